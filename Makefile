@@ -1,0 +1,39 @@
+# The two commands of the README: make demo, make test. Needs Python 3.11+, pip, make and git.
+PYTHON ?= python3
+VENV ?= .venv
+# Options for pip, e.g. PIP_ARGS="--index-url URL" to choose another build of torch.
+PIP_ARGS ?=
+BIN := $(VENV)/bin
+
+.PHONY: demo test lint slow clean
+
+demo: $(VENV)/.demo
+	$(BIN)/hood rollout output=outputs/demo
+	@echo "Look at outputs/demo/contact_sheet.png and outputs/demo/rollout.mp4"
+
+test: lint
+	$(BIN)/python -m pytest
+
+slow: $(VENV)/.dev
+	$(BIN)/python -m pytest -m slow
+
+lint: $(VENV)/.dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+$(VENV)/bin/python:
+	$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11) and 'hood needs Python 3.11 or newer; set PYTHON=')"
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.demo: pyproject.toml constraints.txt | $(VENV)/bin/python
+	$(BIN)/python -m pip install -q $(PIP_ARGS) -c constraints.txt -e ".[pictures]"
+	@touch $@
+
+$(VENV)/.dev: pyproject.toml constraints.txt | $(VENV)/bin/python
+	$(BIN)/python -m pip install -q $(PIP_ARGS) -c constraints.txt -e ".[dev]"
+	@touch $@
+
+clean:
+	rm -rf $(VENV) outputs runs

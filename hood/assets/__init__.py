@@ -1,0 +1,1 @@
+"""Files and objects: bodies, garments, motions, fabrics."""

@@ -1,0 +1,61 @@
+"""``hood COMMAND --help``: keys with their defaults, and every name that can be given."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+
+from hood.assets import library
+from hood.config import CONFIG_FOLDER, load_config, options, plain
+
+_EXAMPLES = {
+    "train": ["hood train experiment=quickstart output=runs/quickstart", "hood train model=ours trainer=paper data.garments=[dress]"],
+    "rollout": [
+        "hood rollout garment=dress sequence=walk_steady num_frames=200 output=outputs/dress",
+        "hood rollout garment=my_shirt.obj sequence=CMU_01_poses.npz material=denim",
+    ],
+    "evaluate": ["hood evaluate", "hood evaluate models=[runs/a/model.safetensors] garments=[dress]"],
+}
+
+
+def describe(name: str) -> str:
+    """Help text of the command ``name``."""
+    config = load_config(name)
+    comments = _comments(name)
+    lines = [f"usage: hood {name} [key=value ...]", ""]
+    for key in config:
+        value = plain(config[key])
+        if isinstance(value, dict):
+            continue
+        text = f"  {key}={_show(value)}"
+        note = comments.get(str(key), "")
+        lines.append(textwrap.fill(f"{text:<34}{note}", 118, subsequent_indent=" " * 34))
+    lines += ["", "config groups (their keys can be overridden too, e.g. material.density=0.3):"]
+    for group in _groups_of(name):
+        lines.append(f"  {group + '=':<14}{' | '.join(options(group))}")
+    lines += ["", "embedded names:"]
+    for kind, label in (("garments", "garment"), ("motions", "sequence"), ("body", "body"), ("weights", "checkpoint")):
+        lines.append(textwrap.fill(f"  {label + '=':<14}{' '.join(library.names(kind))}", 118, subsequent_indent=" " * 16))
+    lines += ["", "examples:", *(f"  {example}" for example in _EXAMPLES[name])]
+    return "\n".join(lines)
+
+
+def _comments(name: str) -> dict[str, str]:
+    """Comments behind the keys of a config file: the help is written once, beside the default."""
+    notes = {}
+    for line in (CONFIG_FOLDER / f"{name}.yaml").read_text(encoding="utf-8").splitlines():
+        match = re.match(r"(\w+):[^#]*#\s*(.*)", line)
+        if match:
+            notes[match.group(1)] = match.group(2)
+    return notes
+
+
+def _groups_of(name: str) -> list[str]:
+    text = (CONFIG_FOLDER / f"{name}.yaml").read_text(encoding="utf-8")
+    return [match for match in re.findall(r"^\s+- (?:override )?/?(\w+):", text, flags=re.M) if match != "_self_"]
+
+
+def _show(value: object) -> str:
+    if isinstance(value, list):
+        return "[" + ",".join(_show(item) for item in value) + "]"
+    return {None: "null", True: "true", False: "false"}.get(value, str(value)) if not isinstance(value, (int, float)) or isinstance(value, bool) else f"{value:g}" if isinstance(value, float) else str(value)

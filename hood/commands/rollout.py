@@ -1,0 +1,245 @@
+"""``hood rollout``: a garment, a body and a motion in; ``rollout.h5``, a video, a contact sheet and a summary out."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from omegaconf import DictConfig
+from tqdm import tqdm
+
+from hood.assets.body import load_body
+from hood.assets.garment import load_garment
+from hood.assets.library import locate
+from hood.assets.sequence import load_sequence
+from hood.config import ConfigError, build, load_config, plain, require_choice, save_run_record
+from hood.dynamics.recorder import RolloutWriter, read_rollout
+from hood.dynamics.rollout import metric_names, simulate
+from hood.dynamics.simulator import Simulator, load_simulator
+from hood.scene.scene import Scene, build_scene
+
+UNTRAINED = "untrained"
+
+
+def run(overrides: Sequence[str]) -> int:
+    """Run the command; returns the exit code."""
+    config = load_config("rollout", overrides)
+    require_choice(config, "device", ("cpu", "cuda"))
+    require_choice(config, "video", ("mp4", "gif", "none"))
+    _check_numbers(config)
+    scene = make_scene(config)
+    simulator, digest = make_simulator(config)
+    folder = prepare_folder(Path(str(config.output)).expanduser())
+    save_run_record(folder, config, int(config.seed))
+    interrupted = _simulate_to_disk(config, scene, simulator, digest, folder / "rollout.h5")
+    summary = summarise(folder / "rollout.h5")
+    _write_json(folder / "summary.json", summary)
+    print(describe(summary))
+    if not interrupted:
+        _draw(config, folder)
+    print(f"files in {folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
+    if interrupted:
+        print(f"hood: interrupted; the {summary['num_frames']} frames done are kept in {folder / 'rollout.h5'}", file=sys.stderr)
+        return 130
+    return 0
+
+
+def make_scene(config: DictConfig) -> Scene:
+    """Assets named in the config, put together."""
+    sequence = load_sequence(str(config.sequence), fps=float(config.fps), up=str(config.up))
+    garment = load_garment(str(config.garment), triangulate=bool(config.triangulate))
+    body = load_body(str(config.body))
+    betas = np.zeros(10)
+    given = [float(b) for b in config.betas]
+    if len(given) > 10 or not np.isfinite(given).all():
+        raise ConfigError(f"betas={given}: give at most 10 finite shape coefficients")
+    betas[: len(given)] = given
+    return build_scene(garment, body, sequence, build(config.material), betas)
+
+
+def make_simulator(config: DictConfig) -> tuple[Simulator, str]:
+    """The checkpoint's simulator and its SHA-256; ``checkpoint=untrained`` builds ``model`` with seeded random weights.
+
+    Raises:
+        ConfigError: the checkpoint holds another model than the one asked for.
+    """
+    torch.manual_seed(int(config.seed))
+    asked = None if config.get("model") is None else plain(config.model)
+    device = str(config.device)
+    if device == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("device=cuda: no CUDA device is available; use device=cpu")
+    if str(config.checkpoint) == UNTRAINED:
+        if asked is None:
+            raise ConfigError("checkpoint=untrained needs a model: add model=small (or ours, fine15, fine48)")
+        simulator: Simulator = build(config.model)
+        return simulator.eval().to(device), UNTRAINED
+    path = locate("weights", str(config.checkpoint))
+    simulator = load_simulator(path)
+    if asked is not None:
+        built: Simulator = build(config.model)
+        if built.config != simulator.config:
+            raise ConfigError(f"{path}: holds model {simulator.config}, not the model asked for; drop model=… from the command")
+    return simulator.eval().to(device), hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def prepare_folder(folder: Path) -> Path:
+    """The output folder, made and checked for writing.
+
+    Raises:
+        OSError: it cannot be made or written to.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    if not os.access(folder, os.W_OK):
+        raise PermissionError(13, "Permission denied", str(folder))
+    return folder
+
+
+def summarise(path: Path) -> dict[str, Any]:
+    """Summary of a rollout file: strain, penetration, times, first non-finite frame."""
+    data = read_rollout(path)
+    finite = np.isfinite(data.cloth_pos).all(axis=(1, 2))
+    metrics = data.metrics
+    times = {name: _quantiles(metrics[f"ms_{name}"][2:]) for name in ("search", "features", "network", "rest", "total")}
+    return {
+        "num_frames": int(len(finite)),
+        "complete": bool(data.attributes["complete"]),
+        "garment": data.attributes["garment"],
+        "num_vertices": int(data.cloth_pos.shape[1]),
+        "dt": float(data.attributes["dt"]),
+        "first_nonfinite_frame": None if finite.all() else int(np.argmin(finite)),
+        "first_frame": {key: _at(metrics[key], 0) for key in ("strain_p50", "strain_p99", "penetration_count", "penetration_depth")},
+        "strain_p50": _median(metrics["strain_p50"]),
+        "strain_p99": _median(metrics["strain_p99"]),
+        "strain_max": _largest(metrics["strain_max"]),
+        "penetration_share_mean": _mean(metrics["penetration_share"]),
+        "penetration_share_max": _largest(metrics["penetration_share"]),
+        "penetration_count_max": _largest(metrics["penetration_count"]),
+        "penetration_depth_max_m": _largest(metrics["penetration_depth"]),
+        "relative_gradient_median": _median(metrics["relative_gradient"]),
+        "ms_per_frame": times,
+    }
+
+
+def describe(summary: dict[str, Any]) -> str:
+    """The summary in three lines."""
+    first = summary["first_nonfinite_frame"]
+    times = {name: value["median"] for name, value in summary["ms_per_frame"].items()}
+    return "\n".join(
+        [
+            f"{summary['garment']}: {summary['num_frames']} frames, "
+            + ("all finite" if first is None else f"first non-finite frame {first}"),
+            f"strain p50 {_percent(summary['strain_p50'])} p99 {_percent(summary['strain_p99'])}, penetration "
+            f"{_percent(summary['penetration_share_mean'])} of the vertices deeper than 2 mm, "
+            f"deepest {1e3 * (summary['penetration_depth_max_m'] or 0.0):.1f} mm",
+            "ms per frame (median): " + ", ".join(f"{name} {value or 0.0:.1f}" for name, value in times.items()),
+        ]
+    )
+
+
+def _simulate_to_disk(config: DictConfig, scene: Scene, simulator: Simulator, digest: str, path: Path) -> bool:
+    """Stream the rollout into ``path``; True when the user interrupted it."""
+    potential = build(config.losses)
+    count = min(int(config.num_frames), scene.num_frames)
+    if count < int(config.num_frames):
+        print(f"{scene.motion.sequence.name} has {count} frames at {1 / scene.dt:g} fps; the rollout ends there")
+    attributes = {
+        "material": plain(config.material),
+        "config": plain(config),
+        "checkpoint": str(config.checkpoint),
+        "checkpoint_sha256": digest,
+        "model": simulator.config,
+        "garment": scene.garment.name,
+        "sequence": scene.motion.sequence.name,
+    }
+    writer = RolloutWriter(
+        path,
+        count,
+        scene.cloth.rest_pos.numpy(),
+        scene.garment.faces,
+        scene.motion.body.faces,
+        len(scene.motion.body.v_template),
+        metric_names(potential),
+        scene.dt,
+        attributes,
+        farthest=float(np.abs(scene.motion.translation).max()),
+    )
+    frames = simulate(simulator, scene, potential, count, int(config.relaxing_steps))
+    try:
+        with writer:
+            for frame in tqdm(frames, total=count, desc=f"rollout {scene.garment.name}", unit="frame", disable=None):
+                writer.append(frame.world_pos.numpy(), frame.body_pos.numpy(), frame.metrics)
+    except KeyboardInterrupt:
+        if writer.frames_done == 0:
+            raise
+        return True
+    return False
+
+
+def _draw(config: DictConfig, folder: Path) -> None:
+    """Contact sheet and video, when the picture libraries are installed."""
+    if str(config.video) == "none" and not bool(config.sheet):
+        return
+    try:
+        from hood.media.film import write_sheet, write_video
+    except ImportError as error:
+        print(f"no pictures: {error}", file=sys.stderr)
+        return
+    data = read_rollout(folder / "rollout.h5")
+    if bool(config.sheet):
+        write_sheet(data, folder / "contact_sheet.png")
+    if str(config.video) != "none":
+        frames = tqdm(range(0, len(data.cloth_pos), int(config.video_stride)), desc="video", unit="frame", disable=None)
+        write_video(data, folder / f"rollout.{config.video}", frames, int(config.video_stride))
+
+
+def _check_numbers(config: DictConfig) -> None:
+    for key, least in (("num_frames", 1), ("relaxing_steps", 0), ("video_stride", 1), ("seed", 0)):
+        if int(config[key]) < least:
+            raise ConfigError(f"{key}={config[key]}: must be at least {least}")
+    if not 1.0 <= float(config.fps) <= 1000.0:
+        raise ConfigError(f"fps={config.fps}: give the simulation's frames per second, 1 to 1000")
+
+
+def _write_json(path: Path, value: dict[str, Any]) -> None:
+    temporary = path.with_name(path.name + ".partial")
+    temporary.write_text(json.dumps(value, indent=1), encoding="utf-8")
+    os.replace(temporary, path)
+
+
+def _quantiles(values: np.ndarray) -> dict[str, float | None]:
+    values = values[np.isfinite(values)]
+    if len(values) == 0:
+        return {"median": None, "p99": None}
+    return {"median": float(np.median(values)), "p99": float(np.quantile(values, 0.99))}
+
+
+def _at(values: np.ndarray, index: int) -> float | None:
+    return float(values[index]) if np.isfinite(values[index]) else None
+
+
+def _reduce(function: Any, values: np.ndarray) -> float | None:
+    values = values[np.isfinite(values)]
+    return float(function(values)) if len(values) else None
+
+
+def _median(values: np.ndarray) -> float | None:
+    return _reduce(np.median, values)
+
+
+def _mean(values: np.ndarray) -> float | None:
+    return _reduce(np.mean, values)
+
+
+def _largest(values: np.ndarray) -> float | None:
+    return _reduce(np.max, values)
+
+
+def _percent(value: float | None) -> str:
+    return "n/a" if value is None else f"{100 * value:.1f}%"

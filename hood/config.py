@@ -1,0 +1,180 @@
+"""The only reader of YAML: Hydra config groups composed, checked and resolved; below it arguments are plain values."""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
+from hydra.utils import instantiate
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from hood.assets.library import unknown
+
+_PACKAGE = Path(__file__).resolve().parent
+#: Installed packages carry the configs inside; a clone has them beside the package.
+CONFIG_FOLDER = _PACKAGE / "configs" if (_PACKAGE / "configs").is_dir() else _PACKAGE.parent / "configs"
+_TARGETS = ("hood.", "torch.optim.")
+
+
+class ConfigError(ValueError):
+    """A configuration the user must change; the message names the key, the near miss and the fix."""
+
+
+def load_config(name: str, overrides: Sequence[str] = ()) -> DictConfig:
+    """Config ``configs/<name>.yaml`` with Hydra ``overrides`` (``key=value``, ``group=option``), fully resolved.
+
+    Raises:
+        ConfigError: misspelt key, group option or type; Hydra's own complaints in one line.
+    """
+    with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
+        try:
+            defaults = compose(name)
+            chosen = [_check_override(name, text, defaults) for text in overrides]
+            # The groups may bring keys of their own, so keys are checked against the composition with all groups chosen.
+            groups = [text for text, override in chosen if _is_group(override)]
+            known = compose(name, groups)
+            for _, override in chosen:
+                if not _is_group(override):
+                    _check_key(override, known)
+            config = compose(name, list(overrides))
+            OmegaConf.resolve(config)
+        except ConfigError:
+            raise
+        except (HydraException, OmegaConfBaseException) as error:
+            raise ConfigError(f"configuration: {_one_line(error)}") from error
+    OmegaConf.set_struct(config, True)
+    _check_types(known, config, "")
+    return config
+
+
+def build(node: DictConfig | dict[str, Any], **extra: Any) -> Any:
+    """Object named by ``node._target_`` with the node's keys as arguments; only ``hood.`` and ``torch.optim.`` targets.
+
+    Raises:
+        ConfigError: forbidden target, or arguments the target does not take.
+    """
+    config = OmegaConf.create(node) if isinstance(node, dict) else node
+    _check_targets(config)
+    try:
+        return instantiate(config, **extra, _convert_="all")
+    except HydraException as error:
+        cause = error.__cause__ or error
+        if isinstance(cause, (ValueError, OSError)):
+            raise cause from error
+        raise ConfigError(f"configuration: {_one_line(cause)}") from error
+
+
+def plain(node: Any) -> Any:
+    """The node as dicts, lists and scalars."""
+    return OmegaConf.to_container(node, resolve=True) if isinstance(node, (DictConfig, ListConfig)) else node
+
+
+def options(group: str) -> list[str]:
+    """Names of a config group's options."""
+    return sorted(path.stem for path in (CONFIG_FOLDER / group).glob("*.yaml"))
+
+
+def groups() -> list[str]:
+    """Names of the config groups."""
+    return sorted(path.name for path in CONFIG_FOLDER.iterdir() if path.is_dir())
+
+
+def require_choice(config: DictConfig, key: str, known: Sequence[str]) -> None:
+    """Raise ConfigError unless ``config[key]`` is one of ``known``; names the near miss."""
+    if str(config[key]) not in known:
+        raise ConfigError(unknown(f"value for {key}", str(config[key]), known))
+
+
+def save_run_record(folder: Path, config: DictConfig, seed: int) -> None:
+    """Write ``config.yaml`` (resolved) and ``versions.json`` (packages, platform, seed) into a run folder."""
+    from importlib.metadata import version
+
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "config.yaml").write_text(OmegaConf.to_yaml(config, resolve=True), encoding="utf-8")
+    packages = {name: version(name) for name in ("torch", "numpy", "scipy", "h5py", "hydra-core", "safetensors")}
+    from hood import __version__
+
+    record = {"hood": __version__, "python": platform.python_version(), "platform": platform.platform(), **packages, "seed": seed}
+    (folder / "versions.json").write_text(json.dumps(record, indent=1), encoding="utf-8")
+
+
+def _check_override(name: str, text: str, defaults: DictConfig) -> tuple[str, Override]:
+    if "=" not in text and not text.startswith("~"):
+        raise ConfigError(f"argument {text!r} is not of the form key=value; keys of {name}: {', '.join(defaults)}")
+    override = OverridesParser.create().parse_override(text)
+    key = override.get_key_element().lstrip("+~").split("@")[0]
+    if _is_group(override) and override.value() is not None and str(override.value()) not in options(key):
+        raise ConfigError(unknown(f"option of {key}", str(override.value()), options(key)))
+    return text, override
+
+
+def _is_group(override: Override) -> bool:
+    key = override.key_or_group
+    return (CONFIG_FOLDER / key).is_dir() and not isinstance(override.value(), dict)
+
+
+def _check_key(override: Override, known: DictConfig) -> None:
+    if override.is_add() or override.is_delete():
+        raise ConfigError(f"override {override.input_line!r}: keys are fixed; write key=value without '+' or '~'")
+    key = override.key_or_group
+    if OmegaConf.select(known, key, default=OmegaConf) is OmegaConf:
+        raise ConfigError(unknown("key", key, _dotted(known, key.count("."))))
+
+
+def _dotted(config: DictConfig, depth: int, prefix: str = "") -> list[str]:
+    keys = []
+    for key in config:
+        path = f"{prefix}{key}"
+        if depth == 0 or not isinstance(config[key], DictConfig):
+            keys.append(path)
+        if depth > 0 and isinstance(config[key], DictConfig):
+            keys.extend(_dotted(config[key], depth - 1, path + "."))
+    return keys
+
+
+def _check_types(known: DictConfig, config: DictConfig, prefix: str) -> None:
+    """A value must have the kind of the default it replaces; a None default takes anything."""
+    for key in config:
+        before, after = known.get(key), config[key]
+        if isinstance(after, DictConfig) and isinstance(before, DictConfig):
+            _check_types(before, after, f"{prefix}{key}.")
+        elif before is not None and not _same_kind(before, after):
+            kind = "list" if isinstance(before, ListConfig) else type(before).__name__
+            raise ConfigError(f"{prefix}{key}={after!r}: expected a value like {plain(before)!r} ({kind})")
+
+
+def _same_kind(before: Any, after: Any) -> bool:
+    if isinstance(before, bool) or isinstance(after, bool):
+        return isinstance(before, bool) and isinstance(after, bool)
+    if isinstance(before, float):
+        return isinstance(after, (int, float))
+    if isinstance(before, str):
+        # Names may look like numbers (garment=12): taken as text.
+        return isinstance(after, (str, int, float)) or after is None
+    if isinstance(before, ListConfig):
+        return isinstance(after, ListConfig)
+    return isinstance(after, type(before))
+
+
+def _check_targets(node: Any) -> None:
+    if isinstance(node, DictConfig):
+        target = node.get("_target_")
+        if target is not None and not str(target).startswith(_TARGETS):
+            raise ConfigError(f"_target_ {target!r} is not allowed: only {' and '.join(_TARGETS)} classes are built")
+        for key in node:
+            _check_targets(node[key])
+    elif isinstance(node, ListConfig):
+        for item in node:
+            _check_targets(item)
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

@@ -1,0 +1,1 @@
+"""Integrate, simulate, roll out."""

@@ -1,0 +1,44 @@
+"""What is reported about a frame: strain and penetration. Never part of the loss."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from hood.scene.cloth import Cloth
+from hood.scene.contact import Contact
+
+#: A vertex deeper than this [m] inside the body counts as penetrating.
+PENETRATION_DEPTH = 2e-3
+
+
+def edge_strain(cloth: Cloth, pos: Tensor) -> Tensor:
+    """Relative length change of every edge, (E,), signed."""
+    start, end = cloth.edges.unbind(dim=1)
+    rest = (cloth.rest_pos[end] - cloth.rest_pos[start]).norm(dim=1)
+    return (pos[end] - pos[start]).norm(dim=1) / rest - 1.0
+
+
+def strain_metrics(cloth: Cloth, pos: Tensor) -> dict[str, float]:
+    """Median, 99th percentile and maximum of the absolute edge strain; NaN where ``pos`` (V, 3) is not finite."""
+    strain = edge_strain(cloth, pos).abs()
+    if not bool(torch.isfinite(strain).all()):
+        return {"strain_p50": float("nan"), "strain_p99": float("nan"), "strain_max": float("nan")}
+    quantiles = torch.quantile(strain.double(), torch.tensor([0.5, 0.99, 1.0], dtype=torch.float64))
+    return dict(zip(("strain_p50", "strain_p99", "strain_max"), quantiles.tolist(), strict=True))
+
+
+def penetration_metrics(contact: Contact | None, num_vertices: int) -> dict[str, float]:
+    """Count, share and depth [m] of the vertices deeper than :data:`PENETRATION_DEPTH` inside the body at t."""
+    if contact is None:
+        return {"penetration_count": 0.0, "penetration_share": 0.0, "penetration_depth": 0.0}
+    depth = (-contact.dist) * contact.valid
+    count = int((depth > PENETRATION_DEPTH).sum())
+    return {
+        "penetration_count": float(count),
+        "penetration_share": count / max(num_vertices, 1),
+        "penetration_depth": float(depth.max().clamp_min(0.0)) if num_vertices else 0.0,
+    }
+
+
+METRICS = ("strain_p50", "strain_p99", "strain_max", "penetration_count", "penetration_share", "penetration_depth")

@@ -1,0 +1,96 @@
+"""How the network's raw output becomes next positions: the paper's accelerations, or corrections to a moving base."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import torch
+from torch import Tensor, nn
+
+from hood.features.normalizer import RunningNormalizer
+from hood.losses.problem import StepProblem, inertial_guess
+
+_SMOOTHING_ROUNDS = 16
+#: A body this far away [m] has a quarter of the say over a vertex's base motion.
+_REACH = 0.03
+
+
+class Output(ABC, nn.Module):
+    """Turns raw network output into displacements [m] from a base position."""
+
+    @abstractmethod
+    def base(self, problem: StepProblem) -> Tensor:
+        """Base positions (V, 3) [m]: what zero output means."""
+
+    @abstractmethod
+    def displacement(self, raw: Tensor) -> Tensor:
+        """Displacement (V, 3) [m] from the base for raw output (V, 3)."""
+
+
+class AccelerationOutput(Output):
+    """The paper's output (section 4.2): acceleration per frame², de-normalised by running statistics; the base is the
+    inertial guess x_t + dt v_t."""
+
+    def __init__(self, decay: float = 0.999) -> None:
+        super().__init__()
+        self.normalizer = RunningNormalizer(3, decay)
+
+    def base(self, problem: StepProblem) -> Tensor:
+        return inertial_guess(problem.state, problem.step, problem.cloth.vertex_scene)
+
+    def displacement(self, raw: Tensor) -> Tensor:
+        return self.normalizer.inverse(raw)
+
+    def observe(self, displacement: Tensor) -> None:
+        """Collect statistics from skinned accelerations x⁺ − 2x + x⁻ (V, 3) [m per frame²]."""
+        self.normalizer.update(displacement)
+
+
+class VelocityBaseOutput(Output):
+    """Corrections of ``scale`` [m] to a base that moves with the body and stays outside it.
+
+    The base is x_t plus the motion of the nearest body surface, averaged over the garment with trust falling with
+    distance, then pushed ``clearance`` [m] out of the body at t + 1. Unlike x_t + dt v_t it does not carry the velocity's
+    errors on, so that a rollout cannot feed them back.
+    """
+
+    def __init__(self, scale: float = 5e-3, clearance: float = 2e-3) -> None:
+        super().__init__()
+        self.scale, self.clearance = scale, clearance
+
+    def base(self, problem: StepProblem) -> Tensor:
+        state, contact, cloth = problem.state, problem.contact, problem.cloth
+        if contact is None:
+            return inertial_guess(state, problem.step, cloth.vertex_scene)
+        trust = 1.0 / (1.0 + 3.0 * (contact.dist.clamp_min(0.0) / _REACH) ** 2)
+        motion = contact.next_point - contact.point
+        target = problem.step.pin_target
+        if target is not None:
+            pinned = cloth.pinned
+            motion = torch.where(pinned.unsqueeze(1), target - state.pos, motion)
+            trust = torch.where(pinned, torch.ones_like(trust), trust)
+        base = state.pos + _smooth(motion, trust, cloth.edges)
+        depth = (self.clearance - contact.next_dist(base)).clamp_min(0.0) * contact.valid
+        return base + depth.unsqueeze(1) * contact.next_normal
+
+    def displacement(self, raw: Tensor) -> Tensor:
+        return self.scale * raw
+
+
+def _smooth(values: Tensor, trust: Tensor, edges: Tensor) -> Tensor:
+    """Trust-weighted averages of ``values`` (V, 3) over growing neighbourhoods: untrusted vertices take their neighbours'
+    values, trusted ones keep theirs."""
+    start, end = edges.unbind(dim=1)
+    senders, receivers = torch.cat([start, end]), torch.cat([end, start])
+    weight = trust.unsqueeze(1)
+    total = torch.cat([values * weight, weight], dim=1)
+    degree = torch.zeros_like(weight).index_add(0, receivers, torch.ones_like(weight[senders])).clamp_min(1.0)
+    smooth = total
+    for _ in range(_SMOOTHING_ROUNDS):
+        spread = torch.zeros_like(smooth).index_add(0, receivers, smooth.index_select(0, senders)) / degree
+        # A vertex keeps its own say in every round, in proportion to its trust.
+        smooth = weight * total + (1.0 - 0.5 * weight) * spread
+    return smooth[:, :3] / smooth[:, 3:].clamp_min(1e-12)
+
+
+OUTPUTS = {"acceleration": AccelerationOutput, "velocity_base": VelocityBaseOutput}

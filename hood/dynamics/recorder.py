@@ -1,0 +1,158 @@
+"""Rollouts on disk: frames stream into ``rollout.h5``, readable at any moment, also after the process was killed."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import h5py
+import numpy as np
+
+#: World coordinates beyond this [m] are written in float64: float32 resolves only 8 µm there.
+_FAR = 100.0
+
+
+class RolloutWriter:
+    """Streams a rollout into an HDF5 file.
+
+    Datasets: ``cloth/pos (T,V,3)``, ``cloth/faces``, ``cloth/rest_pos``, ``body/pos (T,W,3)``, ``body/faces``, ``time (T,)``,
+    ``metrics/* (T,)``; attributes: ``num_frames`` done so far, ``complete``, and what is given as ``attributes``.
+
+    All datasets are laid out, filled with NaN, when the file is made: a full disk shows at once, and later writes never
+    touch the file's structure, so a killed process leaves a file that opens; its frames end at ``num_frames``.
+    On a normal close after fewer frames, the file is cut to the frames done.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        num_frames: int,
+        cloth_rest_pos: np.ndarray,
+        cloth_faces: np.ndarray,
+        body_faces: np.ndarray,
+        num_body_vertices: int,
+        metric_names: tuple[str, ...],
+        dt: float,
+        attributes: Mapping[str, Any],
+        farthest: float = 0.0,
+    ) -> None:
+        self.path = path
+        self.frames_done = 0
+        self._file = h5py.File(path, "w")
+        try:
+            real = np.float64 if farthest > _FAR else np.float32
+            shapes = {"cloth/pos": (num_frames, len(cloth_rest_pos), 3), "body/pos": (num_frames, num_body_vertices, 3)}
+            for name, shape in shapes.items():
+                self._file.create_dataset(name, shape, dtype=real, fillvalue=np.nan)
+            for name in metric_names:
+                self._file.create_dataset(f"metrics/{name}", (num_frames,), dtype=np.float64, fillvalue=np.nan)
+            self._file["cloth/faces"] = np.asarray(cloth_faces, dtype=np.int32)
+            self._file["cloth/rest_pos"] = np.asarray(cloth_rest_pos, dtype=np.float32)
+            self._file["body/faces"] = np.asarray(body_faces, dtype=np.int32)
+            self._file["time"] = np.arange(num_frames) * dt
+            for key, value in {"dt": dt, "num_frames": 0, "complete": False, **attributes}.items():
+                self._file.attrs[key] = value if np.isscalar(value) or isinstance(value, np.ndarray) else json.dumps(value)
+            self._touch_all()
+            self._file.flush()
+        except BaseException:
+            self.discard()
+            raise
+
+    def append(self, cloth_pos: np.ndarray, body_pos: np.ndarray, metrics: Mapping[str, float]) -> None:
+        """Write one frame: world positions (V, 3) and (W, 3) [m] and its metrics."""
+        frame = self.frames_done
+        self._file["cloth/pos"][frame] = cloth_pos
+        self._file["body/pos"][frame] = body_pos
+        for name, value in metrics.items():
+            self._file[f"metrics/{name}"][frame] = value
+        self.frames_done += 1
+        self._file.attrs.modify("num_frames", self.frames_done)
+        self._file.flush()
+
+    def close(self, complete: bool) -> None:
+        """Finish the file; fewer frames than announced are cut off."""
+        total = len(self._file["time"])
+        self._file.attrs.modify("complete", complete)
+        self._file.close()
+        if self.frames_done < total:
+            _truncate(self.path, self.frames_done)
+
+    def discard(self) -> None:
+        """Close and delete the file: nothing half-written stays behind."""
+        try:
+            self._file.close()
+        except (OSError, RuntimeError):
+            pass  # a full disk refuses the final flush too; the file goes away anyway
+        self.path.unlink(missing_ok=True)
+
+    def _touch_all(self) -> None:
+        # HDF5 lays contiguous data out at the first write; one row is enough to allocate and fill everything.
+        for name in ("cloth/pos", "body/pos"):
+            self._file[name][-1] = np.nan
+
+    def __enter__(self) -> RolloutWriter:
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if isinstance(error, OSError) or self.frames_done == 0:
+            self.discard()
+        else:
+            self.close(complete=error is None)
+
+
+@dataclass(frozen=True)
+class RolloutData:
+    """A rollout read back; arrays hold the frames done."""
+
+    cloth_pos: np.ndarray  # (T, V, 3) m, world
+    cloth_faces: np.ndarray  # (F, 3)
+    rest_pos: np.ndarray  # (V, 3) m
+    body_pos: np.ndarray  # (T, W, 3) m, world
+    body_faces: np.ndarray  # (G, 3)
+    time: np.ndarray  # (T,) s
+    metrics: dict[str, np.ndarray]
+    attributes: dict[str, Any]
+
+
+def read_rollout(path: Path) -> RolloutData:
+    """Read ``rollout.h5``, also one whose writer was killed.
+
+    Raises:
+        ValueError: not a rollout file.
+    """
+    try:
+        with h5py.File(path, "r") as file:
+            done = int(file.attrs["num_frames"])
+            return RolloutData(
+                cloth_pos=file["cloth/pos"][:done],
+                cloth_faces=file["cloth/faces"][:],
+                rest_pos=file["cloth/rest_pos"][:],
+                body_pos=file["body/pos"][:done],
+                body_faces=file["body/faces"][:],
+                time=file["time"][:done],
+                metrics={name: data[:done] for name, data in file["metrics"].items()},
+                attributes=dict(file.attrs),
+            )
+    except FileNotFoundError:
+        raise
+    except (OSError, KeyError) as error:
+        raise ValueError(f"{path}: not a rollout file ({error}); make one with hood rollout") from error
+
+
+def _truncate(path: Path, num_frames: int) -> None:
+    """Rewrite the file with its first ``num_frames`` frames."""
+    temporary = path.with_name(path.name + ".partial")
+    with h5py.File(path, "r") as source, h5py.File(temporary, "w") as target:
+        for key, value in source.attrs.items():
+            target.attrs[key] = value
+        per_frame = {"cloth/pos", "body/pos", "time", *(f"metrics/{name}" for name in source["metrics"])}
+        for name in ("cloth/faces", "cloth/rest_pos", "body/faces"):
+            target[name] = source[name][:]
+        for name in per_frame:
+            target[name] = source[name][:num_frames]
+    os.replace(temporary, path)

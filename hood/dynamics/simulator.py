@@ -1,0 +1,254 @@
+"""The learned step: contact search, features, network, next positions. The model is what a checkpoint holds."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from hood.dynamics.output import OUTPUTS, AccelerationOutput, Output
+from hood.dynamics.stopwatch import Stopwatch
+from hood.features import groups, physical
+from hood.features.inputs import Inputs
+from hood.graph.builder import StaticGraph, build_graph, build_static
+from hood.graph.hierarchy import Hierarchy, build_hierarchy, concatenate_hierarchies
+from hood.losses.potential import default_potential
+from hood.losses.problem import StepProblem
+from hood.nn.model import MeshGraphNet
+from hood.nn.schedule import edge_set_names, parse_schedule, set_level
+from hood.scene.cloth import Cloth
+from hood.scene.contact import Contact, find_contact
+from hood.scene.state import State, StepInput
+
+_FORMAT = "hood-1"
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """What the simulator needs to know about a cloth, computed once: its hierarchy and static graph."""
+
+    hierarchy: Hierarchy
+    static: StaticGraph | None = None  # None inside a batch that is still to be put together
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """One predicted step."""
+
+    next_pos: Tensor  # (V, 3) m, local
+    acc: Tensor  # (V, 3) m/s², such that next_pos = pos + dt vel + dt² acc
+
+
+class Simulator(nn.Module):
+    """``State → State``: next_state = simulator.step(cloth, prepared, state, step_input).
+
+    Build it with :func:`build_simulator`; ``config`` holds that call's arguments and travels with the weights.
+    """
+
+    gravity: Tensor
+
+    def __init__(
+        self, features: groups.FeatureSet, network: MeshGraphNet, output: Output, body_radius: float, config: dict[str, Any]
+    ) -> None:
+        super().__init__()
+        self.features, self.network, self.output = features, network, output
+        self.body_radius = body_radius
+        self.config = config
+        self.register_buffer("gravity", torch.tensor([0.0, -9.81, 0.0]), persistent=False)
+        # The residual feature asks the physics where the base guess is wrong; its parameters are part of the model.
+        self._residual = default_potential()
+        self._wants_residual = any(isinstance(group, physical.Residual) for group in features.node)
+        self._wants_base = any(isinstance(group, physical.RelativeVelocity) for group in features.node)
+
+    @property
+    def schedule(self) -> tuple[tuple[str, ...], ...]:
+        return self.network.schedule
+
+    @property
+    def num_coarse(self) -> int:
+        return num_coarse_levels(self.schedule)
+
+    @property
+    def uses_statistics(self) -> bool:
+        """Whether normalisers must see data before training starts."""
+        return isinstance(self.output, AccelerationOutput) or self.features.node_normalizer is not None
+
+    @property
+    def velocity_columns(self) -> slice:
+        """Columns of the node features that hold the velocity: both feature sets put it first."""
+        return slice(0, 3)
+
+    def prepare(self, cloth: Cloth, rest_pos: Any) -> Prepared:
+        """Hierarchy and static graph of one garment; ``rest_pos`` (V, 3) orders its vertices."""
+        hierarchy = _cached_hierarchy(cloth, rest_pos, self.num_coarse)
+        return Prepared(hierarchy, build_static(cloth, hierarchy, self.network.edge_set_names))
+
+    def concatenate(self, cloth: Cloth, prepared: Sequence[Prepared], vertex_counts: Sequence[int]) -> Prepared:
+        """The same for a flat batch ``cloth`` of several garments."""
+        hierarchy = concatenate_hierarchies([item.hierarchy for item in prepared], vertex_counts)
+        return Prepared(hierarchy, build_static(cloth, hierarchy, self.network.edge_set_names))
+
+    def find_contact(self, cloth: Cloth, state: State, step: StepInput) -> Contact | None:
+        """The step's one contact search; None without a body."""
+        return None if step.obstacle is None else find_contact(state.pos, cloth.vertex_scene, step.obstacle)
+
+    def predict(self, problem: StepProblem, prepared: Prepared, watch: Stopwatch | None = None) -> Prediction:
+        """Positions at t + 1. Pinned vertices reach their targets exactly, massless ones stay where they are."""
+        assert prepared.static is not None
+        cloth, state, step = problem.cloth, problem.state, problem.step
+        with _part(watch, "features"):
+            with torch.no_grad():
+                base = self.output.base(problem)
+                residual = self._residual_acceleration(problem, base) if self._wants_residual else None
+                graph = build_graph(prepared.static, step, problem.contact, self.body_radius)
+                inputs = Inputs(cloth, state, step, problem.contact, graph, base if self._wants_base else None, residual)
+            nodes, edges = self.features(inputs)
+        with _part(watch, "network"):
+            raw = self.network(graph, nodes, edges)
+        free = cloth.free.unsqueeze(1)
+        displacement = self.output.displacement(raw)
+        fixed = state.pos
+        if step.pin_target is not None:
+            fixed = torch.where(cloth.pinned.unsqueeze(1), step.pin_target, fixed)
+        next_pos = torch.where(free, base + displacement, fixed)
+        dt = problem.vertex_dt
+        if isinstance(self.output, AccelerationOutput):
+            # The network's own acceleration, without the cancellation of x − 2x_t + x_{t−1} in float32.
+            acc = torch.where(free, displacement / dt**2, problem.acceleration(fixed))
+        else:
+            acc = problem.acceleration(next_pos)
+        return Prediction(next_pos, acc)
+
+    def next_velocity(self, problem: StepProblem, prediction: Prediction) -> Tensor:
+        """(V, 3) m/s at t + 1 of the implicit Euler step: (x_{t+1} − x_t) / dt."""
+        return problem.state.vel + problem.vertex_dt * prediction.acc
+
+    def step(self, cloth: Cloth, prepared: Prepared, state: State, step: StepInput) -> State:
+        """The state at t + 1."""
+        problem = StepProblem(cloth, state, step, self.find_contact(cloth, state, step), self.gravity.to(state.pos))
+        prediction = self.predict(problem, prepared)
+        return State(prediction.next_pos, self.next_velocity(problem, prediction), state.origin)
+
+    def clone(self) -> Simulator:
+        """A new simulator of the same model with the same weights."""
+        copy = build_simulator(**self.config)
+        copy.load_state_dict(self.state_dict())
+        return copy.to(self.gravity.device)
+
+    def _residual_acceleration(self, problem: StepProblem, base: Tensor) -> Tensor:
+        gradient, _ = self._residual.gradient(problem, base)
+        return -gradient / problem.cloth.mass.clamp_min(1e-12).unsqueeze(1) * problem.cloth.free.unsqueeze(1)
+
+
+def build_simulator(
+    features: str = "paper",
+    output: str = "acceleration",
+    schedule: str = "ours",
+    latent_dim: int = 128,
+    aggregation: str = "sum",
+    body_radius: float = 0.03,
+    output_scale: float = 5e-3,
+    output_init: float = 1.0,
+    normalizer_decay: float = 0.999,
+) -> Simulator:
+    """A simulator from plain arguments.
+
+    Args:
+        features: ``paper`` (node 24, edge 12, body edge 9, running statistics) or ``physical`` (fixed scales, residual).
+        output: ``acceleration`` (paper) or ``velocity_base`` (corrections to a base that moves with the body).
+        schedule: name (``ours``, ``fine15``, ``fine48``) or text such as ``3x(mesh+coarse0) 3x(coarse0)``.
+        latent_dim: width of all latents.
+        aggregation: ``sum`` or ``mean`` of the messages at a node.
+        body_radius: reach of body edges [m].
+        output_scale: displacement [m] of one unit of raw output (``velocity_base`` only).
+        output_init: factor on the decoder's last layer at the start.
+        normalizer_decay: decay of the exponentially weighted statistics (``paper`` features).
+    """
+    config = dict(locals())
+    for name, value, known in (("features", features, ("paper", "physical")), ("output", output, tuple(OUTPUTS))):
+        if value not in known:
+            raise ValueError(f"model.{name} is {value!r}; choose {' or '.join(known)}")
+    if features == "physical" and output != "velocity_base":
+        raise ValueError("model.features=physical describes corrections to a base; it needs model.output=velocity_base")
+    num_levels = 1 + num_coarse_levels(parse_schedule(schedule))
+    if features == "paper":
+        feature_set = groups.paper(num_levels, decay=normalizer_decay)
+    else:
+        feature_set = physical.physical(num_levels)
+    network = MeshGraphNet(
+        feature_set.node_width, feature_set.edge_widths, latent_dim, schedule, 3, aggregation, output_init
+    )
+    head: Output = AccelerationOutput(normalizer_decay) if output == "acceleration" else OUTPUTS[output](output_scale)
+    return Simulator(feature_set, network, head, body_radius, config)
+
+
+def num_coarse_levels(schedule: Sequence[Sequence[str]]) -> int:
+    """Coarse levels that a schedule works on."""
+    return max(set_level(name) for name in edge_set_names(schedule))
+
+
+def save_simulator(path: Path, simulator: Simulator, metadata: Mapping[str, str] | None = None, half: bool = False) -> None:
+    """Write weights and model config as safetensors, atomically; ``half`` stores weights in float16."""
+    tensors = {
+        name: (value.half() if half and value.is_floating_point() and value.dtype == torch.float32 else value).contiguous()
+        for name, value in simulator.state_dict().items()
+    }
+    header = {"format": _FORMAT, "model": json.dumps(simulator.config), **(metadata or {})}
+    temporary = path.with_name(path.name + ".partial")
+    try:
+        save_file(tensors, temporary, header)
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def load_simulator(path: Path) -> Simulator:
+    """Read a simulator written by :func:`save_simulator`.
+
+    Raises:
+        ValueError: not such a file, or weights that do not fit the model it names.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except SafetensorError as error:
+        raise ValueError(f"{path}: not a model file ({error}); give the model.safetensors of a run") from error
+    if header.get("format") != _FORMAT:
+        raise ValueError(f"{path}: not a hood model (format {header.get('format')!r}); give the model.safetensors of a run")
+    simulator = build_simulator(**json.loads(header["model"]))
+    expected = simulator.state_dict()
+    wrong = [name for name in {*expected, *tensors} if name not in tensors or name not in expected or tensors[name].shape != expected[name].shape]
+    if wrong:
+        raise ValueError(f"{path}: weights do not fit the model in the file, first at {sorted(wrong)[0]!r}; it is damaged")
+    simulator.load_state_dict({name: value.to(expected[name].dtype) for name, value in tensors.items()})
+    return simulator.eval()
+
+
+_HIERARCHIES: dict[tuple[int, int], tuple[Any, Hierarchy]] = {}
+
+
+def _cached_hierarchy(cloth: Cloth, rest_pos: Any, num_coarse: int) -> Hierarchy:
+    """Hierarchies are kept per template array: training meets the same garments thousands of times."""
+    key = (id(rest_pos), num_coarse)
+    entry = _HIERARCHIES.get(key)
+    # Holding the array keeps its id from being reused.
+    if entry is None or entry[0] is not rest_pos or entry[1].num_vertices != cloth.num_vertices:
+        edges = cloth.edges.cpu().numpy()
+        entry = (rest_pos, build_hierarchy(cloth.num_vertices, edges, rest_pos, num_coarse))
+        _HIERARCHIES[key] = entry
+    return entry[1]
+
+
+def _part(watch: Stopwatch | None, name: str):  # type: ignore[no-untyped-def]
+    return nullcontext() if watch is None else watch.part(name)

@@ -1,0 +1,1 @@
+"""Metrics, validation rollouts, tables."""

@@ -1,0 +1,75 @@
+"""Propagation radius of a network, measured: how far a node's input reaches in one step."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import torch
+from scipy import sparse
+from scipy.sparse.csgraph import shortest_path
+from torch import Tensor
+
+from hood.assets.material import Material
+from hood.dynamics.simulator import Simulator
+from hood.graph.builder import Graph, build_graph, build_static
+from hood.graph.hierarchy import build_hierarchy
+from hood.scene.cloth import Cloth, build_cloth
+from hood.scene.state import StepInput
+
+_LENGTH = 128  # edges along the strip: its diameter must exceed twice the largest radius
+_TRIES = 4  # inputs per node; a ReLU may block a path for one input
+
+
+def measured_radius(simulator: Simulator, seed: int = 0) -> int:
+    """Farthest mesh-hop distance between nodes i and j at which ∂a_j/∂(velocity feature of i) is not zero.
+
+    Float64 autograd on a strip of diameter > 100 without body edges; random features; maximum over targets that include a
+    node of the coarsest level, and nodes at the strip's ends.
+    """
+    network = copy.deepcopy(simulator.network).double().eval()
+    columns = simulator.velocity_columns
+    cloth = _strip()
+    edges = cloth.edges.numpy()
+    hierarchy = build_hierarchy(cloth.num_vertices, edges, cloth.rest_pos.numpy(), simulator.num_coarse)
+    static = build_static(cloth, hierarchy, network.edge_set_names)
+    graph = build_graph(static, StepInput(dt=torch.full((1,), 1.0 / 30.0, dtype=torch.float64)))
+    hops = _hops(cloth.num_vertices, edges)
+    generator = torch.Generator().manual_seed(seed)
+    coarsest = int(torch.nonzero(hierarchy.node_level == hierarchy.node_level.max())[0])
+    farthest = 0
+    for _ in range(_TRIES):
+        features = _random_features(network, graph, generator)
+        nodes = features.pop("nodes").requires_grad_(True)
+        output = network(graph, nodes, features)
+        for target in {coarsest, 0, cloth.num_vertices // 2, cloth.num_vertices - 1}:
+            (gradient,) = torch.autograd.grad(output[target].sum(), nodes, retain_graph=True)
+            reached = gradient[:, columns].abs().amax(dim=1) > 0
+            farthest = max(farthest, int(hops[target][reached.numpy()].max()))
+    return farthest
+
+
+def _strip() -> Cloth:
+    """A strip of ``_LENGTH`` × 1 squares, each split into two triangles."""
+    columns = np.arange(_LENGTH + 1)
+    pos = np.array([[0.01 * i, 0.01 * j, 0.0] for i in columns for j in (0, 1)])
+    quads = [(2 * i, 2 * i + 1, 2 * i + 2, 2 * i + 3) for i in range(_LENGTH)]
+    faces = np.array([triangle for a, b, c, d in quads for triangle in ((a, c, b), (b, c, d))])
+    return build_cloth(pos, faces, Material(), dtype=torch.float64)
+
+
+def _hops(num_vertices: int, edges: np.ndarray) -> np.ndarray:
+    ones = np.ones(len(edges))
+    graph = sparse.csr_matrix((ones, (edges[:, 0], edges[:, 1])), shape=(num_vertices, num_vertices))
+    return shortest_path(graph, directed=False, unweighted=True).astype(int)
+
+
+def _random_features(network: torch.nn.Module, graph: Graph, generator: torch.Generator) -> dict[str, Tensor]:
+    def draw(rows: int, encoder: torch.nn.Module) -> Tensor:
+        width = next(encoder.parameters()).shape[1]
+        return torch.randn(rows, width, generator=generator, dtype=torch.float64)
+
+    features = {"nodes": draw(graph.num_nodes, network.node_encoder)}  # type: ignore[arg-type]
+    for name, encoder in network.edge_encoders.items():  # type: ignore[operator, union-attr]
+        features[name] = draw(graph.edge_sets[name].num_edges, encoder)
+    return features

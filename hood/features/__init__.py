@@ -1,0 +1,1 @@
+"""Features of a step: groups that know their width, and normalisation."""

@@ -1,0 +1,332 @@
+"""Feature groups. A group knows its width and computes its columns; a :class:`FeatureSet` is three lists of groups.
+
+A new group is one class here and one entry in such a list. Groups with ``normalized = False`` bypass the running
+statistics and stand at the end of their list. Relative vectors are sender − receiver; positions are read only as
+differences, so features do not depend on where the scene is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from hood.assets.material import RANGES
+from hood.features.inputs import Inputs
+from hood.features.normalizer import RunningNormalizer
+from hood.graph.builder import BODY
+from hood.mesh import geometry
+
+# Types of METHOD, section 3. Omitted body vertices (2) never carry an edge and so never become nodes.
+CLOTH_TYPE, BODY_TYPE, PINNED_TYPE = 0, 1, 3
+
+
+class NodeGroup(nn.Module):
+    """Columns of the node features: (V, width) for the cloth and (W_active, width) for the body below it."""
+
+    width: int
+    normalized = True
+
+    def cloth(self, inputs: Inputs) -> Tensor:
+        raise NotImplementedError
+
+    def body(self, inputs: Inputs) -> Tensor:
+        raise NotImplementedError
+
+    def forward(self, inputs: Inputs) -> Tensor:
+        """(V + W_active, width)."""
+        cloth = self.cloth(inputs)
+        return cloth if inputs.num_body == 0 else torch.cat([cloth, self.body(inputs)])
+
+
+class EdgeGroup(nn.Module):
+    """Columns of the cloth edge features over ``inputs.edges``, or of the body edge features over ``inputs.body_edges``."""
+
+    width: int
+    normalized = True
+
+    def forward(self, inputs: Inputs) -> Tensor:
+        """(N, width)."""
+        raise NotImplementedError
+
+
+# ---- the paper's node features, in its order -------------------------------------------------------------------------
+
+
+class Velocity(NodeGroup):
+    """Displacement per frame [m]: vel·dt; of the body, position now − before, or next − now."""
+
+    width = 3
+
+    def __init__(self, body: str = "previous") -> None:
+        super().__init__()
+        if body not in ("previous", "next"):
+            raise ValueError(f"feature 'velocity': body is {body!r}; choose 'previous' (now − before) or 'next' (next − now)")
+        self.of_body = body
+
+    def cloth(self, inputs: Inputs) -> Tensor:
+        return inputs.state.vel * inputs.vertex_dt
+
+    def body(self, inputs: Inputs) -> Tensor:
+        obstacle = inputs.obstacle
+        step = obstacle.pos - obstacle.prev_pos if self.of_body == "previous" else obstacle.next_pos - obstacle.pos
+        return inputs.body(step)
+
+
+class TypeEmbedding(NodeGroup):
+    """Learned vector per node type; the table has the reference's 9 rows, of which cloth, body and pinned are read."""
+
+    def __init__(self, num_types: int = 9, width: int = 9) -> None:
+        super().__init__()
+        self.width = width
+        self.table = nn.Embedding(num_types, width)
+
+    def cloth(self, inputs: Inputs) -> Tensor:
+        kind = torch.where(inputs.cloth.pinned, PINNED_TYPE, CLOTH_TYPE)
+        return self.table.weight.index_select(0, kind)
+
+    def body(self, inputs: Inputs) -> Tensor:
+        return self.table.weight[BODY_TYPE].expand(inputs.num_body, -1)
+
+
+class LevelEmbedding(NodeGroup):
+    """Learned vector per level (deepest level in which the node has an edge); body nodes are on level 0."""
+
+    def __init__(self, num_levels: int = 3, width: int = 4) -> None:
+        super().__init__()
+        self.width = width
+        self.table = nn.Embedding(num_levels, width)
+
+    def cloth(self, inputs: Inputs) -> Tensor:
+        level = inputs.graph.node_level.clamp_max(self.table.num_embeddings - 1)
+        return self.table.weight.index_select(0, level)
+
+    def body(self, inputs: Inputs) -> Tensor:
+        return self.table.weight[0].expand(inputs.num_body, -1)
+
+
+class Normal(NodeGroup):
+    """Area-weighted unit vertex normal at t."""
+
+    width = 3
+
+    def cloth(self, inputs: Inputs) -> Tensor:
+        return geometry.vertex_normals(inputs.state.pos, inputs.cloth.faces)
+
+    def body(self, inputs: Inputs) -> Tensor:
+        return inputs.body_normal
+
+
+class Timestep(NodeGroup):
+    """Timestep feature [s]."""
+
+    width = 1
+
+    def cloth(self, inputs: Inputs) -> Tensor:
+        return inputs.node_timestep[: inputs.num_cloth].unsqueeze(1)
+
+    def body(self, inputs: Inputs) -> Tensor:
+        return inputs.node_timestep[inputs.num_cloth :].unsqueeze(1)
+
+
+class LogMass(NodeGroup):
+    """log of the vertex mass [kg]; −1 on the body. Clamped from below: isolated vertices have no mass."""
+
+    width = 1
+
+    def __init__(self, smallest: float = 1e-9) -> None:
+        super().__init__()
+        self.smallest = smallest
+
+    def cloth(self, inputs: Inputs) -> Tensor:
+        return inputs.cloth.mass.clamp_min(self.smallest).log().unsqueeze(1)
+
+    def body(self, inputs: Inputs) -> Tensor:
+        return inputs.state.pos.new_full((inputs.num_body, 1), -1.0)
+
+
+class NodeMaterial(NodeGroup):
+    """Bending, μ, λ mapped to [0, 1] over the training ranges; −1 on the body."""
+
+    width = 3
+    normalized = False
+
+    def cloth(self, inputs: Inputs) -> Tensor:
+        return unit_fabric(inputs.cloth.vertex_fabric)
+
+    def body(self, inputs: Inputs) -> Tensor:
+        return inputs.state.pos.new_full((inputs.num_body, 3), -1.0)
+
+
+def unit_fabric(fabric: Tensor, log_lambda: bool = False) -> Tensor:
+    """(N, 3) lame_mu, lame_lambda, bending_stiffness → (N, 3) bending, μ, λ over their training ranges.
+
+    (log v − log min)/(log max − log min) for bending and μ, λ linear, not clamped to [0, 1] (METHOD, section 4, parity
+    details). Values below a thousandth of a range's start are raised to it before a logarithm: bending may be 0.
+    """
+    mu, lam, bending = fabric.unbind(1)
+    low, high = RANGES["lame_lambda"]
+    linear = (lam - low) / (high - low)
+    columns = [_log_unit(bending, "bending_stiffness"), _log_unit(mu, "lame_mu")]
+    columns.append(_log_unit(lam, "lame_lambda") if log_lambda else linear)
+    return torch.stack(columns, dim=1)
+
+
+def _log_unit(value: Tensor, name: str) -> Tensor:
+    low, high = RANGES[name]
+    return (value.clamp_min(1e-3 * low).log() - math.log(low)) / (math.log(high) - math.log(low))
+
+
+# ---- the paper's edge features ---------------------------------------------------------------------------------------
+
+
+class CurrentRelative(EdgeGroup):
+    """Relative position at t and its norm [m]."""
+
+    width = 4
+
+    def forward(self, inputs: Inputs) -> Tensor:
+        return with_norm(cloth_difference(inputs.state.pos, inputs))
+
+
+class RestRelative(EdgeGroup):
+    """Relative rest position and its norm [m]."""
+
+    width = 4
+
+    def forward(self, inputs: Inputs) -> Tensor:
+        return with_norm(cloth_difference(inputs.cloth.rest_pos, inputs))
+
+
+class EdgeTimestep(EdgeGroup):
+    """Timestep feature [s]."""
+
+    width = 1
+
+    def forward(self, inputs: Inputs) -> Tensor:
+        return inputs.node_timestep[inputs.edges.receivers].unsqueeze(1)
+
+
+class EdgeMaterial(EdgeGroup):
+    """Bending, μ, λ mapped to [0, 1] over the training ranges."""
+
+    width = 3
+    normalized = False
+
+    def forward(self, inputs: Inputs) -> Tensor:
+        return unit_fabric(inputs.edges.fabric)
+
+
+class BodyRelative(EdgeGroup):
+    """Relative position and norm [m] between the cloth at t and the body at t, or at t + 1 with ``body="next"``."""
+
+    width = 4
+
+    def __init__(self, body: str = "current") -> None:
+        super().__init__()
+        if body not in ("current", "next"):
+            raise ValueError(f"feature 'body relative': body is {body!r}; choose 'current' or 'next'")
+        self.of_body = body
+
+    def forward(self, inputs: Inputs) -> Tensor:
+        obstacle = inputs.obstacle
+        target = obstacle.pos if self.of_body == "current" else obstacle.next_pos
+        return with_norm(body_difference(inputs.state.pos, target, inputs))
+
+
+class BodyTimestep(EdgeGroup):
+    """Timestep feature [s]."""
+
+    width = 1
+
+    def forward(self, inputs: Inputs) -> Tensor:
+        return inputs.node_timestep[inputs.body_edges.receivers].unsqueeze(1)
+
+
+def cloth_difference(pos: Tensor, inputs: Inputs) -> Tensor:
+    return pos.index_select(0, inputs.edges.senders) - pos.index_select(0, inputs.edges.receivers)
+
+
+def body_difference(cloth_pos: Tensor, body_pos: Tensor, inputs: Inputs) -> Tensor:
+    pos = torch.cat([cloth_pos, inputs.body(body_pos)])
+    return pos.index_select(0, inputs.body_edges.senders) - pos.index_select(0, inputs.body_edges.receivers)
+
+
+def with_norm(vector: Tensor) -> Tensor:
+    return torch.cat([vector, vector.norm(dim=1, keepdim=True)], dim=1)
+
+
+# ---- assembly --------------------------------------------------------------------------------------------------------
+
+
+class FeatureSet(nn.Module):
+    """Node, cloth edge and body edge features of a step, normalised.
+
+    One normaliser for nodes, one shared by mesh and coarse edges, one for body edges, each over the groups that ask
+    for it; ``decay`` None normalises nothing (groups that bring their own scales).
+    """
+
+    def __init__(
+        self,
+        node: Sequence[NodeGroup],
+        edge: Sequence[EdgeGroup],
+        body_edge: Sequence[EdgeGroup],
+        decay: float | None = 0.999,
+    ) -> None:
+        super().__init__()
+        self.node, self.edge, self.body_edge = nn.ModuleList(node), nn.ModuleList(edge), nn.ModuleList(body_edge)
+        self.node_normalizer = _normalizer("node", node, decay)
+        self.edge_normalizer = _normalizer("edge", edge, decay)
+        self.body_edge_normalizer = _normalizer("body edge", body_edge, decay)
+
+    @property
+    def node_width(self) -> int:
+        return sum(group.width for group in self.node)
+
+    @property
+    def edge_widths(self) -> dict[str, int]:
+        """Widths by edge set as the network takes them."""
+        edge = sum(group.width for group in self.edge)
+        return {"mesh": edge, "coarse": edge, BODY: sum(group.width for group in self.body_edge)}
+
+    def forward(self, inputs: Inputs) -> tuple[Tensor, dict[str, Tensor]]:
+        """Node features (V + W_active, node_width) and edge features by set, rows as in the graph."""
+        nodes = self._assemble(self.node, self.node_normalizer, inputs)
+        rows = self._assemble(self.edge, self.edge_normalizer, inputs)
+        counts = [inputs.graph.edge_sets[name].num_edges for name in inputs.cloth_sets]
+        edges = dict(zip(inputs.cloth_sets, rows.split(counts), strict=True))
+        if inputs.body_edges.num_edges:
+            edges[BODY] = self._assemble(self.body_edge, self.body_edge_normalizer, inputs)
+        else:
+            edges[BODY] = nodes.new_zeros(0, self.edge_widths[BODY])
+        return nodes, edges
+
+    @staticmethod
+    def _assemble(groups: nn.ModuleList, normalizer: nn.Module | None, inputs: Inputs) -> Tensor:
+        values = torch.cat([group(inputs) for group in groups], dim=1)
+        if normalizer is None:
+            return values
+        width = normalizer.width
+        return torch.cat([normalizer(values[:, :width]), values[:, width:]], dim=1)
+
+
+def _normalizer(name: str, groups: Sequence[nn.Module], decay: float | None) -> RunningNormalizer | None:
+    if decay is None:
+        return None
+    flags = [bool(group.normalized) for group in groups]
+    if flags != sorted(flags, reverse=True):
+        raise ValueError(f"{name} features: a normalised group follows an unnormalised one; move the latter to the end")
+    return RunningNormalizer(sum(g.width for g in groups if g.normalized), decay)
+
+
+def paper(num_levels: int = 3, body_velocity: str = "previous", decay: float = 0.999) -> FeatureSet:
+    """The paper's features: node 24 (20 with ``num_levels`` 1, which has no level embedding), edge 12, body edge 9."""
+    level = [LevelEmbedding(num_levels)] if num_levels > 1 else []
+    return FeatureSet(
+        node=[Velocity(body_velocity), TypeEmbedding(), *level, Normal(), Timestep(), LogMass(), NodeMaterial()],
+        edge=[CurrentRelative(), RestRelative(), EdgeTimestep(), EdgeMaterial()],
+        body_edge=[BodyRelative("current"), BodyRelative("next"), BodyTimestep()],
+        decay=decay,
+    )

@@ -1,0 +1,145 @@
+"""What feature groups read: one step's cloth, state, obstacle, contact and graph, with the look-ups they share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from hood.graph.builder import BODY, MESH, EdgeSet, Graph
+from hood.mesh import geometry
+from hood.scene.cloth import Cloth
+from hood.scene.contact import Contact
+from hood.scene.state import Obstacle, State, StepInput
+
+
+@dataclass(frozen=True)
+class EdgeRows:
+    """The cloth edge sets of a graph stacked into one table, so that a group computes all of them at once."""
+
+    senders: Tensor  # (N,)
+    receivers: Tensor  # (N,)
+    scene: Tensor  # (N,)
+    segment: Tensor  # (N,) one number per pair of edge set and scene
+    num_segments: int
+    fabric: Tensor  # (N, 3) lame_mu, lame_lambda, bending_stiffness
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Everything a feature group may read.
+
+    Args:
+        base_pos: (V, 3) [m] the positions the network's output is added to, where the model has such a base.
+        residual: (V, 3) [m/s²] acceleration that the potential's gradient at the base asks for.
+        timestep: (B,) [s] value of the timestep feature; None for the step's dt. The relaxing first step of a rollout is
+            told by it (paper, α in section 4.3).
+    """
+
+    cloth: Cloth
+    state: State
+    step: StepInput
+    contact: Contact | None
+    graph: Graph
+    base_pos: Tensor | None = None
+    residual: Tensor | None = None
+    timestep: Tensor | None = None
+
+    @property
+    def num_cloth(self) -> int:
+        return self.graph.num_cloth
+
+    @property
+    def num_body(self) -> int:
+        return self.graph.body_vertex.shape[0]
+
+    @property
+    def obstacle(self) -> Obstacle:
+        if self.step.obstacle is None:
+            raise ValueError("features: the graph has body nodes but the step has no obstacle; build both from one step")
+        return self.step.obstacle
+
+    @cached_property
+    def base(self) -> Tensor:
+        """``base_pos``, demanded."""
+        if self.base_pos is None:
+            raise ValueError("features: these features are relative to a base guess; pass Inputs(base_pos=…)")
+        return self.base_pos
+
+    @cached_property
+    def node_scene(self) -> Tensor:
+        """Scene of every graph node, (V + W_active,)."""
+        if self.num_body == 0:
+            return self.cloth.vertex_scene
+        return torch.cat([self.cloth.vertex_scene, self.obstacle.vertex_scene[self.graph.body_vertex]])
+
+    @cached_property
+    def node_timestep(self) -> Tensor:
+        """Timestep feature of every graph node [s], (V + W_active,)."""
+        timestep = self.step.dt if self.timestep is None else self.timestep
+        return timestep.to(self.state.pos.dtype)[self.node_scene]
+
+    @cached_property
+    def vertex_dt(self) -> Tensor:
+        """True dt of every cloth vertex [s], (V, 1): turns velocities into displacements per frame."""
+        return self.step.dt.to(self.state.pos.dtype)[self.cloth.vertex_scene].unsqueeze(1)
+
+    @cached_property
+    def body_normal(self) -> Tensor:
+        """Area-weighted vertex normals of the active body vertices at t, (W_active, 3)."""
+        return self._body_normals(self.obstacle.pos)
+
+    @cached_property
+    def body_next_normal(self) -> Tensor:
+        """The same at t + 1."""
+        return self._body_normals(self.obstacle.next_pos)
+
+    @cached_property
+    def _active_faces(self) -> Tensor:
+        """Body faces around active vertices: a garment touches a part of the body, the rest needs no normals."""
+        active = torch.zeros(len(self.obstacle.pos), dtype=torch.bool, device=self.obstacle.pos.device)
+        active[self.graph.body_vertex] = True
+        return self.obstacle.faces[active[self.obstacle.faces].any(dim=1)]
+
+    def _body_normals(self, pos: Tensor) -> Tensor:
+        return geometry.vertex_normals(pos, self._active_faces)[self.graph.body_vertex]
+
+    def body(self, values: Tensor) -> Tensor:
+        """Rows of an obstacle field (W, …) at the active body vertices."""
+        return values[self.graph.body_vertex]
+
+    @property
+    def body_edges(self) -> EdgeSet:
+        return self.graph.edge_sets[BODY]
+
+    @cached_property
+    def cloth_sets(self) -> tuple[str, ...]:
+        return tuple(name for name in self.graph.edge_sets if name != BODY)
+
+    @cached_property
+    def edges(self) -> EdgeRows:
+        """All cloth edge sets in the order of :attr:`cloth_sets`."""
+        sets = [self.graph.edge_sets[name] for name in self.cloth_sets]
+        senders, receivers = torch.cat([s.senders for s in sets]), torch.cat([s.receivers for s in sets])
+        scene = self.cloth.vertex_scene[receivers]
+        number = torch.cat([torch.full_like(s.senders, i) for i, s in enumerate(sets)])
+        segment = number * self.cloth.num_scenes + scene
+        return EdgeRows(
+            senders=senders,
+            receivers=receivers,
+            scene=scene,
+            segment=segment,
+            num_segments=len(sets) * self.cloth.num_scenes,
+            fabric=torch.cat([self._fabric(name) for name in self.cloth_sets]),
+        )
+
+    def _fabric(self, name: str) -> Tensor:
+        """Fabric per edge: the mesh edge's own where it is one, else the mean of its two vertices."""
+        edges = self.graph.edge_sets[name]
+        ends = 0.5 * (self.cloth.vertex_fabric[edges.senders] + self.cloth.vertex_fabric[edges.receivers])
+        if name != MESH or edges.num_edges == 0:
+            return ends
+        own = (edges.source < self.graph.num_mesh_edges).unsqueeze(1)
+        return torch.where(own, self.cloth.edge_fabric[edges.source.clamp_max(self.graph.num_mesh_edges - 1)], ends)

@@ -1,0 +1,233 @@
+"""Feature groups with fixed physical scales, relative to a base guess of the next positions: no statistics to collect,
+no dependence on the frame's velocity (Galilean invariance), outliers compressed by asinh."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from hood.features.groups import (
+    EdgeGroup,
+    FeatureSet,
+    NodeGroup,
+    Normal,
+    body_difference,
+    cloth_difference,
+    unit_fabric,
+)
+from hood.features.inputs import Inputs
+from hood.features.normalizer import FixedScale
+
+GRAVITY = 9.81
+
+
+class RelativeVelocity(NodeGroup):
+    """asinh((vel·dt − base displacement)/scale): what the state's velocity adds to the base guess; of the body, its change
+    of displacement from the last frame to this one."""
+
+    width = 3
+
+    def __init__(self, scale: float = 0.01) -> None:
+        super().__init__()
+        self.scale = FixedScale(scale, asinh=True)
+
+    def cloth(self, inputs: Inputs) -> Tensor:
+        return self.scale(inputs.state.vel * inputs.vertex_dt - (inputs.base - inputs.state.pos))
+
+    def body(self, inputs: Inputs) -> Tensor:
+        obstacle = inputs.obstacle
+        return self.scale(inputs.body(obstacle.next_pos - 2 * obstacle.pos + obstacle.prev_pos))
+
+
+class Residual(NodeGroup):
+    """asinh(residual/g): the acceleration that the potential asks for at the base guess; 0 without one and on the body."""
+
+    width = 3
+
+    def __init__(self, scale: float = GRAVITY) -> None:
+        super().__init__()
+        self.scale = FixedScale(scale, asinh=True)
+
+    def cloth(self, inputs: Inputs) -> Tensor:
+        if inputs.residual is None:
+            return torch.zeros_like(inputs.state.pos)
+        return self.scale(inputs.residual)
+
+    def body(self, inputs: Inputs) -> Tensor:
+        return inputs.state.pos.new_zeros(inputs.num_body, 3)
+
+
+class TypeOneHot(NodeGroup):
+    """Free, pinned or body."""
+
+    width = 3
+
+    def cloth(self, inputs: Inputs) -> Tensor:
+        return functional.one_hot(inputs.cloth.pinned.long(), 3).to(inputs.state.pos)
+
+    def body(self, inputs: Inputs) -> Tensor:
+        return inputs.state.pos.new_tensor([0.0, 0.0, 1.0]).expand(inputs.num_body, 3)
+
+
+class LevelOneHot(NodeGroup):
+    """Deepest level in which the node has an edge; zeros on the body."""
+
+    def __init__(self, num_levels: int = 3) -> None:
+        super().__init__()
+        self.width = num_levels
+
+    def cloth(self, inputs: Inputs) -> Tensor:
+        level = inputs.graph.node_level.clamp_max(self.width - 1)
+        return functional.one_hot(level, self.width).to(inputs.state.pos)
+
+    def body(self, inputs: Inputs) -> Tensor:
+        return inputs.state.pos.new_zeros(inputs.num_body, self.width)
+
+
+class ContactDistance(NodeGroup):
+    """Signed distance of the base guess to the body at t + 1 (clamped to ±``reach`` m, over ``scale``) and the body's
+    normal there; without contact the full reach and no direction. Body rows hold their own normal."""
+
+    width = 4
+
+    def __init__(self, reach: float = 0.05, scale: float = 0.02) -> None:
+        super().__init__()
+        self.reach, self.scale = reach, scale
+
+    def cloth(self, inputs: Inputs) -> Tensor:
+        contact, base = inputs.contact, inputs.base
+        if contact is None:
+            far = base.new_full((inputs.num_cloth, 1), self.reach / self.scale)
+            return torch.cat([far, torch.zeros_like(base)], dim=1)
+        dist = torch.where(contact.valid, contact.next_dist(base), self.reach).clamp(-self.reach, self.reach)
+        normal = torch.where(contact.valid.unsqueeze(1), contact.next_normal, 0.0)
+        return torch.cat([dist.unsqueeze(1) / self.scale, normal], dim=1)
+
+    def body(self, inputs: Inputs) -> Tensor:
+        normal = inputs.body_next_normal
+        return torch.cat([normal.new_zeros(inputs.num_body, 1), normal], dim=1)
+
+
+class ScaledMass(NodeGroup):
+    """log(mass/typical), typical = 0.2 g; 0 on the body and where there is no mass."""
+
+    width = 1
+
+    def __init__(self, typical: float = 2e-4) -> None:
+        super().__init__()
+        self.typical = typical
+
+    def cloth(self, inputs: Inputs) -> Tensor:
+        mass = inputs.cloth.mass
+        return torch.where(mass > 0, mass / self.typical, 1.0).log().unsqueeze(1)
+
+    def body(self, inputs: Inputs) -> Tensor:
+        return inputs.state.pos.new_zeros(inputs.num_body, 1)
+
+
+class LogMaterial(NodeGroup):
+    """Logarithms of bending, μ, λ mapped to [−1, 1] over the training ranges; 0 on the body."""
+
+    width = 3
+
+    def cloth(self, inputs: Inputs) -> Tensor:
+        return 2 * unit_fabric(inputs.cloth.vertex_fabric, log_lambda=True) - 1
+
+    def body(self, inputs: Inputs) -> Tensor:
+        return inputs.state.pos.new_zeros(inputs.num_body, 3)
+
+
+class LogTimestep(NodeGroup):
+    """log(30 Hz · timestep)."""
+
+    width = 1
+
+    def cloth(self, inputs: Inputs) -> Tensor:
+        return (30 * inputs.node_timestep[: inputs.num_cloth]).log().unsqueeze(1)
+
+    def body(self, inputs: Inputs) -> Tensor:
+        return (30 * inputs.node_timestep[inputs.num_cloth :]).log().unsqueeze(1)
+
+
+class ScaledShape(EdgeGroup):
+    """Relative positions at t and at rest with norms, over the mean rest length of the edge's set in its scene."""
+
+    width = 8
+
+    def forward(self, inputs: Inputs) -> Tensor:
+        current, rest = cloth_difference(inputs.state.pos, inputs), cloth_difference(inputs.cloth.rest_pos, inputs)
+        columns = torch.cat([current, _length(current), rest, _length(rest)], dim=1)
+        return columns / _mean_length(_length(rest), inputs).clamp_min(1e-6)
+
+
+class Strain(EdgeGroup):
+    """asinh(gain·(length/rest length − 1)) at t and at the base guess; 0 for edges without rest length (closed buttons)."""
+
+    width = 2
+
+    def __init__(self, gain: float = 100.0) -> None:
+        super().__init__()
+        self.scale = FixedScale(1.0 / gain, asinh=True)
+
+    def forward(self, inputs: Inputs) -> Tensor:
+        rest = _length(cloth_difference(inputs.cloth.rest_pos, inputs))
+        lengths = torch.cat([_length(cloth_difference(pos, inputs)) for pos in (inputs.state.pos, inputs.base)], dim=1)
+        proper = rest > 1e-6
+        return self.scale(torch.where(proper, lengths / torch.where(proper, rest, 1.0) - 1, 0.0))
+
+
+class EdgeLogMaterial(EdgeGroup):
+    """Logarithms of bending, μ, λ mapped to [−1, 1] over the training ranges."""
+
+    width = 3
+
+    def forward(self, inputs: Inputs) -> Tensor:
+        return 2 * unit_fabric(inputs.edges.fabric, log_lambda=True) - 1
+
+
+class BaseBodyRelative(EdgeGroup):
+    """Relative position and norm between the base guess and the body at t + 1, over ``scale`` [m]."""
+
+    width = 4
+
+    def __init__(self, scale: float = 0.01) -> None:
+        super().__init__()
+        self.scale = FixedScale(scale)
+
+    def forward(self, inputs: Inputs) -> Tensor:
+        vector = body_difference(inputs.base, inputs.obstacle.next_pos, inputs)
+        return self.scale(torch.cat([vector, _length(vector)], dim=1))
+
+
+def _length(vector: Tensor) -> Tensor:
+    return vector.norm(dim=1, keepdim=True)
+
+
+def _mean_length(rest_length: Tensor, inputs: Inputs) -> Tensor:
+    """Mean rest length of the edges in the same set and scene, per edge (N, 1)."""
+    edges = inputs.edges
+    total = rest_length.new_zeros(edges.num_segments).index_add_(0, edges.segment, rest_length.squeeze(1))
+    count = torch.bincount(edges.segment, minlength=edges.num_segments).clamp_min(1)
+    return (total / count)[edges.segment].unsqueeze(1)
+
+
+def physical(num_levels: int = 3) -> FeatureSet:
+    """Scaled features for training without a warm-up of statistics; they need ``Inputs.base_pos``."""
+    level = [LevelOneHot(num_levels)] if num_levels > 1 else []
+    return FeatureSet(
+        node=[
+            RelativeVelocity(),
+            Normal(),
+            Residual(),
+            TypeOneHot(),
+            *level,
+            ContactDistance(),
+            ScaledMass(),
+            LogMaterial(),
+            LogTimestep(),
+        ],
+        edge=[ScaledShape(), Strain(), EdgeLogMaterial()],
+        body_edge=[BaseBodyRelative()],
+        decay=None,
+    )

@@ -1,0 +1,1 @@
+"""The hierarchical graph over a garment and its body edges."""

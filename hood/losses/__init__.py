@@ -1,0 +1,1 @@
+"""One energy per file and the potential that sums them."""

@@ -1,0 +1,141 @@
+"""The incremental potential: one function for the training loss, the solver and the reported gap."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from hood.losses.attachment import Attachment
+from hood.losses.bending import Bending
+from hood.losses.collision import Collision
+from hood.losses.friction import Friction
+from hood.losses.gravity import Gravity
+from hood.losses.inertia import Inertia
+from hood.losses.problem import STANDARD_GRAVITY, StepProblem, sum_per_scene
+from hood.losses.stretching import Stretching
+
+
+class Term(Protocol):
+    """An energy. A new one is a class with these two methods and an entry in the potential's ``terms``."""
+
+    def applies(self, problem: StepProblem) -> bool:
+        """Whether the energy can be anything but a constant zero for this problem."""
+        ...
+
+    def __call__(self, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> Tensor:
+        """Energy [J] (B,) at ``next_pos`` (V, 3) [m], reached with acceleration ``acc`` (V, 3) [m/s²]."""
+        ...
+
+
+class Potential:
+    """Sum of energies whose minimum over the next positions is the implicit Euler step (HOOD paper, section
+    3.3).
+
+    ``next_pos`` and ``acc`` are two views of the same unknown, next_pos = x_t + dt v_t + dt² acc; terms use
+    the one that is exact for them.
+    """
+
+    def __init__(self, terms: Mapping[str, Term]) -> None:
+        self.terms = dict(terms)
+
+    def with_terms(self, **terms: Term) -> Potential:
+        """The same potential with some terms replaced or added."""
+        return Potential({**self.terms, **terms})
+
+    def energies(
+        self, problem: StepProblem, next_pos: Tensor, acc: Tensor | None = None
+    ) -> dict[str, Tensor]:
+        """Energies [J] (B,) by term; terms that the scene does not need are left out.
+
+        Args:
+            next_pos: (V, 3) m, local frame.
+            acc: (V, 3) m/s²; by default computed from ``next_pos``, with the precision that allows.
+
+        Raises:
+            ValueError: when ``next_pos`` is in half precision.
+        """
+        if next_pos.dtype in (torch.float16, torch.bfloat16):
+            raise ValueError(
+                f"energies cannot be computed in {next_pos.dtype}; give positions in float32 or float64"
+            )
+        acc = problem.acceleration(next_pos) if acc is None else acc
+        return {
+            name: term(problem, next_pos, acc) for name, term in self.terms.items() if term.applies(problem)
+        }
+
+    def total(self, problem: StepProblem, next_pos: Tensor, acc: Tensor | None = None) -> Tensor:
+        """Potential Φ [J] per scene (B,)."""
+        energies = self.energies(problem, next_pos, acc)
+        return sum(energies.values(), start=next_pos.new_zeros(problem.num_scenes))
+
+    def gradient(
+        self, problem: StepProblem, next_pos: Tensor, acc: Tensor | None = None
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """∂Φ/∂x [N] (V, 3) at ``next_pos``, and the energies [J] there; both detached.
+
+        ``acc`` is as in :meth:`energies`; given or not, it follows the positions in the derivative.
+        """
+        with torch.enable_grad():
+            pos = next_pos.detach().requires_grad_(True)
+            if acc is not None:
+                # Zero in value, one over dt² in slope: keeps the precision of the given acceleration.
+                acc = acc.detach() + (pos - pos.detach()) / problem.vertex_dt**2
+            energies = self.energies(problem, pos, acc)
+            total = sum(energies.values(), start=pos.sum() * 0.0)
+            (gradient,) = torch.autograd.grad(total.sum(), pos)
+        return gradient, {name: energy.detach() for name, energy in energies.items()}
+
+
+def default_potential(
+    collision_weight: float = 5e5,
+    collision_epsilon: float = 2e-3,
+    friction_coefficient: float = 0.5,
+    friction_slip_speed: float = 5e-3,
+    attachment_stiffness: float = 1e3,
+) -> Potential:
+    """The paper's potential in safe forms: contact with triangles, friction by normal force, rest angles."""
+    return Potential(
+        {
+            "stretching": Stretching(),
+            "bending": Bending(),
+            "inertia": Inertia(),
+            "gravity": Gravity(),
+            "collision": Collision(collision_weight, collision_epsilon),
+            "friction": Friction(
+                friction_coefficient, friction_slip_speed, collision_weight, collision_epsilon
+            ),
+            "attachment": Attachment(attachment_stiffness),
+        }
+    )
+
+
+def scale(problem: StepProblem) -> Tensor:
+    """Reference energy e0 = ½ M g² dt² [J] (B,): what free fall over one step is worth, the unit of the gap.
+
+    Standard gravity stands in where the problem has none.
+    """
+    mass = problem.sum_vertices(problem.cloth.mass)
+    return 0.5 * mass * (_gravity_norm(problem) * problem.step.dt.to(mass)) ** 2
+
+
+def relative_gradient(problem: StepProblem, gradient: Tensor) -> Tensor:
+    """Residual rg = ‖∂Φ/∂x‖₂ / ‖M g‖₂ (B,) over free vertices of ``gradient`` (V, 3); 0 is an exact step.
+
+    Standard gravity stands in where the problem has none; a scene without free vertices has 0.
+    """
+    cloth = problem.cloth
+    free = cloth.free.to(gradient.dtype)
+    force_sq = problem.sum_vertices(free * (gradient * gradient).sum(dim=1))
+    weight_sq = sum_per_scene(
+        free * (cloth.mass * _gravity_norm(problem)) ** 2, cloth.vertex_scene, cloth.num_scenes
+    )
+    movable = weight_sq > 0
+    return torch.where(movable, (force_sq / torch.where(movable, weight_sq, 1.0)).sqrt(), 0.0)
+
+
+def _gravity_norm(problem: StepProblem) -> float:
+    norm = float(problem.gravity.norm())
+    return norm if norm > 0 else STANDARD_GRAVITY

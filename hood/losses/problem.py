@@ -1,0 +1,70 @@
+"""What the incremental potential of one step depends on, apart from the unknown next positions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from hood.scene.cloth import Cloth
+from hood.scene.contact import Contact
+from hood.scene.state import State, StepInput
+
+#: Standard gravity [m/s²], y up.
+STANDARD_GRAVITY = 9.81
+
+
+def _standard_gravity() -> Tensor:
+    return torch.tensor([0.0, -STANDARD_GRAVITY, 0.0])
+
+
+@dataclass(frozen=True)
+class StepProblem:
+    """One implicit step t → t+1 of B scenes; everything in it is constant while the next positions vary."""
+
+    cloth: Cloth
+    state: State
+    step: StepInput
+    contact: Contact | None = None
+    gravity: Tensor = field(default_factory=_standard_gravity)  # (3,) m/s²
+
+    @property
+    def num_scenes(self) -> int:
+        return self.cloth.num_scenes
+
+    @property
+    def vertex_dt(self) -> Tensor:
+        """Time step [s] of every vertex's scene, (V, 1)."""
+        return self.step.dt[self.cloth.vertex_scene].unsqueeze(1)
+
+    def acceleration(self, next_pos: Tensor) -> Tensor:
+        """Accelerations [m/s²] (V, 3) that lead to ``next_pos`` (V, 3): (x - x_t - dt v_t) / dt².
+
+        A difference of nearby positions: where an acceleration is known (a network's output), use that
+            instead, float32 loses 6e-4 g here at 1/240 s.
+        """
+        dt = self.vertex_dt
+        return (next_pos - self.state.pos - dt * self.state.vel) / dt**2
+
+    def sum_vertices(self, values: Tensor) -> Tensor:
+        return sum_per_scene(values, self.cloth.vertex_scene, self.num_scenes)
+
+
+def inertial_guess(state: State, step: StepInput, vertex_scene: Tensor | None = None) -> Tensor:
+    """Positions (V, 3) without any force, x_t + dt v_t; several scenes need ``vertex_scene`` (V,)."""
+    dt = step.dt if vertex_scene is None else step.dt[vertex_scene]
+    return state.pos + dt.unsqueeze(1) * state.vel
+
+
+def sum_per_scene(values: Tensor, scene: Tensor, num_scenes: int) -> Tensor:
+    """Sum ``values`` (N,) of elements in ``scene`` (N,) to one value per scene (B,).
+
+    Raises:
+        ValueError: in half precision, where contact energies of millimetre depths are zero.
+    """
+    if values.dtype in (torch.float16, torch.bfloat16):
+        raise ValueError(
+            f"energies cannot be computed in {values.dtype}; give positions in float32 or float64"
+        )
+    return values.new_zeros(num_scenes).index_add(0, scene, values)

@@ -1,0 +1,91 @@
+"""Pictures of a rollout: a video whose camera walks along, and a contact sheet of evenly spaced frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from hood.dynamics.recorder import RolloutData
+from hood.media.render import BODY_COLOR, GARMENT_COLOR, Camera, RenderMesh, contact_sheet, render_frame
+from hood.media.video import VideoWriter, save_png
+
+_SHEET_FRAMES = 12
+_SMOOTHING = 15  # frames over which the camera averages the walker's path
+
+
+class Film:
+    """Draws frames of one rollout with one camera distance and angle; the camera follows the body.
+
+    Args:
+        data: the rollout.
+        width, height: pixels.
+        azimuth_deg: viewing direction, 0 is the front of the first frame.
+    """
+
+    def __init__(self, data: RolloutData, width: int = 400, height: int = 560, azimuth_deg: float = 25.0) -> None:
+        if len(data.cloth_pos) == 0:
+            raise ValueError("the rollout has no frames to draw")
+        self.data, self.width, self.height = data, width, height
+        self._path = _smooth_path(data.body_pos)
+        centred = data.body_pos[:: max(len(data.body_pos) // 20, 1)] - self._path[:: max(len(data.body_pos) // 20, 1), None]
+        self._camera = Camera.framing(centred, azimuth_deg, 8.0, aspect=width / height)
+
+    def frame(self, index: int) -> np.ndarray:
+        """Picture (H, W, 3) uint8 of frame ``index``."""
+        shift = self._path[index]
+        camera = replace(
+            self._camera, position=_add(self._camera.position, shift), target=_add(self._camera.target, shift)
+        )
+        meshes = [RenderMesh(self.data.body_pos[index], self.data.body_faces, BODY_COLOR)]
+        if np.isfinite(self.data.cloth_pos[index]).all():
+            meshes.append(RenderMesh(self.data.cloth_pos[index], self.data.cloth_faces, GARMENT_COLOR))
+        return render_frame(meshes, camera, width=self.width, height=self.height)
+
+    def sheet(self, count: int = _SHEET_FRAMES, columns: int = 6) -> np.ndarray:
+        """Contact sheet of ``count`` evenly spaced frames."""
+        chosen = sheet_frames(len(self.data.cloth_pos), count)
+        return contact_sheet([self.frame(i) for i in chosen], columns, [f"{self.data.time[i]:.2f} s" for i in chosen])
+
+
+def sheet_frames(num_frames: int, count: int = _SHEET_FRAMES) -> list[int]:
+    """Evenly spaced frame numbers, first and last included."""
+    return sorted({int(i) for i in np.linspace(0, num_frames - 1, min(count, num_frames)).round()})
+
+
+def write_sheet(data: RolloutData, path: Path) -> Path:
+    """Contact sheet of the rollout as PNG."""
+    return save_png(path, Film(data).sheet())
+
+
+def write_video(data: RolloutData, path: Path, frames: Iterable[int] | None = None, stride: int = 1) -> Path:
+    """Video of the rollout at its own speed; every ``stride``-th frame is drawn. Returns the file written.
+
+    ``frames`` is the iterable that drives the loop (a progress bar, say); all frames by default.
+    """
+    film = Film(data)
+    step = float(data.time[1] - data.time[0]) if len(data.time) > 1 else 1.0 / 30.0
+    chosen: Sequence[int] | Iterable[int] = range(0, len(data.cloth_pos), stride) if frames is None else frames
+    with VideoWriter(path, fps=1.0 / (step * stride)) as writer:
+        for index in chosen:
+            writer.append(film.frame(index))
+    return writer.path
+
+
+def _smooth_path(body_pos: np.ndarray) -> np.ndarray:
+    """(T, 3): the body's centre seen from above, averaged over time; height is left alone so that jumps are seen."""
+    centre = body_pos.mean(axis=1)
+    centre[:, 1] = 0.0
+    window = min(_SMOOTHING, len(centre))
+    padded = np.concatenate([np.repeat(centre[:1], window, 0), centre, np.repeat(centre[-1:], window, 0)])
+    kernel = np.hanning(2 * window + 1)[1:-1] if window > 1 else np.ones(1)
+    kernel /= kernel.sum()
+    smooth = np.stack([np.convolve(padded[:, axis], kernel, mode="same") for axis in range(3)], axis=1)
+    return smooth[window : window + len(centre)]
+
+
+def _add(position: tuple[float, float, float], shift: np.ndarray) -> tuple[float, float, float]:
+    moved = np.asarray(position) + shift
+    return (float(moved[0]), float(moved[1]), float(moved[2]))

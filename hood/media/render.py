@@ -1,0 +1,164 @@
+"""Shaded pictures of a body and its clothing, in numpy: no display, no graphics card.
+
+Deferred shading: `raster.rasterise` finds the nearest face of every pixel at twice the resolution, then
+one vectorised pass lights the covered pixels (key light with a soft shadow map, sky and bounce light, a
+rim) and the floor behind them. Lights turn with the camera, so that every view is lit from the upper
+left.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hood.media.camera import NEAR, Camera, unit
+from hood.media.raster import barycentric, rasterise
+from hood.media.shading import Light, Surface, backdrop
+
+Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+
+BODY_COLOR = (0.74, 0.70, 0.66)
+GARMENT_COLOR = (0.20, 0.42, 0.66)
+
+_SUPERSAMPLING = 2
+
+
+@dataclass(frozen=True)
+class RenderMesh:
+    """A surface to draw: `pos` (V, 3) [m], y up, `faces` (F, 3), `color` (3,) or per vertex (V, 3) in 0..1.
+
+    Both sides are drawn; the side that faces against its normal is slightly darker.
+    """
+
+    pos: ArrayLike
+    faces: ArrayLike
+    color: ArrayLike = GARMENT_COLOR
+
+
+def render_frame(
+    meshes: Sequence[RenderMesh],
+    camera: Camera,
+    width: int = 480,
+    height: int = 640,
+    *,
+    floor: float | None = None,
+) -> Picture:
+    """Draws the meshes above a floor; returns (height, width, 3) uint8.
+
+    Args:
+        floor: height of the floor [m]. By default the lowest vertex drawn; give it for a film, where it must
+            not move.
+    """
+    surface = _join(meshes)
+    light = Light(camera, surface.pos, surface.faces)
+    floor_height = float(surface.pos[:, 1].min()) if floor is None else floor
+    behind = backdrop(camera, light, surface, floor_height, width, height)
+    image = np.repeat(np.repeat(behind, _SUPERSAMPLING, axis=0), _SUPERSAMPLING, axis=1)
+    _draw_surface(image, camera, light, surface)
+    steps = range(_SUPERSAMPLING)
+    samples = [image[i::_SUPERSAMPLING, j::_SUPERSAMPLING] for i in steps for j in steps]
+    image = np.sum(samples, axis=0) / len(samples)
+    return (255.0 * np.clip(image, 0.0, 1.0) ** (1 / 2.2) + 0.5).astype(np.uint8)
+
+
+def contact_sheet(images: Sequence[Picture], columns: int, labels: Sequence[str] | None = None) -> Picture:
+    """Equal-sized pictures in rows of `columns`, each with its label in the upper left corner."""
+    if not images or columns < 1:
+        raise ValueError(
+            f"contact_sheet: needs an image and a column, got {len(images)} images, {columns} columns"
+        )
+    if labels is not None and len(labels) != len(images):
+        raise ValueError(f"contact_sheet: {len(labels)} labels for {len(images)} images; give one for each")
+    height, width = images[0].shape[:2]
+    for index, image in enumerate(images):
+        if image.shape != (height, width, 3):
+            raise ValueError(
+                f"contact_sheet: image {index} is {image.shape}, image 0 {images[0].shape}; use one size"
+            )
+    rows = -(-len(images) // columns)
+    sheet = np.full((rows * height, columns * width, 3), 255, dtype=np.uint8)
+    for index, image in enumerate(images):
+        top, left = (index // columns) * height, (index % columns) * width
+        cell = image if labels is None else _labelled(image, labels[index])
+        sheet[top : top + height, left : left + width] = cell
+    return sheet
+
+
+def _labelled(image: Picture, label: str) -> Picture:
+    try:
+        from PIL import Image, ImageDraw, ImageFont
+    except ImportError as error:
+        raise ImportError("labels on pictures need Pillow: pip install hood[pictures]") from error
+    canvas = Image.fromarray(image)
+    size = max(12, image.shape[0] // 28)
+    font = ImageFont.load_default(size)
+    ImageDraw.Draw(canvas).text((size // 2, size // 3), label, fill=(60, 62, 66), font=font)
+    return np.asarray(canvas)
+
+
+def _join(meshes: Sequence[RenderMesh]) -> Surface:
+    if not meshes:
+        raise ValueError("render_frame: no meshes given; pass at least one RenderMesh")
+    parts: list[tuple[Array, NDArray[np.int64], Array, Array]] = []
+    offset = 0
+    for index, mesh in enumerate(meshes):
+        pos, faces = np.asarray(mesh.pos, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
+        color = np.asarray(mesh.color, dtype=np.float64)
+        if not np.isfinite(pos).all():
+            bad = int(np.flatnonzero(~np.isfinite(pos).all(axis=1))[0])
+            raise ValueError(f"render_frame: mesh {index}: vertex {bad} is not finite; draw an earlier frame")
+        if color.shape not in ((3,), pos.shape):
+            raise ValueError(f"render_frame: mesh {index}: color is {color.shape}, needs (3,) or {pos.shape}")
+        linear = np.broadcast_to(np.clip(color, 0.0, 1.0) ** 2.2, pos.shape)
+        parts.append((pos, faces + offset, linear, _vertex_normals(pos, faces)))
+        offset += len(pos)
+    return Surface(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _draw_surface(image: Array, camera: Camera, light: Light, surface: Surface) -> None:
+    height, width = image.shape[:2]
+    axes = camera.axes()
+    seen = (surface.pos - np.asarray(camera.position)) @ axes.T
+    faces = surface.faces[(seen[surface.faces, 2] > NEAR).all(axis=1)]
+    depth = np.maximum(seen[:, 2], NEAR)
+    focal = 0.5 * height / np.tan(np.radians(camera.fov) / 2)
+    offset = focal * seen[:, :2] / depth[:, None]
+    screen = np.stack([0.5 * width + offset[:, 0], 0.5 * height - offset[:, 1]], axis=1)
+    visible = rasterise(screen, 1.0 / depth, faces, width, height).face
+    row, column = np.nonzero(visible >= 0)
+    if len(row) == 0:
+        return
+    corners = faces[visible[row, column]]
+    weights = barycentric(screen, corners, np.stack([column + 0.5, row + 0.5], axis=1)) / depth[corners]
+    weights = np.clip(weights / (weights @ np.ones(3))[:, None], 0.0, 1.0)
+
+    pos = _blend(weights, surface.pos, corners)
+    color = _blend(weights, surface.color, corners)
+    normal = unit(_blend(weights, surface.normal, corners))
+    view = unit(np.asarray(camera.position) - pos)
+    a, b, c = (screen[faces[:, k]] for k in range(3))
+    turned = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) > (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    inside = turned[visible[row, column]]
+    normal[inside] *= -1.0
+    color = np.where(inside[:, None], 0.72 * color, color)
+    image[row, column] = light.shade(pos, normal, view, color)
+
+
+def _vertex_normals(pos: Array, faces: NDArray[np.int64]) -> Array:
+    """Area-weighted unit normals (V, 3)."""
+    a, b, c = (pos[faces[:, k]] for k in range(3))
+    face_normal = np.cross(b - a, c - a)
+    total = [
+        sum(np.bincount(faces[:, k], weights=face_normal[:, axis], minlength=len(pos)) for k in range(3))
+        for axis in range(3)
+    ]
+    return unit(np.stack(total, axis=1))
+
+
+def _blend(weights: Array, values: Array, corners: NDArray[np.int64]) -> Array:
+    a, b, c = (weights[:, k, None] * values[corners[:, k]] for k in range(3))
+    return a + b + c

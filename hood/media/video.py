@@ -1,0 +1,147 @@
+"""Films and pictures on disk. A file appears under its name only when it is complete."""
+
+from __future__ import annotations
+
+import io
+import logging
+import os
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+logger = logging.getLogger(__name__)
+Picture = NDArray[np.uint8]
+
+_PICTURES_HINT = "need Pillow: pip install hood[pictures]"
+
+
+def save_png(path: str | Path, image: Picture) -> Path:
+    """Writes (H, W, 3) uint8 as PNG; returns the path."""
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise ImportError(f"PNG files {_PICTURES_HINT}") from error
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = _partial(path)
+    Image.fromarray(np.ascontiguousarray(image)).save(partial, format="PNG")
+    os.replace(partial, path)
+    return path
+
+
+class VideoWriter:
+    """Writes frames to `path`: H.264 for `.mp4`, an animated GIF for `.gif`.
+
+    Without imageio-ffmpeg an `.mp4` becomes a `.gif`, with a warning; `path` holds the name in use. The file gets
+    its name when the `with` block ends without an error; otherwise nothing is left behind.
+
+        with VideoWriter("walk.mp4", fps=30) as film:
+            film.append(image)
+    """
+
+    def __init__(self, path: str | Path, fps: float = 30.0):
+        path = Path(path)
+        if path.suffix not in (".mp4", ".gif"):
+            raise ValueError(f"video {str(path)!r}: suffix must be .mp4 or .gif")
+        if fps <= 0:
+            raise ValueError(f"video {str(path)!r}: fps must be positive, got {fps}")
+        self._ffmpeg: Any = _find_ffmpeg() if path.suffix == ".mp4" else None
+        if path.suffix == ".mp4" and self._ffmpeg is None:
+            path = path.with_suffix(".gif")
+            logger.warning("imageio-ffmpeg is missing (pip install hood[pictures]): writing %s instead", path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.path = path
+        self.fps = fps
+        self._partial = _partial(path)
+        self._shape: tuple[int, ...] | None = None
+        self._stream: Any = None
+        self._gif_frames: list[io.BytesIO] = []
+
+    def append(self, image: Picture) -> None:
+        """Adds one frame (H, W, 3) uint8; all frames have one size. An odd last row or column is dropped."""
+        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+            given = f"{image.shape} {image.dtype}"
+            raise ValueError(f"video {str(self.path)!r}: a frame must be (H, W, 3) uint8, got {given}")
+        if self._shape is None:
+            self._shape = image.shape
+        if image.shape != self._shape:
+            raise ValueError(f"video {str(self.path)!r}: frame {image.shape} after frames {self._shape}")
+        even = np.ascontiguousarray(image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2])
+        if self._ffmpeg is not None:
+            self._send(even)
+        else:
+            self._keep(even)
+
+    def __enter__(self) -> VideoWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if self._stream is not None:
+                self._stream.close()
+            elif self._gif_frames and kind is None:
+                self._save_gif()
+            if kind is None:
+                if self._shape is None:
+                    raise ValueError(f"video {str(self.path)!r}: no frames were appended")
+                os.replace(self._partial, self.path)
+        finally:
+            self._partial.unlink(missing_ok=True)
+
+    def _send(self, image: Picture) -> None:
+        if self._stream is None:
+            height, width = image.shape[:2]
+            self._stream = self._ffmpeg.write_frames(
+                str(self._partial),
+                (width, height),
+                fps=self.fps,
+                codec="libx264",
+                pix_fmt_out="yuv420p",
+                macro_block_size=2,
+                output_params=["-crf", "20", "-movflags", "+faststart"],
+                ffmpeg_log_level="error",
+            )
+            self._stream.send(None)
+        self._stream.send(image)
+
+    def _keep(self, image: Picture) -> None:
+        try:
+            from PIL import Image
+        except ImportError as error:
+            raise ImportError(f"GIF films {_PICTURES_HINT}") from error
+        packed = io.BytesIO()
+        Image.fromarray(image).save(packed, format="PNG", compress_level=1)
+        self._gif_frames.append(packed)
+
+    def _save_gif(self) -> None:
+        from PIL import Image
+
+        stride = max(1, len(self._gif_frames) // 8)
+        pictures = [Image.open(packed).convert("RGB") for packed in self._gif_frames[::stride]]
+        # One palette for the whole film: palettes that change from frame to frame flicker.
+        strip = Image.fromarray(np.concatenate([np.asarray(picture) for picture in pictures]))
+        palette = strip.quantize(256, dither=Image.Dither.NONE)
+        first, *rest = (
+            Image.open(packed).convert("RGB").quantize(palette=palette, dither=Image.Dither.NONE)
+            for packed in self._gif_frames
+        )
+        # GIF counts time in hundredths of a second.
+        duration = max(20, round(100.0 / self.fps) * 10)
+        first.save(self._partial, save_all=True, append_images=rest, duration=duration, loop=0, format="GIF")
+
+
+def _partial(path: Path) -> Path:
+    return path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+
+
+def _find_ffmpeg() -> Any:
+    try:
+        import imageio_ffmpeg
+    except ImportError:
+        return None
+    return imageio_ffmpeg

@@ -1,0 +1,1 @@
+"""Pure geometry on triangle meshes: topology, geometry, proximity, quality."""

@@ -1,0 +1,69 @@
+"""The one contact search of a step: nearest body vertex and closest body triangle point of every cloth vertex."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from hood.mesh import geometry
+from hood.mesh.proximity import search_surface
+from hood.scene.state import Obstacle
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Found at x_t against the body at t and held constant during the step, so that the potential is one and the
+    same function for loss, solver and gap. Rows of vertices without a match within the cap have ``valid`` False.
+    """
+
+    vertex: Tensor  # (V,) nearest body vertex, index into the batch's body vertices
+    vertex_dist: Tensor  # (V,) m, to that vertex
+    face: Tensor  # (V,) closest body face, index into the batch's body faces
+    bary: Tensor  # (V, 3) barycentric weights of the closest point
+    dist: Tensor  # (V,) m, signed distance at t, negative inside
+    valid: Tensor  # (V,) bool, unsigned distance <= cap
+    point: Tensor  # (V, 3) m, the matched body point at t
+    normal: Tensor  # (V, 3) outward unit normal there at t
+    next_point: Tensor  # (V, 3) m, the same material point at t + 1
+    next_normal: Tensor  # (V, 3) outward unit normal there at t + 1
+
+    def next_dist(self, next_pos: Tensor) -> Tensor:
+        """Signed distance [m] of ``next_pos`` (V, 3) to the matched point's tangent plane at t + 1."""
+        return ((next_pos - self.next_point) * self.next_normal).sum(dim=1)
+
+
+def find_contact(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, cap: float = 0.1) -> Contact:
+    """Contact data of cloth positions ``pos`` (V, 3) against the obstacle at t; one search per scene.
+
+    Matches farther than ``cap`` [m] are kept but marked invalid.
+    """
+    hit = search_surface(pos, vertex_scene, obstacle.pos, obstacle.faces, obstacle.vertex_scene, obstacle.face_scene)
+    corners = obstacle.faces[hit.face]
+    point = _weigh(hit.bary, obstacle.pos[corners])
+    next_point = _weigh(hit.bary, obstacle.next_pos[corners])
+    normal = _interpolated_normal(obstacle.pos, obstacle.faces, corners, hit.bary)
+    next_normal = _interpolated_normal(obstacle.next_pos, obstacle.faces, corners, hit.bary)
+    return Contact(
+        vertex=hit.vertex,
+        vertex_dist=hit.vertex_dist,
+        face=hit.face,
+        bary=hit.bary,
+        dist=hit.dist,
+        valid=hit.dist.abs() <= cap,
+        point=point,
+        normal=normal,
+        next_point=next_point,
+        next_normal=next_normal,
+    )
+
+
+def _weigh(bary: Tensor, corner_values: Tensor) -> Tensor:
+    return (bary.unsqueeze(-1) * corner_values).sum(dim=1)
+
+
+def _interpolated_normal(pos: Tensor, faces: Tensor, corners: Tensor, bary: Tensor) -> Tensor:
+    """Normals vary continuously over the surface, so a sliding vertex sees no jump between facets."""
+    normal = _weigh(bary, geometry.vertex_normals(pos, faces)[corners])
+    return normal / normal.norm(dim=1, keepdim=True).clamp_min(torch.finfo(pos.dtype).tiny)

@@ -1,0 +1,139 @@
+"""A scene: one garment, one body in motion. It prescribes the start and every step; it never changes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hood.assets.body import Body
+from hood.assets.garment import Garment, bind_garment
+from hood.assets.material import Material
+from hood.assets.sequence import PoseSequence
+from hood.scene.cloth import Cloth, build_cloth
+from hood.scene.motion import BodyMotion, body_motion
+from hood.scene.start import settle
+from hood.scene.state import Attachments, State, StepInput, concatenate_obstacles
+
+#: Time step [s] of the relaxing first step: inertia shrinks by 100, the paper's α (section 3.4).
+RELAXING_DT = 1.0 / 3.0
+#: The local frame follows the cloth in multiples of this [m]; such shifts are exact in float32 near the cloth.
+_GRID = 0.25
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Static description of one rollout. Steps are numbered by the frame they start from."""
+
+    cloth: Cloth
+    garment: Garment
+    motion: BodyMotion
+    dt: float
+    clearance: float = 2e-3
+
+    @property
+    def num_frames(self) -> int:
+        """Frames of the motion; a rollout has at most as many."""
+        return self.motion.num_frames
+
+    def start(self, frame: int = 0, relaxed: bool = True) -> State:
+        """State at ``frame``: garment skinned to the body, settled; velocity of the skinned garment.
+
+        ``relaxed=False`` gives zero velocity, the start of a relaxing step.
+        """
+        origin = _snap(self.motion.translation[frame])
+        skinned = self.motion.skinned(self.garment, frame, origin)
+        pos = settle(self.cloth, skinned, self.motion.obstacle(frame, origin, static=True), self.clearance)
+        vel = self.start_velocity(frame) if relaxed else torch.zeros_like(pos)
+        return State(pos=pos, vel=vel, origin=torch.as_tensor(origin).unsqueeze(0))
+
+    def start_velocity(self, frame: int) -> Tensor:
+        """(V, 3) m/s of the skinned garment at ``frame``."""
+        if frame + 1 >= self.num_frames:
+            return torch.zeros_like(self.cloth.rest_pos)
+        origin = self.motion.translation[frame]
+        return (self.motion.skinned(self.garment, frame + 1, origin) - self.motion.skinned(self.garment, frame, origin)) / self.dt
+
+    def step_input(
+        self, frame: int, state: State, relaxing: bool = False, attachments: Attachments | None = None
+    ) -> StepInput:
+        """What is prescribed for ``frame`` → ``frame + 1``; a relaxing step freezes the body at ``frame``."""
+        origin = state.origin[0].numpy()
+        pins = None
+        if bool(self.cloth.pinned.any()):
+            pins = self.motion.skinned(self.garment, frame if relaxing else frame + 1, origin)
+        dt = RELAXING_DT if relaxing else self.dt
+        return StepInput(
+            dt=torch.tensor([dt], dtype=state.pos.dtype),
+            obstacle=self.motion.obstacle(frame, origin, static=relaxing),
+            pin_target=pins,
+            attachments=attachments,
+        )
+
+
+def build_scene(
+    garment: Garment,
+    body: Body,
+    sequence: PoseSequence,
+    material: Material | None = None,
+    betas: np.ndarray | None = None,
+    size: float = 1.0,
+    dtype: torch.dtype = torch.float32,
+) -> Scene:
+    """Garment on body: bound, grown with β and scaled by ``size`` (rest shape only: the paper's resizing augmentation)."""
+    garment = bind_garment(garment, body)
+    betas = np.zeros(10) if betas is None else np.asarray(betas, dtype=np.float64)
+    rest_pos = garment.shaped(betas) * size
+    cloth = build_cloth(rest_pos, garment.faces, material or Material(), garment.pinned, dtype=dtype)
+    return Scene(cloth, garment, body_motion(body, sequence, betas, dtype), 1.0 / sequence.fps)
+
+
+def recentre(state: State, vertex_scene: Tensor) -> State:
+    """The same state with each scene's origin moved next to its cloth; world positions are unchanged."""
+    count = torch.bincount(vertex_scene, minlength=len(state.origin)).clamp_min(1)
+    centre = torch.zeros(len(state.origin), 3, dtype=state.pos.dtype).index_add(0, vertex_scene, state.pos) / count[:, None]
+    shift = torch.round(centre / (2 * _GRID)) * (2 * _GRID)
+    if not bool(shift.any()):
+        return state
+    return State(state.pos - shift[vertex_scene], state.vel, state.origin + shift.to(torch.float64))
+
+
+def concatenate_step_inputs(steps: Sequence[StepInput], vertex_counts: Sequence[int]) -> StepInput:
+    """Inputs of several scenes as one flat batch; scenes without pins get their targets as zeros (never read)."""
+    if len(steps) == 1:
+        return steps[0]
+    obstacles = [step.obstacle for step in steps if step.obstacle is not None]
+    if obstacles and len(obstacles) != len(steps):
+        raise ValueError("a batch mixes scenes with and without a body; put them in separate batches")
+    pins = None
+    if any(step.pin_target is not None for step in steps):
+        like = next(step.pin_target for step in steps if step.pin_target is not None)
+        pins = torch.cat(
+            [
+                step.pin_target if step.pin_target is not None else like.new_zeros(count, 3)
+                for step, count in zip(steps, vertex_counts, strict=True)
+            ]
+        )
+    return StepInput(
+        dt=torch.cat([step.dt for step in steps]),
+        obstacle=concatenate_obstacles(obstacles) if obstacles else None,
+        pin_target=pins,
+        attachments=_concatenate_attachments([step.attachments for step in steps], vertex_counts),
+    )
+
+
+def _concatenate_attachments(items: Sequence[Attachments | None], vertex_counts: Sequence[int]) -> Attachments | None:
+    edges, active, offset = [], [], 0
+    for item, count in zip(items, vertex_counts, strict=True):
+        if item is not None:
+            edges.append(item.edges + offset)
+            active.append(item.active)
+        offset += count
+    return Attachments(torch.cat(edges), torch.cat(active)) if edges else None
+
+
+def _snap(position: np.ndarray) -> np.ndarray:
+    return np.round(position / _GRID) * _GRID

@@ -1,0 +1,293 @@
+"""Synthetic meshes and reusable contracts for tests; a new energy is tested by one call of a contract.
+
+Meshes are pairs (pos (V, 3) float64 [m], faces (F, 3) int64).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hood.assets.material import Material
+from hood.losses.potential import Potential, Term
+from hood.losses.problem import StepProblem
+from hood.scene.cloth import Cloth, build_cloth, concatenate_cloths
+from hood.scene.contact import Contact
+from hood.scene.state import State, StepInput
+
+Mesh = tuple[np.ndarray, np.ndarray]
+
+
+def grid(n: int = 8, m: int = 8, size: float = 1.0) -> Mesh:
+    """Horizontal square sheet (y = 0) of n × m vertices and side ``size`` [m]; normals up."""
+    x, z = np.meshgrid(np.linspace(0, size, n), np.linspace(0, size, m), indexing="ij")
+    pos = np.stack([x, np.zeros_like(x), z], axis=-1).reshape(-1, 3)
+    i, j = np.meshgrid(np.arange(n - 1), np.arange(m - 1), indexing="ij")
+    return pos, _split_quads(i.reshape(-1), j.reshape(-1), m, n * m)
+
+
+def strip(n: int = 8, length: float = 1.0, width: float = 0.1) -> Mesh:
+    """Horizontal strip of 2n vertices, ``length`` along x and ``width`` along z [m]."""
+    pos, faces = grid(n, 2, 1.0)
+    return pos * np.array([length, 1.0, width]), faces
+
+
+def cylinder(around: int = 12, rows: int = 6, radius: float = 0.2, height: float = 0.5) -> Mesh:
+    """Open tube about the y axis, outward normals; vertex ``k`` of row ``r`` has index ``r * around + k``."""
+    y, angle = np.meshgrid(
+        np.linspace(0, height, rows), 2 * np.pi * np.arange(around) / around, indexing="ij"
+    )
+    pos = np.stack([radius * np.cos(angle), y, -radius * np.sin(angle)], axis=-1).reshape(-1, 3)
+    i, j = np.meshgrid(np.arange(rows - 1), np.arange(around), indexing="ij")
+    return pos, _split_quads(i.reshape(-1), j.reshape(-1), around, rows * around)
+
+
+def sphere(subdivisions: int = 2, radius: float = 1.0) -> Mesh:
+    """Icosahedron subdivided ``subdivisions`` times, outward normals; 10 · 4ⁿ + 2 vertices."""
+    golden = (1 + np.sqrt(5)) / 2
+    pos = [[a, b, 0] for a in (-1, 1) for b in (-golden, golden)]
+    points = np.array(pos + [[0, *p[:2]] for p in pos] + [[p[1], 0, p[0]] for p in pos], dtype=np.float64)
+    near = np.linalg.norm(points[:, None] - points[None], axis=-1) < 2.1
+    faces = np.array(
+        [
+            (i, j, k)
+            for i in range(12)
+            for j in range(i)
+            for k in range(j)
+            if near[i, j] * near[j, k] * near[k, i]
+        ]
+    )
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    for _ in range(subdivisions):
+        points, faces = _subdivide(points, faces)
+    corners = points[faces]
+    inward = (
+        np.einsum(
+            "fi,fi->f", np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), corners[:, 0]
+        )
+        < 0
+    )
+    faces[inward] = faces[inward][:, ::-1]
+    return radius * points, faces
+
+
+def box(cells: int = 4, size: float = 1.0) -> Mesh:
+    """Cube of side ``size`` about the origin, ``cells`` × ``cells`` quads per side; outward normals."""
+    sheet, faces = grid(cells + 1, cells + 1, size)
+    sheet = sheet + np.array([-0.5, 0.5, -0.5]) * size
+    half = np.array([[1, 0, 0], [0, -1, 0], [0, 0, -1.0]])
+    quarter = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0.0]])
+    other = np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1.0]])
+    turns = [np.eye(3), half, quarter, quarter.T, other, other.T]
+    pos = np.concatenate([sheet @ turn.T for turn in turns])
+    tri = np.concatenate([faces + i * len(sheet) for i in range(6)])
+    _, first, inverse = np.unique(
+        np.round(pos / size * 4 * cells), axis=0, return_index=True, return_inverse=True
+    )
+    return pos[first], inverse.reshape(-1)[tri]
+
+
+def random_rotation(rng: np.random.Generator) -> np.ndarray:
+    """Uniformly random proper rotation (3, 3)."""
+    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
+    q *= np.sign(np.diag(r))
+    return q if np.linalg.det(q) > 0 else -q
+
+
+def make_problem(
+    cloth: Cloth,
+    pos: Tensor | np.ndarray | None = None,
+    vel: Tensor | np.ndarray | None = None,
+    dt: float = 1 / 30,
+    contact: Contact | None = None,
+) -> StepProblem:
+    """A step of ``cloth`` in its dtype, at ``pos`` (default: rest) with velocity ``vel`` (default: 0)."""
+    like = cloth.rest_pos
+    position = like if pos is None else torch.as_tensor(pos).to(like)
+    velocity = torch.zeros_like(like) if vel is None else torch.as_tensor(vel).to(like)
+    state = State(position, velocity, torch.zeros(cloth.num_scenes, 3, dtype=torch.float64))
+    step = StepInput(dt=like.new_full((cloth.num_scenes,), dt))
+    return StepProblem(cloth, state, step, contact, torch.tensor([0.0, -9.81, 0.0]).to(like))
+
+
+def plane_contact(
+    pos: Tensor, normal: Tensor | None = None, height: float = 0.0, motion: Tensor | None = None
+) -> Contact:
+    """Contact of ``pos`` (V, 3) with a plane at ``height`` along ``normal`` (up) moving by ``motion``."""
+    up = pos.new_tensor([0.0, 1.0, 0.0]) if normal is None else normal.to(pos)
+    normals = up.expand_as(pos)
+    dist = (pos * normals).sum(dim=1) - height
+    point = pos - dist.unsqueeze(1) * normals
+    index = torch.zeros(len(pos), dtype=torch.int64)
+    return Contact(
+        vertex=index,
+        vertex_dist=dist.abs(),
+        face=index,
+        bary=pos.new_tensor([1.0, 0.0, 0.0]).expand_as(pos),
+        dist=dist,
+        valid=torch.ones(len(pos), dtype=torch.bool),
+        point=point,
+        normal=normals,
+        next_point=point if motion is None else point + motion.to(pos),
+        next_normal=normals,
+    )
+
+
+def assert_internal_energy_contract(term: Term, seed: int = 0) -> None:
+    """Everything an energy of the cloth's own shape must satisfy, in float64; raises AssertionError
+    otherwise.
+
+    Zero at rest; unchanged by rigid motion, by flipped faces and by relabelling; no net force or torque;
+    gradient equal to finite differences at random, flat, folded, stretched and compressed states; a batch
+    gives what its members give alone; finite energy and gradient at degenerate shapes, in float32 as well.
+    """
+    rng = np.random.default_rng(seed)
+    for mesh in (_wavy_sheet(), cylinder(6, 4), strip(4)):
+        cloth = build_cloth(*mesh, Material(), dtype=torch.float64)
+        crumpled = mesh[0] + 0.03 * rng.normal(size=mesh[0].shape)
+        assert float(_energy(term, cloth, cloth.rest_pos)) <= 1e-20, "energy is not zero at rest"
+        _assert_rigid_invariance(term, cloth, crumpled, rng)
+        _assert_no_net_force(term, cloth, crumpled)
+        _assert_labels_play_no_role(term, mesh, crumpled, rng)
+    assert_gradient(term, rng)
+    _assert_batch_equals_singles(term, rng)
+    assert_finite_when_degenerate(term)
+
+
+def assert_gradient(term: Term, rng: np.random.Generator) -> None:
+    """gradcheck at random, flat, folded (3 rad), stretched and compressed states of a curved sheet."""
+    mesh = _wavy_sheet()
+    cloth = build_cloth(*mesh, Material(bending_stiffness=1e-2), dtype=torch.float64)
+    flat = mesh[0] * np.array([1.0, 0.0, 1.0])
+    noise = 1e-3 * rng.normal(size=flat.shape)
+    states = {
+        "random": mesh[0] + 0.05 * rng.normal(size=flat.shape),
+        "flat": flat,
+        "folded": fold(flat, 3.0) + 0.1 * noise,
+        "stretched": mesh[0] * 3.0 + noise,
+        "compressed": mesh[0] * np.array([0.3, 1.0, 0.5]) + noise,
+    }
+    for name, state in states.items():
+        pos = torch.as_tensor(state).requires_grad_(True)
+        assert torch.autograd.gradcheck(lambda x: _energy(term, cloth, x), pos, atol=1e-7, rtol=1e-4), name
+
+
+def assert_finite_when_degenerate(term: Term) -> None:
+    """Finite energy and gradient where faces are collinear, coincident, lack an edge, or are folded by π."""
+    pos, faces = grid(3, 3, 0.1)
+    fourth = pos.copy()
+    fourth[4] = fourth[1]
+    states = {
+        "collinear": pos * np.array([1.0, 1.0, 0.0]),
+        "coincident": pos * 0.0,
+        "zero-length edge": fourth,
+        "folded by π": np.abs(pos - pos[4]) + pos[4],
+    }
+    for dtype in (torch.float32, torch.float64):
+        cloth = build_cloth(pos, faces, Material(), dtype=dtype)
+        for name, state in states.items():
+            energy, gradient = _energy_and_gradient(term, cloth, state)
+            assert torch.isfinite(energy).all() and torch.isfinite(gradient).all(), f"{name}, {dtype}"
+
+
+def fold(flat: np.ndarray, angle: float) -> np.ndarray:
+    """The sheet ``flat`` (V, 3), y = 0, turned up by ``angle`` [rad] beyond its middle column."""
+    columns = np.unique(flat[:, 0])
+    middle = columns[len(columns) // 2]
+    beyond = np.maximum(flat[:, 0] - middle, 0)
+    folded = flat.copy()
+    folded[:, 0] = np.minimum(flat[:, 0], middle) + beyond * np.cos(angle)
+    folded[:, 1] = beyond * np.sin(angle)
+    return folded
+
+
+def _assert_rigid_invariance(term: Term, cloth: Cloth, state: np.ndarray, rng: np.random.Generator) -> None:
+    energy, gradient = _energy_and_gradient(term, cloth, state)
+    turn = torch.as_tensor(random_rotation(rng))
+    moved = torch.as_tensor(state) @ turn.T + torch.as_tensor(rng.normal(size=3))
+    moved_energy, moved_gradient = _energy_and_gradient(term, cloth, moved)
+    torch.testing.assert_close(moved_energy, energy, rtol=1e-12, atol=0)
+    # A gradient carries the rounding of positions, magnified by one over the size of an element.
+    torch.testing.assert_close(
+        moved_gradient, gradient @ turn.T, rtol=0, atol=1e-11 * float(gradient.abs().max())
+    )
+
+
+def _assert_no_net_force(term: Term, cloth: Cloth, state: np.ndarray) -> None:
+    _, gradient = _energy_and_gradient(term, cloth, state)
+    force = float(gradient.abs().sum())
+    assert force > 0, "a crumpled sheet feels no force"
+    torque = torch.linalg.cross(torch.as_tensor(state), gradient).sum(dim=0)
+    assert float(gradient.sum(dim=0).abs().max()) <= 1e-13 * force, "net force"
+    assert float(torque.abs().max()) <= 1e-13 * force, "net torque"
+
+
+def _assert_labels_play_no_role(term: Term, mesh: Mesh, state: np.ndarray, rng: np.random.Generator) -> None:
+    pos, faces = mesh
+    reference = _energy(
+        term, build_cloth(pos, faces, Material(), dtype=torch.float64), torch.as_tensor(state)
+    )
+    flipped = faces.copy()
+    flipped[::7] = flipped[::7, ::-1]
+    order = rng.permutation(len(pos))
+    new_index = np.argsort(order)
+    for new_pos, new_faces, new_state in (
+        (pos, flipped, state),
+        (pos[order], rng.permutation(new_index[faces], axis=0), state[order]),
+    ):
+        cloth = build_cloth(new_pos, new_faces, Material(), dtype=torch.float64)
+        torch.testing.assert_close(
+            _energy(term, cloth, torch.as_tensor(new_state)), reference, rtol=1e-12, atol=0
+        )
+
+
+def _assert_batch_equals_singles(term: Term, rng: np.random.Generator) -> None:
+    meshes = [_wavy_sheet(), cylinder(5, 3), strip(3)]
+    cloths = [build_cloth(*mesh, Material(), dtype=torch.float64) for mesh in meshes]
+    states = [mesh[0] + 0.02 * rng.normal(size=mesh[0].shape) for mesh in meshes]
+    together, gradient = _energy_and_gradient(term, concatenate_cloths(cloths), np.concatenate(states))
+    alone = [_energy_and_gradient(term, cloth, state) for cloth, state in zip(cloths, states, strict=True)]
+    torch.testing.assert_close(together, torch.cat([energy for energy, _ in alone]), rtol=1e-13, atol=0)
+    torch.testing.assert_close(gradient, torch.cat([grad for _, grad in alone]), rtol=1e-10, atol=1e-14)
+
+
+def _energy(term: Term, cloth: Cloth, pos: Tensor) -> Tensor:
+    return term(make_problem(cloth), pos, torch.zeros_like(pos))
+
+
+def _energy_and_gradient(term: Term, cloth: Cloth, state: np.ndarray | Tensor) -> tuple[Tensor, Tensor]:
+    gradient, energies = Potential({"term": term}).gradient(
+        make_problem(cloth), torch.as_tensor(state).to(cloth.rest_pos)
+    )
+    return energies["term"], gradient
+
+
+def _wavy_sheet() -> Mesh:
+    pos, faces = grid(5, 4, 0.3)
+    pos[:, 1] = 0.03 * np.sin(15.0 * pos[:, 0]) * np.cos(8.0 * pos[:, 2])
+    return pos, faces
+
+
+def _split_quads(i: np.ndarray, j: np.ndarray, columns: int, count: int) -> np.ndarray:
+    """Two triangles per cell (i, j) of a row-major vertex table; diagonals alternate, columns wrap."""
+    a, b = i * columns + j, i * columns + (j + 1) % columns
+    c, d = a + columns, b + columns
+    even = ((i + j) % 2 == 0)[:, None, None]
+    first = np.stack([np.stack([a, b, c], 1), np.stack([b, d, c], 1)], axis=1)
+    second = np.stack([np.stack([a, b, d], 1), np.stack([a, d, c], 1)], axis=1)
+    faces = np.where(even, first, second).reshape(-1, 3).astype(np.int64)
+    assert faces.max() < count
+    return faces
+
+
+def _subdivide(pos: np.ndarray, faces: np.ndarray) -> Mesh:
+    """Split every face in four and project the new vertices onto the unit sphere."""
+    pairs = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    edges, inverse = np.unique(pairs, axis=0, return_inverse=True)
+    middle = pos[edges].mean(axis=1)
+    middle /= np.linalg.norm(middle, axis=1, keepdims=True)
+    ab, bc, ca = (inverse.reshape(-1, 3) + len(pos)).T
+    a, b, c = faces.T
+    tables = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+    return np.concatenate([pos, middle]), np.concatenate([np.stack(table, axis=1) for table in tables])
