@@ -6,8 +6,10 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 
-# Cloth steps allocate and free tensors of a few MB many times a frame; keeping them mapped is worth 1.15–1.9×.
-_ALLOCATOR = {
+# Read by the C library and OpenMP at process start. Cloth steps allocate and free tensors of a few MB many times a frame:
+# keeping them mapped is worth 1.15–1.9×. Waiting threads that spin slow a busy machine down 6× and more.
+_ENVIRONMENT = {
+    "OMP_WAIT_POLICY": "PASSIVE",
     "MALLOC_MMAP_THRESHOLD_": "1073741824",
     "MALLOC_TRIM_THRESHOLD_": "1073741824",
     "MALLOC_TOP_PAD_": "67108864",
@@ -62,7 +64,11 @@ def _run(command: Callable[[Sequence[str]], int], overrides: Sequence[str]) -> i
 
 def _describe(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename and error.strerror:
-        hints = {13: "choose a folder you may write to", 28: "free some space or choose another output", 30: "choose another output"}
+        hints = {
+            13: "choose a folder you may write to",
+            28: "free some space or choose another output",
+            30: "choose another output",
+        }
         hint = hints.get(error.errno or 0)
         return f"{error.filename}: {error.strerror.lower()}" + (f"; {hint}" if hint else "")
     return " ".join(str(error).split()) or type(error).__name__
@@ -91,7 +97,7 @@ def entry(argv: Sequence[str] | None = None) -> None:
     """Console entry: allocator settings take effect only at process start, so the process replaces itself once."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     if sys.platform.startswith("linux") and not os.environ.get("MALLOC_TOP_PAD_"):
-        os.environ.update({key: os.environ.get(key, value) for key, value in _ALLOCATOR.items()})
+        os.environ.update({key: os.environ.get(key, value) for key, value in _ENVIRONMENT.items()})
         os.execv(sys.executable, [sys.executable, "-m", "hood.cli", *arguments])
     sys.exit(main(arguments))
 

@@ -102,14 +102,23 @@ def save_run_record(folder: Path, config: DictConfig, seed: int) -> None:
     packages = {name: version(name) for name in ("torch", "numpy", "scipy", "h5py", "hydra-core", "safetensors")}
     from hood import __version__
 
-    record = {"hood": __version__, "python": platform.python_version(), "platform": platform.platform(), **packages, "seed": seed}
+    record = {
+        "hood": __version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        **packages,
+        "seed": seed,
+    }
     (folder / "versions.json").write_text(json.dumps(record, indent=1), encoding="utf-8")
 
 
 def _check_override(name: str, text: str, defaults: DictConfig) -> tuple[str, Override]:
     if "=" not in text and not text.startswith("~"):
         raise ConfigError(f"argument {text!r} is not of the form key=value; keys of {name}: {', '.join(defaults)}")
-    override = OverridesParser.create().parse_override(text)
+    try:
+        override = OverridesParser.create().parse_override(text)
+    except HydraException as error:
+        raise ConfigError(f"cannot read {text!r}: quote values with spaces or brackets, key=\"'value'\"") from error
     key = override.get_key_element().lstrip("+~").split("@")[0]
     if _is_group(override) and override.value() is not None and str(override.value()) not in options(key):
         raise ConfigError(unknown(f"option of {key}", str(override.value()), options(key)))
@@ -131,7 +140,7 @@ def _check_key(override: Override, known: DictConfig) -> None:
 
 def _dotted(config: DictConfig, depth: int, prefix: str = "") -> list[str]:
     keys = []
-    for key in config:
+    for key in map(str, config):
         path = f"{prefix}{key}"
         if depth == 0 or not isinstance(config[key], DictConfig):
             keys.append(path)
@@ -142,7 +151,7 @@ def _dotted(config: DictConfig, depth: int, prefix: str = "") -> list[str]:
 
 def _check_types(known: DictConfig, config: DictConfig, prefix: str) -> None:
     """A value must have the kind of the default it replaces; a None default takes anything."""
-    for key in config:
+    for key in map(str, config):
         before, after = known.get(key), config[key]
         if isinstance(after, DictConfig) and isinstance(before, DictConfig):
             _check_types(before, after, f"{prefix}{key}.")

@@ -35,9 +35,7 @@ def strip(n: int = 8, length: float = 1.0, width: float = 0.1) -> Mesh:
 
 def cylinder(around: int = 12, rows: int = 6, radius: float = 0.2, height: float = 0.5) -> Mesh:
     """Open tube about the y axis, outward normals; vertex ``k`` of row ``r`` has index ``r * around + k``."""
-    y, angle = np.meshgrid(
-        np.linspace(0, height, rows), 2 * np.pi * np.arange(around) / around, indexing="ij"
-    )
+    y, angle = np.meshgrid(np.linspace(0, height, rows), 2 * np.pi * np.arange(around) / around, indexing="ij")
     pos = np.stack([radius * np.cos(angle), y, -radius * np.sin(angle)], axis=-1).reshape(-1, 3)
     i, j = np.meshgrid(np.arange(rows - 1), np.arange(around), indexing="ij")
     return pos, _split_quads(i.reshape(-1), j.reshape(-1), around, rows * around)
@@ -49,25 +47,12 @@ def sphere(subdivisions: int = 2, radius: float = 1.0) -> Mesh:
     pos = [[a, b, 0] for a in (-1, 1) for b in (-golden, golden)]
     points = np.array(pos + [[0, *p[:2]] for p in pos] + [[p[1], 0, p[0]] for p in pos], dtype=np.float64)
     near = np.linalg.norm(points[:, None] - points[None], axis=-1) < 2.1
-    faces = np.array(
-        [
-            (i, j, k)
-            for i in range(12)
-            for j in range(i)
-            for k in range(j)
-            if near[i, j] * near[j, k] * near[k, i]
-        ]
-    )
+    faces = np.array([(i, j, k) for i in range(12) for j in range(i) for k in range(j) if near[i, j] * near[j, k] * near[k, i]])
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     for _ in range(subdivisions):
         points, faces = _subdivide(points, faces)
     corners = points[faces]
-    inward = (
-        np.einsum(
-            "fi,fi->f", np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), corners[:, 0]
-        )
-        < 0
-    )
+    inward = np.einsum("fi,fi->f", np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), corners[:, 0]) < 0
     faces[inward] = faces[inward][:, ::-1]
     return radius * points, faces
 
@@ -82,9 +67,7 @@ def box(cells: int = 4, size: float = 1.0) -> Mesh:
     turns = [np.eye(3), half, quarter, quarter.T, other, other.T]
     pos = np.concatenate([sheet @ turn.T for turn in turns])
     tri = np.concatenate([faces + i * len(sheet) for i in range(6)])
-    _, first, inverse = np.unique(
-        np.round(pos / size * 4 * cells), axis=0, return_index=True, return_inverse=True
-    )
+    _, first, inverse = np.unique(np.round(pos / size * 4 * cells), axis=0, return_index=True, return_inverse=True)
     return pos[first], inverse.reshape(-1)[tri]
 
 
@@ -111,9 +94,7 @@ def make_problem(
     return StepProblem(cloth, state, step, contact, torch.tensor([0.0, -9.81, 0.0]).to(like))
 
 
-def plane_contact(
-    pos: Tensor, normal: Tensor | None = None, height: float = 0.0, motion: Tensor | None = None
-) -> Contact:
+def plane_contact(pos: Tensor, normal: Tensor | None = None, height: float = 0.0, motion: Tensor | None = None) -> Contact:
     """Contact of ``pos`` (V, 3) with a plane at ``height`` along ``normal`` (up) moving by ``motion``."""
     up = pos.new_tensor([0.0, 1.0, 0.0]) if normal is None else normal.to(pos)
     normals = up.expand_as(pos)
@@ -209,9 +190,7 @@ def _assert_rigid_invariance(term: Term, cloth: Cloth, state: np.ndarray, rng: n
     moved_energy, moved_gradient = _energy_and_gradient(term, cloth, moved)
     torch.testing.assert_close(moved_energy, energy, rtol=1e-12, atol=0)
     # A gradient carries the rounding of positions, magnified by one over the size of an element.
-    torch.testing.assert_close(
-        moved_gradient, gradient @ turn.T, rtol=0, atol=1e-11 * float(gradient.abs().max())
-    )
+    torch.testing.assert_close(moved_gradient, gradient @ turn.T, rtol=0, atol=1e-11 * float(gradient.abs().max()))
 
 
 def _assert_no_net_force(term: Term, cloth: Cloth, state: np.ndarray) -> None:
@@ -225,9 +204,7 @@ def _assert_no_net_force(term: Term, cloth: Cloth, state: np.ndarray) -> None:
 
 def _assert_labels_play_no_role(term: Term, mesh: Mesh, state: np.ndarray, rng: np.random.Generator) -> None:
     pos, faces = mesh
-    reference = _energy(
-        term, build_cloth(pos, faces, Material(), dtype=torch.float64), torch.as_tensor(state)
-    )
+    reference = _energy(term, build_cloth(pos, faces, Material(), dtype=torch.float64), torch.as_tensor(state))
     flipped = faces.copy()
     flipped[::7] = flipped[::7, ::-1]
     order = rng.permutation(len(pos))
@@ -237,9 +214,7 @@ def _assert_labels_play_no_role(term: Term, mesh: Mesh, state: np.ndarray, rng: 
         (pos[order], rng.permutation(new_index[faces], axis=0), state[order]),
     ):
         cloth = build_cloth(new_pos, new_faces, Material(), dtype=torch.float64)
-        torch.testing.assert_close(
-            _energy(term, cloth, torch.as_tensor(new_state)), reference, rtol=1e-12, atol=0
-        )
+        torch.testing.assert_close(_energy(term, cloth, torch.as_tensor(new_state)), reference, rtol=1e-12, atol=0)
 
 
 def _assert_batch_equals_singles(term: Term, rng: np.random.Generator) -> None:
@@ -257,9 +232,7 @@ def _energy(term: Term, cloth: Cloth, pos: Tensor) -> Tensor:
 
 
 def _energy_and_gradient(term: Term, cloth: Cloth, state: np.ndarray | Tensor) -> tuple[Tensor, Tensor]:
-    gradient, energies = Potential({"term": term}).gradient(
-        make_problem(cloth), torch.as_tensor(state).to(cloth.rest_pos)
-    )
+    gradient, energies = Potential({"term": term}).gradient(make_problem(cloth), torch.as_tensor(state).to(cloth.rest_pos))
     return energies["term"], gradient
 
 

@@ -13,8 +13,8 @@ from hood.assets.library import locate, read_arrays
 from hood.assets.sequence import PoseSequence
 from hood.assets.skinning import axis_angle_to_matrix, joint_transforms, linear_blend_skinning
 
-#: Joints of the SMPL skeleton whose vertices get no body edges (hands: fingers are noisy and catch cloth).
-HAND_JOINTS = (22, 23)
+#: Joints 20 and 21 of every skeleton of the family; what hangs below them is hand and fingers.
+_WRISTS = (20, 21)
 _KEYS = ("v_template", "shapedirs", "J_regressor", "weights", "kintree_table", "f")
 
 
@@ -39,8 +39,11 @@ class Body:
 
     @property
     def omitted(self) -> np.ndarray:
-        """(W,) bool: vertices that follow a hand joint most."""
-        return np.isin(self.weights.argmax(axis=1), HAND_JOINTS)
+        """(W,) bool: vertices that follow a joint below a wrist most. They get no body edges: fingers catch cloth."""
+        hand = [False] * self.num_joints
+        for joint, parent in enumerate(self.parents):
+            hand[joint] = parent in _WRISTS or (parent >= 0 and hand[parent])
+        return np.array(hand)[self.weights.argmax(axis=1)]
 
     def shaped(self, betas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rest vertices (W, 3) and joints (J, 3) [m] of shape ``betas`` (S' <= S,)."""
@@ -50,7 +53,11 @@ class Body:
     def transforms(self, sequence: PoseSequence, betas: np.ndarray, dtype: torch.dtype = torch.float32) -> Tensor:
         """(T, J, 3, 4) rest-to-posed joint transforms, root translation not included."""
         joints = torch.as_tensor(self.shaped(betas)[1])
-        rotations = axis_angle_to_matrix(torch.as_tensor(sequence.poses[:, : self.num_joints]))
+        # Skeletons with fingers have more joints than a sequence drives; those stay at rest.
+        poses = np.zeros((sequence.num_frames, self.num_joints, 3))
+        driven = min(self.num_joints, sequence.poses.shape[1])
+        poses[:, :driven] = sequence.poses[:, :driven]
+        rotations = axis_angle_to_matrix(torch.as_tensor(poses))
         return joint_transforms(rotations, joints, self.parents).to(dtype)
 
     def translation(self, sequence: PoseSequence, betas: np.ndarray) -> np.ndarray:

@@ -98,23 +98,15 @@ def all_motions() -> list[Motion]:
         lean=4.0,
         shoulder_twist=13.0,
     )
-    proud = Gait(
-        speed=1.0, cycle=1.16, hip_yaw=9.0, hip_roll=6.0, sway=0.035, half_width=0.065, arm_swing=20.0
-    )
-    tired = Gait(
-        speed=0.65, cycle=1.4, lean=11.0, arm_swing=9.0, elbow=12.0, drop=0.03, sway=0.035, lift=0.02
-    )
-    march = Gait(
-        speed=0.7, cycle=1.15, duty=0.58, lift=0.24, heel_kick=32.0, toe_up=4.0, arm_swing=42.0, elbow=28.0
-    )
+    proud = Gait(speed=1.0, cycle=1.16, hip_yaw=9.0, hip_roll=6.0, sway=0.035, half_width=0.065, arm_swing=20.0)
+    tired = Gait(speed=0.65, cycle=1.4, lean=11.0, arm_swing=9.0, elbow=12.0, drop=0.03, sway=0.035, lift=0.02)
+    march = Gait(speed=0.7, cycle=1.15, duty=0.58, lift=0.24, heel_kick=32.0, toe_up=4.0, arm_swing=42.0, elbow=28.0)
     jog = Gait(
         speed=2.1, cycle=0.74, duty=0.40, lift=0.20, heel_kick=62.0, toe_up=8.0, drop=0.045, bounce=-0.03,
         lean=8.0, sway=0.012, hip_roll=2.5, arm_swing=30.0, arm_lower=64.0, arm_forward=-2.0, elbow=78.0,
         elbow_swing=14.0,
     )  # fmt: skip
-    spot = replace(
-        jog, speed=0.0, cycle=0.70, lift=0.30, heel_kick=40.0, toe_up=0.0, lean=3.0, half_width=0.095
-    )
+    spot = replace(jog, speed=0.0, cycle=0.70, lift=0.30, heel_kick=40.0, toe_up=0.0, lean=3.0, half_width=0.095)
     sideways = Gait(
         speed=0.42, cycle=1.05, duty=0.6, half_width=0.17, lift=0.05, heel_kick=14.0, toe_up=2.0,
         sidestep=90.0, hip_yaw=0.0, shoulder_twist=5.0, arm_swing=6.0, arm_lower=56.0, elbow=35.0, drop=0.05,

@@ -105,24 +105,18 @@ def _place_feet(controls: Controls, skeleton: Skeleton, gait: Gait, phase: Array
         controls.foot_pitch[:, side] += gaussian_filter1d(pitch * strength, blur, mode="nearest")
 
 
-def _plant(
-    controls: Controls, skeleton: Skeleton, gait: Gait, phase: Array, middle: Array, sign: float
-) -> Array:
+def _plant(controls: Controls, skeleton: Skeleton, gait: Gait, phase: Array, middle: Array, sign: float) -> Array:
     """Place x, z and yaw (T, 3) of the footstep whose stance is centred at the phase `middle` (T,)."""
     # Past the last frame the walk goes on straight with its last speed.
     rate, last = (phase[-1] - phase[-2]), len(phase) - 1
-    frame = np.where(
-        middle <= phase[-1], np.interp(middle, phase, np.arange(last + 1)), last + (middle - phase[-1]) / rate
-    )
+    frame = np.where(middle <= phase[-1], np.interp(middle, phase, np.arange(last + 1)), last + (middle - phase[-1]) / rate)
     over = np.maximum(frame - last, 0.0)
     x, z, yaw = (
         np.interp(frame, np.arange(last + 1), track) + over * (track[-1] - track[-2])
         for track in (controls.pelvis[:, 0], controls.pelvis[:, 2], controls.pelvis_turn[:, 1])
     )
     heading = np.radians(yaw)
-    width = skeleton.ankle_spacing + (gait.half_width - skeleton.ankle_spacing) * np.clip(
-        middle - 0.5, 0.0, 1.0
-    )
+    width = skeleton.ankle_spacing + (gait.half_width - skeleton.ankle_spacing) * np.clip(middle - 0.5, 0.0, 1.0)
     aside = sign * width
     return np.stack([x + aside * np.cos(heading), z - aside * np.sin(heading), yaw + 7.0 * sign], axis=1)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,11 +13,11 @@ from scipy.sparse.linalg import splu
 
 from hood.assets.body import Body
 from hood.assets.library import locate, read_arrays
+from hood.assets.mesh_file import MESH_SUFFIXES, read_mesh
 from hood.mesh import topology
 from hood.mesh.proximity import search_surface
 from hood.mesh.quality import check_triangles
 
-_MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb", ".off")
 #: Distance [m] over which the body's influence on a garment vertex halves: beyond it neighbours decide.
 _BINDING_REACH = 0.03
 
@@ -58,10 +59,11 @@ def load_garment(name: str | Path, triangulate: bool = False) -> Garment:
     path = locate("garments", name)
     if path.suffix == ".npz":
         garment = _read_npz(path)
-    elif path.suffix.lower() in _MESH_SUFFIXES:
-        garment = _read_mesh(path, triangulate)
+    elif path.suffix.lower() in MESH_SUFFIXES:
+        rest_pos, faces = read_mesh(path, triangulate)
+        garment = Garment(path.stem, rest_pos, faces, np.zeros(len(rest_pos), dtype=bool))
     else:
-        raise ValueError(f"{path}: unknown garment format {path.suffix!r}; give .npz or one of {', '.join(_MESH_SUFFIXES)}")
+        raise ValueError(f"{path}: unknown garment format {path.suffix!r}; give .npz or one of {', '.join(MESH_SUFFIXES)}")
     check_triangles(garment.rest_pos, garment.faces, str(path))
     return garment
 
@@ -118,43 +120,16 @@ def _read_npz(path: Path) -> Garment:
         if key in arrays:
             optional[key] = np.asarray(arrays[key], dtype=np.float64)
     if "lbs_weights" in optional:
-        optional["lbs_weights"] = optional["lbs_weights"] / optional["lbs_weights"].sum(axis=1, keepdims=True)
+        total = optional["lbs_weights"].sum(axis=1, keepdims=True)
+        optional["lbs_weights"] = optional["lbs_weights"] / np.where(total > 0, total, np.nan)
     pinned = np.asarray(arrays.get("pinned", np.zeros(num_vertices))).astype(bool)
     for key, value in (("pinned", pinned), *((k, optional[k]) for k in ("lbs_weights", "shapedirs") if k in optional)):
         if len(value) != num_vertices:
             raise ValueError(f"{path}: {key} has {len(value)} rows for {num_vertices} vertices; write one row per vertex")
+        finite = np.isfinite(value).reshape(num_vertices, -1).all(axis=1)
+        if not finite.all():
+            raise ValueError(f"{path}: {key} of vertex {int(np.argmin(finite))} is not finite or sums to zero; repair it")
     faces = np.asarray(arrays["faces"])
     if not np.issubdtype(faces.dtype, np.integer):
         raise ValueError(f"{path}: faces are {faces.dtype}; they must be integer vertex indices")
     return Garment(path.stem, np.asarray(arrays["rest_pos"], dtype=np.float64), faces.astype(np.int64), pinned, **optional)
-
-
-def _read_mesh(path: Path, triangulate: bool) -> Garment:
-    import trimesh
-
-    if path.suffix.lower() == ".obj" and not triangulate:
-        _refuse_polygons(path)
-    try:
-        mesh = trimesh.load(path, process=False, maintain_order=True, force="mesh")
-        rest_pos, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
-    except Exception as error:
-        raise ValueError(f"{path}: not a readable mesh ({str(error).splitlines()[0] if str(error) else error!r})") from error
-    return Garment(path.stem, rest_pos, faces, np.zeros(len(rest_pos), dtype=bool))
-
-
-def _refuse_polygons(path: Path) -> None:
-    """OBJ readers split polygons and drop bad indices silently; a rollout on other faces than the user's must be asked for."""
-    num_vertices, face = 0, 0
-    with open(path, encoding="utf-8", errors="replace") as file:
-        lines = file.readlines()
-    num_vertices = sum(line.startswith("v ") for line in lines)
-    for line in lines:
-        if not line.startswith("f "):
-            continue
-        corners = [int(word.split("/")[0]) for word in line.split()[1:] if word.split("/")[0].lstrip("-").isdigit()]
-        if len(corners) != 3:
-            raise ValueError(f"{path}: face {face} has {len(corners)} corners; triangulate it or pass triangulate=true")
-        for corner in corners:
-            if corner == 0 or corner > num_vertices or corner < -num_vertices:
-                raise ValueError(f"{path}: face {face} refers to vertex {corner} of {num_vertices}; repair or remove the face")
-        face += 1

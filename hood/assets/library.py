@@ -6,6 +6,7 @@ import difflib
 import json
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 DATA_FOLDER = Path(__file__).resolve().parent.parent / "data"
 _SUFFIX = {"body": ".npz", "garments": ".npz", "motions": ".npz", "weights": ".safetensors"}
@@ -71,7 +72,7 @@ def read_arrays(path: Path, required: Iterable[str], what: str) -> dict:
     return arrays
 
 
-def _is_object(archive, key: str) -> bool:
+def _is_object(archive: Any, key: str) -> bool:
     """Whether a member would need unpickling (strings of old files, for instance): such members are passed over."""
     try:
         archive[key]

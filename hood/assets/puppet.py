@@ -101,9 +101,7 @@ class Controls:
         foot[:, :, 0] = skeleton.ankle_spacing * np.array([1.0, -1.0])
         yaw = np.tile([7.0, -7.0], (num_frames, 1))
         arm = np.tile([52.0, 2.0, 0.0, 14.0], (num_frames, 2, 1))
-        return Controls(
-            fps, zeros.copy(), zeros.copy(), zeros.copy(), zeros.copy(), foot, yaw, np.zeros_like(yaw), arm
-        )
+        return Controls(fps, zeros.copy(), zeros.copy(), zeros.copy(), zeros.copy(), foot, yaw, np.zeros_like(yaw), arm)
 
     @property
     def time(self) -> Array:
@@ -172,9 +170,7 @@ def _reachable(pelvis: Array, root: Array, ankles: Array, skeleton: Skeleton, fp
     return pelvis[:, 1] - gaussian_filter1d(widened, radius / 2.5, mode="nearest", truncate=2.5)
 
 
-def _leg(
-    pelvis: Array, root: Array, ankle: Array, hinge_yaw: Array, skeleton: Skeleton, side: int
-) -> tuple[Array, Array]:
+def _leg(pelvis: Array, root: Array, ankle: Array, hinge_yaw: Array, skeleton: Skeleton, side: int) -> tuple[Array, Array]:
     """World rotations (T, 3, 3) of thigh and shin that bring the ankle to its target, knee forward."""
     rest_thigh, rest_shin = _leg_bones(skeleton, side)
     upper, lower = np.linalg.norm(rest_thigh), np.linalg.norm(rest_shin)

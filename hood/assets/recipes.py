@@ -61,9 +61,7 @@ def sway(controls: Controls, skeleton: Skeleton, rng: np.random.Generator) -> No
     controls.pelvis[:, 1] -= 0.006 * on
     controls.pelvis_turn[:, 2] += 4.0 * shift
     controls.pelvis_turn[:, 1] += 6.0 * _drift(time, rng) * on
-    controls.spine += on[:, None] * np.stack(
-        [3 * _drift(time, rng), 9 * _drift(time, rng), 4.5 * shift], axis=1
-    )
+    controls.spine += on[:, None] * np.stack([3 * _drift(time, rng), 9 * _drift(time, rng), 4.5 * shift], axis=1)
     controls.head += on[:, None] * np.stack([7 * _drift(time, rng), 26 * _drift(time, rng), 0 * on], axis=1)
     for side in range(2):
         goal = np.array([65.0, 4.0, 0.0, 20.0]) + 5.0 * _drift(time, rng)[:, None] * [0.6, 1.0, 0.0, 2.0]
@@ -208,9 +206,7 @@ def _jump(controls: Controls, takeoff: float, height: float) -> None:
     controls.pelvis_turn[:, 0] += 24.0 * bend
     controls.spine[:, 0] += 12.0 * bend
     controls.head[:, 0] -= 18.0 * bend
-    toes = _track(
-        time, [0, takeoff - 0.16, takeoff + 0.03, land - 0.03, land + 0.12, 99.0], [0, 0, 1, 0.85, 0, 0]
-    )
+    toes = _track(time, [0, takeoff - 0.16, takeoff + 0.03, land - 0.03, land + 0.12, 99.0], [0, 0, 1, 0.85, 0, 0])
     controls.foot_pitch += 38.0 * toes[:, None]
     # The feet do not gain their speed in an instant.
     controls.foot[:, :, 1] += 0.95 * gaussian_filter1d(rise, 0.03 * controls.fps)[:, None]

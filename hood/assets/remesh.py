@@ -1,4 +1,4 @@
-"""Cuts, remeshes and smooths open triangle surfaces for the tailor. Build time only: `pymeshlab` is no runtime dependency."""
+"""Cuts, remeshes and smooths open triangle surfaces for the tailor. Build time only: `pymeshlab`."""
 
 from __future__ import annotations
 
@@ -66,13 +66,6 @@ def compact(verts: Array, faces: Faces) -> tuple[Array, Faces]:
     return verts[used], inverse.reshape(faces.shape).astype(np.int64)
 
 
-def component_at(verts: Array, faces: Faces, point: Array) -> tuple[Array, Faces]:
-    """The connected component that comes nearest to `point` (3,)."""
-    label = topology.connected_components(len(verts), topology.unique_edges(faces))
-    wanted = label[np.linalg.norm(verts - point, axis=1).argmin()]
-    return compact(verts, faces[label[faces[:, 0]] == wanted])
-
-
 def largest_component(verts: Array, faces: Faces) -> tuple[Array, Faces]:
     """The connected component with most vertices."""
     label = topology.connected_components(len(verts), topology.unique_edges(faces))
@@ -83,7 +76,8 @@ def largest_component(verts: Array, faces: Faces) -> tuple[Array, Faces]:
 def isotropic(verts: Array, faces: Faces, num_vertices: int, tolerance: float = 0.03) -> tuple[Array, Faces]:
     """Isotropic remesh to about `num_vertices`; the boundary is resampled along itself."""
     pymeshlab = require("pymeshlab")
-    area = 0.5 * np.linalg.norm(np.cross(*np.moveaxis(verts[faces][:, 1:] - verts[faces][:, :1], 1, 0)), axis=1).sum()
+    corner = verts[faces]
+    area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1).sum() / 2
     edge = float(np.sqrt(area / num_vertices * 2 / np.sqrt(3)))
     for _ in range(8):
         meshes = pymeshlab.MeshSet()
@@ -99,6 +93,72 @@ def isotropic(verts: Array, faces: Faces, num_vertices: int, tolerance: float = 
     return compact(np.array(mesh.vertex_matrix()), np.array(mesh.face_matrix(), dtype=np.int64))
 
 
+def collapse_short(verts: Array, faces: Faces, ratio: float) -> tuple[Array, Faces]:
+    """Contracts edges shorter than `ratio` times the mean where the surface stays a manifold."""
+    edges = topology.unique_edges(faces)
+    limit = ratio * np.linalg.norm(verts[edges[:, 0]] - verts[edges[:, 1]], axis=1).mean()
+    refused: set[tuple[int, int]] = set()
+    while True:
+        edges = topology.unique_edges(faces)
+        length = np.linalg.norm(verts[edges[:, 0]] - verts[edges[:, 1]], axis=1)
+        short = [(int(a), int(b)) for a, b in edges[np.argsort(length)] if (int(a), int(b)) not in refused]
+        if not short or np.linalg.norm(verts[short[0][0]] - verts[short[0][1]]) > limit:
+            return compact(verts, faces)
+        first, second = short[0]
+        border = np.zeros(len(verts), dtype=bool)
+        for loop in topology.boundary_loops(faces):
+            border[loop] = True
+        shared = np.intersect1d(_neighbours(faces, first), _neighbours(faces, second))
+        opposite = ((faces == first).any(1) & (faces == second).any(1)).sum()
+        # The link condition; an inner edge between two boundary vertices would pinch the surface.
+        if len(shared) != opposite or (border[first] and border[second] and opposite == 2):
+            refused.add((first, second))
+            continue
+        verts = verts.copy()
+        if border[first] == border[second]:
+            verts[first] = (verts[first] + verts[second]) / 2
+        elif border[second]:
+            verts[first] = verts[second]
+        faces = np.where(faces == second, first, faces)
+        faces = faces[(faces != np.roll(faces, 1, axis=1)).all(1)]
+
+
+def flip_edges(verts: Array, faces: Faces, rounds: int = 10) -> Faces:
+    """Flips inner edges whose opposite angles sum to more than 180 degrees (Delaunay), which removes caps."""
+    for _ in range(rounds):
+        hinge = topology.hinges(faces)
+        first, second, left, right = hinge.vertices.T
+        angles = [_angle(verts[tip], verts[first], verts[second]) for tip in (left, right)]
+        edges = {(int(a), int(b)) for a, b in topology.unique_edges(faces)}
+        touched = np.zeros(len(faces), dtype=bool)
+        faces = faces.copy()
+        for row in np.nonzero(angles[0] + angles[1] > np.pi + 1e-6)[0]:
+            one, two = hinge.faces[row]
+            a, b, c, d = (int(v) for v in hinge.vertices[row])
+            if touched[one] or touched[two] or (min(c, d), max(c, d)) in edges:
+                continue
+            # Keep the winding: the face of tip c runs a -> b or b -> a.
+            corners = faces[one].tolist()
+            if corners[(corners.index(a) + 1) % 3] != b:
+                a, b = b, a
+            faces[one], faces[two] = (a, d, c), (d, b, c)
+            touched[[one, two]] = True
+            edges.add((min(c, d), max(c, d)))
+        if not touched.any():
+            break
+    return faces
+
+
+def _angle(tip: Array, first: Array, second: Array) -> Array:
+    a, b = first - tip, second - tip
+    return np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(1))
+
+
+def _neighbours(faces: Faces, vertex: int) -> Faces:
+    around = np.unique(faces[(faces == vertex).any(1)])
+    return around[around != vertex]
+
+
 def laplacian(faces: Faces, num_vertices: int) -> sparse.csr_matrix:
     """Graph Laplacian (V,V) with rows that sum to zero and unit diagonal: x - mean of the neighbours."""
     edges = topology.unique_edges(faces)
@@ -110,7 +170,7 @@ def laplacian(faces: Faces, num_vertices: int) -> sparse.csr_matrix:
 
 
 def diffuse(values: Array, verts: Array, faces: Faces, reach: float) -> Array:
-    """Vertex values (V,C) smoothed over about `reach` [m]: one implicit step of the heat equation on the graph."""
+    """Vertex values (V,C) smoothed over about `reach` [m]: one implicit step of the heat equation."""
     edges = topology.unique_edges(faces)
     mean_edge = np.linalg.norm(verts[edges[:, 0]] - verts[edges[:, 1]], axis=1).mean()
     # On a triangle grid of edge h the operator x - mean is -h²/4 times the Laplacian.
@@ -163,7 +223,7 @@ def smooth_loops(verts: Array, faces: Faces, iterations: int) -> Array:
 
 
 def closest(points: Array, verts: Array, faces: Faces) -> SurfaceHit:
-    """Closest points of one surface, see `hood.mesh.proximity.search_surface`; chunked to bound the memory."""
+    """Closest points of one surface (`hood.mesh.proximity.search_surface`), chunked to bound the memory."""
     chunks = []
     surface = torch.as_tensor(verts, dtype=torch.float64), torch.as_tensor(np.asarray(faces, dtype=np.int64))
     owner = [torch.zeros(len(x), dtype=torch.int64) for x in surface]
@@ -175,7 +235,7 @@ def closest(points: Array, verts: Array, faces: Faces) -> SurfaceHit:
 
 
 def push_out(verts: Array, faces: Faces, body_verts: Array, body_faces: Faces, margin: float, rounds: int = 12) -> Array:
-    """Moves vertices and face centres to at least `margin` [m] outside the body, smoothing the push over neighbours."""
+    """Moves vertices and face centres to at least `margin` [m] outside the body; neighbours follow."""
     for _ in range(rounds):
         lack = margin - closest(verts, body_verts, body_faces).dist.numpy()
         middle = margin - closest(verts[faces].mean(1), body_verts, body_faces).dist.numpy()

@@ -96,6 +96,9 @@ def _body_poses(path: Path, arrays: dict[str, np.ndarray]) -> np.ndarray:
             raise ValueError(f"{path}: poses has shape {flat.shape}; AMASS has (N, 156) with at least 66 columns")
         flat = flat[:, : 3 * NUM_BODY_JOINTS]
     elif "root_orient" in arrays and "pose_body" in arrays:
+        shapes = [arrays[key].shape for key in ("root_orient", "pose_body")]
+        if [shape[1:] for shape in shapes] != [(3,), (63,)] or shapes[0][0] != shapes[1][0]:
+            raise ValueError(f"{path}: root_orient and pose_body have shapes {shapes}; AMASS has (N, 3) and (N, 63)")
         flat = np.concatenate([arrays["root_orient"], arrays["pose_body"]], axis=1).astype(np.float64)
     else:
         raise ValueError(f"{path}: not an AMASS motion: neither 'poses' nor 'root_orient' and 'pose_body' inside")
@@ -107,9 +110,10 @@ def _body_poses(path: Path, arrays: dict[str, np.ndarray]) -> np.ndarray:
 def _frame_rate(path: Path, arrays: dict[str, np.ndarray]) -> float:
     for key in ("mocap_framerate", "mocap_frame_rate"):
         if key in arrays:
-            rate = float(arrays[key])
+            value = np.asarray(arrays[key]).reshape(-1)
+            rate = float(value[0]) if len(value) == 1 and np.issubdtype(value.dtype, np.number) else np.nan
             if not np.isfinite(rate) or rate <= 0:
-                raise ValueError(f"{path}: {key} is {rate}; it must be a positive number of frames per second")
+                raise ValueError(f"{path}: {key} is {arrays[key]}; it must be a positive number of frames per second")
             return rate
     raise ValueError(f"{path}: no mocap_framerate: add it (frames per second) to the file")
 

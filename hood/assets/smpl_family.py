@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,16 +21,15 @@ _FAMILY = {24: ("SMPL", 24), 52: ("SMPLH", 22), 55: ("SMPLX", 22)}
 class SmplFamilyBody(Body):
     """A body whose surface is evaluated by ``smplx``, pose blend shapes included; hands stay flat."""
 
-    model: torch.nn.Module | None = None
+    model: Any = None  # smplx module
     driven_joints: int = 22
 
     def surface(self, sequence: PoseSequence, betas: np.ndarray, dtype: torch.dtype = torch.float32) -> Tensor:
         """Posed vertices (T, W, 3) [m] relative to :meth:`translation`."""
-        assert self.model is not None
         model = self.model.to(dtype)
         poses = torch.as_tensor(sequence.poses[:, : self.driven_joints]).to(dtype).flatten(1)
         num_frames = len(poses)
-        shape = torch.zeros(num_frames, model.num_betas, dtype=dtype)  # type: ignore[arg-type]
+        shape = torch.zeros(num_frames, model.num_betas, dtype=dtype)
         count = min(len(betas), shape.shape[1])
         shape[:, :count] = torch.as_tensor(np.asarray(betas)[:count]).to(dtype)
         zeros = {name: torch.zeros(num_frames, width, dtype=dtype) for name, width in self._idle().items()}

@@ -13,8 +13,8 @@ from hood.assets.body import load_body
 from hood.assets.garment import load_garment
 from hood.assets.library import locate, motion_split
 from hood.assets.sequence import load_sequence
-from hood.commands.rollout import UNTRAINED, prepare_folder
-from hood.config import ConfigError, build, load_config, options, require_choice, save_run_record
+from hood.commands.common import UNTRAINED, prepare_folder, require_device
+from hood.config import ConfigError, build, load_config, options, save_run_record
 from hood.dynamics.simulator import load_simulator
 from hood.evaluation.table import Candidate, evaluate, format_table, write_table
 from hood.scene.scene import Scene, build_scene
@@ -23,7 +23,7 @@ from hood.scene.scene import Scene, build_scene
 def run(overrides: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     config = load_config("evaluate", overrides)
-    require_choice(config, "device", ("cpu", "cuda"))
+    require_device(config)
     if int(config.num_frames) < 4:
         raise ConfigError(f"num_frames={config.num_frames}: must be at least 4, the first frames are not timed")
     candidates = [make_candidate(str(name), config) for name in config.models]
@@ -55,15 +55,15 @@ def make_candidate(name: str, config: DictConfig) -> Candidate:
         simulator = build(load_config("rollout", [f"model={model}"]).model)
         return Candidate(model, UNTRAINED, simulator.eval().to(str(config.device)))
     path = locate("weights", name)
-    return Candidate(path.stem if path.stem != "model" else path.parent.name, path.name, load_simulator(path).eval())
+    return Candidate(
+        path.stem if path.stem != "model" else path.parent.name, path.name, load_simulator(path).to(str(config.device))
+    )
 
 
 def make_scenes(config: DictConfig) -> dict[str, list[Scene]]:
     """Every garment on every motion of the validation list."""
     motions = [str(name) for name in config.sequences] or motion_split()["validation"]
     sequences = [load_sequence(name, float(config.fps)) for name in motions]
-    body, material = load_body(str(config.body)), build(config.material)
-    return {
-        str(name): [build_scene(load_garment(str(name)), body, sequence, material) for sequence in sequences]
-        for name in config.garments
-    }
+    body, material, device = load_body(str(config.body)), build(config.material), str(config.device)
+    garments = [load_garment(str(name)) for name in config.garments]
+    return {g.name: [build_scene(g, body, s, material, device=device) for s in sequences] for g in garments}

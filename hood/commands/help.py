@@ -9,7 +9,10 @@ from hood.assets import library
 from hood.config import CONFIG_FOLDER, load_config, options, plain
 
 _EXAMPLES = {
-    "train": ["hood train experiment=quickstart output=runs/quickstart", "hood train model=ours trainer=paper data.garments=[dress]"],
+    "train": [
+        "hood train experiment=quickstart output=runs/quickstart",
+        "hood train model=ours trainer=paper data.garments=[dress]",
+    ],
     "rollout": [
         "hood rollout garment=dress sequence=walk_steady num_frames=200 output=outputs/dress",
         "hood rollout garment=my_shirt.obj sequence=CMU_01_poses.npz material=denim",
@@ -28,8 +31,8 @@ def describe(name: str) -> str:
         if isinstance(value, dict):
             continue
         text = f"  {key}={_show(value)}"
-        note = comments.get(str(key), "")
-        lines.append(textwrap.fill(f"{text:<34}{note}", 118, subsequent_indent=" " * 34))
+        text = f"{text:<34}" if len(text) < 34 else text + "  "
+        lines.append(textwrap.fill(text + comments.get(str(key), ""), 118, subsequent_indent=" " * 34))
     lines += ["", "config groups (their keys can be overridden too, e.g. material.density=0.3):"]
     for group in _groups_of(name):
         lines.append(f"  {group + '=':<14}{' | '.join(options(group))}")
@@ -58,4 +61,8 @@ def _groups_of(name: str) -> list[str]:
 def _show(value: object) -> str:
     if isinstance(value, list):
         return "[" + ",".join(_show(item) for item in value) + "]"
-    return {None: "null", True: "true", False: "false"}.get(value, str(value)) if not isinstance(value, (int, float)) or isinstance(value, bool) else f"{value:g}" if isinstance(value, float) else str(value)
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:g}" if isinstance(value, float) else str(value)

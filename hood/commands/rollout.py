@@ -19,23 +19,22 @@ from hood.assets.body import load_body
 from hood.assets.garment import load_garment
 from hood.assets.library import locate
 from hood.assets.sequence import load_sequence
+from hood.commands.common import UNTRAINED, prepare_folder, require_device
 from hood.config import ConfigError, build, load_config, plain, require_choice, save_run_record
 from hood.dynamics.recorder import RolloutWriter, read_rollout
 from hood.dynamics.rollout import metric_names, simulate
 from hood.dynamics.simulator import Simulator, load_simulator
 from hood.scene.scene import Scene, build_scene
 
-UNTRAINED = "untrained"
-
 
 def run(overrides: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     config = load_config("rollout", overrides)
-    require_choice(config, "device", ("cpu", "cuda"))
+    require_device(config)
     require_choice(config, "video", ("mp4", "gif", "none"))
     _check_numbers(config)
-    scene = make_scene(config)
     simulator, digest = make_simulator(config)
+    scene = make_scene(config)
     folder = prepare_folder(Path(str(config.output)).expanduser())
     save_run_record(folder, config, int(config.seed))
     interrupted = _simulate_to_disk(config, scene, simulator, digest, folder / "rollout.h5")
@@ -46,7 +45,10 @@ def run(overrides: Sequence[str]) -> int:
         _draw(config, folder)
     print(f"files in {folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
     if interrupted:
-        print(f"hood: interrupted; the {summary['num_frames']} frames done are kept in {folder / 'rollout.h5'}", file=sys.stderr)
+        print(
+            f"hood: interrupted; the {summary['num_frames']} frames done are kept in {folder / 'rollout.h5'}",
+            file=sys.stderr,
+        )
         return 130
     return 0
 
@@ -61,7 +63,7 @@ def make_scene(config: DictConfig) -> Scene:
     if len(given) > 10 or not np.isfinite(given).all():
         raise ConfigError(f"betas={given}: give at most 10 finite shape coefficients")
     betas[: len(given)] = given
-    return build_scene(garment, body, sequence, build(config.material), betas)
+    return build_scene(garment, body, sequence, build(config.material), betas, device=str(config.device))
 
 
 def make_simulator(config: DictConfig) -> tuple[Simulator, str]:
@@ -73,8 +75,6 @@ def make_simulator(config: DictConfig) -> tuple[Simulator, str]:
     torch.manual_seed(int(config.seed))
     asked = None if config.get("model") is None else plain(config.model)
     device = str(config.device)
-    if device == "cuda" and not torch.cuda.is_available():
-        raise ConfigError("device=cuda: no CUDA device is available; use device=cpu")
     if str(config.checkpoint) == UNTRAINED:
         if asked is None:
             raise ConfigError("checkpoint=untrained needs a model: add model=small (or ours, fine15, fine48)")
@@ -87,18 +87,6 @@ def make_simulator(config: DictConfig) -> tuple[Simulator, str]:
         if built.config != simulator.config:
             raise ConfigError(f"{path}: holds model {simulator.config}, not the model asked for; drop model=… from the command")
     return simulator.eval().to(device), hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def prepare_folder(folder: Path) -> Path:
-    """The output folder, made and checked for writing.
-
-    Raises:
-        OSError: it cannot be made or written to.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    if not os.access(folder, os.W_OK):
-        raise PermissionError(13, "Permission denied", str(folder))
-    return folder
 
 
 def summarise(path: Path) -> dict[str, Any]:
@@ -114,7 +102,9 @@ def summarise(path: Path) -> dict[str, Any]:
         "num_vertices": int(data.cloth_pos.shape[1]),
         "dt": float(data.attributes["dt"]),
         "first_nonfinite_frame": None if finite.all() else int(np.argmin(finite)),
-        "first_frame": {key: _at(metrics[key], 0) for key in ("strain_p50", "strain_p99", "penetration_count", "penetration_depth")},
+        "first_frame": {
+            key: _at(metrics[key], 0) for key in ("strain_p50", "strain_p99", "penetration_count", "penetration_depth")
+        },
         "strain_p50": _median(metrics["strain_p50"]),
         "strain_p99": _median(metrics["strain_p99"]),
         "strain_max": _largest(metrics["strain_max"]),
@@ -122,6 +112,8 @@ def summarise(path: Path) -> dict[str, Any]:
         "penetration_share_max": _largest(metrics["penetration_share"]),
         "penetration_count_max": _largest(metrics["penetration_count"]),
         "penetration_depth_max_m": _largest(metrics["penetration_depth"]),
+        "potential_mean_J": _mean(metrics["energy_total"]),
+        "potential_inertial_guess_mean_J": _mean(metrics["energy_inertial_guess"]),
         "relative_gradient_median": _median(metrics["relative_gradient"]),
         "ms_per_frame": times,
     }
@@ -161,7 +153,7 @@ def _simulate_to_disk(config: DictConfig, scene: Scene, simulator: Simulator, di
     writer = RolloutWriter(
         path,
         count,
-        scene.cloth.rest_pos.numpy(),
+        scene.cloth.rest_pos.cpu().numpy(),
         scene.garment.faces,
         scene.motion.body.faces,
         len(scene.motion.body.v_template),

@@ -15,30 +15,48 @@ from hood.assets.body import load_body
 from hood.assets.garment import load_garment
 from hood.assets.library import motion_split
 from hood.assets.sequence import load_sequence
-from hood.commands.rollout import prepare_folder
-from hood.config import ConfigError, build, load_config, plain, require_choice, save_run_record
+from hood.commands.common import prepare_folder, require_device
+from hood.config import ConfigError, build, load_config, plain, save_run_record
 from hood.dynamics.simulator import Simulator
 from hood.evaluation.validation import Validation
 from hood.scene.dataset import SceneSampler
+from hood.training import distributed
 from hood.training.trainer import Trainer, TrainerSettings
 
 
 def run(overrides: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     config = load_config("train", overrides)
-    require_choice(config, "device", ("cpu", "cuda"))
-    if str(config.device) == "cuda" and not torch.cuda.is_available():
-        raise ConfigError("device=cuda: no CUDA device is available; use device=cpu")
+    require_device(config)
+    distributed.start()
+    try:
+        return _train(config)
+    finally:
+        distributed.stop()
+
+
+def _train(config: DictConfig) -> int:
     trainer = make_trainer(config)
     folder = prepare_folder(Path(str(config.output)).expanduser())
     _refuse_other_run(config, folder, trainer)
-    save_run_record(folder, config, int(config.seed))
+    main = distributed.rank() == 0
+    if main:
+        save_run_record(folder, config, int(config.seed))
     parameters = sum(p.numel() for p in trainer.simulator.parameters())
-    print(f"{parameters:,} parameters, {len(trainer.slots.sampler.garments)} garments, {len(trainer.slots.sampler.sequences)} motions")
+    if main:
+        print(
+            f"{parameters:,} parameters, {len(trainer.slots.sampler.garments)} garments, "
+            f"{len(trainer.slots.sampler.sequences)} motions"
+        )
     finished = _run_with_progress(trainer)
-    print(f"weights in {folder / 'model.safetensors'}, checkpoint in {trainer.checkpoint_path}")
+    if main:
+        print(f"weights in {folder / 'model.safetensors'}, checkpoint in {trainer.checkpoint_path}")
     if not finished:
-        print(f"hood: stopped at iteration {trainer.iteration}; the same command with resume=true goes on", file=sys.stderr)
+        if main:
+            print(
+                f"hood: stopped at iteration {trainer.iteration}; the same command with resume=true goes on",
+                file=sys.stderr,
+            )
         return 130
     return 0
 
@@ -56,6 +74,7 @@ def make_trainer(config: DictConfig) -> Trainer:
         garments=[load_garment(str(name)) for name in config.data.garments],
         sequences=[load_sequence(str(name), fps, str(config.data.up)) for name in names],
         **plain(config.data.sampling),
+        device=str(config.device),
     )
     potential = build(config.losses)
     validation = None
@@ -81,10 +100,13 @@ def _check_same_config(config: DictConfig, folder: Path) -> None:
     if not record.exists():
         return
     before = OmegaConf.load(record)
+    assert isinstance(before, DictConfig)
     free = ("resume", "output", "device")
-    for key in config:
+    for key in map(str, config):
         if key not in free and plain(before.get(key)) != plain(config[key]):
-            raise ConfigError(f"{record}: {key} differs from this command's; resume with the same settings or use another output")
+            raise ConfigError(
+                f"{record}: {key} differs from this command's; resume with the same settings or use another output"
+            )
 
 
 def _run_with_progress(trainer: Trainer) -> bool:
@@ -96,7 +118,13 @@ def _run_with_progress(trainer: Trainer) -> bool:
 
     previous = {number: signal.signal(number, ask) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
-        with tqdm(total=trainer.settings.iterations, initial=trainer.iteration, desc="train", unit="it", disable=None) as bar:
+        with tqdm(
+            total=trainer.settings.iterations,
+            initial=trainer.iteration,
+            desc="train",
+            unit="it",
+            disable=distributed.rank() != 0 or None,
+        ) as bar:
 
             def progress(iteration: int, report: dict[str, float]) -> None:
                 bar.update(1)

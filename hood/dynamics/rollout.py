@@ -12,8 +12,8 @@ from hood.dynamics.measure import METRICS, penetration_metrics, strain_metrics
 from hood.dynamics.simulator import Simulator
 from hood.dynamics.stopwatch import Stopwatch
 from hood.losses.potential import Potential, relative_gradient, scale
-from hood.losses.problem import StepProblem
-from hood.scene.contact import find_contact
+from hood.losses.problem import StepProblem, inertial_guess
+from hood.scene.contact import Contact, find_contact
 from hood.scene.scene import Scene, recentre
 from hood.scene.start import push_out
 from hood.scene.state import Attachments, State
@@ -37,7 +37,16 @@ class Frame:
 def metric_names(potential: Potential) -> tuple[str, ...]:
     """Every metric a frame of a rollout can have."""
     energies = tuple(f"energy_{name}" for name in potential.terms)
-    return (*METRICS, *energies, "energy_total", "gradient_norm", "relative_gradient", "e0", *(f"ms_{t}" for t in TIMES))
+    return (
+        *METRICS,
+        *energies,
+        "energy_total",
+        "energy_inertial_guess",
+        "gradient_norm",
+        "relative_gradient",
+        "e0",
+        *(f"ms_{t}" for t in TIMES),
+    )
 
 
 @torch.no_grad()
@@ -67,6 +76,7 @@ def simulate(
         watch.restart()
         last = body_frame + 1 >= scene.num_frames
         step = scene.step_input(body_frame - 1 if last else body_frame, state)
+        contact: Contact | None
         if last:
             contact = _contact_now(scene, state, body_frame)
         else:
@@ -76,8 +86,8 @@ def simulate(
                 contact = simulator.find_contact(scene.cloth, state, step)
         shared = {**strain_metrics(scene.cloth, state.pos), **penetration_metrics(contact, scene.cloth.num_vertices)}
         origin = state.origin[0]
-        body_pos = scene.motion.surface(body_frame, origin.numpy()).double() + origin
-        yield Frame(index, state, state.pos.double() + origin, body_pos, {**shared, **metrics})
+        body_pos = scene.motion.surface(body_frame, origin.numpy()).cpu().double() + origin
+        yield Frame(index, state, state.pos.cpu().double() + origin, body_pos, {**shared, **metrics})
         if index + 1 >= count:
             return
         watch_metrics = watch.lap()  # metrics and the caller's work are not part of the frame's time
@@ -92,9 +102,7 @@ def simulate(
         metrics |= energy_metrics(potential, problem, prediction.next_pos, prediction.acc)
 
 
-def start_state(
-    simulator: Simulator, scene: Scene, potential: Potential, relaxing_steps: int, frame: int = 0
-) -> State:
+def start_state(simulator: Simulator, scene: Scene, potential: Potential, relaxing_steps: int, frame: int = 0) -> State:
     """Settled, relaxed start: the relaxing step is kept only where it lowers the potential of its own problem."""
     state = scene.start(frame, relaxed=False)
     prepared = simulator.prepare(scene.cloth, scene.garment.rest_pos)
@@ -112,17 +120,22 @@ def start_state(
 
 
 def energy_metrics(potential: Potential, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> dict[str, float]:
-    """Energies [J], the paper's gradient norm [N] (mean over vertices of ‖∂Φ/∂x_v‖₂), rg and e0 [J] of one scene's step."""
+    """Energies [J] of one scene's step, its gradient norm [N] (the paper's: mean over vertices of ‖∂Φ/∂x_v‖₂), rg, e0 [J],
+    and for comparison the potential of the inertial guess x_t + dt v_t."""
     gradient, energies = potential.gradient(problem, next_pos, acc)
     free = problem.cloth.free
     result = {f"energy_{name}": float(value.sum()) for name, value in energies.items()}
     result["energy_total"] = sum(result.values())
+    guess = inertial_guess(problem.state, problem.step, problem.cloth.vertex_scene)
+    if problem.step.pin_target is not None:
+        guess = torch.where(problem.cloth.pinned.unsqueeze(1), problem.step.pin_target, guess)
+    result["energy_inertial_guess"] = float(potential.total(problem, guess).sum())
     result["gradient_norm"] = float(gradient[free].norm(dim=1).mean()) if bool(free.any()) else 0.0
     result["relative_gradient"] = float(relative_gradient(problem, gradient * free.unsqueeze(1)).mean())
     result["e0"] = float(scale(problem).sum())
     return result
 
 
-def _contact_now(scene: Scene, state: State, frame: int):
+def _contact_now(scene: Scene, state: State, frame: int) -> Contact:
     obstacle = scene.motion.obstacle(frame, state.origin[0].numpy(), static=True)
     return find_contact(state.pos, scene.cloth.vertex_scene, obstacle)

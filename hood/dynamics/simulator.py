@@ -57,7 +57,12 @@ class Simulator(nn.Module):
     gravity: Tensor
 
     def __init__(
-        self, features: groups.FeatureSet, network: MeshGraphNet, output: Output, body_radius: float, config: dict[str, Any]
+        self,
+        features: groups.FeatureSet,
+        network: MeshGraphNet,
+        output: Output,
+        body_radius: float,
+        config: dict[str, Any],
     ) -> None:
         super().__init__()
         self.features, self.network, self.output = features, network, output
@@ -128,6 +133,10 @@ class Simulator(nn.Module):
             acc = problem.acceleration(next_pos)
         return Prediction(next_pos, acc)
 
+    def forward(self, problem: StepProblem, prepared: Prepared) -> Prediction:
+        """The same as :meth:`predict`; the call that wrappers such as DistributedDataParallel see."""
+        return self.predict(problem, prepared)
+
     def next_velocity(self, problem: StepProblem, prediction: Prediction) -> Tensor:
         """(V, 3) m/s at t + 1 of the implicit Euler step: (x_{t+1} − x_t) / dt."""
         return problem.state.vel + problem.vertex_dt * prediction.acc
@@ -184,14 +193,12 @@ def build_simulator(
         feature_set = groups.paper(num_levels, decay=normalizer_decay)
     else:
         feature_set = physical.physical(num_levels)
-    network = MeshGraphNet(
-        feature_set.node_width, feature_set.edge_widths, latent_dim, schedule, 3, aggregation, output_init
-    )
+    network = MeshGraphNet(feature_set.node_width, feature_set.edge_widths, latent_dim, schedule, 3, aggregation, output_init)
     head: Output = AccelerationOutput(normalizer_decay) if output == "acceleration" else OUTPUTS[output](output_scale)
     return Simulator(feature_set, network, head, body_radius, config)
 
 
-def num_coarse_levels(schedule: Sequence[Sequence[str]]) -> int:
+def num_coarse_levels(schedule: Sequence[tuple[str, ...]]) -> int:
     """Coarse levels that a schedule works on."""
     return max(set_level(name) for name in edge_set_names(schedule))
 
@@ -221,14 +228,18 @@ def load_simulator(path: Path) -> Simulator:
     try:
         with safe_open(path, framework="pt") as file:
             header = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            tensors = {name: file.get_tensor(name) for name in file.keys()}
     except SafetensorError as error:
         raise ValueError(f"{path}: not a model file ({error}); give the model.safetensors of a run") from error
     if header.get("format") != _FORMAT:
         raise ValueError(f"{path}: not a hood model (format {header.get('format')!r}); give the model.safetensors of a run")
     simulator = build_simulator(**json.loads(header["model"]))
     expected = simulator.state_dict()
-    wrong = [name for name in {*expected, *tensors} if name not in tensors or name not in expected or tensors[name].shape != expected[name].shape]
+    wrong = [
+        name
+        for name in {*expected, *tensors}
+        if name not in tensors or name not in expected or tensors[name].shape != expected[name].shape
+    ]
     if wrong:
         raise ValueError(f"{path}: weights do not fit the model in the file, first at {sorted(wrong)[0]!r}; it is damaged")
     simulator.load_state_dict({name: value.to(expected[name].dtype) for name, value in tensors.items()})

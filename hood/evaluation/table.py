@@ -22,7 +22,7 @@ from hood.scene.scene import Scene
 _WARMUP = 2
 ALL = "all"
 COLUMNS = (
-    "model", "weights", "garment", "steps", "radius", "ms", "ms_p99", "fps", "L_total", "L_stretching", "L_bending",
+    "model", "weights", "garment", "steps", "radius", "ms", "ms_p99", "fps", "L_total", "L_guess", "L_stretching", "L_bending",
     "L_inertia", "L_gravity", "L_collision", "L_friction", "gradient_norm", "relative_gradient", "strain_p99",
     "penetration", "frames", "failed_at",
 )  # fmt: skip
@@ -47,7 +47,8 @@ def evaluate(
     """Rows of the table: one per model and garment, and one per model over all garments.
 
     Means over the frames that a model's own rollouts reach before the first non-finite one; ``failed_at`` is the earliest
-    such frame (None: never). ``gradient_norm`` [N] is the mean over vertices of ‖∂L/∂x_v‖₂, averaged over frames.
+    such frame (None: never). ``L_guess`` is the potential of the inertial guess on the same states. ``gradient_norm`` [N]
+    is the mean over vertices of ‖∂L/∂x_v‖₂, averaged over frames.
     """
     rows = []
     for candidate in candidates:
@@ -72,7 +73,7 @@ def evaluate(
 def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Fixed-width text of the rows."""
     shown = [
-        "model", "weights", "garment", "steps", "radius", "ms", "ms_p99", "fps", "L_total", "L_stretching", "L_bending",
+        "model", "weights", "garment", "steps", "radius", "ms", "ms_p99", "fps", "L_total", "L_guess", "L_stretching", "L_bending",
         "L_inertia", "L_gravity", "L_collision", "L_friction", "gradient_norm", "strain_p99", "penetration", "failed_at",
     ]  # fmt: skip
     cells = [[_cell(row.get(column)) for column in shown] for row in rows]
@@ -100,7 +101,7 @@ def write_table(rows: Sequence[Mapping[str, Any]], folder: Path) -> tuple[Path, 
 def _own_frames(
     simulator: Simulator, scene: Scene, potential: Potential, num_frames: int
 ) -> tuple[list[dict[str, float]], int | None]:
-    reached = []
+    reached: list[dict[str, float]] = []
     for frame in simulate(simulator, scene, potential, num_frames):
         if not np.isfinite(frame.metrics["strain_p99"]):
             return reached, frame.index
@@ -114,10 +115,19 @@ def _row(frames: Sequence[Mapping[str, float]], failures: Sequence[int]) -> dict
     if not frames:
         return row
     times = np.array([frame["ms_total"] for frame in frames])
-    row |= {"ms": float(np.median(times)), "ms_p99": float(np.quantile(times, 0.99)), "fps": float(1e3 / np.median(times))}
+    row |= {
+        "ms": float(np.median(times)),
+        "ms_p99": float(np.quantile(times, 0.99)),
+        "fps": float(1e3 / np.median(times)),
+    }
     for name in ("stretching", "bending", "inertia", "gravity", "collision", "friction", "total"):
         row[f"L_{name}"] = _mean(frames, f"energy_{name}")
-    for column, key in (("gradient_norm", "gradient_norm"), ("strain_p99", "strain_p99"), ("penetration", "penetration_share")):
+    row["L_guess"] = _mean(frames, "energy_inertial_guess")
+    for column, key in (
+        ("gradient_norm", "gradient_norm"),
+        ("strain_p99", "strain_p99"),
+        ("penetration", "penetration_share"),
+    ):
         row[column] = _mean(frames, key)
     row["relative_gradient"] = float(np.median([frame["relative_gradient"] for frame in frames]))
     return row

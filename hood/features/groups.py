@@ -8,7 +8,8 @@ differences, so features do not depend on where the scene is.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -42,7 +43,7 @@ class NodeGroup(nn.Module):
 
 
 class EdgeGroup(nn.Module):
-    """Columns of the cloth edge features over ``inputs.edges``, or of the body edge features over ``inputs.body_edges``."""
+    """Columns of the cloth edge features (rows: ``inputs.edges``) or the body edge features (``inputs.body_edges``)."""
 
     width: int
     normalized = True
@@ -63,7 +64,7 @@ class Velocity(NodeGroup):
     def __init__(self, body: str = "previous") -> None:
         super().__init__()
         if body not in ("previous", "next"):
-            raise ValueError(f"feature 'velocity': body is {body!r}; choose 'previous' (now − before) or 'next' (next − now)")
+            raise ValueError(f"feature 'velocity': body is {body!r}; choose 'previous' or 'next' (displacement)")
         self.of_body = body
 
     def cloth(self, inputs: Inputs) -> Tensor:
@@ -283,13 +284,12 @@ class FeatureSet(nn.Module):
 
     @property
     def node_width(self) -> int:
-        return sum(group.width for group in self.node)
+        return _width(self.node)
 
     @property
     def edge_widths(self) -> dict[str, int]:
         """Widths by edge set as the network takes them."""
-        edge = sum(group.width for group in self.edge)
-        return {"mesh": edge, "coarse": edge, BODY: sum(group.width for group in self.body_edge)}
+        return {"mesh": _width(self.edge), "coarse": _width(self.edge), BODY: _width(self.body_edge)}
 
     def forward(self, inputs: Inputs) -> tuple[Tensor, dict[str, Tensor]]:
         """Node features (V + W_active, node_width) and edge features by set, rows as in the graph."""
@@ -304,7 +304,7 @@ class FeatureSet(nn.Module):
         return nodes, edges
 
     @staticmethod
-    def _assemble(groups: nn.ModuleList, normalizer: nn.Module | None, inputs: Inputs) -> Tensor:
+    def _assemble(groups: nn.ModuleList, normalizer: RunningNormalizer | None, inputs: Inputs) -> Tensor:
         values = torch.cat([group(inputs) for group in groups], dim=1)
         if normalizer is None:
             return values
@@ -312,13 +312,17 @@ class FeatureSet(nn.Module):
         return torch.cat([normalizer(values[:, :width]), values[:, width:]], dim=1)
 
 
-def _normalizer(name: str, groups: Sequence[nn.Module], decay: float | None) -> RunningNormalizer | None:
+def _width(groups: Iterable[Any]) -> int:
+    return sum(int(group.width) for group in groups)
+
+
+def _normalizer(name: str, groups: Sequence[NodeGroup | EdgeGroup], decay: float | None) -> RunningNormalizer | None:
     if decay is None:
         return None
-    flags = [bool(group.normalized) for group in groups]
+    flags = [group.normalized for group in groups]
     if flags != sorted(flags, reverse=True):
         raise ValueError(f"{name} features: a normalised group follows an unnormalised one; move the latter to the end")
-    return RunningNormalizer(sum(g.width for g in groups if g.normalized), decay)
+    return RunningNormalizer(_width(g for g in groups if g.normalized), decay)
 
 
 def paper(num_levels: int = 3, body_velocity: str = "previous", decay: float = 0.999) -> FeatureSet:

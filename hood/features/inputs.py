@@ -34,8 +34,8 @@ class Inputs:
     Args:
         base_pos: (V, 3) [m] the positions the network's output is added to, where the model has such a base.
         residual: (V, 3) [m/s²] acceleration that the potential's gradient at the base asks for.
-        timestep: (B,) [s] value of the timestep feature; None for the step's dt. The relaxing first step of a rollout is
-            told by it (paper, α in section 4.3).
+        timestep: (B,) [s] value of the timestep feature; None for the step's dt. It is how the relaxing first step of
+            a rollout is told to the network (paper, α in section 4.3).
     """
 
     cloth: Cloth
@@ -58,7 +58,7 @@ class Inputs:
     @property
     def obstacle(self) -> Obstacle:
         if self.step.obstacle is None:
-            raise ValueError("features: the graph has body nodes but the step has no obstacle; build both from one step")
+            raise ValueError("features: the graph has body nodes but the step has no obstacle; build the graph from this step")
         return self.step.obstacle
 
     @cached_property

@@ -12,8 +12,8 @@ class RunningNormalizer(nn.Module):
     """Standardises rows by exponentially weighted statistics (paper, section 4.4).
 
     Every call in training mode is one update with the moments of its rows: with decay γ, call t of T has the weight
-    γ^(T − t), divided by the sum of all weights (bias correction), so the first calls are not pulled towards zero. γ = 1
-    keeps the plain mean over calls. Sums are kept in float64 and travel in the state dict. Nothing accumulates in
+    γ^(T − t), divided by the sum of all weights (bias correction), so the first calls are not pulled towards zero.
+    γ = 1 keeps the plain mean over calls. Sums are kept in float64 and travel in the state dict. Nothing accumulates in
     evaluation mode, after :meth:`freeze` or for calls without rows.
 
     Until ``min_updates`` calls the module is the identity. Channels that have been constant so far are centred only:
@@ -44,7 +44,7 @@ class RunningNormalizer(nn.Module):
         self.register_buffer("frozen", torch.zeros((), dtype=torch.bool))
 
     def forward(self, x: Tensor, mask: Tensor | None = None) -> Tensor:
-        """(N, width) → (N, width) standardised; in training the rows of ``mask`` (N,) bool, or all, are counted first."""
+        """(N, width) → (N, width) standardised; in training, rows of ``mask`` (N,) bool or all are counted first."""
         if self.training and not self.frozen:
             self.update(x if mask is None else x[mask])
         mean, std = self.statistics(x.dtype)

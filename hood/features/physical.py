@@ -23,8 +23,8 @@ GRAVITY = 9.81
 
 
 class RelativeVelocity(NodeGroup):
-    """asinh((vel·dt − base displacement)/scale): what the state's velocity adds to the base guess; of the body, its change
-    of displacement from the last frame to this one."""
+    """asinh((vel·dt − base displacement)/scale): what the state's velocity adds to the base guess; of the body, the
+    change of its displacement from the last frame to this one."""
 
     width = 3
 
@@ -41,7 +41,7 @@ class RelativeVelocity(NodeGroup):
 
 
 class Residual(NodeGroup):
-    """asinh(residual/g): the acceleration that the potential asks for at the base guess; 0 without one and on the body."""
+    """asinh(residual/g): the acceleration that the potential asks for at the base; 0 if not given and on the body."""
 
     width = 3
 
@@ -162,7 +162,7 @@ class ScaledShape(EdgeGroup):
 
 
 class Strain(EdgeGroup):
-    """asinh(gain·(length/rest length − 1)) at t and at the base guess; 0 for edges without rest length (closed buttons)."""
+    """asinh(gain·(length/rest length − 1)) at t and at the base guess; 0 for edges of no rest length (buttons)."""
 
     width = 2
 

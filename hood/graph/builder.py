@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -32,8 +33,8 @@ class EdgeSet:
     """Directed edges, both directions of every undirected edge, sorted by receiver and then sender.
 
     Sums over the edges of a node are sums over consecutive rows (``offsets``). The network works on the M nodes that
-    have an edge; ``nodes`` maps them to the graph's nodes and the ``local_*`` indices point into them. Row ``reverse[i]``
-    is row i in the other direction, so ``reverse`` also lists the edges in the order of their senders.
+    have an edge; ``nodes`` maps them to the graph's nodes and the ``local_*`` indices point into them. Row
+    ``reverse[i]`` is row i in the other direction, so ``reverse`` also lists the edges in the order of their senders.
     """
 
     senders: Tensor  # (N,) graph nodes
@@ -44,6 +45,16 @@ class EdgeSet:
     local_senders: Tensor  # (N,) into nodes
     local_receivers: Tensor  # (N,) into nodes, ascending
     offsets: Tensor  # (M + 1,) rows of node m: offsets[m] … offsets[m + 1]
+
+    @cached_property
+    def rows(self) -> Tensor:
+        """0 … N − 1."""
+        return torch.arange(self.num_edges, device=self.senders.device)
+
+    @cached_property
+    def ends(self) -> Tensor:
+        """Receiver m and sender M + m of every edge, (N, 2): rows of a table of two values per node."""
+        return torch.stack([self.local_receivers, self.local_senders + self.nodes.shape[0]], dim=1)
 
     @property
     def num_edges(self) -> int:
@@ -179,7 +190,7 @@ def _mesh_set(static: StaticGraph, attachments: Attachments | None, active_edges
         keep = torch.cat([keep, attachments.active])
     kept = keep.nonzero().squeeze(1)
     built = edge_set(pairs[kept])
-    return EdgeSet(**{**vars(built), "source": kept[built.source]})
+    return replace(built, source=kept[built.source])
 
 
 def _body_pairs(

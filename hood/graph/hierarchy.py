@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy import sparse
 from torch import Tensor
 
 from hood.graph import coarsen
@@ -57,7 +58,7 @@ def build_hierarchy(num_vertices: int, edges: np.ndarray, rest_pos: np.ndarray, 
 
 
 def concatenate_hierarchies(hierarchies: Sequence[Hierarchy], vertex_counts: Sequence[int]) -> Hierarchy:
-    """One hierarchy of a flat batch; item *i* has ``vertex_counts[i]`` vertices. Missing deeper levels count as empty."""
+    """One hierarchy of a flat batch; item *i* has ``vertex_counts[i]`` vertices. Missing deeper levels are empty."""
     depth = max(len(h.coarse_edges) for h in hierarchies)
     offsets = np.concatenate([[0], np.cumsum(vertex_counts)[:-1]]).tolist()
     levels = [
@@ -67,7 +68,7 @@ def concatenate_hierarchies(hierarchies: Sequence[Hierarchy], vertex_counts: Seq
     return Hierarchy(tuple(levels), torch.cat([h.node_level for h in hierarchies]))
 
 
-def _edge_list(graph, order: np.ndarray) -> np.ndarray:  # type: ignore[no-untyped-def]
+def _edge_list(graph: sparse.csr_matrix, order: np.ndarray) -> np.ndarray:
     coo = graph.tocoo()
     edges = order[np.stack([coo.row, coo.col], axis=1)]
     edges = edges[edges[:, 0] < edges[:, 1]]
@@ -83,6 +84,6 @@ def _check(num_vertices: int, edges: np.ndarray, rest_pos: np.ndarray, num_coars
     outside = (edges < 0) | (edges >= num_vertices)
     if outside.any():
         row = int(np.argmax(outside.any(axis=1)))
-        raise ValueError(f"hierarchy: edge {row} is {edges[row].tolist()} but the mesh has vertices 0…{num_vertices - 1}")
+        raise ValueError(f"hierarchy: edge {row} is {edges[row].tolist()} but there are vertices 0…{num_vertices - 1}")
     if num_coarse < 0:
         raise ValueError(f"hierarchy: num_coarse is {num_coarse}; give 0 or more coarse levels")

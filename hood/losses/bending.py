@@ -31,15 +31,11 @@ class Bending:
         cloth = problem.cloth
         bend = dihedral_angles(next_pos, cloth.hinges) - cloth.rest_angle
         bend = bend - 2.0 * math.pi * torch.round(bend.detach() / (2.0 * math.pi))
-        energy = (
-            0.5 * bending_weight(cloth.bending_stiffness, cloth.rest_length, cloth.hinge_area) * bend * bend
-        )
+        energy = 0.5 * bending_weight(cloth.bending_stiffness, cloth.rest_length, cloth.hinge_area) * bend * bend
         return sum_per_scene(energy, cloth.hinge_scene, cloth.num_scenes)
 
 
 def bending_weight(stiffness: Tensor, rest_length: Tensor, hinge_area: Tensor) -> Tensor:
     """Second derivative of the energy by the angle [J], k l₀² / (4 (A₁ + A₂)), shape (H,); 0 without area."""
     positive = hinge_area > 0
-    return torch.where(
-        positive, stiffness * rest_length**2 / (4.0 * torch.where(positive, hinge_area, 1.0)), 0.0
-    )
+    return torch.where(positive, stiffness * rest_length**2 / (4.0 * torch.where(positive, hinge_area, 1.0)), 0.0)

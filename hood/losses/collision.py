@@ -23,9 +23,7 @@ class Collision:
 
     def __init__(self, weight: float = 5e5, epsilon: float = 2e-3) -> None:
         if weight < 0 or epsilon <= 0:
-            raise ValueError(
-                f"collision: weight is {weight}, epsilon {epsilon}; give weight >= 0 and epsilon > 0"
-            )
+            raise ValueError(f"collision: weight is {weight}, epsilon {epsilon}; give weight >= 0 and epsilon > 0")
         self.weight = weight
         self.epsilon = epsilon
 

@@ -24,13 +24,10 @@ class Friction:
         weight, epsilon: w [J/m³] and ε [m] of the collision term.
     """
 
-    def __init__(
-        self, coefficient: float = 0.5, slip_speed: float = 5e-3, weight: float = 5e5, epsilon: float = 2e-3
-    ) -> None:
+    def __init__(self, coefficient: float = 0.5, slip_speed: float = 5e-3, weight: float = 5e5, epsilon: float = 2e-3) -> None:
         if coefficient < 0 or slip_speed <= 0:
             raise ValueError(
-                f"friction: coefficient is {coefficient}, slip_speed {slip_speed}; "
-                "give coefficient >= 0 and slip_speed > 0"
+                f"friction: coefficient is {coefficient}, slip_speed {slip_speed}; give coefficient >= 0 and slip_speed > 0"
             )
         self.coefficient = coefficient
         self.slip_speed = slip_speed
@@ -61,9 +58,7 @@ class Friction:
         normal = contact.next_normal
         slip = slip - (slip * normal).sum(dim=1, keepdim=True) * normal
         limit = self.slip_speed * problem.vertex_dt.squeeze(1)
-        return problem.sum_vertices(
-            self.coefficient * force * mollified_norm((slip * slip).sum(dim=1), limit)
-        )
+        return problem.sum_vertices(self.coefficient * force * mollified_norm((slip * slip).sum(dim=1), limit))
 
 
 def mollified_norm(norm_sq: Tensor, limit: Tensor) -> Tensor:

@@ -45,9 +45,7 @@ class Potential:
         """The same potential with some terms replaced or added."""
         return Potential({**self.terms, **terms})
 
-    def energies(
-        self, problem: StepProblem, next_pos: Tensor, acc: Tensor | None = None
-    ) -> dict[str, Tensor]:
+    def energies(self, problem: StepProblem, next_pos: Tensor, acc: Tensor | None = None) -> dict[str, Tensor]:
         """Energies [J] (B,) by term; terms that the scene does not need are left out.
 
         Args:
@@ -58,22 +56,16 @@ class Potential:
             ValueError: when ``next_pos`` is in half precision.
         """
         if next_pos.dtype in (torch.float16, torch.bfloat16):
-            raise ValueError(
-                f"energies cannot be computed in {next_pos.dtype}; give positions in float32 or float64"
-            )
+            raise ValueError(f"energies cannot be computed in {next_pos.dtype}; give positions in float32 or float64")
         acc = problem.acceleration(next_pos) if acc is None else acc
-        return {
-            name: term(problem, next_pos, acc) for name, term in self.terms.items() if term.applies(problem)
-        }
+        return {name: term(problem, next_pos, acc) for name, term in self.terms.items() if term.applies(problem)}
 
     def total(self, problem: StepProblem, next_pos: Tensor, acc: Tensor | None = None) -> Tensor:
         """Potential Φ [J] per scene (B,)."""
         energies = self.energies(problem, next_pos, acc)
         return sum(energies.values(), start=next_pos.new_zeros(problem.num_scenes))
 
-    def gradient(
-        self, problem: StepProblem, next_pos: Tensor, acc: Tensor | None = None
-    ) -> tuple[Tensor, dict[str, Tensor]]:
+    def gradient(self, problem: StepProblem, next_pos: Tensor, acc: Tensor | None = None) -> tuple[Tensor, dict[str, Tensor]]:
         """∂Φ/∂x [N] (V, 3) at ``next_pos``, and the energies [J] there; both detached.
 
         ``acc`` is as in :meth:`energies`; given or not, it follows the positions in the derivative.
@@ -104,9 +96,7 @@ def default_potential(
             "inertia": Inertia(),
             "gravity": Gravity(),
             "collision": Collision(collision_weight, collision_epsilon),
-            "friction": Friction(
-                friction_coefficient, friction_slip_speed, collision_weight, collision_epsilon
-            ),
+            "friction": Friction(friction_coefficient, friction_slip_speed, collision_weight, collision_epsilon),
             "attachment": Attachment(attachment_stiffness),
         }
     )
@@ -129,9 +119,7 @@ def relative_gradient(problem: StepProblem, gradient: Tensor) -> Tensor:
     cloth = problem.cloth
     free = cloth.free.to(gradient.dtype)
     force_sq = problem.sum_vertices(free * (gradient * gradient).sum(dim=1))
-    weight_sq = sum_per_scene(
-        free * (cloth.mass * _gravity_norm(problem)) ** 2, cloth.vertex_scene, cloth.num_scenes
-    )
+    weight_sq = sum_per_scene(free * (cloth.mass * _gravity_norm(problem)) ** 2, cloth.vertex_scene, cloth.num_scenes)
     movable = weight_sq > 0
     return torch.where(movable, (force_sq / torch.where(movable, weight_sq, 1.0)).sqrt(), 0.0)
 

@@ -64,7 +64,5 @@ def sum_per_scene(values: Tensor, scene: Tensor, num_scenes: int) -> Tensor:
         ValueError: in half precision, where contact energies of millimetre depths are zero.
     """
     if values.dtype in (torch.float16, torch.bfloat16):
-        raise ValueError(
-            f"energies cannot be computed in {values.dtype}; give positions in float32 or float64"
-        )
+        raise ValueError(f"energies cannot be computed in {values.dtype}; give positions in float32 or float64")
     return values.new_zeros(num_scenes).index_add(0, scene, values)

@@ -39,9 +39,7 @@ class Camera:
         if len(cloud) == 0 or not np.isfinite(cloud).all():
             raise ValueError("Camera.framing: needs at least one point and finite coordinates")
         azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
-        toward = np.array(
-            [np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)]
-        )
+        toward = np.array([np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)])
         view = view_axes(-toward)
         x, y, depth = (cloud @ view.T).T
         tan_y = np.tan(np.radians(fov) / 2) / margin

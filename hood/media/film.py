@@ -7,12 +7,16 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from hood.dynamics.recorder import RolloutData
 from hood.media.render import BODY_COLOR, GARMENT_COLOR, Camera, RenderMesh, contact_sheet, render_frame
 from hood.media.video import VideoWriter, save_png
 
 _SHEET_FRAMES = 12
+#: Contact acts at cloth vertices; the flat triangles between them cut the skin's curve by some millimetres. The body is drawn
+#: this much [m] thinner where cloth is within the reach, so that pictures show the cloth; numbers are of the true body.
+_THINNER, _REACH = 0.008, 0.04
 _SMOOTHING = 15  # frames over which the camera averages the walker's path
 
 
@@ -31,18 +35,19 @@ class Film:
         self.data, self.width, self.height = data, width, height
         self._path = _smooth_path(data.body_pos)
         centred = data.body_pos[:: max(len(data.body_pos) // 20, 1)] - self._path[:: max(len(data.body_pos) // 20, 1), None]
+        self._floor = float(data.body_pos[..., 1].min())
         self._camera = Camera.framing(centred, azimuth_deg, 8.0, aspect=width / height)
 
     def frame(self, index: int) -> np.ndarray:
         """Picture (H, W, 3) uint8 of frame ``index``."""
         shift = self._path[index]
-        camera = replace(
-            self._camera, position=_add(self._camera.position, shift), target=_add(self._camera.target, shift)
-        )
-        meshes = [RenderMesh(self.data.body_pos[index], self.data.body_faces, BODY_COLOR)]
-        if np.isfinite(self.data.cloth_pos[index]).all():
-            meshes.append(RenderMesh(self.data.cloth_pos[index], self.data.cloth_faces, GARMENT_COLOR))
-        return render_frame(meshes, camera, width=self.width, height=self.height)
+        camera = replace(self._camera, position=_add(self._camera.position, shift), target=_add(self._camera.target, shift))
+        body, cloth = self.data.body_pos[index], self.data.cloth_pos[index]
+        meshes = [RenderMesh(body, self.data.body_faces, BODY_COLOR)]
+        if np.isfinite(cloth).all():
+            meshes = [RenderMesh(_beneath(body, self.data.body_faces, cloth), self.data.body_faces, BODY_COLOR)]
+            meshes.append(RenderMesh(cloth, self.data.cloth_faces, GARMENT_COLOR))
+        return render_frame(meshes, camera, width=self.width, height=self.height, floor=self._floor)
 
     def sheet(self, count: int = _SHEET_FRAMES, columns: int = 6) -> np.ndarray:
         """Contact sheet of ``count`` evenly spaced frames."""
@@ -72,6 +77,19 @@ def write_video(data: RolloutData, path: Path, frames: Iterable[int] | None = No
         for index in chosen:
             writer.append(film.frame(index))
     return writer.path
+
+
+def _beneath(body: np.ndarray, faces: np.ndarray, cloth: np.ndarray) -> np.ndarray:
+    """Body vertices (W, 3) moved inwards under cloth (V, 3), fading out over the reach."""
+    corners = body[faces]
+    face_normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = np.zeros_like(body)
+    for corner in range(3):
+        np.add.at(normal, faces[:, corner], face_normal)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    dist, _ = cKDTree(cloth).query(body, distance_upper_bound=_REACH)
+    share = np.clip(2.0 * (1.0 - np.where(np.isfinite(dist), dist, _REACH) / _REACH), 0.0, 1.0)
+    return body - _THINNER * share[:, None] * normal
 
 
 def _smooth_path(body_pos: np.ndarray) -> np.ndarray:

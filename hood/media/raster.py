@@ -98,9 +98,7 @@ def _expand(
     return pixel, value, keep[owner].astype(np.int32)
 
 
-def _edge_functions(
-    x: FloatArray, y: FloatArray, area: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _edge_functions(x: FloatArray, y: FloatArray, area: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Barycentric coordinate k of a screen point is slope_x[:, k] px + slope_y[:, k] py + constant[:, k]."""
     nxt, prv = [1, 2, 0], [2, 0, 1]
     slope_x = (y[:, nxt] - y[:, prv]) / area[:, None]

@@ -68,17 +68,13 @@ def render_frame(
 def contact_sheet(images: Sequence[Picture], columns: int, labels: Sequence[str] | None = None) -> Picture:
     """Equal-sized pictures in rows of `columns`, each with its label in the upper left corner."""
     if not images or columns < 1:
-        raise ValueError(
-            f"contact_sheet: needs an image and a column, got {len(images)} images, {columns} columns"
-        )
+        raise ValueError(f"contact_sheet: needs an image and a column, got {len(images)} images, {columns} columns")
     if labels is not None and len(labels) != len(images):
         raise ValueError(f"contact_sheet: {len(labels)} labels for {len(images)} images; give one for each")
     height, width = images[0].shape[:2]
     for index, image in enumerate(images):
         if image.shape != (height, width, 3):
-            raise ValueError(
-                f"contact_sheet: image {index} is {image.shape}, image 0 {images[0].shape}; use one size"
-            )
+            raise ValueError(f"contact_sheet: image {index} is {image.shape}, image 0 {images[0].shape}; use one size")
     rows = -(-len(images) // columns)
     sheet = np.full((rows * height, columns * width, 3), 255, dtype=np.uint8)
     for index, image in enumerate(images):
@@ -153,8 +149,7 @@ def _vertex_normals(pos: Array, faces: NDArray[np.int64]) -> Array:
     a, b, c = (pos[faces[:, k]] for k in range(3))
     face_normal = np.cross(b - a, c - a)
     total = [
-        sum(np.bincount(faces[:, k], weights=face_normal[:, axis], minlength=len(pos)) for k in range(3))
-        for axis in range(3)
+        sum(np.bincount(faces[:, k], weights=face_normal[:, axis], minlength=len(pos)) for k in range(3)) for axis in range(3)
     ]
     return unit(np.stack(total, axis=1))
 

@@ -22,10 +22,10 @@ _PROBES = (
 _GROUND = np.array([0.80, 0.81, 0.82])
 _HORIZON = np.array([0.93, 0.935, 0.94])
 _ZENITH = np.array([0.80, 0.82, 0.85])
-_KEY = 1.05 * np.array([1.0, 0.97, 0.92])
+_KEY = 1.14 * np.array([1.0, 0.97, 0.92])
 _FILL = 0.22 * np.array([0.86, 0.92, 1.0])
-_SKY = 0.50 * np.array([0.95, 0.98, 1.0])
-_BOUNCE = 0.24 * np.array([1.0, 0.97, 0.94])
+_SKY = 0.43 * np.array([0.95, 0.98, 1.0])
+_BOUNCE = 0.18 * np.array([1.0, 0.97, 0.94])
 
 
 @dataclass(frozen=True)
@@ -80,10 +80,7 @@ class Light:
         gloss = 0.06 * np.clip(_dot(normal, half), 0.0, 1.0) ** 24 * shadow
         rim = 0.10 * (1.0 - facing) ** 3 * up
         received = (
-            (diffuse * shadow)[:, None] * _KEY
-            + fill[:, None] * _FILL
-            + up[:, None] * _SKY
-            + (1.0 - up)[:, None] * _BOUNCE
+            (diffuse * shadow)[:, None] * _KEY + fill[:, None] * _FILL + up[:, None] * _SKY + (1.0 - up)[:, None] * _BOUNCE
         )
         return color * received * (0.72 + 0.28 * facing[:, None]) + (gloss + rim)[:, None]
 

@@ -35,8 +35,8 @@ def save_png(path: str | Path, image: Picture) -> Path:
 class VideoWriter:
     """Writes frames to `path`: H.264 for `.mp4`, an animated GIF for `.gif`.
 
-    Without imageio-ffmpeg an `.mp4` becomes a `.gif`, with a warning; `path` holds the name in use. The file gets
-    its name when the `with` block ends without an error; otherwise nothing is left behind.
+    Without imageio-ffmpeg an `.mp4` becomes a `.gif`, with a warning; `path` holds the name in use. The file
+    gets its name when the `with` block ends without an error; otherwise nothing is left behind.
 
         with VideoWriter("walk.mp4", fps=30) as film:
             film.append(image)
@@ -78,9 +78,7 @@ class VideoWriter:
     def __enter__(self) -> VideoWriter:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         try:
             if self._stream is not None:
                 self._stream.close()
@@ -127,8 +125,7 @@ class VideoWriter:
         strip = Image.fromarray(np.concatenate([np.asarray(picture) for picture in pictures]))
         palette = strip.quantize(256, dither=Image.Dither.NONE)
         first, *rest = (
-            Image.open(packed).convert("RGB").quantize(palette=palette, dither=Image.Dither.NONE)
-            for packed in self._gif_frames
+            Image.open(packed).convert("RGB").quantize(palette=palette, dither=Image.Dither.NONE) for packed in self._gif_frames
         )
         # GIF counts time in hundredths of a second.
         duration = max(20, round(100.0 / self.fps) * 10)

@@ -99,9 +99,7 @@ def search_surface(
         return _no_hit(points)
     incidence = build_incidence(faces, len(vertices))
     fans = _build_fans(vertices, incidence)
-    nearest, nearest_dist = _nearest_vertices(
-        points, point_scene, vertices, vertex_scene, incidence.valence > 0
-    )
+    nearest, nearest_dist = _nearest_vertices(points, point_scene, vertices, vertex_scene, incidence.valence > 0)
     face = _closest_of_fans(points, vertices, nearest, incidence, fans)
     bary, offset = _weights_and_offset(points, vertices, faces, face)
     for rows, candidates in _exhaustive(point_scene, vertex_scene, face_scene, incidence, fans):
@@ -234,9 +232,7 @@ def _search_dense(points: Tensor, vertices: Tensor) -> tuple[Tensor, Tensor]:
     return torch.cat(index), torch.cat(dist)
 
 
-def _closest_of_fans(
-    points: Tensor, vertices: Tensor, nearest: Tensor, incidence: Incidence, fans: _Fans
-) -> Tensor:
+def _closest_of_fans(points: Tensor, vertices: Tensor, nearest: Tensor, incidence: Incidence, fans: _Fans) -> Tensor:
     """The face (N,) with the smallest distance among those around the vertices ``nearest`` (N, 3)."""
     num_slots = incidence.face.shape[1]
     axes = vertices.t().contiguous()
@@ -246,8 +242,7 @@ def _closest_of_fans(
     for rows, around in zip(points.split(block), nearest.split(block), strict=True):
         flat = around.reshape(-1)
         p = [
-            (x.unsqueeze(1) - axis[flat].view_as(around)).view(-1, 1)
-            for x, axis in zip(rows.unbind(dim=1), axes, strict=True)
+            (x.unsqueeze(1) - axis[flat].view_as(around)).view(-1, 1) for x, axis in zip(rows.unbind(dim=1), axes, strict=True)
         ]
         best.append(_gain(p, fans.select(flat)).view(len(rows), -1).argmax(dim=1))
     slot = torch.cat(best)
@@ -323,18 +318,14 @@ def _closest_of_all(points: Tensor, vertices: Tensor, faces: Tensor, candidates:
     return torch.cat(closest)
 
 
-def _weights_and_offset(
-    points: Tensor, vertices: Tensor, faces: Tensor, face: Tensor
-) -> tuple[Tensor, Tensor]:
+def _weights_and_offset(points: Tensor, vertices: Tensor, faces: Tensor, face: Tensor) -> tuple[Tensor, Tensor]:
     """Weights (N, 3) of the closest point on ``face`` (N,), and the vector (N, 3) from there to the point."""
     corners = vertices[faces[face]]
     bary = closest_point_on_triangles(points, corners)
     return bary, (bary.unsqueeze(-1) * (points.unsqueeze(1) - corners)).sum(dim=1)
 
 
-def _pseudonormals(
-    vertices: Tensor, faces: Tensor, face: Tensor, bary: Tensor, incidence: Incidence, fans: _Fans
-) -> Tensor:
+def _pseudonormals(vertices: Tensor, faces: Tensor, face: Tensor, bary: Tensor, incidence: Incidence, fans: _Fans) -> Tensor:
     """Angle-weighted pseudonormals (N, 3), not normalised, at the points ``bary`` of ``face``."""
     normal = _unit_face_normals(vertices, faces[face])
     num_zero = (bary == 0).sum(dim=1)
@@ -342,9 +333,7 @@ def _pseudonormals(
     if len(at_edge):
         corner = bary[at_edge].argmin(dim=1)
         around = incidence.edge_faces[incidence.face_edges[face[at_edge], corner]]
-        normals = _unit_face_normals(vertices, faces[around.clamp_min(0)].reshape(-1, 3)).view(
-            *around.shape, 3
-        )
+        normals = _unit_face_normals(vertices, faces[around.clamp_min(0)].reshape(-1, 3)).view(*around.shape, 3)
         normal[at_edge] = (normals * (around >= 0).unsqueeze(-1)).sum(dim=1)
     at_vertex = (num_zero == 2).nonzero().squeeze(1)
     if len(at_vertex):

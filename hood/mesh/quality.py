@@ -30,23 +30,17 @@ def check_triangles(pos: np.ndarray, faces: np.ndarray, name: str) -> None:
     bad = ~np.isfinite(pos).all(axis=1)
     if bad.any():
         index = int(np.argmax(bad))
-        raise ValueError(
-            f"{name}: vertex {index} is {pos[index].tolist()}; positions must be finite, fix or remove it"
-        )
+        raise ValueError(f"{name}: vertex {index} is {pos[index].tolist()}; positions must be finite, fix or remove it")
     _check_areas(pos.astype(np.float64), faces, name)
 
 
 def _check_shapes(pos: np.ndarray, faces: np.ndarray, name: str) -> None:
     if len(pos) == 0 or faces.size == 0:
-        raise ValueError(
-            f"{name}: the mesh is empty ({len(pos)} vertices, {len(faces)} faces); give at least one triangle"
-        )
+        raise ValueError(f"{name}: the mesh is empty ({len(pos)} vertices, {len(faces)} faces); give at least one triangle")
     if pos.ndim != 2 or pos.shape[1] != 3:
         raise ValueError(f"{name}: positions have shape {pos.shape}; give (num_vertices, 3)")
     if faces.dtype == object or faces.ndim != 2:
-        raise ValueError(
-            f"{name}: faces have different numbers of corners; split polygons into triangles first"
-        )
+        raise ValueError(f"{name}: faces have different numbers of corners; split polygons into triangles first")
     if faces.shape[1] != 3:
         raise ValueError(
             f"{name}: faces have {faces.shape[1]} corners each; split them into triangles first "
@@ -74,9 +68,7 @@ def _check_indices(num_vertices: int, faces: np.ndarray, name: str) -> None:
     if bad.any():
         index = int(np.argmax(bad))
         twin = int(first[inverse.reshape(-1)[index]])
-        raise ValueError(
-            f"{name}: face {index} duplicates face {twin} ({faces[index].tolist()}); remove one of them"
-        )
+        raise ValueError(f"{name}: face {index} duplicates face {twin} ({faces[index].tolist()}); remove one of them")
 
 
 def _check_areas(pos: np.ndarray, faces: np.ndarray, name: str) -> None:

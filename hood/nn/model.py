@@ -49,10 +49,9 @@ class MeshGraphNet(nn.Module):
         self.edge_encoders = nn.ModuleDict({n: MLP(w, latent_dim, latent_dim) for n, w in widths.items()})
         self.steps = nn.ModuleList(ProcessorStep((*sets, BODY), latent_dim, aggregation) for sets in self.schedule)
         self.decoder = MLP(latent_dim, latent_dim, out_width, norm=False)
-        last = self.decoder.layers[-1]
         with torch.no_grad():
-            last.weight.mul_(output_init)
-            last.bias.mul_(output_init)
+            self.decoder.third.weight.mul_(output_init)
+            self.decoder.third.bias.mul_(output_init)
 
     def forward(self, graph: Graph, node_features: Tensor, edge_features: Mapping[str, Tensor]) -> Tensor:
         """(V, out_width) for the cloth nodes.

@@ -36,7 +36,7 @@ def parse_schedule(text: str) -> tuple[Step, ...]:
     while position < len(source):
         block = _BLOCK.match(source, position)
         if block is None:
-            raise ValueError(f"schedule {source!r}: cannot read {source[position:]!r}; write blocks like '3x(mesh+coarse0)'")
+            raise ValueError(f"schedule {source!r}: cannot read {source[position:]!r}; write '3x(mesh+coarse0)'")
         repeats = int(block[1] or 1)
         if repeats < 1:
             raise ValueError(f"schedule {source!r}: {block[0].strip()!r} repeats 0 times; remove it")

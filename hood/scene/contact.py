@@ -65,5 +65,9 @@ def _weigh(bary: Tensor, corner_values: Tensor) -> Tensor:
 
 def _interpolated_normal(pos: Tensor, faces: Tensor, corners: Tensor, bary: Tensor) -> Tensor:
     """Normals vary continuously over the surface, so a sliding vertex sees no jump between facets."""
-    normal = _weigh(bary, geometry.vertex_normals(pos, faces)[corners])
+    # Only faces around matched vertices count: a garment touches a part of the body.
+    matched = torch.zeros(len(pos), dtype=torch.bool, device=pos.device)
+    matched[corners.reshape(-1)] = True
+    around = faces[matched[faces].any(dim=1)]
+    normal = _weigh(bary, geometry.vertex_normals(pos, around)[corners])
     return normal / normal.norm(dim=1, keepdim=True).clamp_min(torch.finfo(pos.dtype).tiny)

@@ -34,6 +34,7 @@ class SceneSampler:
         size_range: garment scale is uniform in this interval.
         piecewise_fraction: share of the scenes with several fabrics on one garment.
         random_yaw: turn the world about the vertical axis, so that no direction is special.
+        device: where the scenes' tensors live.
     """
 
     def __init__(
@@ -45,6 +46,7 @@ class SceneSampler:
         size_range: tuple[float, float] = (0.9, 1.1),
         piecewise_fraction: float = 0.2,
         random_yaw: bool = True,
+        device: str = "cpu",
     ) -> None:
         if not garments or not sequences:
             raise ValueError("training needs at least one garment and one motion")
@@ -52,9 +54,10 @@ class SceneSampler:
         self.garments = [bind_garment(garment, body) for garment in garments]
         self.sequences = list(sequences)
         self.beta_range = beta_range
-        self.size_range = tuple(size_range)
+        self.size_low, self.size_high = size_range
         self.piecewise_fraction = piecewise_fraction
         self.random_yaw = random_yaw
+        self.device = device
 
     def sample(self, rng: np.random.Generator, num_steps: int, garment: int | None = None) -> Window:
         """A scene with at least ``num_steps`` steps ahead of its start frame.
@@ -70,7 +73,7 @@ class SceneSampler:
         if self.random_yaw:
             turn = Rotation.from_rotvec([0.0, rng.uniform(-np.pi, np.pi), 0.0]).as_matrix()
             window = turn_world(window, turn)
-        betas = rng.uniform(-self.beta_range, self.beta_range, self.body.shapedirs.shape[2])
-        size = float(rng.uniform(*self.size_range))
+        betas = np.asarray(rng.uniform(-self.beta_range, self.beta_range, self.body.shapedirs.shape[2]))
+        size = float(rng.uniform(self.size_low, self.size_high))
         material: Material = sample_material(rng, template.rest_pos, self.piecewise_fraction)
-        return Window(build_scene(template, self.body, window, material, betas, size), min(start, 1))
+        return Window(build_scene(template, self.body, window, material, betas, size, device=self.device), min(start, 1))

@@ -30,6 +30,7 @@ class BodyMotion:
     betas: np.ndarray
     translation: np.ndarray  # (T, 3) m float64, world
     dtype: torch.dtype
+    device: torch.device
     _cache: dict[int, Tensor]
 
     @property
@@ -44,12 +45,12 @@ class BodyMotion:
             for old in [key for key in self._cache if abs(key - chunk) > 1]:
                 del self._cache[old]
             window = self.sequence.window(chunk * _CHUNK, (chunk + 1) * _CHUNK)
-            self._cache[chunk] = self.body.surface(window, self.betas, self.dtype)
+            self._cache[chunk] = self.body.surface(window, self.betas, self.dtype).to(self.device)
         return self._cache[chunk][frame % _CHUNK]
 
     def surface(self, frame: int, origin: np.ndarray) -> Tensor:
         """(W, 3) m, relative to ``origin`` (3,) float64."""
-        shift = torch.as_tensor(self.translation[frame] - origin).to(self.dtype)
+        shift = torch.as_tensor(self.translation[frame] - origin).to(self.device, self.dtype)
         return self.local_surface(frame) + shift
 
     def obstacle(self, frame: int, origin: np.ndarray, static: bool = False) -> Obstacle:
@@ -57,15 +58,15 @@ class BodyMotion:
         now = self.surface(frame, origin)
         after = now if static else self.surface(frame + 1, origin)
         before = now if static or frame == 0 else self.surface(frame - 1, origin)
-        faces = _body_faces(self.body)
+        faces = _body_faces(self.body, self.device)
         return Obstacle(
             pos=now,
             next_pos=after,
             prev_pos=before,
             faces=faces,
-            vertex_scene=torch.zeros(len(now), dtype=torch.int64),
-            face_scene=torch.zeros(len(faces), dtype=torch.int64),
-            omitted=torch.as_tensor(self.body.omitted),
+            vertex_scene=faces.new_zeros(len(now)),
+            face_scene=faces.new_zeros(len(faces)),
+            omitted=torch.as_tensor(self.body.omitted, device=self.device),
         )
 
     def skinned(self, garment: Garment, frame: int, origin: np.ndarray) -> Tensor:
@@ -74,22 +75,29 @@ class BodyMotion:
         weights = torch.as_tensor(garment.lbs_weights).to(self.dtype)
         transforms = self.body.transforms(self.sequence.window(frame, frame + 1), self.betas, self.dtype)
         shift = torch.as_tensor(self.translation[frame] - origin).to(self.dtype)
-        return linear_blend_skinning(rest, weights, transforms)[0] + shift
+        return (linear_blend_skinning(rest, weights, transforms)[0] + shift).to(self.device)
 
 
-def body_motion(body: Body, sequence: PoseSequence, betas: np.ndarray, dtype: torch.dtype = torch.float32) -> BodyMotion:
+def body_motion(
+    body: Body,
+    sequence: PoseSequence,
+    betas: np.ndarray,
+    dtype: torch.dtype = torch.float32,
+    device: torch.device | str = "cpu",
+) -> BodyMotion:
     """The motion of ``body`` with shape ``betas`` (S,) through ``sequence``."""
     betas = np.asarray(betas, dtype=np.float64)
-    return BodyMotion(body, sequence, betas, body.translation(sequence, betas), dtype, {})
+    return BodyMotion(body, sequence, betas, body.translation(sequence, betas), dtype, torch.device(device), {})
 
 
-_FACES: dict[int, tuple[Body, Tensor]] = {}
+_FACES: dict[tuple[int, str], tuple[Body, Tensor]] = {}
 
 
-def _body_faces(body: Body) -> Tensor:
+def _body_faces(body: Body, device: torch.device) -> Tensor:
     """One faces tensor per body object: the search keeps its incidence table with the tensor."""
-    entry = _FACES.get(id(body))
+    key = (id(body), str(device))
+    entry = _FACES.get(key)
     if entry is None or entry[0] is not body:
-        entry = (body, torch.as_tensor(body.faces))
-        _FACES[id(body)] = entry
+        entry = (body, torch.as_tensor(body.faces, device=device))
+        _FACES[key] = entry
     return entry[1]

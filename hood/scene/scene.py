@@ -13,6 +13,7 @@ from hood.assets.body import Body
 from hood.assets.garment import Garment, bind_garment
 from hood.assets.material import Material
 from hood.assets.sequence import PoseSequence
+from hood.scene.batch import to_device
 from hood.scene.cloth import Cloth, build_cloth
 from hood.scene.motion import BodyMotion, body_motion
 from hood.scene.start import settle
@@ -55,11 +56,11 @@ class Scene:
         if frame + 1 >= self.num_frames:
             return torch.zeros_like(self.cloth.rest_pos)
         origin = self.motion.translation[frame]
-        return (self.motion.skinned(self.garment, frame + 1, origin) - self.motion.skinned(self.garment, frame, origin)) / self.dt
+        return (
+            self.motion.skinned(self.garment, frame + 1, origin) - self.motion.skinned(self.garment, frame, origin)
+        ) / self.dt
 
-    def step_input(
-        self, frame: int, state: State, relaxing: bool = False, attachments: Attachments | None = None
-    ) -> StepInput:
+    def step_input(self, frame: int, state: State, relaxing: bool = False, attachments: Attachments | None = None) -> StepInput:
         """What is prescribed for ``frame`` → ``frame + 1``; a relaxing step freezes the body at ``frame``."""
         origin = state.origin[0].numpy()
         pins = None
@@ -67,7 +68,7 @@ class Scene:
             pins = self.motion.skinned(self.garment, frame if relaxing else frame + 1, origin)
         dt = RELAXING_DT if relaxing else self.dt
         return StepInput(
-            dt=torch.tensor([dt], dtype=state.pos.dtype),
+            dt=torch.tensor([dt], dtype=state.pos.dtype, device=state.pos.device),
             obstacle=self.motion.obstacle(frame, origin, static=relaxing),
             pin_target=pins,
             attachments=attachments,
@@ -82,23 +83,25 @@ def build_scene(
     betas: np.ndarray | None = None,
     size: float = 1.0,
     dtype: torch.dtype = torch.float32,
+    device: torch.device | str = "cpu",
 ) -> Scene:
     """Garment on body: bound, grown with β and scaled by ``size`` (rest shape only: the paper's resizing augmentation)."""
     garment = bind_garment(garment, body)
     betas = np.zeros(10) if betas is None else np.asarray(betas, dtype=np.float64)
     rest_pos = garment.shaped(betas) * size
     cloth = build_cloth(rest_pos, garment.faces, material or Material(), garment.pinned, dtype=dtype)
-    return Scene(cloth, garment, body_motion(body, sequence, betas, dtype), 1.0 / sequence.fps)
+    cloth = to_device(cloth, device)
+    return Scene(cloth, garment, body_motion(body, sequence, betas, dtype, device), 1.0 / sequence.fps)
 
 
 def recentre(state: State, vertex_scene: Tensor) -> State:
     """The same state with each scene's origin moved next to its cloth; world positions are unchanged."""
     count = torch.bincount(vertex_scene, minlength=len(state.origin)).clamp_min(1)
-    centre = torch.zeros(len(state.origin), 3, dtype=state.pos.dtype).index_add(0, vertex_scene, state.pos) / count[:, None]
+    centre = state.pos.new_zeros(len(state.origin), 3).index_add(0, vertex_scene, state.pos) / count[:, None]
     shift = torch.round(centre / (2 * _GRID)) * (2 * _GRID)
     if not bool(shift.any()):
         return state
-    return State(state.pos - shift[vertex_scene], state.vel, state.origin + shift.to(torch.float64))
+    return State(state.pos - shift[vertex_scene], state.vel, state.origin + shift.cpu().to(torch.float64))
 
 
 def concatenate_step_inputs(steps: Sequence[StepInput], vertex_counts: Sequence[int]) -> StepInput:

@@ -5,17 +5,20 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.parallel import DistributedDataParallel
 
 from hood.dynamics.simulator import Simulator, save_simulator
 from hood.losses.potential import Potential, relative_gradient, scale
 from hood.losses.problem import StepProblem
 from hood.scene.dataset import SceneSampler
+from hood.training import distributed
 from hood.training.checkpoint import load_checkpoint, save_checkpoint
 from hood.training.curriculum import CollisionRamp, Horizon, StepDecay, WarmupCosine
 from hood.training.metrics_log import MetricsLog
@@ -79,12 +82,20 @@ class Trainer:
     ) -> None:
         self.simulator, self.potential, self.settings = simulator, potential, settings
         self.folder, self.seed, self.validation = folder, seed, validation
-        self.slots = Slots(sampler, simulator, settings.batch_size, seed, settings.horizon.maximum)
+        ranks, rank = distributed.world_size(), distributed.rank()
+        if settings.batch_size % ranks:
+            raise ValueError(f"trainer.batch_size={settings.batch_size} cannot be shared by {ranks} processes; use a multiple")
+        mine = range(rank, settings.batch_size, ranks)
+        self.slots = Slots(sampler, simulator, settings.batch_size, seed, settings.horizon.maximum, mine)
+        # A batch without any body edge leaves their networks unused.
+        self.model: torch.nn.Module = (
+            DistributedDataParallel(simulator, find_unused_parameters=True) if ranks > 1 else simulator
+        )
         self.optimizer = torch.optim.Adam(simulator.parameters(), lr=settings.learning_rate)
         self.iteration = 0
         self.skipped = 0
         self._skipped_in_row = 0
-        self._average = {name: value.detach().clone() for name, value in simulator.state_dict().items()}
+        self._average = {name: value.detach().clone() for name, value in simulator.named_parameters()}
 
     @property
     def checkpoint_path(self) -> Path:
@@ -95,16 +106,17 @@ class Trainer:
         settings = self.settings
         self.folder.mkdir(parents=True, exist_ok=True)
         begun, first = time.monotonic(), self.iteration
-        with MetricsLog(self.folder, self.iteration) as log:
-            while self.iteration < settings.iterations and not should_stop():
+        main = distributed.rank() == 0
+        with MetricsLog(self.folder, self.iteration) if main else nullcontext() as log:
+            while self.iteration < settings.iterations and not distributed.any_rank(should_stop()):
                 report = self.update()
                 done = self.iteration
-                if done % settings.log_every == 0 or done == settings.iterations:
+                if log and (done % settings.log_every == 0 or done == settings.iterations):
                     rate = (done - first) / max(time.monotonic() - begun, 1e-9)
                     log.write(done, {**report, "iterations_per_second": rate})
                 if progress is not None:
                     progress(done, report)
-                if settings.validate_every and self.validation and done % settings.validate_every == 0:
+                if log and settings.validate_every and self.validation and done % settings.validate_every == 0:
                     log.write(done, {f"validation_{k}": v for k, v in self.validation(self.averaged()).items()})
                 if done % settings.checkpoint_every == 0:
                     self.save()
@@ -122,12 +134,16 @@ class Trainer:
         potential = settings.collision.apply(self.potential, self.iteration)
         collecting = self.iteration < settings.statistics_iterations and simulator.uses_statistics
         with torch.set_grad_enabled(not collecting):
-            prediction = simulator.predict(problem, prepared)
+            prediction = simulator(problem, prepared) if collecting else self.model(problem, prepared)
         gradient, energies = potential.gradient(problem, prediction.next_pos.detach(), prediction.acc.detach())
         gradient = gradient * cloth.free.unsqueeze(1)
         residual = relative_gradient(problem, gradient)
         report = {name: float(value.mean()) for name, value in energies.items()}
-        report |= {"total": sum(report.values()), "relative_gradient": float(residual.median()), "horizon": float(horizon)}
+        report |= {
+            "total": sum(report.values()),
+            "relative_gradient": float(residual.median()),
+            "horizon": float(horizon),
+        }
         if not collecting:
             weight = self._weight(problem, residual)
             # The analytic gradient is injected at the output: no graph through the energies is kept.
@@ -140,11 +156,14 @@ class Trainer:
     def averaged(self) -> Simulator:
         """The simulator with exponentially averaged weights (the plain ones when averaging is off), in eval mode."""
         clone = self.simulator.clone()
-        clone.load_state_dict(self._average if self.settings.ema_decay > 0 else self.simulator.state_dict())
+        clone.load_state_dict(self.simulator.state_dict() | (self._average if self.settings.ema_decay > 0 else {}))
         return clone.eval()
 
     def save(self) -> None:
         """Write the resume checkpoint and the weights, both atomically."""
+        slots = {index: entry for part in distributed.gather(self.slots.state_dict()) for index, entry in part.items()}
+        if distributed.rank() != 0:
+            return
         state: dict[str, Any] = {
             "iteration": self.iteration,
             "seed": self.seed,
@@ -152,7 +171,7 @@ class Trainer:
             "simulator": self.simulator.state_dict(),
             "average": self._average,
             "optimizer": self.optimizer.state_dict(),
-            "slots": self.slots.state_dict(),
+            "slots": slots,
             "rng": torch.get_rng_state(),
             "model": self.simulator.config,
         }
@@ -171,7 +190,8 @@ class Trainer:
         if state["seed"] != self.seed:
             raise ValueError(f"{path}: trained with seed {state['seed']}; pass seed={state['seed']} to resume it")
         self.simulator.load_state_dict(state["simulator"])
-        self._average = state["average"]
+        for name, mean in self._average.items():
+            mean.copy_(state["average"][name])
         self.optimizer.load_state_dict(state["optimizer"])
         self.slots.load_state_dict(state["slots"])
         self.iteration, self.skipped = int(state["iteration"]), int(state["skipped"])
@@ -203,7 +223,11 @@ class Trainer:
                     f"{_MAX_SKIPPED} updates in a row were not finite (iteration {self.iteration}); lower "
                     f"trainer.learning_rate and resume from {self.checkpoint_path}"
                 )
-        return {"parameter_gradient_norm": norm, "learning_rate": settings.learning_rate * factor, "skipped": float(self.skipped)}
+        return {
+            "parameter_gradient_norm": norm,
+            "learning_rate": settings.learning_rate * factor,
+            "skipped": float(self.skipped),
+        }
 
     def _update_average(self) -> None:
         decay = self.settings.ema_decay
@@ -211,9 +235,5 @@ class Trainer:
             return
         # Early averages forget faster, so that the first checkpoints are not the untrained weights.
         decay = min(decay, (1 + self.iteration) / (10 + self.iteration))
-        for name, value in self.simulator.state_dict().items():
-            mean = self._average[name]
-            if value.is_floating_point():
-                mean.lerp_(value, 1 - decay)
-            else:
-                mean.copy_(value)
+        with torch.no_grad():
+            torch._foreach_lerp_(list(self._average.values()), list(self.simulator.parameters()), 1 - decay)

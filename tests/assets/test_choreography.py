@@ -57,9 +57,7 @@ def test_layout_is_amass(name: str, performed: dict) -> None:
 
 
 @pytest.mark.parametrize("name", MOTIONS)
-def test_motion_is_humanly_possible(
-    name: str, performed: dict, skeleton: Skeleton, parents: list[int]
-) -> None:
+def test_motion_is_humanly_possible(name: str, performed: dict, skeleton: Skeleton, parents: list[int]) -> None:
     arrays, fps = performed[name], MOTIONS[name].fps
     joints, transforms = world_joints(arrays, skeleton, parents)
     speed = np.linalg.norm(np.diff(joints, axis=0), axis=2) * fps

@@ -38,9 +38,7 @@ def test_inertia_and_gravity_by_hand():
     acc = torch.tensor([1.0, 2.0, -2.0], dtype=F64).expand_as(pos)
     assert float(Inertia()(problem, pos, acc)) == pytest.approx(0.5 * mass * DT**2 * 9.0)
     lifted = pos + torch.tensor([5.0, 2.0, 1.0], dtype=F64)
-    assert float(Gravity()(problem, lifted, acc) - Gravity()(problem, pos, acc)) == pytest.approx(
-        mass * 9.81 * 2.0
-    )
+    assert float(Gravity()(problem, lifted, acc) - Gravity()(problem, pos, acc)) == pytest.approx(mass * 9.81 * 2.0)
 
 
 def test_free_fall_step_is_the_minimum_of_inertia_and_gravity():
@@ -109,9 +107,7 @@ def test_friction_force_is_at_most_coulomb_and_opposes_the_slip():
     problem = make_problem(cloth, pos, contact=contact)
     term = Friction(coefficient=0.3)
     limit = 0.3 * 3 * term.weight * (term.epsilon - 1e-3) ** 2
-    slip = torch.as_tensor(rng.normal(size=pos.shape)) * torch.logspace(
-        -6, -1, len(pos), dtype=F64
-    ).unsqueeze(1)
+    slip = torch.as_tensor(rng.normal(size=pos.shape)) * torch.logspace(-6, -1, len(pos), dtype=F64).unsqueeze(1)
     force = gradient(term, problem, pos + body + slip)
     tangential = slip - (slip @ normal).unsqueeze(1) * normal
     size = tangential.norm(dim=1)
@@ -164,9 +160,7 @@ def test_attachment_pulls_closed_pairs_only():
     problem = make_problem(cloth, pos)
     assert float(Attachment()(problem, pos, pos)) == 0.0
     edges = torch.tensor([[0, 5], [2, 15]])
-    problem = replace(
-        problem, step=replace(problem.step, attachments=Attachments(edges, torch.tensor([False, True])))
-    )
+    problem = replace(problem, step=replace(problem.step, attachments=Attachments(edges, torch.tensor([False, True]))))
     gap = pos[2] - pos[15]
     assert float(Attachment(200.0)(problem, pos, pos)) == pytest.approx(100.0 * float(gap @ gap))
     force = gradient(Attachment(200.0), problem, pos)

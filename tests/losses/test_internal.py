@@ -97,6 +97,4 @@ def test_bending_gradient_of_tiny_edges_in_float32():
         x = torch.as_tensor(state).to(dtype).requires_grad_(True)
         Bending()(make_problem(cloth), x, x).sum().backward()
         gradients.append(x.grad.double())
-    torch.testing.assert_close(
-        gradients[0], gradients[1], rtol=0, atol=1e-4 * float(gradients[1].abs().max())
-    )
+    torch.testing.assert_close(gradients[0], gradients[1], rtol=0, atol=1e-4 * float(gradients[1].abs().max()))

@@ -47,9 +47,7 @@ def test_total_is_the_sum_and_gradient_its_derivative():
     assert values.keys() == energies.keys()
     direction = torch.as_tensor(np.random.default_rng(1).normal(size=pos.shape))
     h = 1e-7
-    difference = (
-        potential.total(problem, pos + h * direction) - potential.total(problem, pos - h * direction)
-    ) / (2 * h)
+    difference = (potential.total(problem, pos + h * direction) - potential.total(problem, pos - h * direction)) / (2 * h)
     assert float(difference) == pytest.approx(float((gradient * direction).sum()), rel=1e-5)
 
 
@@ -64,9 +62,7 @@ def test_batch_equals_singles_with_different_time_steps():
     for name, value in energies.items():
         torch.testing.assert_close(value, torch.cat([e[name] for _, e in alone]), rtol=1e-12, atol=1e-16)
     for function in (scale, lambda p: relative_gradient(p, potential.gradient(p, p.state.pos)[0])):
-        torch.testing.assert_close(
-            function(together), torch.cat([function(p) for p in problems]), rtol=1e-12, atol=0
-        )
+        torch.testing.assert_close(function(together), torch.cat([function(p) for p in problems]), rtol=1e-12, atol=0)
 
 
 def test_terms_without_effect_are_left_out():
@@ -123,9 +119,7 @@ def test_half_precision_is_refused(dtype):
         default_potential().energies(problem, problem.state.pos.to(dtype))
     for term in default_potential().terms.values():
         if term.applies(problem):
-            half = replace(
-                problem, cloth=_to(problem.cloth, dtype), step=StepInput(problem.step.dt.to(dtype))
-            )
+            half = replace(problem, cloth=_to(problem.cloth, dtype), step=StepInput(problem.step.dt.to(dtype)))
             half = replace(half, state=_to(problem.state, dtype), contact=_to(problem.contact, dtype))
             with pytest.raises(ValueError, match="float32"):
                 term(half, half.state.pos, half.state.vel)
@@ -165,7 +159,5 @@ def test_hanging_at_rest_has_a_relative_gradient_of_one():
 
 def _to(item, dtype):
     values = {name: getattr(item, name) for name in item.__dataclass_fields__}
-    real = {
-        n: v.to(dtype) for n, v in values.items() if isinstance(v, torch.Tensor) and v.is_floating_point()
-    }
+    real = {n: v.to(dtype) for n, v in values.items() if isinstance(v, torch.Tensor) and v.is_floating_point()}
     return replace(item, **real)

@@ -50,13 +50,9 @@ def test_rasterise_agrees_with_a_point_in_triangle_test() -> None:
 
 
 def test_shared_edges_leave_no_holes_and_chunks_do_not_matter() -> None:
-    grid = np.stack(np.meshgrid(np.linspace(1.3, 60.7, 23), np.linspace(0.2, 50.1, 19)), axis=-1).reshape(
-        -1, 2
-    )
+    grid = np.stack(np.meshgrid(np.linspace(1.3, 60.7, 23), np.linspace(0.2, 50.1, 19)), axis=-1).reshape(-1, 2)
     corner = (np.arange(18)[:, None] * 23 + np.arange(22)).ravel()
-    faces = np.concatenate(
-        [np.stack([corner, corner + 1, corner + 24], 1), np.stack([corner, corner + 24, corner + 23], 1)]
-    )
+    faces = np.concatenate([np.stack([corner, corner + 1, corner + 24], 1), np.stack([corner, corner + 24, corner + 23], 1)])
     whole = rasterise(grid, grid[:, 0], faces, 64, 52)
     assert (whole.face[1:49, 2:60] >= 0).all()
     parts = rasterise(grid, grid[:, 0], faces, 64, 52, chunk_faces=7)

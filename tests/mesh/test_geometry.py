@@ -88,9 +88,7 @@ def test_degenerate_hinges_have_angle_zero_and_finite_gradients(dtype):
 
 
 def test_folded_by_pi_is_finite():
-    pos = torch.tensor([[0, 0, 0], [0, 0, 1], [1, 0, 0.5], [1, 0, 0.5]], dtype=torch.float64).requires_grad_(
-        True
-    )
+    pos = torch.tensor([[0, 0, 0], [0, 0, 1], [1, 0, 0.5], [1, 0, 0.5]], dtype=torch.float64).requires_grad_(True)
     theta = geometry.dihedral_angles(pos, HINGE)
     theta.sum().backward()
     assert abs(float(theta.detach())) == pytest.approx(math.pi)
@@ -98,9 +96,7 @@ def test_folded_by_pi_is_finite():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize(
-    "function", [geometry.triangle_areas, geometry.face_normals, geometry.vertex_normals]
-)
+@pytest.mark.parametrize("function", [geometry.triangle_areas, geometry.face_normals, geometry.vertex_normals])
 def test_degenerate_triangles_have_zero_values_and_zero_gradients(function, dtype):
     for shape in ([[1, 2, 3]] * 3, [[0, 0, 0], [1, 1, 1], [3, 3, 3]], [[0, 0, 0], [0, 0, 0], [1, 0, 0]]):
         pos = torch.tensor(shape, dtype=dtype).requires_grad_(True)
@@ -137,8 +133,6 @@ def test_gradients_of_areas_and_normals():
 
 def test_tube_bends_by_its_turning_angle():
     mesh = cylinder(12, 3)
-    theta = geometry.dihedral_angles(
-        torch.as_tensor(mesh[0]), torch.as_tensor(topology.hinges(mesh[1]).vertices)
-    )
+    theta = geometry.dihedral_angles(torch.as_tensor(mesh[0]), torch.as_tensor(topology.hinges(mesh[1]).vertices))
     seams = theta.abs() > 1e-6
     torch.testing.assert_close(theta[seams].abs(), torch.full_like(theta[seams], 2 * math.pi / 12))

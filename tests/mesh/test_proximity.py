@@ -19,9 +19,7 @@ def brute_force(points, mesh):
     a, u, v = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     p = points[:, None] - a[None]
     weights = np.linalg.solve(
-        np.stack(
-            [np.stack([(u * u).sum(1), (u * v).sum(1)], 1), np.stack([(u * v).sum(1), (v * v).sum(1)], 1)], 1
-        ),
+        np.stack([np.stack([(u * u).sum(1), (u * v).sum(1)], 1), np.stack([(u * v).sum(1), (v * v).sum(1)], 1)], 1),
         np.stack([(p * u).sum(2), (p * v).sum(2)], 2)[..., None],
     )[..., 0]
     miss = np.linalg.norm(p - weights[..., :1] * u - weights[..., 1:] * v, axis=2)
@@ -47,9 +45,7 @@ def test_distances_equal_brute_force_and_signs_are_right(mesh):
     hit = search(points, mesh)
     expected = brute_force(points, mesh)
     np.testing.assert_allclose(hit.dist.abs().numpy(), expected, atol=1e-12)
-    closest = (hit.bary.unsqueeze(-1) * torch.as_tensor(mesh[0])[torch.as_tensor(mesh[1])[hit.face]]).sum(
-        dim=1
-    )
+    closest = (hit.bary.unsqueeze(-1) * torch.as_tensor(mesh[0])[torch.as_tensor(mesh[1])[hit.face]]).sum(dim=1)
     np.testing.assert_allclose(np.linalg.norm(points - closest.numpy(), axis=1), expected, atol=1e-12)
 
 
@@ -68,9 +64,7 @@ def test_sign_and_distance_around_acute_edges_and_uneven_fans(uneven):
     """Face normals alone, or unweighted sums of them, give wrong signs here."""
     mesh = spike(uneven)
     rng = np.random.default_rng(6)
-    points = np.concatenate(
-        [near_surface(rng, mesh, 2000, 0.1), mesh[0][8] + 0.2 * rng.normal(size=(2000, 3))]
-    )
+    points = np.concatenate([near_surface(rng, mesh, 2000, 0.1), mesh[0][8] + 0.2 * rng.normal(size=(2000, 3))])
     corners = mesh[0][mesh[1]]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     inside = (np.einsum("nfd,fd->nf", points[:, None] - corners[None, :, 0], normals) < 0).all(axis=1)
@@ -212,18 +206,14 @@ def test_closest_point_on_triangles_is_a_minimum():
     torch.testing.assert_close(bary.sum(dim=1), torch.ones(300, dtype=torch.float64))
     dist = ((bary.unsqueeze(-1) * corners).sum(dim=1) - points).norm(dim=1)
     samples = torch.as_tensor(rng.dirichlet(np.ones(3) * 0.5, size=2000))
-    sampled = (
-        (torch.einsum("sc,ncd->nsd", samples, corners) - points.unsqueeze(1)).norm(dim=2).min(dim=1).values
-    )
+    sampled = (torch.einsum("sc,ncd->nsd", samples, corners) - points.unsqueeze(1)).norm(dim=2).min(dim=1).values
     assert (dist <= sampled + 1e-12).all()
     assert float((sampled - dist).max()) < 0.2
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_closest_point_on_degenerate_triangles(dtype):
-    corners = torch.tensor(
-        [[[0, 0, 0]] * 3, [[0, 0, 0], [1, 0, 0], [3, 0, 0]], [[0, 0, 0], [0, 0, 0], [2, 0, 0]]], dtype=dtype
-    )
+    corners = torch.tensor([[[0, 0, 0]] * 3, [[0, 0, 0], [1, 0, 0], [3, 0, 0]], [[0, 0, 0], [0, 0, 0], [2, 0, 0]]], dtype=dtype)
     points = torch.tensor([[1, 2, 2], [2, 1, 0], [1, 0, 1]], dtype=dtype)
     bary = closest_point_on_triangles(points, corners)
     dist = ((bary.unsqueeze(-1) * corners).sum(dim=1) - points).norm(dim=1)

@@ -16,9 +16,7 @@ def edited(row, values, faces=FACES):
 def test_legal_meshes_pass():
     check_triangles(POS, FACES, "sheet")
     check_triangles(np.concatenate([POS, POS[:2] + 5]), FACES, "isolated vertices")
-    check_triangles(
-        np.concatenate([POS, [[0.5, 1, 0.5]]]), np.concatenate([FACES, [[0, 3, 9]]]), "three faces at an edge"
-    )
+    check_triangles(np.concatenate([POS, [[0.5, 1, 0.5]]]), np.concatenate([FACES, [[0, 3, 9]]]), "three faces at an edge")
     tube = cylinder()
     check_triangles(np.concatenate([POS, tube[0]]), np.concatenate([FACES, tube[1] + 9]), "two components")
     check_triangles(POS.astype(np.float32), FACES.astype(np.int32)[:, ::-1], "flipped")

@@ -59,9 +59,7 @@ def test_boundary_of_a_grid_is_its_rim():
     rim = {v for v in range(n * m) if v // m in (0, n - 1) or v % m in (0, m - 1)}
     assert set(loop.tolist()) == rim and len(loop) == len(rim)
     edges = {tuple(edge) for edge in topology.unique_edges(faces).tolist()}
-    assert all(
-        tuple(sorted(pair)) in edges for pair in zip(loop.tolist(), np.roll(loop, -1).tolist(), strict=True)
-    )
+    assert all(tuple(sorted(pair)) in edges for pair in zip(loop.tolist(), np.roll(loop, -1).tolist(), strict=True))
 
 
 def test_boundary_of_a_tube_is_two_rings():

@@ -1,0 +1,52 @@
+"""Shared assets, loaded once: they are frozen, so tests may share them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from hood.assets.body import Body, load_body
+from hood.assets.garment import Garment, load_garment
+from hood.assets.library import DATA_FOLDER
+from hood.assets.sequence import PoseSequence, load_sequence
+from hood.scene.scene import Scene, build_scene
+
+GARMENT_NAMES = ("tshirt", "tank", "longsleeve", "shorts", "trousers", "dress", "skirt")
+
+torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session")
+def body_file() -> Path:
+    return DATA_FOLDER / "body" / "default.npz"
+
+
+@pytest.fixture(scope="session")
+def body() -> Body:
+    return load_body()
+
+
+@pytest.fixture(scope="session")
+def garments() -> dict[str, Garment]:
+    """The seven default garments by name."""
+    return {name: load_garment(name) for name in GARMENT_NAMES}
+
+
+@pytest.fixture(scope="session")
+def walk() -> PoseSequence:
+    """A walk at 30 fps, y up."""
+    return load_sequence("walk_proud")
+
+
+@pytest.fixture(scope="session")
+def tank_scene(garments: dict[str, Garment], body: Body, walk: PoseSequence) -> Scene:
+    """A tank top on the first 12 frames of the walk; no pinned vertices."""
+    return build_scene(garments["tank"], body, walk.window(0, 12))
+
+
+@pytest.fixture(scope="session")
+def skirt_scene(garments: dict[str, Garment], body: Body, walk: PoseSequence) -> Scene:
+    """A skirt with a pinned waistband on 12 frames in the middle of the walk."""
+    return build_scene(garments["skirt"], body, walk.window(60, 72))
