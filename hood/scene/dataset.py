@@ -63,12 +63,21 @@ class SceneSampler:
         """A scene with at least ``num_steps`` steps ahead of its start frame.
 
         ``garment`` fixes the template by its index; None draws one.
+
+        Raises:
+            ValueError: every motion is shorter than that.
         """
         index = int(rng.integers(len(self.garments))) if garment is None else garment % len(self.garments)
         template = self.garments[index]
-        lengths = np.array([max(s.num_frames - num_steps - 1, 1) for s in self.sequences], dtype=np.float64)
+        lengths = np.array([max(s.num_frames - num_steps - 1, 0) for s in self.sequences], dtype=np.float64)
+        if not lengths.any():
+            longest = max(self.sequences, key=lambda s: s.num_frames)
+            raise ValueError(
+                f"no motion has the {num_steps + 2} frames that a training rollout needs; the longest, {longest.name!r}, "
+                f"has {longest.num_frames} (lower trainer.horizon.maximum or give longer motions)"
+            )
         sequence = self.sequences[int(rng.choice(len(self.sequences), p=lengths / lengths.sum()))]
-        start = int(rng.integers(max(sequence.num_frames - num_steps - 1, 1)))
+        start = int(rng.integers(sequence.num_frames - num_steps - 1))
         window = sequence.window(max(start - 1, 0), start + num_steps + 2)
         if self.random_yaw:
             turn = Rotation.from_rotvec([0.0, rng.uniform(-np.pi, np.pi), 0.0]).as_matrix()

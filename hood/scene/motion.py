@@ -14,7 +14,8 @@ from hood.assets.sequence import PoseSequence
 from hood.assets.skinning import linear_blend_skinning
 from hood.scene.state import Obstacle
 
-_CHUNK = 64
+#: Frames posed at once: enough to amortise the call, few enough for short training windows.
+_CHUNK = 16
 
 
 @dataclass(frozen=True)

@@ -98,7 +98,8 @@ def recentre(state: State, vertex_scene: Tensor) -> State:
     """The same state with each scene's origin moved next to its cloth; world positions are unchanged."""
     count = torch.bincount(vertex_scene, minlength=len(state.origin)).clamp_min(1)
     centre = state.pos.new_zeros(len(state.origin), 3).index_add(0, vertex_scene, state.pos) / count[:, None]
-    shift = torch.round(centre / (2 * _GRID)) * (2 * _GRID)
+    # A broken cloth has no centre; its frame stays, so that the body can still be seen.
+    shift = torch.round(centre.nan_to_num(0.0, 0.0, 0.0) / (2 * _GRID)) * (2 * _GRID)
     if not bool(shift.any()):
         return state
     return State(state.pos - shift[vertex_scene], state.vel, state.origin + shift.cpu().to(torch.float64))

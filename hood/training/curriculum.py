@@ -10,16 +10,17 @@ from hood.losses.potential import Potential
 
 @dataclass(frozen=True)
 class Horizon:
-    """Predicted steps per training rollout: one at first, one more every ``every`` iterations, at most ``maximum``.
+    """Predicted steps per training rollout: ``start`` at first, one more every ``every`` iterations, at most ``maximum``.
 
     The paper (section 3.4): every 5000 iterations, at most 5.
     """
 
     every: int = 5000
     maximum: int = 5
+    start: int = 1
 
     def __call__(self, iteration: int) -> int:
-        return min(1 + iteration // max(self.every, 1), self.maximum)
+        return min(self.start + iteration // max(self.every, 1), self.maximum)
 
 
 @dataclass(frozen=True)
