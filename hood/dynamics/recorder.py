@@ -92,7 +92,7 @@ class RolloutWriter:
 
     def _touch_all(self) -> None:
         # HDF5 lays contiguous data out at the first write; one row is enough to allocate and fill everything.
-        for name in ("cloth/pos", "body/pos"):
+        for name in ("cloth/pos", "body/pos", *(f"metrics/{name}" for name in self._file.get("metrics", ()))):
             self._file[name][-1] = np.nan
 
     def __enter__(self) -> RolloutWriter:
@@ -147,12 +147,16 @@ def read_rollout(path: Path) -> RolloutData:
 def _truncate(path: Path, num_frames: int) -> None:
     """Rewrite the file with its first ``num_frames`` frames."""
     temporary = path.with_name(path.name + ".partial")
-    with h5py.File(path, "r") as source, h5py.File(temporary, "w") as target:
-        for key, value in source.attrs.items():
-            target.attrs[key] = value
-        per_frame = {"cloth/pos", "body/pos", "time", *(f"metrics/{name}" for name in source["metrics"])}
-        for name in ("cloth/faces", "cloth/rest_pos", "body/faces"):
-            target[name] = source[name][:]
-        for name in per_frame:
-            target[name] = source[name][:num_frames]
-    os.replace(temporary, path)
+    try:
+        with h5py.File(path, "r") as source, h5py.File(temporary, "w") as target:
+            for key, value in source.attrs.items():
+                target.attrs[key] = value
+            per_frame = {"cloth/pos", "body/pos", "time", *(f"metrics/{name}" for name in source["metrics"])}
+            for name in ("cloth/faces", "cloth/rest_pos", "body/faces"):
+                target[name] = source[name][:]
+            for name in per_frame:
+                target[name] = source[name][:num_frames]
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise

@@ -149,7 +149,9 @@ class Simulator(nn.Module):
 
     def clone(self) -> Simulator:
         """A new simulator of the same model with the same weights."""
-        copy = build_simulator(**self.config)
+        # A copy must not move the generator that a resumed run shares with an uninterrupted one.
+        with torch.random.fork_rng(devices=[]):
+            copy = build_simulator(**self.config)
         copy.load_state_dict(self.state_dict())
         return copy.to(self.gravity.device)
 
@@ -183,6 +185,9 @@ def build_simulator(
         normalizer_decay: decay of the exponentially weighted statistics (``paper`` features).
     """
     config = dict(locals())
+    for name in ("latent_dim", "body_radius", "output_scale"):
+        if not config[name] > 0:
+            raise ValueError(f"model.{name} is {config[name]!r}; it must be > 0")
     for name, value, known in (("features", features, ("paper", "physical")), ("output", output, tuple(OUTPUTS))):
         if value not in known:
             raise ValueError(f"model.{name} is {value!r}; choose {' or '.join(known)}")
@@ -233,7 +238,10 @@ def load_simulator(path: Path) -> Simulator:
         raise ValueError(f"{path}: not a model file ({error}); give the model.safetensors of a run") from error
     if header.get("format") != _FORMAT:
         raise ValueError(f"{path}: not a hood model (format {header.get('format')!r}); give the model.safetensors of a run")
-    simulator = build_simulator(**json.loads(header["model"]))
+    try:
+        simulator = build_simulator(**json.loads(header["model"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: names a model that this version cannot build ({error}); train it again") from error
     expected = simulator.state_dict()
     wrong = [
         name
@@ -246,19 +254,19 @@ def load_simulator(path: Path) -> Simulator:
     return simulator.eval()
 
 
-_HIERARCHIES: dict[tuple[int, int], tuple[Any, Hierarchy]] = {}
+_HIERARCHIES: dict[tuple[int, int], tuple[Any, Tensor, Hierarchy]] = {}
 
 
 def _cached_hierarchy(cloth: Cloth, rest_pos: Any, num_coarse: int) -> Hierarchy:
     """Hierarchies are kept per template array: training meets the same garments thousands of times."""
     key = (id(rest_pos), num_coarse)
     entry = _HIERARCHIES.get(key)
-    # Holding the array keeps its id from being reused.
-    if entry is None or entry[0] is not rest_pos or entry[1].num_vertices != cloth.num_vertices:
-        edges = cloth.edges.cpu().numpy()
-        entry = (rest_pos, build_hierarchy(cloth.num_vertices, edges, rest_pos, num_coarse))
+    edges = cloth.edges.cpu()
+    # Holding the array keeps its id from being reused; other faces may still share it.
+    if entry is None or entry[0] is not rest_pos or not torch.equal(entry[1], edges):
+        entry = (rest_pos, edges, build_hierarchy(cloth.num_vertices, edges.numpy(), rest_pos, num_coarse))
         _HIERARCHIES[key] = entry
-    return entry[1]
+    return entry[2]
 
 
 def _part(watch: Stopwatch | None, name: str):  # type: ignore[no-untyped-def]

@@ -24,8 +24,8 @@ _TRIES = 4  # inputs per node; a ReLU may block a path for one input
 def measured_radius(simulator: Simulator, seed: int = 0) -> int:
     """Farthest mesh-hop distance between nodes i and j at which ∂a_j/∂(velocity feature of i) is not zero.
 
-    Float64 autograd on a strip of diameter > 100 without body edges; random features; maximum over targets that include a
-    node of the coarsest level, and nodes at the strip's ends.
+    Float64 autograd on a strip of diameter > 100 without body edges; random features; maximum over nodes of every level, the
+    coarsest among them. The farthest path of a multi-level schedule may start on any level.
     """
     network = copy.deepcopy(simulator.network).double().eval()
     columns = simulator.velocity_columns
@@ -36,17 +36,26 @@ def measured_radius(simulator: Simulator, seed: int = 0) -> int:
     graph = build_graph(static, StepInput(dt=torch.full((1,), 1.0 / 30.0, dtype=torch.float64)))
     hops = _hops(cloth.num_vertices, edges)
     generator = torch.Generator().manual_seed(seed)
-    coarsest = int(torch.nonzero(hierarchy.node_level == hierarchy.node_level.max())[0])
+    targets = _targets(hierarchy.node_level)
     farthest = 0
     for _ in range(_TRIES):
         features = _random_features(network, graph, generator)
         nodes = features.pop("nodes").requires_grad_(True)
         output = network(graph, nodes, features)
-        for target in {coarsest, 0, cloth.num_vertices // 2, cloth.num_vertices - 1}:
+        for target in targets:
             (gradient,) = torch.autograd.grad(output[target].sum(), nodes, retain_graph=True)
             reached = gradient[:, columns].abs().amax(dim=1) > 0
             farthest = max(farthest, int(hops[target][reached.numpy()].max()))
     return farthest
+
+
+def _targets(node_level: Tensor) -> list[int]:
+    """First, middle and last node of every level."""
+    chosen = []
+    for level in node_level.unique():
+        nodes = torch.nonzero(node_level == level).squeeze(1)
+        chosen += [int(nodes[0]), int(nodes[len(nodes) // 2]), int(nodes[-1])]
+    return sorted(set(chosen))
 
 
 def _strip() -> Cloth:

@@ -60,6 +60,16 @@ class Scene:
             self.motion.skinned(self.garment, frame + 1, origin) - self.motion.skinned(self.garment, frame, origin)
         ) / self.dt
 
+    def skinned_acceleration(self, frame: int) -> Tensor:
+        """(V, 3) m per frame²: x⁺ − 2x + x⁻ of the skinned garment at ``frame``, or at the nearest frame that has both
+        neighbours; zero for motions of two frames."""
+        if self.num_frames < 3:
+            return torch.zeros_like(self.cloth.rest_pos)
+        frame = min(max(frame, 1), self.num_frames - 2)
+        origin = self.motion.translation[frame]
+        before, now, after = (self.motion.skinned(self.garment, frame + k, origin) for k in (-1, 0, 1))
+        return after - 2 * now + before
+
     def step_input(self, frame: int, state: State, relaxing: bool = False, attachments: Attachments | None = None) -> StepInput:
         """What is prescribed for ``frame`` → ``frame + 1``; a relaxing step freezes the body at ``frame``."""
         origin = state.origin[0].numpy()

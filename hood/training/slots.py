@@ -77,6 +77,14 @@ class Slots:
             self._batch = (cloth, prepared)
         return *self._batch, concatenate_states(states), concatenate_step_inputs(steps, counts)
 
+    def skinned_accelerations(self) -> Tensor:
+        """(V, 3) m per frame² of the batch's skinned garments at their current frames: the scale of the paper's output."""
+        parts = []
+        for slot in self._slots.values():
+            assert slot.window is not None
+            parts.append(slot.window.scene.skinned_acceleration(slot.window.start_frame + max(slot.age - 1, 0)))
+        return torch.cat(parts)
+
     def advance(self, next_pos: Tensor, next_vel: Tensor) -> None:
         """Take the predicted positions (V, 3) and velocities (V, 3) over, detached; broken rollouts end here."""
         offset = 0

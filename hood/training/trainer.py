@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
+from hood.dynamics.output import AccelerationOutput
 from hood.dynamics.simulator import Simulator, save_simulator
 from hood.losses.potential import Potential, relative_gradient, scale
 from hood.losses.problem import StepProblem
@@ -133,6 +134,8 @@ class Trainer:
         problem = StepProblem(cloth, state, step, contact, simulator.gravity)
         potential = settings.collision.apply(self.potential, self.iteration)
         collecting = self.iteration < settings.statistics_iterations and simulator.uses_statistics
+        if collecting and isinstance(simulator.output, AccelerationOutput):
+            simulator.output.observe(self.slots.skinned_accelerations())
         with torch.set_grad_enabled(not collecting):
             prediction = simulator(problem, prepared) if collecting else self.model(problem, prepared)
         gradient, energies = potential.gradient(problem, prediction.next_pos.detach(), prediction.acc.detach())

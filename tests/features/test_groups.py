@@ -16,7 +16,9 @@ from hood.scene.state import Obstacle, State, StepInput, concatenate_obstacles, 
 
 DT = 1 / 30
 REST = torch.tensor([[0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1.0]], dtype=torch.float64)
-FABRIC = Material(lame_mu=RANGES["lame_mu"][1], lame_lambda=RANGES["lame_lambda"][0], bending_stiffness=RANGES["bending_stiffness"][1])
+FABRIC = Material(
+    lame_mu=RANGES["lame_mu"][1], lame_lambda=RANGES["lame_lambda"][0], bending_stiffness=RANGES["bending_stiffness"][1]
+)
 
 
 def make_inputs(base: bool = True, shift: float = 0.0, dt: float = DT) -> Inputs:
@@ -28,7 +30,9 @@ def make_inputs(base: bool = True, shift: float = 0.0, dt: float = DT) -> Inputs
     vel[1, 2] = 3.0
     body = torch.tensor([[9, 9, 9], [0, 0.08, 0], [0, 0.08, 1], [1, 0.08, 0.0]], dtype=torch.float64)
     zero = torch.zeros(4, dtype=torch.int64)
-    obstacle = Obstacle(body + shift, body + shift + 0.01, body + shift - 0.02, torch.tensor([[1, 2, 3]]), zero, zero[:1], zero.bool())
+    obstacle = Obstacle(
+        body + shift, body + shift + 0.01, body + shift - 0.02, torch.tensor([[1, 2, 3]]), zero, zero[:1], zero.bool()
+    )
     dist = torch.tensor([0.02, 1, 1, 1], dtype=torch.float64)
     up = torch.tensor([0.0, 1, 0], dtype=torch.float64).expand(4, 3)
     point = pos + shift - dist.unsqueeze(1) * up

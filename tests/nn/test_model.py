@@ -94,9 +94,7 @@ def reference_step(step: ProcessorStep, nodes: Tensor, edges: dict[str, Tensor],
     for name in step.sets:
         rows, topology = subsets[name].rows, subsets[name].edges
         rows = torch.arange(topology.num_edges) if rows is None else rows
-        message = concatenated(
-            step.edge_mlps[name], nodes[topology.receivers], nodes[topology.senders], edges[name][rows]
-        )
+        message = concatenated(step.edge_mlps[name], nodes[topology.receivers], nodes[topology.senders], edges[name][rows])
         parts.append(torch.zeros_like(nodes).index_add(0, topology.receivers, message))
         if step.aggregation == "mean":
             degree = torch.bincount(topology.receivers, minlength=len(nodes)).clamp_min(1)
@@ -201,7 +199,7 @@ def test_body_nodes_without_edges_have_no_effect():
     torch.testing.assert_close(network(wider, nodes, case.edges), expected, atol=1e-13, rtol=0)
 
 
-def test_without_body_edges_the_network_runs_and_leaves_their_networks_untouched():
+def test_network_runs_without_body_edges():
     graph, network = make_graph(grid(9, 8), num_body=1), make_net()
     bare = edge_set(torch.zeros(0, 2, dtype=torch.int64))
     subsets = dict.fromkeys(graph.body_subsets, Subset(bare, None))

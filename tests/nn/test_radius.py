@@ -22,7 +22,7 @@ def test_output_depends_on_inputs_up_to_the_radius_and_no_farther(schedule, expe
     hops = torch.as_tensor(csgraph.shortest_path(adjacency(cloth.num_vertices, cloth.edges.numpy()), unweighted=True))
     assert hops.max() > 110
     torch.manual_seed(0)
-    network = MeshGraphNet(6, {"mesh": 3, "coarse": 3, "body": 3}, 8, schedule).double()
+    network = MeshGraphNet(6, {"mesh": 3, "coarse": 3, "body": 3}, 16, schedule).double()
     graph = build_graph(build_static(cloth, hierarchy, network.edge_set_names), StepInput(torch.full((1,), 1 / 30)))
     edges = {name: torch.randn(s.num_edges, 3, dtype=torch.float64) for name, s in graph.edge_sets.items()}
     # Three c0 edges lead from a level-1 node to a level-2 node, so the longest paths start and end on level 1, not on the

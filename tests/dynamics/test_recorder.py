@@ -1,0 +1,160 @@
+"""Rollouts on disk: what is read back, and what a kill, an interrupt or a full disk leaves."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from hood.dynamics.recorder import RolloutData, RolloutWriter, read_rollout
+
+NAMES = ("strain_p99", "energy_total")
+FACES = np.array([[0, 1, 2], [1, 3, 2]])
+
+
+def writer(path: Path, num_frames: int = 5, farthest: float = 0.0) -> RolloutWriter:
+    attributes = {"garment": "rag", "config": {"fps": 30}, "model": None, "seed": 3}
+    return RolloutWriter(path, num_frames, np.eye(4, 3), FACES, FACES[:1], 3, NAMES, 0.5, attributes, farthest)
+
+
+def frame(index: int) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:
+    metrics = {"strain_p99": 0.1 * index} | ({"energy_total": float(index)} if index else {})
+    return np.full((4, 3), index + 0.25), np.full((3, 3), -index - 0.5), metrics
+
+
+def append(target: RolloutWriter, count: int) -> None:
+    for index in range(count):
+        target.append(*frame(index))
+
+
+def check(data: RolloutData, count: int) -> None:
+    assert data.cloth_pos.shape == (count, 4, 3)
+    assert data.body_pos.shape == (count, 3, 3)
+    assert data.cloth_pos[:, 0, 0].tolist() == [index + 0.25 for index in range(count)]
+    assert data.body_pos[:, 0, 0].tolist() == [-index - 0.5 for index in range(count)]
+    assert data.time.tolist() == [0.5 * index for index in range(count)]
+    np.testing.assert_allclose(data.metrics["strain_p99"], 0.1 * np.arange(count))
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    with writer(tmp_path / "r.h5") as target:
+        append(target, 5)
+    data = read_rollout(tmp_path / "r.h5")
+    check(data, 5)
+    np.testing.assert_array_equal(data.cloth_faces, FACES)
+    np.testing.assert_array_equal(data.rest_pos, np.eye(4, 3))
+    assert data.attributes["num_frames"] == 5
+    assert bool(data.attributes["complete"])
+    assert data.attributes["garment"] == "rag"
+    assert data.attributes["seed"] == 3
+    assert json.loads(data.attributes["config"]) == {"fps": 30}
+    assert json.loads(data.attributes["model"]) is None
+    assert data.attributes["dt"] == 0.5
+    assert data.cloth_pos.dtype == np.float32
+
+
+def test_metrics_that_a_frame_lacks_are_nan(tmp_path: Path) -> None:
+    with writer(tmp_path / "r.h5") as target:
+        append(target, 5)
+    energy = read_rollout(tmp_path / "r.h5").metrics["energy_total"]
+    assert np.isnan(energy[0])
+    assert energy[1:].tolist() == [1, 2, 3, 4]
+
+
+def test_far_worlds_are_kept_in_float64(tmp_path: Path) -> None:
+    place = np.full((4, 3), 1e4) + 1e-7
+    with writer(tmp_path / "r.h5", 1, farthest=1e4) as target:
+        target.append(place, np.zeros((3, 3)), {})
+    np.testing.assert_allclose(read_rollout(tmp_path / "r.h5").cloth_pos[0], place, rtol=0, atol=1e-10)
+
+
+def test_the_file_is_readable_while_it_is_written_to(tmp_path: Path) -> None:
+    with writer(tmp_path / "r.h5") as target:
+        append(target, 2)
+        with h5py.File(tmp_path / "r.h5", "r") as file:
+            assert file.attrs["num_frames"] == 2
+            assert not file.attrs["complete"]
+            # Frames to come are not a number, never a plausible zero.
+            assert np.isnan(file["cloth/pos"][2:]).all()
+            assert np.isnan(file["metrics/energy_total"][2:]).all()
+        append(target, 3)
+
+
+@pytest.mark.parametrize("frames", [0, 1, 3])
+def test_a_killed_process_leaves_a_file_that_opens(tmp_path: Path, frames: int) -> None:
+    code = f"""
+import os, signal, sys
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+from pathlib import Path
+from test_recorder import append, writer
+append(writer(Path({str(tmp_path / "r.h5")!r})), {frames})
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+    killed = subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parents[2], check=False)
+    assert killed.returncode == -signal.SIGKILL
+    data = read_rollout(tmp_path / "r.h5")
+    check(data, frames)
+    assert data.attributes["num_frames"] == frames
+    assert not data.attributes["complete"]
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
+def test_an_interrupt_keeps_the_frames_done(tmp_path: Path, error: type[BaseException]) -> None:
+    target = writer(tmp_path / "r.h5", num_frames=50)
+    with pytest.raises(error), target:
+        append(target, 2)
+        raise error
+    check(read_rollout(tmp_path / "r.h5"), 2)
+    with h5py.File(tmp_path / "r.h5", "r") as file:
+        assert file["cloth/pos"].shape == (2, 4, 3)
+        assert file["metrics/strain_p99"].shape == (2,)
+        assert file["time"].shape == (2,)
+        assert not file.attrs["complete"]
+        assert file.attrs["garment"] == "rag"
+    assert [path.name for path in tmp_path.iterdir()] == ["r.h5"]
+
+
+def test_an_interrupt_before_the_first_frame_leaves_nothing(tmp_path: Path) -> None:
+    target = writer(tmp_path / "r.h5")
+    with pytest.raises(KeyboardInterrupt), target:
+        raise KeyboardInterrupt
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_leaves_nothing(tmp_path: Path) -> None:
+    target = writer(tmp_path / "r.h5")
+    with pytest.raises(OSError, match="No space"), target:
+        append(target, 2)
+        raise OSError(28, "No space left on device")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_refused_layout_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(TypeError):
+        RolloutWriter(tmp_path / "r.h5", 2, np.eye(3), FACES, FACES, 3, NAMES, 0.5, {"object": {1, 2}})
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_writer_that_is_handed_over_and_closed_early(tmp_path: Path) -> None:
+    target = writer(tmp_path / "r.h5")
+    append(target, 3)
+    target.close(complete=False)
+    check(read_rollout(tmp_path / "r.h5"), 3)
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "text.h5").write_text("hello")
+    with pytest.raises(ValueError, match=r"text\.h5: not a rollout file"):
+        read_rollout(tmp_path / "text.h5")
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["x"] = 1
+    with pytest.raises(ValueError, match=r"other\.h5: not a rollout file"):
+        read_rollout(tmp_path / "other.h5")
+    with pytest.raises(FileNotFoundError):
+        read_rollout(tmp_path / "none.h5")
