@@ -135,18 +135,18 @@ def _check_key(override: Override, known: DictConfig) -> None:
         raise ConfigError(f"override {override.input_line!r}: keys are fixed; write key=value without '+' or '~'")
     key = override.key_or_group
     if OmegaConf.select(known, key, default=OmegaConf) is OmegaConf:
-        raise ConfigError(unknown("key", key, _dotted(known, key.count("."))))
+        raise ConfigError(unknown("key", key, _siblings(known, key)))
 
 
-def _dotted(config: DictConfig, depth: int, prefix: str = "") -> list[str]:
-    keys = []
-    for key in map(str, config):
-        path = f"{prefix}{key}"
-        if depth == 0 or not isinstance(config[key], DictConfig):
-            keys.append(path)
-        if depth > 0 and isinstance(config[key], DictConfig):
-            keys.extend(_dotted(config[key], depth - 1, path + "."))
-    return keys
+def _siblings(known: DictConfig, key: str) -> list[str]:
+    """Keys that stand where ``key`` was looked for: below the deepest part of its path that exists."""
+    parts = key.split(".")[:-1]
+    for depth in range(len(parts), -1, -1):
+        prefix = ".".join(parts[:depth])
+        node = OmegaConf.select(known, prefix) if prefix else known
+        if isinstance(node, DictConfig):
+            return [f"{prefix}.{name}" if prefix else str(name) for name in node if name != "_target_"]
+    return []
 
 
 def _check_types(known: DictConfig, config: DictConfig, prefix: str) -> None:

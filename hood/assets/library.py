@@ -8,7 +8,10 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 DATA_FOLDER = Path(__file__).resolve().parent.parent / "data"
+_LABEL = {"body": "body", "garments": "garment", "motions": "sequence", "weights": "checkpoint"}
 _SUFFIX = {"body": ".npz", "garments": ".npz", "motions": ".npz", "weights": ".safetensors"}
 
 
@@ -31,7 +34,7 @@ def locate(kind: str, name: str | Path) -> Path:
         return path
     if path.suffix or len(path.parts) > 1:
         raise FileNotFoundError(f"{path}: no such file (embedded {kind}: {', '.join(names(kind)) or 'none'})")
-    raise FileNotFoundError(unknown(f"{kind} name", str(name), names(kind)) + "; or give the path of a file")
+    raise FileNotFoundError(unknown(_LABEL[kind], str(name), names(kind)) + "; or give the path of a file")
 
 
 def unknown(what: str, given: str, known: Iterable[str]) -> str:
@@ -55,13 +58,12 @@ def read_arrays(path: Path, required: Iterable[str], what: str) -> dict:
     Raises:
         ValueError: not an npz file, or a required key is missing; names file, key and fix.
     """
-    import numpy as np
 
     try:
         with np.load(path, allow_pickle=False) as archive:
             if not hasattr(archive, "files"):
                 raise ValueError("a single array")
-            arrays = {key: archive[key] for key in archive.files if key in set(required) or not _is_object(archive, key)}
+            arrays = _plain_members(archive, set(required))
     except FileNotFoundError:
         raise
     except Exception as error:
@@ -72,13 +74,16 @@ def read_arrays(path: Path, required: Iterable[str], what: str) -> dict:
     return arrays
 
 
-def _is_object(archive: Any, key: str) -> bool:
-    """Whether a member would need unpickling (strings of old files, for instance): such members are passed over."""
-    try:
-        archive[key]
-    except ValueError:
-        return True
-    return False
+def _plain_members(archive: Any, required: set[str]) -> dict:
+    """Members of an open archive; those that would need unpickling (strings of old files) are passed over unless required."""
+    arrays = {}
+    for key in archive.files:
+        try:
+            arrays[key] = archive[key]
+        except ValueError:
+            if key in required:
+                raise
+    return arrays
 
 
 def _first_line(error: Exception) -> str:

@@ -59,9 +59,9 @@ def make_scene(config: DictConfig) -> Scene:
     garment = load_garment(str(config.garment), triangulate=bool(config.triangulate))
     body = load_body(str(config.body))
     betas = np.zeros(10)
-    given = [float(b) for b in config.betas]
-    if len(given) > 10 or not np.isfinite(given).all():
-        raise ConfigError(f"betas={given}: give at most 10 finite shape coefficients")
+    given = plain(config.betas)
+    if len(given) > 10 or not all(isinstance(b, (int, float)) and np.isfinite(b) for b in given):
+        raise ConfigError(f"betas={given}: give at most 10 finite shape coefficients, e.g. betas=[1.5,0,-1]")
     betas[: len(given)] = given
     return build_scene(garment, body, sequence, build(config.material), betas, device=str(config.device))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 from collections.abc import Mapping
@@ -59,6 +60,9 @@ class RolloutWriter:
                 self._file.attrs[key] = value if np.isscalar(value) or isinstance(value, np.ndarray) else json.dumps(value)
             self._touch_all()
             self._file.flush()
+        except OSError as error:
+            self.discard()
+            raise _plain_error(error, path) from error
         except BaseException:
             self.discard()
             raise
@@ -101,6 +105,8 @@ class RolloutWriter:
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
         if isinstance(error, OSError) or self.frames_done == 0:
             self.discard()
+            if isinstance(error, OSError):
+                raise _plain_error(error, self.path) from error
         else:
             self.close(complete=error is None)
 
@@ -142,6 +148,12 @@ def read_rollout(path: Path) -> RolloutData:
         raise
     except (OSError, KeyError) as error:
         raise ValueError(f"{path}: not a rollout file ({error}); make one with hood rollout") from error
+
+
+def _plain_error(error: OSError, path: Path) -> OSError:
+    """HDF5 buries the reason of a failed write in a long message: the same error with number, reason and file."""
+    number = errno.ENOSPC if "errno = 28" in str(error) else error.errno or errno.EIO
+    return OSError(number, os.strerror(number), str(path))
 
 
 def _truncate(path: Path, num_frames: int) -> None:

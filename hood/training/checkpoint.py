@@ -8,6 +8,9 @@ from typing import Any
 
 import torch
 
+#: What a run cannot go on without.
+_KEYS = {"iteration", "seed", "skipped", "simulator", "average", "optimizer", "slots", "rng", "model"}
+
 
 def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
     """Write ``state`` (tensors and plain values) to ``path``; the old file stays until the new one is complete."""
@@ -35,7 +38,8 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise
     except Exception as error:
-        raise ValueError(f"{path}: not a readable training checkpoint ({str(error).splitlines()[0]})") from error
-    if not isinstance(state, dict) or "iteration" not in state:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ValueError(f"{path}: not a readable training checkpoint ({reason})") from error
+    if not isinstance(state, dict) or not _KEYS <= set(state):
         raise ValueError(f"{path}: not a training checkpoint; give the checkpoint.pt of a run folder")
     return state

@@ -43,7 +43,7 @@ def _lines_up_to(path: Path, iteration: int) -> list[str]:
         try:
             if json.loads(line)["iteration"] <= iteration:
                 kept.append(line + "\n")
-        except (ValueError, KeyError):
+        except (ValueError, KeyError, TypeError):
             continue  # a line cut by a kill
     return kept
 

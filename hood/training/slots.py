@@ -120,7 +120,8 @@ class Slots:
             if entry["live"]:
                 slot.window = self._draw(index, slot.draws - 1)
                 slot.prepared = self._prepare(slot.window)
-                slot.state = State(entry["pos"], entry["vel"], entry["origin"])
+                device = slot.window.scene.cloth.rest_pos.device
+                slot.state = State(entry["pos"].to(device), entry["vel"].to(device), entry["origin"])
 
     def _reset(self, index: int, slot: _Slot) -> None:
         for _ in range(_MAX_DRAWS):

@@ -88,10 +88,7 @@ class Trainer:
             raise ValueError(f"trainer.batch_size={settings.batch_size} cannot be shared by {ranks} processes; use a multiple")
         mine = range(rank, settings.batch_size, ranks)
         self.slots = Slots(sampler, simulator, settings.batch_size, seed, settings.horizon.maximum, mine)
-        # A batch without any body edge leaves their networks unused.
-        self.model: torch.nn.Module = (
-            DistributedDataParallel(simulator, find_unused_parameters=True) if ranks > 1 else simulator
-        )
+        self.model: torch.nn.Module = DistributedDataParallel(simulator) if ranks > 1 else simulator
         self.optimizer = torch.optim.Adam(simulator.parameters(), lr=settings.learning_rate)
         self.iteration = 0
         self.skipped = 0
@@ -151,6 +148,9 @@ class Trainer:
             weight = self._weight(problem, residual)
             # The analytic gradient is injected at the output: no graph through the energies is kept.
             surrogate = (prediction.next_pos * (gradient * weight[cloth.vertex_scene].unsqueeze(1))).sum()
+            if self.model is not simulator:
+                # A share without body edges leaves their networks out; all processes must reduce the same parameters.
+                surrogate = surrogate + 0.0 * sum(p.sum() for p in simulator.parameters())
             report |= self._optimise(surrogate)
         self.slots.advance(prediction.next_pos, simulator.next_velocity(problem, prediction))
         self.iteration += 1
@@ -185,13 +185,15 @@ class Trainer:
         """Go on from a checkpoint of a run with the same model and data.
 
         Raises:
-            ValueError: the checkpoint is of another model or seed.
+            ValueError: the checkpoint is of another model, seed or batch size.
         """
         state = load_checkpoint(path)
         if state["model"] != self.simulator.config:
             raise ValueError(f"{path}: trained with model {state['model']}, this run has {self.simulator.config}")
         if state["seed"] != self.seed:
             raise ValueError(f"{path}: trained with seed {state['seed']}; pass seed={state['seed']} to resume it")
+        if len(state["slots"]) != self.settings.batch_size:
+            raise ValueError(f"{path}: trained with trainer.batch_size={len(state['slots'])}; pass the same to resume it")
         self.simulator.load_state_dict(state["simulator"])
         for name, mean in self._average.items():
             mean.copy_(state["average"][name])
