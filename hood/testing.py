@@ -169,7 +169,8 @@ def assert_finite_when_degenerate(term: Term) -> None:
         cloth = build_cloth(pos, faces, Material(), dtype=dtype)
         for name, state in states.items():
             energy, gradient = _energy_and_gradient(term, cloth, state)
-            assert torch.isfinite(energy).all() and torch.isfinite(gradient).all(), f"{name}, {dtype}"
+            assert torch.isfinite(energy).all(), f"energy, {name}, {dtype}"
+            assert torch.isfinite(gradient).all(), f"gradient, {name}, {dtype}"
 
 
 def fold(flat: np.ndarray, angle: float) -> np.ndarray:

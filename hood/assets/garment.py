@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -12,7 +11,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from hood.assets.body import Body
-from hood.assets.library import locate, read_arrays
+from hood.assets.library import DATA_FOLDER, locate, read_arrays
 from hood.assets.mesh_file import MESH_SUFFIXES, read_mesh
 from hood.mesh import topology
 from hood.mesh.proximity import search_surface
@@ -32,6 +31,7 @@ class Garment:
     pinned: np.ndarray  # (V,) bool
     lbs_weights: np.ndarray | None = None  # (V, J)
     shapedirs: np.ndarray | None = None  # (V, 3, S) m per unit of beta
+    bound_to: str | None = None  # body whose weights and shape offsets these are; None: whichever it is put on
     uv: np.ndarray | None = None  # (U, 2)
     uv_faces: np.ndarray | None = None  # (F, 3)
 
@@ -73,9 +73,11 @@ def bind_garment(garment: Garment, body: Body) -> Garment:
 
     Each vertex asks the closest point of the body's T-pose; far vertices trust it less. The result minimises
     Σ c_v |w_v − w_v⁰|² + Σ_edges |w_a − w_b|² with confidence c falling with distance (paper, section 3.5: weights diffused
-    beyond the body), so loose cloth gets smooth weights. Already bound garments are returned as they are.
+    beyond the body), so loose cloth gets smooth weights. A garment that has fitting weights is returned
+    as it is, unless they are those of another body.
     """
-    if garment.bound and garment.lbs_weights is not None and garment.lbs_weights.shape[1] == body.num_joints:
+    fits = garment.lbs_weights is not None and garment.lbs_weights.shape[1] == body.num_joints
+    if garment.bound and fits and garment.bound_to in (None, body.name):
         return garment
     nearest = _closest_rows(garment.rest_pos, body)
     raw = np.concatenate([body.weights, body.shapedirs.reshape(len(body.weights), -1)], axis=1)
@@ -84,7 +86,7 @@ def bind_garment(garment: Garment, body: Body) -> Garment:
     weights = np.clip(smooth[:, : body.num_joints], 0.0, None)
     weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
     shapedirs = smooth[:, body.num_joints :].reshape(len(values), 3, -1)
-    return replace(garment, lbs_weights=weights, shapedirs=shapedirs)
+    return replace(garment, lbs_weights=weights, shapedirs=shapedirs, bound_to=body.name)
 
 
 @dataclass(frozen=True)
@@ -115,7 +117,9 @@ def _diffuse(values: np.ndarray, faces: np.ndarray, dist: np.ndarray) -> np.ndar
 def _read_npz(path: Path) -> Garment:
     arrays = read_arrays(path, ("rest_pos", "faces"), "garment")
     num_vertices = len(arrays["rest_pos"])
-    optional = {key: arrays[key] for key in ("uv", "uv_faces") if key in arrays}
+    optional: dict[str, Any] = {key: arrays[key] for key in ("uv", "uv_faces") if key in arrays}
+    if path.is_relative_to(DATA_FOLDER):
+        optional["bound_to"] = "default"
     for key in ("lbs_weights", "shapedirs"):
         if key in arrays:
             optional[key] = np.asarray(arrays[key], dtype=np.float64)

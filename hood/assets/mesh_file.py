@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -26,7 +27,7 @@ def read_mesh(path: Path, triangulate: bool = False) -> tuple[np.ndarray, np.nda
     import trimesh
 
     try:
-        mesh = trimesh.load(path, process=False, maintain_order=True, force="mesh")
+        mesh: Any = trimesh.load(path, process=False, maintain_order=True, force="mesh")
         pos, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
     except Exception as error:
         reason = str(error).splitlines()[0] if str(error) else repr(error)

@@ -45,7 +45,8 @@ def measured_radius(simulator: Simulator, seed: int = 0) -> int:
         for target in targets:
             (gradient,) = torch.autograd.grad(output[target].sum(), nodes, retain_graph=True)
             reached = gradient[:, columns].abs().amax(dim=1) > 0
-            farthest = max(farthest, int(hops[target][reached.numpy()].max()))
+            # A dead ReLU may cut a target off altogether; it then says nothing about the reach.
+            farthest = max(farthest, int(hops[target][reached.numpy()].max(initial=0)))
     return farthest
 
 

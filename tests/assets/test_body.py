@@ -123,9 +123,7 @@ def test_skeleton_with_fingers(fingered_file: Path, smpl_file: Path, walk: PoseS
     assert 1e-3 < float((surface - plain).norm(dim=2).mean()) < 0.1
 
 
-def test_a_garment_is_dressed_on_a_licensed_body(
-    fingered_file: Path, garments: dict[str, Garment], walk: PoseSequence
-) -> None:
+def test_a_garment_is_dressed_on_a_licensed_body(fingered_file: Path, garments: dict[str, Garment], walk: PoseSequence) -> None:
     licensed = load_body(fingered_file)
     assert bind_garment(garments["tank"], licensed).lbs_weights.shape[1] == 52
     scene = build_scene(garments["tank"], licensed, walk.window(0, 2))

@@ -50,10 +50,14 @@ def performed(skeleton: Skeleton) -> dict[str, dict]:
 def test_layout_is_amass(name: str, performed: dict) -> None:
     arrays, motion = performed[name], MOTIONS[name]
     count = round(motion.seconds * motion.fps)
-    assert arrays["poses"].shape == (count, 156) and arrays["trans"].shape == (count, 3)
-    assert arrays["betas"].shape == (16,) and not arrays["betas"].any()
-    assert not arrays["poses"][:, 66:].any() and np.isfinite(arrays["poses"]).all()
-    assert float(arrays["mocap_framerate"]) == motion.fps and str(arrays["gender"]) == "neutral"
+    assert arrays["poses"].shape == (count, 156)
+    assert arrays["trans"].shape == (count, 3)
+    assert arrays["betas"].shape == (16,)
+    assert not arrays["betas"].any()
+    assert not arrays["poses"][:, 66:].any()
+    assert np.isfinite(arrays["poses"]).all()
+    assert float(arrays["mocap_framerate"]) == motion.fps
+    assert str(arrays["gender"]) == "neutral"
 
 
 @pytest.mark.parametrize("name", MOTIONS)
@@ -61,14 +65,17 @@ def test_motion_is_humanly_possible(name: str, performed: dict, skeleton: Skelet
     arrays, fps = performed[name], MOTIONS[name].fps
     joints, transforms = world_joints(arrays, skeleton, parents)
     speed = np.linalg.norm(np.diff(joints, axis=0), axis=2) * fps
-    assert speed[:, 0].max() < 3.0 and speed.max() < 6.0
+    assert speed[:, 0].max() < 3.0
+    assert speed.max() < 6.0
     acceleration = np.linalg.norm(np.diff(joints, n=2, axis=0), axis=2) * fps**2
     assert acceleration.max() < 300.0
 
     poses = np.degrees(arrays["poses"][:, :66].reshape(-1, 22, 3))
     knees, elbows = poses[:, [4, 5], 0], np.stack([-poses[:, 18, 1], poses[:, 19, 1]])
-    assert knees.min() > 0.0 and knees.max() < 130.0
-    assert elbows.min() > -6.0 and elbows.max() < 125.0
+    assert knees.min() > 0.0
+    assert knees.max() < 130.0
+    assert elbows.min() > -6.0
+    assert elbows.max() < 125.0
     spine = np.linalg.norm(poses[:, [3, 6, 9]], axis=2)
     assert spine.max() < 25.0
 
@@ -102,7 +109,8 @@ def test_motion_starts_still_with_arms_half_lowered(name: str, performed: dict, 
     arrays, fps = performed[name], MOTIONS[name].fps
     first = arrays["poses"][0, :66].reshape(22, 3)
     lowered = np.degrees([-first[16, 2], first[17, 2]])
-    assert (lowered > 40).all() and (lowered < 65).all()
+    assert (lowered > 40).all()
+    assert (lowered < 65).all()
     moved = np.abs(np.diff(arrays["poses"][: round(0.1 * fps)], axis=0)).max() * fps
     assert moved < 0.25
 
@@ -145,7 +153,8 @@ def test_planted_feet_ignore_the_pelvis(skeleton: Skeleton, parents: list[int]) 
 def test_split_is_by_motion_and_long_enough() -> None:
     training = [m for m in all_motions() if not m.validation]
     validation = [m for m in all_motions() if m.validation]
-    assert len(MOTIONS) == len(training) + len(validation) and len(validation) >= 4
+    assert len(MOTIONS) == len(training) + len(validation)
+    assert len(validation) >= 4
     assert sum(motion.seconds for motion in all_motions()) >= 240.0
     assert {motion.fps for motion in all_motions()} == {60.0, 100.0, 120.0}
 

@@ -95,9 +95,7 @@ def test_body_weights_and_joints(body: dict[str, np.ndarray]) -> None:
 
 
 @pytest.mark.parametrize("beta, low, high", [(-2.0, 1.45, 1.65), (0.0, 1.65, 1.80), (2.0, 1.80, 2.00)])
-def test_first_shape_direction_is_height(
-    body: dict[str, np.ndarray], beta: float, low: float, high: float
-) -> None:
+def test_first_shape_direction_is_height(body: dict[str, np.ndarray], beta: float, low: float, high: float) -> None:
     verts = body["v_template"] + beta * body["shapedirs"][..., 0]
     assert low < np.ptp(verts[:, 1]) < high
 

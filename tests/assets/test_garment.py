@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -144,3 +145,13 @@ def test_far_vertices_take_smooth_weights(body: Body) -> None:
 
 def test_bound_garments_are_left_alone(garments: dict[str, Garment], body: Body) -> None:
     assert bind_garment(garments["tank"], body) is garments["tank"]
+
+
+def test_garments_of_another_body_are_bound_anew(garments: dict[str, Garment], body: Body) -> None:
+    """Weights of the embedded body say nothing about a licensed one with as many joints."""
+    other = replace(body, name="other", weights=np.roll(body.weights, 1, axis=1))
+    bound = bind_garment(garments["tank"], other)
+    assert bound.bound_to == "other"
+    assert np.abs(bound.lbs_weights - garments["tank"].lbs_weights).max() > 0.5
+    own = replace(garments["tank"], bound_to=None)
+    assert bind_garment(own, other) is own

@@ -11,11 +11,15 @@ from hood.assets.library import locate, motion_split, names, read_arrays, unknow
 
 
 @pytest.mark.parametrize(
-    "kind, given, near",
-    [("garments", "tshrt", "tshirt"), ("motions", "walk_prod", "walk_proud"), ("body", "defautl", "default")],
+    "kind, what, given, near",
+    [
+        ("garments", "garment", "tshrt", "tshirt"),
+        ("motions", "sequence", "walk_prod", "walk_proud"),
+        ("body", "body", "defautl", "default"),
+    ],
 )
-def test_a_misspelt_name_names_its_neighbour(kind: str, given: str, near: str) -> None:
-    with pytest.raises(FileNotFoundError, match=f"unknown {kind} name '{given}': did you mean '{near}'"):
+def test_a_misspelt_name_names_its_neighbour(kind: str, what: str, given: str, near: str) -> None:
+    with pytest.raises(FileNotFoundError, match=f"unknown {what} '{given}': did you mean '{near}'"):
         locate(kind, given)
 
 

@@ -130,9 +130,7 @@ def test_fingers_do_not_become_hands(tmp_path: Path) -> None:
 def test_turning_the_world_turns_the_body_about_the_world_axis(body: Body, tmp_path: Path) -> None:
     sequence = load_sequence(write_amass(tmp_path / "m.npz", *recorded(30.0, 0.2), 30.0))
     turn = Rotation.from_rotvec([0.0, 1.1, 0.0]).as_matrix()
-    for before, after in zip(
-        loaded_places(body, sequence), loaded_places(body, turn_world(sequence, turn)), strict=True
-    ):
+    for before, after in zip(loaded_places(body, sequence), loaded_places(body, turn_world(sequence, turn)), strict=True):
         np.testing.assert_allclose(after, before @ turn.T, rtol=0, atol=1e-9)
 
 

@@ -22,9 +22,7 @@ def test_surface_equals_smplx(seed: int, body: Body, body_file: Path) -> None:
     betas = torch.as_tensor(rng.normal(size=10))
     poses = torch.as_tensor(rng.normal(scale=0.7, size=(3, 24, 3)))
     with torch.no_grad():
-        expected = model(
-            betas=betas.expand(3, 10), global_orient=poses[:, :1].flatten(1), body_pose=poses[:, 1:].flatten(1)
-        )
+        expected = model(betas=betas.expand(3, 10), global_orient=poses[:, :1].flatten(1), body_pose=poses[:, 1:].flatten(1))
     rest, joints = body.shaped(betas.numpy())
     transforms = joint_transforms(axis_angle_to_matrix(poses), torch.as_tensor(joints), body.parents)
     own = linear_blend_skinning(torch.as_tensor(rest), torch.as_tensor(body.weights), transforms)

@@ -33,6 +33,13 @@ def append(target: RolloutWriter, count: int) -> None:
         target.append(*frame(index))
 
 
+def write_until(path: Path, count: int, error: BaseException, num_frames: int = 5) -> None:
+    """Write ``count`` frames; then ``error`` strikes inside the block."""
+    with writer(path, num_frames) as target:
+        append(target, count)
+        raise error
+
+
 def check(data: RolloutData, count: int) -> None:
     assert data.cloth_pos.shape == (count, 4, 3)
     assert data.body_pos.shape == (count, 3, 3)
@@ -93,7 +100,8 @@ import os, signal, sys
 sys.path.insert(0, {str(Path(__file__).parent)!r})
 from pathlib import Path
 from test_recorder import append, writer
-append(writer(Path({str(tmp_path / "r.h5")!r})), {frames})
+target = writer(Path({str(tmp_path / "r.h5")!r}))  # held: an object that goes away closes its file
+append(target, {frames})
 os.kill(os.getpid(), signal.SIGKILL)
 """
     killed = subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parents[2], check=False)
@@ -106,10 +114,8 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
 def test_an_interrupt_keeps_the_frames_done(tmp_path: Path, error: type[BaseException]) -> None:
-    target = writer(tmp_path / "r.h5", num_frames=50)
-    with pytest.raises(error), target:
-        append(target, 2)
-        raise error
+    with pytest.raises(error):
+        write_until(tmp_path / "r.h5", 2, error(), num_frames=50)
     check(read_rollout(tmp_path / "r.h5"), 2)
     with h5py.File(tmp_path / "r.h5", "r") as file:
         assert file["cloth/pos"].shape == (2, 4, 3)
@@ -121,17 +127,14 @@ def test_an_interrupt_keeps_the_frames_done(tmp_path: Path, error: type[BaseExce
 
 
 def test_an_interrupt_before_the_first_frame_leaves_nothing(tmp_path: Path) -> None:
-    target = writer(tmp_path / "r.h5")
-    with pytest.raises(KeyboardInterrupt), target:
-        raise KeyboardInterrupt
+    with pytest.raises(KeyboardInterrupt):
+        write_until(tmp_path / "r.h5", 0, KeyboardInterrupt())
     assert not list(tmp_path.iterdir())
 
 
 def test_a_full_disk_leaves_nothing(tmp_path: Path) -> None:
-    target = writer(tmp_path / "r.h5")
-    with pytest.raises(OSError, match="No space"), target:
-        append(target, 2)
-        raise OSError(28, "No space left on device")
+    with pytest.raises(OSError, match="No space"):
+        write_until(tmp_path / "r.h5", 2, OSError(28, "No space left on device"))
     assert not list(tmp_path.iterdir())
 
 

@@ -178,7 +178,8 @@ def test_scene_without_surface_and_undefined_points_match_nothing():
     zeros = [torch.zeros(n, dtype=torch.int64) for n in (len(vertices), len(faces))]
     hit = search_surface(points, torch.tensor([0, 1, 0]), vertices, faces, *zeros)
     assert float(hit.dist[0]) == pytest.approx(0.1)
-    assert torch.isinf(hit.dist[1]) and not bool(hit.dist[2].abs() <= 1e9)
+    assert torch.isinf(hit.dist[1])
+    assert not bool(hit.dist[2].abs() <= 1e9)
 
 
 def test_vertices_without_faces_are_ignored():

@@ -57,7 +57,8 @@ def test_boundary_of_a_grid_is_its_rim():
     _, faces = grid(n, m)
     (loop,) = topology.boundary_loops(faces)
     rim = {v for v in range(n * m) if v // m in (0, n - 1) or v % m in (0, m - 1)}
-    assert set(loop.tolist()) == rim and len(loop) == len(rim)
+    assert set(loop.tolist()) == rim
+    assert len(loop) == len(rim)
     edges = {tuple(edge) for edge in topology.unique_edges(faces).tolist()}
     assert all(tuple(sorted(pair)) in edges for pair in zip(loop.tolist(), np.roll(loop, -1).tolist(), strict=True))
 

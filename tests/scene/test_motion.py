@@ -29,9 +29,7 @@ def test_ten_kilometres_away_local_surfaces_are_the_same(body: Body, walk: PoseS
             assert float((getattr(first, name) - getattr(second, name)).abs().max()) <= 1e-6
 
 
-def test_ten_kilometres_away_the_start_is_the_same(
-    body: Body, walk: PoseSequence, garments: dict[str, Garment]
-) -> None:
+def test_ten_kilometres_away_the_start_is_the_same(body: Body, walk: PoseSequence, garments: dict[str, Garment]) -> None:
     near = walk.window(0, 3)
     scenes = [build_scene(garments["tank"], body, s) for s in (near, replace(near, transl=near.transl + FAR))]
     first, second = (scene.start(0) for scene in scenes)

@@ -75,9 +75,7 @@ def test_size_changes_the_rest_shape_only(garments: dict[str, Garment], body: Bo
     torch.testing.assert_close(larger.cloth.rest_pos, plain.cloth.rest_pos * 1.1)
     torch.testing.assert_close(larger.cloth.mass, plain.cloth.mass * 1.21, rtol=1e-5, atol=0)
     origin = np.zeros(3)
-    torch.testing.assert_close(
-        larger.motion.skinned(larger.garment, 0, origin), plain.motion.skinned(plain.garment, 0, origin)
-    )
+    torch.testing.assert_close(larger.motion.skinned(larger.garment, 0, origin), plain.motion.skinned(plain.garment, 0, origin))
 
 
 def test_shape_grows_garment_and_body(garments: dict[str, Garment], body: Body, walk: PoseSequence) -> None:

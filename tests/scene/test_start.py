@@ -20,15 +20,13 @@ from hood.testing import grid, sphere
 
 
 @pytest.mark.parametrize("name", ["tshirt", "tank", "longsleeve", "shorts", "trousers", "dress", "skirt"])
-def test_default_garments_start_well(
-    name: str, garments: dict[str, Garment], body: Body, walk: PoseSequence
-) -> None:
+def test_default_garments_start_well(name: str, garments: dict[str, Garment], body: Body, walk: PoseSequence) -> None:
     scene = build_scene(garments[name], body, walk.window(0, 2))
     state = scene.start(0)
     obstacle = scene.motion.obstacle(0, state.origin[0].numpy(), static=True)
     contact = find_contact(state.pos, scene.cloth.vertex_scene, obstacle)
     assert float(contact.dist.min()) > -2e-3
-    assert float(contact.dist[scene.cloth.free].min()) > 0.0
+    assert float(contact.dist[scene.cloth.free].min()) > scene.clearance - 1e-4
     assert strain_metrics(scene.cloth, state.pos)["strain_p99"] <= 0.15
 
 

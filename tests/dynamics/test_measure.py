@@ -1,0 +1,59 @@
+"""Reported measures: strain and penetration."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from hood.assets.material import Material
+from hood.dynamics.measure import METRICS, edge_strain, penetration_metrics, strain_metrics
+from hood.scene.cloth import build_cloth
+from hood.testing import grid, plane_contact
+
+CLOTH = build_cloth(*grid(6, 6, 0.5), Material(), dtype=torch.float64)
+
+
+def test_uniform_stretch_is_the_strain_of_every_edge() -> None:
+    torch.testing.assert_close(edge_strain(CLOTH, 1.2 * CLOTH.rest_pos), torch.full((len(CLOTH.edges),), 0.2).double())
+    assert float(edge_strain(CLOTH, 0.9 * CLOTH.rest_pos).max()) == pytest.approx(-0.1)
+
+
+def test_quantiles_of_the_absolute_strain() -> None:
+    pos = CLOTH.rest_pos * torch.tensor([0.7, 1.0, 1.0])
+    strain = edge_strain(CLOTH, pos).abs().numpy()
+    metrics = strain_metrics(CLOTH, pos)
+    assert metrics["strain_p50"] == pytest.approx(np.quantile(strain, 0.5))
+    assert metrics["strain_p99"] == pytest.approx(np.quantile(strain, 0.99))
+    assert metrics["strain_max"] == pytest.approx(0.3)
+
+
+def test_strain_is_rigidly_invariant_and_nan_when_broken() -> None:
+    turn = torch.tensor([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]).double()
+    assert strain_metrics(CLOTH, CLOTH.rest_pos @ turn.T + 3.0)["strain_max"] < 1e-12
+    pos = CLOTH.rest_pos.clone()
+    pos[3, 1] = float("inf")
+    assert all(np.isnan(value) for value in strain_metrics(CLOTH, pos).values())
+
+
+def test_penetration_counts_vertices_deeper_than_two_millimetres() -> None:
+    pos = CLOTH.rest_pos.clone()
+    pos[:, 1] = 0.01
+    pos[0, 1], pos[1, 1], pos[2, 1] = -0.0019, -0.0021, -0.03
+    metrics = penetration_metrics(plane_contact(pos), 36)
+    assert metrics["penetration_count"] == 2
+    assert metrics["penetration_share"] == pytest.approx(2 / 36)
+    assert metrics["penetration_depth"] == pytest.approx(0.03)
+
+
+def test_invalid_matches_do_not_count() -> None:
+    pos = CLOTH.rest_pos - torch.tensor([0.0, 0.5, 0.0]).double()
+    contact = plane_contact(pos)
+    far = replace(contact, valid=torch.zeros_like(contact.valid))
+    assert penetration_metrics(far, 36) == penetration_metrics(None, 36) == dict.fromkeys(METRICS[3:], 0.0)
+
+
+def test_depth_is_zero_outside() -> None:
+    assert penetration_metrics(plane_contact(CLOTH.rest_pos + 0.1), 36)["penetration_depth"] == 0.0

@@ -1,0 +1,309 @@
+"""The learned step: what holds for any weights, and models on disk."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+from scipy.spatial.transform import Rotation
+
+from hood.assets.body import Body
+from hood.assets.garment import Garment
+from hood.assets.material import Material
+from hood.assets.sequence import PoseSequence, turn_world
+from hood.dynamics.simulator import Simulator, build_simulator, load_simulator, save_simulator
+from hood.losses.problem import StepProblem
+from hood.scene.cloth import build_cloth, concatenate_cloths
+from hood.scene.scene import Scene, build_scene, concatenate_step_inputs
+from hood.scene.state import State, StepInput, concatenate_states
+from hood.testing import grid
+
+SCHEDULE = "1x(mesh+coarse0) 1x(coarse0)"
+KINDS = {
+    "paper": {"features": "paper", "output": "acceleration"},
+    "base": {"features": "paper", "output": "velocity_base"},
+    "physical": {"features": "physical", "output": "velocity_base"},
+}
+
+
+def make(kind: str, seed: int = 0, **options: object) -> Simulator:
+    torch.manual_seed(seed)
+    arguments = {"schedule": SCHEDULE, "latent_dim": 8, "output_init": 0.1, **KINDS[kind], **options}
+    return build_simulator(**arguments).eval()
+
+
+def take(simulator: Simulator, scene: Scene, frame: int = 0) -> tuple[State, State]:
+    """The start of ``scene`` and the state one step later."""
+    with torch.no_grad():
+        state = scene.start(frame)
+        prepared = simulator.prepare(scene.cloth, scene.garment.rest_pos)
+        return state, simulator.step(scene.cloth, prepared, state, scene.step_input(frame, state))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_same_seed_same_result(kind: str, tank_scene: Scene) -> None:
+    first, second, other = (take(make(kind, seed), tank_scene)[1] for seed in (0, 0, 1))
+    assert torch.equal(first.pos, second.pos)
+    assert torch.equal(first.vel, second.vel)
+    assert not torch.equal(first.pos, other.pos)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_step_writes_nothing_into_its_input(kind: str, skirt_scene: Scene) -> None:
+    simulator = make(kind)
+    state = skirt_scene.start(0)
+    step = skirt_scene.step_input(0, state)
+    before = [state.pos.clone(), state.vel.clone(), step.obstacle.pos.clone(), step.pin_target.clone()]
+    weights = {name: value.clone() for name, value in simulator.state_dict().items()}
+    with torch.no_grad():
+        simulator.step(skirt_scene.cloth, simulator.prepare(skirt_scene.cloth, skirt_scene.garment.rest_pos), state, step)
+    for old, new in zip(before, (state.pos, state.vel, step.obstacle.pos, step.pin_target), strict=True):
+        assert torch.equal(old, new)
+    assert all(torch.equal(value, weights[name]) for name, value in simulator.state_dict().items())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_pinned_vertices_reach_their_targets_bit_by_bit(kind: str, skirt_scene: Scene) -> None:
+    state, after = take(make(kind), skirt_scene)
+    target = skirt_scene.step_input(0, state).pin_target
+    pinned = skirt_scene.cloth.pinned
+    assert torch.equal(after.pos[pinned], target[pinned])
+    assert not torch.equal(after.pos[~pinned], target[~pinned])
+    # Their velocity is that of the motion they made.
+    made = (after.pos - state.pos)[pinned] * 30
+    torch.testing.assert_close(after.vel[pinned], made, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_velocity_is_the_displacement_over_dt(kind: str, tank_scene: Scene) -> None:
+    state, after = take(make(kind), tank_scene)
+    torch.testing.assert_close(after.vel, (after.pos - state.pos) * 30, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_batch_gives_what_its_members_give(kind: str, tank_scene: Scene, skirt_scene: Scene) -> None:
+    simulator = make(kind)
+    scenes = (tank_scene, skirt_scene, tank_scene)
+    frames = (0, 2, 5)
+    states = [scene.start(frame) for scene, frame in zip(scenes, frames, strict=True)]
+    steps = [s.step_input(frame, state) for s, frame, state in zip(scenes, frames, states, strict=True)]
+    prepared = [simulator.prepare(s.cloth, s.garment.rest_pos) for s in scenes]
+    counts = [s.cloth.num_vertices for s in scenes]
+    cloth = concatenate_cloths([s.cloth for s in scenes])
+    with torch.no_grad():
+        alone = [
+            simulator.step(s.cloth, p, state, step) for s, p, state, step in zip(scenes, prepared, states, steps, strict=True)
+        ]
+        together = simulator.step(
+            cloth,
+            simulator.concatenate(cloth, prepared, counts),
+            concatenate_states(states),
+            concatenate_step_inputs(steps, counts),
+        )
+    assert float((together.pos - torch.cat([s.pos for s in alone])).abs().max()) < 1e-5
+    assert float((together.vel - torch.cat([s.vel for s in alone])).abs().max()) < 1e-3
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_translated_world_gives_the_translated_step(
+    kind: str, body: Body, garments: dict[str, Garment], walk: PoseSequence
+) -> None:
+    near = walk.window(60, 63)
+    shift = np.array([100.0, 2.0, -50.0])
+    simulator = make(kind)
+    results = []
+    for sequence in (near, replace(near, transl=near.transl + shift)):
+        _, after = take(simulator, build_scene(garments["tank"], body, sequence))
+        results.append(after.pos.double() + after.origin)
+    assert float((results[1] - results[0] - torch.as_tensor(shift)).abs().max()) < 2e-5
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_turned_world_turns_the_base(kind: str, body: Body, garments: dict[str, Garment], walk: PoseSequence) -> None:
+    """Zero output: what the physics around the network contributes has no preferred direction."""
+    near = walk.window(60, 63)
+    turn = Rotation.from_rotvec([0.0, 1.2, 0.0]).as_matrix()
+    simulator = make(kind, output_init=0.0)
+    results = []
+    for sequence in (near, turn_world(near, turn)):
+        scene = build_scene(garments["tank"], body, sequence, dtype=torch.float64)
+        _, after = take(simulator.double(), scene)
+        results.append((after.pos + after.origin).numpy())
+    np.testing.assert_allclose(results[1], results[0] @ turn.T, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_body_at_all(kind: str) -> None:
+    pos, faces = grid(6, 6, 0.3)
+    cloth = build_cloth(pos, faces, Material())
+    simulator = make(kind)
+    state = State(cloth.rest_pos, torch.zeros_like(cloth.rest_pos), torch.zeros(1, 3).double())
+    step = StepInput(dt=torch.tensor([1 / 30]))
+    assert simulator.find_contact(cloth, state, step) is None
+    with torch.no_grad():
+        after = simulator.step(cloth, simulator.prepare(cloth, pos), state, step)
+    assert bool(torch.isfinite(after.pos).all())
+    assert not torch.equal(after.pos, state.pos)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_massless_isolated_vertex_stays_put(kind: str) -> None:
+    pos, faces = grid(5, 5, 0.3)
+    pos = np.concatenate([pos, [[0.1, 0.2, 0.1]]])
+    cloth = build_cloth(pos, faces, Material())
+    simulator = make(kind)
+    state = State(cloth.rest_pos, torch.ones_like(cloth.rest_pos), torch.zeros(1, 3).double())
+    with torch.no_grad():
+        after = simulator.step(cloth, simulator.prepare(cloth, pos), state, StepInput(dt=torch.tensor([1 / 30])))
+    assert torch.equal(after.pos[-1], state.pos[-1])
+    assert float(after.vel[-1].abs().max()) < 1e-6
+    assert bool(torch.isfinite(after.pos).all())
+
+
+def test_pins_without_targets_stay() -> None:
+    pos, faces = grid(4, 4, 0.3)
+    pinned = np.arange(16) < 4
+    cloth = build_cloth(pos, faces, Material(), pinned)
+    simulator = make("paper")
+    state = State(cloth.rest_pos, torch.zeros_like(cloth.rest_pos), torch.zeros(1, 3).double())
+    with torch.no_grad():
+        after = simulator.step(cloth, simulator.prepare(cloth, pos), state, StepInput(dt=torch.tensor([1 / 30])))
+    assert torch.equal(after.pos[:4], state.pos[:4])
+
+
+def test_acceleration_and_position_of_a_prediction_agree(tank_scene: Scene) -> None:
+    """In float64, where the difference of positions is exact enough to compare with."""
+    for kind in KINDS:
+        simulator = make(kind).double()
+        garment = tank_scene.garment
+        cloth = build_cloth(garment.rest_pos, garment.faces, Material(), dtype=torch.float64)
+        vel = 0.1 * torch.ones_like(cloth.rest_pos)
+        state = State(cloth.rest_pos, vel, torch.zeros(1, 3).double())
+        problem = StepProblem(cloth, state, StepInput(dt=torch.tensor([1 / 30]).double()), None, simulator.gravity)
+        with torch.no_grad():
+            prediction = simulator.predict(problem, simulator.prepare(cloth, garment.rest_pos))
+        torch.testing.assert_close(prediction.acc, problem.acceleration(prediction.next_pos), rtol=0, atol=1e-8)
+
+
+def test_garments_that_share_their_vertices_do_not_share_a_graph() -> None:
+    """The hierarchy is kept per array of vertices; other faces on the same array need their own."""
+    pos, faces = grid(7, 7, 0.3)
+    simulator = make("paper")
+    whole = simulator.prepare(build_cloth(pos, faces, Material()), pos)
+    half = simulator.prepare(build_cloth(pos, faces[::2], Material()), pos)
+    assert not torch.equal(whole.hierarchy.node_level, half.hierarchy.node_level)
+    again = simulator.prepare(build_cloth(pos, faces, Material()), pos)
+    assert torch.equal(again.hierarchy.node_level, whole.hierarchy.node_level)
+
+
+@pytest.mark.parametrize(
+    "options, words",
+    [
+        ({"features": "papper"}, ("model.features", "'papper'", "paper or physical")),
+        ({"output": "velocity"}, ("model.output", "'velocity'", "velocity_base")),
+        ({"features": "physical", "output": "acceleration"}, ("model.features=physical", "model.output=velocity_base")),
+        ({"schedule": "ourz"}, ("'ourz'", "did you mean 'ours'")),
+        ({"schedule": "3x(mehs)"}, ("'mehs'", "did you mean 'mesh'")),
+        ({"aggregation": "max"}, ("aggregation", "'max'")),
+        ({"latent_dim": 0}, ("model.latent_dim", "> 0")),
+        ({"body_radius": -0.1}, ("model.body_radius", "> 0")),
+        ({"output_scale": 0.0}, ("model.output_scale", "> 0")),
+        ({"normalizer_decay": 1.5}, ("decay", "1.5")),
+    ],
+)
+def test_wrong_arguments_are_named(options: dict, words: tuple[str, ...]) -> None:
+    with pytest.raises(ValueError) as error:
+        build_simulator(**{"schedule": SCHEDULE, "latent_dim": 4, **options})
+    assert all(word in str(error.value) for word in words), str(error.value)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_round_trip_through_a_file(kind: str, tmp_path: Path, tank_scene: Scene) -> None:
+    simulator = make(kind)
+    simulator.train()
+    take(simulator, tank_scene)  # statistics are part of the model
+    simulator.eval()
+    save_simulator(tmp_path / "m.safetensors", simulator, {"iteration": "7"})
+    loaded = load_simulator(tmp_path / "m.safetensors")
+    assert loaded.config == simulator.config
+    assert not loaded.training
+    assert torch.equal(take(loaded, tank_scene)[1].pos, take(simulator, tank_scene)[1].pos)
+    assert [path.name for path in tmp_path.iterdir()] == ["m.safetensors"]
+
+
+def test_half_precision_file(tmp_path: Path, tank_scene: Scene) -> None:
+    simulator = make("physical")
+    save_simulator(tmp_path / "full.safetensors", simulator)
+    save_simulator(tmp_path / "half.safetensors", simulator, half=True)
+    sizes = [(tmp_path / f"{name}.safetensors").stat().st_size for name in ("half", "full")]
+    assert sizes[0] < 0.75 * sizes[1]
+    loaded = load_simulator(tmp_path / "half.safetensors")
+    assert {p.dtype for p in loaded.parameters()} == {torch.float32}
+    assert float((take(loaded, tank_scene)[1].pos - take(simulator, tank_scene)[1].pos).abs().max()) < 1e-4
+
+
+def test_a_clone_is_equal_and_independent(tank_scene: Scene) -> None:
+    simulator = make("paper")
+    generator = torch.get_rng_state()
+    clone = simulator.clone()
+    assert torch.equal(torch.get_rng_state(), generator)
+    with torch.no_grad():
+        next(clone.parameters()).add_(1.0)
+    assert not torch.equal(next(clone.parameters()), next(simulator.parameters()))
+
+
+def damaged(path: Path, case: str) -> Path:
+    simulator = make("physical")
+    save_simulator(path, simulator)
+    content = path.read_bytes()
+    header = {"format": "hood-1", "model": json.dumps(simulator.config)}
+    weights = {name: value.clone() for name, value in simulator.state_dict().items()}
+    if case == "cut":
+        path.write_bytes(content[: len(content) // 2])
+    elif case == "empty":
+        path.write_bytes(b"")
+    elif case == "text":
+        path.write_text("hello")
+    elif case == "foreign":
+        save_file({"weight": torch.zeros(3)}, path)
+    elif case == "missing weight":
+        save_file(dict(list(weights.items())[1:]), path, header)
+    elif case == "wrong shape":
+        name = next(iter(weights))
+        save_file({**weights, name: torch.zeros(1)}, path, header)
+    elif case == "unknown option":
+        save_file(weights, path, {**header, "model": json.dumps({**simulator.config, "heads": 4})})
+    elif case == "no model":
+        save_file(weights, path, {"format": "hood-1"})
+    elif case == "model is no JSON":
+        save_file(weights, path, {**header, "model": "small"})
+    return path
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        "cut", "empty", "text", "foreign", "missing weight", "wrong shape", "unknown option", "no model",
+        "model is no JSON",
+    ],
+)  # fmt: skip
+def test_damaged_and_foreign_files_are_refused_in_one_sentence(tmp_path: Path, case: str) -> None:
+    path = damaged(tmp_path / "m.safetensors", case)
+    with pytest.raises(ValueError, match=r"m\.safetensors: ") as error:
+        load_simulator(path)
+    assert "\n" not in str(error.value)
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "m.safetensors"
+    save_simulator(path, make("physical"))
+    before = path.read_bytes()
+    with pytest.raises(TypeError):
+        save_simulator(path, make("physical", seed=1), {"iteration": 3})  # type: ignore[dict-item]
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["m.safetensors"]

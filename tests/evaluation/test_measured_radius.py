@@ -1,0 +1,23 @@
+"""How far a node's input reaches in one step: the paper's Table 1, measured by derivatives."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from hood.dynamics.simulator import build_simulator
+from hood.evaluation.radius import measured_radius
+from hood.nn.schedule import parse_schedule, radius
+
+
+@pytest.mark.parametrize("schedule, expected", [("fine15", 15), ("ours", 48), ("fine48", 48)])
+def test_radius_of_the_papers_models(schedule: str, expected: int) -> None:
+    torch.manual_seed(0)
+    simulator = build_simulator(schedule=schedule, latent_dim=16)
+    assert measured_radius(simulator) == expected
+    assert radius(parse_schedule(schedule)) == expected
+
+
+def test_radius_of_a_small_schedule_with_physical_features() -> None:
+    simulator = build_simulator("physical", "velocity_base", "2x(mesh+coarse0) 1x(coarse0)", latent_dim=16)
+    assert measured_radius(simulator) == 6

@@ -1,0 +1,299 @@
+"""The command line, in process: a rollout's files, and user errors in one line with exit code 2."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+
+from hood import __version__
+from hood.assets.library import names
+from hood.cli import main
+from hood.dynamics.recorder import read_rollout
+from hood.dynamics.simulator import build_simulator, save_simulator
+
+UNTRAINED = ["checkpoint=untrained", "model=small", "model.latent_dim=8", "model.schedule='1x(mesh+coarse0)'"]
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commands run in an empty folder: what they leave behind is seen."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("HOOD_TRACEBACK", raising=False)
+
+
+def tiny_model(path: Path, **options: object) -> Path:
+    torch.manual_seed(0)
+    arguments = {"features": "physical", "output": "velocity_base", "schedule": "1x(mesh)", "latent_dim": 4}
+    save_simulator(path, build_simulator(**{**arguments, **options}))
+    return path
+
+
+def quads(path: Path) -> Path:
+    path.write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n")
+    return path
+
+
+def motion(path: Path, bad_frame: int | None = None) -> Path:
+    poses = np.zeros((8, 156))
+    if bad_frame is not None:
+        poses[bad_frame, 4] = np.nan
+    np.savez(path, poses=poses, trans=np.zeros((8, 3)), mocap_framerate=30.0, betas=np.zeros(16), gender="neutral")
+    return path
+
+
+def not_amass(path: Path) -> Path:
+    np.savez(path, trans=np.zeros((8, 3)), frames=np.zeros((8, 3)))
+    return path
+
+
+def text_file(path: Path) -> Path:
+    path.write_text("hello")
+    return path
+
+
+Prepare = Callable[[], object]
+ERRORS: dict[str, tuple[list[str], tuple[str, ...], Prepare]] = {
+    "misspelt command": (["rolout"], ("'rolout'", "'rollout'"), lambda: None),
+    "misspelt key": (["rollout", "garmnet=dress"], ("'garmnet'", "'garment'"), lambda: None),
+    "misspelt option": (["rollout", "material=demin"], ("'demin'", "'denim'"), lambda: None),
+    "misspelt model": (["rollout", "checkpoint=untrained", "model=smal"], ("'smal'", "'small'"), lambda: None),
+    "misspelt garment": (["rollout", *UNTRAINED, "garment=tshrt"], ("'tshrt'", "'tshirt'"), lambda: None),
+    "misspelt sequence": (["rollout", *UNTRAINED, "sequence=walk_prod"], ("'walk_prod'", "'walk_proud'"), lambda: None),
+    "misspelt body": (["rollout", *UNTRAINED, "body=defalt"], ("'defalt'", "'default'"), lambda: None),
+    "unknown checkpoint": (["rollout", "checkpoint=zzzz"], ("'zzzz'",), lambda: None),
+    "missing checkpoint": (["rollout", "checkpoint=a/m.safetensors"], ("a/m.safetensors", "no such file"), lambda: None),
+    "misspelt device": (["rollout", *UNTRAINED, "device=cup"], ("'cup'", "'cpu'"), lambda: None),
+    "misspelt video": (["rollout", *UNTRAINED, "video=mp5"], ("'mp5'", "'mp4'"), lambda: None),
+    "wrong type": (["rollout", *UNTRAINED, "num_frames=abc"], ("num_frames", "'abc'"), lambda: None),
+    "no frames": (["rollout", *UNTRAINED, "num_frames=0"], ("num_frames=0",), lambda: None),
+    "negative seed": (["rollout", *UNTRAINED, "seed=-1"], ("seed=-1",), lambda: None),
+    "frame rate": (["rollout", *UNTRAINED, "fps=0"], ("fps",), lambda: None),
+    "up axis": (["rollout", *UNTRAINED, "up=x"], ("up", "x"), lambda: None),
+    "betas": (["rollout", *UNTRAINED, "betas=[.nan]"], ("betas",), lambda: None),
+    "text betas": (["rollout", *UNTRAINED, "betas=[a]"], ("betas",), lambda: None),
+    "untrained without model": (["rollout", "checkpoint=untrained"], ("model=small",), lambda: None),
+    "missing garment file": (["rollout", *UNTRAINED, "garment=my.obj"], ("my.obj", "no such file"), lambda: None),
+    "missing motion file": (["rollout", *UNTRAINED, "sequence=x/walk.npz"], ("x/walk.npz",), lambda: None),
+    "not a motion": (
+        ["rollout", *UNTRAINED, "sequence=other.npz"], ("other.npz", "not an AMASS"), lambda: not_amass(Path("other.npz")),
+    ),
+    "text as motion": (
+        ["rollout", *UNTRAINED, "sequence=text.npz"], ("text.npz", "not a readable"), lambda: text_file(Path("text.npz")),
+    ),
+    "NaN poses": (
+        ["rollout", *UNTRAINED, "sequence=nan.npz"], ("nan.npz", "frame 5"), lambda: motion(Path("nan.npz"), 5),
+    ),
+    "quads": (
+        ["rollout", *UNTRAINED, "garment=q.obj"], ("q.obj", "face 0", "triangulate=true"), lambda: quads(Path("q.obj")),
+    ),
+    "pickled body": (
+        ["rollout", *UNTRAINED, "body=smpl.pkl"], ("smpl.pkl", "pickles"), lambda: text_file(Path("smpl.pkl")),
+    ),
+    "text as checkpoint": (
+        ["rollout", "checkpoint=m.safetensors"], ("m.safetensors", "not a model file"),
+        lambda: text_file(Path("m.safetensors")),
+    ),
+    "wrong model for a checkpoint": (
+        ["rollout", "checkpoint=m.safetensors", "model=small"], ("m.safetensors", "not the model asked for"),
+        lambda: tiny_model(Path("m.safetensors")),
+    ),
+    "output below a file": (
+        ["rollout", *UNTRAINED, "output=file/run"], ("file", "not a directory"), lambda: text_file(Path("file")),
+    ),
+    "output is a file": (
+        ["rollout", *UNTRAINED, "output=file"], ("file", "exists"), lambda: text_file(Path("file")),
+    ),
+    "unparsable override": (["rollout", "garment=[dress"], ("garment=[dress",), lambda: None),
+    "word without value": (["rollout", "dress"], ("'dress'", "key=value"), lambda: None),
+    "added key": (["rollout", "+speed=2"], ("+speed",), lambda: None),
+    "foreign target": (
+        ["rollout", *UNTRAINED, "material._target_=os.system"], ("os.system", "not allowed"), lambda: None,
+    ),
+    "foreign model": (
+        ["rollout", *UNTRAINED, "model._target_=subprocess.run"], ("subprocess.run", "not allowed"), lambda: None,
+    ),
+    "unphysical fabric": (["rollout", *UNTRAINED, "material.density=-1"], ("density",), lambda: None),
+    "unknown schedule": (["rollout", *UNTRAINED[:2], "model.schedule=ourz"], ("'ourz'", "'ours'"), lambda: None),
+    "training garment": (["train", "data.garments=[tnak]", "output=run"], ("'tnak'", "'tank'"), lambda: None),
+    "training key": (["train", "trainer.iteration=3"], ("'trainer.iteration'", "'trainer.iterations'"), lambda: None),
+    "training value": (["train", "trainer.iterations=0", "output=run"], ("trainer.iterations",), lambda: None),
+    "training signal": (["train", "trainer.signal=scald", "output=run"], ("scald",), lambda: None),
+    "training device": (["train", "device=gpu", "output=run"], ("'gpu'",), lambda: None),
+    "evaluated model": (["evaluate", "models=[untrained:our]", "output=run"], ("'our'",), lambda: None),
+    "evaluated checkpoint": (["evaluate", "models=[zzzz]", "output=run"], ("'zzzz'",), lambda: None),
+    "evaluated frames": (["evaluate", "num_frames=1", "output=run"], ("num_frames=1",), lambda: None),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", ERRORS)
+def test_user_errors_are_one_line_and_leave_nothing(case: str, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    arguments, words, prepare = ERRORS[case]
+    prepare()
+    before = sorted(path.name for path in tmp_path.rglob("*"))
+    assert main(arguments) == 2
+    captured = capsys.readouterr()
+    assert captured.err.startswith("hood: error: ")
+    assert captured.err.count("\n") == 1, captured.err
+    assert all(word in captured.err for word in words), captured.err
+    assert sorted(path.name for path in tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("command", ["train", "rollout", "evaluate"])
+def test_help_lists_keys_groups_and_names(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    from hood.config import load_config, plain
+
+    assert main([command, "--help"]) == 0
+    text = capsys.readouterr().out
+    for key, value in load_config(command).items():
+        if not isinstance(plain(value), dict):
+            assert f"  {key}=" in text
+    assert all(name in text for name in names("garments") + names("motions"))
+    assert max(len(line) for line in text.splitlines()) <= 120
+
+
+def test_usage_and_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 0
+    usage = capsys.readouterr().out
+    assert all(command in usage for command in ("train", "rollout", "evaluate"))
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.strip() == f"hood {__version__}"
+
+
+def test_traceback_on_demand(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOOD_TRACEBACK", "1")
+    with pytest.raises(ValueError, match="garmnet"):
+        main(["rollout", "garmnet=dress"])
+
+
+def test_an_interrupt_has_its_own_exit_code(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """Ctrl-C during the second step keeps the frames done."""
+    from hood.dynamics.simulator import Simulator
+
+    step, calls = Simulator.predict, []
+
+    def interrupted(*arguments: object) -> object:
+        calls.append(1)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return step(*arguments)
+
+    monkeypatch.setattr(Simulator, "predict", interrupted)
+    assert main(["rollout", *UNTRAINED, "garment=tank", "num_frames=9", "video=none", "output=run"]) == 130
+    assert "2 frames done are kept" in capsys.readouterr().err
+    data = read_rollout(tmp_path / "run" / "rollout.h5")
+    assert len(data.cloth_pos) == 2
+    assert not data.attributes["complete"]
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["num_frames"] == 2
+    assert not list(tmp_path.rglob("*.partial"))
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("rollout") / "run"
+    arguments = ["garment=skirt", "num_frames=3", "video=none", "material.density=0.3", f"output={folder}"]
+    assert main(["rollout", *UNTRAINED, *arguments]) == 0
+    return folder
+
+
+def test_a_rollout_writes_its_files_and_nothing_else(run_folder: Path) -> None:
+    assert sorted(path.name for path in run_folder.iterdir()) == [
+        "config.yaml", "contact_sheet.png", "rollout.h5", "summary.json", "versions.json",
+    ]  # fmt: skip
+
+
+def test_rollout_file_has_the_documented_content(run_folder: Path) -> None:
+    with h5py.File(run_folder / "rollout.h5", "r") as file:
+        num_vertices, num_body = file["cloth/rest_pos"].shape[0], file["body/pos"].shape[1]
+        assert file["cloth/pos"].shape == (3, num_vertices, 3)
+        assert file["body/pos"].shape == (3, num_body, 3)
+        assert file["cloth/faces"][:].max() < num_vertices
+        assert file["body/faces"][:].max() < num_body
+        np.testing.assert_allclose(file["time"][:], np.arange(3) / 30)
+        for name in ("strain_p50", "strain_p99", "strain_max", "penetration_count", "penetration_share", "penetration_depth"):
+            assert np.isfinite(file[f"metrics/{name}"][:]).all()
+        for name in ("energy_stretching", "energy_total", "gradient_norm", "relative_gradient", "e0", "ms_total"):
+            values = file[f"metrics/{name}"][:]
+            assert np.isnan(values[0])
+            assert np.isfinite(values[1:]).all()
+        attributes = dict(file.attrs)
+    assert attributes["num_frames"] == 3
+    assert bool(attributes["complete"])
+    assert attributes["garment"] == "skirt"
+    assert attributes["sequence"] == "walk_proud"
+    assert attributes["checkpoint"] == attributes["checkpoint_sha256"] == "untrained"
+    assert json.loads(attributes["material"])["density"] == 0.3
+    assert json.loads(attributes["config"])["num_frames"] == 3
+    assert json.loads(attributes["model"])["latent_dim"] == 8
+    assert attributes["dt"] == pytest.approx(1 / 30)
+
+
+def test_records_of_the_run(run_folder: Path) -> None:
+    summary = json.loads((run_folder / "summary.json").read_text())
+    assert summary["num_frames"] == 3
+    assert summary["complete"]
+    assert summary["first_nonfinite_frame"] is None
+    assert summary["first_frame"]["strain_p99"] <= 0.15
+    assert "density: 0.3" in (run_folder / "config.yaml").read_text()
+    assert json.loads((run_folder / "versions.json").read_text())["seed"] == 0
+    picture = (run_folder / "contact_sheet.png").read_bytes()
+    assert picture.startswith(b"\x89PNG")
+    assert len(picture) > 5000
+
+
+def test_own_files_and_a_checkpoint(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A garment from an OBJ, a motion of eight frames, a model file; fewer frames than asked for."""
+    import hashlib
+
+    from hood.assets.garment import load_garment
+
+    garment = load_garment("tank")
+    lines = [f"v {x} {y} {z}" for x, y, z in garment.rest_pos] + [f"f {a} {b} {c}" for a, b, c in garment.faces + 1]
+    (tmp_path / "mine.obj").write_text("\n".join(lines))
+    motion(tmp_path / "stand.npz")
+    model = tiny_model(tmp_path / "m.safetensors")
+    arguments = ["garment=mine.obj", "sequence=stand.npz", "checkpoint=m.safetensors", "video=none", "sheet=false"]
+    assert main(["rollout", *arguments, "num_frames=20", "output=out"]) == 0
+    assert "stand has 8 frames" in capsys.readouterr().out
+    data = read_rollout(tmp_path / "out" / "rollout.h5")
+    assert len(data.cloth_pos) == 8
+    np.testing.assert_array_equal(data.cloth_faces, garment.faces)
+    assert data.attributes["checkpoint_sha256"] == hashlib.sha256(model.read_bytes()).hexdigest()
+
+
+def test_train_resume_and_refuse(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = [
+        "model.latent_dim=4", "model.schedule='1x(mesh)'", "trainer.batch_size=1", "trainer.log_every=1",
+        "data.garments=[tank]", "data.sequences=[walk_proud]", "output=run",
+    ]  # fmt: skip
+    assert main(["train", *options, "trainer.iterations=2"]) == 0
+    assert {"checkpoint.pt", "model.safetensors", "metrics.jsonl", "config.yaml", "versions.json"} <= {
+        path.name for path in (tmp_path / "run").iterdir()
+    }
+    assert len((tmp_path / "run" / "metrics.jsonl").read_text().splitlines()) == 2
+    capsys.readouterr()
+    assert main(["train", *options, "trainer.iterations=2"]) == 2
+    assert "resume=true" in capsys.readouterr().err
+    assert main(["train", *options, "trainer.iterations=2", "resume=true", "seed=4"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert main(["train", *options, "trainer.iterations=2", "resume=true"]) == 0
+    assert (
+        main(["rollout", "checkpoint=run/model.safetensors", "garment=tank", "num_frames=2", "video=none", "sheet=false"]) == 0
+    )
+
+
+def test_evaluate_writes_its_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    tiny_model(tmp_path / "m.safetensors")
+    arguments = ["models=[m.safetensors]", "garments=[tank]", "sequences=[walk_proud]", "num_frames=5", "output=table"]
+    assert main(["evaluate", *arguments]) == 0
+    assert "tank" in capsys.readouterr().out
+    rows = json.loads((tmp_path / "table" / "table.json").read_text())
+    assert [row["garment"] for row in rows] == ["tank", "all"]
+    assert rows[0]["radius"] == rows[0]["steps"] == 1

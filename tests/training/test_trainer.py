@@ -1,0 +1,257 @@
+"""Training: the signal goes down, a resumed run is the uninterrupted one, other runs are refused."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from hood.assets.body import Body, load_body
+from hood.assets.garment import Garment, load_garment
+from hood.assets.sequence import PoseSequence, load_sequence
+from hood.dynamics.output import AccelerationOutput
+from hood.dynamics.simulator import Simulator, build_simulator, load_simulator
+from hood.losses.potential import Potential, default_potential
+from hood.losses.problem import StepProblem
+from hood.scene.dataset import SceneSampler, Window
+from hood.training import distributed
+from hood.training.curriculum import CollisionRamp, Horizon, WarmupCosine
+from hood.training.trainer import Trainer, TrainerSettings
+
+PHYSICAL = {"features": "physical", "output": "velocity_base", "output_init": 0.1}
+PAPER = {"features": "paper", "output": "acceleration"}
+SETTINGS = TrainerSettings(
+    iterations=12, batch_size=2, learning_rate=1e-3, schedule=WarmupCosine(3), horizon=Horizon(every=3, maximum=2),
+    collision=CollisionRamp(5e5, 5e5), signal="scaled", ema_decay=0.9, statistics_iterations=4, checkpoint_every=100,
+    log_every=1,
+)  # fmt: skip
+
+
+def tiny(options: dict, seed: int = 0) -> Simulator:
+    torch.manual_seed(seed)
+    return build_simulator(schedule="1x(mesh+coarse0)", latent_dim=8, **options)
+
+
+@pytest.fixture(scope="module")
+def sampler(body: Body, garments: dict[str, Garment], walk: PoseSequence) -> SceneSampler:
+    return SceneSampler(body, [garments["tank"]], [walk.window(0, 90)])
+
+
+def make(
+    folder: Path,
+    sampler: SceneSampler,
+    options: dict = PHYSICAL,
+    settings: TrainerSettings = SETTINGS,
+    seed: int = 0,
+    potential: Potential | None = None,
+) -> Trainer:
+    return Trainer(tiny(options), potential or default_potential(), sampler, settings, folder, seed)
+
+
+class OneScene(SceneSampler):
+    """Always the same scene, whatever the generator."""
+
+    def sample(self, rng: np.random.Generator, num_steps: int, garment: int | None = None) -> Window:
+        return super().sample(np.random.default_rng(3), num_steps, garment)
+
+
+@pytest.mark.parametrize("signal", ["scaled", "potential"])
+def test_the_signal_goes_down_on_a_fixed_scene(
+    signal: str, tmp_path: Path, body: Body, garments: dict[str, Garment], walk: PoseSequence
+) -> None:
+    constant = {"schedule": WarmupCosine(5, floor=1.0), "horizon": Horizon(every=100, maximum=1)}
+    settings = replace(SETTINGS, iterations=60, batch_size=1, signal=signal, **constant)
+    trainer = make(tmp_path, OneScene(body, [garments["tank"]], [walk.window(0, 60)]), settings=settings)
+    reports = [trainer.update() for _ in range(20)]
+    assert all(np.isfinite(list(report.values())).all() for report in reports)
+    # A relaxing step and a regular one take turns; the relaxing one is the same problem every time.
+    totals = np.array([report["total"] for report in reports[::2]])
+    assert (np.diff(totals) < 1e-6).all()
+    assert totals[-1] < totals[0] - 1e-3
+
+
+def metrics(folder: Path) -> list[dict]:
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    return [{key: value for key, value in line.items() if key != "iterations_per_second"} for line in lines]
+
+
+def assert_same(first: object, second: object) -> None:
+    if isinstance(first, Tensor):
+        assert torch.equal(first, second)
+    elif isinstance(first, dict):
+        assert first.keys() == second.keys()
+        for key in first:
+            assert_same(first[key], second[key])
+    elif isinstance(first, (list, tuple)):
+        for a, b in zip(first, second, strict=True):
+            assert_same(a, b)
+    else:
+        assert first == second
+
+
+@pytest.mark.parametrize("options", [PHYSICAL, PAPER], ids=["physical", "paper"])
+def test_six_and_six_iterations_are_twelve(options: dict, tmp_path: Path, sampler: SceneSampler) -> None:
+    whole = make(tmp_path / "whole", sampler, options)
+    assert whole.run()
+    first = make(tmp_path / "parts", sampler, options)
+    assert not first.run(should_stop=lambda: first.iteration >= 6)
+    torch.manual_seed(99)  # a new process has another generator and other weights
+    second = make(tmp_path / "parts", sampler, options)
+    second.resume(second.checkpoint_path)
+    assert second.iteration == 6
+    assert second.run()
+    assert metrics(tmp_path / "parts") == metrics(tmp_path / "whole")
+    assert [line["iteration"] for line in metrics(tmp_path / "parts")] == list(range(1, 13))
+    states = [torch.load(tmp_path / name / "checkpoint.pt", weights_only=True) for name in ("whole", "parts")]
+    assert_same(*states)
+    models = [load_simulator(tmp_path / name / "model.safetensors").state_dict() for name in ("whole", "parts")]
+    assert_same(*models)
+
+
+def test_the_paper_model_collects_statistics_first(tmp_path: Path, sampler: SceneSampler) -> None:
+    """Output statistics are those of skinned accelerations: millimetres per frame², not metres."""
+    trainer = make(tmp_path, sampler, PAPER)
+    before = {name: value.clone() for name, value in trainer.simulator.named_parameters()}
+    for _ in range(4):
+        assert "learning_rate" not in trainer.update()
+    assert all(torch.equal(value, before[name]) for name, value in trainer.simulator.named_parameters())
+    output = trainer.simulator.output
+    assert isinstance(output, AccelerationOutput)
+    assert int(output.normalizer.num_updates) == 4
+    deviation = output.normalizer.statistics(torch.float64)[1]
+    assert bool((deviation > 1e-6).all())
+    assert bool((deviation < 0.05).all())
+    assert "learning_rate" in trainer.update()
+    assert int(output.normalizer.num_updates) == 4
+    assert not all(torch.equal(value, before[name]) for name, value in trainer.simulator.named_parameters())
+
+
+def test_averaged_weights(tmp_path: Path, sampler: SceneSampler) -> None:
+    trainer = make(tmp_path, sampler)
+    for _ in range(3):
+        trainer.update()
+    plain, averaged = trainer.simulator.state_dict(), trainer.averaged().state_dict()
+    assert any(not torch.equal(plain[name], averaged[name]) for name in plain)
+    off = make(tmp_path, sampler, settings=replace(SETTINGS, ema_decay=0.0))
+    off.update()
+    assert_same(dict(off.simulator.state_dict()), dict(off.averaged().state_dict()))
+
+
+def test_the_learning_rate_follows_its_schedule(tmp_path: Path, sampler: SceneSampler) -> None:
+    trainer = make(tmp_path, sampler)
+    rates = [trainer.update()["learning_rate"] for _ in range(3)]
+    assert rates == pytest.approx([1e-3 / 3, 2e-3 / 3, 1e-3])
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory, sampler: SceneSampler) -> Path:
+    trainer = make(tmp_path_factory.mktemp("run"), sampler, settings=replace(SETTINGS, iterations=1))
+    trainer.run()
+    return trainer.checkpoint_path
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        ({"options": {**PHYSICAL, "output_scale": 1e-2}}, ("trained with model", "'output_scale': 0.005")),
+        ({"seed": 5}, ("trained with seed 0", "seed=0")),
+        ({"settings": replace(SETTINGS, batch_size=3)}, ("trainer.batch_size=2",)),
+    ],
+    ids=["model", "seed", "batch size"],
+)
+def test_checkpoints_of_other_runs_are_refused(
+    change: dict, words: tuple[str, ...], tmp_path: Path, sampler: SceneSampler, checkpoint: Path
+) -> None:
+    trainer = make(tmp_path, sampler, **change)
+    before = {name: value.clone() for name, value in trainer.simulator.state_dict().items()}
+    with pytest.raises(ValueError, match=r"checkpoint\.pt") as error:
+        trainer.resume(checkpoint)
+    assert all(word in str(error.value) for word in words), str(error.value)
+    assert_same(before, dict(trainer.simulator.state_dict()))
+
+
+class Broken:
+    """An energy without a number."""
+
+    def applies(self, problem: StepProblem) -> bool:
+        return True
+
+    def __call__(self, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> Tensor:
+        return next_pos.sum().reshape(1).expand(problem.num_scenes) * float("nan")
+
+
+def test_updates_without_a_number_change_nothing_and_end_the_run(
+    tmp_path: Path, sampler: SceneSampler, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hood.training.trainer._MAX_SKIPPED", 5)
+    trainer = make(tmp_path, sampler, potential=Potential({"broken": Broken()}))
+    before = {name: value.clone() for name, value in trainer.simulator.named_parameters()}
+    with pytest.raises(ValueError, match=r"5 updates in a row.*checkpoint\.pt"):
+        trainer.run()
+    assert trainer.skipped == 5
+    assert all(torch.equal(value, before[name]) for name, value in trainer.simulator.named_parameters())
+
+
+@pytest.mark.parametrize(
+    "options, word",
+    [
+        ({"signal": "plain"}, "trainer.signal"),
+        ({"iterations": 0}, "trainer.iterations"),
+        ({"batch_size": 0}, "trainer.batch_size"),
+        ({"learning_rate": 0.0}, "trainer.learning_rate"),
+    ],
+)
+def test_wrong_settings_are_named(options: dict, word: str) -> None:
+    with pytest.raises(ValueError, match=word):
+        TrainerSettings(**options)
+
+
+def train_two_updates(target: Path) -> None:
+    """Two updates of a batch of two scenes, alone or as one of several processes; rank 0 writes the weights."""
+    torch.set_num_threads(1)
+    distributed.start()
+    sampler = SceneSampler(load_body(), [load_garment("tank")], [load_sequence("walk_proud").window(0, 90)])
+    trainer = make(target.parent, sampler)
+    for _ in range(2):
+        trainer.update()
+    if distributed.rank() == 0:
+        torch.save(trainer.simulator.state_dict(), target)
+    distributed.stop()
+
+
+@pytest.mark.slow
+def test_two_processes_train_what_one_trains(tmp_path: Path) -> None:
+    train_two_updates(tmp_path / "one.pt")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = str(probe.getsockname()[1])
+    here = Path(__file__)
+    code = (
+        f"import sys; sys.path.insert(0, {str(here.parent)!r}); from pathlib import Path; "
+        f"from test_trainer import train_two_updates; train_two_updates(Path({str(tmp_path / 'two.pt')!r}))"
+    )
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-c", code],
+            cwd=here.parents[2],
+            env=os.environ
+            | {"RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1"}
+            | {"MASTER_PORT": port, "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""},
+        )
+        for rank in range(2)
+    ]
+    assert [process.wait(timeout=120) for process in processes] == [0, 0]
+    one, two = (torch.load(tmp_path / f"{name}.pt", weights_only=True) for name in ("one", "two"))
+    start = tiny(PHYSICAL).state_dict()
+    for name, value in one.items():
+        torch.testing.assert_close(two[name], value, rtol=0, atol=1e-5)
+    assert any(float((one[name] - start[name]).abs().max()) > 1e-4 for name in one)
