@@ -218,6 +218,7 @@ def save_simulator(path: Path, simulator: Simulator, metadata: Mapping[str, str]
     temporary = path.with_name(path.name + ".partial")
     try:
         save_file(tensors, temporary, header)
+        temporary.chmod(0o644)  # safetensors makes files that only their owner can read
         os.replace(temporary, path)
     except BaseException:
         temporary.unlink(missing_ok=True)
