@@ -24,6 +24,7 @@ from hood.config import ConfigError, build, load_config, plain, require_choice, 
 from hood.dynamics.recorder import RolloutWriter, read_rollout
 from hood.dynamics.rollout import metric_names, simulate
 from hood.dynamics.simulator import Simulator, load_simulator
+from hood.dynamics.stepper import NewtonStepper, Stepper
 from hood.scene.scene import Scene, build_scene
 
 
@@ -33,11 +34,12 @@ def run(overrides: Sequence[str]) -> int:
     require_device(config)
     require_choice(config, "video", ("mp4", "gif", "none"))
     _check_numbers(config)
-    simulator, digest = make_simulator(config)
+    require_choice(config, "stepper", ("network", "newton"))
+    stepper, digest = make_stepper(config)
     scene = make_scene(config)
     folder = prepare_folder(Path(str(config.output)).expanduser())
     save_run_record(folder, config, int(config.seed))
-    interrupted = _simulate_to_disk(config, scene, simulator, digest, folder / "rollout.h5")
+    interrupted = _simulate_to_disk(config, scene, stepper, digest, folder / "rollout.h5")
     summary = summarise(folder / "rollout.h5")
     _write_json(folder / "summary.json", summary)
     print(describe(summary))
@@ -64,6 +66,15 @@ def make_scene(config: DictConfig) -> Scene:
         raise ConfigError(f"betas={given}: give at most 10 finite shape coefficients, e.g. betas=[1.5,0,-1]")
     betas[: len(given)] = given
     return build_scene(garment, body, sequence, build(config.material), betas, device=str(config.device))
+
+
+def make_stepper(config: DictConfig) -> tuple[Stepper, str]:
+    """What takes the steps, and the SHA-256 of its weights (``none`` for the solver)."""
+    if str(config.stepper) == "network":
+        return make_simulator(config)
+    stepper = NewtonStepper(build(config.losses), build(config.solver))
+    stepper.gravity = stepper.gravity.to(str(config.device))
+    return stepper, "none"
 
 
 def make_simulator(config: DictConfig) -> tuple[Simulator, str]:
@@ -94,7 +105,9 @@ def summarise(path: Path) -> dict[str, Any]:
     data = read_rollout(path)
     finite = np.isfinite(data.cloth_pos).all(axis=(1, 2))
     metrics = data.metrics
-    times = {name: _quantiles(metrics[f"ms_{name}"][2:]) for name in ("search", "features", "network", "rest", "total")}
+    times = {name[3:]: _quantiles(metrics[name][2:]) for name in sorted(metrics) if name.startswith("ms_")}
+    converged = metrics.get("solver_converged")
+    solver = {} if converged is None else {"solver_steps_not_converged": int((converged == 0).sum())}
     return {
         "num_frames": int(len(finite)),
         "complete": bool(data.attributes["complete"]),
@@ -116,11 +129,13 @@ def summarise(path: Path) -> dict[str, Any]:
         "potential_inertial_guess_mean_J": _mean(metrics["energy_inertial_guess"]),
         "relative_gradient_median": _median(metrics["relative_gradient"]),
         "ms_per_frame": times,
+        **solver,
     }
 
 
 def describe(summary: dict[str, Any]) -> str:
-    """The summary in three lines."""
+    """The summary in three lines, and a fourth where the solver missed its target."""
+    missed = summary.get("solver_steps_not_converged", 0)
     first = summary["first_nonfinite_frame"]
     times = {name: value["median"] for name, value in summary["ms_per_frame"].items()}
     return "\n".join(
@@ -131,11 +146,12 @@ def describe(summary: dict[str, Any]) -> str:
             f"{_percent(summary['penetration_share_mean'])} of the vertices deeper than 2 mm, "
             f"deepest {1e3 * (summary['penetration_depth_max_m'] or 0.0):.1f} mm",
             "ms per frame (median): " + ", ".join(f"{name} {value or 0.0:.1f}" for name, value in times.items()),
+            *([f"{missed} steps did not reach solver.target_rg; their frames are kept as far as they got"] if missed else []),
         ]
     )
 
 
-def _simulate_to_disk(config: DictConfig, scene: Scene, simulator: Simulator, digest: str, path: Path) -> bool:
+def _simulate_to_disk(config: DictConfig, scene: Scene, stepper: Stepper, digest: str, path: Path) -> bool:
     """Stream the rollout into ``path``; True when the user interrupted it."""
     potential = build(config.losses)
     count = min(int(config.num_frames), scene.num_frames)
@@ -146,7 +162,8 @@ def _simulate_to_disk(config: DictConfig, scene: Scene, simulator: Simulator, di
         "config": plain(config),
         "checkpoint": str(config.checkpoint),
         "checkpoint_sha256": digest,
-        "model": simulator.config,
+        "model": stepper.config,
+        "stepper": str(config.stepper),
         "garment": scene.garment.name,
         "sequence": scene.motion.sequence.name,
     }
@@ -157,12 +174,12 @@ def _simulate_to_disk(config: DictConfig, scene: Scene, simulator: Simulator, di
         scene.garment.faces,
         scene.motion.body.faces,
         len(scene.motion.body.v_template),
-        metric_names(potential),
+        metric_names(potential, stepper),
         scene.dt,
         attributes,
         farthest=float(np.abs(scene.motion.translation).max()),
     )
-    frames = simulate(simulator, scene, potential, count, int(config.relaxing_steps))
+    frames = simulate(stepper, scene, potential, count, int(config.relaxing_steps))
     try:
         with writer:
             for frame in tqdm(frames, total=count, desc=f"rollout {scene.garment.name}", unit="frame", disable=None):

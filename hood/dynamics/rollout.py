@@ -1,4 +1,4 @@
-"""Autoregressive rollout of a simulator on a scene, one frame at a time."""
+"""Autoregressive rollout of a stepper on a scene, one frame at a time."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from hood.dynamics.measure import METRICS, penetration_metrics, strain_metrics
-from hood.dynamics.simulator import Simulator
+from hood.dynamics.stepper import Stepper
 from hood.dynamics.stopwatch import Stopwatch
 from hood.losses.potential import Potential, relative_gradient, scale
 from hood.losses.problem import StepProblem, inertial_guess
@@ -18,8 +18,6 @@ from hood.scene.scene import Scene, recentre
 from hood.scene.start import push_out
 from hood.scene.state import Attachments, State
 
-#: Milliseconds of a frame by part, in the metrics of a rollout.
-TIMES = ("search", "features", "network", "rest", "total")
 AttachmentSchedule = Callable[[int], Attachments | None]
 
 
@@ -34,7 +32,7 @@ class Frame:
     metrics: dict[str, float]
 
 
-def metric_names(potential: Potential) -> tuple[str, ...]:
+def metric_names(potential: Potential, stepper: Stepper) -> tuple[str, ...]:
     """Every metric a frame of a rollout can have."""
     energies = tuple(f"energy_{name}" for name in potential.terms)
     return (
@@ -45,13 +43,14 @@ def metric_names(potential: Potential) -> tuple[str, ...]:
         "gradient_norm",
         "relative_gradient",
         "e0",
-        *(f"ms_{t}" for t in TIMES),
+        *stepper.metrics,
+        *(f"ms_{part}" for part in stepper.times),
     )
 
 
 @torch.no_grad()
 def simulate(
-    simulator: Simulator,
+    stepper: Stepper,
     scene: Scene,
     potential: Potential,
     num_frames: int | None = None,
@@ -67,50 +66,49 @@ def simulate(
     """
     count = scene.num_frames - start_frame if num_frames is None else min(num_frames, scene.num_frames - start_frame)
     watch = Stopwatch()
-    prepared = simulator.prepare(scene.cloth, scene.garment.rest_pos)
-    state = start_state(simulator, scene, potential, relaxing_steps, start_frame)
+    prepared = stepper.prepare(scene.cloth, scene.garment.rest_pos)
+    state = start_state(stepper, scene, potential, relaxing_steps, start_frame)
     metrics: dict[str, float] = {}
     for index in range(count):
         body_frame = start_frame + index
         state = recentre(state, scene.cloth.vertex_scene)
         watch.restart()
         last = body_frame + 1 >= scene.num_frames
-        step = scene.step_input(body_frame - 1 if last else body_frame, state)
         contact: Contact | None
         if last:
             contact = _contact_now(scene, state, body_frame)
         else:
-            if attachments is not None:
-                step = scene.step_input(body_frame, state, attachments=attachments(index))
+            with watch.part("posing"):
+                closed = None if attachments is None else attachments(index)
+                step = scene.step_input(body_frame, state, attachments=closed)
             with watch.part("search"):
-                contact = simulator.find_contact(scene.cloth, state, step)
+                contact = stepper.find_contact(scene.cloth, state, step)
         shared = {**strain_metrics(scene.cloth, state.pos), **penetration_metrics(contact, scene.cloth.num_vertices)}
         origin = state.origin[0]
         body_pos = scene.motion.surface(body_frame, origin.numpy()).cpu().double() + origin
         yield Frame(index, state, state.pos.cpu().double() + origin, body_pos, {**shared, **metrics})
         if index + 1 >= count:
             return
-        watch_metrics = watch.lap()  # metrics and the caller's work are not part of the frame's time
-        problem = StepProblem(scene.cloth, state, step, contact, simulator.gravity.to(state.pos))
-        prediction = simulator.predict(problem, prepared, watch)
-        state = State(prediction.next_pos, simulator.next_velocity(problem, prediction), state.origin)
-        times = watch.lap()
-        search = watch_metrics.get("search", 0.0)
-        times["search"] = times.get("search", 0.0) + search
-        times["total"] += search
-        metrics = {f"ms_{name}": times.get(name, 0.0) for name in TIMES}
+        before = watch.lap()  # metrics and the caller's work are not part of the frame's time
+        problem = StepProblem(scene.cloth, state, step, contact, stepper.gravity.to(state.pos))
+        prediction = stepper.predict(problem, prepared, watch)
+        state = State(prediction.next_pos, stepper.next_velocity(problem, prediction), state.origin)
+        times = {**watch.lap(), "search": before["search"]}
+        times["rest"] += before["posing"]
+        times["total"] += before["search"] + before["posing"]
+        metrics = {f"ms_{part}": times.get(part, 0.0) for part in stepper.times} | prediction.metrics
         metrics |= energy_metrics(potential, problem, prediction.next_pos, prediction.acc)
 
 
-def start_state(simulator: Simulator, scene: Scene, potential: Potential, relaxing_steps: int, frame: int = 0) -> State:
+def start_state(stepper: Stepper, scene: Scene, potential: Potential, relaxing_steps: int, frame: int = 0) -> State:
     """Settled, relaxed start: the relaxing step is kept only where it lowers the potential of its own problem."""
     state = scene.start(frame, relaxed=False)
-    prepared = simulator.prepare(scene.cloth, scene.garment.rest_pos)
+    prepared = stepper.prepare(scene.cloth, scene.garment.rest_pos)
     for _ in range(relaxing_steps):
         step = scene.step_input(frame, state, relaxing=True)
-        contact = simulator.find_contact(scene.cloth, state, step)
-        problem = StepProblem(scene.cloth, state, step, contact, simulator.gravity.to(state.pos))
-        prediction = simulator.predict(problem, prepared)
+        contact = stepper.find_contact(scene.cloth, state, step)
+        problem = StepProblem(scene.cloth, state, step, contact, stepper.gravity.to(state.pos))
+        prediction = stepper.predict(problem, prepared)
         pos = push_out(scene.cloth, prediction.next_pos, step.obstacle, scene.clearance)
         if bool(torch.isfinite(pos).all()) and bool(
             (potential.total(problem, pos) < potential.total(problem, state.pos)).all()

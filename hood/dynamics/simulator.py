@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from hood.dynamics.output import OUTPUTS, AccelerationOutput, Output
-from hood.dynamics.stopwatch import Stopwatch
+from hood.dynamics.stopwatch import Stopwatch, timed
 from hood.features import groups, physical
 from hood.features.inputs import Inputs
 from hood.graph.builder import StaticGraph, build_graph, build_static
@@ -46,6 +45,7 @@ class Prediction:
 
     next_pos: Tensor  # (V, 3) m, local
     acc: Tensor  # (V, 3) m/s², such that next_pos = pos + dt vel + dt² acc
+    metrics: dict[str, float] = field(default_factory=dict)  # what the stepper itself has to report
 
 
 class Simulator(nn.Module):
@@ -55,6 +55,8 @@ class Simulator(nn.Module):
     """
 
     gravity: Tensor
+    times: tuple[str, ...] = ("search", "features", "network", "rest", "total")
+    metrics: tuple[str, ...] = ()
 
     def __init__(
         self,
@@ -110,14 +112,14 @@ class Simulator(nn.Module):
         """Positions at t + 1. Pinned vertices reach their targets exactly, massless ones stay where they are."""
         assert prepared.static is not None
         cloth, state, step = problem.cloth, problem.state, problem.step
-        with _part(watch, "features"):
+        with timed(watch, "features"):
             with torch.no_grad():
                 base = self.output.base(problem)
                 residual = self._residual_acceleration(problem, base) if self._wants_residual else None
                 graph = build_graph(prepared.static, step, problem.contact, self.body_radius)
                 inputs = Inputs(cloth, state, step, problem.contact, graph, base if self._wants_base else None, residual)
             nodes, edges = self.features(inputs)
-        with _part(watch, "network"):
+        with timed(watch, "network"):
             raw = self.network(graph, nodes, edges)
         free = cloth.free.unsqueeze(1)
         displacement = self.output.displacement(raw)
@@ -268,7 +270,3 @@ def _cached_hierarchy(cloth: Cloth, rest_pos: Any, num_coarse: int) -> Hierarchy
         entry = (rest_pos, edges, build_hierarchy(cloth.num_vertices, edges.numpy(), rest_pos, num_coarse))
         _HIERARCHIES[key] = entry
     return entry[2]
-
-
-def _part(watch: Stopwatch | None, name: str):  # type: ignore[no-untyped-def]
-    return nullcontext() if watch is None else watch.part(name)

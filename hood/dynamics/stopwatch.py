@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 import torch
 
@@ -35,3 +35,8 @@ class Stopwatch:
     def restart(self) -> None:
         """Forget what was counted since the last lap."""
         self._parts, self._start = {}, time.perf_counter()
+
+
+def timed(watch: Stopwatch | None, name: str) -> AbstractContextManager[None]:
+    """``watch.part(name)``, or nothing without a watch."""
+    return nullcontext() if watch is None else watch.part(name)

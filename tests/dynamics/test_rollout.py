@@ -124,7 +124,7 @@ def rollout(skirt_scene: Scene) -> list[Frame]:
 def test_metrics_are_finite_and_named(rollout: list[Frame]) -> None:
     assert [frame.index for frame in rollout] == list(range(8))
     for frame in rollout:
-        assert set(frame.metrics) <= set(metric_names(POTENTIAL))
+        assert set(frame.metrics) <= set(metric_names(POTENTIAL, small()))
         assert all(np.isfinite(value) for value in frame.metrics.values())
         assert frame.world_pos.dtype == frame.body_pos.dtype == torch.float64
     assert "energy_total" not in rollout[0].metrics

@@ -1,0 +1,76 @@
+"""What a rollout needs of whatever takes the step, and the stepper that needs no network."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from hood.dynamics.simulator import Prediction
+from hood.dynamics.stopwatch import Stopwatch, timed
+from hood.losses.potential import Potential
+from hood.losses.problem import StepProblem
+from hood.scene.cloth import Cloth
+from hood.scene.contact import Contact, find_contact
+from hood.scene.state import State, StepInput
+from hood.solver.newton import NewtonSettings, minimize
+
+
+class Stepper(Protocol):
+    """Takes steps: :class:`hood.dynamics.simulator.Simulator` by a network, :class:`NewtonStepper` by minimisation."""
+
+    gravity: Tensor  # (3,) m/s²
+    config: dict[str, Any]  # travels into the rollout file
+    times: tuple[str, ...]  # parts of a frame's time
+    metrics: tuple[str, ...]  # names of the entries of ``Prediction.metrics``
+
+    def prepare(self, cloth: Cloth, rest_pos: Any) -> Any:
+        """What is computed once per cloth."""
+        ...
+
+    def find_contact(self, cloth: Cloth, state: State, step: StepInput) -> Contact | None:
+        """The step's one contact search; None without a body."""
+        ...
+
+    def predict(self, problem: StepProblem, prepared: Any, watch: Stopwatch | None = None) -> Prediction:
+        """Positions at t + 1."""
+        ...
+
+    def next_velocity(self, problem: StepProblem, prediction: Prediction) -> Tensor:
+        """(V, 3) m/s at t + 1."""
+        ...
+
+
+class NewtonStepper:
+    """Implicit Euler by projected Newton on the same potential that trains the networks; no weights.
+
+    Steps that miss the target accuracy are taken as far as they got and counted in the metrics.
+    """
+
+    times: tuple[str, ...] = ("search", "solver", "rest", "total")
+    metrics: tuple[str, ...] = ("solver_iterations", "solver_converged")
+
+    def __init__(self, potential: Potential, settings: NewtonSettings | None = None) -> None:
+        self.potential, self.settings = potential, settings or NewtonSettings()
+        self.gravity = torch.tensor([0.0, -9.81, 0.0])
+        self.config: dict[str, Any] = {"stepper": "newton", **asdict(self.settings)}
+
+    def prepare(self, cloth: Cloth, rest_pos: Any) -> None:
+        """Nothing: the solver keeps its plan of a cloth itself."""
+
+    def find_contact(self, cloth: Cloth, state: State, step: StepInput) -> Contact | None:
+        """The step's one contact search; None without a body."""
+        return None if step.obstacle is None else find_contact(state.pos, cloth.vertex_scene, step.obstacle)
+
+    def predict(self, problem: StepProblem, prepared: None, watch: Stopwatch | None = None) -> Prediction:
+        """The minimum next to the contact-projected inertial guess."""
+        with timed(watch, "solver"):
+            pos, report = minimize(self.potential, problem, settings=self.settings)
+        reached = {"solver_iterations": float(report.iterations), "solver_converged": float(bool(report.converged.all()))}
+        return Prediction(pos, report.acc, reached)
+
+    def next_velocity(self, problem: StepProblem, prediction: Prediction) -> Tensor:
+        """(V, 3) m/s at t + 1: (x_{t+1} − x_t) / dt."""
+        return problem.state.vel + problem.vertex_dt * prediction.acc

@@ -1,0 +1,72 @@
+"""Accuracy without ground truth: how far a step is from the minimum of the potential it should minimise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from hood.losses.potential import Potential, scale
+from hood.losses.problem import StepProblem
+from hood.solver.iterate import in_double
+from hood.solver.newton import NewtonSettings, minimize
+
+#: Accuracy of a reference minimum; a start that misses it is flagged.
+REFERENCE = NewtonSettings(target_rg=1e-3, max_iterations=300)
+#: Starts whose minima differ by more than this [e0] found different minima.
+AGREEMENT = 1e-2
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Gap of a method's positions, scene by scene.
+
+    γ = (Φ(x) − Φ*) / e0 with e0 = ½ M g² dt²; √γ is about the RMS error of the acceleration in g. Not clamped: positions
+    that beat every minimisation become the reference themselves, and ``converged`` is then False.
+    """
+
+    gamma: Tensor  # (B,) float64
+    phi: Tensor  # (B,) J, of the positions
+    reference: Tensor  # (B,) J, lowest potential known: over the starts and the positions themselves
+    converged: Tensor  # (B,) bool, the lowest start reached the reference accuracy
+    spread: Tensor  # (B,) e0, highest minus lowest potential over the converged starts; above AGREEMENT they disagree
+
+    @property
+    def agree(self) -> Tensor:
+        """(B,) bool: the starts found the same minimum within :data:`AGREEMENT`."""
+        return self.spread <= AGREEMENT
+
+
+def gap(
+    potential: Potential,
+    problem: StepProblem,
+    next_pos: Tensor,
+    starts: Sequence[Tensor] = (),
+    settings: NewtonSettings = REFERENCE,
+) -> Gap:
+    """Gap γ of ``next_pos`` (V, 3) for the step ``problem``.
+
+    The reference Φ* is the lowest of at least three minimisations: from the contact-projected inertial guess, from the previous
+    positions and from ``next_pos`` itself; ``starts`` adds more. The potential is not convex, so one start is not enough.
+    Computed in float64.
+    """
+    work = in_double(problem)
+    pos = next_pos.detach().double()
+    phi = potential.total(work, pos)
+    e0 = scale(work)
+    values, converged = [], []
+    for start in (None, work.state.pos, pos, *(s.detach().double() for s in starts)):
+        _, report = minimize(potential, work, start, settings)
+        values.append(report.phi)
+        converged.append(report.converged)
+    table, sound = torch.stack(values), torch.stack(converged)
+    table = torch.where(torch.isfinite(table), table, float("inf"))
+    lowest, which = table.min(dim=0)
+    high = torch.where(sound, table, float("-inf")).amax(dim=0)
+    low = torch.where(sound, table, float("inf")).amin(dim=0)
+    spread = torch.where(sound.any(dim=0), (high - low) / e0, float("nan"))
+    reference = torch.where(torch.isfinite(phi), torch.minimum(lowest, phi), lowest)
+    reached = sound.gather(0, which.unsqueeze(0)).squeeze(0) & (lowest <= phi)
+    return Gap((phi - reference) / e0, phi, reference, reached, spread)

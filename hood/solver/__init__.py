@@ -1,0 +1,1 @@
+"""Minimises the incremental potential without a network: projected Newton, and local sweeps."""

@@ -1,0 +1,112 @@
+"""A state of the unknowns during a minimisation, in the form that keeps its precision."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from hood.losses.collision import Collision
+from hood.losses.potential import Potential
+from hood.losses.problem import StepProblem, inertial_guess
+from hood.scene.batch import to_device
+
+
+@dataclass(frozen=True)
+class Iterate:
+    """Candidate next positions and what they are worth."""
+
+    pos: Tensor  # (V, 3) m
+    acc: Tensor  # (V, 3) m/s²
+    phi: Tensor  # (B,) J
+    noise: Tensor  # (B,) J, rounding of phi
+
+
+class Unknowns:
+    """The unknown next positions of a step, as accelerations: in float32 positions would not resolve inertia."""
+
+    def __init__(self, potential: Potential, problem: StepProblem) -> None:
+        self.potential, self.problem = potential, problem
+        self.scene = problem.cloth.vertex_scene
+        self.free = problem.cloth.free.unsqueeze(1)
+        self.dt_sq = problem.vertex_dt**2
+        self._base = inertial_guess(problem.state, problem.step, self.scene)
+        self._fixed = fixed_positions(problem)
+        self._fixed_acc = (self._fixed - self._base) / self.dt_sq
+
+    def at(self, pos: Tensor) -> Iterate:
+        """The iterate at positions (V, 3), of which free vertices are read."""
+        return self.evaluate((pos - self._base) / self.dt_sq)
+
+    def place(self, acc: Tensor) -> Tensor:
+        """Positions (V, 3) reached with ``acc`` (V, 3)."""
+        return torch.where(self.free, self._base + self.dt_sq * acc, self._fixed)
+
+    def evaluate(self, acc: Tensor) -> Iterate:
+        """The iterate with accelerations (V, 3), of which free vertices are read."""
+        acc = torch.where(self.free, acc, self._fixed_acc)
+        pos = self.place(acc)
+        with torch.no_grad():
+            energies = self.potential.energies(self.problem, pos, acc)
+        zero = pos.new_zeros(self.problem.num_scenes)
+        size = sum((energy.abs() for energy in energies.values()), start=zero)
+        return Iterate(pos, acc, sum(energies.values(), start=zero), 8.0 * torch.finfo(pos.dtype).eps * size)
+
+    def select(self, moved: Tensor, there: Iterate, here: Iterate) -> Iterate:
+        """``there`` in the scenes ``moved`` (B,) bool, ``here`` in the others."""
+        by_vertex = moved[self.scene].unsqueeze(1)
+        return Iterate(
+            torch.where(by_vertex, there.pos, here.pos),
+            torch.where(by_vertex, there.acc, here.acc),
+            torch.where(moved, there.phi, here.phi),
+            torch.where(moved, there.noise, here.noise),
+        )
+
+
+def projected_guess(potential: Potential, problem: StepProblem) -> Tensor:
+    """Start (V, 3): free flight x_t + dt v_t + dt² g, then out of the body along the matched normals.
+
+    Vertices are left just inside the contact distance, where the penalty carries their weight: outside it the penalty
+    has no curvature and the first iteration would overshoot.
+    """
+    cloth, contact, dt = problem.cloth, problem.contact, problem.vertex_dt
+    gravity = problem.gravity.to(dt)
+    guess = inertial_guess(problem.state, problem.step, cloth.vertex_scene) + dt**2 * gravity
+    term = next((term for term in potential.terms.values() if isinstance(term, Collision)), None)
+    if contact is not None and term is not None and term.weight > 0:
+        carried = (cloth.mass * gravity.norm() / (3.0 * term.weight)).sqrt()
+        touching = contact.valid & cloth.free
+        # Rows without a match may hold infinite or undefined numbers.
+        normal = torch.where(touching[:, None], contact.next_normal, 0.0)
+        dist = ((guess - torch.where(touching[:, None], contact.next_point, 0.0)) * normal).sum(1)
+        push = torch.where(touching, term.epsilon - carried - dist, 0.0).clamp_min(0.0)
+        guess = guess + push[:, None] * normal
+    return torch.where(cloth.free.unsqueeze(1), guess, fixed_positions(problem))
+
+
+def fixed_positions(problem: StepProblem) -> Tensor:
+    """Where vertices go that the solver does not move: pins to their targets, massless ones stay. (V, 3)."""
+    target = problem.step.pin_target
+    if target is None:
+        return problem.state.pos
+    return torch.where(problem.cloth.pinned.unsqueeze(1), target, problem.state.pos)
+
+
+def in_double(problem: StepProblem) -> StepProblem:
+    """The same problem in float64."""
+    if problem.state.pos.dtype == torch.float64:
+        return problem
+    double, step = torch.float64, problem.step
+    return StepProblem(
+        to_device(problem.cloth, dtype=double),
+        to_device(problem.state, dtype=double),
+        replace(step, dt=step.dt.to(double), pin_target=None if step.pin_target is None else step.pin_target.to(double)),
+        None if problem.contact is None else to_device(problem.contact, dtype=double),
+        problem.gravity.to(double),
+    )
+
+
+def rounded(problem: StepProblem, pos: Tensor) -> Tensor:
+    """``pos`` (V, 3) in the problem's type, fixed vertices exactly where it says."""
+    return torch.where(problem.cloth.free.unsqueeze(1), pos.to(problem.state.pos.dtype), fixed_positions(problem))

@@ -1,0 +1,130 @@
+"""Gradient and Hessian assembled in closed form."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from hood.assets.material import Material
+from hood.losses.potential import default_potential
+from hood.scene.cloth import build_cloth
+from hood.scene.state import Attachments
+from hood.solver import linear
+from hood.solver.plan import build_plan, plan_for, quadratic_model
+from hood.testing import fold, grid, make_problem, plane_contact
+
+F64 = torch.float64
+
+
+def touching_sheet(pinned=True, attached=True):
+    """A sheet that pierces a moving plane, slides on it and is buttoned to itself."""
+    pos, faces = grid(5, 4, 0.3)
+    rng = np.random.default_rng(0)
+    cloth = build_cloth(pos, faces, Material(bending_stiffness=1e-3), np.arange(20) < (4 if pinned else 0), dtype=F64)
+    start = cloth.rest_pos + 0.001 * torch.as_tensor(rng.normal(size=pos.shape))
+    motion = torch.tensor([2e-3, 1e-3, 0.0])
+    problem = make_problem(cloth, start, 0.05 * rng.normal(size=pos.shape), contact=plane_contact(start, motion=motion))
+    if attached:
+        button = Attachments(torch.tensor([[3, 16], [5, 18]]), torch.tensor([True, False]))
+        problem = replace(problem, step=replace(problem.step, attachments=button))
+    return problem
+
+
+def states(problem):
+    rest = problem.cloth.rest_pos
+    noise = 1e-3 * torch.as_tensor(np.random.default_rng(1).normal(size=rest.shape))
+    fallen = rest.clone()
+    fallen[4] = fallen[5]
+    return {
+        "near": problem.state.pos + noise,
+        "stretched": 1.5 * rest + noise,
+        "compressed": 0.6 * rest + noise,
+        "folded": torch.as_tensor(fold(rest.numpy(), 3.0)) + 0.1 * noise,
+        "coincident vertices": fallen,
+    }
+
+
+@pytest.mark.parametrize("name", ["near", "stretched", "compressed", "folded", "coincident vertices"])
+def test_gradient_is_that_of_the_potential(name):
+    problem, potential = touching_sheet(), default_potential()
+    pos = states(problem)[name]
+    acc = problem.acceleration(pos)
+    expected, _ = potential.gradient(problem, pos, acc)
+    model = quadratic_model(potential, problem, plan_for(problem), pos, acc)
+    torch.testing.assert_close(model.gradient, expected, rtol=1e-10, atol=1e-10 * float(expected.abs().max()))
+
+
+def product_and_difference(problem, pos, direction, h=1e-7):
+    potential, plan = default_potential(), plan_for(problem)
+    model = quadratic_model(potential, problem, plan, pos, problem.acceleration(pos))
+    applied = linear.product(plan.pattern, model.triples)(direction[plan.vertices])
+    ahead, behind = (potential.gradient(problem, pos + sign * h * direction)[0] for sign in (1.0, -1.0))
+    return applied, ((ahead - behind) / (2 * h))[plan.vertices]
+
+
+def test_hessian_is_exact_in_tension():
+    problem = touching_sheet()
+    pos = 1.05 * problem.cloth.rest_pos * torch.tensor([1.0, 0.0, 1.02]) + torch.tensor([0.001, 0.0005, 0.0])
+    direction = torch.as_tensor(np.random.default_rng(2).normal(size=pos.shape)) * problem.cloth.free.unsqueeze(1)
+    applied, difference = product_and_difference(problem, pos, direction)
+    torch.testing.assert_close(applied, difference, rtol=0, atol=1e-6 * float(difference.abs().max()))
+
+
+def test_hessian_of_sticking_and_sliding_friction():
+    problem = touching_sheet(attached=False)
+    carried = problem.contact.next_point - problem.contact.point
+    for slip in (5e-5, 1e-3):
+        pos = problem.state.pos + carried + slip * torch.tensor([0.6, 0.0, 0.8])
+        limp = {name: 0 * getattr(problem.cloth, name) for name in ("lame_mu", "lame_lambda", "bending_stiffness")}
+        flat = replace(problem, cloth=replace(problem.cloth, **limp))
+        direction = torch.as_tensor(np.random.default_rng(3).normal(size=pos.shape)) * problem.cloth.free.unsqueeze(1)
+        applied, difference = product_and_difference(flat, pos, direction, h=1e-9)
+        torch.testing.assert_close(applied, difference, rtol=0, atol=1e-4 * float(difference.abs().max()))
+
+
+def dense(problem, pos):
+    plan = plan_for(problem)
+    model = quadratic_model(default_potential(), problem, plan, pos, problem.acceleration(pos))
+    apply, size = linear.product(plan.pattern, model.triples), 3 * plan.pattern.size
+    return torch.stack([apply(column.reshape(-1, 3)).reshape(-1) for column in torch.eye(size, dtype=F64)])
+
+
+def test_hessian_is_positive_where_the_potential_is_not_convex():
+    problem = touching_sheet()
+    for name, pos in states(problem).items():
+        matrix = dense(problem, pos)
+        torch.testing.assert_close(matrix, matrix.T, rtol=0, atol=1e-12 * float(matrix.abs().max()))
+        inertia = float((problem.cloth.mass / problem.vertex_dt.squeeze(1) ** 2).min())
+        assert float(torch.linalg.eigvalsh(matrix).min()) >= 0.99 * inertia, name
+
+
+def test_projection_is_needed_under_compression():
+    pos, faces = grid(5, 5, 0.2)
+    problem = make_problem(build_cloth(pos, faces, Material(bending_stiffness=0.0), dtype=F64))
+    direction = torch.zeros_like(problem.state.pos)
+    direction[::2, 1] = 1.0
+    applied, difference = product_and_difference(problem, 0.6 * problem.cloth.rest_pos, direction)
+    assert float((difference * direction).sum()) < 0 < float((applied * direction).sum())
+
+
+def test_plan_is_kept_until_something_changes():
+    problem = touching_sheet()
+    first = plan_for(problem)
+    assert plan_for(problem) is first
+    assert plan_for(replace(problem, cloth=replace(problem.cloth, mass=problem.cloth.mass.float()))) is first
+    opened = replace(problem.step.attachments, active=torch.tensor([False, True]))
+    assert plan_for(replace(problem, step=replace(problem.step, attachments=opened))) is first
+    other = replace(problem, step=replace(problem.step, attachments=None))
+    assert plan_for(other) is not first
+    loose = replace(problem, cloth=replace(problem.cloth, pinned=torch.zeros(20, dtype=torch.bool)))
+    assert plan_for(loose).pattern.size == 20
+
+
+def test_fixed_vertices_are_no_unknowns():
+    problem = touching_sheet()
+    plan = build_plan(problem.cloth)
+    assert plan.vertices.tolist() == list(range(4, 20))
+    assert plan.pattern.size == 16
