@@ -164,9 +164,12 @@ def scoop(half_width: float, front: float, back: float, top: float = 0.66) -> Ca
 
 
 def armhole(shoulder: float, side: float) -> Callable[[Array], Array]:
-    """Cuts off the arm along a plane through |x| = `shoulder` at y = 0.61 and |x| = 0.19 at y = `side`."""
+    """Cuts off the arm along a plane through |x| = `shoulder` at y = 0.61 and |x| = 0.19 at y = `side`.
+
+    What hangs well below the armpit is kept however wide it is.
+    """
     slope = (0.19 - shoulder) / (0.61 - side)
-    return lambda p: shoulder + slope * (0.61 - p[:, 1]) - np.abs(p[:, 0])
+    return lambda p: np.maximum(shoulder + slope * (0.61 - p[:, 1]) - np.abs(p[:, 0]), side - 0.08 - p[:, 1])
 
 
 PATTERNS = {
@@ -198,7 +201,7 @@ PATTERNS = {
     ),
     "dress": Pattern(
         lambda f: dress_field(f, 0.012, 0.30),
-        (scoop(0.090, 0.135, 0.090), armhole(0.142, 0.430), above(-0.36)),
+        (scoop(0.070, 0.120, 0.070), armhole(0.165, 0.430), above(-0.36)),
         weight_reach=0.05,
         flared=True,
     ),
