@@ -6,9 +6,26 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-Field = float | np.ndarray
 
-#: Ranges of METHOD §5 [SI]; the features are normalised by them, training samples inside them.
+@dataclass(frozen=True)
+class FaceField:
+    """A property with one value per face: panels of different fabric, exact up to the seam."""
+
+    values: np.ndarray  # (F,) in the order of the garment's faces
+
+
+@dataclass(frozen=True)
+class EdgeField:
+    """A property with one value per edge: a seam's or a pleat's bending stiffness."""
+
+    values: np.ndarray  # (E,) in the order of hood.mesh.topology.unique_edges: ascending pairs, lexicographic
+
+
+#: One number for the garment, an array (V,) with one value per vertex, or a field on faces or edges. What a field lies on
+#: is said, never guessed: meshes may have as many vertices as faces.
+Field = float | np.ndarray | FaceField | EdgeField
+
+#: Ranges of the paper [SI]; the features are normalised by them, training samples inside them.
 RANGES: dict[str, tuple[float, float]] = {
     "density": (0.0434, 0.7),
     "lame_mu": (15909.0, 63636.0),
@@ -19,9 +36,15 @@ RANGES: dict[str, tuple[float, float]] = {
 
 @dataclass(frozen=True)
 class Material:
-    """A fabric. Every property is one number or a field of shape (V,).
+    """A fabric. Every property is one number or a :data:`Field` on vertices, faces or edges.
+
+    Energies use a field exactly where it lies on what they sum over (faces for all but ``bending_stiffness``, edges for
+    that); elsewhere it is carried over by the rules of :mod:`hood.scene.fabric`.
 
     Defaults: the paper's default fabric (density 0.20022 kg/m², μ 23600 Pa, λ 44400 Pa, bending 3.9626e-5).
+
+    Raises:
+        ValueError: a value is not finite or not physical; names the property and the index.
     """
 
     density: Field = 0.20022  # kg/m²
@@ -42,14 +65,43 @@ class Material:
             "thickness": ("> 0", lambda v: v > 0),
         }
         for name in self.names():
-            values = np.atleast_1d(np.asarray(getattr(self, name), dtype=np.float64))
+            values, place = values_of(getattr(self, name))
             rule, ok = rules.get(name, ("finite", np.isfinite))
-            bad = ~(np.isfinite(values) & ok(values))
-            if bad.any():
-                index = int(np.argmax(bad))
-                raise ValueError(f"material {name!r} is {values[index]} at index {index}; it must be finite and {rule}")
-        if np.any(np.asarray(self.lame_mu) + np.asarray(self.lame_lambda) <= 0):
-            raise ValueError("material: lame_mu + lame_lambda must be > 0; raise lame_lambda")
+            index = first_bad(np.isfinite(values) & ok(values))
+            if index is not None:
+                where = "" if values.ndim == 0 else f" at {place} {index}"
+                raise ValueError(f"material {name!r} is {values.flat[index]}{where}; it must be finite and {rule}")
+        (lame_mu, place), (lame_lambda, other) = values_of(self.lame_mu), values_of(self.lame_lambda)
+        if place == other or "" in (place, other):
+            check_lame(lame_mu, lame_lambda, place or other)
+
+
+def values_of(field: Field) -> tuple[np.ndarray, str]:
+    """Values of a property and what they lie on: ``"vertex"``, ``"face"``, ``"edge"``, or ``""`` for one number (shape ())."""
+    on = {FaceField: "face", EdgeField: "edge"}.get(type(field), "vertex")
+    values = np.asarray(field.values if isinstance(field, (FaceField, EdgeField)) else field, dtype=np.float64)
+    return values, on if values.ndim else ""
+
+
+def check_lame(lame_mu: np.ndarray, lame_lambda: np.ndarray, place: str) -> None:
+    """Refuse μ + λ <= 0, with which a membrane has no stable rest shape; arrays of one length or numbers.
+
+    Raises:
+        ValueError: names the index.
+    """
+    if lame_mu.ndim and lame_lambda.ndim and lame_mu.shape != lame_lambda.shape:
+        return  # one of the two has the wrong length: refused where the length is known
+    total = np.asarray(lame_mu + lame_lambda)
+    index = first_bad(total > 0)
+    if index is not None:
+        where = f" at {place} {index}" if total.ndim else ""
+        raise ValueError(f"material: lame_mu + lame_lambda is {total.flat[index]}{where}; it must be > 0, raise 'lame_lambda'")
+
+
+def first_bad(good: np.ndarray) -> int | None:
+    """Index of the first False, None without any."""
+    flat = np.atleast_1d(good).reshape(-1)
+    return None if flat.all() else int(np.argmin(flat))
 
 
 def sample_material(

@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
 from hood.losses.problem import StepProblem
+from hood.scene.contact import CentroidContact, find_centroid_contact
+
+
+class Planes(NamedTuple):
+    """One plane per vertex at t+1, on whose outer side it should be; rows not ``touching`` are zero."""
+
+    touching: Tensor  # (V,) bool
+    point: Tensor  # (V, 3) m
+    normal: Tensor  # (V, 3) outward unit normal
 
 
 class Collision:
@@ -29,16 +41,60 @@ class Collision:
 
     def with_weight(self, weight: float) -> Collision:
         """The same term with another weight, for a ramp during training."""
-        return Collision(weight, self.epsilon)
+        return type(self)(weight, self.epsilon)
 
     def applies(self, problem: StepProblem) -> bool:
         return problem.contact is not None
+
+    def planes(self, problem: StepProblem) -> Planes:
+        """The planes that d is measured from; the problem must have a contact."""
+        contact = problem.contact
+        assert contact is not None
+        return _planes(problem, contact.valid, contact.next_point, contact.next_normal)
+
+    def depth(self, problem: StepProblem, next_pos: Tensor) -> tuple[Tensor, Tensor]:
+        """Depth ε - d [m] (V,), negative outside, and normals (V, 3); both 0 without a match."""
+        planes = self.planes(problem)
+        dist = ((next_pos - planes.point) * planes.normal).sum(dim=1)
+        return torch.where(planes.touching, self.epsilon - dist, 0.0), planes.normal
 
     def __call__(self, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> Tensor:
         """Energy [J] (B,) at ``next_pos`` (V, 3)."""
         if problem.contact is None:
             return next_pos.new_zeros(problem.num_scenes)
-        touching = problem.contact.valid & (problem.cloth.mass > 0)
-        # where() before the arithmetic: rows without a match may hold infinite or undefined distances.
-        dist = torch.where(touching, problem.contact.next_dist(next_pos), self.epsilon)
-        return problem.sum_vertices(self.weight * (self.epsilon - dist).clamp_min(0.0) ** 3)
+        depth, _ = self.depth(problem, next_pos)
+        return problem.sum_vertices(self.weight * depth.clamp_min(0.0) ** 3)
+
+
+class CentroidCollision(Collision):
+    """Collision with the planes of HOOD's published code: those of the face whose *centroid* was nearest at t.
+
+    d = (x - c)·n with centroid c and face normal n at t+1, found for every vertex however far the body is
+    (:class:`hood.scene.contact.CentroidContact`). A facet's plane jumps from face to face, the nearest centroid need
+    not belong to the nearest face, and a plane found far away cuts through cloth beside the body: the default
+    uses the closest point of the surface within a cap. For comparisons with that code only.
+    """
+
+    def prepare(self, problem: StepProblem) -> StepProblem:
+        """The problem with the centroid search done, once per step."""
+        if problem.contact is None or isinstance(problem.contact, CentroidContact):
+            return problem
+        obstacle = problem.step.obstacle
+        if obstacle is None:
+            raise ValueError("collision with centroids: the step has contact data but no obstacle; give StepInput.obstacle")
+        contact = find_centroid_contact(problem.contact, problem.state.pos, problem.cloth.vertex_scene, obstacle)
+        return replace(problem, contact=contact)
+
+    def planes(self, problem: StepProblem) -> Planes:
+        """The planes that d is measured from; the problem must have been prepared."""
+        contact = problem.contact
+        if not isinstance(contact, CentroidContact):
+            raise ValueError("collision with centroids: not searched for yet; pass the problem through Potential.prepare once")
+        return _planes(problem, contact.facing, contact.next_centroid, contact.next_face_normal)
+
+
+def _planes(problem: StepProblem, valid: Tensor, point: Tensor, normal: Tensor) -> Planes:
+    touching = valid & (problem.cloth.mass > 0)
+    # where() before the arithmetic: rows without a match may hold infinite or undefined numbers.
+    row = touching.unsqueeze(1)
+    return Planes(touching, torch.where(row, point, 0.0), torch.where(row, normal, 0.0))

@@ -9,43 +9,33 @@ from hood.losses.problem import StepProblem
 from hood.scene.contact import Contact
 
 
-class Friction:
-    """Friction energy [J], the sum over vertices of μ_f N f(‖u_T‖).
+class LaggedFriction:
+    """Friction energy [J], the sum over vertices of μ_f N f(‖u_T‖); subclasses say what the normal force N is.
 
-    u_T is the tangential slip from t to t+1 relative to the matched body point, N = 3 w max(ε - d_t, 0)² the
-    normal force of the collision term at t (lagged, so that the friction is a potential). f is the C¹
-    mollifier of Li et al. ("Incremental Potential Contact", 2020, eq. 12 and 13) with e = ``slip_speed`` ·
-    dt: quadratic-cubic below a slip of e, equal to ‖u_T‖ above. The force is at most μ_f N and reaches it at
-    ``slip_speed``; below, contacts creep.
+    u_T is the tangential slip from t to t+1 relative to the matched body point, N is taken at t (lagged, so that
+    the friction is a potential). f is the C¹ mollifier of Li et al. ("Incremental Potential Contact", 2020, eq.
+    12 and 13) with e = ``slip_speed`` · dt: quadratic-cubic below a slip of e, equal to ‖u_T‖ above. The force
+    is at most μ_f N and reaches it at ``slip_speed``; below, contacts creep.
 
     Args:
         coefficient: μ_f.
         slip_speed: ε_v [m/s], speed below which friction counts as static.
-        weight, epsilon: w [J/m³] and ε [m] of the collision term.
     """
 
-    def __init__(self, coefficient: float = 0.5, slip_speed: float = 5e-3, weight: float = 5e5, epsilon: float = 2e-3) -> None:
+    def __init__(self, coefficient: float, slip_speed: float) -> None:
         if coefficient < 0 or slip_speed <= 0:
             raise ValueError(
                 f"friction: coefficient is {coefficient}, slip_speed {slip_speed}; give coefficient >= 0 and slip_speed > 0"
             )
         self.coefficient = coefficient
         self.slip_speed = slip_speed
-        self.weight = weight
-        self.epsilon = epsilon
-
-    def with_weight(self, weight: float) -> Friction:
-        """The same term with another collision weight, for a ramp during training."""
-        return Friction(self.coefficient, self.slip_speed, weight, self.epsilon)
 
     def applies(self, problem: StepProblem) -> bool:
         return problem.contact is not None and self.coefficient > 0
 
     def normal_force(self, problem: StepProblem, contact: Contact) -> Tensor:
         """Lagged normal forces N [N], shape (V,)."""
-        touching = contact.valid & (problem.cloth.mass > 0)
-        dist = torch.where(touching, contact.dist, self.epsilon)
-        return 3.0 * self.weight * (self.epsilon - dist).clamp_min(0.0) ** 2
+        raise NotImplementedError
 
     def __call__(self, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> Tensor:
         """Energy [J] (B,) at ``next_pos`` (V, 3)."""
@@ -59,6 +49,61 @@ class Friction:
         slip = slip - (slip * normal).sum(dim=1, keepdim=True) * normal
         limit = self.slip_speed * problem.vertex_dt.squeeze(1)
         return problem.sum_vertices(self.coefficient * force * mollified_norm((slip * slip).sum(dim=1), limit))
+
+
+class Friction(LaggedFriction):
+    """Friction by the contact's own force: N = 3 w max(ε - d_t, 0)², that of the collision term at t.
+
+    Args:
+        weight, epsilon: w [J/m³] and ε [m] of the collision term.
+    """
+
+    def __init__(self, coefficient: float = 0.5, slip_speed: float = 5e-3, weight: float = 5e5, epsilon: float = 2e-3) -> None:
+        super().__init__(coefficient, slip_speed)
+        self.weight = weight
+        self.epsilon = epsilon
+
+    def with_weight(self, weight: float) -> Friction:
+        """The same term with another collision weight, for a ramp during training."""
+        return Friction(self.coefficient, self.slip_speed, weight, self.epsilon)
+
+    def normal_force(self, problem: StepProblem, contact: Contact) -> Tensor:
+        touching = contact.valid & (problem.cloth.mass > 0)
+        dist = torch.where(touching, contact.dist, self.epsilon)
+        return 3.0 * self.weight * (self.epsilon - dist).clamp_min(0.0) ** 2
+
+
+class WeightFriction(LaggedFriction):
+    """Friction by weight, as in HOOD's published code: N = m ‖g‖ max(n·up, 0) within ``radius`` of the surface.
+
+    n is the surface normal at t and up the direction against gravity, so the weight counts as far as the surface is
+    horizontal, and not at all under an overhang. Cloth pressed on by tight fit or a moving limb gets no more
+    friction than cloth that just lies there, and cloth hovering within the radius gets as much: the default
+    follows the contact force. For comparisons with that code only.
+
+    The form as it was meant: the published mask compares a squared distance with ``radius`` (5.5 cm instead of 3
+    mm), takes z as up while gravity acts along y, and measures the slip against the body's motion from t-1 to t.
+    Here the distance is a distance (signed, to the closest point of the surface: penetrating vertices count), up
+    is the problem's, and the body moves from t to t+1 as it does for the collision.
+
+    Args:
+        radius: [m].
+    """
+
+    def __init__(self, coefficient: float = 0.5, slip_speed: float = 5e-3, radius: float = 3e-3) -> None:
+        super().__init__(coefficient, slip_speed)
+        if radius <= 0:
+            raise ValueError(f"friction: radius is {radius}; give radius > 0")
+        self.radius = radius
+
+    def with_weight(self, weight: float) -> WeightFriction:
+        """The term itself: the weight of a collision term plays no role in it."""
+        return self
+
+    def normal_force(self, problem: StepProblem, contact: Contact) -> Tensor:
+        near = contact.valid & (contact.dist <= self.radius)
+        normal = torch.where(near.unsqueeze(1), contact.normal, 0.0)
+        return problem.cloth.mass * (-(normal * problem.gravity.to(normal)).sum(dim=1)).clamp_min(0.0)
 
 
 def mollified_norm(norm_sq: Tensor, limit: Tensor) -> Tensor:

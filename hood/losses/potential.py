@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
 from hood.losses.attachment import Attachment
-from hood.losses.bending import Bending
-from hood.losses.collision import Collision
-from hood.losses.friction import Friction
+from hood.losses.bending import Bending, CurrentLengthBending
+from hood.losses.collision import CentroidCollision, Collision
+from hood.losses.friction import Friction, WeightFriction
 from hood.losses.gravity import Gravity
 from hood.losses.inertia import Inertia
 from hood.losses.problem import STANDARD_GRAVITY, StepProblem, sum_per_scene
@@ -30,6 +30,15 @@ class Term(Protocol):
         ...
 
 
+@runtime_checkable
+class PreparedTerm(Protocol):
+    """A term that needs to know more about a step than every step tells."""
+
+    def prepare(self, problem: StepProblem) -> StepProblem:
+        """The problem with what the term needs; itself when it is there already."""
+        ...
+
+
 class Potential:
     """Sum of energies whose minimum over the next positions is the implicit Euler step (HOOD paper, section
     3.3).
@@ -44,6 +53,16 @@ class Potential:
     def with_terms(self, **terms: Term) -> Potential:
         """The same potential with some terms replaced or added."""
         return Potential({**self.terms, **terms})
+
+    def prepare(self, problem: StepProblem) -> StepProblem:
+        """The problem with what the terms found out about it, once per step: call it where a problem is made.
+
+        The problem itself, unless a term asks for more than the contact that features and terms share.
+        """
+        for term in self.terms.values():
+            if isinstance(term, PreparedTerm):
+                problem = term.prepare(problem)
+        return problem
 
     def energies(self, problem: StepProblem, next_pos: Tensor, acc: Tensor | None = None) -> dict[str, Tensor]:
         """Energies [J] (B,) by term; terms that the scene does not need are left out.
@@ -99,6 +118,22 @@ def default_potential(
             "friction": Friction(friction_coefficient, friction_slip_speed, collision_weight, collision_epsilon),
             "attachment": Attachment(attachment_stiffness),
         }
+    )
+
+
+def reference_potential(
+    collision_weight: float = 5e5,
+    collision_epsilon: float = 2e-3,
+    friction_coefficient: float = 0.5,
+    friction_slip_speed: float = 5e-3,
+    friction_radius: float = 3e-3,
+    attachment_stiffness: float = 1e3,
+) -> Potential:
+    """The energies of HOOD's published code, where they differ from :func:`default_potential`: for comparisons."""
+    return default_potential(collision_weight, collision_epsilon, attachment_stiffness=attachment_stiffness).with_terms(
+        bending=CurrentLengthBending(),
+        collision=CentroidCollision(collision_weight, collision_epsilon),
+        friction=WeightFriction(friction_coefficient, friction_slip_speed, friction_radius),
     )
 
 

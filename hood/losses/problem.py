@@ -29,6 +29,12 @@ class StepProblem:
     contact: Contact | None = None
     gravity: Tensor = field(default_factory=_standard_gravity)  # (3,) m/s²
 
+    def __post_init__(self) -> None:
+        if len(self.step.dt) != self.cloth.num_scenes:
+            raise ValueError(
+                f"step problem: dt has {len(self.step.dt)} entries for {self.cloth.num_scenes} scenes; give one per scene"
+            )
+
     @property
     def num_scenes(self) -> int:
         return self.cloth.num_scenes

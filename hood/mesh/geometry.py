@@ -103,7 +103,7 @@ def rest_inverse(rest_pos: Tensor, faces: Tensor) -> Tensor:
 
 def _face_cross(pos: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
     """Cross product of the edges x₁ - x₀ and x₂ - x₀ (F, 3), and which faces are not degenerate (F,) bool."""
-    corners = pos[faces]
+    corners = pos.index_select(0, faces.reshape(-1)).view(-1, 3, 3)
     e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     cross = torch.linalg.cross(e1, e2)
     return cross, _regular(cross, (e1 * e1).sum(dim=1), e2)

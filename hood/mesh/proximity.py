@@ -8,6 +8,7 @@ under a body) and surfaces of a few faces are tested against every point. Distan
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -51,21 +52,28 @@ class Incidence(NamedTuple):
     edge_faces: Tensor  # (E, M) faces at an edge, -1 where there is none
 
 
-class _Fans(NamedTuple):
-    """Per vertex and incident face (W, K): the edges u (to ``following``), v (to ``preceding``), products."""
+class _Span(NamedTuple):
+    """Triangles as the two edges from their first corner, by components, and products of these."""
 
-    u: list[Tensor]  # three components
-    v: list[Tensor]
+    u: Sequence[Tensor]  # x, y, z
+    v: Sequence[Tensor]
     uu: Tensor
     vv: Tensor
     uv: Tensor
     det: Tensor  # uu * vv - uv², at least 0
 
-    def select(self, index: Tensor) -> _Fans:
-        """The rows ``index`` of every field."""
-        u, v = ([x.index_select(0, index) for x in axes] for axes in (self.u, self.v))
-        uu, vv, uv, det = (x.index_select(0, index) for x in (self.uu, self.vv, self.uv, self.det))
-        return _Fans(u, v, uu, vv, uv, det)
+
+class _Fans(NamedTuple):
+    """The faces around every vertex."""
+
+    edges: Tensor  # (W, 6, K) u (to ``following``) and v (to ``preceding``), three components each
+    uu: Tensor  # (W, K) squared length of u
+
+    def select(self, index: Tensor) -> _Span:
+        """The faces around the vertices ``index`` (N,), all arrays (N, K)."""
+        # One gather of whole rows and a copy; recomputing the products is faster than gathering them too.
+        edges = self.edges.index_select(0, index).transpose(0, 1).contiguous().unbind()
+        return _span(edges[:3], edges[3:])
 
 
 _incidence_cache: deque[tuple[Tensor, int, Incidence]] = deque(maxlen=8)
@@ -120,29 +128,23 @@ def closest_point_on_triangles(points: Tensor, corners: Tensor) -> Tensor:
     Weights are non-negative and sum to 1; those of corners that the closest feature does not touch are
     exactly 0. A degenerate triangle is treated as its three edges.
     """
-    a, b, c = corners.unbind(dim=-2)
-    u, v, p = b - a, c - a, points - a
-    uu, vv, uv = _dot(u, u), _dot(v, v), _dot(u, v)
-    pu, pv = _dot(p, u), _dot(p, v)
+    a, b, c, point = corners[:, 0].t(), corners[:, 1].t(), corners[:, 2].t(), points.t()
+    u, v, p, w, q = b - a, c - a, point - a, c - b, point - b  # rows are components: three times faster than columns
+    uu, vv, uv, pu, pv = _dot(u, u), _dot(v, v), _dot(u, v), _dot(p, u), _dot(p, v)
     det = uu * vv - uv * uv
     regular = det > _det_floor(uu, vv)
     safe = torch.where(regular, det, 1.0)
     s, t = (vv * pu - uv * pv) / safe, (uu * pv - uv * pu) / safe
     inside = regular & (s >= 0) & (t >= 0) & (s + t <= 1)
-    on_u, on_v, on_w = _ratio(pu, uu), _ratio(pv, vv), _ratio(_dot(p - u, v - u), _dot(v - u, v - u))
-    zero = torch.zeros_like(on_u)
-    options = torch.stack(
-        [
-            torch.stack([1 - on_u, on_u, zero], dim=-1),
-            torch.stack([1 - on_v, zero, on_v], dim=-1),
-            torch.stack([zero, 1 - on_w, on_w], dim=-1),
-        ],
-        dim=-2,
-    )
-    misses = p.unsqueeze(-2) - (options[..., 1:2] * u.unsqueeze(-2) + options[..., 2:3] * v.unsqueeze(-2))
-    best = _dot(misses, misses).argmin(dim=-1)
-    edge = options.gather(-2, best[..., None, None].expand(*best.shape, 1, 3)).squeeze(-2)
-    return torch.where(inside.unsqueeze(-1), torch.stack([1 - s - t, s, t], dim=-1).clamp(0, 1), edge)
+    on_u, on_v, on_w = _ratio(pu, uu), _ratio(pv, vv), _ratio(_dot(q, w), _dot(w, w))
+    misses = [p - on_u * u, p - on_v * v, q - on_w * w]
+    miss_u, miss_v, miss_w = (_dot(m, m) for m in misses)
+    use_w, use_v = (miss_w < miss_u) & (miss_w < miss_v), miss_v < miss_u
+    second = torch.where(use_w, 1 - on_w, torch.where(use_v, 0.0, on_u))
+    third = torch.where(use_w, on_w, torch.where(use_v, on_v, 0.0))
+    first = torch.where(use_w, 0.0, torch.where(use_v, 1 - on_v, 1 - on_u))
+    free = torch.stack([1 - s - t, s, t]).clamp(0, 1)
+    return torch.where(inside, free, torch.stack([first, second, third])).t().contiguous()
 
 
 def build_incidence(faces: Tensor, num_vertices: int) -> Incidence:
@@ -179,17 +181,19 @@ def _edge_tables(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _build_fans(vertices: Tensor, incidence: Incidence) -> _Fans:
+    rows, slots = incidence.face.shape
     axes = vertices.t().contiguous()
-    following, preceding = incidence.following.reshape(-1), incidence.preceding.reshape(-1)
-    shape = incidence.face.shape
-    u = [x.index_select(0, following).view(shape).sub_(x.unsqueeze(1)) for x in axes]
-    v = [x.index_select(0, preceding).view(shape).sub_(x.unsqueeze(1)) for x in axes]
-    return _span(u, v)
+    edges = vertices.new_empty(rows, 6, slots)
+    for i, corner in enumerate((incidence.following.reshape(-1), incidence.preceding.reshape(-1))):
+        for k, axis in enumerate(axes):
+            torch.sub(axis.index_select(0, corner).view(rows, slots), axis.unsqueeze(1), out=edges[:, 3 * i + k])
+    u = edges[:, :3].unbind(dim=1)
+    return _Fans(edges, _sum_products(u, u))
 
 
-def _span(u: list[Tensor], v: list[Tensor]) -> _Fans:
+def _span(u: Sequence[Tensor], v: Sequence[Tensor]) -> _Span:
     uu, vv, uv = _sum_products(u, u), _sum_products(v, v), _sum_products(u, v)
-    return _Fans(u, v, uu, vv, uv, (uu * vv - uv * uv).clamp_min_(0))
+    return _Span(u, v, uu, vv, uv, (uu * vv - uv * uv).clamp_min_(0))
 
 
 def _nearest_vertices(
@@ -214,8 +218,8 @@ def _nearest_vertices(
 def _search_tree(points: Tensor, vertices: Tensor) -> tuple[Tensor, Tensor]:
     if points.device.type != "cpu":
         return _search_dense(points, vertices)
-    # Building is a third of the time: an unbalanced tree builds faster, but queries lose more than that.
-    tree = cKDTree(vertices.detach().numpy(), leafsize=16)
+    # Few points a query: large leaves and the median's approximation are faster to build and no slower to search.
+    tree = cKDTree(vertices.detach().numpy(), leafsize=32, balanced_tree=False, compact_nodes=False)
     dist, index = tree.query(points.detach().numpy(), k=_NUM_NEAREST, workers=1)
     return torch.from_numpy(index.astype(np.int64, copy=False)), torch.from_numpy(dist).to(points.dtype)
 
@@ -235,22 +239,19 @@ def _search_dense(points: Tensor, vertices: Tensor) -> tuple[Tensor, Tensor]:
 def _closest_of_fans(points: Tensor, vertices: Tensor, nearest: Tensor, incidence: Incidence, fans: _Fans) -> Tensor:
     """The face (N,) with the smallest distance among those around the vertices ``nearest`` (N, 3)."""
     num_slots = incidence.face.shape[1]
-    axes = vertices.t().contiguous()
     # On a CPU, blocks whose temporaries stay in the cache: a fifth faster in all.
     block = _BLOCK_PAIRS // num_slots + 1 if points.device.type == "cpu" else len(points)
     best = []
     for rows, around in zip(points.split(block), nearest.split(block), strict=True):
         flat = around.reshape(-1)
-        p = [
-            (x.unsqueeze(1) - axis[flat].view_as(around)).view(-1, 1) for x, axis in zip(rows.unbind(dim=1), axes, strict=True)
-        ]
-        best.append(_gain(p, fans.select(flat)).view(len(rows), -1).argmax(dim=1))
+        p = (rows.repeat_interleave(_NUM_NEAREST, dim=0) - vertices.index_select(0, flat)).t().contiguous().unsqueeze(2)
+        best.append(_gain(p.unbind(), fans.select(flat)).view(len(rows), -1).argmax(dim=1))
     slot = torch.cat(best)
     vertex = nearest.gather(1, (slot // num_slots).unsqueeze(1)).squeeze(1)
     return incidence.face[vertex, slot % num_slots]
 
 
-def _gain(p: list[Tensor], fan: _Fans) -> Tensor:
+def _gain(p: Sequence[Tensor], fan: _Span) -> Tensor:
     """Minus half the squared distance from p to the triangles spanned by u and v, all broadcast together.
 
     With p relative to the triangle's first corner, the squared distance from p to the point su + tv is
@@ -320,9 +321,9 @@ def _closest_of_all(points: Tensor, vertices: Tensor, faces: Tensor, candidates:
 
 def _weights_and_offset(points: Tensor, vertices: Tensor, faces: Tensor, face: Tensor) -> tuple[Tensor, Tensor]:
     """Weights (N, 3) of the closest point on ``face`` (N,), and the vector (N, 3) from there to the point."""
-    corners = vertices[faces[face]]
+    corners = vertices.index_select(0, faces.index_select(0, face).view(-1)).view(-1, 3, 3)
     bary = closest_point_on_triangles(points, corners)
-    return bary, (bary.unsqueeze(-1) * (points.unsqueeze(1) - corners)).sum(dim=1)
+    return bary, _sum_products(bary.unsqueeze(2).unbind(dim=1), (points.unsqueeze(1) - corners).unbind(dim=1))
 
 
 def _pseudonormals(vertices: Tensor, faces: Tensor, face: Tensor, bary: Tensor, incidence: Incidence, fans: _Fans) -> Tensor:
@@ -343,12 +344,12 @@ def _pseudonormals(vertices: Tensor, faces: Tensor, face: Tensor, bary: Tensor, 
 
 
 def _vertex_pseudonormals(vertex: Tensor, incidence: Incidence, fans: _Fans) -> Tensor:
-    u = torch.stack([x[vertex] for x in fans.u], dim=-1)
-    v = torch.stack([x[vertex] for x in fans.v], dim=-1)
-    area = fans.det[vertex].sqrt()
+    fan = fans.select(vertex)
+    u, v = torch.stack(tuple(fan.u), dim=-1), torch.stack(tuple(fan.v), dim=-1)
+    area = fan.det.sqrt()
     slot = torch.arange(incidence.face.shape[1], device=vertex.device)
     real = (slot < incidence.valence[vertex].unsqueeze(1)) & (area > 0)
-    weight = torch.where(real, torch.atan2(area, fans.uv[vertex]) / torch.where(real, area, 1.0), 0.0)
+    weight = torch.where(real, torch.atan2(area, fan.uv) / torch.where(real, area, 1.0), 0.0)
     return (weight.unsqueeze(-1) * torch.linalg.cross(u, v)).sum(dim=1)
 
 
@@ -374,8 +375,9 @@ def _ratio(value: Tensor, length_sq: Tensor) -> Tensor:
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
-    return (a * b).sum(dim=-1)
+    """Dot products (N,) of vectors (3, N)."""
+    return _sum_products(a.unbind(), b.unbind())
 
 
-def _sum_products(a: list[Tensor], b: list[Tensor]) -> Tensor:
+def _sum_products(a: Sequence[Tensor], b: Sequence[Tensor]) -> Tensor:
     return (a[0] * b[0]).addcmul_(a[1], b[1]).addcmul_(a[2], b[2])

@@ -29,6 +29,13 @@ def unique_edges(faces: np.ndarray) -> np.ndarray:
     return np.unique(edges, axis=0)
 
 
+def edge_index(edges: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """Rows (N,) of ``edges`` (E, 2), as :func:`unique_edges` orders them, that hold the vertex pairs (N, 2); any direction."""
+    pairs = np.sort(np.asarray(pairs, dtype=np.int64).reshape(-1, 2), axis=1)
+    key = np.array([int(edges.max(initial=0)) + 1, 1])
+    return np.searchsorted(edges @ key, pairs @ key)
+
+
 def hinges(faces: np.ndarray) -> Hinges:
     """Hinges of ``faces`` (F, 3), ordered by edge; the winding of the faces plays no role.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,7 +12,12 @@ from torch import Tensor
 
 from hood.assets.material import Material
 from hood.mesh import geometry, topology
+from hood.mesh.quality import check_triangles
 from hood.scene.batch import concatenate, indexes
+from hood.scene.fabric import FabricMap
+
+#: Faces longer than this many times their height are warned about: their elements are stiff and lose digits.
+_ASPECT_LIMIT = 1e3
 
 
 @dataclass(frozen=True)
@@ -19,7 +25,8 @@ class Cloth:
     """B garments, concatenated. Derived fields (masses, rest quantities) are constant during a rollout.
 
     Fabric fields live where the energies need them (faces, hinges); ``vertex_fabric`` and ``edge_fabric`` hold
-    (lame_mu [Pa], lame_lambda [Pa], bending_stiffness) where the network's features need them.
+    (lame_mu [Pa], lame_lambda [Pa], bending_stiffness) where the network's features need them. How a property given
+    elsewhere gets there: :mod:`hood.scene.fabric`.
     """
 
     rest_pos: Tensor  # (V, 3) m
@@ -68,52 +75,58 @@ def build_cloth(
 ) -> Cloth:
     """Cloth of one garment.
 
+    Legal, and handled so: an isolated vertex has no mass and stays where it is. An edge with three or more faces has a
+    hinge between each of them and the next, in the order of their indices. Winding plays no role in any energy;
+    faces may be flipped at will. Components do not act on each other. Faces beyond an aspect ratio of 1000 (longest edge
+    over height) are warned about.
+
     Args:
         rest_pos: (V, 3) [m], the undeformed garment.
         faces: (F, 3) vertex indices.
-        material: fabric; each property a scalar or a field of shape (V,).
+        material: fabric; each property a number or a field on vertices, faces or edges.
         pinned: (V,) bool, vertices that follow prescribed positions.
         flat_rest: take 0 as rest angle of every hinge instead of the angle in ``rest_pos``.
+
+    Raises:
+        ValueError: the mesh cannot be simulated (see :func:`hood.mesh.quality.check_triangles`), a fabric's field or
+            ``pinned`` does not fit it; names the index and the fix.
     """
-    num_vertices = len(rest_pos)
+    points, triangles = np.asarray(rest_pos), np.asarray(faces)
+    check_triangles(points, triangles, "cloth")
     # Rest quantities are differences of positions: computed in float64, stored in the working precision.
-    pos = torch.as_tensor(np.asarray(rest_pos, dtype=np.float64))
-    tri = torch.as_tensor(np.asarray(faces, dtype=np.int64))
-    edges = torch.as_tensor(topology.unique_edges(np.asarray(faces)))
-    hinge_table = topology.hinges(np.asarray(faces))
-    hinges = torch.as_tensor(hinge_table.vertices)
-    hinge_faces = torch.as_tensor(hinge_table.faces)
+    points, triangles = points.astype(np.float64), triangles.astype(np.int64)
+    pos, tri = torch.as_tensor(points), torch.as_tensor(triangles)
+    edge_table, hinge_table = topology.unique_edges(triangles), topology.hinges(triangles)
+    edges, hinges = torch.as_tensor(edge_table), torch.as_tensor(hinge_table.vertices)
     area = geometry.triangle_areas(pos, tri)
-    fields = {name: _vertex_field(name, getattr(material, name), num_vertices) for name in Material.names()}
-    density = fields["density"][tri].mean(dim=1)
-    fabric = torch.stack([fields["lame_mu"], fields["lame_lambda"], fields["bending_stiffness"]], dim=1)
+    _warn_about_slivers(pos, tri, area)
+    fabric = FabricMap(material, len(points), triangles, edge_table, area.numpy())
+    density = torch.tensor(fabric.on_faces("density"))
+    hinge_edges = topology.edge_index(edge_table, hinge_table.vertices[:, :2])
     angle = geometry.dihedral_angles(pos, hinges)
     real = {
         "rest_pos": pos,
         "density": density,
-        "thickness": fields["thickness"][tri].mean(dim=1),
-        "lame_mu": fields["lame_mu"][tri].mean(dim=1),
-        "lame_lambda": fields["lame_lambda"][tri].mean(dim=1),
-        "bending_stiffness": fields["bending_stiffness"][hinges[:, :2]].mean(dim=1),
-        "vertex_fabric": fabric,
-        "edge_fabric": fabric[edges].mean(dim=1),
+        **{name: torch.tensor(fabric.on_faces(name)) for name in ("thickness", "lame_mu", "lame_lambda")},
+        "bending_stiffness": torch.tensor(fabric.on_edges("bending_stiffness")[hinge_edges]),
+        "vertex_fabric": torch.tensor(np.stack([fabric.on_vertices(name) for name in _FEATURES], axis=1)),
+        "edge_fabric": torch.tensor(np.stack([fabric.on_edges(name) for name in _FEATURES], axis=1)),
         "mass": geometry.vertex_masses(pos, tri, density),
         "rest_area": area,
         "rest_inverse": geometry.rest_inverse(pos, tri),
         "rest_length": (pos[hinges[:, 1]] - pos[hinges[:, 0]]).norm(dim=1),
-        "hinge_area": area[hinge_faces].sum(dim=1),
+        "hinge_area": area[torch.as_tensor(hinge_table.faces)].sum(dim=1),
         "rest_angle": torch.zeros_like(angle) if flat_rest else angle,
     }
-    pin = torch.zeros(num_vertices, dtype=torch.bool) if pinned is None else torch.as_tensor(pinned).bool()
     return Cloth(
         faces=tri,
         edges=edges,
         hinges=hinges,
-        vertex_scene=torch.zeros(num_vertices, dtype=torch.int64),
+        vertex_scene=torch.zeros(len(points), dtype=torch.int64),
         edge_scene=torch.zeros(len(edges), dtype=torch.int64),
         face_scene=torch.zeros(len(tri), dtype=torch.int64),
         hinge_scene=torch.zeros(len(hinges), dtype=torch.int64),
-        pinned=pin,
+        pinned=_pinned_mask(pinned, len(points)),
         num_scenes=1,
         **{name: value.to(dtype) for name, value in real.items()},
     )
@@ -125,12 +138,30 @@ def concatenate_cloths(cloths: Sequence[Cloth]) -> Cloth:
     return concatenate(cloths, counts)
 
 
-def _vertex_field(name: str, value: float | np.ndarray | Tensor, num_vertices: int) -> Tensor:
-    array = torch.as_tensor(value, dtype=torch.float64)
-    if array.ndim == 0:
-        return array.expand(num_vertices)
-    if array.shape != (num_vertices,):
+#: What vertex_fabric and edge_fabric hold, in this order.
+_FEATURES = ("lame_mu", "lame_lambda", "bending_stiffness")
+
+
+def _pinned_mask(pinned: np.ndarray | None, num_vertices: int) -> Tensor:
+    if pinned is None:
+        return torch.zeros(num_vertices, dtype=torch.bool)
+    mask = np.asarray(pinned)
+    if mask.shape != (num_vertices,) or not np.isin(mask, (0, 1)).all():
         raise ValueError(
-            f"material {name!r} has shape {tuple(array.shape)}; give one number or one per vertex ({num_vertices},)"
+            f"cloth: pinned has shape {mask.shape} and type {mask.dtype}; give one bool per vertex, ({num_vertices},) "
+            "(from indices: mask = np.zeros(num_vertices, bool); mask[indices] = True)"
         )
-    return array
+    return torch.as_tensor(mask.astype(bool))
+
+
+def _warn_about_slivers(pos: Tensor, faces: Tensor, area: Tensor) -> None:
+    corners = pos[faces]
+    longest_sq = (corners - corners[:, [1, 2, 0]]).square().sum(dim=2).amax(dim=1)
+    aspect = 0.5 * longest_sq / area
+    worst = int(aspect.argmax())
+    if float(aspect[worst]) > _ASPECT_LIMIT:
+        warnings.warn(
+            f"cloth: face {worst} (vertices {faces[worst].tolist()}) is {float(aspect[worst]):.0e} times longer than high; "
+            "such slivers are stiff and lose digits, remesh the garment",
+            stacklevel=3,
+        )

@@ -1,4 +1,4 @@
-"""The one contact search of a step: nearest body vertex and closest body triangle point of every cloth vertex."""
+"""Contact search, once per step: nearest body vertex and closest body triangle point of every cloth vertex."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from hood.mesh import geometry
+from hood.mesh.centroids import nearest_centroids
 from hood.mesh.proximity import search_surface
 from hood.scene.state import Obstacle
 
@@ -56,6 +57,40 @@ def find_contact(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, cap: flo
         normal=normal,
         next_point=next_point,
         next_normal=next_normal,
+    )
+
+
+@dataclass(frozen=True)
+class CentroidContact(Contact):
+    """Contact that also knows, for every vertex, the body face whose centroid was nearest at x_t: a compatibility form.
+
+    What the surface search found stays as it is. There is no distance cap: rows are ``facing`` a plane unless
+    their scene has no face with a normal.
+    """
+
+    centroid_face: Tensor  # (V,) index into the batch's body faces
+    facing: Tensor  # (V,) bool
+    next_centroid: Tensor  # (V, 3) m, the face's centroid at t + 1
+    next_face_normal: Tensor  # (V, 3) its outward unit normal at t + 1
+
+
+def find_centroid_contact(contact: Contact, pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle) -> CentroidContact:
+    """``contact`` of the positions ``pos`` (V, 3) at t, extended by one search for the nearest face centroids."""
+    face, dist = nearest_centroids(pos, vertex_scene, obstacle.pos, obstacle.faces, obstacle.face_scene)
+    matched = torch.isfinite(dist)
+    if len(obstacle.faces) == 0:
+        nowhere = torch.zeros_like(pos)
+        return CentroidContact(
+            **vars(contact), centroid_face=face, facing=matched, next_centroid=nowhere, next_face_normal=nowhere
+        )
+    corners = obstacle.faces[face]
+    normal = geometry.face_normals(obstacle.next_pos, corners)
+    return CentroidContact(
+        **vars(contact),
+        centroid_face=face,
+        facing=matched & normal.any(dim=1),
+        next_centroid=obstacle.next_pos[corners].mean(dim=1),
+        next_face_normal=normal,
     )
 
 

@@ -51,6 +51,15 @@ class StepInput:
     pin_target: Tensor | None = None  # (V, 3) m local at t + 1; read at pinned vertices only
     attachments: Attachments | None = None
 
+    def __post_init__(self) -> None:
+        sound = torch.isfinite(self.dt) & (self.dt > 0)
+        if self.dt.ndim != 1 or not bool(sound.all()):
+            scene = int(sound.reshape(-1).long().argmin())
+            raise ValueError(
+                f"time step: dt of scene {scene} is {self.dt.reshape(-1)[scene]} in shape {tuple(self.dt.shape)}; give one "
+                "finite number of seconds > 0 per scene, shape (num_scenes,)"
+            )
+
 
 def concatenate_obstacles(obstacles: Sequence[Obstacle]) -> Obstacle:
     """Obstacles of several scenes (one scene each) as one flat batch."""

@@ -14,18 +14,20 @@ import torch
 from torch import Tensor
 
 from hood.losses.attachment import Attachment
-from hood.losses.bending import Bending, bending_weight
-from hood.losses.collision import Collision
-from hood.losses.friction import Friction
+from hood.losses.bending import Bending, CurrentLengthBending, bending_weight
+from hood.losses.collision import CentroidCollision, Collision
+from hood.losses.friction import Friction, LaggedFriction, WeightFriction
 from hood.losses.gravity import Gravity
 from hood.losses.inertia import Inertia
-from hood.losses.potential import Potential
+from hood.losses.potential import Potential, Term
 from hood.losses.problem import StepProblem
 from hood.losses.stretching import Stretching
-from hood.scene.contact import Contact
 
 #: Terms whose derivatives are written out here. A subclass may compute something else and does not count.
-CLOSED_FORM = (Stretching, Bending, Attachment, Inertia, Gravity, Collision, Friction)
+BENDINGS = (Bending, CurrentLengthBending)
+COLLISIONS = (Collision, CentroidCollision)
+FRICTIONS = (Friction, WeightFriction)
+CLOSED_FORM = (Stretching, *BENDINGS, Attachment, Inertia, Gravity, *COLLISIONS, *FRICTIONS)
 #: As in hood.mesh.geometry: a triangle is degenerate when a sine in it is below this many units of rounding.
 _DEGENERATE_ULPS = 8.0
 
@@ -93,16 +95,41 @@ def _positive_part(s00: Tensor, s01: Tensor, s11: Tensor) -> tuple[Tensor, Tenso
 def hinge_model(corners: Tensor, rest_angle: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Bending: gradient (N, 4, 3) and the one row (N, 4, 3) of its Gauss-Newton matrix, √k ∇θ ∇θᵀ √k.
 
-    The angle is that of :func:`hood.mesh.geometry.dihedral_angles`. With e = x₁ - x₀ and the opposite-vertex normals
-    n₁ = e × a, n₂ = b × e its gradients are -‖e‖ n₁/‖n₁‖² and -‖e‖ n₂/‖n₂‖² at the opposite vertices; those of the
-    edge's ends follow from there being no net force and torque. Degenerate hinges have none.
-
     Args:
         corners: (N, 4, 3) m: edge start, edge end, opposite vertices.
         rest_angle: (N,) rad.
         weight: (N,) J, second derivative of the energy by the angle.
     """
+    angle, slope = _angles(corners.permute(1, 2, 0).contiguous())
+    bend = angle - rest_angle
+    bend = bend - 2.0 * math.pi * torch.round(bend / (2.0 * math.pi))
+    return (weight * bend * slope).permute(2, 0, 1), (weight.sqrt() * slope).permute(2, 0, 1)
+
+
+def current_length_model(corners: Tensor, weight: Tensor, rest_length: Tensor) -> tuple[Tensor, Tensor]:
+    """:func:`hinge_model` of ½ weight r² with r = θ l / l₀, where l is the edge's length now; its row is √weight ∇r.
+
+    The arguments are those of :func:`hinge_model`, and ``rest_length`` (N,) m.
+    """
     x = corners.permute(1, 2, 0).contiguous()
+    angle, slope = _angles(x)
+    edge = x[1] - x[0]
+    length = (edge * edge).sum(0).sqrt()
+    ratio = length / rest_length
+    bend_slope = ratio * slope
+    along = angle / (rest_length * torch.where(length > 0, length, 1.0)) * edge
+    bend_slope[0] -= along
+    bend_slope[1] += along
+    return (weight * angle * ratio * bend_slope).permute(2, 0, 1), (weight.sqrt() * bend_slope).permute(2, 0, 1)
+
+
+def _angles(x: Tensor) -> tuple[Tensor, Tensor]:
+    """Angles (N,) of hinges with corners (4, 3, N), and their gradients (4, 3, N) by them [1/m].
+
+    The angle is that of :func:`hood.mesh.geometry.dihedral_angles`. With e = x₁ - x₀ and the opposite-vertex normals
+    n₁ = e × a, n₂ = b × e its gradients are -‖e‖ n₁/‖n₁‖² and -‖e‖ n₂/‖n₂‖² at the opposite vertices; those of the
+    edge's ends follow from there being no net force and torque. Degenerate hinges have angle and gradient 0.
+    """
     local = x[1:] - x[0]
     size = local.abs().amax(dim=(0, 1)).clamp_min(torch.finfo(x.dtype).tiny)
     edge, a, b = (local / size).unbind(dim=0)
@@ -112,13 +139,11 @@ def hinge_model(corners: Tensor, rest_angle: Tensor, weight: Tensor) -> tuple[Te
     edge_sq, n1_sq, n2_sq = (torch.where(regular, value, 1.0) for value in (edge_sq, n1_sq, n2_sq))
     length = edge_sq.sqrt()
     sine = torch.where(regular, -length * (n1 * b).sum(0), 0.0)
-    bend = torch.atan2(sine, torch.where(regular, (n1 * n2).sum(0), 1.0)) - rest_angle
-    bend = bend - 2.0 * math.pi * torch.round(bend / (2.0 * math.pi))
+    angle = torch.atan2(sine, torch.where(regular, (n1 * n2).sum(0), 1.0))
     scale = torch.where(regular, -length, 0.0) / size
     at_a, at_b = scale / n1_sq * n1, scale / n2_sq * n2
     at_end = -((edge * a).sum(0) / edge_sq * at_a + (edge * b).sum(0) / edge_sq * at_b)
-    slope = torch.stack([-at_a - at_b - at_end, at_end, at_a, at_b])
-    return (weight * bend * slope).permute(2, 0, 1), (weight.sqrt() * slope).permute(2, 0, 1)
+    return angle, torch.stack([-at_a - at_b - at_end, at_end, at_a, at_b])
 
 
 def _regular(cross_sq: Tensor, product_sq: Tensor) -> Tensor:
@@ -126,10 +151,20 @@ def _regular(cross_sq: Tensor, product_sq: Tensor) -> Tensor:
     return (cross_sq > (_DEGENERATE_ULPS * info.eps) ** 2 * product_sq) & (cross_sq > info.tiny / info.eps)
 
 
-def hinge_weight(problem: StepProblem) -> Tensor:
-    """Second derivative of the bending energy by the angle [J], (H,)."""
+def bending_model(
+    term: Term, corners: Tensor, rest_angle: Tensor, weight: Tensor, rest_length: Tensor
+) -> tuple[Tensor, Tensor]:
+    """:func:`hinge_model` of the term at hand; the last three arguments are rows of :func:`hinge_constants`."""
+    if type(term) is CurrentLengthBending:
+        return current_length_model(corners, weight, rest_length)
+    return hinge_model(corners, rest_angle, weight)
+
+
+def hinge_constants(problem: StepProblem) -> tuple[Tensor, Tensor, Tensor]:
+    """Rest angle [rad], second derivative of the rest shape's bending energy by the angle [J], edge at rest [m]: (H,) each."""
     cloth = problem.cloth
-    return bending_weight(cloth.bending_stiffness, cloth.rest_length, cloth.hinge_area)
+    weight = bending_weight(cloth.bending_stiffness, cloth.rest_length**2, cloth.hinge_area)
+    return cloth.rest_angle, weight, cloth.rest_length
 
 
 def attachment_stiffness(term: Attachment, problem: StepProblem) -> Tensor:
@@ -155,10 +190,10 @@ def vertex_model(potential: Potential, problem: StepProblem, pos: Tensor, acc: T
             matrix.diagonal(dim1=1, dim2=2).add_(mass / problem.vertex_dt**2)
         elif type(term) is Gravity:
             gradient = gradient - problem.cloth.mass[:, None] * problem.gravity.to(pos)
-        elif type(term) is Collision:
+        elif isinstance(term, Collision) and type(term) in COLLISIONS:
             force, block = _collision(term, problem, pos)
             gradient, matrix = gradient + force, matrix + block
-        elif type(term) is Friction:
+        elif isinstance(term, LaggedFriction) and type(term) in FRICTIONS:
             force, block = _friction(term, problem, pos)
             gradient, matrix = gradient + force, matrix + block
     return gradient, matrix
@@ -170,29 +205,18 @@ def only_vertices(problem: StepProblem, rows: Tensor) -> StepProblem:
     state = replace(problem.state, pos=problem.state.pos[rows], vel=problem.state.vel[rows])
     contact = problem.contact
     if contact is not None:
-        contact = Contact(**{name: value[rows] for name, value in vars(contact).items()})
+        contact = type(contact)(**{name: value[rows] for name, value in vars(contact).items()})
     return replace(problem, cloth=cloth, state=state, contact=contact)
 
 
 def _collision(term: Collision, problem: StepProblem, pos: Tensor) -> tuple[Tensor, Tensor]:
-    depth, normal = signed_depth(term, problem, pos)
+    depth, normal = term.depth(problem, pos)
     depth = depth.clamp_min(0.0)
     gradient = (-3.0 * term.weight * depth * depth)[:, None] * normal
     return gradient, _outer((6.0 * term.weight * depth)[:, None] * normal, normal)
 
 
-def signed_depth(term: Collision, problem: StepProblem, pos: Tensor) -> tuple[Tensor, Tensor]:
-    """Depth ε - d (N,) [m] of ``pos`` (N, 3) in the contact zone and normals (N, 3); both 0 without a match."""
-    contact = problem.contact
-    assert contact is not None
-    touching = contact.valid & (problem.cloth.mass > 0)
-    # Rows without a match may hold infinite or undefined numbers.
-    normal = torch.where(touching[:, None], contact.next_normal, 0.0)
-    dist = ((pos - torch.where(touching[:, None], contact.next_point, 0.0)) * normal).sum(1)
-    return torch.where(touching, term.epsilon - dist, 0.0), normal
-
-
-def _friction(term: Friction, problem: StepProblem, pos: Tensor) -> tuple[Tensor, Tensor]:
+def _friction(term: LaggedFriction, problem: StepProblem, pos: Tensor) -> tuple[Tensor, Tensor]:
     """Slope f'/y across the slip and curvature f'' along it, both positive for the mollified norm."""
     contact = problem.contact
     assert contact is not None

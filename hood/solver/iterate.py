@@ -70,18 +70,14 @@ def projected_guess(potential: Potential, problem: StepProblem) -> Tensor:
     Vertices are left just inside the contact distance, where the penalty carries their weight: outside it the penalty
     has no curvature and the first iteration would overshoot.
     """
-    cloth, contact, dt = problem.cloth, problem.contact, problem.vertex_dt
+    cloth, dt = problem.cloth, problem.vertex_dt
     gravity = problem.gravity.to(dt)
     guess = inertial_guess(problem.state, problem.step, cloth.vertex_scene) + dt**2 * gravity
     term = next((term for term in potential.terms.values() if isinstance(term, Collision)), None)
-    if contact is not None and term is not None and term.weight > 0:
+    if problem.contact is not None and term is not None and term.weight > 0:
         carried = (cloth.mass * gravity.norm() / (3.0 * term.weight)).sqrt()
-        touching = contact.valid & cloth.free
-        # Rows without a match may hold infinite or undefined numbers.
-        normal = torch.where(touching[:, None], contact.next_normal, 0.0)
-        dist = ((guess - torch.where(touching[:, None], contact.next_point, 0.0)) * normal).sum(1)
-        push = torch.where(touching, term.epsilon - carried - dist, 0.0).clamp_min(0.0)
-        guess = guess + push[:, None] * normal
+        depth, normal = term.depth(problem, guess)
+        guess = guess + (depth - carried).clamp_min(0.0)[:, None] * normal
     return torch.where(cloth.free.unsqueeze(1), guess, fixed_positions(problem))
 
 

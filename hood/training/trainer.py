@@ -18,6 +18,7 @@ from hood.dynamics.output import AccelerationOutput
 from hood.dynamics.simulator import Simulator, save_simulator
 from hood.losses.potential import Potential, relative_gradient, scale
 from hood.losses.problem import StepProblem
+from hood.nn.model import PRECISIONS
 from hood.scene.dataset import SceneSampler
 from hood.training import distributed
 from hood.training.checkpoint import load_checkpoint, save_checkpoint
@@ -35,6 +36,7 @@ class TrainerSettings:
 
     ``signal``: ``"potential"`` is the plain mean potential; ``"scaled"`` divides each scene's gradient by its e0 and by
     1 + rg / 3, so that one broken scene does not drown the others.
+    ``precision``: of the network's latents and products; ``"bf16"`` keeps weights, their gradients and energies in float32.
     """
 
     iterations: int = 150_000
@@ -46,12 +48,15 @@ class TrainerSettings:
     clip_norm: float = 1.0
     signal: str = "potential"
     ema_decay: float = 0.0
+    precision: str = "fp32"
     statistics_iterations: int = 100
     checkpoint_every: int = 500
     log_every: int = 20
     validate_every: int = 0
 
     def __post_init__(self) -> None:
+        if self.precision not in PRECISIONS:
+            raise ValueError(f"trainer.precision {self.precision!r}: give {' or '.join(map(repr, PRECISIONS))}")
         if self.signal not in ("potential", "scaled"):
             raise ValueError(f"trainer.signal {self.signal!r}: give 'potential' or 'scaled'")
         for name in ("iterations", "batch_size", "checkpoint_every", "log_every"):
@@ -83,6 +88,7 @@ class Trainer:
     ) -> None:
         self.simulator, self.potential, self.settings = simulator, potential, settings
         self.folder, self.seed, self.validation = folder, seed, validation
+        simulator.network.use_precision(settings.precision)
         ranks, rank = distributed.world_size(), distributed.rank()
         if settings.batch_size % ranks:
             raise ValueError(f"trainer.batch_size={settings.batch_size} cannot be shared by {ranks} processes; use a multiple")
@@ -128,8 +134,8 @@ class Trainer:
         horizon = settings.horizon(self.iteration)
         cloth, prepared, state, step = self.slots.batch(horizon)
         contact = simulator.find_contact(cloth, state, step)
-        problem = StepProblem(cloth, state, step, contact, simulator.gravity)
         potential = settings.collision.apply(self.potential, self.iteration)
+        problem = potential.prepare(StepProblem(cloth, state, step, contact, simulator.gravity))
         collecting = self.iteration < settings.statistics_iterations and simulator.uses_statistics
         if collecting and isinstance(simulator.output, AccelerationOutput):
             simulator.output.observe(self.slots.skinned_accelerations())

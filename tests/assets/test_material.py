@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hood.assets.material import RANGES, Material, sample_material
+from hood.assets.material import RANGES, EdgeField, FaceField, Material, sample_material
 
 
 def test_default_is_inside_the_training_ranges() -> None:
@@ -34,14 +34,26 @@ def test_unphysical_values_are_refused(name: str, value: float, rule: str) -> No
 def test_a_bad_entry_of_a_field_is_named() -> None:
     field = np.full(9, 0.2)
     field[6] = -1.0
-    with pytest.raises(ValueError, match="material 'density' is -1.0 at index 6"):
+    with pytest.raises(ValueError, match="material 'density' is -1.0 at vertex 6"):
         Material(density=field)
+    with pytest.raises(ValueError, match="material 'thickness' is -1.0 at face 6; it must be finite and > 0"):
+        Material(thickness=FaceField(field))
+    with pytest.raises(ValueError, match="material 'bending_stiffness' is -1.0 at edge 6; it must be finite and >= 0"):
+        Material(bending_stiffness=EdgeField(field))
+    with pytest.raises(ValueError, match="material 'density' is -1.0; it must be finite and > 0"):
+        Material(density=-1.0)
 
 
 def test_negative_lambda_is_legal_while_the_sum_is_positive() -> None:
     Material(lame_mu=100.0, lame_lambda=-50.0)
-    with pytest.raises(ValueError, match="lame_lambda"):
+    with pytest.raises(ValueError, match="lame_mu \\+ lame_lambda is 0.0; .*raise 'lame_lambda'"):
         Material(lame_mu=100.0, lame_lambda=-100.0)
+    both = np.array([100.0, 100.0, 100.0]), np.array([0.0, -50.0, -150.0])
+    with pytest.raises(ValueError, match="lame_mu \\+ lame_lambda is -50.0 at face 2"):
+        Material(lame_mu=FaceField(both[0]), lame_lambda=FaceField(both[1]))
+    with pytest.raises(ValueError, match="lame_mu \\+ lame_lambda is -50.0 at edge 2"):
+        Material(lame_mu=100.0, lame_lambda=EdgeField(both[1]))
+    Material(lame_mu=FaceField(both[0]), lame_lambda=both[1])  # where they meet is the cloth's business
 
 
 def test_zero_bending_is_legal() -> None:

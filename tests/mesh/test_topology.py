@@ -79,3 +79,9 @@ def test_empty_mesh_has_no_topology():
     assert topology.unique_edges(none).shape == (0, 2)
     assert topology.hinges(none).vertices.shape == (0, 4)
     assert topology.boundary_loops(none) == []
+
+
+def test_edge_index_finds_edges_in_any_direction():
+    edges = topology.unique_edges(grid(4, 3)[1])
+    order = np.random.default_rng(0).permutation(len(edges))
+    np.testing.assert_array_equal(topology.edge_index(edges, edges[order][:, ::-1]), order)

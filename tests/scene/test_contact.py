@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from hood.scene.contact import find_contact
+from hood.scene.contact import find_centroid_contact, find_contact
 from hood.scene.state import Obstacle, concatenate_obstacles
 from hood.testing import sphere
 
@@ -82,3 +82,27 @@ def test_normals_are_continuous_over_facets() -> None:
     normal = find_contact(points, scenes(points), ball()).normal
     facet = 2 * np.sin(0.5 * 0.14)  # jump of flat normals between neighbouring facets
     assert float((normal[1:] - normal[:-1]).norm(dim=1).max()) < 0.2 * facet
+
+
+def test_the_face_with_the_nearest_centroid() -> None:
+    body = ball(motion=(0.02, 0.01, 0.0))
+    points = directions(60) * 0.9  # farther than any cap
+    contact = find_contact(points, scenes(points), body)
+    found = find_centroid_contact(contact, points, scenes(points), body)
+    centroids = body.pos[body.faces].mean(dim=1)
+    assert torch.equal(found.centroid_face, torch.cdist(points, centroids).argmin(dim=1))
+    assert bool(found.facing.all())
+    move = torch.tensor([0.02, 0.01, 0.0]).double()
+    torch.testing.assert_close(found.next_centroid, centroids[found.centroid_face] + move)
+    torch.testing.assert_close(found.next_face_normal.norm(dim=1), torch.ones(60).double())
+    assert float((found.next_face_normal * directions(60)).sum(dim=1).min()) > 0.98
+    assert torch.equal(found.dist, contact.dist)
+
+
+def test_without_a_surface_no_vertex_faces_anything() -> None:
+    body = ball()
+    empty = Obstacle(body.pos, body.pos, body.pos, body.faces[:0], body.vertex_scene, body.face_scene[:0])
+    points = directions(3)
+    found = find_centroid_contact(find_contact(points, scenes(points), body), points, scenes(points), empty)
+    assert not bool(found.facing.any())
+    assert found.next_centroid.shape == (3, 3)

@@ -1,0 +1,98 @@
+"""A fabric's properties where they are needed: carried between vertices, faces and edges by one rule per pair.
+
+| given on | on vertices | on faces | on edges |
+|---|---|---|---|
+| one number | that number | that number | that number |
+| vertices | as given | mean of the three corners | mean of the two ends |
+| faces | mean of the faces around, weighted by rest area | as given | mean of the faces at the edge |
+| edges | mean of the edges around | mean of the three edges | as given |
+
+A property given where it is needed is used as it is. Hinges take the value of their edge. The area-weighted mean keeps
+the mass: a vertex has a third of every face around it. Isolated vertices have the mean of the garment; nothing but the
+network's features reads it.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+
+from hood.assets.material import Material, check_lame, values_of
+from hood.mesh import topology
+
+
+class FabricMap:
+    """Reads the properties of ``material`` on the vertices, faces and edges of one mesh, all in float64.
+
+    Args:
+        num_vertices: V.
+        faces: (F, 3).
+        edges: (E, 2), :func:`hood.mesh.topology.unique_edges` of the faces.
+        area: (F,) m² at rest.
+
+    Raises:
+        ValueError: a field has the wrong length, or μ + λ is not positive on a face.
+    """
+
+    def __init__(self, material: Material, num_vertices: int, faces: np.ndarray, edges: np.ndarray, area: np.ndarray) -> None:
+        self.faces, self.edges, self.area = faces, edges, area
+        self._counts = {"vertex": num_vertices, "face": len(faces), "edge": len(edges)}
+        self._values = {name: values_of(getattr(material, name)) for name in Material.names()}
+        for name, (values, place) in self._values.items():
+            if place and values.shape != (self._counts[place],):
+                raise ValueError(
+                    f"material {name!r} has shape {values.shape} on {_PLURAL[place]}; give one number, or one per {place} "
+                    f"({self._counts[place]},)"
+                )
+        # Positive where both were given does not make it positive where they meet.
+        check_lame(self.on_faces("lame_mu"), self.on_faces("lame_lambda"), "face")
+
+    def on_vertices(self, name: str) -> np.ndarray:
+        """(V,) values of a property."""
+        values, place = self._values[name]
+        if place == "face":
+            return self._gather(self.faces, values, self.area)
+        if place == "edge":
+            return self._gather(self.edges, values, np.ones(len(self.edges)))
+        return self._broadcast(values, "vertex")
+
+    def on_faces(self, name: str) -> np.ndarray:
+        """(F,) values of a property."""
+        values, place = self._values[name]
+        if place == "vertex":
+            return values[self.faces].mean(axis=1)
+        if place == "edge":
+            return values[self._face_edges].mean(axis=1)
+        return self._broadcast(values, "face")
+
+    def on_edges(self, name: str) -> np.ndarray:
+        """(E,) values of a property."""
+        values, place = self._values[name]
+        if place == "vertex":
+            return values[self.edges].mean(axis=1)
+        if place == "face":
+            edge = self._face_edges.reshape(-1)
+            total = np.bincount(edge, np.repeat(values, 3), len(self.edges))
+            return total / np.bincount(edge, minlength=len(self.edges))
+        return self._broadcast(values, "edge")
+
+    @cached_property
+    def _face_edges(self) -> np.ndarray:
+        """(F, 3) edges of every face."""
+        sides = self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+        return topology.edge_index(self.edges, sides).reshape(-1, 3)
+
+    def _gather(self, elements: np.ndarray, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        """Weighted mean (V,) over the elements (N, C) around every vertex."""
+        count, corners = self._counts["vertex"], elements.shape[1]
+        total = np.bincount(elements.reshape(-1), np.repeat(weight, corners), count)
+        mixed = np.bincount(elements.reshape(-1), np.repeat(weight * values, corners), count)
+        isolated = total == 0
+        return np.where(isolated, np.average(values, weights=weight), mixed / np.where(isolated, 1.0, total))
+
+    def _broadcast(self, values: np.ndarray, place: str) -> np.ndarray:
+        return np.broadcast_to(values, (self._counts[place],))
+
+
+_PLURAL = {"vertex": "vertices", "face": "faces", "edge": "edges"}
