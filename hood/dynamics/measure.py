@@ -29,10 +29,13 @@ def strain_metrics(cloth: Cloth, pos: Tensor) -> dict[str, float]:
 
 
 def penetration_metrics(contact: Contact | None, num_vertices: int) -> dict[str, float]:
-    """Count, share and depth [m] of the vertices deeper than :data:`PENETRATION_DEPTH` inside the body at t."""
+    """Count, share and depth [m] of the vertices deeper than :data:`PENETRATION_DEPTH` inside the body at t.
+
+    Vertices beyond the reach of the contact energy count as well: there nothing pushes them out.
+    """
     if contact is None:
         return {"penetration_count": 0.0, "penetration_share": 0.0, "penetration_depth": 0.0}
-    depth = (-contact.dist) * contact.valid
+    depth = torch.where(torch.isfinite(contact.dist), -contact.dist, 0.0)
     count = int((depth > PENETRATION_DEPTH).sum())
     return {
         "penetration_count": float(count),

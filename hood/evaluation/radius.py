@@ -12,8 +12,9 @@ from torch import Tensor
 
 from hood.assets.material import Material
 from hood.dynamics.simulator import Simulator
-from hood.graph.builder import Graph, build_graph, build_static
+from hood.graph.builder import BODY, Graph, build_graph, build_static
 from hood.graph.hierarchy import build_hierarchy
+from hood.nn.model import MeshGraphNet
 from hood.scene.cloth import Cloth, build_cloth
 from hood.scene.state import StepInput
 
@@ -74,12 +75,12 @@ def _hops(num_vertices: int, edges: np.ndarray) -> np.ndarray:
     return shortest_path(graph, directed=False, unweighted=True).astype(int)
 
 
-def _random_features(network: torch.nn.Module, graph: Graph, generator: torch.Generator) -> dict[str, Tensor]:
+def _random_features(network: MeshGraphNet, graph: Graph, generator: torch.Generator) -> dict[str, Tensor]:
     def draw(rows: int, encoder: torch.nn.Module) -> Tensor:
         width = next(encoder.parameters()).shape[1]
         return torch.randn(rows, width, generator=generator, dtype=torch.float64)
 
-    features = {"nodes": draw(graph.num_nodes, network.node_encoder)}  # type: ignore[arg-type]
-    for name, encoder in network.edge_encoders.items():  # type: ignore[operator, union-attr]
-        features[name] = draw(graph.edge_sets[name].num_edges, encoder)
+    features = {"nodes": draw(graph.num_nodes, network.node_encoder)}
+    for name in (*network.edge_set_names, BODY):
+        features[name] = draw(graph.edge_sets[name].num_edges, network.edge_encoder(name))
     return features

@@ -2,41 +2,59 @@
 
 from __future__ import annotations
 
-import csv
-import json
-import os
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from hood.dynamics.rollout import simulate
 from hood.dynamics.simulator import Simulator
+from hood.dynamics.stepper import Stepper
+from hood.evaluation.gap import AGREEMENT, REFERENCE, Gap, gap
 from hood.evaluation.radius import measured_radius
+from hood.evaluation.sample import StepSample
 from hood.losses.potential import Potential
 from hood.scene.scene import Scene
+from hood.solver.newton import NewtonSettings
 
 #: Frames at the start of a rollout that are left out of the times: caches fill and pages are mapped there.
 _WARMUP = 2
 ALL = "all"
-COLUMNS = (
-    *("model", "weights", "garment", "steps", "radius", "ms", "ms_p99", "fps", "L_total", "L_guess"),
-    *("L_stretching", "L_bending", "L_inertia", "L_gravity", "L_collision", "L_friction"),
-    *("gradient_norm", "relative_gradient", "strain_p99", "penetration", "frames", "failed_at"),
-)
-#: Columns that the printed table leaves to the files.
-_FILE_ONLY = ("relative_gradient", "frames")
+
+#: Told what is being done and how many rollouts are done.
+Progress = Callable[[str, int], None]
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A model to evaluate and what its weights are."""
+    """What takes the steps, and what its weights are (``none`` for the solver)."""
 
     name: str
     weights: str
-    simulator: Simulator
+    stepper: Stepper
+
+
+@dataclass(frozen=True)
+class GapSettings:
+    """How many gaps are computed and how exactly.
+
+    Args:
+        states: steps of every rollout, spread evenly over its frames; 0 for no gap and no minimisation.
+        reference: how far the minimisations behind a gap go.
+    """
+
+    states: int = 5
+    reference: NewtonSettings = REFERENCE
+
+
+@dataclass
+class _Measured:
+    """What rollouts gave."""
+
+    frames: list[dict[str, float]] = field(default_factory=list)
+    failures: list[int] = field(default_factory=list)
+    gaps: list[Gap] = field(default_factory=list)
 
 
 def evaluate(
@@ -44,73 +62,67 @@ def evaluate(
     scenes: Mapping[str, Sequence[Scene]],
     potential: Potential,
     num_frames: int,
-    progress: Callable[[str], None] = lambda text: None,
+    gaps: GapSettings | None = None,
+    progress: Progress = lambda text, done: None,
 ) -> list[dict[str, Any]]:
-    """Rows of the table: one per model and garment, and one per model over all garments.
+    """Rows of the table: one per candidate and garment, and one per candidate over all garments.
 
-    Means over the frames that a model's own rollouts reach before the first non-finite one; ``failed_at`` is the earliest
-    such frame (None: never). ``L_guess`` is the potential of the inertial guess on the same states. ``gradient_norm`` [N]
-    is the mean over vertices of ‖∂L/∂x_v‖₂, averaged over frames.
+    Means over the frames that a candidate's own rollouts reach before the first non-finite one; ``failed_at`` is the
+    earliest such frame (None: never). ``steps`` and ``radius`` are None without a network. ``L_guess`` is the potential of
+    the inertial guess on the same states. ``gradient_norm`` [N] is the mean over vertices of ‖∂L/∂x_v‖₂, averaged over
+    frames; ``rg`` is a median over frames. Of the states whose gap is computed (``gap_states`` of them): ``gap`` is the
+    median, ``gap_p95`` the 95th percentile, ``unconverged`` the share whose reference missed its accuracy and
+    ``disagree`` the share where minimisations ended in different minima.
     """
-    rows = []
+    gaps = gaps or GapSettings()
+    rows, done = [], 0
     for candidate in candidates:
-        steps = len(candidate.simulator.schedule)
-        radius = measured_radius(candidate.simulator)
-        frames: dict[str, list[dict[str, float]]] = {}
-        failures: dict[str, list[int]] = {}
+        shared = {"model": candidate.name, "weights": candidate.weights, **_reach(candidate.stepper)}
+        whole = _Measured()
         for garment, variants in scenes.items():
-            frames[garment], failures[garment] = [], []
+            part = _Measured()
             for scene in variants:
-                progress(f"{candidate.name} {garment} {scene.motion.sequence.name}")
-                reached, failed = _own_frames(candidate.simulator, scene, potential, num_frames)
-                frames[garment] += reached
-                failures[garment] += [] if failed is None else [failed]
-        shared = {"model": candidate.name, "weights": candidate.weights, "steps": steps, "radius": radius}
-        groups = [(garment, frames[garment], failures[garment]) for garment in scenes]
-        groups.append((ALL, sum(frames.values(), []), sum(failures.values(), [])))
-        rows += [{**shared, "garment": garment, **_row(values, failed)} for garment, values, failed in groups]
+                title = f"{candidate.name} {garment} {scene.motion.sequence.name}"
+                for text in _run(candidate.stepper, scene, potential, num_frames, gaps, part):
+                    progress(f"{title} {text}", done)
+                done += 1
+                progress(title, done)
+            rows.append({**shared, "garment": garment, **_row(part)})
+            whole.frames += part.frames
+            whole.failures += part.failures
+            whole.gaps += part.gaps
+        rows.append({**shared, "garment": ALL, **_row(whole)})
     return rows
 
 
-def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Fixed-width text of the rows."""
-    shown = [column for column in COLUMNS if column not in _FILE_ONLY]
-    cells = [[_cell(row.get(column)) for column in shown] for row in rows]
-    widths = [max(len(title), *(len(line[i]) for line in cells)) for i, title in enumerate(shown)]
-    lines = ["  ".join(title.rjust(width) for title, width in zip(shown, widths, strict=True))]
-    lines += ["  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True)) for line in cells]
-    return "\n".join(lines)
+def _reach(stepper: Stepper) -> dict[str, int | None]:
+    if not isinstance(stepper, Simulator):
+        return {"steps": None, "radius": None}
+    return {"steps": len(stepper.schedule), "radius": measured_radius(stepper)}
 
 
-def write_table(rows: Sequence[Mapping[str, Any]], folder: Path) -> tuple[Path, Path]:
-    """Write ``table.csv`` and ``table.json`` atomically; returns their paths."""
-    csv_path, json_path = folder / "table.csv", folder / "table.json"
-    temporary = csv_path.with_name(csv_path.name + ".partial")
-    with open(temporary, "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, COLUMNS)
-        writer.writeheader()
-        writer.writerows({column: row.get(column) for column in COLUMNS} for row in rows)
-    os.replace(temporary, csv_path)
-    temporary = json_path.with_name(json_path.name + ".partial")
-    temporary.write_text(json.dumps(list(rows), indent=1), encoding="utf-8")
-    os.replace(temporary, json_path)
-    return csv_path, json_path
-
-
-def _own_frames(
-    simulator: Simulator, scene: Scene, potential: Potential, num_frames: int
-) -> tuple[list[dict[str, float]], int | None]:
-    reached: list[dict[str, float]] = []
-    for frame in simulate(simulator, scene, potential, num_frames):
+def _run(
+    stepper: Stepper, scene: Scene, potential: Potential, num_frames: int, gaps: GapSettings, into: _Measured
+) -> Iterator[str]:
+    """One rollout, added to ``into``; yields what is being done."""
+    count = min(num_frames, scene.num_frames)
+    sample = StepSample(range(_WARMUP + 1, count), gaps.states)
+    for frame in simulate(stepper, scene, potential, count, observe=sample if gaps.states else None):
+        yield f"frame {frame.index + 1}/{count}"
         if not np.isfinite(frame.metrics["strain_p99"]):
-            return reached, frame.index
+            into.failures.append(frame.index)
+            break
         if frame.index > _WARMUP:
-            reached.append(frame.metrics)
-    return reached, None
+            into.frames.append(frame.metrics)
+    for index, (problem, prediction) in enumerate(sample.steps):
+        yield f"gap {index + 1}/{len(sample.steps)}"
+        into.gaps.append(gap(potential, problem, prediction.next_pos, settings=gaps.reference))
 
 
-def _row(frames: Sequence[Mapping[str, float]], failures: Sequence[int]) -> dict[str, Any]:
+def _row(measured: _Measured) -> dict[str, Any]:
+    frames, failures = measured.frames, measured.failures
     row: dict[str, Any] = {"frames": len(frames), "failed_at": min(failures) if failures else None}
+    row |= _gap_columns(measured.gaps)
     if not frames:
         return row
     times = np.array([frame["ms_total"] for frame in frames])
@@ -128,15 +140,22 @@ def _row(frames: Sequence[Mapping[str, float]], failures: Sequence[int]) -> dict
         ("penetration", "penetration_share"),
     ):
         row[column] = _mean(frames, key)
-    row["relative_gradient"] = float(np.median([frame["relative_gradient"] for frame in frames]))
+    row["rg"] = float(np.median([frame["relative_gradient"] for frame in frames]))
     return row
+
+
+def _gap_columns(gaps: Sequence[Gap]) -> dict[str, Any]:
+    if not gaps:
+        return {"gap_states": 0}
+    gamma = np.array([float(item.gamma) for item in gaps])
+    return {
+        "gap": float(np.median(gamma)),
+        "gap_p95": float(np.quantile(gamma, 0.95)),
+        "unconverged": float(np.mean([not bool(item.converged) for item in gaps])),
+        "disagree": float(np.mean([bool(item.spread > AGREEMENT) for item in gaps])),
+        "gap_states": len(gaps),
+    }
 
 
 def _mean(frames: Sequence[Mapping[str, float]], key: str) -> float:
     return float(np.mean([frame.get(key, 0.0) for frame in frames]))
-
-
-def _cell(value: Any) -> str:
-    if value is None:
-        return "-"
-    return f"{value:.3g}" if isinstance(value, float) else str(value)

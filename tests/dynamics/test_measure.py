@@ -48,11 +48,17 @@ def test_penetration_counts_vertices_deeper_than_two_millimetres() -> None:
     assert metrics["penetration_depth"] == pytest.approx(0.03)
 
 
-def test_invalid_matches_do_not_count() -> None:
-    pos = CLOTH.rest_pos - torch.tensor([0.0, 0.5, 0.0]).double()
-    contact = plane_contact(pos)
-    far = replace(contact, valid=torch.zeros_like(contact.valid))
-    assert penetration_metrics(far, 36) == penetration_metrics(None, 36) == dict.fromkeys(METRICS[3:], 0.0)
+def test_vertices_beyond_the_reach_of_the_contact_energy_count() -> None:
+    contact = plane_contact(CLOTH.rest_pos - torch.tensor([0.0, 0.5, 0.0]).double())
+    deep = replace(contact, valid=torch.zeros_like(contact.valid))
+    assert penetration_metrics(deep, 36)["penetration_count"] == 36
+    assert penetration_metrics(deep, 36)["penetration_depth"] == pytest.approx(0.5)
+
+
+def test_vertices_without_any_surface_do_not_count() -> None:
+    contact = plane_contact(CLOTH.rest_pos)
+    nowhere = replace(contact, dist=torch.full_like(contact.dist, torch.inf))
+    assert penetration_metrics(nowhere, 36) == penetration_metrics(None, 36) == dict.fromkeys(METRICS[3:], 0.0)
 
 
 def test_depth_is_zero_outside() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -49,3 +50,26 @@ def test_an_unconverged_reference_is_flagged(problem: StepProblem) -> None:
     assert not bool(result.converged.any())
     assert bool(torch.isnan(result.spread).all())
     assert float(result.gamma) >= 0
+
+
+def test_a_converged_state_is_no_better_than_its_own_minimisation(problem: StepProblem) -> None:
+    """Where the third start has nothing left to do, rounding must not flag the reference."""
+    potential = default_potential()
+    for seed in range(5):
+        noise = torch.randn(problem.state.vel.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+        step = replace(problem, state=replace(problem.state, vel=0.05 * noise))
+        pos, report = minimize(potential, step, settings=NewtonSettings(target_rg=1e-10))
+        assert bool(report.converged.all())
+        result = gap(potential, step, pos)
+        assert bool(result.converged.all())
+        assert abs(float(result.gamma)) < 1e-6
+
+
+def test_one_converged_start_agrees_with_nothing(problem: StepProblem) -> None:
+    """Positions that converged before, and no iterations for the other starts."""
+    potential = default_potential()
+    pos, _ = minimize(potential, problem, settings=NewtonSettings(target_rg=1e-6))
+    result = gap(potential, problem, pos, settings=NewtonSettings(target_rg=1e-3, max_iterations=0))
+    assert bool(result.converged.all())
+    assert bool(torch.isnan(result.spread).all())
+    assert not bool(result.agree.any())

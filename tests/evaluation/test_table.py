@@ -12,10 +12,13 @@ import torch
 
 from hood.dynamics.rollout import simulate
 from hood.dynamics.simulator import build_simulator
-from hood.evaluation.table import ALL, COLUMNS, Candidate, evaluate, format_table, write_table
+from hood.dynamics.stepper import NewtonStepper
+from hood.evaluation.report import COLUMNS, describe, format_table, write_table
+from hood.evaluation.table import ALL, Candidate, GapSettings, evaluate
 from hood.evaluation.validation import Validation
 from hood.losses.potential import default_potential
 from hood.scene.scene import Scene
+from hood.solver.newton import NewtonSettings
 
 FRAMES = 6
 
@@ -31,7 +34,17 @@ def candidates() -> list[Candidate]:
 @pytest.fixture(scope="module")
 def rows(candidates: list[Candidate], tank_scene: Scene, skirt_scene: Scene) -> list[dict]:
     scenes = {"tank": [tank_scene], "skirt": [skirt_scene, skirt_scene]}
-    return evaluate(candidates, scenes, default_potential(), FRAMES)
+    return evaluate(candidates, scenes, default_potential(), FRAMES, GapSettings(states=0))
+
+
+@pytest.fixture(scope="module")
+def solver_rows(band_scene: Scene) -> list[dict]:
+    """The solver, and the guess it starts from taken for the answer."""
+    potential = default_potential()
+    solver = NewtonStepper(potential, NewtonSettings(target_rg=1e-3))
+    guess = NewtonStepper(potential, NewtonSettings(max_iterations=0))
+    pair = [Candidate("newton", "none", solver), Candidate("guess", "none", guess)]
+    return evaluate(pair, {"band": [band_scene]}, potential, 7, GapSettings(states=2))
 
 
 def test_one_row_per_model_and_garment_and_one_over_all(rows: list[dict]) -> None:
@@ -46,7 +59,7 @@ def test_one_row_per_model_and_garment_and_one_over_all(rows: list[dict]) -> Non
 
 def test_numbers_are_the_means_of_the_rollout(rows: list[dict], candidates: list[Candidate], tank_scene: Scene) -> None:
     """Frames after the warm-up count, frame 0 never."""
-    frames = list(simulate(candidates[0].simulator, tank_scene, default_potential(), FRAMES))[3:]
+    frames = list(simulate(candidates[0].stepper, tank_scene, default_potential(), FRAMES))[3:]
     row = rows[0]
     assert row["frames"] == len(frames) == 3
     assert row["failed_at"] is None
@@ -55,7 +68,7 @@ def test_numbers_are_the_means_of_the_rollout(rows: list[dict], candidates: list
         ("strain_p99", "strain_p99"), ("penetration", "penetration_share"),
     ):  # fmt: skip
         assert row[column] == pytest.approx(np.mean([frame.metrics[key] for frame in frames]), rel=1e-6)
-    assert row["relative_gradient"] == pytest.approx(np.median([f.metrics["relative_gradient"] for f in frames]))
+    assert row["rg"] == pytest.approx(np.median([f.metrics["relative_gradient"] for f in frames]))
     assert row["ms"] > 0
     assert row["fps"] == pytest.approx(1e3 / row["ms"])
     assert row["ms_p99"] >= row["ms"]
@@ -74,17 +87,70 @@ def test_a_broken_model_is_reported_not_averaged(rows: list[dict]) -> None:
         assert all(value is None or not isinstance(value, float) or np.isfinite(value) for value in row.values())
 
 
-def test_text_and_files(rows: list[dict], tmp_path: Path) -> None:
-    text = format_table(rows).splitlines()
-    assert len(text) == 1 + len(rows)
-    assert len({len(line) for line in text}) == 1
+def test_the_solver_has_no_gap_and_a_guess_has_one(solver_rows: list[dict]) -> None:
+    newton, _, guess, _ = solver_rows
+    assert (newton["steps"], newton["radius"], newton["weights"]) == (None, None, "none")
+    assert (newton["frames"], newton["gap_states"]) == (4, 2)
+    assert abs(newton["gap"]) <= newton["gap_p95"] + 1e-6 <= 1e-2
+    assert newton["rg"] <= 2e-3  # the solver's 1e-3, after rounding to float32
+    assert newton["unconverged"] == newton["disagree"] == 0.0
+    assert guess["gap"] > 1.0
+    assert guess["gap_p95"] >= guess["gap"]
+    assert guess["rg"] > newton["rg"]
+
+
+def test_references_that_stop_early_are_flagged(band_scene: Scene) -> None:
+    potential = default_potential()
+    guess = Candidate("guess", "none", NewtonStepper(potential, NewtonSettings(max_iterations=0)))
+    settings = GapSettings(2, NewtonSettings(target_rg=1e-3, max_iterations=1))
+    rows = evaluate([guess], {"band": [band_scene]}, potential, 7, settings)
+    assert rows[0]["unconverged"] == 1.0
+    assert "2 of 2 reference minima did not converge" in describe(rows)
+
+
+def test_no_states_no_minimisation(candidates: list[Candidate], band_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*args: object) -> None:
+        raise RuntimeError("minimised")
+
+    monkeypatch.setattr("hood.evaluation.gap.minimize", refuse)
+    scenes = {"band": [band_scene]}
+    rows = evaluate(candidates[:1], scenes, default_potential(), 5, GapSettings(states=0))
+    assert rows[0]["gap_states"] == 0
+    assert rows[0].get("gap") is None
+    assert rows[0]["rg"] > 0
+    with pytest.raises(RuntimeError, match="minimised"):
+        evaluate(candidates[:1], scenes, default_potential(), 5, GapSettings(states=1))
+
+
+def test_progress_names_the_work_and_counts_rollouts(candidates: list[Candidate], band_scene: Scene) -> None:
+    told: list[tuple[str, int]] = []
+    settings = GapSettings(1, NewtonSettings(max_iterations=1))
+    scenes = {"band": [band_scene] * 2}
+    evaluate(candidates[:1], scenes, default_potential(), 4, settings, lambda text, done: told.append((text, done)))
+    assert told[0] == ("base band walk_proud frame 1/4", 0)
+    assert told.count(("base band walk_proud gap 1/1", 1)) == 1
+    assert [done for _, done in told] == sorted(done for _, done in told)
+    assert told[-1][1] == 2
+
+
+def test_text_and_files(rows: list[dict], solver_rows: list[dict], tmp_path: Path) -> None:
+    rows = rows + solver_rows
+    for part in format_table(rows).split("\n\n"):
+        lines = part.splitlines()
+        assert len(lines) == 1 + len(rows)
+        assert len({len(line) for line in lines}) == 1
+        assert max(map(len, lines)) <= 160
+    assert "untrained: random weights" in describe(rows)
+    assert "untrained" not in describe(solver_rows)
+    assert "did not converge" not in describe(rows)
     csv_path, json_path = write_table(rows, tmp_path)
     with open(csv_path, newline="") as file:
         table = list(csv.DictReader(file))
     assert list(table[0]) == list(COLUMNS)
     assert [line["model"] for line in table] == [row["model"] for row in rows]
     assert float(table[0]["L_total"]) == pytest.approx(rows[0]["L_total"])
-    assert table[0]["failed_at"] == ""
+    assert table[0]["failed_at"] == table[0]["gap"] == ""
+    assert float(table[-1]["gap"]) == pytest.approx(solver_rows[-1]["gap"])
     assert json.loads(json_path.read_text()) == rows
     assert sorted(path.name for path in tmp_path.iterdir()) == ["table.csv", "table.json"]
 
@@ -97,7 +163,7 @@ def test_validation_summarises_own_rollouts(candidates: list[Candidate], tank_sc
         default_potential(),
         num_frames=4,
     )
-    good = validation(candidates[0].simulator)
+    good = validation(candidates[0].stepper)
     assert good["non_finite"] == 0
     assert all(np.isfinite(value) for value in good.values())
     assert good["strain_p99"] <= good["strain_p99_worst"]

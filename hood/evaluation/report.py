@@ -1,0 +1,82 @@
+"""The evaluation table as text and as files."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from hood.evaluation.gap import AGREEMENT
+from hood.evaluation.table import ALL
+
+_NAMES = ("model", "weights", "garment")
+_MAIN = ("steps", "radius", "ms", "ms_p99", "fps", "L_total", "gradient_norm", "rg")
+_GAP = ("gap", "gap_p95", "unconverged", "disagree")
+_TERMS = ("L_guess", "L_stretching", "L_bending", "L_inertia", "L_gravity", "L_collision", "L_friction")
+_STATE = ("strain_p99", "penetration")
+COLUMNS = (*_NAMES, *_MAIN, *_GAP, *_TERMS, *_STATE, "failed_at", "frames", "gap_states")
+#: Columns of the printed tables; all in one would be wider than a screen.
+_PRINTED = ((*_NAMES, *_MAIN, *_GAP, "failed_at"), (*_NAMES, *_TERMS, *_STATE))
+
+
+def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The rows as two fixed-width tables, cost and accuracy first, then energies and state of the cloth."""
+    return "\n\n".join(_fixed_width(rows, columns) for columns in _PRINTED)
+
+
+def describe(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Meaning and units of the columns, and how far the figures of these rows can be trusted."""
+    lines = [
+        "ms per frame; L [J], L_guess of the inertial guess, gradient_norm [N] and strain_p99 are means, rg = ‖∇Φ‖ / ‖M g‖ a "
+        "median over frames; penetration is a share of the vertices",
+        "gap = (Φ - Φ*) / e0, the energy above the minimum of the same step: median and 95th percentile; √gap is about the "
+        "error of the accelerations in g",
+    ]
+    whole = [row for row in rows if row["garment"] == ALL]
+    states = sum(row["gap_states"] for row in whole)
+    flagged = round(sum(row["gap_states"] * row.get("unconverged", 0.0) for row in whole))
+    apart = round(sum(row["gap_states"] * row.get("disagree", 0.0) for row in whole))
+    if flagged:
+        lines.append(
+            f"{flagged} of {states} reference minima did not converge (column unconverged): their gaps are lower bounds"
+        )
+    if apart:
+        lines.append(
+            f"minimisations of {apart} of {states} states ended in minima more than {AGREEMENT:g} e0 apart (column disagree); "
+            "the lowest counts"
+        )
+    if any(row["weights"] == "untrained" for row in rows):
+        lines.append("untrained: random weights; steps, radius and times of these rows mean something, their accuracy does not")
+    return "\n".join(lines)
+
+
+def write_table(rows: Sequence[Mapping[str, Any]], folder: Path) -> tuple[Path, Path]:
+    """Write ``table.csv`` and ``table.json`` atomically; returns their paths."""
+    csv_path, json_path = folder / "table.csv", folder / "table.json"
+    temporary = csv_path.with_name(csv_path.name + ".partial")
+    with open(temporary, "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, COLUMNS)
+        writer.writeheader()
+        writer.writerows({column: row.get(column) for column in COLUMNS} for row in rows)
+    os.replace(temporary, csv_path)
+    temporary = json_path.with_name(json_path.name + ".partial")
+    temporary.write_text(json.dumps(list(rows), indent=1), encoding="utf-8")
+    os.replace(temporary, json_path)
+    return csv_path, json_path
+
+
+def _fixed_width(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> str:
+    cells = [[_cell(row.get(column)) for column in columns] for row in rows]
+    widths = [max(len(title), *(len(line[i]) for line in cells)) for i, title in enumerate(columns)]
+    lines = ["  ".join(title.rjust(width) for title, width in zip(columns, widths, strict=True))]
+    lines += ["  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True)) for line in cells]
+    return "\n".join(lines)
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
