@@ -163,13 +163,19 @@ def scoop(half_width: float, front: float, back: float, top: float = 0.66) -> Ca
     return keep
 
 
-def armhole(shoulder: float, side: float) -> Callable[[Array], Array]:
-    """Cuts off the arm along a plane through |x| = `shoulder` at y = 0.61 and |x| = 0.19 at y = `side`.
+def armhole(shoulder: float, side: float, hollow: float = 0.0) -> Callable[[Array], Array]:
+    """Cuts off the arm along a line from |x| = `shoulder` at y = 0.61 to |x| = 0.19 at y = `side`.
 
-    What hangs well below the armpit is kept however wide it is.
+    The line bends inwards by `hollow` between its ends, so that lowered arms do not pinch the cloth. What hangs well
+    below the armpit is kept however wide it is.
     """
-    slope = (0.19 - shoulder) / (0.61 - side)
-    return lambda p: np.maximum(shoulder + slope * (0.61 - p[:, 1]) - np.abs(p[:, 0]), side - 0.08 - p[:, 1])
+
+    def keep(p: Array) -> Array:
+        share = (0.61 - p[:, 1]) / (0.61 - side)
+        bend = 4.0 * hollow * np.clip(share * (1.0 - share), 0.0, None)
+        return np.maximum(shoulder + (0.19 - shoulder) * share - bend - np.abs(p[:, 0]), side - 0.08 - p[:, 1])
+
+    return keep
 
 
 PATTERNS = {
@@ -200,8 +206,8 @@ PATTERNS = {
         legs=True,
     ),
     "dress": Pattern(
-        lambda f: dress_field(f, 0.012, 0.30),
-        (scoop(0.070, 0.120, 0.070), armhole(0.165, 0.430), above(-0.36)),
+        lambda f: dress_field(f, 0.012, 0.27),
+        (scoop(0.066, 0.120, 0.075), armhole(0.150, 0.425, 0.020), above(-0.31)),
         weight_reach=0.05,
         flared=True,
     ),

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from hood.scene.cloth import Cloth
 from hood.scene.state import Attachments
-from hood.solver.pattern import BlockPattern, RowSum
+from hood.solver.pattern import BlockPattern, Scatter, upper_pairs
 from hood.solver.plan import SolverPlan
 
 
@@ -20,8 +20,8 @@ class Incidence:
 
     element: Tensor  # (M,) rows of the element table
     own: Tensor  # (M,) position of the own corner in its row
-    gradient_sum: RowSum  # (M, 3) → (n, 3)
-    matrix_sum: RowSum  # (3 M, 3) → (3 n, 3)
+    gradient_sum: Scatter  # (3, M) → (n, 3)
+    matrix_sum: Scatter  # upper triangles (6, M) → (n, 3, 3)
 
 
 @dataclass(frozen=True)
@@ -76,9 +76,12 @@ def _build(plan: SolverPlan, cloth: Cloth, attachments: Attachments | None) -> l
 def _incidence(table: np.ndarray, place: np.ndarray, size: int, device: torch.device) -> Incidence:
     element, own = np.nonzero(place[table] >= 0)
     target = place[table[element, own]]
+    axis, count = np.arange(3)[:, None], len(target)
+    mirrored = sorted({(k, *pair) for k, (p, q) in enumerate(upper_pairs(3)) for pair in ((p, q), (q, p))})
+    source, row, col = (np.array(part)[:, None] for part in zip(*mirrored, strict=True))
     return Incidence(
         torch.as_tensor(element, device=device),
         torch.as_tensor(own, device=device),
-        RowSum(target, size),
-        RowSum(3 * target[:, None] + np.arange(3), 3 * size),
+        Scatter(3 * target + axis, axis * count + np.arange(count), 3 * size, 3 * count),
+        Scatter(9 * target + 3 * row + col, source * count + np.arange(count), 9 * size, 6 * count),
     )

@@ -11,6 +11,7 @@ from hood.losses.collision import Collision
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem, inertial_guess
 from hood.scene.batch import to_device
+from hood.solver.terms import StepTerms
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,7 @@ class Unknowns:
     """The unknown next positions of a step, as accelerations: in float32 positions would not resolve inertia."""
 
     def __init__(self, potential: Potential, problem: StepProblem) -> None:
-        self.potential, self.problem = potential, problem
+        self.potential, self.problem, self.terms = potential, problem, StepTerms(potential, problem)
         self.scene = problem.cloth.vertex_scene
         self.free = problem.cloth.free.unsqueeze(1)
         self.dt_sq = problem.vertex_dt**2
@@ -43,15 +44,19 @@ class Unknowns:
         """Positions (V, 3) reached with ``acc`` (V, 3)."""
         return torch.where(self.free, self._base + self.dt_sq * acc, self._fixed)
 
+    def place_free(self, rows: Tensor, acc: Tensor) -> Tensor:
+        """The same for some free vertices (n,), from their accelerations (n, 3)."""
+        return self._base[rows] + self.dt_sq[rows] * acc
+
     def evaluate(self, acc: Tensor) -> Iterate:
         """The iterate with accelerations (V, 3), of which free vertices are read."""
         acc = torch.where(self.free, acc, self._fixed_acc)
         pos = self.place(acc)
         with torch.no_grad():
-            energies = self.potential.energies(self.problem, pos, acc)
+            energies = self.terms.energies(pos, acc)
         zero = pos.new_zeros(self.problem.num_scenes)
-        size = sum((energy.abs() for energy in energies.values()), start=zero)
-        return Iterate(pos, acc, sum(energies.values(), start=zero), 8.0 * torch.finfo(pos.dtype).eps * size)
+        size = sum((energy.abs() for energy in energies), start=zero)
+        return Iterate(pos, acc, sum(energies, start=zero), 8.0 * torch.finfo(pos.dtype).eps * size)
 
     def select(self, moved: Tensor, there: Iterate, here: Iterate) -> Iterate:
         """``there`` in the scenes ``moved`` (B,) bool, ``here`` in the others."""
@@ -64,15 +69,24 @@ class Unknowns:
         )
 
 
-def projected_guess(potential: Potential, problem: StepProblem) -> Tensor:
-    """Start (V, 3): free flight x_t + dt v_t + dt² g, then out of the body along the matched normals.
+def first_iterate(unknowns: Unknowns) -> Iterate:
+    """The start: :func:`projected_guess` with or without gravity, whichever has the lower potential in a scene.
+
+    Cloth in the air falls freely; what hangs or lies is held by forces that cancel its weight, and goes on as it moves.
+    """
+    falling, held = (unknowns.at(projected_guess(unknowns.potential, unknowns.problem, falls)) for falls in (True, False))
+    return unknowns.select(held.phi < falling.phi, held, falling)
+
+
+def projected_guess(potential: Potential, problem: StepProblem, falls: bool = True) -> Tensor:
+    """Free flight x_t + dt v_t, with dt² g if it ``falls``, then out of the body along the matched normals: (V, 3).
 
     Vertices are left just inside the contact distance, where the penalty carries their weight: outside it the penalty
     has no curvature and the first iteration would overshoot.
     """
     cloth, dt = problem.cloth, problem.vertex_dt
     gravity = problem.gravity.to(dt)
-    guess = inertial_guess(problem.state, problem.step, cloth.vertex_scene) + dt**2 * gravity
+    guess = inertial_guess(problem.state, problem.step, cloth.vertex_scene) + (dt**2 * gravity if falls else 0.0)
     term = next((term for term in potential.terms.values() if isinstance(term, Collision)), None)
     if problem.contact is not None and term is not None and term.weight > 0:
         carried = (cloth.mass * gravity.norm() / (3.0 * term.weight)).sqrt()

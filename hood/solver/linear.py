@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy import linalg, sparse
+from scipy import linalg
 from torch import Tensor
 
 from hood.losses.problem import sum_per_scene
-from hood.solver.pattern import BlockPattern
+from hood.solver.pattern import BlockPattern, row_product
 from hood.solver.plan import SolverPlan
 
 
@@ -29,84 +29,119 @@ def product(pattern: BlockPattern, triples: Tensor) -> Callable[[Tensor], Tensor
     """x (N, 3) → H x (N, 3)."""
     if triples.device.type != "cpu":
         return block_product(pattern, triples)
-    blocks = (triples.view(-1, 3, 3).numpy(), pattern.cols, pattern.starts)
-    matrix = sparse.bsr_matrix(blocks, shape=(3 * pattern.size, 3 * pattern.size))
-    return lambda x: torch.from_numpy(matrix @ x.numpy().reshape(-1)).view(-1, 3)
+    apply = row_product(triples.reshape(-1), pattern.indices, pattern.indptr, 3 * pattern.size)
+    return lambda x: apply(x.reshape(-1)).view(-1, 3)
 
 
 def block_product(pattern: BlockPattern, triples: Tensor) -> Callable[[Tensor], Tensor]:
     """The same in torch operations, on any device."""
-    rows, cols = (torch.as_tensor(index, device=triples.device) for index in (pattern.rows, pattern.cols))
-    blocks = triples.view(-1, 3, 3)
-    return lambda x: torch.zeros_like(x).index_add(0, rows, torch.bmm(blocks, x[cols].unsqueeze(2)).squeeze(2))
+    rows, cols = (torch.as_tensor(index, device=triples.device) for index in (pattern.triple_rows, pattern.triple_cols))
+    return lambda x: torch.zeros_like(x).view(-1).index_add(0, rows, (triples * x[cols]).sum(1)).view(-1, 3)
 
 
 def conjugate_gradients(
     apply: Callable[[Tensor], Tensor],
-    inverse: Tensor,
+    precondition: Callable[[Tensor], Tensor],
     rhs: Tensor,
     scene: Tensor,
     num_scenes: int,
     tolerance: Tensor,
     max_iterations: int,
-) -> tuple[Tensor, int]:
-    """Approximate solutions of H x = ``rhs`` (N, 3), scene by scene, and the iterations used.
+) -> tuple[Tensor, int, Tensor]:
+    """Approximate solutions of H x = ``rhs`` (N, 3) scene by scene, the iterations used, and the scenes (B,) bool in
+    which H turned out indefinite.
 
     The scenes of a batch run side by side without touching each other: each has its own step lengths and stops on its
-    own, so a batch gives what its members give alone. Any truncation is a descent direction.
+    own, so a batch gives what its members give alone. Any truncation is a descent direction; a scene stops where a
+    direction has no positive curvature.
 
     Args:
         apply: x → H x.
-        inverse: (N, 3, 3) inverses of the diagonal blocks, the preconditioner.
+        precondition: r → P r, symmetric positive definite.
         tolerance: (B,) residual, relative to the right-hand side, both measured by the preconditioner.
     """
+    if num_scenes == 1:
+        x, iterations, stopped = _one_scene(apply, precondition, rhs, float(tolerance), max_iterations)
+        return x, iterations, torch.tensor([stopped], device=rhs.device)
 
     def dot(a: Tensor, b: Tensor) -> Tensor:
-        products = a * b
-        return products.sum().reshape(1) if num_scenes == 1 else sum_per_scene(products.sum(1), scene, num_scenes)
-
-    def spread(values: Tensor) -> Tensor:
-        return values if num_scenes == 1 else values[scene].unsqueeze(1)
-
-    def precondition(r: Tensor) -> Tensor:
-        return torch.bmm(inverse, r.unsqueeze(2)).squeeze(2)
+        return sum_per_scene((a * b).sum(1), scene, num_scenes)
 
     x, r = torch.zeros_like(rhs), rhs.clone()
     z = precondition(r)
     p, rz = z, dot(r, z)
     limit = tolerance**2 * rz
+    active, indefinite = rz > limit, torch.zeros_like(rz, dtype=torch.bool)
     for iteration in range(max_iterations):
-        active = rz > limit
         if not bool(active.any()):
-            return x, iteration
+            return x, iteration, indefinite
         q = apply(p)
         curvature = dot(p, q)
-        usable = active & (curvature > 0)
-        length = torch.where(usable, rz / torch.where(usable, curvature, 1.0), 0.0)
-        x = x + spread(length) * p
-        r = r - spread(length) * q
+        indefinite = indefinite | (active & ~(curvature > 0))
+        active = active & (curvature > 0)
+        length = torch.where(active, rz / torch.where(active, curvature, 1.0), 0.0)[scene].unsqueeze(1)
+        # Not a product alone: a direction may have overflowed in a scene that has stopped.
+        x = torch.where(length > 0, x + length * p, x)
+        r = torch.where(length > 0, r - length * q, r)
         z = precondition(r)
-        before, rz = rz, torch.where(usable, dot(r, z), torch.where(active, 0.0, rz))
-        p = z + spread(torch.where(usable, rz / before, 0.0)) * p
-    return x, max_iterations
+        before, rz = rz, torch.where(active, dot(r, z), rz)
+        active = active & (rz > limit)
+        p = torch.where(active[scene].unsqueeze(1), z + (rz / torch.where(active, before, 1.0))[scene].unsqueeze(1) * p, 0.0)
+    return x, max_iterations, indefinite
 
 
-def solve_direct(plan: SolverPlan, triples: Tensor, rhs: Tensor) -> Tensor:
-    """Solution of H x = ``rhs`` (N, 3) by a band Cholesky factorisation, on the CPU.
+def _one_scene(
+    apply: Callable[[Tensor], Tensor],
+    precondition: Callable[[Tensor], Tensor],
+    rhs: Tensor,
+    tolerance: float,
+    max_iterations: int,
+) -> tuple[Tensor, int, bool]:
+    """The same for a single scene, in a third of the operations."""
+    x, r = torch.zeros_like(rhs), rhs.clone()
+    z = precondition(r)
+    p, rz = z.clone(), _dot(r, z)
+    limit = tolerance**2 * rz
+    for iteration in range(max_iterations):
+        if not rz > limit:
+            return x, iteration, False
+        q = apply(p)
+        curvature = _dot(p, q)
+        if not curvature > 0:
+            return x, iteration, True
+        x.add_(p, alpha=rz / curvature)
+        r.sub_(q, alpha=rz / curvature)
+        z = precondition(r)
+        before, rz = rz, _dot(r, z)
+        p.mul_(rz / before).add_(z)
+    return x, max_iterations, False
 
-    Raises:
-        numpy.linalg.LinAlgError: H is not positive definite to rounding.
-    """
+
+def _dot(a: Tensor, b: Tensor) -> float:
+    return float(torch.dot(a.view(-1), b.view(-1)))
+
+
+def by_blocks(inverse: Tensor) -> Callable[[Tensor], Tensor]:
+    """r (N, 3) → inverse r with ``inverse`` (N, 3, 3) of the diagonal blocks: the block-Jacobi preconditioner."""
+    return lambda r: torch.bmm(inverse, r.unsqueeze(2)).squeeze(2)
+
+
+def solve_direct(plan: SolverPlan, triples: Tensor, rhs: Tensor) -> tuple[Tensor, int | None]:
+    """Solution of H x = ``rhs`` (N, 3) by a band Cholesky factorisation, on the CPU, and None; where H is not positive
+    definite to rounding, zeros and a block row where that was seen."""
     layout = band_layout(plan)
     size = 3 * plan.pattern.size
     values, right = triples.cpu().numpy().reshape(-1), rhs.cpu().numpy().reshape(-1)
     band = np.zeros((layout.num_below + 1) * size, dtype=values.dtype)
     band[layout.places] = values[layout.entries]
     storage = band.reshape(size, layout.num_below + 1).T  # column-major, as LAPACK wants it: no copy
-    factor = linalg.cholesky_banded(storage, overwrite_ab=True, lower=True, check_finite=False)
+    factorise, solve = linalg.get_lapack_funcs(("pbtrf", "pbtrs"), (storage,))
+    factor, stop = factorise(storage, lower=1, overwrite_ab=1)
+    if stop > 0:
+        return torch.zeros_like(rhs), int(layout.order[stop - 1]) // 3
     solution = np.empty_like(right)
-    solution[layout.order] = linalg.cho_solve_banded((factor, True), right[layout.order], check_finite=False)
-    return torch.as_tensor(solution).view(-1, 3).to(rhs.device)
+    solution[layout.order] = solve(factor, right[layout.order], lower=1)[0]
+    return torch.as_tensor(solution).view(-1, 3).to(rhs.device), None
 
 
 def diagonal_inverse(pattern: BlockPattern, triples: Tensor) -> Tensor:
@@ -121,7 +156,7 @@ def invert_blocks(blocks: Tensor) -> Tensor:
     outer = scale[:, :, None] * scale[:, None, :]
     r0, r1, r2 = (blocks * outer).unbind(dim=1)
     c0, c1, c2 = torch.linalg.cross(r1, r2), torch.linalg.cross(r2, r0), torch.linalg.cross(r0, r1)
-    determinant = (r0 * c0).sum(1).clamp_min(torch.finfo(blocks.dtype).eps)
+    determinant = torch.mv(r0 * c0, r0.new_ones(3)).clamp_min(torch.finfo(blocks.dtype).eps)
     return torch.stack([c0, c1, c2], dim=2) / determinant[:, None, None] * outer
 
 
@@ -130,8 +165,8 @@ def band_layout(plan: SolverPlan) -> BandLayout:
     if "band" not in plan.cache:
         pattern, axes = plan.pattern, np.arange(3)
         rank, num_below = pattern.band_order()
-        row = np.broadcast_to((3 * rank[pattern.rows])[:, None, None] + axes[:, None], (len(pattern.rows), 3, 3)).reshape(-1)
-        col = np.broadcast_to((3 * rank[pattern.cols])[:, None, None] + axes, (len(pattern.cols), 3, 3)).reshape(-1)
+        row = np.repeat(3 * rank[pattern.triple_rows // 3] + pattern.triple_rows % 3, 3)
+        col = (3 * rank[pattern.triple_cols][:, None] + axes).reshape(-1)
         entries = np.flatnonzero(row >= col)
         order = np.argsort((3 * rank[:, None] + axes).reshape(-1))
         plan.cache["band"] = BandLayout(order, entries, (row - col + col * (num_below + 1))[entries], num_below)

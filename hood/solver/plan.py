@@ -9,15 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hood.losses.attachment import Attachment
-from hood.losses.bending import Bending
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
-from hood.losses.stretching import Stretching
 from hood.scene.cloth import Cloth
 from hood.scene.state import Attachments
 from hood.solver import elements
-from hood.solver.pattern import BlockPattern, RowSum
+from hood.solver.pattern import BlockPattern, Scatter, axial_targets, matrix_targets, to_vertices, upper_pairs
+from hood.solver.terms import StepTerms
 
 
 @dataclass(frozen=True)
@@ -30,12 +28,11 @@ class SolverPlan:
     vertices: Tensor  # (N,) indices of the free vertices
     scene: Tensor  # (N,) their scenes
     pattern: BlockPattern
-    vertex_triples: RowSum  # from all V vertices; fixed ones are left out
-    face_triples: RowSum
-    hinge_triples: RowSum
-    attachment_triples: RowSum | None
-    face_vertices: RowSum  # onto all V vertices
-    hinge_vertices: RowSum
+    matrix: Scatter  # matrices of all vertices, faces, hinges and attachments, one after the other, onto the pattern
+    slack: Scatter  # slack of vertices and faces
+    face_vertices: Scatter  # gradients onto all V vertices
+    hinge_vertices: Scatter
+    attachment_vertices: Scatter | None
     cache: dict[str, object] = field(default_factory=dict)  # what linear solvers and sweeps derive from the above
 
 
@@ -44,33 +41,30 @@ class QuadraticModel:
     """Second-order model of the potential about a state."""
 
     gradient: Tensor  # (V, 3) N, pinned and massless vertices included
-    triples: Tensor  # (R, 3) N/m, the Hessian of the free vertices in the pattern's layout
+    triples: Tensor  # (R, 3) N/m, positive definite matrix of the free vertices in the pattern's layout
+    slack: Tensor  # (R, 3) N/m, what is missing to the Hessian; negative semi-definite
 
 
 def build_plan(cloth: Cloth, attachments: Attachments | None = None) -> SolverPlan:
     """Plan for steps of ``cloth``; ``attachments`` when the steps have any (their edges enter the sparsity)."""
     free = cloth.free.cpu().numpy()
     unknown = np.where(free, np.cumsum(free) - 1, -1)
-    faces, hinges = (unknown[table.cpu().numpy()] for table in (cloth.faces, cloth.hinges))
-    pairs = [_pairs(faces), _pairs(hinges)]
-    edges = None
-    if attachments is not None:
-        edges = unknown[attachments.edges.cpu().numpy()]
-        pairs.append(_pairs(edges))
-    couples = np.concatenate(pairs)
+    tables = [cloth.faces, cloth.hinges] + ([] if attachments is None else [attachments.edges])
+    corners = [table.cpu().numpy() for table in tables]
+    unknowns = [unknown[table] for table in corners]
+    couples = np.concatenate([_pairs(table) for table in unknowns])
     pattern = BlockPattern(int(free.sum()), couples[(couples >= 0).all(axis=1)])
-    num_vertices = cloth.num_vertices
     vertices = torch.as_tensor(np.flatnonzero(free), device=cloth.faces.device)
+    sums = [to_vertices(table, cloth.num_vertices) for table in corners]
     return SolverPlan(
         vertices=vertices,
         scene=cloth.vertex_scene[vertices],
         pattern=pattern,
-        vertex_triples=RowSum(pattern.triples(unknown, unknown), pattern.num_triples),
-        face_triples=_triple_sum(pattern, faces),
-        hinge_triples=_triple_sum(pattern, hinges),
-        attachment_triples=None if edges is None else _triple_sum(pattern, edges),
-        face_vertices=RowSum(cloth.faces.cpu().numpy(), num_vertices),
-        hinge_vertices=RowSum(cloth.hinges.cpu().numpy(), num_vertices),
+        matrix=_matrix_sum(pattern, unknown, unknowns),
+        slack=_slack_sum(pattern, unknown, unknowns[0]),
+        face_vertices=sums[0],
+        hinge_vertices=sums[1],
+        attachment_vertices=sums[2] if len(sums) > 2 else None,
     )
 
 
@@ -91,79 +85,80 @@ def plan_for(problem: StepProblem) -> SolverPlan:
     return plan
 
 
+class ModelBuilder:
+    """Assembles the quadratic models of one step; keeps the memory that every model needs."""
+
+    def __init__(self, terms: StepTerms, plan: SolverPlan) -> None:
+        self.terms, self.plan = terms, plan
+        cloth, like = terms.problem.cloth, terms.problem.state.pos
+        sizes = [9 * len(like), 45 * len(cloth.faces), 78 * len(cloth.hinges)]
+        # Zero where nothing is ever written: no such term.
+        self._values, self._slack = like.new_zeros(plan.matrix.num_values), like.new_zeros(plan.slack.num_values)
+        parts = self._values.split([*sizes, len(self._values) - sum(sizes)])
+        self._vertices, self._faces, self._hinges, self._springs = parts
+        self._vertex_slack, self._face_slack = self._slack.split([sizes[0], len(self._slack) - sizes[0]])
+
+    def __call__(self, pos: Tensor, acc: Tensor) -> QuadraticModel:
+        """The model at ``pos`` (V, 3) reached with ``acc`` (V, 3)."""
+        terms, plan = self.terms, self.plan
+        vertices = terms.vertices.model(pos, acc)
+        gradient = vertices.gradient
+        self._vertices.copy_(vertices.matrix.view(-1))
+        if vertices.slack is not None:
+            self._vertex_slack.copy_(vertices.slack.view(-1))
+        faces = terms.faces(pos, out=self._faces.view(45, -1))
+        if faces is not None:
+            gradient = gradient + plan.face_vertices(faces.gradient).view(-1, 3)
+            self._face_slack.copy_(faces.slack.view(-1))
+        for index, (slope, row) in enumerate(terms.hinges(pos)):
+            gradient = gradient + plan.hinge_vertices(slope).view(-1, 3)
+            elements.outer_upper(row.flatten(0, 1), self._hinges.view(78, -1), add=index > 0)
+        springs = terms.attachments(pos)
+        if springs is not None:
+            assert plan.attachment_vertices is not None
+            gradient = gradient + plan.attachment_vertices(springs[0]).view(-1, 3)
+            self._springs.copy_(springs[1].view(-1))
+        other = terms.other_gradient(pos, acc)
+        gradient = gradient if other is None else gradient + other
+        return QuadraticModel(gradient, plan.matrix(self._values).view(-1, 3), plan.slack(self._slack).view(-1, 3))
+
+
 def quadratic_model(potential: Potential, problem: StepProblem, plan: SolverPlan, pos: Tensor, acc: Tensor) -> QuadraticModel:
-    """Gradient of the potential, equal to :meth:`Potential.gradient`, and a positive definite Hessian.
+    """Gradient of the potential, equal to :meth:`Potential.gradient`, a positive definite matrix and what it lacks.
 
-    The Hessian is exact for inertia, contact and friction, projected for the membrane, Gauss-Newton for bending (see
-    :mod:`hood.solver.elements`). Terms of other classes enter the gradient, by autograd, but not the Hessian.
+    Matrix plus slack is the Hessian, exact for inertia, contact, friction and membrane, Gauss-Newton for bending (see
+    :mod:`hood.solver.elements`). Terms of other classes enter the gradient, by autograd, but not the matrix.
     """
-    gradient, blocks = elements.vertex_model(potential, problem, pos, acc)
-    other = elements.other_gradient(potential, problem, pos, acc)
-    gradient = gradient if other is None else gradient + other
-    cloth = problem.cloth
-    triples = plan.vertex_triples(blocks.reshape(-1, 3))
-    terms = [term for term in potential.terms.values() if term.applies(problem)]
-    for term in terms:
-        if type(term) is Stretching:
-            face = elements.face_model(
-                pos[cloth.faces],
-                elements.face_shape(cloth.rest_inverse),
-                cloth.rest_area * cloth.thickness,
-                cloth.lame_mu,
-                cloth.lame_lambda,
-            )
-            gradient = gradient + plan.face_vertices(face.gradient.reshape(-1, 3))
-            triples += plan.face_triples(_face_matrix(face).reshape(-1, 3))
-        elif type(term) is Bending:
-            slope, root = elements.hinge_model(pos[cloth.hinges], cloth.rest_angle, elements.hinge_weight(problem))
-            gradient = gradient + plan.hinge_vertices(slope.reshape(-1, 3))
-            row = root.reshape(-1, 12)
-            triples += plan.hinge_triples((row[:, :, None] * row[:, None, :]).reshape(-1, 3))
-        elif type(term) is Attachment:
-            assert plan.attachment_triples is not None
-            force, matrix = _attachments(term, problem, pos)
-            gradient = gradient + force
-            triples += plan.attachment_triples(matrix.reshape(-1, 3))
-    return QuadraticModel(gradient, triples)
+    return ModelBuilder(StepTerms(potential, problem), plan)(pos, acc)
 
 
-def _face_matrix(face: elements.FaceModel) -> Tensor:
-    """(F, 9, 9) with rows and columns ordered by corner, then axis."""
-    root = face.root.reshape(-1, 3, 9)
-    matrix = root[:, 0, :, None] * root[:, 0, None, :]
-    for row in (1, 2):  # faster than a batched product of matrices this small
-        matrix.addcmul_(root[:, row, :, None], root[:, row, None, :])
-    by_axis = matrix.view(-1, 3, 3, 3, 3)
-    for axis in range(3):
-        by_axis[:, :, axis, :, axis] += face.axial
-    return matrix
+def _matrix_sum(pattern: BlockPattern, unknown: np.ndarray, elements: list[np.ndarray]) -> Scatter:
+    targets, sources, num_values = [_block_targets(pattern, unknown)], [np.arange(9 * len(unknown))], 9 * len(unknown)
+    for table in elements:
+        target, source = matrix_targets(pattern, table)
+        targets.append(target)
+        sources.append(num_values + source)
+        num_values += len(upper_pairs(3 * table.shape[1])) * len(table)
+    return Scatter(np.concatenate(targets), np.concatenate(sources), 3 * pattern.num_triples, num_values)
 
 
-def _attachments(term: Attachment, problem: StepProblem, pos: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradient (V, 3) and element matrices (A, 6, 6) of the springs."""
-    attachments = problem.step.attachments
-    assert attachments is not None
-    stiffness = elements.attachment_stiffness(term, problem)
-    a, b = attachments.edges.unbind(dim=1)
-    pull = stiffness[:, None] * (pos[a] - pos[b])
-    gradient = torch.zeros_like(pos).index_add(0, a, pull).index_add(0, b, -pull)
-    sign = torch.tensor([[1.0, -1.0], [-1.0, 1.0]], dtype=pos.dtype, device=pos.device)
-    unit = torch.kron(sign, torch.eye(3, dtype=pos.dtype, device=pos.device))
-    return gradient, stiffness[:, None, None] * unit
+def _slack_sum(pattern: BlockPattern, unknown: np.ndarray, faces: np.ndarray) -> Scatter:
+    target, source = axial_targets(pattern, faces)
+    targets, num_values = np.concatenate([_block_targets(pattern, unknown), target]), 9 * len(unknown)
+    sources = np.concatenate([np.arange(num_values), num_values + source])
+    return Scatter(targets, sources, 3 * pattern.num_triples, num_values + len(upper_pairs(faces.shape[1])) * len(faces))
+
+
+def _block_targets(pattern: BlockPattern, unknown: np.ndarray) -> np.ndarray:
+    """Where matrices (V, 3, 3) of single vertices go; -1 for fixed ones."""
+    triple = pattern.triples(unknown, unknown)[:, :, None]
+    return np.where(triple >= 0, 3 * triple + np.arange(3), -1).reshape(-1)
 
 
 def _pairs(corners: np.ndarray) -> np.ndarray:
     """(K, 2) unordered pairs of different corners of elements (N, C)."""
     first, second = np.triu_indices(corners.shape[1], 1)
     return np.stack([corners[:, first], corners[:, second]], axis=2).reshape(-1, 2)
-
-
-def _triple_sum(pattern: BlockPattern, corners: np.ndarray) -> RowSum:
-    """Where the triples of element matrices (N, 3C, 3C) go; they are ordered by row corner, axis, column corner."""
-    count, width = corners.shape
-    rows = np.broadcast_to(corners[:, :, None], (count, width, width))
-    cols = np.broadcast_to(corners[:, None, :], (count, width, width))
-    return RowSum(pattern.triples(rows, cols).transpose(0, 1, 3, 2), pattern.num_triples)
 
 
 def _same(a: Tensor | None, b: Tensor | None) -> bool:

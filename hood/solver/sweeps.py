@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from hood.losses.attachment import Attachment
-from hood.losses.bending import Bending
-from hood.losses.collision import Collision
 from hood.losses.potential import Potential, relative_gradient
 from hood.losses.problem import StepProblem
-from hood.losses.stretching import Stretching
 from hood.solver import elements
 from hood.solver.colouring import Colour, Incidence, colours_of
+from hood.solver.elements import Corners, FaceConstants, HingeConstants
+from hood.solver.forces import VertexForces, Walls
 from hood.solver.iterate import Iterate, Unknowns, in_double, rounded
 from hood.solver.linear import invert_blocks
 from hood.solver.plan import plan_for
+from hood.solver.terms import StepTerms
 
 #: Shares of a sweep's displacement that are tried, in this order.
 _SHARES = (1.0, 0.5, 0.25)
@@ -48,9 +48,10 @@ def sweep(
     """
     if count < 0:
         raise ValueError(f"sweep: count is {count}; give 0 or more sweeps")
+    problem = potential.prepare(problem)
     work = in_double(problem) if double else problem
-    groups = neighbourhoods(work)
     unknowns = Unknowns(potential, work)
+    groups = neighbourhoods(unknowns.terms)
     now = unknowns.at(start.detach().to(work.state.pos.dtype))
     active = torch.isfinite(now.phi)
     kept = torch.zeros_like(active, dtype=torch.int64)
@@ -81,64 +82,65 @@ class Neighbourhood:
     """A colour with everything constant in a step gathered: what its vertices' energies read."""
 
     colour: Colour
-    vertices: StepProblem  # of the colour's vertices alone
-    faces: Tensor  # (M, 3)
-    face_constants: tuple[Tensor, ...]  # of face_model
-    hinges: Tensor  # (M, 4)
-    hinge_constants: tuple[Tensor, ...]  # of hinge_model
+    forces: VertexForces
+    face_corners: Corners  # own corner first
+    face_constants: FaceConstants
+    hinge_corners: Corners
+    hinge_constants: HingeConstants
+    springs: tuple[Tensor, Tensor] | None  # stiffness (M,) and ends (M, 2), own one first
 
 
-def neighbourhoods(problem: StepProblem) -> list[Neighbourhood]:
-    """The colours of the problem's free vertices."""
-    cloth = problem.cloth
-    shape, area, bending = (
-        elements.face_shape(cloth.rest_inverse),
-        cloth.rest_area * cloth.thickness,
-        elements.hinge_weight(problem),
-    )
-    return [
-        Neighbourhood(
-            colour,
-            elements.only_vertices(problem, colour.vertices),
-            cloth.faces[colour.faces.element],
-            tuple(table[colour.faces.element] for table in (shape, area, cloth.lame_mu, cloth.lame_lambda)),
-            cloth.hinges[colour.hinges.element],
-            tuple(table[colour.hinges.element] for table in (cloth.rest_angle, bending)),
+def neighbourhoods(terms: StepTerms) -> list[Neighbourhood]:
+    """The colours of the free vertices of a step."""
+    problem, cloth, attachments = terms.problem, terms.problem.cloth, terms.problem.step.attachments
+    groups = []
+    for colour in colours_of(plan_for(problem), cloth, attachments):
+        faces, hinges, springs = colour.faces, colour.hinges, None
+        turned = (faces.own[:, None] + torch.arange(3, device=faces.own.device)) % 3
+        if attachments is not None and terms.springs and colour.attachments is not None:
+            around = colour.attachments
+            ends = attachments.edges[around.element]
+            ends = torch.where((around.own == 1)[:, None], ends.flip(1), ends)
+            springs = terms.spring_stiffness()[around.element], ends
+        groups.append(
+            Neighbourhood(
+                colour,
+                terms.vertices.take(colour.vertices),
+                Corners(cloth.faces[faces.element].gather(1, turned)),
+                terms.face_constants.take(faces.element, faces.own),
+                Corners(cloth.hinges[hinges.element]),
+                terms.hinge_constants.take(hinges.element),
+                springs,
+            )
         )
-        for colour in colours_of(plan_for(problem), cloth, problem.step.attachments)
-    ]
+    return groups
 
 
 def _sweep(unknowns: Unknowns, groups: list[Neighbourhood], now: Iterate) -> Tensor:
     """Accelerations (V, 3) after one step of every vertex."""
-    problem, terms = unknowns.problem, dict(unknowns.potential.terms)
-    name = next((name for name, term in terms.items() if type(term) is Collision and term.applies(problem)), None)
-    collision = None if name is None else terms.pop(name)
-    smooth = Potential(terms)
     acc, pos = now.acc.clone(), now.pos.clone()
     for group in groups:
-        rows = group.colour.vertices
-        gradient, matrix = vertex_systems(smooth, problem, group, pos, acc)
+        rows, walls = group.colour.vertices, group.forces.walls
+        gradient, matrix = vertex_systems(unknowns.terms, group, pos, acc, contact=False)
         inverse = invert_blocks(matrix)
         move = -_apply(inverse, gradient)
-        if isinstance(collision, Collision):
-            move = move + _push(collision, group.vertices, pos[rows] + move, inverse)
+        for wall in walls:
+            move = move + _push(wall, pos[rows] + move, inverse)
         acc[rows] += move / unknowns.dt_sq[rows]
-        pos[rows] = unknowns.place(acc)[rows]
+        pos[rows] = unknowns.place_free(rows, acc[rows])
     return acc
 
 
-def _push(term: Collision, problem: StepProblem, pos: Tensor, inverse: Tensor) -> Tensor:
+def _push(wall: Walls, pos: Tensor, inverse: Tensor) -> Tensor:
     """Displacement (n, 3) that the contact adds to where the other energies would take the vertices.
 
     Its force λ = 3 w p² meets the compliance a = n·M⁻¹n of the rest, p = s - a λ with s the depth without it: a
     quadratic equation. A step with the contact's own curvature would do badly, as the penalty sets in without any.
     """
-    depth, normal = elements.signed_depth(term, problem, pos)
-    depth = depth.clamp_min(0.0)
-    give = _apply(inverse, normal)
-    left = 2.0 * depth / (1.0 + (1.0 + 12.0 * term.weight * (give * normal).sum(1) * depth).sqrt())
-    return (3.0 * term.weight * left * left)[:, None] * give
+    depth = wall.depth(pos).clamp_min(0.0)
+    give = _apply(inverse, wall.normal)
+    left = 2.0 * depth / (1.0 + (1.0 + 12.0 * wall.weight * (give * wall.normal).sum(1) * depth).sqrt())
+    return (3.0 * wall.weight * left * left)[:, None] * give
 
 
 def _apply(matrix: Tensor, vector: Tensor) -> Tensor:
@@ -146,7 +148,7 @@ def _apply(matrix: Tensor, vector: Tensor) -> Tensor:
 
 
 def vertex_systems(
-    potential: Potential, problem: StepProblem, group: Neighbourhood, pos: Tensor, acc: Tensor
+    terms: StepTerms, group: Neighbourhood, pos: Tensor, acc: Tensor, contact: bool = True
 ) -> tuple[Tensor, Tensor]:
     """Gradient (n, 3) and positive matrix (n, 3, 3) of the potential by each vertex of a colour.
 
@@ -154,47 +156,34 @@ def vertex_systems(
     """
     colour = group.colour
     rows = colour.vertices
-    gradient, matrix = elements.vertex_model(potential, group.vertices, pos[rows], acc[rows])
-    other = elements.other_gradient(potential, problem, pos, acc)
+    forces = group.forces if contact else group.forces.without_walls()
+    model = forces.model(pos[rows], acc[rows])
+    gradient, matrix = model.gradient, model.matrix
+    other = terms.other_gradient(pos, acc)
     if other is not None:
         gradient = gradient + other[rows]
-    for term in potential.terms.values():
-        if type(term) is Stretching:
-            around, (force, block) = colour.faces, _faces(group, pos)
-        elif type(term) is Bending:
-            around, (force, block) = colour.hinges, _hinges(group, pos)
-        elif type(term) is Attachment and colour.attachments is not None:
-            around, (force, block) = colour.attachments, _springs(term, problem, colour.attachments, pos)
-        else:
-            continue
-        gradient = gradient + around.gradient_sum(force)
-        matrix = matrix + around.matrix_sum(block.reshape(-1, 3)).view(-1, 3, 3)
+    for around, force, block in _around(terms, group, pos):
+        gradient = gradient + around.gradient_sum(force).view(-1, 3)
+        matrix = matrix + around.matrix_sum(block).view(-1, 3, 3)
     return gradient, matrix
 
 
-def _faces(group: Neighbourhood, pos: Tensor) -> tuple[Tensor, Tensor]:
-    own = group.colour.faces.own
-    model = elements.face_model(pos[group.faces], *group.face_constants)
-    each = torch.arange(len(own), device=own.device)
-    root = model.root[each, :, own]
-    block = torch.bmm(root.transpose(1, 2), root)
-    block.diagonal(dim1=1, dim2=2).add_(model.axial[each, own, own][:, None])
-    return model.gradient[each, own], block
-
-
-def _hinges(group: Neighbourhood, pos: Tensor) -> tuple[Tensor, Tensor]:
-    own = group.colour.hinges.own
-    slope, root = elements.hinge_model(pos[group.hinges], *group.hinge_constants)
-    each = torch.arange(len(own), device=own.device)
-    row = root[each, own]
-    return slope[each, own], row[:, :, None] * row[:, None, :]
-
-
-def _springs(term: Attachment, problem: StepProblem, around: Incidence, pos: Tensor) -> tuple[Tensor, Tensor]:
-    attachments = problem.step.attachments
-    assert attachments is not None
-    edges = attachments.edges[around.element]
-    each = torch.arange(len(edges), device=edges.device)
-    stiffness = elements.attachment_stiffness(term, problem)[around.element]
-    gap = pos[edges[each, around.own]] - pos[edges[each, 1 - around.own]]
-    return stiffness[:, None] * gap, stiffness[:, None, None] * torch.eye(3, dtype=pos.dtype, device=pos.device)
+def _around(terms: StepTerms, group: Neighbourhood, pos: Tensor) -> Iterator[tuple[Incidence, Tensor, Tensor]]:
+    """Gradients (3, M) and upper triangles (6, M) of the elements around a colour's vertices, by their own corners."""
+    colour = group.colour
+    if terms.has_membrane:
+        faces = elements.face_model(group.face_corners(pos), group.face_constants, num_corners=1)
+        yield colour.faces, faces.gradient[0], faces.matrix
+    if terms.bendings:
+        x, own = group.hinge_corners(pos), colour.hinges.own
+        each = torch.arange(len(own), device=own.device)
+        for term in terms.bendings:
+            slope, row = elements.hinge_model(term, x, group.hinge_constants)
+            row = row[own, :, each].t()
+            block = row.new_empty(6, len(own))
+            elements.outer_upper(row, block)
+            yield colour.hinges, slope[own, :, each].t(), block
+    if group.springs is not None and colour.attachments is not None:
+        stiffness, ends = group.springs
+        slope, matrix = elements.spring_model(stiffness, Corners(ends)(pos))
+        yield colour.attachments, slope[0], matrix[[0, 1, 2, 6, 7, 11]]

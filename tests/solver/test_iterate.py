@@ -12,8 +12,10 @@ import torch
 from hood.assets.material import Material
 from hood.losses.potential import default_potential
 from hood.scene.cloth import build_cloth
+from hood.scene.state import State
 from hood.solver import plan
-from hood.solver.iterate import Unknowns, projected_guess
+from hood.solver.iterate import Unknowns, first_iterate, projected_guess
+from hood.solver.newton import NewtonSettings, minimize
 from hood.testing import grid, make_problem, plane_contact
 
 F64 = torch.float64
@@ -59,6 +61,21 @@ def test_guess_ignores_vertices_without_a_match():
     torch.testing.assert_close(guess[4:], problem.state.pos[4:] + problem.gravity / 900)
 
 
+def test_cloth_in_the_air_starts_falling_and_cloth_at_rest_stays():
+    potential, problem = default_potential(), problem_at(0.08)
+    problem = replace(problem, step=replace(problem.step, pin_target=problem.state.pos))
+    limp = replace(problem, cloth=replace(problem.cloth, pinned=torch.zeros(16, dtype=torch.bool)))
+    start = first_iterate(Unknowns(potential, limp))
+    torch.testing.assert_close(start.pos, limp.state.pos + limp.gravity / 900)
+    state, settings = problem.state, NewtonSettings(target_rg=1e-6)
+    for _ in range(40):
+        pos, report = minimize(potential, replace(problem, state=state), settings=settings)
+        state = State(pos, 0.5 * (state.vel + report.acc / 30), state.origin)
+    hanging = replace(problem, state=state)
+    start = first_iterate(Unknowns(potential, hanging))
+    assert torch.equal(start.pos, projected_guess(potential, hanging, falls=False))
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 def test_accelerations_carry_the_precision(dtype):
     """A change of 1e-10 m is lost in float32 positions, not in the inertia of the iterate."""
@@ -74,6 +91,7 @@ def test_accelerations_carry_the_precision(dtype):
 
 def test_plans_do_not_outlive_their_cloth():
     problem = problem_at(0.1)
+    gc.collect()  # those of other tests
     before = len(plan._PLANS)
     plan.plan_for(problem)
     assert len(plan._PLANS) == before + 1

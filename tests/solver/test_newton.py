@@ -18,7 +18,7 @@ from hood.scene.contact import Contact
 from hood.scene.state import Attachments, State, StepInput, concatenate_states
 from hood.solver import linear
 from hood.solver.newton import NewtonSettings, minimize
-from hood.solver.pattern import RowSum
+from hood.solver.pattern import Scatter
 from hood.testing import cylinder, grid, make_problem, plane_contact, strip
 
 F64 = torch.float64
@@ -288,7 +288,7 @@ def test_operations_for_other_devices_give_the_same(monkeypatch):
     problem = batch(pieces())
     expected, report = minimize(default_potential(), problem, settings=settings)
     monkeypatch.setattr(linear, "product", linear.block_product)
-    monkeypatch.setattr(RowSum, "__call__", RowSum.by_index)
+    monkeypatch.setattr(Scatter, "__call__", Scatter.by_index)
     found, other = minimize(default_potential(), problem, settings=settings)
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-10)
     assert other.iterations == report.iterations

@@ -58,16 +58,19 @@ def test_gradient_is_that_of_the_potential(name):
 
 
 def product_and_difference(problem, pos, direction, h=1e-7):
+    """The exact matrix, slack included, times a direction, and finite differences of the gradient."""
     potential, plan = default_potential(), plan_for(problem)
     model = quadratic_model(potential, problem, plan, pos, problem.acceleration(pos))
-    applied = linear.product(plan.pattern, model.triples)(direction[plan.vertices])
+    applied = linear.product(plan.pattern, model.triples + model.slack)(direction[plan.vertices])
     ahead, behind = (potential.gradient(problem, pos + sign * h * direction)[0] for sign in (1.0, -1.0))
     return applied, ((ahead - behind) / (2 * h))[plan.vertices]
 
 
-def test_hessian_is_exact_in_tension():
+@pytest.mark.parametrize("size", [1.05, 0.6])
+def test_matrix_and_slack_are_the_hessian(size):
+    """In tension and under compression, with contact, sliding, pins and springs; flat, where bending is exact."""
     problem = touching_sheet()
-    pos = 1.05 * problem.cloth.rest_pos * torch.tensor([1.0, 0.0, 1.02]) + torch.tensor([0.001, 0.0005, 0.0])
+    pos = size * problem.cloth.rest_pos * torch.tensor([1.0, 0.0, 1.02]) + torch.tensor([0.001, 0.0005, 0.0])
     direction = torch.as_tensor(np.random.default_rng(2).normal(size=pos.shape)) * problem.cloth.free.unsqueeze(1)
     applied, difference = product_and_difference(problem, pos, direction)
     torch.testing.assert_close(applied, difference, rtol=0, atol=1e-6 * float(difference.abs().max()))
@@ -85,29 +88,36 @@ def test_hessian_of_sticking_and_sliding_friction():
         torch.testing.assert_close(applied, difference, rtol=0, atol=1e-4 * float(difference.abs().max()))
 
 
-def dense(problem, pos):
-    plan = plan_for(problem)
-    model = quadratic_model(default_potential(), problem, plan, pos, problem.acceleration(pos))
-    apply, size = linear.product(plan.pattern, model.triples), 3 * plan.pattern.size
+def dense(pattern, triples):
+    apply, size = linear.product(pattern, triples), 3 * pattern.size
     return torch.stack([apply(column.reshape(-1, 3)).reshape(-1) for column in torch.eye(size, dtype=F64)])
 
 
-def test_hessian_is_positive_where_the_potential_is_not_convex():
+def test_the_matrix_is_positive_and_the_slack_is_not():
     problem = touching_sheet()
+    plan = plan_for(problem)
     for name, pos in states(problem).items():
-        matrix = dense(problem, pos)
-        torch.testing.assert_close(matrix, matrix.T, rtol=0, atol=1e-12 * float(matrix.abs().max()))
+        model = quadratic_model(default_potential(), problem, plan, pos, problem.acceleration(pos))
+        matrix, slack = dense(plan.pattern, model.triples), dense(plan.pattern, model.slack)
+        size = float(matrix.abs().max())
+        torch.testing.assert_close(matrix, matrix.T, rtol=0, atol=1e-12 * size)
+        torch.testing.assert_close(slack, slack.T, rtol=0, atol=1e-12 * size)
         inertia = float((problem.cloth.mass / problem.vertex_dt.squeeze(1) ** 2).min())
         assert float(torch.linalg.eigvalsh(matrix).min()) >= 0.99 * inertia, name
+        assert float(torch.linalg.eigvalsh(slack).max()) <= 1e-10 * size, name
 
 
-def test_projection_is_needed_under_compression():
+def test_the_hessian_is_indefinite_under_compression():
     pos, faces = grid(5, 5, 0.2)
     problem = make_problem(build_cloth(pos, faces, Material(bending_stiffness=0.0), dtype=F64))
     direction = torch.zeros_like(problem.state.pos)
     direction[::2, 1] = 1.0
-    applied, difference = product_and_difference(problem, 0.6 * problem.cloth.rest_pos, direction)
-    assert float((difference * direction).sum()) < 0 < float((applied * direction).sum())
+    squeezed, plan = 0.6 * problem.cloth.rest_pos, plan_for(problem)
+    applied, difference = product_and_difference(problem, squeezed, direction)
+    torch.testing.assert_close(applied, difference, rtol=0, atol=1e-6 * float(difference.abs().max()))
+    model = quadratic_model(default_potential(), problem, plan, squeezed, problem.acceleration(squeezed))
+    positive = linear.product(plan.pattern, model.triples)(direction)
+    assert float((applied * direction).sum()) < 0 < float((positive * direction).sum())
 
 
 def test_plan_is_kept_until_something_changes():

@@ -17,6 +17,7 @@ from hood.solver.colouring import colours_of, greedy_colours
 from hood.solver.newton import NewtonSettings, minimize
 from hood.solver.plan import plan_for, quadratic_model
 from hood.solver.sweeps import neighbourhoods, sweep, vertex_systems
+from hood.solver.terms import StepTerms
 from hood.testing import cylinder, grid, make_problem, plane_contact
 
 F64 = torch.float64
@@ -142,9 +143,10 @@ def test_vertex_systems_are_the_diagonal_of_the_model():
     acc, plan = problem.acceleration(pos), plan_for(problem)
     model = quadratic_model(potential, problem, plan, pos, acc)
     place = {vertex: row for row, vertex in enumerate(plan.vertices.tolist())}
-    for group in neighbourhoods(problem):
+    terms = StepTerms(potential, problem)
+    for group in neighbourhoods(terms):
         colour = group.colour
-        gradient, matrix = vertex_systems(potential, problem, group, pos, acc)
+        gradient, matrix = vertex_systems(terms, group, pos, acc)
         torch.testing.assert_close(gradient, model.gradient[colour.vertices], rtol=1e-10, atol=1e-12)
         rows = [place[vertex] for vertex in colour.vertices.tolist()]
         blocks = model.triples[plan.pattern.diagonal[rows].reshape(-1)].view(-1, 3, 3)

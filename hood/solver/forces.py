@@ -1,0 +1,190 @@
+"""First and second derivatives of the energies that act on single vertices, with everything constant in a step gathered."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from hood.losses.attachment import Attachment
+from hood.losses.collision import CentroidCollision, Collision
+from hood.losses.friction import Friction, LaggedFriction, WeightFriction, mollified_norm
+from hood.losses.gravity import Gravity
+from hood.losses.inertia import Inertia
+from hood.losses.potential import Potential, Term
+from hood.losses.problem import StepProblem
+from hood.losses.stretching import Stretching
+from hood.solver.elements import BENDINGS
+
+COLLISIONS = (Collision, CentroidCollision)
+FRICTIONS = (Friction, WeightFriction)
+#: Terms whose derivatives are written out. A subclass may compute something else and does not count.
+CLOSED_FORM = (Stretching, *BENDINGS, Attachment, Inertia, Gravity, *COLLISIONS, *FRICTIONS)
+
+
+@dataclass(frozen=True)
+class Walls:
+    """A collision term as N planes; rows without one are zero and feel nothing."""
+
+    weight: float  # J/m³
+    point: Tensor  # (N, 3) m
+    normal: Tensor  # (N, 3)
+    reach: Tensor  # (N,) m, distance at which the penalty sets in
+
+    def depth(self, pos: Tensor) -> Tensor:
+        """Depth ε - d (N,) [m] of ``pos`` (N, 3) in the contact zone, negative outside."""
+        return self.reach - _rows(pos - self.point, self.normal)
+
+    def take(self, rows: Tensor) -> Walls:
+        return Walls(self.weight, self.point[rows], self.normal[rows], self.reach[rows])
+
+
+@dataclass(frozen=True)
+class Grip:
+    """A friction term on N vertices, force f at most along the tangential slip; rows without any are zero."""
+
+    force: Tensor  # (N,) N, the coefficient included
+    normal: Tensor  # (N, 3)
+    anchor: Tensor  # (N, 3) m, where the vertex would be if it stuck
+    limit: Tensor  # (N,) m, slip below which it counts as sticking
+
+    def slip(self, pos: Tensor) -> Tensor:
+        """Tangential slip (N, 3) [m] of ``pos`` (N, 3)."""
+        slip = torch.where((self.force > 0)[:, None], pos - self.anchor, 0.0)
+        return slip - _rows(slip, self.normal)[:, None] * self.normal
+
+    def take(self, rows: Tensor) -> Grip:
+        return Grip(self.force[rows], self.normal[rows], self.anchor[rows], self.limit[rows])
+
+
+@dataclass(frozen=True)
+class VertexModel:
+    """Second-order model of the energies on N vertices."""
+
+    gradient: Tensor  # (N, 3) N
+    matrix: Tensor  # (N, 3, 3) N/m, positive semi-definite
+    slack: Tensor | None  # (N, 3, 3) N/m, exact matrix minus ``matrix``, negative semi-definite; None for zero
+
+
+@dataclass(frozen=True)
+class VertexForces:
+    """Inertia, gravity, contact and friction of N vertices."""
+
+    inertia: Tensor  # (N, 1) kg, 0 where there is no such term
+    stiffness: Tensor  # (N,) N/m, of inertia
+    weight: Tensor  # (N, 3) N
+    walls: tuple[Walls, ...]
+    grips: tuple[Grip, ...]
+
+    def take(self, rows: Tensor) -> VertexForces:
+        """Those of some vertices."""
+        walls, grips = tuple(wall.take(rows) for wall in self.walls), tuple(grip.take(rows) for grip in self.grips)
+        return VertexForces(self.inertia[rows], self.stiffness[rows], self.weight[rows], walls, grips)
+
+    def without_walls(self) -> VertexForces:
+        """The same without contact."""
+        return VertexForces(self.inertia, self.stiffness, self.weight, (), self.grips)
+
+    def energies(self, pos: Tensor, acc: Tensor, dt: Tensor) -> list[Tensor]:
+        """Energies [J] (N,) of the terms at positions and accelerations (N, 3); time step ``dt`` (N, 1)."""
+        moved = dt**2 * acc
+        parts = [0.5 * self.stiffness * _rows(moved, moved), -_rows(self.weight, pos)]
+        parts += [wall.weight * wall.depth(pos).clamp_min(0.0) ** 3 for wall in self.walls]
+        for grip in self.grips:
+            slip = grip.slip(pos)
+            parts.append(grip.force * mollified_norm(_rows(slip, slip), grip.limit))
+        return parts
+
+    def model(self, pos: Tensor, acc: Tensor) -> VertexModel:
+        """Derivatives at positions and accelerations (N, 3).
+
+        Friction is majorised: its matrix is the slope f'/y across *and* along the slip, so that a step does not overshoot
+        the kink at rest; the curvature f'' along it is smaller, which is the slack.
+        """
+        gradient = self.inertia * acc - self.weight
+        matrix = torch.diag_embed(self.stiffness.unsqueeze(1).expand(-1, 3))
+        slack = None
+        for wall in self.walls:
+            depth = wall.depth(pos).clamp_min(0.0)
+            gradient = gradient - (3.0 * wall.weight * depth * depth)[:, None] * wall.normal
+            matrix += _outer((6.0 * wall.weight * depth)[:, None] * wall.normal, wall.normal)
+        for grip in self.grips:
+            force, block, less = _friction(grip, pos)
+            gradient, matrix = gradient + force, matrix.add_(block)
+            slack = less if slack is None else slack + less
+        return VertexModel(gradient, matrix, slack)
+
+
+def vertex_forces(potential: Potential, problem: StepProblem) -> VertexForces:
+    """The potential's terms of :data:`CLOSED_FORM` that act on single vertices."""
+    mass, pos = problem.cloth.mass, problem.state.pos
+    inertia, weight = torch.zeros_like(mass), torch.zeros_like(pos)
+    walls: list[Walls] = []
+    grips: list[Grip] = []
+    for term in potential.terms.values():
+        if not term.applies(problem):
+            continue
+        if type(term) is Inertia:
+            inertia = inertia + mass
+        elif type(term) is Gravity:
+            weight = weight + mass[:, None] * problem.gravity.to(pos)
+        elif isinstance(term, Collision) and type(term) in COLLISIONS:
+            walls.append(walls_of(term, problem))
+        elif isinstance(term, LaggedFriction) and type(term) in FRICTIONS:
+            grips.append(_grip(term, problem))
+    return VertexForces(inertia[:, None], inertia / problem.vertex_dt.squeeze(1) ** 2, weight, tuple(walls), tuple(grips))
+
+
+def walls_of(term: Collision, problem: StepProblem) -> Walls:
+    """The planes of a collision term; the problem must have a contact."""
+    planes = term.planes(problem)
+    reach = term.epsilon * planes.touching.to(planes.point.dtype)
+    return Walls(term.weight, planes.point, planes.normal, reach)
+
+
+def _grip(term: LaggedFriction, problem: StepProblem) -> Grip:
+    contact = problem.contact
+    assert contact is not None
+    force = term.coefficient * term.normal_force(problem, contact)
+    # Rows without a match may hold infinite or undefined numbers.
+    sliding = (force > 0)[:, None]
+    anchor = problem.state.pos + torch.where(sliding, contact.next_point - contact.point, 0.0)
+    limit = term.slip_speed * problem.vertex_dt.squeeze(1)
+    return Grip(force, torch.where(sliding, contact.next_normal, 0.0), anchor, limit)
+
+
+def _friction(grip: Grip, pos: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Gradient, matrix and slack."""
+    normal, slip = grip.normal, grip.slip(pos)
+    size = _rows(slip, slip).sqrt()
+    small = size < grip.limit
+    ratio = size / grip.limit
+    slope = grip.force * torch.where(small, (2.0 - ratio) / grip.limit, 1.0 / torch.where(small, 1.0, size))
+    along = grip.force * torch.where(small, 2.0 * (1.0 - ratio) / grip.limit, 0.0)
+    heading = slip / torch.where(size > 0, size, 1.0)[:, None]
+    matrix = torch.diag_embed(slope.unsqueeze(1).expand(-1, 3)) - _outer(slope[:, None] * normal, normal)
+    return slope[:, None] * slip, matrix, _outer((along - slope)[:, None] * heading, heading)
+
+
+def attachment_stiffness(term: Term, problem: StepProblem) -> Tensor:
+    """Spring constants [N/m] (A,) of the step's attachments, 0 where open."""
+    attachments = problem.step.attachments
+    assert attachments is not None
+    assert isinstance(term, Attachment)
+    return term.stiffness * attachments.active.to(problem.state.pos.dtype)
+
+
+def other_terms(potential: Potential, problem: StepProblem) -> Potential | None:
+    """The terms that have no closed form here and play a role in the problem; None without any."""
+    others = {name: term for name, term in potential.terms.items() if type(term) not in CLOSED_FORM}
+    return Potential(others) if any(term.applies(problem) for term in others.values()) else None
+
+
+def _rows(a: Tensor, b: Tensor) -> Tensor:
+    """Products (N,) of rows (N, 3); a sum over so short an axis would be slow."""
+    return torch.mv(a * b, a.new_ones(3))
+
+
+def _outer(a: Tensor, b: Tensor) -> Tensor:
+    return a[:, :, None] * b[:, None, :]

@@ -1,0 +1,100 @@
+"""The line search: along a path that bends away from the body where the straight one would run into it."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from hood.solver.forces import Walls
+from hood.solver.iterate import Iterate, Unknowns
+
+_ARMIJO = 1e-4
+_BACKTRACKS = 40
+
+
+class Path:
+    """Where steps of some length from an iterate lead.
+
+    A Newton step knows the contact force and its slope at its start: a vertex outside the body meets no resistance and
+    one inside too little, so that a few vertices would shorten the step of all. Here every vertex with contact ends where
+    the *whole* cubic penalty balances the Newton model, moved along the compliance of its own 3 × 3 block. The
+    correction is of second order in the step, so the path starts in the Newton direction and short steps descend.
+
+    Args:
+        direction: (V, 3) m, zero for fixed vertices.
+        inverse: (N, 3, 3) inverses of the model's diagonal blocks.
+        vertices: (N,) their vertices.
+    """
+
+    def __init__(self, unknowns: Unknowns, now: Iterate, direction: Tensor, inverse: Tensor, vertices: Tensor) -> None:
+        self._unknowns, self._now = unknowns, now
+        self._step = direction / unknowns.dt_sq
+        walls = unknowns.terms.vertices.walls
+        self._stops = []
+        for wall in walls:
+            # A straight line is deepest at one of its ends.
+            deepest = torch.maximum(wall.depth(now.pos), wall.depth(now.pos + direction))[vertices]
+            rows = (deepest > 0).nonzero().squeeze(1)
+            if len(rows):
+                self._stops.append(_Stop(wall, now.pos, inverse[rows], vertices[rows]))
+
+    def at(self, length: Tensor) -> Iterate:
+        """The iterate at step lengths (B,)."""
+        unknowns = self._unknowns
+        acc = self._now.acc + length[unknowns.scene].unsqueeze(1) * self._step
+        for stop in self._stops:
+            rows = stop.vertices
+            acc[rows] += stop.correction(unknowns.place_free(rows, acc[rows])) / unknowns.dt_sq[rows]
+        return unknowns.evaluate(acc)
+
+
+class _Stop:
+    """Contact of n vertices with a wall during a step."""
+
+    def __init__(self, wall: Walls, pos: Tensor, inverse: Tensor, vertices: Tensor) -> None:
+        self.vertices = vertices
+        self._wall = wall.take(vertices)
+        self._depth = self._wall.depth(pos[vertices]).clamp_min(0.0)
+        self._give = torch.bmm(inverse, self._wall.normal.unsqueeze(2)).squeeze(2)
+        self._compliance = (self._give * self._wall.normal).sum(1)
+
+    def correction(self, pos: Tensor) -> Tensor:
+        """Displacement (n, 3) of vertices that the Newton model has put at ``pos`` (n, 3)."""
+        cubic, start, end = 3.0 * self._wall.weight, self._depth, self._wall.depth(pos)
+        # The model's own force at the end, and the stiffness of everything else.
+        force = cubic * start * (2.0 * end - start)
+        rest = torch.maximum(1.0 / self._compliance - 2.0 * cubic * start, 0.1 / self._compliance)
+        # cubic q² + rest (q - end) = force for the depth q >= 0.
+        load = (force + rest * end).clamp_min(0.0)
+        balance = 2.0 * load / (rest + (rest * rest + 4.0 * cubic * load).sqrt())
+        push = torch.where(end > balance, end - balance, 0.0)
+        return (push / self._compliance)[:, None] * self._give
+
+
+def backtrack(unknowns: Unknowns, path: Path, now: Iterate, slope: Tensor, searching: Tensor) -> tuple[Iterate, Tensor]:
+    """The next iterate, and the scenes (B,) of ``searching`` that moved: Armijo backtracking, scene by scene.
+
+    Args:
+        slope: (B,) J, of the potential along the path at its start.
+    """
+    length = torch.ones_like(slope)
+    searching, moved, result = searching & (slope < 0), torch.zeros_like(searching), now
+    for _ in range(_BACKTRACKS):
+        if not bool(searching.any()):
+            break
+        trial = path.at(length * searching)
+        accepted = searching & (trial.phi <= now.phi + _ARMIJO * length * slope + now.noise)
+        if bool(accepted.all()):
+            return trial, accepted
+        result = unknowns.select(accepted, trial, result)
+        moved, searching = moved | accepted, searching & ~accepted
+        length = torch.where(searching, _shorter(length, slope, trial.phi - now.phi), length)
+    return result, moved
+
+
+def _shorter(length: Tensor, slope: Tensor, rise: Tensor) -> Tensor:
+    """Step length (B,) at the minimum of the parabola through what is known, between a tenth and a half of the last."""
+    excess = rise - length * slope
+    usable = torch.isfinite(excess) & (excess > 0)
+    parabola = torch.where(usable, -0.5 * slope * length**2 / torch.where(usable, excess, 1.0), 0.1 * length)
+    return torch.minimum(torch.maximum(parabola, 0.1 * length), 0.5 * length)

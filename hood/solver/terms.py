@@ -1,0 +1,78 @@
+"""The potential of one step with everything constant gathered once: its energies, and derivatives element by element.
+
+The numbers are those of :class:`hood.losses.potential.Potential`, to rounding, in a third of the time: the tables that
+every iteration reads lie as its arithmetic wants them.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from hood.losses.attachment import Attachment
+from hood.losses.potential import Potential
+from hood.losses.problem import StepProblem, sum_per_scene
+from hood.losses.stretching import Stretching
+from hood.solver import elements
+from hood.solver.elements import BENDINGS, Corners
+from hood.solver.forces import attachment_stiffness, other_terms, vertex_forces
+
+
+class StepTerms:
+    """Energies and derivatives of a potential for one step."""
+
+    def __init__(self, potential: Potential, problem: StepProblem) -> None:
+        self.problem = problem
+        cloth, terms = problem.cloth, [term for term in potential.terms.values() if term.applies(problem)]
+        self.vertices = vertex_forces(potential, problem)
+        self.bendings = [term for term in terms if type(term) in BENDINGS]
+        self.springs = [term for term in terms if type(term) is Attachment]
+        self.others = other_terms(potential, problem)
+        num_membranes = sum(type(term) is Stretching for term in terms)
+        self.has_membrane = num_membranes > 0
+        self.face_constants = elements.face_constants(cloth, num_membranes)
+        self.hinge_constants = elements.hinge_constants(cloth)
+        self._face_corners, self._hinge_corners = Corners(cloth.faces), Corners(cloth.hinges)
+
+    def energies(self, pos: Tensor, acc: Tensor) -> list[Tensor]:
+        """Energies [J] (B,), term by term or several together, at ``pos`` (V, 3) reached with ``acc`` (V, 3)."""
+        problem, cloth = self.problem, self.problem.cloth
+        parts = [(energy, cloth.vertex_scene) for energy in self.vertices.energies(pos, acc, problem.vertex_dt)]
+        if self.has_membrane:
+            parts.append((elements.face_energy(self._face_corners(pos), self.face_constants), cloth.face_scene))
+        if self.bendings:
+            x = self._hinge_corners(pos)
+            parts += [(elements.hinge_energy(term, x, self.hinge_constants), cloth.hinge_scene) for term in self.bendings]
+        sums = [_sum(values, scene, problem.num_scenes) for values, scene in parts]
+        sums += [term(problem, pos, acc) for term in self.springs]
+        return sums + ([] if self.others is None else list(self.others.energies(problem, pos, acc).values()))
+
+    def faces(self, pos: Tensor, out: Tensor | None = None) -> elements.FaceModel | None:
+        """The membrane at ``pos`` (V, 3), its matrix in ``out``; None without such a term."""
+        return elements.face_model(self._face_corners(pos), self.face_constants, out=out) if self.has_membrane else None
+
+    def hinges(self, pos: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Gradient and row of every bending term, see :func:`hood.solver.elements.hinge_model`."""
+        if not self.bendings:
+            return []
+        x = self._hinge_corners(pos)
+        return [elements.hinge_model(term, x, self.hinge_constants) for term in self.bendings]
+
+    def attachments(self, pos: Tensor) -> tuple[Tensor, Tensor] | None:
+        """Gradient and matrix of the springs, see :func:`hood.solver.elements.spring_model`; None without any."""
+        attachments = self.problem.step.attachments
+        if attachments is None or not self.springs:
+            return None
+        return elements.spring_model(self.spring_stiffness(), Corners(attachments.edges)(pos))
+
+    def spring_stiffness(self) -> Tensor:
+        """Spring constants [N/m] (A,), of all terms together."""
+        return torch.stack([attachment_stiffness(term, self.problem) for term in self.springs]).sum(0)
+
+    def other_gradient(self, pos: Tensor, acc: Tensor) -> Tensor | None:
+        """Gradient (V, 3) [N] of the energies that have no closed form here, by autograd; None without any."""
+        return None if self.others is None else self.others.gradient(self.problem, pos, acc)[0]
+
+
+def _sum(values: Tensor, scene: Tensor, num_scenes: int) -> Tensor:
+    return values.sum().reshape(1) if num_scenes == 1 else sum_per_scene(values, scene, num_scenes)
