@@ -1,4 +1,4 @@
-"""Command line: ``hood train|rollout|evaluate key=value …``. User errors are one line and exit code 2."""
+"""Command line: ``hood train|rollout|evaluate|convert key=value …``. User errors are one line and exit code 2."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 
 # Read by the C library and OpenMP at process start. Cloth steps allocate and free tensors of a few MB many times a frame:
 # keeping them mapped is worth 1.15–1.9×. Waiting threads that spin slow a busy machine down 6× and more.
-_ENVIRONMENT = {
+ENVIRONMENT = {
     "OMP_WAIT_POLICY": "PASSIVE",
     # One step of a 1k garment takes 45 ms on one thread and 100 ms on two: its operations are too small to share.
     "OMP_NUM_THREADS": "1",
@@ -20,6 +20,7 @@ COMMANDS = {
     "train": "train a model from a config",
     "rollout": "simulate a garment on a moving body",
     "evaluate": "table of cost and accuracy over the validation list",
+    "convert": "write published HOOD weights (.pth) as a model file",
 }
 
 
@@ -99,7 +100,7 @@ def entry(argv: Sequence[str] | None = None) -> None:
     """Console entry: allocator settings take effect only at process start, so the process replaces itself once."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     if sys.platform.startswith("linux") and not os.environ.get("MALLOC_TOP_PAD_"):
-        os.environ.update({key: os.environ.get(key, value) for key, value in _ENVIRONMENT.items()})
+        os.environ.update({key: os.environ.get(key, value) for key, value in ENVIRONMENT.items()})
         os.execv(sys.executable, [sys.executable, "-m", "hood.cli", *arguments])
     sys.exit(main(arguments))
 

@@ -291,9 +291,19 @@ def test_train_resume_and_refuse(tmp_path: Path, capsys: pytest.CaptureFixture[s
 
 def test_evaluate_writes_its_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tiny_model(tmp_path / "m.safetensors")
-    arguments = ["models=[m.safetensors]", "garments=[tank]", "sequences=[walk_proud]", "num_frames=5", "output=table"]
+    arguments = [
+        "models=[m.safetensors,newton]", "garments=[tank]", "sequences=[walk_proud]", "num_frames=5", "output=table",
+        "solver.max_iterations=2", "gap_states=1", "gap_iterations=3",
+    ]  # fmt: skip
     assert main(["evaluate", *arguments]) == 0
-    assert "tank" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "tank" in printed
+    assert "2 of 2 reference minima did not converge" in printed
     rows = json.loads((tmp_path / "table" / "table.json").read_text())
-    assert [row["garment"] for row in rows] == ["tank", "all"]
+    assert [(row["model"], row["garment"]) for row in rows] == [
+        (model, garment) for model in ("m", "newton") for garment in ("tank", "all")
+    ]
     assert rows[0]["radius"] == rows[0]["steps"] == 1
+    assert (rows[2]["radius"], rows[2]["weights"], rows[2]["gap_states"]) == (None, "none", 1)
+    assert main(["evaluate", *arguments[:-2], "gap_states=-1"]) == 2
+    assert "gap_states=-1" in capsys.readouterr().err

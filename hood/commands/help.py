@@ -17,7 +17,11 @@ _EXAMPLES = {
         "hood rollout garment=dress sequence=walk_steady num_frames=200 output=outputs/dress",
         "hood rollout garment=my_shirt.obj sequence=CMU_01_poses.npz material=denim",
     ],
-    "evaluate": ["hood evaluate", "hood evaluate models=[runs/a/model.safetensors] garments=[dress]"],
+    "convert": ["hood convert checkpoint=postcvpr.pth output=postcvpr.safetensors"],
+    "evaluate": [
+        "hood evaluate",
+        "hood evaluate models=[runs/a/model.safetensors,newton] garments=[dress] sequences=[] gap_states=3",
+    ],
 }
 
 
@@ -33,12 +37,13 @@ def describe(name: str) -> str:
         text = f"  {key}={_show(value)}"
         text = f"{text:<34}" if len(text) < 34 else text + "  "
         lines.append(textwrap.fill(text + comments.get(str(key), ""), 118, subsequent_indent=" " * 34))
-    lines += ["", "config groups (their keys can be overridden too, e.g. material.density=0.3):"]
-    for group in _groups_of(name):
-        lines.append(f"  {group + '=':<14}{' | '.join(options(group))}")
-    lines += ["", "embedded names:"]
-    for kind, label in (("garments", "garment"), ("motions", "sequence"), ("body", "body"), ("weights", "checkpoint")):
-        lines.append(textwrap.fill(f"  {label + '=':<14}{' '.join(library.names(kind))}", 118, subsequent_indent=" " * 16))
+    groups = _groups_of(name)
+    if groups:
+        lines += ["", "config groups (their keys can be overridden too, e.g. material.density=0.3):"]
+        lines += [f"  {group + '=':<14}{' | '.join(options(group))}" for group in groups]
+        lines += ["", "embedded names:"]
+        for kind, label in (("garments", "garment"), ("motions", "sequence"), ("body", "body"), ("weights", "checkpoint")):
+            lines.append(textwrap.fill(f"  {label + '=':<14}{' '.join(library.names(kind))}", 118, subsequent_indent=" " * 16))
     lines += ["", "examples:", *(f"  {example}" for example in _EXAMPLES[name])]
     return "\n".join(lines)
 

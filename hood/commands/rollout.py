@@ -19,11 +19,11 @@ from hood.assets.body import load_body
 from hood.assets.garment import load_garment
 from hood.assets.library import locate
 from hood.assets.sequence import load_sequence
-from hood.commands.common import UNTRAINED, prepare_folder, require_device
+from hood.commands.common import UNTRAINED, prepare_folder, read_model, require_device
 from hood.config import ConfigError, build, load_config, plain, require_choice, save_run_record
 from hood.dynamics.recorder import RolloutWriter, read_rollout
 from hood.dynamics.rollout import metric_names, simulate
-from hood.dynamics.simulator import Simulator, load_simulator
+from hood.dynamics.simulator import Simulator
 from hood.dynamics.stepper import NewtonStepper, Stepper
 from hood.scene.scene import Scene, build_scene
 
@@ -71,7 +71,9 @@ def make_scene(config: DictConfig) -> Scene:
 def make_stepper(config: DictConfig) -> tuple[Stepper, str]:
     """What takes the steps, and the SHA-256 of its weights (``none`` for the solver)."""
     if str(config.stepper) == "network":
-        return make_simulator(config)
+        simulator, digest = make_simulator(config)
+        simulator.network.use_precision(str(config.precision))
+        return simulator, digest
     stepper = NewtonStepper(build(config.losses), build(config.solver))
     stepper.gravity = stepper.gravity.to(str(config.device))
     return stepper, "none"
@@ -92,7 +94,7 @@ def make_simulator(config: DictConfig) -> tuple[Simulator, str]:
         simulator: Simulator = build(config.model)
         return simulator.eval().to(device), UNTRAINED
     path = locate("weights", str(config.checkpoint))
-    simulator = load_simulator(path)
+    simulator = read_model(path, float(config.fps))
     if asked is not None:
         built: Simulator = build(config.model)
         if built.config != simulator.config:

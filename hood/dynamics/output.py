@@ -31,9 +31,9 @@ class AccelerationOutput(Output):
     """The paper's output (section 4.2): acceleration per frame², de-normalised by running statistics; the base is the
     inertial guess x_t + dt v_t."""
 
-    def __init__(self, decay: float = 0.999) -> None:
+    def __init__(self, decay: float = 0.999, divisor_floor: float | None = None) -> None:
         super().__init__()
-        self.normalizer = RunningNormalizer(3, decay)
+        self.normalizer = RunningNormalizer(3, decay, divisor_floor=divisor_floor)
 
     def base(self, problem: StepProblem) -> Tensor:
         return inertial_guess(problem.state, problem.step, problem.cloth.vertex_scene)

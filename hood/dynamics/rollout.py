@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from hood.dynamics.measure import METRICS, penetration_metrics, strain_metrics
+from hood.dynamics.simulator import Prediction, Simulator
 from hood.dynamics.stepper import Stepper
 from hood.dynamics.stopwatch import Stopwatch
 from hood.losses.potential import Potential, relative_gradient, scale
@@ -19,6 +20,8 @@ from hood.scene.start import push_out
 from hood.scene.state import Attachments, State
 
 AttachmentSchedule = Callable[[int], Attachments | None]
+#: Called after a step with the frame it leads to, what the step had to solve and what came out.
+Observer = Callable[[int, StepProblem, Prediction], None]
 
 
 @dataclass(frozen=True)
@@ -57,12 +60,13 @@ def simulate(
     relaxing_steps: int = 1,
     attachments: AttachmentSchedule | None = None,
     start_frame: int = 0,
+    observe: Observer | None = None,
 ) -> Iterator[Frame]:
     """Frames 0, 1, … of the garment on the moving body.
 
     Frame 0 is the settled start after ``relaxing_steps`` relaxing steps (paper, section 3.4), vertices pushed out of the
     body. A frame's energies belong to the step that led to it, as do its times. The simulation goes on over non-finite
-    frames, so that their number and place are seen.
+    frames, so that their number and place are seen. ``observe`` sees every step outside its time.
     """
     count = scene.num_frames - start_frame if num_frames is None else min(num_frames, scene.num_frames - start_frame)
     watch = Stopwatch()
@@ -89,8 +93,9 @@ def simulate(
         yield Frame(index, state, state.pos.cpu().double() + origin, body_pos, {**shared, **metrics})
         if index + 1 >= count:
             return
-        before = watch.lap()  # metrics and the caller's work are not part of the frame's time
-        problem = StepProblem(scene.cloth, state, step, contact, stepper.gravity.to(state.pos))
+        problem = potential.prepare(StepProblem(scene.cloth, state, step, contact, stepper.gravity.to(state.pos)))
+        # Metrics, what only they need to know of the step, and the caller's work are not part of the frame's time.
+        before = watch.lap()
         prediction = stepper.predict(problem, prepared, watch)
         state = State(prediction.next_pos, stepper.next_velocity(problem, prediction), state.origin)
         times = {**watch.lap(), "search": before["search"]}
@@ -98,23 +103,35 @@ def simulate(
         times["total"] += before["search"] + before["posing"]
         metrics = {f"ms_{part}": times.get(part, 0.0) for part in stepper.times} | prediction.metrics
         metrics |= energy_metrics(potential, problem, prediction.next_pos, prediction.acc)
+        if observe is not None:
+            observe(index + 1, problem, prediction)
 
 
 def start_state(stepper: Stepper, scene: Scene, potential: Potential, relaxing_steps: int, frame: int = 0) -> State:
-    """Settled, relaxed start: the relaxing step is kept only where it lowers the potential of its own problem."""
+    """Settled, relaxed start: the relaxing step is kept only where it lowers the potential of its own problem.
+
+    Models that count in frames (:class:`hood.dynamics.frames.FrameRules`) go on from the relaxing step as they left it: with
+    its positions and its velocity.
+    """
     state = scene.start(frame, relaxed=False)
     prepared = stepper.prepare(scene.cloth, scene.garment.rest_pos)
+    in_frames = isinstance(stepper, Simulator) and stepper.rules.frame_dt is not None
+    velocity = scene.start_velocity(frame)
     for _ in range(relaxing_steps):
         step = scene.step_input(frame, state, relaxing=True)
         contact = stepper.find_contact(scene.cloth, state, step)
-        problem = StepProblem(scene.cloth, state, step, contact, stepper.gravity.to(state.pos))
+        problem = potential.prepare(StepProblem(scene.cloth, state, step, contact, stepper.gravity.to(state.pos)))
         prediction = stepper.predict(problem, prepared)
+        if in_frames:
+            state = State(prediction.next_pos, state.vel, state.origin)
+            velocity = stepper.next_velocity(problem, prediction)
+            continue
         pos = push_out(scene.cloth, prediction.next_pos, step.obstacle, scene.clearance)
         if bool(torch.isfinite(pos).all()) and bool(
             (potential.total(problem, pos) < potential.total(problem, state.pos)).all()
         ):
             state = State(pos, state.vel, state.origin)
-    return State(state.pos, scene.start_velocity(frame), state.origin)
+    return State(state.pos, velocity, state.origin)
 
 
 def energy_metrics(potential: Potential, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> dict[str, float]:

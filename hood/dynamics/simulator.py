@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import os
 from collections.abc import Mapping, Sequence
@@ -14,12 +15,14 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from hood.dynamics.output import OUTPUTS, AccelerationOutput, Output
+from hood.dynamics.frames import FrameRules
+from hood.dynamics.output import OUTPUTS, AccelerationOutput, Output, VelocityBaseOutput
 from hood.dynamics.stopwatch import Stopwatch, timed
 from hood.features import groups, physical
 from hood.features.inputs import Inputs
 from hood.graph.builder import StaticGraph, build_graph, build_static
-from hood.graph.hierarchy import Hierarchy, build_hierarchy, concatenate_hierarchies
+from hood.graph.cache import cached_hierarchy
+from hood.graph.hierarchy import Hierarchy, concatenate_hierarchies
 from hood.losses.potential import default_potential
 from hood.losses.problem import StepProblem
 from hood.nn.model import MeshGraphNet
@@ -65,10 +68,14 @@ class Simulator(nn.Module):
         output: Output,
         body_radius: float,
         config: dict[str, Any],
+        rules: FrameRules | None = None,
+        embedded_levels: int = 1,
     ) -> None:
         super().__init__()
         self.features, self.network, self.output = features, network, output
         self.body_radius = body_radius
+        self.rules = rules or FrameRules()
+        self._embedded_levels = embedded_levels
         self.config = config
         self.register_buffer("gravity", torch.tensor([0.0, -9.81, 0.0]), persistent=False)
         # The residual feature asks the physics where the base guess is wrong; its parameters are part of the model.
@@ -82,7 +89,8 @@ class Simulator(nn.Module):
 
     @property
     def num_coarse(self) -> int:
-        return num_coarse_levels(self.schedule)
+        """Coarse levels of the hierarchy that the model needs: those it works on and those its level feature tells apart."""
+        return max(num_coarse_levels(self.schedule), self._embedded_levels - 1)
 
     @property
     def uses_statistics(self) -> bool:
@@ -94,9 +102,13 @@ class Simulator(nn.Module):
         """Columns of the node features that hold the velocity: both feature sets put it first."""
         return slice(0, 3)
 
-    def prepare(self, cloth: Cloth, rest_pos: Any) -> Prepared:
-        """Hierarchy and static graph of one garment; ``rest_pos`` (V, 3) orders its vertices."""
-        hierarchy = _cached_hierarchy(cloth, rest_pos, self.num_coarse)
+    def prepare(self, cloth: Cloth, rest_pos: Any, hierarchy: Hierarchy | None = None) -> Prepared:
+        """Hierarchy and static graph of one garment; ``rest_pos`` (V, 3) orders its vertices.
+
+        A ``hierarchy`` that came with the garment (:func:`hood.graph.given.given_hierarchy`) is used as it is.
+        """
+        if hierarchy is None:
+            hierarchy = _cached_hierarchy(cloth, rest_pos, self.num_coarse)
         return Prepared(hierarchy, build_static(cloth, hierarchy, self.network.edge_set_names))
 
     def concatenate(self, cloth: Cloth, prepared: Sequence[Prepared], vertex_counts: Sequence[int]) -> Prepared:
@@ -111,26 +123,27 @@ class Simulator(nn.Module):
     def predict(self, problem: StepProblem, prepared: Prepared, watch: Stopwatch | None = None) -> Prediction:
         """Positions at t + 1. Pinned vertices reach their targets exactly, massless ones stay where they are."""
         assert prepared.static is not None
-        cloth, state, step = problem.cloth, problem.state, problem.step
+        cloth, step = problem.cloth, problem.step
         with timed(watch, "features"):
             with torch.no_grad():
-                base = self.output.base(problem)
-                residual = self._residual_acceleration(problem, base) if self._wants_residual else None
-                graph = build_graph(prepared.static, step, problem.contact, self.body_radius)
-                inputs = Inputs(cloth, state, step, problem.contact, graph, base if self._wants_base else None, residual)
+                seen = self.rules.enter(problem)
+                base = self.output.base(seen)
+                residual = self._residual_acceleration(seen, base) if self._wants_residual else None
+                graph = build_graph(prepared.static, seen.step, seen.contact, self.body_radius)
+                guess = base if self._wants_base else None
+                inputs = Inputs(cloth, seen.state, seen.step, seen.contact, graph, guess, residual, timestep=step.dt)
             nodes, edges = self.features(inputs)
         with timed(watch, "network"):
             raw = self.network(graph, nodes, edges)
         free = cloth.free.unsqueeze(1)
         displacement = self.output.displacement(raw)
-        fixed = state.pos
+        fixed = problem.state.pos
         if step.pin_target is not None:
             fixed = torch.where(cloth.pinned.unsqueeze(1), step.pin_target, fixed)
         next_pos = torch.where(free, base + displacement, fixed)
-        dt = problem.vertex_dt
         if isinstance(self.output, AccelerationOutput):
             # The network's own acceleration, without the cancellation of x − 2x_t + x_{t−1} in float32.
-            acc = torch.where(free, displacement / dt**2, problem.acceleration(fixed))
+            acc = torch.where(free, self.rules.acceleration(problem, displacement), problem.acceleration(fixed))
         else:
             acc = problem.acceleration(next_pos)
         return Prediction(next_pos, acc)
@@ -141,7 +154,7 @@ class Simulator(nn.Module):
 
     def next_velocity(self, problem: StepProblem, prediction: Prediction) -> Tensor:
         """(V, 3) m/s at t + 1 of the implicit Euler step: (x_{t+1} − x_t) / dt."""
-        return problem.state.vel + problem.vertex_dt * prediction.acc
+        return self.rules.next_velocity(problem, prediction.acc)
 
     def step(self, cloth: Cloth, prepared: Prepared, state: State, step: StepInput) -> State:
         """The state at t + 1."""
@@ -155,6 +168,7 @@ class Simulator(nn.Module):
         with torch.random.fork_rng(devices=[]):
             copy = build_simulator(**self.config)
         copy.load_state_dict(self.state_dict())
+        copy.network.use_precision(self.network.precision)
         return copy.to(self.gravity.device)
 
     def _residual_acceleration(self, problem: StepProblem, base: Tensor) -> Tensor:
@@ -172,8 +186,18 @@ def build_simulator(
     output_scale: float = 5e-3,
     output_init: float = 1.0,
     normalizer_decay: float = 0.999,
+    body_velocity: str = "previous",
+    embedded_levels: int | None = None,
+    coarse_encoders: int | None = None,
+    divisor_floor: float | None = None,
+    frame_dt: float | None = None,
+    pins_ahead: bool = False,
+    velocity: str = "displacement",
 ) -> Simulator:
     """A simulator from plain arguments.
+
+    The arguments from ``body_velocity`` on are conventions of earlier weights; their defaults are the project's own and leave
+    no trace in ``config``.
 
     Args:
         features: ``paper`` (node 24, edge 12, body edge 9, running statistics) or ``physical`` (fixed scales, residual).
@@ -185,8 +209,14 @@ def build_simulator(
         output_scale: displacement [m] of one unit of raw output (``velocity_base`` only).
         output_init: factor on the decoder's last layer at the start.
         normalizer_decay: decay of the exponentially weighted statistics (``paper`` features).
+        body_velocity: displacement of the body that its nodes see: from the ``previous`` frame or to the ``next``
+            (``paper`` features).
+        embedded_levels: levels that the level feature tells apart, the mesh included; None: those the schedule works on.
+        coarse_encoders: encoders for coarse edges, see :class:`hood.nn.model.MeshGraphNet`; None: one per set.
+        divisor_floor: least divisor of the statistics, see :class:`hood.features.normalizer.RunningNormalizer`.
+        frame_dt, pins_ahead, velocity: see :class:`hood.dynamics.frames.FrameRules`.
     """
-    config = dict(locals())
+    config = {name: value for name, value in locals().items() if name not in _CONVENTIONS or value != _CONVENTIONS[name]}
     for name in ("latent_dim", "body_radius", "output_scale"):
         if not config[name] > 0:
             raise ValueError(f"model.{name} is {config[name]!r}; it must be > 0")
@@ -195,14 +225,30 @@ def build_simulator(
             raise ValueError(f"model.{name} is {value!r}; choose {' or '.join(known)}")
     if features == "physical" and output != "velocity_base":
         raise ValueError("model.features=physical describes corrections to a base; it needs model.output=velocity_base")
-    num_levels = 1 + num_coarse_levels(parse_schedule(schedule))
+    for name, count in (("embedded_levels", embedded_levels), ("coarse_encoders", coarse_encoders)):
+        if count is not None and count < 1:
+            raise ValueError(f"model.{name} is {count!r}; it must be at least 1, or null for the model's own number")
+    rules = FrameRules(frame_dt, pins_ahead, velocity)
+    num_levels = 1 + num_coarse_levels(parse_schedule(schedule)) if embedded_levels is None else embedded_levels
     if features == "paper":
-        feature_set = groups.paper(num_levels, decay=normalizer_decay)
+        feature_set = groups.paper(num_levels, body_velocity, normalizer_decay, divisor_floor)
     else:
         feature_set = physical.physical(num_levels)
-    network = MeshGraphNet(feature_set.node_width, feature_set.edge_widths, latent_dim, schedule, 3, aggregation, output_init)
-    head: Output = AccelerationOutput(normalizer_decay) if output == "acceleration" else OUTPUTS[output](output_scale)
-    return Simulator(feature_set, network, head, body_radius, config)
+    widths = (feature_set.node_width, feature_set.edge_widths)
+    network = MeshGraphNet(*widths, latent_dim, schedule, 3, aggregation, output_init, coarse_encoders)
+    head: Output = (
+        AccelerationOutput(normalizer_decay, divisor_floor) if output == "acceleration" else VelocityBaseOutput(output_scale)
+    )
+    return Simulator(feature_set, network, head, body_radius, config, rules, num_levels)
+
+
+#: Conventions of :func:`build_simulator` that are written down only where they differ: files of models that follow the
+#: project's own stay readable by versions that know no other.
+_CONVENTIONS: dict[str, Any] = {
+    name: parameter.default
+    for name, parameter in inspect.signature(build_simulator).parameters.items()
+    if name in ("body_velocity", "embedded_levels", "coarse_encoders", "divisor_floor", "frame_dt", "pins_ahead", "velocity")
+}
 
 
 def num_coarse_levels(schedule: Sequence[tuple[str, ...]]) -> int:
@@ -267,6 +313,6 @@ def _cached_hierarchy(cloth: Cloth, rest_pos: Any, num_coarse: int) -> Hierarchy
     edges = cloth.edges.cpu()
     # Holding the array keeps its id from being reused; other faces may still share it.
     if entry is None or entry[0] is not rest_pos or not torch.equal(entry[1], edges):
-        entry = (rest_pos, edges, build_hierarchy(cloth.num_vertices, edges.numpy(), rest_pos, num_coarse))
+        entry = (rest_pos, edges, cached_hierarchy(cloth.num_vertices, edges.numpy(), rest_pos, num_coarse))
         _HIERARCHIES[key] = entry
     return entry[2]

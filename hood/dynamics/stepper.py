@@ -61,8 +61,11 @@ class NewtonStepper:
         """Nothing: the solver keeps its plan of a cloth itself."""
 
     def find_contact(self, cloth: Cloth, state: State, step: StepInput) -> Contact | None:
-        """The step's one contact search; None without a body."""
-        return None if step.obstacle is None else find_contact(state.pos, cloth.vertex_scene, step.obstacle)
+        """The step's one contact search, with what the potential adds to it; None without a body."""
+        if step.obstacle is None:
+            return None
+        contact = find_contact(state.pos, cloth.vertex_scene, step.obstacle)
+        return self.potential.prepare(StepProblem(cloth, state, step, contact, self.gravity)).contact
 
     def predict(self, problem: StepProblem, prepared: None, watch: Stopwatch | None = None) -> Prediction:
         """The minimum next to the contact-projected inertial guess."""

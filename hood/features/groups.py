@@ -20,7 +20,7 @@ from hood.features.normalizer import RunningNormalizer
 from hood.graph.builder import BODY
 from hood.mesh import geometry
 
-# Types of METHOD, section 3. Omitted body vertices (2) never carry an edge and so never become nodes.
+# Types of the reference implementation. Omitted body vertices (2) never carry an edge and so never become nodes.
 CLOTH_TYPE, BODY_TYPE, PINNED_TYPE = 0, 1, 3
 
 
@@ -164,8 +164,8 @@ class NodeMaterial(NodeGroup):
 def unit_fabric(fabric: Tensor, log_lambda: bool = False) -> Tensor:
     """(N, 3) lame_mu, lame_lambda, bending_stiffness → (N, 3) bending, μ, λ over their training ranges.
 
-    (log v − log min)/(log max − log min) for bending and μ, λ linear, not clamped to [0, 1] (METHOD, section 4, parity
-    details). Values below a thousandth of a range's start are raised to it before a logarithm: bending may be 0.
+    (log v − log min)/(log max − log min) for bending and μ, λ linear, not clamped to [0, 1].
+    Values below a thousandth of a range's start are raised to it before a logarithm: bending may be 0.
     """
     mu, lam, bending = fabric.unbind(1)
     low, high = RANGES["lame_lambda"]
@@ -198,7 +198,7 @@ class RestRelative(EdgeGroup):
     width = 4
 
     def forward(self, inputs: Inputs) -> Tensor:
-        return with_norm(cloth_difference(inputs.cloth.rest_pos, inputs))
+        return inputs.edges.once("rest", lambda: with_norm(cloth_difference(inputs.cloth.rest_pos, inputs)))
 
 
 class EdgeTimestep(EdgeGroup):
@@ -217,7 +217,7 @@ class EdgeMaterial(EdgeGroup):
     normalized = False
 
     def forward(self, inputs: Inputs) -> Tensor:
-        return unit_fabric(inputs.edges.fabric)
+        return inputs.edges.once("unit fabric", lambda: unit_fabric(inputs.edges.fabric))
 
 
 class BodyRelative(EdgeGroup):
@@ -275,12 +275,13 @@ class FeatureSet(nn.Module):
         edge: Sequence[EdgeGroup],
         body_edge: Sequence[EdgeGroup],
         decay: float | None = 0.999,
+        divisor_floor: float | None = None,
     ) -> None:
         super().__init__()
         self.node, self.edge, self.body_edge = nn.ModuleList(node), nn.ModuleList(edge), nn.ModuleList(body_edge)
-        self.node_normalizer = _normalizer("node", node, decay)
-        self.edge_normalizer = _normalizer("edge", edge, decay)
-        self.body_edge_normalizer = _normalizer("body edge", body_edge, decay)
+        self.node_normalizer = _normalizer("node", node, decay, divisor_floor)
+        self.edge_normalizer = _normalizer("edge", edge, decay, divisor_floor)
+        self.body_edge_normalizer = _normalizer("body edge", body_edge, decay, divisor_floor)
 
     @property
     def node_width(self) -> int:
@@ -316,21 +317,29 @@ def _width(groups: Iterable[Any]) -> int:
     return sum(int(group.width) for group in groups)
 
 
-def _normalizer(name: str, groups: Sequence[NodeGroup | EdgeGroup], decay: float | None) -> RunningNormalizer | None:
+def _normalizer(
+    name: str, groups: Sequence[NodeGroup | EdgeGroup], decay: float | None, divisor_floor: float | None
+) -> RunningNormalizer | None:
     if decay is None:
         return None
     flags = [group.normalized for group in groups]
     if flags != sorted(flags, reverse=True):
         raise ValueError(f"{name} features: a normalised group follows an unnormalised one; move the latter to the end")
-    return RunningNormalizer(_width(g for g in groups if g.normalized), decay)
+    return RunningNormalizer(_width(g for g in groups if g.normalized), decay, divisor_floor=divisor_floor)
 
 
-def paper(num_levels: int = 3, body_velocity: str = "previous", decay: float = 0.999) -> FeatureSet:
-    """The paper's features: node 24 (20 with ``num_levels`` 1, which has no level embedding), edge 12, body edge 9."""
+def paper(
+    num_levels: int = 3, body_velocity: str = "previous", decay: float = 0.999, divisor_floor: float | None = None
+) -> FeatureSet:
+    """The paper's features: node 24 (20 with ``num_levels`` 1, which has no level embedding), edge 12, body edge 9.
+
+    ``divisor_floor`` is that of :class:`hood.features.normalizer.RunningNormalizer`.
+    """
     level = [LevelEmbedding(num_levels)] if num_levels > 1 else []
     return FeatureSet(
         node=[Velocity(body_velocity), TypeEmbedding(), *level, Normal(), Timestep(), LogMass(), NodeMaterial()],
         edge=[CurrentRelative(), RestRelative(), EdgeTimestep(), EdgeMaterial()],
         body_edge=[BodyRelative("current"), BodyRelative("next"), BodyTimestep()],
         decay=decay,
+        divisor_floor=divisor_floor,
     )

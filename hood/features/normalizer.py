@@ -17,13 +17,15 @@ class RunningNormalizer(nn.Module):
     evaluation mode, after :meth:`freeze` or for calls without rows.
 
     Until ``min_updates`` calls the module is the identity. Channels that have been constant so far are centred only:
-    dividing by a vanishing deviation would blow up the first value that differs.
+    dividing by a vanishing deviation would blow up the first value that differs. With ``divisor_floor`` every channel is
+    divided by its deviation or that floor, whichever is larger: the rule of the reference implementation.
 
     Args:
         width: number of channels.
         decay: γ; 0.999 averages over about the last 1000 calls.
         floor: smallest deviation that counts as variation, also relative to the mean at 1e-6.
         min_updates: calls before the statistics are used.
+        divisor_floor: least divisor; None centres constant channels only.
     """
 
     weight: Tensor
@@ -32,11 +34,16 @@ class RunningNormalizer(nn.Module):
     num_updates: Tensor
     frozen: Tensor
 
-    def __init__(self, width: int, decay: float = 0.999, floor: float = 1e-8, min_updates: int = 1) -> None:
+    def __init__(
+        self, width: int, decay: float = 0.999, floor: float = 1e-8, min_updates: int = 1, divisor_floor: float | None = None
+    ) -> None:
         super().__init__()
         if not 0 < decay <= 1:
             raise ValueError(f"normaliser: decay is {decay}; it must lie in (0, 1]")
+        if divisor_floor is not None and not divisor_floor > 0:
+            raise ValueError(f"normaliser: divisor_floor is {divisor_floor}; it must be > 0")
         self.width, self.decay, self.floor, self.min_updates = width, decay, floor, min_updates
+        self.divisor_floor = divisor_floor
         self.register_buffer("weight", torch.zeros((), dtype=torch.float64))
         self.register_buffer("first", torch.zeros(width, dtype=torch.float64))
         self.register_buffer("second", torch.zeros(width, dtype=torch.float64))
@@ -73,6 +80,8 @@ class RunningNormalizer(nn.Module):
         mean = self.first / weight
         std = (self.second / weight - mean.square()).clamp_min(0).sqrt()
         ready = self.num_updates >= self.min_updates
+        if self.divisor_floor is not None:
+            return torch.where(ready, mean, 0.0).to(dtype), torch.where(ready, std.clamp_min(self.divisor_floor), 1.0).to(dtype)
         varying = ready & (std > self.floor) & (std > 1e-6 * mean.abs())
         return torch.where(ready, mean, 0.0).to(dtype), torch.where(varying, std, 1.0).to(dtype)
 

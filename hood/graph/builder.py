@@ -53,8 +53,31 @@ class EdgeSet:
 
     @cached_property
     def ends(self) -> Tensor:
-        """Receiver m and sender M + m of every edge, (N, 2): rows of a table of two values per node."""
-        return torch.stack([self.local_receivers, self.local_senders + self.nodes.shape[0]], dim=1)
+        """2 · receiver and 2 · sender + 1 of every edge, (N, 2): rows of a table of two values per node."""
+        return torch.stack([2 * self.local_receivers, 2 * self.local_senders + 1], dim=1)
+
+    def spans(self, length: int) -> list[tuple[slice, Tensor]]:
+        """For every ``length`` consecutive rows the nodes that receive them, and their offsets within those rows."""
+        if length not in self._spans:
+            self._spans[length] = self._find_spans(length)
+        return self._spans[length]
+
+    @cached_property
+    def _spans(self) -> dict[int, list[tuple[slice, Tensor]]]:
+        return {}
+
+    def _find_spans(self, length: int) -> list[tuple[slice, Tensor]]:
+        count = self.num_edges
+        if length >= count:
+            return [(slice(0, self.nodes.shape[0]), self.offsets)]
+        starts = list(range(0, count, length))
+        stops = [min(start + length, count) for start in starts]
+        first = self.local_receivers[starts].tolist()
+        last = self.local_receivers[[stop - 1 for stop in stops]].tolist()
+        return [
+            (slice(a, b + 1), self.offsets[a : b + 2].clamp(start, stop) - start)
+            for a, b, start, stop in zip(first, last, starts, stops, strict=True)
+        ]
 
     @property
     def num_edges(self) -> int:

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import cast
 
 import torch
 from torch import Tensor, nn
 
-from hood.graph.builder import BODY, Graph, Subset
+from hood.graph.builder import BODY, MESH, Graph, Subset, coarse_name, set_level
+from hood.nn.dense import pad_rows
 from hood.nn.message_passing import ProcessorStep
 from hood.nn.mlp import MLP
 from hood.nn.schedule import edge_set_names, finest_level, parse_schedule
+
+#: How a network may compute.
+PRECISIONS = ("fp32", "bf16")
 
 
 class MeshGraphNet(nn.Module):
@@ -29,7 +34,14 @@ class MeshGraphNet(nn.Module):
         out_width: width of the output.
         aggregation: ``sum`` or ``mean`` of the messages at a node.
         output_init: factor on the decoder's last layer at initialisation; small values start near zero output.
+        coarse_encoders: number of encoders for coarse edges, ``coarse0`` first. Sets beyond them share the last one,
+            encoders beyond the sets are never evaluated; None gives every set its own.
+
+    ``precision`` says how the network computes and is no part of what it is: weights, input and output keep their own
+    precision. Set it by :meth:`use_precision`.
     """
+
+    precision: str
 
     def __init__(
         self,
@@ -40,11 +52,13 @@ class MeshGraphNet(nn.Module):
         out_width: int = 3,
         aggregation: str = "sum",
         output_init: float = 1.0,
+        coarse_encoders: int | None = None,
     ) -> None:
         super().__init__()
         self.schedule = parse_schedule(schedule)
         self.edge_set_names = edge_set_names(self.schedule)
-        widths = {name: _edge_width(name, edge_widths) for name in (*self.edge_set_names, BODY)}
+        encoded = self.edge_set_names if coarse_encoders is None else (MESH, *map(coarse_name, range(coarse_encoders)))
+        widths = {name: _edge_width(name, edge_widths) for name in (*encoded, BODY)}
         self.node_encoder = MLP(node_width, latent_dim, latent_dim)
         self.edge_encoders = nn.ModuleDict({n: MLP(w, latent_dim, latent_dim) for n, w in widths.items()})
         self.steps = nn.ModuleList(ProcessorStep((*sets, BODY), latent_dim, aggregation) for sets in self.schedule)
@@ -52,6 +66,17 @@ class MeshGraphNet(nn.Module):
         with torch.no_grad():
             self.decoder.third.weight.mul_(output_init)
             self.decoder.third.bias.mul_(output_init)
+        self.use_precision("fp32")
+
+    def use_precision(self, name: str) -> None:
+        """``fp32`` computes in the precision of the weights, ``bf16`` the latents and products of the processor in bfloat16.
+
+        With bf16 sums, statistics of layer norms, the first layers of the encoders (which see the features) and the decoder
+        stay as they are; in training so do weights and their gradients.
+        """
+        if name not in PRECISIONS:
+            raise ValueError(f"precision is {name!r}; choose {' or '.join(PRECISIONS)}")
+        self.precision = name
 
     def forward(self, graph: Graph, node_features: Tensor, edge_features: Mapping[str, Tensor]) -> Tensor:
         """(V, out_width) for the cloth nodes.
@@ -61,14 +86,23 @@ class MeshGraphNet(nn.Module):
             node_features: (V + W_active, node_width), cloth rows first.
             edge_features: by set, rows as in ``graph.edge_sets``.
         """
-        nodes = self.node_encoder(node_features)
-        edges = {name: encoder(edge_features[name]) for name, encoder in self.edge_encoders.items()}
+        dtype = torch.bfloat16 if self.precision == "bf16" else None
+        # Rows of padding are nodes without edges. A node's latent, a sum over all steps, stays in float32.
+        nodes = self.node_encoder(pad_rows(node_features), dtype).to(node_features.dtype)
+        edges = {name: self.edge_encoder(name)(edge_features[name], dtype) for name in (*self.edge_set_names, BODY)}
+        overwrite = not torch.is_grad_enabled()
         whole = {name: Subset(graph.edge_sets[name], None) for name in self.edge_set_names}
         for sets, step in zip(self.schedule, self.steps, strict=True):
             subsets = {name: whole[name] for name in sets}
             subsets[BODY] = graph.body_subsets[finest_level(sets)]
-            nodes, edges = step(nodes, edges, subsets)
-        return self.decoder(nodes[: graph.num_cloth])
+            nodes, edges = step(nodes, edges, subsets, overwrite)
+        return self.decoder(nodes[: graph.num_cloth].to(node_features.dtype))
+
+    def edge_encoder(self, name: str) -> MLP:
+        """The encoder of edge set ``name``."""
+        if name not in self.edge_encoders:
+            name = max((n for n in self.edge_encoders if n.startswith("coarse")), key=set_level)
+        return cast(MLP, self.edge_encoders[name])
 
     def num_parameters(self) -> int:
         """Trainable parameters; embeddings live in the feature set and count there."""

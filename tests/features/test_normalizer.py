@@ -105,3 +105,12 @@ def test_fixed_scale_and_its_inverse():
         scale = FixedScale([0.5, 2.0], asinh)
         torch.testing.assert_close(scale.inverse(scale(x)), x)
     torch.testing.assert_close(FixedScale(0.5)(x), torch.tensor([[1.0, -40.0]]))
+
+
+def test_divisor_floor_divides_constant_channels_too():
+    normalizer = RunningNormalizer(2, decay=1.0, divisor_floor=1e-3)
+    normalizer(torch.tensor([[1.0, 5.0], [3.0, 5.0]]))
+    expected = torch.tensor([[1.0, 1000.0]])
+    torch.testing.assert_close(normalizer.eval()(torch.tensor([[3.0, 6.0]])), expected)
+    with pytest.raises(ValueError, match="divisor_floor"):
+        RunningNormalizer(2, divisor_floor=0.0)

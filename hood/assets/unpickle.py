@@ -1,0 +1,84 @@
+"""Pickles from elsewhere, read without running anything they name.
+
+A pickle may name any importable function and have it called. Here nothing is imported: every name is looked up in a
+list of inert stand-ins that record what they are given, and arrays are made from the records afterwards. Names outside
+the list are refused.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from hood.assets.standins import Refused, opaque, resolve, stand_in
+
+#: Files beyond this size [bytes] are not opened.
+SIZE_LIMIT = 4 << 30
+#: Modules that had another name in Python 2.
+_RENAMED = {"__builtin__": "builtins", "copy_reg": "copyreg"}
+
+
+def load_pickle(path: str | Path, size_limit: int = SIZE_LIMIT) -> Any:
+    """The content of a pickle file: containers, numbers, text, numpy arrays, scipy.sparse matrices; arrays of the
+    abandoned package chumpy become numpy arrays. Text of Python 2 is read as latin-1.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: larger than ``size_limit`` [bytes], damaged, or naming anything else; the message holds
+            ``module.name``.
+    """
+    path = check_size(path, size_limit)
+    with open(path, "rb") as file:
+        return guarded(path, "pickle", lambda: resolve(RestrictedUnpickler(file).load()))
+
+
+def check_size(path: str | Path, size_limit: int) -> Path:
+    """The path of an existing file that is not larger than ``size_limit`` [bytes]."""
+    path = Path(path).expanduser()
+    size = os.stat(path).st_size
+    if size > size_limit:
+        raise ValueError(f"{path}: {size} bytes, the limit is {size_limit}; raise size_limit if you trust the file")
+    return path
+
+
+def guarded(path: Path, what: str, read: Callable[[], Any]) -> Any:
+    """``read()`` with everything that broken bytes can raise turned into one ValueError that names the file."""
+    try:
+        return read()
+    except Refused as error:
+        raise ValueError(f"{path}: {error}") from error
+    except (MemoryError, RecursionError) as error:
+        raise ValueError(f"{path}: not a readable {what} ({type(error).__name__} while reading it)") from error
+    except Exception as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ValueError(f"{path}: not a readable {what} ({reason})") from error
+
+
+class RestrictedUnpickler(pickle.Unpickler):
+    """Unpickler whose names lead to stand-ins. ``inert`` lists packages whose classes become :class:`Opaque`."""
+
+    inert: tuple[str, ...] = ()
+
+    def __init__(self, file: BinaryIO | io.BytesIO) -> None:
+        super().__init__(file, encoding="latin1")
+
+    def find_class(self, module: str, name: str) -> Any:
+        """The stand-in for ``module.name``.
+
+        Raises:
+            Refused: there is none.
+        """
+        module = _RENAMED.get(module, module)
+        found = stand_in(module, name)
+        if found is not None:
+            return found
+        if module.split(".")[0] in self.inert:
+            return opaque(f"{module}.{name}")
+        raise Refused(
+            f"names {module}.{name}, which is not read: only numbers, text, containers, arrays and sparse matrices are "
+            "(a file that needs it may be harmful; convert it where it was made)"
+        )

@@ -1,0 +1,99 @@
+"""Hierarchies on disk: a large garment's levels are computed once per user, not once per process.
+
+An entry is named by the SHA-256 of everything that the result depends on, so there is nothing to invalidate. Entries that
+cannot be read are computed again and replaced; a folder that cannot be written to is done without. ``HOOD_CACHE`` moves the
+folder; empty or ``off`` does without.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+import tempfile
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from hood.graph.hierarchy import Hierarchy, build_hierarchy
+
+#: Part of every name: raise it with any change to what :func:`hood.graph.hierarchy.build_hierarchy` returns.
+VERSION = 1
+#: Smaller meshes are not kept. Refined dress on one busy core, building / reading: 28 / 0.4 ms at 1k vertices, 87 / 0.5 ms at
+#: 5k, 190 / 1 ms at 12k and 2200 / 7 ms at 100k: below, a process's start would save some 30 ms.
+MIN_VERTICES = 2000
+#: Entries beyond this many are removed, the oldest first.
+MAX_ENTRIES = 200
+
+
+def cached_hierarchy(num_vertices: int, edges: np.ndarray, rest_pos: np.ndarray, num_coarse: int) -> Hierarchy:
+    """What :func:`hood.graph.hierarchy.build_hierarchy` returns for the same arguments, from disk where it is known."""
+    folder = cache_folder()
+    if folder is None or num_vertices < MIN_VERTICES or num_coarse < 1:
+        return build_hierarchy(num_vertices, edges, rest_pos, num_coarse)
+    path = folder / "hierarchy" / f"{_digest(num_vertices, edges, rest_pos, num_coarse)}.npz"
+    known = _read(path, num_vertices, num_coarse)
+    if known is not None:
+        return known
+    built = build_hierarchy(num_vertices, edges, rest_pos, num_coarse)
+    _write(path, built)
+    return built
+
+
+def cache_folder() -> Path | None:
+    """The user's cache folder as the platform has it, or ``HOOD_CACHE``; None where that turns caching off."""
+    chosen = os.environ.get("HOOD_CACHE")
+    if chosen is not None:
+        return None if chosen.strip().lower() in ("", "off") else Path(chosen).expanduser()
+    try:
+        home = Path.home()
+    except RuntimeError:  # a user without a home
+        return None
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA", home / "AppData" / "Local")) / "hood" / "Cache"
+    if sys.platform == "darwin":
+        return home / "Library" / "Caches" / "hood"
+    return Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache") / "hood"
+
+
+def _digest(num_vertices: int, edges: np.ndarray, rest_pos: np.ndarray, num_coarse: int) -> str:
+    rest_pos = np.ascontiguousarray(rest_pos)
+    digest = hashlib.sha256(f"{VERSION} {num_vertices} {num_coarse} {rest_pos.dtype} {rest_pos.shape}".encode())
+    digest.update(np.ascontiguousarray(edges, dtype=np.int64).tobytes())
+    digest.update(rest_pos.tobytes())
+    return digest.hexdigest()
+
+
+def _read(path: Path, num_vertices: int, num_coarse: int) -> Hierarchy | None:
+    """The entry, or None where there is none that fits."""
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            level = arrays["node_level"]
+            tables = [arrays[f"coarse{k}"] for k in range(num_coarse)]
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
+    good = level.shape == (num_vertices,) and level.dtype == np.int64
+    for table in tables:
+        good = good and table.dtype == np.int64 and table.ndim == 2 and table.shape[1] == 2
+        good = good and (table.size == 0 or (table.min() >= 0 and table.max() < num_vertices))
+    return Hierarchy(tuple(torch.from_numpy(table) for table in tables), torch.from_numpy(level)) if good else None
+
+
+def _write(path: Path, hierarchy: Hierarchy) -> None:
+    """Write an entry atomically; other processes may be doing the same."""
+    arrays = {f"coarse{k}": edges.numpy() for k, edges in enumerate(hierarchy.coarse_edges)}
+    temporary = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".partial", delete=False) as file:
+            temporary = Path(file.name)
+            np.savez(file, node_level=hierarchy.node_level.numpy(), **arrays)  # type: ignore[arg-type]
+        os.replace(temporary, path)
+        entries = sorted(path.parent.glob("*.npz"), key=lambda entry: entry.stat().st_mtime)
+        for old in entries[:-MAX_ENTRIES]:
+            old.unlink(missing_ok=True)
+    except OSError:  # no space, no permission: the result is there all the same
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)

@@ -1,0 +1,84 @@
+"""``hood convert``, and published weights in ``hood rollout``."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors import safe_open
+
+from hood.cli import main
+from hood.dynamics.recorder import read_rollout
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "dynamics"))
+from reference_oracle import make_state
+
+
+@pytest.fixture
+def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("HOOD_TRACEBACK", raising=False)
+    torch.save({"training_module": make_state("postcvpr", 4)}, "postcvpr.pth")
+    return tmp_path / "postcvpr.pth"
+
+
+def test_published_and_converted_weights_give_the_same_rollout(weights: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["convert", "checkpoint=postcvpr.pth", "output=new/model.safetensors"]) == 0
+    text = capsys.readouterr().out
+    assert "postcvpr weights, 15 steps" in text
+    with safe_open(weights.parent / "new" / "model.safetensors", "pt") as file:
+        header = file.metadata()
+        count = sum(file.get_tensor(name).numel() for name in file.keys() if "normalizer" not in name)
+    assert f"{count} parameters" in text
+    assert header["layout"] == "postcvpr"
+    assert json.loads(header["model"])["velocity"] == "carried"
+    arguments = ["garment=skirt", "num_frames=3", "video=none", "sheet=false"]
+    runs = []
+    for checkpoint in ("postcvpr.pth", "new/model.safetensors"):
+        assert main(["rollout", f"checkpoint={checkpoint}", *arguments, "output=run"]) == 0
+        runs.append(read_rollout(weights.parent / "run" / "rollout.h5").cloth_pos)
+    np.testing.assert_array_equal(*runs)
+    assert np.isfinite(runs[0]).all()
+
+
+def test_the_output_defaults_to_the_checkpoints_name(weights: Path) -> None:
+    assert main(["convert", "checkpoint=postcvpr.pth"]) == 0
+    assert sorted(path.name for path in weights.parent.iterdir()) == ["postcvpr.pth", "postcvpr.safetensors"]
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["convert"], ("checkpoint is not given",)),
+        (["convert", "checkpoint=quickstart"], ("is a model file already",)),
+        (["convert", "checkpoint=none.pth"], ("none.pth", "no such file")),
+        (["convert", "checkpoint=postcvpr.pth", "output=m.pt"], ("output=m.pt", ".safetensors")),
+        (["convert", "chekpoint=postcvpr.pth"], ("'chekpoint'", "'checkpoint'")),
+        (["convert", "checkpoint=text.pth"], ("text.pth", "not a readable torch file")),
+        (["rollout", "checkpoint=postcvpr.pth", "fps=60"], ("fps=60", "use fps=30")),
+        (["rollout", "checkpoint=text.pth"], ("text.pth", "not a readable torch file")),
+        (["evaluate", "models=[text.pth]"], ("text.pth", "not a readable torch file")),
+    ],
+)
+def test_user_errors_are_one_line_and_leave_nothing(
+    arguments: list[str], words: tuple[str, ...], weights: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (weights.parent / "text.pth").write_text("hello")
+    before = sorted(path.name for path in weights.parent.rglob("*"))
+    assert main(arguments) == 2
+    message = capsys.readouterr().err
+    assert message.startswith("hood: error: ")
+    assert message.count("\n") == 1
+    assert all(word in message for word in words), message
+    assert sorted(path.name for path in weights.parent.rglob("*")) == before
+
+
+def test_help(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["convert", "--help"]) == 0
+    text = capsys.readouterr().out
+    assert all(word in text for word in ("checkpoint=null", "output=null", "hood convert checkpoint="))
+    assert "config groups" not in text
