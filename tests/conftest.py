@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,7 @@ from hood.scene.scene import Scene, build_scene
 GARMENT_NAMES = ("tshirt", "tank", "longsleeve", "shorts", "trousers", "dress", "skirt")
 
 torch.set_num_threads(1)
+os.environ["HOOD_CACHE"] = "off"  # tests leave nothing in the user's folder
 
 
 @pytest.fixture(scope="session")

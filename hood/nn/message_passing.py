@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import cast
 
 from torch import Tensor, nn
-from torch.nn import functional
 
 from hood.graph.builder import Subset
+from hood.nn.dense import linear, pad_rows
 from hood.nn.edge_update import update_edges
 from hood.nn.mlp import MLP
 
@@ -36,31 +36,36 @@ class ProcessorStep(nn.Module):
         self.node_mlp = MLP((1 + len(self.sets)) * latent_dim, latent_dim, latent_dim)
 
     def forward(
-        self, nodes: Tensor, edges: Mapping[str, Tensor], subsets: Mapping[str, Subset]
+        self, nodes: Tensor, edges: Mapping[str, Tensor], subsets: Mapping[str, Subset], overwrite: bool = False
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Nodes (N, latent_dim) and edge latents by set; ``subsets`` says which rows of a set take part."""
+        """Nodes (N, latent_dim) and edge latents by set; ``subsets`` says which rows of a set take part.
+
+        With ``overwrite`` the edge latents given may be used for the new ones where no gradient is asked for.
+        """
         # The node network's first layer by columns: aggregates exist only at the nodes that have an edge in the set.
         first = self.node_mlp.first
         own, *parts = first.weight.split(self.latent_dim, dim=1)
-        hidden = functional.linear(nodes, own, first.bias)
-        updated = dict(edges)
+        updated, low = dict(edges), nodes.to(next(iter(edges.values())).dtype)
+        hidden = linear(low, own, first.bias)
         for name, weight in zip(self.sets, parts, strict=True):
             subset = subsets[name]
             if subset.edges.num_edges == 0:
                 continue
-            updated[name], received = self._update_set(name, nodes, edges[name], subset)
-            hidden.index_add_(0, subset.edges.nodes, functional.linear(received, weight))
-        return nodes + self.node_mlp.tail(hidden), updated
+            updated[name], received = self._update_set(name, low, edges[name], subset, overwrite)
+            received = linear(received, weight)[: subset.edges.nodes.shape[0]]
+            hidden.index_add_(0, subset.edges.nodes, received)
+        return self.node_mlp.tail(hidden, nodes), updated
 
-    def _update_set(self, name: str, nodes: Tensor, latent: Tensor, subset: Subset) -> tuple[Tensor, Tensor]:
-        """New latents of a set, and the aggregate (M, latent_dim) at the nodes that have an edge in it."""
+    def _update_set(self, name: str, nodes: Tensor, latent: Tensor, subset: Subset, overwrite: bool) -> tuple[Tensor, Tensor]:
+        """New latents of a set, and the aggregate at the nodes that have an edge in it (and in rows of no meaning)."""
         mlp, edges, rows = cast(MLP, self.edge_mlps[name]), subset.edges, subset.rows
-        present = nodes.index_select(0, edges.nodes)
+        present = nodes.index_select(0, pad_rows(edges.nodes))
         if rows is None:
-            latent, received = update_edges(mlp, present, latent, edges)
+            latent, received = update_edges(mlp, present, latent, edges, overwrite)
         else:
-            part, received = update_edges(mlp, present, latent.index_select(0, rows), edges)
-            latent = latent.index_copy(0, rows, part)
+            part, received = update_edges(mlp, present, latent.index_select(0, rows), edges, overwrite=True)
+            latent = latent.index_copy_(0, rows, part) if overwrite else latent.index_copy(0, rows, part)
         if self.aggregation == "mean":
-            received = received / edges.offsets.diff().unsqueeze(1).to(received.dtype)
+            degree = pad_rows(edges.offsets.diff()).clamp_min(1)
+            received = received / degree.unsqueeze(1).to(received.dtype)
         return latent, received

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from hood.nn.dense import affine, blocks, gram, linear
 
 
 class MLP(nn.Module):
@@ -20,12 +25,117 @@ class MLP(nn.Module):
         self.third = nn.Linear(latent_dim, out_width)
         self.norm = nn.LayerNorm(out_width) if norm else None
 
-    def forward(self, x: Tensor) -> Tensor:
-        """(N, in_width) → (N, out_width)."""
-        return self.tail(self.first(x))
+    def forward(self, x: Tensor, dtype: torch.dtype | None = None) -> Tensor:
+        """(N, in_width) → (N, out_width); layers after the first in ``dtype`` if given."""
+        if torch.is_grad_enabled():
+            hidden = self.first(x)
+            return self.tail(hidden if dtype is None else hidden.to(dtype))
+        out = x.new_empty(x.shape[0], self.third.out_features, dtype=dtype)
+        for part in blocks(out):  # the first layer's output is as large as the result and needed by blocks only
+            out[part] = self.tail(self.first(x[part]).to(out.dtype))
+        return out
 
-    def tail(self, hidden: Tensor) -> Tensor:
-        """The network from the first layer's output (N, latent_dim), before its ReLU; overwrites ``hidden``."""
-        hidden = torch.relu_(self.second(torch.relu_(hidden)))
-        out = self.third(hidden)
-        return out if self.norm is None else self.norm(out)
+    def tail(self, hidden: Tensor, residual: Tensor | None = None) -> Tensor:
+        """The network from the first layer's output (N, latent_dim), before its ReLU, in the precision of ``hidden``; plus
+        ``residual`` (N, out_width) if given."""
+        if self.norm is None:
+            hidden = torch.relu(linear(torch.relu(hidden), self.second.weight, self.second.bias))
+            out = linear(hidden, self.third.weight, self.third.bias)
+            return out if residual is None else residual + out
+        result: Tensor = _Tail.apply(hidden, residual, torch.is_grad_enabled(), self.norm.eps, *self.tail_parameters())
+        return result
+
+    def tail_parameters(self) -> tuple[Tensor, ...]:
+        """What :class:`Layers` is made of."""
+        norm = self.norm
+        assert norm is not None, "the decoder has no layer norm"
+        return self.second.weight, self.second.bias, self.third.weight, self.third.bias, norm.weight, norm.bias
+
+
+class Kept(NamedTuple):
+    """What the backward pass of a block reads."""
+
+    one: Tensor  # (N, d) after the first ReLU
+    two: Tensor  # (N, d) after the second
+    raw: Tensor  # (N, d) before the layer norm
+    mean: Tensor  # (N, 1)
+    rstd: Tensor  # (N, 1)
+
+
+class Layers:
+    """Second and third layer and layer norm, applied to one block of rows at a time, forward and backward.
+
+    Products are in ``dtype``; the layer norm's statistics and the sums of the parameters' gradients over the blocks are in
+    the parameters' own precision.
+    """
+
+    def __init__(self, dtype: torch.dtype, eps: float, parameters: tuple[Tensor, ...]) -> None:
+        self.second, self.bias_2, self.third, self.bias_3 = (p.to(dtype) for p in parameters[:4])
+        # Only a CPU's layer norm takes parameters of another precision; the statistics are float32 everywhere.
+        on_cpu = parameters[4].device.type == "cpu"
+        self.scale, self.shift = (p if on_cpu else p.to(dtype) for p in parameters[4:6])
+        self.eps = eps
+        self._parameters = parameters
+        self.grads: list[Tensor] = []
+
+    def forward(self, one: Tensor) -> tuple[Tensor, Kept]:
+        """Output (N, d) from ``one`` (N, d), the first layer's output after its ReLU."""
+        two = affine(one, self.second, self.bias_2, relu=True)
+        raw = affine(two, self.third, self.bias_3)
+        out, mean, rstd = torch.native_layer_norm(raw, (raw.shape[1],), self.scale, self.shift, self.eps)
+        return out, Kept(one, two, raw, mean, rstd)
+
+    def start_backward(self) -> None:
+        """Set the gradients of the parameters to zero."""
+        self.grads = [torch.zeros_like(p) for p in self._parameters]
+
+    def backward(self, grad: Tensor, kept: Kept) -> Tensor:
+        """Gradient before the first ReLU from ``grad`` behind the layer norm; parameters' gradients are added up."""
+        grad_w2, grad_b2, grad_w3, grad_b3, grad_scale, grad_shift = self.grads
+        width = [grad.shape[1]]
+        grad, d_scale, d_shift = torch.ops.aten.native_layer_norm_backward(
+            grad, kept.raw, width, kept.mean, kept.rstd, self.scale, self.shift, [True, True, True]
+        )
+        grad_scale += d_scale
+        grad_shift += d_shift
+        grad_w3 += gram(grad, kept.two)
+        grad_b3 += grad.sum(dim=0)
+        grad = through_relu(affine(grad, self.third.t()), kept.two)
+        grad_w2 += gram(grad, kept.one)
+        grad_b2 += grad.sum(dim=0)
+        return through_relu(affine(grad, self.second.t()), kept.one)
+
+
+def through_relu(grad: Tensor, output: Tensor) -> Tensor:
+    """Gradient before a ReLU from the one behind it, in place."""
+    return torch.ops.aten.threshold_backward.grad_input(grad, output, 0, grad_input=grad)
+
+
+class _Tail(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, hidden: Tensor, residual: Tensor | None, keep: bool, eps: float, *parameters: Tensor) -> Tensor:
+        layers = Layers(hidden.dtype, eps, parameters)
+        out = torch.empty_like(hidden if residual is None else residual)
+        saved: list[Tensor] = []
+        for part in blocks(hidden):
+            result, kept = layers.forward(torch.relu(hidden[part]))
+            if residual is None:
+                out[part] = result
+            else:
+                torch.add(residual[part], result, out=out[part])
+            if keep:
+                saved += kept
+        ctx.save_for_backward(*parameters, *saved)
+        ctx.eps, ctx.dtype = eps, hidden.dtype
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        parameters, saved = ctx.saved_tensors[:6], ctx.saved_tensors[6:]
+        layers = Layers(ctx.dtype, ctx.eps, parameters)
+        layers.start_backward()
+        grad_hidden = torch.empty(grad.shape, dtype=ctx.dtype, device=grad.device)
+        for i, part in enumerate(blocks(grad_hidden)):
+            grad_hidden[part] = layers.backward(grad[part].to(ctx.dtype).contiguous(), Kept(*saved[5 * i : 5 * i + 5]))
+        return grad_hidden, grad if ctx.needs_input_grad[1] else None, None, None, *layers.grads

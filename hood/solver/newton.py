@@ -24,8 +24,8 @@ class NewtonSettings:
         target_rg: relative gradient to reach, see :func:`hood.losses.potential.relative_gradient`.
         max_iterations: Newton iterations.
         budget_ms: stop after the iteration that passes this time [ms]; None for no limit.
-        linear: ``cg`` (conjugate gradients, block-Jacobi) or ``direct`` (band Cholesky, on the CPU), which takes twice the
-            time of a Newton iteration at 1,000 vertices and three times at 4,000, and fewer of them where the step is long.
+        linear: ``cg`` (conjugate gradients, block-Jacobi) or ``direct`` (band Cholesky, on the CPU). A Newton
+            iteration with the latter takes twice the time at 1,000 vertices and three times at 4,000, for a tenth fewer.
         cg_iterations: at most as many per Newton iteration.
         double: compute in float64 whatever the problem's type. In float32 the potential of a garment is known to
             1e-7 of its value, which stops a line search early; the result comes back in the problem's type anyway.

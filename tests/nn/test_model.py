@@ -11,7 +11,7 @@ from hood.assets.material import Material
 from hood.features import groups
 from hood.graph.builder import Graph, Subset, build_graph, build_static, edge_set
 from hood.graph.hierarchy import build_hierarchy, concatenate_hierarchies
-from hood.nn import edge_update
+from hood.nn import dense
 from hood.nn.message_passing import ProcessorStep
 from hood.nn.mlp import MLP
 from hood.nn.model import MeshGraphNet
@@ -106,7 +106,7 @@ def reference_step(step: ProcessorStep, nodes: Tensor, edges: dict[str, Tensor],
 @pytest.mark.parametrize("aggregation", ["sum", "mean"])
 @pytest.mark.parametrize("level", [0, 1])
 def test_step_follows_its_formulas_in_value_and_gradient(aggregation, level, monkeypatch):
-    monkeypatch.setattr(edge_update, "BLOCK_ELEMENTS", 0)  # 256 rows: the mesh set takes several blocks
+    monkeypatch.setattr(dense, "BLOCK_BYTES", 0)  # 256 rows: the mesh set takes several blocks
     graph = make_graph(grid(14, 14))
     step = ProcessorStep(("coarse0", "mesh", "body"), 8, aggregation).double()
     generator = torch.Generator().manual_seed(0)
@@ -141,7 +141,7 @@ def test_gradient_of_the_network_is_that_of_finite_differences():
 
 
 def test_evaluation_without_gradients_gives_the_same_output(monkeypatch):
-    monkeypatch.setattr(edge_update, "BLOCK_ELEMENTS", 0)
+    monkeypatch.setattr(dense, "BLOCK_BYTES", 0)
     case, network = make_case(make_graph(grid(14, 14))), make_net()
     with torch.no_grad():
         quiet = network(case.graph, case.nodes, case.edges)

@@ -64,12 +64,12 @@ class OneScene(SceneSampler):
         return super().sample(np.random.default_rng(3), num_steps, garment)
 
 
-@pytest.mark.parametrize("signal", ["scaled", "potential"])
+@pytest.mark.parametrize("signal, precision", [("scaled", "fp32"), ("potential", "fp32"), ("scaled", "bf16")])
 def test_the_signal_goes_down_on_a_fixed_scene(
-    signal: str, tmp_path: Path, body: Body, garments: dict[str, Garment], walk: PoseSequence
+    signal: str, precision: str, tmp_path: Path, body: Body, garments: dict[str, Garment], walk: PoseSequence
 ) -> None:
     constant = {"schedule": WarmupCosine(5, floor=1.0), "horizon": Horizon(every=100, maximum=1)}
-    settings = replace(SETTINGS, iterations=60, batch_size=1, signal=signal, **constant)
+    settings = replace(SETTINGS, iterations=60, batch_size=1, signal=signal, precision=precision, **constant)
     trainer = make(tmp_path, OneScene(body, [garments["tank"]], [walk.window(0, 60)]), settings=settings)
     reports = [trainer.update() for _ in range(20)]
     assert all(np.isfinite(list(report.values())).all() for report in reports)
@@ -77,6 +77,7 @@ def test_the_signal_goes_down_on_a_fixed_scene(
     totals = np.array([report["total"] for report in reports[::2]])
     assert (np.diff(totals) < 1e-6).all()
     assert totals[-1] < totals[0] - 1e-3
+    assert all(p.dtype == torch.float32 for p in trainer.averaged().parameters())
 
 
 def metrics(folder: Path) -> list[dict]:
@@ -205,6 +206,7 @@ def test_updates_without_a_number_change_nothing_and_end_the_run(
     "options, word",
     [
         ({"signal": "plain"}, "trainer.signal"),
+        ({"precision": "fp16"}, "trainer.precision"),
         ({"iterations": 0}, "trainer.iterations"),
         ({"batch_size": 0}, "trainer.batch_size"),
         ({"learning_rate": 0.0}, "trainer.learning_rate"),

@@ -1,0 +1,346 @@
+"""Time and memory of the network against the same function written naively: one alternating run.
+
+    python benchmarks/network.py --sizes 1000 5000 --models fine15 ours
+    python benchmarks/network.py --sizes 5000 --models fine15 --pyg
+
+The garment is a square sheet with diagonals, two fifths of its vertices touch a body of 6,890 vertices, weights and
+features are random. ``naive`` concatenates both ends and the edge for every edge set, sums with ``index_add`` and runs
+the node network on all body vertices, in float32; its output must equal the network's to 1e-5 before anything is timed.
+Times are medians of the process's CPU time over runs that take turns, after one warm-up each, so that a busy machine
+slows all of them alike. Peak memory is what a fresh process needs on top of weights and inputs (Linux only). GFLOP/s count the
+products the network itself computes, against a (1024, 128) × (128, 128) product in the same precision, by the
+faster of the machine's two libraries.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import ctypes
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from hood.assets.material import Material
+from hood.cli import ENVIRONMENT
+from hood.graph.builder import BODY, Graph, build_graph, build_static
+from hood.graph.hierarchy import build_hierarchy
+from hood.nn.dense import affine
+from hood.nn.message_passing import ProcessorStep
+from hood.nn.mlp import MLP
+from hood.nn.model import MeshGraphNet
+from hood.nn.schedule import edge_set_names, finest_level, parse_schedule, set_level
+from hood.scene.cloth import build_cloth
+from hood.scene.contact import Contact
+from hood.scene.state import Obstacle, StepInput
+from hood.testing import grid, plane_contact
+
+NUM_BODY = 6890
+TOUCHED = 1500  # body vertices near the cloth
+WIDTHS = {"mesh": 12, "coarse": 12, "body": 9}
+LATENT = 128
+
+
+@dataclass
+class Case:
+    """A network with random features on a graph, and the same for the naive form: all body nodes, edges as listed."""
+
+    network: MeshGraphNet
+    graph: Graph
+    nodes: Tensor
+    edges: dict[str, Tensor]
+    all_nodes: Tensor
+    listed: dict[str, tuple[Tensor, Tensor, Tensor]]  # senders, receivers, row in the sorted set
+    listed_edges: dict[str, Tensor]
+    level_rows: dict[int, Tensor]  # rows of the listed body edges per level
+
+
+def make_case(size: int, model: str, device: str = "cpu") -> Case:
+    """A sheet of about ``size`` vertices; deterministic."""
+    torch.manual_seed(0)
+    side = max(round(size**0.5), 3)
+    cloth = build_cloth(*grid_with_diagonals(side), Material())
+    schedule = parse_schedule(model)
+    num_coarse = max(set_level(name) for name in edge_set_names(schedule))
+    network = MeshGraphNet(24 if num_coarse else 20, WIDTHS, LATENT, model).to(device)
+    hierarchy = build_hierarchy(cloth.num_vertices, cloth.edges.numpy(), cloth.rest_pos.numpy(), num_coarse)
+    obstacle, contact = touch(cloth.num_vertices)
+    step = StepInput(torch.full((1,), 1 / 30), obstacle)
+    graph = build_graph(build_static(cloth, hierarchy, network.edge_set_names), step, contact)
+    nodes = torch.randn(graph.num_nodes, network.node_encoder.first.in_features)
+    edges = {name: torch.randn(s.num_edges, WIDTHS.get(name, 12)) for name, s in graph.edge_sets.items()}
+    all_nodes = torch.randn(graph.num_cloth + NUM_BODY, nodes.shape[1])
+    all_nodes[: graph.num_cloth] = nodes[: graph.num_cloth]
+    all_nodes[graph.num_cloth + graph.body_vertex] = nodes[graph.num_cloth :]
+    listed = {name: list_edges(graph, name) for name in graph.edge_sets}
+    listed_edges = {name: edges[name][rows] for name, (_, _, rows) in listed.items()}
+    levels = {level: kept_rows(graph, level, listed[BODY][2]) for level in graph.body_subsets}
+    return Case(network, graph, nodes, edges, all_nodes, listed, listed_edges, levels)
+
+
+def grid_with_diagonals(side: int) -> tuple[np.ndarray, np.ndarray]:
+    """A sheet of ``side``² vertices with edges of about 1 cm."""
+    return grid(side, side, 0.01 * side)
+
+
+def touch(num_vertices: int) -> tuple[Obstacle, Contact]:
+    """Two fifths of the vertices, in one patch, near ``TOUCHED`` body vertices."""
+    pos, scene = torch.zeros(NUM_BODY, 3), torch.zeros(NUM_BODY, dtype=torch.int64)
+    obstacle = Obstacle(pos, pos, pos, torch.zeros(0, 3, dtype=torch.int64), scene, scene[:0], scene.bool())
+    index = torch.arange(num_vertices)
+    near = index < round(0.4 * num_vertices)
+    vertex = (index * TOUCHED // max(int(near.sum()), TOUCHED)).clamp_max(TOUCHED - 1) * 3
+    plane = plane_contact(torch.zeros(num_vertices, 3))
+    contact = Contact(**{**vars(plane), "vertex": vertex, "vertex_dist": torch.where(near, 0.01, 1.0)})
+    return obstacle, contact
+
+
+def list_edges(graph: Graph, name: str) -> tuple[Tensor, Tensor, Tensor]:
+    """Senders, receivers and sorted rows of a set in the order of its undirected list, one direction after the other."""
+    edges = graph.edge_sets[name]
+    rows = torch.argsort(edges.source + (edges.senders < edges.receivers) * (edges.num_edges + 1))
+    ids = torch.cat([torch.arange(graph.num_cloth), graph.num_cloth + graph.body_vertex])
+    return ids[edges.senders[rows]], ids[edges.receivers[rows]], rows
+
+
+def kept_rows(graph: Graph, level: int, order: Tensor) -> Tensor:
+    """Rows of the listed body edges that belong to ``body_subsets[level]``."""
+    kept = torch.zeros(graph.edge_sets[BODY].num_edges, dtype=torch.bool)
+    rows = graph.body_subsets[level].rows
+    kept[slice(None) if rows is None else rows] = True
+    return kept[order].nonzero().squeeze(1)
+
+
+# ---- the naive form --------------------------------------------------------------------------------------------------
+
+
+def plain(mlp: MLP, x: Tensor) -> Tensor:
+    """The perceptron, one operation after the other, nothing in place."""
+    hidden = torch.relu(functional.linear(torch.relu(mlp.first(x)), mlp.second.weight, mlp.second.bias))
+    out = mlp.third(hidden)
+    return out if mlp.norm is None else mlp.norm(out)
+
+
+def naive(case: Case) -> Tensor:
+    """The network by its formulas."""
+    network = case.network
+    nodes = plain(network.node_encoder, case.all_nodes)
+    edges = {name: plain(encoder, case.listed_edges[name]) for name, encoder in network.edge_encoders.items()}
+    for sets, step in zip(network.schedule, network.steps, strict=True):
+        nodes = naive_step(case, step, nodes, edges, finest_level(sets))
+    return plain(network.decoder, nodes[: case.graph.num_cloth])
+
+
+def naive_step(case: Case, step: ProcessorStep, nodes: Tensor, edges: dict[str, Tensor], level: int) -> Tensor:
+    """New nodes; ``edges`` are replaced in the dictionary."""
+    parts = [nodes]
+    for name in step.sets:
+        senders, receivers, _ = case.listed[name]
+        latent, rows = edges[name], case.level_rows[level] if name == BODY and level else None
+        if rows is not None:
+            senders, receivers, latent = senders[rows], receivers[rows], latent[rows]
+        message = plain(step.edge_mlps[name], torch.cat([nodes[receivers], nodes[senders], latent], dim=1))
+        parts.append(torch.zeros_like(nodes).index_add(0, receivers, message))
+        edges[name] = edges[name] + message if rows is None else edges[name].index_add(0, rows, message)
+    return nodes + plain(step.node_mlp, torch.cat(parts, dim=1))
+
+
+def pyg(case: Case) -> Callable[[], Tensor]:
+    """The single-level network as torch_geometric's MetaLayer; needs ``pip install torch_geometric``."""
+    from torch_geometric.nn import MetaLayer  # type: ignore[import-not-found]
+    from torch_geometric.utils import scatter  # type: ignore[import-not-found]
+
+    class EdgeModel(nn.Module):
+        def __init__(self, mlp: MLP) -> None:
+            super().__init__()
+            self.mlp = mlp
+
+        def forward(self, src: Tensor, dst: Tensor, attr: Tensor, *_: Any) -> Tensor:
+            return plain(self.mlp, torch.cat([dst, src, attr], dim=1))
+
+    network = case.network
+    if network.edge_set_names != ("mesh",):
+        raise ValueError("--pyg: MetaLayer has one edge set besides the body's; use --models fine15 or fine48")
+    index = {name: torch.stack(case.listed[name][:2]) for name in ("mesh", BODY)}
+    layers = [{name: MetaLayer(EdgeModel(step.edge_mlps[name])) for name in index} for step in network.steps]
+
+    def run() -> Tensor:
+        nodes = plain(network.node_encoder, case.all_nodes)
+        edges = {name: plain(encoder, case.listed_edges[name]) for name, encoder in network.edge_encoders.items()}
+        for step, layer in zip(network.steps, layers, strict=True):
+            parts = [nodes]
+            for name, pairs in index.items():
+                _, message, _ = layer[name](nodes, pairs, edges[name])
+                parts.append(scatter(message, pairs[1], dim=0, dim_size=len(nodes), reduce="sum"))
+                edges[name] = edges[name] + message
+            nodes = nodes + plain(step.node_mlp, torch.cat(parts, dim=1))
+        return plain(network.decoder, nodes[: case.graph.num_cloth])
+
+    return run
+
+
+# ---- measuring -------------------------------------------------------------------------------------------------------
+
+
+def forms(case: Case, with_pyg: bool = False) -> dict[str, tuple[nn.Module, Callable[[], Tensor]]]:
+    """What takes part, by name: the parameters' owner and a call."""
+    half = copy.deepcopy(case.network)
+    half.precision = "bf16"
+    result = {
+        "naive": (case.network, partial(naive, case)),
+        "fp32": (case.network, partial(case.network, case.graph, case.nodes, case.edges)),
+        "bf16": (half, partial(half, case.graph, case.nodes, case.edges)),
+    }
+    if with_pyg:
+        result["pyg"] = (case.network, pyg(case))
+    return result
+
+
+def train(owner: nn.Module, run: Callable[[], Tensor]) -> None:
+    """One forward and backward pass."""
+    owner.zero_grad(set_to_none=True)
+    run().square().mean().backward()
+
+
+def quiet(run: Callable[[], Tensor]) -> None:
+    with torch.no_grad():
+        run()
+
+
+def alternate(calls: Mapping[str, Callable[[], None]], rounds: int) -> dict[str, float]:
+    """Median CPU seconds of every call; they take turns."""
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for turn in range(rounds + 1):
+        for name, call in calls.items():
+            began = time.process_time()
+            call()
+            if turn:  # the first is the warm-up
+                times[name].append(time.process_time() - began)
+    return {name: float(np.median(values)) for name, values in times.items()}
+
+
+def check(case: Case, runs: Mapping[str, tuple[nn.Module, Callable[[], Tensor]]]) -> float:
+    """Largest error of bf16 in the RMS sense; float32 forms must agree to 1e-5."""
+    with torch.no_grad():
+        results = {name: run().double() for name, (_, run) in runs.items()}
+    scale = results["naive"].square().mean().sqrt()
+    for name, value in results.items():
+        worst = float((value - results["naive"]).abs().max() / scale)
+        if name != "bf16" and worst > 1e-5:
+            raise SystemExit(f"{name} differs from naive by {worst:.1e} of the output's RMS; the comparison is void")
+    return float((results["bf16"] - results["naive"]).square().mean().sqrt() / scale)
+
+
+def network_flops(case: Case) -> float:
+    """Floating-point operations of the matrix products of one forward pass of the network."""
+    graph, network = case.graph, case.network
+
+    def mlp(rows: int, first: int, out: int = LATENT) -> float:
+        return 2.0 * rows * LATENT * (first + LATENT + out)
+
+    total = mlp(graph.num_nodes, case.nodes.shape[1]) + mlp(graph.num_cloth, LATENT, 3)
+    total += sum(mlp(s.num_edges, WIDTHS.get(name, 12)) for name, s in graph.edge_sets.items())
+    for sets in network.schedule:
+        parts = [graph.edge_sets[name] for name in sets] + [graph.body_subsets[finest_level(sets)].edges]
+        total += mlp(graph.num_nodes, LATENT)
+        total += sum(mlp(p.num_edges, LATENT) + 2.0 * len(p.nodes) * LATENT * 3 * LATENT for p in parts)
+    return total
+
+
+def product_rate(dtype: torch.dtype) -> dict[str, float]:
+    """FLOP/s of (1024, 128) × (128, 128) in ``dtype`` by torch's own product and by the network's."""
+    x, weight = torch.randn(1024, LATENT).to(dtype), torch.randn(LATENT, LATENT).to(dtype)
+    out = torch.empty(1024, LATENT, dtype=dtype)
+    calls = {"torch.mm": lambda: torch.mm(x, weight.t(), out=out), "network": lambda: affine(x, weight)}
+    repeated = {name: lambda call=call: [call() for _ in range(100)] and None for name, call in calls.items()}
+    return {name: 100 * 2.0 * 1024 * LATENT**2 / seconds for name, seconds in alternate(repeated, 15).items()}
+
+
+def peak_memory(size: int, model: str, name: str, training: bool) -> float:
+    """MB that one pass of ``name`` needs beyond weights and inputs, measured in a fresh process."""
+    request = json.dumps([size, model, name, training])
+    command = [sys.executable, __file__, "--memory-of", request]
+    return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+
+
+def measure_memory(size: int, model: str, name: str, training: bool) -> float:
+    """The same in this process: growth of the resident set's high-water mark over one pass."""
+    small = forms(make_case(100, model), name == "pyg")[name]
+    train(*small) if training else quiet(small[1])  # pages of the libraries' code are not counted
+    owner, run = forms(make_case(size, model), name == "pyg")[name]
+    ctypes.CDLL(None).malloc_trim(0)  # what building the case has freed would be used again without being seen
+    before = resident("VmRSS")
+    Path("/proc/self/clear_refs").write_text("5")  # the mark starts again from here
+    train(owner, run) if training else quiet(run)
+    return resident("VmHWM") - before
+
+
+def resident(field: str) -> float:
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(float(line.split()[1]) for line in lines if line.startswith(field)) / 1024
+
+
+def table(size: int, model: str, args: argparse.Namespace) -> None:
+    """Print the rows of one size and model."""
+    case = make_case(size, model)
+    runs = forms(case, args.pyg and model.startswith("fine"))
+    error = check(case, runs)
+    flops = network_flops(case)
+    rate = {"fp32": max(product_rate(torch.float32).values()), "bf16": max(product_rate(torch.bfloat16).values())}
+    counts = {name: s.num_edges for name, s in case.graph.edge_sets.items()}
+    print(f"\n{model}, {case.graph.num_cloth:,} vertices, edges {counts}, {flops / 1e9:.1f} GFLOP; bf16 error {error:.2%}")
+    print("| pass | form | ms | vs naive | MB | vs naive | GFLOP/s | of the product's |\n" + "|---" * 8 + "|")
+    for training in (False, True) if not args.forward_only else (False,):
+        calls = {name: partial(train, *entry) if training else partial(quiet, entry[1]) for name, entry in runs.items()}
+        seconds = alternate(calls, args.rounds)
+        memory = {name: peak_memory(size, model, name, training) for name in runs} if args.memory else {}
+        for name, value in seconds.items():
+            own = (3 if training else 1) * flops / value
+            fraction = f"{own / 1e9:.0f} | {own / rate[name]:.0%}" if name in rate else " | "
+            space = f"{memory[name]:.0f} | {memory[name] / memory['naive']:.2f}" if memory else " | "
+            label = "forward + backward" if training else "forward"
+            print(
+                f"| {label} | {name} | {1e3 * value:.1f} | {seconds['naive'] / value:.2f} | {space} | {fraction} |", flush=True
+            )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--sizes", type=int, nargs="+", default=[1000, 5041])
+    parser.add_argument("--models", nargs="+", default=["fine15", "ours"], help="schedules by name or text")
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--pyg", action="store_true", help="also torch_geometric's MetaLayer (fine15 and fine48)")
+    parser.add_argument("--forward-only", action="store_true")
+    parser.add_argument("--no-memory", dest="memory", action="store_false")
+    parser.add_argument("--memory-of", help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if any(os.environ.get(key) is None for key in ENVIRONMENT):  # read at process start only, and by all forms alike
+        environment = {**ENVIRONMENT, **os.environ}
+        os.execve(sys.executable, [sys.executable, *sys.argv], environment)
+    torch.set_num_threads(args.threads)
+    if args.memory_of:
+        print(measure_memory(*json.loads(args.memory_of)))
+        return
+    rates = {name: product_rate(dtype) for name, dtype in (("fp32", torch.float32), ("bf16", torch.bfloat16))}
+    for name, rate in rates.items():
+        print(f"(1024, 128) × (128, 128) in {name}: " + ", ".join(f"{k} {v / 1e9:.0f} GFLOP/s" for k, v in rate.items()))
+    for model in args.models:
+        for size in args.sizes:
+            table(size, model, args)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,134 @@
+"""Matrix products of tall arrays: in blocks of rows that stay in cache, by the fastest library that torch carries.
+
+On a CPU torch's float32 product is MKL's, which uses half of the vector units of an AMD processor: 90 GFLOP/s where oneDNN,
+which torch carries as well, reaches 190 on one core. torch offers oneDNN for float32 only through the operators that its
+own compiler emits, so they are tried once and the plain product takes over wherever they are missing. oneDNN compiles a
+kernel per shape (2–8 ms); numbers of rows are therefore rounded up to few sizes, or the changing number of body edges
+would cost more than the network.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cache
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+from torch.nn import functional
+
+#: Bytes of one array of a block: the few in use at a time stay in cache.
+BLOCK_BYTES = 2**20
+#: Rows of a block are a multiple of this.
+UNIT = 256
+#: Gradients of weights narrower than this are faster by MKL.
+_NARROW = 96
+
+
+def affine(x: Tensor, weight: Tensor, bias: Tensor | None = None, relu: bool = False) -> Tensor:
+    """x Wᵀ + b of one block, (N, in) → (N, out) in the precision of ``x``, with a ReLU on request; no gradient."""
+    kernel = _kernel(x.device.type, x.dtype)
+    if kernel is None or not torch.backends.mkldnn.enabled:
+        out = functional.linear(x, weight, bias)
+        return out.relu_() if relu else out
+    out = kernel(pad_rows(x), _packed(weight), bias, "relu" if relu else "none", [], "")
+    return out if out.shape[0] == x.shape[0] else out[: x.shape[0]]
+
+
+def gram(left: Tensor, right: Tensor) -> Tensor:
+    """leftᵀ right of one block, (N, a), (N, b) → (a, b): the gradient of a weight; no gradient of its own."""
+    kernel = _kernel(left.device.type, left.dtype)
+    if kernel is None or not torch.backends.mkldnn.enabled:
+        return left.t() @ right
+    if left.dtype == torch.bfloat16:  # goes to oneDNN by itself, and faster than below, where both factors are transposed
+        return pad_rows(left).t() @ pad_rows(right)
+    if min(left.shape[1], right.shape[1]) < _NARROW or left.shape[0] % UNIT:
+        return left.t() @ right
+    return kernel(left.t(), right.t(), None, "none", [], "")
+
+
+def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
+    """x Wᵀ + b, (N, in) → (N, out), differentiable; weights are cast to the precision of ``x``, gradients back to theirs."""
+    result: Tensor = _Linear.apply(x, weight, bias)
+    return result
+
+
+def blocks(x: Tensor) -> Iterator[slice]:
+    """Rows of ``x`` (N, d) in blocks; a GPU gets everything at once."""
+    count = x.shape[0]
+    if x.device.type == "cpu":
+        rows = max(BLOCK_BYTES // (x.shape[1] * x.element_size()) // UNIT * UNIT, UNIT)
+    else:
+        rows = max(count, 1)
+    for start in range(0, count, rows):
+        yield slice(start, min(start + rows, count))
+
+
+def padded_count(count: int) -> int:
+    """Rows that an array of ``count`` should have: one of 16 sizes between a power of two and the next."""
+    if count < UNIT:
+        return max(16, 1 << (count - 1).bit_length())
+    unit = max(UNIT, 1 << (count.bit_length() - 5))
+    return -(-count // unit) * unit
+
+
+def pad_rows(x: Tensor) -> Tensor:
+    """``x`` (N, …) with zeros below, up to :func:`padded_count`."""
+    extra = padded_count(x.shape[0]) - x.shape[0]
+    return x if extra == 0 else functional.pad(x, (0, 0) * (x.dim() - 1) + (0, extra))
+
+
+class _Linear(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+        ctx.save_for_backward(x, weight)
+        ctx.has_bias = bias is not None
+        return _in_blocks(x, weight.to(x.dtype), None if bias is None else bias.to(x.dtype))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        x, weight = ctx.saved_tensors
+        grad = grad.contiguous()
+        grad_x = _in_blocks(grad, weight.to(grad.dtype).t(), None) if ctx.needs_input_grad[0] else None
+        grad_weight = torch.zeros_like(weight, memory_format=torch.contiguous_format)
+        for part in blocks(grad):
+            grad_weight += gram(grad[part], x[part])
+        return grad_x, grad_weight, grad.sum(dim=0, dtype=weight.dtype) if ctx.has_bias else None
+
+
+def _in_blocks(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+    parts = list(blocks(x))
+    if len(parts) <= 1 or padded_count(x.shape[0]) == x.shape[0]:
+        out = affine(x, weight, bias)
+        # A view of a longer array could not be changed in place under autograd.
+        return out.clone() if out._is_view() else out
+    out = x.new_empty(x.shape[0], weight.shape[0])
+    for part in parts:
+        out[part] = affine(x[part], weight, bias)
+    return out
+
+
+def _packed(weight: Tensor) -> Tensor:
+    """``weight`` without gaps between its rows or columns: for others oneDNN falls back on a loop 5,000 times slower."""
+    return weight if weight.is_contiguous() or weight.t().is_contiguous() else weight.contiguous()
+
+
+@cache
+def _kernel(device: str, dtype: torch.dtype) -> Any:
+    """oneDNN's linear operator where it exists, supports the precision and gives the right numbers; else None."""
+    known = device == "cpu" and dtype in (torch.float32, torch.bfloat16)
+    if not known or torch.backends.cpu.get_cpu_capability() != "AVX512" or not torch.backends.mkldnn.is_available():
+        return None
+    try:
+        if dtype == torch.bfloat16 and not torch.ops.mkldnn._is_mkldnn_bf16_supported():
+            return None
+        kernel = torch.ops.mkldnn._linear_pointwise.default
+        x = torch.linspace(-1, 1, 16 * 8).view(16, 8).to(dtype)
+        weight, bias = x[:4].flip(0) + 0.5, x[0, :4]
+        expected = torch.relu(x.float() @ weight.float().t() + bias.float())
+        good = torch.allclose(kernel(x, weight, bias, "relu", [], "").float(), expected, atol=4 * torch.finfo(dtype).eps)
+    except (AttributeError, RuntimeError, TypeError):  # another version of torch
+        return None
+    return kernel if good else None
