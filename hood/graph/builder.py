@@ -108,7 +108,7 @@ class Graph:
     ``body_vertex`` (indices into the obstacle's vertices).
 
     ``body_subsets[l]`` holds the body edges of cloth nodes on level l or deeper: a processor step that works on
-    levels ≥ l only (METHOD, section 4) uses these.
+    levels ≥ l only (paper, section 4.2) uses these.
     """
 
     num_cloth: int
