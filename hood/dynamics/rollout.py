@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from hood.dynamics.measure import METRICS, penetration_metrics, strain_metrics
-from hood.dynamics.simulator import Prediction, Simulator
+from hood.dynamics.simulator import Prediction
 from hood.dynamics.stepper import Stepper
 from hood.dynamics.stopwatch import Stopwatch
 from hood.losses.potential import Potential, relative_gradient, scale
@@ -110,19 +110,17 @@ def simulate(
 def start_state(stepper: Stepper, scene: Scene, potential: Potential, relaxing_steps: int, frame: int = 0) -> State:
     """Settled, relaxed start: the relaxing step is kept only where it lowers the potential of its own problem.
 
-    Models that count in frames (:class:`hood.dynamics.frames.FrameRules`) go on from the relaxing step as they left it: with
-    its positions and its velocity.
+    A stepper with ``keeps_relaxing_step`` goes on from it as it left it, with its positions and its velocity.
     """
     state = scene.start(frame, relaxed=False)
     prepared = stepper.prepare(scene.cloth, scene.garment.rest_pos)
-    in_frames = isinstance(stepper, Simulator) and stepper.rules.frame_dt is not None
     velocity = scene.start_velocity(frame)
     for _ in range(relaxing_steps):
         step = scene.step_input(frame, state, relaxing=True)
         contact = stepper.find_contact(scene.cloth, state, step)
         problem = potential.prepare(StepProblem(scene.cloth, state, step, contact, stepper.gravity.to(state.pos)))
         prediction = stepper.predict(problem, prepared)
-        if in_frames:
+        if stepper.keeps_relaxing_step:
             state = State(prediction.next_pos, state.vel, state.origin)
             velocity = stepper.next_velocity(problem, prediction)
             continue

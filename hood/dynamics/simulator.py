@@ -98,6 +98,11 @@ class Simulator(nn.Module):
         return isinstance(self.output, AccelerationOutput) or self.features.node_normalizer is not None
 
     @property
+    def keeps_relaxing_step(self) -> bool:
+        """Models that count in frames (:class:`hood.dynamics.frames.FrameRules`) go on from it as they left it."""
+        return self.rules.frame_dt is not None
+
+    @property
     def velocity_columns(self) -> slice:
         """Columns of the node features that hold the velocity: both feature sets put it first."""
         return slice(0, 3)

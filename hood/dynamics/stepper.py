@@ -26,6 +26,11 @@ class Stepper(Protocol):
     times: tuple[str, ...]  # parts of a frame's time
     metrics: tuple[str, ...]  # names of the entries of ``Prediction.metrics``
 
+    @property
+    def keeps_relaxing_step(self) -> bool:
+        """Whether a rollout goes on from the relaxing step as it is, velocity included."""
+        ...
+
     def prepare(self, cloth: Cloth, rest_pos: Any) -> Any:
         """What is computed once per cloth."""
         ...
@@ -51,6 +56,7 @@ class NewtonStepper:
 
     times: tuple[str, ...] = ("search", "solver", "rest", "total")
     metrics: tuple[str, ...] = ("solver_iterations", "solver_converged")
+    keeps_relaxing_step = False
 
     def __init__(self, potential: Potential, settings: NewtonSettings | None = None) -> None:
         self.potential, self.settings = potential, settings or NewtonSettings()
