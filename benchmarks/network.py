@@ -10,21 +10,27 @@ Times are medians of the process's CPU time over runs that take turns, after one
 slows all of them alike. Peak memory is what a fresh process needs on top of weights and inputs (Linux only). GFLOP/s count the
 products the network itself computes, against a (1024, 128) × (128, 128) product in the same precision, by the
 faster of the machine's two libraries.
+
+Progress goes to the standard error, rows to the standard output and, with ``--output``, to a CSV file as soon as they are
+known. Where one turn of all forms lasts longer than ``--long`` seconds three turns are taken instead of ``--rounds``; the
+column ``turns`` says so. A form that needs more memory than the machine has is left out with a sentence that says how much:
+memory grows linearly with the number of vertices, by the line through two small sizes.
 """
 
 from __future__ import annotations
 
 import argparse
 import copy
+import csv
 import ctypes
 import json
 import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +57,9 @@ NUM_BODY = 6890
 TOUCHED = 1500  # body vertices near the cloth
 WIDTHS = {"mesh": 12, "coarse": 12, "body": 9}
 LATENT = 128
+PROBES = (1089, 2209)  # sizes whose memory tells that of larger ones
+FEW = 3  # turns where one lasts long
+COLUMNS = ("pass", "form", "turns", "ms", "vs naive", "MB", "vs naive", "GFLOP/s", "of the product's")
 
 
 @dataclass
@@ -219,28 +228,32 @@ def quiet(run: Callable[[], Tensor]) -> None:
         run()
 
 
-def alternate(calls: Mapping[str, Callable[[], None]], rounds: int) -> dict[str, float]:
-    """Median CPU seconds of every call; they take turns."""
+def alternate(calls: Mapping[str, Callable[[], None]], rounds: int, long: float = float("inf")) -> dict[str, list[float]]:
+    """CPU seconds of every call in ``rounds`` turns, or fewer if one lasts longer than ``long``; they take turns."""
     times: dict[str, list[float]] = {name: [] for name in calls}
     for turn in range(rounds + 1):
+        began = time.process_time()
         for name, call in calls.items():
-            began = time.process_time()
+            start = time.process_time()
             call()
             if turn:  # the first is the warm-up
-                times[name].append(time.process_time() - began)
-    return {name: float(np.median(values)) for name, values in times.items()}
+                times[name].append(time.process_time() - start)
+        if turn >= FEW and time.process_time() - began > long:
+            break
+    return times
 
 
 def check(case: Case, runs: Mapping[str, tuple[nn.Module, Callable[[], Tensor]]]) -> float:
-    """Largest error of bf16 in the RMS sense; float32 forms must agree to 1e-5."""
+    """Largest error of bf16 in the RMS sense; float32 forms must agree to 1e-5 with the first one (naive where it fits)."""
     with torch.no_grad():
         results = {name: run().double() for name, (_, run) in runs.items()}
-    scale = results["naive"].square().mean().sqrt()
+    first, reference = next(iter(results.items()))
+    scale = reference.square().mean().sqrt()
     for name, value in results.items():
-        worst = float((value - results["naive"]).abs().max() / scale)
+        worst = float((value - reference).abs().max() / scale)
         if name != "bf16" and worst > 1e-5:
-            raise SystemExit(f"{name} differs from naive by {worst:.1e} of the output's RMS; the comparison is void")
-    return float((results["bf16"] - results["naive"]).square().mean().sqrt() / scale)
+            raise SystemExit(f"{name} differs from {first} by {worst:.1e} of the output's RMS; the comparison is void")
+    return float((results["bf16"] - reference).square().mean().sqrt() / scale)
 
 
 def network_flops(case: Case) -> float:
@@ -265,14 +278,46 @@ def product_rate(dtype: torch.dtype) -> dict[str, float]:
     out = torch.empty(1024, LATENT, dtype=dtype)
     calls = {"torch.mm": lambda: torch.mm(x, weight.t(), out=out), "network": lambda: affine(x, weight)}
     repeated = {name: lambda call=call: [call() for _ in range(100)] and None for name, call in calls.items()}
-    return {name: 100 * 2.0 * 1024 * LATENT**2 / seconds for name, seconds in alternate(repeated, 15).items()}
+    return {name: 100 * 2.0 * 1024 * LATENT**2 / np.median(seconds) for name, seconds in alternate(repeated, 15).items()}
 
 
+@cache
 def peak_memory(size: int, model: str, name: str, training: bool) -> float:
     """MB that one pass of ``name`` needs beyond weights and inputs, measured in a fresh process."""
     request = json.dumps([size, model, name, training])
     command = [sys.executable, __file__, "--memory-of", request]
     return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+
+
+def expected_memory(size: int, model: str, name: str, training: bool) -> float:
+    """MB that one pass is going to need: the line through :data:`PROBES`; 0 for sizes not much larger."""
+    if size < 2 * PROBES[1]:
+        return 0.0
+    small, large = (peak_memory(probe, model, name, training) for probe in PROBES)
+    slope = max(large - small, 0.0) / (PROBES[1] - PROBES[0])
+    return large + slope * (size - PROBES[1])
+
+
+def available_memory() -> float:
+    """MB that new processes may take."""
+    lines = Path("/proc/meminfo").read_text().splitlines()
+    return next(float(line.split()[1]) for line in lines if line.startswith("MemAvailable")) / 1024
+
+
+def fitting(size: int, model: str, names: Sequence[str], training: bool) -> list[str]:
+    """Those of ``names`` that the machine has memory for; a sentence for every other one."""
+    kept, room = [], 0.9 * available_memory()  # a tenth is left to everyone else
+    for name in names:
+        need = expected_memory(size, model, name, training)
+        if need < room:
+            kept.append(name)
+            continue
+        what = "forward + backward" if training else "forward"
+        print(
+            f"{what}: {name} needs about {need / 1024:.1f} GB, more than this machine has ({room / 1024:.1f} GB free)",
+            flush=True,
+        )
+    return kept
 
 
 def measure_memory(size: int, model: str, name: str, training: bool) -> float:
@@ -294,26 +339,58 @@ def resident(field: str) -> float:
 
 def table(size: int, model: str, args: argparse.Namespace) -> None:
     """Print the rows of one size and model."""
+    tell(f"{model}, {size} vertices: building the graph")
     case = make_case(size, model)
     runs = forms(case, args.pyg and model.startswith("fine"))
-    error = check(case, runs)
+    tell(f"{model}, {size} vertices: do all forms agree?")
+    present = fitting(size, model, list(runs), training=False)
+    both = {"fp32", "bf16"} <= set(present)
+    error = f"bf16 error {check(case, {name: runs[name] for name in present}):.2%}" if both else "outputs not compared"
     flops = network_flops(case)
-    rate = {"fp32": max(product_rate(torch.float32).values()), "bf16": max(product_rate(torch.bfloat16).values())}
     counts = {name: s.num_edges for name, s in case.graph.edge_sets.items()}
-    print(f"\n{model}, {case.graph.num_cloth:,} vertices, edges {counts}, {flops / 1e9:.1f} GFLOP; bf16 error {error:.2%}")
-    print("| pass | form | ms | vs naive | MB | vs naive | GFLOP/s | of the product's |\n" + "|---" * 8 + "|")
+    print(f"\n{model}, {case.graph.num_cloth:,} vertices, edges {counts}, {flops / 1e9:.1f} GFLOP; {error}")
+    print(f"| {' | '.join(COLUMNS)} |\n" + "|---" * len(COLUMNS) + "|", flush=True)
     for training in (False, True) if not args.forward_only else (False,):
-        calls = {name: partial(train, *entry) if training else partial(quiet, entry[1]) for name, entry in runs.items()}
-        seconds = alternate(calls, args.rounds)
-        memory = {name: peak_memory(size, model, name, training) for name in runs} if args.memory else {}
-        for name, value in seconds.items():
-            own = (3 if training else 1) * flops / value
-            fraction = f"{own / 1e9:.0f} | {own / rate[name]:.0%}" if name in rate else " | "
-            space = f"{memory[name]:.0f} | {memory[name] / memory['naive']:.2f}" if memory else " | "
-            label = "forward + backward" if training else "forward"
-            print(
-                f"| {label} | {name} | {1e3 * value:.1f} | {seconds['naive'] / value:.2f} | {space} | {fraction} |", flush=True
-            )
+        names = fitting(size, model, list(runs), training) if training else present
+        rows(size, model, training, {name: runs[name] for name in names}, flops, args)
+
+
+def rows(
+    size: int,
+    model: str,
+    training: bool,
+    runs: Mapping[str, tuple[nn.Module, Callable[[], Tensor]]],
+    flops: float,
+    args: argparse.Namespace,
+) -> None:
+    """Measure one pass of every form and print its rows."""
+    label = "forward + backward" if training else "forward"
+    tell(f"{model}, {size} vertices: {label}, the times of {', '.join(runs)}")
+    rate = {"fp32": max(product_rate(torch.float32).values()), "bf16": max(product_rate(torch.bfloat16).values())}
+    calls = {name: partial(train, *entry) if training else partial(quiet, entry[1]) for name, entry in runs.items()}
+    times = alternate(calls, args.rounds, args.long)
+    seconds = {name: float(np.median(values)) for name, values in times.items()}
+    for owner, _ in runs.values():
+        owner.zero_grad(set_to_none=True)
+    memory: dict[str, float] = {}
+    for name in runs if args.memory else ():
+        tell(f"{model}, {size} vertices: {label}, the memory of {name}")
+        memory[name] = peak_memory(size, model, name, training)
+    for name, value in seconds.items():
+        own = (3 if training else 1) * flops / value
+        compared = f"{seconds['naive'] / value:.2f}" if "naive" in seconds else ""
+        space = f"{memory[name]:.0f}" if memory else ""
+        share = f"{memory[name] / memory['naive']:.2f}" if "naive" in memory else ""
+        fraction = (f"{own / 1e9:.0f}", f"{own / rate[name]:.0%}") if name in rate else ("", "")
+        cells = (label, name, str(len(times[name])), f"{1e3 * value:.1f}", compared, space, share, *fraction)
+        print(f"| {' | '.join(cells)} |", flush=True)
+        if args.output:
+            with args.output.open("a", newline="") as file:
+                csv.writer(file).writerow((model, size, *cells))
+
+
+def tell(text: str) -> None:
+    print(f"[{time.strftime('%H:%M:%S')}] {text}", file=sys.stderr, flush=True)
 
 
 def main() -> None:
@@ -321,6 +398,8 @@ def main() -> None:
     parser.add_argument("--sizes", type=int, nargs="+", default=[1000, 5041])
     parser.add_argument("--models", nargs="+", default=["fine15", "ours"], help="schedules by name or text")
     parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--long", type=float, default=15.0, help="seconds of a turn from which three turns are enough")
+    parser.add_argument("--output", type=Path, help="CSV file to which every row is appended once it is known")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--pyg", action="store_true", help="also torch_geometric's MetaLayer (fine15 and fine48)")
     parser.add_argument("--forward-only", action="store_true")
@@ -337,6 +416,10 @@ def main() -> None:
     rates = {name: product_rate(dtype) for name, dtype in (("fp32", torch.float32), ("bf16", torch.bfloat16))}
     for name, rate in rates.items():
         print(f"(1024, 128) × (128, 128) in {name}: " + ", ".join(f"{k} {v / 1e9:.0f} GFLOP/s" for k, v in rate.items()))
+    if args.output:
+        args.output.parent.mkdir(parents=True, exist_ok=True)
+        with args.output.open("w", newline="") as file:
+            csv.writer(file).writerow(("model", "vertices", *COLUMNS))
     for model in args.models:
         for size in args.sizes:
             table(size, model, args)

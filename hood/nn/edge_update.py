@@ -14,7 +14,8 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from hood.graph.builder import EdgeSet
-from hood.nn.dense import affine, blocks, gram, linear
+from hood.nn import triton_edge
+from hood.nn.dense import affine_plus, blocks, gram, linear, relu_
 from hood.nn.mlp import MLP, Kept, Layers
 
 
@@ -22,7 +23,7 @@ def update_edges(mlp: MLP, nodes: Tensor, latent: Tensor, edges: EdgeSet, overwr
     """e' = e + m and Σ m at the receivers, m = MLP([v_receiver, v_sender, e]) with a layer norm at its output.
 
     The first layer is split by columns, W [v_r, v_s, e] = W_r v_r + W_s v_s + W_e e: its node parts are evaluated once
-    per node instead of once per edge.
+    per node instead of once per edge. Without gradients a CUDA device with Triton takes :mod:`hood.nn.triton_edge`.
 
     Args:
         mlp: edge network, 3d → d.
@@ -40,6 +41,9 @@ def update_edges(mlp: MLP, nodes: Tensor, latent: Tensor, edges: EdgeSet, overwr
     table = linear(nodes, weight, torch.cat([mlp.first.bias, torch.zeros_like(mlp.first.bias)]))
     keep = torch.is_grad_enabled()
     overwrite = overwrite and not keep
+    if triton_edge.applies(latent):
+        precision = triton_edge.input_precision()
+        return triton_edge.update_edges_fused(mlp, table, latent, edges, overwrite, precision)
     result: tuple[Tensor, Tensor] = _EdgeUpdate.apply(
         latent, table, to_edge, edges, keep, overwrite, mlp.norm.eps, *mlp.tail_parameters()
     )
@@ -53,6 +57,13 @@ def sum_rows(x: Tensor, order: Tensor, offsets: Tensor) -> Tensor:
     bfloat16 are taken in float32.
     """
     return functional.embedding_bag(order, x, offsets, mode="sum", include_last_offset=True)
+
+
+def add_rows(x: Tensor, message: Tensor, out: Tensor) -> Tensor:
+    """x + message, rounded once; ``message`` of a wider precision is lost."""
+    if message.dtype == x.dtype:
+        return torch.add(x, message, out=out)
+    return out.copy_(message.add_(x.to(message.dtype)))  # three operations of one precision are faster than a mixed one
 
 
 class _EdgeUpdate(torch.autograd.Function):
@@ -69,20 +80,29 @@ class _EdgeUpdate(torch.autograd.Function):
         *parameters: Tensor,
     ) -> tuple[Tensor, Tensor]:
         layers, weight = Layers(latent.dtype, eps, parameters), to_edge.to(latent.dtype)
-        received = latent.new_zeros(table.shape[0], latent.shape[1])
-        table = table.view(-1, latent.shape[1])
+        table = table.detach().view(-1, latent.shape[1])
+        received = latent.new_empty(len(table) // 2, latent.shape[1], dtype=layers.scale.dtype)
         updated = latent if overwrite else torch.empty_like(latent)
         saved: list[Tensor] = []
         parts = list(blocks(latent))
         spans = edges.spans(parts[0].stop) if parts else []
+        done = 0  # nodes whose first edge has been met
         for part, (nodes, offsets) in zip(parts, spans, strict=True):
             ends = functional.embedding_bag(edges.ends[part], table, mode="sum")
-            message, kept = layers.forward(affine(latent[part], weight).add_(ends).relu_())
-            # A node's edges may lie in two blocks, so its sum is completed rather than set.
-            received[nodes] += sum_rows(message, edges.rows[: part.stop - part.start], offsets)
-            torch.add(latent[part], message, out=updated[part])
+            message, kept = layers.forward(relu_(affine_plus(latent[part], weight, ends)), keep)
+            sums = sum_rows(message, edges.rows[: part.stop - part.start], offsets)
+            if nodes.start < done:  # a node's edges may lie in two blocks
+                received[nodes.start].add_(sums[0])
+                sums = sums[1:]
+            elif nodes.start > done:  # nodes without edges between two blocks
+                received[done : nodes.start] = 0
+            received[nodes.stop - len(sums) : nodes.stop] = sums
+            done = nodes.stop
+            add_rows(latent[part], message, updated[part])
             if keep:
                 saved += kept
+        received[done:] = 0
+        received = received.to(latent.dtype)
         if keep:
             ctx.save_for_backward(latent, to_edge, *parameters, *saved)
             ctx.edges, ctx.eps = edges, eps
@@ -91,8 +111,8 @@ class _EdgeUpdate(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_updated: Tensor, grad_sum: Tensor) -> tuple[Tensor | None, ...]:
-        latent, to_edge, *parameters = ctx.saved_tensors[:8]
-        saved = ctx.saved_tensors[8:]
+        tensors = ctx.saved_tensors  # once: under activation checkpointing a second look would compute them again
+        (latent, to_edge, *parameters), saved = tensors[:8], tensors[8:]
         edges: EdgeSet = ctx.edges
         layers, weight = Layers(latent.dtype, ctx.eps, tuple(parameters)), to_edge.to(latent.dtype).t()
         layers.start_backward()
@@ -100,10 +120,9 @@ class _EdgeUpdate(torch.autograd.Function):
         grad_edge = torch.zeros_like(to_edge, memory_format=torch.contiguous_format)
         for i, part in enumerate(blocks(latent)):
             grad = grad_sum.index_select(0, edges.local_receivers[part]).add_(grad_updated[part])
-            before = layers.backward(grad, Kept(*saved[5 * i : 5 * i + 5]))
-            grad_hidden[part] = before
+            before = layers.backward(grad, Kept(*saved[5 * i : 5 * i + 5]), out=grad_hidden[part])
             grad_edge += gram(before, latent[part])
-            torch.add(affine(before, weight), grad_updated[part], out=grad_latent[part])
+            affine_plus(before, weight, grad_updated[part], out=grad_latent[part])
         grad_table = latent.new_zeros(grad_sum.shape[0], 2, latent.shape[1])
         grad_table[: len(edges.nodes), 0] = sum_rows(grad_hidden, edges.rows, edges.offsets)
         grad_table[: len(edges.nodes), 1] = sum_rows(grad_hidden, edges.reverse, edges.offsets)

@@ -7,15 +7,15 @@ from typing import cast
 
 import torch
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 from hood.graph.builder import BODY, MESH, Graph, Subset, coarse_name, set_level
 from hood.nn.dense import pad_rows
 from hood.nn.message_passing import ProcessorStep
 from hood.nn.mlp import MLP
+from hood.nn.precision import PRECISIONS as PRECISIONS
+from hood.nn.precision import check_precision, products
 from hood.nn.schedule import edge_set_names, finest_level, parse_schedule
-
-#: How a network may compute.
-PRECISIONS = ("fp32", "bf16")
 
 
 class MeshGraphNet(nn.Module):
@@ -42,6 +42,7 @@ class MeshGraphNet(nn.Module):
     """
 
     precision: str
+    checkpointing: bool
 
     def __init__(
         self,
@@ -67,16 +68,24 @@ class MeshGraphNet(nn.Module):
             self.decoder.third.weight.mul_(output_init)
             self.decoder.third.bias.mul_(output_init)
         self.use_precision("fp32")
+        self.use_checkpointing(False)
 
     def use_precision(self, name: str) -> None:
         """``fp32`` computes in the precision of the weights, ``bf16`` the latents and products of the processor in bfloat16.
 
         With bf16 sums, statistics of layer norms, the first layers of the encoders (which see the features) and the decoder
-        stay as they are; in training so do weights and their gradients.
+        stay as they are; in training so do weights and their gradients. ``tf32`` is fp32 with products of factors rounded to
+        10 bits behind the point: inference on a GPU.
         """
-        if name not in PRECISIONS:
-            raise ValueError(f"precision is {name!r}; choose {' or '.join(PRECISIONS)}")
+        check_precision(name)
         self.precision = name
+
+    def use_checkpointing(self, on: bool) -> None:
+        """Whether training keeps only the latents between processor steps and computes a step again for its gradient.
+
+        The results are the same to the last bit; one more forward pass buys the memory.
+        """
+        self.checkpointing = on
 
     def forward(self, graph: Graph, node_features: Tensor, edge_features: Mapping[str, Tensor]) -> Tensor:
         """(V, out_width) for the cloth nodes.
@@ -86,6 +95,11 @@ class MeshGraphNet(nn.Module):
             node_features: (V + W_active, node_width), cloth rows first.
             edge_features: by set, rows as in ``graph.edge_sets``.
         """
+        check_precision(self.precision, node_features.device)
+        with products(self.precision):
+            return self._forward(graph, node_features, edge_features)
+
+    def _forward(self, graph: Graph, node_features: Tensor, edge_features: Mapping[str, Tensor]) -> Tensor:
         dtype = torch.bfloat16 if self.precision == "bf16" else None
         # Rows of padding are nodes without edges. A node's latent, a sum over all steps, stays in float32.
         nodes = self.node_encoder(pad_rows(node_features), dtype).to(node_features.dtype)
@@ -95,7 +109,10 @@ class MeshGraphNet(nn.Module):
         for sets, step in zip(self.schedule, self.steps, strict=True):
             subsets = {name: whole[name] for name in sets}
             subsets[BODY] = graph.body_subsets[finest_level(sets)]
-            nodes, edges = step(nodes, edges, subsets, overwrite)
+            if self.checkpointing and not overwrite:
+                nodes, edges = checkpoint(step, nodes, edges, subsets, use_reentrant=False, preserve_rng_state=False)
+            else:
+                nodes, edges = step(nodes, edges, subsets, overwrite)
         return self.decoder(nodes[: graph.num_cloth].to(node_features.dtype))
 
     def edge_encoder(self, name: str) -> MLP:

@@ -1,0 +1,47 @@
+"""The switch for TensorFloat-32, and who is refused it."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from hood.nn.model import MeshGraphNet
+from hood.nn.precision import check_precision, products
+
+SWITCH = torch.backends.cuda.matmul
+
+
+@pytest.mark.parametrize("before", ["none", "ieee", "tf32"])
+def test_the_switch_goes_back_to_what_it_was(before: str) -> None:
+    found = SWITCH.fp32_precision
+    try:
+        SWITCH.fp32_precision = before
+        with products("tf32"):
+            assert SWITCH.fp32_precision == "tf32"
+        assert SWITCH.fp32_precision == before
+        with pytest.raises(KeyError), products("tf32"):
+            raise KeyError
+        assert SWITCH.fp32_precision == before
+        for name in ("fp32", "bf16"):
+            with products(name):
+                assert SWITCH.fp32_precision == before
+    finally:
+        SWITCH.fp32_precision = found
+
+
+def test_who_is_refused() -> None:
+    for name in ("fp32", "bf16"):
+        check_precision(name, torch.device("cpu"))
+    check_precision("tf32", torch.device("cuda"))
+    check_precision("tf32")
+    with pytest.raises(ValueError, match="precision=tf32 needs device=cuda, not cpu"):
+        check_precision("tf32", torch.device("cpu"))
+    with pytest.raises(ValueError, match="precision is 'half'; choose fp32, bf16 or tf32"):
+        check_precision("half")
+
+
+def test_a_network_refuses_it_on_a_cpu() -> None:
+    network = MeshGraphNet(3, {"mesh": 2, "body": 2}, 4, "1x(mesh)")
+    network.use_precision("tf32")
+    with pytest.raises(ValueError, match="precision=tf32 needs device=cuda"):
+        network(None, torch.zeros(1, 3), {})
