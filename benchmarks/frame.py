@@ -1,10 +1,12 @@
-"""Where the time of a rollout's frame goes: body search, features, network, the rest.
+"""Where the time of a rollout's frame goes: body search, features, network, the rest; and what its metrics cost apart.
 
     python benchmarks/frame.py --sizes 1000 5000 12000 --models fine15 ours --precision fp32 bf16
 
 The embedded dress, refined to the given number of vertices, on the embedded body of 6,890 vertices, walking; random
 weights. Every frame starts from the garment skinned to the body's pose, so that contact is that of a worn garment whatever
-the weights predict. Medians over the frames of the process's CPU time [ms]; --precision takes turns frame by frame.
+the weights predict. Medians over the frames of the process's CPU time [ms]; --precision takes turns frame by frame. The
+share of the network is that of the total, which leaves out the metrics: contact with the body's triangles, strain,
+penetration and energies, what ``metrics=all`` adds to a frame (``hood rollout metrics=none`` spares them).
 """
 
 from __future__ import annotations
@@ -13,8 +15,6 @@ import argparse
 import os
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -25,34 +25,18 @@ from hood.assets.garment import Garment, load_garment
 from hood.assets.material import Material
 from hood.assets.sequence import load_sequence
 from hood.cli import ENVIRONMENT
+from hood.dynamics.measure import penetration_metrics, strain_metrics
+from hood.dynamics.rollout import energy_metrics
 from hood.dynamics.simulator import Simulator, build_simulator
 from hood.dynamics.stopwatch import Stopwatch
+from hood.losses.potential import default_potential
 from hood.losses.problem import StepProblem
 from hood.mesh.topology import unique_edges
 from hood.scene.scene import Scene, build_scene, recentre
 from hood.scene.state import State
 
-PARTS = ("posing", "search", "features", "network", "rest", "total")
-
-
-class CpuWatch(Stopwatch):
-    """Milliseconds of the process's CPU time by part."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.parts: dict[str, float] = {}
-        self.began = time.process_time()
-
-    @contextmanager
-    def part(self, name: str) -> Iterator[None]:
-        began = time.process_time()
-        yield
-        self.parts[name] = self.parts.get(name, 0.0) + 1e3 * (time.process_time() - began)
-
-    def done(self) -> dict[str, float]:
-        """Every part, ``rest`` and ``total``."""
-        total = 1e3 * (time.process_time() - self.began)
-        return {**self.parts, "rest": total - sum(self.parts.values()), "total": total}
+PARTS = ("posing", "search", "features", "network", "rest", "total", "metrics")
+POTENTIAL = default_potential()
 
 
 def refined(garment: Garment, count: int) -> Garment:
@@ -96,15 +80,20 @@ def make_scene(count: int) -> Scene:
 def time_frame(simulator: Simulator, scene: Scene, prepared: object, frame: int) -> dict[str, float]:
     """One step from the skinned garment at ``frame``; milliseconds by part."""
     state = recentre(scene.start(frame, relaxed=False), scene.cloth.vertex_scene)
-    watch = CpuWatch()
+    watch = Stopwatch(time.process_time)
     with watch.part("posing"):
-        step = scene.step_input(frame, state)
+        problem = StepProblem(scene.cloth, state, scene.step_input(frame, state), gravity=simulator.gravity)
     with watch.part("search"):
-        contact = simulator.find_contact(scene.cloth, state, step)
-    problem = StepProblem(scene.cloth, state, step, contact, simulator.gravity)
+        problem = simulator.search(problem)
     prediction = simulator.predict(problem, prepared, watch)  # type: ignore[arg-type]
     State(prediction.next_pos, simulator.next_velocity(problem, prediction), state.origin)
-    return watch.done()
+    times = watch.lap()
+    with watch.aside("metrics"):
+        known = POTENTIAL.prepare(problem)
+        strain_metrics(scene.cloth, state.pos)
+        penetration_metrics(known.contact, scene.cloth.num_vertices)
+        energy_metrics(POTENTIAL, known, prediction.next_pos, prediction.acc)
+    return {**times, "metrics": watch.spent_aside("metrics")}
 
 
 def run(size: int, model: str, precisions: list[str], frames: int) -> None:
@@ -136,7 +125,7 @@ def main() -> None:
     if any(os.environ.get(key) is None for key in ENVIRONMENT):  # read at process start only
         os.execve(sys.executable, [sys.executable, *sys.argv], {**ENVIRONMENT, **os.environ})
     torch.set_num_threads(args.threads)
-    print("| vertices | model | precision | " + " | ".join(PARTS) + " | network's share |\n" + "|---" * 10 + "|")
+    print("| vertices | model | precision | " + " | ".join(PARTS) + " | network's share |\n" + "|---" * 11 + "|")
     for size in args.sizes:
         for model in args.models:
             run(size, model, args.precision, args.frames)

@@ -6,10 +6,12 @@ Meshes are pairs (pos (V, 3) float64 [m], faces (F, 3) int64).
 from __future__ import annotations
 
 import itertools
+from dataclasses import fields, is_dataclass
+from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from hood.assets.material import Material
 from hood.losses.potential import Potential, Term
@@ -115,6 +117,27 @@ def plane_contact(pos: Tensor, normal: Tensor | None = None, height: float = 0.0
         next_point=point if motion is None else point + motion.to(pos),
         next_normal=normals,
     )
+
+
+def without_values(item: Any) -> Any:
+    """A tensor, a module (changed in place) or a record of such, without values and not on the CPU; under a FakeTensorMode."""
+    if isinstance(item, Tensor):
+        return torch.empty_strided(item.shape, item.stride(), dtype=item.dtype, device="meta")
+    if isinstance(item, dict):
+        return {name: without_values(value) for name, value in item.items()}
+    if isinstance(item, nn.Module):
+        for module in item.modules():
+            for name, parameter in module._parameters.items():
+                module._parameters[name] = None if parameter is None else nn.Parameter(without_values(parameter))
+            for name, buffer in module._buffers.items():
+                module._buffers[name] = None if buffer is None else without_values(buffer)
+        return item
+    if not is_dataclass(item):
+        return item
+    empty = object.__new__(type(item))
+    for field in fields(item):  # unlike replace() this leaves out checks, and what was computed from the values
+        object.__setattr__(empty, field.name, without_values(getattr(item, field.name)))
+    return empty
 
 
 #: What an energy of the cloth's own shape must attain in float64, see :func:`internal_energy_figures`.

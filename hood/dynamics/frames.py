@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from hood.losses.problem import StepProblem
-from hood.scene.contact import Contact, find_contact
 from hood.scene.scene import RELAXING_DT
 from hood.scene.state import State
 
@@ -44,9 +43,18 @@ class FrameRules:
     def enter(self, problem: StepProblem) -> StepProblem:
         """The step as the network sees it."""
         if self.frame_dt is not None:
-            _check_dt(problem.step.dt, self.frame_dt)
+            self.check(problem.step.dt)
             step = replace(problem.step, dt=torch.full_like(problem.step.dt, self.frame_dt))
             problem = replace(problem, step=step)
+        return self.stand(problem)
+
+    def check(self, dt: Tensor) -> None:
+        """Raise ValueError if the model cannot take steps of ``dt`` (B,) [s]."""
+        if self.frame_dt is not None:
+            _check_dt(dt, self.frame_dt)
+
+    def stand(self, problem: StepProblem) -> StepProblem:
+        """The problem with pinned vertices where the model has them; contact stays what it was at t."""
         return _pins_ahead(problem, self.velocity) if self.pins_ahead else problem
 
     def acceleration(self, problem: StepProblem, displacement: Tensor) -> Tensor:
@@ -77,24 +85,12 @@ def _check_dt(dt: Tensor, frame_dt: float) -> None:
 
 
 def _pins_ahead(problem: StepProblem, velocity: str) -> StepProblem:
-    """The problem with pinned vertices at their targets, and their nearest body vertices found there."""
-    cloth, state, step, contact = problem.cloth, problem.state, problem.step, problem.contact
+    """The problem with pinned vertices at their targets; contact stays what it was at t."""
+    cloth, state, step = problem.cloth, problem.state, problem.step
     pinned = cloth.pinned.unsqueeze(1)
     target = state.pos if step.pin_target is None else step.pin_target
     pos = torch.where(pinned, target, state.pos)
     vel = state.vel
     if velocity == "displacement":
         vel = torch.where(pinned, (pos - state.pos) / problem.vertex_dt, vel)
-    rows = cloth.pinned.nonzero().squeeze(1)
-    if contact is not None and step.obstacle is not None and len(rows):
-        contact = _with_rows(contact, rows, find_contact(pos[rows], cloth.vertex_scene[rows], step.obstacle))
-    return replace(problem, state=State(pos, vel, state.origin), contact=contact)
-
-
-def _with_rows(contact: Contact, rows: Tensor, part: Contact) -> Contact:
-    """Nearest body vertices of ``rows`` replaced: what body edges are made of."""
-    return replace(
-        contact,
-        vertex=contact.vertex.index_copy(0, rows, part.vertex),
-        vertex_dist=contact.vertex_dist.index_copy(0, rows, part.vertex_dist),
-    )
+    return replace(problem, state=State(pos, vel, state.origin))

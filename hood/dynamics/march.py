@@ -9,7 +9,7 @@ from torch import Tensor
 
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
-from hood.scene.contact import Contact, find_contact
+from hood.scene.contact import Contact
 from hood.scene.state import State, StepInput
 from hood.solver.newton import NewtonSettings, Report, minimize
 
@@ -39,16 +39,13 @@ def march(
 
     Args:
         step_input: by step; default the one of ``problem`` in every step.
-        contact: by step and state; default one search per step against the step's obstacle.
+        contact: by step and state; default, and where it gives None, one search per step against the step's obstacle.
         start: (V, 3) m, where a step's minimisation starts; default that of :func:`hood.solver.newton.minimize`.
     """
     state = problem.state
     for index in range(num_steps):
         step = problem.step if step_input is None else step_input(index)
-        if contact is not None:
-            found = contact(index, state)
-        else:
-            found = None if step.obstacle is None else find_contact(state.pos, problem.cloth.vertex_scene, step.obstacle)
+        found = None if contact is None else contact(index, state)
         now = potential.prepare(replace(problem, state=state, step=step, contact=found))
         pos, report = minimize(potential, now, None if start is None else start(now), settings)
         state = State(pos, state.vel + now.vertex_dt * report.acc, state.origin)

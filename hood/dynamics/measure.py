@@ -11,6 +11,9 @@ from hood.scene.contact import Contact
 #: A vertex deeper than this [m] inside the body counts as penetrating.
 PENETRATION_DEPTH = 2e-3
 
+STRAIN_METRICS = ("strain_p50", "strain_p99", "strain_max")
+PENETRATION_METRICS = ("penetration_count", "penetration_share", "penetration_depth")
+
 
 def edge_strain(cloth: Cloth, pos: Tensor) -> Tensor:
     """Relative length change of every edge, (E,), signed."""
@@ -42,6 +45,3 @@ def penetration_metrics(contact: Contact | None, num_vertices: int) -> dict[str,
         "penetration_share": count / max(num_vertices, 1),
         "penetration_depth": float(depth.max().clamp_min(0.0)) if num_vertices else 0.0,
     }
-
-
-METRICS = ("strain_p50", "strain_p99", "strain_max", "penetration_count", "penetration_share", "penetration_depth")

@@ -18,6 +18,8 @@ _REACH = 0.03
 class Output(ABC, nn.Module):
     """Turns raw network output into displacements [m] from a base position."""
 
+    needs_contact = False  # of the problem that ``base`` is asked for
+
     @abstractmethod
     def base(self, problem: StepProblem) -> Tensor:
         """Base positions (V, 3) [m]: what zero output means."""
@@ -53,6 +55,8 @@ class VelocityBaseOutput(Output):
     distance, then pushed ``clearance`` [m] out of the body at t + 1. Unlike x_t + dt v_t it does not carry the velocity's
     errors on, so that a rollout cannot feed them back.
     """
+
+    needs_contact = True
 
     def __init__(self, scale: float = 5e-3, clearance: float = 2e-3) -> None:
         super().__init__()

@@ -134,6 +134,7 @@ def read_rollout(path: Path) -> RolloutData:
     try:
         with h5py.File(path, "r") as file:
             done = int(file.attrs["num_frames"])
+            _check_extents(file, path.stat().st_size)
             return RolloutData(
                 cloth_pos=file["cloth/pos"][:done],
                 cloth_faces=file["cloth/faces"][:],
@@ -146,8 +147,17 @@ def read_rollout(path: Path) -> RolloutData:
             )
     except FileNotFoundError:
         raise
-    except (OSError, KeyError) as error:
-        raise ValueError(f"{path}: not a rollout file ({error}); make one with hood rollout") from error
+    except Exception as error:  # damaged files make h5py raise nearly anything
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ValueError(f"{path}: not a rollout file ({reason}); make one with hood rollout") from error
+
+
+def _check_extents(file: h5py.File, num_bytes: int) -> None:
+    """Rollouts are stored as they are: a table that claims more than the file holds would be read as empty memory."""
+    for name in ("cloth/pos", "cloth/faces", "cloth/rest_pos", "body/pos", "body/faces", "time"):
+        table = file[name]
+        if table.ndim == 0 or table.size * table.dtype.itemsize > num_bytes:
+            raise ValueError(f"{name} claims the shape {table.shape}, the file has {num_bytes} bytes")
 
 
 def _plain_error(error: OSError, path: Path) -> OSError:

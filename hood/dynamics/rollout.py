@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from hood.dynamics.measure import METRICS, penetration_metrics, strain_metrics
-from hood.dynamics.simulator import Prediction
+from hood.dynamics.measure import PENETRATION_METRICS, STRAIN_METRICS, penetration_metrics, strain_metrics
+from hood.dynamics.simulator import Prediction, Simulator
 from hood.dynamics.stepper import Stepper
 from hood.dynamics.stopwatch import Stopwatch
+from hood.graph.given import given_hierarchy
 from hood.losses.potential import Potential, relative_gradient, scale
 from hood.losses.problem import StepProblem, inertial_guess
 from hood.scene.contact import Contact, find_contact
@@ -35,20 +37,23 @@ class Frame:
     metrics: dict[str, float]
 
 
-def metric_names(potential: Potential, stepper: Stepper) -> tuple[str, ...]:
-    """Every metric a frame of a rollout can have."""
-    energies = tuple(f"energy_{name}" for name in potential.terms)
-    return (
-        *METRICS,
-        *energies,
+#: What is measured of a frame besides its time and what the stepper reports: strain, penetration and energies, strain
+#: alone, or nothing. Only ``all`` needs contact with the body's surface.
+METRIC_CHOICES = ("all", "strain", "none")
+
+
+def metric_names(potential: Potential, stepper: Stepper, metrics: str = "all") -> tuple[str, ...]:
+    """Every metric a frame of a rollout can have, for one of :data:`METRIC_CHOICES`."""
+    energies = (
+        *(f"energy_{name}" for name in potential.terms),
         "energy_total",
         "energy_inertial_guess",
         "gradient_norm",
         "relative_gradient",
         "e0",
-        *stepper.metrics,
-        *(f"ms_{part}" for part in stepper.times),
     )
+    measured = {"all": (*STRAIN_METRICS, *PENETRATION_METRICS, *energies), "strain": STRAIN_METRICS, "none": ()}
+    return (*measured[metrics], *stepper.metrics, *(f"ms_{part}" for part in stepper.times), "ms_metrics")
 
 
 @torch.no_grad()
@@ -61,50 +66,82 @@ def simulate(
     attachments: AttachmentSchedule | None = None,
     start_frame: int = 0,
     observe: Observer | None = None,
+    metrics: str = "all",
 ) -> Iterator[Frame]:
     """Frames 0, 1, … of the garment on the moving body.
 
     Frame 0 is the settled start after ``relaxing_steps`` relaxing steps (paper, section 3.4), vertices pushed out of the
     body. A frame's energies belong to the step that led to it, as do its times. The simulation goes on over non-finite
     frames, so that their number and place are seen. ``observe`` sees every step outside its time.
+
+    ``metrics`` is one of :data:`METRIC_CHOICES`. What only they need to know, contact included, is no part of the step and
+    changes nothing about it; its time is ``ms_metrics``, which ``ms_total`` leaves out as it does the caller's work.
+
+    Raises:
+        ValueError: ``metrics`` is none of the choices.
     """
+    if metrics not in METRIC_CHOICES:
+        raise ValueError(f"metrics is {metrics!r}; choose {', '.join(METRIC_CHOICES)}")
     count = scene.num_frames - start_frame if num_frames is None else min(num_frames, scene.num_frames - start_frame)
-    watch = Stopwatch()
-    prepared = stepper.prepare(scene.cloth, scene.garment.rest_pos)
+    prepared = prepare_stepper(stepper, scene)
     state = start_state(stepper, scene, potential, relaxing_steps, start_frame)
-    metrics: dict[str, float] = {}
+    stepped: dict[str, float] = {}
+    watch = Stopwatch()
     for index in range(count):
         body_frame = start_frame + index
         state = recentre(state, scene.cloth.vertex_scene)
-        watch.restart()
-        last = body_frame + 1 >= scene.num_frames
-        contact: Contact | None
-        if last:
-            contact = _contact_now(scene, state, body_frame)
-        else:
+        problem = None
+        if index + 1 < count:
             with watch.part("posing"):
                 closed = None if attachments is None else attachments(index)
                 step = scene.step_input(body_frame, state, attachments=closed)
+                problem = StepProblem(scene.cloth, state, step, gravity=stepper.gravity.to(state.pos))
             with watch.part("search"):
-                contact = stepper.find_contact(scene.cloth, state, step)
-        shared = {**strain_metrics(scene.cloth, state.pos), **penetration_metrics(contact, scene.cloth.num_vertices)}
-        origin = state.origin[0]
-        body_pos = scene.motion.surface(body_frame, origin.numpy()).cpu().double() + origin
-        yield Frame(index, state, state.pos.cpu().double() + origin, body_pos, {**shared, **metrics})
-        if index + 1 >= count:
+                problem = stepper.search(problem)
+        with watch.aside("metrics"):
+            known = potential.prepare(problem) if problem is not None and metrics == "all" else problem
+            row = {**_state_metrics(scene, state, body_frame, known, metrics), **stepped}
+        row["ms_metrics"] = watch.spent_aside("metrics")
+        with watch.aside("caller"):
+            origin = state.origin[0]
+            body_pos = scene.motion.surface(body_frame, origin.numpy()).cpu().double() + origin
+            yield Frame(index, state, state.pos.cpu().double() + origin, body_pos, row)
+        if problem is None or known is None:
             return
-        problem = potential.prepare(StepProblem(scene.cloth, state, step, contact, stepper.gravity.to(state.pos)))
-        # Metrics, what only they need to know of the step, and the caller's work are not part of the frame's time.
-        before = watch.lap()
         prediction = stepper.predict(problem, prepared, watch)
         state = State(prediction.next_pos, stepper.next_velocity(problem, prediction), state.origin)
-        times = {**watch.lap(), "search": before["search"]}
-        times["rest"] += before["posing"]
-        times["total"] += before["search"] + before["posing"]
-        metrics = {f"ms_{part}": times.get(part, 0.0) for part in stepper.times} | prediction.metrics
-        metrics |= energy_metrics(potential, problem, prediction.next_pos, prediction.acc)
+        stepped = _times(stepper, watch.lap()) | prediction.metrics
+        with watch.aside("metrics"):
+            if metrics == "all":
+                stepped |= energy_metrics(potential, known, prediction.next_pos, prediction.acc)
         if observe is not None:
-            observe(index + 1, problem, prediction)
+            with watch.aside("caller"):
+                observe(index + 1, known, prediction)
+
+
+def _times(stepper: Stepper, lap: dict[str, float]) -> dict[str, float]:
+    """The parts that the stepper names; the others (posing the body) go to its rest."""
+    times = {part: lap.get(part, 0.0) for part in stepper.times}
+    times["rest"] += sum(value for part, value in lap.items() if part not in times)
+    return {f"ms_{part}": value for part, value in times.items()}
+
+
+def _state_metrics(scene: Scene, state: State, frame: int, problem: StepProblem | None, metrics: str) -> dict[str, float]:
+    """Strain and penetration at ``frame``, as far as ``metrics`` asks for them; ``problem`` is the step from there."""
+    measured = {} if metrics == "none" else strain_metrics(scene.cloth, state.pos)
+    if metrics == "all":
+        contact = _contact_now(scene, state, frame) if problem is None else problem.with_contact().contact
+        measured |= penetration_metrics(contact, scene.cloth.num_vertices)
+    return measured
+
+
+def prepare_stepper(stepper: Stepper, scene: Scene) -> Any:
+    """What the stepper computes once per cloth. Coarse levels that came with the garment are used where there are enough."""
+    levels = scene.garment.coarse_edges
+    if isinstance(stepper, Simulator) and levels is not None and len(levels) >= stepper.num_coarse:
+        hierarchy = given_hierarchy(scene.cloth.num_vertices, levels, stepper.num_coarse)
+        return stepper.prepare(scene.cloth, scene.garment.rest_pos, hierarchy)
+    return stepper.prepare(scene.cloth, scene.garment.rest_pos)
 
 
 def start_state(stepper: Stepper, scene: Scene, potential: Potential, relaxing_steps: int, frame: int = 0) -> State:
@@ -112,19 +149,19 @@ def start_state(stepper: Stepper, scene: Scene, potential: Potential, relaxing_s
 
     A stepper with ``keeps_relaxing_step`` goes on from it as it left it, with its positions and its velocity.
     """
-    state = scene.start(frame, relaxed=False)
-    prepared = stepper.prepare(scene.cloth, scene.garment.rest_pos)
+    state = scene.start(frame, relaxed=False, thorough=True)
+    prepared = prepare_stepper(stepper, scene)
     velocity = scene.start_velocity(frame)
     for _ in range(relaxing_steps):
         step = scene.step_input(frame, state, relaxing=True)
-        contact = stepper.find_contact(scene.cloth, state, step)
-        problem = potential.prepare(StepProblem(scene.cloth, state, step, contact, stepper.gravity.to(state.pos)))
+        problem = stepper.search(StepProblem(scene.cloth, state, step, gravity=stepper.gravity.to(state.pos)))
         prediction = stepper.predict(problem, prepared)
         if stepper.keeps_relaxing_step:
             state = State(prediction.next_pos, state.vel, state.origin)
             velocity = stepper.next_velocity(problem, prediction)
             continue
         pos = push_out(scene.cloth, prediction.next_pos, step.obstacle, scene.clearance)
+        problem = potential.prepare(problem)
         if bool(torch.isfinite(pos).all()) and bool(
             (potential.total(problem, pos) < potential.total(problem, state.pos)).all()
         ):
@@ -149,6 +186,6 @@ def energy_metrics(potential: Potential, problem: StepProblem, next_pos: Tensor,
     return result
 
 
-def _contact_now(scene: Scene, state: State, frame: int) -> Contact:
+def _contact_now(scene: Scene, state: State, frame: int) -> Contact | None:
     obstacle = scene.motion.obstacle(frame, state.origin[0].numpy(), static=True)
-    return find_contact(state.pos, scene.cloth.vertex_scene, obstacle)
+    return None if obstacle is None else find_contact(state.pos, scene.cloth.vertex_scene, obstacle)

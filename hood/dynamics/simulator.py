@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,9 +11,10 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor, nn
 
+from hood.assets.atomic import write_atomically
 from hood.dynamics.frames import FrameRules
 from hood.dynamics.output import OUTPUTS, AccelerationOutput, Output, VelocityBaseOutput
 from hood.dynamics.stopwatch import Stopwatch, timed
@@ -25,10 +25,11 @@ from hood.graph.cache import cached_hierarchy
 from hood.graph.hierarchy import Hierarchy, concatenate_hierarchies
 from hood.losses.potential import default_potential
 from hood.losses.problem import StepProblem
+from hood.mesh.nearest import Nearest
 from hood.nn.model import MeshGraphNet
 from hood.nn.schedule import edge_set_names, parse_schedule, set_level
 from hood.scene.cloth import Cloth
-from hood.scene.contact import Contact, find_contact
+from hood.scene.contact import find_nearest
 from hood.scene.state import State, StepInput
 
 _FORMAT = "hood-1"
@@ -121,25 +122,47 @@ class Simulator(nn.Module):
         hierarchy = concatenate_hierarchies([item.hierarchy for item in prepared], vertex_counts)
         return Prepared(hierarchy, build_static(cloth, hierarchy, self.network.edge_set_names))
 
-    def find_contact(self, cloth: Cloth, state: State, step: StepInput) -> Contact | None:
-        """The step's one contact search; None without a body."""
-        return None if step.obstacle is None else find_contact(state.pos, cloth.vertex_scene, step.obstacle)
+    @property
+    def needs_contact(self) -> bool:
+        """Whether the step asks for contact with the body's surface; the paper's needs the nearest body vertices alone."""
+        return self.output.needs_contact or any(group.needs_contact for group in self.features.node)
+
+    def search(self, problem: StepProblem) -> StepProblem:
+        """The problem with its contact where the step needs it; :meth:`predict` does so if it has not been done."""
+        return problem.with_contact() if self.needs_contact else problem
+
+    def nearest(self, problem: StepProblem, seen: StepProblem) -> Nearest | None:
+        """Nearest body vertices of the positions the network sees: those of the contact, where that is of the same ones."""
+        obstacle = seen.step.obstacle
+        if obstacle is None:
+            return None
+        if seen.contact is not None and seen.state is problem.state:
+            return seen.contact.nearest
+        return find_nearest(seen.cloth, seen.state.pos, obstacle, self.body_radius)
 
     def predict(self, problem: StepProblem, prepared: Prepared, watch: Stopwatch | None = None) -> Prediction:
         """Positions at t + 1. Pinned vertices reach their targets exactly, massless ones stay where they are."""
         assert prepared.static is not None
         cloth, step = problem.cloth, problem.step
+        with timed(watch, "search"):
+            problem = self.search(problem)
+            seen = self.rules.enter(problem)
+            nearest = self.nearest(problem, seen)
         with timed(watch, "features"):
             with torch.no_grad():
-                seen = self.rules.enter(problem)
                 base = self.output.base(seen)
                 residual = self._residual_acceleration(seen, base) if self._wants_residual else None
-                graph = build_graph(prepared.static, seen.step, seen.contact, self.body_radius)
+                graph = build_graph(prepared.static, seen.step, nearest, self.body_radius)
                 guess = base if self._wants_base else None
                 inputs = Inputs(cloth, seen.state, seen.step, seen.contact, graph, guess, residual, timestep=step.dt)
             nodes, edges = self.features(inputs)
         with timed(watch, "network"):
             raw = self.network(graph, nodes, edges)
+        return self.integrate(problem, base, raw)
+
+    def integrate(self, problem: StepProblem, base: Tensor, raw: Tensor) -> Prediction:
+        """Positions at t + 1 from the network's output ``raw`` (V, 3), which is relative to ``base`` (V, 3) [m]."""
+        cloth, step = problem.cloth, problem.step
         free = cloth.free.unsqueeze(1)
         displacement = self.output.displacement(raw)
         fixed = problem.state.pos
@@ -163,7 +186,7 @@ class Simulator(nn.Module):
 
     def step(self, cloth: Cloth, prepared: Prepared, state: State, step: StepInput) -> State:
         """The state at t + 1."""
-        problem = StepProblem(cloth, state, step, self.find_contact(cloth, state, step), self.gravity.to(state.pos))
+        problem = StepProblem(cloth, state, step, gravity=self.gravity.to(state.pos))
         prediction = self.predict(problem, prepared)
         return State(prediction.next_pos, self.next_velocity(problem, prediction), state.origin)
 
@@ -268,14 +291,7 @@ def save_simulator(path: Path, simulator: Simulator, metadata: Mapping[str, str]
         for name, value in simulator.state_dict().items()
     }
     header = {"format": _FORMAT, "model": json.dumps(simulator.config), **(metadata or {})}
-    temporary = path.with_name(path.name + ".partial")
-    try:
-        save_file(tensors, temporary, header)
-        temporary.chmod(0o644)  # safetensors makes files that only their owner can read
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    write_atomically(path, save(tensors, header))
 
 
 def load_simulator(path: Path) -> Simulator:

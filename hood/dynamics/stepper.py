@@ -13,8 +13,6 @@ from hood.dynamics.stopwatch import Stopwatch, timed
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
 from hood.scene.cloth import Cloth
-from hood.scene.contact import Contact, find_contact
-from hood.scene.state import State, StepInput
 from hood.solver.newton import NewtonSettings, minimize
 
 
@@ -35,8 +33,8 @@ class Stepper(Protocol):
         """What is computed once per cloth."""
         ...
 
-    def find_contact(self, cloth: Cloth, state: State, step: StepInput) -> Contact | None:
-        """The step's one contact search; None without a body."""
+    def search(self, problem: StepProblem) -> StepProblem:
+        """The problem with the contact, if the step itself needs it: itself where that is there already or not needed."""
         ...
 
     def predict(self, problem: StepProblem, prepared: Any, watch: Stopwatch | None = None) -> Prediction:
@@ -66,15 +64,14 @@ class NewtonStepper:
     def prepare(self, cloth: Cloth, rest_pos: Any) -> None:
         """Nothing: the solver keeps its plan of a cloth itself."""
 
-    def find_contact(self, cloth: Cloth, state: State, step: StepInput) -> Contact | None:
-        """The step's one contact search, with what the potential adds to it; None without a body."""
-        if step.obstacle is None:
-            return None
-        contact = find_contact(state.pos, cloth.vertex_scene, step.obstacle)
-        return self.potential.prepare(StepProblem(cloth, state, step, contact, self.gravity)).contact
+    def search(self, problem: StepProblem) -> StepProblem:
+        """The problem with what the potential's terms ask of it."""
+        return self.potential.prepare(problem)
 
     def predict(self, problem: StepProblem, prepared: None, watch: Stopwatch | None = None) -> Prediction:
         """The minimum next to the contact-projected inertial guess."""
+        with timed(watch, "search"):
+            problem = self.search(problem)
         with timed(watch, "solver"):
             pos, report = minimize(self.potential, problem, settings=self.settings)
         reached = {"solver_iterations": float(report.iterations), "solver_converged": float(bool(report.converged.all()))}

@@ -18,7 +18,6 @@ from hood.assets.material import RANGES
 from hood.features.inputs import Inputs
 from hood.features.normalizer import RunningNormalizer
 from hood.graph.builder import BODY
-from hood.mesh import geometry
 
 # Types of the reference implementation. Omitted body vertices (2) never carry an edge and so never become nodes.
 CLOTH_TYPE, BODY_TYPE, PINNED_TYPE = 0, 1, 3
@@ -29,6 +28,7 @@ class NodeGroup(nn.Module):
 
     width: int
     normalized = True
+    needs_contact = False  # reads ``inputs.contact``, or what was computed with it
 
     def cloth(self, inputs: Inputs) -> Tensor:
         raise NotImplementedError
@@ -41,6 +41,10 @@ class NodeGroup(nn.Module):
         cloth = self.cloth(inputs)
         return cloth if inputs.num_body == 0 else torch.cat([cloth, self.body(inputs)])
 
+    def columns(self, inputs: Inputs) -> Sequence[Tensor]:
+        """The same as a list of one."""
+        return (self(inputs),)
+
 
 class EdgeGroup(nn.Module):
     """Columns of the cloth edge features (rows: ``inputs.edges``) or the body edge features (``inputs.body_edges``)."""
@@ -51,6 +55,10 @@ class EdgeGroup(nn.Module):
     def forward(self, inputs: Inputs) -> Tensor:
         """(N, width)."""
         raise NotImplementedError
+
+    def columns(self, inputs: Inputs) -> Sequence[Tensor]:
+        """The same in parts: spares a group of many rows the copy that puts its own together."""
+        return (self(inputs),)
 
 
 # ---- the paper's node features, in its order -------------------------------------------------------------------------
@@ -114,7 +122,7 @@ class Normal(NodeGroup):
     width = 3
 
     def cloth(self, inputs: Inputs) -> Tensor:
-        return geometry.vertex_normals(inputs.state.pos, inputs.cloth.faces)
+        return inputs.cloth_normal
 
     def body(self, inputs: Inputs) -> Tensor:
         return inputs.body_normal
@@ -189,7 +197,11 @@ class CurrentRelative(EdgeGroup):
     width = 4
 
     def forward(self, inputs: Inputs) -> Tensor:
-        return with_norm(cloth_difference(inputs.state.pos, inputs))
+        return torch.cat(self.columns(inputs), dim=1)
+
+    def columns(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
+        vector = cloth_difference(inputs.state.pos, inputs)
+        return vector, vector.norm(dim=1, keepdim=True)
 
 
 class RestRelative(EdgeGroup):
@@ -207,7 +219,7 @@ class EdgeTimestep(EdgeGroup):
     width = 1
 
     def forward(self, inputs: Inputs) -> Tensor:
-        return inputs.node_timestep[inputs.edges.receivers].unsqueeze(1)
+        return inputs.edge_timestep(inputs.edges.receivers)
 
 
 class EdgeMaterial(EdgeGroup):
@@ -243,16 +255,16 @@ class BodyTimestep(EdgeGroup):
     width = 1
 
     def forward(self, inputs: Inputs) -> Tensor:
-        return inputs.node_timestep[inputs.body_edges.receivers].unsqueeze(1)
+        return inputs.edge_timestep(inputs.body_edges.receivers)
 
 
 def cloth_difference(pos: Tensor, inputs: Inputs) -> Tensor:
-    return pos.index_select(0, inputs.edges.senders) - pos.index_select(0, inputs.edges.receivers)
+    return pos.index_select(0, inputs.edges.senders).sub_(pos.index_select(0, inputs.edges.receivers))
 
 
 def body_difference(cloth_pos: Tensor, body_pos: Tensor, inputs: Inputs) -> Tensor:
     pos = torch.cat([cloth_pos, inputs.body(body_pos)])
-    return pos.index_select(0, inputs.body_edges.senders) - pos.index_select(0, inputs.body_edges.receivers)
+    return pos.index_select(0, inputs.body_edges.senders).sub_(pos.index_select(0, inputs.body_edges.receivers))
 
 
 def with_norm(vector: Tensor) -> Tensor:
@@ -302,15 +314,17 @@ class FeatureSet(nn.Module):
             edges[BODY] = self._assemble(self.body_edge, self.body_edge_normalizer, inputs)
         else:
             edges[BODY] = nodes.new_zeros(0, self.edge_widths[BODY])
+            if self.body_edge_normalizer is not None:
+                # No rows count as nothing, but processes that share a batch all have to be heard.
+                self.body_edge_normalizer(edges[BODY][:, : self.body_edge_normalizer.width])
         return nodes, edges
 
     @staticmethod
-    def _assemble(groups: nn.ModuleList, normalizer: RunningNormalizer | None, inputs: Inputs) -> Tensor:
-        values = torch.cat([group(inputs) for group in groups], dim=1)
+    def _assemble(groups: Iterable[Any], normalizer: RunningNormalizer | None, inputs: Inputs) -> Tensor:
+        values = torch.cat([part for group in groups for part in group.columns(inputs)], dim=1)
         if normalizer is None:
             return values
-        width = normalizer.width
-        return torch.cat([normalizer(values[:, :width]), values[:, width:]], dim=1)
+        return normalizer.leading(values)
 
 
 def _width(groups: Iterable[Any]) -> int:

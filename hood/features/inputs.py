@@ -11,7 +11,9 @@ import torch
 from torch import Tensor
 
 from hood.graph.builder import BODY, MESH, EdgeSet, Graph
+from hood.graph.fixed import FixedGraph
 from hood.mesh import geometry
+from hood.mesh.proximity import build_incidence
 from hood.scene.cloth import Cloth
 from hood.scene.contact import Contact
 from hood.scene.state import Obstacle, State, StepInput
@@ -49,6 +51,7 @@ class Inputs:
         residual: (V, 3) [m/s²] acceleration that the potential's gradient at the base asks for.
         timestep: (B,) [s] value of the timestep feature; None for the step's dt. It is how the relaxing first step of
             a rollout is told to the network (paper, α in section 4.3).
+        edge_rows: the table :attr:`edges` where it is known already; made or recognised from an earlier step otherwise.
     """
 
     cloth: Cloth
@@ -59,6 +62,7 @@ class Inputs:
     base_pos: Tensor | None = None
     residual: Tensor | None = None
     timestep: Tensor | None = None
+    edge_rows: EdgeRows | None = None
 
     @property
     def num_cloth(self) -> int:
@@ -94,6 +98,12 @@ class Inputs:
         timestep = self.step.dt if self.timestep is None else self.timestep
         return timestep.to(self.state.pos.dtype)[self.node_scene]
 
+    def edge_timestep(self, receivers: Tensor) -> Tensor:
+        """The same of edges with these ``receivers`` (N,): (N, 1)."""
+        if self.cloth.num_scenes == 1:
+            return self.node_timestep[:1].unsqueeze(1).expand(len(receivers), 1)
+        return self.node_timestep.index_select(0, receivers).unsqueeze(1)
+
     @cached_property
     def vertex_dt(self) -> Tensor:
         """True dt of every cloth vertex [s], (V, 1): turns velocities into displacements per frame."""
@@ -110,18 +120,25 @@ class Inputs:
         return self._body_normals(self.obstacle.next_pos)
 
     @cached_property
-    def _active_faces(self) -> Tensor:
-        """Body faces around active vertices: a garment touches a part of the body, the rest needs no normals."""
-        active = torch.zeros(len(self.obstacle.pos), dtype=torch.bool, device=self.obstacle.pos.device)
-        active[self.graph.body_vertex] = True
-        return self.obstacle.faces[active[self.obstacle.faces].any(dim=1)]
+    def cloth_normal(self) -> Tensor:
+        """Area-weighted vertex normals of the cloth at t, (V, 3)."""
+        pos, faces = self.state.pos, self.cloth.faces
+        if isinstance(self.graph, FixedGraph):
+            return geometry.vertex_normals(pos, faces)
+        incidence = build_incidence(faces, len(pos))
+        return geometry.normals_of_fans(pos, faces, incidence.around, incidence.first)
 
     def _body_normals(self, pos: Tensor) -> Tensor:
-        return geometry.vertex_normals(pos, self._active_faces)[self.graph.body_vertex]
+        faces = self.obstacle.faces
+        if isinstance(self.graph, FixedGraph):
+            # Faces that may be data of a step that is traced: nothing to look up a table with.
+            return self.body(geometry.vertex_normals(pos, faces))
+        incidence = build_incidence(faces, len(pos))
+        return geometry.normals_of_fans(pos, faces, incidence.around, incidence.first, self.graph.body_vertex)
 
     def body(self, values: Tensor) -> Tensor:
         """Rows of an obstacle field (W, …) at the active body vertices."""
-        return values[self.graph.body_vertex]
+        return values.index_select(0, self.graph.body_vertex)
 
     @property
     def body_edges(self) -> EdgeSet:
@@ -134,19 +151,22 @@ class Inputs:
     @cached_property
     def edges(self) -> EdgeRows:
         """All cloth edge sets in the order of :attr:`cloth_sets`."""
+        if self.edge_rows is not None:
+            return self.edge_rows
         cloth, sets = self.cloth, [self.graph.edge_sets[name] for name in self.cloth_sets]
         of_sets = [x for s in sets for x in (s.senders, s.receivers, s.source)]
         of_cloth = [cloth.rest_pos, cloth.vertex_scene, cloth.vertex_fabric, cloth.edge_fabric]
         if torch.is_inference_mode_enabled() or any(x.requires_grad for x in of_cloth):
-            return self._edge_rows()  # of no use to a later step: inference tensors, or a graph already walked
+            return self.make_edge_rows()  # of no use to a later step: inference tensors, or a graph already walked
         key = [(x, x._version) for x in of_sets + of_cloth]
         for known, rows in _recent_rows:
             if len(known) == len(key) and all(a is b and i == j for (a, i), (b, j) in zip(known, key, strict=True)):
                 return rows
-        _recent_rows.append((key, self._edge_rows()))
+        _recent_rows.append((key, self.make_edge_rows()))
         return _recent_rows[-1][1]
 
-    def _edge_rows(self) -> EdgeRows:
+    def make_edge_rows(self) -> EdgeRows:
+        """The table :attr:`edges`, made anew."""
         sets = [self.graph.edge_sets[name] for name in self.cloth_sets]
         senders, receivers = torch.cat([s.senders for s in sets]), torch.cat([s.receivers for s in sets])
         scene = self.cloth.vertex_scene[receivers]

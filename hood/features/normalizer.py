@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -15,6 +15,9 @@ class RunningNormalizer(nn.Module):
     γ^(T − t), divided by the sum of all weights (bias correction), so the first calls are not pulled towards zero.
     γ = 1 keeps the plain mean over calls. Sums are kept in float64 and travel in the state dict. Nothing accumulates in
     evaluation mode, after :meth:`freeze` or for calls without rows.
+
+    Where several processes share a batch, ``shared_sum`` adds up their moments: all of them then hold the statistics of the
+    whole batch, provided that all of them make every call, also those without rows.
 
     Until ``min_updates`` calls the module is the identity. Channels that have been constant so far are centred only:
     dividing by a vanishing deviation would blow up the first value that differs. With ``divisor_floor`` every channel is
@@ -44,6 +47,7 @@ class RunningNormalizer(nn.Module):
             raise ValueError(f"normaliser: divisor_floor is {divisor_floor}; it must be > 0")
         self.width, self.decay, self.floor, self.min_updates = width, decay, floor, min_updates
         self.divisor_floor = divisor_floor
+        self.shared_sum: Callable[[Tensor], Tensor] | None = None
         self.register_buffer("weight", torch.zeros((), dtype=torch.float64))
         self.register_buffer("first", torch.zeros(width, dtype=torch.float64))
         self.register_buffer("second", torch.zeros(width, dtype=torch.float64))
@@ -57,6 +61,15 @@ class RunningNormalizer(nn.Module):
         mean, std = self.statistics(x.dtype)
         return (x - mean) / std
 
+    def leading(self, x: Tensor) -> Tensor:
+        """:meth:`forward` of the first columns of a wider table (N, ≥ width), written into it; the others stay."""
+        part = x[:, : self.width]
+        if self.training and not self.frozen:
+            self.update(part)
+        mean, std = self.statistics(x.dtype)
+        part.sub_(mean).div_(std)
+        return x
+
     def inverse(self, y: Tensor) -> Tensor:
         """Undo :meth:`forward` without counting: y·σ + mean."""
         mean, std = self.statistics(y.dtype)
@@ -65,13 +78,19 @@ class RunningNormalizer(nn.Module):
     @torch.no_grad()
     def update(self, x: Tensor) -> None:
         """Count the rows of ``x`` (N, width) as one call."""
-        if x.shape[0] == 0:
-            return
         rows = x.detach().double()
+        moments = torch.cat([rows.new_tensor([len(rows)]), rows.sum(dim=0), rows.square().sum(dim=0)])
+        count = len(rows)
+        if self.shared_sum is not None:
+            moments = self.shared_sum(moments)
+            count = int(moments[0])
+        if count == 0:
+            return
         fresh = 1.0 - self.decay if self.decay < 1 else 1.0
         self.weight.mul_(self.decay).add_(fresh)
-        self.first.mul_(self.decay).add_(rows.mean(dim=0), alpha=fresh)
-        self.second.mul_(self.decay).add_(rows.square().mean(dim=0), alpha=fresh)
+        first, second = (moments[1:] / moments[0]).split(self.width)
+        self.first.mul_(self.decay).add_(first, alpha=fresh)
+        self.second.mul_(self.decay).add_(second, alpha=fresh)
         self.num_updates += 1
 
     def statistics(self, dtype: torch.dtype) -> tuple[Tensor, Tensor]:

@@ -44,6 +44,7 @@ class Residual(NodeGroup):
     """asinh(residual/g): the acceleration that the potential asks for at the base; 0 if not given and on the body."""
 
     width = 3
+    needs_contact = True
 
     def __init__(self, scale: float = GRAVITY) -> None:
         super().__init__()
@@ -90,6 +91,7 @@ class ContactDistance(NodeGroup):
     normal there; without contact the full reach and no direction. Body rows hold their own normal."""
 
     width = 4
+    needs_contact = True
 
     def __init__(self, reach: float = 0.05, scale: float = 0.02) -> None:
         super().__init__()

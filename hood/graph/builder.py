@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from hood.graph.hierarchy import Hierarchy
+from hood.mesh.nearest import Nearest
 from hood.scene.cloth import Cloth
-from hood.scene.contact import Contact
 from hood.scene.state import Attachments, Obstacle, StepInput
 
 MESH = "mesh"
@@ -173,7 +173,7 @@ def build_static(cloth: Cloth, hierarchy: Hierarchy, names: Sequence[str]) -> St
 def build_graph(
     static: StaticGraph,
     step: StepInput,
-    contact: Contact | None = None,
+    nearest: Nearest | None = None,
     radius: float = 0.03,
     active_edges: Tensor | None = None,
 ) -> Graph:
@@ -182,14 +182,14 @@ def build_graph(
     Args:
         static: the cloth's static part.
         step: its closed ``attachments`` join the mesh edges; its ``obstacle`` tells which body vertices are omitted.
-        contact: nearest body vertices; None without a body.
+        nearest: nearest body vertices of the cloth's; None without a body.
         radius: body edges are kept where the nearest body vertex is closer than this [m] (paper: 3 cm).
         active_edges: (E,) bool, mesh edges that exist in this step; None for all of them.
     """
     sets = dict(static.edge_sets)
     if MESH in sets:
-        sets[MESH] = _mesh_set(static, step.attachments, active_edges)
-    cloth_node, body_vertex = _body_pairs(static, step.obstacle, contact, radius)
+        sets[MESH] = mesh_set(static, step.attachments, active_edges)
+    cloth_node, body_vertex = _body_pairs(static, step.obstacle, nearest, radius)
     body_vertex, compact = torch.unique(body_vertex, return_inverse=True)
     pairs = torch.stack([cloth_node, static.num_cloth + compact], dim=1)
     body = edge_set(pairs)
@@ -200,7 +200,8 @@ def build_graph(
     return Graph(static.num_cloth, body_vertex, sets, subsets, static.node_level, static.mesh_edges.shape[0])
 
 
-def _mesh_set(static: StaticGraph, attachments: Attachments | None, active_edges: Tensor | None) -> EdgeSet:
+def mesh_set(static: StaticGraph, attachments: Attachments | None, active_edges: Tensor | None) -> EdgeSet:
+    """Mesh edges that exist in a step (all of them if ``active_edges`` is None) and the attachments closed in it."""
     closed = attachments is not None and bool(attachments.active.any())
     if active_edges is None and not closed:
         return static.edge_sets[MESH]
@@ -217,17 +218,17 @@ def _mesh_set(static: StaticGraph, attachments: Attachments | None, active_edges
 
 
 def _body_pairs(
-    static: StaticGraph, obstacle: Obstacle | None, contact: Contact | None, radius: float
+    static: StaticGraph, obstacle: Obstacle | None, nearest: Nearest | None, radius: float
 ) -> tuple[Tensor, Tensor]:
     """Cloth node and body vertex of every body edge; omitted vertices drop out after the search, not before it."""
-    if obstacle is None or contact is None:
+    if obstacle is None or nearest is None:
         none = static.node_level.new_zeros(0)
         return none, none
-    near = contact.vertex_dist < radius
+    near = nearest.dist < radius
     if obstacle.omitted is not None:
-        near = near & ~obstacle.omitted[contact.vertex]
+        near = near & ~obstacle.omitted[nearest.vertex]
     cloth_node = near.nonzero().squeeze(1)
-    return cloth_node, contact.vertex[cloth_node]
+    return cloth_node, nearest.vertex[cloth_node]
 
 
 def _subset(edges: EdgeSet, keep: Tensor) -> Subset:

@@ -43,8 +43,12 @@ class Collision:
         """The same term with another weight, for a ramp during training."""
         return type(self)(weight, self.epsilon)
 
+    def prepare(self, problem: StepProblem) -> StepProblem:
+        """The problem with its contact searched for, once per step."""
+        return problem.with_contact()
+
     def applies(self, problem: StepProblem) -> bool:
-        return problem.contact is not None
+        return problem.searched_contact is not None
 
     def planes(self, problem: StepProblem) -> Planes:
         """The planes that d is measured from; the problem must have a contact."""
@@ -77,6 +81,7 @@ class CentroidCollision(Collision):
 
     def prepare(self, problem: StepProblem) -> StepProblem:
         """The problem with the centroid search done, once per step."""
+        problem = super().prepare(problem)
         if problem.contact is None or isinstance(problem.contact, CentroidContact):
             return problem
         obstacle = problem.step.obstacle

@@ -30,8 +30,12 @@ class LaggedFriction:
         self.coefficient = coefficient
         self.slip_speed = slip_speed
 
+    def prepare(self, problem: StepProblem) -> StepProblem:
+        """The problem with its contact searched for, once per step, if there is friction."""
+        return problem.with_contact() if self.coefficient > 0 else problem
+
     def applies(self, problem: StepProblem) -> bool:
-        return problem.contact is not None and self.coefficient > 0
+        return self.coefficient > 0 and problem.searched_contact is not None
 
     def normal_force(self, problem: StepProblem, contact: Contact) -> Tensor:
         """Lagged normal forces N [N], shape (V,)."""

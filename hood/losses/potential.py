@@ -55,9 +55,9 @@ class Potential:
         return Potential({**self.terms, **terms})
 
     def prepare(self, problem: StepProblem) -> StepProblem:
-        """The problem with what the terms found out about it, once per step: call it where a problem is made.
+        """The problem with what the terms found out about it, once per step: call it before the first energy.
 
-        The problem itself, unless a term asks for more than the contact that features and terms share.
+        The problem itself where no term asks for more than it holds; contact that is there already is not searched again.
         """
         for term in self.terms.values():
             if isinstance(term, PreparedTerm):

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
 from hood.scene.cloth import Cloth
-from hood.scene.contact import Contact
+from hood.scene.contact import Contact, find_contact
 from hood.scene.state import State, StepInput
 
 #: Standard gravity [m/s²], y up.
@@ -21,7 +21,10 @@ def _standard_gravity() -> Tensor:
 
 @dataclass(frozen=True)
 class StepProblem:
-    """One implicit step t → t+1 of B scenes; everything in it is constant while the next positions vary."""
+    """One implicit step t → t+1 of B scenes; everything in it is constant while the next positions vary.
+
+    ``contact`` is None without a body, and until somebody who needs it asks for :meth:`with_contact`.
+    """
 
     cloth: Cloth
     state: State
@@ -38,6 +41,24 @@ class StepProblem:
     @property
     def num_scenes(self) -> int:
         return self.cloth.num_scenes
+
+    def with_contact(self) -> StepProblem:
+        """The problem with its contact, searched for at x_t; itself where that has been done or there is no body."""
+        obstacle = self.step.obstacle
+        if self.contact is not None or obstacle is None:
+            return self
+        return replace(self, contact=find_contact(self.state.pos, self.cloth.vertex_scene, obstacle))
+
+    @property
+    def searched_contact(self) -> Contact | None:
+        """``contact``, demanded: None without a body only.
+
+        Raises:
+            ValueError: there is a body, but nobody searched for its contact.
+        """
+        if self.contact is None and self.step.obstacle is not None:
+            raise ValueError("step problem: contact not searched for yet; pass the problem through Potential.prepare once")
+        return self.contact
 
     @property
     def vertex_dt(self) -> Tensor:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 #: A triangle counts as degenerate when the sine between its edges is below this many units of rounding.
 _DEGENERATE_ULPS = 8.0
@@ -15,8 +16,7 @@ _DEGENERATE_ULPS = 8.0
 
 def triangle_areas(pos: Tensor, faces: Tensor) -> Tensor:
     """Triangle areas [m²], shape (F,). Zero, with zero gradient, for degenerate faces."""
-    cross, _ = _face_cross(pos, faces)
-    return 0.5 * _safe_norm(cross)
+    return 0.5 * _safe_norm(_cross(pos, faces))
 
 
 def face_normals(pos: Tensor, faces: Tensor) -> Tensor:
@@ -28,13 +28,26 @@ def face_normals(pos: Tensor, faces: Tensor) -> Tensor:
 
 def vertex_normals(pos: Tensor, faces: Tensor) -> Tensor:
     """Area-weighted unit normals (V, 3); zero where undefined (isolated vertex, cancelling faces)."""
-    cross, _ = _face_cross(pos, faces)
+    cross = _cross(pos, faces)
     total = pos.new_zeros(pos.shape)
     for corner in range(3):
         total = total.index_add(0, faces[:, corner], cross)
-    length = _safe_norm(total)
-    defined = length > torch.finfo(pos.dtype).tiny
-    return torch.where(defined, 1.0 / torch.where(defined, length, 1.0), 0.0).unsqueeze(1) * total
+    return _unit(total)
+
+
+def normals_of_fans(pos: Tensor, faces: Tensor, around: Tensor, first: Tensor, rows: Tensor | None = None) -> Tensor:
+    """The same where the faces at every vertex are known, of the vertices ``rows`` (N,) or of all of them.
+
+    Sums have a fixed order also on an accelerator, where those of :func:`vertex_normals` come as they come.
+
+    Args:
+        pos: (V, 3).
+        faces: (F, 3).
+        around: (3F,) faces by vertex (:class:`hood.mesh.proximity.Incidence`).
+        first: (V,) where those of each vertex begin.
+    """
+    total = functional.embedding_bag(around, _cross(pos, faces), first, mode="sum")
+    return _unit(total if rows is None else total.index_select(0, rows))
 
 
 def vertex_masses(rest_pos: Tensor, faces: Tensor, density: Tensor | float) -> Tensor:
@@ -101,12 +114,29 @@ def rest_inverse(rest_pos: Tensor, faces: Tensor) -> Tensor:
     return torch.stack(rows, dim=1).reshape(-1, 2, 2)
 
 
+def _edges(pos: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
+    """The edges x₁ - x₀ and x₂ - x₀ of every face, each (F, 3)."""
+    first, second, third = (pos.index_select(0, corner) for corner in faces.unbind(dim=1))
+    return second.sub_(first), third.sub_(first)
+
+
+def _cross(pos: Tensor, faces: Tensor) -> Tensor:
+    """Cross product of the edges x₁ - x₀ and x₂ - x₀, (F, 3)."""
+    return torch.linalg.cross(*_edges(pos, faces))
+
+
 def _face_cross(pos: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
-    """Cross product of the edges x₁ - x₀ and x₂ - x₀ (F, 3), and which faces are not degenerate (F,) bool."""
-    corners = pos.index_select(0, faces.reshape(-1)).view(-1, 3, 3)
-    e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    """The same, and which faces are not degenerate (F,) bool."""
+    e1, e2 = _edges(pos, faces)
     cross = torch.linalg.cross(e1, e2)
     return cross, _regular(cross, (e1 * e1).sum(dim=1), e2)
+
+
+def _unit(vectors: Tensor) -> Tensor:
+    """Vectors (N, 3) divided by their lengths; zero where that is nothing."""
+    length = _safe_norm(vectors)
+    defined = length > torch.finfo(vectors.dtype).tiny
+    return torch.where(defined, 1.0 / torch.where(defined, length, 1.0), 0.0).unsqueeze(1) * vectors
 
 
 def _regular(cross: Tensor, first_sq: Tensor, second: Tensor) -> Tensor:

@@ -48,6 +48,8 @@ class Incidence(NamedTuple):
     following: Tensor  # (W, K)
     preceding: Tensor  # (W, K)
     valence: Tensor  # (W,) number of incident faces
+    around: Tensor  # (3G,) incident faces without padding, vertex by vertex
+    first: Tensor  # (W,) where those of each vertex begin
     face_edges: Tensor  # (G, 3) the edge opposite each corner
     edge_faces: Tensor  # (E, M) faces at an edge, -1 where there is none
 
@@ -76,7 +78,8 @@ class _Fans(NamedTuple):
         return _span(edges[:3], edges[3:])
 
 
-_incidence_cache: deque[tuple[Tensor, int, Incidence]] = deque(maxlen=8)
+#: Of a tensor of faces: itself and its version, what it held, the number of vertices, and what was found.
+_incidence_cache: deque[tuple[Tensor, int | None, Tensor, int, Incidence]] = deque(maxlen=8)
 
 
 @torch.no_grad()
@@ -149,20 +152,28 @@ def closest_point_on_triangles(points: Tensor, corners: Tensor) -> Tensor:
 
 def build_incidence(faces: Tensor, num_vertices: int) -> Incidence:
     """Connectivity of ``faces`` (G, 3). Recent results are kept and recognised by the content."""
-    for known, count, incidence in _incidence_cache:
+    # The same tensor is recognised without looking at what it holds: on an accelerator the host would wait for that.
+    version = None if faces.is_inference() else faces._version  # tensors of inference mode do not count their changes
+    for given, seen, _, count, incidence in _incidence_cache:
+        if given is faces and seen == version is not None and count == num_vertices:
+            return incidence
+    for _, _, known, count, incidence in _incidence_cache:
         if count == num_vertices and known.device == faces.device and torch.equal(known, faces):
+            _incidence_cache.append((faces, version, known, count, incidence))
             return incidence
     tri = faces.detach().cpu().numpy().astype(np.int64)
     corner = np.argsort(tri.reshape(-1), kind="stable")
     valence = np.bincount(tri.reshape(-1), minlength=num_vertices)
     first = np.cumsum(valence) - valence
     slot = np.arange(max(int(valence.max()), 1))
+    around = corner // 3
     slots = first[:, None] + np.where(slot < valence[:, None], slot, 0)
     corner = corner[np.minimum(slots, len(corner) - 1)]
     owner, local = corner // 3, corner % 3
-    arrays = [owner, tri[owner, (local + 1) % 3], tri[owner, (local + 2) % 3], valence, *_edge_tables(tri)]
+    neighbours = [tri[owner, (local + step) % 3] for step in (1, 2)]
+    arrays = [owner, *neighbours, valence, around, first, *_edge_tables(tri)]
     incidence = Incidence(*(torch.as_tensor(array).to(faces.device) for array in arrays))
-    _incidence_cache.append((faces.detach().clone(), num_vertices, incidence))
+    _incidence_cache.append((faces, version, faces.detach().clone(), num_vertices, incidence))
     return incidence
 
 
@@ -216,7 +227,8 @@ def _nearest_vertices(
 
 
 def _search_tree(points: Tensor, vertices: Tensor) -> tuple[Tensor, Tensor]:
-    if points.device.type != "cpu":
+    """Nearest vertices (N, 3), ascending, and distances; of fewer than three the last one is repeated."""
+    if points.device.type != "cpu" or len(vertices) < _NUM_NEAREST:
         return _search_dense(points, vertices)
     # Few points a query: large leaves and the median's approximation are faster to build and no slower to search.
     tree = cKDTree(vertices.detach().numpy(), leafsize=32, balanced_tree=False, compact_nodes=False)
@@ -227,12 +239,14 @@ def _search_tree(points: Tensor, vertices: Tensor) -> tuple[Tensor, Tensor]:
 def _search_dense(points: Tensor, vertices: Tensor) -> tuple[Tensor, Tensor]:
     """The same by all pairwise distances, in chunks; what an accelerator is fast at."""
     index, dist = [], []
+    count = min(_NUM_NEAREST, len(vertices))
+    places = [min(place, count - 1) for place in range(_NUM_NEAREST)]
     for chunk in points.split(max(1, _CHUNK_PAIRS // len(vertices))):
         # The matrix-product form loses half the digits for points close to the surface.
         pairs = torch.cdist(chunk, vertices, compute_mode="donot_use_mm_for_euclid_dist")
-        nearest = pairs.topk(_NUM_NEAREST, dim=1, largest=False, sorted=True)
-        index.append(nearest.indices)
-        dist.append(nearest.values)
+        nearest = pairs.topk(count, dim=1, largest=False, sorted=True)
+        index.append(nearest.indices[:, places])
+        dist.append(nearest.values[:, places])
     return torch.cat(index), torch.cat(dist)
 
 

@@ -1,4 +1,8 @@
-"""Contact search, once per step: nearest body vertex and closest body triangle point of every cloth vertex."""
+"""The two searches of a step: nearest body vertices, which body edges are made of, and contact with the body's surface.
+
+A step that needs the surface (energies, corrections to a base outside the body) finds the nearest vertices on the way;
+a step that needs body edges alone is spared the triangles.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +13,24 @@ from torch import Tensor
 
 from hood.mesh import geometry
 from hood.mesh.centroids import nearest_centroids
-from hood.mesh.proximity import search_surface
+from hood.mesh.nearest import Nearest, nearest_dense, nearest_vertices
+from hood.mesh.proximity import build_incidence, search_surface
+from hood.scene.cloth import Cloth
 from hood.scene.state import Obstacle
+
+
+def find_nearest(cloth: Cloth, pos: Tensor, obstacle: Obstacle, radius: float, dense: bool = False) -> Nearest:
+    """The nearest body vertex to each of the positions ``pos`` (V, 3) at t, if closer than ``radius`` [m].
+
+    Body vertices without faces are passed over, as they are by :func:`find_contact`; omitted ones are not.
+    ``dense`` tries all pairs whatever the device.
+    """
+    used = torch.zeros(len(obstacle.pos), dtype=torch.bool, device=obstacle.pos.device)
+    used.index_fill_(0, obstacle.faces.reshape(-1), True)
+    single = cloth.num_scenes == 1
+    scenes = (None, None) if single else (cloth.vertex_scene, obstacle.vertex_scene)
+    search = nearest_dense if dense else nearest_vertices
+    return search(pos, scenes[0], obstacle.pos, scenes[1], used, radius)
 
 
 @dataclass(frozen=True)
@@ -30,6 +50,11 @@ class Contact:
     next_point: Tensor  # (V, 3) m, the same material point at t + 1
     next_normal: Tensor  # (V, 3) outward unit normal there at t + 1
 
+    @property
+    def nearest(self) -> Nearest:
+        """Nearest body vertices, whatever their distance."""
+        return Nearest(self.vertex, self.vertex_dist)
+
     def next_dist(self, next_pos: Tensor) -> Tensor:
         """Signed distance [m] of ``next_pos`` (V, 3) to the matched point's tangent plane at t + 1."""
         return ((next_pos - self.next_point) * self.next_normal).sum(dim=1)
@@ -44,8 +69,9 @@ def find_contact(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, cap: flo
     corners = obstacle.faces[hit.face]
     point = _weigh(hit.bary, obstacle.pos[corners])
     next_point = _weigh(hit.bary, obstacle.next_pos[corners])
-    normal = _interpolated_normal(obstacle.pos, obstacle.faces, corners, hit.bary)
-    next_normal = _interpolated_normal(obstacle.next_pos, obstacle.faces, corners, hit.bary)
+    normal, next_normal = (
+        _interpolated_normal(at, obstacle.faces, corners, hit.bary) for at in (obstacle.pos, obstacle.next_pos)
+    )
     return Contact(
         vertex=hit.vertex,
         vertex_dist=hit.vertex_dist,
@@ -100,9 +126,7 @@ def _weigh(bary: Tensor, corner_values: Tensor) -> Tensor:
 
 def _interpolated_normal(pos: Tensor, faces: Tensor, corners: Tensor, bary: Tensor) -> Tensor:
     """Normals vary continuously over the surface, so a sliding vertex sees no jump between facets."""
-    # Only faces around matched vertices count: a garment touches a part of the body.
-    matched = torch.zeros(len(pos), dtype=torch.bool, device=pos.device)
-    matched[corners.reshape(-1)] = True
-    around = faces[matched[faces].any(dim=1)]
-    normal = _weigh(bary, geometry.vertex_normals(pos, around)[corners])
+    incidence = build_incidence(faces, len(pos))
+    at_vertices = geometry.normals_of_fans(pos, faces, incidence.around, incidence.first)
+    normal = _weigh(bary, at_vertices.index_select(0, corners.reshape(-1)).view(-1, 3, 3))
     return normal / normal.norm(dim=1, keepdim=True).clamp_min(torch.finfo(pos.dtype).tiny)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from hood.assets.material import Material
-from hood.dynamics.measure import METRICS, edge_strain, penetration_metrics, strain_metrics
+from hood.dynamics.measure import PENETRATION_METRICS, edge_strain, penetration_metrics, strain_metrics
 from hood.scene.cloth import build_cloth
 from hood.testing import grid, plane_contact
 
@@ -58,7 +58,7 @@ def test_vertices_beyond_the_reach_of_the_contact_energy_count() -> None:
 def test_vertices_without_any_surface_do_not_count() -> None:
     contact = plane_contact(CLOTH.rest_pos)
     nowhere = replace(contact, dist=torch.full_like(contact.dist, torch.inf))
-    assert penetration_metrics(nowhere, 36) == penetration_metrics(None, 36) == dict.fromkeys(METRICS[3:], 0.0)
+    assert penetration_metrics(nowhere, 36) == penetration_metrics(None, 36) == dict.fromkeys(PENETRATION_METRICS, 0.0)
 
 
 def test_depth_is_zero_outside() -> None:

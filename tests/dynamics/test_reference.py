@@ -110,7 +110,7 @@ def single_step(bench: Bench, layout: str, dtype: torch.dtype, latent: int = 16)
     before, now = (pos.to(dtype) for pos in bench.pos)
     step = bench.step_input(*bench.body[:3], bench.targets[2], DT, now)
     state = State(now, (now - before) / step.dt, torch.zeros(1, 3, dtype=torch.float64))
-    problem = StepProblem(cloth, state, step, simulator.find_contact(cloth, state, step), simulator.gravity)
+    problem = StepProblem(cloth, state, step, gravity=simulator.gravity)
     with torch.no_grad():
         prediction = simulator.predict(problem, bench.prepare(simulator, cloth))
     given = OracleStep(bench.pos[1], bench.pos[0], None, bench.targets[2], *bench.body[:3], DT)
@@ -169,7 +169,7 @@ def own_rollout(bench: Bench, simulator: Simulator, dtype: torch.dtype, num_step
         after = frame if step == 0 else frame + 1
         surfaces = (bench.body[max(frame - 1, 0)], bench.body[frame], bench.body[after])
         given = bench.step_input(*surfaces, bench.targets[after], 1 / 3 if step == 0 else DT, start)
-        problem = StepProblem(cloth, state, given, simulator.find_contact(cloth, state, given), simulator.gravity)
+        problem = StepProblem(cloth, state, given, gravity=simulator.gravity)
         prediction = simulator.predict(problem, prepared)
         yield prediction.acc * given.dt**2, prediction.next_pos
         state = State(prediction.next_pos, simulator.next_velocity(problem, prediction), state.origin)

@@ -12,10 +12,11 @@ from torch import Tensor, nn
 from hood.assets.body import Body
 from hood.assets.garment import Garment
 from hood.assets.sequence import PoseSequence
-from hood.dynamics.rollout import Frame, metric_names, simulate, start_state
+from hood.dynamics.rollout import METRIC_CHOICES, Frame, metric_names, simulate, start_state
 from hood.dynamics.simulator import Simulator, build_simulator
 from hood.graph.builder import MESH, Graph
 from hood.losses.potential import default_potential
+from hood.scene import contact
 from hood.scene.scene import Scene, build_scene
 from hood.scene.state import Attachments
 
@@ -132,6 +133,59 @@ def test_metrics_are_finite_and_named(rollout: list[Frame]) -> None:
     assert last["energy_total"] == pytest.approx(sum(last.get(f"energy_{name}", 0.0) for name in POTENTIAL.terms))
     assert last["e0"] > 0
     assert last["relative_gradient"] > 0
+
+
+@pytest.fixture
+def surface_searches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Number of points of every search for contact with the body's surface so far."""
+    calls: list[int] = []
+    search = contact.search_surface
+
+    def counted(points: Tensor, *rest: Tensor) -> object:
+        calls.append(len(points))
+        return search(points, *rest)
+
+    monkeypatch.setattr(contact, "search_surface", counted)
+    return calls
+
+
+def of_paper() -> Simulator:
+    torch.manual_seed(0)
+    return build_simulator("paper", "acceleration", "1x(mesh)", latent_dim=4, output_init=0.01).eval()
+
+
+@pytest.mark.parametrize(
+    "metrics, make, expected",
+    [("none", of_paper, 0), ("strain", of_paper, 0), ("all", of_paper, 3), ("none", small, 2), ("all", small, 3)],
+)
+def test_the_surface_is_searched_where_somebody_asks_for_it_and_once_a_step(
+    metrics: str, make: Callable[[], Simulator], expected: int, tank_scene: Scene, surface_searches: list[int]
+) -> None:
+    """After frame 0: metrics of contact ask at frames 1, 2, 3, a model that needs it at the two that a step follows."""
+    frames = simulate(make(), tank_scene, POTENTIAL, 4, relaxing_steps=0, metrics=metrics)
+    positions = [next(frames).world_pos]
+    surface_searches.clear()
+    positions += [frame.world_pos for frame in frames]
+    assert len(surface_searches) == expected
+    reference = [frame.world_pos for frame in simulate(make(), tank_scene, POTENTIAL, 4, relaxing_steps=0)]
+    assert all(torch.equal(*pair) for pair in zip(positions, reference, strict=True))
+
+
+@pytest.mark.parametrize("metrics", METRIC_CHOICES)
+def test_frames_hold_the_metrics_asked_for(metrics: str, tank_scene: Scene) -> None:
+    simulator = of_paper()
+    last = list(simulate(simulator, tank_scene, POTENTIAL, 3, metrics=metrics))[-1].metrics
+    assert set(last) <= set(metric_names(POTENTIAL, simulator, metrics))
+    assert ("strain_p50" in last) == (metrics != "none")
+    assert ("penetration_depth" in last) == ("energy_total" in last) == (metrics == "all")
+    parts = sum(last[f"ms_{part}"] for part in ("search", "features", "network", "rest"))
+    assert last["ms_total"] == pytest.approx(parts)
+    assert last["ms_metrics"] >= 0
+
+
+def test_unknown_metrics_are_refused(tank_scene: Scene) -> None:
+    with pytest.raises(ValueError, match="metrics is 'some'; choose all, strain, none"):
+        list(simulate(of_paper(), tank_scene, POTENTIAL, 2, metrics="some"))
 
 
 def test_pins_follow_the_body_over_the_rollout(rollout: list[Frame], skirt_scene: Scene) -> None:

@@ -144,7 +144,7 @@ def test_no_body_at_all(kind: str) -> None:
     simulator = make(kind)
     state = State(cloth.rest_pos, torch.zeros_like(cloth.rest_pos), torch.zeros(1, 3).double())
     step = StepInput(dt=torch.tensor([1 / 30]))
-    assert simulator.find_contact(cloth, state, step) is None
+    assert simulator.search(StepProblem(cloth, state, step)).contact is None
     with torch.no_grad():
         after = simulator.step(cloth, simulator.prepare(cloth, pos), state, step)
     assert bool(torch.isfinite(after.pos).all())

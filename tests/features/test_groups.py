@@ -43,7 +43,7 @@ def make_inputs(base: bool = True, shift: float = 0.0, dt: float = DT) -> Inputs
     step = StepInput(torch.tensor([dt], dtype=torch.float64), obstacle)
     state = State(pos + shift, vel, torch.zeros(1, 3, dtype=torch.float64))
     hierarchy = Hierarchy((torch.tensor([[0, 2]]),), torch.tensor([1, 0, 1, 0]))
-    graph = build_graph(build_static(cloth, hierarchy, ("mesh", "coarse0")), step, contact)
+    graph = build_graph(build_static(cloth, hierarchy, ("mesh", "coarse0")), step, contact.nearest)
     return Inputs(cloth, state, step, contact, graph, pos + shift + 0.05 if base else None)
 
 
@@ -162,7 +162,7 @@ def test_batch_equals_singles(features):
     hierarchy = Hierarchy((torch.tensor([[0, 2]]),), torch.tensor([1, 0, 1, 0]))
     step = StepInput(torch.cat([i.step.dt for i in items]), obstacle)
     static = build_static(cloth, concatenate_hierarchies([hierarchy] * 2, [4, 4]), ("mesh", "coarse0"))
-    graph = build_graph(static, step, contact)
+    graph = build_graph(static, step, contact.nearest)
     state = concatenate_states([i.state for i in items])
     nodes, edges = features(Inputs(cloth, state, step, contact, graph, torch.cat([i.base_pos for i in items])))
     alone = [features(i) for i in items]

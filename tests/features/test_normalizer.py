@@ -58,6 +58,20 @@ def test_masked_rows_are_not_counted_but_are_normalised():
     torch.testing.assert_close(masked(spoiled, mask)[: len(x)], plain(x))
 
 
+def test_the_leading_columns_of_a_wider_table():
+    """Counted and standardised as a table of their own; the others stay."""
+    whole, alone = RunningNormalizer(3), RunningNormalizer(3)
+    table = torch.randn(50, 5, generator=torch.Generator().manual_seed(0))
+    expected = torch.cat([alone(table[:, :3]), table[:, 3:]], dim=1)
+    assert torch.equal(whole.leading(table.clone()), expected)
+    for name, value in alone.state_dict().items():
+        assert torch.equal(whole.state_dict()[name], value)
+    whole.eval()
+    again = whole.leading(table.clone())
+    assert torch.equal(again, expected)
+    assert int(whole.num_updates) == 1
+
+
 def test_identity_until_enough_calls():
     normalizer, x = RunningNormalizer(4, min_updates=2), calls(1)[0]
     assert torch.equal(normalizer(x), x)

@@ -7,10 +7,10 @@ import torch
 from hood.assets.material import Material
 from hood.graph.builder import build_graph, build_static, edge_set
 from hood.graph.hierarchy import build_hierarchy
+from hood.mesh.nearest import Nearest
 from hood.scene.cloth import Cloth, build_cloth
-from hood.scene.contact import Contact
 from hood.scene.state import Attachments, Obstacle, StepInput
-from hood.testing import grid, plane_contact
+from hood.testing import grid
 
 DT = torch.tensor([1 / 30])
 
@@ -30,11 +30,6 @@ def body_of(count: int, omitted: tuple[int, ...] = ()) -> Obstacle:
     hidden = torch.zeros(count, dtype=torch.bool)
     hidden[list(omitted)] = True
     return Obstacle(pos, pos, pos, torch.zeros(1, 3, dtype=torch.int64), scene, torch.zeros(1, dtype=torch.int64), hidden)
-
-
-def contact_of(vertex: torch.Tensor, dist: torch.Tensor) -> Contact:
-    plane = plane_contact(torch.zeros(len(vertex), 3))
-    return Contact(**{**vars(plane), "vertex": vertex, "vertex_dist": dist})
 
 
 def test_edge_set_has_both_directions_sorted_by_receiver_with_consistent_tables():
@@ -64,7 +59,7 @@ def test_body_edges_follow_the_radius_and_drop_omitted_vertices_after_the_search
     dist = torch.full((81,), 0.05)
     vertex[:4] = torch.tensor([9, 2, 9, 6])
     dist[:4] = torch.tensor([0.01, 0.029, 0.02, 0.01])
-    graph = build_graph(static_of(cloth), StepInput(DT, body_of(12, omitted=(6,))), contact_of(vertex, dist))
+    graph = build_graph(static_of(cloth), StepInput(DT, body_of(12, omitted=(6,))), Nearest(vertex, dist))
     assert graph.body_vertex.tolist() == [2, 9]
     body = graph.edge_sets["body"]
     pairs = set(zip(body.senders.tolist(), body.receivers.tolist(), strict=True))
@@ -73,8 +68,8 @@ def test_body_edges_follow_the_radius_and_drop_omitted_vertices_after_the_search
 
 def test_body_subsets_keep_the_nodes_of_their_level_only(cloth):
     static = static_of(cloth)
-    contact = contact_of(torch.arange(81) % 12, torch.full((81,), 0.01))
-    graph = build_graph(static, StepInput(DT, body_of(12)), contact)
+    nearest = Nearest(torch.arange(81) % 12, torch.full((81,), 0.01))
+    graph = build_graph(static, StepInput(DT, body_of(12)), nearest)
     body = graph.edge_sets["body"]
     assert graph.body_subsets[0].rows is None
     for level in (1, 2):

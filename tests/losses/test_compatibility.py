@@ -117,7 +117,7 @@ def test_one_search_per_step_and_none_for_the_default(monkeypatch):
         potential.total(problem, problem.state.pos)
     with pytest.raises(ValueError, match="obstacle"):
         potential.prepare(replace(problem, step=replace(problem.step, obstacle=None)))
-    free = replace(problem, contact=None)
+    free = replace(problem, contact=None, step=replace(problem.step, obstacle=None))
     assert potential.prepare(free) is free
     assert "collision" not in potential.energies(free, free.state.pos)
 

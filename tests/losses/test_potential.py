@@ -6,12 +6,12 @@ import torch
 
 from hood.assets.material import Material
 from hood.losses.collision import Collision
-from hood.losses.potential import default_potential, relative_gradient, scale
+from hood.losses.potential import Potential, default_potential, relative_gradient, scale
 from hood.losses.problem import StepProblem, inertial_guess
 from hood.scene.cloth import build_cloth, concatenate_cloths
 from hood.scene.contact import Contact
-from hood.scene.state import Attachments, State, StepInput, concatenate_states
-from hood.testing import cylinder, grid, make_problem, plane_contact
+from hood.scene.state import Attachments, Obstacle, State, StepInput, concatenate_states
+from hood.testing import cylinder, grid, make_problem, plane_contact, sphere
 
 F64 = torch.float64
 
@@ -74,6 +74,26 @@ def test_terms_without_effect_are_left_out():
     assert "friction" not in frictionless.energies(problem, problem.state.pos)
     buttoned = replace(problem.step, attachments=Attachments(torch.tensor([[0, 1]]), torch.tensor([True])))
     assert "attachment" in default_potential().energies(replace(problem, step=buttoned), problem.state.pos)
+
+
+def test_contact_is_searched_for_where_a_term_needs_it_and_demanded_there():
+    """Energies of a problem with a body must not be those of one without: forgetting to prepare it is an error."""
+    cloth = build_cloth(*grid(3, 3, 0.1), Material(), dtype=F64)
+    ball, faces = (torch.as_tensor(array) for array in sphere(2, 0.1))
+    zeros = torch.zeros(len(ball), dtype=torch.int64)
+    body = Obstacle(ball, ball, ball, faces, zeros, torch.zeros(len(faces), dtype=torch.int64))
+    bare = make_problem(cloth, cloth.rest_pos + 0.05)
+    problem = replace(bare, step=replace(bare.step, obstacle=body))
+    potential = default_potential()
+    with pytest.raises(ValueError, match=r"contact not searched for yet; pass the problem through Potential\.prepare"):
+        potential.total(problem, problem.state.pos)
+    prepared = potential.prepare(problem)
+    assert potential.prepare(prepared) is prepared
+    assert problem.contact is None
+    assert float(potential.energies(prepared, problem.state.pos)["collision"]) > 0
+    shape = Potential({name: potential.terms[name] for name in ("stretching", "inertia")})
+    assert shape.prepare(problem) is problem
+    assert potential.prepare(bare) is bare
 
 
 def test_replacing_a_term_leaves_the_original_untouched():

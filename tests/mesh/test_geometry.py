@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from hood.mesh import geometry, topology
+from hood.mesh.proximity import build_incidence
 from hood.testing import cylinder, grid, random_rotation, sphere
 
 HINGE = torch.tensor([[0, 1, 2, 3]])
@@ -34,6 +35,19 @@ def test_isolated_vertex_has_no_mass_and_no_normal():
     pos = torch.cat([pos, torch.ones(1, 3, dtype=pos.dtype)])
     assert geometry.vertex_masses(pos, faces, 0.2)[-1] == 0
     assert (geometry.vertex_normals(pos, faces)[-1] == 0).all()
+
+
+def test_normals_of_fans_are_the_vertex_normals():
+    pos, faces = tensors(sphere(2))
+    pos = torch.cat([pos[:1] + 2, pos, pos[:1] - 2])  # isolated vertices in front and behind
+    faces = faces + 1
+    table = build_incidence(faces, len(pos))
+    expected = geometry.vertex_normals(pos, faces)
+    torch.testing.assert_close(geometry.normals_of_fans(pos, faces, table.around, table.first), expected, rtol=0, atol=1e-14)
+    rows = torch.tensor([0, 7, len(pos) - 1, 3])
+    chosen = geometry.normals_of_fans(pos, faces, table.around, table.first, rows)
+    torch.testing.assert_close(chosen, expected[rows], rtol=0, atol=1e-14)
+    assert not bool(chosen[[0, 2]].any())
 
 
 def test_normals_point_out_of_a_sphere_and_a_tube():

@@ -190,10 +190,32 @@ def test_vertices_without_faces_are_ignored():
     assert float(hit.dist) == pytest.approx(0.9, abs=0.02)
 
 
-def test_incidence_is_recognised_by_content():
+@pytest.mark.parametrize("num_used", [1, 2])
+def test_batched_surfaces_of_fewer_than_three_vertices(num_used):
+    """Faces that use one or two vertices are a point or an edge; the other scene of the batch is a sphere."""
+    ball = sphere(2)
+    vertices = torch.as_tensor(np.concatenate([ball[0], [[0.0, 0, 0], [1.0, 0, 0]]]))
+    degenerate = len(ball[0]) + np.array([[0, 0, 0], [0, 0, num_used - 1]])
+    faces = torch.as_tensor(np.concatenate([ball[1], degenerate]))
+    vertex_scene = (torch.arange(len(vertices)) >= len(ball[0])).long()
+    face_scene = (torch.arange(len(faces)) >= len(ball[1])).long()
+    points = torch.tensor([[2.0, 0, 0], [2.0, 0, 0], [0.5, 0.3, 0]], dtype=torch.float64)
+    hit = search_surface(points, torch.tensor([0, 1, 1]), vertices, faces, vertex_scene, face_scene)
+    expected = [1.0, 2.0, 0.34**0.5] if num_used == 1 else [1.0, 1.0, 0.3]
+    np.testing.assert_allclose(hit.dist.abs().numpy(), expected, atol=1e-12)
+    np.testing.assert_allclose(hit.vertex_dist.numpy(), [1.0, float(num_used == 1) + 1, 0.34**0.5], atol=1e-12)
+    assert hit.vertex.tolist()[1] == len(ball[0]) + num_used - 1
+
+
+def test_incidence_is_recognised_without_reading_it_and_by_content(monkeypatch):
     faces = torch.as_tensor(sphere(1)[1])
     first = proximity.build_incidence(faces, 42)
     assert proximity.build_incidence(faces.clone(), 42) is first
+    with monkeypatch.context() as patch:
+        patch.setattr(torch, "equal", None)
+        assert proximity.build_incidence(faces, 42) is first
+    with torch.inference_mode():
+        assert proximity.build_incidence(faces.clone(), 42) is first
     faces[0] = faces[0].flip(0)
     assert proximity.build_incidence(faces, 42) is not first
 
