@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import torch
@@ -11,16 +13,28 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from hood.assets.body import load_body
-from hood.assets.garment import load_garment
+from hood.assets.garment import Garment, load_garment
 from hood.assets.library import locate, motion_split
-from hood.assets.sequence import load_sequence
-from hood.commands.common import UNTRAINED, prepare_folder, read_model, require_device
-from hood.config import ConfigError, build, load_config, options, save_run_record
+from hood.assets.sequence import PoseSequence, load_sequence
+from hood.commands.batch import expand_sequences
+from hood.commands.common import (
+    UNTRAINED,
+    prepare_folder,
+    read_model,
+    require_device,
+    require_same_config,
+    together,
+    use_precision,
+)
+from hood.config import ConfigError, build, load_config, options, plain, save_run_record
+from hood.dynamics.simulator import Simulator
 from hood.dynamics.stepper import NewtonStepper
+from hood.evaluation.diary import Diary, Unit
 from hood.evaluation.gap import REFERENCE
 from hood.evaluation.report import describe, format_table, write_table
-from hood.evaluation.table import Candidate, GapSettings, evaluate
+from hood.evaluation.table import Candidate, GapSettings, Measured, candidate_rows, measure
 from hood.scene.scene import Scene, build_scene
+from hood.training import distributed
 
 #: ``models=[newton]``: no network, the potential minimised in every frame.
 NEWTON = "newton"
@@ -31,25 +45,66 @@ def run(overrides: Sequence[str]) -> int:
     config = load_config("evaluate", overrides)
     require_device(config)
     _check_numbers(config)
-    gaps = GapSettings(int(config.gap_states), replace(REFERENCE, max_iterations=int(config.gap_iterations)))
-    candidates = [make_candidate(str(name), config) for name in config.models]
-    scenes = make_scenes(config)
-    folder = prepare_folder(Path(str(config.output)).expanduser())
-    save_run_record(folder, config, int(config.seed))
-    total = len(candidates) * sum(len(variants) for variants in scenes.values())
-    with tqdm(total=total, desc="evaluate", unit="rollout", disable=None) as bar:
+    return together(lambda: _evaluate(config))
 
-        def progress(text: str, done: int) -> None:
+
+def _evaluate(config: DictConfig) -> int:
+    folder = Path(str(config.output)).expanduser()
+    plan = make_plan(config)
+    distributed.on_main(lambda: _prepare(config, folder))
+    diary = Diary(folder, distributed.rank())
+    done = {key: item for part in distributed.gather(diary.read(plan.digests)) for key, item in part.items()}
+    todo = [unit for unit in plan.units if unit not in done][distributed.rank() :: distributed.world_size()]
+    if done and distributed.rank() == 0:
+        print(f"{len(done)} of {len(plan.units)} rollouts were done before")
+    mine = _measure(config, plan, todo, diary)
+    measured = done | {key: item for part in distributed.gather(mine) for key, item in part.items()}
+    if distributed.rank() == 0:
+        _report(config, plan, measured, folder)
+    return 0
+
+
+def _measure(config: DictConfig, plan: Plan, todo: Sequence[Unit], diary: Diary) -> dict[Unit, Measured]:
+    """This process's share of the rollouts; each is written down as soon as it is done."""
+    potential, count = build(config.losses), int(config.num_frames)
+    gaps = GapSettings(int(config.gap_states), replace(REFERENCE, max_iterations=int(config.gap_iterations)))
+    measured: dict[Unit, Measured] = {}
+    quiet = True if distributed.rank() else None
+    with tqdm(total=len(todo), desc="evaluate", unit="rollout", disable=quiet) as bar:
+
+        def tell(text: str) -> None:
             bar.set_postfix_str(text, refresh=False)
-            bar.update(done - bar.n)
             bar.refresh()
 
-        rows = evaluate(candidates, scenes, build(config.losses), int(config.num_frames), gaps, progress)
+        for unit in todo:
+            measured[unit] = measure(plan.candidates[unit.model], plan.scene(unit), potential, count, gaps, tell)
+            diary.write(unit, plan.digests[unit.model], measured[unit])
+            bar.update()
+    return measured
+
+
+def _report(config: DictConfig, plan: Plan, measured: Mapping[Unit, Measured], folder: Path) -> None:
+    rows = []
+    for index, candidate in enumerate(plan.candidates):
+        parts = {name: Measured() for name in plan.garments}
+        for unit in plan.units:
+            if unit.model == index:
+                parts[unit.garment] += measured[unit]
+        rows += candidate_rows(candidate, parts)
     print(format_table(rows))
     print(f"\n{describe(rows)}")
     csv_path, json_path = write_table(rows, folder)
     print(f"tables in {csv_path} and {json_path}")
-    return 0
+
+
+def _prepare(config: DictConfig, folder: Path) -> None:
+    prepare_folder(folder)
+    if bool(config.resume):
+        require_same_config(config, folder, ("resume", "output"))
+    else:
+        for path in folder.glob("rollouts.*.jsonl"):
+            path.unlink()
+    save_run_record(folder, config, int(config.seed))
 
 
 def make_candidate(name: str, config: DictConfig) -> Candidate:
@@ -65,21 +120,71 @@ def make_candidate(name: str, config: DictConfig) -> Candidate:
             raise ConfigError(f"models: unknown model {model!r} in {name!r}; known are {', '.join(options('model'))}")
         torch.manual_seed(int(config.seed))
         simulator = build(load_config("rollout", [f"model={model}"]).model)
-        simulator.network.use_precision(str(config.precision))
+        use_precision(simulator, config)
         return Candidate(model, UNTRAINED, simulator.eval().to(str(config.device)))
     path = locate("weights", name)
     simulator = read_model(path, float(config.fps)).to(str(config.device))
-    simulator.network.use_precision(str(config.precision))
+    use_precision(simulator, config)
     return Candidate(path.stem if path.stem != "model" else path.parent.name, path.name, simulator)
 
 
-def make_scenes(config: DictConfig) -> dict[str, list[Scene]]:
-    """Every garment on every motion of the validation list."""
-    motions = [str(name) for name in config.sequences] or motion_split()["validation"]
-    sequences = [load_sequence(name, float(config.fps)) for name in motions]
-    body, material, device = load_body(str(config.body)), build(config.material), str(config.device)
+@dataclass
+class Plan:
+    """What is evaluated: every candidate with every garment on every motion."""
+
+    config: DictConfig
+    candidates: list[Candidate]
+    digests: list[str]  # of the candidates' weights
+    garments: dict[str, Garment]
+    motions: list[str]
+
+    @property
+    def units(self) -> list[Unit]:
+        """The rollouts, in a fixed order."""
+        return [Unit(m, g, s) for m in range(len(self.candidates)) for g in self.garments for s in self.motions]
+
+    def scene(self, unit: Unit) -> Scene:
+        """The scene of a rollout; the last one is kept, and so is its motion."""
+        return _scene(self, unit.garment, unit.motion)
+
+
+def make_plan(config: DictConfig) -> Plan:
+    """Candidates, garments and motions named in the config.
+
+    Raises:
+        ConfigError: two garments with one name.
+    """
+    candidates = [make_candidate(str(name), config) for name in config.models]
+    motions = expand_sequences([str(name) for name in config.sequences]) or motion_split()["validation"]
     garments = [load_garment(str(name)) for name in config.garments]
-    return {g.name: [build_scene(g, body, s, material, device=device) for s in sequences] for g in garments}
+    names = [garment.name for garment in garments]
+    if len(set(names)) < len(names):
+        raise ConfigError(f"garments={plain(config.garments)}: names must differ, these are {', '.join(names)}")
+    return Plan(config, candidates, [_digest(c) for c in candidates], dict(zip(names, garments, strict=True)), motions)
+
+
+@lru_cache(maxsize=1)
+def _sequence(name: str, fps: float) -> PoseSequence:
+    return load_sequence(name, fps)
+
+
+def _scene(plan: Plan, garment: str, motion: str) -> Scene:
+    config = plan.config
+    sequence = _sequence(motion, float(config.fps))
+    return build_scene(
+        plan.garments[garment], load_body(str(config.body)), sequence, build(config.material), device=str(config.device)
+    )
+
+
+def _digest(candidate: Candidate) -> str:
+    """SHA-256 of the weights: results are not taken over from others that had the same name."""
+    if not isinstance(candidate.stepper, Simulator):
+        return "none"
+    content = hashlib.sha256()
+    for name, value in candidate.stepper.state_dict().items():
+        content.update(name.encode())
+        content.update(value.detach().cpu().contiguous().numpy().tobytes())
+    return content.hexdigest()
 
 
 def _check_numbers(config: DictConfig) -> None:

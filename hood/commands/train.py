@@ -5,50 +5,72 @@ from __future__ import annotations
 import signal
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from tqdm import tqdm
 
 from hood.assets.body import load_body
 from hood.assets.garment import load_garment
 from hood.assets.library import motion_split
+from hood.assets.motions import MotionFiles, find_motions
 from hood.assets.sequence import load_sequence
-from hood.commands.common import prepare_folder, require_device
-from hood.config import ConfigError, build, load_config, plain, save_run_record
+from hood.commands.common import prepare_folder, require_device, require_same_config, together
+from hood.config import ConfigError, build, load_config, plain, require_choice, save_run_record
 from hood.dynamics.simulator import Simulator
 from hood.evaluation.validation import Validation
+from hood.losses.potential import Potential
 from hood.scene.dataset import SceneSampler
 from hood.training import distributed
+from hood.training.checkpoint import previous
 from hood.training.trainer import Trainer, TrainerSettings
+from hood.training.watch import Watch
+
+#: Keys that a resumed run may change: they do not change what is learned.
+_FREE = ("resume", "output", "device", "validation_states")
+_BOOKKEEPING = (
+    "workers",
+    "activation_checkpointing",
+    "checkpoint_every",
+    "log_every",
+    "validate_every",
+    "validation_frames",
+    "max_rollbacks",
+)
 
 
 def run(overrides: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     config = load_config("train", overrides)
     require_device(config)
-    distributed.start()
-    try:
-        return _train(config)
-    finally:
-        distributed.stop()
+    return together(lambda: _train(config))
 
 
 def _train(config: DictConfig) -> int:
     trainer = make_trainer(config)
-    folder = prepare_folder(Path(str(config.output)).expanduser())
-    _refuse_other_run(config, folder, trainer)
     main = distributed.rank() == 0
+    folder = Path(str(config.output)).expanduser()
+    if distributed.on_main(lambda: _is_resumed(config, prepare_folder(folder), trainer.checkpoint_path)):
+        trainer.resume(trainer.checkpoint_path)
+    distributed.on_main(lambda: save_run_record(folder, config, int(config.seed)))
     if main:
-        save_run_record(folder, config, int(config.seed))
-    parameters = sum(p.numel() for p in trainer.simulator.parameters())
-    if main:
+        parameters = sum(p.numel() for p in trainer.simulator.parameters())
         print(
             f"{parameters:,} parameters, {len(trainer.slots.sampler.garments)} garments, "
             f"{len(trainer.slots.sampler.sequences)} motions"
         )
-    finished = _run_with_progress(trainer)
+    try:
+        finished = _run_with_progress(trainer)
+    except OSError:
+        if main and trainer.checkpoint_path.exists():
+            print(
+                f"hood: stopped at iteration {trainer.iteration}; {trainer.checkpoint_path} is intact, the same command with "
+                "resume=true goes on from it",
+                file=sys.stderr,
+            )
+        raise
     if main:
         print(f"weights in {folder / 'model.safetensors'}, checkpoint in {trainer.checkpoint_path}")
     if not finished:
@@ -68,45 +90,56 @@ def make_trainer(config: DictConfig) -> Trainer:
     simulator.to(str(config.device))
     settings: TrainerSettings = build(config.trainer)
     fps = float(config.data.fps)
-    names = list(config.data.sequences) or motion_split()["train"]
+    names = find_motions(list(config.data.sequences) or motion_split()["train"])
     sampler = SceneSampler(
         body=load_body(str(config.data.body)),
         garments=[load_garment(str(name)) for name in config.data.garments],
-        sequences=[load_sequence(str(name), fps, str(config.data.up)) for name in names],
+        sequences=_open_motions(config, names, fps, settings.horizon.maximum + 3),
         **plain(config.data.sampling),
         device=str(config.device),
     )
     potential = build(config.losses)
-    validation = None
-    if settings.validate_every:
-        motions = [load_sequence(name, fps) for name in list(config.data.validation_sequences) or motion_split()["validation"]]
-        validation = Validation(sampler.body, sampler.garments, motions, potential, int(config.data.validation_frames))
-    return Trainer(simulator, potential, sampler, settings, Path(str(config.output)).expanduser(), int(config.seed), validation)
+    folder = Path(str(config.output)).expanduser()
+    watch = _make_watch(config, sampler, potential, folder) if settings.validate_every else None
+    return Trainer(simulator, potential, sampler, settings, folder, int(config.seed), watch)
 
 
-def _refuse_other_run(config: DictConfig, folder: Path, trainer: Trainer) -> None:
-    if trainer.checkpoint_path.exists():
+def _open_motions(config: DictConfig, names: list[str], fps: float, min_frames: int) -> MotionFiles:
+    """The training motions, read when they are drawn."""
+    require_choice(config.data, "unusable", ("refuse", "skip"))
+    load = partial(load_sequence, fps=fps, up=str(config.data.up))
+    motions = MotionFiles(names, load, fps, min_frames, str(config.data.unusable) == "skip")
+    if motions.skipped and distributed.rank() == 0:
+        print(f"hood: {len(motions.skipped)} of {len(names)} motions skipped, first: {motions.skipped[0]}", file=sys.stderr)
+    return motions
+
+
+def _make_watch(config: DictConfig, sampler: SceneSampler, potential: Potential, folder: Path) -> Watch:
+    names = find_motions(list(config.data.validation_sequences) or motion_split()["validation"], "validation")
+    motions = [load_sequence(str(name), float(config.data.fps), str(config.data.up)) for name in names]
+    validation = Validation(
+        sampler.body,
+        sampler.garments,
+        motions,
+        potential,
+        num_frames=int(config.data.validation_frames),
+        states=int(config.validation_states),
+        device=str(config.device),
+    )
+    return Watch(validation, folder)
+
+
+def _is_resumed(config: DictConfig, folder: Path, checkpoint: Path) -> bool:
+    """Whether the folder's run goes on; a run that is in the way is refused."""
+    if checkpoint.exists() or previous(checkpoint).exists():
         if not bool(config.resume):
             raise ConfigError(f"{folder} holds a training run; pass resume=true to go on or another output")
-        _check_same_config(config, folder)
-        trainer.resume(trainer.checkpoint_path)
-    elif bool(config.resume) and any(folder.glob("*.safetensors")):
+        # It must see the same data and schedule, or its losses would not be those of an uninterrupted run.
+        require_same_config(config, folder, _FREE, _BOOKKEEPING)
+        return True
+    if bool(config.resume) and any(folder.glob("*.safetensors")):
         raise ConfigError(f"{folder}: nothing to resume, checkpoint.pt is missing")
-
-
-def _check_same_config(config: DictConfig, folder: Path) -> None:
-    """A resumed run must see the same data and schedule, or its losses would not be those of an uninterrupted one."""
-    record = folder / "config.yaml"
-    if not record.exists():
-        return
-    before = OmegaConf.load(record)
-    assert isinstance(before, DictConfig)
-    free = ("resume", "output", "device")
-    for key in map(str, config):
-        if key not in free and plain(before.get(key)) != plain(config[key]):
-            raise ConfigError(
-                f"{record}: {key} differs from this command's; resume with the same settings or use another output"
-            )
+    return False
 
 
 def _run_with_progress(trainer: Trainer) -> bool:
@@ -126,8 +159,11 @@ def _run_with_progress(trainer: Trainer) -> bool:
             disable=distributed.rank() != 0 or None,
         ) as bar:
 
-            def progress(iteration: int, report: dict[str, float]) -> None:
-                bar.update(1)
+            def progress(iteration: int, report: dict[str, float] | None) -> None:
+                if report is None:
+                    bar.unpause()  # a validation is no part of the rate
+                    return
+                bar.update(iteration - bar.n)
                 if iteration % 20 == 0:
                     bar.set_postfix(rg=f"{report['relative_gradient']:.2f}", horizon=int(report["horizon"]), refresh=False)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import numpy as np
 from hood.dynamics.rollout import simulate
 from hood.dynamics.simulator import Simulator
 from hood.dynamics.stepper import Stepper
-from hood.evaluation.gap import AGREEMENT, REFERENCE, Gap, gap
+from hood.evaluation.gap import AGREEMENT, REFERENCE, gap
 from hood.evaluation.radius import measured_radius
 from hood.evaluation.sample import StepSample
 from hood.losses.potential import Potential
@@ -49,12 +50,15 @@ class GapSettings:
 
 
 @dataclass
-class _Measured:
-    """What rollouts gave."""
+class Measured:
+    """What rollouts gave, as plain numbers: it can be written down and added up in any order."""
 
-    frames: list[dict[str, float]] = field(default_factory=list)
-    failures: list[int] = field(default_factory=list)
-    gaps: list[Gap] = field(default_factory=list)
+    frames: list[dict[str, float]] = field(default_factory=list)  # metrics of the finite frames that count
+    failures: list[int] = field(default_factory=list)  # first non-finite frames
+    gaps: list[dict[str, float]] = field(default_factory=list)  # γ, converged (0 or 1), spread [e0] of every state looked at
+
+    def __add__(self, other: Measured) -> Measured:
+        return Measured(self.frames + other.frames, self.failures + other.failures, self.gaps + other.gaps)
 
 
 def evaluate(
@@ -74,25 +78,43 @@ def evaluate(
     median, ``gap_p95`` the 95th percentile, ``unconverged`` the share whose reference missed its accuracy and
     ``disagree`` the share where minimisations ended in different minima.
     """
-    gaps = gaps or GapSettings()
     rows, done = [], 0
     for candidate in candidates:
-        shared = {"model": candidate.name, "weights": candidate.weights, **_reach(candidate.stepper)}
-        whole = _Measured()
+        parts = {garment: Measured() for garment in scenes}
         for garment, variants in scenes.items():
-            part = _Measured()
             for scene in variants:
-                title = f"{candidate.name} {garment} {scene.motion.sequence.name}"
-                for text in _run(candidate.stepper, scene, potential, num_frames, gaps, part):
-                    progress(f"{title} {text}", done)
+                tell = partial(_tell, progress, done)
+                parts[garment] += measure(candidate, scene, potential, num_frames, gaps, tell)
                 done += 1
-                progress(title, done)
-            rows.append({**shared, "garment": garment, **_row(part)})
-            whole.frames += part.frames
-            whole.failures += part.failures
-            whole.gaps += part.gaps
-        rows.append({**shared, "garment": ALL, **_row(whole)})
+                progress(f"{candidate.name} {garment} {scene.motion.name}", done)
+        rows += candidate_rows(candidate, parts)
     return rows
+
+
+def measure(
+    candidate: Candidate,
+    scene: Scene,
+    potential: Potential,
+    num_frames: int,
+    gaps: GapSettings | None = None,
+    tell: Callable[[str], None] = lambda text: None,
+) -> Measured:
+    """One rollout of a candidate; ``tell`` hears what is being done."""
+    measured = Measured()
+    for text in _run(candidate.stepper, scene, potential, num_frames, gaps or GapSettings(), measured):
+        tell(f"{candidate.name} {scene.garment.name} {scene.motion.name} {text}")
+    return measured
+
+
+def candidate_rows(candidate: Candidate, parts: Mapping[str, Measured]) -> list[dict[str, Any]]:
+    """The candidate's rows of the table: one per garment of ``parts``, and one over all, see :func:`evaluate`."""
+    shared = {"model": candidate.name, "weights": candidate.weights, **_reach(candidate.stepper)}
+    whole = sum(parts.values(), start=Measured())
+    return [{**shared, "garment": name, **_row(part)} for name, part in {**parts, ALL: whole}.items()]
+
+
+def _tell(progress: Progress, done: int, text: str) -> None:
+    progress(text, done)
 
 
 def _reach(stepper: Stepper) -> dict[str, int | None]:
@@ -102,7 +124,7 @@ def _reach(stepper: Stepper) -> dict[str, int | None]:
 
 
 def _run(
-    stepper: Stepper, scene: Scene, potential: Potential, num_frames: int, gaps: GapSettings, into: _Measured
+    stepper: Stepper, scene: Scene, potential: Potential, num_frames: int, gaps: GapSettings, into: Measured
 ) -> Iterator[str]:
     """One rollout, added to ``into``; yields what is being done."""
     count = min(num_frames, scene.num_frames)
@@ -116,10 +138,11 @@ def _run(
             into.frames.append(frame.metrics)
     for index, (problem, prediction) in enumerate(sample.steps):
         yield f"gap {index + 1}/{len(sample.steps)}"
-        into.gaps.append(gap(potential, problem, prediction.next_pos, settings=gaps.reference))
+        found = gap(potential, problem, prediction.next_pos, settings=gaps.reference)
+        into.gaps.append({"gamma": float(found.gamma), "converged": float(found.converged), "spread": float(found.spread)})
 
 
-def _row(measured: _Measured) -> dict[str, Any]:
+def _row(measured: Measured) -> dict[str, Any]:
     frames, failures = measured.frames, measured.failures
     row: dict[str, Any] = {"frames": len(frames), "failed_at": min(failures) if failures else None}
     row |= _gap_columns(measured.gaps)
@@ -144,15 +167,15 @@ def _row(measured: _Measured) -> dict[str, Any]:
     return row
 
 
-def _gap_columns(gaps: Sequence[Gap]) -> dict[str, Any]:
+def _gap_columns(gaps: Sequence[Mapping[str, float]]) -> dict[str, Any]:
     if not gaps:
         return {"gap_states": 0}
-    gamma = np.array([float(item.gamma) for item in gaps])
+    gamma = np.array([item["gamma"] for item in gaps])
     return {
         "gap": float(np.median(gamma)),
         "gap_p95": float(np.quantile(gamma, 0.95)),
-        "unconverged": float(np.mean([not bool(item.converged) for item in gaps])),
-        "disagree": float(np.mean([bool(item.spread > AGREEMENT) for item in gaps])),
+        "unconverged": float(np.mean([item["converged"] == 0.0 for item in gaps])),
+        "disagree": float(np.mean([item["spread"] > AGREEMENT for item in gaps])),
         "gap_states": len(gaps),
     }
 

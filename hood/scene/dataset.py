@@ -3,16 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
+from hood.assets.binding import bind_garment
 from hood.assets.body import Body
-from hood.assets.garment import Garment, bind_garment
+from hood.assets.garment import Garment
 from hood.assets.material import Material, sample_material
+from hood.assets.mirror import mirror_body, mirror_garment
+from hood.assets.motions import MotionFiles, motion_lengths
 from hood.assets.sequence import PoseSequence, turn_world
+from hood.scene.batch import to_device
+from hood.scene.cloth import Cloth
+from hood.scene.motion import BodyMotion, body_motion
 from hood.scene.scene import Scene, build_scene
+
+#: Draws before a set of motions that cannot be read is given up.
+_MAX_UNREADABLE = 100
 
 
 @dataclass(frozen=True)
@@ -21,20 +34,33 @@ class Window:
 
     scene: Scene
     start_frame: int
+    template: int = 0  # index into the sampler's garments
+    mirrored: bool = False
+
+    def to(self, device: torch.device | str) -> Window:
+        """The same with the scene's tensors on ``device``."""
+        scene = self.scene
+        assert isinstance(scene.motion, BodyMotion)
+        motion = scene.motion.with_surfaces(scene.motion.posed, device)
+        return replace(self, scene=replace(scene, cloth=to_device(scene.cloth, device), motion=motion))
 
 
 class SceneSampler:
     """Draws training scenes; a scene is a function of the generator alone, so a seed replays it.
 
+    Scenes are made on the CPU, whatever device they are moved to.
+
     Args:
         body: the body to dress.
         garments: templates, drawn uniformly.
-        sequences: motions, drawn by their length.
+        sequences: motions, drawn by their length; :class:`hood.assets.motions.MotionFiles` are read when drawn.
         beta_range: shape coefficients are U(-beta_range, beta_range).
         size_range: garment scale is uniform in this interval.
         piecewise_fraction: share of the scenes with several fabrics on one garment.
         random_yaw: turn the world about the vertical axis, so that no direction is special.
-        device: where the scenes' tensors live.
+        mirror: show every other scene, at random, as its image x → −x, so that no side is special: without it, what a
+            network learns from lopsided motions lets cloth drift sideways on a body that stands still.
+        device: where the scenes' tensors live in training.
     """
 
     def __init__(
@@ -46,43 +72,102 @@ class SceneSampler:
         size_range: tuple[float, float] = (0.9, 1.1),
         piecewise_fraction: float = 0.2,
         random_yaw: bool = True,
+        mirror: bool = True,
         device: str = "cpu",
     ) -> None:
         if not garments or not sequences:
             raise ValueError("training needs at least one garment and one motion")
         self.body = body
         self.garments = [bind_garment(garment, body) for garment in garments]
-        self.sequences = list(sequences)
+        self.sequences = sequences if isinstance(sequences, MotionFiles) else list(sequences)
+        self._lengths = motion_lengths(self.sequences)
         self.beta_range = beta_range
         self.size_low, self.size_high = size_range
         self.piecewise_fraction = piecewise_fraction
-        self.random_yaw = random_yaw
+        self.random_yaw, self.mirror = random_yaw, mirror
         self.device = device
 
     def sample(self, rng: np.random.Generator, num_steps: int, garment: int | None = None) -> Window:
-        """A scene with at least ``num_steps`` steps ahead of its start frame.
+        """A scene on the CPU with at least ``num_steps`` steps ahead of its start frame.
 
         ``garment`` fixes the template by its index; None draws one.
 
         Raises:
-            ValueError: every motion is shorter than that.
+            ValueError: every motion is shorter than that, or a motion that was drawn cannot be read.
         """
         index = int(rng.integers(len(self.garments))) if garment is None else garment % len(self.garments)
         template = self.garments[index]
-        lengths = np.array([max(s.num_frames - num_steps - 1, 0) for s in self.sequences], dtype=np.float64)
-        if not lengths.any():
-            longest = max(self.sequences, key=lambda s: s.num_frames)
-            raise ValueError(
-                f"no motion has the {num_steps + 2} frames that a training rollout needs; the longest, {longest.name!r}, "
-                f"has {longest.num_frames} (lower trainer.horizon.maximum or give longer motions)"
-            )
-        sequence = self.sequences[int(rng.choice(len(self.sequences), p=lengths / lengths.sum()))]
-        start = int(rng.integers(sequence.num_frames - num_steps - 1))
-        window = sequence.window(max(start - 1, 0), start + num_steps + 2)
+        window, start = self._draw_motion(rng, num_steps)
         if self.random_yaw:
             turn = Rotation.from_rotvec([0.0, rng.uniform(-np.pi, np.pi), 0.0]).as_matrix()
             window = turn_world(window, turn)
         betas = np.asarray(rng.uniform(-self.beta_range, self.beta_range, self.body.shapedirs.shape[2]))
         size = float(rng.uniform(self.size_low, self.size_high))
         material: Material = sample_material(rng, template.rest_pos, self.piecewise_fraction)
-        return Window(build_scene(template, self.body, window, material, betas, size, device=self.device), min(start, 1))
+        mirrored = self.mirror and rng.random() < 0.5
+        body, dress = self._assets(index, mirrored)
+        scene = build_scene(dress, body, window, material, betas, size)
+        return Window(scene, min(start, 1), index, mirrored)
+
+    def pack(self, window: Window) -> dict[str, Any]:
+        """A sampled window as plain arrays, without the body and the garment that every process has; surfaces posed."""
+        motion = window.scene.motion
+        assert isinstance(motion, BodyMotion)
+        return {
+            "cloth": {name: _to_numpy(value) for name, value in vars(window.scene.cloth).items()},
+            "sequence": motion.sequence,
+            "betas": motion.betas,
+            "surfaces": {chunk: surface.numpy() for chunk, surface in motion.surfaces().items()},
+            "start_frame": window.start_frame,
+            "template": window.template,
+            "mirrored": window.mirrored,
+        }
+
+    def unpack(self, packed: dict[str, Any]) -> Window:
+        """What was packed, to the last bit, with this sampler's own body and garments."""
+        body, garment = self._assets(packed["template"], packed["mirrored"])
+        values: dict[str, Any] = {
+            name: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for name, v in packed["cloth"].items()
+        }
+        cloth = Cloth(**{spec.name: values[spec.name] for spec in fields(Cloth)})
+        motion = body_motion(body, packed["sequence"], packed["betas"], cloth.rest_pos.dtype)
+        surfaces = {chunk: torch.from_numpy(surface) for chunk, surface in packed["surfaces"].items()}
+        scene = Scene(cloth, garment, motion.with_surfaces(surfaces, "cpu"), 1.0 / packed["sequence"].fps)
+        return Window(scene, packed["start_frame"], packed["template"], packed["mirrored"])
+
+    def _draw_motion(self, rng: np.random.Generator, num_steps: int) -> tuple[PoseSequence, int]:
+        """Part of a motion with ``num_steps`` steps ahead of a start frame, and that frame in the whole motion."""
+        weights = np.maximum(self._lengths - num_steps - 1, 0).astype(np.float64)
+        if not weights.any():
+            longest = int(self._lengths.argmax())
+            raise ValueError(
+                f"no motion has the {num_steps + 2} frames that a training rollout needs; the longest, "
+                f"{self.sequences[longest].name!r}, has {self._lengths[longest]} (lower trainer.horizon.maximum or give longer "
+                "motions)"
+            )
+        weights /= weights.sum()
+        for _ in range(_MAX_UNREADABLE):
+            index = int(rng.choice(len(weights), p=weights))
+            start = int(rng.integers(self._lengths[index] - num_steps - 1))
+            source = self.sequences
+            sequence = source.usable(index) if isinstance(source, MotionFiles) else source[index]
+            if sequence is not None:
+                return sequence.window(max(start - 1, 0), start + num_steps + 2), start
+        raise ValueError(f"{_MAX_UNREADABLE} motions drawn in a row could not be read; check the files of data.sequences")
+
+    def _assets(self, index: int, mirrored: bool) -> tuple[Body, Garment]:
+        if not mirrored:
+            return self.body, self.garments[index]
+        return self._mirrored_body, self._mirrored_garments[index]
+
+    @cached_property
+    def _mirrored_body(self) -> Body:
+        return mirror_body(self.body)
+
+    @cached_property
+    def _mirrored_garments(self) -> list[Garment]:
+        return [mirror_garment(garment) for garment in self.garments]
+
+
+def _to_numpy(value: Any) -> Any:
+    return value.numpy() if isinstance(value, Tensor) else value

@@ -1,39 +1,54 @@
-"""Training checkpoints: everything a run needs to go on exactly, written atomically, read without unpickling classes."""
+"""Training checkpoints: everything a run needs to go on exactly, written atomically, read without unpickling classes.
+
+The checkpoint before the newest stays beside it: a file that a failing disk spoilt costs one interval, not the run.
+"""
 
 from __future__ import annotations
 
+import io
 import os
+import zipfile
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from hood.assets.atomic import write_atomically
+
 #: What a run cannot go on without.
-_KEYS = {"iteration", "seed", "skipped", "simulator", "average", "optimizer", "slots", "rng", "model"}
+_KEYS = {"iteration", "seed", "skipped", "skipped_in_row", "rollbacks", "best", "simulator", "average", "optimizer", "slots"}
+_KEYS |= {"rng", "model"}
+
+
+def previous(path: Path) -> Path:
+    """Where the checkpoint before the one at ``path`` is: ``checkpoint.previous.pt`` for ``checkpoint.pt``."""
+    return path.with_name(f"{path.stem}.previous{path.suffix}")
 
 
 def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
-    """Write ``state`` (tensors and plain values) to ``path``; the old file stays until the new one is complete."""
-    temporary = path.with_name(path.name + ".partial")
-    try:
-        with open(temporary, "wb") as file:
-            torch.save(state, file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    """Write ``state`` (tensors and plain values) to ``path``; the old file stays as :func:`previous`.
+
+    Raises:
+        OSError: no space or no permission; the old files are untouched.
+    """
+    # Through memory: a full disk is then a plain OSError, not one buried in the archive writer's own.
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    write_atomically(path, buffer.getvalue(), keep=previous(path))
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
-    """Read a training checkpoint; only tensors and plain values are accepted.
+    """Read a training checkpoint; only tensors and plain values are accepted, and checksums must hold.
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: not a training checkpoint.
+        ValueError: not a training checkpoint, or a damaged one.
     """
     try:
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()  # torch.load would take flipped bits for weights
+            if damaged is not None:
+                raise ValueError(f"checksum of {damaged} does not hold")
         state = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
         raise
@@ -43,3 +58,30 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     if not isinstance(state, dict) or not _KEYS <= set(state):
         raise ValueError(f"{path}: not a training checkpoint; give the checkpoint.pt of a run folder")
     return state
+
+
+def set_aside(path: Path) -> None:
+    """Rename a damaged checkpoint, so that the next one written does not push the last good one out for it."""
+    if path.exists():
+        os.replace(path, path.with_name(f"{path.stem}.damaged{path.suffix}"))
+
+
+def load_last_good(path: Path) -> tuple[dict[str, Any], str | None]:
+    """The checkpoint at ``path``, or the previous one where that is missing or damaged, and then a sentence that says so.
+
+    Raises:
+        FileNotFoundError: neither exists.
+        ValueError: neither can be read.
+    """
+    try:
+        return load_checkpoint(path), None
+    except (FileNotFoundError, ValueError) as error:
+        older = previous(path)
+        if not older.exists():
+            raise
+        reason = f"{path}: no such file" if isinstance(error, FileNotFoundError) else str(error)
+        try:
+            state = load_checkpoint(older)
+        except ValueError as second:
+            raise ValueError(f"{reason}; and {second}") from error
+        return state, f"{reason}; going on from {older.name}, iteration {state['iteration']}"

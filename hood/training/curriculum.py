@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from hood.losses.potential import Potential
 
@@ -22,6 +22,10 @@ class Horizon:
     def __call__(self, iteration: int) -> int:
         return min(self.start + iteration // max(self.every, 1), self.maximum)
 
+    def scaled(self, factor: float) -> Horizon:
+        """The same curriculum, ``factor`` times as long."""
+        return replace(self, every=scaled_count("trainer.horizon.every", self.every, factor))
+
 
 @dataclass(frozen=True)
 class StepDecay:
@@ -32,6 +36,10 @@ class StepDecay:
 
     def __call__(self, iteration: int, num_iterations: int) -> float:
         return 0.5 ** (iteration // self.every) + self.floor
+
+    def scaled(self, factor: float) -> StepDecay:
+        """The same decay, ``factor`` times as long."""
+        return replace(self, every=scaled_count("trainer.schedule.every", self.every, factor))
 
 
 @dataclass(frozen=True)
@@ -46,6 +54,10 @@ class WarmupCosine:
             return (iteration + 1) / self.warmup
         progress = (iteration - self.warmup) / max(num_iterations - self.warmup, 1)
         return self.floor + (1 - self.floor) * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
+
+    def scaled(self, factor: float) -> WarmupCosine:
+        """The same with a warm-up ``factor`` times as long; the cosine fills what remains of the run in any case."""
+        return replace(self, warmup=scaled_count("trainer.schedule.warmup", self.warmup, factor))
 
 
 @dataclass(frozen=True)
@@ -64,8 +76,30 @@ class CollisionRamp:
         progress = min(max((iteration - self.begin_iteration) / span, 0.0), 1.0)
         return self.start + (self.end - self.start) * progress
 
+    def scaled(self, factor: float) -> CollisionRamp:
+        """The same ramp with its two ends ``factor`` times as late."""
+        begin, end = (
+            scaled_count(f"trainer.collision.{name}", getattr(self, name), factor)
+            for name in ("begin_iteration", "end_iteration")
+        )
+        return replace(self, begin_iteration=begin, end_iteration=end)
+
     def apply(self, potential: Potential, iteration: int) -> Potential:
         """The potential with this iteration's weight in collision and friction."""
         weight = self(iteration)
         names = [name for name in ("collision", "friction") if name in potential.terms]
         return potential.with_terms(**{name: potential.terms[name].with_weight(weight) for name in names})  # type: ignore[attr-defined]
+
+
+def scaled_count(name: str, count: int, factor: float) -> int:
+    """``count`` iterations times ``factor``, rounded; 0 stays 0, and nothing else becomes it.
+
+    Raises:
+        ValueError: ``factor`` is not a finite number > 0, or so small that nothing is left of ``name``.
+    """
+    if not (math.isfinite(factor) and factor > 0):
+        raise ValueError(f"trainer.time_scale is {factor}; it must be a finite number > 0")
+    scaled = round(count * factor)
+    if count > 0 and scaled == 0:
+        raise ValueError(f"trainer.time_scale={factor:g} leaves nothing of {name}={count}; raise it")
+    return scaled

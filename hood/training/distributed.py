@@ -1,12 +1,21 @@
-"""Several training processes, started by torchrun: one share of the batch each, gradients averaged by DDP."""
+"""Several processes, started by torchrun on one machine or many: gradients averaged by DDP, work shared by rank."""
 
 from __future__ import annotations
 
 import os
-from typing import Any
+from collections.abc import Callable, Mapping
+from datetime import timedelta
+from typing import Any, TypeVar
 
 import torch
 import torch.distributed as dist
+from torch import Tensor
+
+Result = TypeVar("Result")
+
+#: Shares of a batch of rollouts may differ by hours: the one that is done first waits.
+_PATIENCE = timedelta(days=7)
+_TOLD = "raised on process 0"
 
 
 def start() -> None:
@@ -15,7 +24,8 @@ def start() -> None:
         if torch.cuda.is_available():
             torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")) % torch.cuda.device_count())
         # Flags and slots are exchanged on the CPU in any case, gradients where the model is.
-        dist.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo")
+        backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
+        dist.init_process_group(backend, timeout=_PATIENCE)
 
 
 def stop() -> None:
@@ -50,3 +60,42 @@ def gather(value: Any) -> list[Any]:
     values: list[Any] = [None] * world_size()
     dist.all_gather_object(values, value)
     return values
+
+
+def on_main(function: Callable[[], Result]) -> Result:
+    """What ``function`` returns on process 0, on every process; what it raises there is raised on all of them.
+
+    Files are written, and read where no file system is shared, in one place; no process waits for one that gave up.
+    """
+    outcome: list[Any] = [None, None]
+    if rank() == 0:
+        try:
+            outcome[0] = function()
+        except (ValueError, OSError, ImportError) as error:
+            outcome[1] = error
+    if world_size() > 1:
+        dist.broadcast_object_list(outcome, src=0, device=torch.device("cpu"))
+    if outcome[1] is not None:
+        if rank() != 0:
+            outcome[1].add_note(_TOLD)
+        raise outcome[1]
+    result: Result = outcome[0]
+    return result
+
+
+def is_told(error: BaseException) -> bool:
+    """Whether an error came from process 0, which tells it itself."""
+    return _TOLD in getattr(error, "__notes__", ())
+
+
+def mean(report: Mapping[str, float]) -> dict[str, float]:
+    """Entry-wise mean over the processes; an entry that a process lacks (an energy its scenes do not have) counts as 0."""
+    reports = gather(dict(report))
+    names = dict.fromkeys(name for part in reports for name in part)
+    return {name: sum(part.get(name, 0.0) for part in reports) / len(reports) for name in names}
+
+
+def all_reduce_sum(value: Tensor) -> Tensor:
+    """Sum over the processes, in place; what each of them gets is the same to the last bit."""
+    dist.all_reduce(value)
+    return value

@@ -3,36 +3,72 @@
 from __future__ import annotations
 
 import json
+import math
+import sys
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import numpy as np
+
+from hood.assets.atomic import write_atomically
+
 
 class MetricsLog:
-    """Appends to ``metrics.jsonl``; on resume, lines after the resumed iteration are dropped first."""
+    """Appends to ``metrics.jsonl``; on resume, lines after the resumed iteration are dropped first.
+
+    A disk that refuses a line raises an OSError that names the file; one that refuses TensorBoard's events ends those.
+    """
 
     def __init__(self, folder: Path, iteration: int) -> None:
-        path = folder / "metrics.jsonl"
-        kept = _lines_up_to(path, iteration)
-        path.write_text("".join(kept), encoding="utf-8")
-        self._file = open(path, "a", encoding="utf-8")
-        self._board = _tensorboard(folder, iteration)
+        self._folder = folder
+        self.path = folder / "metrics.jsonl"
+        self._open(iteration)
 
     def write(self, iteration: int, values: dict[str, float]) -> None:
-        """One record; flushed at once, so that a killed run keeps it."""
-        self._file.write(json.dumps({"iteration": iteration, **values}) + "\n")
-        self._file.flush()
-        if self._board is not None:
-            for name, value in values.items():
-                self._board.add_scalar(name, value, iteration)
+        """One record, on disk at once, so that a killed run keeps it; what is not a finite number becomes null."""
+        record = {name: value if math.isfinite(value) else None for name, value in values.items()}
+        line = (json.dumps({"iteration": iteration, **record}) + "\n").encode()
+        try:
+            while line:
+                line = line[self._file.write(line) or 0 :]
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(self.path)) from error
+        for name, value in values.items():
+            self._to_board("add_scalar", name, value, iteration)
+
+    def picture(self, iteration: int, name: str, image: np.ndarray) -> None:
+        """A picture (H, W, 3) uint8 for TensorBoard."""
+        self._to_board("add_image", name, image, iteration, dataformats="HWC")
+
+    def cut(self, iteration: int) -> None:
+        """Drop what was recorded after ``iteration``: training went back there."""
+        self._close()
+        self._open(iteration)
 
     def __enter__(self) -> MetricsLog:
         return self
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._close()
+
+    def _open(self, iteration: int) -> None:
+        write_atomically(self.path, "".join(_lines_up_to(self.path, iteration)).encode())
+        self._file = open(self.path, "ab", buffering=0)
+        self._board = _tensorboard(self._folder, iteration)
+
+    def _close(self) -> None:
         self._file.close()
-        if self._board is not None:
-            self._board.close()
+        self._to_board("close")
+
+    def _to_board(self, method: str, *values: Any, **options: Any) -> None:
+        if self._board is None:
+            return
+        try:
+            getattr(self._board, method)(*values, **options)
+        except (OSError, ImportError) as error:
+            self._board = None
+            print(f"hood: no more TensorBoard events: {error}", file=sys.stderr)
 
 
 def _lines_up_to(path: Path, iteration: int) -> list[str]:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,16 +15,17 @@ from hood.scene.cloth import Cloth, concatenate_cloths
 from hood.scene.dataset import SceneSampler, Window
 from hood.scene.scene import concatenate_step_inputs, recentre
 from hood.scene.state import State, StepInput, concatenate_states
+from hood.training.buckets import make_buckets, next_bucket
+from hood.training.prefetch import MAX_DRAWS, Request, SceneFeed, choose_workers, draw_window
 
 #: A training rollout is given up once 1% of its edges are strained beyond this: nothing can be learned from debris.
 _BROKEN_STRAIN = 1.5
-#: Skinning cannot dress every pose: a start with 2% of its edges beyond this strain is drawn again, a few times.
-_BAD_START = 0.25
-_MAX_DRAWS = 4
 
 
 @dataclass
 class _Slot:
+    bucket: int
+    place: int  # in its bucket
     draws: int = 0
     age: int = 0
     window: Window | None = None
@@ -34,11 +34,18 @@ class _Slot:
 
 
 class Slots:
-    """B running rollouts.
+    """Running rollouts, a batch of them for every bucket of garments of similar size (:mod:`hood.training.buckets`).
 
-    Scene number ``draws`` of slot *i* is a function of (seed, i, draws): a checkpoint stores these numbers and the states,
-    nothing else. Garments go round the slots, so that every template is seen equally often. This process runs the slots
-    ``mine`` of ``batch_size``; the scenes do not depend on how many processes share them.
+    Scene number ``draws`` of slot *i* is a function of (seed, i, draws), the bucket of an update one of their number: a
+    checkpoint stores these numbers and the states, nothing else. Garments go round the slots of their bucket, so that every
+    template is seen equally often. This process runs every ``ranks``-th slot from ``rank`` on; the scenes do not depend on
+    how many processes share them, nor on ``workers``.
+
+    Args:
+        batch_size: scenes of one update, or with ``max_vertices`` what that number is a multiple of.
+        max_horizon: regular steps of the longest rollout.
+        max_vertices: vertices of one update at most, over all processes; None: garments of all sizes share batches.
+        workers: processes that make scenes ahead, see :class:`hood.training.prefetch.SceneFeed`; None: one per idle core.
     """
 
     def __init__(
@@ -48,21 +55,36 @@ class Slots:
         batch_size: int,
         seed: int,
         max_horizon: int,
-        mine: Sequence[int] | None = None,
+        rank: int = 0,
+        ranks: int = 1,
+        max_vertices: int | None = None,
+        workers: int | None = 0,
     ) -> None:
         self.sampler, self.simulator, self.seed, self.max_horizon = sampler, simulator, seed, max_horizon
-        self.batch_size = batch_size
-        self._slots = {index: _Slot() for index in (range(batch_size) if mine is None else mine)}
-        self._batch: tuple[Cloth, Prepared] | None = None
+        self.buckets = make_buckets([len(garment.rest_pos) for garment in sampler.garments], batch_size, max_vertices)
+        self._slots = {
+            bucket.first + place: _Slot(number, place)
+            for number, bucket in enumerate(self.buckets)
+            for place in range(rank, bucket.count, ranks)
+        }
+        self._turns = [0] * len(self.buckets)
+        self._batches: dict[int, tuple[Cloth, Prepared]] = {}
+        self.feed = SceneFeed(sampler, choose_workers(workers, len(self._slots)))
+
+    @property
+    def num_slots(self) -> int:
+        """Rollouts of all buckets, over all processes."""
+        return self.buckets[-1].first + self.buckets[-1].count
 
     def batch(self, horizon: int) -> tuple[Cloth, Prepared, State, StepInput]:
         """The current problems as one flat batch; slots past ``horizon`` steps start a new scene first."""
-        for index, slot in self._slots.items():
+        number, slots = self._current()
+        for index, slot in slots.items():
             # Step 0 is the relaxing step; ``horizon`` regular steps follow it.
             if slot.window is None or slot.age > horizon:
                 self._reset(index, slot)
         states, steps, counts = [], [], []
-        for slot in self._slots.values():
+        for slot in slots.values():
             assert slot.window is not None
             assert slot.state is not None
             scene, relaxing = slot.window.scene, slot.age == 0
@@ -71,24 +93,28 @@ class Slots:
             states.append(slot.state)
             steps.append(scene.step_input(frame, slot.state, relaxing=relaxing))
             counts.append(scene.cloth.num_vertices)
-        if self._batch is None:
-            cloth = concatenate_cloths([slot.window.scene.cloth for slot in self._slots.values()])  # type: ignore[union-attr]
-            prepared = self.simulator.concatenate(cloth, [slot.prepared for slot in self._slots.values()], counts)  # type: ignore[misc]
-            self._batch = (cloth, prepared)
-        return *self._batch, concatenate_states(states), concatenate_step_inputs(steps, counts)
+        if number not in self._batches:
+            cloth = concatenate_cloths([slot.window.scene.cloth for slot in slots.values()])  # type: ignore[union-attr]
+            prepared = self.simulator.concatenate(cloth, [slot.prepared for slot in slots.values()], counts)  # type: ignore[misc]
+            self._batches[number] = (cloth, prepared)
+        return *self._batches[number], concatenate_states(states), concatenate_step_inputs(steps, counts)
 
     def skinned_accelerations(self) -> Tensor:
         """(V, 3) m per frame² of the batch's skinned garments at their current frames: the scale of the paper's output."""
         parts = []
-        for slot in self._slots.values():
+        for slot in self._current()[1].values():
             assert slot.window is not None
             parts.append(slot.window.scene.skinned_acceleration(slot.window.start_frame + max(slot.age - 1, 0)))
         return torch.cat(parts)
 
     def advance(self, next_pos: Tensor, next_vel: Tensor) -> None:
-        """Take the predicted positions (V, 3) and velocities (V, 3) over, detached; broken rollouts end here."""
+        """Take the predicted positions (V, 3) and velocities (V, 3) over, detached; broken rollouts end here.
+
+        The turn passes on to the next bucket.
+        """
+        number, slots = self._current()
         offset = 0
-        for slot in self._slots.values():
+        for slot in slots.values():
             assert slot.window is not None
             assert slot.state is not None
             scene = slot.window.scene
@@ -101,46 +127,69 @@ class Slots:
             slot.age += 1
             if _broken(scene.cloth, pos):
                 slot.window = None
+        self._turns[number] += 1
 
     def state_dict(self) -> dict[int, dict[str, Any]]:
         """By slot: plain numbers and tensors that :meth:`load_state_dict` restores exactly."""
         entries = {}
         for index, slot in self._slots.items():
             entry: dict[str, Any] = {"draws": slot.draws, "age": slot.age, "live": slot.window is not None}
+            entry["turns"] = self._turns[slot.bucket]
             if slot.state is not None and slot.window is not None:
                 entry |= {"pos": slot.state.pos, "vel": slot.state.vel, "origin": slot.state.origin}
             entries[index] = entry
         return entries
 
-    def load_state_dict(self, state: dict[int, dict[str, Any]]) -> None:
-        self._batch = None
+    def restart(self) -> None:
+        """Give every running rollout up: the next batch starts scenes that were not drawn before."""
+        self._batches.clear()
+        for slot in self._slots.values():
+            slot.window = None
+
+    def load_state_dict(self, state: Mapping[int, Mapping[str, Any]]) -> None:
+        self.restart()
         for index, slot in self._slots.items():
             entry = state[index]
             slot.draws, slot.age = int(entry["draws"]), int(entry["age"])
+            self._turns[slot.bucket] = int(entry["turns"])
             if entry["live"]:
-                slot.window = self._draw(index, slot.draws - 1)
+                draw, device = slot.draws - 1, self.sampler.device
+                garment = self.buckets[slot.bucket].template(slot.place, draw)
+                window = draw_window(self.sampler, self.seed, index, draw, garment, self.max_horizon + 1)
+                slot.window = window.to(device)
                 slot.prepared = self._prepare(slot.window)
-                device = slot.window.scene.cloth.rest_pos.device
                 slot.state = State(entry["pos"].to(device), entry["vel"].to(device), entry["origin"])
+            self.feed.expect(self._request(index, slot))
+
+    def close(self) -> None:
+        """End the processes that make scenes ahead; they start again when needed."""
+        self.feed.close()
+
+    def _current(self) -> tuple[int, dict[int, _Slot]]:
+        """The bucket whose update it is and this process's slots of it."""
+        number = next_bucket(self.buckets, self._turns)
+        return number, {index: slot for index, slot in self._slots.items() if slot.bucket == number}
 
     def _reset(self, index: int, slot: _Slot) -> None:
-        for _ in range(_MAX_DRAWS):
-            slot.window = window = self._draw(index, slot.draws)
-            slot.state = window.scene.start(window.start_frame, relaxed=False)
-            slot.draws += 1
-            strain = edge_strain(window.scene.cloth, slot.state.pos).abs()
-            if float((strain > _BAD_START).double().mean()) < 0.02:
-                break
-        slot.prepared = self._prepare(window)
+        start = self.feed.take(self._request(index, slot))
+        device = self.sampler.device
+        slot.window = start.window.to(device)
+        slot.state = State(start.state.pos.to(device), start.state.vel.to(device), start.state.origin)
+        slot.draws += start.draws
+        slot.prepared = self._prepare(slot.window)
         slot.age = 0
-        self._batch = None
+        self._batches.pop(slot.bucket, None)
+        self.feed.expect(self._request(index, slot))
+
+    def _request(self, index: int, slot: _Slot) -> Request:
+        """The next scene of a slot."""
+        bucket = self.buckets[slot.bucket]
+        garments = tuple(bucket.template(slot.place, slot.draws + attempt) for attempt in range(MAX_DRAWS))
+        return Request(self.seed, index, slot.draws, garments, self.max_horizon + 1)
 
     def _prepare(self, window: Window) -> Prepared:
-        return self.simulator.prepare(window.scene.cloth, window.scene.garment.rest_pos)
-
-    def _draw(self, index: int, draw: int) -> Window:
-        rng = np.random.default_rng([self.seed, index, draw])
-        return self.sampler.sample(rng, self.max_horizon + 1, garment=index + draw * self.batch_size)
+        # A mirrored scene has the levels of its template: they are then the image of the original's, and found once.
+        return self.simulator.prepare(window.scene.cloth, self.sampler.garments[window.template].rest_pos)
 
 
 def _broken(cloth: Cloth, pos: Tensor) -> bool:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import math
+import sys
 import time
-from collections.abc import Callable
-from contextlib import nullcontext
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,18 +18,18 @@ from torch.nn.parallel import DistributedDataParallel
 
 from hood.dynamics.output import AccelerationOutput
 from hood.dynamics.simulator import Simulator, save_simulator
+from hood.features.normalizer import RunningNormalizer
 from hood.losses.potential import Potential, relative_gradient, scale
 from hood.losses.problem import StepProblem
 from hood.nn.model import PRECISIONS
 from hood.scene.dataset import SceneSampler
 from hood.training import distributed
-from hood.training.checkpoint import load_checkpoint, save_checkpoint
-from hood.training.curriculum import CollisionRamp, Horizon, StepDecay, WarmupCosine
+from hood.training.checkpoint import load_last_good, previous, save_checkpoint, set_aside
+from hood.training.curriculum import CollisionRamp, Horizon, StepDecay, WarmupCosine, scaled_count
+from hood.training.loss import relative_loss
 from hood.training.metrics_log import MetricsLog
 from hood.training.slots import Slots
-
-#: Non-finite updates in a row after which training stops: the last checkpoint is then the better start.
-_MAX_SKIPPED = 50
+from hood.training.watch import Watch
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,12 @@ class TrainerSettings:
 
     ``signal``: ``"potential"`` is the plain mean potential; ``"scaled"`` divides each scene's gradient by its e0 and by
     1 + rg / 3, so that one broken scene does not drown the others.
+    ``max_skipped``: updates without a finite loss and gradient in a row after which training goes back to the last good
+    checkpoint, on other scenes; ``max_rollbacks``: how often it does so without getting any further.
     ``precision``: of the network's latents and products; ``"bf16"`` keeps weights, their gradients and energies in float32.
+    ``time_scale``: factor on the whole schedule, see :meth:`compressed`. ``max_vertices``: batches of garments of similar size,
+    :mod:`hood.training.buckets`. ``workers``: processes that make scenes ahead, None for one per idle core.
+    ``activation_checkpointing``: keep the latents between processor steps only and compute the rest again when it is needed.
     """
 
     iterations: int = 150_000
@@ -53,27 +60,63 @@ class TrainerSettings:
     checkpoint_every: int = 500
     log_every: int = 20
     validate_every: int = 0
+    max_skipped: int = 20
+    max_rollbacks: int = 3
+    time_scale: float = 1.0
+    max_vertices: int | None = None
+    workers: int | None = 0
+    activation_checkpointing: bool = False
 
     def __post_init__(self) -> None:
         if self.precision not in PRECISIONS:
             raise ValueError(f"trainer.precision {self.precision!r}: give {' or '.join(map(repr, PRECISIONS))}")
         if self.signal not in ("potential", "scaled"):
             raise ValueError(f"trainer.signal {self.signal!r}: give 'potential' or 'scaled'")
-        for name in ("iterations", "batch_size", "checkpoint_every", "log_every"):
+        for name in ("iterations", "batch_size", "checkpoint_every", "log_every", "max_skipped"):
             if getattr(self, name) < 1:
                 raise ValueError(f"trainer.{name} is {getattr(self, name)}; it must be at least 1")
+        for name in ("validate_every", "max_rollbacks"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"trainer.{name} is {getattr(self, name)}; it must be at least 0")
         if self.learning_rate <= 0 or self.clip_norm <= 0:
             raise ValueError("trainer.learning_rate and trainer.clip_norm must be > 0")
+        if self.time_scale != 1.0:
+            self.compressed()  # refused here rather than after the data has been read
+
+    def compressed(self) -> TrainerSettings:
+        """The same with ``time_scale`` 1 and everything that is counted from the start of the schedule multiplied by it:
+        iterations, curriculum, learning-rate decay or warm-up, collision ramp.
+
+        What serves the statistics is a number of samples and stays: ``statistics_iterations`` and the decay of the normalisers.
+        """
+        if self.time_scale == 1.0:
+            return self
+        iterations = scaled_count("trainer.iterations", self.iterations, self.time_scale)
+        if iterations <= self.statistics_iterations:
+            raise ValueError(
+                f"trainer.time_scale={self.time_scale:g} leaves {iterations} iterations, of which the first "
+                f"{self.statistics_iterations} only collect statistics; raise it"
+            )
+        return replace(
+            self,
+            time_scale=1.0,
+            iterations=iterations,
+            schedule=self.schedule.scaled(self.time_scale),
+            horizon=self.horizon.scaled(self.time_scale),
+            collision=self.collision.scaled(self.time_scale),
+        )
 
 
-Validation = Callable[[Simulator], dict[str, float]]
-Progress = Callable[[int, dict[str, float]], None]
+#: Told the iteration and what was measured; None instead of a report: time passed that was not training.
+Progress = Callable[[int, dict[str, float] | None], None]
 
 
 class Trainer:
     """Owns the optimisation: slots of running rollouts, optimiser, averaged weights, checkpoints.
 
-    Files in ``folder``: ``checkpoint.pt`` (resume), ``model.safetensors`` (use), ``metrics.jsonl``, TensorBoard events.
+    Files in ``folder``: ``checkpoint.pt`` and ``checkpoint.previous.pt`` (resume), ``model.safetensors`` (use),
+    ``best.safetensors`` (use; the best validation so far), ``metrics.jsonl``, ``validation/``, TensorBoard events. Process 0
+    alone writes and reads them. A disk that refuses a file ends the training with the last checkpoint intact.
     """
 
     def __init__(
@@ -84,21 +127,36 @@ class Trainer:
         settings: TrainerSettings,
         folder: Path,
         seed: int,
-        validation: Validation | None = None,
+        watch: Watch | None = None,
     ) -> None:
+        settings = settings.compressed()
         self.simulator, self.potential, self.settings = simulator, potential, settings
-        self.folder, self.seed, self.validation = folder, seed, validation
+        self.folder, self.seed, self.watch = folder, seed, watch
         simulator.network.use_precision(settings.precision)
+        simulator.network.use_checkpointing(settings.activation_checkpointing)
         ranks, rank = distributed.world_size(), distributed.rank()
         if settings.batch_size % ranks:
             raise ValueError(f"trainer.batch_size={settings.batch_size} cannot be shared by {ranks} processes; use a multiple")
-        mine = range(rank, settings.batch_size, ranks)
-        self.slots = Slots(sampler, simulator, settings.batch_size, seed, settings.horizon.maximum, mine)
-        self.model: torch.nn.Module = DistributedDataParallel(simulator) if ranks > 1 else simulator
+        shares = (rank, ranks, settings.max_vertices, settings.workers)
+        self.slots = Slots(sampler, simulator, settings.batch_size, seed, settings.horizon.maximum, *shares)
+        self.model: torch.nn.Module = simulator
+        if ranks > 1:
+            # Statistics are kept equal by their own sums; scenes are drawn by slot, so only other draws need a generator each.
+            self.model = DistributedDataParallel(simulator, broadcast_buffers=False)
+            torch.manual_seed(seed + 7919 * rank)
+            for module in simulator.modules():
+                if isinstance(module, RunningNormalizer):
+                    module.shared_sum = distributed.all_reduce_sum
         self.optimizer = torch.optim.Adam(simulator.parameters(), lr=settings.learning_rate)
         self.iteration = 0
         self.skipped = 0
+        self.rollbacks = 0
+        self.best = math.inf
         self._skipped_in_row = 0
+        self._rollbacks_in_row = 0
+        self._failed_at = -1
+        self._saved_at = -1
+        self._metrics: MetricsLog | None = None
         self._average = {name: value.detach().clone() for name, value in simulator.named_parameters()}
 
     @property
@@ -106,25 +164,41 @@ class Trainer:
         return self.folder / "checkpoint.pt"
 
     def run(self, progress: Progress | None = None, should_stop: Callable[[], bool] = lambda: False) -> bool:
-        """Train up to ``settings.iterations``; True when finished, False when ``should_stop`` ended it early."""
+        """Train up to ``settings.iterations``; True when finished, False when ``should_stop`` ended it early.
+
+        Raises:
+            OSError: a file could not be written; what was written before is intact.
+            ValueError: training does not stay finite.
+        """
         settings = self.settings
-        self.folder.mkdir(parents=True, exist_ok=True)
-        begun, first = time.monotonic(), self.iteration
-        main = distributed.rank() == 0
-        with MetricsLog(self.folder, self.iteration) if main else nullcontext() as log:
+        with ExitStack() as stack:
+            stack.callback(self.slots.close)
+            distributed.on_main(lambda: self._open_log(stack))
+            if self.iteration == 0 and self._saved_at != 0:
+                self.save()  # something to go back to, and a full disk shows at once
+            clock = _Clock(self.iteration)
             while self.iteration < settings.iterations and not distributed.any_rank(should_stop()):
                 report = self.update()
-                done = self.iteration
-                if log and (done % settings.log_every == 0 or done == settings.iterations):
-                    rate = (done - first) / max(time.monotonic() - begun, 1e-9)
-                    log.write(done, {**report, "iterations_per_second": rate})
+                last = self.iteration == settings.iterations
+                # In the middle of a streak of skipped updates the weights are not known to be good.
+                saving = last or (self.iteration % settings.checkpoint_every == 0 and not self._skipped_in_row)
+                if self._is_lost(saving):
+                    self._roll_back()
+                    clock = _Clock(self.iteration)
+                    continue
+                if last or self.iteration % settings.log_every == 0:
+                    self._log({**report, "iterations_per_second": clock.rate(self.iteration)})
                 if progress is not None:
-                    progress(done, report)
-                if log and settings.validate_every and self.validation and done % settings.validate_every == 0:
-                    log.write(done, {f"validation_{k}": v for k, v in self.validation(self.averaged()).items()})
-                if done % settings.checkpoint_every == 0:
+                    progress(self.iteration, report)
+                if self.watch is not None and settings.validate_every and self.iteration % settings.validate_every == 0:
+                    with clock.paused():
+                        self._validate()
+                    if progress is not None:
+                        progress(self.iteration, None)
+                if saving:
                     self.save()
-        self.save()
+            if self.iteration != self._saved_at and not self._is_lost(True):
+                self.save()
         return self.iteration >= settings.iterations
 
     def update(self) -> dict[str, float]:
@@ -133,9 +207,8 @@ class Trainer:
         simulator.train()
         horizon = settings.horizon(self.iteration)
         cloth, prepared, state, step = self.slots.batch(horizon)
-        contact = simulator.find_contact(cloth, state, step)
         potential = settings.collision.apply(self.potential, self.iteration)
-        problem = potential.prepare(StepProblem(cloth, state, step, contact, simulator.gravity))
+        problem = potential.prepare(StepProblem(cloth, state, step, gravity=simulator.gravity))
         collecting = self.iteration < settings.statistics_iterations and simulator.uses_statistics
         if collecting and isinstance(simulator.output, AccelerationOutput):
             simulator.output.observe(self.slots.skinned_accelerations())
@@ -147,6 +220,7 @@ class Trainer:
         report = {name: float(value.mean()) for name, value in energies.items()}
         report |= {
             "total": sum(report.values()),
+            "loss": float(relative_loss(problem, energies, prediction.acc.detach()).mean()),
             "relative_gradient": float(residual.median()),
             "horizon": float(horizon),
         }
@@ -157,7 +231,7 @@ class Trainer:
             if self.model is not simulator:
                 # A share without body edges leaves their networks out; all processes must reduce the same parameters.
                 surrogate = surrogate + 0.0 * sum(p.sum() for p in simulator.parameters())
-            report |= self._optimise(surrogate)
+            report |= self._optimise(surrogate, math.isfinite(report["total"]))
         self.slots.advance(prediction.next_pos, simulator.next_velocity(problem, prediction))
         self.iteration += 1
         return report
@@ -169,44 +243,139 @@ class Trainer:
         return clone.eval()
 
     def save(self) -> None:
-        """Write the resume checkpoint and the weights, both atomically."""
+        """Write the resume checkpoint and the weights, both atomically.
+
+        Raises:
+            OSError: no space or no permission; the files that are there stay as they were.
+        """
+        if self.iteration > self._failed_at:
+            self._rollbacks_in_row = 0
         slots = {index: entry for part in distributed.gather(self.slots.state_dict()) for index, entry in part.items()}
-        if distributed.rank() != 0:
-            return
+        generators = distributed.gather(_generator_states(self._device))
         state: dict[str, Any] = {
             "iteration": self.iteration,
             "seed": self.seed,
             "skipped": self.skipped,
+            "skipped_in_row": self._skipped_in_row,
+            "rollbacks": [self.rollbacks, self._rollbacks_in_row, self._failed_at],
+            "best": self.best,
             "simulator": self.simulator.state_dict(),
             "average": self._average,
             "optimizer": self.optimizer.state_dict(),
             "slots": slots,
-            "rng": torch.get_rng_state(),
+            "rng": generators,
             "model": self.simulator.config,
         }
-        save_checkpoint(self.checkpoint_path, state)
-        save_simulator(self.folder / "model.safetensors", self.averaged(), {"iteration": str(self.iteration)})
+        distributed.on_main(lambda: self._write(state))
+        self._saved_at = self.iteration
 
     def resume(self, path: Path) -> None:
-        """Go on from a checkpoint of a run with the same model and data.
+        """Go on from a checkpoint of a run with the same model and data, on any number of processes.
+
+        Where the newest checkpoint is missing or damaged the previous one is taken, and a line on stderr says so.
 
         Raises:
             ValueError: the checkpoint is of another model, seed or batch size.
         """
-        state = load_checkpoint(path)
+        state, note = distributed.on_main(lambda: load_last_good(path))
+        if note and distributed.rank() == 0:
+            print(f"hood: {note}", file=sys.stderr)
+            set_aside(path)
         if state["model"] != self.simulator.config:
             raise ValueError(f"{path}: trained with model {state['model']}, this run has {self.simulator.config}")
         if state["seed"] != self.seed:
             raise ValueError(f"{path}: trained with seed {state['seed']}; pass seed={state['seed']} to resume it")
-        if len(state["slots"]) != self.settings.batch_size:
-            raise ValueError(f"{path}: trained with trainer.batch_size={len(state['slots'])}; pass the same to resume it")
+        if len(state["slots"]) != self.slots.num_slots:
+            if self.settings.max_vertices is None:
+                raise ValueError(f"{path}: trained with trainer.batch_size={len(state['slots'])}; pass the same to resume it")
+            raise ValueError(
+                f"{path}: trained with {len(state['slots'])} running scenes, this run has {self.slots.num_slots}; pass the "
+                "same trainer.batch_size, trainer.max_vertices and data.garments to resume it"
+            )
+        self._restore(state)
+        self._saved_at = self.iteration if note is None else -1
+        self.slots.load_state_dict(state["slots"])
+        self.best = float(state["best"])
+        self.skipped, self._skipped_in_row = int(state["skipped"]), int(state["skipped_in_row"])
+        self.rollbacks, self._rollbacks_in_row, self._failed_at = state["rollbacks"]
+        if len(state["rng"]) == distributed.world_size():
+            _set_generator_states(state["rng"][distributed.rank()], self._device)
+
+    @property
+    def _device(self) -> torch.device:
+        return self.simulator.gravity.device
+
+    def _open_log(self, stack: ExitStack) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self._metrics = stack.enter_context(MetricsLog(self.folder, self.iteration))
+
+    def _write(self, state: dict[str, Any]) -> None:
+        save_checkpoint(self.checkpoint_path, state)
+        save_simulator(self.folder / "model.safetensors", self.averaged(), {"iteration": str(self.iteration)})
+
+    def _restore(self, state: Mapping[str, Any]) -> None:
+        """What is learned, as it was at the checkpoint."""
         self.simulator.load_state_dict(state["simulator"])
         for name, mean in self._average.items():
             mean.copy_(state["average"][name])
         self.optimizer.load_state_dict(state["optimizer"])
-        self.slots.load_state_dict(state["slots"])
-        self.iteration, self.skipped = int(state["iteration"]), int(state["skipped"])
-        torch.set_rng_state(state["rng"])
+        self.iteration = int(state["iteration"])
+
+    def _is_lost(self, look: bool) -> bool:
+        """Whether training cannot go on from here; ``look`` at the weights also while losses are finite."""
+        if self._skipped_in_row >= self.settings.max_skipped:
+            return True
+        if not look and not self._skipped_in_row:
+            return False
+        values = (*self.simulator.state_dict().values(), *self._average.values())
+        return not all(bool(torch.isfinite(value).all()) for value in values if value.is_floating_point())
+
+    def _roll_back(self) -> None:
+        """Go back to the last good checkpoint, the second time to the one before it, and on with scenes not seen so far."""
+        failed = self.iteration
+        if self._rollbacks_in_row >= self.settings.max_rollbacks:
+            raise ValueError(
+                f"training does not stay finite: {self.skipped} updates skipped, {self._rollbacks_in_row} times back to a "
+                f"checkpoint without getting past iteration {self._failed_at}; start again with a lower "
+                f"trainer.learning_rate ({self.checkpoint_path} holds the last finite weights)"
+            )
+        path = self.checkpoint_path if self._rollbacks_in_row == 0 else previous(self.checkpoint_path)
+        state, _ = distributed.on_main(lambda: load_last_good(path if path.exists() else self.checkpoint_path))
+        self._restore(state)
+        self.slots.restart()
+        self.optimizer.zero_grad(set_to_none=True)
+        self._skipped_in_row = 0
+        self.rollbacks, self._rollbacks_in_row = self.rollbacks + 1, self._rollbacks_in_row + 1
+        self._failed_at = max(failed, self._failed_at)
+        if distributed.rank() == 0:
+            print(f"hood: iteration {failed} is not finite; back to iteration {self.iteration}, other scenes", file=sys.stderr)
+        note = {"rolled_back_from": float(failed), "rollbacks": float(self.rollbacks), "skipped": float(self.skipped)}
+        self._log(note, cut=True)
+
+    def _log(self, report: dict[str, float], cut: bool = False) -> None:
+        """One record of what all processes measured; ``cut`` drops those of later iterations."""
+        report = distributed.mean(report)
+
+        def write() -> None:
+            assert self._metrics is not None
+            if cut:
+                self._metrics.cut(self.iteration)
+            self._metrics.write(self.iteration, report)
+
+        distributed.on_main(write)
+
+    def _validate(self) -> None:
+        """Validation rollouts; the weights that did best so far are kept."""
+        assert self.watch is not None
+        averaged = self.averaged()
+        values, strip = self.watch(averaged, self.iteration)
+        self._log({f"validation_{name}": value for name, value in values.items()})
+        if self._metrics is not None and strip is not None:
+            self._metrics.picture(self.iteration, "validation", strip)
+        if values["score"] < self.best:
+            self.best = values["score"]
+            header = {"iteration": str(self.iteration), "validation": json.dumps(values)}
+            distributed.on_main(lambda: save_simulator(self.folder / "best.safetensors", averaged, header))
 
     def _weight(self, problem: StepProblem, residual: Tensor) -> Tensor:
         count = problem.num_scenes
@@ -214,7 +383,7 @@ class Trainer:
             return torch.full_like(residual, 1.0 / count)
         return 1.0 / (scale(problem) * (1.0 + residual / 3.0) * count)
 
-    def _optimise(self, surrogate: Tensor) -> dict[str, float]:
+    def _optimise(self, surrogate: Tensor, finite: bool) -> dict[str, float]:
         settings = self.settings
         factor = settings.schedule(self.iteration, settings.iterations)
         for group in self.optimizer.param_groups:
@@ -222,18 +391,13 @@ class Trainer:
         self.optimizer.zero_grad(set_to_none=True)
         surrogate.backward()
         norm = float(torch.nn.utils.clip_grad_norm_(self.simulator.parameters(), settings.clip_norm))
-        if math.isfinite(norm):
+        if distributed.any_rank(not (finite and math.isfinite(norm))):
+            self.skipped += 1
+            self._skipped_in_row += 1
+        else:
             self.optimizer.step()
             self._update_average()
             self._skipped_in_row = 0
-        else:
-            self.skipped += 1
-            self._skipped_in_row += 1
-            if self._skipped_in_row >= _MAX_SKIPPED:
-                raise ValueError(
-                    f"{_MAX_SKIPPED} updates in a row were not finite (iteration {self.iteration}); lower "
-                    f"trainer.learning_rate and resume from {self.checkpoint_path}"
-                )
         return {
             "parameter_gradient_norm": norm,
             "learning_rate": settings.learning_rate * factor,
@@ -248,3 +412,30 @@ class Trainer:
         decay = min(decay, (1 + self.iteration) / (10 + self.iteration))
         with torch.no_grad():
             torch._foreach_lerp_(list(self._average.values()), list(self.simulator.parameters()), 1 - decay)
+
+
+class _Clock:
+    """Iterations per second of training alone."""
+
+    def __init__(self, iteration: int) -> None:
+        self._first, self._begun, self._away = iteration, time.monotonic(), 0.0
+
+    def rate(self, iteration: int) -> float:
+        return (iteration - self._first) / max(time.monotonic() - self._begun - self._away, 1e-9)
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        left = time.monotonic()
+        yield
+        self._away += time.monotonic() - left
+
+
+def _generator_states(device: torch.device) -> dict[str, Tensor]:
+    states = {"cpu": torch.get_rng_state()}
+    return states | ({"cuda": torch.cuda.get_rng_state(device)} if device.type == "cuda" else {})
+
+
+def _set_generator_states(states: Mapping[str, Tensor], device: torch.device) -> None:
+    torch.set_rng_state(states["cpu"])
+    if "cuda" in states and device.type == "cuda":
+        torch.cuda.set_rng_state(states["cuda"], device)

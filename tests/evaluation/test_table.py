@@ -162,8 +162,14 @@ def test_validation_summarises_own_rollouts(candidates: list[Candidate], tank_sc
         [tank_scene.motion.sequence],
         default_potential(),
         num_frames=4,
+        states=0,
     )
     good = validation(candidates[0].stepper)
     assert good["non_finite"] == 0
     assert all(np.isfinite(value) for value in good.values())
     assert good["strain_p99"] <= good["strain_p99_worst"]
+    assert good["score"] == pytest.approx(good["relative_gradient"] ** 2 * good["strain_p99"])
+    assert "gap" not in good
+    wild = validation(candidates[1].stepper)
+    assert wild["non_finite"] > 0
+    assert wild["score"] == np.inf

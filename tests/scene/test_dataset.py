@@ -84,7 +84,7 @@ def test_shapes_sizes_and_directions_vary(sampler: SceneSampler, garments: dict[
 
 
 def test_without_augmentation(body: Body, garments: dict[str, Garment], motions: list[PoseSequence]) -> None:
-    plain = SceneSampler(body, [garments["tank"]], motions[:1], 0.0, (1.0, 1.0), 0.0, random_yaw=False)
+    plain = SceneSampler(body, [garments["tank"]], motions[:1], 0.0, (1.0, 1.0), 0.0, random_yaw=False, mirror=False)
     scene = plain.sample(np.random.default_rng(0), 5).scene
     np.testing.assert_allclose(scene.cloth.rest_pos, garments["tank"].rest_pos, atol=1e-6)
     np.testing.assert_allclose(scene.motion.sequence.world_rotation, motions[0].world_rotation)

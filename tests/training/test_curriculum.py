@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
+from hood.config import build, load_config
 from hood.losses.potential import default_potential
 from hood.training.curriculum import CollisionRamp, Horizon, StepDecay, WarmupCosine
+from hood.training.trainer import TrainerSettings
 
 
 def test_horizon_grows_step_by_step_to_its_maximum() -> None:
@@ -46,3 +50,53 @@ def test_the_weight_reaches_collision_and_friction_and_nothing_else() -> None:
         assert potential.terms[name].weight == 5e5
     for name in ("stretching", "bending", "inertia", "gravity"):
         assert applied.terms[name] is potential.terms[name]
+
+
+PAPER = TrainerSettings()
+
+
+def test_time_scale_compresses_everything_alike() -> None:
+    """At the same share of the run the compressed schedule stands where the whole one stands."""
+    short = replace(PAPER, time_scale=0.02).compressed()
+    assert short.iterations == 3000
+    for share in (0.0, 0.02, 0.1, 0.33, 0.34, 0.5, 0.667, 0.99, 1.0):
+        long_at, short_at = round(150_000 * share), round(3000 * share)
+        assert short.horizon(short_at) == PAPER.horizon(long_at)
+        assert short.schedule(short_at, 3000) == PAPER.schedule(long_at, 150_000)
+        assert short.collision(short_at) == pytest.approx(PAPER.collision(long_at), rel=0.01)
+    assert (short.horizon.every, short.collision.begin_iteration, short.collision.end_iteration) == (100, 1000, 3000)
+
+
+def test_time_scale_leaves_rates_sample_counts_and_the_rest() -> None:
+    short = replace(PAPER, time_scale=0.02).compressed()
+    for name in ("learning_rate", "statistics_iterations", "clip_norm", "checkpoint_every", "batch_size"):
+        assert getattr(short, name) == getattr(PAPER, name)
+    assert short.compressed() is short
+    assert PAPER.compressed() is PAPER
+    warm = replace(PAPER, schedule=WarmupCosine(50), time_scale=0.1).compressed()
+    assert warm.schedule == WarmupCosine(5)
+
+
+@pytest.mark.parametrize(
+    "factor, words",
+    [
+        (0.0, "trainer.time_scale is 0.0"),
+        (-1.0, "trainer.time_scale is -1.0"),
+        (float("nan"), "trainer.time_scale is nan"),
+        (float("inf"), "trainer.time_scale is inf"),
+        (1e-9, r"leaves nothing of trainer.iterations=150000"),
+        (6e-4, r"leaves 90 iterations, of which the first 100 only collect statistics"),
+    ],
+)
+def test_time_scales_that_leave_no_training_are_refused(factor: float, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        replace(PAPER, time_scale=factor)
+
+
+def test_the_configs_hold_the_papers_numbers() -> None:
+    config = load_config("train", ["experiment=paper", "trainer.time_scale=0.02"])
+    assert config.trainer.time_scale == 0.02
+    assert build(config.trainer).compressed() == replace(PAPER, time_scale=0.02, workers=None).compressed()
+    assert config.model.features == "paper"
+    sampling = config.data.sampling
+    assert (sampling.beta_range, list(sampling.size_range), sampling.piecewise_fraction) == (2.0, [0.9, 1.1], 0.0)

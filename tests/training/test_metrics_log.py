@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from pathlib import Path
+
+import pytest
 
 from hood.training.metrics_log import MetricsLog
 
@@ -27,6 +30,48 @@ def test_resume_drops_what_lies_ahead(tmp_path: Path) -> None:
     with MetricsLog(tmp_path, 5) as log:
         log.write(6, {"total": 60.0})
     assert [(r["iteration"], r["total"]) for r in read(tmp_path)] == [(i, float(i)) for i in range(1, 6)] + [(6, 60.0)]
+
+
+def test_going_back_drops_what_lay_ahead(tmp_path: Path) -> None:
+    with MetricsLog(tmp_path, 0) as log:
+        for iteration in range(1, 5):
+            log.write(iteration, {"total": float(iteration)})
+        log.cut(2)
+        log.write(2, {"rolled_back_from": 4.0})
+        log.write(3, {"total": 30.0})
+    assert [list(record.values()) for record in read(tmp_path)] == [[1, 1.0], [2, 2.0], [2, 4.0], [3, 30.0]]
+
+
+def test_what_is_no_number_is_null(tmp_path: Path) -> None:
+    with MetricsLog(tmp_path, 0) as log:
+        log.write(1, {"total": float("nan"), "score": float("inf"), "loss": 1.0})
+    assert read(tmp_path) == [{"iteration": 1, "total": None, "score": None, "loss": 1.0}]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
+def test_a_full_disk_is_named(tmp_path: Path) -> None:
+    log = MetricsLog(tmp_path, 0)
+    log.write(1, {"total": 1.0})
+    log._file.close()
+    log._file = open("/dev/full", "ab", buffering=0)
+    with pytest.raises(OSError) as error:
+        log.write(2, {"total": 2.0})
+    assert (error.value.errno, error.value.filename) == (errno.ENOSPC, str(tmp_path / "metrics.jsonl"))
+    log.__exit__(None, None, None)
+    assert read(tmp_path) == [{"iteration": 1, "total": 1.0}]
+
+
+def test_tensorboard_alone_does_not_end_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    class Full:
+        def add_scalar(self, *args: object) -> None:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    with MetricsLog(tmp_path, 0) as log:
+        log._board = Full()
+        log.write(1, {"total": 1.0, "loss": 2.0})
+        log.write(2, {"total": 1.0})
+    assert [record["iteration"] for record in read(tmp_path)] == [1, 2]
+    assert capsys.readouterr().err.count("no more TensorBoard events") == 1
 
 
 def test_a_fresh_run_starts_a_fresh_file(tmp_path: Path) -> None:

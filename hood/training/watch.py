@@ -1,0 +1,101 @@
+"""Watching a model while it trains: validation rollouts shared by all processes, and a strip of frames to look at."""
+
+from __future__ import annotations
+
+import io
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hood.assets.atomic import write_atomically
+from hood.dynamics.recorder import RolloutData
+from hood.dynamics.rollout import Frame
+from hood.dynamics.simulator import Simulator
+from hood.evaluation.validation import Validation, summarise
+from hood.scene.scene import Scene
+from hood.training import distributed
+
+#: Pixels of one picture of a strip.
+_WIDTH, _HEIGHT = 240, 336
+
+
+@dataclass
+class Watch:
+    """Validates a model in training; draws ``pictures`` frames of the first garment as one row.
+
+    Files: ``validation/strip_ITERATION.png`` in ``folder``. Without the picture libraries there is no strip, said once.
+    """
+
+    validation: Validation
+    folder: Path
+    pictures: int = 8
+    _said: bool = field(default=False, init=False)
+
+    def __call__(self, simulator: Simulator, iteration: int) -> tuple[dict[str, float], np.ndarray | None]:
+        """Figures over all validation rollouts, the same on every process, and on process 0 the strip (H, W, 3) uint8.
+
+        Raises:
+            OSError: the strip cannot be written.
+        """
+        film = _Reel()
+        mine = range(distributed.rank(), len(self.validation.garments), distributed.world_size())
+        rollouts = {}
+        for index in mine:
+            shown = film.see if index == 0 and self.pictures else None
+            rollouts[index] = self.validation.rollout(simulator, index, shown)
+        together = {index: item for part in distributed.gather(rollouts) for index, item in part.items()}
+        values = summarise([together[index] for index in sorted(together)])
+        strip = self._draw(film)
+        distributed.on_main(lambda: None if strip is None else self._write(strip, iteration))
+        return values, strip
+
+    def _draw(self, film: _Reel) -> np.ndarray | None:
+        if not film.cloth:
+            return None
+        try:
+            from hood.media.film import Film
+
+            return Film(film.data(), _WIDTH, _HEIGHT).sheet(self.pictures, self.pictures)
+        except ImportError as error:
+            if not self._said:
+                print(f"hood: no validation pictures: {error}", file=sys.stderr)
+            self._said = True
+            return None
+
+    def _write(self, strip: np.ndarray, iteration: int) -> None:
+        from PIL import Image
+
+        (self.folder / "validation").mkdir(exist_ok=True)
+        packed = io.BytesIO()
+        Image.fromarray(strip).save(packed, format="PNG")
+        write_atomically(self.folder / "validation" / f"strip_{iteration:06d}.png", packed.getvalue())
+
+
+class _Reel:
+    """The frames of one rollout."""
+
+    def __init__(self) -> None:
+        self.cloth: list[np.ndarray] = []
+        self.body: list[np.ndarray] = []
+        self.scene: Scene | None = None
+
+    def see(self, scene: Scene, frame: Frame) -> None:
+        self.scene = scene
+        self.cloth.append(frame.world_pos.numpy())
+        self.body.append(frame.body_pos.numpy())
+
+    def data(self) -> RolloutData:
+        scene: Any = self.scene
+        return RolloutData(
+            cloth_pos=np.stack(self.cloth),
+            cloth_faces=scene.garment.faces,
+            rest_pos=scene.garment.rest_pos,
+            body_pos=np.stack(self.body),
+            body_faces=scene.motion.faces,
+            time=np.arange(len(self.cloth)) * scene.dt,
+            metrics={},
+            attributes={},
+        )
