@@ -1,4 +1,4 @@
-"""Command line: ``hood train|rollout|evaluate|convert key=value …``. User errors are one line and exit code 2."""
+"""Command line: ``hood COMMAND key=value …``. User errors are one line and exit code 2."""
 
 from __future__ import annotations
 
@@ -20,6 +20,8 @@ COMMANDS = {
     "train": "train a model from a config",
     "rollout": "simulate a garment on a moving body",
     "evaluate": "table of cost and accuracy over the validation list",
+    "inspect": "say what files are, what is wrong with them and how to repair it",
+    "prepare": "repair a garment, bind it to a body and write it for rollouts",
     "convert": "write published HOOD weights (.pth) as a model file",
 }
 

@@ -16,11 +16,14 @@ from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from hood.assets.atomic import write_atomically
 from hood.assets.library import unknown
 
 _PACKAGE = Path(__file__).resolve().parent
 #: Installed packages carry the configs inside; a clone has them beside the package.
 CONFIG_FOLDER = _PACKAGE / "configs" if (_PACKAGE / "configs").is_dir() else _PACKAGE.parent / "configs"
+#: Keys that take one name or a list of names.
+_ONE_OR_MORE = ("garment",)
 _TARGETS = ("hood.", "torch.optim.")
 
 
@@ -98,7 +101,7 @@ def save_run_record(folder: Path, config: DictConfig, seed: int) -> None:
     from importlib.metadata import version
 
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "config.yaml").write_text(OmegaConf.to_yaml(config, resolve=True), encoding="utf-8")
+    write_atomically(folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True).encode())
     packages = {name: version(name) for name in ("torch", "numpy", "scipy", "h5py", "hydra-core", "safetensors")}
     from hood import __version__
 
@@ -109,7 +112,7 @@ def save_run_record(folder: Path, config: DictConfig, seed: int) -> None:
         **packages,
         "seed": seed,
     }
-    (folder / "versions.json").write_text(json.dumps(record, indent=1), encoding="utf-8")
+    write_atomically(folder / "versions.json", json.dumps(record, indent=1).encode())
 
 
 def _check_override(name: str, text: str, defaults: DictConfig) -> tuple[str, Override]:
@@ -155,6 +158,8 @@ def _check_types(known: DictConfig, config: DictConfig, prefix: str) -> None:
         before, after = known.get(key), config[key]
         if isinstance(after, DictConfig) and isinstance(before, DictConfig):
             _check_types(before, after, f"{prefix}{key}.")
+        elif key in _ONE_OR_MORE and isinstance(after, ListConfig):
+            continue
         elif before is not None and not _same_kind(before, after):
             kind = "list" if isinstance(before, ListConfig) else type(before).__name__
             raise ConfigError(f"{prefix}{key}={after!r}: expected a value like {plain(before)!r} ({kind})")

@@ -13,6 +13,7 @@ from hood.assets.garment import Garment, load_garment
 from hood.assets.library import DATA_FOLDER
 from hood.assets.sequence import PoseSequence, load_sequence
 from hood.scene.scene import Scene, build_scene
+from hood.testing import cylinder
 
 GARMENT_NAMES = ("tshirt", "tank", "longsleeve", "shorts", "trousers", "dress", "skirt")
 
@@ -52,3 +53,11 @@ def tank_scene(garments: dict[str, Garment], body: Body, walk: PoseSequence) -> 
 def skirt_scene(garments: dict[str, Garment], body: Body, walk: PoseSequence) -> Scene:
     """A skirt with a pinned waistband on 12 frames in the middle of the walk."""
     return build_scene(garments["skirt"], body, walk.window(60, 72))
+
+
+@pytest.fixture(scope="session")
+def band_scene(body: Body, walk: PoseSequence) -> Scene:
+    """Small enough for minimisations: a band of 80 vertices that hangs from the waist by its rim, on 12 frames of the walk."""
+    pos, faces = cylinder(16, 5, 0.21, 0.12)
+    pos = pos + [0.0, -0.05, 0.02]
+    return build_scene(Garment("band", pos, faces, pos[:, 1] > 0.069), body, walk.window(60, 72))

@@ -93,7 +93,7 @@ ERRORS: dict[str, tuple[list[str], tuple[str, ...], Prepare]] = {
         ["rollout", *UNTRAINED, "garment=q.obj"], ("q.obj", "face 0", "triangulate=true"), lambda: quads(Path("q.obj")),
     ),
     "pickled body": (
-        ["rollout", *UNTRAINED, "body=smpl.pkl"], ("smpl.pkl", "pickles"), lambda: text_file(Path("smpl.pkl")),
+        ["rollout", *UNTRAINED, "body=smpl.pkl"], ("smpl.pkl", "pickle"), lambda: text_file(Path("smpl.pkl")),
     ),
     "text as checkpoint": (
         ["rollout", "checkpoint=m.safetensors"], ("m.safetensors", "not a model file"),
@@ -233,6 +233,19 @@ def test_rollout_file_has_the_documented_content(run_folder: Path) -> None:
     assert json.loads(attributes["config"])["num_frames"] == 3
     assert json.loads(attributes["model"])["latent_dim"] == 8
     assert attributes["dt"] == pytest.approx(1 / 30)
+
+
+def test_a_rollout_without_metrics_holds_times_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["garment=tank", "num_frames=3", "video=none", "sheet=false", f"output={tmp_path / 'run'}"]
+    assert main(["rollout", *UNTRAINED, *arguments, "metrics=none"]) == 0
+    assert "strain p50 n/a p99 n/a, penetration n/a\n" in capsys.readouterr().out
+    names = set(read_rollout(tmp_path / "run" / "rollout.h5").metrics)
+    assert names == {f"ms_{part}" for part in ("search", "features", "network", "rest", "total", "metrics")}
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["strain_p50"] is summary["potential_mean_J"] is summary["first_frame"]["strain_p99"] is None
+    assert summary["ms_per_frame"]["network"]["median"] > 0
+    assert main(["rollout", *UNTRAINED, *arguments, "metrics=some"]) != 0
+    assert "unknown value for metrics 'some'" in capsys.readouterr().err
 
 
 def test_records_of_the_run(run_folder: Path) -> None:

@@ -9,13 +9,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hood.assets.library import locate, read_arrays
-from hood.assets.sequence import PoseSequence
+from hood.assets.library import locate
+from hood.assets.model_file import choose_model, read_model
+from hood.assets.sequence import NUM_BODY_JOINTS, PoseSequence
 from hood.assets.skinning import axis_angle_to_matrix, joint_transforms, linear_blend_skinning
 
 #: Joints 20 and 21 of every skeleton of the family; what hangs below them is hand and fingers.
 _WRISTS = (20, 21)
-_KEYS = ("v_template", "shapedirs", "J_regressor", "weights", "kintree_table", "f")
+#: Where the fingers (15 joints a side, left first) start in a skeleton of that many joints: SMPL-H, and SMPL-X, whose jaw
+#: and eyes come before them.
+_FIRST_FINGER = {52: 22, 55: 25}
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,7 @@ class Body:
     weights: np.ndarray  # (W, J)
     parents: tuple[int, ...]  # (J,), -1 for the root
     faces: np.ndarray  # (G, 3) int64
+    family: str | None = None  # "smpl", "smplh" or "smplx": whose shape coefficients it takes; None: its own
 
     @property
     def num_joints(self) -> int:
@@ -46,18 +50,34 @@ class Body:
         return np.array(hand)[self.weights.argmax(axis=1)]
 
     def shaped(self, betas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rest vertices (W, 3) and joints (J, 3) [m] of shape ``betas`` (S' <= S,)."""
-        rest = self.v_template + self.shapedirs[..., : len(betas)] @ np.asarray(betas, dtype=np.float64)
+        """Rest vertices (W, 3) and joints (J, 3) [m] of shape ``betas`` (S',); coefficients the body lacks are left out."""
+        count = min(len(betas), self.shapedirs.shape[2])
+        rest = self.v_template + self.shapedirs[..., :count] @ np.asarray(betas, dtype=np.float64)[:count]
         return rest, self.joint_regressor @ rest
+
+    def joint_poses(self, sequence: PoseSequence) -> np.ndarray:
+        """(T, J, 3) axis-angle [rad] of every joint; those that the sequence does not drive stay at rest."""
+        poses = np.zeros((sequence.num_frames, self.num_joints, 3))
+        first = _FIRST_FINGER.get(self.num_joints)
+        # Joints 22 and 23 of a sequence are SMPL's hands; other skeletons have jaw or fingers there.
+        driven = min(self.num_joints, sequence.poses.shape[1] if first is None else NUM_BODY_JOINTS)
+        poses[:, :driven] = sequence.poses[:, :driven]
+        if sequence.fingers is not None and first is not None:
+            poses[:, first : first + sequence.fingers.shape[1]] = sequence.fingers
+        return poses
+
+    def subject_betas(self, sequence: PoseSequence) -> np.ndarray:
+        """(S,) of the recorded subject where this body is the model that recorded it, zeros otherwise."""
+        betas = np.zeros(max(self.shapedirs.shape[2], 1))
+        if self.family is not None and self.family == sequence.family:
+            count = min(len(betas), len(sequence.betas))
+            betas[:count] = sequence.betas[:count]
+        return betas
 
     def transforms(self, sequence: PoseSequence, betas: np.ndarray, dtype: torch.dtype = torch.float32) -> Tensor:
         """(T, J, 3, 4) rest-to-posed joint transforms, root translation not included."""
         joints = torch.as_tensor(self.shaped(betas)[1])
-        # Skeletons with fingers have more joints than a sequence drives; those stay at rest.
-        poses = np.zeros((sequence.num_frames, self.num_joints, 3))
-        driven = min(self.num_joints, sequence.poses.shape[1])
-        poses[:, :driven] = sequence.poses[:, :driven]
-        rotations = axis_angle_to_matrix(torch.as_tensor(poses))
+        rotations = axis_angle_to_matrix(torch.as_tensor(self.joint_poses(sequence)))
         return joint_transforms(rotations, joints, self.parents).to(dtype)
 
     def translation(self, sequence: PoseSequence, betas: np.ndarray) -> np.ndarray:
@@ -74,30 +94,33 @@ class Body:
         return linear_blend_skinning(rest, torch.as_tensor(self.weights).to(dtype), self.transforms(sequence, betas, dtype))
 
 
-def load_body(name: str | Path = "default") -> Body:
-    """The embedded body by name, or a body file in SMPL layout (``.npz``).
+def load_body(name: str | Path = "default", gender: str | None = None) -> Body:
+    """The embedded body by name, a body model file (``.npz``, official ``.pkl``), or the fitting file of a folder of them.
 
-    Files of the SMPL family with pose blend shapes are read through ``smplx``, see :mod:`hood.assets.smpl_family`.
+    Files of the SMPL family with pose blend shapes are evaluated through ``smplx``, see :mod:`hood.assets.smpl_family`.
+
+    Args:
+        gender: "neutral", "male" or "female": which model of a folder; None means neutral.
+
+    Raises:
+        FileNotFoundError: unknown name or missing file.
+        ValueError: not a body model; names the file, the key and the fix.
     """
-    path = locate("body", name)
-    if path.suffix == ".pkl":
-        raise ValueError(f"{path}: pickles run code when read; convert it to .npz with the keys {', '.join(_KEYS)}")
-    arrays = read_arrays(path, _KEYS, "body model")
+    path = locate("body", name, folders=True)
+    if path.is_dir():
+        path = choose_model(path, gender)
+    arrays = read_model(path)
     if "posedirs" in arrays and np.any(arrays["posedirs"]):
-        from hood.assets.smpl_family import load_smpl_family
+        from hood.assets.smpl_family import smpl_family_body
 
-        return load_smpl_family(path, arrays)
-    weights = np.asarray(arrays["weights"], dtype=np.float64)
-    num_vertices, num_joints = weights.shape
-    if arrays["v_template"].shape != (num_vertices, 3):
-        raise ValueError(f"{path}: v_template has shape {arrays['v_template'].shape}, weights say ({num_vertices}, 3)")
-    parents = [int(p) for p in np.asarray(arrays["kintree_table"])[0].astype(np.int64)]
+        return smpl_family_body(path, arrays)
+    weights = arrays["weights"]
     return Body(
         name=path.stem,
-        v_template=np.asarray(arrays["v_template"], dtype=np.float64),
-        shapedirs=np.asarray(arrays["shapedirs"], dtype=np.float64),
-        joint_regressor=np.asarray(arrays["J_regressor"], dtype=np.float64),
+        v_template=arrays["v_template"],
+        shapedirs=arrays["shapedirs"],
+        joint_regressor=arrays["J_regressor"],
         weights=weights / weights.sum(axis=1, keepdims=True),
-        parents=tuple(p if 0 <= p < num_joints else -1 for p in parents),
-        faces=np.asarray(arrays["f"]).astype(np.int64),
+        parents=tuple(int(parent) for parent in arrays["kintree_table"][0]),
+        faces=arrays["f"],
     )

@@ -1,54 +1,69 @@
-"""Garments: mesh files and embedded templates, bound to a body so that they follow its shape and its first pose."""
+"""Garments: embedded templates, prepared files, mesh files, and the reference implementation's pickles."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import torch
-from scipy import sparse
-from scipy.sparse.linalg import splu
 
-from hood.assets.body import Body
-from hood.assets.library import DATA_FOLDER, locate, read_arrays
-from hood.assets.mesh_file import MESH_SUFFIXES, read_mesh
-from hood.mesh import topology
-from hood.mesh.proximity import search_surface
+from hood.assets.garment_arrays import read_fields, write_fields
+from hood.assets.library import locate
+from hood.assets.mesh_file import MESH_SUFFIXES, MeshFile, read_mesh_file
+from hood.assets.reference_garments import read_reference_garment
 from hood.mesh.quality import check_triangles
 
-#: Distance [m] over which the body's influence on a garment vertex halves: beyond it neighbours decide.
-_BINDING_REACH = 0.03
+#: What can be given as a garment, besides embedded names.
+GARMENT_SUFFIXES = (".npz", ".pkl", *MESH_SUFFIXES)
 
 
 @dataclass(frozen=True)
 class Garment:
-    """A garment in the body's T-pose at zero shape coefficients, with what it needs to follow the body."""
+    """A garment at zero shape coefficients, with what it needs to follow a body's shape and pose.
+
+    The rest shape is in the body's T-pose unless ``skin_pos`` says otherwise: then ``rest_pos`` may be in any pose (a
+    garment modelled around an A-pose keeps its lengths and angles) and ``skin_pos`` is where skinning starts from.
+    """
 
     name: str
     rest_pos: np.ndarray  # (V, 3) m, float64
     faces: np.ndarray  # (F, 3) int64
     pinned: np.ndarray  # (V,) bool
     lbs_weights: np.ndarray | None = None  # (V, J)
-    shapedirs: np.ndarray | None = None  # (V, 3, S) m per unit of beta
+    shapedirs: np.ndarray | None = None  # (V, 3, S) m per unit of beta, in T-pose
     bound_to: str | None = None  # body whose weights and shape offsets these are; None: whichever it is put on
     uv: np.ndarray | None = None  # (U, 2)
     uv_faces: np.ndarray | None = None  # (F, 3)
+    normal_faces: np.ndarray | None = None  # (F, 3): corners of one number share a normal; None: smooth everywhere
+    colours: np.ndarray | None = None  # (V, 3), 0 to 1
+    skin_pos: np.ndarray | None = None  # (V, 3) m, in T-pose; None: rest_pos is
+    rest_turn: np.ndarray | None = None  # (V, 3, 3) from the T-pose into the pose of rest_pos; None: identity
+    coarse_edges: tuple[np.ndarray, ...] | None = None  # each (E, 2), levels of a hierarchy that came with the garment
 
     @property
     def bound(self) -> bool:
         return self.lbs_weights is not None and self.shapedirs is not None
 
     def shaped(self, betas: np.ndarray) -> np.ndarray:
-        """Garment (V, 3) [m] in T-pose, grown with the body of shape ``betas``."""
+        """Rest shape (V, 3) [m], grown with the body of shape ``betas``."""
+        offset = self._offset(betas)
+        if self.rest_turn is not None:
+            offset = np.einsum("vij,vj->vi", self.rest_turn, offset)
+        return self.rest_pos + offset
+
+    def tpose(self, betas: np.ndarray) -> np.ndarray:
+        """Garment (V, 3) [m] in T-pose on the body of shape ``betas``: what skinning poses."""
+        return (self.rest_pos if self.skin_pos is None else self.skin_pos) + self._offset(betas)
+
+    def _offset(self, betas: np.ndarray) -> np.ndarray:
         assert self.shapedirs is not None, "bind the garment first"
         count = min(len(betas), self.shapedirs.shape[2])
-        return self.rest_pos + self.shapedirs[..., :count] @ np.asarray(betas[:count], dtype=np.float64)
+        return np.asarray(self.shapedirs[..., :count] @ np.asarray(betas[:count], dtype=np.float64))
 
 
 def load_garment(name: str | Path, triangulate: bool = False) -> Garment:
-    """An embedded garment by name, a garment ``.npz`` or a mesh file (OBJ, PLY, STL, GLB, OFF) in the body's T-pose.
+    """An embedded garment by name, a garment ``.npz``, a mesh file (OBJ, PLY, STL, GLB, OFF) in the body's T-pose, or a
+    ``.pkl`` of the reference implementation (``garments_dict.pkl:name`` chooses one of several).
 
     Args:
         triangulate: split faces of four and more corners instead of refusing them.
@@ -57,84 +72,44 @@ def load_garment(name: str | Path, triangulate: bool = False) -> Garment:
         FileNotFoundError: unknown name or missing file.
         ValueError: unreadable or broken mesh; names the file, the index and the fix.
     """
-    path = locate("garments", name)
-    if path.suffix == ".npz":
-        garment = _read_npz(path)
-    elif path.suffix.lower() in MESH_SUFFIXES:
-        rest_pos, faces = read_mesh(path, triangulate)
-        garment = Garment(path.stem, rest_pos, faces, np.zeros(len(rest_pos), dtype=bool))
+    path, entry = locate_garment(name)
+    suffix = path.suffix.lower()
+    if suffix == ".npz":
+        garment = Garment(path.stem, **read_fields(path))
+    elif suffix == ".pkl":
+        garment = Garment(**read_reference_garment(path, entry))
+    elif suffix in MESH_SUFFIXES:
+        garment = garment_of_mesh(path, read_mesh_file(path, triangulate))
     else:
-        raise ValueError(f"{path}: unknown garment format {path.suffix!r}; give .npz or one of {', '.join(MESH_SUFFIXES)}")
+        raise ValueError(f"{path}: unknown garment format {path.suffix!r}; give one of {', '.join(GARMENT_SUFFIXES)}")
     check_triangles(garment.rest_pos, garment.faces, str(path))
+    _check_levels(garment, path)
     return garment
 
 
-def bind_garment(garment: Garment, body: Body) -> Garment:
-    """The garment with skinning weights and shape offsets of ``body``, diffused beyond the skin.
-
-    Each vertex asks the closest point of the body's T-pose; far vertices trust it less. The result minimises
-    Σ c_v |w_v − w_v⁰|² + Σ_edges |w_a − w_b|² with confidence c falling with distance (paper, section 3.5: weights diffused
-    beyond the body), so loose cloth gets smooth weights. A garment that has fitting weights is returned
-    as it is, unless they are those of another body.
-    """
-    fits = garment.lbs_weights is not None and garment.lbs_weights.shape[1] == body.num_joints
-    if garment.bound and fits and garment.bound_to in (None, body.name):
-        return garment
-    nearest = _closest_rows(garment.rest_pos, body)
-    raw = np.concatenate([body.weights, body.shapedirs.reshape(len(body.weights), -1)], axis=1)
-    values = sum(nearest.bary[:, k : k + 1] * raw[nearest.corners[:, k]] for k in range(3))
-    smooth = _diffuse(values, garment.faces, np.abs(nearest.dist))
-    weights = np.clip(smooth[:, : body.num_joints], 0.0, None)
-    weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
-    shapedirs = smooth[:, body.num_joints :].reshape(len(values), 3, -1)
-    return replace(garment, lbs_weights=weights, shapedirs=shapedirs, bound_to=body.name)
+def garment_of_mesh(path: Path, mesh: MeshFile) -> Garment:
+    """The garment in a mesh file as it is written; it may still need repair."""
+    pinned = np.zeros(len(mesh.pos), dtype=bool)
+    extra = {key: getattr(mesh, key) for key in ("uv", "uv_faces", "normal_faces", "colours")}
+    return Garment(path.stem, mesh.pos, mesh.faces, pinned, **extra)
 
 
-@dataclass(frozen=True)
-class _Nearest:
-    corners: np.ndarray
-    bary: np.ndarray
-    dist: np.ndarray
+def save_garment(path: Path, garment: Garment) -> None:
+    """Write a garment ``.npz`` that :func:`load_garment` reads back; an existing file is replaced at once or not at all."""
+    write_fields(path, {field.name: getattr(garment, field.name) for field in fields(garment)})
 
 
-def _closest_rows(points: np.ndarray, body: Body) -> _Nearest:
-    vertices, faces = torch.as_tensor(body.v_template), torch.as_tensor(body.faces)
-    zeros = [torch.zeros(len(x), dtype=torch.int64) for x in (points, vertices, faces)]
-    hit = search_surface(torch.as_tensor(points), zeros[0], vertices, faces, zeros[1], zeros[2])
-    return _Nearest(body.faces[hit.face.numpy()], hit.bary.numpy(), hit.dist.numpy())
+def locate_garment(name: str | Path) -> tuple[Path, str | None]:
+    """File of a garment, and which of its entries is meant (``garments_dict.pkl:dress``)."""
+    head, colon, entry = str(name).rpartition(":")
+    if colon and head.lower().endswith(".pkl"):
+        return locate("garments", head), entry
+    return locate("garments", name), None
 
 
-def _diffuse(values: np.ndarray, faces: np.ndarray, dist: np.ndarray) -> np.ndarray:
-    edges = topology.unique_edges(faces)
-    num_vertices = len(values)
-    rows, cols = np.concatenate([edges[:, 0], edges[:, 1]]), np.concatenate([edges[:, 1], edges[:, 0]])
-    adjacency = sparse.csr_matrix((np.ones(len(rows)), (rows, cols)), shape=(num_vertices, num_vertices))
-    laplacian = sparse.diags(np.asarray(adjacency.sum(axis=1)).ravel()) - adjacency
-    confidence = np.maximum(2.0 ** (-dist / _BINDING_REACH), 1e-3)
-    system = sparse.diags(confidence) + laplacian
-    return splu(system.tocsc()).solve(confidence[:, None] * values)
-
-
-def _read_npz(path: Path) -> Garment:
-    arrays = read_arrays(path, ("rest_pos", "faces"), "garment")
-    num_vertices = len(arrays["rest_pos"])
-    optional: dict[str, Any] = {key: arrays[key] for key in ("uv", "uv_faces") if key in arrays}
-    if path.is_relative_to(DATA_FOLDER):
-        optional["bound_to"] = "default"
-    for key in ("lbs_weights", "shapedirs"):
-        if key in arrays:
-            optional[key] = np.asarray(arrays[key], dtype=np.float64)
-    if "lbs_weights" in optional:
-        total = optional["lbs_weights"].sum(axis=1, keepdims=True)
-        optional["lbs_weights"] = optional["lbs_weights"] / np.where(total > 0, total, np.nan)
-    pinned = np.asarray(arrays.get("pinned", np.zeros(num_vertices))).astype(bool)
-    for key, value in (("pinned", pinned), *((k, optional[k]) for k in ("lbs_weights", "shapedirs") if k in optional)):
-        if len(value) != num_vertices:
-            raise ValueError(f"{path}: {key} has {len(value)} rows for {num_vertices} vertices; write one row per vertex")
-        finite = np.isfinite(value).reshape(num_vertices, -1).all(axis=1)
-        if not finite.all():
-            raise ValueError(f"{path}: {key} of vertex {int(np.argmin(finite))} is not finite or sums to zero; repair it")
-    faces = np.asarray(arrays["faces"])
-    if not np.issubdtype(faces.dtype, np.integer):
-        raise ValueError(f"{path}: faces are {faces.dtype}; they must be integer vertex indices")
-    return Garment(path.stem, np.asarray(arrays["rest_pos"], dtype=np.float64), faces.astype(np.int64), pinned, **optional)
+def _check_levels(garment: Garment, path: Path) -> None:
+    for level, edges in enumerate(garment.coarse_edges or ()):
+        outside = (edges < 0) | (edges >= len(garment.rest_pos))
+        if outside.any():
+            row = int(np.argmax(outside.any(axis=1)))
+            raise ValueError(f"{path}: coarse edge {row} of level {level} is {edges[row].tolist()}; there is no such vertex")

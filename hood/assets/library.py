@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import difflib
 import json
+import math
+import zipfile
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import IO
 
 import numpy as np
 
 DATA_FOLDER = Path(__file__).resolve().parent.parent / "data"
+#: Content beyond this size [bytes] is not read into memory.
+SIZE_LIMIT = 3 << 29
 _LABEL = {"body": "body", "garments": "garment", "motions": "sequence", "weights": "checkpoint"}
 _SUFFIX = {"body": ".npz", "garments": ".npz", "motions": ".npz", "weights": ".safetensors"}
 
@@ -20,8 +24,8 @@ def names(kind: str) -> list[str]:
     return sorted(path.stem for path in (DATA_FOLDER / kind).glob("*" + _SUFFIX[kind]))
 
 
-def locate(kind: str, name: str | Path) -> Path:
-    """File of an embedded asset, or the user's own file.
+def locate(kind: str, name: str | Path, folders: bool = False) -> Path:
+    """File of an embedded asset, or the user's own file; with ``folders`` also the user's own folder.
 
     Raises:
         FileNotFoundError: neither an embedded name nor an existing file; the message lists the nearest names.
@@ -30,8 +34,10 @@ def locate(kind: str, name: str | Path) -> Path:
     if embedded.is_file():
         return embedded
     path = Path(name).expanduser()
-    if path.is_file():
+    if path.is_file() or (folders and path.is_dir()):
         return path
+    if path.is_dir():
+        raise FileNotFoundError(f"{path}: a folder; give the path of a {_LABEL[kind]} file in it")
     if path.suffix or len(path.parts) > 1:
         raise FileNotFoundError(f"{path}: no such file (embedded {kind}: {', '.join(names(kind)) or 'none'})")
     raise FileNotFoundError(unknown(_LABEL[kind], str(name), names(kind)) + "; or give the path of a file")
@@ -52,39 +58,59 @@ def motion_split() -> dict[str, list[str]]:
     return split
 
 
-def read_arrays(path: Path, required: Iterable[str], what: str) -> dict:
-    """Arrays of an ``.npz`` file, never unpickled.
+def read_arrays(path: Path, required: Iterable[str], what: str, size_limit: int = SIZE_LIMIT) -> dict:
+    """Arrays of an ``.npz`` file, never unpickled; members that would need it (strings of old files) are passed over.
 
     Raises:
-        ValueError: not an npz file, or a required key is missing; names file, key and fix.
+        FileNotFoundError: no such file.
+        ValueError: not an npz file, larger than ``size_limit`` [bytes] once unpacked, or a required key is missing; names
+            file, key and fix.
     """
-
+    required = list(required)
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            if not hasattr(archive, "files"):
-                raise ValueError("a single array")
-            arrays = _plain_members(archive, set(required))
+        with zipfile.ZipFile(path) as archive:
+            arrays = _members(archive, set(required), size_limit)
     except FileNotFoundError:
         raise
     except Exception as error:
-        raise ValueError(f"{path}: not a readable {what} .npz file ({_first_line(error)})") from error
+        raise ValueError(f"{path}: not a readable {what} .npz file ({first_line(error)})") from error
     missing = [key for key in required if key not in arrays]
     if missing:
         raise ValueError(f"{path}: not a {what} file: key {missing[0]!r} is missing (found {sorted(arrays)[:8]})")
     return arrays
 
 
-def _plain_members(archive: Any, required: set[str]) -> dict:
-    """Members of an open archive; those that would need unpickling (strings of old files) are passed over unless required."""
+def first_line(error: Exception) -> str:
+    """What an error says, in one line."""
+    return str(error).splitlines()[0] if str(error) else type(error).__name__
+
+
+def _members(archive: zipfile.ZipFile, required: set[str], size_limit: int) -> dict[str, np.ndarray]:
+    entries = [info for info in archive.infolist() if info.filename.endswith(".npy")]
+    total = sum(info.file_size for info in entries)
+    if total > size_limit:
+        raise ValueError(f"unpacks to {total} bytes, the limit is {size_limit}")
     arrays = {}
-    for key in archive.files:
-        try:
-            arrays[key] = archive[key]
-        except ValueError:
+    for info in entries:
+        key = info.filename.removesuffix(".npy")
+        with archive.open(info) as file:
+            shape, dtype = _npy_header(file)
+        if dtype.hasobject:
             if key in required:
-                raise
+                raise ValueError(f"key {key!r} holds Python objects, which are not read; save it as a plain array")
+            continue
+        # Memory is taken before the content is read: a header may promise what the file does not hold.
+        if math.prod(shape) * dtype.itemsize > info.file_size:
+            raise ValueError(f"key {key!r} claims shape {shape} and holds {info.file_size} bytes; the file is damaged")
+        with archive.open(info) as file:
+            arrays[key] = np.lib.format.read_array(file, allow_pickle=False)
     return arrays
 
 
-def _first_line(error: Exception) -> str:
-    return str(error).splitlines()[0] if str(error) else type(error).__name__
+def _npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
+    version = np.lib.format.read_magic(file)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(file)
+    if any(size < 0 for size in shape):
+        raise ValueError(f"shape {shape} is negative; the file is damaged")
+    return shape, dtype

@@ -1,98 +1,160 @@
-"""Mesh files as the user wrote them: same vertices, same faces, same order; what readers change silently is refused."""
+"""Mesh files as the user wrote them: same vertices, same faces, same order; what cannot be kept is refused or reported."""
 
 from __future__ import annotations
 
-import re
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from hood.assets.gltf_mesh import read_glb
+from hood.assets.obj_file import read_obj
+from hood.assets.off_stl_files import read_off, read_stl
+from hood.assets.ply_file import read_ply
+from hood.assets.raw_mesh import RawMesh, Unreadable
+from hood.assets.unpickle import check_size, guarded
+from hood.mesh.polygons import MAX_CORNERS, triangulate
+
+_READERS: dict[str, Callable[[Path], RawMesh]] = {
+    ".obj": read_obj,
+    ".ply": read_ply,
+    ".off": read_off,
+    ".stl": read_stl,
+    ".glb": read_glb,
+    ".gltf": read_glb,
+}
 #: Formats that keep a corner of every face or every texture seam as a vertex of its own: equal positions are one vertex.
-_SPLIT_FORMATS = (".stl", ".glb")
-MESH_SUFFIXES = (".obj", ".ply", ".off", *_SPLIT_FORMATS)
+_SPLIT_FORMATS = (".stl", ".glb", ".gltf")
+MESH_SUFFIXES = tuple(_READERS)
+#: Files beyond this size [bytes] are not opened.
+MESH_SIZE_LIMIT = 1 << 30
+
+
+@dataclass(frozen=True)
+class MeshFile:
+    """A mesh file as triangles. Texture seams and hard edges do not tear it: their tables stand apart."""
+
+    pos: np.ndarray  # (V, 3) float64, in the file's units
+    faces: np.ndarray  # (F, 3) int64
+    uv: np.ndarray | None = None  # (U, 2), v up
+    uv_faces: np.ndarray | None = None  # (F, 3) into uv
+    normal_faces: np.ndarray | None = None  # (F, 3): corners of one number share a normal; None: smooth everywhere
+    colours: np.ndarray | None = None  # (V, 3), 0 to 1
+    num_polygons: int = 0  # faces of four and more corners that were split
+    num_joined: int = 0  # vertices that the format had doubled
+    notes: tuple[str, ...] = ()  # what was not kept
 
 
 def read_mesh(path: Path, triangulate: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) float64 [m] and triangles (F, 3) int64 of a mesh file.
+    """Vertices (V, 3) float64 [m] and triangles (F, 3) int64 of a mesh file; arguments and errors of :func:`read_mesh_file`."""
+    mesh = read_mesh_file(path, triangulate)
+    return mesh.pos, mesh.faces
+
+
+def read_mesh_file(path: Path, split_polygons: bool = False) -> MeshFile:
+    """A mesh file (OBJ, PLY, OFF, STL, GLB).
 
     Args:
-        triangulate: split faces of four and more corners instead of refusing them.
+        split_polygons: split faces of four and more corners (:func:`hood.mesh.polygons.triangulate`) instead of refusing
+            them.
 
     Raises:
+        FileNotFoundError: no such file.
         ValueError: unreadable file, polygons, or an index out of range; names the file, the face and the fix.
     """
-    if path.suffix.lower() == ".obj":
-        return _read_obj(path, triangulate)
-    import trimesh
+    suffix = path.suffix.lower()
+    if suffix not in _READERS:
+        raise ValueError(f"{path}: unknown mesh format {suffix!r}; give {', '.join(MESH_SUFFIXES)}")
+    check_size(path, MESH_SIZE_LIMIT)
 
-    try:
-        mesh: Any = trimesh.load(path, process=False, maintain_order=True, force="mesh")
-        pos, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
-    except Exception as error:
-        reason = str(error).splitlines()[0] if str(error) else repr(error)
-        raise ValueError(f"{path}: not a readable mesh ({reason})") from error
-    declared = _declared_faces(path)
-    if not triangulate and declared is not None and declared < len(faces):
-        raise ValueError(
-            f"{path}: {declared} faces are {len(faces)} triangles, some have more than three corners; triangulate "
-            "them or pass triangulate=true"
-        )
-    return _merge(pos, faces) if path.suffix.lower() in _SPLIT_FORMATS else (pos, faces)
+    def read() -> MeshFile | ValueError:
+        try:
+            return _finish(_READERS[suffix](path), split_polygons, suffix in _SPLIT_FORMATS)
+        except Unreadable as error:
+            return ValueError(f"{path}: {error}")
+        except ValueError as error:
+            if str(error).startswith(f"{path}: "):
+                return error
+            raise
 
-
-def _read_obj(path: Path, triangulate: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and faces alone: general readers duplicate vertices along material borders, which tears a garment."""
-    pos: list[list[float]] = []
-    polygons: list[list[int]] = []
-    with open(path, encoding="utf-8", errors="replace") as file:
-        for number, line in enumerate(file, start=1):
-            words = line.split("#")[0].split()
-            try:
-                if words[:1] == ["v"]:
-                    pos.append([float(word) for word in words[1:4]])
-                elif words[:1] == ["f"]:
-                    corners = [int(word.split("/")[0]) for word in words[1:]]
-                    # Negative indices count back from the last vertex so far; 0 does not exist in the format.
-                    polygons.append([len(pos) + c if c < 0 else c - 1 for c in corners])
-            except ValueError:
-                raise ValueError(f"{path}: line {number} is not readable ({line.strip()[:60]!r})") from None
-    if any(len(row) != 3 for row in pos):
-        index = next(i for i, row in enumerate(pos) if len(row) != 3)
-        raise ValueError(f"{path}: vertex {index} has {len(pos[index])} coordinates; give three")
-    return np.array(pos, dtype=np.float64).reshape(-1, 3), _triangles(path, polygons, len(pos), triangulate)
+    result = guarded(path, f"{suffix[1:].upper()} mesh", read)
+    if isinstance(result, ValueError):
+        raise result
+    assert isinstance(result, MeshFile)
+    return result
 
 
-def _triangles(path: Path, polygons: list[list[int]], num_vertices: int, triangulate: bool) -> np.ndarray:
-    triangles = []
-    for face, corners in enumerate(polygons):
-        if len(corners) < 3 or (len(corners) > 3 and not triangulate):
-            raise ValueError(f"{path}: face {face} has {len(corners)} corners; triangulate it or pass triangulate=true")
-        for corner in corners:
-            if not 0 <= corner < num_vertices:
-                raise ValueError(
-                    f"{path}: face {face} refers to vertex {corner + 1} of {num_vertices}; repair or remove the face"
-                )
-        triangles += [[corners[0], corners[k], corners[k + 1]] for k in range(1, len(corners) - 1)]
-    return np.array(triangles, dtype=np.int64).reshape(-1, 3)
+def _finish(raw: RawMesh, split_polygons: bool, join: bool) -> MeshFile:
+    _check(raw, split_polygons)
+    rows = triangulate(raw.pos, raw.corners, raw.counts)
+    vertex_map, kept = _equal_positions(raw.pos) if join else (np.arange(len(raw.pos)), np.arange(len(raw.pos)))
+    notes = list(raw.notes)
+    uv_faces = _corner_table(raw.uv_corners, len(raw.uv) if raw.uv is not None else 0, rows, "texture coordinate", notes)
+    faces = vertex_map[raw.corners][rows]
+    return MeshFile(
+        pos=raw.pos[kept],
+        faces=faces,
+        uv=raw.uv if uv_faces is not None else None,
+        uv_faces=uv_faces,
+        normal_faces=_shared_normals(raw, rows, faces, notes),
+        colours=None if raw.colours is None else raw.colours[kept],
+        num_polygons=int((raw.counts > 3).sum()),
+        num_joined=len(raw.pos) - len(kept),
+        notes=tuple(notes),
+    )
 
 
-def _declared_faces(path: Path) -> int | None:
-    """Number of faces that the head of a PLY or OFF file announces; None for other formats."""
-    with open(path, "rb") as file:
-        head = file.read(4096).decode("latin-1")
-    if path.suffix.lower() == ".ply":
-        match = re.search(r"^element\s+face\s+(\d+)", head, re.M)
-    elif path.suffix.lower() == ".off":
-        match = re.match(r"OFF\s+(?:#[^\n]*\n\s*)*\d+\s+(\d+)", head)
-    else:
+def _check(raw: RawMesh, split_polygons: bool) -> None:
+    """Corner counts and vertex indices; with them in order the polygons can be split."""
+    counts, num_vertices = raw.counts, len(raw.pos)
+    bad = (counts < 3) | (counts > (MAX_CORNERS if split_polygons else 3))
+    outside = (raw.corners < 0) | (raw.corners >= num_vertices)
+    face_of_corner = np.repeat(np.arange(len(counts)), np.maximum(counts, 0))
+    first_bad = int(np.argmax(bad)) if bad.any() else len(counts)
+    first_outside = int(face_of_corner[np.argmax(outside)]) if outside.any() else len(counts)
+    if first_outside < first_bad or (first_outside == first_bad < len(counts)):
+        corner = int(raw.corners[np.argmax(outside)])
+        raise Unreadable(f"face {first_outside} refers to vertex {corner + 1} of {num_vertices}; repair or remove the face")
+    if bad.any():
+        count = int(counts[first_bad])
+        fix = "remove it" if count < 3 else "split it" if split_polygons else "triangulate it or pass triangulate=true"
+        raise Unreadable(f"face {first_bad} has {count} corners; {fix}")
+
+
+def _corner_table(table: np.ndarray | None, size: int, rows: np.ndarray, what: str, notes: list[str]) -> np.ndarray | None:
+    """Indices (F, 3) of the triangles' corners; None, with a note, where some faces have none."""
+    if table is None:
         return None
-    return int(match.group(1)) if match else None
+    missing = int((table[rows] < 0).any(axis=1).sum())
+    if missing:
+        notes.append(f"{missing} of {len(rows)} triangles have no {what}s; the others' are not kept")
+        return None
+    if (table >= size).any():
+        raise Unreadable(f"a face refers to {what} {int(table.max()) + 1} of {size}; repair or remove the face")
+    return table[rows].astype(np.int64)
 
 
-def _merge(pos: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices at equal positions become one, in the order of first appearance."""
+def _shared_normals(raw: RawMesh, rows: np.ndarray, faces: np.ndarray, notes: list[str]) -> np.ndarray | None:
+    """Numbers (F, 3) of the different normals at the different vertices; None where no vertex has two."""
+    count = len(raw.normals) if raw.normals is not None else 0
+    table = _corner_table(raw.normal_corners, count, rows, "normal", notes)
+    if table is None or raw.normals is None or len(faces) == 0:
+        return None
+    # Files round normals: those within about half a degree are one.
+    _, value = np.unique(np.round(raw.normals, 2), axis=0, return_inverse=True)
+    key = faces * np.int64(len(raw.normals) + 1) + value.reshape(-1)[table]
+    keys, number = np.unique(key, return_inverse=True)
+    if len(keys) == len(np.unique(faces)):
+        return None
+    return number.reshape(faces.shape).astype(np.int64)
+
+
+def _equal_positions(pos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices at equal positions become one, in the order of first appearance: new number of each, and rows that stay."""
+    if len(pos) == 0:
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     _, first, inverse = np.unique(pos, axis=0, return_index=True, return_inverse=True)
     order = np.argsort(first)
     rank = np.argsort(order)
-    return pos[first[order]], rank[inverse.reshape(-1)][faces]
+    return rank[inverse.reshape(-1)], first[order]

@@ -1,4 +1,4 @@
-"""Motions: AMASS files of any frame rate, resampled and turned y up."""
+"""Motions as a body performs them: of any frame rate and layout, resampled and turned y up."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from hood.assets.library import locate, read_arrays
+from hood.assets.library import locate
+from hood.assets.motion_file import NUM_BODY_JOINTS, read_recording
 
-#: Body joints that drive a garment: pelvis to wrists. Columns 66:72 of SMPL+H poses are fingers, not SMPL's hands.
-NUM_BODY_JOINTS = 22
-_SMPL_JOINTS = 24
+__all__ = ["HANDS", "NUM_BODY_JOINTS", "Z_UP_TO_Y_UP", "PoseSequence", "load_sequence", "resample", "turn_world"]
+
 #: z-up (AMASS) to y-up: (x, y, z) → (x, z, -y).
 Z_UP_TO_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+HANDS = ("flat", "file")
 
 
 @dataclass(frozen=True)
@@ -26,11 +27,14 @@ class PoseSequence:
     """
 
     name: str
-    poses: np.ndarray  # (T, 24, 3) axis-angle [rad], float64; hands zero
+    poses: np.ndarray  # (T, 24, 3) axis-angle [rad], float64; hands zero unless asked for
     transl: np.ndarray  # (T, 3) m, float64
     fps: float
     betas: np.ndarray  # (S,) of the recorded subject, of the model that recorded it
     world_rotation: np.ndarray  # (3, 3)
+    fingers: np.ndarray | None = None  # (T, 30, 3) axis-angle [rad]; None: flat hands
+    gender: str | None = None  # of the recorded subject; None: the file does not tell
+    family: str | None = None  # "smpl", "smplh" or "smplx", the model that recorded it; None: the file does not tell
 
     @property
     def num_frames(self) -> int:
@@ -38,47 +42,91 @@ class PoseSequence:
 
     def window(self, start: int, stop: int) -> PoseSequence:
         """Frames ``start:stop``."""
-        return replace(self, poses=self.poses[start:stop], transl=self.transl[start:stop])
+        fingers = None if self.fingers is None else self.fingers[start:stop]
+        return replace(self, poses=self.poses[start:stop], transl=self.transl[start:stop], fingers=fingers)
 
 
-def load_sequence(name: str | Path, fps: float = 30.0, up: str = "z") -> PoseSequence:
-    """An embedded motion or an AMASS ``.npz`` (SMPL+H or SMPL-X keys), resampled to ``fps`` and turned y up.
+def load_sequence(
+    name: str | Path,
+    fps: float = 30.0,
+    up: str = "auto",
+    *,
+    start: float | str | None = None,
+    stop: float | str | None = None,
+    loop: int = 1,
+    blend_in: float = 0.0,
+    blend_from: str = "t",
+    hands: str = "flat",
+    file_fps: float | None = None,
+) -> PoseSequence:
+    """An embedded motion or a motion file (see :func:`hood.assets.motion_file.read_recording`) as it is to be performed.
+
+    Args:
+        fps: frames per second of the result; rotations are interpolated by slerp, translations linearly.
+        up: axis of the file's world that points up: "z", "y", or "auto", z for AMASS layouts and y for the others.
+        start, stop: part of the file to keep, in seconds, or in frames of the file as "120f".
+        loop: times the motion is played; each play goes on from where the last one ended.
+        blend_in: seconds of moving from a standing pose into the first frame, put before it.
+        blend_from: that pose, "t" or "a".
+        hands: "flat", or "file" for the fingers (SMPL-H, SMPL-X) or hands (SMPL) that the file holds.
+        file_fps: frame rate of the file, whatever it says itself.
 
     Raises:
         FileNotFoundError: unknown name or missing file.
-        ValueError: not an AMASS file, fewer than two frames, non-finite poses, unknown up axis.
+        ValueError: not a motion file, nothing left of it, an option out of range; names the file and the fix.
     """
+    from hood.assets import sequence_edit as edit
+
     path = locate("motions", name)
-    if path.suffix != ".npz":
-        raise ValueError(f"{path}: motions are AMASS .npz files (poses, trans, mocap_framerate)")
-    if up not in ("y", "z"):
-        raise ValueError(f"up axis {up!r}: give 'z' (AMASS) or 'y'")
-    arrays = read_arrays(path, ("trans",), "AMASS motion")
-    poses, transl = _body_poses(path, arrays), np.asarray(arrays["trans"], dtype=np.float64)
-    _check(path, poses, transl)
-    rate = _frame_rate(path, arrays)
-    betas = np.asarray(arrays.get("betas", np.zeros(10)), dtype=np.float64).reshape(-1)
-    sequence = PoseSequence(path.stem, poses, transl, rate, betas, np.eye(3))
-    sequence = resample(sequence, fps)
-    return turn_world(sequence, Z_UP_TO_Y_UP) if up == "z" else sequence
+    if up not in ("y", "z", "auto"):
+        raise ValueError(f"up axis {up!r}: give 'z' (AMASS), 'y' or 'auto'")
+    if hands not in HANDS:
+        raise ValueError(f"hands {hands!r}: give 'flat' or 'file'")
+    recording = read_recording(path, file_fps)
+    poses, fingers = recording.poses, recording.fingers
+    if hands == "flat":
+        poses, fingers = poses.copy(), None
+        poses[:, NUM_BODY_JOINTS:] = 0.0
+    sequence = PoseSequence(
+        path.stem,
+        poses,
+        recording.transl,
+        recording.fps,
+        recording.betas,
+        np.eye(3),
+        fingers,
+        recording.gender,
+        recording.family,
+    )
+    sequence = resample(edit.trim(sequence, start, stop), fps)
+    if (recording.up if up == "auto" else up) == "z":
+        sequence = turn_world(sequence, Z_UP_TO_Y_UP)
+    return edit.blend_in(edit.loop(sequence, loop), blend_in, blend_from)
 
 
 def resample(sequence: PoseSequence, fps: float) -> PoseSequence:
     """The motion at another frame rate: rotations by slerp, translations linearly; time stamps k / fps, no drift."""
     if abs(sequence.fps - fps) < 1e-9:
         return sequence
-    count = int(np.floor((sequence.num_frames - 1) * fps / sequence.fps + 1e-9)) + 1
-    if count < 2:
-        raise ValueError(f"{sequence.name}: {sequence.num_frames} frames at {sequence.fps:g} fps are less than two at {fps:g}")
-    source = np.arange(sequence.num_frames) / sequence.fps
-    target = np.minimum(np.arange(count) / fps, source[-1])
-    poses = np.zeros((count, _SMPL_JOINTS, 3))
-    for joint in range(_SMPL_JOINTS):
-        if np.any(sequence.poses[:, joint]):
-            turns = Rotation.from_rotvec(sequence.poses[:, joint])
-            poses[:, joint] = Slerp(source, turns)(target).as_rotvec()
+    source, target = time_stamps(sequence.name, sequence.num_frames, sequence.fps, fps)
     transl = np.stack([np.interp(target, source, sequence.transl[:, axis]) for axis in range(3)], axis=1)
-    return replace(sequence, poses=poses, transl=transl, fps=fps)
+    fingers = None if sequence.fingers is None else _slerp(sequence.fingers, source, target)
+    return replace(sequence, poses=_slerp(sequence.poses, source, target), transl=transl, fps=fps, fingers=fingers)
+
+
+def time_stamps(name: str, num_frames: int, fps: float, new_fps: float) -> tuple[np.ndarray, np.ndarray]:
+    """Times [s] of the frames of a recording, and of its frames at another rate: k / new_fps as far as it goes.
+
+    Raises:
+        ValueError: less than two frames are left, or more than a million.
+    """
+    count = np.floor((num_frames - 1) * new_fps / fps + 1e-9) + 1
+    if count < 2:
+        raise ValueError(f"{name}: {num_frames} frames at {fps:g} fps are less than two at {new_fps:g}")
+    if count > 1e6:
+        raise ValueError(f"{name}: {num_frames} frames at {fps:g} fps are {count:.0f} at {new_fps:g}; check the frame rate")
+    source = np.arange(num_frames) / fps
+    return source, np.minimum(np.arange(int(count)) / new_fps, source[-1])
 
 
 def turn_world(sequence: PoseSequence, rotation: np.ndarray) -> PoseSequence:
@@ -89,41 +137,10 @@ def turn_world(sequence: PoseSequence, rotation: np.ndarray) -> PoseSequence:
     return replace(sequence, poses=poses, transl=transl, world_rotation=rotation @ sequence.world_rotation)
 
 
-def _body_poses(path: Path, arrays: dict[str, np.ndarray]) -> np.ndarray:
-    if "poses" in arrays:
-        flat = np.asarray(arrays["poses"], dtype=np.float64)
-        if flat.ndim != 2 or flat.shape[1] < 3 * NUM_BODY_JOINTS:
-            raise ValueError(f"{path}: poses has shape {flat.shape}; AMASS has (N, 156) with at least 66 columns")
-        flat = flat[:, : 3 * NUM_BODY_JOINTS]
-    elif "root_orient" in arrays and "pose_body" in arrays:
-        shapes = [arrays[key].shape for key in ("root_orient", "pose_body")]
-        if [shape[1:] for shape in shapes] != [(3,), (63,)] or shapes[0][0] != shapes[1][0]:
-            raise ValueError(f"{path}: root_orient and pose_body have shapes {shapes}; AMASS has (N, 3) and (N, 63)")
-        flat = np.concatenate([arrays["root_orient"], arrays["pose_body"]], axis=1).astype(np.float64)
-    else:
-        raise ValueError(f"{path}: not an AMASS motion: neither 'poses' nor 'root_orient' and 'pose_body' inside")
-    poses = np.zeros((len(flat), _SMPL_JOINTS, 3))
-    poses[:, :NUM_BODY_JOINTS] = flat.reshape(len(flat), NUM_BODY_JOINTS, 3)
-    return poses
-
-
-def _frame_rate(path: Path, arrays: dict[str, np.ndarray]) -> float:
-    for key in ("mocap_framerate", "mocap_frame_rate"):
-        if key in arrays:
-            value = np.asarray(arrays[key]).reshape(-1)
-            rate = float(value[0]) if len(value) == 1 and np.issubdtype(value.dtype, np.number) else np.nan
-            if not np.isfinite(rate) or rate <= 0:
-                raise ValueError(f"{path}: {key} is {arrays[key]}; it must be a positive number of frames per second")
-            return rate
-    raise ValueError(f"{path}: no mocap_framerate: add it (frames per second) to the file")
-
-
-def _check(path: Path, poses: np.ndarray, transl: np.ndarray) -> None:
-    if len(poses) != len(transl) or transl.ndim != 2 or transl.shape[1] != 3:
-        raise ValueError(f"{path}: poses has {len(poses)} frames, trans has shape {transl.shape}; they must agree")
-    if len(poses) < 2:
-        raise ValueError(f"{path}: the sequence has {len(poses)} frame(s); a motion needs at least 2")
-    for name, values in (("poses", poses), ("trans", transl)):
-        bad = ~np.isfinite(values).reshape(len(values), -1).all(axis=1)
-        if bad.any():
-            raise ValueError(f"{path}: {name} is not finite in frame {int(np.argmax(bad))}; remove or repair that frame")
+def _slerp(poses: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """(T, J, 3) axis-angle at the times ``target`` of (N, J, 3) at the times ``source``."""
+    result = np.zeros((len(target), *poses.shape[1:]))
+    for joint in range(poses.shape[1]):
+        if np.any(poses[:, joint]):
+            result[:, joint] = Slerp(source, Rotation.from_rotvec(poses[:, joint]))(target).as_rotvec()
+    return result

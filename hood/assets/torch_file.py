@@ -7,6 +7,7 @@ opaque records and the weights beside them can be read.
 from __future__ import annotations
 
 import io
+import os
 import struct
 import zipfile
 from collections.abc import Callable
@@ -41,9 +42,7 @@ def load_torch(path: str | Path, size_limit: int = SIZE_LIMIT) -> Any:
     """
     path = check_size(path, size_limit)
     with open(path, "rb") as file:
-        read = _read_zip if zipfile.is_zipfile(file) else _read_stream
-        file.seek(0)
-        return guarded(path, "torch file", lambda: resolve(read(file, size_limit)))
+        return guarded(path, "torch file", lambda: resolve(_read(file, size_limit)))
 
 
 class _StorageType:
@@ -104,6 +103,12 @@ _FUNCTIONS: dict[tuple[str, str], Any] = {
 }
 
 
+def _read(file: BinaryIO, size_limit: int) -> Any:
+    read = _read_zip if zipfile.is_zipfile(file) else _read_stream
+    file.seek(0)
+    return read(file, size_limit)
+
+
 def _read_zip(file: BinaryIO, size_limit: int) -> Any:
     with zipfile.ZipFile(file) as archive:
         sizes = {info.filename: info.file_size for info in archive.infolist()}
@@ -133,6 +138,7 @@ def _read_stream(file: BinaryIO, size_limit: int) -> Any:
         raise Refused("tensors in big-endian order; save the file again on this machine")
     buffers: dict[str, tuple[bytearray, Tensor]] = {}
     total = 0
+    size_limit = min(size_limit, os.fstat(file.fileno()).st_size)  # no storage is larger than the file it is in
 
     def storage(dtype: torch.dtype, key: Any, location: Any, count: int, view: Any = None) -> Tensor:
         nonlocal total

@@ -58,13 +58,17 @@ def guarded(path: Path, what: str, read: Callable[[], Any]) -> Any:
         raise ValueError(f"{path}: not a readable {what} ({reason})") from error
 
 
-class RestrictedUnpickler(pickle.Unpickler):
-    """Unpickler whose names lead to stand-ins. ``inert`` lists packages whose classes become :class:`Opaque`."""
+class RestrictedUnpickler(pickle._Unpickler):  # type: ignore[name-defined,misc]
+    """Unpickler whose names lead to stand-ins. ``inert`` lists packages whose classes become :class:`Opaque`.
+
+    Python's own, not the one in C: that one makes room for as many bytes or notes as a damaged length claims, before it
+    reads them. Arrays are single entries of a pickle, so that little time is lost.
+    """
 
     inert: tuple[str, ...] = ()
 
     def __init__(self, file: BinaryIO | io.BytesIO) -> None:
-        super().__init__(file, encoding="latin1")
+        super().__init__(_Bounded(file), encoding="latin1")
 
     def find_class(self, module: str, name: str) -> Any:
         """The stand-in for ``module.name``.
@@ -82,3 +86,36 @@ class RestrictedUnpickler(pickle.Unpickler):
             f"names {module}.{name}, which is not read: only numbers, text, containers, arrays and sparse matrices are "
             "(a file that needs it may be harmful; convert it where it was made)"
         )
+
+
+class _Bounded:
+    """A file that is never asked for more than it holds."""
+
+    def __init__(self, file: BinaryIO | io.BytesIO) -> None:
+        place = file.tell()
+        self._left = file.seek(0, os.SEEK_END) - place
+        file.seek(place)
+        self._file = file
+
+    def read(self, count: int) -> bytes:
+        """``count`` bytes.
+
+        Raises:
+            EOFError: there are fewer.
+        """
+        if not 0 <= count <= self._left:
+            raise EOFError(f"it announces {count} more bytes and {self._left} are left")
+        self._left -= count
+        return self._file.read(count)
+
+    def readline(self) -> bytes:
+        """Bytes up to the next line end."""
+        line = self._file.readline()
+        self._left -= len(line)
+        return line
+
+    def readinto(self, buffer: bytearray) -> int:
+        """Fill ``buffer``."""
+        content = self.read(len(buffer))
+        buffer[:] = content
+        return len(content)

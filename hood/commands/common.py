@@ -3,17 +3,37 @@
 from __future__ import annotations
 
 import os
+import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
-from hood.config import ConfigError, require_choice
+from hood.config import ConfigError, plain, require_choice
 from hood.dynamics.reference import SUFFIXES, load_reference_checkpoint
 from hood.dynamics.simulator import Simulator, load_simulator
+from hood.nn.precision import check_precision
+from hood.training import distributed
 
 #: ``checkpoint=untrained``: seeded random weights instead of a file.
 UNTRAINED = "untrained"
+
+
+def together(command: Callable[[], int]) -> int:
+    """Run a command that torchrun may have started several times; an error of process 0 that ends all is told once."""
+    distributed.start()
+    try:
+        return command()
+    except (ValueError, OSError, ImportError) as error:
+        if distributed.rank() == 0:
+            raise
+        if not distributed.is_told(error):
+            print(f"hood: process {distributed.rank()}: {error}", file=sys.stderr)
+        return 2
+    finally:
+        distributed.stop()
 
 
 def prepare_folder(folder: Path) -> Path:
@@ -39,6 +59,38 @@ def read_model(path: Path, fps: float) -> Simulator:
     if frame_dt is not None and abs(fps * frame_dt - 1) > 1e-3:
         raise ConfigError(f"fps={fps:g}: {path} knows steps of 1/{1 / frame_dt:g} s only; use fps={1 / frame_dt:g}")
     return simulator
+
+
+def use_precision(simulator: Simulator, config: DictConfig) -> None:
+    """Let the simulator's network compute as ``config.precision`` says.
+
+    Raises:
+        ValueError: no such precision, or not on this device.
+    """
+    check_precision(str(config.precision), torch.device(str(config.device)))
+    simulator.network.use_precision(str(config.precision))
+
+
+def require_same_config(config: DictConfig, folder: Path, free: Sequence[str], free_below: Sequence[str] = ()) -> None:
+    """Raise ConfigError where the run in ``folder`` was started with other settings.
+
+    Keys in ``free`` may differ, and so may keys in ``free_below`` of the groups.
+    """
+    record = folder / "config.yaml"
+    if not record.exists():
+        return
+    before = OmegaConf.load(record)
+    assert isinstance(before, DictConfig)
+
+    def that_matters(value: Any) -> Any:
+        value = plain(value)
+        return {key: item for key, item in value.items() if key not in free_below} if isinstance(value, dict) else value
+
+    for key in map(str, config):
+        if key not in free and that_matters(before.get(key)) != that_matters(config[key]):
+            raise ConfigError(
+                f"{record}: {key} differs from this command's; resume with the same settings or use another output"
+            )
 
 
 def require_device(config: DictConfig) -> None:

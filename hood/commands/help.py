@@ -17,6 +17,15 @@ _EXAMPLES = {
         "hood rollout garment=dress sequence=walk_steady num_frames=200 output=outputs/dress",
         "hood rollout garment=my_shirt.obj sequence=CMU_01_poses.npz material=denim",
     ],
+    "inspect": [
+        "hood inspect my_shirt.obj",
+        "hood inspect my_shirt.obj CMU_01_poses.npz --json",
+    ],
+    "prepare": [
+        "hood prepare garment=my_shirt.obj output=my_shirt.npz",
+        "hood prepare garment=[shirt.obj,trousers.glb] pins=waistband output=outfit.npz",
+        "hood prepare garment=suit.obj pose=CMU_01_poses.npz frame=0 output=suit.npz",
+    ],
     "convert": ["hood convert checkpoint=postcvpr.pth output=postcvpr.safetensors"],
     "evaluate": [
         "hood evaluate",
@@ -29,7 +38,7 @@ def describe(name: str) -> str:
     """Help text of the command ``name``."""
     config = load_config(name)
     comments = _comments(name)
-    lines = [f"usage: hood {name} [key=value ...]", ""]
+    lines = [f"usage: hood {name} {'FILE ... ' if name == 'inspect' else ''}[key=value ...]", ""]
     for key in config:
         value = plain(config[key])
         if isinstance(value, dict):

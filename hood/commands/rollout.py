@@ -6,26 +6,33 @@ import hashlib
 import json
 import os
 import sys
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from hood.assets.body import load_body
-from hood.assets.garment import load_garment
 from hood.assets.library import locate
-from hood.assets.sequence import load_sequence
-from hood.commands.common import UNTRAINED, prepare_folder, read_model, require_device
+from hood.commands.batch import Job, find_jobs, share
+from hood.commands.common import UNTRAINED, prepare_folder, read_model, require_device, together, use_precision
+from hood.commands.performance import make_motion
+from hood.commands.wardrobe import read_outfit
 from hood.config import ConfigError, build, load_config, plain, require_choice, save_run_record
+from hood.dynamics.captured import MODES, CapturedSimulator
 from hood.dynamics.recorder import RolloutWriter, read_rollout
-from hood.dynamics.rollout import metric_names, simulate
+from hood.dynamics.rollout import METRIC_CHOICES, metric_names, simulate
 from hood.dynamics.simulator import Simulator
 from hood.dynamics.stepper import NewtonStepper, Stepper
-from hood.scene.scene import Scene, build_scene
+from hood.scene.scene import Scene, dress
+from hood.training import distributed
+
+#: ``step=plain``: shapes as the step needs them, the readable reference.
+PLAIN = "plain"
 
 
 def run(overrides: Sequence[str]) -> int:
@@ -33,47 +40,116 @@ def run(overrides: Sequence[str]) -> int:
     config = load_config("rollout", overrides)
     require_device(config)
     require_choice(config, "video", ("mp4", "gif", "none"))
+    require_choice(config, "metrics", METRIC_CHOICES)
     _check_numbers(config)
     require_choice(config, "stepper", ("network", "newton"))
-    stepper, digest = make_stepper(config)
+    require_choice(config, "step", (PLAIN, *MODES))
+    return together(lambda: _run(config))
+
+
+def _run(config: DictConfig) -> int:
+    """One motion, or each of many in a folder of its own; processes that torchrun started share the many."""
+    output = Path(str(config.output)).expanduser()
+    jobs = distributed.on_main(lambda: find_jobs(str(config.sequence), output))
+    if jobs is not None:
+        return _run_all(config, jobs, output)
+    if distributed.rank() != 0:
+        return 0
+    return 130 if _run_one(config, *make_stepper(config))[1] else 0
+
+
+def _run_one(config: DictConfig, stepper: Stepper, digest: str) -> tuple[dict[str, Any], bool]:
+    """The rollout of one motion with all its files: the summary, and whether the user interrupted it."""
     scene = make_scene(config)
     folder = prepare_folder(Path(str(config.output)).expanduser())
+    (folder / "summary.json").unlink(missing_ok=True)  # its presence says that everything is there
     save_run_record(folder, config, int(config.seed))
     interrupted = _simulate_to_disk(config, scene, stepper, digest, folder / "rollout.h5")
     summary = summarise(folder / "rollout.h5")
-    _write_json(folder / "summary.json", summary)
     print(describe(summary))
-    if not interrupted:
-        _draw(config, folder)
+    try:
+        if not interrupted:
+            _draw(config, folder)
+    finally:
+        _write_json(folder / "summary.json", summary)
     print(f"files in {folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
     if interrupted:
         print(
             f"hood: interrupted; the {summary['num_frames']} frames done are kept in {folder / 'rollout.h5'}",
             file=sys.stderr,
         )
+    return summary, interrupted
+
+
+def _run_all(config: DictConfig, jobs: list[Job], output: Path) -> int:
+    """Every motion in its folder, and ``summary.json`` over all of them."""
+    stepper, digest = make_stepper(config)
+
+    def work(job: Job) -> tuple[dict[str, Any], bool]:
+        one = OmegaConf.merge(config, {"sequence": job.sequence, "output": str(job.folder)})
+        assert isinstance(one, DictConfig)
+        done = _finished(one, digest, job.folder) if bool(config.resume) else None
+        return (done, False) if done is not None else _run_one(one, stepper, digest)
+
+    outcome = share(jobs, work)
+    if distributed.rank() == 0:
+        prepare_folder(output)
+        _write_json(output / "summary.json", {"num_motions": len(jobs), "motions": outcome.rows})
+        print(describe_all(outcome.rows, len(jobs)))
+        print(f"summary of all in {output / 'summary.json'}")
+        if len(outcome.rows) < len(jobs):
+            print("hood: not all done; the same command with resume=true goes on", file=sys.stderr)
+    if outcome.hopeless is not None:
+        raise outcome.hopeless
+    if outcome.interrupted:
         return 130
-    return 0
+    return 2 if any("error" in row for row in outcome.rows.values()) else 0
+
+
+def _finished(config: DictConfig, digest: str, folder: Path) -> dict[str, Any] | None:
+    """The summary of a rollout that was finished with the same settings and weights; None where there is none."""
+    try:
+        summary: dict[str, Any] = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        with h5py.File(folder / "rollout.h5", "r") as file:
+            attributes = dict(file.attrs)
+        before = json.loads(attributes["config"])
+    except (OSError, ValueError, KeyError):
+        return None
+    now = plain(config)
+    same = all(before.get(key) == now[key] for key in now if key not in ("resume", "output"))
+    return summary if same and bool(attributes["complete"]) and attributes["checkpoint_sha256"] == digest else None
+
+
+def describe_all(rows: Mapping[str, Mapping[str, Any]], total: int) -> str:
+    """One line per motion, and how many were done."""
+    lines = []
+    for name, row in rows.items():
+        if "error" in row:
+            lines.append(f"{name}: {row['error']}")
+            continue
+        first = row["first_nonfinite_frame"]
+        state = f"{row['num_frames']} frames, " + ("all finite" if first is None else f"first non-finite frame {first}")
+        lines.append(
+            f"{name}: {state}, strain p99 {_percent(row['strain_p99'])}, penetration {_percent(row['penetration_share_mean'])}"
+        )
+    failed = sum("error" in row for row in rows.values())
+    return "\n".join([*lines, f"{len(rows) - failed} of {total} motions simulated" + (f", {failed} failed" if failed else "")])
 
 
 def make_scene(config: DictConfig) -> Scene:
     """Assets named in the config, put together."""
-    sequence = load_sequence(str(config.sequence), fps=float(config.fps), up=str(config.up))
-    garment = load_garment(str(config.garment), triangulate=bool(config.triangulate))
-    body = load_body(str(config.body))
-    betas = np.zeros(10)
-    given = plain(config.betas)
-    if len(given) > 10 or not all(isinstance(b, (int, float)) and np.isfinite(b) for b in given):
-        raise ConfigError(f"betas={given}: give at most 10 finite shape coefficients, e.g. betas=[1.5,0,-1]")
-    betas[: len(given)] = given
-    return build_scene(garment, body, sequence, build(config.material), betas, device=str(config.device))
+    motion = make_motion(config)
+    garment = read_outfit(config.garment, motion, bool(config.triangulate), config.pins)
+    return dress(garment, motion, build(config.material))
 
 
 def make_stepper(config: DictConfig) -> tuple[Stepper, str]:
     """What takes the steps, and the SHA-256 of its weights (``none`` for the solver)."""
     if str(config.stepper) == "network":
         simulator, digest = make_simulator(config)
-        simulator.network.use_precision(str(config.precision))
-        return simulator, digest
+        use_precision(simulator, config)
+        stepper: Stepper = simulator if str(config.step) == PLAIN else CapturedSimulator(simulator, str(config.step))
+        return stepper, digest
     stepper = NewtonStepper(build(config.losses), build(config.solver))
     stepper.gravity = stepper.gravity.to(str(config.device))
     return stepper, "none"
@@ -103,10 +179,10 @@ def make_simulator(config: DictConfig) -> tuple[Simulator, str]:
 
 
 def summarise(path: Path) -> dict[str, Any]:
-    """Summary of a rollout file: strain, penetration, times, first non-finite frame."""
+    """Summary of a rollout file: strain, penetration, times, first non-finite frame; None for what was not measured."""
     data = read_rollout(path)
     finite = np.isfinite(data.cloth_pos).all(axis=(1, 2))
-    metrics = data.metrics
+    metrics = defaultdict(lambda: np.full(len(finite), np.nan), data.metrics)
     times = {name[3:]: _quantiles(metrics[name][2:]) for name in sorted(metrics) if name.startswith("ms_")}
     converged = metrics.get("solver_converged")
     solver = {} if converged is None else {"solver_steps_not_converged": int((converged == 0).sum())}
@@ -144,9 +220,7 @@ def describe(summary: dict[str, Any]) -> str:
         [
             f"{summary['garment']}: {summary['num_frames']} frames, "
             + ("all finite" if first is None else f"first non-finite frame {first}"),
-            f"strain p50 {_percent(summary['strain_p50'])} p99 {_percent(summary['strain_p99'])}, penetration "
-            f"{_percent(summary['penetration_share_mean'])} of the vertices deeper than 2 mm, "
-            f"deepest {1e3 * (summary['penetration_depth_max_m'] or 0.0):.1f} mm",
+            f"strain p50 {_percent(summary['strain_p50'])} p99 {_percent(summary['strain_p99'])}, {_penetration(summary)}",
             "ms per frame (median): " + ", ".join(f"{name} {value or 0.0:.1f}" for name, value in times.items()),
             *([f"{missed} steps did not reach solver.target_rg; their frames are kept as far as they got"] if missed else []),
         ]
@@ -158,7 +232,7 @@ def _simulate_to_disk(config: DictConfig, scene: Scene, stepper: Stepper, digest
     potential = build(config.losses)
     count = min(int(config.num_frames), scene.num_frames)
     if count < int(config.num_frames):
-        print(f"{scene.motion.sequence.name} has {count} frames at {1 / scene.dt:g} fps; the rollout ends there")
+        print(f"{scene.motion.name} has {count} frames at {1 / scene.dt:g} fps; the rollout ends there")
     attributes = {
         "material": plain(config.material),
         "config": plain(config),
@@ -167,24 +241,24 @@ def _simulate_to_disk(config: DictConfig, scene: Scene, stepper: Stepper, digest
         "model": stepper.config,
         "stepper": str(config.stepper),
         "garment": scene.garment.name,
-        "sequence": scene.motion.sequence.name,
+        "sequence": scene.motion.name,
     }
     writer = RolloutWriter(
         path,
         count,
         scene.cloth.rest_pos.cpu().numpy(),
         scene.garment.faces,
-        scene.motion.body.faces,
-        len(scene.motion.body.v_template),
-        metric_names(potential, stepper),
+        scene.motion.faces,
+        scene.motion.num_vertices,
+        metric_names(potential, stepper, str(config.metrics)),
         scene.dt,
         attributes,
         farthest=float(np.abs(scene.motion.translation).max()),
     )
-    frames = simulate(stepper, scene, potential, count, int(config.relaxing_steps))
+    frames = simulate(stepper, scene, potential, count, int(config.relaxing_steps), metrics=str(config.metrics))
     try:
         with writer:
-            for frame in tqdm(frames, total=count, desc=f"rollout {scene.garment.name}", unit="frame", disable=None):
+            for frame in tqdm(frames, total=count, desc=f"rollout {scene.garment.name}", unit="frame", disable=_quiet()):
                 writer.append(frame.world_pos.numpy(), frame.body_pos.numpy(), frame.metrics)
     except KeyboardInterrupt:
         if writer.frames_done == 0:
@@ -206,7 +280,7 @@ def _draw(config: DictConfig, folder: Path) -> None:
     if bool(config.sheet):
         write_sheet(data, folder / "contact_sheet.png")
     if str(config.video) != "none":
-        frames = tqdm(range(0, len(data.cloth_pos), int(config.video_stride)), desc="video", unit="frame", disable=None)
+        frames = tqdm(range(0, len(data.cloth_pos), int(config.video_stride)), desc="video", unit="frame", disable=_quiet())
         write_video(data, folder / f"rollout.{config.video}", frames, int(config.video_stride))
 
 
@@ -252,5 +326,17 @@ def _largest(values: np.ndarray) -> float | None:
     return _reduce(np.max, values)
 
 
+def _quiet() -> bool | None:
+    """For progress bars: shown on a terminal, by one process."""
+    return True if distributed.rank() else None
+
+
 def _percent(value: float | None) -> str:
     return "n/a" if value is None else f"{100 * value:.1f}%"
+
+
+def _penetration(summary: dict[str, Any]) -> str:
+    share, depth = summary["penetration_share_mean"], summary["penetration_depth_max_m"]
+    if share is None or depth is None:
+        return "penetration n/a"
+    return f"penetration {_percent(share)} of the vertices deeper than 2 mm, deepest {1e3 * depth:.1f} mm"

@@ -21,7 +21,7 @@ _SMOOTHING = 15  # frames over which the camera averages the walker's path
 
 
 class Film:
-    """Draws frames of one rollout with one camera distance and angle; the camera follows the body.
+    """Draws frames of one rollout with one camera distance and angle; the camera follows the body, or the cloth without one.
 
     Args:
         data: the rollout.
@@ -33,9 +33,11 @@ class Film:
         if len(data.cloth_pos) == 0:
             raise ValueError("the rollout has no frames to draw")
         self.data, self.width, self.height = data, width, height
-        self._path = _smooth_path(data.body_pos)
-        centred = data.body_pos[:: max(len(data.body_pos) // 20, 1)] - self._path[:: max(len(data.body_pos) // 20, 1), None]
-        self._floor = float(data.body_pos[..., 1].min())
+        # Without a body the camera looks at the cloth, as far as that is finite.
+        shown = data.body_pos if data.body_pos.shape[1] else np.nan_to_num(data.cloth_pos, posinf=0.0, neginf=0.0)
+        self._path = _smooth_path(shown)
+        centred = shown[:: max(len(shown) // 20, 1)] - self._path[:: max(len(shown) // 20, 1), None]
+        self._floor = float(shown[..., 1].min())
         self._camera = Camera.framing(centred, azimuth_deg, 8.0, aspect=width / height)
 
     def frame(self, index: int) -> np.ndarray:
@@ -43,9 +45,12 @@ class Film:
         shift = self._path[index]
         camera = replace(self._camera, position=_add(self._camera.position, shift), target=_add(self._camera.target, shift))
         body, cloth = self.data.body_pos[index], self.data.cloth_pos[index]
-        meshes = [RenderMesh(body, self.data.body_faces, BODY_COLOR)]
-        if np.isfinite(cloth).all():
-            meshes = [RenderMesh(_beneath(body, self.data.body_faces, cloth), self.data.body_faces, BODY_COLOR)]
+        dressed = bool(np.isfinite(cloth).all())
+        meshes = []
+        if len(body):
+            thinner = _beneath(body, self.data.body_faces, cloth) if dressed else body
+            meshes.append(RenderMesh(thinner, self.data.body_faces, BODY_COLOR))
+        if dressed:
             meshes.append(RenderMesh(cloth, self.data.cloth_faces, GARMENT_COLOR))
         return render_frame(meshes, camera, width=self.width, height=self.height, floor=self._floor)
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from hood.assets.binding import bind_garment
 from hood.assets.body import Body
 from hood.assets.garment import Garment
 from hood.assets.sequence import PoseSequence
@@ -18,12 +21,71 @@ from hood.scene.state import Obstacle
 _CHUNK = 16
 
 
+class Motion(Protocol):
+    """What a scene needs of whatever moves in it: :class:`BodyMotion`, a parametric body, or one of
+    :mod:`hood.scene.mesh_motion`. Positions are relative to an ``origin`` (3,) [m], float64, in ``dtype`` on ``device``."""
+
+    @property
+    def name(self) -> str:
+        """What is performed, and by whom."""
+        ...
+
+    @property
+    def num_frames(self) -> int: ...
+
+    @property
+    def fps(self) -> float: ...
+
+    @property
+    def dtype(self) -> torch.dtype: ...
+
+    @property
+    def device(self) -> torch.device: ...
+
+    @property
+    def translation(self) -> np.ndarray:
+        """(T, 3) m, float64: a point of the world near the body in every frame."""
+        ...
+
+    @property
+    def faces(self) -> np.ndarray:
+        """(G, 3) int64; empty where there is no body."""
+        ...
+
+    @property
+    def num_vertices(self) -> int: ...
+
+    def surface(self, frame: int, origin: np.ndarray) -> Tensor:
+        """(W, 3) m."""
+        ...
+
+    def obstacle(self, frame: int, origin: np.ndarray, static: bool = False) -> Obstacle | None:
+        """The body around the step ``frame`` → ``frame + 1``, frozen at ``frame`` when ``static``; None without a body."""
+        ...
+
+    def dressed(self, garment: Garment) -> Garment:
+        """The garment with what it needs to follow this body.
+
+        Raises:
+            ValueError: it cannot follow it; says what to give instead.
+        """
+        ...
+
+    def rest_pos(self, garment: Garment) -> np.ndarray:
+        """(V, 3) m: the undeformed garment, grown with the body's shape."""
+        ...
+
+    def skinned(self, garment: Garment, frame: int, origin: np.ndarray) -> Tensor:
+        """(V, 3) m: where the dressed garment is at ``frame`` when it moves with the body alone."""
+        ...
+
+
 @dataclass(frozen=True)
 class BodyMotion:
     """Body of shape ``betas`` performing ``sequence``.
 
-    Surfaces are kept relative to the body's own translation in ``dtype``; translations are float64, so that a walk far from
-    the origin loses nothing. Surfaces are posed in chunks on demand and the last chunk is kept.
+    Surfaces are posed and kept in float64 relative to the body's own translation, so that a walk far from the origin loses
+    nothing; ``dtype`` is what comes out. Surfaces are posed in chunks on demand and the last chunk is kept.
     """
 
     body: Body
@@ -35,24 +97,58 @@ class BodyMotion:
     _cache: dict[int, Tensor]
 
     @property
+    def name(self) -> str:
+        return self.sequence.name
+
+    @property
     def num_frames(self) -> int:
         return self.sequence.num_frames
 
+    @property
+    def fps(self) -> float:
+        return self.sequence.fps
+
+    @property
+    def faces(self) -> np.ndarray:
+        return self.body.faces
+
+    @property
+    def num_vertices(self) -> int:
+        return len(self.body.v_template)
+
     def local_surface(self, frame: int) -> Tensor:
-        """(W, 3) m, relative to ``translation[frame]``."""
+        """(W, 3) m, relative to ``translation[frame]``, float64."""
         chunk = frame // _CHUNK
         if chunk not in self._cache:
             # Two chunks cover the three frames around any step.
             for old in [key for key in self._cache if abs(key - chunk) > 1]:
                 del self._cache[old]
             window = self.sequence.window(chunk * _CHUNK, (chunk + 1) * _CHUNK)
-            self._cache[chunk] = self.body.surface(window, self.betas, self.dtype).to(self.device)
+            self._cache[chunk] = self.body.surface(window, self.betas, torch.float64).to(self.device)
         return self._cache[chunk][frame % _CHUNK]
+
+    @property
+    def posed(self) -> dict[int, Tensor]:
+        """Chunks of surfaces posed so far and kept."""
+        return self._cache
+
+    def surfaces(self) -> dict[int, Tensor]:
+        """Every surface, in the chunks in which :meth:`local_surface` poses them."""
+        chunks = {}
+        for chunk in range(-(-self.num_frames // _CHUNK)):
+            self.local_surface(chunk * _CHUNK)
+            chunks[chunk] = self._cache[chunk]
+        return chunks
+
+    def with_surfaces(self, chunks: Mapping[int, Tensor], device: torch.device | str) -> BodyMotion:
+        """The same motion on ``device`` with surfaces posed before; none is posed again as long as all are given."""
+        return replace(self, device=torch.device(device), _cache={key: chunk.to(device) for key, chunk in chunks.items()})
 
     def surface(self, frame: int, origin: np.ndarray) -> Tensor:
         """(W, 3) m, relative to ``origin`` (3,) float64."""
-        shift = torch.as_tensor(self.translation[frame] - origin).to(self.device, self.dtype)
-        return self.local_surface(frame) + shift
+        shift = torch.as_tensor(self.translation[frame] - origin).to(self.device)
+        # Rounded once, at the end: a mesh that moves as this body does gives the same numbers.
+        return (self.local_surface(frame) + shift).to(self.dtype)
 
     def obstacle(self, frame: int, origin: np.ndarray, static: bool = False) -> Obstacle:
         """The body around the step ``frame`` → ``frame + 1``; ``static`` freezes it at ``frame`` (relaxing step)."""
@@ -70,9 +166,17 @@ class BodyMotion:
             omitted=torch.as_tensor(self.body.omitted, device=self.device),
         )
 
+    def dressed(self, garment: Garment) -> Garment:
+        """The garment bound to the body (:func:`hood.assets.binding.bind_garment`)."""
+        return bind_garment(garment, self.body)
+
+    def rest_pos(self, garment: Garment) -> np.ndarray:
+        """(V, 3) m: the garment grown with the body's shape."""
+        return garment.shaped(self.betas)
+
     def skinned(self, garment: Garment, frame: int, origin: np.ndarray) -> Tensor:
         """(V, 3) m: the garment posed with the body at ``frame`` by its skinning weights, relative to ``origin``."""
-        rest = torch.as_tensor(garment.shaped(self.betas)).to(self.dtype)
+        rest = torch.as_tensor(garment.tpose(self.betas)).to(self.dtype)
         weights = torch.as_tensor(garment.lbs_weights).to(self.dtype)
         transforms = self.body.transforms(self.sequence.window(frame, frame + 1), self.betas, self.dtype)
         shift = torch.as_tensor(self.translation[frame] - origin).to(self.dtype)

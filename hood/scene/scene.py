@@ -1,4 +1,4 @@
-"""A scene: one garment, one body in motion. It prescribes the start and every step; it never changes."""
+"""A scene: one garment, and one body in motion or none. It prescribes the start and every step; it never changes."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from hood.assets.body import Body
-from hood.assets.garment import Garment, bind_garment
+from hood.assets.garment import Garment
 from hood.assets.material import Material
 from hood.assets.sequence import PoseSequence
 from hood.scene.batch import to_device
 from hood.scene.cloth import Cloth, build_cloth
-from hood.scene.motion import BodyMotion, body_motion
+from hood.scene.motion import Motion, body_motion
 from hood.scene.start import settle
 from hood.scene.state import Attachments, State, StepInput, concatenate_obstacles
 
@@ -31,28 +31,38 @@ class Scene:
 
     cloth: Cloth
     garment: Garment
-    motion: BodyMotion
+    motion: Motion
     dt: float
     clearance: float = 2e-3
+    start_pos: np.ndarray | None = None  # (V, 3) m, world, float64: frame 0 starts there, and is not settled
+    start_vel: np.ndarray | None = None  # (V, 3) m/s, likewise
 
     @property
     def num_frames(self) -> int:
         """Frames of the motion; a rollout has at most as many."""
         return self.motion.num_frames
 
-    def start(self, frame: int = 0, relaxed: bool = True) -> State:
+    def start(self, frame: int = 0, relaxed: bool = True, thorough: bool = False) -> State:
         """State at ``frame``: garment skinned to the body, settled; velocity of the skinned garment.
 
-        ``relaxed=False`` gives zero velocity, the start of a relaxing step.
+        ``relaxed=False`` gives zero velocity, the start of a relaxing step; ``thorough`` as in
+        :func:`hood.scene.start.settle`.
         """
+        vel = self.start_velocity(frame) if relaxed else torch.zeros_like(self.cloth.rest_pos)
+        if self.start_pos is not None and frame == 0:
+            origin = _snap(self.start_pos.mean(axis=0), 2 * _GRID)  # where a rollout would move it, see recentre
+            pos = torch.as_tensor(self.start_pos - origin).to(self.cloth.rest_pos)
+            return State(pos=pos, vel=vel, origin=torch.as_tensor(origin).unsqueeze(0))
         origin = _snap(self.motion.translation[frame])
         skinned = self.motion.skinned(self.garment, frame, origin)
-        pos = settle(self.cloth, skinned, self.motion.obstacle(frame, origin, static=True), self.clearance)
-        vel = self.start_velocity(frame) if relaxed else torch.zeros_like(pos)
+        obstacle = self.motion.obstacle(frame, origin, static=True)
+        pos = settle(self.cloth, skinned, obstacle, self.clearance, thorough=thorough)
         return State(pos=pos, vel=vel, origin=torch.as_tensor(origin).unsqueeze(0))
 
     def start_velocity(self, frame: int) -> Tensor:
         """(V, 3) m/s of the skinned garment at ``frame``."""
+        if self.start_vel is not None and frame == 0:
+            return torch.as_tensor(self.start_vel).to(self.cloth.rest_pos)
         if frame + 1 >= self.num_frames:
             return torch.zeros_like(self.cloth.rest_pos)
         origin = self.motion.translation[frame]
@@ -96,12 +106,20 @@ def build_scene(
     device: torch.device | str = "cpu",
 ) -> Scene:
     """Garment on body: bound, grown with β and scaled by ``size`` (rest shape only: the paper's resizing augmentation)."""
-    garment = bind_garment(garment, body)
     betas = np.zeros(10) if betas is None else np.asarray(betas, dtype=np.float64)
-    rest_pos = garment.shaped(betas) * size
-    cloth = build_cloth(rest_pos, garment.faces, material or Material(), garment.pinned, dtype=dtype)
-    cloth = to_device(cloth, device)
-    return Scene(cloth, garment, body_motion(body, sequence, betas, dtype, device), 1.0 / sequence.fps)
+    return dress(garment, body_motion(body, sequence, betas, dtype, device), material, size)
+
+
+def dress(garment: Garment, motion: Motion, material: Material | None = None, size: float = 1.0) -> Scene:
+    """Garment on whatever moves, in the motion's precision and on its device; ``size`` scales the rest shape.
+
+    Raises:
+        ValueError: the garment cannot follow the body, or is not on it in the motion's first frame.
+    """
+    garment = motion.dressed(garment)
+    rest_pos = motion.rest_pos(garment) * size
+    cloth = build_cloth(rest_pos, garment.faces, material or Material(), garment.pinned, dtype=motion.dtype)
+    return Scene(to_device(cloth, motion.device), garment, motion, 1.0 / motion.fps)
 
 
 def recentre(state: State, vertex_scene: Tensor) -> State:
@@ -149,5 +167,5 @@ def _concatenate_attachments(items: Sequence[Attachments | None], vertex_counts:
     return Attachments(torch.cat(edges), torch.cat(active)) if edges else None
 
 
-def _snap(position: np.ndarray) -> np.ndarray:
-    return np.round(position / _GRID) * _GRID
+def _snap(position: np.ndarray, grid: float = _GRID) -> np.ndarray:
+    return np.round(position / grid) * grid

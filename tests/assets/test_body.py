@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from hood.assets.binding import bind_garment
 from hood.assets.body import Body, load_body
-from hood.assets.garment import Garment, bind_garment
+from hood.assets.garment import Garment
 from hood.assets.sequence import PoseSequence
 from hood.scene.scene import build_scene
 
@@ -130,10 +131,10 @@ def test_a_garment_is_dressed_on_a_licensed_body(fingered_file: Path, garments: 
     assert bool(torch.isfinite(scene.motion.skinned(scene.garment, 0, scene.motion.translation[0])).all())
 
 
-def test_pickles_are_refused(tmp_path: Path) -> None:
+def test_broken_pickles_name_the_file(tmp_path: Path) -> None:
     path = tmp_path / "SMPL_NEUTRAL.pkl"
     path.write_bytes(b"\x80\x04.")
-    with pytest.raises(ValueError, match=r"SMPL_NEUTRAL\.pkl: pickles run code.*\.npz"):
+    with pytest.raises(ValueError, match=r"SMPL_NEUTRAL\.pkl: not a readable pickle"):
         load_body(path)
 
 
@@ -145,9 +146,3 @@ def test_incomplete_and_mismatched_files(tmp_path: Path, arrays: dict[str, np.nd
     np.savez(tmp_path / "b.npz", **{**small, "v_template": small["v_template"][:-1]})
     with pytest.raises(ValueError, match=r"b\.npz: v_template"):
         load_body(tmp_path / "b.npz")
-
-
-def test_unknown_number_of_joints(tmp_path: Path, arrays: dict[str, np.ndarray]) -> None:
-    np.savez(tmp_path / "c.npz", **{**arrays, "weights": arrays["weights"][:, :20], "posedirs": np.ones((6890, 3, 9))})
-    with pytest.raises(ValueError, match="20 joints; SMPL has 24"):
-        load_body(tmp_path / "c.npz")

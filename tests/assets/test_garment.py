@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hood.assets.binding import bind_garment
 from hood.assets.body import Body
-from hood.assets.garment import Garment, bind_garment, load_garment
+from hood.assets.garment import Garment, load_garment
 from hood.mesh import topology
 from hood.testing import cylinder, grid
 

@@ -155,7 +155,7 @@ REFUSED: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "lengths differ": (lambda a: a.update(trans=a["trans"][:-1]), ("agree",)),
     "no translation": (lambda a: a.pop("trans"), ("'trans'",)),
     "no poses": (lambda a: a.pop("poses"), ("not an AMASS motion",)),
-    "few columns": (lambda a: a.update(poses=a["poses"][:, :63]), ("at least 66 columns",)),
+    "few columns": (lambda a: a.update(poses=a["poses"][:, :63]), ("poses", "(N, 66)")),
     "no frame rate": (lambda a: a.pop("mocap_framerate"), ("mocap_framerate",)),
     "zero frame rate": (lambda a: a.update(mocap_framerate=0.0), ("mocap_framerate", "positive")),
     "text frame rate": (lambda a: a.update(mocap_framerate="fast"), ("mocap_framerate", "positive")),

@@ -58,8 +58,8 @@ def test_frames_connect_over_chunks(body: Body, walk: PoseSequence) -> None:
         here, there = motion.obstacle(frame, origin), motion.obstacle(frame + 1, origin)
         assert torch.equal(here.next_pos, there.pos)
         assert torch.equal(there.prev_pos, here.pos)
-        alone = body.surface(walk.window(frame, frame + 1), np.zeros(10))[0]
-        torch.testing.assert_close(motion.local_surface(frame), alone, rtol=0, atol=1e-6)
+        alone = body.surface(walk.window(frame, frame + 1), np.zeros(10), torch.float64)[0]
+        torch.testing.assert_close(motion.local_surface(frame), alone, rtol=0, atol=1e-12)
 
 
 def test_the_first_frame_has_no_past(body: Body, walk: PoseSequence) -> None:

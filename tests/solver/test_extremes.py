@@ -313,8 +313,9 @@ def rollouts_here_and_there(
 def test_world_offset(offset, dtype, tolerance, garments: dict[str, Garment], body: Body, walk: PoseSequence):
     """The same rollout anywhere within 10 km. Few iterations: where the minimum itself hangs on rounding (a fold may go
     either way) two converged runs in float32 can part by millimetres at single vertices, near the origin as well."""
+    # The start needs no thorough settling, whose accelerated projections amplify rounding some hundred times.
     settings = NewtonSettings(max_iterations=8)
-    pairs = rollouts_here_and_there(garments["tank"], body, walk.window(60, 64), np.array(offset), settings, 0, dtype)
+    pairs = rollouts_here_and_there(garments["tank"], body, walk.window(10, 14), np.array(offset), settings, 0, dtype)
     for here, there in pairs:
         torch.testing.assert_close(there, here, rtol=0, atol=tolerance)
     assert float((pairs[0][0] - pairs[-1][0]).abs().max()) > 1e-2

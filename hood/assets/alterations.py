@@ -1,0 +1,182 @@
+"""What makes a garment file wearable, step by step; each step returns the garment and says what it did, with counts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from hood.assets.binding import PosedBody, bind_posed, push_out, signed_distances
+from hood.assets.garment import Garment
+from hood.assets.sequence import Z_UP_TO_Y_UP
+from hood.assets.units import find_scale, size_ratio, used
+from hood.mesh import repair, topology
+
+#: A garment whose middle vertex is farther from the skin than this [m] was made for another place or body.
+_FARTHEST = 0.35
+#: With more of its vertices inside the body it does not surround it.
+_MOST_INSIDE = 0.5
+
+
+@dataclass
+class Fitting:
+    """A garment on its way from a file to a body, with a record of every change."""
+
+    garment: Garment
+    vertex_map: np.ndarray  # (V of the file,) present number of each vertex of the file; -1: removed
+    changes: list[Change] = field(default_factory=list)
+
+    def note(self, what: str, count: int, text: str, **details: Any) -> None:
+        """Record a change of ``count`` things; nothing is recorded for none."""
+        if count:
+            self.changes.append(Change(what, count, text, details))
+
+
+@dataclass(frozen=True)
+class Change:
+    """One change: its name for programs, how many things it touched, and a sentence."""
+
+    what: str
+    count: int
+    text: str
+    details: dict[str, Any]
+
+
+def start_fitting(garment: Garment) -> Fitting:
+    """A fitting of a garment as it was read."""
+    return Fitting(garment, np.arange(len(garment.rest_pos)))
+
+
+def scale_to_metres(fitting: Fitting, scale: float | None, body_pos: np.ndarray) -> None:
+    """Multiply by ``scale``, or by what the size beside the body asks for.
+
+    Raises:
+        ValueError: no known unit fits, or ``scale`` is not positive.
+    """
+    garment = fitting.garment
+    pos = used(garment.rest_pos, garment.faces)
+    factor = find_scale(pos, body_pos) if scale is None else scale
+    if factor is None:
+        ratio = size_ratio(pos, body_pos)
+        raise ValueError(
+            f"{garment.name}: {ratio:.3g} times the body's height fits no unit; give scale=FACTOR, metres per unit"
+        )
+    if not (np.isfinite(factor) and factor > 0):
+        raise ValueError(f"scale={factor:g}: give metres per unit of the file, such as 0.01 for centimetres")
+    if factor != 1.0:
+        moved = {key: getattr(garment, key) * factor for key in ("rest_pos", "skin_pos") if getattr(garment, key) is not None}
+        fitting.garment = replace(garment, **moved)
+        fitting.note("scaled", len(garment.rest_pos), f"scaled by {factor:g}", factor=factor)
+
+
+def place(fitting: Fitting, up: str, offset: np.ndarray) -> None:
+    """Turn a z-up mesh y up and move it by ``offset`` (3,) [m]."""
+    garment = fitting.garment
+    if up == "z":
+        garment = replace(garment, rest_pos=garment.rest_pos @ Z_UP_TO_Y_UP.T)
+        fitting.note("turned", len(garment.rest_pos), "turned from z up to y up")
+    if np.any(offset):
+        garment = replace(garment, rest_pos=garment.rest_pos + offset)
+        fitting.note("moved", len(garment.rest_pos), f"moved by {np.round(offset, 4).tolist()} m", offset=offset.tolist())
+    fitting.garment = garment
+
+
+def sew(fitting: Fitting, tolerance: float | None) -> None:
+    """Weld boundary vertices within ``tolerance`` [m]; None: a thousandth of the median edge."""
+    garment = fitting.garment
+    if tolerance is None:
+        tolerance = repair.weld_tolerance(garment.rest_pos, garment.faces)
+    welded = repair.weld(garment.rest_pos, garment.faces, tolerance)
+    count = len(garment.rest_pos) - len(welded.kept)
+    if count:
+        fitting.garment = _keep_vertices(garment, welded.vertex_map[garment.faces], welded.kept)
+        fitting.vertex_map = np.where(fitting.vertex_map < 0, -1, welded.vertex_map[fitting.vertex_map])
+    fitting.note("welded", count, f"welded {count} vertices on seams, within {1e3 * tolerance:.2g} mm", tolerance=tolerance)
+
+
+def clean(fitting: Fitting) -> None:
+    """Remove faces without area, duplicate faces and unused vertices; turn faces over that lie against their neighbours."""
+    garment = fitting.garment
+    broken = repair.broken_faces(garment.rest_pos, garment.faces)
+    garment = _keep_faces(garment, ~broken)
+    duplicate = repair.duplicate_faces(garment.faces)
+    garment = _keep_faces(garment, ~duplicate)
+    if len(garment.faces) == 0:
+        raise ValueError(f"{garment.name}: no face has an area; nothing is left of the garment")
+    flipped = repair.flipped_faces(garment.faces)
+    garment = _turn_faces(garment, flipped)
+    alone = repair.isolated_vertices(len(garment.rest_pos), garment.faces)
+    number = np.where(alone, -1, np.cumsum(~alone) - 1)
+    fitting.garment = _keep_vertices(garment, number[garment.faces], np.flatnonzero(~alone)) if alone.any() else garment
+    fitting.vertex_map = np.where(fitting.vertex_map < 0, -1, number[fitting.vertex_map])
+    for what, mask, text in (
+        ("removed_broken_faces", broken, "removed {} faces without area"),
+        ("removed_duplicate_faces", duplicate, "removed {} duplicate faces"),
+        ("turned_faces", flipped, "turned {} faces over, their winding was against their neighbours'"),
+        ("removed_unused_vertices", alone, "removed {} vertices of no face"),
+    ):
+        fitting.note(what, int(mask.sum()), text.format(int(mask.sum())))
+
+
+def leave_body(fitting: Fitting, posed: PosedBody, clearance: float) -> None:
+    """Push vertices that lie inside the posed body out to ``clearance`` [m]: the moved mesh is the rest shape.
+
+    Raises:
+        ValueError: the garment is not around this body at all.
+    """
+    garment = fitting.garment
+    dist = signed_distances(garment.rest_pos, posed.surface, posed.faces)
+    inside = float((dist < 0).mean())
+    if np.median(np.abs(dist)) > _FARTHEST or inside > _MOST_INSIDE:
+        gap = posed.surface.mean(axis=0) - garment.rest_pos.mean(axis=0)
+        raise ValueError(
+            f"{garment.name}: does not surround the body ({100 * inside:.0f}% of the vertices inside, the middle one "
+            f"{np.median(np.abs(dist)):.2f} m from the skin, centres {np.round(gap, 2).tolist()} m apart); "
+            "check scale, up, offset and pose"
+        )
+    pushed = push_out(garment.rest_pos, posed.surface, posed.faces, clearance)
+    # Vertices that are merely nearer than the clearance were where their maker wanted them.
+    pos = np.where((dist < 0)[:, None], pushed.pos, garment.rest_pos)
+    fitting.garment = replace(garment, rest_pos=pos)
+    fitting.note(
+        "pushed_out",
+        pushed.num_inside,
+        f"pushed {pushed.num_inside} vertices ({100 * inside:.1f}%) out of the body, the deepest {1e3 * pushed.depth:.1f} mm",
+        depth=pushed.depth,
+    )
+
+
+def bind(fitting: Fitting, posed: PosedBody) -> None:
+    """Bind to the body in the pose and shape the garment was made in."""
+    fitting.garment = bind_posed(fitting.garment, posed)
+
+
+def summary(garment: Garment) -> str:
+    """Size of a garment in one line."""
+    edges = topology.unique_edges(garment.faces)
+    used = ~repair.isolated_vertices(len(garment.rest_pos), garment.faces)
+    parts = len(np.unique(topology.connected_components(len(garment.rest_pos), edges)[used]))
+    openings = len(topology.boundary_loops(garment.faces))
+    return f"{len(garment.rest_pos)} vertices, {len(garment.faces)} triangles, {parts} component(s), {openings} openings"
+
+
+_PER_VERTEX = ("rest_pos", "pinned", "lbs_weights", "shapedirs", "colours", "skin_pos", "rest_turn")
+_PER_FACE = ("faces", "uv_faces", "normal_faces")
+
+
+def _keep_vertices(garment: Garment, faces: np.ndarray, kept: np.ndarray) -> Garment:
+    """The garment with its vertices ``kept`` and ``faces`` in their numbers; its coarse edges are of another mesh now."""
+    rows = {key: getattr(garment, key)[kept] for key in _PER_VERTEX if getattr(garment, key) is not None}
+    return replace(garment, **rows | {"faces": faces, "coarse_edges": None})
+
+
+def _keep_faces(garment: Garment, kept: np.ndarray) -> Garment:
+    return replace(garment, **{k: getattr(garment, k)[kept] for k in _PER_FACE if getattr(garment, k) is not None})
+
+
+def _turn_faces(garment: Garment, turned: np.ndarray) -> Garment:
+    tables = {key: getattr(garment, key).copy() for key in _PER_FACE if getattr(garment, key) is not None}
+    for table in tables.values():
+        table[turned] = table[turned][:, ::-1]
+    return replace(garment, **tables)

@@ -1,0 +1,83 @@
+"""What a file is, by its name and its keys; only what is needed to tell is read, and nothing is run."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Collection
+from pathlib import Path
+
+import h5py
+
+from hood.assets.animated_mesh import body_kind
+from hood.assets.gltf import read_gltf
+from hood.assets.library import names
+from hood.assets.mesh_file import MESH_SUFFIXES
+from hood.assets.reference_garments import garment_names
+from hood.assets.unpickle import guarded, load_pickle
+
+GARMENT, BODY, MOTION, MOVING_MESH = "garment", "body model", "motion", "moving mesh"
+CHECKPOINT, ROLLOUT, REFERENCE_ROLLOUT, VERTEX_LIST = "checkpoint", "rollout", "rollout of the reference", "vertex list"
+_CHECKPOINTS = (".safetensors", ".pth", ".pt", ".ckpt")
+_EMBEDDED = {"garments": GARMENT, "motions": MOTION, "body": BODY, "weights": CHECKPOINT}
+_KEYS = {
+    GARMENT: ({"rest_pos", "faces"}, {"vertices", "faces", "coarse_edges"}),
+    BODY: ({"v_template", "weights"},),
+    MOTION: ({"poses"}, {"root_orient"}, {"global_orient"}, {"pose", "translation"}),
+    REFERENCE_ROLLOUT: ({"pred", "cloth_faces"},),
+    MOVING_MESH: ({"verts", "faces"}, {"vertices", "faces"}, {"verts", "f"}),
+}
+
+
+def identify(name: str) -> str:
+    """The kind of an embedded name or a file.
+
+    Raises:
+        FileNotFoundError: neither an embedded name nor a file.
+        ValueError: unreadable, or of a kind that nothing here reads; says what was found in it.
+    """
+    for folder, kind in _EMBEDDED.items():
+        if name in names(folder):
+            return kind
+    head, colon, _ = name.rpartition(":")
+    path = Path(head if colon and head.lower().endswith(".pkl") else name).expanduser()
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such file, and no embedded asset of that name")
+    if path.is_dir():
+        return MOVING_MESH if body_kind(path) == "mesh" else BODY
+    suffix = path.suffix.lower()
+    if suffix in (".glb", ".gltf"):
+        gltf = read_gltf(path)
+        return MOVING_MESH if gltf.items("animations") or gltf.items("skins") else GARMENT
+    if suffix in MESH_SUFFIXES:
+        return GARMENT
+    if suffix in _CHECKPOINTS:
+        return CHECKPOINT
+    if suffix in (".txt", ".json"):
+        return VERTEX_LIST
+    if suffix in (".h5", ".hdf5"):
+        return guarded(path, "HDF5 file", lambda: _h5_kind(path))
+    if suffix == ".npz":
+        return _kind_of_keys(path, guarded(path, "NumPy archive", lambda: _archive_keys(path)))
+    if suffix == ".pkl":
+        content = load_pickle(path)
+        if garment_names(content):
+            return GARMENT
+        return _kind_of_keys(path, [str(key) for key in content] if isinstance(content, dict) else [])
+    raise ValueError(f"{path}: unknown file type {path.suffix!r}; nothing here reads it")
+
+
+def _kind_of_keys(path: Path, keys: Collection[str]) -> str:
+    for kind, alternatives in _KEYS.items():
+        if any(needed <= set(keys) for needed in alternatives):
+            return kind
+    raise ValueError(f"{path}: no garment, body, motion or mesh has the keys {', '.join(sorted(keys)[:8]) or '(none)'}")
+
+
+def _archive_keys(path: Path) -> list[str]:
+    with zipfile.ZipFile(path) as archive:
+        return [name.removesuffix(".npy") for name in archive.namelist()]
+
+
+def _h5_kind(path: Path) -> str:
+    with h5py.File(path, "r") as file:
+        return ROLLOUT if "cloth" in file and "pos" in file["cloth"] else MOVING_MESH

@@ -1,0 +1,292 @@
+"""Facts and problems of single files for ``hood inspect``; each problem comes with what repairs it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hood.assets.animated_mesh import load_mesh_sequence
+from hood.assets.binding import signed_distances
+from hood.assets.body import Body, load_body
+from hood.assets.garment import Garment, garment_of_mesh, load_garment, locate_garment
+from hood.assets.library import locate
+from hood.assets.mesh_file import MESH_SUFFIXES, read_mesh_file
+from hood.assets.motion_file import read_recording
+from hood.assets.pins import JOINTS, REGIONS, read_indices
+from hood.assets.sequence import Z_UP_TO_Y_UP
+from hood.assets.standing import find_standing_pose
+from hood.assets.units import find_scale, size_ratio, used
+from hood.assets.unpickle import load_pickle
+from hood.commands.common import read_model
+from hood.dynamics.recorder import read_rollout
+from hood.mesh.defects import Defects, find_defects
+from hood.mesh.quality import check_triangles
+from hood.mesh.topology import boundary_loops
+
+_UNITS = {1.0: "metres", 0.01: "centimetres", 0.001: "millimetres"}
+#: A mesh turned by a quarter must lie this much nearer to the body to be taken for z-up.
+_TURN_GAIN = 0.6
+#: A garment whose vertices are farther from the skin than this [m] in the middle lies elsewhere.
+_NEAR = 0.2
+#: Openings beyond this number are torn seams: they are counted, not named.
+_MOST_OPENINGS = 12
+
+
+@dataclass
+class Finding:
+    """What one file is. ``problems`` are pairs of what is wrong and what repairs it; ``repairs`` are overrides of prepare."""
+
+    file: str
+    kind: str
+    facts: dict[str, Any] = field(default_factory=dict)
+    problems: list[tuple[str, str]] = field(default_factory=list)
+    repairs: list[str] = field(default_factory=list)
+
+    @property
+    def command(self) -> str | None:
+        """The command that repairs a garment; None where nothing needs repair."""
+        return None if not self.repairs else " ".join(["hood prepare", f"garment={self.file}", *dict.fromkeys(self.repairs)])
+
+    def problem(self, what: str, fix: str, repair: str | None = None) -> None:
+        """Record a problem; ``repair`` is what prepare needs to be told, "" where it does it unasked."""
+        self.problems.append((what, fix))
+        if repair is not None:
+            self.repairs.append(repair or "weld=auto")
+
+
+def inspect_garment(name: str, body: Body) -> Finding:
+    """A garment file beside ``body`` in its T-pose."""
+    finding = Finding(name, "garment")
+    path, _ = locate_garment(name)
+    if path.suffix.lower() in MESH_SUFFIXES:
+        mesh = read_mesh_file(path, split_polygons=True)
+        garment = garment_of_mesh(path, mesh)
+        finding.kind = "garment mesh"
+        if mesh.num_polygons:
+            finding.problem(f"{mesh.num_polygons} faces have more than three corners", "triangulate=true, or prepare", "")
+        for note in mesh.notes:
+            finding.problem(note, "export the mesh again with them on all faces")
+        finding.facts["doubled vertices joined"] = mesh.num_joined
+    else:
+        garment = load_garment(name)
+    if len(garment.faces) == 0 or not np.isfinite(garment.rest_pos).all():
+        check_triangles(garment.rest_pos, garment.faces, name)
+    finding.facts |= _garment_facts(garment)
+    defects = find_defects(garment.rest_pos, garment.faces)
+    _describe_defects(finding, defects, garment, body)
+    if garment.bound:
+        _name_openings(finding, garment.rest_pos if garment.skin_pos is None else garment.skin_pos, garment.faces, body)
+    else:
+        _place_beside(finding, garment, body)
+    return finding
+
+
+def _garment_facts(garment: Garment) -> dict[str, Any]:
+    return {
+        "vertices": len(garment.rest_pos),
+        "triangles": len(garment.faces),
+        "size": np.round(np.ptp(garment.rest_pos, axis=0), 4).tolist(),
+        "bound to": (garment.bound_to or "any body of its skeleton") if garment.bound else None,
+        "held vertices": int(garment.pinned.sum()),
+        "texture coordinates": 0 if garment.uv is None else len(garment.uv),
+        "hard edges": garment.normal_faces is not None,
+        "vertex colours": garment.colours is not None,
+        "coarse levels in the file": len(garment.coarse_edges or ()),
+    }
+
+
+def _describe_defects(finding: Finding, defects: Defects, garment: Garment, body: Body) -> None:
+    finding.facts |= {
+        "components": defects.num_components,
+        "openings": defects.openings,
+        "edge length (least, median, greatest)": [float(f"{length:.4g}") for length in defects.edge_length],
+        "edges with three or more faces": defects.non_manifold_edges,
+        "slivers": defects.slivers,
+    }
+    for count, what, fix in (
+        (defects.unwelded_vertices, "vertices lie on another one along open seams", "weld=auto joins them"),
+        (defects.broken_faces, "faces have no area or repeat a vertex", "prepare removes them"),
+        (defects.duplicate_faces, "faces are there twice", "prepare removes them"),
+        (defects.isolated_vertices, "vertices belong to no face", "prepare removes them"),
+        (defects.flipped_faces, "faces are wound against their neighbours", "prepare turns them over"),
+    ):
+        if count:
+            finding.problem(f"{count} {what}", fix, "")
+    if defects.slivers:
+        finding.problem(f"{defects.slivers} faces are slivers, stiff and inaccurate", "remesh the garment where it was made")
+    if defects.non_manifold_edges:
+        finding.problem(
+            f"{defects.non_manifold_edges} edges have three or more faces",
+            "legal (a sewn-in layer); separate the layers if they are none",
+        )
+
+
+def _place_beside(finding: Finding, garment: Garment, body: Body) -> None:
+    """Units, up axis, pose and place of an unbound garment."""
+    surface, pos = body.v_template, used(garment.rest_pos, garment.faces)
+    factor = find_scale(pos, surface)
+    finding.facts["size in body heights"] = float(f"{size_ratio(pos, surface):.3g}")
+    finding.facts["units"] = "unknown" if factor is None else _UNITS[factor]
+    if factor is None:
+        finding.problem("its size fits no unit", "scale=FACTOR, metres per unit", "scale=FACTOR")
+        return
+    if factor != 1.0:
+        finding.problem(f"it is in {_UNITS[factor]}", f"scale={factor:g}, or scale=auto", f"scale={factor:g}")
+    pos = pos * factor
+    turned = pos @ Z_UP_TO_Y_UP.T
+    far = float(np.median(np.abs(signed_distances(pos, surface, body.faces))))
+    far_turned = float(np.median(np.abs(signed_distances(turned, surface, body.faces))))
+    up = "z" if far > 0.03 and far_turned < _TURN_GAIN * far else "y"
+    finding.facts["up axis"] = up
+    if up == "z":
+        finding.problem("it lies as if z were up", "up=z", "up=z")
+        pos = turned
+    standing = find_standing_pose(pos, body, np.zeros(10))
+    dist = signed_distances(pos, standing.pose.surface, body.faces)
+    middle, inside = float(np.median(np.abs(dist))), int((dist < 0).sum())
+    finding.facts["arms below the T-pose [degrees]"] = standing.angle
+    finding.facts["distance to the skin, median [m]"] = round(middle, 4)
+    finding.facts["vertices inside the body"] = inside
+    if middle > _NEAR:
+        gap = np.round(_centre(standing.pose.surface) - _centre(pos), 2).tolist()
+        finding.problem(
+            f"it is {middle:.2f} m away from {body.name!r} in T-pose",
+            "offset=[x,y,z] or pose=…",
+            f"offset={gap}".replace(" ", ""),
+        )
+        return
+    placed = garment.rest_pos * factor
+    _name_openings(finding, placed @ Z_UP_TO_Y_UP.T if up == "z" else placed, garment.faces, body)
+    if standing.angle:
+        finding.problem(f"its arms hang {standing.angle:g} degrees below the T-pose's", "pose=auto binds it so", "pose=auto")
+    if inside:
+        share, depth = 100 * inside / len(dist), -1e3 * float(dist.min())
+        finding.problem(
+            f"{inside} vertices ({share:.1f}%) are inside the body, to {depth:.1f} mm", "prepare pushes them out", ""
+        )
+
+
+def _centre(pos: np.ndarray) -> np.ndarray:
+    return np.asarray((pos.min(axis=0) + pos.max(axis=0)) / 2)
+
+
+def inspect_body(name: str) -> Finding:
+    """A parametric body model."""
+    body = load_body(name)
+    finding = Finding(name, "body model")
+    defects = find_defects(body.v_template, body.faces)
+    finding.facts = {
+        "vertices": len(body.v_template),
+        "triangles": len(body.faces),
+        "joints": body.num_joints,
+        "shape coefficients": body.shapedirs.shape[2],
+        "height": round(float(np.ptp(body.v_template, axis=0).max()), 4),
+        "openings": defects.openings,
+    }
+    return finding
+
+
+def inspect_motion(name: str) -> Finding:
+    """A motion of joint rotations."""
+    recording = read_recording(locate("motions", name))
+    finding = Finding(name, "motion")
+    up = Rotation.from_rotvec(recording.poses[:, 0]).apply([0.0, 1.0, 0.0]).mean(axis=0)
+    axis = "xyz"[int(np.abs(up).argmax())]
+    speed = np.linalg.norm(np.diff(recording.transl, axis=0), axis=1) * recording.fps
+    finding.facts = {
+        "frames": len(recording.poses),
+        "frames per second": recording.fps,
+        "seconds": round((len(recording.poses) - 1) / recording.fps, 3),
+        "layout": recording.family,
+        "gender": recording.gender,
+        "shape coefficients": len(recording.betas),
+        "up axis by its layout": recording.up,
+        "up axis by its poses": axis,
+        "greatest root speed [m/s]": round(float(speed.max(initial=0.0)), 2),
+        "fingers": recording.fingers is not None,
+    }
+    if axis in "yz" and axis != recording.up:
+        finding.problem(f"the body stands along {axis}, its layout says {recording.up}", f"up={axis}")
+    if float(np.quantile(speed, 0.99)) > 20.0:
+        finding.problem("the root moves faster than 20 m/s", "trans may be in centimetres: divide it by 100")
+    return finding
+
+
+def inspect_moving_mesh(name: str, fps: float) -> Finding:
+    """A mesh that moves, or stands, as a body."""
+    mesh = load_mesh_sequence(name, fps)
+    finding = Finding(name, "moving mesh")
+    defects = find_defects(mesh.verts[0].astype(np.float64), mesh.faces)
+    finding.facts = {
+        "vertices": mesh.verts.shape[1],
+        "triangles": len(mesh.faces),
+        f"frames at {fps:g} fps": mesh.num_frames,
+        "size": np.round(np.ptp(mesh.verts[0], axis=0), 3).tolist(),
+        "components": defects.num_components,
+        "openings": defects.openings,
+    }
+    if defects.openings:
+        finding.problem(f"the mesh has {len(defects.openings)} openings", "close them: inside and outside need a closed body")
+    return finding
+
+
+def inspect_checkpoint(name: str) -> Finding:
+    """Weights of a model."""
+    path = locate("weights", name)
+    simulator = read_model(path, 30.0)
+    finding = Finding(name, "checkpoint")
+    finding.facts = {
+        "parameters": sum(parameter.numel() for parameter in simulator.parameters()),
+        "message-passing steps": len(simulator.schedule),
+        **{key: simulator.config[key] for key in ("features", "output", "latent_dim")},
+    }
+    return finding
+
+
+def inspect_rollout(name: str) -> Finding:
+    """A simulated motion on disk."""
+    data = read_rollout(Path(name))
+    finding = Finding(name, "rollout")
+    finite = np.isfinite(data.cloth_pos).all(axis=(1, 2))
+    finding.facts = {
+        "frames": len(data.cloth_pos),
+        "complete": bool(data.attributes.get("complete", False)),
+        "cloth vertices": data.cloth_pos.shape[1],
+        "body vertices": data.body_pos.shape[1],
+        **{
+            key: str(data.attributes[key]) for key in ("garment", "sequence", "checkpoint", "stepper") if key in data.attributes
+        },
+    }
+    if not finite.all():
+        finding.problem(f"frame {int(np.argmin(finite))} is not finite", "simulate again with stepper=newton or a smaller step")
+    if not finding.facts["complete"]:
+        finding.problem("it was interrupted", "run hood rollout again")
+    return finding
+
+
+def inspect_pickle(name: str, kind: str) -> Finding:
+    """A file that is known but not run: its keys."""
+    content = load_pickle(name)
+    return Finding(name, kind, {"keys": sorted(map(str, content))[:20]})
+
+
+def inspect_list(name: str) -> Finding:
+    """A list of vertices to hold."""
+    vertices = read_indices(Path(name))
+    return Finding(name, "vertex list", {"vertices": len(vertices), "greatest": int(vertices.max(initial=-1))})
+
+
+def _name_openings(finding: Finding, pos: np.ndarray, faces: np.ndarray, body: Body) -> None:
+    """For each opening, longest first: its vertices, and the region (a word for pins) whose joint is nearest."""
+    joints = body.shaped(np.zeros(0))[1]
+    regions = {region: joints[JOINTS.index(joint)] for region, joint in REGIONS.items() if JOINTS.index(joint) < len(joints)}
+    loops = boundary_loops(faces)
+    if not regions or not 0 < len(loops) <= _MOST_OPENINGS:
+        return
+    centres = [pos[loop].mean(axis=0) for loop in loops]
+    nearest = [min(regions, key=lambda region: float(np.linalg.norm(regions[region] - centre))) for centre in centres]
+    finding.facts["openings"] = [f"{len(loop)} vertices near {name}" for loop, name in zip(loops, nearest, strict=True)]

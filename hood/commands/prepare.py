@@ -1,0 +1,226 @@
+"""``hood prepare``: a garment as it was found in, a repaired one bound to a body out; every repair is reported."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig
+
+from hood.assets import alterations
+from hood.assets.alterations import Fitting
+from hood.assets.binding import PosedBody, bind_garment, posed_body
+from hood.assets.body import Body, load_body
+from hood.assets.garment import Garment, garment_of_mesh, load_garment, locate_garment, save_garment
+from hood.assets.library import locate
+from hood.assets.mesh_file import MESH_SUFFIXES, read_mesh_file
+from hood.assets.outfit import join_garments
+from hood.assets.pins import pin_mask, pin_numbers
+from hood.assets.sequence import PoseSequence, load_sequence
+from hood.assets.standing import A_POSE_ANGLE, POSE_SUFFIXES, arms_down, find_standing_pose, read_pose
+from hood.commands.common import prepare_folder
+from hood.commands.wardrobe import checked_pins, names_of, shape_coefficients
+from hood.config import ConfigError, load_config, plain, require_choice
+from hood.media.mesh_export import write_obj
+from hood.mesh.quality import check_triangles
+from hood.scene.fitting import FitFigures, fit_figures
+from hood.scene.scene import build_scene
+
+_STANDING = ("auto", "tpose", "apose")
+#: A start beyond these is warned about: edges stretched by this share, vertices this deep [m].
+_STRETCH_LIMIT, _DEPTH_LIMIT = 0.10, 2e-3
+
+
+def run(overrides: Sequence[str]) -> int:
+    """Run the command; returns the exit code."""
+    config = load_config("prepare", overrides)
+    require_choice(config, "format", ("text", "json"))
+    require_choice(config, "up", ("y", "z"))
+    if config.garment is None:
+        raise ConfigError("garment is not given: hood prepare garment=shirt.obj output=shirt.npz")
+    names = names_of(config.garment)
+    target = _target(config, names)
+    if config.mesh is not None:
+        _mesh_target(config)
+    body, betas = load_body(str(config.body)), shape_coefficients(config.betas)
+    fittings = [_fit(name, config, body, betas) for name in names]
+    outfit = join_garments([bind_garment(fitting.garment, body) for fitting in fittings])
+    outfit = _pin(outfit, fittings, config, body)
+    starts = _starts(outfit, config, body, betas)
+    prepare_folder(target.parent)
+    save_garment(target, outfit)
+    if config.mesh is not None:
+        write_obj(_mesh_target(config), outfit)
+    report = _report(names, fittings, outfit, starts, target)
+    print(json.dumps(report, indent=1) if str(config.format) == "json" else _text(report))
+    return 0
+
+
+def _target(config: DictConfig, names: list[str]) -> Path:
+    if config.output is None:
+        stem = "+".join(Path(name.rpartition(":")[2] if ".pkl:" in name else name).stem for name in names)
+        return Path(f"{stem}_prepared.npz")
+    target = Path(str(config.output)).expanduser()
+    if target.suffix != ".npz":
+        raise ConfigError(f"output={target}: prepared garments are .npz files")
+    return target
+
+
+def _mesh_target(config: DictConfig) -> Path:
+    target = Path(str(config.mesh)).expanduser()
+    if target.suffix != ".obj":
+        raise ConfigError(f"mesh={target}: meshes are written as .obj")
+    prepare_folder(target.parent)
+    return target
+
+
+def _fit(name: str, config: DictConfig, body: Body, betas: np.ndarray) -> Fitting:
+    """One garment, read, repaired and bound."""
+    fitting = _read(name)
+    surface = body.shaped(betas)[0]
+    alterations.scale_to_metres(fitting, _number(config, "scale", "auto"), surface)
+    alterations.place(fitting, str(config.up), _offset(config))
+    if str(config.weld) != "none":
+        alterations.sew(fitting, _number(config, "weld", "auto"))
+    alterations.clean(fitting)
+    check_triangles(fitting.garment.rest_pos, fitting.garment.faces, name)
+    clearance = _number(config, "clearance", "")
+    assert clearance is not None
+    if fitting.garment.bound:
+        return fitting
+    posed = _pose(fitting, config, body, betas)
+    alterations.leave_body(fitting, posed, clearance)
+    check_triangles(fitting.garment.rest_pos, fitting.garment.faces, name)
+    alterations.bind(fitting, posed)
+    return fitting
+
+
+def _read(name: str) -> Fitting:
+    path, _ = locate_garment(name)
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        return alterations.start_fitting(load_garment(name))
+    mesh = read_mesh_file(path, split_polygons=True)
+    garment = garment_of_mesh(path, mesh)
+    bad = ~np.isfinite(garment.rest_pos).all(axis=1)
+    if bad.any() or len(garment.faces) == 0:
+        check_triangles(garment.rest_pos, garment.faces, str(path))
+    fitting = alterations.start_fitting(garment)
+    fitting.note("split_polygons", mesh.num_polygons, f"split {mesh.num_polygons} polygons into triangles")
+    fitting.note("joined", mesh.num_joined, f"joined {mesh.num_joined} vertices that {path.suffix[1:].upper()} files double")
+    for note in mesh.notes:
+        fitting.note("not_kept", 1, note)
+    return fitting
+
+
+def _pose(fitting: Fitting, config: DictConfig, body: Body, betas: np.ndarray) -> PosedBody:
+    """The body in the pose that the garment was made in."""
+    given = str(config.pose)
+    if given == "auto":
+        found = find_standing_pose(fitting.garment.rest_pos, body, betas)
+        if found.angle:
+            text = f"made around a pose with the arms {found.angle:g} degrees below the T-pose's"
+            fitting.note("pose", len(fitting.garment.rest_pos), text, angle=found.angle)
+        return found.pose
+    if given in _STANDING:
+        return posed_body(body, arms_down(A_POSE_ANGLE if given == "apose" else 0.0), 0, betas)
+    return posed_body(body, *_named_pose(given, config), betas)
+
+
+def _named_pose(given: str, config: DictConfig) -> tuple[PoseSequence, int]:
+    path, frame = locate("motions", given), int(config.frame)
+    if path.suffix.lower() in POSE_SUFFIXES:
+        return read_pose(path), 0
+    sequence = load_sequence(given, fps=float(config.fps))
+    if not 0 <= frame < sequence.num_frames:
+        raise ConfigError(f"frame={frame}: {given} has {sequence.num_frames} frames at {float(config.fps):g} fps")
+    return sequence, frame
+
+
+def _pin(outfit: Garment, fittings: list[Fitting], config: DictConfig, body: Body) -> Garment:
+    """The outfit with the pins asked for; numbers are those of the files, before vertices were joined or removed."""
+    if config.pins is None:
+        return outfit
+    numbers, words = pin_numbers(checked_pins(plain(config.pins)))
+    mask = pin_mask(words, outfit, body)
+    starts = np.cumsum([0, *(len(fitting.garment.rest_pos) for fitting in fittings)])
+    tables = [np.where(f.vertex_map < 0, -1, f.vertex_map + start) for f, start in zip(fittings, starts, strict=False)]
+    present = np.concatenate(tables)
+    outside = (numbers < 0) | (numbers >= len(present))
+    if outside.any():
+        raise ConfigError(f"pins: vertex {int(numbers[np.argmax(outside)])} of {len(present)}; they are numbered from 0")
+    mask[present[numbers][present[numbers] >= 0]] = True
+    return replace(outfit, pinned=mask)
+
+
+def _starts(outfit: Garment, config: DictConfig, body: Body, betas: np.ndarray) -> dict[str, FitFigures]:
+    """Figures of a rollout's start from the T-pose and, if it is another, from the pose of the garment."""
+    poses: dict[str, tuple[PoseSequence, int]] = {"tpose": (arms_down(0.0), 0)}
+    if str(config.pose) not in _STANDING:
+        poses[str(config.pose)] = _named_pose(str(config.pose), config)
+    return {
+        name: fit_figures(build_scene(outfit, body, sequence.window(frame, frame + 1), betas=betas))
+        for name, (sequence, frame) in poses.items()
+    }
+
+
+def _report(
+    names: list[str], fittings: list[Fitting], outfit: Garment, starts: dict[str, FitFigures], target: Path
+) -> dict[str, Any]:
+    return {
+        "garments": [
+            {
+                "file": name,
+                "result": alterations.summary(fitting.garment),
+                "changes": [asdict(change) for change in fitting.changes],
+            }
+            for name, fitting in zip(names, fittings, strict=True)
+        ],
+        "num_vertices": len(outfit.rest_pos),
+        "num_faces": len(outfit.faces),
+        "num_pinned": int(outfit.pinned.sum()),
+        "starts": {name: asdict(figures) for name, figures in starts.items()},
+        "output": str(target),
+    }
+
+
+def _text(report: dict[str, Any]) -> str:
+    lines = []
+    for part in report["garments"]:
+        lines.append(f"{part['file']}:")
+        lines += [f"  {change['text']}" for change in part["changes"]] or ["  nothing to repair"]
+        lines.append(f"  now {part['result']}")
+    if report["num_pinned"]:
+        lines.append(f"holds {report['num_pinned']} of {report['num_vertices']} vertices")
+    for name, start in report["starts"].items():
+        lines.append(
+            f"start in {name}: edges stretched by at most {100 * start['stretch_max']:.1f}%, "
+            f"deepest vertex {1e3 * start['depth_max']:.1f} mm"
+        )
+        if start["stretch_max"] > _STRETCH_LIMIT or start["depth_max"] > _DEPTH_LIMIT:
+            lines.append("  that is far from rest: check that pose, scale and body are those the garment was made for")
+    lines.append(f"written to {report['output']}; run it with: hood rollout garment={report['output']}")
+    return "\n".join(lines)
+
+
+def _number(config: DictConfig, key: str, word: str) -> float | None:
+    """A number of the config; None for ``word``."""
+    if str(config[key]) == word:
+        return None
+    try:
+        value = float(config[key])
+    except (TypeError, ValueError):
+        value = -1.0
+    if not (np.isfinite(value) and value >= 0):
+        raise ConfigError(f"{key}={config[key]}: give a number ≥ 0" + (f" or {word}" if word else ""))
+    return value
+
+
+def _offset(config: DictConfig) -> np.ndarray:
+    values = plain(config.offset)
+    if len(values) != 3 or not all(isinstance(x, (int, float)) and np.isfinite(x) for x in values):
+        raise ConfigError(f"offset={values}: give metres along x, y and z, offset=[0,1.2,0]")
+    return np.array(values, dtype=np.float64)

@@ -1,0 +1,80 @@
+"""Garments as the commands are given them: one or several, repaired or not, with the vertices that are held."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from hood.assets.garment import Garment, load_garment
+from hood.assets.outfit import join_garments
+from hood.assets.pins import pin_mask
+from hood.assets.units import require_metres, used
+from hood.config import ConfigError, plain
+from hood.scene.motion import BodyMotion, Motion
+
+
+def names_of(given: Any, key: str = "garment") -> list[str]:
+    """Names in a config value that is one name or a list of them.
+
+    Raises:
+        ConfigError: neither, or an empty list.
+    """
+    value = plain(given)
+    names = value if isinstance(value, list) else [value]
+    if not names or not all(isinstance(name, (str, int, float)) and not isinstance(name, bool) for name in names):
+        raise ConfigError(f"{key}={value}: give a name, a file, or several, {key}=[shirt.obj,trousers]")
+    return [str(name) for name in names]
+
+
+def read_outfit(given: Any, motion: Motion, triangulate: bool = False, pins: Any = None) -> Garment:
+    """The garment or garments named by a config value, as one garment that can follow ``motion``.
+
+    Args:
+        given: a name, a file, or a list of them.
+        triangulate: split polygons of mesh files instead of refusing them.
+        pins: what is held instead of the files' own pins, see :func:`hood.assets.pins.pin_mask`; None: the files' own.
+
+    Raises:
+        ValueError: a garment that cannot be read, is not in metres or does not fit, or pins it does not have.
+    """
+    garments = [load_garment(name, triangulate=triangulate) for name in names_of(given)]
+    if motion.num_vertices:
+        surface = motion.surface(0, motion.translation[0]).cpu().numpy()
+        for garment in garments:
+            if not garment.bound:
+                require_metres(used(garment.rest_pos, garment.faces), surface, garment.name)
+    outfit = join_garments([motion.dressed(garment) for garment in garments])
+    pins = plain(pins)
+    if pins is None:
+        return outfit
+    body = motion.body if isinstance(motion, BodyMotion) else None
+    return replace(outfit, pinned=pin_mask(checked_pins(pins), outfit, body))
+
+
+def checked_pins(pins: Any) -> str | int | Sequence[str | int]:
+    """A config value for pins: a word, a number, or a list of them.
+
+    Raises:
+        ConfigError: something else.
+    """
+    if isinstance(pins, (str, int)) and not isinstance(pins, bool):
+        return pins
+    if isinstance(pins, list) and all(isinstance(pin, (str, int)) and not isinstance(pin, bool) for pin in pins):
+        return pins
+    raise ConfigError(f"pins={pins}: give vertex numbers, regions or lists, such as pins=[waistband,12,13] or pins=held.txt")
+
+
+def shape_coefficients(given: Any) -> np.ndarray:
+    """Ten shape coefficients from a config value of at most ten finite numbers.
+
+    Raises:
+        ConfigError: something else.
+    """
+    values = plain(given)
+    numbers = isinstance(values, list) and all(isinstance(b, (int, float)) and np.isfinite(b) for b in values)
+    if not numbers or len(values) > 10:
+        raise ConfigError(f"betas={values}: give at most 10 finite shape coefficients, e.g. betas=[1.5,0,-1]")
+    return np.array([*values, *[0.0] * (10 - len(values))], dtype=np.float64)

@@ -1,0 +1,54 @@
+"""How well a garment sits on a body before anything is simulated: as it is skinned, and as a rollout starts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from hood.scene.contact import find_contact
+from hood.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class FitFigures:
+    """Figures of one state of a garment on a body."""
+
+    stretch_max: float  # greatest relative lengthening of an edge
+    strain_p99: float  # of the absolute edge strains
+    num_inside: int  # vertices inside the body
+    depth_max: float  # m, of the deepest of them
+    dist_median: float  # m, to the skin; infinite without a body
+
+
+def fit_figures(scene: Scene, frame: int = 0, settled: bool = True) -> FitFigures:
+    """Figures of the start at ``frame``: settled as a rollout does, or merely skinned."""
+    if settled:
+        state = scene.start(frame, relaxed=False, thorough=True)
+        pos, origin = state.pos, state.origin[0].numpy()
+    else:
+        origin = scene.motion.translation[frame]
+        pos = scene.motion.skinned(scene.garment, frame, origin)
+    strain = _strain(scene, pos)
+    obstacle = scene.motion.obstacle(frame, origin, static=True)
+    dist = torch.full((len(pos),), torch.inf, dtype=torch.float64)
+    if obstacle is not None:
+        dist = find_contact(pos, scene.cloth.vertex_scene, obstacle).dist.double()
+    return FitFigures(
+        stretch_max=float(strain.max()),
+        strain_p99=float(torch.quantile(strain.abs()[:_QUANTILE_LIMIT], 0.99)),
+        num_inside=int((dist < 0).sum()),
+        depth_max=float((-dist).max().clamp_min(0.0)),
+        dist_median=float(dist.abs().median()),
+    )
+
+
+#: torch.quantile refuses longer inputs.
+_QUANTILE_LIMIT = 1 << 24
+
+
+def _strain(scene: Scene, pos: Tensor) -> Tensor:
+    start, end = scene.cloth.edges.unbind(dim=1)
+    rest = (scene.cloth.rest_pos[end] - scene.cloth.rest_pos[start]).norm(dim=1)
+    return ((pos[end] - pos[start]).norm(dim=1) / rest - 1.0).double()

@@ -1,0 +1,382 @@
+"""Feeds damaged files to every reader, in a process of its own with little memory; prints what went wrong as JSON.
+
+    python fuzz_worker.py COUNT SEED FOLDER
+
+A file may be read, or refused by a ValueError or OSError of one line that names it. Anything else is reported: other
+exceptions, more than 10 s, more than 2 GB, commands or connections, and answers that blame the memory.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import pickle
+import resource
+import signal
+import sys
+import traceback
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from hood.assets.animated_mesh import load_mesh_sequence
+from hood.assets.garment import load_garment
+from hood.assets.identify import identify
+from hood.assets.mesh_file import read_mesh_file
+from hood.assets.model_file import read_model
+from hood.assets.motion_file import read_recording
+from hood.assets.pins import read_indices
+from hood.assets.standing import read_pose
+from hood.assets.torch_file import load_torch
+from hood.dynamics.recorder import read_rollout
+from hood.dynamics.simulator import build_simulator, load_simulator, save_simulator
+from hood.testing import cylinder
+
+MEMORY, SECONDS = 2 << 30, 10
+_HARMFUL = ("os.system", "os.exec", "os.posix_spawn", "os.fork", "subprocess.Popen", "socket.connect", "shutil.rmtree")
+
+Content = bytes | dict[str, Any]
+Sample = tuple[str, Content, Callable[[Path], Any]]
+
+
+class Execute:
+    """Pickles to a call."""
+
+    def __init__(self, function: Any, *arguments: Any) -> None:
+        self.call = function, arguments
+
+    def __reduce__(self) -> Any:
+        return self.call
+
+
+def malicious(mark: Path) -> list[bytes]:
+    """Pickles that would leave ``mark`` behind: by a command, by code, and hidden in what looks like data."""
+    import os
+
+    command, code = f"touch {mark}", f"open({str(mark)!r}, 'w').close()"
+    system, evaluate = Execute(os.system, command), Execute(eval, code)
+    nested = Execute(map, Execute(getattr, Execute(__import__, "os"), "system"), [command])
+    contents = [system, evaluate, Execute(exec, code), nested, {"dress": {"rest_pos": system, "faces": evaluate}}]
+    contents += [{"poses": np.array([system], dtype=object), "trans": nested}, [evaluate], {system: 1}]
+    return [pickle.dumps(content, protocol) for content in contents for protocol in (0, 2, 4)] + [
+        f"cos\nsystem\n(S'{command}'\ntR.".encode(),
+        f"c__builtin__\neval\n(S{code!r}\ntR.".encode(),
+    ]
+
+
+def samples(folder: Path) -> list[Sample]:
+    """A small sound file of every format, and its reader."""
+    pos, faces = cylinder(6, 3)
+    quads = np.array(
+        [[r * 6 + k, r * 6 + (k + 1) % 6, r * 6 + 6 + (k + 1) % 6, r * 6 + 6 + k] for r in range(2) for k in range(6)]
+    )
+    mesh = lambda path: read_mesh_file(path, split_polygons=True)  # noqa: E731
+    rng = np.random.default_rng(0)
+    weights = rng.uniform(size=(18, 24))
+    garment = {"rest_pos": pos, "faces": faces, "pinned": np.zeros(18, bool), "lbs_weights": weights}
+    garment |= {"shapedirs": np.zeros((18, 3, 10)), "uv": pos[:, :2], "uv_faces": faces, "coarse_edges_0": faces[:, :2]}
+    entry = {"rest_pos": pos, "faces": faces, "node_type": np.zeros((18, 1), int), "coarse_edges": {3: {0: faces[:, :2]}}}
+    entry["lbs"] = {"v": pos, "shapedirs": np.zeros((18, 3, 10)), "lbs_weights": weights}
+    amass = {"poses": rng.normal(size=(4, 156)), "trans": np.zeros((4, 3)), "mocap_framerate": np.array(60.0)}
+    amass |= {"betas": np.zeros(16), "gender": np.array("neutral")}
+    smplx = {"root_orient": np.zeros((4, 3)), "pose_body": np.zeros((4, 63)), "trans": np.zeros((4, 3))}
+    smplx |= {"mocap_frame_rate": np.array(30.0), "betas": np.zeros(16)}
+    pose = {
+        "body_pose": np.zeros((4, 69)),
+        "global_orient": np.zeros((4, 3)),
+        "transl": np.zeros((4, 3)),
+        "betas": np.zeros(10),
+    }
+    vto = {"pose": np.zeros((4, 72)), "translation": np.zeros((4, 3)), "shape": np.zeros(10)}
+    model = {"v_template": pos, "shapedirs": np.zeros((18, 3, 10)), "posedirs": np.zeros((18, 3, 207)), "f": faces}
+    model |= {
+        "J_regressor": np.full((24, 18), 1 / 18),
+        "weights": weights,
+        "kintree_table": np.stack([np.arange(24) - 1, np.arange(24)]),
+    }
+    moving = {"verts": np.stack([pos, pos + 0.1]), "faces": faces, "fps": np.array(30.0)}
+    torch_file = io.BytesIO()
+    import torch
+
+    torch.save({"training_module": {"a": torch.zeros(3, 4)}}, torch_file)
+    save_simulator(folder / "m.safetensors", build_simulator(schedule="1x(mesh)", latent_dim=2))
+    return [
+        ("obj", _obj(pos, quads), mesh),
+        ("ply", _ascii_ply(pos, quads), mesh),
+        ("ply", _binary_ply(pos, quads, uniform=True), mesh),
+        ("ply", _binary_ply(pos, quads, uniform=False), mesh),
+        ("off", _off(pos, quads), mesh),
+        ("stl", _stl(pos, faces), mesh),
+        ("stl", _ascii_stl(pos, faces), mesh),
+        ("glb", _glb(pos, faces), mesh),
+        ("glb", _glb(pos, faces), load_mesh_sequence),
+        ("npz", garment, load_garment),
+        ("pkl", {"dress": entry}, load_garment),
+        ("pkl", {"vertices": pos, "faces": faces, "coarse_edges": entry["coarse_edges"]}, load_garment),
+        ("txt", b"1 2 3\n4, 5 # six\n", read_indices),
+        ("json", b"[1, 2, 3, 44]", read_indices),
+        ("json", json.dumps([0.1] * 72).encode(), read_pose),
+        ("npy", _npy(np.zeros(72)), read_pose),
+        ("npz", amass, read_recording),
+        ("npz", smplx, read_recording),
+        ("pkl", pose, read_recording),
+        ("pkl", vto, read_recording),
+        ("npz", model, read_model),
+        ("pkl", model, read_model),
+        ("npz", moving, load_mesh_sequence),
+        ("pkl", moving, load_mesh_sequence),
+        ("h5", _h5(moving), load_mesh_sequence),
+        ("h5", _rollout(pos, faces), read_rollout),
+        ("pth", torch_file.getvalue(), load_torch),
+        ("safetensors", (folder / "m.safetensors").read_bytes(), load_simulator),
+    ]
+
+
+def _obj(pos: np.ndarray, quads: np.ndarray) -> bytes:
+    lines = [f"v {x} {y} {z} 1 0 0" for x, y, z in pos] + [f"vt {x} {y}" for x, y, _ in pos] + ["vn 0 0 1"]
+    return "\n".join([*lines, *("f " + " ".join(f"{c}/{c}/1" for c in face) for face in quads + 1)]).encode()
+
+
+def _ply_head(form: str, count: int, size: str) -> str:
+    properties = (
+        "".join(f"property float {axis}\n" for axis in "xyz")
+        + "property uchar red\nproperty uchar green\nproperty uchar blue\n"
+    )
+    faces = f"element face {count}\nproperty list {size} int vertex_indices\nend_header\n"
+    return f"ply\nformat {form} 1.0\nelement vertex 18\n{properties}{faces}"
+
+
+def _ascii_ply(pos: np.ndarray, quads: np.ndarray) -> bytes:
+    rows = [f"{x} {y} {z} 255 0 0" for x, y, z in pos] + ["4 " + " ".join(map(str, face)) for face in quads]
+    return (_ply_head("ascii", len(quads), "uchar") + "\n".join(rows)).encode()
+
+
+def _binary_ply(pos: np.ndarray, quads: np.ndarray, uniform: bool) -> bytes:
+    body = b"".join(row.astype("<f4").tobytes() + b"\xff\0\0" for row in pos)
+    rows = [quads[k] if uniform or k % 2 else quads[k, :3] for k in range(len(quads))]
+    body += b"".join(np.uint32(len(row)).tobytes() + row.astype("<i4").tobytes() for row in rows)
+    return _ply_head("binary_little_endian", len(quads), "uint").encode() + body
+
+
+def _off(pos: np.ndarray, quads: np.ndarray) -> bytes:
+    rows = [
+        "OFF",
+        f"18 {len(quads)} 0",
+        *(f"{x} {y} {z}" for x, y, z in pos),
+        *("4 " + " ".join(map(str, face)) for face in quads),
+    ]
+    return "\n".join(rows).encode()
+
+
+def _stl(pos: np.ndarray, faces: np.ndarray) -> bytes:
+    body = b"".join(b"\0" * 12 + pos[face].astype("<f4").tobytes() + b"\0\0" for face in faces)
+    return b"\0" * 80 + np.uint32(len(faces)).tobytes() + body
+
+
+def _ascii_stl(pos: np.ndarray, faces: np.ndarray) -> bytes:
+    lines = ["solid s"]
+    for face in faces:
+        lines += ["facet normal 0 0 1", "outer loop", *(f"vertex {x} {y} {z}" for x, y, z in pos[face]), "endloop", "endfacet"]
+    return "\n".join([*lines, "endsolid s"]).encode()
+
+
+def _glb(pos: np.ndarray, faces: np.ndarray) -> bytes:
+    parts = [pos.astype("<f4").tobytes(), faces.astype("<u4").tobytes(), pos[:, :2].astype("<f4").tobytes()]
+    starts = np.cumsum([0, *map(len, parts)]).tolist()
+    document = {
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "translation": [0, 1, 0], "children": [1]}, {"mesh": 0, "scale": [2, 2, 2]}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 2}, "indices": 1}]}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": len(pos), "type": "VEC3"},
+            {"bufferView": 1, "componentType": 5125, "count": faces.size, "type": "SCALAR"},
+            {"bufferView": 2, "componentType": 5126, "count": len(pos), "type": "VEC2"},
+        ],
+        "bufferViews": [{"buffer": 0, "byteOffset": a, "byteLength": b - a} for a, b in zip(starts, starts[1:], strict=False)],
+        "buffers": [{"byteLength": starts[-1]}],
+    }  # fmt: skip
+    text, binary = json.dumps(document).encode(), b"".join(parts)
+    text += b" " * (-len(text) % 4)
+    chunks = np.uint32(len(text)).tobytes() + b"JSON" + text + np.uint32(len(binary)).tobytes() + b"BIN\0" + binary
+    return b"glTF" + np.array([2, 12 + len(chunks)], "<u4").tobytes() + chunks
+
+
+def _npy(array: np.ndarray) -> bytes:
+    content = io.BytesIO()
+    np.save(content, array)
+    return content.getvalue()
+
+
+def _h5(arrays: dict[str, Any]) -> bytes:
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:
+        for key, value in arrays.items():
+            file[key] = value
+    return content.getvalue()
+
+
+def _rollout(pos: np.ndarray, faces: np.ndarray) -> bytes:
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:
+        file["cloth/pos"] = file["body/pos"] = np.stack([pos, pos])
+        file["cloth/faces"] = file["body/faces"] = faces
+        file["cloth/rest_pos"], file["time"], file["metrics/strain_p50"] = pos, np.arange(2.0), np.zeros(2)
+        file.attrs.update({"num_frames": 2, "complete": True, "dt": 1 / 30})
+    return content.getvalue()
+
+
+def encode(suffix: str, content: Content, rng: np.random.Generator | None = None) -> bytes:
+    """The bytes of a file; with ``rng``, of one whose fields were changed."""
+    if isinstance(content, bytes):
+        return content
+    fields = dict(content) if rng is None else change_fields(content, rng)
+    if suffix == "pkl":
+        return pickle.dumps(fields)
+    file = io.BytesIO()
+    np.savez(file, **{key: np.asarray(value) for key, value in fields.items()})
+    return file.getvalue()
+
+
+def change_fields(fields: dict[str, Any], rng: np.random.Generator) -> dict[str, Any]:
+    """Some fields missing, of other shapes, types and values; nested ones too."""
+    changed = dict(fields)
+    key = list(changed)[rng.integers(len(changed))]
+    if isinstance(changed[key], dict) and rng.random() < 0.8:
+        changed[key] = change_fields(changed[key], rng)
+        return changed
+    value = np.asarray(changed[key]) if not isinstance(changed[key], dict) else np.zeros(3)
+    big = np.iinfo(np.int64).max
+    options: list[Callable[[], Any]] = [
+        lambda: changed.pop(key),
+        lambda: value.reshape(-1),
+        lambda: value[None],
+        lambda: value[:0] if value.ndim else value,
+        lambda: np.repeat(value.reshape(-1), 3),
+        lambda: np.full(value.shape, np.nan),
+        lambda: np.full(value.shape, 1e300),
+        lambda: np.full(value.shape, big),
+        lambda: -np.ones(value.shape, int),
+        lambda: value.astype(str) if value.dtype != object else value,
+        lambda: value.astype(complex) if value.dtype.kind in "biuf" else value,
+        lambda: np.array(["text", "more"]),
+        lambda: "text",
+        lambda: 7,
+        lambda: np.zeros(0),
+        lambda: np.zeros((2, 0, 3)),
+    ]
+    new = options[rng.integers(len(options))]()
+    if key in changed:
+        changed[key] = new
+    return changed
+
+
+def damage(content: bytes, rng: np.random.Generator) -> bytes:
+    """Bits flipped, the end cut off, numbers made huge, parts repeated, removed or overwritten."""
+    data = bytearray(content)
+    kind, size = rng.integers(7), len(content)
+    place = int(rng.integers(size))
+    if kind == 0:
+        for bit in rng.integers(8 * size, size=rng.integers(1, 30)):
+            data[bit // 8] ^= 1 << (bit % 8)
+    elif kind == 1:
+        del data[place:]
+    elif kind == 2:
+        huge = [b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"\xff" * 8, b"\xff" * 7 + b"\x7f", b"\0" * 8]
+        value = huge[rng.integers(len(huge))]
+        data[place : place + len(value)] = value
+    elif kind == 3:
+        digits = [index for index, byte in enumerate(data) if 48 <= byte <= 57]
+        at = digits[rng.integers(len(digits))] if digits else place
+        data[at : at + 1] = [b"99999999999", b"-1", b"1e400", b"nan", b"4294967296"][rng.integers(5)]
+    elif kind == 4:
+        data[place:place] = data[place : place + int(rng.integers(1, 400))] * int(rng.integers(1, 50))
+    elif kind == 5:
+        del data[place : place + int(rng.integers(1, 200))]
+    else:
+        data[place : place + 32] = rng.bytes(32)
+    return bytes(data)
+
+
+def attempt(path: Path, read: Callable[[Path], Any]) -> str | None:
+    """What is wrong with how ``read`` deals with the file; None: nothing."""
+    signal.alarm(SECONDS)
+    try:
+        read(path)
+    except (ValueError, OSError) as error:
+        text = str(error)
+        if "\n" in text:
+            return f"several lines: {text!r}"
+        if path.stem not in text and str(path) not in str(getattr(error, "filename", "")):
+            return f"does not name the file: {text!r}"
+        return f"memory: {text!r}" if "MemoryError" in text or "allocate" in text else None
+    except Slow as error:
+        return str(error)
+    except BaseException:
+        return traceback.format_exc(limit=-4)
+    finally:
+        signal.alarm(0)
+    return None
+
+
+class Slow(BaseException):
+    """Raised by the alarm."""
+
+
+def main(count: int, seed: int, folder: Path) -> None:
+    """Run ``count`` damaged files; prints the failures."""
+    executed: list[str] = []
+    sys.addaudithook(lambda event, _: executed.append(event) if event in _HARMFUL else None)
+    warnings.simplefilter("ignore")
+
+    def ring(*_: Any) -> None:
+        raise Slow(f"more than {SECONDS} s")
+
+    signal.signal(signal.SIGALRM, ring)
+    files = samples(folder)
+    for suffix, content, read in files:  # everything is imported and sound before the limits fall
+        path = folder / f"sound.{suffix}"
+        path.write_bytes(encode(suffix, content))
+        read(path)
+    used = int(
+        next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmSize")).split()[1]
+    )
+    resource.setrlimit(resource.RLIMIT_AS, (used * 1024 + MEMORY, resource.RLIM_INFINITY))
+    failures = []
+    marks = malicious(folder / "executed")
+    for number in range(count):
+        rng = np.random.default_rng([seed, number])
+        suffix, content, read = files[number % len(files)]
+        if number % 10 == 9 and suffix in ("pkl", "pth"):
+            data = marks[rng.integers(len(marks))]
+        else:
+            data = encode(suffix, content, rng if rng.random() < 0.5 else None)
+            data = damage(data, rng) if isinstance(content, bytes) or rng.random() < 0.5 else data
+        path = folder / f"input{number}.{suffix}"
+        path.write_bytes(data)
+        for reader in (read, lambda file: identify(str(file))):
+            wrong = attempt(path, reader)
+            if wrong:
+                failures.append(
+                    {"number": number, "suffix": suffix, "reader": getattr(reader, "__name__", "?"), "wrong": wrong}
+                )
+        path.unlink()
+    for number, data in enumerate(marks):
+        for suffix, content, read in files:
+            if suffix in ("pkl", "pth") and isinstance(content, (bytes, dict)):
+                path = folder / f"evil{number}.{suffix}"
+                path.write_bytes(data)
+                wrong = attempt(path, read)
+                if wrong:
+                    failures.append({"number": f"evil {number}", "suffix": suffix, "reader": read.__name__, "wrong": wrong})
+                path.unlink()
+    if (folder / "executed").exists() or executed:
+        failures.append({"number": -1, "suffix": "pkl", "reader": "?", "wrong": f"executed {executed}"})
+    print(json.dumps({"tried": count, "failures": failures}))
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]), int(sys.argv[2]), Path(sys.argv[3]))

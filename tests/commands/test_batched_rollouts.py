@@ -1,0 +1,165 @@
+"""Many motions in one command: files, folders, what an interruption leaves, what is not done twice."""
+
+from __future__ import annotations
+
+import errno
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hood.cli import main
+from hood.commands import rollout
+from hood.commands.batch import Job, find_jobs, share
+from hood.config import ConfigError
+from hood.dynamics.recorder import read_rollout
+
+UNTRAINED = ["checkpoint=untrained", "model=small", "model.latent_dim=4", "model.schedule='1x(mesh)'"]
+ROLLOUT = ["rollout", *UNTRAINED, "garment=tank", "num_frames=2", "video=none", "sheet=false", "sequence=motions", "output=out"]
+NAMES = ["a", "b", "deep/c"]
+
+
+@pytest.fixture
+def motions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    for name in NAMES:
+        write(tmp_path / "motions" / f"{name}.npz")
+    return tmp_path / "motions"
+
+
+def write(path: Path, broken: bool = False) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    poses = np.full((4, 156), np.nan) if broken else np.zeros((4, 156))
+    np.savez(path, poses=poses, trans=np.zeros((4, 3)), mocap_framerate=30.0, betas=np.zeros(16), gender="neutral")
+
+
+def times(folder: Path) -> dict[str, int]:
+    return {path.parent.name: path.stat().st_mtime_ns for path in folder.rglob("rollout.h5")}
+
+
+def test_names_of_folders(motions: Path) -> None:
+    for entry in ("motions", "motions/**/*.npz"):
+        jobs = find_jobs(entry, Path("out"))
+        assert jobs is not None
+        assert [str(job.folder) for job in jobs] == [f"out/{name}" for name in NAMES]
+        assert [Path(job.sequence).resolve() for job in jobs] == [motions / f"{name}.npz" for name in NAMES]
+    (motions / "list.txt").write_text("a.npz\nwalk_proud\ndeep/c.npz\n")
+    jobs = find_jobs("motions/list.txt", Path("out"))
+    assert jobs is not None
+    assert [str(job.folder) for job in jobs] == ["out/a", "out/walk_proud", "out/deep/c"]
+    assert find_jobs("walk_proud", Path("out")) is None
+    assert find_jobs("motions/a.npz", Path("out")) is None
+    with pytest.raises(ValueError, match="no file matches"):
+        find_jobs("motions/*.pkl", Path("out"))
+
+
+def test_two_motions_do_not_share_a_folder(motions: Path) -> None:
+    (motions / "a.pkl").write_bytes(b"")
+    with pytest.raises(ConfigError, match=r"a\.npz and .*a\.pkl would both go to out/a"):
+        find_jobs("motions/a.*", Path("out"))
+
+
+def test_one_folder_each_and_one_summary(motions: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(ROLLOUT) == 0
+    out = motions.parent / "out"
+    for name in NAMES:
+        assert len(read_rollout(out / name / "rollout.h5").cloth_pos) == 2
+        assert {path.name for path in (out / name).iterdir() if path.is_file()} == {
+            "config.yaml", "rollout.h5", "summary.json", "versions.json",
+        }  # fmt: skip
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["num_motions"] == 3
+    assert [Path(name).stem for name in summary["motions"]] == ["a", "b", "c"]
+    for name, row in zip(NAMES, summary["motions"].values(), strict=True):
+        assert row == json.loads((out / name / "summary.json").read_text())
+    assert "3 of 3 motions simulated" in capsys.readouterr().out
+
+
+def test_a_motion_that_cannot_be_used_stops_no_other(motions: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write(motions / "b.npz", broken=True)
+    assert main(ROLLOUT) == 2
+    printed = capsys.readouterr().out
+    assert "2 of 3 motions simulated, 1 failed" in printed
+    rows = json.loads((motions.parent / "out" / "summary.json").read_text())["motions"]
+    errors = [row["error"] for row in rows.values() if "error" in row]
+    assert len(errors) == 1
+    assert "b.npz" in errors[0]
+
+
+def test_an_interrupted_batch_goes_on_where_it_stopped(
+    motions: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    real, calls = rollout._simulate_to_disk, []
+
+    def interrupted(*arguments: object) -> bool:
+        calls.append(arguments)
+        return real(*arguments) or len(calls) == 2  # type: ignore[arg-type]
+
+    monkeypatch.setattr(rollout, "_simulate_to_disk", interrupted)
+    assert main(ROLLOUT) == 130
+    assert len(calls) == 2
+    assert "resume=true goes on" in capsys.readouterr().err
+    out = motions.parent / "out"
+    (out / "b" / "summary.json").unlink()  # as after a kill while the pictures were drawn
+    before = times(out)
+    assert set(before) == {"a", "b"}
+    monkeypatch.undo()
+    monkeypatch.chdir(motions.parent)
+    assert main([*ROLLOUT, "resume=true"]) == 0
+    after = times(out)
+    assert after["a"] == before["a"]
+    assert after["b"] > before["b"]
+    assert "c" in after
+    assert len(json.loads((out / "summary.json").read_text())["motions"]) == 3
+    # Other settings, and another command without resume=true, begin again.
+    assert main([*ROLLOUT, "resume=true", "material.density=0.3"]) == 0
+    assert all(times(out)[name] > after[name] for name in after)
+
+
+def test_a_full_disk_ends_the_share_and_keeps_what_is_done() -> None:
+    jobs = [Job(name, Path(name)) for name in "abc"]
+
+    def work(job: Job) -> tuple[dict, bool]:
+        if job.sequence == "b":
+            raise OSError(errno.ENOSPC, "No space left on device", "b/rollout.h5")
+        return {"num_frames": 1}, False
+
+    outcome = share(jobs, work)
+    assert outcome.rows == {"a": {"num_frames": 1}}
+    assert outcome.hopeless is not None
+    assert not outcome.interrupted
+
+
+EVALUATE = ["evaluate", "models=[newton]", "garments=[tank]", "sequences=[motions]", "num_frames=4", "gap_states=0",
+            "solver.max_iterations=1", "output=table"]  # fmt: skip
+
+
+def test_finished_rollouts_of_an_evaluation_survive(
+    motions: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from hood.commands import evaluate
+
+    real, done = evaluate.measure, []
+
+    def counted(candidate: object, scene: object, *rest: object) -> object:
+        if len(done) == 2:
+            raise KeyboardInterrupt
+        done.append(scene)
+        return real(candidate, scene, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(evaluate, "measure", counted)
+    assert main(EVALUATE) == 130
+    assert not (motions.parent / "table" / "table.json").exists()
+    monkeypatch.setattr(evaluate, "measure", lambda *a: done.append(a) or real(*a))
+    assert main([*EVALUATE, "resume=true"]) == 0
+    assert len(done) == 3
+    printed = capsys.readouterr().out
+    assert "2 of 3 rollouts were done before" in printed
+    rows = json.loads((motions.parent / "table" / "table.json").read_text())
+    assert [row["garment"] for row in rows] == ["tank", "all"]
+    assert rows[0]["frames"] == rows[1]["frames"] == 3
+    assert main([*EVALUATE, "resume=true", "num_frames=5"]) == 2
+    assert "num_frames differs" in capsys.readouterr().err
+    assert main(EVALUATE) == 0  # without resume=true: all over again
+    assert len(done) == 6

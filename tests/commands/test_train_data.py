@@ -1,0 +1,65 @@
+"""What ``hood train`` makes of data.* and of the keys that are about time, size and machine."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hood.assets.motions import MotionFiles
+from hood.commands.train import make_trainer
+from hood.config import ConfigError, load_config
+from hood.training.trainer import Trainer
+
+SMALL = ["model.latent_dim=8", "data.garments=[tank]"]
+
+
+def trainer(*overrides: str) -> Trainer:
+    return make_trainer(load_config("train", [*SMALL, *overrides]))
+
+
+def write(path: Path, num_frames: int) -> str:
+    poses, transl = np.zeros((num_frames, 156)), np.zeros((num_frames, 3))
+    np.savez(path, poses=poses, trans=transl, mocap_framerate=30.0)
+    return str(path)
+
+
+def test_the_embedded_split_is_the_default() -> None:
+    sequences = trainer().slots.sampler.sequences
+    assert isinstance(sequences, MotionFiles)
+    assert len(sequences) == 22
+    assert "walk_proud" not in sequences.names
+
+
+def test_globs_and_splits_on_the_command_line(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        write(tmp_path / f"{name}_poses.npz", 100)
+    assert trainer(f"data.sequences=[{tmp_path}/**/*_poses.npz]").slots.sampler.sequences[1].name == "b_poses"
+    (tmp_path / "split.json").write_text(json.dumps({"train": ["b_poses.npz"], "validation": ["a_poses.npz"]}))
+    split = f"[{tmp_path}/split.json]"
+    both = trainer(f"data.sequences={split}", f"data.validation_sequences={split}", "trainer.validate_every=1")
+    assert [s.name for s in both.slots.sampler.sequences] == ["b_poses"]
+    assert both.watch is not None
+    assert [s.name for s in both.watch.validation.motions] == ["a_poses"]
+
+
+def test_motions_shorter_than_a_rollout(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    entries = f"data.sequences=[{write(tmp_path / 'short.npz', 40)},{write(tmp_path / 'long.npz', 80)}]"
+    with pytest.raises(ValueError, match=r"short\.npz: 40 frames at 30 fps, at least 63.*data\.unusable=skip"):
+        trainer(entries)
+    assert [s.name for s in trainer(entries, "data.unusable=skip").slots.sampler.sequences] == ["long"]
+    assert "1 of 2 motions skipped, first: " in capsys.readouterr().err
+    with pytest.raises(ConfigError, match="did you mean 'skip'"):
+        trainer(entries, "data.unusable=skipp")
+
+
+def test_time_scale_reaches_the_trainer() -> None:
+    settings = trainer("trainer=paper", "trainer.time_scale=0.02").settings
+    assert (settings.iterations, settings.horizon.every, settings.collision.end_iteration) == (3000, 100, 3000)
+
+
+def test_buckets_by_size() -> None:
+    slots = trainer("data.garments=[tank,dress,dress_4k]", "trainer.batch_size=1", "trainer.max_vertices=4500").slots
+    assert [(bucket.templates, bucket.count) for bucket in slots.buckets] == [((0, 1), 4), ((2,), 1)]
