@@ -59,13 +59,6 @@ def sum_rows(x: Tensor, order: Tensor, offsets: Tensor) -> Tensor:
     return functional.embedding_bag(order, x, offsets, mode="sum", include_last_offset=True)
 
 
-def add_rows(x: Tensor, message: Tensor, out: Tensor) -> Tensor:
-    """x + message, rounded once; ``message`` of a wider precision is lost."""
-    if message.dtype == x.dtype:
-        return torch.add(x, message, out=out)
-    return out.copy_(message.add_(x.to(message.dtype)))  # three operations of one precision are faster than a mixed one
-
-
 class _EdgeUpdate(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -80,29 +73,20 @@ class _EdgeUpdate(torch.autograd.Function):
         *parameters: Tensor,
     ) -> tuple[Tensor, Tensor]:
         layers, weight = Layers(latent.dtype, eps, parameters), to_edge.to(latent.dtype)
-        table = table.detach().view(-1, latent.shape[1])
-        received = latent.new_empty(len(table) // 2, latent.shape[1], dtype=layers.scale.dtype)
+        received = latent.new_zeros(table.shape[0], latent.shape[1])
+        table = table.view(-1, latent.shape[1])
         updated = latent if overwrite else torch.empty_like(latent)
         saved: list[Tensor] = []
         parts = list(blocks(latent))
         spans = edges.spans(parts[0].stop) if parts else []
-        done = 0  # nodes whose first edge has been met
         for part, (nodes, offsets) in zip(parts, spans, strict=True):
             ends = functional.embedding_bag(edges.ends[part], table, mode="sum")
-            message, kept = layers.forward(relu_(affine_plus(latent[part], weight, ends)), keep)
-            sums = sum_rows(message, edges.rows[: part.stop - part.start], offsets)
-            if nodes.start < done:  # a node's edges may lie in two blocks
-                received[nodes.start].add_(sums[0])
-                sums = sums[1:]
-            elif nodes.start > done:  # nodes without edges between two blocks
-                received[done : nodes.start] = 0
-            received[nodes.stop - len(sums) : nodes.stop] = sums
-            done = nodes.stop
-            add_rows(latent[part], message, updated[part])
+            message, kept = layers.forward(relu_(affine_plus(latent[part], weight, ends)))
+            # A node's edges may lie in two blocks, so its sum is completed rather than set.
+            received[nodes] += sum_rows(message, edges.rows[: part.stop - part.start], offsets)
+            torch.add(latent[part], message, out=updated[part])
             if keep:
                 saved += kept
-        received[done:] = 0
-        received = received.to(latent.dtype)
         if keep:
             ctx.save_for_backward(latent, to_edge, *parameters, *saved)
             ctx.edges, ctx.eps = edges, eps
