@@ -13,12 +13,17 @@ from hood.losses.problem import StepProblem, inertial_guess
 _SMOOTHING_ROUNDS = 16
 #: A body this far away [m] has a quarter of the say over a vertex's base motion.
 _REACH = 0.03
+#: Cloth may be pressed this deep [m] into the contact zone: 3 w p² is then some seventy times a vertex's weight.
+_DEEPEST = 3e-4
+#: Local steps are shortened to this [m]: far from a minimum they mean little.
+_LONGEST_STEP = 5e-3
 
 
 class Output(ABC, nn.Module):
     """Turns raw network output into displacements [m] from a base position."""
 
     needs_contact = False  # of the problem that ``base`` is asked for
+    width = 3  # columns of the raw output
 
     @abstractmethod
     def base(self, problem: StepProblem) -> Tensor:
@@ -81,6 +86,37 @@ class VelocityBaseOutput(Output):
         return self.scale * raw
 
 
+class LocalStepOutput(VelocityBaseOutput):
+    """Corrections in several passes, each with a share of the vertices' own steps down the potential.
+
+    The raw output of a pass (V, 5) is a displacement in units of ``scale`` (``late_scale`` after the first pass), the share of
+    the local step that is taken (:mod:`hood.solver.local`; ``gain`` more after the first pass) and the share of the pass
+    before: the network says how far, the physics where to. After every pass the cloth is taken out of the body.
+    """
+
+    width = 5
+
+    def __init__(self, scale: float = 5e-3, clearance: float = 2e-3, late_scale: float = 1e-3, gain: float = 0.3) -> None:
+        super().__init__(scale, clearance)
+        self.late_scale, self.gain = late_scale, gain
+
+    def correction(self, raw: Tensor, index: int, step: Tensor, before: Tensor | None) -> Tensor:
+        """Displacement (V, 3) [m] of pass ``index``, with the local steps (V, 3) [m] at its start and the displacement of the
+        pass before."""
+        first = index == 0
+        step = step * (_LONGEST_STEP / step.norm(dim=1, keepdim=True).clamp_min(_LONGEST_STEP))
+        moved = (self.scale if first else self.late_scale) * raw[:, :3] + (raw[:, 3:4] + (0.0 if first else self.gain)) * step
+        return moved if before is None else moved + raw[:, 4:5] * before
+
+    def outside(self, problem: StepProblem, pos: Tensor) -> Tensor:
+        """``pos`` (V, 3) taken out of the body at t + 1, up to the depth in the contact zone that cloth's forces reach."""
+        contact = problem.contact
+        if contact is None:
+            return pos
+        depth = (self.clearance - _DEEPEST - contact.next_dist(pos)).clamp_min(0.0) * contact.valid
+        return pos + depth.unsqueeze(1) * contact.next_normal
+
+
 def _smooth(values: Tensor, trust: Tensor, edges: Tensor) -> Tensor:
     """Trust-weighted averages of ``values`` (V, 3) over growing neighbourhoods: untrusted vertices take their neighbours'
     values, trusted ones keep theirs."""
@@ -97,4 +133,4 @@ def _smooth(values: Tensor, trust: Tensor, edges: Tensor) -> Tensor:
     return smooth[:, :3] / smooth[:, 3:].clamp_min(1e-12)
 
 
-OUTPUTS = {"acceleration": AccelerationOutput, "velocity_base": VelocityBaseOutput}
+OUTPUTS = {"acceleration": AccelerationOutput, "velocity_base": VelocityBaseOutput, "local_steps": LocalStepOutput}

@@ -16,9 +16,10 @@ from torch import Tensor, nn
 
 from hood.assets.atomic import write_atomically
 from hood.dynamics.frames import FrameRules
-from hood.dynamics.output import OUTPUTS, AccelerationOutput, Output, VelocityBaseOutput
+from hood.dynamics.output import OUTPUTS, AccelerationOutput, LocalStepOutput, Output, VelocityBaseOutput
+from hood.dynamics.passes import Feedback, Passes
 from hood.dynamics.stopwatch import Stopwatch, timed
-from hood.features import groups, physical
+from hood.features import groups, local, physical
 from hood.features.inputs import Inputs
 from hood.graph.builder import StaticGraph, build_graph, build_static
 from hood.graph.cache import cached_hierarchy
@@ -27,7 +28,7 @@ from hood.losses.potential import default_potential
 from hood.losses.problem import StepProblem
 from hood.mesh.nearest import Nearest
 from hood.nn.model import MeshGraphNet
-from hood.nn.schedule import edge_set_names, parse_schedule, set_level
+from hood.nn.schedule import edge_set_names, parse_passes, parse_schedule, set_level
 from hood.scene.cloth import Cloth
 from hood.scene.contact import find_nearest
 from hood.scene.state import State, StepInput
@@ -50,6 +51,8 @@ class Prediction:
     next_pos: Tensor  # (V, 3) m, local
     acc: Tensor  # (V, 3) m/s², such that next_pos = pos + dt vel + dt² acc
     metrics: dict[str, float] = field(default_factory=dict)  # what the stepper itself has to report
+    #: Of models in several passes: (V, 3) m after every pass but the last, and the forces (V, 3) N there.
+    early: tuple[tuple[Tensor, Tensor], ...] = ()
 
 
 class Simulator(nn.Module):
@@ -81,7 +84,8 @@ class Simulator(nn.Module):
         self.register_buffer("gravity", torch.tensor([0.0, -9.81, 0.0]), persistent=False)
         # The residual feature asks the physics where the base guess is wrong; its parameters are part of the model.
         self._residual = default_potential()
-        self._wants_residual = any(isinstance(group, physical.Residual) for group in features.node)
+        self._wants_feedback = isinstance(output, LocalStepOutput)
+        self._wants_residual = not self._wants_feedback and any(isinstance(group, physical.Residual) for group in features.node)
         self._wants_base = any(isinstance(group, physical.RelativeVelocity) for group in features.node)
 
     @property
@@ -155,19 +159,24 @@ class Simulator(nn.Module):
                 graph = build_graph(prepared.static, seen.step, nearest, self.body_radius)
                 guess = base if self._wants_base else None
                 inputs = Inputs(cloth, seen.state, seen.step, seen.contact, graph, guess, residual, timestep=step.dt)
+                feedback = Feedback(self._residual, seen) if self._wants_feedback else None
+                if feedback is not None:
+                    inputs, _ = feedback(inputs, base)
             nodes, edges = self.features(inputs)
         with timed(watch, "network"):
-            raw = self.network(graph, nodes, edges)
-        return self.integrate(problem, base, raw)
+            if feedback is None:
+                return self.integrate(problem, base, self.network(graph, nodes, edges))
+            assert isinstance(self.output, LocalStepOutput)
+            passes = Passes(self.network, self.output, seen, feedback, inputs, base, self._fixed(problem))
+            pos = passes.take(self.network(graph, nodes, edges, passes.look))
+            early = tuple(zip(passes.positions[:-1], passes.forces, strict=True))
+            return Prediction(pos, problem.acceleration(pos), early=early)
 
     def integrate(self, problem: StepProblem, base: Tensor, raw: Tensor) -> Prediction:
         """Positions at t + 1 from the network's output ``raw`` (V, 3), which is relative to ``base`` (V, 3) [m]."""
-        cloth, step = problem.cloth, problem.step
-        free = cloth.free.unsqueeze(1)
+        free = problem.cloth.free.unsqueeze(1)
         displacement = self.output.displacement(raw)
-        fixed = problem.state.pos
-        if step.pin_target is not None:
-            fixed = torch.where(cloth.pinned.unsqueeze(1), step.pin_target, fixed)
+        fixed = self._fixed(problem)
         next_pos = torch.where(free, base + displacement, fixed)
         if isinstance(self.output, AccelerationOutput):
             # The network's own acceleration, without the cancellation of x − 2x_t + x_{t−1} in float32.
@@ -175,6 +184,13 @@ class Simulator(nn.Module):
         else:
             acc = problem.acceleration(next_pos)
         return Prediction(next_pos, acc)
+
+    def _fixed(self, problem: StepProblem) -> Tensor:
+        """(V, 3) m: targets of pinned vertices, present places of the others."""
+        target = problem.step.pin_target
+        if target is None:
+            return problem.state.pos
+        return torch.where(problem.cloth.pinned.unsqueeze(1), target, problem.state.pos)
 
     def forward(self, problem: StepProblem, prepared: Prepared) -> Prediction:
         """The same as :meth:`predict`; the call that wrappers such as DistributedDataParallel see."""
@@ -221,6 +237,7 @@ def build_simulator(
     frame_dt: float | None = None,
     pins_ahead: bool = False,
     velocity: str = "displacement",
+    late_scale: float = 1e-3,
 ) -> Simulator:
     """A simulator from plain arguments.
 
@@ -228,13 +245,16 @@ def build_simulator(
     no trace in ``config``.
 
     Args:
-        features: ``paper`` (node 24, edge 12, body edge 9, running statistics) or ``physical`` (fixed scales, residual).
-        output: ``acceleration`` (paper) or ``velocity_base`` (corrections to a base that moves with the body).
-        schedule: name (``ours``, ``fine15``, ``fine48``) or text such as ``3x(mesh+coarse0) 3x(coarse0)``.
+        features: ``paper`` (node 24, edge 12, body edge 9, running statistics), ``physical`` (fixed scales, residual) or
+            ``local`` (the same with what every vertex and its neighbourhood would do about the residual).
+        output: ``acceleration`` (paper), ``velocity_base`` (corrections to a base that moves with the body) or
+            ``local_steps`` (several such corrections with shares of the vertices' own steps; features=local).
+        schedule: name (``ours``, ``fine15``, ``fine48``) or text such as ``3x(mesh+coarse0) 3x(coarse0)``; ``|`` between
+            passes (``local_steps`` only).
         latent_dim: width of all latents.
         aggregation: ``sum`` or ``mean`` of the messages at a node.
         body_radius: reach of body edges [m].
-        output_scale: displacement [m] of one unit of raw output (``velocity_base`` only).
+        output_scale: displacement [m] of one unit of raw output (``velocity_base``; ``local_steps`` in the first pass).
         output_init: factor on the decoder's last layer at the start.
         normalizer_decay: decay of the exponentially weighted statistics (``paper`` features).
         body_velocity: displacement of the body that its nodes see: from the ``previous`` frame or to the ``next``
@@ -243,16 +263,21 @@ def build_simulator(
         coarse_encoders: encoders for coarse edges, see :class:`hood.nn.model.MeshGraphNet`; None: one per set.
         divisor_floor: least divisor of the statistics, see :class:`hood.features.normalizer.RunningNormalizer`.
         frame_dt, pins_ahead, velocity: see :class:`hood.dynamics.frames.FrameRules`.
+        late_scale: as ``output_scale``, in the later passes of ``local_steps``.
     """
     config = {name: value for name, value in locals().items() if name not in _CONVENTIONS or value != _CONVENTIONS[name]}
-    for name in ("latent_dim", "body_radius", "output_scale"):
-        if not config[name] > 0:
+    for name in ("latent_dim", "body_radius", "output_scale", "late_scale"):
+        if name in config and not config[name] > 0:
             raise ValueError(f"model.{name} is {config[name]!r}; it must be > 0")
-    for name, value, known in (("features", features, ("paper", "physical")), ("output", output, tuple(OUTPUTS))):
+    for name, value, known in (("features", features, ("paper", "physical", "local")), ("output", output, tuple(OUTPUTS))):
         if value not in known:
             raise ValueError(f"model.{name} is {value!r}; choose {' or '.join(known)}")
     if features == "physical" and output != "velocity_base":
         raise ValueError("model.features=physical describes corrections to a base; it needs model.output=velocity_base")
+    if (features == "local") != (output == "local_steps"):
+        raise ValueError(f"model.features={features} with model.output={output}: local and local_steps need each other")
+    if len(parse_passes(schedule)) > 1 and output != "local_steps":
+        raise ValueError(f"model.schedule has several passes (|); they need model.output=local_steps, not {output}")
     for name, count in (("embedded_levels", embedded_levels), ("coarse_encoders", coarse_encoders)):
         if count is not None and count < 1:
             raise ValueError(f"model.{name} is {count!r}; it must be at least 1, or null for the model's own number")
@@ -261,21 +286,37 @@ def build_simulator(
     if features == "paper":
         feature_set = groups.paper(num_levels, body_velocity, normalizer_decay, divisor_floor)
     else:
-        feature_set = physical.physical(num_levels)
+        feature_set = local.local(num_levels) if features == "local" else physical.physical(num_levels)
+    head: Output
+    if output == "acceleration":
+        head = AccelerationOutput(normalizer_decay, divisor_floor)
+    elif output == "velocity_base":
+        head = VelocityBaseOutput(output_scale)
+    else:
+        head = LocalStepOutput(output_scale, late_scale=late_scale)
     widths = (feature_set.node_width, feature_set.edge_widths)
-    network = MeshGraphNet(*widths, latent_dim, schedule, 3, aggregation, output_init, coarse_encoders)
-    head: Output = (
-        AccelerationOutput(normalizer_decay, divisor_floor) if output == "acceleration" else VelocityBaseOutput(output_scale)
+    network = MeshGraphNet(
+        *widths, latent_dim, schedule, head.width, aggregation, output_init, coarse_encoders, local.LOOK_WIDTHS
     )
     return Simulator(feature_set, network, head, body_radius, config, rules, num_levels)
 
 
-#: Conventions of :func:`build_simulator` that are written down only where they differ: files of models that follow the
-#: project's own stay readable by versions that know no other.
+#: Arguments of :func:`build_simulator` that are written down only where they differ from its defaults: files of models that
+#: follow the project's own conventions stay readable by versions that know no other.
 _CONVENTIONS: dict[str, Any] = {
     name: parameter.default
     for name, parameter in inspect.signature(build_simulator).parameters.items()
-    if name in ("body_velocity", "embedded_levels", "coarse_encoders", "divisor_floor", "frame_dt", "pins_ahead", "velocity")
+    if name
+    in (
+        "body_velocity",
+        "embedded_levels",
+        "coarse_encoders",
+        "divisor_floor",
+        "frame_dt",
+        "pins_ahead",
+        "velocity",
+        "late_scale",
+    )
 }
 
 

@@ -49,6 +49,8 @@ class Inputs:
     Args:
         base_pos: (V, 3) [m] the positions the network's output is added to, where the model has such a base.
         residual: (V, 3) [m/s²] acceleration that the potential's gradient at the base asks for.
+        local_step: (V, 3) [m] what every vertex alone would do about it, see :mod:`hood.solver.local`.
+        wide_residual: (V, 6) [m/s²] the residual of small and of large neighbourhoods, see :mod:`hood.features.local`.
         timestep: (B,) [s] value of the timestep feature; None for the step's dt. It is how the relaxing first step of
             a rollout is told to the network (paper, α in section 4.3).
         edge_rows: the table :attr:`edges` where it is known already; made or recognised from an earlier step otherwise.
@@ -61,6 +63,8 @@ class Inputs:
     graph: Graph
     base_pos: Tensor | None = None
     residual: Tensor | None = None
+    local_step: Tensor | None = None
+    wide_residual: Tensor | None = None
     timestep: Tensor | None = None
     edge_rows: EdgeRows | None = None
 

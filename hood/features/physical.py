@@ -3,6 +3,8 @@ no dependence on the frame's velocity (Galilean invariance), outliers compressed
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -159,8 +161,8 @@ class ScaledShape(EdgeGroup):
 
     def forward(self, inputs: Inputs) -> Tensor:
         current, rest = cloth_difference(inputs.state.pos, inputs), cloth_difference(inputs.cloth.rest_pos, inputs)
-        columns = torch.cat([current, _length(current), rest, _length(rest)], dim=1)
-        return columns / _mean_length(_length(rest), inputs).clamp_min(1e-6)
+        columns = torch.cat([current, length(current), rest, length(rest)], dim=1)
+        return columns / _mean_length(length(rest), inputs).clamp_min(1e-6)
 
 
 class Strain(EdgeGroup):
@@ -173,8 +175,8 @@ class Strain(EdgeGroup):
         self.scale = FixedScale(1.0 / gain, asinh=True)
 
     def forward(self, inputs: Inputs) -> Tensor:
-        rest = _length(cloth_difference(inputs.cloth.rest_pos, inputs))
-        lengths = torch.cat([_length(cloth_difference(pos, inputs)) for pos in (inputs.state.pos, inputs.base)], dim=1)
+        rest = length(cloth_difference(inputs.cloth.rest_pos, inputs))
+        lengths = torch.cat([length(cloth_difference(pos, inputs)) for pos in (inputs.state.pos, inputs.base)], dim=1)
         proper = rest > 1e-6
         return self.scale(torch.where(proper, lengths / torch.where(proper, rest, 1.0) - 1, 0.0))
 
@@ -199,10 +201,11 @@ class BaseBodyRelative(EdgeGroup):
 
     def forward(self, inputs: Inputs) -> Tensor:
         vector = body_difference(inputs.base, inputs.obstacle.next_pos, inputs)
-        return self.scale(torch.cat([vector, _length(vector)], dim=1))
+        return self.scale(torch.cat([vector, length(vector)], dim=1))
 
 
-def _length(vector: Tensor) -> Tensor:
+def length(vector: Tensor) -> Tensor:
+    """Norms (N, 1) of the rows of ``vector`` (N, 3)."""
     return vector.norm(dim=1, keepdim=True)
 
 
@@ -214,14 +217,16 @@ def _mean_length(rest_length: Tensor, inputs: Inputs) -> Tensor:
     return (total / count)[edges.segment].unsqueeze(1)
 
 
-def physical(num_levels: int = 3) -> FeatureSet:
-    """Scaled features for training without a warm-up of statistics; they need ``Inputs.base_pos``."""
+def physical(num_levels: int = 3, more: Sequence[NodeGroup] = ()) -> FeatureSet:
+    """Scaled features for training without a warm-up of statistics, with ``more`` beside the residual; they need
+    ``Inputs.base_pos``."""
     level = [LevelOneHot(num_levels)] if num_levels > 1 else []
     return FeatureSet(
         node=[
             RelativeVelocity(),
             Normal(),
             Residual(),
+            *more,
             TypeOneHot(),
             *level,
             ContactDistance(),

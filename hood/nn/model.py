@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from itertools import islice
 from typing import cast
 
 import torch
@@ -15,7 +16,11 @@ from hood.nn.message_passing import ProcessorStep
 from hood.nn.mlp import MLP
 from hood.nn.precision import PRECISIONS as PRECISIONS
 from hood.nn.precision import check_precision, products
-from hood.nn.schedule import edge_set_names, finest_level, parse_schedule
+from hood.nn.schedule import edge_set_names, finest_level, parse_passes, parse_schedule
+
+#: Between two passes: the index of the one that ended and its raw output (V, out_width) in, what its prediction looks like
+#: out: columns of the cloth nodes, and of the edge sets that the next pass works on.
+Look = Callable[[int, Tensor], tuple[Tensor, Mapping[str, Tensor]]]
 
 
 class MeshGraphNet(nn.Module):
@@ -24,6 +29,9 @@ class MeshGraphNet(nn.Module):
     One encoder for all nodes and one per edge set; processor steps as the schedule says, each with its own networks;
     body edges take part in every step, restricted to cloth nodes on the step's levels. Cloth and body nodes share the
     node networks; body nodes receive nothing from cloth edges.
+
+    A schedule of several passes decodes an output at the end of each; what it leads to is looked at, and what is seen is
+    added to the latents before the next pass.
 
     Args:
         node_width: width of the node features.
@@ -36,6 +44,7 @@ class MeshGraphNet(nn.Module):
         output_init: factor on the decoder's last layer at initialisation; small values start near zero output.
         coarse_encoders: number of encoders for coarse edges, ``coarse0`` first. Sets beyond them share the last one,
             encoders beyond the sets are never evaluated; None gives every set its own.
+        look_widths: columns of nodes and of edges that are seen between passes; schedules of one pass need none.
 
     ``precision`` says how the network computes and is no part of what it is: weights, input and output keep their own
     precision. Set it by :meth:`use_precision`.
@@ -54,9 +63,11 @@ class MeshGraphNet(nn.Module):
         aggregation: str = "sum",
         output_init: float = 1.0,
         coarse_encoders: int | None = None,
+        look_widths: tuple[int, int] = (0, 0),
     ) -> None:
         super().__init__()
         self.schedule = parse_schedule(schedule)
+        self.passes = parse_passes(schedule)
         self.edge_set_names = edge_set_names(self.schedule)
         encoded = self.edge_set_names if coarse_encoders is None else (MESH, *map(coarse_name, range(coarse_encoders)))
         widths = {name: _edge_width(name, edge_widths) for name in (*encoded, BODY)}
@@ -64,9 +75,16 @@ class MeshGraphNet(nn.Module):
         self.edge_encoders = nn.ModuleDict({n: MLP(w, latent_dim, latent_dim) for n, w in widths.items()})
         self.steps = nn.ModuleList(ProcessorStep((*sets, BODY), latent_dim, aggregation) for sets in self.schedule)
         self.decoder = MLP(latent_dim, latent_dim, out_width, norm=False)
+        later = range(1, len(self.passes))
+        self.late_decoders = nn.ModuleList(MLP(latent_dim, latent_dim, out_width, norm=False) for _ in later)
+        self.node_looks = nn.ModuleList(MLP(look_widths[0], latent_dim, latent_dim) for _ in later)
+        self.edge_looks = nn.ModuleList(
+            nn.ModuleDict({name: nn.Linear(look_widths[1], latent_dim) for name in self.pass_sets(index)}) for index in later
+        )
         with torch.no_grad():
-            self.decoder.third.weight.mul_(output_init)
-            self.decoder.third.bias.mul_(output_init)
+            for decoder in (self.decoder, *self.late_decoders):
+                decoder.third.weight.mul_(output_init)
+                decoder.third.bias.mul_(output_init)
         self.use_precision("fp32")
         self.use_checkpointing(False)
 
@@ -87,33 +105,68 @@ class MeshGraphNet(nn.Module):
         """
         self.checkpointing = on
 
-    def forward(self, graph: Graph, node_features: Tensor, edge_features: Mapping[str, Tensor]) -> Tensor:
-        """(V, out_width) for the cloth nodes.
+    def pass_sets(self, index: int) -> tuple[str, ...]:
+        """Cloth edge sets that pass ``index`` works on."""
+        first = sum(self.passes[:index])
+        return edge_set_names(self.schedule[first : first + self.passes[index]])
+
+    def forward(
+        self, graph: Graph, node_features: Tensor, edge_features: Mapping[str, Tensor], look: Look | None = None
+    ) -> Tensor:
+        """(V, out_width) for the cloth nodes, of the last pass.
 
         Args:
             graph: needs every set of :attr:`edge_set_names`.
             node_features: (V + W_active, node_width), cloth rows first.
             edge_features: by set, rows as in ``graph.edge_sets``.
+            look: called between two passes; schedules of one pass need none.
         """
         check_precision(self.precision, node_features.device)
         with products(self.precision):
-            return self._forward(graph, node_features, edge_features)
+            return self._forward(graph, node_features, edge_features, look)
 
-    def _forward(self, graph: Graph, node_features: Tensor, edge_features: Mapping[str, Tensor]) -> Tensor:
+    def _forward(self, graph: Graph, node_features: Tensor, edge_features: Mapping[str, Tensor], look: Look | None) -> Tensor:
         dtype = torch.bfloat16 if self.precision == "bf16" else None
         # Rows of padding are nodes without edges. A node's latent, a sum over all steps, stays in float32.
         nodes = self.node_encoder(pad_rows(node_features), dtype).to(node_features.dtype)
         edges = {name: self.edge_encoder(name)(edge_features[name], dtype) for name in (*self.edge_set_names, BODY)}
+        steps = iter(zip(self.schedule, self.steps, strict=True))
+        raw = nodes.new_empty(0)
+        for index, length in enumerate(self.passes):
+            if index > 0:
+                assert look is not None, "several passes need someone who looks at what they lead to"
+                nodes, edges = self._see(index, nodes, edges, *look(index - 1, raw))
+            for sets, step in islice(steps, length):
+                nodes, edges = self._take(cast(ProcessorStep, step), sets, graph, nodes, edges)
+            decoder = self.decoder if index == 0 else self.late_decoders[index - 1]
+            raw = decoder(nodes[: graph.num_cloth].to(node_features.dtype))
+        return raw
+
+    def _take(
+        self, step: ProcessorStep, sets: tuple[str, ...], graph: Graph, nodes: Tensor, edges: Mapping[str, Tensor]
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Latents after one processor step on the edge sets ``sets``."""
         overwrite = not torch.is_grad_enabled()
-        whole = {name: Subset(graph.edge_sets[name], None) for name in self.edge_set_names}
-        for sets, step in zip(self.schedule, self.steps, strict=True):
-            subsets = {name: whole[name] for name in sets}
-            subsets[BODY] = graph.body_subsets[finest_level(sets)]
-            if self.checkpointing and not overwrite:
-                nodes, edges = checkpoint(step, nodes, edges, subsets, use_reentrant=False, preserve_rng_state=False)
-            else:
-                nodes, edges = step(nodes, edges, subsets, overwrite)
-        return self.decoder(nodes[: graph.num_cloth].to(node_features.dtype))
+        subsets = {name: Subset(graph.edge_sets[name], None) for name in sets}
+        subsets[BODY] = graph.body_subsets[finest_level(sets)]
+        if self.checkpointing and not overwrite:
+            taken: tuple[Tensor, dict[str, Tensor]] = checkpoint(
+                step, nodes, edges, subsets, use_reentrant=False, preserve_rng_state=False
+            )
+            return taken
+        taken = step(nodes, edges, subsets, overwrite)
+        return taken
+
+    def _see(
+        self, index: int, nodes: Tensor, edges: Mapping[str, Tensor], node_look: Tensor, edge_look: Mapping[str, Tensor]
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Latents with what is seen before pass ``index`` added to them."""
+        dtype = torch.bfloat16 if self.precision == "bf16" else None
+        seen = self.node_looks[index - 1](pad_rows(node_look), dtype)[: len(node_look)].to(nodes.dtype)
+        nodes = torch.cat([nodes[: len(seen)] + seen, nodes[len(seen) :]])
+        encoders = cast(nn.ModuleDict, self.edge_looks[index - 1])
+        added = {name: edges[name] + encoders[name](edge_look[name]).to(edges[name].dtype) for name in encoders}
+        return nodes, {**edges, **added}
 
     def edge_encoder(self, name: str) -> MLP:
         """The encoder of edge set ``name``."""

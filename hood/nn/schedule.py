@@ -1,4 +1,5 @@
-"""Which edge sets every processor step works on, written as a string such as ``3x(mesh+coarse0) 3x(coarse0)``."""
+"""Which edge sets every processor step works on, written as a string such as ``3x(mesh+coarse0) 3x(coarse0)``; ``|`` ends a
+pass, whose prediction is decoded before the next one begins."""
 
 from __future__ import annotations
 
@@ -24,9 +25,10 @@ def parse_schedule(text: str) -> tuple[Step, ...]:
     """Steps of a schedule, each a tuple of cloth edge sets in the order of the node network's input: coarse sets
     ascending, then the mesh. Body edges belong to every step and are not written.
 
-    ``text`` is a name from :data:`SCHEDULES` or blocks ``Nx(set+set)``. Raises ValueError for anything misspelt.
+    ``text`` is a name from :data:`SCHEDULES` or blocks ``Nx(set+set)``, with ``|`` between passes (:func:`parse_passes`).
+    Raises ValueError for anything misspelt.
     """
-    source = SCHEDULES.get(text.strip(), text)
+    source = SCHEDULES.get(text.strip(), text).replace("|", " ")
     if "(" not in source:
         hint = difflib.get_close_matches(text, SCHEDULES, n=1)
         guess = f"; did you mean {hint[0]!r}?" if hint else ""
@@ -43,6 +45,15 @@ def parse_schedule(text: str) -> tuple[Step, ...]:
         steps += [_parse_sets(block[2], source)] * repeats
         position = block.end()
     return tuple(steps)
+
+
+def parse_passes(text: str) -> tuple[int, ...]:
+    """Number of steps in each pass of a schedule, at least one pass. Raises ValueError for a pass without steps."""
+    parts = SCHEDULES.get(text.strip(), text).split("|")
+    for index, part in enumerate(parts):
+        if len(parts) > 1 and not part.strip():
+            raise ValueError(f"schedule {text!r}: pass {index} of {len(parts)} has no steps; remove a '|'")
+    return tuple(len(parse_schedule(part)) for part in parts)
 
 
 def edge_set_names(schedule: Sequence[Step]) -> tuple[str, ...]:

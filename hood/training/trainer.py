@@ -28,6 +28,7 @@ from hood.training.checkpoint import load_last_good, previous, save_checkpoint, 
 from hood.training.curriculum import CollisionRamp, Horizon, StepDecay, WarmupCosine, scaled_count
 from hood.training.loss import relative_loss
 from hood.training.metrics_log import MetricsLog
+from hood.training.optimiser import OPTIMIZERS, make_optimizer
 from hood.training.slots import Slots
 from hood.training.watch import Watch
 
@@ -54,6 +55,7 @@ class TrainerSettings:
     collision: CollisionRamp = field(default_factory=lambda: CollisionRamp(5e3, 5e5, 50_000, 150_000))
     clip_norm: float = 1.0
     signal: str = "potential"
+    optimizer: str = "adam"
     ema_decay: float = 0.0
     precision: str = "fp32"
     statistics_iterations: int = 100
@@ -70,6 +72,8 @@ class TrainerSettings:
     def __post_init__(self) -> None:
         if self.precision not in PRECISIONS:
             raise ValueError(f"trainer.precision {self.precision!r}: give {' or '.join(map(repr, PRECISIONS))}")
+        if self.optimizer not in OPTIMIZERS:
+            raise ValueError(f"trainer.optimizer {self.optimizer!r}: give {' or '.join(map(repr, OPTIMIZERS))}")
         if self.signal not in ("potential", "scaled"):
             raise ValueError(f"trainer.signal {self.signal!r}: give 'potential' or 'scaled'")
         for name in ("iterations", "batch_size", "checkpoint_every", "log_every", "max_skipped"):
@@ -147,7 +151,7 @@ class Trainer:
             for module in simulator.modules():
                 if isinstance(module, RunningNormalizer):
                     module.shared_sum = distributed.all_reduce_sum
-        self.optimizer = torch.optim.Adam(simulator.parameters(), lr=settings.learning_rate)
+        self.optimizer = make_optimizer(settings.optimizer, simulator, settings.learning_rate)
         self.iteration = 0
         self.skipped = 0
         self.rollbacks = 0
@@ -228,6 +232,9 @@ class Trainer:
             weight = self._weight(problem, residual)
             # The analytic gradient is injected at the output: no graph through the energies is kept.
             surrogate = (prediction.next_pos * (gradient * weight[cloth.vertex_scene].unsqueeze(1))).sum()
+            for pos, force in prediction.early:  # every pass answers for where it leads itself
+                weight = self._weight(problem, relative_gradient(problem, force))
+                surrogate = surrogate - (pos * (force * weight[cloth.vertex_scene].unsqueeze(1))).sum()
             if self.model is not simulator:
                 # A share without body edges leaves their networks out; all processes must reduce the same parameters.
                 surrogate = surrogate + 0.0 * sum(p.sum() for p in simulator.parameters())

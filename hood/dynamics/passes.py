@@ -1,0 +1,91 @@
+"""A step in several passes: the network predicts, the potential says what is wrong with it, the network goes on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from hood.dynamics.output import LocalStepOutput
+from hood.features.inputs import Inputs
+from hood.features.local import WIDE_ROUNDS, look
+from hood.losses.potential import Potential
+from hood.losses.problem import StepProblem
+from hood.mesh.diffusion import Diffusion
+from hood.nn.model import MeshGraphNet
+from hood.solver.local import LocalTerms
+
+
+class Feedback:
+    """What the potential of one step says about positions, as features read it; constants of the step are gathered once."""
+
+    def __init__(self, potential: Potential, problem: StepProblem) -> None:
+        self._terms = LocalTerms(potential, problem)
+        self._diffusion = Diffusion(problem.cloth.edges, problem.cloth.num_vertices)
+        self._mass = problem.cloth.mass.clamp_min(1e-12).unsqueeze(1)
+
+    @torch.no_grad()
+    def __call__(self, inputs: Inputs, pos: Tensor) -> tuple[Inputs, Tensor]:
+        """The inputs with the view from positions (V, 3), and the forces −∂Φ/∂x (V, 3) [N] there."""
+        view = self._terms(pos)
+        # Forces and masses of a neighbourhood are added up; its residual is their ratio.
+        spread, wide, done = torch.cat([view.force, self._mass], dim=1), [], 0
+        for rounds in WIDE_ROUNDS:
+            spread, done = self._diffusion.spread(spread, rounds - done), rounds
+            wide.append(spread[:, :3] / spread[:, 3:])
+        seen = replace(
+            inputs,
+            base_pos=pos,
+            residual=view.force / self._mass,
+            local_step=view.step,
+            wide_residual=torch.cat(wide, dim=1),
+        )
+        return seen, view.force
+
+
+class Passes:
+    """The passes of one step: turns each raw output into positions and shows the next pass what they look like.
+
+    A pass starts from what the pass before led to, without a gradient: it answers for its own correction.
+
+    Args:
+        inputs: with the feedback at the base.
+        base: (V, 3) m, where the first pass starts.
+        fixed: (V, 3) m, where vertices are that are not free.
+    """
+
+    def __init__(
+        self,
+        network: MeshGraphNet,
+        output: LocalStepOutput,
+        problem: StepProblem,
+        feedback: Feedback,
+        inputs: Inputs,
+        base: Tensor,
+        fixed: Tensor,
+    ) -> None:
+        self._network, self._output, self._problem, self._feedback = network, output, problem, feedback
+        self._inputs, self._last, self._fixed = inputs, base, fixed
+        self._before: Tensor | None = None
+        self.positions: list[Tensor] = []  # (V, 3) m after every pass
+        self.forces: list[Tensor] = []  # (V, 3) N there, but for the last
+
+    def take(self, raw: Tensor) -> Tensor:
+        """Positions (V, 3) [m] after the pass with this output."""
+        step = self._inputs.local_step
+        assert step is not None
+        correction = self._output.correction(raw, len(self.positions), step, self._before)
+        there = self._output.outside(self._problem, self._last + correction)
+        pos = torch.where(self._problem.cloth.free.unsqueeze(1), there, self._fixed)
+        self.positions.append(pos)
+        self._before, self._last = pos.detach() - self._last, pos.detach()
+        return pos
+
+    def look(self, index: int, raw: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """What the next pass sees of the prediction of pass ``index``."""
+        pos = self.take(raw).detach()
+        self._inputs, force = self._feedback(self._inputs, pos)
+        self.forces.append(force)
+        with torch.no_grad():
+            return look(self._inputs, self._network.pass_sets(index + 1))

@@ -1,0 +1,92 @@
+"""The potential as every vertex sees it alone: its force, and the step it would take with its neighbours held."""
+
+from __future__ import annotations
+
+import weakref
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from hood.losses.potential import Potential
+from hood.losses.problem import StepProblem
+from hood.scene.cloth import Cloth
+from hood.solver.linear import invert_blocks
+from hood.solver.terms import StepTerms
+
+#: Upper triangle of a 3 × 3 block.
+_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+@dataclass(frozen=True)
+class LocalView:
+    """Force and local step of every vertex at one set of positions; zero where nothing moves."""
+
+    force: Tensor  # (V, 3) N, −∂Φ/∂x
+    step: Tensor  # (V, 3) m, D⁻¹ force with the positive diagonal block D of the Hessian
+
+
+class LocalTerms:
+    """Views of one step's potential; everything constant in the step is gathered once."""
+
+    def __init__(self, potential: Potential, problem: StepProblem) -> None:
+        self.problem = problem
+        self.terms = StepTerms(potential, problem)
+        self._incidence = _incidence_of(problem.cloth)
+
+    @torch.no_grad()
+    def __call__(self, pos: Tensor) -> LocalView:
+        """The view at positions (V, 3)."""
+        terms, cloth = self.terms, self.problem.cloth
+        acc = self.problem.acceleration(pos)
+        own = terms.vertices.model(pos, acc)
+        gradient, matrix = own.gradient, own.matrix
+        parts = []
+        faces = terms.faces(pos)
+        if faces is not None:
+            parts.append(torch.cat([faces.gradient.transpose(0, 1), _diagonal(faces.matrix)]).flatten(1))
+        for slope, row in terms.hinges(pos):
+            parts.append(torch.cat([slope.transpose(0, 1), torch.stack([row[:, a] * row[:, b] for a, b in _PAIRS])]).flatten(1))
+        if parts:
+            order, offsets = self._incidence
+            table = torch.cat(parts, dim=1).t().contiguous()
+            sums = functional.embedding_bag(order, table, offsets, mode="sum", include_last_offset=True)
+            gradient = gradient + sums[:, :3]
+            matrix = matrix + sums[:, [3, 4, 5, 4, 6, 7, 5, 7, 8]].view(-1, 3, 3)
+        springs = terms.attachments(pos)
+        if springs is not None:
+            ends = self.problem.step.attachments.edges.t().reshape(-1)  # type: ignore[union-attr]
+            gradient = gradient.index_add(0, ends, springs[0].permute(0, 2, 1).reshape(-1, 3))
+            stiffness = terms.spring_stiffness().repeat(2)
+            matrix = matrix.index_add(0, ends, stiffness[:, None, None] * torch.eye(3).to(matrix))
+        other = terms.other_gradient(pos, acc)
+        gradient = gradient if other is None else gradient + other
+        force = torch.where(cloth.free.unsqueeze(1), -gradient, 0.0)
+        step = torch.bmm(invert_blocks(matrix), force.unsqueeze(2)).squeeze(2)
+        return LocalView(force, torch.where(cloth.free.unsqueeze(1), step, 0.0))
+
+
+def _diagonal(upper: Tensor) -> Tensor:
+    """(6, 3, N) diagonal blocks of element matrices given by their upper triangles (45, N)."""
+    return torch.stack([torch.stack([upper[_place(3 * c + a, 3 * c + b)] for c in range(3)]) for a, b in _PAIRS])
+
+
+def _place(row: int, col: int, size: int = 9) -> int:
+    return row * size - row * (row - 1) // 2 + col - row
+
+
+_INCIDENCES: dict[int, tuple[weakref.ref[Tensor], tuple[Tensor, Tensor]]] = {}
+
+
+def _incidence_of(cloth: Cloth) -> tuple[Tensor, Tensor]:
+    """Corners of faces and hinges by the vertex they are at, kept as long as the cloth's faces live."""
+    key = id(cloth.faces)
+    if key in _INCIDENCES and _INCIDENCES[key][0]() is cloth.faces:
+        return _INCIDENCES[key][1]
+    vertex = torch.cat([cloth.faces.t().reshape(-1), cloth.hinges.t().reshape(-1)])
+    order = torch.argsort(vertex, stable=True)
+    count = torch.bincount(vertex, minlength=cloth.num_vertices)
+    value = (order, torch.cat([count.new_zeros(1), count.cumsum(0)]))
+    _INCIDENCES[key] = (weakref.ref(cloth.faces, lambda _: _INCIDENCES.pop(key, None)), value)
+    return value
