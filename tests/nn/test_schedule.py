@@ -2,7 +2,7 @@
 
 import pytest
 
-from hood.nn.schedule import edge_set_names, finest_level, parse_schedule, radius
+from hood.nn.schedule import edge_set_names, finest_level, parse_passes, parse_schedule, radius
 
 
 def test_ours_is_the_papers_fifteen_steps():
@@ -40,3 +40,13 @@ def test_text_is_read_with_or_without_counts_and_spaces():
 def test_misspelt_schedules_are_refused(text, message):
     with pytest.raises(ValueError, match=message.replace("(", "\\(")):
         parse_schedule(text)
+
+
+def test_passes_of_a_schedule() -> None:
+    text = "2x(mesh) 1x(coarse0) | 1x(mesh) | 4x(mesh+coarse0)"
+    assert parse_passes(text) == (3, 1, 4)
+    assert parse_schedule(text) == parse_schedule(text.replace("|", ""))
+    assert parse_passes("ours") == (15,)
+    for bad in ("1x(mesh) |", "| 1x(mesh)", "1x(mesh) || 1x(mesh)"):
+        with pytest.raises(ValueError, match="has no steps"):
+            parse_passes(bad)

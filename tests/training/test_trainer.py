@@ -23,6 +23,7 @@ from hood.training.trainer import Trainer, TrainerSettings
 
 PHYSICAL = {"features": "physical", "output": "velocity_base", "output_init": 0.1}
 PAPER = {"features": "paper", "output": "acceleration"}
+PASSES = {"features": "local", "output": "local_steps", "schedule": "1x(mesh+coarse0) | 1x(mesh)", "output_init": 0.1}
 SETTINGS = TrainerSettings(
     iterations=12, batch_size=2, learning_rate=1e-3, schedule=WarmupCosine(3), horizon=Horizon(every=3, maximum=2),
     collision=CollisionRamp(5e5, 5e5), signal="scaled", ema_decay=0.9, statistics_iterations=4, checkpoint_every=100,
@@ -32,7 +33,7 @@ SETTINGS = TrainerSettings(
 
 def tiny(options: dict, seed: int = 0) -> Simulator:
     torch.manual_seed(seed)
-    return build_simulator(schedule="1x(mesh+coarse0)", latent_dim=8, **options)
+    return build_simulator(**{"schedule": "1x(mesh+coarse0)", "latent_dim": 8, **options})
 
 
 def make(
@@ -91,6 +92,7 @@ def assert_same(first: object, second: object) -> None:
 VARIANTS = {
     "physical": (PHYSICAL, {}),
     "paper": (PAPER, {"signal": "potential"}),
+    "passes": (PASSES, {"optimizer": "muon"}),
     "bf16": (PHYSICAL, {"precision": "bf16", "ema_decay": 0.0}),
 }
 
