@@ -3,6 +3,7 @@ and of neighbourhoods. The same columns, fewer, are seen again between the passe
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import torch
@@ -19,41 +20,53 @@ WIDE_ROUNDS = (4, 16)
 _STEP, _MOVE, _GAIN = 1e-4, 1e-2, 100.0
 
 
-class LocalStep(NodeGroup):
-    """asinh(step/scale): what a vertex alone would do about the residual, in the unit of stiff cloth's errors; 0 on the
-    body."""
+class _View(NodeGroup, ABC):
+    """asinh(value/scale) of what the potential says about the cloth; 0 on the body."""
+
+    needs_contact = True
+
+    def __init__(self, scale: float) -> None:
+        super().__init__()
+        self.scale = FixedScale(scale, asinh=True)
+
+    @abstractmethod
+    def value(self, inputs: Inputs) -> Tensor | None:
+        """(V, width), None where it was not computed."""
+
+    def cloth(self, inputs: Inputs) -> Tensor:
+        return self.scale(_demand(self.value(inputs)))
+
+    def body(self, inputs: Inputs) -> Tensor:
+        return inputs.state.pos.new_zeros(inputs.num_body, self.width)
+
+
+class LocalStep(_View):
+    """What a vertex alone would do about the residual [m], in the unit of stiff cloth's errors."""
 
     width = 3
-    needs_contact = True
 
     def __init__(self, scale: float = _STEP) -> None:
-        super().__init__()
-        self.scale = FixedScale(scale, asinh=True)
+        super().__init__(scale)
 
-    def cloth(self, inputs: Inputs) -> Tensor:
-        return self.scale(_demand(inputs.local_step))
-
-    def body(self, inputs: Inputs) -> Tensor:
-        return inputs.state.pos.new_zeros(inputs.num_body, self.width)
+    def value(self, inputs: Inputs) -> Tensor | None:
+        return inputs.local_step
 
 
-class WideResidual(NodeGroup):
-    """asinh(residual/g) of neighbourhoods instead of single vertices: what is left where internal forces cancel; 0 on the
-    body. Sums over compressed residuals of single vertices could not recover it."""
+class WideResidual(_View):
+    """The residual [m/s²] of neighbourhoods instead of single vertices: what is left where internal forces cancel. Sums over
+    compressed residuals of single vertices could not recover it."""
 
     width = 3 * len(WIDE_ROUNDS)
-    needs_contact = True
 
     def __init__(self, scale: float = GRAVITY) -> None:
-        super().__init__()
-        self.scale = FixedScale(scale, asinh=True)
+        super().__init__(scale)
 
-    def cloth(self, inputs: Inputs) -> Tensor:
-        return self.scale(_demand(inputs.wide_residual))
+    def value(self, inputs: Inputs) -> Tensor | None:
+        return inputs.wide_residual
 
-    def body(self, inputs: Inputs) -> Tensor:
-        return inputs.state.pos.new_zeros(inputs.num_body, self.width)
 
+#: What :func:`look` reads; they have no parameters.
+_RESIDUAL, _LOCAL_STEP, _WIDE, _CONTACT = Residual(), LocalStep(), WideResidual(), ContactDistance()
 
 #: Columns of :func:`look` of nodes and of edges.
 LOOK_WIDTHS = (3 + 3 + 3 + 1 + 1 + WideResidual.width, 1)
@@ -65,12 +78,12 @@ def look(inputs: Inputs, sets: Sequence[str]) -> tuple[Tensor, dict[str, Tensor]
     step = _demand(inputs.local_step)
     moved = inputs.state.vel * inputs.vertex_dt - (inputs.base - inputs.state.pos)
     nodes = [
-        Residual().cloth(inputs),
-        torch.asinh(step / _STEP),
+        _RESIDUAL.cloth(inputs),
+        _LOCAL_STEP.cloth(inputs),
         torch.asinh(moved / _MOVE),
-        ContactDistance().cloth(inputs)[:, :1],
-        torch.asinh(length(step) / _STEP),
-        torch.asinh(_demand(inputs.wide_residual) / GRAVITY),
+        _CONTACT.cloth(inputs)[:, :1],
+        _LOCAL_STEP.scale(length(step)),
+        _WIDE.cloth(inputs),
     ]
     return torch.cat(nodes, dim=1), {name: _strain(inputs, name) for name in sets}
 
