@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
+import numpy as np
 import torch
 from omegaconf import DictConfig
 from tqdm import tqdm
@@ -26,18 +27,24 @@ from hood.commands.common import (
     together,
     use_precision,
 )
+from hood.commands.wardrobe import shape_coefficients
 from hood.config import ConfigError, build, load_config, options, plain, save_run_record
+from hood.dynamics.reel import Reel
 from hood.dynamics.simulator import Simulator
 from hood.dynamics.stepper import NewtonStepper
 from hood.evaluation.diary import Diary, Unit
+from hood.evaluation.drift import sideways_drift, standing_scene
 from hood.evaluation.gap import REFERENCE
 from hood.evaluation.report import describe, format_table, write_table
 from hood.evaluation.table import Candidate, GapSettings, Measured, candidate_rows, measure
+from hood.losses.potential import Potential
 from hood.scene.scene import Scene, build_scene
 from hood.training import distributed
 
 #: ``models=[newton]``: no network, the potential minimised in every frame.
 NEWTON = "newton"
+#: The motion of a body that stands still, on which drift is measured.
+STANDING = ":standing"
 
 
 def run(overrides: Sequence[str]) -> int:
@@ -77,10 +84,38 @@ def _measure(config: DictConfig, plan: Plan, todo: Sequence[Unit], diary: Diary)
             bar.refresh()
 
         for unit in todo:
-            measured[unit] = measure(plan.candidates[unit.model], plan.scene(unit), potential, count, gaps, tell)
+            measured[unit] = _measure_unit(config, plan, unit, potential, count, gaps, tell)
             diary.write(unit, plan.digests[unit.model], measured[unit])
             bar.update()
     return measured
+
+
+def _measure_unit(
+    config: DictConfig,
+    plan: Plan,
+    unit: Unit,
+    potential: Potential,
+    count: int,
+    gaps: GapSettings,
+    tell: Callable[[str], None],
+) -> Measured:
+    candidate, scene = plan.candidates[unit.model], plan.scene(unit)
+    if unit.motion == STANDING:
+        tell(f"{candidate.name} {unit.garment} {STANDING}")
+        return Measured(drifts=[sideways_drift(candidate.stepper, scene, potential)])
+    reel, drawn = Reel(), bool(config.contact_sheets)
+    measured = measure(candidate, scene, potential, count, gaps, tell, partial(reel.see, scene) if drawn else None)
+    if drawn:
+        name = f"{unit.model}_{candidate.name}_{unit.garment}_{unit.motion}_{unit.shape}.png"
+        _write_sheet(reel, Path(str(config.output)).expanduser() / "sheets" / name.replace("/", "-"))
+    return measured
+
+
+def _write_sheet(reel: Reel, path: Path) -> None:
+    from hood.media.film import write_sheet
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_sheet(reel.data(), path)
 
 
 def _report(config: DictConfig, plan: Plan, measured: Mapping[Unit, Measured], folder: Path) -> None:
@@ -137,15 +172,19 @@ class Plan:
     digests: list[str]  # of the candidates' weights
     garments: dict[str, Garment]
     motions: list[str]
+    shapes: list[np.ndarray]  # (10,) each
 
     @property
     def units(self) -> list[Unit]:
         """The rollouts, in a fixed order."""
-        return [Unit(m, g, s) for m in range(len(self.candidates)) for g in self.garments for s in self.motions]
+        performed = [(motion, shape) for shape in range(len(self.shapes)) for motion in self.motions]
+        if int(self.config.drift_frames):
+            performed.append((STANDING, 0))
+        return [Unit(m, g, *one) for m in range(len(self.candidates)) for g in self.garments for one in performed]
 
     def scene(self, unit: Unit) -> Scene:
         """The scene of a rollout; the last one is kept, and so is its motion."""
-        return _scene(self, unit.garment, unit.motion)
+        return _scene(self, unit)
 
 
 def make_plan(config: DictConfig) -> Plan:
@@ -160,7 +199,9 @@ def make_plan(config: DictConfig) -> Plan:
     names = [garment.name for garment in garments]
     if len(set(names)) < len(names):
         raise ConfigError(f"garments={plain(config.garments)}: names must differ, these are {', '.join(names)}")
-    return Plan(config, candidates, [_digest(c) for c in candidates], dict(zip(names, garments, strict=True)), motions)
+    shapes = [shape_coefficients(given, "shapes") for given in config.shapes]
+    digests = [_digest(candidate) for candidate in candidates]
+    return Plan(config, candidates, digests, dict(zip(names, garments, strict=True)), motions, shapes)
 
 
 @lru_cache(maxsize=1)
@@ -168,12 +209,13 @@ def _sequence(name: str, fps: float) -> PoseSequence:
     return load_sequence(name, fps)
 
 
-def _scene(plan: Plan, garment: str, motion: str) -> Scene:
-    config = plan.config
-    sequence = _sequence(motion, float(config.fps))
-    return build_scene(
-        plan.garments[garment], load_body(str(config.body)), sequence, build(config.material), device=str(config.device)
-    )
+def _scene(plan: Plan, unit: Unit) -> Scene:
+    config, garment, body = plan.config, plan.garments[unit.garment], load_body(str(plan.config.body))
+    material, fps = build(config.material), float(config.fps)
+    if unit.motion == STANDING:
+        return standing_scene(garment, body, int(config.drift_frames), material, fps, device=str(config.device))
+    sequence = _sequence(unit.motion, fps)
+    return build_scene(garment, body, sequence, material, plan.shapes[unit.shape], device=str(config.device))
 
 
 def _digest(candidate: Candidate) -> str:
@@ -190,6 +232,7 @@ def _digest(candidate: Candidate) -> str:
 def _check_numbers(config: DictConfig) -> None:
     for key, least, why in (
         ("num_frames", 4, "the first frames are not timed"),
+        ("drift_frames", 0, "0 measures no drift"),
         ("gap_states", 0, "0 computes no gap"),
         ("gap_iterations", 1, "a reference needs iterations; gap_states=0 computes no gap"),
     ):

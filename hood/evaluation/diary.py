@@ -17,6 +17,7 @@ class Unit(NamedTuple):
     model: int  # place in the list of candidates
     garment: str
     motion: str
+    shape: int = 0  # place in the list of body shapes
 
 
 class Diary:

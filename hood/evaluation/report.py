@@ -16,7 +16,7 @@ _NAMES = ("model", "weights", "garment")
 _MAIN = ("steps", "radius", "ms", "ms_p99", "fps", "L_total", "gradient_norm", "rg")
 _GAP = ("gap", "gap_p95", "unconverged", "disagree")
 _TERMS = ("L_guess", "L_stretching", "L_bending", "L_inertia", "L_gravity", "L_collision", "L_friction")
-_STATE = ("strain_p99", "penetration")
+_STATE = ("strain_p99", "penetration", "penetration_worst", "drift")
 COLUMNS = (*_NAMES, *_MAIN, *_GAP, *_TERMS, *_STATE, "failed_at", "frames", "gap_states")
 #: Columns of the printed tables; all in one would be wider than a screen.
 _PRINTED = ((*_NAMES, *_MAIN, *_GAP, "failed_at"), (*_NAMES, *_TERMS, *_STATE))
@@ -30,8 +30,8 @@ def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
 def describe(rows: Sequence[Mapping[str, Any]]) -> str:
     """Meaning and units of the columns, and how far the figures of these rows can be trusted."""
     lines = [
-        "ms per frame; L [J], L_guess of the inertial guess, gradient_norm [N] and strain_p99 are means, rg = ‖∇Φ‖ / ‖M g‖ a "
-        "median over frames; penetration is a share of the vertices",
+        "ms per frame; L [J], L_guess of the inertial guess, gradient_norm [N] and penetration, the share of vertices deeper "
+        "than 2 mm, are means; rg = ‖∇Φ‖ / ‖M g‖ and strain_p99 are medians over frames; drift [m] is to the side",
         "gap = (Φ - Φ*) / e0, the energy above the minimum of the same step: median and 95th percentile; √gap is about the "
         "error of the accelerations in g",
     ]

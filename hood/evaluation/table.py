@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hood.dynamics.rollout import simulate
+from hood.dynamics.rollout import Frame, simulate
 from hood.dynamics.simulator import Simulator
 from hood.dynamics.stepper import Stepper
 from hood.evaluation.gap import AGREEMENT, REFERENCE, gap
@@ -25,6 +25,8 @@ ALL = "all"
 
 #: Told what is being done and how many rollouts are done.
 Progress = Callable[[str, int], None]
+#: Shown every frame of a rollout.
+See = Callable[[Frame], None]
 
 
 @dataclass(frozen=True)
@@ -56,9 +58,11 @@ class Measured:
     frames: list[dict[str, float]] = field(default_factory=list)  # metrics of the finite frames that count
     failures: list[int] = field(default_factory=list)  # first non-finite frames
     gaps: list[dict[str, float]] = field(default_factory=list)  # γ, converged (0 or 1), spread [e0] of every state looked at
+    drifts: list[float] = field(default_factory=list)  # [m] to the side, on a body that stands still
 
     def __add__(self, other: Measured) -> Measured:
-        return Measured(self.frames + other.frames, self.failures + other.failures, self.gaps + other.gaps)
+        parts = (self.frames + other.frames, self.failures + other.failures, self.gaps + other.gaps)
+        return Measured(*parts, self.drifts + other.drifts)
 
 
 def evaluate(
@@ -74,9 +78,11 @@ def evaluate(
     Means over the frames that a candidate's own rollouts reach before the first non-finite one; ``failed_at`` is the
     earliest such frame (None: never). ``steps`` and ``radius`` are None without a network. ``L_guess`` is the potential of
     the inertial guess on the same states. ``gradient_norm`` [N] is the mean over vertices of ‖∂L/∂x_v‖₂, averaged over
-    frames; ``rg`` is a median over frames. Of the states whose gap is computed (``gap_states`` of them): ``gap`` is the
-    median, ``gap_p95`` the 95th percentile, ``unconverged`` the share whose reference missed its accuracy and
-    ``disagree`` the share where minimisations ended in different minima.
+    frames; ``rg`` and ``strain_p99`` are medians over frames; ``penetration`` is the mean share of vertices deeper than 2 mm,
+    ``penetration_worst`` that of the worst frame; ``drift`` [m] is the largest of those measured (None: none was). Of the
+    states whose gap is computed (``gap_states`` of them): ``gap`` is the median, ``gap_p95`` the 95th percentile,
+    ``unconverged`` the share whose reference missed its accuracy and ``disagree`` the share where minimisations ended in
+    different minima.
     """
     rows, done = [], 0
     for candidate in candidates:
@@ -98,10 +104,11 @@ def measure(
     num_frames: int,
     gaps: GapSettings | None = None,
     tell: Callable[[str], None] = lambda text: None,
+    see: See | None = None,
 ) -> Measured:
-    """One rollout of a candidate; ``tell`` hears what is being done."""
+    """One rollout of a candidate; ``tell`` hears what is being done, ``see`` is shown every frame."""
     measured = Measured()
-    for text in _run(candidate.stepper, scene, potential, num_frames, gaps or GapSettings(), measured):
+    for text in _run(candidate.stepper, scene, potential, num_frames, gaps or GapSettings(), measured, see):
         tell(f"{candidate.name} {scene.garment.name} {scene.motion.name} {text}")
     return measured
 
@@ -124,12 +131,14 @@ def _reach(stepper: Stepper) -> dict[str, int | None]:
 
 
 def _run(
-    stepper: Stepper, scene: Scene, potential: Potential, num_frames: int, gaps: GapSettings, into: Measured
+    stepper: Stepper, scene: Scene, potential: Potential, num_frames: int, gaps: GapSettings, into: Measured, see: See | None
 ) -> Iterator[str]:
     """One rollout, added to ``into``; yields what is being done."""
     count = min(num_frames, scene.num_frames)
     sample = StepSample(range(_WARMUP + 1, count), gaps.states)
     for frame in simulate(stepper, scene, potential, count, observe=sample if gaps.states else None):
+        if see is not None:
+            see(frame)
         yield f"frame {frame.index + 1}/{count}"
         if not np.isfinite(frame.metrics["strain_p99"]):
             into.failures.append(frame.index)
@@ -146,6 +155,8 @@ def _row(measured: Measured) -> dict[str, Any]:
     frames, failures = measured.frames, measured.failures
     row: dict[str, Any] = {"frames": len(frames), "failed_at": min(failures) if failures else None}
     row |= _gap_columns(measured.gaps)
+    if measured.drifts:
+        row["drift"] = max(measured.drifts)
     if not frames:
         return row
     times = np.array([frame["ms_total"] for frame in frames])
@@ -157,12 +168,10 @@ def _row(measured: Measured) -> dict[str, Any]:
     for name in ("stretching", "bending", "inertia", "gravity", "collision", "friction", "total"):
         row[f"L_{name}"] = _mean(frames, f"energy_{name}")
     row["L_guess"] = _mean(frames, "energy_inertial_guess")
-    for column, key in (
-        ("gradient_norm", "gradient_norm"),
-        ("strain_p99", "strain_p99"),
-        ("penetration", "penetration_share"),
-    ):
-        row[column] = _mean(frames, key)
+    row["gradient_norm"] = _mean(frames, "gradient_norm")
+    row["penetration"] = _mean(frames, "penetration_share")
+    row["penetration_worst"] = max(frame.get("penetration_share", 0.0) for frame in frames)
+    row["strain_p99"] = float(np.median([frame["strain_p99"] for frame in frames]))
     row["rg"] = float(np.median([frame["relative_gradient"] for frame in frames]))
     return row
 

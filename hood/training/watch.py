@@ -6,16 +6,13 @@ import io
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from hood.assets.atomic import write_atomically
-from hood.dynamics.recorder import RolloutData
-from hood.dynamics.rollout import Frame
+from hood.dynamics.reel import Reel
 from hood.dynamics.simulator import Simulator
 from hood.evaluation.validation import Validation, summarise
-from hood.scene.scene import Scene
 from hood.training import distributed
 
 #: Pixels of one picture of a strip.
@@ -40,7 +37,7 @@ class Watch:
         Raises:
             OSError: the strip cannot be written.
         """
-        film = _Reel()
+        film = Reel()
         mine = range(distributed.rank(), len(self.validation.garments), distributed.world_size())
         rollouts = {}
         for index in mine:
@@ -52,7 +49,7 @@ class Watch:
         distributed.on_main(lambda: None if strip is None else self._write(strip, iteration))
         return values, strip
 
-    def _draw(self, film: _Reel) -> np.ndarray | None:
+    def _draw(self, film: Reel) -> np.ndarray | None:
         if not film.cloth:
             return None
         try:
@@ -72,30 +69,3 @@ class Watch:
         packed = io.BytesIO()
         Image.fromarray(strip).save(packed, format="PNG")
         write_atomically(self.folder / "validation" / f"strip_{iteration:06d}.png", packed.getvalue())
-
-
-class _Reel:
-    """The frames of one rollout."""
-
-    def __init__(self) -> None:
-        self.cloth: list[np.ndarray] = []
-        self.body: list[np.ndarray] = []
-        self.scene: Scene | None = None
-
-    def see(self, scene: Scene, frame: Frame) -> None:
-        self.scene = scene
-        self.cloth.append(frame.world_pos.numpy())
-        self.body.append(frame.body_pos.numpy())
-
-    def data(self) -> RolloutData:
-        scene: Any = self.scene
-        return RolloutData(
-            cloth_pos=np.stack(self.cloth),
-            cloth_faces=scene.garment.faces,
-            rest_pos=scene.garment.rest_pos,
-            body_pos=np.stack(self.body),
-            body_faces=scene.motion.faces,
-            time=np.arange(len(self.cloth)) * scene.dt,
-            metrics={},
-            attributes={},
-        )

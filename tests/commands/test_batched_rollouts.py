@@ -163,3 +163,20 @@ def test_finished_rollouts_of_an_evaluation_survive(
     assert "num_frames differs" in capsys.readouterr().err
     assert main(EVALUATE) == 0  # without resume=true: all over again
     assert len(done) == 6
+
+
+def test_every_shape_performs_every_motion_and_is_drawn(motions: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    more = ["shapes=[[],[2]]", "drift_frames=3", "contact_sheets=true", "output=shapes"]
+    assert main([*EVALUATE[:-1], *more]) == 0
+    folder = motions.parent / "shapes"
+    rows = json.loads((folder / "table.json").read_text())
+    assert rows[0]["frames"] == 2 * 3
+    assert 0.0 <= rows[0]["drift"] < 0.01
+    sheets = sorted(path.name for path in (folder / "sheets").iterdir())
+    assert len(sheets) == 6
+    assert sheets[0].startswith("0_newton_tank_")
+    lines = [json.loads(line) for path in folder.glob("rollouts.*.jsonl") for line in path.read_text().split("\n") if line]
+    depths = {line["unit"][3]: line["measured"]["frames"][0]["energy_gravity"] for line in lines if line["measured"]["frames"]}
+    assert depths[0] != depths[1]  # another body
+    assert main([*EVALUATE[:-1], "shapes=[[0,x]]", "output=shapes2"]) == 2
+    assert "shapes=[0, 'x']" in capsys.readouterr().err

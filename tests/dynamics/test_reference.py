@@ -175,21 +175,36 @@ def own_rollout(bench: Bench, simulator: Simulator, dtype: torch.dtype, num_step
         state = State(prediction.next_pos, simulator.next_velocity(problem, prediction), state.origin)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_a_rollout_from_the_relaxing_step_agrees(layout: str, dtype: torch.dtype) -> None:
-    bench, weights = make_bench(13), make_state(layout, seed=3)
+def rollout_errors(layout: str, dtype: torch.dtype, latent: int, seed: int) -> list[tuple[float, float]]:
+    """Errors of accelerations and positions [m] in every step of a rollout; bench and weights are drawn by ``seed``."""
+    bench, weights = make_bench(13 + seed), make_state(layout, latent, seed)
     simulator = import_reference_weights(weights)[0].to(dtype)
-    reference = Oracle(layout, weights).rollout(
-        bench.oracle_scene(), bench.targets[0], bench.body, bench.targets, bench.isolated
-    )
+    scene, rows = bench.oracle_scene(), bench.compared
+    reference = Oracle(layout, weights).rollout(scene, bench.targets[0], bench.body, bench.targets, bench.isolated)
     with torch.no_grad():
         steps = list(zip(own_rollout(bench, simulator, dtype), reference, strict=True))
     assert len(steps) == 5
-    rows = bench.compared
-    for (mine, pos), (expected, following) in steps:
-        assert error(mine[rows], expected[rows]) <= LIMIT[dtype]
-        assert float((pos.double() - following).abs().max()) <= (1e-11 if dtype == torch.float64 else 1e-6)
+    return [
+        (error(mine[rows], expected[rows]), float((pos.double() - following).abs().max()))
+        for (mine, pos), (expected, following) in steps
+    ]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("latent, seed", [(16, 0), (16, 1), (16, 2), (128, 0)])
+def test_a_rollout_from_the_relaxing_step_agrees(layout: str, latent: int, seed: int) -> None:
+    for acceleration, position in rollout_errors(layout, torch.float64, latent, seed):
+        assert acceleration <= LIMIT[torch.float64]
+        assert position <= 1e-11
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 16))])
+def test_a_rollout_in_float32_at_the_published_width(layout: str, seed: int) -> None:
+    """Narrow random networks amplify rounding, the naive form in float32 as much; 128 features average it out."""
+    for acceleration, position in rollout_errors(layout, torch.float32, 128, seed):
+        assert acceleration <= LIMIT[torch.float32]
+        assert position <= 1e-6
 
 
 @pytest.mark.parametrize(

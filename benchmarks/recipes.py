@@ -1,0 +1,185 @@
+"""Training recipes compared: accuracy of own rollouts against the time the training took.
+
+    python benchmarks/recipes.py baseline --seeds 0 1 2     # the paper's settings beside trainer=fast, in a fifth of their time
+    python benchmarks/recipes.py choices                    # trainer=fast with one of its choices taken back at a time
+    python benchmarks/recipes.py ablations                  # Fine15, Fine48 and Ours with equal updates and with equal time
+    python benchmarks/recipes.py levels                     # the small model with one, two and three levels
+
+Every run is ``hood train`` in a process of its own with one thread, ``--jobs`` of them side by side; its time is the CPU time
+of that process, so that a busy machine changes nothing. Every finished run is evaluated by ``hood evaluate`` on motions it
+was not trained on: γ of the states its own rollouts reach (median and 95th percentile), strain and rg. The command goes on
+where it was stopped; runs that are done are not done again. The table is printed and written as ``SUITE.csv`` in ``--output``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import os
+import statistics
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+SMALL = ("model=small",)
+#: The parametrisation that trainer=fast is made for, for models that come with the paper's.
+PHYSICAL = (
+    "model.features=physical",
+    "model.output=velocity_base",
+    "+model.output_scale=5e-3",
+    "+model.output_init=0.1",
+    LATENT,
+)
+LATENT = "model.latent_dim=48"
+PAPER_SCALE = 0.02  # of the paper's 150,000 iterations
+EQUAL_UPDATES = 800
+
+EVALUATION = ("garments=[tshirt,trousers,dress,skirt]", "sequences=[walk_proud,dance_mixed]", "num_frames=60", "gap_states=4")
+COLUMNS = ("recipe", "seed", "updates", "cpu_s", "gap", "gap_p95", "strain_p99", "rg", "penetration", "ms", "failed_at")
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Settings of ``hood train`` under a name."""
+
+    name: str
+    overrides: tuple[str, ...]
+
+
+def fast(name: str, updates: int, *overrides: str) -> Recipe:
+    """``trainer=fast`` shortened to ``updates``; the horizon gets as long as in a full run, in the same share of it."""
+    every = max(round(25 * updates / 2400), 1)
+    return Recipe(name, ("trainer=fast", f"trainer.iterations={updates}", f"trainer.horizon.every={every}", *overrides))
+
+
+def paper(name: str, *overrides: str) -> Recipe:
+    """``trainer=paper`` with its whole schedule shortened alike."""
+    return Recipe(name, (*overrides, "trainer=paper", f"trainer.time_scale={PAPER_SCALE}"))
+
+
+PAPER_PARAMETERS = ("model.features=paper", "model.output=acceleration", "~model.output_scale", "~model.output_init")
+UNAUGMENTED = ("data.sampling.piecewise_fraction=0.0", "data.sampling.random_yaw=false", "data.sampling.mirror=false")
+SHORT = 150  # updates of trainer=fast, about a sixth of the time of the paper's at PAPER_SCALE on the same model
+
+SUITES: dict[str, list[Recipe]] = {
+    "baseline": [
+        paper("paper throughout", *SMALL, *PAPER_PARAMETERS, *UNAUGMENTED),
+        paper("paper trainer", *SMALL),
+        fast("fast, half as short", SHORT // 2, *SMALL),
+        fast("fast, short", SHORT, *SMALL),
+        fast("fast", 6 * SHORT, *SMALL),
+        fast("fast, passes, short", SHORT // 2, "model=passes"),
+    ],
+    "choices": [
+        fast("fast", SHORT, *SMALL),
+        fast("adam 1e-3", SHORT, *SMALL, "trainer.optimizer=adam", "trainer.learning_rate=1e-3"),
+        fast("unscaled signal", SHORT, *SMALL, "trainer.signal=potential"),
+        fast("horizon 5", SHORT, *SMALL, "trainer.horizon.maximum=5"),
+        fast("no averaged weights", SHORT, *SMALL, "trainer.ema_decay=0.0"),
+        fast("paper's features and output", SHORT, *SMALL, *PAPER_PARAMETERS),
+        fast("batch of one", 4 * SHORT, *SMALL, "trainer.batch_size=1"),
+    ],
+    "ablations": [
+        fast("fine15", EQUAL_UPDATES, "model=fine15", *PHYSICAL, LATENT),
+        fast("ours", EQUAL_UPDATES, "model=ours", *PHYSICAL, LATENT),
+        fast("fine48", EQUAL_UPDATES, "model=fine48", *PHYSICAL, LATENT),
+        fast("fine48, equal time", round(EQUAL_UPDATES / 3), "model=fine48", *PHYSICAL, LATENT),
+    ],
+    "levels": [
+        fast("small1", EQUAL_UPDATES, *SMALL, "model.schedule='8x(mesh)'"),
+        fast("small2", EQUAL_UPDATES, *SMALL, "model.schedule='2x(mesh+coarse0) 4x(coarse0+coarse1) 2x(mesh+coarse0)'"),
+        fast("small3", EQUAL_UPDATES, *SMALL),
+    ],
+}
+
+
+def folder_of(output: Path, recipe: Recipe, seed: int) -> Path:
+    return output / recipe.name.replace(", ", "-").replace(" ", "_").replace("'", "") / f"seed{seed}"
+
+
+def hood(arguments: list[str], log: Path) -> tuple[int, float]:
+    """Exit code and CPU seconds of one ``hood`` command with one thread; what it prints goes to ``log``."""
+    with open(log, "ab") as sink:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "hood.cli", *arguments], stdout=sink, stderr=sink, env=os.environ | {"OMP_NUM_THREADS": "1"}
+        )
+        _, status, usage = os.wait4(process.pid, 0)
+    return os.waitstatus_to_exitcode(status), usage.ru_utime + usage.ru_stime
+
+
+def run(recipe: Recipe, seed: int, output: Path) -> dict[str, object]:
+    """Train and evaluate, as far as that is not done; the row of the table."""
+    folder = folder_of(output, recipe, seed)
+    folder.mkdir(parents=True, exist_ok=True)
+    spent_path, log = folder / "cpu_seconds.json", folder / "log.txt"
+    spent = json.loads(spent_path.read_text()) if spent_path.exists() else {"train": 0.0, "done": False}
+    if not spent["done"]:
+        resume = f"resume={str((folder / 'run' / 'checkpoint.pt').exists()).lower()}"
+        arguments = ["train", *recipe.overrides, f"seed={seed}", "trainer.workers=0", f"output={folder}/run", resume]
+        code, seconds = hood(arguments, log)
+        spent["train"] += seconds
+        spent["done"] = code == 0
+        spent_path.write_text(json.dumps(spent))
+        if code:
+            raise SystemExit(f"{recipe.name}, seed {seed}: hood train exited with {code}, see {log}")
+    table = folder / "evaluation" / "table.json"
+    if not table.exists():
+        code, _ = hood(["evaluate", f"models=[{folder}/run/model.safetensors]", *EVALUATION, f"output={table.parent}"], log)
+        if code:
+            raise SystemExit(f"{recipe.name}, seed {seed}: hood evaluate exited with {code}, see {log}")
+    row = next(row for row in json.loads(table.read_text()) if row["garment"] == "all")
+    last = json.loads((folder / "run" / "metrics.jsonl").read_text().splitlines()[-1])
+    return {"recipe": recipe.name, "seed": seed, "updates": last["iteration"], "cpu_s": spent["train"], **row}
+
+
+def cell(value: object) -> str:
+    return "-" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+def report(rows: list[dict[str, object]], path: Path) -> None:
+    """Every run, then the median over seeds of every recipe; the CSV holds the runs."""
+    with open(path.with_suffix(".partial"), "w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows(rows)
+    os.replace(path.with_suffix(".partial"), path)
+    print("  ".join(title.rjust(28 if title == "recipe" else 10) for title in COLUMNS))
+    for row in rows:
+        print("  ".join(cell(row.get(title)).rjust(28 if title == "recipe" else 10) for title in COLUMNS))
+    print("\nmedian over seeds (lowest to highest)")
+    for name in dict.fromkeys(str(row["recipe"]) for row in rows):
+        mine = [row for row in rows if row["recipe"] == name]
+        gaps = [float(row["gap"]) if row.get("gap") is not None else float("inf") for row in mine]  # type: ignore[arg-type]
+        seconds = statistics.median(float(row["cpu_s"]) for row in mine)  # type: ignore[arg-type]
+        spread = f"({min(gaps):.3g} to {max(gaps):.3g}, {len(gaps)} seeds)"
+        print(f"{name:>28}  {seconds:8.0f} s  γ {statistics.median(gaps):.3g} {spread}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("suite", choices=SUITES)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="runs side by side, one thread each")
+    parser.add_argument("--only", nargs="+", default=None, help="names of recipes; all by default")
+    parser.add_argument("--output", type=Path, default=Path("runs/recipes"))
+    arguments = parser.parse_args()
+    recipes = [recipe for recipe in SUITES[arguments.suite] if arguments.only is None or recipe.name in arguments.only]
+    todo = [(recipe, seed) for seed in arguments.seeds for recipe in recipes]
+    begin = time.monotonic()
+
+    def one(pair: tuple[Recipe, int]) -> dict[str, object]:
+        row = run(*pair, arguments.output)
+        print(f"{time.monotonic() - begin:6.0f} s  {pair[0].name}, seed {pair[1]}: γ {cell(row.get('gap'))}", file=sys.stderr)
+        return row
+
+    with ThreadPoolExecutor(arguments.jobs) as pool:
+        rows = list(pool.map(one, todo))
+    report(rows, arguments.output / f"{arguments.suite}.csv")
+
+
+if __name__ == "__main__":
+    main()
