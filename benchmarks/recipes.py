@@ -32,7 +32,6 @@ PHYSICAL = (
     "model.output=velocity_base",
     "+model.output_scale=5e-3",
     "+model.output_init=0.1",
-    LATENT,
 )
 LATENT = "model.latent_dim=48"
 PAPER_SCALE = 0.02  # of the paper's 150,000 iterations

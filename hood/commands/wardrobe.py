@@ -67,8 +67,8 @@ def checked_pins(pins: Any) -> str | int | Sequence[str | int]:
     raise ConfigError(f"pins={pins}: give vertex numbers, regions or lists, such as pins=[waistband,12,13] or pins=held.txt")
 
 
-def shape_coefficients(given: Any) -> np.ndarray:
-    """Ten shape coefficients from a config value of at most ten finite numbers.
+def shape_coefficients(given: Any, key: str = "betas") -> np.ndarray:
+    """Ten shape coefficients from a config value of at most ten finite numbers; ``key`` is where it stands.
 
     Raises:
         ConfigError: something else.
@@ -76,5 +76,5 @@ def shape_coefficients(given: Any) -> np.ndarray:
     values = plain(given)
     numbers = isinstance(values, list) and all(isinstance(b, (int, float)) and np.isfinite(b) for b in values)
     if not numbers or len(values) > 10:
-        raise ConfigError(f"betas={values}: give at most 10 finite shape coefficients, e.g. betas=[1.5,0,-1]")
+        raise ConfigError(f"{key}={values}: give at most 10 finite shape coefficients, e.g. [1.5,0,-1]")
     return np.array([*values, *[0.0] * (10 - len(values))], dtype=np.float64)
