@@ -26,14 +26,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 SMALL = ("model=small",)
-#: The parametrisation that trainer=fast is made for, for models that come with the paper's.
-PHYSICAL = (
-    "model.features=physical",
-    "model.output=velocity_base",
-    "+model.output_scale=5e-3",
-    "+model.output_init=0.1",
+#: The small model's size in the paper's parametrisation.
+SMALL_PAPER = (
+    "model=ours",
+    "model.latent_dim=48",
+    "model.schedule='2x(mesh+coarse0) 1x(coarse0+coarse1) 2x(coarse1+coarse2) 1x(coarse0+coarse1) 2x(mesh+coarse0)'",
 )
-LATENT = "model.latent_dim=48"
 PAPER_SCALE = 0.02  # of the paper's 150,000 iterations
 EQUAL_UPDATES = 800
 
@@ -60,13 +58,12 @@ def paper(name: str, *overrides: str) -> Recipe:
     return Recipe(name, (*overrides, "trainer=paper", f"trainer.time_scale={PAPER_SCALE}"))
 
 
-PAPER_PARAMETERS = ("model.features=paper", "model.output=acceleration", "~model.output_scale", "~model.output_init")
 UNAUGMENTED = ("data.sampling.piecewise_fraction=0.0", "data.sampling.random_yaw=false", "data.sampling.mirror=false")
 SHORT = 150  # updates of trainer=fast, about a sixth of the time of the paper's at PAPER_SCALE on the same model
 
 SUITES: dict[str, list[Recipe]] = {
     "baseline": [
-        paper("paper throughout", *SMALL, *PAPER_PARAMETERS, *UNAUGMENTED),
+        paper("paper throughout", *SMALL_PAPER, *UNAUGMENTED),
         paper("paper trainer", *SMALL),
         fast("fast, half as short", SHORT // 2, *SMALL),
         fast("fast, short", SHORT, *SMALL),
@@ -79,14 +76,14 @@ SUITES: dict[str, list[Recipe]] = {
         fast("unscaled signal", SHORT, *SMALL, "trainer.signal=potential"),
         fast("horizon 5", SHORT, *SMALL, "trainer.horizon.maximum=5"),
         fast("no averaged weights", SHORT, *SMALL, "trainer.ema_decay=0.0"),
-        fast("paper's features and output", SHORT, *SMALL, *PAPER_PARAMETERS),
+        fast("paper's features and output", SHORT, *SMALL_PAPER),
         fast("batch of one", 4 * SHORT, *SMALL, "trainer.batch_size=1"),
     ],
     "ablations": [
-        fast("fine15", EQUAL_UPDATES, "model=fine15", *PHYSICAL, LATENT),
-        fast("ours", EQUAL_UPDATES, "model=ours", *PHYSICAL, LATENT),
-        fast("fine48", EQUAL_UPDATES, "model=fine48", *PHYSICAL, LATENT),
-        fast("fine48, equal time", round(EQUAL_UPDATES / 3), "model=fine48", *PHYSICAL, LATENT),
+        fast("fine15", EQUAL_UPDATES, *SMALL, "model.schedule=fine15"),
+        fast("ours", EQUAL_UPDATES, *SMALL, "model.schedule=ours"),
+        fast("fine48", EQUAL_UPDATES, *SMALL, "model.schedule=fine48"),
+        fast("fine48, equal time", round(EQUAL_UPDATES / 3), *SMALL, "model.schedule=fine48"),
     ],
     "levels": [
         fast("small1", EQUAL_UPDATES, *SMALL, "model.schedule='8x(mesh)'"),
