@@ -12,7 +12,7 @@ from hood.config import ConfigError, build, groups, load_config, options, plain,
 from hood.dynamics.simulator import Simulator
 from hood.losses.potential import Potential, default_potential
 from hood.training.curriculum import WarmupCosine
-from hood.training.trainer import TrainerSettings
+from hood.training.settings import TrainerSettings
 
 
 def test_defaults_of_every_command_load() -> None:

@@ -25,7 +25,8 @@ from hood.losses.potential import Potential
 from hood.scene.dataset import SceneSampler
 from hood.training import distributed
 from hood.training.checkpoint import previous
-from hood.training.trainer import Trainer, TrainerSettings
+from hood.training.settings import TrainerSettings
+from hood.training.trainer import Trainer
 from hood.training.watch import Watch
 
 #: Keys that a resumed run may change: they do not change what is learned.

@@ -8,10 +8,12 @@ from __future__ import annotations
 import io
 import os
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from hood.assets.atomic import write_atomically
 
@@ -85,3 +87,16 @@ def load_last_good(path: Path) -> tuple[dict[str, Any], str | None]:
         except ValueError as second:
             raise ValueError(f"{reason}; and {second}") from error
         return state, f"{reason}; going on from {older.name}, iteration {state['iteration']}"
+
+
+def generator_states(device: torch.device) -> dict[str, Tensor]:
+    """States of torch's random generators, for a checkpoint."""
+    states = {"cpu": torch.get_rng_state()}
+    return states | ({"cuda": torch.cuda.get_rng_state(device)} if device.type == "cuda" else {})
+
+
+def set_generator_states(states: Mapping[str, Tensor], device: torch.device) -> None:
+    """The inverse of :func:`generator_states`."""
+    torch.set_rng_state(states["cpu"])
+    if "cuda" in states and device.type == "cuda":
+        torch.cuda.set_rng_state(states["cuda"], device)

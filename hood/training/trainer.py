@@ -5,10 +5,8 @@ from __future__ import annotations
 import json
 import math
 import sys
-import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -21,95 +19,23 @@ from hood.dynamics.simulator import Simulator, save_simulator
 from hood.features.normalizer import RunningNormalizer
 from hood.losses.potential import Potential, relative_gradient, scale
 from hood.losses.problem import StepProblem
-from hood.nn.model import PRECISIONS
 from hood.scene.dataset import SceneSampler
 from hood.training import distributed
-from hood.training.checkpoint import load_last_good, previous, save_checkpoint, set_aside
-from hood.training.curriculum import CollisionRamp, Horizon, StepDecay, WarmupCosine, scaled_count
+from hood.training.checkpoint import (
+    generator_states,
+    load_last_good,
+    previous,
+    save_checkpoint,
+    set_aside,
+    set_generator_states,
+)
+from hood.training.clock import Clock
 from hood.training.loss import relative_loss
 from hood.training.metrics_log import MetricsLog
-from hood.training.optimiser import OPTIMIZERS, make_optimizer
+from hood.training.optimiser import make_optimizer
+from hood.training.settings import TrainerSettings
 from hood.training.slots import Slots
 from hood.training.watch import Watch
-
-
-@dataclass(frozen=True)
-class TrainerSettings:
-    """How a model is trained; defaults are the paper's where it speaks and the reference's where it is silent.
-
-    ``signal``: ``"potential"`` is the plain mean potential; ``"scaled"`` divides each scene's gradient by its e0 and by
-    1 + rg / 3, so that one broken scene does not drown the others.
-    ``max_skipped``: updates without a finite loss and gradient in a row after which training goes back to the last good
-    checkpoint, on other scenes; ``max_rollbacks``: how often it does so without getting any further.
-    ``precision``: of the network's latents and products; ``"bf16"`` keeps weights, their gradients and energies in float32.
-    ``time_scale``: factor on the whole schedule, see :meth:`compressed`. ``max_vertices``: batches of garments of similar size,
-    :mod:`hood.training.buckets`. ``workers``: processes that make scenes ahead, None for one per idle core.
-    ``activation_checkpointing``: keep the latents between processor steps only and compute the rest again when it is needed.
-    """
-
-    iterations: int = 150_000
-    batch_size: int = 1
-    learning_rate: float = 5e-5
-    schedule: StepDecay | WarmupCosine = field(default_factory=StepDecay)
-    horizon: Horizon = field(default_factory=Horizon)
-    collision: CollisionRamp = field(default_factory=lambda: CollisionRamp(5e3, 5e5, 50_000, 150_000))
-    clip_norm: float = 1.0
-    signal: str = "potential"
-    optimizer: str = "adam"
-    ema_decay: float = 0.0
-    precision: str = "fp32"
-    statistics_iterations: int = 100
-    checkpoint_every: int = 500
-    log_every: int = 20
-    validate_every: int = 0
-    max_skipped: int = 20
-    max_rollbacks: int = 3
-    time_scale: float = 1.0
-    max_vertices: int | None = None
-    workers: int | None = 0
-    activation_checkpointing: bool = False
-
-    def __post_init__(self) -> None:
-        if self.precision not in PRECISIONS:
-            raise ValueError(f"trainer.precision {self.precision!r}: give {' or '.join(map(repr, PRECISIONS))}")
-        if self.optimizer not in OPTIMIZERS:
-            raise ValueError(f"trainer.optimizer {self.optimizer!r}: give {' or '.join(map(repr, OPTIMIZERS))}")
-        if self.signal not in ("potential", "scaled"):
-            raise ValueError(f"trainer.signal {self.signal!r}: give 'potential' or 'scaled'")
-        for name in ("iterations", "batch_size", "checkpoint_every", "log_every", "max_skipped"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"trainer.{name} is {getattr(self, name)}; it must be at least 1")
-        for name in ("validate_every", "max_rollbacks"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"trainer.{name} is {getattr(self, name)}; it must be at least 0")
-        if self.learning_rate <= 0 or self.clip_norm <= 0:
-            raise ValueError("trainer.learning_rate and trainer.clip_norm must be > 0")
-        if self.time_scale != 1.0:
-            self.compressed()  # refused here rather than after the data has been read
-
-    def compressed(self) -> TrainerSettings:
-        """The same with ``time_scale`` 1 and everything that is counted from the start of the schedule multiplied by it:
-        iterations, curriculum, learning-rate decay or warm-up, collision ramp.
-
-        What serves the statistics is a number of samples and stays: ``statistics_iterations`` and the decay of the normalisers.
-        """
-        if self.time_scale == 1.0:
-            return self
-        iterations = scaled_count("trainer.iterations", self.iterations, self.time_scale)
-        if iterations <= self.statistics_iterations:
-            raise ValueError(
-                f"trainer.time_scale={self.time_scale:g} leaves {iterations} iterations, of which the first "
-                f"{self.statistics_iterations} only collect statistics; raise it"
-            )
-        return replace(
-            self,
-            time_scale=1.0,
-            iterations=iterations,
-            schedule=self.schedule.scaled(self.time_scale),
-            horizon=self.horizon.scaled(self.time_scale),
-            collision=self.collision.scaled(self.time_scale),
-        )
-
 
 #: Told the iteration and what was measured; None instead of a report: time passed that was not training.
 Progress = Callable[[int, dict[str, float] | None], None]
@@ -180,7 +106,7 @@ class Trainer:
             distributed.on_main(lambda: self._open_log(stack))
             if self.iteration == 0 and self._saved_at != 0:
                 self.save()  # something to go back to, and a full disk shows at once
-            clock = _Clock(self.iteration)
+            clock = Clock(self.iteration)
             while self.iteration < settings.iterations and not distributed.any_rank(should_stop()):
                 report = self.update()
                 last = self.iteration == settings.iterations
@@ -188,7 +114,7 @@ class Trainer:
                 saving = last or (self.iteration % settings.checkpoint_every == 0 and not self._skipped_in_row)
                 if self._is_lost(saving):
                     self._roll_back()
-                    clock = _Clock(self.iteration)
+                    clock = Clock(self.iteration)
                     continue
                 if last or self.iteration % settings.log_every == 0:
                     self._log({**report, "iterations_per_second": clock.rate(self.iteration)})
@@ -258,7 +184,7 @@ class Trainer:
         if self.iteration > self._failed_at:
             self._rollbacks_in_row = 0
         slots = {index: entry for part in distributed.gather(self.slots.state_dict()) for index, entry in part.items()}
-        generators = distributed.gather(_generator_states(self._device))
+        generators = distributed.gather(generator_states(self._device))
         state: dict[str, Any] = {
             "iteration": self.iteration,
             "seed": self.seed,
@@ -306,7 +232,7 @@ class Trainer:
         self.skipped, self._skipped_in_row = int(state["skipped"]), int(state["skipped_in_row"])
         self.rollbacks, self._rollbacks_in_row, self._failed_at = state["rollbacks"]
         if len(state["rng"]) == distributed.world_size():
-            _set_generator_states(state["rng"][distributed.rank()], self._device)
+            set_generator_states(state["rng"][distributed.rank()], self._device)
 
     @property
     def _device(self) -> torch.device:
@@ -419,30 +345,3 @@ class Trainer:
         decay = min(decay, (1 + self.iteration) / (10 + self.iteration))
         with torch.no_grad():
             torch._foreach_lerp_(list(self._average.values()), list(self.simulator.parameters()), 1 - decay)
-
-
-class _Clock:
-    """Iterations per second of training alone."""
-
-    def __init__(self, iteration: int) -> None:
-        self._first, self._begun, self._away = iteration, time.monotonic(), 0.0
-
-    def rate(self, iteration: int) -> float:
-        return (iteration - self._first) / max(time.monotonic() - self._begun - self._away, 1e-9)
-
-    @contextmanager
-    def paused(self) -> Iterator[None]:
-        left = time.monotonic()
-        yield
-        self._away += time.monotonic() - left
-
-
-def _generator_states(device: torch.device) -> dict[str, Tensor]:
-    states = {"cpu": torch.get_rng_state()}
-    return states | ({"cuda": torch.cuda.get_rng_state(device)} if device.type == "cuda" else {})
-
-
-def _set_generator_states(states: Mapping[str, Tensor], device: torch.device) -> None:
-    torch.set_rng_state(states["cpu"])
-    if "cuda" in states and device.type == "cuda":
-        torch.cuda.set_rng_state(states["cuda"], device)

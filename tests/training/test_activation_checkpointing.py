@@ -16,7 +16,8 @@ from hood.assets.sequence import PoseSequence
 from hood.dynamics.simulator import build_simulator
 from hood.losses.potential import default_potential
 from hood.scene.dataset import SceneSampler
-from hood.training.trainer import Trainer, TrainerSettings
+from hood.training.settings import TrainerSettings
+from hood.training.trainer import Trainer
 
 
 @pytest.fixture(scope="module")

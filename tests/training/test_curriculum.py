@@ -9,7 +9,7 @@ import pytest
 from hood.config import build, load_config
 from hood.losses.potential import default_potential
 from hood.training.curriculum import CollisionRamp, Horizon, StepDecay, WarmupCosine
-from hood.training.trainer import TrainerSettings
+from hood.training.settings import TrainerSettings
 
 
 def test_horizon_grows_step_by_step_to_its_maximum() -> None:

@@ -25,7 +25,8 @@ from hood.losses.potential import default_potential
 from hood.scene.dataset import SceneSampler
 from hood.training import distributed
 from hood.training.curriculum import CollisionRamp, Horizon, WarmupCosine
-from hood.training.trainer import Trainer, TrainerSettings
+from hood.training.settings import TrainerSettings
+from hood.training.trainer import Trainer
 
 pytestmark = pytest.mark.slow
 

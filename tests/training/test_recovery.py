@@ -18,7 +18,8 @@ from hood.losses.problem import StepProblem
 from hood.scene.dataset import SceneSampler
 from hood.training.checkpoint import load_checkpoint, previous
 from hood.training.curriculum import CollisionRamp, Horizon, WarmupCosine
-from hood.training.trainer import Trainer, TrainerSettings
+from hood.training.settings import TrainerSettings
+from hood.training.trainer import Trainer
 
 SETTINGS = TrainerSettings(
     iterations=10, batch_size=1, learning_rate=1e-3, schedule=WarmupCosine(3), horizon=Horizon(every=100, maximum=2, start=2),

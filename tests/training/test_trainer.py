@@ -19,7 +19,8 @@ from hood.dynamics.simulator import Simulator, build_simulator, load_simulator
 from hood.losses.potential import Potential, default_potential
 from hood.scene.dataset import SceneSampler, Window
 from hood.training.curriculum import CollisionRamp, Horizon, WarmupCosine
-from hood.training.trainer import Trainer, TrainerSettings
+from hood.training.settings import TrainerSettings
+from hood.training.trainer import Trainer
 
 PHYSICAL = {"features": "physical", "output": "velocity_base", "output_init": 0.1}
 PAPER = {"features": "paper", "output": "acceleration"}

@@ -19,7 +19,8 @@ from hood.losses.potential import default_potential
 from hood.scene.dataset import SceneSampler
 from hood.scene.scene import Scene
 from hood.training.curriculum import CollisionRamp, Horizon, WarmupCosine
-from hood.training.trainer import Trainer, TrainerSettings
+from hood.training.settings import TrainerSettings
+from hood.training.trainer import Trainer
 from hood.training.watch import Watch
 
 SETTINGS = TrainerSettings(
@@ -86,7 +87,7 @@ def test_models_that_break_are_never_best(tmp_path: Path, sampler: SceneSampler)
 def test_validation_does_not_count_as_training(tmp_path: Path, sampler: SceneSampler, monkeypatch: pytest.MonkeyPatch) -> None:
     """An update takes one second here, a validation a hundred."""
     now = [0.0]
-    monkeypatch.setattr("hood.training.trainer.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("hood.training.clock.time.monotonic", lambda: now[0])
 
     def watch(simulator: Simulator, iteration: int) -> tuple[dict[str, float], None]:
         now[0] += 100.0
