@@ -33,7 +33,7 @@ SMALL_PAPER = (
     "model.schedule='2x(mesh+coarse0) 1x(coarse0+coarse1) 2x(coarse1+coarse2) 1x(coarse0+coarse1) 2x(mesh+coarse0)'",
 )
 PAPER_SCALE = 0.02  # of the paper's 150,000 iterations
-EQUAL_UPDATES = 800
+EQUAL_UPDATES = 400
 
 EVALUATION = ("garments=[tshirt,trousers,dress,skirt]", "sequences=[walk_proud,dance_mixed]", "num_frames=60", "gap_states=4")
 COLUMNS = ("recipe", "seed", "updates", "cpu_s", "gap", "gap_p95", "strain_p99", "rg", "penetration", "ms", "failed_at")
