@@ -21,3 +21,10 @@ def test_radius_of_the_papers_models(schedule: str, expected: int) -> None:
 def test_radius_of_a_small_schedule_with_physical_features() -> None:
     simulator = build_simulator("physical", "velocity_base", "2x(mesh+coarse0) 1x(coarse0)", latent_dim=16)
     assert measured_radius(simulator) == 6
+
+
+def test_radius_of_several_passes_is_that_of_all_their_steps() -> None:
+    schedule = "2x(mesh) | 1x(mesh) 1x(mesh+coarse0) | 1x(mesh)"
+    simulator = build_simulator("local", "local_steps", schedule, latent_dim=8)
+    plain = build_simulator("physical", "velocity_base", schedule.replace("|", ""), latent_dim=8)
+    assert measured_radius(simulator) == measured_radius(plain) == 6
