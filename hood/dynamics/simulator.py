@@ -213,6 +213,7 @@ class Simulator(nn.Module):
             copy = build_simulator(**self.config)
         copy.load_state_dict(self.state_dict())
         copy.network.use_precision(self.network.precision)
+        copy.network.use_kernels(self.network.kernels)
         return copy.to(self.gravity.device)
 
     def _residual_acceleration(self, problem: StepProblem, base: Tensor) -> Tensor:
@@ -326,13 +327,30 @@ def num_coarse_levels(schedule: Sequence[tuple[str, ...]]) -> int:
 
 
 def save_simulator(path: Path, simulator: Simulator, metadata: Mapping[str, str] | None = None, half: bool = False) -> None:
-    """Write weights and model config as safetensors, atomically; ``half`` stores weights in float16."""
-    tensors = {
-        name: (value.half() if half and value.is_floating_point() and value.dtype == torch.float32 else value).contiguous()
-        for name, value in simulator.state_dict().items()
-    }
+    """Write weights and model config as safetensors, atomically.
+
+    ``half`` stores what was learned in float16; statistics stay in float32, their counts are beyond its range.
+
+    Raises:
+        ValueError: a weight is beyond the range of float16.
+    """
+    learned = {name for name, _ in simulator.named_parameters()} if half else set()
+    tensors = {name: value.half() if name in learned else value for name, value in simulator.state_dict().items()}
+    for name in learned:
+        if not bool(torch.isfinite(tensors[name]).all()):
+            raise ValueError(f"{name}: a weight beyond the range of float16; keep this model in float32")
+    tensors = {name: value.contiguous() for name, value in tensors.items()}
     header = {"format": _FORMAT, "model": json.dumps(simulator.config), **(metadata or {})}
     write_atomically(path, save(tensors, header))
+
+
+def read_header(path: Path) -> dict[str, str]:
+    """What a model file says about itself beside its weights: ``model``, and where it comes from.
+
+    Raises:
+        ValueError: not a file written by :func:`save_simulator`.
+    """
+    return _read_file(path)[1]
 
 
 def load_simulator(path: Path) -> Simulator:
@@ -341,14 +359,7 @@ def load_simulator(path: Path) -> Simulator:
     Raises:
         ValueError: not such a file, or weights that do not fit the model it names.
     """
-    try:
-        with safe_open(path, framework="pt") as file:
-            header = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}
-    except SafetensorError as error:
-        raise ValueError(f"{path}: not a model file ({error}); give the model.safetensors of a run") from error
-    if header.get("format") != _FORMAT:
-        raise ValueError(f"{path}: not a hood model (format {header.get('format')!r}); give the model.safetensors of a run")
+    tensors, header = _read_file(path)
     try:
         simulator = build_simulator(**json.loads(header["model"]))
     except (KeyError, TypeError, ValueError) as error:
@@ -363,6 +374,18 @@ def load_simulator(path: Path) -> Simulator:
         raise ValueError(f"{path}: weights do not fit the model in the file, first at {sorted(wrong)[0]!r}; it is damaged")
     simulator.load_state_dict({name: value.to(expected[name].dtype) for name, value in tensors.items()})
     return simulator.eval()
+
+
+def _read_file(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}
+    except SafetensorError as error:
+        raise ValueError(f"{path}: not a model file ({error}); give the model.safetensors of a run") from error
+    if header.get("format") != _FORMAT:
+        raise ValueError(f"{path}: not a hood model (format {header.get('format')!r}); give the model.safetensors of a run")
+    return tensors, header
 
 
 _HIERARCHIES: dict[tuple[int, int], tuple[Any, Tensor, Hierarchy]] = {}

@@ -13,6 +13,7 @@ from safetensors import safe_open
 
 from hood.cli import main
 from hood.dynamics.recorder import read_rollout
+from hood.dynamics.simulator import load_simulator, read_header
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "dynamics"))
 from reference_oracle import make_state
@@ -50,11 +51,33 @@ def test_the_output_defaults_to_the_checkpoints_name(weights: Path) -> None:
     assert sorted(path.name for path in weights.parent.iterdir()) == ["postcvpr.pth", "postcvpr.safetensors"]
 
 
+def test_half_the_size(weights: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """From published weights and from a model file; what the file says about itself stays."""
+    assert main(["convert", "checkpoint=postcvpr.pth"]) == 0
+    assert main(["convert", "checkpoint=postcvpr.pth", "half=true", "output=a.safetensors"]) == 0
+    assert main(["convert", "checkpoint=postcvpr.safetensors", "half=true", "output=b.safetensors"]) == 0
+    changes = [float(line.rsplit(" ", 1)[1]) for line in capsys.readouterr().out.splitlines() if "float16" in line]
+    assert changes[0] == changes[1]
+    assert 1e-5 < changes[0] < 2**-11
+    files = [weights.parent / name for name in ("postcvpr.safetensors", "a.safetensors", "b.safetensors")]
+    plain, first, second = ([*load_simulator(path).state_dict().items()] for path in files)
+    headers = [read_header(path) for path in files]
+    assert headers[0] == headers[1] == headers[2]
+    for (name, value), (_, half), (_, copy) in zip(plain, first, second, strict=True):
+        assert torch.equal(half, copy), name
+        if "normalizer" in name:
+            assert torch.equal(half, value), name  # counts are beyond float16
+        else:
+            torch.testing.assert_close(half, value, rtol=2**-11, atol=1e-7)
+    assert files[1].stat().st_size == files[2].stat().st_size < files[0].stat().st_size
+
+
 @pytest.mark.parametrize(
     "arguments, words",
     [
         (["convert"], ("checkpoint is not given",)),
-        (["convert", "checkpoint=quickstart"], ("is a model file already",)),
+        (["convert", "checkpoint=quickstart"], ("is a model file already", "half=true")),
+        (["convert", "checkpoint=quickstart", "half=true"], ("output is not given", "output=small.safetensors")),
         (["convert", "checkpoint=none.pth"], ("none.pth", "no such file")),
         (["convert", "checkpoint=postcvpr.pth", "output=m.pt"], ("output=m.pt", ".safetensors")),
         (["convert", "chekpoint=postcvpr.pth"], ("'chekpoint'", "'checkpoint'")),
