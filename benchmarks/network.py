@@ -2,6 +2,7 @@
 
     python benchmarks/network.py --sizes 1000 5000 --models fine15 ours
     python benchmarks/network.py --sizes 5000 --models fine15 --pyg
+    python benchmarks/network.py --sizes 5041 --models fine15 ours --compiled
 
 The garment is a square sheet with diagonals, two fifths of its vertices touch a body of 6,890 vertices, weights and
 features are random. ``naive`` concatenates both ends and the edge for every edge set, sums with ``index_add`` and runs
@@ -12,9 +13,10 @@ products the network itself computes, against a (1024, 128) × (128, 128) produc
 faster of the machine's two libraries.
 
 Progress goes to the standard error, rows to the standard output and, with ``--output``, to a CSV file as soon as they are
-known. Where one turn of all forms lasts longer than ``--long`` seconds three turns are taken instead of ``--rounds``; the
-column ``turns`` says so. A form that needs more memory than the machine has is left out with a sentence that says how much:
-memory grows linearly with the number of vertices, by the line through two small sizes.
+known. ``--compiled`` adds the network by its compiled kernels. Where one turn of all forms lasts longer than ``--long``
+seconds three turns are taken instead of ``--rounds``; the column ``turns`` says so. A form that needs more memory than the
+machine has is left out with a sentence that says how much: memory grows linearly with the number of vertices, by the line
+through two small sizes.
 """
 
 from __future__ import annotations
@@ -47,6 +49,7 @@ from hood.nn.dense import affine
 from hood.nn.message_passing import ProcessorStep
 from hood.nn.mlp import MLP
 from hood.nn.model import MeshGraphNet
+from hood.nn.precision import PRECISIONS
 from hood.nn.schedule import edge_set_names, finest_level, parse_schedule, set_level
 from hood.scene.cloth import build_cloth
 from hood.scene.contact import Contact
@@ -58,6 +61,7 @@ TOUCHED = 1500  # body vertices near the cloth
 WIDTHS = {"mesh": 12, "coarse": 12, "body": 9}
 LATENT = 128
 PROBES = (1089, 2209)  # sizes whose memory tells that of larger ones
+COMPILED = "compiled "  # before a precision: the form's name
 FEW = 3  # turns where one lasts long
 COLUMNS = ("pass", "form", "turns", "ms", "vs naive", "MB", "vs naive", "GFLOP/s", "of the product's")
 
@@ -203,7 +207,7 @@ def pyg(case: Case) -> Callable[[], Tensor]:
 # ---- measuring -------------------------------------------------------------------------------------------------------
 
 
-def forms(case: Case, with_pyg: bool = False) -> dict[str, tuple[nn.Module, Callable[[], Tensor]]]:
+def forms(case: Case, with_pyg: bool = False, with_compiled: bool = False) -> dict[str, tuple[nn.Module, Callable[[], Tensor]]]:
     """What takes part, by name: the parameters' owner and a call."""
     half = copy.deepcopy(case.network)
     half.precision = "bf16"
@@ -212,6 +216,11 @@ def forms(case: Case, with_pyg: bool = False) -> dict[str, tuple[nn.Module, Call
         "fp32": (case.network, partial(case.network, case.graph, case.nodes, case.edges)),
         "bf16": (half, partial(half, case.graph, case.nodes, case.edges)),
     }
+    for name in PRECISIONS if with_compiled else ():
+        network = copy.deepcopy(case.network)
+        network.use_precision(name)
+        network.use_kernels("compiled")
+        result[f"{COMPILED}{name}"] = (network, partial(network, case.graph, case.nodes, case.edges))
     if with_pyg:
         result["pyg"] = (case.network, pyg(case))
     return result
@@ -244,16 +253,18 @@ def alternate(calls: Mapping[str, Callable[[], None]], rounds: int, long: float 
 
 
 def check(case: Case, runs: Mapping[str, tuple[nn.Module, Callable[[], Tensor]]]) -> float:
-    """Largest error of bf16 in the RMS sense; float32 forms must agree to 1e-5 with the first one (naive where it fits)."""
+    """Error of bf16 in the RMS sense, the larger of its forms'; float32 forms must agree to 1e-5 with the first one (naive
+    where it fits)."""
     with torch.no_grad():
         results = {name: run().double() for name, (_, run) in runs.items()}
     first, reference = next(iter(results.items()))
     scale = reference.square().mean().sqrt()
     for name, value in results.items():
         worst = float((value - reference).abs().max() / scale)
-        if name != "bf16" and worst > 1e-5:
+        if not name.endswith("bf16") and worst > 1e-5:
             raise SystemExit(f"{name} differs from {first} by {worst:.1e} of the output's RMS; the comparison is void")
-    return float((results["bf16"] - reference).square().mean().sqrt() / scale)
+    half = [value for name, value in results.items() if name.endswith("bf16")]
+    return max(float((value - reference).square().mean().sqrt() / scale) for value in half)
 
 
 def network_flops(case: Case) -> float:
@@ -322,9 +333,9 @@ def fitting(size: int, model: str, names: Sequence[str], training: bool) -> list
 
 def measure_memory(size: int, model: str, name: str, training: bool) -> float:
     """The same in this process: growth of the resident set's high-water mark over one pass."""
-    small = forms(make_case(100, model), name == "pyg")[name]
+    small = forms(make_case(100, model), name == "pyg", name.startswith(COMPILED))[name]
     train(*small) if training else quiet(small[1])  # pages of the libraries' code are not counted
-    owner, run = forms(make_case(size, model), name == "pyg")[name]
+    owner, run = forms(make_case(size, model), name == "pyg", name.startswith(COMPILED))[name]
     ctypes.CDLL(None).malloc_trim(0)  # what building the case has freed would be used again without being seen
     before = resident("VmRSS")
     Path("/proc/self/clear_refs").write_text("5")  # the mark starts again from here
@@ -341,7 +352,7 @@ def table(size: int, model: str, args: argparse.Namespace) -> None:
     """Print the rows of one size and model."""
     tell(f"{model}, {size} vertices: building the graph")
     case = make_case(size, model)
-    runs = forms(case, args.pyg and model.startswith("fine"))
+    runs = forms(case, args.pyg and model.startswith("fine"), args.compiled)
     tell(f"{model}, {size} vertices: do all forms agree?")
     present = fitting(size, model, list(runs), training=False)
     both = {"fp32", "bf16"} <= set(present)
@@ -381,7 +392,8 @@ def rows(
         compared = f"{seconds['naive'] / value:.2f}" if "naive" in seconds else ""
         space = f"{memory[name]:.0f}" if memory else ""
         share = f"{memory[name] / memory['naive']:.2f}" if "naive" in memory else ""
-        fraction = (f"{own / 1e9:.0f}", f"{own / rate[name]:.0%}") if name in rate else ("", "")
+        precision = name.removeprefix(COMPILED)
+        fraction = (f"{own / 1e9:.0f}", f"{own / rate[precision]:.0%}") if precision in rate else ("", "")
         cells = (label, name, str(len(times[name])), f"{1e3 * value:.1f}", compared, space, share, *fraction)
         print(f"| {' | '.join(cells)} |", flush=True)
         if args.output:
@@ -402,6 +414,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, help="CSV file to which every row is appended once it is known")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--pyg", action="store_true", help="also torch_geometric's MetaLayer (fine15 and fine48)")
+    parser.add_argument("--compiled", action="store_true", help="also the compiled kernels (needs a C++ compiler and AVX-512)")
     parser.add_argument("--forward-only", action="store_true")
     parser.add_argument("--no-memory", dest="memory", action="store_false")
     parser.add_argument("--memory-of", help=argparse.SUPPRESS)

@@ -49,7 +49,8 @@ from hood.scene.batch import to_device
 from hood.scene.cloth import build_cloth
 from hood.scene.contact import find_contact
 from hood.scene.state import Obstacle, State, StepInput
-from hood.solver.newton import NewtonSettings, Progress, Report, minimize
+from hood.solver.iterate import Progress
+from hood.solver.newton import NewtonSettings, Report, minimize
 from hood.solver.plan import plan_for
 from hood.solver.sweeps import sweep
 from hood.testing import grid, sphere
