@@ -14,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from hood.config import ConfigError, plain, require_choice
 from hood.dynamics.reference import SUFFIXES, load_reference_checkpoint
 from hood.dynamics.simulator import Simulator, load_simulator
+from hood.nn.compiled import check_kernels
 from hood.nn.precision import check_precision
 from hood.training import distributed
 
@@ -62,13 +63,17 @@ def read_model(path: Path, fps: float) -> Simulator:
 
 
 def use_precision(simulator: Simulator, config: DictConfig) -> None:
-    """Let the simulator's network compute as ``config.precision`` says.
+    """Let the simulator's network compute as ``config.precision`` and ``config.kernels`` say.
 
     Raises:
-        ValueError: no such precision, or not on this device.
+        ValueError: no such precision or kernels, or not on this device.
     """
-    check_precision(str(config.precision), torch.device(str(config.device)))
-    simulator.network.use_precision(str(config.precision))
+    precision, kernels, device = str(config.precision), str(config.kernels), torch.device(str(config.device))
+    network = simulator.network
+    check_precision(precision, device)
+    check_kernels(kernels, precision, network.latent_dim, device)
+    network.use_precision(precision)
+    network.use_kernels(kernels)
 
 
 def require_same_config(config: DictConfig, folder: Path, free: Sequence[str], free_below: Sequence[str] = ()) -> None:

@@ -32,6 +32,7 @@ from hood.training.watch import Watch
 #: Keys that a resumed run may change: they do not change what is learned.
 _FREE = ("resume", "output", "device", "validation_states")
 _BOOKKEEPING = (
+    "kernels",
     "workers",
     "activation_checkpointing",
     "checkpoint_every",

@@ -52,7 +52,8 @@ class CapturedSimulator:
         capacity: places to begin with.
 
     Raises:
-        ValueError: an unknown mode, ``captured`` without CUDA, or a model whose step has no form of fixed shapes.
+        ValueError: an unknown mode, ``captured`` without CUDA, ``compiled`` of compiled kernels, or a model whose step has no
+            form of fixed shapes.
     """
 
     times: tuple[str, ...] = ("step", "rest", "total")
@@ -62,6 +63,8 @@ class CapturedSimulator:
             raise ValueError(f"step is {mode!r}; choose plain, {', '.join(MODES[:-1])} or {MODES[-1]}")
         if mode == "captured" and simulator.gravity.device.type != "cuda":
             raise ValueError("step=captured needs device=cuda, a CPU has no graphs to replay; use step=fixed or step=plain")
+        if mode == "compiled" and simulator.network.kernels == "compiled":
+            raise ValueError("step=compiled compiles torch's operations and needs kernels=torch; or use step=plain")
         check_model(simulator)
         check_precision(simulator.network.precision, simulator.gravity.device)
         self.simulator, self.mode = simulator, mode

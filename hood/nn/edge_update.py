@@ -14,8 +14,8 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from hood.graph.builder import EdgeSet
-from hood.nn import triton_edge
-from hood.nn.dense import affine_plus, blocks, gram, linear, relu_
+from hood.nn import compiled_block, triton_edge
+from hood.nn.dense import affine_plus, blocks, gram, linear, relu_, sum_rows
 from hood.nn.mlp import MLP, Kept, Layers
 
 
@@ -44,19 +44,12 @@ def update_edges(mlp: MLP, nodes: Tensor, latent: Tensor, edges: EdgeSet, overwr
     if triton_edge.applies(latent):
         precision = triton_edge.input_precision()
         return triton_edge.update_edges_fused(mlp, table, latent, edges, overwrite, precision)
-    result: tuple[Tensor, Tensor] = _EdgeUpdate.apply(
-        latent, table, to_edge, edges, keep, overwrite, mlp.norm.eps, *mlp.tail_parameters()
-    )
+    parameters = mlp.tail_parameters()
+    if mlp.compiled and compiled_block.applies(latent, parameters):
+        setting = compiled_block.Setting(keep, mlp.norm.eps, edges, overwrite)
+        return compiled_block.update_edges_compiled(latent, table, to_edge, setting, *parameters)
+    result: tuple[Tensor, Tensor] = _EdgeUpdate.apply(latent, table, to_edge, edges, keep, overwrite, mlp.norm.eps, *parameters)
     return result
-
-
-def sum_rows(x: Tensor, order: Tensor, offsets: Tensor) -> Tensor:
-    """out[m] = Σ x[order[i]] over i in offsets[m] … offsets[m + 1], in that order: deterministic.
-
-    On a CPU this is the fastest row sum torch has: 2× a CSR product, 2–5× ``index_add``, 15× ``segment_reduce``. Sums of
-    bfloat16 are taken in float32.
-    """
-    return functional.embedding_bag(order, x, offsets, mode="sum", include_last_offset=True)
 
 
 class _EdgeUpdate(torch.autograd.Function):

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from hood.nn import compiled_block
 from hood.nn.dense import affine, blocks, gram, linear
 
 
@@ -15,8 +16,10 @@ class MLP(nn.Module):
     """in → latent → latent → out, ReLU between, LayerNorm on the output unless ``norm`` is False (decoder).
 
     ``first`` may see the concatenation of several inputs; callers may split its weight by columns, evaluate the parts
-    where they are cheapest and continue with :meth:`tail`.
+    where they are cheapest and continue with :meth:`tail`. ``compiled``: by :mod:`hood.nn.compiled_block` where it applies.
     """
+
+    compiled = False
 
     def __init__(self, in_width: int, latent_dim: int, out_width: int, norm: bool = True) -> None:
         super().__init__()
@@ -42,7 +45,10 @@ class MLP(nn.Module):
             hidden = torch.relu(linear(torch.relu(hidden), self.second.weight, self.second.bias))
             out = linear(hidden, self.third.weight, self.third.bias)
             return out if residual is None else residual + out
-        result: Tensor = _Tail.apply(hidden, residual, torch.is_grad_enabled(), self.norm.eps, *self.tail_parameters())
+        keep, parameters = torch.is_grad_enabled(), self.tail_parameters()
+        if self.compiled and compiled_block.applies(hidden, parameters):
+            return compiled_block.tail_compiled(hidden, residual, compiled_block.Setting(keep, self.norm.eps), *parameters)
+        result: Tensor = _Tail.apply(hidden, residual, keep, self.norm.eps, *parameters)
         return result
 
     def tail_parameters(self) -> tuple[Tensor, ...]:

@@ -71,6 +71,39 @@ class MetricsLog:
             print(f"hood: no more TensorBoard events: {error}", file=sys.stderr)
 
 
+class Window:
+    """Means of what was reported since the last record: one update of a few scenes says little, a hard one looks like trouble.
+
+    What is not finite is passed over unless there is nothing else; what is no measurement (``LATEST``) keeps its last value.
+    """
+
+    LATEST = ("horizon", "learning_rate", "skipped")
+
+    def __init__(self) -> None:
+        self._reports: list[dict[str, float]] = []
+
+    def add(self, report: dict[str, float]) -> None:
+        """One more update."""
+        self._reports.append(report)
+
+    def close(self) -> dict[str, float]:
+        """The record of the window; the next one begins empty."""
+        reports, self._reports = self._reports, []
+        record = {}
+        for name, value in reports[-1].items():
+            values = [report[name] for report in reports if math.isfinite(report.get(name, math.nan))]
+            record[name] = value if name in self.LATEST or not values else sum(values) / len(values)
+        return record
+
+    def state_dict(self) -> list[dict[str, float]]:
+        """What a resumed run needs to write the same record."""
+        return list(self._reports)
+
+    def load_state_dict(self, state: list[dict[str, float]]) -> None:
+        """Back to what :meth:`state_dict` gave."""
+        self._reports = list(state)
+
+
 def _lines_up_to(path: Path, iteration: int) -> list[str]:
     if not path.exists():
         return []

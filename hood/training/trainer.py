@@ -31,7 +31,7 @@ from hood.training.checkpoint import (
 )
 from hood.training.clock import Clock
 from hood.training.loss import relative_loss
-from hood.training.metrics_log import MetricsLog
+from hood.training.metrics_log import MetricsLog, Window
 from hood.training.optimiser import make_optimizer
 from hood.training.settings import TrainerSettings
 from hood.training.slots import Slots
@@ -63,6 +63,7 @@ class Trainer:
         self.simulator, self.potential, self.settings = simulator, potential, settings
         self.folder, self.seed, self.watch = folder, seed, watch
         simulator.network.use_precision(settings.precision)
+        simulator.network.use_kernels(settings.kernels)
         simulator.network.use_checkpointing(settings.activation_checkpointing)
         ranks, rank = distributed.world_size(), distributed.rank()
         if settings.batch_size % ranks:
@@ -87,6 +88,7 @@ class Trainer:
         self._failed_at = -1
         self._saved_at = -1
         self._metrics: MetricsLog | None = None
+        self._window = Window()
         self._average = {name: value.detach().clone() for name, value in simulator.named_parameters()}
 
     @property
@@ -116,8 +118,9 @@ class Trainer:
                     self._roll_back()
                     clock = Clock(self.iteration)
                     continue
+                self._window.add(report)
                 if last or self.iteration % settings.log_every == 0:
-                    self._log({**report, "iterations_per_second": clock.rate(self.iteration)})
+                    self._log({**self._window.close(), "iterations_per_second": clock.rate(self.iteration)})
                 if progress is not None:
                     progress(self.iteration, report)
                 if self.watch is not None and settings.validate_every and self.iteration % settings.validate_every == 0:
@@ -197,6 +200,7 @@ class Trainer:
             "optimizer": self.optimizer.state_dict(),
             "slots": slots,
             "rng": generators,
+            "window": distributed.gather(self._window.state_dict()),
             "model": self.simulator.config,
         }
         distributed.on_main(lambda: self._write(state))
@@ -233,6 +237,7 @@ class Trainer:
         self.rollbacks, self._rollbacks_in_row, self._failed_at = state["rollbacks"]
         if len(state["rng"]) == distributed.world_size():
             set_generator_states(state["rng"][distributed.rank()], self._device)
+            self._window.load_state_dict(state["window"][distributed.rank()])
 
     @property
     def _device(self) -> torch.device:
@@ -277,6 +282,7 @@ class Trainer:
         self._restore(state)
         self.slots.restart()
         self.optimizer.zero_grad(set_to_none=True)
+        self._window = Window()
         self._skipped_in_row = 0
         self.rollbacks, self._rollbacks_in_row = self.rollbacks + 1, self._rollbacks_in_row + 1
         self._failed_at = max(failed, self._failed_at)

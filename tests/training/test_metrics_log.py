@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from hood.training.metrics_log import MetricsLog
+from hood.training.metrics_log import MetricsLog, Window
 
 
 def read(folder: Path) -> list[dict]:
@@ -86,3 +86,16 @@ def test_lines_cut_by_a_kill_are_dropped(tmp_path: Path) -> None:
     with MetricsLog(tmp_path, 3) as log:
         log.write(4, {"total": 4.0})
     assert [record["iteration"] for record in read(tmp_path)] == [1, 4]
+
+
+def test_a_window_is_the_mean_of_its_updates() -> None:
+    window = Window()
+    for value in (1.0, float("nan"), 4.0, 7.0):
+        window.add({"loss": value, "horizon": value, "skipped": 2.0})
+    copy = Window()
+    copy.load_state_dict(window.state_dict())
+    assert window.close() == copy.close() == {"loss": 4.0, "horizon": 7.0, "skipped": 2.0}
+    window.add({"loss": 3.0})
+    assert window.close() == {"loss": 3.0}
+    window.add({"loss": float("inf")})
+    assert window.close() == {"loss": float("inf")}

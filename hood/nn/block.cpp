@@ -1,0 +1,296 @@
+// One network block over rows, tile by tile, in registers and first-level cache: first layer (of an edge network), second and
+// third layer, layer norm, residual and the sums at the receivers; forward and backward. Built by hood/nn/compiled.py with
+// WIDTH, a multiple of 16, PANEL, 16 to 64 columns that divide it, and HALF, 1 for bfloat16 and 0 for float32.
+#include <immintrin.h>
+
+#include <cstdint>
+
+namespace {
+
+constexpr int D = WIDTH;
+constexpr int TILE = 96;           // rows: a tile's arrays stay in second-level cache, a panel of weights is used again
+constexpr int V = PANEL / 16;      // registers of 16 numbers for a panel's columns
+constexpr int GROUP = 24 / V;      // rows whose sums are in registers at a time
+constexpr int GRAM_ROWS = 16 / V / 4 * 4;  // the same for gradients of weights; divides 16
+
+// ---- the precision of latents and factors; everything else is float32 ----------------------------------------------------
+
+#if HALF
+using T = uint16_t;
+inline __m512 load(const T* p) {
+    return _mm512_castsi512_ps(_mm512_slli_epi32(_mm512_cvtepu16_epi32(_mm256_loadu_si256((const __m256i*)p)), 16));
+}
+inline void store(T* p, __m512 v) { _mm256_storeu_si256((__m256i*)p, (__m256i)_mm512_cvtneps_pbh(v)); }
+inline __m512 multiply(__m512 sum, uint32_t a, __m512i b) {
+    return _mm512_dpbf16_ps(sum, (__m512bh)_mm512_set1_epi32((int)a), (__m512bh)b);
+}
+#else
+using T = float;
+inline __m512 load(const T* p) { return _mm512_loadu_ps(p); }
+inline void store(T* p, __m512 v) { _mm512_storeu_ps(p, v); }
+inline __m512 multiply(__m512 sum, uint32_t a, __m512i b) {
+    return _mm512_fmadd_ps(_mm512_castsi512_ps(_mm512_set1_epi32((int)a)), _mm512_castsi512_ps(b), sum);
+}
+#endif
+constexpr int PER_WORD = 4 / sizeof(T);  // factors in 32 bits: a product adds that many terms at once
+constexpr int WORDS = D / PER_WORD;
+using Word = uint32_t __attribute__((may_alias));
+
+inline __m512 relu(__m512 v) { return _mm512_max_ps(_mm512_setzero_ps(), v); }  // keeps a NaN
+
+// ---- products ------------------------------------------------------------------------------------------------------------
+
+// sums over k of a[r * a_row + k * a_step] * b[k * b_step + …] for R rows and a panel of columns
+template <int R>
+inline void accumulate(__m512 (&sum)[R][V], const Word* a, int64_t a_row, int64_t a_step, const Word* b, int64_t b_step, int steps) {
+    for (int k = 0; k < steps; ++k) {
+        __m512i column[V];
+#pragma GCC unroll 4
+        for (int j = 0; j < V; ++j) column[j] = _mm512_loadu_si512(b + k * b_step + 16 * j);
+#pragma GCC unroll 24
+        for (int r = 0; r < R; ++r)
+#pragma GCC unroll 4
+            for (int j = 0; j < V; ++j) sum[r][j] = multiply(sum[r][j], a[r * a_row + k * a_step], column[j]);
+    }
+}
+
+template <int R, class Emit>
+inline void rows_product(const T* x, const T* weight, int row, int column, const Emit& emit) {
+    __m512 sum[R][V];
+#pragma GCC unroll 24
+    for (int r = 0; r < R; ++r)
+#pragma GCC unroll 4
+        for (int j = 0; j < V; ++j) sum[r][j] = _mm512_setzero_ps();
+    accumulate<R>(sum, (const Word*)(x + (int64_t)row * D), WORDS, 1, (const Word*)weight + (int64_t)column * WORDS, PANEL, WORDS);
+#pragma GCC unroll 24
+    for (int r = 0; r < R; ++r)
+#pragma GCC unroll 4
+        for (int j = 0; j < V; ++j) emit(row + r, column + 16 * j, sum[r][j]);
+}
+
+// emit(row, column, 16 values) of x W for all rows of a tile; the weight lies in panels of columns
+template <class Emit>
+void product(const T* x, int rows, const T* weight, const Emit& emit) {
+    for (int column = 0; column < D; column += PANEL) {
+        int row = 0;
+        for (; row + GROUP <= rows; row += GROUP) rows_product<GROUP>(x, weight, row, column, emit);
+        for (; row < rows; ++row) rows_product<1>(x, weight, row, column, emit);
+    }
+}
+
+// rows of a tile by their terms: with bfloat16 two rows share a word
+void interleave(const T* x, int rows, T* out) {
+#if HALF
+    for (int row = 0; row < rows; row += 2)
+        for (int c = 0; c < D; c += 16) {
+            __m512i low = _mm512_cvtepu16_epi32(_mm256_loadu_si256((const __m256i*)(x + (int64_t)row * D + c)));
+            __m512i high = _mm512_setzero_si512();
+            if (row + 1 < rows) high = _mm512_cvtepu16_epi32(_mm256_loadu_si256((const __m256i*)(x + (int64_t)(row + 1) * D + c)));
+            _mm512_storeu_si512(out + (int64_t)row * D + 2 * c, _mm512_or_si512(low, _mm512_slli_epi32(high, 16)));
+        }
+#endif
+}
+
+// total += leftᵀ right over the rows of a tile
+void gram(const T* left, const T* right, int rows, float* total) {
+    alignas(64) static thread_local T a[TILE * D], b[TILE * D];
+    if (HALF) {
+        interleave(left, rows, a);
+        interleave(right, rows, b);
+        left = a, right = b;
+    }
+    const int steps = (rows + PER_WORD - 1) / PER_WORD;
+    for (int column = 0; column < D; column += PANEL)
+        for (int row = 0; row < D; row += GRAM_ROWS) {
+            __m512 sum[GRAM_ROWS][V];
+            float* at = total + (int64_t)row * D + column;
+#pragma GCC unroll 16
+            for (int r = 0; r < GRAM_ROWS; ++r)
+#pragma GCC unroll 4
+                for (int j = 0; j < V; ++j) sum[r][j] = _mm512_loadu_ps(at + r * D + 16 * j);
+            accumulate<GRAM_ROWS>(sum, (const Word*)left + row, 1, D, (const Word*)right + column, D, steps);
+#pragma GCC unroll 16
+            for (int r = 0; r < GRAM_ROWS; ++r)
+#pragma GCC unroll 4
+                for (int j = 0; j < V; ++j) _mm512_storeu_ps(at + r * D + 16 * j, sum[r][j]);
+        }
+}
+
+inline void add_to(float* total, __m512 v) { _mm512_storeu_ps(total, _mm512_add_ps(_mm512_loadu_ps(total), v)); }
+
+// total += sum of the rows of a tile
+inline void add_rows(const T* x, int rows, float* total) {
+    for (int c = 0; c < D; c += PANEL) {
+        __m512 sum[V];
+        for (int j = 0; j < V; ++j) sum[j] = _mm512_loadu_ps(total + c + 16 * j);
+        for (int r = 0; r < rows; ++r)
+#pragma GCC unroll 4
+            for (int j = 0; j < V; ++j) sum[j] = _mm512_add_ps(sum[j], load(x + (int64_t)r * D + c + 16 * j));
+        for (int j = 0; j < V; ++j) _mm512_storeu_ps(total + c + 16 * j, sum[j]);
+    }
+}
+
+inline __m512 load_any(const void* p, int64_t at, int wide) {
+    return wide ? _mm512_loadu_ps((const float*)p + at) : load((const T*)p + at);
+}
+
+// sums of consecutive rows of the same receiver
+struct Sums {
+    T* out;
+    int64_t node;
+    alignas(64) float sum[D];
+    Sums(T* out) : out(out), node(-1) {}
+    void move(int64_t next) {
+        if (next == node) return;
+        flush();
+        node = next;
+        for (int c = 0; c < D; ++c) sum[c] = 0;
+    }
+    void flush() {
+        if (node >= 0)
+            for (int c = 0; c < D; c += 16) store(out + node * D + c, _mm512_loadu_ps(sum + c));
+    }
+};
+
+}  // namespace
+
+struct Block {
+    int64_t count;
+    const T* x;      // edge latents, or the first layer's outputs before their ReLU
+    const T* table;  // of edges: parts of the first layer per node, as receiver and as sender
+    const int64_t *receivers, *senders;
+    const T *first, *second, *third;  // weights in panels
+    const float *bias_2, *bias_3, *scale, *shift;
+    const void* residual;  // or null
+    void* out;
+    T* received;
+    T *one, *two, *hat;  // kept for the backward pass, or null
+    float* rstd;
+    int64_t wide;  // whether residual and output are float32
+    double eps;
+};
+
+extern "C" void forward(const Block* b) {
+    alignas(64) static thread_local T one_tile[TILE * D], two_tile[TILE * D];
+    alignas(64) static thread_local float raw[TILE * D];
+    Sums sums(b->received);
+    for (int64_t start = 0; start < b->count; start += TILE) {
+        const int rows = b->count - start < TILE ? (int)(b->count - start) : TILE;
+        const T* x = b->x + start * D;
+        T* one = b->one ? b->one + start * D : one_tile;
+        T* two = b->two ? b->two + start * D : two_tile;
+        if (b->table) {
+            const int64_t *receivers = b->receivers + start, *senders = b->senders + start;
+            product(x, rows, b->first, [&](int r, int c, __m512 v) {
+                const __m512 ends = _mm512_add_ps(load(b->table + receivers[r] * 2 * D + c), load(b->table + senders[r] * 2 * D + D + c));
+                store(one + (int64_t)r * D + c, relu(_mm512_add_ps(v, ends)));
+            });
+        } else {
+            for (int i = 0; i < rows * D; i += 16) store(one + i, relu(load(x + i)));
+        }
+        product(one, rows, b->second, [&](int r, int c, __m512 v) {
+            store(two + (int64_t)r * D + c, relu(_mm512_add_ps(v, _mm512_loadu_ps(b->bias_2 + c))));
+        });
+        product(two, rows, b->third, [&](int r, int c, __m512 v) {
+            _mm512_storeu_ps(raw + (int64_t)r * D + c, _mm512_add_ps(v, _mm512_loadu_ps(b->bias_3 + c)));
+        });
+        for (int r = 0; r < rows; ++r) {
+            const int64_t at = (start + r) * D;
+            __m512 v[D / 16], total = _mm512_setzero_ps(), square = _mm512_setzero_ps();
+#pragma GCC unroll 16
+            for (int j = 0; j < D / 16; ++j) total = _mm512_add_ps(total, v[j] = _mm512_loadu_ps(raw + r * D + 16 * j));
+            const __m512 mean = _mm512_set1_ps(_mm512_reduce_add_ps(total) / D);
+#pragma GCC unroll 16
+            for (int j = 0; j < D / 16; ++j) {
+                v[j] = _mm512_sub_ps(v[j], mean);
+                square = _mm512_fmadd_ps(v[j], v[j], square);
+            }
+            const float rstd = 1.0f / __builtin_sqrtf(_mm512_reduce_add_ps(square) / D + (float)b->eps);
+            const __m512 factor = _mm512_set1_ps(rstd);
+            if (b->rstd) b->rstd[start + r] = rstd;
+            if (b->received) sums.move(b->receivers[start + r]);
+#pragma GCC unroll 16
+            for (int j = 0; j < D / 16; ++j) {
+                const int c = 16 * j;
+                const __m512 hat = _mm512_mul_ps(v[j], factor);
+                if (b->hat) store(b->hat + at + c, hat);
+                __m512 out = _mm512_fmadd_ps(hat, _mm512_loadu_ps(b->scale + c), _mm512_loadu_ps(b->shift + c));
+                if (b->received) add_to(sums.sum + c, out);
+                if (b->residual) out = _mm512_add_ps(out, load_any(b->residual, at + c, b->wide));
+                if (b->wide)
+                    _mm512_storeu_ps((float*)b->out + at + c, out);
+                else
+                    store((T*)b->out + at + c, out);
+            }
+        }
+    }
+    if (b->received) sums.flush();
+}
+
+struct Gradient {
+    int64_t count;
+    const void* grad;   // at the output
+    const T* grad_sum;  // of edges: at the sums
+    const int64_t* receivers;
+    const T *x, *one, *two, *hat;
+    const float* rstd;
+    const T *first, *second, *third;  // transposed weights in panels
+    const float* scale;
+    float *grad_first, *grad_second, *grad_third, *grad_bias_2, *grad_bias_3, *grad_scale, *grad_shift;  // are added to
+    T *grad_hidden, *grad_x;
+    int64_t wide;  // whether grad is float32
+};
+
+extern "C" void backward(const Gradient* b) {
+    alignas(64) static thread_local T third[TILE * D], second[TILE * D];
+    for (int64_t start = 0; start < b->count; start += TILE) {
+        const int rows = b->count - start < TILE ? (int)(b->count - start) : TILE;
+        const T *one = b->one + start * D, *two = b->two + start * D, *hat = b->hat + start * D;
+        T* hidden = b->grad_hidden + start * D;
+        for (int r = 0; r < rows; ++r) {
+            const int64_t at = (start + r) * D;
+            __m512 g[D / 16], mean = _mm512_setzero_ps(), along = _mm512_setzero_ps();
+            const T* sum = b->grad_sum ? b->grad_sum + b->receivers[start + r] * D : nullptr;
+#pragma GCC unroll 16
+            for (int j = 0; j < D / 16; ++j) {
+                const int c = 16 * j;
+                const __m512 h = load(hat + (int64_t)r * D + c);
+                g[j] = load_any(b->grad, at + c, b->wide);
+                if (sum) g[j] = _mm512_add_ps(g[j], load(sum + c));
+                add_to(b->grad_shift + c, g[j]);
+                add_to(b->grad_scale + c, _mm512_mul_ps(g[j], h));
+                g[j] = _mm512_mul_ps(g[j], _mm512_loadu_ps(b->scale + c));
+                mean = _mm512_add_ps(mean, g[j]);
+                along = _mm512_fmadd_ps(g[j], h, along);
+            }
+            const __m512 m = _mm512_set1_ps(_mm512_reduce_add_ps(mean) / D), a = _mm512_set1_ps(_mm512_reduce_add_ps(along) / D);
+            const __m512 factor = _mm512_set1_ps(b->rstd[start + r]);
+#pragma GCC unroll 16
+            for (int j = 0; j < D / 16; ++j) {
+                const int c = 16 * j;
+                const __m512 h = load(hat + (int64_t)r * D + c);
+                const __m512 v = _mm512_mul_ps(_mm512_sub_ps(g[j], _mm512_fmadd_ps(a, h, m)), factor);
+                store(third + (int64_t)r * D + c, v);
+            }
+        }
+        add_rows(third, rows, b->grad_bias_3);
+        gram(third, two, rows, b->grad_third);
+        product(third, rows, b->third, [&](int r, int c, __m512 v) {
+            const int64_t i = (int64_t)r * D + c;
+            v = _mm512_maskz_mov_ps(_mm512_cmp_ps_mask(load(two + i), _mm512_setzero_ps(), _CMP_GT_OQ), v);
+            store(second + i, v);
+        });
+        add_rows(second, rows, b->grad_bias_2);
+        gram(second, one, rows, b->grad_second);
+        product(second, rows, b->second, [&](int r, int c, __m512 v) {
+            const int64_t i = (int64_t)r * D + c;
+            store(hidden + i, _mm512_maskz_mov_ps(_mm512_cmp_ps_mask(load(one + i), _mm512_setzero_ps(), _CMP_GT_OQ), v));
+        });
+        if (!b->first) continue;
+        gram(hidden, b->x + start * D, rows, b->grad_first);
+        product(hidden, rows, b->first, [&](int r, int c, __m512 v) {
+            const int64_t i = (start + r) * D + c;
+            store(b->grad_x + i, _mm512_add_ps(v, load((const T*)b->grad + i)));
+        });
+    }
+}

@@ -1,0 +1,144 @@
+"""Which kernels a network takes on a CPU: torch's own, or ``block.cpp``, compiled where it runs.
+
+The compiled ones take a tile of rows through all layers of a block in registers and first-level cache, forward and backward:
+no array between two layers is written to memory unless the gradient needs it, and nothing passes over a tile twice. They need a
+C++ compiler and a processor with AVX-512, are compiled once per user, width and precision (some seconds) and kept in the
+user's cache folder. They work on one thread.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import shutil
+import subprocess
+import tempfile
+from functools import cache
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from hood.graph.cache import cache_folder
+
+#: ``torch``: torch's operations, everywhere; ``compiled``: the blocks of the network in C++.
+KERNELS = ("torch", "compiled")
+#: Widths of latents are a multiple of this: numbers in a register.
+LANES = 16
+SOURCE = Path(__file__).with_name("block.cpp")
+_FLAGS = ("-O3", "-std=c++17", "-shared", "-fPIC", "-mfma", *(f"-mavx512{part}" for part in ("f", "bw", "dq", "vl")))
+_POINTER, _COUNT = ctypes.c_void_p, ctypes.c_int64
+
+
+def _fields(*groups: str | tuple[str, type]) -> list[tuple[str, type]]:
+    named = [(name, _POINTER) for group in groups if isinstance(group, str) for name in group.split()]
+    return [("count", _COUNT), *named, *(group for group in groups if isinstance(group, tuple))]
+
+
+class Block(ctypes.Structure):
+    """``Block`` of ``block.cpp``."""
+
+    _fields_ = _fields(
+        "x table receivers senders first second third bias_2 bias_3 scale shift residual out received one two hat rstd",
+        ("wide", _COUNT),
+        ("eps", ctypes.c_double),
+    )
+
+
+class Gradient(ctypes.Structure):
+    """``Gradient`` of ``block.cpp``."""
+
+    _fields_ = _fields(
+        "grad grad_sum receivers x one two hat rstd first second third scale grad_first grad_second grad_third "
+        "grad_bias_2 grad_bias_3 grad_scale grad_shift grad_hidden grad_x",
+        ("wide", _COUNT),
+    )
+
+
+def check_kernels(name: str, precision: str, width: int, device: torch.device | None = None) -> None:
+    """Raise ValueError unless ``name`` is a choice that works here for latents of ``width`` columns in ``precision``."""
+    if name not in KERNELS:
+        raise ValueError(f"kernels is {name!r}; choose {' or '.join(KERNELS)}")
+    if name == "torch":
+        return
+    if device is not None and device.type != "cpu":
+        raise ValueError(f"kernels=compiled are for device=cpu, not {device.type}; use kernels=torch")
+    if width % LANES:
+        raise ValueError(f"kernels=compiled need latents of a multiple of {LANES} columns, not {width}; use kernels=torch")
+    if torch.backends.cpu.get_cpu_capability() != "AVX512":
+        raise ValueError("kernels=compiled need a processor with AVX-512; use kernels=torch")
+    if precision == "bf16" and not _multiplies_bfloat16():
+        raise ValueError("kernels=compiled with precision=bf16 need a processor with AVX512_BF16; use kernels=torch")
+    library(width, precision == "bf16")
+
+
+def panel(width: int) -> int:
+    """Columns of ``width`` whose sums are in registers at a time."""
+    return next(columns for columns in (64, 48, 32, LANES) if width % columns == 0)
+
+
+def call(function: str, values: ctypes.Structure, width: int, half: bool) -> None:
+    """Run ``forward`` on a :class:`Block` or ``backward`` on a :class:`Gradient`."""
+    getattr(library(width, half), function)(ctypes.byref(values))
+
+
+def point(values: Block | Gradient, **tensors: Tensor | None) -> None:
+    """Let fields of ``values`` point to tensors; these have to outlive the call and be contiguous."""
+    for name, tensor in tensors.items():
+        assert tensor is None or tensor.is_contiguous(), f"{name} has gaps"
+        setattr(values, name, None if tensor is None else tensor.data_ptr())
+
+
+@cache
+def library(width: int, half: bool) -> ctypes.CDLL:
+    """The compiled blocks for latents of ``width`` columns in bfloat16 or float32.
+
+    Raises:
+        ValueError: there is no compiler, or it fails.
+    """
+    compiler = find_compiler()
+    flags = [*_FLAGS, f"-DWIDTH={width}", f"-DPANEL={panel(width)}", f"-DHALF={int(half)}", *(["-mavx512bf16"] if half else [])]
+    version = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
+    digest = hashlib.sha256("\0".join([compiler, version, *flags, SOURCE.read_text()]).encode()).hexdigest()
+    folder = cache_folder()
+    if folder is not None:
+        path = folder / "kernels" / f"{digest}.so"
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            return ctypes.CDLL(str(path)) if path.exists() else _compile(compiler, flags, path)
+        except OSError:  # a folder that cannot be written to, a file of another machine: done without
+            pass
+    with tempfile.TemporaryDirectory() as temporary:
+        return _compile(compiler, flags, Path(temporary) / "block.so")
+
+
+def find_compiler() -> str:
+    """The C++ compiler: ``CXX`` of the environment, else g++ or clang++.
+
+    Raises:
+        ValueError: there is none.
+    """
+    for name in [os.environ["CXX"]] if os.environ.get("CXX") else ["g++", "clang++"]:
+        found = shutil.which(name)
+        if found is not None:
+            return found
+    raise ValueError("kernels=compiled need a C++ compiler: install g++ or clang++ (or name one in CXX), or use kernels=torch")
+
+
+def _compile(compiler: str, flags: list[str], path: Path) -> ctypes.CDLL:
+    """Compile under another name and rename: other processes may be doing the same."""
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        made = Path(folder) / path.name
+        run = subprocess.run([compiler, *flags, str(SOURCE), "-o", str(made)], capture_output=True, text=True, check=False)
+        if run.returncode:
+            lines = run.stderr.strip().splitlines() or [f"exit code {run.returncode}"]
+            first = next((line for line in lines if "error" in line), lines[0])
+            raise ValueError(f"kernels=compiled: {compiler} fails ({first.strip()}); name another in CXX or use kernels=torch")
+        os.replace(made, path)
+    return ctypes.CDLL(str(path))
+
+
+def _multiplies_bfloat16() -> bool:
+    supported = getattr(torch.cpu, "_is_avx512_bf16_supported", None)  # missing in other versions of torch
+    return supported is not None and bool(supported())
