@@ -20,6 +20,8 @@ from hood.mesh.proximity import search_surface
 _BINDING_REACH = 0.03
 #: Least stretch that undoing a pose assumes: blends of opposite rotations shrink volume to nothing.
 _LEAST_STRETCH = 0.3
+#: Joints of the trunk and the hips that hang on it, the same in all skeletons of the SMPL family.
+_TRUNK, _HIPS = (0, 3, 6, 9), (1, 2)
 #: Searches for the way out: leaving one limb may enter another.
 _ROUNDS = 8
 
@@ -70,6 +72,25 @@ def bind_garment(garment: Garment, body: Body) -> Garment:
     at = garment.rest_pos if garment.skin_pos is None else garment.skin_pos
     weights, shapedirs = _spread_skin(at, garment.faces, body, body.v_template)
     return replace(garment, lbs_weights=weights, shapedirs=shapedirs, bound_to=body.name)
+
+
+def hold_on_trunk(garment: Garment, body: Body) -> Garment:
+    """The bound garment with held vertices of the trunk following the trunk alone.
+
+    Skin at the waist follows the thighs by up to a fifth. A waistband that does so folds with the belly: its edges change
+    by 20% and it sinks 7 mm into a body that squats. A waistband keeps its girth. Nothing changes for other vertices, nor
+    in a T-pose.
+    """
+    if garment.lbs_weights is None or not garment.pinned.any() or body.parents[1:3] != (0, 0):
+        return garment
+    weights = garment.lbs_weights.copy()
+    hips, trunk = weights[:, _HIPS].sum(axis=1), weights[:, _TRUNK].sum(axis=1)
+    chosen = garment.pinned & (hips > 0) & (hips < trunk)
+    if not chosen.any():
+        return garment
+    weights[np.ix_(chosen, _HIPS)] = 0.0
+    weights[chosen] /= weights[chosen].sum(axis=1, keepdims=True)
+    return replace(garment, lbs_weights=weights)
 
 
 def bind_posed(garment: Garment, posed: PosedBody) -> Garment:

@@ -16,6 +16,7 @@ from hood.mesh import topology
 #: Openings by name and the joint that they surround. Any joint's own name works as well.
 REGIONS = {
     "waistband": "spine1",
+    "hem": "pelvis",
     "neckline": "neck",
     "cuff_left": "left_wrist",
     "cuff_right": "right_wrist",
@@ -36,6 +37,8 @@ _LIST_SUFFIXES = (".txt", ".json")
 #: An opening farther from its joint than this [m] is none of that region.
 _REGION_REACH = 0.45
 _LIST_LIMIT = 64 << 20
+#: The two that one joint does not tell apart.
+_AT_THE_HIPS = ("waistband", "hem")
 
 Pins = str | int | Sequence[str | int]
 
@@ -91,7 +94,7 @@ def _named(word: str, garment: Garment, body: Body | None) -> np.ndarray:
 def region_loop(garment: Garment, body: Body, region: str) -> np.ndarray:
     """Vertices of the opening (boundary loop) of ``garment`` nearest to the joint of ``region`` in T-pose.
 
-    Near means the loop's centre: an opening surrounds its joint.
+    Near means the loop's centre: an opening surrounds its joint. A waistband is above the hips, a hem below.
 
     Raises:
         ValueError: the garment has no opening there, or the body no such joint.
@@ -106,13 +109,41 @@ def region_loop(garment: Garment, body: Body, region: str) -> np.ndarray:
         raise ValueError(f"pins={region}: garment {garment.name!r} is closed, it has no openings; give vertex numbers")
     centres = np.stack([pos[loop].mean(axis=0) for loop in loops])
     dist = np.linalg.norm(centres - joints[joint], axis=1)
+    if region in _AT_THE_HIPS:
+        dist[[name != region for name in opening_names(centres, joints)]] = np.inf
     nearest = int(np.argmin(dist))
+    if not np.isfinite(dist[nearest]):
+        raise ValueError(f"pins={region}: no opening of {garment.name!r} is a {region}; give vertex numbers")
     if dist[nearest] > _REGION_REACH:
         raise ValueError(
             f"pins={region}: the nearest of the {len(loops)} openings of {garment.name!r} is {dist[nearest]:.2f} m from "
             f"the {JOINTS[joint].replace('_', ' ')}; give vertex numbers"
         )
     return loops[nearest]
+
+
+def opening_names(centres: np.ndarray, joints: np.ndarray) -> list[str]:
+    """For the centre (L, 3) of each opening the region whose joint, of (J, 3) in T-pose, is nearest.
+
+    One opening at most is the waistband, the nearest of those above the hips; the others near the waist are hems.
+    """
+    names = [name for name, joint in REGIONS.items() if JOINTS.index(joint) < len(joints)]
+    if not names or len(centres) == 0:
+        return []
+    places = np.stack([joints[JOINTS.index(REGIONS[name])] for name in names])
+    dist = np.linalg.norm(centres[:, None] - places, axis=2)
+    for column, name in enumerate(names):
+        dist[~_on_side(name, centres, joints), column] = np.inf
+    found = [names[column] for column in dist.argmin(axis=1)]
+    waists = [row for row, name in enumerate(found) if name == "waistband"]
+    band = min(waists, key=lambda row: float(dist[row].min()), default=None)
+    return ["hem" if row in waists and row != band else name for row, name in enumerate(found)]
+
+
+def _on_side(region: str, centres: np.ndarray, joints: np.ndarray) -> np.ndarray:
+    """(L,) bool: whether an opening is on the side of the hips where ``region`` is; all are for most regions."""
+    above = centres[:, 1] > joints[JOINTS.index("left_hip"), 1]
+    return {"waistband": above, "hem": ~above}.get(region, np.ones(len(centres), dtype=bool))
 
 
 def read_indices(path: Path) -> np.ndarray:

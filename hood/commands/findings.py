@@ -16,7 +16,7 @@ from hood.assets.garment import Garment, garment_of_mesh, load_garment, locate_g
 from hood.assets.library import locate
 from hood.assets.mesh_file import MESH_SUFFIXES, read_mesh_file
 from hood.assets.motion_file import read_recording
-from hood.assets.pins import JOINTS, REGIONS, read_indices
+from hood.assets.pins import opening_names, read_indices
 from hood.assets.sequence import Z_UP_TO_Y_UP
 from hood.assets.standing import find_standing_pose
 from hood.assets.units import find_scale, size_ratio, used
@@ -281,12 +281,10 @@ def inspect_list(name: str) -> Finding:
 
 
 def _name_openings(finding: Finding, pos: np.ndarray, faces: np.ndarray, body: Body) -> None:
-    """For each opening, longest first: its vertices, and the region (a word for pins) whose joint is nearest."""
-    joints = body.shaped(np.zeros(0))[1]
-    regions = {region: joints[JOINTS.index(joint)] for region, joint in REGIONS.items() if JOINTS.index(joint) < len(joints)}
+    """For each opening, longest first: its vertices, and the region (a word for pins) that it is."""
     loops = boundary_loops(faces)
-    if not regions or not 0 < len(loops) <= _MOST_OPENINGS:
+    if not 0 < len(loops) <= _MOST_OPENINGS:
         return
-    centres = [pos[loop].mean(axis=0) for loop in loops]
-    nearest = [min(regions, key=lambda region: float(np.linalg.norm(regions[region] - centre))) for centre in centres]
-    finding.facts["openings"] = [f"{len(loop)} vertices near {name}" for loop, name in zip(loops, nearest, strict=True)]
+    names = opening_names(np.stack([pos[loop].mean(axis=0) for loop in loops]), body.shaped(np.zeros(0))[1])
+    if names:
+        finding.facts["openings"] = [f"{len(loop)} vertices near {name}" for loop, name in zip(loops, names, strict=True)]

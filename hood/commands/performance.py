@@ -8,21 +8,29 @@ from typing import Any
 from omegaconf import DictConfig
 
 from hood.assets.animated_mesh import body_kind
+from hood.assets.library import names
 from hood.config import ConfigError, plain
-from hood.scene.cast import MotionOptions, load_motion
+from hood.scene.cast import NO_MOTION, MotionOptions, load_motion
 from hood.scene.motion import Motion
 
 
 def make_motion(config: DictConfig) -> Motion:
-    """What moves in the scene, on the config's device; says so where a motion is named and not performed.
+    """What moves in the scene, on the config's device.
+
+    A body that performs no motion but its own does so beside an embedded motion, the default, and says that; a file was
+    meant.
 
     Raises:
         FileNotFoundError, ValueError: from :func:`hood.scene.cast.load_motion`.
-        ConfigError: a value of the wrong kind; names the key.
+        ConfigError: a value of the wrong kind, or a motion file that the body cannot perform; names the key.
     """
     kind = body_kind(str(config.body))
-    if kind != "model" and str(config.sequence) != "none":
+    if kind != "model" and str(config.sequence) != NO_MOTION:
         has = "performs its own motion" if kind == "mesh" else "does not move"
+        if str(config.sequence) not in names("motions"):
+            raise ConfigError(
+                f"sequence={config.sequence}: body={config.body} {has}; leave sequence out, or give a body of the SMPL family"
+            )
         print(f"body={config.body} {has}: sequence={config.sequence} is not used", file=sys.stderr)
     return load_motion(str(config.body), str(config.sequence), motion_options(config), device=str(config.device))
 

@@ -6,8 +6,7 @@ import hashlib
 import json
 import os
 import sys
-from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +19,14 @@ from tqdm import tqdm
 from hood.assets.library import locate
 from hood.commands.batch import Job, find_jobs, share
 from hood.commands.common import UNTRAINED, prepare_folder, read_model, require_device, together, use_precision
+from hood.commands.dial import check_dial, exported, refined
 from hood.commands.performance import make_motion
+from hood.commands.summary import describe, describe_all, summarise
 from hood.commands.wardrobe import read_outfit
 from hood.config import ConfigError, build, load_config, plain, require_choice, save_run_record
 from hood.dynamics.captured import MODES, CapturedSimulator
 from hood.dynamics.recorder import RolloutWriter, read_rollout
+from hood.dynamics.refine import GuessStepper
 from hood.dynamics.rollout import METRIC_CHOICES, metric_names, simulate
 from hood.dynamics.simulator import Simulator
 from hood.dynamics.stepper import NewtonStepper, Stepper
@@ -42,7 +44,8 @@ def run(overrides: Sequence[str]) -> int:
     require_choice(config, "video", ("mp4", "gif", "none"))
     require_choice(config, "metrics", METRIC_CHOICES)
     _check_numbers(config)
-    require_choice(config, "stepper", ("network", "newton"))
+    require_choice(config, "stepper", ("network", "newton", "refine"))
+    check_dial(config)
     require_choice(config, "step", (PLAIN, *MODES))
     return together(lambda: _run(config))
 
@@ -61,6 +64,7 @@ def _run(config: DictConfig) -> int:
 def _run_one(config: DictConfig, stepper: Stepper, digest: str) -> tuple[dict[str, Any], bool]:
     """The rollout of one motion with all its files: the summary, and whether the user interrupted it."""
     scene = make_scene(config)
+    stepper = refined(stepper, config, scene.cloth.num_vertices)
     folder = prepare_folder(Path(str(config.output)).expanduser())
     (folder / "summary.json").unlink(missing_ok=True)  # its presence says that everything is there
     save_run_record(folder, config, int(config.seed))
@@ -120,22 +124,6 @@ def _finished(config: DictConfig, digest: str, folder: Path) -> dict[str, Any] |
     return summary if same and bool(attributes["complete"]) and attributes["checkpoint_sha256"] == digest else None
 
 
-def describe_all(rows: Mapping[str, Mapping[str, Any]], total: int) -> str:
-    """One line per motion, and how many were done."""
-    lines = []
-    for name, row in rows.items():
-        if "error" in row:
-            lines.append(f"{name}: {row['error']}")
-            continue
-        first = row["first_nonfinite_frame"]
-        state = f"{row['num_frames']} frames, " + ("all finite" if first is None else f"first non-finite frame {first}")
-        lines.append(
-            f"{name}: {state}, strain p99 {_percent(row['strain_p99'])}, penetration {_percent(row['penetration_share_mean'])}"
-        )
-    failed = sum("error" in row for row in rows.values())
-    return "\n".join([*lines, f"{len(rows) - failed} of {total} motions simulated" + (f", {failed} failed" if failed else "")])
-
-
 def make_scene(config: DictConfig) -> Scene:
     """Assets named in the config, put together."""
     motion = make_motion(config)
@@ -144,13 +132,14 @@ def make_scene(config: DictConfig) -> Scene:
 
 
 def make_stepper(config: DictConfig) -> tuple[Stepper, str]:
-    """What takes the steps, and the SHA-256 of its weights (``none`` for the solver)."""
+    """What takes the steps, before they are refined, and the SHA-256 of its weights (``none`` without a network)."""
     if str(config.stepper) == "network":
         simulator, digest = make_simulator(config)
         use_precision(simulator, config)
         stepper: Stepper = simulator if str(config.step) == PLAIN else CapturedSimulator(simulator, str(config.step))
         return stepper, digest
-    stepper = NewtonStepper(build(config.losses), build(config.solver))
+    potential = build(config.losses)
+    stepper = GuessStepper(potential) if str(config.stepper) == "refine" else NewtonStepper(potential, build(config.solver))
     stepper.gravity = stepper.gravity.to(str(config.device))
     return stepper, "none"
 
@@ -176,55 +165,6 @@ def make_simulator(config: DictConfig) -> tuple[Simulator, str]:
         if built.config != simulator.config:
             raise ConfigError(f"{path}: holds model {simulator.config}, not the model asked for; drop model=… from the command")
     return simulator.eval().to(device), hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def summarise(path: Path) -> dict[str, Any]:
-    """Summary of a rollout file: strain, penetration, times, first non-finite frame; None for what was not measured."""
-    data = read_rollout(path)
-    finite = np.isfinite(data.cloth_pos).all(axis=(1, 2))
-    metrics = defaultdict(lambda: np.full(len(finite), np.nan), data.metrics)
-    times = {name[3:]: _quantiles(metrics[name][2:]) for name in sorted(metrics) if name.startswith("ms_")}
-    converged = metrics.get("solver_converged")
-    solver = {} if converged is None else {"solver_steps_not_converged": int((converged == 0).sum())}
-    return {
-        "num_frames": int(len(finite)),
-        "complete": bool(data.attributes["complete"]),
-        "garment": data.attributes["garment"],
-        "num_vertices": int(data.cloth_pos.shape[1]),
-        "dt": float(data.attributes["dt"]),
-        "first_nonfinite_frame": None if finite.all() else int(np.argmin(finite)),
-        "first_frame": {
-            key: _at(metrics[key], 0) for key in ("strain_p50", "strain_p99", "penetration_count", "penetration_depth")
-        },
-        "strain_p50": _median(metrics["strain_p50"]),
-        "strain_p99": _median(metrics["strain_p99"]),
-        "strain_max": _largest(metrics["strain_max"]),
-        "penetration_share_mean": _mean(metrics["penetration_share"]),
-        "penetration_share_max": _largest(metrics["penetration_share"]),
-        "penetration_count_max": _largest(metrics["penetration_count"]),
-        "penetration_depth_max_m": _largest(metrics["penetration_depth"]),
-        "potential_mean_J": _mean(metrics["energy_total"]),
-        "potential_inertial_guess_mean_J": _mean(metrics["energy_inertial_guess"]),
-        "relative_gradient_median": _median(metrics["relative_gradient"]),
-        "ms_per_frame": times,
-        **solver,
-    }
-
-
-def describe(summary: dict[str, Any]) -> str:
-    """The summary in three lines, and a fourth where the solver missed its target."""
-    missed = summary.get("solver_steps_not_converged", 0)
-    first = summary["first_nonfinite_frame"]
-    times = {name: value["median"] for name, value in summary["ms_per_frame"].items()}
-    return "\n".join(
-        [
-            f"{summary['garment']}: {summary['num_frames']} frames, "
-            + ("all finite" if first is None else f"first non-finite frame {first}"),
-            f"strain p50 {_percent(summary['strain_p50'])} p99 {_percent(summary['strain_p99'])}, {_penetration(summary)}",
-            "ms per frame (median): " + ", ".join(f"{name} {value or 0.0:.1f}" for name, value in times.items()),
-            *([f"{missed} steps did not reach solver.target_rg; their frames are kept as far as they got"] if missed else []),
-        ]
-    )
 
 
 def _simulate_to_disk(config: DictConfig, scene: Scene, stepper: Stepper, digest: str, path: Path) -> bool:
@@ -254,12 +194,16 @@ def _simulate_to_disk(config: DictConfig, scene: Scene, stepper: Stepper, digest
         scene.dt,
         attributes,
         farthest=float(np.abs(scene.motion.translation).max()),
+        fields=exported(config),
     )
-    frames = simulate(stepper, scene, potential, count, int(config.relaxing_steps), metrics=str(config.metrics))
+    frames = simulate(
+        stepper, scene, potential, count, int(config.relaxing_steps), metrics=str(config.metrics), fields=exported(config)
+    )
     try:
         with writer:
             for frame in tqdm(frames, total=count, desc=f"rollout {scene.garment.name}", unit="frame", disable=_quiet()):
-                writer.append(frame.world_pos.numpy(), frame.body_pos.numpy(), frame.metrics)
+                fields = {name: values.numpy() for name, values in frame.fields.items()}
+                writer.append(frame.world_pos.numpy(), frame.body_pos.numpy(), frame.metrics, fields)
     except KeyboardInterrupt:
         if writer.frames_done == 0:
             raise
@@ -276,12 +220,12 @@ def _draw(config: DictConfig, folder: Path) -> None:
     except ImportError as error:
         print(f"no pictures: {error}", file=sys.stderr)
         return
-    data = read_rollout(folder / "rollout.h5")
+    data, colour = read_rollout(folder / "rollout.h5"), str(config.colour)
     if bool(config.sheet):
-        write_sheet(data, folder / "contact_sheet.png")
+        write_sheet(data, folder / "contact_sheet.png", colour)
     if str(config.video) != "none":
         frames = tqdm(range(0, len(data.cloth_pos), int(config.video_stride)), desc="video", unit="frame", disable=_quiet())
-        write_video(data, folder / f"rollout.{config.video}", frames, int(config.video_stride))
+        write_video(data, folder / f"rollout.{config.video}", frames, int(config.video_stride), colour)
 
 
 def _check_numbers(config: DictConfig) -> None:
@@ -298,45 +242,6 @@ def _write_json(path: Path, value: dict[str, Any]) -> None:
     os.replace(temporary, path)
 
 
-def _quantiles(values: np.ndarray) -> dict[str, float | None]:
-    values = values[np.isfinite(values)]
-    if len(values) == 0:
-        return {"median": None, "p99": None}
-    return {"median": float(np.median(values)), "p99": float(np.quantile(values, 0.99))}
-
-
-def _at(values: np.ndarray, index: int) -> float | None:
-    return float(values[index]) if np.isfinite(values[index]) else None
-
-
-def _reduce(function: Any, values: np.ndarray) -> float | None:
-    values = values[np.isfinite(values)]
-    return float(function(values)) if len(values) else None
-
-
-def _median(values: np.ndarray) -> float | None:
-    return _reduce(np.median, values)
-
-
-def _mean(values: np.ndarray) -> float | None:
-    return _reduce(np.mean, values)
-
-
-def _largest(values: np.ndarray) -> float | None:
-    return _reduce(np.max, values)
-
-
 def _quiet() -> bool | None:
     """For progress bars: shown on a terminal, by one process."""
     return True if distributed.rank() else None
-
-
-def _percent(value: float | None) -> str:
-    return "n/a" if value is None else f"{100 * value:.1f}%"
-
-
-def _penetration(summary: dict[str, Any]) -> str:
-    share, depth = summary["penetration_share_mean"], summary["penetration_depth_max_m"]
-    if share is None or depth is None:
-        return "penetration n/a"
-    return f"penetration {_percent(share)} of the vertices deeper than 2 mm, deepest {1e3 * depth:.1f} mm"

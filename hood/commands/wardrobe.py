@@ -41,13 +41,15 @@ def read_outfit(given: Any, motion: Motion, triangulate: bool = False, pins: Any
         ValueError: a garment that cannot be read, is not in metres or does not fit, or pins it does not have.
     """
     garments = [load_garment(name, triangulate=triangulate) for name in names_of(given)]
+    pins = plain(pins)
+    if pins is not None:  # what is held differs in how it follows the body
+        garments = [replace(garment, pinned=np.zeros_like(garment.pinned)) for garment in garments]
     if motion.num_vertices:
         surface = motion.surface(0, motion.translation[0]).cpu().numpy()
         for garment in garments:
             if not garment.bound:
                 require_metres(used(garment.rest_pos, garment.faces), surface, garment.name)
     outfit = join_garments([motion.dressed(garment) for garment in garments])
-    pins = plain(pins)
     if pins is None:
         return outfit
     body = motion.body if isinstance(motion, BodyMotion) else None

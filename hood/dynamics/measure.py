@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from hood.losses.problem import STANDARD_GRAVITY, StepProblem
 from hood.scene.cloth import Cloth
 from hood.scene.contact import Contact
 
@@ -45,3 +46,16 @@ def penetration_metrics(contact: Contact | None, num_vertices: int) -> dict[str,
         "penetration_share": count / max(num_vertices, 1),
         "penetration_depth": float(depth.max().clamp_min(0.0)) if num_vertices else 0.0,
     }
+
+
+def vertex_residual(problem: StepProblem, gradient: Tensor) -> Tensor:
+    """Relative gradient vertex by vertex: ‖∂Φ/∂x_v‖ / (m_v g), (V,), the force left unbalanced in units of the vertex's own
+    weight, from ``gradient`` (V, 3) [N]. 0 where nothing moves.
+
+    Its root mean square, weighted by the squares of the weights, is :func:`hood.losses.potential.relative_gradient`. Standard
+    gravity stands in where the problem has none.
+    """
+    cloth, strength = problem.cloth, float(problem.gravity.norm())
+    weight = cloth.mass * (strength if strength > 0 else STANDARD_GRAVITY)
+    moves = cloth.free & (weight > 0)
+    return torch.where(moves, gradient.norm(dim=1) / torch.where(moves, weight, 1.0), 0.0)

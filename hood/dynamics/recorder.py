@@ -5,8 +5,8 @@ from __future__ import annotations
 import errno
 import json
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -22,7 +22,8 @@ class RolloutWriter:
     """Streams a rollout into an HDF5 file.
 
     Datasets: ``cloth/pos (T,V,3)``, ``cloth/faces``, ``cloth/rest_pos``, ``body/pos (T,W,3)``, ``body/faces``, ``time (T,)``,
-    ``metrics/* (T,)``; attributes: ``num_frames`` done so far, ``complete``, and what is given as ``attributes``.
+    ``metrics/* (T,)``, and of every vertex ``cloth/NAME (T,V)`` for each name in ``fields``; attributes: ``num_frames`` done
+    so far, ``complete``, and what is given as ``attributes``.
 
     All datasets are laid out, filled with NaN, when the file is made: a full disk shows at once, and later writes never
     touch the file's structure, so a killed process leaves a file that opens; its frames end at ``num_frames``.
@@ -41,6 +42,7 @@ class RolloutWriter:
         dt: float,
         attributes: Mapping[str, Any],
         farthest: float = 0.0,
+        fields: Sequence[str] = (),
     ) -> None:
         self.path = path
         self.frames_done = 0
@@ -50,6 +52,9 @@ class RolloutWriter:
             shapes = {"cloth/pos": (num_frames, len(cloth_rest_pos), 3), "body/pos": (num_frames, num_body_vertices, 3)}
             for name, shape in shapes.items():
                 self._file.create_dataset(name, shape, dtype=real, fillvalue=np.nan)
+            for name in fields:
+                by_vertex = (num_frames, len(cloth_rest_pos))
+                self._file.create_dataset(f"cloth/{name}", by_vertex, dtype=np.float32, fillvalue=np.nan)
             for name in metric_names:
                 self._file.create_dataset(f"metrics/{name}", (num_frames,), dtype=np.float64, fillvalue=np.nan)
             self._file["cloth/faces"] = np.asarray(cloth_faces, dtype=np.int32)
@@ -67,13 +72,21 @@ class RolloutWriter:
             self.discard()
             raise
 
-    def append(self, cloth_pos: np.ndarray, body_pos: np.ndarray, metrics: Mapping[str, float]) -> None:
-        """Write one frame: world positions (V, 3) and (W, 3) [m] and its metrics."""
+    def append(
+        self,
+        cloth_pos: np.ndarray,
+        body_pos: np.ndarray,
+        metrics: Mapping[str, float],
+        fields: Mapping[str, np.ndarray] | None = None,
+    ) -> None:
+        """Write one frame: world positions (V, 3) and (W, 3) [m], its metrics and its fields (V,)."""
         frame = self.frames_done
         self._file["cloth/pos"][frame] = cloth_pos
         self._file["body/pos"][frame] = body_pos
         for name, value in metrics.items():
             self._file[f"metrics/{name}"][frame] = value
+        for name, values in (fields or {}).items():
+            self._file[f"cloth/{name}"][frame] = values
         self.frames_done += 1
         self._file.attrs.modify("num_frames", self.frames_done)
         self._file.flush()
@@ -96,7 +109,7 @@ class RolloutWriter:
 
     def _touch_all(self) -> None:
         # HDF5 lays contiguous data out at the first write; one row is enough to allocate and fill everything.
-        for name in ("cloth/pos", "body/pos", *(f"metrics/{name}" for name in self._file.get("metrics", ()))):
+        for name in ("cloth/pos", "body/pos", *_field_paths(self._file), *_metric_paths(self._file)):
             self._file[name][-1] = np.nan
 
     def __enter__(self) -> RolloutWriter:
@@ -123,6 +136,7 @@ class RolloutData:
     time: np.ndarray  # (T,) s
     metrics: dict[str, np.ndarray]
     attributes: dict[str, Any]
+    fields: dict[str, np.ndarray] = field(default_factory=dict)  # (T, V) by name, such as rg
 
 
 def read_rollout(path: Path) -> RolloutData:
@@ -144,6 +158,7 @@ def read_rollout(path: Path) -> RolloutData:
                 time=file["time"][:done],
                 metrics={name: data[:done] for name, data in file["metrics"].items()},
                 attributes=dict(file.attrs),
+                fields={name.removeprefix("cloth/"): file[name][:done] for name in _field_paths(file)},
             )
     except FileNotFoundError:
         raise
@@ -154,10 +169,21 @@ def read_rollout(path: Path) -> RolloutData:
 
 def _check_extents(file: h5py.File, num_bytes: int) -> None:
     """Rollouts are stored as they are: a table that claims more than the file holds would be read as empty memory."""
-    for name in ("cloth/pos", "cloth/faces", "cloth/rest_pos", "body/pos", "body/faces", "time"):
+    names = ("cloth/pos", "cloth/faces", "cloth/rest_pos", "body/pos", "body/faces", "time")
+    for name in (*names, *_field_paths(file)):
         table = file[name]
         if table.ndim == 0 or table.size * table.dtype.itemsize > num_bytes:
             raise ValueError(f"{name} claims the shape {table.shape}, the file has {num_bytes} bytes")
+
+
+def _field_paths(file: h5py.File) -> list[str]:
+    """Values of every vertex in every frame: tables beside the positions, two axes long."""
+    known = ("pos", "faces", "rest_pos")
+    return [f"cloth/{name}" for name, table in file["cloth"].items() if name not in known and table.ndim == 2]
+
+
+def _metric_paths(file: h5py.File) -> list[str]:
+    return [f"metrics/{name}" for name in file.get("metrics", ())]
 
 
 def _plain_error(error: OSError, path: Path) -> OSError:
@@ -173,7 +199,7 @@ def _truncate(path: Path, num_frames: int) -> None:
         with h5py.File(path, "r") as source, h5py.File(temporary, "w") as target:
             for key, value in source.attrs.items():
                 target.attrs[key] = value
-            per_frame = {"cloth/pos", "body/pos", "time", *(f"metrics/{name}" for name in source["metrics"])}
+            per_frame = {"cloth/pos", "body/pos", "time", *_field_paths(source), *_metric_paths(source)}
             for name in ("cloth/faces", "cloth/rest_pos", "body/faces"):
                 target[name] = source[name][:]
             for name in per_frame:

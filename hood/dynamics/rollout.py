@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from hood.dynamics.measure import PENETRATION_METRICS, STRAIN_METRICS, penetration_metrics, strain_metrics
+from hood.dynamics.measure import (
+    PENETRATION_METRICS,
+    STRAIN_METRICS,
+    penetration_metrics,
+    strain_metrics,
+    vertex_residual,
+)
+from hood.dynamics.refine import RefinedStepper, unrefined
 from hood.dynamics.simulator import Prediction, Simulator
 from hood.dynamics.stepper import Stepper
 from hood.dynamics.stopwatch import Stopwatch
@@ -18,8 +25,11 @@ from hood.losses.potential import Potential, relative_gradient, scale
 from hood.losses.problem import StepProblem, inertial_guess
 from hood.scene.contact import Contact, find_contact
 from hood.scene.scene import Scene, recentre
-from hood.scene.start import push_out
+from hood.scene.start import free_stretch, push_out
 from hood.scene.state import Attachments, State
+
+#: A start with an edge lengthened by more than this share would snap back in the first frames.
+_STRETCH = 0.1
 
 AttachmentSchedule = Callable[[int], Attachments | None]
 #: Called after a step with the frame it leads to, what the step had to solve and what came out.
@@ -35,11 +45,14 @@ class Frame:
     world_pos: Tensor  # (V, 3) m float64
     body_pos: Tensor  # (W, 3) m float64
     metrics: dict[str, float]
+    fields: dict[str, Tensor] = field(default_factory=dict)  # (V,) by name, of the step that led here; NaN in frame 0
 
 
 #: What is measured of a frame besides its time and what the stepper reports: strain, penetration and energies, strain
 #: alone, or nothing. Only ``all`` needs contact with the body's surface.
 METRIC_CHOICES = ("all", "strain", "none")
+#: What can be had of every vertex: the relative gradient, see :func:`hood.dynamics.measure.vertex_residual`.
+FIELD_CHOICES = ("rg",)
 
 
 def metric_names(potential: Potential, stepper: Stepper, metrics: str = "all") -> tuple[str, ...]:
@@ -67,6 +80,7 @@ def simulate(
     start_frame: int = 0,
     observe: Observer | None = None,
     metrics: str = "all",
+    fields: Sequence[str] = (),
 ) -> Iterator[Frame]:
     """Frames 0, 1, … of the garment on the moving body.
 
@@ -75,17 +89,23 @@ def simulate(
     frames, so that their number and place are seen. ``observe`` sees every step outside its time.
 
     ``metrics`` is one of :data:`METRIC_CHOICES`. What only they need to know, contact included, is no part of the step and
-    changes nothing about it; its time is ``ms_metrics``, which ``ms_total`` leaves out as it does the caller's work.
+    changes nothing about it; its time is ``ms_metrics``, which ``ms_total`` leaves out as it does the caller's work. The same
+    holds for ``fields``, names of :data:`FIELD_CHOICES`.
 
     Raises:
-        ValueError: ``metrics`` is none of the choices.
+        ValueError: ``metrics`` or a field is none of the choices.
     """
     if metrics not in METRIC_CHOICES:
         raise ValueError(f"metrics is {metrics!r}; choose {', '.join(METRIC_CHOICES)}")
+    strange = [name for name in fields if name not in FIELD_CHOICES]
+    if strange:
+        raise ValueError(f"export holds {strange[0]!r}; choose of {', '.join(FIELD_CHOICES)}")
     count = scene.num_frames - start_frame if num_frames is None else min(num_frames, scene.num_frames - start_frame)
     prepared = prepare_stepper(stepper, scene)
     state = start_state(stepper, scene, potential, relaxing_steps, start_frame)
     stepped: dict[str, float] = {}
+    known_fields = {name: torch.full((scene.cloth.num_vertices,), torch.nan) for name in fields}
+    wants_potential = metrics == "all" or bool(fields)
     watch = Stopwatch()
     for index in range(count):
         body_frame = start_frame + index
@@ -99,21 +119,24 @@ def simulate(
             with watch.part("search"):
                 problem = stepper.search(problem)
         with watch.aside("metrics"):
-            known = potential.prepare(problem) if problem is not None and metrics == "all" else problem
+            known = potential.prepare(problem) if problem is not None and wants_potential else problem
             row = {**_state_metrics(scene, state, body_frame, known, metrics), **stepped}
         row["ms_metrics"] = watch.spent_aside("metrics")
         with watch.aside("caller"):
             origin = state.origin[0]
             body_pos = scene.motion.surface(body_frame, origin.numpy()).cpu().double() + origin
-            yield Frame(index, state, state.pos.cpu().double() + origin, body_pos, row)
+            yield Frame(index, state, state.pos.cpu().double() + origin, body_pos, row, known_fields)
         if problem is None or known is None:
             return
         prediction = stepper.predict(problem, prepared, watch)
         state = State(prediction.next_pos, stepper.next_velocity(problem, prediction), state.origin)
         stepped = _times(stepper, watch.lap()) | prediction.metrics
         with watch.aside("metrics"):
+            if wants_potential:
+                gradient, energies = potential.gradient(known, prediction.next_pos, prediction.acc)
+                known_fields = {name: vertex_residual(known, gradient).float().cpu() for name in fields}
             if metrics == "all":
-                stepped |= energy_metrics(potential, known, prediction.next_pos, prediction.acc)
+                stepped |= energy_metrics(potential, known, gradient, energies)
         if observe is not None:
             with watch.aside("caller"):
                 observe(index + 1, known, prediction)
@@ -138,14 +161,18 @@ def _state_metrics(scene: Scene, state: State, frame: int, problem: StepProblem 
 def prepare_stepper(stepper: Stepper, scene: Scene) -> Any:
     """What the stepper computes once per cloth. Coarse levels that came with the garment are used where there are enough."""
     levels = scene.garment.coarse_edges
-    if isinstance(stepper, Simulator) and levels is not None and len(levels) >= stepper.num_coarse:
-        hierarchy = given_hierarchy(scene.cloth.num_vertices, levels, stepper.num_coarse)
-        return stepper.prepare(scene.cloth, scene.garment.rest_pos, hierarchy)
+    network = unrefined(stepper)
+    if isinstance(stepper, RefinedStepper):
+        stepper.begin_rollout()
+    if isinstance(network, Simulator) and levels is not None and len(levels) >= network.num_coarse:
+        hierarchy = given_hierarchy(scene.cloth.num_vertices, levels, network.num_coarse)
+        return network.prepare(scene.cloth, scene.garment.rest_pos, hierarchy)
     return stepper.prepare(scene.cloth, scene.garment.rest_pos)
 
 
 def start_state(stepper: Stepper, scene: Scene, potential: Potential, relaxing_steps: int, frame: int = 0) -> State:
-    """Settled, relaxed start: the relaxing step is kept only where it lowers the potential of its own problem.
+    """Settled, relaxed start: the relaxing step is kept only where it lowers the potential of its own problem and leaves no
+    edge stretched by more than a tenth that was not before.
 
     A stepper with ``keeps_relaxing_step`` goes on from it as it left it, with its positions and its velocity.
     """
@@ -162,17 +189,22 @@ def start_state(stepper: Stepper, scene: Scene, potential: Potential, relaxing_s
             continue
         pos = push_out(scene.cloth, prediction.next_pos, step.obstacle, scene.clearance)
         problem = potential.prepare(problem)
-        if bool(torch.isfinite(pos).all()) and bool(
-            (potential.total(problem, pos) < potential.total(problem, state.pos)).all()
-        ):
+        lower = bool((potential.total(problem, pos) < potential.total(problem, state.pos)).all())
+        if lower and bool(torch.isfinite(pos).all()) and _longest(scene, pos) <= max(_STRETCH, _longest(scene, state.pos)):
             state = State(pos, state.vel, state.origin)
     return State(state.pos, velocity, state.origin)
 
 
-def energy_metrics(potential: Potential, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> dict[str, float]:
+def _longest(scene: Scene, pos: Tensor) -> float:
+    """Largest relative lengthening of an edge that is not held at both ends."""
+    return float(free_stretch(scene.cloth, pos).max()) if len(scene.cloth.edges) else 0.0
+
+
+def energy_metrics(
+    potential: Potential, problem: StepProblem, gradient: Tensor, energies: Mapping[str, Tensor]
+) -> dict[str, float]:
     """Energies [J] of one scene's step, its gradient norm [N] (the paper's: mean over vertices of ‖∂Φ/∂x_v‖₂), rg, e0 [J],
-    and for comparison the potential of the inertial guess x_t + dt v_t."""
-    gradient, energies = potential.gradient(problem, next_pos, acc)
+    and for comparison the potential of the inertial guess x_t + dt v_t; from what :meth:`Potential.gradient` says."""
     free = problem.cloth.free
     result = {f"energy_{name}": float(value.sum()) for name, value in energies.items()}
     result["energy_total"] = sum(result.values())

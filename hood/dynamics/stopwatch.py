@@ -37,6 +37,11 @@ class Stopwatch:
         """Milliseconds since the last lap in blocks set aside as ``name``."""
         return self._asides.get(name, 0.0)
 
+    def elapsed(self) -> float:
+        """Milliseconds since the last lap, without what was set aside. On CUDA, what was begun is waited for."""
+        _wait()
+        return 1e3 * (self._clock() - self._start) - sum(self._asides.values())
+
     def lap(self) -> dict[str, float]:
         """Milliseconds since the last lap: each part, ``rest`` and ``total``, which leaves out what was set aside."""
         _wait()

@@ -10,7 +10,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from hood.dynamics.recorder import RolloutData
-from hood.media.render import BODY_COLOR, GARMENT_COLOR, Camera, RenderMesh, contact_sheet, render_frame
+from hood.media.colouring import colouring_of
+from hood.media.palette import outfit_colours
+from hood.media.render import BODY_COLOR, Camera, RenderMesh, contact_sheet, render_frame
 from hood.media.video import VideoWriter, save_png
 
 _SHEET_FRAMES = 12
@@ -27,12 +29,24 @@ class Film:
         data: the rollout.
         width, height: pixels.
         azimuth_deg: viewing direction, 0 is the front of the first frame.
+        colour: what the garment's colour shows, with a bar that says so: ``strain``, ``rg``, or ``none``, its own.
+        beside: rollouts whose films are shown next to this one: a colour means the same in all of them.
     """
 
-    def __init__(self, data: RolloutData, width: int = 400, height: int = 560, azimuth_deg: float = 25.0) -> None:
+    def __init__(
+        self,
+        data: RolloutData,
+        width: int = 400,
+        height: int = 560,
+        azimuth_deg: float = 25.0,
+        colour: str = "none",
+        beside: Sequence[RolloutData] = (),
+    ) -> None:
         if len(data.cloth_pos) == 0:
             raise ValueError("the rollout has no frames to draw")
         self.data, self.width, self.height = data, width, height
+        self._colouring = colouring_of(data, colour, beside)
+        self._own_colour = outfit_colours(str(data.attributes.get("garment", "")), data.cloth_faces, data.cloth_pos.shape[1])
         # Without a body the camera looks at the cloth, as far as that is finite.
         shown = data.body_pos if data.body_pos.shape[1] else np.nan_to_num(data.cloth_pos, posinf=0.0, neginf=0.0)
         self._path = _smooth_path(shown)
@@ -51,8 +65,10 @@ class Film:
             thinner = _beneath(body, self.data.body_faces, cloth) if dressed else body
             meshes.append(RenderMesh(thinner, self.data.body_faces, BODY_COLOR))
         if dressed:
-            meshes.append(RenderMesh(cloth, self.data.cloth_faces, GARMENT_COLOR))
-        return render_frame(meshes, camera, width=self.width, height=self.height, floor=self._floor)
+            shown = self._own_colour if self._colouring is None else self._colouring.colours(index)
+            meshes.append(RenderMesh(cloth, self.data.cloth_faces, shown))
+        picture = render_frame(meshes, camera, width=self.width, height=self.height, floor=self._floor)
+        return picture if self._colouring is None else self._colouring.with_bar(picture)
 
     def sheet(self, count: int = _SHEET_FRAMES, columns: int = 6) -> np.ndarray:
         """Contact sheet of ``count`` evenly spaced frames."""
@@ -65,17 +81,19 @@ def sheet_frames(num_frames: int, count: int = _SHEET_FRAMES) -> list[int]:
     return sorted({int(i) for i in np.linspace(0, num_frames - 1, min(count, num_frames)).round()})
 
 
-def write_sheet(data: RolloutData, path: Path) -> Path:
-    """Contact sheet of the rollout as PNG."""
-    return save_png(path, Film(data).sheet())
+def write_sheet(data: RolloutData, path: Path, colour: str = "none") -> Path:
+    """Contact sheet of the rollout as PNG; ``colour`` as in :class:`Film`."""
+    return save_png(path, Film(data, colour=colour).sheet())
 
 
-def write_video(data: RolloutData, path: Path, frames: Iterable[int] | None = None, stride: int = 1) -> Path:
+def write_video(
+    data: RolloutData, path: Path, frames: Iterable[int] | None = None, stride: int = 1, colour: str = "none"
+) -> Path:
     """Video of the rollout at its own speed; every ``stride``-th frame is drawn. Returns the file written.
 
     ``frames`` is the iterable that drives the loop (a progress bar, say); all frames by default.
     """
-    film = Film(data)
+    film = Film(data, colour=colour)
     step = float(data.time[1] - data.time[0]) if len(data.time) > 1 else 1.0 / 30.0
     chosen: Sequence[int] | Iterable[int] = range(0, len(data.cloth_pos), stride) if frames is None else frames
     with VideoWriter(path, fps=1.0 / (step * stride)) as writer:

@@ -15,6 +15,9 @@ from hood.assets.sequence import load_sequence
 from hood.scene.mesh_motion import NoBody, mesh_motion
 from hood.scene.motion import Motion, body_motion
 
+#: A sequence that says so: meshes perform their own, and without a body there is none.
+NO_MOTION = "none"
+
 
 @dataclass(frozen=True)
 class MotionOptions:
@@ -57,7 +60,8 @@ def load_motion(
 
     Raises:
         FileNotFoundError: unknown name or missing file.
-        ValueError: unreadable, or an option out of range; names the file or option and the fix.
+        ValueError: unreadable, an option out of range, or a body that needs a motion and has none; names the file or option
+            and the fix.
     """
     options = options or MotionOptions()
     kind = body_kind(body)
@@ -69,6 +73,11 @@ def load_motion(
             file_fps=options.file_fps, scale=options.scale, animation=options.animation or 0, parts=options.parts,
         )  # fmt: skip
         return mesh_motion(mesh, options.num_frames, dtype, device)
+    if str(sequence) == NO_MOTION:
+        raise ValueError(
+            f"body={body} has no motion of its own and sequence=none; give a motion, sequence=walk_proud or a file, or a mesh "
+            "that stands still as body"
+        )
     poses = load_sequence(
         sequence, options.fps, options.up, start=options.start, stop=options.stop, loop=options.loop,
         blend_in=options.blend_in, blend_from=options.blend_from, hands=options.hands, file_fps=options.file_fps,

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from hood.scene.contact import find_contact
 from hood.scene.scene import Scene
+from hood.scene.start import settle
 
 
 @dataclass(frozen=True)
@@ -24,14 +25,12 @@ class FitFigures:
 
 def fit_figures(scene: Scene, frame: int = 0, settled: bool = True) -> FitFigures:
     """Figures of the start at ``frame``: settled as a rollout does, or merely skinned."""
-    if settled:
-        state = scene.start(frame, relaxed=False, thorough=True)
-        pos, origin = state.pos, state.origin[0].numpy()
-    else:
-        origin = scene.motion.translation[frame]
-        pos = scene.motion.skinned(scene.garment, frame, origin)
-    strain = _strain(scene, pos)
+    origin = scene.motion.translation[frame]
+    pos = scene.motion.skinned(scene.garment, frame, origin)
     obstacle = scene.motion.obstacle(frame, origin, static=True)
+    if settled:  # not by Scene.start, which refuses what is told here in numbers
+        pos = settle(scene.cloth, pos, obstacle, scene.clearance, thorough=True)
+    strain = _strain(scene, pos)
     dist = torch.full((len(pos),), torch.inf, dtype=torch.float64)
     if obstacle is not None:
         dist = find_contact(pos, scene.cloth.vertex_scene, obstacle).dist.double()

@@ -15,6 +15,7 @@ from hood.assets.body import Body
 from hood.assets.garment import Garment
 from hood.assets.mesh_sequence import MeshSequence
 from hood.assets.skinning import linear_blend_skinning
+from hood.mesh import topology
 from hood.mesh.proximity import search_surface
 from hood.scene.anchors import Anchors, anchors
 from hood.scene.state import Obstacle
@@ -95,8 +96,8 @@ class MeshMotion:
             rest = _misfit(pos, self.sequence.rest, faces)
             if rest.fits and sum(rest) <= sum(first):
                 return bind_garment(garment, _rest_body(self.sequence))
-        # A sheet may well fall on a body from afar; what was made for another body is misplaced there.
-        if first.inside <= _INSIDE and garment.bound_to is None:
+        # A sheet may well fall on a body from afar; what was made for another body, or is open at both ends, is misplaced.
+        if first.inside <= _INSIDE and garment.bound_to is None and (first.fits or not _wearable(garment)):
             if not first.fits:
                 warnings.warn(
                     f"garment {garment.name!r}: half of it is over {first.middle:.2g} m away from {self.name!r} at first",
@@ -225,6 +226,13 @@ def _misfit(pos: np.ndarray, points: np.ndarray, faces: np.ndarray) -> _Misfit:
     zeros = [torch.zeros(len(table), dtype=torch.int64) for table in tensors]
     dist = search_surface(tensors[0], zeros[0], tensors[1], tensors[2], zeros[1], zeros[2]).dist.numpy()
     return _Misfit(float((dist < -_DEEP).mean()), float(np.median(np.abs(dist))))
+
+
+def _wearable(garment: Garment) -> bool:
+    """Whether a part of it has openings to put it on by: a sheet has its rim alone."""
+    part = topology.connected_components(len(garment.rest_pos), topology.unique_edges(garment.faces))
+    rims = [int(part[loop[0]]) for loop in topology.boundary_loops(garment.faces)]
+    return len(rims) > len(set(rims))
 
 
 def _rest_body(sequence: MeshSequence) -> Body:

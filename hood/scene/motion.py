@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hood.assets.binding import bind_garment
+from hood.assets.binding import bind_garment, hold_on_trunk
 from hood.assets.body import Body
 from hood.assets.garment import Garment
 from hood.assets.sequence import PoseSequence
@@ -167,8 +167,9 @@ class BodyMotion:
         )
 
     def dressed(self, garment: Garment) -> Garment:
-        """The garment bound to the body (:func:`hood.assets.binding.bind_garment`)."""
-        return bind_garment(garment, self.body)
+        """The garment bound to the body (:func:`hood.assets.binding.bind_garment`), what is held there steadied
+        (:func:`hood.assets.binding.hold_on_trunk`)."""
+        return hold_on_trunk(bind_garment(garment, self.body), self.body)
 
     def rest_pos(self, garment: Garment) -> np.ndarray:
         """(V, 3) m: the garment grown with the body's shape."""

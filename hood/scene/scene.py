@@ -16,13 +16,16 @@ from hood.assets.sequence import PoseSequence
 from hood.scene.batch import to_device
 from hood.scene.cloth import Cloth, build_cloth
 from hood.scene.motion import Motion, body_motion
-from hood.scene.start import settle
+from hood.scene.start import free_stretch, settle
 from hood.scene.state import Attachments, State, StepInput, concatenate_obstacles
 
 #: Time step [s] of the relaxing first step: inertia shrinks by 100, the paper's α (section 3.4).
 RELAXING_DT = 1.0 / 3.0
 #: The local frame follows the cloth in multiples of this [m]; such shifts are exact in float32 near the cloth.
 _GRID = 0.25
+#: A garment that is worn stretches no edge by so much more when it is taken out of the body; measured: 0 there, 0.9 to 2.1
+#: where it was made for another pose.
+_TORN = 0.4
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,10 @@ class Scene:
 
         ``relaxed=False`` gives zero velocity, the start of a relaxing step; ``thorough`` as in
         :func:`hood.scene.start.settle`.
+
+        Raises:
+            ValueError: a thorough start finds the garment passing through the body, as one does that was made for another
+                pose: out of the body, it is torn.
         """
         vel = self.start_velocity(frame) if relaxed else torch.zeros_like(self.cloth.rest_pos)
         if self.start_pos is not None and frame == 0:
@@ -57,7 +64,21 @@ class Scene:
         skinned = self.motion.skinned(self.garment, frame, origin)
         obstacle = self.motion.obstacle(frame, origin, static=True)
         pos = settle(self.cloth, skinned, obstacle, self.clearance, thorough=thorough)
+        if thorough:
+            self._require_worn(frame, skinned, pos)
         return State(pos=pos, vel=vel, origin=torch.as_tensor(origin).unsqueeze(0))
+
+    def _require_worn(self, frame: int, skinned: Tensor, settled: Tensor) -> None:
+        """Settling shortens the edges of a garment that is worn, and lengthens those of one that a limb passes through."""
+        if self.cloth.edges.shape[0] == 0:
+            return
+        given, now = (float(free_stretch(self.cloth, pos).max()) for pos in (skinned, settled))
+        if now - max(given, 0.0) > _TORN:
+            raise ValueError(
+                f"garment {self.garment.name!r}: passes through {self.motion.name!r} in frame {frame} (taken out of it, edges "
+                f"are stretched by {100 * now:.0f}%); give it as it is worn there, bind it to a body with the pose it was made "
+                "in (hood prepare pose=…), or start from another frame or a standing pose (start=…, blend_in=1)"
+            )
 
     def start_velocity(self, frame: int) -> Tensor:
         """(V, 3) m/s of the skinned garment at ``frame``."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -22,6 +23,19 @@ class Iterate:
     acc: Tensor  # (V, 3) m/s²
     phi: Tensor  # (B,) J
     noise: Tensor  # (B,) J, rounding of phi
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a minimisation stood before an iteration."""
+
+    seconds: float
+    phi: Tensor  # (B,) J
+    relative_gradient: Tensor  # (B,); NaN where nobody asked for it
+
+
+#: Asked before every iteration, with where the minimisation stands and the positions (V, 3) there: whether to go on.
+Proceed = Callable[[Progress, Tensor], bool]
 
 
 class Unknowns:

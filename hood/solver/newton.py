@@ -11,7 +11,7 @@ from torch import Tensor
 from hood.losses.potential import Potential, relative_gradient
 from hood.losses.problem import StepProblem
 from hood.solver.direction import Directions
-from hood.solver.iterate import Iterate, Unknowns, first_iterate, in_double, rounded
+from hood.solver.iterate import Iterate, Proceed, Progress, Unknowns, first_iterate, in_double, rounded
 from hood.solver.plan import ModelBuilder, QuadraticModel, SolverPlan, plan_for
 from hood.solver.search import Path, backtrack
 
@@ -49,15 +49,6 @@ class NewtonSettings:
 
 
 @dataclass(frozen=True)
-class Progress:
-    """Where the solver stood before an iteration."""
-
-    seconds: float
-    phi: Tensor  # (B,) J
-    relative_gradient: Tensor  # (B,)
-
-
-@dataclass(frozen=True)
 class Report:
     """What :func:`minimize` reached, scene by scene; float64 where it computed in float64."""
 
@@ -66,7 +57,7 @@ class Report:
     phi: Tensor  # (B,) J
     relative_gradient: Tensor  # (B,)
     converged: Tensor  # (B,) bool
-    reason: tuple[str, ...]  # (B) "" or "max iterations", "time budget", "line search failed", "not finite"
+    reason: tuple[str, ...]  # (B) "" or "max iterations", "time budget", "stopped", "line search failed", "not finite"
     acc: Tensor  # (V, 3) m/s² that leads to the positions, without their cancellation in float32
     history: list[Progress] = field(default_factory=list)
 
@@ -78,6 +69,7 @@ def minimize(
     start: Tensor | None = None,
     settings: NewtonSettings | None = None,
     plan: SolverPlan | None = None,
+    proceed: Proceed | None = None,
 ) -> tuple[Tensor, Report]:
     """Positions (V, 3) at t + 1 that minimise ``potential``: one step of implicit Euler.
 
@@ -91,6 +83,7 @@ def minimize(
         start: (V, 3) m, free vertices are taken from it; default :func:`hood.solver.iterate.first_iterate`.
         settings: default ``NewtonSettings()``.
         plan: of the problem's cloth; default from a cache.
+        proceed: asked before every iteration but the one that nothing is left for; default always.
     """
     began = time.perf_counter()
     settings = settings or NewtonSettings()
@@ -99,7 +92,7 @@ def minimize(
     plan = plan or plan_for(work)
     if start is not None:
         start = start.detach().to(work.state.pos.dtype)
-    pos, report = _Newton(potential, work, plan, settings).run(start, began)
+    pos, report = _Newton(potential, work, plan, settings).run(start, began, proceed)
     return rounded(problem, pos), replace(report, acc=report.acc.to(problem.state.pos.dtype))
 
 
@@ -109,12 +102,12 @@ class _Newton:
         self.unknowns = Unknowns(potential, problem)
         self.directions = Directions(plan, problem.num_scenes, settings.linear, settings.cg_iterations)
 
-    def run(self, start: Tensor | None, began: float) -> tuple[Tensor, Report]:
+    def run(self, start: Tensor | None, began: float, proceed: Proceed | None) -> tuple[Tensor, Report]:
         settings, problem = self.settings, self.problem
         build = ModelBuilder(self.unknowns.terms, self.plan)
         now = first_iterate(self.unknowns) if start is None else self.unknowns.at(start)
         active = torch.isfinite(now.phi)
-        finite, stuck, late = active, ~active, False
+        finite, stuck, late, why = active, ~active, False, "max iterations"
         history: list[Progress] = []
         iteration = 0
         while True:
@@ -125,12 +118,16 @@ class _Newton:
             history.append(Progress(time.perf_counter() - began, now.phi, residual))
             late = settings.budget_ms is not None and 1e3 * history[-1].seconds > settings.budget_ms
             if late or iteration >= settings.max_iterations or not bool(active.any()):
+                why = "time budget" if late else why
+                break
+            if proceed is not None and not proceed(history[-1], now.pos):
+                why = "stopped"
                 break
             now, moved = self._step(now, model, residual, active)
             stuck = stuck | (active & ~moved)
             iteration += 1
         converged = finite & (residual <= settings.target_rg)
-        reason = _reasons(converged, finite, stuck, "time budget" if late else "max iterations")
+        reason = _reasons(converged, finite, stuck, why)
         return now.pos, Report(iteration, self.directions.used, now.phi, residual, converged, reason, now.acc, history)
 
     def _step(self, now: Iterate, model: QuadraticModel, residual: Tensor, active: Tensor) -> tuple[Iterate, Tensor]:

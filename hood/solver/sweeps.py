@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -14,7 +15,7 @@ from hood.solver import elements
 from hood.solver.colouring import Colour, Incidence, colours_of
 from hood.solver.elements import Corners, FaceConstants, HingeConstants
 from hood.solver.forces import VertexForces, Walls
-from hood.solver.iterate import Iterate, Unknowns, in_double, rounded
+from hood.solver.iterate import Iterate, Proceed, Progress, Unknowns, first_iterate, in_double, rounded
 from hood.solver.linear import invert_blocks
 from hood.solver.plan import plan_for
 from hood.solver.terms import StepTerms
@@ -31,11 +32,18 @@ class SweepReport:
     phi: Tensor  # (B,) J
     relative_gradient: Tensor  # (B,)
     acc: Tensor  # (V, 3) m/s² that leads to the positions
+    history: list[Progress] = field(default_factory=list)  # before every sweep, and at the end
 
 
 @torch.no_grad()
 def sweep(
-    potential: Potential, problem: StepProblem, start: Tensor, count: int = 1, double: bool = True
+    potential: Potential,
+    problem: StepProblem,
+    start: Tensor | None,
+    count: int = 1,
+    double: bool = True,
+    proceed: Proceed | None = None,
+    residuals: bool = False,
 ) -> tuple[Tensor, SweepReport]:
     """``start`` (V, 3) after up to ``count`` sweeps of block descent (Chen et al., "Vertex Block Descent", 2024).
 
@@ -43,25 +51,42 @@ def sweep(
     It is kept, whole or shortened, only in scenes where the potential falls; a scene without progress is left alone.
     Errors of wavelength L need some (L / edge length)² sweeps: for long ones use :func:`hood.solver.newton.minimize`.
 
+    Args:
+        start: (V, 3) m; None for :func:`hood.solver.iterate.first_iterate`.
+        double: compute in float64 whatever the problem's type.
+        proceed: asked before every sweep; default always.
+        residuals: compute the relative gradient before every sweep; otherwise ``history`` has it at the end alone.
+
     Raises:
         ValueError: ``count`` is negative.
     """
+    began = time.perf_counter()
     if count < 0:
         raise ValueError(f"sweep: count is {count}; give 0 or more sweeps")
     problem = potential.prepare(problem)
     work = in_double(problem) if double else problem
     unknowns = Unknowns(potential, work)
     groups = neighbourhoods(unknowns.terms)
-    now = unknowns.at(start.detach().to(work.state.pos.dtype))
+    now = first_iterate(unknowns) if start is None else unknowns.at(start.detach().to(work.state.pos.dtype))
     active = torch.isfinite(now.phi)
     kept = torch.zeros_like(active, dtype=torch.int64)
+    history: list[Progress] = []
+
+    def record(known: bool) -> Progress:
+        residual = relative_gradient(work, potential.gradient(work, now.pos, now.acc)[0]) if known else unknown
+        history.append(Progress(time.perf_counter() - began, now.phi, residual))
+        return history[-1]
+
+    unknown = torch.full_like(now.phi, torch.nan)
     for _ in range(count):
-        if not bool(active.any()):
+        progress = record(residuals)
+        if not bool(active.any()) or (proceed is not None and not proceed(progress, now.pos)):
+            history.pop()
             break
         now, active = _improve(unknowns, now, _sweep(unknowns, groups, now), active)
         kept += active
-    gradient, _ = potential.gradient(work, now.pos, now.acc)
-    report = SweepReport(kept, now.phi, relative_gradient(work, gradient), now.acc.to(problem.state.pos.dtype))
+    last = record(True)
+    report = SweepReport(kept, now.phi, last.relative_gradient, now.acc.to(problem.state.pos.dtype), history)
     return rounded(problem, now.pos), report
 
 

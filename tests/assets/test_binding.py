@@ -7,14 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
-from hood.assets.binding import bind_garment, bind_posed, posed_body, push_out, signed_distances
+from hood.assets.binding import bind_garment, bind_posed, hold_on_trunk, posed_body, push_out, signed_distances
 from hood.assets.body import Body
 from hood.assets.garment import Garment, load_garment, save_garment
 from hood.assets.outfit import join_garments
-from hood.assets.sequence import PoseSequence
+from hood.assets.sequence import PoseSequence, load_sequence
+from hood.assets.skinning import linear_blend_skinning
 from hood.assets.standing import arms_down, find_standing_pose, read_pose
 from hood.assets.units import find_scale, require_metres, used
+from hood.mesh import topology
 from hood.testing import sphere
 
 
@@ -149,3 +152,32 @@ def test_poses_from_files(tmp_path: Path) -> None:
         (tmp_path / name).write_text(text)
         with pytest.raises(ValueError, match=name):
             read_pose(tmp_path / name)
+
+
+def test_a_held_waistband_follows_the_trunk_alone(garments: dict[str, Garment], body: Body) -> None:
+    """It keeps its girth; nothing else changes, nor does anything in the T-pose."""
+    shorts = garments["shorts"]
+    held = hold_on_trunk(shorts, body)
+    assert shorts.lbs_weights[shorts.pinned][:, [1, 2]].max() > 0.1
+    assert not held.lbs_weights[shorts.pinned][:, [1, 2]].any()
+    np.testing.assert_allclose(held.lbs_weights.sum(axis=1), 1.0)
+    np.testing.assert_array_equal(held.lbs_weights[~shorts.pinned], shorts.lbs_weights[~shorts.pinned])
+    squat = load_sequence("squats").window(60, 61)
+    edges = topology.unique_edges(shorts.faces)
+    edges = edges[shorts.pinned[edges].all(axis=1)]
+    changes = []
+    for garment in (shorts, held):
+        bones = body.transforms(squat, np.zeros(10), torch.float64)
+        pos = linear_blend_skinning(torch.as_tensor(garment.rest_pos), torch.as_tensor(garment.lbs_weights), bones)[0].numpy()
+        length, rest = (np.linalg.norm(p[edges[:, 1]] - p[edges[:, 0]], axis=1) for p in (pos, garment.rest_pos))
+        changes.append(float(np.abs(length / rest - 1).max()))
+    assert changes[0] > 0.15
+    assert changes[1] < 0.02
+
+
+def test_what_is_held_at_the_legs_follows_them(garments: dict[str, Garment], body: Body) -> None:
+    trousers = garments["trousers"]
+    ankles = replace(trousers, pinned=trousers.rest_pos[:, 1] < trousers.rest_pos[:, 1].min() + 0.3)
+    assert hold_on_trunk(ankles, body) is ankles
+    loose = replace(trousers, pinned=np.zeros_like(trousers.pinned))
+    assert hold_on_trunk(loose, body) is loose

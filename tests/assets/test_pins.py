@@ -10,7 +10,7 @@ import pytest
 
 from hood.assets.body import Body
 from hood.assets.garment import Garment
-from hood.assets.pins import pin_mask, read_indices
+from hood.assets.pins import opening_names, pin_mask, read_indices
 from hood.mesh import topology
 
 
@@ -25,13 +25,31 @@ def test_the_waistband_of_the_skirt_is_what_it_is_held_by(garments: dict[str, Ga
 def test_openings_of_a_shirt(garments: dict[str, Garment], body: Body) -> None:
     shirt = garments["longsleeve"]
     loops = [set(loop.tolist()) for loop in topology.boundary_loops(shirt.faces)]
-    masks = {name: pin_mask(name, shirt, body) for name in ("neckline", "cuff_left", "cuff_right", "waistband")}
+    masks = {name: pin_mask(name, shirt, body) for name in ("neckline", "cuff_left", "cuff_right", "hem")}
     found = [frozenset(np.flatnonzero(mask).tolist()) for mask in masks.values()]
     assert len(set(found)) == 4
     assert all(set(loop) in loops for loop in found)
     assert shirt.rest_pos[masks["cuff_left"], 0].min() > 0.3 > -0.3 > shirt.rest_pos[masks["cuff_right"], 0].max()
-    assert shirt.rest_pos[masks["neckline"], 1].min() > shirt.rest_pos[masks["waistband"], 1].max()
+    assert shirt.rest_pos[masks["neckline"], 1].min() > shirt.rest_pos[masks["hem"], 1].max()
     np.testing.assert_array_equal(pin_mask("left_wrist", shirt, body), masks["cuff_left"])
+
+
+def test_names_of_openings(garments: dict[str, Garment], body: Body) -> None:
+    """Below the hips is a hem, whatever joint is nearest; one opening at most is the waistband."""
+    joints = body.shaped(np.zeros(10))[1]
+    expected = {
+        "skirt": ["hem", "waistband"], "shorts": ["hem", "hem", "waistband"],
+        "trousers": ["hem_left", "hem_right", "waistband"], "dress": ["armhole_left", "armhole_right", "hem", "neckline"],
+        "tank": ["armhole_left", "armhole_right", "hem", "neckline"],
+    }  # fmt: skip
+    for name, regions in expected.items():
+        garment = garments[name]
+        centres = [garment.rest_pos[loop].mean(axis=0) for loop in topology.boundary_loops(garment.faces)]
+        assert sorted(opening_names(np.stack(centres), joints)) == regions, name
+    # A sash around the waist has two openings above the hips: the lower edge is its hem.
+    assert opening_names(joints[3] + [[0.0, 0.02, 0.0], [0.0, -0.06, 0.0]], joints) == ["waistband", "hem"]
+    with pytest.raises(ValueError, match="no opening of 'dress' is a waistband"):
+        pin_mask("waistband", garments["dress"], body)
 
 
 def test_lists_numbers_and_words_add_up(tmp_path: Path, garments: dict[str, Garment], body: Body) -> None:

@@ -64,7 +64,8 @@ def test_embedded_assets_fit(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["inspect", "tank", "walk_proud", "default"]) == 0
     text = capsys.readouterr().out
     assert "they fit" in text
-    assert "near waistband" in text
+    assert "near hem" in text
+    assert "near neckline" in text
     assert "body height 1.7" in text
 
 

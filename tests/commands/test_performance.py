@@ -55,3 +55,11 @@ def test_what_is_not_performed_is_said(tmp_path: Path, capsys: pytest.CaptureFix
         assert bool(said) == bool(words)
     make_motion(load_config("rollout", ["body=none", "sequence=none"]))
     assert not capsys.readouterr().err
+
+
+def test_a_motion_file_that_is_not_performed_is_refused(tmp_path: Path) -> None:
+    points, faces = sphere(1, 0.5)
+    np.savez(tmp_path / "ball.npz", verts=points, faces=faces)
+    for body, words in ((str(tmp_path / "ball.npz"), "performs its own motion"), ("none", "does not move")):
+        with pytest.raises(ConfigError, match=rf"sequence=mine\.npz: body=\S+ {words}; leave sequence out"):
+            make_motion(load_config("rollout", [f"body={body}", "sequence=mine.npz"]))

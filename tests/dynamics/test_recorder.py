@@ -161,3 +161,23 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         read_rollout(tmp_path / "other.h5")
     with pytest.raises(FileNotFoundError):
         read_rollout(tmp_path / "none.h5")
+
+
+def test_values_of_every_vertex_are_kept_and_cut_with_the_rest(tmp_path: Path) -> None:
+    """Also where the rollout ends early; files without such values stay what they were."""
+    for count in (3, 2):
+        path = tmp_path / f"{count}.h5"
+        with RolloutWriter(path, 3, np.eye(4, 3), FACES, FACES[:1], 3, NAMES, 0.5, {}, fields=("rg",)) as target:
+            for index in range(count):
+                target.append(*frame(index), {"rg": np.full(4, index if index else np.nan)})
+        data = read_rollout(path)
+        assert list(data.fields) == ["rg"]
+        assert data.fields["rg"].dtype == np.float32
+        assert data.fields["rg"].shape == (count, 4)
+        assert np.isnan(data.fields["rg"][0]).all()
+        np.testing.assert_array_equal(data.fields["rg"][1:, 2], np.arange(1, count))
+    with writer(tmp_path / "plain.h5") as target:
+        append(target, 5)
+    assert read_rollout(tmp_path / "plain.h5").fields == {}
+    with h5py.File(tmp_path / "plain.h5", "r") as file:
+        assert set(file["cloth"]) == {"pos", "faces", "rest_pos"}

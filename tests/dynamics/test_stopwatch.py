@@ -46,3 +46,17 @@ def test_a_lap_begins_where_the_last_one_ended() -> None:
     with timed(None, "search"):
         clock.now += 1.0
     assert watch.lap()["total"] == pytest.approx(1000.0)
+
+
+def test_elapsed_is_the_frame_so_far() -> None:
+    clock = Clock()
+    watch = Stopwatch(clock)
+    with watch.part("search"):
+        clock.now += 0.004
+        assert watch.elapsed() == pytest.approx(4.0)
+    with watch.aside("caller"):
+        clock.now += 1.0
+    clock.now += 0.001
+    assert watch.elapsed() == pytest.approx(5.0)
+    assert watch.lap()["total"] == pytest.approx(5.0)
+    assert watch.elapsed() == pytest.approx(0.0)

@@ -73,3 +73,8 @@ def test_meshes_and_no_body(tmp_path: Path) -> None:
     nothing = load_motion("none", "none", MotionOptions(num_frames=12, fps=50.0))
     assert isinstance(nothing, NoBody)
     assert (nothing.num_frames, nothing.fps) == (12, 50.0)
+
+
+def test_a_body_without_a_motion_is_refused() -> None:
+    with pytest.raises(ValueError, match="body=default has no motion of its own and sequence=none; give a motion"):
+        load_motion("default", "none")

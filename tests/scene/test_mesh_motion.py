@@ -13,10 +13,12 @@ from hood.assets.body import Body
 from hood.assets.garment import Garment
 from hood.assets.mesh_sequence import MeshSequence
 from hood.assets.sequence import PoseSequence
+from hood.assets.standing import arms_down
 from hood.scene.mesh_motion import NoBody, mesh_motion, worn_pos
 from hood.scene.motion import body_motion
 from hood.scene.scene import Scene, dress
-from hood.testing import cylinder, sphere
+from hood.scene.start import free_stretch
+from hood.testing import cylinder, grid, sphere
 
 POINTS, FACES = sphere(3, 0.5)
 TUBE = Garment("tube", cylinder(16, 6, 0.53, 0.4)[0] - [0, 0.2, 0], cylinder(16, 6, 0.53, 0.4)[1], np.arange(96) < 16)
@@ -98,12 +100,26 @@ def test_garments_elsewhere_are_refused(garments: dict[str, Garment], body: Body
     motion = mesh_motion(exported(body, walk.window(60, 63), np.zeros(10)))
     with pytest.raises(ValueError, match="'skirt': not worn by 'exported' in its first frame.*weights"):
         dress(garments["skirt"], motion)
-    # A mesh file may be anything, a sheet that falls on the body for one.
-    with pytest.warns(UserWarning, match="'skirt': half of it is over"):
+    with pytest.raises(ValueError, match="'skirt': not worn by 'exported' in its first frame"):
         dress(replace(garments["skirt"], lbs_weights=None, bound_to=None), motion)
+    # A sheet may well fall on the body from afar.
+    sheet, faces = grid(5, 5, 0.4)
+    with pytest.warns(UserWarning, match="'sheet': half of it is over"):
+        dress(Garment("sheet", sheet + [0.0, 3.0, 0.0], faces, np.zeros(25, dtype=bool)), motion)
     inside = replace(TUBE, rest_pos=TUBE.rest_pos * 0.8)
     with pytest.raises(ValueError, match=r"'tube': not worn by 'ball'.*% of the vertices are deeper than 2 cm"):
         dress(inside, mesh_motion(turning()[0]))
+
+
+def test_a_garment_that_a_limb_passes_through_is_refused(garments: dict[str, Garment], body: Body) -> None:
+    """A shirt as it is worn in the T-pose, near the skin of a body in A-pose but for the sleeves."""
+    shirt = replace(garments["tshirt"], lbs_weights=None, shapedirs=None, bound_to=None)
+    verts = [body.surface(arms_down(angle), np.zeros(10), torch.float64).numpy() for angle in (0.0, 45.0)]
+    right, wrong = (dress(shirt, mesh_motion(MeshSequence("still", v, body.faces, 30.0))) for v in verts)
+    assert float(free_stretch(right.cloth, right.start(0, thorough=True).pos).max()) < 0.01
+    with pytest.raises(ValueError, match="'tshirt': passes through 'still' in frame 0 .*hood prepare"):
+        wrong.start(0, thorough=True)
+    assert wrong.start(0).pos.isfinite().all()  # training measures its starts itself
 
 
 def test_weights_for_the_meshs_joints(garments: dict[str, Garment], body: Body, walk: PoseSequence) -> None:

@@ -9,12 +9,12 @@ import torch
 from hood.assets.body import Body
 from hood.assets.garment import Garment
 from hood.assets.material import Material
-from hood.assets.sequence import PoseSequence
+from hood.assets.sequence import PoseSequence, load_sequence
 from hood.dynamics.measure import strain_metrics
 from hood.scene.cloth import build_cloth
 from hood.scene.contact import find_contact
 from hood.scene.scene import build_scene
-from hood.scene.start import push_out, settle
+from hood.scene.start import free_stretch, push_out, settle
 from hood.scene.state import Obstacle
 from hood.testing import grid, sphere
 
@@ -71,3 +71,33 @@ def test_cloth_far_inside_is_not_sent_across_the_body() -> None:
     cloth = build_cloth(*grid(3, 3, 0.02), Material(), dtype=torch.float64)
     centre = cloth.rest_pos - 0.01
     assert torch.equal(push_out(cloth, centre, ball(0.3), 2e-3), centre)
+
+
+@pytest.mark.parametrize(
+    ("name", "motion", "frame"), [("trousers", "kicks", 60), ("shorts", "squats", 60), ("skirt", "jumps", 60)]
+)
+def test_starts_in_the_midst_of_a_wild_motion(
+    name: str, motion: str, frame: int, garments: dict[str, Garment], body: Body
+) -> None:
+    """A bent hip: cloth has to slide along the thigh, and the waistband must not fold with the belly."""
+    scene = build_scene(garments[name], body, load_sequence(motion).window(frame, frame + 2))
+    state = scene.start(0, relaxed=False, thorough=True)
+    start, end = scene.cloth.edges.unbind(dim=1)
+    rest = (scene.cloth.rest_pos[end] - scene.cloth.rest_pos[start]).norm(dim=1)
+    assert float(((state.pos[end] - state.pos[start]).norm(dim=1) / rest - 1).max()) < 0.1
+    obstacle = scene.motion.obstacle(0, state.origin[0].numpy(), static=True)
+    assert float(find_contact(state.pos, scene.cloth.vertex_scene, obstacle).dist.min()) > -2e-3
+
+
+def test_a_thorough_start_slides_cloth_along_itself() -> None:
+    """A long strip with all its stretch at one end: in the end every edge has a share, and the held end stays."""
+    pos, faces = grid(4, 40, 0.1)
+    held = pos[:, 2] == pos[:, 2].min()
+    cloth = build_cloth(pos, faces, Material(), held, dtype=torch.float64)
+    start = cloth.rest_pos.clone()
+    start[pos[:, 2] > 0.8 * pos[:, 2].max()] += torch.tensor([0.0, 0.0, 0.1]).double()
+    assert float(free_stretch(cloth, settle(cloth, start, None, iterations=10)).max()) > 0.3
+    settled = settle(cloth, start, None, thorough=True)
+    assert float(free_stretch(cloth, settled).max()) <= 0.08
+    assert torch.equal(settled[held], start[held])
+    assert settled.isfinite().all()

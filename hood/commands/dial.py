@@ -1,0 +1,157 @@
+"""The dial between speed and accuracy: what a user says about it, what it becomes, and how it is reported."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig
+
+from hood.config import ConfigError, build, plain, require_choice
+from hood.dynamics.goals import Budget, Count, Goal, MaxStrain, TargetResidual, floor_from_table
+from hood.dynamics.refine import METHODS, RefinedStepper
+from hood.dynamics.rollout import FIELD_CHOICES
+from hood.dynamics.stepper import Stepper
+
+#: The ways to say how far a step is refined; a user gives one of them.
+DIALS = ("refine", "target_rg", "budget_ms", "max_strain")
+COLOURS = ("none", "strain", "rg")
+#: What says more about a dial, and its value where nothing is said.
+_DETAILS = {"refine_method": "newton", "refine_most": 50, "refine_table": None}
+
+
+def chosen(config: Mapping[Any, Any]) -> tuple[str, float] | None:
+    """Name and value of the dial that is set; None where steps are taken as they come.
+
+    Raises:
+        ConfigError: two are set, or the value is no number.
+    """
+    given = [name for name in DIALS if config.get(name) is not None and not (name == "refine" and config[name] == 0)]
+    if len(given) > 1:
+        text = " and ".join(f"{name}={config[name]}" for name in given)
+        raise ConfigError(f"{text}: these say in {len(given)} ways how far a step is refined; give one of {', '.join(DIALS)}")
+    if not given:
+        return None
+    value = config[given[0]]
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ConfigError(f"{given[0]}={value!r}: give a number")
+    return given[0], float(value)
+
+
+def check_dial(config: DictConfig) -> None:
+    """Raise ConfigError where what is said about refinement, export and colour does not fit together."""
+    dial = chosen(config)
+    require_choice(config, "refine_method", METHODS)
+    require_choice(config, "colour", COLOURS)
+    exported(config)
+    if int(config.refine_most) < 1:
+        raise ConfigError(f"refine_most={config.refine_most}: must be at least 1")
+    if dial is None:
+        if str(config.stepper) == "refine":
+            raise ConfigError(f"stepper=refine takes its steps by refinement alone; give one of {', '.join(DIALS)}")
+        for name, default in _DETAILS.items():
+            if config[name] != default:
+                raise ConfigError(f"{name}={config[name]}: nothing is refined; give one of {', '.join(DIALS)} as well")
+        return
+    if str(config.stepper) == "newton":
+        raise ConfigError(
+            f"{dial[0]}={config[dial[0]]}: stepper=newton goes as far as solver.* says; use stepper=refine instead"
+        )
+    if config.refine_table is not None and dial[0] != "max_strain":
+        raise ConfigError(f"refine_table={config.refine_table}: says where max_strain begins; {dial[0]} needs none")
+    make_goal(config, num_vertices=1000)
+
+
+def exported(config: DictConfig) -> tuple[str, ...]:
+    """Values of every vertex that go into the file: those asked for, and what pictures are coloured by.
+
+    Raises:
+        ConfigError: an unknown one.
+    """
+    names = [str(name) for name in plain(config.export)]
+    for name in names:
+        if name not in FIELD_CHOICES:
+            raise ConfigError(f"export={plain(config.export)}: {name!r} is not known; choose of {', '.join(FIELD_CHOICES)}")
+    drawn = str(config.colour)
+    return tuple(dict.fromkeys([*names, *([drawn] if drawn in FIELD_CHOICES else [])]))
+
+
+def make_goal(config: DictConfig, num_vertices: int) -> Goal | None:
+    """A new goal for one rollout of a cloth of this size; None where nothing is refined.
+
+    Raises:
+        ConfigError, ValueError: a value that no refinement can have.
+    """
+    dial = chosen(config)
+    if dial is None:
+        return None
+    name, value = dial
+    most = int(config.refine_most)
+    if name == "refine":
+        return Count(int(value))
+    if name == "target_rg":
+        return TargetResidual(value, most)
+    if name == "budget_ms":
+        return Budget(value, most)
+    if config.refine_table is None:
+        return MaxStrain(value, most)
+    table = Path(str(config.refine_table)).expanduser()
+    return MaxStrain(value, most, floor_from_table(table, value, num_vertices, str(config.refine_method)))
+
+
+def refined(stepper: Stepper, config: DictConfig, num_vertices: int) -> Stepper:
+    """The stepper with its steps refined as the config says: itself where it says nothing."""
+    goal = make_goal(config, num_vertices)
+    if goal is None:
+        return stepper
+    return RefinedStepper(stepper, build(config.losses), goal, str(config.refine_method), build(config.solver))
+
+
+def summarise_refinement(config: Mapping[str, Any], metrics: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Entry ``refinement`` of a summary: the dial, iterations and accuracy reached, frames that met it and that missed it.
+
+    Frames count from the first step on. A frame meets ``budget_ms`` with its time from one frame to the next, ``ms_total``.
+    """
+    dial = chosen(config)
+    if dial is None or "refine_iterations" not in metrics:
+        return {}
+    name, value = dial
+    iterations, residual = metrics["refine_iterations"][1:], metrics["refine_rg"][1:]
+    entry: dict[str, Any] = {
+        "dial": f"{name}={value:g}",
+        "method": str(config["refine_method"]),
+        "iterations_median": _of(np.median, iterations),
+        "iterations_max": _of(np.max, iterations),
+        "rg_median": _of(np.median, residual),
+        "rg_p95": _of(lambda values: np.quantile(values, 0.95), residual),
+    }
+    met = metrics.get("refine_met")
+    if name == "budget_ms":
+        times = metrics["ms_total"]
+        met = np.where(np.isfinite(times), times <= value, np.nan)
+        entry["ms_p95"] = _of(lambda values: np.quantile(values, 0.95), times)
+        entry["budget_used_median"] = _of(lambda values: np.median(values) / value, times)
+    if met is not None:
+        seen = met[1:][np.isfinite(met[1:])]
+        entry |= {"frames_met": int((seen == 1).sum()), "frames_missed": int((seen == 0).sum())}
+    return {"refinement": entry}
+
+
+def describe_refinement(summary: Mapping[str, Any]) -> list[str]:
+    """The entry in a line; none where nothing was refined."""
+    entry = summary.get("refinement")
+    if entry is None:
+        return []
+    iterations, residual = entry["iterations_median"], entry["rg_median"]
+    text = f"refined, {entry['dial']}: median {iterations or 0:.0f} iterations ({entry['method']})"
+    text += "" if residual is None else f", relative gradient {residual:.2g}"
+    if "frames_met" in entry:
+        text += f"; {entry['frames_met']} frames met it, {entry['frames_missed']} missed it"
+    return [text]
+
+
+def _of(function: Any, values: np.ndarray) -> float | None:
+    values = values[np.isfinite(values)]
+    return float(function(values)) if len(values) else None

@@ -1,0 +1,120 @@
+"""What a rollout comes to in a few numbers, from its file: ``summary.json`` and the lines a command prints."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hood.commands.dial import describe_refinement, summarise_refinement
+from hood.dynamics.recorder import read_rollout
+
+
+def summarise(path: Path) -> dict[str, Any]:
+    """Summary of a rollout file: strain, penetration, times, first non-finite frame; None for what was not measured."""
+    data = read_rollout(path)
+    finite = np.isfinite(data.cloth_pos).all(axis=(1, 2))
+    metrics = defaultdict(lambda: np.full(len(finite), np.nan), data.metrics)
+    times = {name[3:]: _quantiles(metrics[name][2:]) for name in sorted(metrics) if name.startswith("ms_")}
+    converged = metrics.get("solver_converged")
+    solver = {} if converged is None else {"solver_steps_not_converged": int((converged == 0).sum())}
+    return {
+        "num_frames": int(len(finite)),
+        "complete": bool(data.attributes["complete"]),
+        "garment": data.attributes["garment"],
+        "num_vertices": int(data.cloth_pos.shape[1]),
+        "dt": float(data.attributes["dt"]),
+        "first_nonfinite_frame": None if finite.all() else int(np.argmin(finite)),
+        "first_frame": {
+            key: _at(metrics[key], 0) for key in ("strain_p50", "strain_p99", "penetration_count", "penetration_depth")
+        },
+        "strain_p50": _median(metrics["strain_p50"]),
+        "strain_p99": _median(metrics["strain_p99"]),
+        "strain_max": _largest(metrics["strain_max"]),
+        "penetration_share_mean": _mean(metrics["penetration_share"]),
+        "penetration_share_max": _largest(metrics["penetration_share"]),
+        "penetration_count_max": _largest(metrics["penetration_count"]),
+        "penetration_depth_max_m": _largest(metrics["penetration_depth"]),
+        "potential_mean_J": _mean(metrics["energy_total"]),
+        "potential_inertial_guess_mean_J": _mean(metrics["energy_inertial_guess"]),
+        "relative_gradient_median": _median(metrics["relative_gradient"]),
+        "ms_per_frame": times,
+        **solver,
+        **summarise_refinement(json.loads(data.attributes["config"]), data.metrics),
+    }
+
+
+def describe(summary: dict[str, Any]) -> str:
+    """The summary in three lines, and one more where steps were refined and where the solver missed its target."""
+    missed = summary.get("solver_steps_not_converged", 0)
+    first = summary["first_nonfinite_frame"]
+    times = {name: value["median"] for name, value in summary["ms_per_frame"].items()}
+    return "\n".join(
+        [
+            f"{summary['garment']}: {summary['num_frames']} frames, "
+            + ("all finite" if first is None else f"first non-finite frame {first}"),
+            f"strain p50 {_percent(summary['strain_p50'])} p99 {_percent(summary['strain_p99'])}, {_penetration(summary)}",
+            "ms per frame (median): " + ", ".join(f"{name} {value or 0.0:.1f}" for name, value in times.items()),
+            *describe_refinement(summary),
+            *([f"{missed} steps did not reach solver.target_rg; their frames are kept as far as they got"] if missed else []),
+        ]
+    )
+
+
+def describe_all(rows: Mapping[str, Mapping[str, Any]], total: int) -> str:
+    """One line per motion, and how many were done."""
+    lines = []
+    for name, row in rows.items():
+        if "error" in row:
+            lines.append(f"{name}: {row['error']}")
+            continue
+        first = row["first_nonfinite_frame"]
+        state = f"{row['num_frames']} frames, " + ("all finite" if first is None else f"first non-finite frame {first}")
+        lines.append(
+            f"{name}: {state}, strain p99 {_percent(row['strain_p99'])}, penetration {_percent(row['penetration_share_mean'])}"
+        )
+    failed = sum("error" in row for row in rows.values())
+    return "\n".join([*lines, f"{len(rows) - failed} of {total} motions simulated" + (f", {failed} failed" if failed else "")])
+
+
+def _quantiles(values: np.ndarray) -> dict[str, float | None]:
+    values = values[np.isfinite(values)]
+    if len(values) == 0:
+        return {"median": None, "p99": None}
+    return {"median": float(np.median(values)), "p99": float(np.quantile(values, 0.99))}
+
+
+def _at(values: np.ndarray, index: int) -> float | None:
+    return float(values[index]) if np.isfinite(values[index]) else None
+
+
+def _reduce(function: Any, values: np.ndarray) -> float | None:
+    values = values[np.isfinite(values)]
+    return float(function(values)) if len(values) else None
+
+
+def _median(values: np.ndarray) -> float | None:
+    return _reduce(np.median, values)
+
+
+def _mean(values: np.ndarray) -> float | None:
+    return _reduce(np.mean, values)
+
+
+def _largest(values: np.ndarray) -> float | None:
+    return _reduce(np.max, values)
+
+
+def _percent(value: float | None) -> str:
+    return "n/a" if value is None else f"{100 * value:.1f}%"
+
+
+def _penetration(summary: dict[str, Any]) -> str:
+    share, depth = summary["penetration_share_mean"], summary["penetration_depth_max_m"]
+    if share is None or depth is None:
+        return "penetration n/a"
+    return f"penetration {_percent(share)} of the vertices deeper than 2 mm, deepest {1e3 * depth:.1f} mm"

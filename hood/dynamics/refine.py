@@ -1,0 +1,197 @@
+"""Speed for accuracy: steps that a network has predicted are taken further down the potential, as far as a goal asks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import deepcopy
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from hood.dynamics.goals import Goal, Standing
+from hood.dynamics.simulator import Prediction
+from hood.dynamics.stepper import Stepper
+from hood.dynamics.stopwatch import Stopwatch, timed
+from hood.losses.potential import Potential
+from hood.losses.problem import StepProblem
+from hood.scene.cloth import Cloth
+from hood.scene.scene import RELAXING_DT
+from hood.solver.colouring import colours_of
+from hood.solver.iterate import Progress, Unknowns, first_iterate, in_double, rounded
+from hood.solver.newton import NewtonSettings, minimize
+from hood.solver.plan import plan_for
+from hood.solver.sweeps import sweep
+
+METHODS = ("newton", "sweeps")
+#: Where the relative gradient is this small nothing is left to gain.
+_CONVERGED = 1e-4
+
+
+class GuessStepper:
+    """The contact-projected inertial guess as a step: where the solver starts, and a refinement without a network.
+
+    Vertices fly on, with their weight or without it, whichever has the lower potential, and are moved out of the body.
+    """
+
+    times: tuple[str, ...] = ("search", "guess", "rest", "total")
+    metrics: tuple[str, ...] = ()
+    keeps_relaxing_step = False
+
+    def __init__(self, potential: Potential) -> None:
+        self.potential = potential
+        self.gravity = torch.tensor([0.0, -9.81, 0.0])
+        self.config: dict[str, Any] = {"stepper": "guess"}
+
+    def prepare(self, cloth: Cloth, rest_pos: Any) -> None:
+        """Nothing is needed."""
+
+    def search(self, problem: StepProblem) -> StepProblem:
+        """The problem with what the potential's terms ask of it."""
+        return self.potential.prepare(problem)
+
+    @torch.no_grad()
+    def predict(self, problem: StepProblem, prepared: None, watch: Stopwatch | None = None) -> Prediction:
+        """The guess."""
+        with timed(watch, "search"):
+            problem = self.search(problem)
+        with timed(watch, "guess"):
+            guess = first_iterate(Unknowns(self.potential, in_double(problem)))
+            return Prediction(rounded(problem, guess.pos), guess.acc.to(problem.state.pos.dtype))
+
+    def next_velocity(self, problem: StepProblem, prediction: Prediction) -> Tensor:
+        """(V, 3) m/s at t + 1: (x_{t+1} − x_t) / dt."""
+        return problem.state.vel + problem.vertex_dt * prediction.acc
+
+
+class RefinedStepper:
+    """Takes the steps of another stepper further: iterations down ``potential`` from where that one led.
+
+    The potential of a step never rises: what an iteration leads to is kept where it is lower, and a step for which there is no
+    such place stays, to the bit, what the inner stepper made of it. Pinned vertices stay on their targets. Of every frame
+    the metrics hold ``refine_iterations`` (those that were kept), ``refine_rg`` (the relative gradient reached),
+    ``refine_phi_before`` and ``refine_phi_after`` [J] and what the goal reports; its time is ``ms_refine``. Where a goal wants
+    no refinement of a frame, nothing is computed and the last three are NaN.
+
+    Args:
+        inner: a network's :class:`hood.dynamics.simulator.Simulator`, or :class:`GuessStepper`.
+        potential: what is lowered, usually the one that the network was trained with.
+        goal: how far. What it learns belongs to a rollout, which begins with a fresh copy.
+        method: ``newton``, a few global iterations, or ``sweeps`` of single vertices, which smooth at short range.
+        settings: of Newton's linear systems; its accuracy and iterations are the goal's affair.
+    """
+
+    def __init__(
+        self,
+        inner: Stepper,
+        potential: Potential,
+        goal: Goal,
+        method: str = "newton",
+        settings: NewtonSettings | None = None,
+    ) -> None:
+        if method not in METHODS:
+            raise ValueError(f"refine_method is {method!r}; choose {' or '.join(METHODS)}")
+        self.inner, self.potential, self.goal, self.method = inner, potential, goal, method
+        self._fresh_goal = deepcopy(goal)
+        self.settings = replace(settings or NewtonSettings(), target_rg=_CONVERGED, max_iterations=goal.most, budget_ms=None)
+        self.gravity = inner.gravity
+        self.config: dict[str, Any] = {**inner.config, "refined": f"{method}, {type(goal).__name__}"}
+        own = ("refine_iterations", "refine_rg", "refine_phi_before", "refine_phi_after")
+        self.metrics: tuple[str, ...] = (*inner.metrics, *own, *goal.metrics)
+        parts = [part for part in inner.times if part not in ("rest", "total")]
+        self.times: tuple[str, ...] = (*dict.fromkeys([*parts, "search"]), "refine", "rest", "total")
+
+    @property
+    def keeps_relaxing_step(self) -> bool:
+        return self.inner.keeps_relaxing_step
+
+    def prepare(self, cloth: Cloth, rest_pos: Any) -> Any:
+        """What the inner stepper computes once per cloth."""
+        return self.inner.prepare(cloth, rest_pos)
+
+    def begin_rollout(self) -> None:
+        """Forget what the goal has learned in the last one."""
+        self.goal = deepcopy(self._fresh_goal)
+
+    def search(self, problem: StepProblem) -> StepProblem:
+        """The problem with what the inner stepper and the potential's terms ask of it."""
+        return self.potential.prepare(self.inner.search(problem))
+
+    def next_velocity(self, problem: StepProblem, prediction: Prediction) -> Tensor:
+        """(V, 3) m/s at t + 1, by the inner stepper's rule."""
+        return self.inner.next_velocity(problem, prediction)
+
+    @torch.no_grad()
+    def predict(self, problem: StepProblem, prepared: Any, watch: Stopwatch | None = None) -> Prediction:
+        """Positions at t + 1."""
+        with timed(watch, "search"):
+            problem = self.search(problem)
+        prediction = self.inner.predict(problem, prepared, watch)
+        if self.keeps_relaxing_step and bool(((problem.step.dt - RELAXING_DT).abs() < 1e-6).all()):
+            # Such models turn the way that they went into a velocity: a refined one would be a blow.
+            return prediction
+        with timed(watch, "refine"):
+            plan = plan_for(problem)  # made once per cloth, so here: no part of what an iteration costs
+            if self.method == "sweeps":
+                colours_of(plan, problem.cloth, problem.step.attachments)
+            # A relaxing step is no frame and keeps no time: the refinement alone counts for its goal.
+            return self._refine(problem, prediction, (Stopwatch() if watch is None else watch).elapsed)
+
+    def _refine(self, problem: StepProblem, prediction: Prediction, elapsed: Callable[[], float]) -> Prediction:
+        goal, nan = self.goal, float("nan")
+        standing = Standing(problem, prediction.next_pos, 0, nan, elapsed())
+        before = after = nan
+        if goal.begin(standing):
+            prediction, history = self._descend(problem, prediction, elapsed)
+            before, after = _sum(history[0].phi), _sum(history[-1].phi)
+            kept = sum(_sum(b.phi) < _sum(a.phi) for a, b in zip(history, history[1:], strict=False))
+            residual = float(history[-1].relative_gradient.max())
+            standing = Standing(problem, prediction.next_pos, kept, residual, elapsed())
+        own = {
+            "refine_iterations": float(standing.iterations),
+            "refine_rg": standing.residual,
+            "refine_phi_before": before,
+            "refine_phi_after": after,
+        }
+        return replace(prediction, metrics={**prediction.metrics, **own, **goal.end(standing)})
+
+    def _descend(
+        self, problem: StepProblem, prediction: Prediction, elapsed: Callable[[], float]
+    ) -> tuple[Prediction, list[Progress]]:
+        """The prediction after the iterations that the goal asks for, and where each of them began."""
+        done = -1
+
+        def proceed(progress: Progress, pos: Tensor) -> bool:
+            nonlocal done
+            done += 1
+            residual = float(progress.relative_gradient.max())
+            return self.goal.proceed(Standing(problem, pos, done, residual, elapsed()))
+
+        start = prediction.next_pos
+        if self.method == "newton":
+            pos, report = minimize(self.potential, problem, start, self.settings, proceed=proceed)
+            acc, history = report.acc, report.history
+        else:
+            wants = self.goal.wants_residual
+            pos, swept = sweep(
+                self.potential, problem, start, self.goal.most, self.settings.double, proceed=proceed, residuals=wants
+            )
+            acc, history = swept.acc, swept.history
+        lower = history[-1].phi < history[0].phi
+        if not bool(lower.any()):
+            # Newton may move within the rounding of the potential; its first entry says what holds where it began.
+            return replace(prediction, early=()), history[:1] if self.method == "newton" else history[-1:]
+        # Scenes of a batch are refined each for itself.
+        moved = lower[problem.cloth.vertex_scene].unsqueeze(1)
+        refined = torch.where(moved, pos, prediction.next_pos), torch.where(moved, acc, prediction.acc)
+        return Prediction(*refined, metrics=prediction.metrics), history
+
+
+def unrefined(stepper: Stepper) -> Stepper:
+    """The stepper that a :class:`RefinedStepper` takes further; any other one itself."""
+    return stepper.inner if isinstance(stepper, RefinedStepper) else stepper
+
+
+def _sum(values: Tensor) -> float:
+    return float(values.sum())

@@ -1,0 +1,150 @@
+"""When a refinement stops: counts, targets, strain, and a budget of time on a clock that is moved by hand."""
+
+from __future__ import annotations
+
+import json
+import random
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from hood.assets.material import Material
+from hood.dynamics.goals import Budget, Count, MaxStrain, Standing, TargetResidual, floor_from_table
+from hood.losses.problem import StepProblem
+from hood.scene.cloth import build_cloth
+from hood.testing import grid, make_problem
+
+
+@pytest.fixture(scope="module")
+def problem() -> StepProblem:
+    return make_problem(build_cloth(*grid(5, 5, 0.2), Material()))
+
+
+def at(problem: StepProblem, iterations: int, residual: float = 1.0, stretch: float = 0.0, elapsed: float = 0.0) -> Standing:
+    return Standing(problem, (1.0 + stretch) * problem.cloth.rest_pos, iterations, residual, elapsed)
+
+
+def test_a_count_counts(problem: StepProblem) -> None:
+    assert not Count(0).begin(at(problem, 0))
+    goal = Count(3)
+    assert goal.begin(at(problem, 0))
+    assert [goal.proceed(at(problem, k)) for k in range(5)] == [True, True, True, False, False]
+
+
+def test_a_target_is_met_or_reported_as_missed(problem: StepProblem) -> None:
+    goal = TargetResidual(0.1, most=4)
+    assert goal.proceed(at(problem, 1, 0.2))
+    assert not goal.proceed(at(problem, 1, 0.1))
+    assert not goal.proceed(at(problem, 4, 0.2))
+    assert goal.proceed(at(problem, 1, float("nan")))
+    assert goal.end(at(problem, 1, 0.1)) == {"refine_met": 1.0}
+    assert goal.end(at(problem, 4, 0.2)) == {"refine_met": 0.0}
+
+
+def test_strain_asks_for_more_where_it_is_above_and_for_less_where_it_is_below(problem: StepProblem) -> None:
+    goal = MaxStrain(0.05, most=6, floor=2)
+    assert at(problem, 0, stretch=0.04).strain == pytest.approx(0.04, abs=1e-5)
+    assert goal.begin(at(problem, 0))
+    assert goal.proceed(at(problem, 1, stretch=0.0))  # never below the floor
+    assert not goal.proceed(at(problem, 2, stretch=0.04))
+    assert goal.proceed(at(problem, 2, stretch=0.06))
+    assert not goal.proceed(at(problem, 6, stretch=0.06))
+    assert goal.end(at(problem, 6, stretch=0.06)) == {"refine_met": 0.0}
+    assert goal.floor == 3
+    assert goal.end(at(problem, 3, stretch=0.045)) == {"refine_met": 1.0}
+    assert goal.floor == 3
+    for floor in (2, 1, 0, 0):
+        assert goal.end(at(problem, 0, stretch=0.01)) == {"refine_met": 1.0}
+        assert goal.floor == floor
+    assert not goal.begin(at(problem, 0, stretch=0.01))
+    assert goal.begin(at(problem, 0, stretch=0.06))
+
+
+class Machine:
+    """Frames on a clock of its own: the network's time, the set-up and the iterations, all with noise."""
+
+    def __init__(self, problem: StepProblem, network: float, setup: float, cost: float, noise: float, seed: int = 0) -> None:
+        self.problem, self.network, self.setup, self.cost, self.noise = problem, network, setup, cost, noise
+        self.random = random.Random(seed)
+
+    def frame(self, goal: Budget, network: bool = True, slower: float = 1.0) -> tuple[float, int]:
+        """Milliseconds and iterations of a frame."""
+        now, done = self._some(self.network, 0.05) if network else 0.0, 0
+        if goal.begin(at(self.problem, 0, elapsed=now)):
+            now += slower * self._some(self.setup, self.noise)
+            while goal.proceed(at(self.problem, done, elapsed=now)):
+                now += slower * self._some(self.cost, self.noise)
+                done += 1
+        goal.end(at(self.problem, done, elapsed=now))
+        return now, done
+
+    def _some(self, ms: float, noise: float) -> float:
+        return ms * self.random.lognormvariate(0.0, noise)
+
+
+@pytest.mark.parametrize("network, setup, cost", [(60.0, 12.0, 14.0), (500.0, 40.0, 60.0)])
+@pytest.mark.parametrize("factor", [1.2, 2.0, 4.0])
+def test_a_budget_is_used_and_kept(problem: StepProblem, network: float, setup: float, cost: float, factor: float) -> None:
+    """Iterations vary by 40%, the first frame takes three times as long as the others."""
+    machine = Machine(problem, network, setup, cost, 0.4)
+    goal = Budget(factor * network)
+    machine.frame(goal, network=False, slower=3.0)
+    frames = [machine.frame(goal) for _ in range(300)]
+    ms, iterations = np.array([frame[0] for frame in frames]), np.array([frame[1] for frame in frames])
+    assert np.quantile(ms, 0.95) <= goal.budget_ms
+    assert np.median(ms) >= 0.7 * goal.budget_ms
+    if factor > 1.2:
+        assert np.median(iterations) >= 1
+
+
+def test_a_budget_follows_a_machine_that_slows_down(problem: StepProblem) -> None:
+    machine, goal = Machine(problem, 50.0, 10.0, 10.0, 0.2), Budget(150.0)
+    fast = [machine.frame(goal)[1] for _ in range(100)]
+    slow = [machine.frame(goal, slower=3.0) for _ in range(200)]
+    assert np.median([done for _, done in slow]) < 0.5 * np.median(fast[10:])
+    assert np.quantile([ms for ms, _ in slow], 0.9) <= 150.0
+    back = [machine.frame(goal)[1] for _ in range(300)]
+    assert np.median(back[200:]) >= np.median(fast[10:]) - 2
+
+
+def test_one_expensive_start_does_not_end_refinement_for_good(problem: StepProblem) -> None:
+    machine, goal = Machine(problem, 50.0, 10.0, 10.0, 0.1), Budget(120.0)
+    assert machine.frame(goal, slower=30.0)[0] > 120.0
+    later = [machine.frame(goal)[1] for _ in range(60)]
+    assert np.median(later[-20:]) >= 2
+
+
+def test_values_that_mean_nothing_are_refused() -> None:
+    with pytest.raises(ValueError, match="refine is -1"):
+        Count(-1)
+    with pytest.raises(ValueError, match="target_rg is 0"):
+        TargetResidual(0.0)
+    with pytest.raises(ValueError, match="budget_ms is -3"):
+        Budget(-3.0)
+    with pytest.raises(ValueError, match="max_strain is nan"):
+        MaxStrain(float("nan"))
+
+
+def test_a_table_says_where_to_begin(tmp_path: Path) -> None:
+    path = tmp_path / "table.json"
+    strains = {(1000, 0): 0.2, (1000, 2): 0.08, (1000, 5): 0.04, (1000, 10): 0.03, (4000, 0): 0.5, (4000, 20): 0.09}
+    rows = [{"method": "newton", "vertices": v, "refine": k, "strain_p99": s, "ms": 10.0 * k} for (v, k), s in strains.items()]
+    path.write_text(json.dumps({"rows": rows}))
+    assert floor_from_table(path, 0.1, 1200, "newton") == 2
+    assert floor_from_table(path, 0.04, 1200, "newton") == 5
+    assert floor_from_table(path, 0.3, 800, "newton") == 0
+    assert floor_from_table(path, 0.05, 5000, "newton") == 20  # the lowest there is
+    with pytest.raises(ValueError, match="no row of method 'sweeps'"):
+        floor_from_table(path, 0.1, 1000, "sweeps")
+    path.write_text(json.dumps({"rows": [{"method": "newton", "vertices": 1000}]}))
+    with pytest.raises(ValueError, match=r"table\.json: not a table of refinements"):
+        floor_from_table(path, 0.1, 1000, "newton")
+    with pytest.raises(FileNotFoundError):
+        floor_from_table(tmp_path / "none.json", 0.1, 1000, "newton")
+
+
+def test_strain_of_frames_that_are_not_finite_is_missed(problem: StepProblem) -> None:
+    broken = Standing(problem, torch.full_like(problem.cloth.rest_pos, torch.nan), 3, 1.0, 0.0)
+    assert MaxStrain(0.05, floor=3).end(broken) == {"refine_met": 0.0}

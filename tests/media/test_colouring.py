@@ -1,0 +1,101 @@
+"""Values on the garment: what they are, which colour they get, what the bar says."""
+
+from __future__ import annotations
+
+import importlib.util
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hood.dynamics.recorder import RolloutData
+from hood.media.colouring import colouring_of, vertex_strain
+from hood.media.film import Film
+from hood.testing import cylinder, sphere
+
+needs_pillow = pytest.mark.skipif(importlib.util.find_spec("PIL") is None, reason="needs Pillow")
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+
+
+@pytest.fixture(scope="module")
+def data() -> RolloutData:
+    """A tube about a ball, three frames, wider from frame to frame; rg rises by a factor of ten."""
+    pos, faces = cylinder(24, 6, 0.3, 0.5)
+    ball, ball_faces = sphere(2, 0.25)
+    wider = np.array([[1.0, 1.0, 1.0], [1.1, 1.0, 1.1], [1.2, 1.0, 1.2]])
+    rg = np.repeat([[np.nan], [0.1], [1.0]], len(pos), axis=1).astype(np.float32)
+    body = np.repeat((ball + [0.0, 0.25, 0.0])[None], 3, axis=0)
+    return RolloutData(pos * wider[:, None], faces, pos, body, ball_faces, np.arange(3) / 30, {}, {}, {"rg": rg})
+
+
+def test_strain_of_vertices_is_the_largest_around_them(data: RolloutData) -> None:
+    strain = vertex_strain(data)
+    assert strain.shape == data.cloth_pos.shape[:2]
+    np.testing.assert_allclose(strain[0], 0.0, atol=1e-12)
+    np.testing.assert_allclose(strain[1:], [[0.1], [0.2]] * np.ones(strain.shape[1]), rtol=1e-6)
+    one = data.cloth_pos.copy()
+    one[0, 70] *= 1.001
+    assert set(np.flatnonzero(vertex_strain(replace(data, cloth_pos=one))[0] > 1e-9)) >= {70, 69, 71}
+    one[0, 70] = np.nan
+    assert np.isnan(vertex_strain(replace(data, cloth_pos=one))[0, [69, 70]]).all()
+
+
+def test_a_range_for_all_frames(data: RolloutData) -> None:
+    strain = colouring_of(data, "strain")
+    assert strain is not None
+    assert (strain.low, strain.high) == (0.0, 0.2)
+    assert [label for _, label in strain.ticks] == ["0%", "10%", "20%"]
+    rg = colouring_of(data, "rg")
+    assert rg is not None
+    assert (rg.low, rg.high) == (1e-4, 1.0)
+    assert [label for _, label in rg.ticks] == ["0.0001", "0.001", "0.01", "0.1", "1"]
+    assert colouring_of(data, "none") is None
+
+
+def test_rollouts_side_by_side_share_their_range(data: RolloutData) -> None:
+    calm = replace(data, cloth_pos=data.cloth_pos[:1].repeat(3, 0), fields={"rg": 1e-2 * data.fields["rg"]})
+    for colour in ("strain", "rg"):
+        first, second = colouring_of(data, colour, [calm]), colouring_of(calm, colour, [data])
+        assert first is not None
+        assert second is not None
+        assert (first.low, first.high, first.ticks) == (second.low, second.high, second.ticks)
+        assert (first.colours(2) @ LUMINANCE).mean() < (second.colours(2) @ LUMINANCE).mean()
+
+
+def test_colours_get_darker_and_the_unknown_is_grey(data: RolloutData) -> None:
+    colouring = colouring_of(data, "rg")
+    assert colouring is not None
+    before, low, high = (colouring.colours(frame)[0] for frame in range(3))
+    assert before.max() - before.min() < 0.06
+    assert low @ LUMINANCE > high @ LUMINANCE
+    ramp = replace(colouring, values=np.geomspace(1e-5, 10.0, 200)[None])
+    brightness = ramp.colours(0) @ LUMINANCE
+    assert (np.diff(brightness) <= 1e-12).all()
+    assert ramp.colours(0).min() >= 0
+    assert ramp.colours(0).max() <= 1
+    zero = replace(colouring, values=np.zeros((1, 3))).colours(0)
+    np.testing.assert_array_equal(zero, ramp.colours(0)[:1].repeat(3, 0))
+
+
+def test_what_cannot_be_shown_is_refused(data: RolloutData) -> None:
+    with pytest.raises(ValueError, match=r"no cloth/rg; simulate it with export=\[rg\]"):
+        colouring_of(replace(data, fields={}), "rg")
+    with pytest.raises(ValueError, match="colour is 'heat'; choose none, strain or rg"):
+        colouring_of(data, "heat")
+
+
+@needs_pillow
+def test_pictures_show_the_colours_and_the_bar(data: RolloutData) -> None:
+    plain = Film(data, 120, 160).frame(2)
+    for colour in ("strain", "rg"):
+        film = Film(data, 120, 160, colour=colour)
+        early, late = film.frame(0).astype(int), film.frame(2).astype(int)
+        assert early.shape == plain.shape
+        # The middle of the picture is cloth: dark and red at the end of the scale.
+        assert late[60:100, 50:70].mean() < early[60:100, 50:70].mean() - 30
+        assert np.abs(late - plain.astype(int))[60:100, 50:70].mean() > 20
+        # The bar runs from light to dark along the lower edge, the same in all frames.
+        rows = late[140:150, 14:106].sum(axis=2)
+        bar = rows[np.argmax(rows[:, 0] - rows[:, -1])]
+        assert bar[0] > bar[-1] + 300
+        assert np.mean(np.diff(bar) <= 0) > 0.9

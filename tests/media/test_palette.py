@@ -1,0 +1,26 @@
+"""Garments of an outfit have colours of their own."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hood.media.palette import outfit_colours
+from hood.media.render import GARMENT_COLOR
+from hood.testing import grid
+
+
+def test_one_garment_has_one_colour() -> None:
+    faces = grid(3, 3, 1.0)[1]
+    assert outfit_colours("shirt", np.concatenate([faces, faces + 9]), 18) == GARMENT_COLOR
+
+
+def test_garments_of_an_outfit_differ() -> None:
+    """Three sheets one after another, a vertex of no face between the first two."""
+    faces = grid(3, 3, 1.0)[1]
+    colours = np.asarray(outfit_colours("a+b+c", np.concatenate([faces, faces + 10, faces + 19]), 28))
+    assert colours.shape == (28, 3)
+    sheets = [colours[:9], colours[10:19], colours[19:]]
+    assert [len(np.unique(sheet, axis=0)) for sheet in sheets] == [1, 1, 1]
+    np.testing.assert_array_equal(sheets[0][0], GARMENT_COLOR)
+    assert len(np.unique(np.stack([sheet[0] for sheet in sheets]), axis=0)) == 3
+    assert ((colours >= 0) & (colours <= 1)).all()
