@@ -2,6 +2,7 @@
 
     python benchmarks/recipes.py baseline --seeds 0 1 2     # the paper's settings beside trainer=fast, in a fifth of their time
     python benchmarks/recipes.py choices                    # trainer=fast with one of its choices taken back at a time
+    python benchmarks/recipes.py passes                     # how many times a model looks at what it predicts
     python benchmarks/recipes.py ablations                  # Fine15, Fine48 and Ours with equal updates and with equal time
     python benchmarks/recipes.py levels                     # the small model with one, two and three levels
 
@@ -61,6 +62,12 @@ def paper(name: str, *overrides: str) -> Recipe:
 UNAUGMENTED = ("data.sampling.piecewise_fraction=0.0", "data.sampling.random_yaw=false", "data.sampling.mirror=false")
 SHORT = 80  # updates of trainer=fast: less than a fifth of the time of the paper's at PAPER_SCALE, on the same model
 
+TWO_PASSES = "2x(mesh+coarse0) 1x(coarse0+coarse1) 2x(coarse1+coarse2) 1x(coarse0+coarse1) 2x(mesh+coarse0) | 1x(mesh)"
+FIVE_PASSES = (
+    "1x(mesh+coarse0) | 1x(coarse0+coarse1) 1x(mesh+coarse0) | 1x(coarse1+coarse2) 1x(coarse0+coarse1) 1x(mesh+coarse0) | "
+    "1x(mesh+coarse0) | 2x(mesh)"
+)
+
 SUITES: dict[str, list[Recipe]] = {
     "baseline": [
         paper("paper throughout", *SMALL_PAPER, *UNAUGMENTED),
@@ -78,6 +85,13 @@ SUITES: dict[str, list[Recipe]] = {
         fast("no averaged weights", SHORT, *SMALL, "trainer.ema_decay=0.0"),
         fast("paper's features and output", SHORT, *SMALL_PAPER),
         fast("batch of one", 4 * SHORT, *SMALL, "trainer.batch_size=1"),
+    ],
+    "passes": [
+        fast("8 passes, 11 steps", SHORT, "model=passes"),
+        fast("5 passes, 9 steps", SHORT, "model=passes", f"model.schedule='{FIVE_PASSES}'"),
+        fast("2 passes, 9 steps", SHORT, "model=passes", f"model.schedule='{TWO_PASSES}'"),
+        fast("1 pass, 9 steps", SHORT, "model=passes", f"model.schedule='{TWO_PASSES.replace(' |', '')}'"),
+        fast("8 passes, adam 1e-3", SHORT, "model=passes", "trainer.optimizer=adam", "trainer.learning_rate=1e-3"),
     ],
     "ablations": [
         fast("fine15", EQUAL_UPDATES, *SMALL, "model.schedule=fine15"),
@@ -107,7 +121,7 @@ def hood(arguments: list[str], log: Path) -> tuple[int, float]:
     return os.waitstatus_to_exitcode(status), usage.ru_utime + usage.ru_stime
 
 
-def run(recipe: Recipe, seed: int, output: Path) -> dict[str, object]:
+def run(recipe: Recipe, seed: int, output: Path, kernels: str) -> dict[str, object]:
     """Train and evaluate, as far as that is not done; the row of the table."""
     folder = folder_of(output, recipe, seed)
     folder.mkdir(parents=True, exist_ok=True)
@@ -115,7 +129,8 @@ def run(recipe: Recipe, seed: int, output: Path) -> dict[str, object]:
     spent = json.loads(spent_path.read_text()) if spent_path.exists() else {"train": 0.0, "done": False}
     if not spent["done"]:
         resume = f"resume={str((folder / 'run' / 'checkpoint.pt').exists()).lower()}"
-        arguments = ["train", *recipe.overrides, f"seed={seed}", "trainer.workers=0", f"output={folder}/run", resume]
+        more = [f"seed={seed}", "trainer.workers=0", f"trainer.kernels={kernels}", f"output={folder}/run", resume]
+        arguments = ["train", *recipe.overrides, *more]
         code, seconds = hood(arguments, log)
         spent["train"] += seconds
         spent["done"] = code == 0
@@ -160,6 +175,7 @@ def main() -> None:
     parser.add_argument("suite", choices=SUITES)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="runs side by side, one thread each")
+    parser.add_argument("--kernels", choices=("torch", "compiled"), default="torch", help="of every training, see hood train")
     parser.add_argument("--only", nargs="+", default=None, help="names of recipes; all by default")
     parser.add_argument("--output", type=Path, default=Path("runs/recipes"))
     arguments = parser.parse_args()
@@ -168,7 +184,7 @@ def main() -> None:
     begin = time.monotonic()
 
     def one(pair: tuple[Recipe, int]) -> dict[str, object]:
-        row = run(*pair, arguments.output)
+        row = run(*pair, arguments.output, arguments.kernels)
         print(f"{time.monotonic() - begin:6.0f} s  {pair[0].name}, seed {pair[1]}: γ {cell(row.get('gap'))}", file=sys.stderr)
         return row
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -28,8 +29,10 @@ from hood.commands.common import (
     use_precision,
 )
 from hood.commands.wardrobe import shape_coefficients
-from hood.config import ConfigError, build, load_config, options, plain, save_run_record
+from hood.config import ConfigError, build, load_config, options, plain, require_choice, save_run_record
+from hood.dynamics.goals import Count
 from hood.dynamics.reel import Reel
+from hood.dynamics.refine import METHODS, GuessStepper, RefinedStepper, unrefined
 from hood.dynamics.simulator import Simulator
 from hood.dynamics.stepper import NewtonStepper
 from hood.evaluation.diary import Diary, Unit
@@ -43,6 +46,8 @@ from hood.training import distributed
 
 #: ``models=[newton]``: no network, the potential minimised in every frame.
 NEWTON = "newton"
+#: No network either: where the solver starts, the inertial guess out of contact.
+GUESS = "guess"
 #: The motion of a body that stands still, on which drift is measured.
 STANDING = ":standing"
 
@@ -52,6 +57,7 @@ def run(overrides: Sequence[str]) -> int:
     config = load_config("evaluate", overrides)
     require_device(config)
     _check_numbers(config)
+    require_choice(config, "refine_method", METHODS)
     return together(lambda: _evaluate(config))
 
 
@@ -143,7 +149,24 @@ def _prepare(config: DictConfig, folder: Path) -> None:
 
 
 def make_candidate(name: str, config: DictConfig) -> Candidate:
-    """A checkpoint by name or path, ``newton`` for the solver, or ``untrained:MODEL`` for seeded random weights."""
+    """A checkpoint by name or path, ``newton`` for the solver, ``guess`` for where it starts, or ``untrained:MODEL`` for seeded
+    random weights; all but the solver with ``+k`` behind the name: every step refined by k iterations."""
+    found = re.fullmatch(r"(.+)\+(\d+)", name)
+    if found is None:
+        return _unrefined_candidate(name, config)
+    if found[1] == NEWTON:
+        raise ConfigError(f"models: {name!r} refines what is solved already; {GUESS}+{found[2]} is the solver stopped early")
+    inner = _unrefined_candidate(found[1], config)
+    potential, settings = build(config.losses), build(config.solver)
+    stepper = RefinedStepper(inner.stepper, potential, Count(int(found[2])), str(config.refine_method), settings)
+    return Candidate(f"{inner.name}+{found[2]}", inner.weights, stepper)
+
+
+def _unrefined_candidate(name: str, config: DictConfig) -> Candidate:
+    if name == GUESS:
+        guess = GuessStepper(build(config.losses))
+        guess.gravity = guess.gravity.to(str(config.device))
+        return Candidate(GUESS, "none", guess)
     if name == NEWTON:
         stepper = NewtonStepper(build(config.losses), build(config.solver))
         stepper.gravity = stepper.gravity.to(str(config.device))
@@ -220,10 +243,11 @@ def _scene(plan: Plan, unit: Unit) -> Scene:
 
 def _digest(candidate: Candidate) -> str:
     """SHA-256 of the weights: results are not taken over from others that had the same name."""
-    if not isinstance(candidate.stepper, Simulator):
+    stepper = unrefined(candidate.stepper)
+    if not isinstance(stepper, Simulator):
         return "none"
     content = hashlib.sha256()
-    for name, value in candidate.stepper.state_dict().items():
+    for name, value in stepper.state_dict().items():
         content.update(name.encode())
         content.update(value.detach().cpu().contiguous().numpy().tobytes())
     return content.hexdigest()

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from hood.dynamics.refine import unrefined
 from hood.dynamics.rollout import Frame, simulate
 from hood.dynamics.simulator import Simulator
 from hood.dynamics.stepper import Stepper
@@ -125,6 +126,7 @@ def _tell(progress: Progress, done: int, text: str) -> None:
 
 
 def _reach(stepper: Stepper) -> dict[str, int | None]:
+    stepper = unrefined(stepper)
     if not isinstance(stepper, Simulator):
         return {"steps": None, "radius": None}
     return {"steps": len(stepper.schedule), "radius": measured_radius(stepper)}

@@ -180,3 +180,19 @@ def test_every_shape_performs_every_motion_and_is_drawn(motions: Path, capsys: p
     assert depths[0] != depths[1]  # another body
     assert main([*EVALUATE[:-1], "shapes=[[0,x]]", "output=shapes2"]) == 2
     assert "shapes=[0, 'x']" in capsys.readouterr().err
+
+
+def test_refined_candidates(motions: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Refining lowers rg, and keeps steps and radius of the network."""
+    command = ["evaluate", "models=[quickstart,quickstart+2,guess,guess+2]", "garments=[tank]", "sequences=[walk_proud]",
+               "num_frames=6", "gap_states=0", "output=refined"]  # fmt: skip
+    assert main(command) == 0
+    rows = [row for row in json.loads((motions.parent / "refined" / "table.json").read_text()) if row["garment"] == "all"]
+    assert [row["model"] for row in rows] == ["quickstart", "quickstart+2", "guess", "guess+2"]
+    assert rows[1]["rg"] < rows[0]["rg"]
+    assert rows[3]["rg"] < rows[2]["rg"]
+    assert (rows[1]["steps"], rows[1]["radius"]) == (rows[0]["steps"], rows[0]["radius"])
+    assert rows[3]["steps"] is None
+    capsys.readouterr()
+    assert main(["evaluate", "models=[newton+2]"]) == 2
+    assert "guess+2 is the solver stopped early" in capsys.readouterr().err
