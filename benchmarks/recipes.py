@@ -36,7 +36,7 @@ SMALL_PAPER = (
 PAPER_SCALE = 0.01  # of the paper's 150,000 iterations
 EQUAL_UPDATES = 400
 
-EVALUATION = ("garments=[tshirt,trousers,dress,skirt]", "sequences=[walk_proud,dance_mixed]", "num_frames=60", "gap_states=4")
+EVALUATION = ("garments=[tshirt,trousers,dress,skirt]", "num_frames=60", "gap_states=4", "gap_iterations=100")
 COLUMNS = ("recipe", "seed", "updates", "cpu_s", "gap", "gap_p95", "strain_p99", "rg", "penetration", "ms", "failed_at")
 
 
