@@ -12,7 +12,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from hood.assets.binding import bind_garment
+from hood.assets.binding import bind_garment, hold_on_trunk
 from hood.assets.body import Body
 from hood.assets.garment import Garment
 from hood.assets.material import Material, sample_material
@@ -78,7 +78,7 @@ class SceneSampler:
         if not garments or not sequences:
             raise ValueError("training needs at least one garment and one motion")
         self.body = body
-        self.garments = [bind_garment(garment, body) for garment in garments]
+        self.garments = [hold_on_trunk(bind_garment(garment, body), body) for garment in garments]
         self.sequences = sequences if isinstance(sequences, MotionFiles) else list(sequences)
         self._lengths = motion_lengths(self.sequences)
         self.beta_range = beta_range

@@ -106,7 +106,7 @@ def tiny(**options: object) -> Simulator:
 @torch.no_grad()
 def test_the_relaxing_step_of_a_model_in_frames_is_kept(skirt_scene: Scene) -> None:
     simulator = tiny(frame_dt=DT, pins_ahead=True, velocity="carried")
-    start = skirt_scene.start(0, relaxed=False)
+    start = skirt_scene.start(0, relaxed=False, thorough=True)
     state = start_state(simulator, skirt_scene, default_potential(), 1)
     moved = state.pos - start.pos
     pinned = skirt_scene.cloth.pinned
