@@ -12,7 +12,7 @@ demo: $(VENV)/.demo
 	@echo "Look at outputs/demo/contact_sheet.png and outputs/demo/rollout.mp4"
 
 test: lint
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 slow: $(VENV)/.dev
 	$(BIN)/python -m pytest -m slow
