@@ -62,7 +62,7 @@ def read_model(path: Path, fps: float) -> Simulator:
     return simulator
 
 
-def use_precision(simulator: Simulator, config: DictConfig) -> None:
+def use_arithmetic(simulator: Simulator, config: DictConfig) -> None:
     """Let the simulator's network compute as ``config.precision`` and ``config.kernels`` say.
 
     Raises:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -26,7 +27,7 @@ from hood.commands.common import (
     require_device,
     require_same_config,
     together,
-    use_precision,
+    use_arithmetic,
 )
 from hood.commands.wardrobe import shape_coefficients
 from hood.config import ConfigError, build, load_config, options, plain, require_choice, save_run_record
@@ -58,6 +59,8 @@ def run(overrides: Sequence[str]) -> int:
     require_device(config)
     _check_numbers(config)
     require_choice(config, "refine_method", METHODS)
+    if bool(config.contact_sheets) and importlib.util.find_spec("PIL") is None:
+        raise ConfigError('contact_sheets=true: drawing needs Pillow (pip install "hood[pictures]")')
     return together(lambda: _evaluate(config))
 
 
@@ -178,11 +181,11 @@ def _unrefined_candidate(name: str, config: DictConfig) -> Candidate:
             raise ConfigError(f"models: unknown model {model!r} in {name!r}; known are {', '.join(options('model'))}")
         torch.manual_seed(int(config.seed))
         simulator = build(load_config("rollout", [f"model={model}"]).model)
-        use_precision(simulator, config)
+        use_arithmetic(simulator, config)
         return Candidate(model, UNTRAINED, simulator.eval().to(str(config.device)))
     path = locate("weights", name)
     simulator = read_model(path, float(config.fps)).to(str(config.device))
-    use_precision(simulator, config)
+    use_arithmetic(simulator, config)
     return Candidate(path.stem if path.stem != "model" else path.parent.name, path.name, simulator)
 
 

@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from hood.assets.library import locate
 from hood.commands.batch import Job, find_jobs, share
-from hood.commands.common import UNTRAINED, prepare_folder, read_model, require_device, together, use_precision
+from hood.commands.common import UNTRAINED, prepare_folder, read_model, require_device, together, use_arithmetic
 from hood.commands.dial import check_dial, exported, refined
 from hood.commands.performance import make_motion
 from hood.commands.summary import describe, describe_all, summarise
@@ -135,7 +135,7 @@ def make_stepper(config: DictConfig) -> tuple[Stepper, str]:
     """What takes the steps, before they are refined, and the SHA-256 of its weights (``none`` without a network)."""
     if str(config.stepper) == "network":
         simulator, digest = make_simulator(config)
-        use_precision(simulator, config)
+        use_arithmetic(simulator, config)
         stepper: Stepper = simulator if str(config.step) == PLAIN else CapturedSimulator(simulator, str(config.step))
         return stepper, digest
     potential = build(config.losses)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from imitations import Ch, Select
 from scipy import sparse
 
 from hood.assets.unpickle import load_pickle
@@ -69,20 +70,6 @@ def test_shared_and_nested_objects(tmp_path: Path) -> None:
     found = load_pickle(tmp_path / "n.pkl")
     assert found["a"] is found["b"][0] is found["b"][1]["c"] is found["ragged"][1][0]
     assert found["cyclic"][1] is found["cyclic"]
-
-
-class Ch:
-    """Imitates chumpy's array: the state holds it as ``x``."""
-
-    def __init__(self, x: np.ndarray) -> None:
-        self.x, self._dirty_vars = x, set()
-
-
-class Select:
-    """Imitates chumpy's selection of entries of another array."""
-
-    def __init__(self, a: Ch, idxs: np.ndarray, shape: tuple) -> None:
-        self.a, self.idxs, self.preferred_shape = a, idxs, shape
 
 
 @pytest.mark.parametrize("protocol", [0, 2, 4])
