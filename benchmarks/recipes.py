@@ -79,7 +79,7 @@ SUITES: dict[str, list[Recipe]] = {
         fast("fast, passes, short", SHORT // 2, "model=passes"),
     ],
     "choices": [
-        fast("fast", SHORT, *SMALL),
+        fast("fast, short", SHORT, *SMALL),
         fast("adam 1e-3", SHORT, *SMALL, "trainer.optimizer=adam", "trainer.learning_rate=1e-3"),
         fast("unscaled signal", SHORT, *SMALL, "trainer.signal=potential"),
         fast("horizon 5", SHORT, *SMALL, "trainer.horizon.maximum=5"),
