@@ -153,7 +153,7 @@ class Trainer:
         report = {name: float(value.mean()) for name, value in energies.items()}
         report |= {
             "total": sum(report.values()),
-            "loss": float(relative_loss(problem, energies, prediction.acc.detach()).mean()),
+            "loss": float((relative_loss(problem, energies, prediction.acc.detach()) * self._damping(residual)).mean()),
             "relative_gradient": float(residual.median()),
             "horizon": float(horizon),
         }
@@ -316,11 +316,13 @@ class Trainer:
             header = {"iteration": str(self.iteration), "validation": json.dumps(values)}
             distributed.on_main(lambda: save_simulator(self.folder / "best.safetensors", averaged, header))
 
+    def _damping(self, residual: Tensor) -> Tensor:
+        """How much of a scene (B,) counts: with the scaled signal one that is far from rest less, as far as it is."""
+        return torch.ones_like(residual) if self.settings.signal == "potential" else 1.0 / (1.0 + residual / 3.0)
+
     def _weight(self, problem: StepProblem, residual: Tensor) -> Tensor:
-        count = problem.num_scenes
-        if self.settings.signal == "potential":
-            return torch.full_like(residual, 1.0 / count)
-        return 1.0 / (scale(problem) * (1.0 + residual / 3.0) * count)
+        unit = 1.0 if self.settings.signal == "potential" else scale(problem)
+        return self._damping(residual) / (unit * problem.num_scenes)
 
     def _optimise(self, surrogate: Tensor, finite: bool) -> dict[str, float]:
         settings = self.settings

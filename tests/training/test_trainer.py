@@ -71,6 +71,15 @@ def test_the_signal_goes_down_on_a_fixed_scene(
     assert all(p.dtype == torch.float32 for p in trainer.averaged().parameters())
 
 
+def test_the_loss_that_is_reported_is_the_one_that_is_trained(tmp_path: Path, sampler: SceneSampler) -> None:
+    """With the scaled signal a scene counts less the further it is from rest; with the potential's every scene counts alike."""
+    settings = replace(SETTINGS, batch_size=1)
+    scaled = make(tmp_path / "a", sampler, settings=settings).update()
+    plain = make(tmp_path / "b", sampler, settings=replace(settings, signal="potential")).update()
+    assert scaled["relative_gradient"] == plain["relative_gradient"] > 1.0
+    assert scaled["loss"] == pytest.approx(plain["loss"] / (1.0 + scaled["relative_gradient"] / 3.0), rel=1e-5)
+
+
 def metrics(folder: Path) -> list[dict]:
     lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     return [{key: value for key, value in line.items() if key != "iterations_per_second"} for line in lines]
