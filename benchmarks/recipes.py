@@ -74,6 +74,7 @@ SUITES: dict[str, list[Recipe]] = {
         paper("paper trainer", *SMALL),
         fast("fast, half as short", SHORT // 2, *SMALL),
         fast("fast, short", SHORT, *SMALL),
+        fast("fast, batch of two, short", round(1.7 * SHORT), *SMALL, "trainer.batch_size=2", "trainer.schedule.warmup=10"),
         fast("fast", 5 * SHORT, *SMALL),
         paper("paper trainer, passes", "model=passes"),
         fast("fast, passes, short", SHORT // 2, "model=passes"),
