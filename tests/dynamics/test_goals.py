@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import random
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from hood.assets.material import Material
-from hood.dynamics.goals import Budget, Count, MaxStrain, Standing, TargetResidual, floor_from_table
+from hood.dynamics.goals import Budget, Count, MaxStrain, Standing, TargetResidual
 from hood.losses.problem import StepProblem
 from hood.scene.cloth import build_cloth
 from hood.testing import grid, make_problem
@@ -125,24 +123,6 @@ def test_values_that_mean_nothing_are_refused() -> None:
         Budget(-3.0)
     with pytest.raises(ValueError, match="max_strain is nan"):
         MaxStrain(float("nan"))
-
-
-def test_a_table_says_where_to_begin(tmp_path: Path) -> None:
-    path = tmp_path / "table.json"
-    strains = {(1000, 0): 0.2, (1000, 2): 0.08, (1000, 5): 0.04, (1000, 10): 0.03, (4000, 0): 0.5, (4000, 20): 0.09}
-    rows = [{"method": "newton", "vertices": v, "refine": k, "strain_p99": s, "ms": 10.0 * k} for (v, k), s in strains.items()]
-    path.write_text(json.dumps({"rows": rows}))
-    assert floor_from_table(path, 0.1, 1200, "newton") == 2
-    assert floor_from_table(path, 0.04, 1200, "newton") == 5
-    assert floor_from_table(path, 0.3, 800, "newton") == 0
-    assert floor_from_table(path, 0.05, 5000, "newton") == 20  # the lowest there is
-    with pytest.raises(ValueError, match="no row of method 'sweeps'"):
-        floor_from_table(path, 0.1, 1000, "sweeps")
-    path.write_text(json.dumps({"rows": [{"method": "newton", "vertices": 1000}]}))
-    with pytest.raises(ValueError, match=r"table\.json: not a table of refinements"):
-        floor_from_table(path, 0.1, 1000, "newton")
-    with pytest.raises(FileNotFoundError):
-        floor_from_table(tmp_path / "none.json", 0.1, 1000, "newton")
 
 
 def test_strain_of_frames_that_are_not_finite_is_missed(problem: StepProblem) -> None:
