@@ -150,7 +150,7 @@ class Budget:
     wants_residual = False
     metrics: tuple[str, ...] = ()
     _LATE = 0.03
-    _PACE = 0.02  # by which a late frame lowers the risk
+    _PACE = 0.01  # by which a late frame lowers the risk
     _MOST_RISK = 0.25
     _SHY = 30.0  # what must fit grows by this share of the dearest iteration for every unit of risk below zero
     _MEMORY = 60  # measurements that are remembered
@@ -216,7 +216,7 @@ class Budget:
         return {}
 
     def _dear(self, past: deque[float], elsewhere: float = 0.0) -> float:
-        """The cost that only a share ``risk`` of the measured ones exceeds; of few the least, or what was measured elsewhere."""
+        """The cost that only a share ``risk`` of those measured exceeds; of few the least, or what was measured elsewhere."""
         if len(past) < self._FEW:
             known = [*past, *([self._trust * self._scale * elsewhere] if elsewhere > 0 else [])]
             return min(known, default=0.0)
