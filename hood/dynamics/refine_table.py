@@ -93,11 +93,10 @@ def _method(path: Path, index: int, row: Any) -> str:
 
 def _number(path: Path, index: int, row: dict[str, Any], field: str, least: int) -> float:
     """Entry ``field`` of a row: finite, ``least`` or more."""
-    value = row.get(field)
-    sound = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value) and value >= least
-    whole = field not in ("vertices", "refine") or (sound and value == int(value))
-    if not sound or not whole:
-        kind = "a whole number" if field in ("vertices", "refine") else "a finite number"
-        given = "is missing" if field not in row else f"is {value!r}"
-        raise ValueError(f"{path}: row {index}: {field} {given}; give {kind}, {least} or more")
-    return float(value)
+    value, counts = row.get(field), field in ("vertices", "refine")
+    if isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value) and value >= least:
+        if not counts or value == int(value):
+            return float(value)
+    given = "is missing" if field not in row else f"is {value!r}"
+    kind = "a whole number" if counts else "a finite number"
+    raise ValueError(f"{path}: row {index}: {field} {given}; give {kind}, {least} or more")
