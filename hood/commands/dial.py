@@ -10,14 +10,16 @@ import numpy as np
 from omegaconf import DictConfig
 
 from hood.config import ConfigError, build, plain, require_choice
-from hood.dynamics.goals import Budget, Count, Goal, MaxStrain, TargetResidual, floor_from_table
+from hood.dynamics.goals import Budget, Count, Goal, MaxStrain, TargetResidual
 from hood.dynamics.refine import METHODS, RefinedStepper
+from hood.dynamics.refine_table import costs_from_table, floor_from_table
 from hood.dynamics.rollout import FIELD_CHOICES
 from hood.dynamics.stepper import Stepper
 
 #: The ways to say how far a step is refined; a user gives one of them.
 DIALS = ("refine", "target_rg", "budget_ms", "max_strain")
 COLOURS = ("none", "strain", "rg")
+_BEGIN_FROM_TABLE = ("budget_ms", "max_strain")
 #: What says more about a dial, and its value where nothing is said.
 _DETAILS = {"refine_method": "newton", "refine_most": 50, "refine_table": None}
 
@@ -59,8 +61,10 @@ def check_dial(config: DictConfig) -> None:
         raise ConfigError(
             f"{dial[0]}={config[dial[0]]}: stepper=newton goes as far as solver.* says; use stepper=refine instead"
         )
-    if config.refine_table is not None and dial[0] != "max_strain":
-        raise ConfigError(f"refine_table={config.refine_table}: says where max_strain begins; {dial[0]} needs none")
+    if config.refine_table is not None and dial[0] not in _BEGIN_FROM_TABLE:
+        raise ConfigError(
+            f"refine_table={config.refine_table}: says where {' and '.join(_BEGIN_FROM_TABLE)} begin; {dial[0]} needs none"
+        )
     make_goal(config, num_vertices=1000)
 
 
@@ -93,12 +97,15 @@ def make_goal(config: DictConfig, num_vertices: int) -> Goal | None:
         return Count(int(value))
     if name == "target_rg":
         return TargetResidual(value, most)
+    table = None if config.refine_table is None else Path(str(config.refine_table)).expanduser()
+    method = str(config.refine_method)
     if name == "budget_ms":
-        return Budget(value, most)
-    if config.refine_table is None:
-        return MaxStrain(value, most)
-    table = Path(str(config.refine_table)).expanduser()
-    return MaxStrain(value, most, floor_from_table(table, value, num_vertices, str(config.refine_method)))
+        return Budget(value, most, None if table is None else costs_from_table(table, num_vertices, method))
+    return (
+        MaxStrain(value, most)
+        if table is None
+        else MaxStrain(value, most, floor_from_table(table, value, num_vertices, method))
+    )
 
 
 def refined(stepper: Stepper, config: DictConfig, num_vertices: int) -> Stepper:

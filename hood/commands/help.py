@@ -17,6 +17,11 @@ _EXAMPLES = {
         "hood rollout garment=dress sequence=walk_steady num_frames=200 output=outputs/dress",
         "hood rollout garment=my_shirt.obj sequence=CMU_01_poses.npz material=denim",
     ],
+    "compare": [
+        "hood compare outputs/network/rollout.h5 outputs/solver/rollout.h5",
+        "hood compare a=outputs/plain b=outputs/refined colour=rg output=outputs/compare",
+        "hood compare outputs/plain outputs/refined colour=fabric blind=true seed=7 output=outputs/pair_7",
+    ],
     "inspect": [
         "hood inspect my_shirt.obj",
         "hood inspect my_shirt.obj CMU_01_poses.npz --json",
@@ -38,7 +43,7 @@ def describe(name: str) -> str:
     """Help text of the command ``name``."""
     config = load_config(name)
     comments = _comments(name)
-    lines = [f"usage: hood {name} {'FILE ... ' if name == 'inspect' else ''}[key=value ...]", ""]
+    lines = [f"usage: hood {name} {'FILE ... ' if name in ('inspect', 'compare') else ''}[key=value ...]", ""]
     for key in config:
         value = plain(config[key])
         if isinstance(value, dict):

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from collections import deque
 from dataclasses import dataclass
-from pathlib import Path
-from statistics import median
 from typing import Protocol
 
 from torch import Tensor
 
 from hood.dynamics.measure import strain_metrics
+from hood.dynamics.refine_table import Costs
 from hood.losses.problem import StepProblem
+from hood.scene.scene import RELAXING_DT
 
 #: Iterations at most where a goal is not reached.
 MOST = 50
@@ -103,7 +102,7 @@ class MaxStrain:
     frame that needed more iterations than it, and falls by one with every frame that ends below :data:`_COMFORT` of the limit.
 
     Args:
-        floor: iterations to begin with, see :func:`floor_from_table`.
+        floor: iterations to begin with, see :func:`hood.dynamics.refine_table.floor_from_table`.
     """
 
     wants_residual = False
@@ -136,40 +135,65 @@ class Budget:
     """As many iterations as fit into ``budget_ms`` a frame, all of the frame included.
 
     What an iteration costs, and what comes before the first and after the last, is measured in this very rollout. An
-    iteration is begun where its cost and a margin fit into what is left. The margin, ``caution`` times the cost, finds itself
-    the value at which :data:`_LATE` of all frames are late, whatever the noise: it grows with a late frame and shrinks a
-    little with every other one, in the proportion in which these may occur.
+    iteration is begun where even a dear one fits into what is left: one whose cost only a share ``risk`` of the last
+    :data:`_MEMORY` exceeds. On a machine with other work a few iterations take several times as long as most, and frames are
+    late by those few. The risk finds itself the value at which :data:`_LATE` of all frames are late, whatever the noise: it
+    falls with a late frame and rises a little with every other one, in the proportion in which these may occur; below zero
+    more than the dearest iteration must fit. Frames that are late before their refinement use the same allowance up, so
+    that on a machine where nothing is left of it nothing is refined.
+
+    Args:
+        measured: what a table says, see :func:`hood.dynamics.refine_table.costs_from_table`: the first frames are planned with
+            it, scaled by what a frame takes here before it is refined. Without it one iteration is tried.
     """
 
     wants_residual = False
     metrics: tuple[str, ...] = ()
-    _LATE = 0.02
-    _GAIN = 0.5  # by which a late frame raises the caution
-    _MOST_CAUTIOUS = 20.0
-    _MEMORY = 40  # measurements that are remembered
+    _LATE = 0.03
+    _PACE = 0.01  # by which a late frame lowers the risk
+    _MOST_RISK = 0.25
+    _SHY = 30.0  # what must fit grows by this share of the dearest iteration for every unit of risk below zero
+    _MEMORY = 60  # measurements that are remembered
     _FEW = 5  # measurements of which the least is believed: the first ones pay for memory and caches
-    _HOPE, _FEW_HOPE = 0.995, 0.9  # per frame that was not refined: what was expensive once is tried again some day
+    _HOPE, _FEW_HOPE = (
+        0.995,
+        0.9,
+    )  # per frame that was not refined, while a late one is allowed: what was dear once is tried again
+    _CALM = 20  # frames on time that are taken for granted when those late before their refinement are counted
 
-    def __init__(self, budget_ms: float, most: int = 200) -> None:
+    def __init__(self, budget_ms: float, most: int = 200, measured: Costs | None = None) -> None:
         if not budget_ms > 0:
             raise ValueError(f"budget_ms is {budget_ms:g}; give the milliseconds of a frame, > 0")
-        self.budget_ms, self.most = budget_ms, most
-        self.caution = self._GAIN
+        self.budget_ms, self.most, self.measured = budget_ms, most, measured
+        self._risk = self._LATE
         self._costs: deque[float] = deque(maxlen=self._MEMORY)
         self._setups: deque[float] = deque(maxlen=self._MEMORY)
         self._endings: deque[float] = deque(maxlen=self._MEMORY)
+        self._frames = self._late_before = 0
+        self._scale = self._trust = 1.0  # of what was measured elsewhere: this machine against that one, and hope
         self._last = 0.0  # ms of the frame at the last measurement
         self._refined = False
 
     @property
+    def risk(self) -> float:
+        """Share of the iterations that may cost more than is planned for."""
+        left = self._LATE - self._late_before / (self._frames + self._CALM)
+        return self._risk if left > 0 else min(self._risk, left)
+
+    @property
     def cost(self) -> float:
-        """Expected cost of an iteration [ms]; 0 before the first."""
-        return self._expected(self._costs)
+        """What is planned for an iteration [ms]; 0 before the first, where no table says it."""
+        return self._dear(self._costs, 0.0 if self.measured is None else self.measured.iteration)
 
     def begin(self, standing: Standing) -> bool:
         self._last = standing.elapsed
-        self._refined = self._fits(standing.elapsed + self._expected(self._setups))
-        if not self._refined:
+        self._frames += 1
+        self._late_before += standing.elapsed > self.budget_ms
+        if self.measured is not None and self.measured.frame and not _relaxes(standing.problem):
+            self._scale = standing.elapsed / self.measured.frame
+        self._refined = self._fits(standing.elapsed + self._dear(self._setups, self.measured.setup if self.measured else 0.0))
+        if not self._refined and self.risk > 0:
+            self._trust *= self._FEW_HOPE
             for past in (self._costs, self._setups):
                 hope = self._HOPE if len(past) >= self._FEW else self._FEW_HOPE
                 for index, value in enumerate(past):
@@ -180,49 +204,31 @@ class Budget:
         (self._costs if standing.iterations else self._setups).append(standing.elapsed - self._last)
         self._last = standing.elapsed
         # Before the first measurement an iteration may cost anything: one is tried.
-        fits = self._fits(standing.elapsed) if self._costs else standing.iterations == 0
+        known = bool(self._costs) or self.measured is not None
+        fits = self._fits(standing.elapsed) if known else standing.iterations == 0
         return fits and standing.iterations < self.most
 
     def end(self, standing: Standing) -> dict[str, float]:
         if self._refined:
             self._endings.append(standing.elapsed - self._last)
         late = standing.elapsed > self.budget_ms
-        caution = self.caution + self._GAIN * ((1.0 - self._LATE) if late else -self._LATE)
-        self.caution = min(max(caution, 0.0), self._MOST_CAUTIOUS)
+        self._risk = min(self._risk + self._PACE * (self._LATE - late), self._MOST_RISK)
         return {}
 
-    def _expected(self, past: deque[float]) -> float:
-        return 0.0 if not past else min(past) if len(past) < self._FEW else median(past)
+    def _dear(self, past: deque[float], elsewhere: float = 0.0) -> float:
+        """The cost that only a share ``risk`` of those measured exceeds; of few the least, or what was measured elsewhere."""
+        if len(past) < self._FEW:
+            known = [*past, *([self._trust * self._scale * elsewhere] if elsewhere > 0 else [])]
+            return min(known, default=0.0)
+        ordered, risk = sorted(past), self.risk
+        if risk <= 0:
+            return ordered[-1] * (1.0 - self._SHY * risk)
+        return ordered[min(int((1.0 - risk) * len(ordered)), len(ordered) - 1)]
 
     def _fits(self, elapsed: float) -> bool:
-        return elapsed + (1.0 + self.caution) * self.cost + self._expected(self._endings) <= self.budget_ms
+        return elapsed + self.cost + self._dear(self._endings) <= self.budget_ms
 
 
-def floor_from_table(path: Path, limit: float, num_vertices: int, method: str) -> int:
-    """Iterations with which a table of measurements stays at ``limit`` or below, see :class:`MaxStrain`.
-
-    The file is JSON: ``{"rows": [{"method": "newton", "vertices": 1014, "refine": 5, "strain_p99": 0.04}, …]}``; further
-    entries of a row are not read. Of the method's rows those count whose number of vertices is nearest by ratio; where none
-    of them is low enough, the lowest.
-
-    Raises:
-        ValueError: not such a file, or no row of the method.
-    """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))["rows"]
-        rows = [
-            (int(row["vertices"]), int(row["refine"]), float(row["strain_p99"])) for row in content if row["method"] == method
-        ]
-    except FileNotFoundError:
-        raise
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(
-            f"{path}: not a table of refinements ({type(error).__name__}: {error}); it needs rows with method, vertices, "
-            "refine and strain_p99"
-        ) from error
-    if not rows or min(vertices for vertices, *_ in rows) < 1:
-        raise ValueError(f"{path}: has no row of method {method!r} with vertices; leave refine_table out to adapt online alone")
-    nearest = min((max(v / num_vertices, num_vertices / v) for v, *_ in rows))
-    fitting = [(k, strain) for v, k, strain in rows if max(v / num_vertices, num_vertices / v) == nearest]
-    enough = [k for k, strain in fitting if strain <= limit]
-    return min(enough) if enough else min(fitting, key=lambda row: row[1])[0]
+def _relaxes(problem: StepProblem) -> bool:
+    """Whether this is a relaxing step: no frame, its time says nothing."""
+    return bool(((problem.step.dt - RELAXING_DT).abs() < 1e-6).all())

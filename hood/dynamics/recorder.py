@@ -156,7 +156,7 @@ def read_rollout(path: Path) -> RolloutData:
                 body_pos=file["body/pos"][:done],
                 body_faces=file["body/faces"][:],
                 time=file["time"][:done],
-                metrics={name: data[:done] for name, data in file["metrics"].items()},
+                metrics={name: data[:done] for name, data in file.get("metrics", {}).items()},
                 attributes=dict(file.attrs),
                 fields={name.removeprefix("cloth/"): file[name][:done] for name in _field_paths(file)},
             )

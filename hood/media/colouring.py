@@ -39,14 +39,14 @@ class Colouring:
         """(V, 3) in 0..1 of the vertices in ``frame``."""
         return self._colour(self._place(self.values[frame]))
 
-    def with_bar(self, picture: Picture) -> Picture:
-        """A copy of ``picture`` with the bar, its ticks and title along the lower edge."""
+    def with_bar(self, picture: Picture, size: int | None = None) -> Picture:
+        """A copy of ``picture`` with the bar, its ticks and title along the lower edge, in letters of ``size`` pixels."""
         try:
             from PIL import Image, ImageDraw, ImageFont
         except ImportError as error:
             raise ImportError("labels on pictures need Pillow: pip install hood[pictures]") from error
         height, width = picture.shape[:2]
-        size = max(11, height // 40)
+        size = max(11, height // 40) if size is None else size
         left, right = width // 10, width - width // 10
         bottom = height - size // 2 - size
         top = bottom - max(size // 2, 5)

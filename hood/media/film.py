@@ -30,7 +30,8 @@ class Film:
         width, height: pixels.
         azimuth_deg: viewing direction, 0 is the front of the first frame.
         colour: what the garment's colour shows, with a bar that says so: ``strain``, ``rg``, or ``none``, its own.
-        beside: rollouts whose films are shown next to this one: a colour means the same in all of them.
+        beside: rollouts whose films are shown next to this one: a colour means the same in all of them, and without a body
+            the camera sees the cloth of all of them.
     """
 
     def __init__(
@@ -45,17 +46,25 @@ class Film:
         if len(data.cloth_pos) == 0:
             raise ValueError("the rollout has no frames to draw")
         self.data, self.width, self.height = data, width, height
-        self._colouring = colouring_of(data, colour, beside)
+        self.colouring = colouring_of(data, colour, beside)
         self._own_colour = outfit_colours(str(data.attributes.get("garment", "")), data.cloth_faces, data.cloth_pos.shape[1])
         # Without a body the camera looks at the cloth, as far as that is finite.
-        shown = data.body_pos if data.body_pos.shape[1] else np.nan_to_num(data.cloth_pos, posinf=0.0, neginf=0.0)
+        shown = data.body_pos
+        if not data.body_pos.shape[1]:
+            cloths = [data.cloth_pos, *(other.cloth_pos for other in beside)]
+            shown = np.nan_to_num(np.concatenate(cloths, axis=1), posinf=0.0, neginf=0.0)
         self._path = _smooth_path(shown)
         centred = shown[:: max(len(shown) // 20, 1)] - self._path[:: max(len(shown) // 20, 1), None]
         self._floor = float(shown[..., 1].min())
         self._camera = Camera.framing(centred, azimuth_deg, 8.0, aspect=width / height)
 
     def frame(self, index: int) -> np.ndarray:
-        """Picture (H, W, 3) uint8 of frame ``index``."""
+        """Picture (H, W, 3) uint8 of frame ``index``, with the bar of its colours."""
+        picture = self.picture(index)
+        return picture if self.colouring is None else self.colouring.with_bar(picture)
+
+    def picture(self, index: int) -> np.ndarray:
+        """Picture (H, W, 3) uint8 of frame ``index`` alone."""
         shift = self._path[index]
         camera = replace(self._camera, position=_add(self._camera.position, shift), target=_add(self._camera.target, shift))
         body, cloth = self.data.body_pos[index], self.data.cloth_pos[index]
@@ -65,10 +74,9 @@ class Film:
             thinner = _beneath(body, self.data.body_faces, cloth) if dressed else body
             meshes.append(RenderMesh(thinner, self.data.body_faces, BODY_COLOR))
         if dressed:
-            shown = self._own_colour if self._colouring is None else self._colouring.colours(index)
+            shown = self._own_colour if self.colouring is None else self.colouring.colours(index)
             meshes.append(RenderMesh(cloth, self.data.cloth_faces, shown))
-        picture = render_frame(meshes, camera, width=self.width, height=self.height, floor=self._floor)
-        return picture if self._colouring is None else self._colouring.with_bar(picture)
+        return render_frame(meshes, camera, width=self.width, height=self.height, floor=self._floor)
 
     def sheet(self, count: int = _SHEET_FRAMES, columns: int = 6) -> np.ndarray:
         """Contact sheet of ``count`` evenly spaced frames."""
@@ -94,12 +102,17 @@ def write_video(
     ``frames`` is the iterable that drives the loop (a progress bar, say); all frames by default.
     """
     film = Film(data, colour=colour)
-    step = float(data.time[1] - data.time[0]) if len(data.time) > 1 else 1.0 / 30.0
+    step = seconds_per_frame(data)
     chosen: Sequence[int] | Iterable[int] = range(0, len(data.cloth_pos), stride) if frames is None else frames
     with VideoWriter(path, fps=1.0 / (step * stride)) as writer:
         for index in chosen:
             writer.append(film.frame(index))
     return writer.path
+
+
+def seconds_per_frame(data: RolloutData) -> float:
+    """Time [s] from one frame to the next; of a single frame 1/30."""
+    return float(data.time[1] - data.time[0]) if len(data.time) > 1 else 1.0 / 30.0
 
 
 def _beneath(body: np.ndarray, faces: np.ndarray, cloth: np.ndarray) -> np.ndarray:

@@ -20,8 +20,12 @@ REFUSED = {
     "a dial on the solver": (["stepper=newton", "refine=3"], "stepper=newton goes as far as solver.* says"),
     "refinement of nothing by nothing": (["stepper=refine"], "stepper=refine takes its steps by refinement alone"),
     "details without a dial": (["refine_method=sweeps"], "refine_method=sweeps: nothing is refined"),
-    "a table for another dial": (["refine=2", "refine_table=t.json"], "says where max_strain begins"),
+    "a table for another dial": (
+        ["refine=2", "refine_table=t.json"],
+        "says where budget_ms and max_strain begin; refine needs none",
+    ),
     "no such table": (["max_strain=0.1", "refine_table=t.json"], "t.json: no such file"),
+    "no such table of times": (["budget_ms=50", "refine_table=t.json"], "t.json: no such file"),
     "misspelt method": (["refine=2", "refine_method=sweep"], "'sweeps'"),
     "zero budget": (["budget_ms=0"], "budget_ms is 0; give the milliseconds of a frame"),
     "negative count": (["refine=-1"], "refine is -1; give 0 or more iterations"),

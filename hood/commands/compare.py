@@ -1,0 +1,162 @@
+"""``hood compare A.h5 B.h5``: rollouts of one motion next to each other, as a video and a contact sheet."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import random
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig
+from tqdm import tqdm
+
+from hood.assets.atomic import write_atomically
+from hood.commands.common import prepare_folder
+from hood.config import ConfigError, load_config, require_choice
+from hood.dynamics.recorder import RolloutData, read_rollout
+
+COLOURS = ("strain", "rg", "fabric")
+#: Written above a rollout where its file holds them: medians over the frames that have a value.
+_NOTED = (
+    ("gap", "gap {:.2g}"),
+    ("relative_gradient", "rg {:.2g}"),
+    ("strain_p99", "p99 strain {:.1%}"),
+    ("ms_total", "{:.0f} ms a frame"),
+)
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A rollout that is compared."""
+
+    path: Path
+    name: str
+    data: RolloutData
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run the command; returns the exit code."""
+    files, config = _split(arguments)
+    require_choice(config, "colour", COLOURS)
+    require_choice(config, "video", ("mp4", "gif", "none"))
+    for key, least in (("num_frames", 1), ("video_stride", 1), ("seed", 0), ("height", 64)):
+        if config[key] is not None and (not isinstance(config[key], int) or config[key] < least):
+            raise ConfigError(f"{key}={config[key]}: must be a whole number, at least {least}")
+    if str(config.video) == "none" and not bool(config.sheet):
+        raise ConfigError("video=none and sheet=false leave nothing to draw; leave one of them out")
+    entries = _read(files, config)
+    folder = prepare_folder(Path(str(config.output)).expanduser())
+    if bool(config.blind):
+        entries = _shuffled(entries, int(config.seed))
+    _draw(entries, config, folder)
+    return 0
+
+
+def _split(arguments: Sequence[str]) -> tuple[list[Path], DictConfig]:
+    """Files in their order and the config: a word of the form ``key=value`` is an override, every other word a file."""
+    overrides = [word for word in arguments if "=" in word and not Path(word).exists()]
+    given = [word for word in arguments if word not in overrides]
+    strange = next((word for word in given if word.startswith("-")), None)
+    if strange is not None:
+        raise ConfigError(f"unknown option {strange!r}; write key=value, see hood compare --help")
+    config = load_config("compare", overrides)
+    files = [str(config[key]) for key in ("a", "b") if config[key] is not None] + given
+    if len(files) < 2:
+        raise ConfigError(f"{len(files)} rollouts are given, two or more are compared: hood compare A.h5 B.h5")
+    return [Path(name).expanduser() for name in files], config
+
+
+def _read(files: Sequence[Path], config: DictConfig) -> list[_Entry]:
+    """The rollouts, cut to the frames that are shown.
+
+    Raises:
+        ValueError: a file is none, or they cannot be shown side by side.
+    """
+    from hood.media.beside import require_same_motion
+
+    paths = [path / "rollout.h5" if path.is_dir() else path for path in files]
+    read = [(str(path), _read_one(path, str(config.colour))) for path in paths]
+    count = None if config.num_frames is None else int(config.num_frames)
+    cut = require_same_motion(read, count)
+    return [_Entry(*one) for one in zip(paths, _names(paths), cut, strict=True)]
+
+
+def _read_one(path: Path, colour: str) -> RolloutData:
+    if not path.is_file():
+        raise ConfigError(f"{path}: no such file; give the rollout.h5 of hood rollout, or its folder")
+    data = read_rollout(path)
+    sizes = {len(data.time), len(data.cloth_pos), len(data.body_pos)}
+    meshes = ((data.cloth_pos, data.cloth_faces, "cloth"), (data.body_pos, data.body_faces, "body"))
+    for pos, faces, which in meshes:
+        if pos.ndim != 3 or pos.shape[2] != 3 or len(sizes) > 1:
+            raise ValueError(f"{path}: not a rollout file ({which}/pos has the shape {pos.shape}); make one with hood rollout")
+        if faces.ndim != 2 or faces.shape[1] != 3 or (faces.size and not 0 <= faces.min() <= faces.max() < pos.shape[1]):
+            raise ValueError(f"{path}: not a rollout file ({which}/faces name vertices that are not there)")
+    if len(data.time) == 0:
+        raise ValueError(f"{path}: holds no frames; run hood rollout again")
+    if colour == "rg" and "rg" not in data.fields:
+        raise ValueError(f"{path}: colour=rg needs cloth/rg, which is missing; simulate it with export=[rg]")
+    return data
+
+
+def _names(paths: Sequence[Path]) -> list[str]:
+    """The shortest ends of the paths that tell them apart, ``rollout.h5`` left out."""
+    parts = [path.absolute().parent.parts + (() if path.name == "rollout.h5" else (path.stem,)) for path in paths]
+    for length in range(1, max(map(len, parts)) + 1):
+        names = ["/".join(part[-length:]) for part in parts]
+        if len(set(names)) == len(set(parts)):
+            break
+    return names
+
+
+def _shuffled(entries: Sequence[_Entry], seed: int) -> list[_Entry]:
+    """An order that depends on the seed and on what the rollouts hold, not on the order in which they were given."""
+    digests = {id(entry): hashlib.sha256(entry.data.cloth_pos.tobytes()).hexdigest() for entry in entries}
+    order = sorted(entries, key=lambda entry: (digests[id(entry)], str(entry.path)))
+    random.Random(f"{seed} {' '.join(digests[id(entry)] for entry in order)}").shuffle(order)
+    return order
+
+
+def _draw(entries: Sequence[_Entry], config: DictConfig, folder: Path) -> None:
+    from hood.media.beside import Panel, SideBySide, write_beside
+    from hood.media.video import save_png
+
+    blind, colour = bool(config.blind), str(config.colour)
+    rows = [{"title": _letter(i) if blind else e.name, **_facts(e)} for i, e in enumerate(entries)]
+    panels = [Panel(e.data, str(r["title"]), "" if blind else _note(r)) for e, r in zip(entries, rows, strict=True)]
+    height = int(config.height)
+    view = SideBySide(panels, "none" if colour == "fabric" else colour, round(height / 1.4), height)
+    written = []
+    if bool(config.sheet):
+        written.append(save_png(folder / "contact_sheet.png", view.sheet()))
+    if str(config.video) != "none":
+        frames = tqdm(range(0, view.num_frames, int(config.video_stride)), desc="video", unit="frame", disable=None)
+        written.append(write_beside(view, folder / f"comparison.{config.video}", frames, int(config.video_stride)))
+    key = {"colour": colour, "num_frames": view.num_frames, "blind": blind, "seed": int(config.seed), "left_to_right": rows}
+    write_atomically(folder / "key.json", json.dumps(key, indent=1).encode())
+    if not blind:
+        print("\n".join(f"{row['title']}: {_note(row) or 'no metrics'}" for row in rows))
+    print(f"files in {folder}: {', '.join(path.name for path in written)}; key.json says which is which")
+
+
+def _facts(entry: _Entry) -> dict[str, Any]:
+    """File, size and the medians that its metrics allow."""
+    facts: dict[str, Any] = {"file": str(entry.path), "vertices": int(entry.data.cloth_pos.shape[1])}
+    for name, _ in _NOTED:
+        values = entry.data.metrics.get(name, np.empty(0))
+        if np.isfinite(values).any():
+            facts[name] = float(np.median(values[np.isfinite(values)]))
+    return facts
+
+
+def _note(facts: dict[str, Any]) -> str:
+    return ", ".join(text.format(facts[name]) for name, text in _NOTED if name in facts)
+
+
+def _letter(index: int) -> str:
+    """A, B, … Z, then numbers."""
+    return chr(ord("A") + index) if index < 26 else str(index + 1)
