@@ -155,10 +155,8 @@ class Budget:
     _SHY = 30.0  # what must fit grows by this share of the dearest iteration for every unit of risk below zero
     _MEMORY = 60  # measurements that are remembered
     _FEW = 5  # measurements of which the least is believed: the first ones pay for memory and caches
-    _HOPE, _FEW_HOPE = (
-        0.995,
-        0.9,
-    )  # per frame that was not refined, while a late one is allowed: what was dear once is tried again
+    #: Per frame that was not refined, while a late one is allowed: what was dear once is tried again.
+    _HOPE, _FEW_HOPE = 0.995, 0.9
     _CALM = 20  # frames on time that are taken for granted when those late before their refinement are counted
 
     def __init__(self, budget_ms: float, most: int = 200, measured: Costs | None = None) -> None:
