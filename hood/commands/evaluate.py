@@ -15,11 +15,13 @@ import torch
 from omegaconf import DictConfig
 from tqdm import tqdm
 
+from hood.assets.atomic import write_atomically
 from hood.assets.body import load_body
 from hood.assets.garment import Garment, load_garment
 from hood.assets.library import locate, motion_split
 from hood.assets.sequence import PoseSequence, load_sequence
 from hood.commands.batch import expand_sequences
+from hood.commands.circumstances import circumstances, training_note
 from hood.commands.common import (
     UNTRAINED,
     prepare_folder,
@@ -41,6 +43,7 @@ from hood.evaluation.drift import sideways_drift, standing_scene
 from hood.evaluation.gap import REFERENCE
 from hood.evaluation.report import describe, format_table, write_table
 from hood.evaluation.table import Candidate, GapSettings, Measured, candidate_rows, measure
+from hood.evaluation.table_one import page
 from hood.losses.potential import Potential
 from hood.scene.scene import Scene, build_scene
 from hood.training import distributed
@@ -61,10 +64,10 @@ def run(overrides: Sequence[str]) -> int:
     require_choice(config, "refine_method", METHODS)
     if bool(config.contact_sheets) and importlib.util.find_spec("PIL") is None:
         raise ConfigError('contact_sheets=true: drawing needs Pillow (pip install "hood[pictures]")')
-    return together(lambda: _evaluate(config))
+    return together(lambda: _evaluate(config, overrides))
 
 
-def _evaluate(config: DictConfig) -> int:
+def _evaluate(config: DictConfig, overrides: Sequence[str]) -> int:
     folder = Path(str(config.output)).expanduser()
     plan = make_plan(config)
     distributed.on_main(lambda: _prepare(config, folder))
@@ -76,7 +79,7 @@ def _evaluate(config: DictConfig) -> int:
     mine = _measure(config, plan, todo, diary)
     measured = done | {key: item for part in distributed.gather(mine) for key, item in part.items()}
     if distributed.rank() == 0:
-        _report(config, plan, measured, folder)
+        _report(plan, measured, folder, overrides)
     return 0
 
 
@@ -127,18 +130,23 @@ def _write_sheet(reel: Reel, path: Path) -> None:
     write_sheet(reel.data(), path)
 
 
-def _report(config: DictConfig, plan: Plan, measured: Mapping[Unit, Measured], folder: Path) -> None:
+def _report(plan: Plan, measured: Mapping[Unit, Measured], folder: Path, overrides: Sequence[str]) -> None:
     rows = []
     for index, candidate in enumerate(plan.candidates):
-        parts = {name: Measured() for name in plan.garments}
+        parts: dict[str, list[Measured]] = {name: [] for name in plan.garments}
         for unit in plan.units:
             if unit.model == index:
-                parts[unit.garment] += measured[unit]
+                parts[unit.garment].append(measured[unit])
         rows += candidate_rows(candidate, parts)
     print(format_table(rows))
     print(f"\n{describe(rows)}")
     csv_path, json_path = write_table(rows, folder)
-    print(f"tables in {csv_path} and {json_path}")
+    vertices = {name: len(garment.rest_pos) for name, garment in plan.garments.items()}
+    training = {candidate.name: candidate.training for candidate in plan.candidates}
+    page_path = folder / "table1.md"
+    text = page(rows, circumstances(plan.config, overrides, plan.motions, vertices, training))
+    write_atomically(page_path, text.encode())
+    print(f"tables in {csv_path}, {json_path} and, beside the paper's, {page_path}")
 
 
 def _prepare(config: DictConfig, folder: Path) -> None:
@@ -162,7 +170,7 @@ def make_candidate(name: str, config: DictConfig) -> Candidate:
     inner = _unrefined_candidate(found[1], config)
     potential, settings = build(config.losses), build(config.solver)
     stepper = RefinedStepper(inner.stepper, potential, Count(int(found[2])), str(config.refine_method), settings)
-    return Candidate(f"{inner.name}+{found[2]}", inner.weights, stepper)
+    return Candidate(f"{inner.name}+{found[2]}", inner.weights, stepper, inner.training)
 
 
 def _unrefined_candidate(name: str, config: DictConfig) -> Candidate:
@@ -186,7 +194,8 @@ def _unrefined_candidate(name: str, config: DictConfig) -> Candidate:
     path = locate("weights", name)
     simulator = read_model(path, float(config.fps)).to(str(config.device))
     use_arithmetic(simulator, config)
-    return Candidate(path.stem if path.stem != "model" else path.parent.name, path.name, simulator)
+    name = path.stem if path.stem != "model" else path.parent.name
+    return Candidate(name, path.name, simulator, training_note(path))
 
 
 @dataclass
