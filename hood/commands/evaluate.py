@@ -9,13 +9,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from hood.assets.atomic import write_atomically
 from hood.assets.body import load_body
 from hood.assets.garment import Garment, load_garment
 from hood.assets.library import locate, motion_split
@@ -31,6 +31,7 @@ from hood.commands.common import (
     together,
     use_arithmetic,
 )
+from hood.commands.evaluation_files import report_spectrum, report_table
 from hood.commands.wardrobe import shape_coefficients
 from hood.config import ConfigError, build, load_config, options, plain, require_choice, save_run_record
 from hood.dynamics.goals import Count
@@ -41,9 +42,8 @@ from hood.dynamics.stepper import NewtonStepper
 from hood.evaluation.diary import Diary, Unit
 from hood.evaluation.drift import sideways_drift, standing_scene
 from hood.evaluation.gap import REFERENCE
-from hood.evaluation.report import describe, format_table, write_table
+from hood.evaluation.spectrum import spectrum_rows
 from hood.evaluation.table import Candidate, GapSettings, Measured, candidate_rows, measure
-from hood.evaluation.table_one import page
 from hood.losses.potential import Potential
 from hood.scene.scene import Scene, build_scene
 from hood.training import distributed
@@ -52,6 +52,8 @@ from hood.training import distributed
 NEWTON = "newton"
 #: No network either: where the solver starts, the inertial guess out of contact.
 GUESS = "guess"
+#: What is made of the spectra of the errors.
+SPECTRA = ("none", "table", "picture")
 #: The motion of a body that stands still, on which drift is measured.
 STANDING = ":standing"
 
@@ -62,8 +64,15 @@ def run(overrides: Sequence[str]) -> int:
     require_device(config)
     _check_numbers(config)
     require_choice(config, "refine_method", METHODS)
-    if bool(config.contact_sheets) and importlib.util.find_spec("PIL") is None:
-        raise ConfigError('contact_sheets=true: drawing needs Pillow (pip install "hood[pictures]")')
+    require_choice(config, "spectrum", SPECTRA)
+    if config.spectrum != "none" and int(config.gap_states) == 0:
+        raise ConfigError(
+            f"spectrum={config.spectrum}: it is computed of the states of gap_states, which is 0; give gap_states >= 1"
+        )
+    pictures = ("contact_sheets=true", bool(config.contact_sheets)), ("spectrum=picture", config.spectrum == "picture")
+    drawn = [setting for setting, wanted in pictures if wanted]
+    if drawn and importlib.util.find_spec("PIL") is None:
+        raise ConfigError(f'{drawn[0]}: drawing needs Pillow (pip install "hood[pictures]")')
     return together(lambda: _evaluate(config, overrides))
 
 
@@ -86,7 +95,8 @@ def _evaluate(config: DictConfig, overrides: Sequence[str]) -> int:
 def _measure(config: DictConfig, plan: Plan, todo: Sequence[Unit], diary: Diary) -> dict[Unit, Measured]:
     """This process's share of the rollouts; each is written down as soon as it is done."""
     potential, count = build(config.losses), int(config.num_frames)
-    gaps = GapSettings(int(config.gap_states), replace(REFERENCE, max_iterations=int(config.gap_iterations)))
+    reference = replace(REFERENCE, max_iterations=int(config.gap_iterations))
+    gaps = GapSettings(int(config.gap_states), reference, config.spectrum != "none")
     measured: dict[Unit, Measured] = {}
     quiet = True if distributed.rank() else None
     with tqdm(total=len(todo), desc="evaluate", unit="rollout", disable=quiet) as bar:
@@ -131,22 +141,21 @@ def _write_sheet(reel: Reel, path: Path) -> None:
 
 
 def _report(plan: Plan, measured: Mapping[Unit, Measured], folder: Path, overrides: Sequence[str]) -> None:
-    rows = []
+    rows: list[dict[str, Any]] = []
+    waves: list[dict[str, Any]] = []
     for index, candidate in enumerate(plan.candidates):
         parts: dict[str, list[Measured]] = {name: [] for name in plan.garments}
         for unit in plan.units:
             if unit.model == index:
                 parts[unit.garment].append(measured[unit])
         rows += candidate_rows(candidate, parts)
-    print(format_table(rows))
-    print(f"\n{describe(rows)}")
-    csv_path, json_path = write_table(rows, folder)
+        for name, part in parts.items():
+            waves += spectrum_rows(candidate.name, name, [item for one in part for item in one.spectra])
     vertices = {name: len(garment.rest_pos) for name, garment in plan.garments.items()}
     training = {candidate.name: candidate.training for candidate in plan.candidates}
-    page_path = folder / "table1.md"
-    text = page(rows, circumstances(plan.config, overrides, plan.motions, vertices, training))
-    write_atomically(page_path, text.encode())
-    print(f"tables in {csv_path}, {json_path} and, beside the paper's, {page_path}")
+    report_table(rows, circumstances(plan.config, overrides, plan.motions, vertices, training), folder)
+    if plan.config.spectrum != "none":
+        report_spectrum(waves, folder, picture=plan.config.spectrum == "picture")
 
 
 def _prepare(config: DictConfig, folder: Path) -> None:

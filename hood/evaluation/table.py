@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import partial
 from typing import Any
 
@@ -17,6 +17,7 @@ from hood.evaluation.gap import AGREEMENT, REFERENCE, gap
 from hood.evaluation.interval import bootstrap_interval
 from hood.evaluation.radius import measured_radius
 from hood.evaluation.sample import StepSample
+from hood.evaluation.spectrum import error_spectrum, garment_bands
 from hood.losses.potential import Potential
 from hood.scene.scene import Scene
 from hood.solver.newton import NewtonSettings
@@ -60,10 +61,12 @@ class GapSettings:
     Args:
         states: steps of every rollout, spread evenly over its frames; 0 for no gap and no minimisation.
         reference: how far the minimisations behind a gap go.
+        spectrum: of the same states, in which wavelengths the error is.
     """
 
     states: int = 5
     reference: NewtonSettings = REFERENCE
+    spectrum: bool = False
 
 
 @dataclass
@@ -76,9 +79,10 @@ class Measured:
     drifts: list[float] = field(default_factory=list)  # [m] to the side, on a body that stands still
     ends: list[int | None] = field(default_factory=list)  # of every rollout: first frame failed, see FAILURE_STRAIN; None: none
 
+    spectra: list[dict[str, Any]] = field(default_factory=list)  # of the states of gaps, see error_spectrum
+
     def __add__(self, other: Measured) -> Measured:
-        parts = (self.frames + other.frames, self.failures + other.failures, self.gaps + other.gaps)
-        return Measured(*parts, self.drifts + other.drifts, self.ends + other.ends)
+        return Measured(*(getattr(self, item.name) + getattr(other, item.name) for item in fields(self)))
 
 
 def evaluate(
@@ -173,10 +177,13 @@ def _run(
         if frame.index > _WARMUP:
             into.frames.append(frame.metrics)
     into.ends.append(end)
+    bands = garment_bands(scene.cloth) if gaps.spectrum and sample.steps else None
     for index, (problem, prediction) in enumerate(sample.steps):
         yield f"gap {index + 1}/{len(sample.steps)}"
         found = gap(potential, problem, prediction.next_pos, settings=gaps.reference)
         into.gaps.append({"gamma": float(found.gamma), "converged": float(found.converged), "spread": float(found.spread)})
+        if bands is not None:
+            into.spectra.append(error_spectrum(potential, problem, prediction.next_pos, bands, gaps.reference))
 
 
 def _row(measured: Measured) -> dict[str, Any]:
