@@ -19,7 +19,7 @@ _TERMS = ("L_guess", "L_stretching", "L_bending", "L_inertia", "L_gravity", "L_c
 _STATE = ("strain_p99", "penetration", "penetration_worst", "drift")
 _FAILURE = ("failed_at", "failed", "frames_to_failure")
 _ENDS = tuple(f"{column}_{end}" for column in INTERVALS for end in ("low", "high"))
-COLUMNS = (*_NAMES, *_MAIN, *_GAP, *_TERMS, *_STATE, *_FAILURE, "rollouts", "frames", "gap_states", *_ENDS)
+COLUMNS = (*_NAMES, *_MAIN, *_GAP, *_TERMS, *_STATE, *_FAILURE, "rollouts", "frames", "gap_states", "gap_spread", *_ENDS)
 #: Columns of the printed tables; all in one would be wider than a screen.
 _PRINTED = ((*_NAMES, *_MAIN, *_GAP, "failed"), (*_NAMES, *_TERMS, *_STATE))
 

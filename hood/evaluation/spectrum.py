@@ -120,7 +120,7 @@ def format_spectrum(rows: Sequence[Mapping[str, Any]]) -> str:
     for model, garment in dict.fromkeys((row["model"], row["garment"]) for row in rows):
         part = [row for row in rows if (row["model"], row["garment"]) == (model, garment)]
         lines.append(f"{model} {garment}, {part[0]['states']} states:")
-        lines += [f"  {band_name(row):>16}  {row['rms']:8.3f}  ({row['share']:4.0%}; {row['energy']:.2g})" for row in part]
+        lines += [f"  {band_name(row):>18}  {row['rms']:8.3f}  ({row['share']:4.0%}; {row['energy']:.2g})" for row in part]
     return "\n".join(lines)
 
 
@@ -130,7 +130,7 @@ def band_name(row: Mapping[str, Any]) -> str:
         return f"above {100 * row['shortest']:.3g} cm" if row["shortest"] is not None else "all"
     if row["shortest"] is None:
         return f"below {100 * row['longest']:.3g} cm"
-    return f"{100 * row['shortest']:.3g}–{100 * row['longest']:.3g} cm"
+    return f"{100 * row['shortest']:.3g} to {100 * row['longest']:.3g} cm"
 
 
 def bar_panels(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:

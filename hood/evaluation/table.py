@@ -104,8 +104,8 @@ def evaluate(
     2 mm, ``penetration_worst`` that of the worst frame; ``drift`` [m] is the largest of those measured (None: none was). Of
     the states whose gap is computed (``gap_states`` of them): ``gap`` is the median, ``gap_p95`` the 95th percentile,
     ``unconverged`` the share whose reference missed its accuracy and ``disagree`` the share where minimisations ended in
-    different minima. Columns of :data:`INTERVALS` have 95% intervals over rollouts, ``NAME_low`` and ``NAME_high``, from two
-    rollouts on.
+    different minima, ``gap_spread`` [e0] the 95th percentile of how far these are apart. Columns of :data:`INTERVALS` have 95%
+    intervals over rollouts, ``NAME_low`` and ``NAME_high``, from two rollouts on.
     """
     rows, done = [], 0
     for candidate in candidates:
@@ -238,11 +238,14 @@ def _gap_columns(gaps: Sequence[Mapping[str, float]]) -> dict[str, Any]:
     if not gaps:
         return {"gap_states": 0}
     gamma = np.array([item["gamma"] for item in gaps])
+    spread = np.array([item["spread"] for item in gaps])
+    known = spread[np.isfinite(spread)]
     return {
         "gap": float(np.median(gamma)),
         "gap_p95": float(np.quantile(gamma, 0.95)),
         "unconverged": float(np.mean([item["converged"] == 0.0 for item in gaps])),
-        "disagree": float(np.mean([item["spread"] > AGREEMENT for item in gaps])),
+        "disagree": float(np.mean(spread > AGREEMENT)),
+        "gap_spread": float(np.quantile(known, 0.95)) if len(known) else None,
         "gap_states": len(gaps),
     }
 

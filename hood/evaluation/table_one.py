@@ -43,7 +43,7 @@ _MORE = (
     ("L_inertia", "inertia"), ("L_gravity", "gravity"), ("L_collision", "collision"), ("L_friction", "friction"),
     ("L_guess", "L_total of the inertial guess"), ("penetration", "penetrating"), ("penetration_worst", "worst frame"),
     ("drift", "drift [m]"), ("failed", "failed rollouts"), ("frames_to_failure", "frames to failure"),
-    ("unconverged", "γ unconverged"), ("disagree", "γ disagree"), ("gap_states", "γ states"),
+    ("unconverged", "γ unconverged"), ("disagree", "γ disagree"), ("gap_spread", "γ spread p95"), ("gap_states", "γ states"),
 )  # fmt: skip
 
 
@@ -184,7 +184,7 @@ def _legend() -> str:
         "ms, rg and strain p99 medians over frames. A rollout has failed at the first frame that is not finite or whose strain "
         f"p99 exceeds {FAILURE_STRAIN:.0%}; frames to failure is the median over rollouts (–: less than half failed). γ "
         "unconverged and γ disagree are the shares of the states whose reference minimum missed its accuracy, and of those "
-        "where minimisations ended in different minima, of which the lowest counts."
+        "where minimisations ended in different minima, of which the lowest counts; γ spread p95 [e0]: how far apart."
     )
 
 

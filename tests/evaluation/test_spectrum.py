@@ -148,7 +148,7 @@ def test_rows_text_and_files(tmp_path: Path) -> None:
     assert [row["share"] for row in rows] == pytest.approx([(0.36 + 1.0) / 2, 0.0, 0.32])
     assert [row["energy"] for row in rows] == pytest.approx([0.2, 0.0, 0.3])
     assert {(row["states"], row["unconverged"]) for row in rows} == {(2, 0.5)}
-    assert [band_name(row) for row in rows] == ["above 40 cm", "20–40 cm", "below 20 cm"]
+    assert [band_name(row) for row in rows] == ["above 40 cm", "20 to 40 cm", "below 20 cm"]
     assert format_spectrum(rows).splitlines()[2].split() == ["above", "40", "cm", "2.000", "(", "68%;", "0.2)"]
     csv_path, json_path = write_spectrum(rows, tmp_path)
     assert json.loads(json_path.read_text()) == rows

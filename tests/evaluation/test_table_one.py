@@ -96,7 +96,7 @@ def test_the_page_says_what_was_measured_and_how() -> None:
     assert "| newton | tank | 1 | – | – | 2 | 2 |" in text
     for line in text.splitlines():
         if line.startswith("| newton"):
-            assert line.count(" |") in (14, 17)
+            assert line.count(" |") in (14, 18)
 
 
 def test_failures_are_counted_by_rollout() -> None:
@@ -106,6 +106,14 @@ def test_failures_are_counted_by_rollout() -> None:
     assert (b["failed"], b["frames_to_failure"]) == (0.0, None)
     assert (c["rollouts"], c.get("failed")) == (0, None)
     assert (whole["rollouts"], whole["failed"], whole["frames_to_failure"]) == (4, 0.5, 9)
+
+
+def test_how_far_minima_are_apart_is_told() -> None:
+    """States with one converged minimisation know of no distance."""
+    gaps = [{"gamma": 0.1, "converged": 1.0, "spread": value} for value in (0.0, 0.02, 0.04, float("nan"))]
+    known, unknown = (candidate_rows(solver(), {"a": [Measured(gaps=part)]})[0] for part in (gaps, gaps[3:]))
+    assert (known["disagree"], known["gap_spread"]) == (0.5, pytest.approx(0.038))
+    assert (unknown["disagree"], unknown["gap_spread"]) == (0.0, None)
 
 
 def test_intervals_are_those_between_rollouts() -> None:
