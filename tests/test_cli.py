@@ -127,6 +127,7 @@ ERRORS: dict[str, tuple[list[str], tuple[str, ...], Prepare]] = {
     "training device": (["train", "device=gpu", "output=run"], ("'gpu'",), lambda: None),
     "evaluated model": (["evaluate", "models=[untrained:our]", "output=run"], ("'our'",), lambda: None),
     "evaluated checkpoint": (["evaluate", "models=[zzzz]", "output=run"], ("'zzzz'",), lambda: None),
+    "spectrum of nothing": (["evaluate", "spectrum=table", "gap_states=0", "output=run"], ("gap_states",), lambda: None),
     "evaluated frames": (["evaluate", "num_frames=1", "output=run"], ("num_frames=1",), lambda: None),
 }  # fmt: skip
 
@@ -306,12 +307,19 @@ def test_evaluate_writes_its_table(tmp_path: Path, capsys: pytest.CaptureFixture
     tiny_model(tmp_path / "m.safetensors")
     arguments = [
         "models=[m.safetensors,newton]", "garments=[tank]", "sequences=[walk_proud]", "num_frames=5", "output=table",
-        "solver.max_iterations=2", "gap_states=1", "gap_iterations=3",
+        "spectrum=picture", "solver.max_iterations=2", "gap_states=1", "gap_iterations=3",
     ]  # fmt: skip
     assert main(["evaluate", *arguments]) == 0
     printed = capsys.readouterr().out
     assert "tank" in printed
     assert "2 of 2 reference minima did not converge" in printed
+    page = (tmp_path / "table" / "table1.md").read_text()
+    assert "hood evaluate 'models=[m.safetensors,newton]' 'garments=[tank]' 'sequences=[walk_proud]' num_frames=5" in page
+    assert "m: its file does not say." in page
+    assert "| m | tank | 1 | 1 | 1 |" in page
+    waves = json.loads((tmp_path / "table" / "spectrum.json").read_text())
+    assert {(row["model"], row["garment"], row["states"]) for row in waves} == {("m", "tank", 1), ("newton", "tank", 1)}
+    assert (tmp_path / "table" / "spectrum.png").read_bytes().startswith(b"\x89PNG")
     rows = json.loads((tmp_path / "table" / "table.json").read_text())
     assert [(row["model"], row["garment"]) for row in rows] == [
         (model, garment) for model in ("m", "newton") for garment in ("tank", "all")

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,6 +21,7 @@ from hood.assets.garment import Garment, load_garment
 from hood.assets.library import locate, motion_split
 from hood.assets.sequence import PoseSequence, load_sequence
 from hood.commands.batch import expand_sequences
+from hood.commands.circumstances import circumstances, training_note
 from hood.commands.common import (
     UNTRAINED,
     prepare_folder,
@@ -29,6 +31,7 @@ from hood.commands.common import (
     together,
     use_arithmetic,
 )
+from hood.commands.evaluation_files import report_spectrum, report_table
 from hood.commands.wardrobe import shape_coefficients
 from hood.config import ConfigError, build, load_config, options, plain, require_choice, save_run_record
 from hood.dynamics.goals import Count
@@ -39,7 +42,7 @@ from hood.dynamics.stepper import NewtonStepper
 from hood.evaluation.diary import Diary, Unit
 from hood.evaluation.drift import sideways_drift, standing_scene
 from hood.evaluation.gap import REFERENCE
-from hood.evaluation.report import describe, format_table, write_table
+from hood.evaluation.spectrum import spectrum_rows
 from hood.evaluation.table import Candidate, GapSettings, Measured, candidate_rows, measure
 from hood.losses.potential import Potential
 from hood.scene.scene import Scene, build_scene
@@ -49,6 +52,8 @@ from hood.training import distributed
 NEWTON = "newton"
 #: No network either: where the solver starts, the inertial guess out of contact.
 GUESS = "guess"
+#: What is made of the spectra of the errors.
+SPECTRA = ("none", "table", "picture")
 #: The motion of a body that stands still, on which drift is measured.
 STANDING = ":standing"
 
@@ -59,12 +64,19 @@ def run(overrides: Sequence[str]) -> int:
     require_device(config)
     _check_numbers(config)
     require_choice(config, "refine_method", METHODS)
-    if bool(config.contact_sheets) and importlib.util.find_spec("PIL") is None:
-        raise ConfigError('contact_sheets=true: drawing needs Pillow (pip install "hood[pictures]")')
-    return together(lambda: _evaluate(config))
+    require_choice(config, "spectrum", SPECTRA)
+    if config.spectrum != "none" and int(config.gap_states) == 0:
+        raise ConfigError(
+            f"spectrum={config.spectrum}: it is computed of the states of gap_states, which is 0; give gap_states >= 1"
+        )
+    pictures = ("contact_sheets=true", bool(config.contact_sheets)), ("spectrum=picture", config.spectrum == "picture")
+    drawn = [setting for setting, wanted in pictures if wanted]
+    if drawn and importlib.util.find_spec("PIL") is None:
+        raise ConfigError(f'{drawn[0]}: drawing needs Pillow (pip install "hood[pictures]")')
+    return together(lambda: _evaluate(config, overrides))
 
 
-def _evaluate(config: DictConfig) -> int:
+def _evaluate(config: DictConfig, overrides: Sequence[str]) -> int:
     folder = Path(str(config.output)).expanduser()
     plan = make_plan(config)
     distributed.on_main(lambda: _prepare(config, folder))
@@ -76,14 +88,15 @@ def _evaluate(config: DictConfig) -> int:
     mine = _measure(config, plan, todo, diary)
     measured = done | {key: item for part in distributed.gather(mine) for key, item in part.items()}
     if distributed.rank() == 0:
-        _report(config, plan, measured, folder)
+        _report(plan, measured, folder, overrides)
     return 0
 
 
 def _measure(config: DictConfig, plan: Plan, todo: Sequence[Unit], diary: Diary) -> dict[Unit, Measured]:
     """This process's share of the rollouts; each is written down as soon as it is done."""
     potential, count = build(config.losses), int(config.num_frames)
-    gaps = GapSettings(int(config.gap_states), replace(REFERENCE, max_iterations=int(config.gap_iterations)))
+    reference = replace(REFERENCE, max_iterations=int(config.gap_iterations))
+    gaps = GapSettings(int(config.gap_states), reference, config.spectrum != "none")
     measured: dict[Unit, Measured] = {}
     quiet = True if distributed.rank() else None
     with tqdm(total=len(todo), desc="evaluate", unit="rollout", disable=quiet) as bar:
@@ -127,18 +140,22 @@ def _write_sheet(reel: Reel, path: Path) -> None:
     write_sheet(reel.data(), path)
 
 
-def _report(config: DictConfig, plan: Plan, measured: Mapping[Unit, Measured], folder: Path) -> None:
-    rows = []
+def _report(plan: Plan, measured: Mapping[Unit, Measured], folder: Path, overrides: Sequence[str]) -> None:
+    rows: list[dict[str, Any]] = []
+    waves: list[dict[str, Any]] = []
     for index, candidate in enumerate(plan.candidates):
-        parts = {name: Measured() for name in plan.garments}
+        parts: dict[str, list[Measured]] = {name: [] for name in plan.garments}
         for unit in plan.units:
             if unit.model == index:
-                parts[unit.garment] += measured[unit]
+                parts[unit.garment].append(measured[unit])
         rows += candidate_rows(candidate, parts)
-    print(format_table(rows))
-    print(f"\n{describe(rows)}")
-    csv_path, json_path = write_table(rows, folder)
-    print(f"tables in {csv_path} and {json_path}")
+        for name, part in parts.items():
+            waves += spectrum_rows(candidate.name, name, [item for one in part for item in one.spectra])
+    vertices = {name: len(garment.rest_pos) for name, garment in plan.garments.items()}
+    training = {candidate.name: candidate.training for candidate in plan.candidates}
+    report_table(rows, circumstances(plan.config, overrides, plan.motions, vertices, training), folder)
+    if plan.config.spectrum != "none":
+        report_spectrum(waves, folder, picture=plan.config.spectrum == "picture")
 
 
 def _prepare(config: DictConfig, folder: Path) -> None:
@@ -162,7 +179,7 @@ def make_candidate(name: str, config: DictConfig) -> Candidate:
     inner = _unrefined_candidate(found[1], config)
     potential, settings = build(config.losses), build(config.solver)
     stepper = RefinedStepper(inner.stepper, potential, Count(int(found[2])), str(config.refine_method), settings)
-    return Candidate(f"{inner.name}+{found[2]}", inner.weights, stepper)
+    return Candidate(f"{inner.name}+{found[2]}", inner.weights, stepper, inner.training)
 
 
 def _unrefined_candidate(name: str, config: DictConfig) -> Candidate:
@@ -186,7 +203,8 @@ def _unrefined_candidate(name: str, config: DictConfig) -> Candidate:
     path = locate("weights", name)
     simulator = read_model(path, float(config.fps)).to(str(config.device))
     use_arithmetic(simulator, config)
-    return Candidate(path.stem if path.stem != "model" else path.parent.name, path.name, simulator)
+    name = path.stem if path.stem != "model" else path.parent.name
+    return Candidate(name, path.name, simulator, training_note(path))
 
 
 @dataclass

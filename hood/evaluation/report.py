@@ -10,16 +10,18 @@ from pathlib import Path
 from typing import Any
 
 from hood.evaluation.gap import AGREEMENT
-from hood.evaluation.table import ALL
+from hood.evaluation.table import ALL, FAILURE_STRAIN, INTERVALS
 
 _NAMES = ("model", "weights", "garment")
 _MAIN = ("steps", "radius", "ms", "ms_p99", "fps", "L_total", "gradient_norm", "rg")
 _GAP = ("gap", "gap_p95", "unconverged", "disagree")
 _TERMS = ("L_guess", "L_stretching", "L_bending", "L_inertia", "L_gravity", "L_collision", "L_friction")
 _STATE = ("strain_p99", "penetration", "penetration_worst", "drift")
-COLUMNS = (*_NAMES, *_MAIN, *_GAP, *_TERMS, *_STATE, "failed_at", "frames", "gap_states")
+_FAILURE = ("failed_at", "failed", "frames_to_failure")
+_ENDS = tuple(f"{column}_{end}" for column in INTERVALS for end in ("low", "high"))
+COLUMNS = (*_NAMES, *_MAIN, *_GAP, *_TERMS, *_STATE, *_FAILURE, "rollouts", "frames", "gap_states", "gap_spread", *_ENDS)
 #: Columns of the printed tables; all in one would be wider than a screen.
-_PRINTED = ((*_NAMES, *_MAIN, *_GAP, "failed_at"), (*_NAMES, *_TERMS, *_STATE))
+_PRINTED = ((*_NAMES, *_MAIN, *_GAP, "failed"), (*_NAMES, *_TERMS, *_STATE))
 
 
 def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -34,6 +36,8 @@ def describe(rows: Sequence[Mapping[str, Any]]) -> str:
         "than 2 mm, are means; rg = ‖∇Φ‖ / ‖M g‖ and strain_p99 are medians over frames; drift [m] is to the side",
         "gap = (Φ - Φ*) / e0, the energy above the minimum of the same step: median and 95th percentile; √gap is about the "
         "error of the accelerations in g",
+        f"failed: share of the rollouts with a frame that is not finite or whose strain_p99 exceeds {FAILURE_STRAIN:.0%}; "
+        "frames_to_failure (in the files) is the median of those frames. 95% intervals over rollouts are in the files",
     ]
     whole = [row for row in rows if row["garment"] == ALL]
     states = sum(row["gap_states"] for row in whole)

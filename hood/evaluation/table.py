@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import partial
 from typing import Any
 
@@ -14,8 +14,10 @@ from hood.dynamics.rollout import Frame, simulate
 from hood.dynamics.simulator import Simulator
 from hood.dynamics.stepper import Stepper
 from hood.evaluation.gap import AGREEMENT, REFERENCE, gap
+from hood.evaluation.interval import bootstrap_interval
 from hood.evaluation.radius import measured_radius
 from hood.evaluation.sample import StepSample
+from hood.evaluation.spectrum import error_spectrum, garment_bands
 from hood.losses.potential import Potential
 from hood.scene.scene import Scene
 from hood.solver.newton import NewtonSettings
@@ -23,6 +25,18 @@ from hood.solver.newton import NewtonSettings
 #: Frames at the start of a rollout that are left out of the times: caches fill and pages are mapped there.
 _WARMUP = 2
 ALL = "all"
+#: A frame whose 99th percentile of strain exceeds this is a failure: a hundredth of its edges is twice as long as at rest.
+FAILURE_STRAIN = 1.0
+#: Columns that have a confidence interval NAME_low, NAME_high: of what they are which figure.
+_STATISTICS: dict[str, tuple[str, Callable[[np.ndarray], float]]] = {
+    "ms": ("ms_total", np.median),
+    "L_total": ("energy_total", np.mean),
+    "gradient_norm": ("gradient_norm", np.mean),
+    "rg": ("relative_gradient", np.median),
+    "gap": ("gamma", np.median),
+    "strain_p99": ("strain_p99", np.median),
+}
+INTERVALS = tuple(_STATISTICS)
 
 #: Told what is being done and how many rollouts are done.
 Progress = Callable[[str, int], None]
@@ -32,11 +46,12 @@ See = Callable[[Frame], None]
 
 @dataclass(frozen=True)
 class Candidate:
-    """What takes the steps, and what its weights are (``none`` for the solver)."""
+    """What takes the steps, what its weights are (``none`` for the solver), and what they cost, as far as their file says."""
 
     name: str
     weights: str
     stepper: Stepper
+    training: str = ""
 
 
 @dataclass(frozen=True)
@@ -46,10 +61,12 @@ class GapSettings:
     Args:
         states: steps of every rollout, spread evenly over its frames; 0 for no gap and no minimisation.
         reference: how far the minimisations behind a gap go.
+        spectrum: of the same states, in which wavelengths the error is.
     """
 
     states: int = 5
     reference: NewtonSettings = REFERENCE
+    spectrum: bool = False
 
 
 @dataclass
@@ -60,10 +77,12 @@ class Measured:
     failures: list[int] = field(default_factory=list)  # first non-finite frames
     gaps: list[dict[str, float]] = field(default_factory=list)  # γ, converged (0 or 1), spread [e0] of every state looked at
     drifts: list[float] = field(default_factory=list)  # [m] to the side, on a body that stands still
+    ends: list[int | None] = field(default_factory=list)  # of every rollout: first frame failed, see FAILURE_STRAIN; None: none
+
+    spectra: list[dict[str, Any]] = field(default_factory=list)  # of the states of gaps, see error_spectrum
 
     def __add__(self, other: Measured) -> Measured:
-        parts = (self.frames + other.frames, self.failures + other.failures, self.gaps + other.gaps)
-        return Measured(*parts, self.drifts + other.drifts)
+        return Measured(*(getattr(self, item.name) + getattr(other, item.name) for item in fields(self)))
 
 
 def evaluate(
@@ -77,21 +96,24 @@ def evaluate(
     """Rows of the table: one per candidate and garment, and one per candidate over all garments.
 
     Means over the frames that a candidate's own rollouts reach before the first non-finite one; ``failed_at`` is the
-    earliest such frame (None: never). ``steps`` and ``radius`` are None without a network. ``L_guess`` is the potential of
-    the inertial guess on the same states. ``gradient_norm`` [N] is the mean over vertices of ‖∂L/∂x_v‖₂, averaged over
-    frames; ``rg`` and ``strain_p99`` are medians over frames; ``penetration`` is the mean share of vertices deeper than 2 mm,
-    ``penetration_worst`` that of the worst frame; ``drift`` [m] is the largest of those measured (None: none was). Of the
-    states whose gap is computed (``gap_states`` of them): ``gap`` is the median, ``gap_p95`` the 95th percentile,
+    earliest such frame (None: never). Of the ``rollouts``, ``failed`` is the share that failed, as non-finite or by
+    :data:`FAILURE_STRAIN`, and ``frames_to_failure`` the median of the frames where they did, rollouts that lasted counted as
+    later than all (None: less than half failed). ``steps`` and ``radius`` are None without a network. ``L_guess`` is the
+    potential of the inertial guess on the same states. ``gradient_norm`` [N] is the mean over vertices of ‖∂L/∂x_v‖₂, averaged
+    over frames; ``rg`` and ``strain_p99`` are medians over frames; ``penetration`` is the mean share of vertices deeper than
+    2 mm, ``penetration_worst`` that of the worst frame; ``drift`` [m] is the largest of those measured (None: none was). Of
+    the states whose gap is computed (``gap_states`` of them): ``gap`` is the median, ``gap_p95`` the 95th percentile,
     ``unconverged`` the share whose reference missed its accuracy and ``disagree`` the share where minimisations ended in
-    different minima.
+    different minima, ``gap_spread`` [e0] the 95th percentile of how far these are apart. Columns of :data:`INTERVALS` have 95%
+    intervals over rollouts, ``NAME_low`` and ``NAME_high``, from two rollouts on.
     """
     rows, done = [], 0
     for candidate in candidates:
-        parts = {garment: Measured() for garment in scenes}
+        parts: dict[str, list[Measured]] = {garment: [] for garment in scenes}
         for garment, variants in scenes.items():
             for scene in variants:
                 tell = partial(_tell, progress, done)
-                parts[garment] += measure(candidate, scene, potential, num_frames, gaps, tell)
+                parts[garment].append(measure(candidate, scene, potential, num_frames, gaps, tell))
                 done += 1
                 progress(f"{candidate.name} {garment} {scene.motion.name}", done)
         rows += candidate_rows(candidate, parts)
@@ -114,11 +136,15 @@ def measure(
     return measured
 
 
-def candidate_rows(candidate: Candidate, parts: Mapping[str, Measured]) -> list[dict[str, Any]]:
-    """The candidate's rows of the table: one per garment of ``parts``, and one over all, see :func:`evaluate`."""
+def candidate_rows(candidate: Candidate, parts: Mapping[str, Sequence[Measured]]) -> list[dict[str, Any]]:
+    """The candidate's rows of the table, from its rollouts by garment: one per garment and one over all, see
+    :func:`evaluate`."""
     shared = {"model": candidate.name, "weights": candidate.weights, **_reach(candidate.stepper)}
-    whole = sum(parts.values(), start=Measured())
-    return [{**shared, "garment": name, **_row(part)} for name, part in {**parts, ALL: whole}.items()]
+    whole = [rollout for part in parts.values() for rollout in part]
+    return [
+        {**shared, "garment": name, **_row(sum(part, start=Measured())), **_intervals(part)}
+        for name, part in {**parts, ALL: whole}.items()
+    ]
 
 
 def _tell(progress: Progress, done: int, text: str) -> None:
@@ -136,27 +162,34 @@ def _run(
     stepper: Stepper, scene: Scene, potential: Potential, num_frames: int, gaps: GapSettings, into: Measured, see: See | None
 ) -> Iterator[str]:
     """One rollout, added to ``into``; yields what is being done."""
-    count = min(num_frames, scene.num_frames)
+    count, end = min(num_frames, scene.num_frames), None
     sample = StepSample(range(_WARMUP + 1, count), gaps.states)
     for frame in simulate(stepper, scene, potential, count, observe=sample if gaps.states else None):
         if see is not None:
             see(frame)
         yield f"frame {frame.index + 1}/{count}"
-        if not np.isfinite(frame.metrics["strain_p99"]):
+        strain = frame.metrics["strain_p99"]
+        if end is None and not strain <= FAILURE_STRAIN:
+            end = frame.index
+        if not np.isfinite(strain):
             into.failures.append(frame.index)
             break
         if frame.index > _WARMUP:
             into.frames.append(frame.metrics)
+    into.ends.append(end)
+    bands = garment_bands(scene.cloth) if gaps.spectrum and sample.steps else None
     for index, (problem, prediction) in enumerate(sample.steps):
         yield f"gap {index + 1}/{len(sample.steps)}"
         found = gap(potential, problem, prediction.next_pos, settings=gaps.reference)
         into.gaps.append({"gamma": float(found.gamma), "converged": float(found.converged), "spread": float(found.spread)})
+        if bands is not None:
+            into.spectra.append(error_spectrum(potential, problem, prediction.next_pos, bands, gaps.reference))
 
 
 def _row(measured: Measured) -> dict[str, Any]:
     frames, failures = measured.frames, measured.failures
     row: dict[str, Any] = {"frames": len(frames), "failed_at": min(failures) if failures else None}
-    row |= _gap_columns(measured.gaps)
+    row |= _failure_columns(measured.ends) | _gap_columns(measured.gaps)
     if measured.drifts:
         row["drift"] = max(measured.drifts)
     if not frames:
@@ -178,15 +211,41 @@ def _row(measured: Measured) -> dict[str, Any]:
     return row
 
 
+def _failure_columns(ends: Sequence[int | None]) -> dict[str, Any]:
+    if not ends:
+        return {"rollouts": 0}
+    frames = sorted(np.inf if end is None else end for end in ends)
+    median = frames[(len(frames) - 1) // 2]
+    return {
+        "rollouts": len(ends),
+        "failed": float(np.mean(np.isfinite(frames))),
+        "frames_to_failure": int(median) if np.isfinite(median) else None,
+    }
+
+
+def _intervals(rollouts: Sequence[Measured]) -> dict[str, float]:
+    """``NAME_low`` and ``NAME_high`` of the columns of :data:`INTERVALS` that have one."""
+    found: dict[str, float] = {}
+    for column, (key, statistic) in _STATISTICS.items():
+        tables = [one.gaps if column == "gap" else one.frames for one in rollouts]
+        low, high = bootstrap_interval([np.array([item.get(key, 0.0) for item in table]) for table in tables], statistic)
+        if np.isfinite(low) and np.isfinite(high):
+            found |= {f"{column}_low": low, f"{column}_high": high}
+    return found
+
+
 def _gap_columns(gaps: Sequence[Mapping[str, float]]) -> dict[str, Any]:
     if not gaps:
         return {"gap_states": 0}
     gamma = np.array([item["gamma"] for item in gaps])
+    spread = np.array([item["spread"] for item in gaps])
+    known = spread[np.isfinite(spread)]
     return {
         "gap": float(np.median(gamma)),
         "gap_p95": float(np.quantile(gamma, 0.95)),
         "unconverged": float(np.mean([item["converged"] == 0.0 for item in gaps])),
-        "disagree": float(np.mean([item["spread"] > AGREEMENT for item in gaps])),
+        "disagree": float(np.mean(spread > AGREEMENT)),
+        "gap_spread": float(np.quantile(known, 0.95)) if len(known) else None,
         "gap_states": len(gaps),
     }
 

@@ -198,12 +198,14 @@ def test_refined_candidates(motions: Path, capsys: pytest.CaptureFixture[str]) -
     assert "guess+2 is the solver stopped early" in capsys.readouterr().err
 
 
-def test_sheets_without_the_picture_library_are_refused_before_any_work(
-    motions: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("setting", ["contact_sheets=true", "spectrum=picture"])
+def test_pictures_without_the_picture_library_are_refused_before_any_work(
+    setting: str, motions: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from hood.commands import evaluate
 
     monkeypatch.setattr(evaluate.importlib.util, "find_spec", lambda name: None)
-    assert main([*EVALUATE[:-1], "contact_sheets=true", "output=none"]) == 2
-    assert "needs Pillow" in capsys.readouterr().err
+    given = [text for text in EVALUATE if not text.startswith(("gap_states", "output"))]
+    assert main([*given, "gap_states=1", setting, "output=none"]) == 2
+    assert f"{setting}: drawing needs Pillow" in capsys.readouterr().err
     assert not (motions.parent / "none").exists()

@@ -1,0 +1,67 @@
+"""What the figures of an evaluation depend on, in words: the command, the machine, what the models were trained with."""
+
+from __future__ import annotations
+
+import platform
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import torch
+from omegaconf import DictConfig
+
+from hood.config import plain
+from hood.dynamics.reference import SUFFIXES
+from hood.dynamics.simulator import read_header
+from hood.evaluation.table_one import Circumstances
+
+#: Arguments that change nothing about the figures.
+_ASIDE = ("output", "resume", "contact_sheets")
+
+
+def circumstances(
+    config: DictConfig,
+    overrides: Sequence[str],
+    motions: Sequence[str],
+    vertices: Mapping[str, int],
+    training: Mapping[str, str],
+) -> Circumstances:
+    """Of an evaluation with ``config``: ``vertices`` by garment, ``training`` in words by model."""
+    return Circumstances(
+        command=command_line("evaluate", overrides),
+        machine=machine_name(str(config.device)),
+        body=f"{Path(str(config.body)).stem} (embedded)" if str(config.body) == "default" else Path(str(config.body)).name,
+        motions=[Path(name).stem for name in motions],
+        num_shapes=len(plain(config.shapes)),
+        num_frames=int(config.num_frames),
+        fps=float(config.fps),
+        vertices=dict(vertices),
+        training=dict(training),
+    )
+
+
+def command_line(command: str, overrides: Sequence[str]) -> str:
+    """The command that gives the same figures: what says where files go is left out."""
+    kept = [text for text in overrides if text.split("=", 1)[0].strip("+~") not in _ASIDE]
+    return shlex.join(["hood", command, *kept])
+
+
+def machine_name(device: str) -> str:
+    """Processor or accelerator by its own name, threads, torch version."""
+    if device.startswith("cuda"):
+        return f"{torch.cuda.get_device_name(device)}, torch {torch.__version__}"
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    name = names[0] if names else platform.processor() or platform.machine()
+    return f"{name}, {torch.get_num_threads()} thread(s), torch {torch.__version__}"
+
+
+def training_note(path: Path) -> str:
+    """What a model file says about its training; empty where it says nothing."""
+    if path.suffix.lower() in SUFFIXES:
+        return "published weights"
+    header = {key: value for key, value in read_header(path).items() if key not in ("format", "model", "validation")}
+    iteration = header.pop("iteration", None)
+    notes = [] if iteration is None else [f"{int(iteration):,} updates"]
+    return ", ".join([*notes, *(f"{key} {value}" for key, value in sorted(header.items()))])
