@@ -31,6 +31,10 @@ _EXAMPLES = {
         "hood evaluate",
         "hood evaluate models=[runs/a/model.safetensors,newton] garments=[dress] sequences=[] gap_states=3",
     ],
+    "tradeoff": [
+        "hood tradeoff",
+        "hood tradeoff models=[runs/a/model.safetensors] precisions=[fp32] garments_4k=[] garments_12k=[] output=outputs/a",
+    ],
 }
 
 
