@@ -10,9 +10,11 @@ import shlex
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -80,7 +82,10 @@ class Points:
         waiting = deque(point for point in points if not self.is_done(point))
         running: list[_Running] = []
         failures: list[Failure] = []
-        with tqdm(total=len(points), initial=len(points) - len(waiting), desc="trade-off", unit="point") as bar:
+        with (
+            tqdm(total=len(points), initial=len(points) - len(waiting), desc="trade-off", unit="point") as bar,
+            _interruptible(),
+        ):
             try:
                 while waiting or running:
                     while waiting and len(running) < self.jobs:
@@ -108,7 +113,7 @@ class Points:
         ]
         load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
         with open(self.log_of(point), "ab") as sink:
-            sink.write(f"$ {shlex.join(arguments)}\n".encode())
+            sink.write(f"\n$ {shlex.join(arguments)}\n".encode())
             sink.flush()
             process = subprocess.Popen(
                 arguments, stdin=subprocess.DEVNULL, stdout=sink, stderr=sink, env=os.environ | {"OMP_NUM_THREADS": "1"}
@@ -130,10 +135,12 @@ class Points:
         return []
 
     def _complaint(self, item: _Running) -> str:
-        said = self.log_of(item.point).read_text(encoding="utf-8", errors="replace").replace("\r", "\n").splitlines()
-        errors = [line for line in said if "error" in line.lower()]
-        last = errors[-1].strip() if errors else "nothing was said"
-        return f"exit code {item.process.returncode}: {last}"
+        """How it ended, and the last error that it told: the log keeps earlier attempts as well."""
+        said = self.log_of(item.point).read_text(encoding="utf-8", errors="replace").rpartition("\n$ ")[2]
+        errors = [line.strip() for line in said.splitlines()[1:] if "error" in line.lower()]
+        code = item.process.returncode
+        ending = f"exit code {code}" if code > 0 else f"ended by signal {-code}"
+        return f"{ending}: {errors[-1] if errors else 'no error was told'}"
 
     def _progress(self, point: Point) -> str:
         folder = self.folder_of(point)
@@ -142,14 +149,28 @@ class Points:
 
 
 def _end(running: Sequence[_Running]) -> None:
+    """End the processes. Evaluations may be killed at any moment, and processes started in the background ignore SIGINT."""
     for item in running:
-        item.process.send_signal(signal.SIGINT)
+        item.process.terminate()
     for item in running:
         try:
             item.process.wait(_PATIENCE)
         except subprocess.TimeoutExpired:
             item.process.kill()
             item.process.wait()
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """SIGTERM interrupts the block like Ctrl-C: the processes it started do not outlive it."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def weights_digest(point: Point) -> str:

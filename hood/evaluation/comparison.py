@@ -161,10 +161,12 @@ def crossover(found: Sequence[Standing], device: str) -> str:
     if lost and won and max(s.vertices for s in lost) < min(s.vertices for s in won):
         below, above = lost[-1], won[0]
         assert above.best is not None
+        number = _crossing(below, above)
+        start = f"Up to {below.vertices:,}" if number is None else f"Below {number:,}"
+        how = f" ({number:,} is interpolated between these sizes.)" if number is not None else ""
         return (
-            f"Below {_crossing(below, above):,} vertices on this {device} the solver alone is the better choice: it is at "
-            f"{_sizes(lost)}, while at {_sizes(won)} {above.best.reached.label} reaches the same γ in less time. (The number "
-            f"is interpolated between {below.vertices:,} and {above.vertices:,} vertices.)" + doubt
+            f"{start} vertices on this {device} the solver alone is the better choice: it is at {_sizes(lost)}, while at "
+            f"{_sizes(won)} {above.best.reached.label} reaches the same γ in less time.{how}{doubt}"
         )
     if lost and not won:
         return (
@@ -193,13 +195,12 @@ def _sizes(found: Sequence[Standing]) -> str:
     return (numbers[0] if len(numbers) == 1 else f"{', '.join(numbers[:-1])} and {numbers[-1]}") + " vertices"
 
 
-def _crossing(below: Standing, above: Standing) -> int:
-    """Vertices at which both take equally long, on a straight line in logarithms; two digits. Without both ratios, the
-    smallest size at which the network wins."""
-    ratios = [s.best.ratio if s.best is not None else None for s in (below, above)]
-    if ratios[0] is None or ratios[1] is None or not ratios[0] < 1.0 < ratios[1]:
-        return above.vertices
-    share = -math.log(ratios[0]) / math.log(ratios[1] / ratios[0])
+def _crossing(below: Standing, above: Standing) -> int | None:
+    """Vertices at which both take equally long, on a straight line in logarithms, to two digits; None without both ratios."""
+    low, high = (standing.best.ratio if standing.best is not None else None for standing in (below, above))
+    if low is None or high is None or not low < 1.0 < high:
+        return None
+    share = -math.log(low) / math.log(high / low)
     crossing = below.vertices * (above.vertices / below.vertices) ** share
     digits = 10 ** (math.floor(math.log10(crossing)) - 1)
     return round(crossing / digits) * digits

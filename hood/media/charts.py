@@ -144,7 +144,7 @@ def cost_chart(reached: Sequence[Reached], title: str) -> Any:
 
     items = [item for item in reached if item.charted][::-1]
     with rc_context({**_STYLE, "axes.grid.axis": "x"}):
-        figure = Figure(figsize=(9.0, 1.3 + 0.22 * len(items)), layout="constrained")
+        figure = Figure(figsize=(9.0, 1.7 + 0.22 * len(items)), layout="constrained")
         axes = figure.subplots()
         left = [0.0] * len(items)
         for name in PARTS:

@@ -38,8 +38,9 @@ def introduction(study: Study) -> list[str]:
         "states that it reaches by itself.",
         "γ (gamma) says how close: the energy that is left above the minimum, in units of e0, what it costs to be wrong about "
         "every vertex's acceleration by 1 g, the acceleration of free fall. The root of γ is about the error of the "
-        "acceleration in g: γ = 1 is off by 1 g, γ = 0.01 by 0.1 g. At 30 frames per second 0.1 g is 1.1 mm per frame. Smaller is better. "
-        f"Below about {AGREEMENT:g} the figure itself is uncertain: folded cloth has several minima, that far apart.",
+        "acceleration in g: γ = 1 is off by 1 g, γ = 0.01 by 0.1 g. At 30 frames per second 0.1 g is 1.1 mm per frame. "
+        f"Smaller is better. Below about {AGREEMENT:g} the figure itself is uncertain: folded cloth has several minima, that "
+        "far apart.",
         f"Measured on {study.device}, one thread per setting. Bars in the charts and ranges in brackets are {LEVEL:.0%} "
         "confidence intervals.",
     ]
@@ -84,8 +85,8 @@ def method(study: Study) -> list[str]:
         f"the first frames are left out. Up to {jobs} settings were measured side by side.{load}",
         "The minimum is the lowest of three minimisations in float64, from the inertial guess, the previous positions and the "
         f"setting's own result. Of {states:,} states, the reference of {unsure:,} missed its accuracy (γ is a lower bound "
-        f"there) and minimisations of {apart:,} ended more than {AGREEMENT:g} e0 apart (the lowest counts); all are kept. γ is never "
-        "clamped: a setting that beats every minimisation is itself the reference.",
+        f"there) and minimisations of {apart:,} ended more than {AGREEMENT:g} e0 apart (the lowest counts); all are kept. "
+        "γ is never clamped: a setting that beats every minimisation is itself the reference.",
         f"Intervals: rollouts are drawn again with replacement, then states within each, {DRAWS:,} times with a fixed seed, "
         "alike for all settings that were measured on the same rollouts.",
         "rg is the unbalanced force in units of the weight; p99 strain the 99th percentile of the change of edge lengths; both "
