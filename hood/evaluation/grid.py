@@ -74,7 +74,8 @@ class Point:
         if self.model == NEWTON:
             return "solver alone, converged"
         if self.model == GUESS:
-            return f"solver alone, {self.refine} {'sweeps' if self.method == 'sweeps' else 'iterations'}"
+            unit = "sweep" if self.method == "sweeps" else "iteration"
+            return f"solver alone, {self.refine} {unit}{'' if self.refine == 1 else 's'}"
         refined = f" + {self.refine}" if self.refine else ""
         swept = " sweeps" if self.method == "sweeps" and self.refine else ""
         return f"{self.name}{refined}{swept}, {self.precision}"

@@ -57,51 +57,69 @@ def front_chart(reached: Sequence[Reached], rejected: Collection[Point], colours
             axes.set_xlabel("milliseconds per frame (median; everything included)")
             axes.tick_params(labelleft=True)
         panels[0].set_ylabel("γ: energy above the exact step, in e0   (down is better)")
+        if any(item.point in rejected for item in reached):
+            panels[0].plot([], [], "o", color="#555555", markerfacecolor="white", label="overstretched, or broken down")
         handles, labels = panels[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside right upper", fontsize=8.5)
     return figure
 
 
 def _panel(axes: Any, reached: Sequence[Reached], rejected: Collection[Point], colours: dict[str, str], quantity: str) -> None:
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
     axes.set_xscale("log")
     axes.set_yscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_minor_formatter(NullFormatter())
     for name in dict.fromkeys(item.point.series for item in reached):
         _series(axes, [item for item in reached if item.point.series == name], rejected, colours, quantity)
     if quantity == "gap":
         _staircase(axes, pareto_front(reached, rejected))
     _limits(axes, reached, quantity)
     axes.axhspan(FLOOR / 10, _BLUR, color="#f4f4f4", zorder=0)
-    note = {"transform": axes.get_yaxis_transform(), "ha": "right", "va": "top", "fontsize": 7, "color": "#777777"}
-    axes.text(0.99, _BLUR, "below: as far apart as different minima", **note)
+    # What is both fast and exact: that corner is free.
+    note = {"transform": axes.transAxes, "va": "bottom", "fontsize": 7, "color": "#666666"}
+    axes.text(0.015, 0.02, f"grey: below {_BLUR:g}, as far apart\nas minima of one and the same step", **note)
 
 
 def _series(axes: Any, items: list[Reached], rejected: Collection[Point], colours: dict[str, str], quantity: str) -> None:
     """A line from few iterations to many. The converged solver is no further iteration: it stands by itself."""
     point = items[0].point
-    colour = _SOLVER if point.alone else colours[point.model]
-    coarse = point.precision != "fp32"
+    style = _line_style(point)
+    colour = style["color"] = _SOLVER if point.alone else colours[point.model]
     line = sorted((item for item in items if item.point.model != NEWTON), key=lambda item: item.point.refine)
     shown = [item for item in line if getattr(item, quantity).value >= FLOOR]
-    style = {"color": colour, "linewidth": 1.1, "linestyle": "--" if coarse else "-", "marker": "s" if coarse else "o"}
-    faces = {item.point: "white" if item.point in rejected else colour for item in items}
     if line:
-        axes.plot(
-            [i.ms.value for i in shown], [getattr(i, quantity).value for i in shown], **(style | {"marker": ""}), alpha=0.6
-        )
+        places = [item.ms.value for item in shown], [getattr(item, quantity).value for item in shown]
+        axes.plot(*places, **(style | {"marker": ""}), alpha=0.6)
         axes.plot([], [], **style, markersize=5, label=point.series)
+    named = line if len(line) < 5 else [line[0], line[-1]]
     for item in items:
-        converged = item.point.model == NEWTON
-        value = getattr(item, quantity)
-        if value.value < FLOOR:
-            _at_the_edge(axes, item, value.value, colour)
+        if getattr(item, quantity).value < FLOOR:
+            _at_the_edge(axes, item, getattr(item, quantity).value, colour)
             continue
-        marker = "*" if converged else style["marker"]
-        _errors(axes, item, value, colour)
-        axes.plot([item.ms.value], [value.value], marker=marker, color=colour, markerfacecolor=faces[item.point],
-                  markersize=11 if converged else 5.5, linestyle="", zorder=3)  # fmt: skip
-        if converged or line and item in (line[0], line[-1]) or len(line) < 5:
-            text = "converged" if converged else str(item.point.refine)
-            axes.annotate(text, (item.ms.value, value.value), (5, 4), textcoords="offset points", fontsize=7.5, color=colour)
+        face = "white" if item.point in rejected else colour
+        _marker(axes, item, getattr(item, quantity), style | {"markerfacecolor": face}, item in named)
+
+
+def _line_style(point: Point) -> dict[str, Any]:
+    marker, line = ("s", "--") if point.precision != "fp32" else ("o", "-")
+    if point.method == "sweeps":
+        marker, line = "D" if marker == "s" else "^", ":"
+    return {"linewidth": 1.1, "linestyle": line, "marker": marker}
+
+
+def _marker(axes: Any, item: Reached, value: Any, style: dict[str, Any], named: bool) -> None:
+    converged = item.point.model == NEWTON
+    _errors(axes, item, value, style["color"])
+    looks = {"marker": "*", "markersize": 11} if converged else {"markersize": 5.5}
+    axes.plot([item.ms.value], [value.value], **(style | looks | {"linestyle": "", "zorder": 3}))
+    if converged or named:
+        text = "converged" if converged else str(item.point.refine)
+        place = {"xytext": (5, 4), "textcoords": "offset points"}
+        axes.annotate(text, (item.ms.value, value.value), fontsize=7.5, color=style["color"], **place)
 
 
 def _errors(axes: Any, item: Reached, value: Any, colour: str) -> None:
@@ -138,11 +156,15 @@ def _limits(axes: Any, reached: Sequence[Reached], quantity: str) -> None:
 
 
 def cost_chart(reached: Sequence[Reached], title: str) -> Any:
-    """Figure of one size: where the time of a frame goes, one bar for every setting."""
+    """Figure of one size: where the time of a frame goes, with the fewest and the most iterations of every series."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    items = [item for item in reached if item.charted][::-1]
+    series: dict[str, list[Reached]] = {}
+    for item in (item for item in reached if item.charted):
+        series.setdefault("" if item.point.model == NEWTON else item.point.series, []).append(item)
+    ends = (sorted(line, key=lambda item: item.point.refine) for line in series.values())
+    items = [item for line in ends for item in ([line[0], line[-1]] if len(line) > 1 else line)][::-1]
     with rc_context({**_STYLE, "axes.grid.axis": "x"}):
         figure = Figure(figsize=(9.0, 1.7 + 0.22 * len(items)), layout="constrained")
         axes = figure.subplots()

@@ -75,7 +75,8 @@ def _size_section(study: Study, size: str, pictures: dict[str, str]) -> str:
         _front_table(study, size),
         _equal_gap(study, size),
         _equal_time(study, size),
-        f"<details><summary>Where the time goes</summary><figure>{pictures[f'cost_{size}']}</figure></details>",
+        "<details><summary>Where the time goes, with the fewest and the most iterations</summary>"
+        f"<figure>{pictures[f'cost_{size}']}</figure></details>",
     ]
     return section(f"{items[0].vertices:,} vertices", "".join(parts))
 

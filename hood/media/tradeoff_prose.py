@@ -50,8 +50,8 @@ def caption(study: Study, size: str) -> str:
     """What the chart of a size shows, and what it does not."""
     items = study.at(size)
     text = (
-        "Left and down is better. Lines join iterations, whose number stands beside them; squares and dashes are lower "
-        "precision; the broad band is the Pareto front: settings that no other one beats in both time and γ."
+        "Left and down is better. Lines join iterations (numbers); squares and dashes are lower "
+        "precision, dots sweeps; the broad band (left) is the Pareto front: settings that no other one beats in both time and γ."
     )
     if any(item.point.model == NEWTON for item in items):
         text += f" Hollow: p99 strain exceeds {OVERSTRETCHED:g} times the converged solver's, or a rollout broke down."
