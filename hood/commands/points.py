@@ -43,12 +43,23 @@ class Failure:
     log: Path
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Running:
     point: Point
     process: subprocess.Popen[bytes]
     begin: float
     load: float
+    cpu_seconds: float | None = None  # of the process; known when it has ended
+
+    def ended(self) -> bool:
+        """Whether the process has ended."""
+        if not hasattr(os, "wait4"):
+            return self.process.poll() is not None
+        found, status, usage = os.wait4(self.process.pid, os.WNOHANG)
+        if found:
+            self.process.returncode = os.waitstatus_to_exitcode(status)
+            self.cpu_seconds = usage.ru_utime + usage.ru_stime
+        return bool(found)
 
 
 class Points:
@@ -90,9 +101,11 @@ class Points:
                 while waiting or running:
                     while waiting and len(running) < self.jobs:
                         running.append(self._start(waiting.popleft()))
-                    bar.set_postfix_str(", ".join(self._progress(item.point) for item in running))
+                    text = ", ".join(self._progress(item.point) for item in running)
+                    if text != bar.postfix:
+                        bar.set_postfix_str(text)
                     time.sleep(0.1)
-                    for item in [item for item in running if item.process.poll() is not None]:
+                    for item in [item for item in running if item.ended()]:
                         running.remove(item)
                         failures += self._finish(item)
                         bar.update()
@@ -123,13 +136,16 @@ class Points:
     def _finish(self, item: _Running) -> list[Failure]:
         if item.process.returncode:
             return [Failure(item.point, self._complaint(item), self.log_of(item.point))]
+        seconds = time.monotonic() - item.begin
         record: dict[str, Any] = {
             "command": item.point.command,
             "weights": weights_digest(item.point),
             "device": self.device,
             "jobs": self.jobs,
             "load_at_start": item.load,
-            "seconds": time.monotonic() - item.begin,
+            "seconds": seconds,
+            # A process alone on its processor has all of its time.
+            "cpu_share": None if item.cpu_seconds is None else item.cpu_seconds / seconds,
         }
         write_atomically(self.folder_of(item.point) / "point.json", json.dumps(record, indent=1).encode())
         return []

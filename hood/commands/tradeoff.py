@@ -130,6 +130,8 @@ def _write(folder: Path, reached: Sequence[Reached], failures: Sequence[Failure]
     _write_tables(folder, reached)
     page = write_page(study, folder)
     print(_front_text(reached, rejected))
+    if study.warning:
+        print(f"\n{study.warning}")
     print(f"\n{study.sentence}\n\npage in {page}, tables in {folder / 'points.csv'} and {folder / 'refine_table.json'}")
 
 

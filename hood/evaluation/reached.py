@@ -25,6 +25,8 @@ PARTS = {
     "refine": ("ms_refine", "ms_solver"),
     "rest": ("ms_rest", "ms_guess"),
 }
+#: A process that had its processor for less than this share of the time was disturbed: reading files takes some as well.
+UNDISTURBED = 0.85
 #: Strain beyond this multiple of the solver's counts as too much.
 OVERSTRETCHED = 2.0
 
@@ -66,6 +68,12 @@ class Reached:
         """Whether it has a time and a gap."""
         return math.isfinite(self.ms.value) and math.isfinite(self.gap.value)
 
+    @property
+    def disturbed(self) -> bool:
+        """Whether other work took the processor away while it was measured on a CPU, so that its times are too long."""
+        share = self.record.get("cpu_share")
+        return share is not None and share < UNDISTURBED and str(self.record.get("device", "")).startswith("CPU")
+
     def row(self) -> dict[str, Any]:
         """Its line of the table: plain values, None where nothing was measured."""
         point = self.point
@@ -80,7 +88,7 @@ class Reached:
         entries |= {f"ms_{name}": value for name, value in self.parts.items()}
         for name in ("rollouts", "frames", "states", "unconverged", "disagreeing", "failures"):
             entries[name] = getattr(self, name)
-        entries |= {"device": self.record.get("device"), "command": point.command}
+        entries |= {"device": self.record.get("device"), "cpu_share": self.record.get("cpu_share"), "command": point.command}
         return {key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in entries.items()}
 
 

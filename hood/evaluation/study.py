@@ -37,6 +37,19 @@ class Study:
         return " and ".join(dict.fromkeys(str(item.record.get("device", "unnamed device")) for item in self.reached))
 
     @property
+    def warning(self) -> str:
+        """Whether times can be trusted; empty where they can."""
+        disturbed = [item for item in self.reached if item.disturbed]
+        if not disturbed:
+            return ""
+        least = min(item.record["cpu_share"] for item in disturbed)
+        return (
+            f"The machine was busy with other work: {len(disturbed)} of {len(self.reached)} settings had their processor for only "
+            f"a part of the time (down to {least:.0%}), so times are too long and comparisons of time do not hold. Measure again "
+            "on a machine that is free, or with fewer jobs."
+        )
+
+    @property
     def sentence(self) -> str:
         """Where a network gives way to the solver alone."""
         return crossover(standings(self.reached, self.rejected), self.device)

@@ -9,7 +9,7 @@ _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 1180px; margin: 2em auto; padding: 0 1.2em; }
 h1 { font-size: 1.7em; } h2 { font-size: 1.3em; margin-top: 2.2em; border-bottom: 1px solid #ddd; } h3 { font-size: 1.05em; }
 p { max-width: 50em; } .lead { font-size: 1.15em; font-weight: 600; background: #f6f3e7; padding: .7em 1em; }
-.wide { overflow-x: auto; } table { border-collapse: collapse; font-size: 13px; }
+.warning { background: #fbe3de; } .wide { overflow-x: auto; } table { border-collapse: collapse; font-size: 13px; }
 th, td { text-align: left; padding: .25em .7em; border-bottom: 1px solid #eee; vertical-align: top; white-space: nowrap; }
 th { background: #f7f7f7; } code { font-size: 12px; white-space: pre; user-select: all; }
 figure { margin: 1em 0; } figure svg { width: 100%; height: auto; }

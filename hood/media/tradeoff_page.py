@@ -23,6 +23,8 @@ def write_page(study: Study, folder: Path) -> Path:
     """Write ``index.html`` and the charts as PNG; returns the page's path."""
     pictures = _pictures(study, folder)
     parts = ["<h1>Speed and accuracy of cloth dynamics</h1>", f'<p class="lead">{escape(study.sentence)}</p>']
+    if study.warning:
+        parts.append(f'<p class="lead warning">{escape(study.warning)}</p>')
     parts += [*map(paragraph, prose.introduction(study)), _choices(study)]
     for size in study.sizes:
         parts.append(_size_section(study, size, pictures))
@@ -135,6 +137,7 @@ def _all_points(study: Study) -> str:
             )
             if count
         ]
+        flags += [f"processor {item.record['cpu_share']:.0%} of the time"] if item.disturbed else []
         flags += ["overstretched"] if item.point in study.rejected and not item.failures else []
         rows.append([item.point.size, item.label, _range(item.ms, ".1f"), _range(item.ms_p95, ".1f"), _range(item.gap),
                      _range(item.gap_p95), f"{item.rg:.2g}", f"{item.strain_p99:.1%}", str(item.states), "; ".join(flags),

@@ -51,7 +51,7 @@ def caption(study: Study, size: str) -> str:
     items = study.at(size)
     text = (
         "Left and down is better. Lines join iterations (numbers); squares and dashes are lower "
-        "precision, dots sweeps; the broad band (left) is the Pareto front: settings that no other one beats in both time and γ."
+        "precision, dots sweeps; the broad band (left) is the Pareto front: settings that none beats in both time and γ."
     )
     if any(item.point.model == NEWTON for item in items):
         text += f" Hollow: p99 strain exceeds {OVERSTRETCHED:g} times the converged solver's, or a rollout broke down."

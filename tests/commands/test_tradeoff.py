@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import functools
 import importlib.util
 import json
@@ -24,6 +25,7 @@ from hood.commands.points import Points
 from hood.commands.tradeoff import chosen_models, make_grid
 from hood.config import load_config
 from hood.dynamics.simulator import build_simulator, save_simulator
+from hood.media import tradeoff_page
 
 #: Stands for ``hood``: writes what ``hood evaluate`` would, and its own name into calls.txt. "bad" fails, "slow" sleeps.
 FAKE = """
@@ -60,6 +62,12 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tradeoff, "Points", functools.partial(Points, program=program))
 
 
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pages without their charts: drawing is what takes long, and has tests of its own."""
+    monkeypatch.setattr(tradeoff_page, "_pictures", lambda study, folder: collections.defaultdict(str))
+
+
 def store(jobs: int = 2) -> Points:
     return Points(Path("points"), jobs, "CPU (made up)", (sys.executable, "-I", "fake.py"))
 
@@ -83,8 +91,8 @@ def test_the_default_grid_is_the_one_described() -> None:
 
 
 def test_every_command_is_one_that_evaluate_reads() -> None:
-    grid = make_grid(load_config("tradeoff", ["settings=[material=denim]"]), ["untrained:ours"])
-    for point in {(p.size, p.model): p for p in grid.points()}.values():
+    grid = make_grid(load_config("tradeoff", ['settings=["material=denim"]']), ["untrained:ours"])
+    for point in {p.model: p for p in grid.points()}.values():
         words = shlex.split(point.command)
         assert words[:2] == ["hood", "evaluate"]
         config = load_config("evaluate", words[2:])
@@ -184,6 +192,11 @@ def test_the_command_writes_page_tables_and_charts(capsys: pytest.CaptureFixture
     table = json.loads(Path("chart/refine_table.json").read_text())["rows"]
     assert [(row["refine"], row["ms"]) for row in table] == [(0, 102.5), (2, 122.5)]
     assert Path("chart/refine_table_guess_fp32.json").exists()
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_grown_grid_measures_the_new_points_alone() -> None:
+    assert main(COMMAND) == 0
     before = calls()
     assert main([*COMMAND, "jobs=1"]) == 0
     assert calls() == before
@@ -191,6 +204,7 @@ def test_the_command_writes_page_tables_and_charts(capsys: pytest.CaptureFixture
     assert len(calls()) == len(before) + 1
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_page_names_what_failed_and_what_is_not_measured_yet(capsys: pytest.CaptureFixture[str]) -> None:
     Path("bad.safetensors").write_bytes(b"weights")
     command = [*COMMAND, "models=[untrained:small,bad.safetensors]", "refine_1k=[0]"]
@@ -204,6 +218,7 @@ def test_the_page_names_what_failed_and_what_is_not_measured_yet(capsys: pytest.
     assert "20 iterations: not measured yet" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_other_settings_want_another_folder(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(COMMAND) == 0
     assert main([*COMMAND, "frames_1k=50"]) == 2
@@ -222,8 +237,8 @@ REFUSED = {
     "few frames": (["frames_1k=3"], "frames_1k=3: must be at least 4"),
     "half an iteration": (["refine_1k=[0.5]"], "refine_1k: 0.5 is no number of iterations"),
     "the solver without iterations": (["guess_1k=[0]"], "whole numbers from 1 on"),
-    "a setting that is no key": (["settings=[speed=2]"], "'speed'"),
-    "a setting of its own": (["settings=[num_frames=7]"], "num_frames is set by hood tradeoff itself"),
+    "a setting that is no key": (['settings=["speed=2"]'], "'speed'"),
+    "a setting of its own": (['settings=["num_frames=7"]'], "num_frames is set by hood tradeoff itself"),
     "nothing to measure": (["garments_1k=[]"], "no point is left to measure"),
     "unknown model at a size": (["models_1k=[ours]"], "models_1k: 'ours' is none of the models"),
 }
@@ -250,6 +265,7 @@ def test_a_missing_matplotlib_is_told_before_any_work(
     assert not Path("chart").exists()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_point_is_measured_by_hood_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tradeoff, "Points", Points)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
@@ -260,7 +276,7 @@ def test_a_point_is_measured_by_hood_itself(tmp_path: Path, monkeypatch: pytest.
     )
     settings = [
         "models=[m.safetensors]", "refine_1k=[0]", "guess_1k=[]", "newton=false", "frames_1k=5", "states_1k=1",
-        "settings=[gap_iterations=3]",
+        'settings=["gap_iterations=3"]', 
     ]  # fmt: skip
     assert main([*COMMAND, *settings]) == 0
     row = json.loads(Path("chart/points.json").read_text())[0]

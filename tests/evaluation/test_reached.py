@@ -11,7 +11,8 @@ from measured_points import point, reached, rollout, solver, write_point
 
 from hood.dynamics.goals import floor_from_table
 from hood.evaluation.diary import Diary, Unit
-from hood.evaluation.reached import overstretched, read_reached, read_record, refinement_tables
+from hood.evaluation.reached import overstretched, read_reached, read_record, refinement_tables, summarise
+from hood.evaluation.study import Study
 from hood.evaluation.table import Measured
 
 
@@ -69,6 +70,15 @@ def test_too_much_strain_is_twice_the_converged_solvers_at_that_size() -> None:
     elsewhere = reached("net", 0, 1.0, 0.1, size="4k", strain=9.0)
     items = [sound, stretched, elsewhere, *solver({2: (1.0, 0.1)}, strain=0.1)]
     assert overstretched(items) == {stretched.point}
+
+
+def test_a_shared_processor_is_noticed_on_a_cpu() -> None:
+    def measured(device: str, share: float | None) -> Study:
+        item = summarise(point(), [rollout([1.0], [0.1])], 1000, {"device": device, "cpu_share": share})
+        return Study([item, reached("net", 5, 1.0, 0.1)], set())
+
+    assert "1 of 2 settings had their processor for only a part of the time (down to 40%)" in measured("CPU (a)", 0.4).warning
+    assert measured("CPU (a)", 0.97).warning == measured("CPU (a)", None).warning == measured("GPU (b)", 0.4).warning == ""
 
 
 def test_the_dial_reads_the_tables(tmp_path: Path) -> None:

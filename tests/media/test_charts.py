@@ -59,7 +59,13 @@ def test_bars_of_the_cost_add_up_to_the_time() -> None:
     figure = cost_chart(ITEMS[:3], "title")
     ends = [bar.get_x() + bar.get_width() for bar in figure.axes[0].patches]
     assert max(ends) == max(sum(item.parts.values()) for item in ITEMS[:3])
-    assert "net + 1, fp32" in texts(figure)
+    assert "net + 2, fp32" in texts(figure)
+    # The fewest and the most iterations of every series, and the converged solver.
+    names = [text for text in texts(cost_chart(ITEMS, "title")).splitlines() if "net" in text or "alone" in text]
+    assert list(dict.fromkeys(names)) == [
+        "solver alone, converged", "solver alone, 10 iterations", "solver alone, 1 iteration", "net + 5, bf16", "net, bf16",
+        "net + 5, fp32", "net, fp32",
+    ]  # fmt: skip
 
 
 def test_svgs_are_whole_stand_in_one_page_and_load_nothing() -> None:
