@@ -44,9 +44,9 @@ class Study:
             return ""
         least = min(item.record["cpu_share"] for item in disturbed)
         return (
-            f"The machine was busy with other work: {len(disturbed)} of {len(self.reached)} settings had their processor for only "
-            f"a part of the time (down to {least:.0%}), so times are too long and comparisons of time do not hold. Measure again "
-            "on a machine that is free, or with fewer jobs."
+            f"The machine was busy with other work: {len(disturbed)} of {len(self.reached)} settings had their processor for "
+            f"only a part of the time (down to {least:.0%}), so times are too long and comparisons of time do not hold. "
+            "Measure again on a machine that is free, or with fewer jobs."
         )
 
     @property
