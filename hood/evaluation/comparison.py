@@ -96,15 +96,16 @@ class AtEqualTime:
 
 
 def at_equal_time(item: Reached, networks: Sequence[Reached]) -> AtEqualTime | None:
-    """``item`` against networks that are not refined, of the same size; None where none takes as little time."""
+    """``item`` against networks that are not refined, of the same size; None where none takes as little time and its own was not
+    measured."""
     networks = [other for other in networks if other.charted]
-    cheaper = [other for other in networks if other.ms.value <= item.ms.value]
+    # Its own network takes no longer, whatever the noise says.
+    cheaper = [o for o in networks if o.ms.value <= item.ms.value or _same_network(o.point, item.point)]
     if not item.charted or not cheaper:
         return None
     best = min(cheaper, key=lambda other: other.gap.value)
     times = np.stack([other.ms_draws for other in networks])
     gaps = np.stack([other.gap_draws for other in networks])
-    # Its own network takes no longer in any draw, whatever the noise.
     own = np.array([_same_network(other.point, item.point) for other in networks])
     fits = (times <= item.ms_draws) | own[:, None] | np.array([other is best for other in networks])[:, None]
     draws = np.where(fits, gaps, np.inf).min(axis=0) - item.gap_draws
@@ -185,8 +186,8 @@ def crossover(found: Sequence[Standing], device: str) -> str:
             f"is no single size at which one gives way to the other." + doubt
         )
     return (
-        f"On this {device} no crossover was seen: neither the solver alone nor a network is the better choice by its intervals."
-        + doubt
+        f"On this {device} no crossover was seen: at {_sizes(open_sizes)} neither the solver alone nor a network is the better "
+        "choice by its intervals, or the solver was not measured at equal γ."
     )
 
 

@@ -14,7 +14,7 @@ th, td { text-align: left; padding: .25em .7em; border-bottom: 1px solid #eee; v
 th { background: #f7f7f7; } code { font-size: 12px; white-space: pre; user-select: all; }
 figure { margin: 1em 0; } figure svg { width: 100%; height: auto; }
 figcaption { color: #555; font-size: 13px; max-width: 75em; }
-summary { cursor: pointer; font-weight: 600; }
+details { margin-top: 1em; } summary { cursor: pointer; font-weight: 600; }
 @media (prefers-color-scheme: dark) { html { background: #fff; } }
 """
 

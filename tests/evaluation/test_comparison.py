@@ -98,6 +98,13 @@ def test_at_equal_time_the_best_network_that_takes_no_longer_counts() -> None:
     assert (found.best.point.model, found.verdict) == ("huge", "network")
 
 
+def test_its_own_network_takes_no_longer_whatever_the_noise_says() -> None:
+    found = at_equal_time(exact("net", 1, 9.9, 0.05), [exact("net", 0, 10.0, 0.5)])
+    assert found is not None
+    assert (found.best.point.model, found.verdict) == ("net", REFINED)
+    assert at_equal_time(exact("net", 1, 9.9, 0.05), [exact("other", 0, 10.0, 0.5)]) is None
+
+
 def test_overlapping_intervals_leave_equal_time_open() -> None:
     found = at_equal_time(reached("net", 1, 20.0, 0.49, noise=0.4), [reached("net", 0, 10.0, 0.5, noise=0.4)])
     assert found is not None
