@@ -96,8 +96,8 @@ class AtEqualTime:
 
 
 def at_equal_time(item: Reached, networks: Sequence[Reached]) -> AtEqualTime | None:
-    """``item`` against networks that are not refined, of the same size; None where none takes as little time and its own was not
-    measured."""
+    """``item`` against networks that are not refined, of the same size; None where none takes as little time and its own
+    was not measured."""
     networks = [other for other in networks if other.charted]
     # Its own network takes no longer, whatever the noise says.
     cheaper = [o for o in networks if o.ms.value <= item.ms.value or _same_network(o.point, item.point)]
