@@ -20,6 +20,7 @@ COMMANDS = {
     "train": "train a model from a config",
     "rollout": "simulate a garment on a moving body",
     "evaluate": "table of cost and accuracy over the validation list",
+    "tradeoff": "chart of time against accuracy over models, refinements and sizes",
     "compare": "show rollouts of one motion next to each other, coloured by strain or rg",
     "inspect": "say what files are, what is wrong with them and how to repair it",
     "prepare": "repair a garment, bind it to a body and write it for rollouts",

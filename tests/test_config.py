@@ -16,7 +16,7 @@ from hood.training.settings import TrainerSettings
 
 
 def test_defaults_of_every_command_load() -> None:
-    for name in ("train", "rollout", "evaluate"):
+    for name in ("train", "rollout", "evaluate", "tradeoff"):
         assert load_config(name).device == "cpu"
 
 

@@ -42,16 +42,13 @@ from hood.dynamics.stepper import NewtonStepper
 from hood.evaluation.diary import Diary, Unit
 from hood.evaluation.drift import sideways_drift, standing_scene
 from hood.evaluation.gap import REFERENCE
+from hood.evaluation.grid import GUESS, NEWTON
 from hood.evaluation.spectrum import spectrum_rows
 from hood.evaluation.table import Candidate, GapSettings, Measured, candidate_rows, measure
 from hood.losses.potential import Potential
 from hood.scene.scene import Scene, build_scene
 from hood.training import distributed
 
-#: ``models=[newton]``: no network, the potential minimised in every frame.
-NEWTON = "newton"
-#: No network either: where the solver starts, the inertial guess out of contact.
-GUESS = "guess"
 #: What is made of the spectra of the errors.
 SPECTRA = ("none", "table", "picture")
 #: The motion of a body that stands still, on which drift is measured.

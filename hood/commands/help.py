@@ -36,6 +36,10 @@ _EXAMPLES = {
         "hood evaluate",
         "hood evaluate models=[runs/a/model.safetensors,newton] garments=[dress] sequences=[] gap_states=3",
     ],
+    "tradeoff": [
+        "hood tradeoff",
+        "hood tradeoff models=[runs/a/model.safetensors] precisions=[fp32] garments_4k=[] garments_12k=[] output=outputs/a",
+    ],
 }
 
 
@@ -55,6 +59,7 @@ def describe(name: str) -> str:
     if groups:
         lines += ["", "config groups (their keys can be overridden too, e.g. material.density=0.3):"]
         lines += [f"  {group + '=':<14}{' | '.join(options(group))}" for group in groups]
+    if groups or name == "tradeoff":
         lines += ["", "embedded names:"]
         for kind, label in (("garments", "garment"), ("motions", "sequence"), ("body", "body"), ("weights", "checkpoint")):
             lines.append(textwrap.fill(f"  {label + '=':<14}{' '.join(library.names(kind))}", 118, subsequent_indent=" " * 16))

@@ -27,15 +27,16 @@ class Diary:
         self.folder = folder
         self.path = folder / f"rollouts.{rank}.jsonl"
 
-    def read(self, digests: Sequence[str]) -> dict[Unit, Measured]:
-        """What was written for candidates whose weights have these ``digests``; lines cut by a kill are passed over."""
+    def read(self, digests: Sequence[str] | None) -> dict[Unit, Measured]:
+        """What was written for candidates whose weights have these ``digests``, the latest of every rollout; None for whatever
+        weights they had. Lines cut by a kill are passed over."""
         found = {}
         for path in sorted(self.folder.glob("rollouts.*.jsonl")):
             for line in path.read_text(encoding="utf-8").splitlines():
                 try:
                     entry = json.loads(line)
                     unit = Unit(*entry["unit"])
-                    if digests[unit.model] == entry["weights"]:
+                    if digests is None or digests[unit.model] == entry["weights"]:
                         found[unit] = Measured(**entry["measured"])
                 except (ValueError, KeyError, TypeError, IndexError):
                     continue

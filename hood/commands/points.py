@@ -1,0 +1,210 @@
+"""Points measured in processes of their own, several side by side; what is done is not done again."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import shlex
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from tqdm import tqdm
+
+from hood.assets.atomic import write_atomically
+from hood.assets.library import locate
+from hood.commands.common import UNTRAINED
+from hood.evaluation.grid import Point, quoted
+from hood.evaluation.reached import read_record
+
+#: What a point is measured with, before the arguments of ``hood``.
+PROGRAM = (sys.executable, "-m", "hood.cli")
+#: Seconds that an interrupted process has to end.
+_PATIENCE = 20.0
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A point that gave no result, why, and where more is said."""
+
+    point: Point
+    reason: str
+    log: Path
+
+
+@dataclass
+class _Running:
+    point: Point
+    process: subprocess.Popen[bytes]
+    begin: float
+    load: float
+    cpu_seconds: float | None = None  # of the process; known when it has ended
+
+    def ended(self) -> bool:
+        """Whether the process has ended."""
+        if not hasattr(os, "wait4"):
+            return self.process.poll() is not None
+        found, status, usage = os.wait4(self.process.pid, os.WNOHANG)
+        if found:
+            self.process.returncode = os.waitstatus_to_exitcode(status)
+            self.cpu_seconds = usage.ru_utime + usage.ru_stime
+        return bool(found)
+
+
+class Points:
+    """The points of a chart on disk: one folder each below ``folder``.
+
+    Args:
+        jobs: points side by side, one thread each.
+        device: its name, written down with every point.
+        program: what stands for ``hood``.
+    """
+
+    def __init__(self, folder: Path, jobs: int, device: str, program: Sequence[str] = PROGRAM) -> None:
+        self.folder, self.jobs, self.device, self.program = folder, jobs, device, tuple(program)
+
+    def folder_of(self, point: Point) -> Path:
+        return self.folder / point.folder
+
+    def log_of(self, point: Point) -> Path:
+        return self.folder_of(point) / "log.txt"
+
+    def is_done(self, point: Point) -> bool:
+        """Whether it was measured to the end by this very command and with the weights that have that name today."""
+        record = read_record(self.folder_of(point))
+        return record.get("command") == point.command and record.get("weights") == weights_digest(point)
+
+    def measure(self, points: Sequence[Point]) -> list[Failure]:
+        """Measure those that are not done; returns those that failed.
+
+        An interruption ends the processes; the rollouts they had finished are not done again.
+        """
+        waiting = deque(point for point in points if not self.is_done(point))
+        running: list[_Running] = []
+        failures: list[Failure] = []
+        with (
+            tqdm(total=len(points), initial=len(points) - len(waiting), desc="trade-off", unit="point") as bar,
+            _interruptible(),
+        ):
+            try:
+                while waiting or running:
+                    while waiting and len(running) < self.jobs:
+                        running.append(self._start(waiting.popleft()))
+                    text = ", ".join(self._progress(item.point) for item in running)
+                    if text != bar.postfix:
+                        bar.set_postfix_str(text)
+                    time.sleep(0.1)
+                    for item in [item for item in running if item.ended()]:
+                        running.remove(item)
+                        failures += self._finish(item)
+                        bar.update()
+            finally:
+                _end(running)
+        return failures
+
+    def _start(self, point: Point) -> _Running:
+        folder = self.folder_of(point)
+        folder.mkdir(parents=True, exist_ok=True)
+        begun = any(folder.glob("rollouts.*.jsonl"))
+        arguments = [
+            *self.program,
+            "evaluate",
+            *point.settings,
+            f"output={quoted(str(folder))}",
+            f"resume={str(begun).lower()}",
+        ]
+        load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
+        with open(self.log_of(point), "ab") as sink:
+            sink.write(f"\n$ {shlex.join(arguments)}\n".encode())
+            sink.flush()
+            process = subprocess.Popen(
+                arguments, stdin=subprocess.DEVNULL, stdout=sink, stderr=sink, env=os.environ | {"OMP_NUM_THREADS": "1"}
+            )
+        return _Running(point, process, time.monotonic(), load)
+
+    def _finish(self, item: _Running) -> list[Failure]:
+        if item.process.returncode:
+            return [Failure(item.point, self._complaint(item), self.log_of(item.point))]
+        seconds = time.monotonic() - item.begin
+        record: dict[str, Any] = {
+            "command": item.point.command,
+            "weights": weights_digest(item.point),
+            "device": self.device,
+            "jobs": self.jobs,
+            "load_at_start": item.load,
+            "seconds": seconds,
+            # A process alone on its processor has all of its time.
+            "cpu_share": None if item.cpu_seconds is None else item.cpu_seconds / seconds,
+        }
+        write_atomically(self.folder_of(item.point) / "point.json", json.dumps(record, indent=1).encode())
+        return []
+
+    def _complaint(self, item: _Running) -> str:
+        """How it ended, and the last error that it told: the log keeps earlier attempts as well."""
+        said = self.log_of(item.point).read_text(encoding="utf-8", errors="replace").rpartition("\n$ ")[2]
+        errors = [line.strip() for line in said.splitlines()[1:] if "error" in line.lower()]
+        code = item.process.returncode
+        ending = f"exit code {code}" if code > 0 else f"ended by signal {-code}"
+        return f"{ending}: {errors[-1] if errors else 'no error was told'}"
+
+    def _progress(self, point: Point) -> str:
+        folder = self.folder_of(point)
+        lines = sum(path.read_bytes().count(b'"unit"') for path in folder.glob("rollouts.*.jsonl"))
+        return f"{point.size} {point.label}: {lines} rollouts"
+
+
+def _end(running: Sequence[_Running]) -> None:
+    """End the processes. Evaluations may be killed at any moment, and processes started in the background ignore SIGINT."""
+    for item in running:
+        item.process.terminate()
+    for item in running:
+        try:
+            item.process.wait(_PATIENCE)
+        except subprocess.TimeoutExpired:
+            item.process.kill()
+            item.process.wait()
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """SIGTERM interrupts the block like Ctrl-C: the processes it started do not outlive it."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def weights_digest(point: Point) -> str:
+    """SHA-256 of the file of weights: a point measured with others of the same name is not done.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+    """
+    if point.alone or point.model.startswith(UNTRAINED + ":"):
+        return "none"
+    return hashlib.sha256(locate("weights", point.model).read_bytes()).hexdigest()
+
+
+def device_name(device: str) -> str:
+    """The processor's or graphics card's own name."""
+    if device == "cuda":
+        return f"GPU ({torch.cuda.get_device_name()})"
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text(encoding="utf-8", errors="replace").splitlines() if info.exists() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name") and ":" in line]
+    return f"CPU ({names[0] if names else platform.processor() or platform.machine()})"

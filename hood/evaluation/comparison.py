@@ -1,0 +1,207 @@
+"""Settings compared: the Pareto front, network and solver at equal accuracy and at equal time, and where one gives way.
+
+A verdict is given only where confidence intervals leave no doubt; everything else is called open.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from hood.evaluation.bootstrap import LEVEL, Estimate, interval
+from hood.evaluation.grid import Point
+from hood.evaluation.reached import Reached
+
+NETWORK, SOLVER, REFINED, OPEN = "network", "solver", "refined", "open"
+
+
+def pareto_front(reached: Sequence[Reached], rejected: Collection[Point] = ()) -> list[Reached]:
+    """Those that no other one beats in time and in gap, cheapest first; ``rejected`` ones stand outside."""
+    front: list[Reached] = []
+    for item in sorted((r for r in reached if r.charted and r.point not in rejected), key=lambda r: (r.ms.value, r.gap.value)):
+        if not front or item.gap.value < front[-1].gap.value:
+            front.append(item)
+    return front
+
+
+@dataclass(frozen=True)
+class AtEqualGap:
+    """The solver alone made as accurate as a network's setting: ``ratio`` is its time over that of the setting.
+
+    ``low`` is the bound that a verdict for the network needs and ``high`` the one for the solver: where the solver was not
+    measured as inaccurate or as accurate as the setting, its time there is bounded on one side only.
+    """
+
+    reached: Reached
+    low: float
+    high: float
+    ratio: float | None  # None: bounded on one side only
+    verdict: str
+
+
+class _Bounds(NamedTuple):
+    low: float
+    high: float
+
+
+def at_equal_gap(item: Reached, alone: Sequence[Reached], level: float = LEVEL) -> AtEqualGap | None:
+    """``item`` against the measured settings of the solver ``alone`` of the same size; None where nothing can be compared.
+
+    Between two settings of the solver its time follows a straight line in the log–log chart; where the more accurate of them
+    has no logarithm (γ ≤ 0) its own time counts.
+    """
+    alone = [other for other in alone if other.charted]
+    if not item.charted or not alone:
+        return None
+    times = np.stack([other.ms_draws for other in alone])
+    gaps = np.stack([other.gap_draws for other in alone])
+    bounds = np.array(
+        [_ratio(*draw) for draw in zip(item.ms_draws, item.gap_draws, times.T, gaps.T, strict=True)],
+    )
+    here = _ratio(item.ms.value, item.gap.value, np.array([o.ms.value for o in alone]), np.array([o.gap.value for o in alone]))
+    low, high = interval(bounds[:, 0], level)[0], interval(bounds[:, 1], level)[1]
+    verdict = NETWORK if low > 1.0 else SOLVER if high < 1.0 else OPEN
+    return AtEqualGap(item, low, high, here.low if here.low == here.high else None, verdict)
+
+
+def _ratio(ms: float, gap: float, times: np.ndarray, gaps: np.ndarray) -> _Bounds:
+    """Bounds of the time the solver needs for ``gap``, over ``ms``."""
+    last: tuple[float, float] | None = None  # the most accurate setting so far that is not accurate enough
+    for time, reached in sorted(zip(times.tolist(), gaps.tolist(), strict=True)):
+        if reached <= gap:
+            if last is None:
+                return _Bounds(0.0, time / ms)
+            if reached > 0.0:
+                share = math.log(last[1] / gap) / math.log(last[1] / reached)
+                time = last[0] * (time / last[0]) ** share
+            return _Bounds(time / ms, time / ms)
+        if last is None or reached < last[1]:
+            last = time, reached
+    assert last is not None
+    return _Bounds(last[0] / ms, math.inf)
+
+
+@dataclass(frozen=True)
+class AtEqualTime:
+    """A refined network beside the most accurate network alone that takes no longer; ``gain`` = γ alone − γ refined."""
+
+    reached: Reached
+    best: Reached
+    gain: Estimate
+    verdict: str
+
+
+def at_equal_time(item: Reached, networks: Sequence[Reached]) -> AtEqualTime | None:
+    """``item`` against networks that are not refined, of the same size; None where none takes as little time and its own
+    was not measured."""
+    networks = [other for other in networks if other.charted]
+    # Its own network takes no longer, whatever the noise says.
+    cheaper = [o for o in networks if o.ms.value <= item.ms.value or _same_network(o.point, item.point)]
+    if not item.charted or not cheaper:
+        return None
+    best = min(cheaper, key=lambda other: other.gap.value)
+    times = np.stack([other.ms_draws for other in networks])
+    gaps = np.stack([other.gap_draws for other in networks])
+    own = np.array([_same_network(other.point, item.point) for other in networks])
+    fits = (times <= item.ms_draws) | own[:, None] | np.array([other is best for other in networks])[:, None]
+    draws = np.where(fits, gaps, np.inf).min(axis=0) - item.gap_draws
+    gain = Estimate(best.gap.value - item.gap.value, *interval(draws))
+    verdict = REFINED if gain.low > 0.0 else NETWORK if gain.high < 0.0 else OPEN
+    return AtEqualTime(item, best, gain, verdict)
+
+
+def _same_network(one: Point, other: Point) -> bool:
+    return (one.model, one.precision, one.size) == (other.model, other.precision, other.size)
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Who is the better choice at one size."""
+
+    size: str
+    vertices: int
+    winner: str
+    best: AtEqualGap | None  # the network's setting that does best beside the solver
+
+
+def standings(reached: Sequence[Reached], rejected: Collection[Point] = ()) -> list[Standing]:
+    """Per size, smallest first, whether a network earns its place beside the solver.
+
+    The network does where one of its settings is faster than the solver at equal γ, the solver where it is faster than all of
+    them. Settings that overstretch the cloth (``rejected``) stand outside. The more settings are tried, the more likely one of
+    them looks good by chance, so the intervals are as much wider as there are settings (Bonferroni).
+    """
+    found = []
+    for size in dict.fromkeys(item.point.size for item in reached):
+        here = [item for item in reached if item.point.size == size and item.charted and item.point not in rejected]
+        alone, learned = [r for r in here if r.point.alone], [r for r in here if not r.point.alone]
+        level = 1.0 - (1.0 - LEVEL) / max(len(learned), 1)
+        compared = [c for c in (at_equal_gap(item, alone, level) for item in learned) if c is not None]
+        if not compared:
+            continue
+        best = max(compared, key=lambda c: (c.verdict == NETWORK, c.ratio if c.ratio is not None else c.low))
+        won, lost = best.verdict == NETWORK, all(c.verdict == SOLVER for c in compared)
+        vertices = round(float(np.mean([item.vertices for item in here])))
+        found.append(Standing(size, vertices, NETWORK if won else SOLVER if lost else OPEN, best))
+    return sorted(found, key=lambda standing: standing.vertices)
+
+
+def crossover(found: Sequence[Standing], device: str) -> str:
+    """In a sentence: from which size on a network is worth its time on this device, as far as the intervals say."""
+    if not found:
+        return "No network was measured beside the solver alone, so nothing can be said about which is the better choice."
+    open_sizes = [s for s in found if s.winner == OPEN]
+    doubt = ""
+    if open_sizes:
+        doubt = f" At {_sizes(open_sizes)} the intervals overlap or the solver was not measured at equal γ: no claim is made."
+    won, lost = [s for s in found if s.winner == NETWORK], [s for s in found if s.winner == SOLVER]
+    if lost and won and max(s.vertices for s in lost) < min(s.vertices for s in won):
+        below, above = lost[-1], won[0]
+        assert above.best is not None
+        number = _crossing(below, above)
+        start = f"Up to {below.vertices:,}" if number is None else f"Below {number:,}"
+        how = f" ({number:,} is interpolated between these sizes.)" if number is not None else ""
+        return (
+            f"{start} vertices on this {device} the solver alone is the better choice: it is at {_sizes(lost)}, while at "
+            f"{_sizes(won)} {above.best.reached.label} reaches the same γ in less time.{how}{doubt}"
+        )
+    if lost and not won:
+        return (
+            f"At {_sizes(lost)} on this {device} the solver alone is the better choice; no crossover to a network was seen."
+            + doubt
+        )
+    if won and not lost:
+        names = ", ".join(dict.fromkeys(s.best.reached.label for s in won if s.best is not None))
+        return (
+            f"At {_sizes(won)} on this {device} a network is the better choice ({names}); no size was seen below which the "
+            f"solver alone is." + doubt
+        )
+    if won:
+        return (
+            f"On this {device} the solver alone is the better choice at {_sizes(lost)} and a network at {_sizes(won)}: there "
+            f"is no single size at which one gives way to the other." + doubt
+        )
+    return (
+        f"On this {device} no crossover was seen: at {_sizes(open_sizes)} neither the solver alone nor a network is the better "
+        "choice by its intervals, or the solver was not measured at equal γ."
+    )
+
+
+def _sizes(found: Sequence[Standing]) -> str:
+    numbers = [f"{standing.vertices:,}" for standing in found]
+    return (numbers[0] if len(numbers) == 1 else f"{', '.join(numbers[:-1])} and {numbers[-1]}") + " vertices"
+
+
+def _crossing(below: Standing, above: Standing) -> int | None:
+    """Vertices at which both take equally long, on a straight line in logarithms, to two digits; None without both ratios."""
+    low, high = (standing.best.ratio if standing.best is not None else None for standing in (below, above))
+    if low is None or high is None or not low < 1.0 < high:
+        return None
+    share = -math.log(low) / math.log(high / low)
+    crossing = below.vertices * (above.vertices / below.vertices) ** share
+    digits = 10 ** (math.floor(math.log10(crossing)) - 1)
+    return round(crossing / digits) * digits

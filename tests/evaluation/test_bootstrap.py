@@ -1,0 +1,79 @@
+"""Confidence intervals of quantiles: they cover what they claim, know that states of a rollout are alike, and repeat."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hood.evaluation.bootstrap import Estimate, estimate, interval, resample
+
+
+def test_the_interval_covers_the_true_median_as_often_as_it_says() -> None:
+    random = np.random.default_rng(3)
+    hits = 0
+    for _ in range(200):
+        found = estimate(random.normal(5.0, 2.0, size=(40, 1)).tolist(), 0.5, None)
+        hits += found.low <= 5.0 <= found.high
+    # 95% of 200; five standard deviations of a binomial either way, and percentile intervals of 40 values are a little narrow.
+    assert 172 <= hits <= 199
+
+
+def test_its_width_is_that_of_the_normal_distribution() -> None:
+    """The median's standard error is 1.2533 σ / √n."""
+    found = estimate(np.random.default_rng(0).normal(size=(400, 1)).tolist(), 0.5)
+    assert found.high - found.low == pytest.approx(2 * 1.96 * 1.2533 / 20, rel=0.25)
+
+
+def test_states_of_one_rollout_do_not_count_as_if_they_were_independent() -> None:
+    random = np.random.default_rng(1)
+    places = random.normal(size=12)
+    alike = [[place] * 20 for place in places]
+    few, many = estimate([[place] for place in places], 0.5), estimate(alike, 0.5)
+    assert (many.low, many.high) == (few.low, few.high)
+    mixed = random.permutation(np.repeat(places, 20)).reshape(12, 20)
+    independent = estimate(mixed.tolist(), 0.5)
+    assert independent.value == many.value
+    assert many.high - many.low > 1.3 * (independent.high - independent.low)
+
+
+def test_the_value_is_the_quantile_of_everything_unclamped() -> None:
+    groups = [[-3.0, 1.0], [2.0], [-5.0, 7.0, 0.5]]
+    assert estimate(groups, 0.5).value == np.quantile([-3, 1, 2, -5, 7, 0.5], 0.5)
+    assert estimate(groups, 0.95).value == np.quantile([-3, 1, 2, -5, 7, 0.5], 0.95)
+    assert estimate(groups, 0.5).low < 0
+
+
+def test_rollouts_of_different_lengths_are_drawn_with_their_own_states() -> None:
+    groups = [[1.0], [2.0, 2.0, 2.0], [], [3.0]]
+    draws = resample(groups, 0.5, draws=400)
+    assert set(draws) <= {1.0, 1.5, 2.0, 2.5, 3.0}
+    # One state of the first rollout in a draw of three from it alone, not three padded ones.
+    assert np.isfinite(draws).all()
+    assert (draws == 1.0).any()
+    assert (draws == 3.0).any()
+
+
+@pytest.mark.parametrize("level", [0.0, 0.37, 0.5, 0.95, 1.0])
+def test_quantiles_are_those_of_numpy(level: float) -> None:
+    values = np.random.default_rng(0).normal(size=9)
+    # One rollout is drawn every time, so draws differ in their states alone: all are quantiles of values that occur.
+    draws = resample([values.tolist()], level, draws=50, seed=4)
+    random = np.random.default_rng(4)
+    random.integers(1, size=(50, 1))
+    places = (random.random((50, 1, 9)) * 9).astype(int)[:, 0]
+    np.testing.assert_allclose(draws, np.quantile(values[places], level, axis=1), rtol=1e-12)
+
+
+def test_settings_on_the_same_rollouts_are_drawn_alike() -> None:
+    """What rollouts have in common cancels: the difference of two settings is known far better than each of them."""
+    scenes = np.random.default_rng(0).normal(size=(10, 5))
+    one, other = resample(scenes.tolist(), 0.5), resample((scenes + 0.01).tolist(), 0.5)
+    assert np.ptp(one) > 0.5
+    np.testing.assert_allclose(other - one, 0.01, atol=1e-12)
+
+
+def test_nothing_measured_is_nan_and_infinity_survives() -> None:
+    assert all(np.isnan(estimate([], 0.5)))
+    assert all(np.isnan(estimate([[], []], 0.5)))
+    assert isinstance(estimate([[1.0]], 0.5), Estimate)
+    assert interval(np.array([1.0] * 50 + [np.inf] * 50)) == (1.0, np.inf)
