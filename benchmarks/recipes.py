@@ -99,7 +99,8 @@ SUITES: dict[str, list[Recipe]] = {
         fast("fine15", EQUAL_UPDATES, *SMALL, "model.schedule=fine15"),
         fast("ours", EQUAL_UPDATES, *SMALL, "model.schedule=ours"),
         fast("fine48", EQUAL_UPDATES, *SMALL, "model.schedule=fine48"),
-        fast("fine48, equal time", round(EQUAL_UPDATES / 3), *SMALL, "model.schedule=fine48"),
+        fast("ours, equal time", round(0.92 * EQUAL_UPDATES), *SMALL, "model.schedule=ours"),
+        fast("fine48, equal time", round(0.36 * EQUAL_UPDATES), *SMALL, "model.schedule=fine48"),
     ],
     "levels": [
         fast("small1", EQUAL_UPDATES, *SMALL, "model.schedule='8x(mesh)'"),
