@@ -90,11 +90,11 @@ def estimate(groups: Sequence[Sequence[float]], quantile: float, samples: np.nda
     filled = _filled(groups)
     if not filled:
         return Estimate(np.nan, np.nan, np.nan)
-    samples = resample(filled, quantile) if samples is None else samples
+    samples = resample(groups, quantile) if samples is None else samples
     return Estimate(float(np.quantile(np.concatenate(filled), quantile)), *interval(samples))
 
 
-def _filled(groups: Sequence[Sequence[float] | np.ndarray]) -> list[np.ndarray]:
+def _filled(groups: Sequence[Sequence[float]]) -> list[np.ndarray]:
     return [np.asarray(group, dtype=np.float64) for group in groups if len(group)]
 
 
