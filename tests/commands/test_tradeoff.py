@@ -72,6 +72,11 @@ def store(jobs: int = 2) -> Points:
     return Points(Path("points"), jobs, "CPU (made up)", (sys.executable, "-I", "fake.py"))
 
 
+def write_model(path: Path) -> None:
+    torch.manual_seed(0)
+    save_simulator(path, build_simulator(features="physical", output="velocity_base", schedule="1x(mesh)", latent_dim=4))
+
+
 def calls() -> list[str]:
     path = Path("calls.txt")
     return path.read_text().splitlines() if path.exists() else []
@@ -206,7 +211,7 @@ def test_a_grown_grid_measures_the_new_points_alone() -> None:
 
 @pytest.mark.usefixtures("undrawn")
 def test_the_page_names_what_failed_and_what_is_not_measured_yet(capsys: pytest.CaptureFixture[str]) -> None:
-    Path("bad.safetensors").write_bytes(b"weights")
+    write_model(Path("bad.safetensors"))
     command = [*COMMAND, "models=[untrained:small,bad.safetensors]", "refine_1k=[0]"]
     assert main(command) == 1
     said = capsys.readouterr().err
@@ -286,11 +291,7 @@ def test_a_missing_matplotlib_is_told_before_any_work(
 def test_a_point_is_measured_by_hood_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tradeoff, "Points", Points)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
-    torch.manual_seed(0)
-    save_simulator(
-        tmp_path / "m.safetensors",
-        build_simulator(features="physical", output="velocity_base", schedule="1x(mesh)", latent_dim=4),
-    )
+    write_model(tmp_path / "m.safetensors")
     settings = [
         "models=[m.safetensors]", "refine_1k=[0]", "guess_1k=[]", "newton=false", "frames_1k=4", "states_1k=1",
         'settings=["gap_iterations=1"]', 
