@@ -73,6 +73,8 @@ def _describe(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename and error.strerror:
         hints = {
             13: "choose a folder you may write to",
+            17: "choose another output",
+            20: "choose another output",
             28: "free some space or choose another output",
             30: "choose another output",
         }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -35,6 +36,30 @@ def together(command: Callable[[], int]) -> int:
         return 2
     finally:
         distributed.stop()
+
+
+def output_folder(config: DictConfig) -> Path:
+    """The folder that ``config.output`` names; nothing is made yet.
+
+    Raises:
+        ConfigError: it names none.
+    """
+    if config.output is None or not str(config.output):
+        raise ConfigError("output: no folder is named; give one, e.g. output=outputs/mine")
+    return Path(str(config.output)).expanduser()
+
+
+def require_package(module: str, title: str, extra: str, what: str) -> None:
+    """Raise ConfigError unless ``module`` is there, before ``what`` is begun that draws with it."""
+    if importlib.util.find_spec(module) is None:
+        raise ConfigError(f'{what}: drawing needs {title} (pip install "hood[{extra}]")')
+
+
+def require_distinct(key: str, values: Sequence[Any]) -> None:
+    """Raise ConfigError where one of ``values`` is given twice: it would be computed twice."""
+    twice = next((value for place, value in enumerate(values) if value in values[:place]), None)
+    if twice is not None:
+        raise ConfigError(f"{key}: {twice!r} is given twice; leave one out")
 
 
 def prepare_folder(folder: Path) -> Path:

@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from hood.assets.atomic import write_atomically
-from hood.commands.common import prepare_folder
+from hood.commands.common import output_folder, prepare_folder, require_package
 from hood.config import ConfigError, load_config, require_choice
 from hood.dynamics.recorder import RolloutData, read_rollout
 
@@ -48,8 +48,10 @@ def run(arguments: Sequence[str]) -> int:
             raise ConfigError(f"{key}={config[key]}: must be a whole number, at least {least}")
     if str(config.video) == "none" and not bool(config.sheet):
         raise ConfigError("video=none and sheet=false leave nothing to draw; leave one of them out")
+    folder = output_folder(config)
+    require_package("PIL", "Pillow", "pictures", "hood compare")
     entries = _read(files, config)
-    folder = prepare_folder(Path(str(config.output)).expanduser())
+    prepare_folder(folder)
     if bool(config.blind):
         entries = _shuffled(entries, int(config.seed))
     _draw(entries, config, folder)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.util
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,9 +24,12 @@ from hood.commands.batch import expand_sequences
 from hood.commands.circumstances import circumstances, training_note
 from hood.commands.common import (
     UNTRAINED,
+    output_folder,
     prepare_folder,
     read_model,
     require_device,
+    require_distinct,
+    require_package,
     require_same_config,
     together,
     use_arithmetic,
@@ -46,6 +49,8 @@ from hood.evaluation.grid import GUESS, NEWTON
 from hood.evaluation.spectrum import spectrum_rows
 from hood.evaluation.table import Candidate, GapSettings, Measured, candidate_rows, measure
 from hood.losses.potential import Potential
+from hood.nn.compiled import KERNELS
+from hood.nn.precision import check_precision
 from hood.scene.scene import Scene, build_scene
 from hood.training import distributed
 
@@ -59,8 +64,11 @@ def run(overrides: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     config = load_config("evaluate", overrides)
     require_device(config)
+    _check_lists(config)
     _check_numbers(config)
     require_choice(config, "refine_method", METHODS)
+    require_choice(config, "kernels", KERNELS)
+    check_precision(str(config.precision), torch.device(str(config.device)))
     require_choice(config, "spectrum", SPECTRA)
     if config.spectrum != "none" and int(config.gap_states) == 0:
         raise ConfigError(
@@ -68,13 +76,13 @@ def run(overrides: Sequence[str]) -> int:
         )
     pictures = ("contact_sheets=true", bool(config.contact_sheets)), ("spectrum=picture", config.spectrum == "picture")
     drawn = [setting for setting, wanted in pictures if wanted]
-    if drawn and importlib.util.find_spec("PIL") is None:
-        raise ConfigError(f'{drawn[0]}: drawing needs Pillow (pip install "hood[pictures]")')
+    if drawn:
+        require_package("PIL", "Pillow", "pictures", drawn[0])
     return together(lambda: _evaluate(config, overrides))
 
 
 def _evaluate(config: DictConfig, overrides: Sequence[str]) -> int:
-    folder = Path(str(config.output)).expanduser()
+    folder = output_folder(config)
     plan = make_plan(config)
     distributed.on_main(lambda: _prepare(config, folder))
     diary = Diary(folder, distributed.rank())
@@ -126,7 +134,7 @@ def _measure_unit(
     measured = measure(candidate, scene, potential, count, gaps, tell, partial(reel.see, scene) if drawn else None)
     if drawn:
         name = f"{unit.model}_{candidate.name}_{unit.garment}_{unit.motion}_{unit.shape}.png"
-        _write_sheet(reel, Path(str(config.output)).expanduser() / "sheets" / name.replace("/", "-"))
+        _write_sheet(reel, output_folder(config) / "sheets" / name.replace("/", "-"))
     return measured
 
 
@@ -271,7 +279,16 @@ def _digest(candidate: Candidate) -> str:
     return content.hexdigest()
 
 
+def _check_lists(config: DictConfig) -> None:
+    for key, example in (("models", "[quickstart,newton]"), ("garments", "[tank]"), ("shapes", "[[]], the mean shape")):
+        if not len(config[key]):
+            raise ConfigError(f"{key}=[]: nothing is left to evaluate; give some, e.g. {key}={example}")
+        require_distinct(key, plain(config[key]))
+
+
 def _check_numbers(config: DictConfig) -> None:
+    if not (math.isfinite(config.fps) and config.fps > 0):
+        raise ConfigError(f"fps={config.fps:g}: must be a number of frames per second above 0, e.g. fps=30")
     for key, least, why in (
         ("num_frames", 4, "the first frames are not timed"),
         ("drift_frames", 0, "0 measures no drift"),

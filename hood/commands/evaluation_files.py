@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from hood.assets.atomic import write_atomically
-from hood.evaluation.report import describe, format_table, write_table
-from hood.evaluation.spectrum import bar_panels, format_spectrum, write_spectrum
+from hood.evaluation.report import COLUMNS, describe, format_table
+from hood.evaluation.rows import write_rows
+from hood.evaluation.spectrum import COLUMNS as SPECTRUM_COLUMNS
+from hood.evaluation.spectrum import bar_panels, format_spectrum
 from hood.evaluation.table_one import Circumstances, page
 
 
@@ -16,7 +18,7 @@ def report_table(rows: Sequence[Mapping[str, Any]], about: Circumstances, folder
     """Print the table; write it as ``table.csv``, ``table.json`` and, beside the paper's, ``table1.md``."""
     print(format_table(rows))
     print(f"\n{describe(rows)}")
-    csv_path, json_path = write_table(rows, folder)
+    csv_path, json_path = write_rows(rows, COLUMNS, folder, "table")
     page_path = folder / "table1.md"
     write_atomically(page_path, page(rows, about).encode())
     print(f"tables in {csv_path}, {json_path} and, beside the paper's, {page_path}")
@@ -26,7 +28,7 @@ def report_spectrum(rows: Sequence[Mapping[str, Any]], folder: Path, picture: bo
     """Print in which wavelengths the errors are; write it as ``spectrum.csv``, ``spectrum.json`` and, as ``picture``,
     ``spectrum.png``."""
     print(f"\n{format_spectrum(rows)}")
-    paths = [str(path) for path in write_spectrum(rows, folder)]
+    paths = [str(path) for path in write_rows(rows, SPECTRUM_COLUMNS, folder, "spectrum")]
     if picture:
         from hood.media.bars import write_bars
 

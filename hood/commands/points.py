@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import platform
 import shlex
 import signal
 import subprocess
@@ -24,6 +23,7 @@ from tqdm import tqdm
 
 from hood.assets.atomic import write_atomically
 from hood.assets.library import locate
+from hood.commands.circumstances import processor_name
 from hood.commands.common import UNTRAINED
 from hood.evaluation.grid import Point, quoted
 from hood.evaluation.reached import read_record
@@ -204,7 +204,4 @@ def device_name(device: str) -> str:
     """The processor's or graphics card's own name."""
     if device == "cuda":
         return f"GPU ({torch.cuda.get_device_name()})"
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text(encoding="utf-8", errors="replace").splitlines() if info.exists() else []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name") and ":" in line]
-    return f"CPU ({names[0] if names else platform.processor() or platform.machine()})"
+    return f"CPU ({processor_name()})"

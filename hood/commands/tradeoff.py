@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import importlib.util
-import io
 import json
 import sys
 from collections.abc import Sequence
@@ -15,15 +12,15 @@ from omegaconf import DictConfig
 
 from hood.assets.atomic import write_atomically
 from hood.assets.garment import load_garment
-from hood.assets.library import locate, names
-from hood.commands.batch import expand_sequences
-from hood.commands.common import UNTRAINED, prepare_folder, require_device, require_same_config
+from hood.assets.library import names
+from hood.commands.common import output_folder, prepare_folder, require_same_config
 from hood.commands.points import Failure, Points, device_name
+from hood.commands.tradeoff_checks import check_config, check_models, check_points, check_settings
 from hood.config import ConfigError, load_config, plain, save_run_record
-from hood.dynamics.refine import METHODS
 from hood.evaluation.comparison import pareto_front
 from hood.evaluation.grid import Grid, Point, Size, listed
 from hood.evaluation.reached import Reached, overstretched, read_reached, read_record, refinement_tables
+from hood.evaluation.rows import write_rows
 from hood.evaluation.study import Study
 
 #: Where no models are given: those of them that are embedded.
@@ -39,20 +36,20 @@ _FREE_BY_SIZE = ("refine", "guess", "models")
 def run(overrides: Sequence[str]) -> int:
     """Run the command; returns the exit code: 1 where points failed and the page is without them."""
     config = load_config("tradeoff", overrides)
-    require_device(config)
-    if importlib.util.find_spec("matplotlib") is None:
-        raise ConfigError('hood tradeoff draws with matplotlib, which is not installed (pip install "hood[charts]")')
-    _check(config)
+    folder = output_folder(config)
+    check_config(config, SIZES)
+    check_settings([str(text) for text in config.settings])
     models, absent = chosen_models(config)
     grid = make_grid(config, models)
     points, vertices = grid.points(), _vertices(grid)
-    _check_points(points)
-    folder = Path(str(config.output)).expanduser()
+    check_points(points)
+    store = Points(folder / "points", int(config.jobs), device_name(str(config.device)))
+    if not config.measure and not any(store.is_done(point) for point in points):
+        raise ConfigError(f"measure=false: {folder} holds none of these points; leave measure out, or give their output")
     free = (*_FREE, *(f"{key}_{size}" for key in _FREE_BY_SIZE for size in SIZES))
     prepare_folder(folder)
     require_same_config(config, folder, free)
     save_run_record(folder, config, seed=0)
-    store = Points(folder / "points", int(config.jobs), device_name(str(config.device)))
     failures = store.measure(points) if bool(config.measure) else []
     reached, failures = collect(store, points, vertices, failures)
     _write(folder, reached, failures, absent)
@@ -63,12 +60,10 @@ def chosen_models(config: DictConfig) -> tuple[list[str], list[str]]:
     """The models of the grid, and those of the known ones that are not embedded.
 
     Raises:
-        FileNotFoundError: a model that was asked for is not there.
+        FileNotFoundError, ValueError: a model that was asked for is not there, or none.
     """
     given = [str(name) for name in config.models]
-    for name in given:
-        if not name.startswith(UNTRAINED + ":"):
-            locate("weights", name)
+    check_models(given)
     if given:
         return given, []
     there = names("weights")
@@ -119,7 +114,8 @@ def collect(
 
 def _write(folder: Path, reached: Sequence[Reached], failures: Sequence[Failure], absent: Sequence[str]) -> None:
     for failure in failures:
-        print(f"hood: left out: {failure.point.size} {failure.point.label}: {failure.reason}; {failure.log}", file=sys.stderr)
+        log = f"; {failure.log}" if failure.log.exists() else ""
+        print(f"hood: left out: {failure.point.size} {failure.point.label}: {failure.reason}{log}", file=sys.stderr)
     if not any(item.charted for item in reached):
         raise ValueError(f"{folder}: no point has a time and a gap; the logs in points/*/log.txt say why")
     from hood.media.tradeoff_page import write_page
@@ -139,12 +135,7 @@ def _write_tables(folder: Path, reached: Sequence[Reached]) -> None:
     """``points.csv`` and ``points.json``, and the tables for ``refine_table``: ``refine_table.json`` is that of the checkpoint
     that ``hood rollout`` takes by default, or of the first series where that was not measured."""
     rows = [item.row() for item in reached]
-    text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, list(rows[0]))
-    writer.writeheader()
-    writer.writerows(rows)
-    write_atomically(folder / "points.csv", text.getvalue().encode())
-    write_atomically(folder / "points.json", json.dumps(rows, indent=1).encode())
+    write_rows(rows, list(rows[0]), folder, "points")
     tables = refinement_tables(reached)
     for name, table in tables.items():
         write_atomically(folder / f"refine_table_{name.replace('/', '-').replace(':', '-')}.json", _json(table))
@@ -171,42 +162,3 @@ def _vertices(grid: Grid) -> dict[str, int]:
     """Mean number of vertices of the garments of every size."""
     counts = {size.name: [len(load_garment(name).rest_pos) for name in size.garments] for size in grid.sizes}
     return {name: round(sum(found) / len(found)) for name, found in counts.items() if found}
-
-
-def _check_points(points: Sequence[Point]) -> None:
-    """Raise ConfigError unless ``hood evaluate`` reads the settings, before hours are spent on them."""
-    if not points:
-        raise ConfigError("no point is left to measure: give garments, and models or newton=true")
-    own = {text.split("=")[0] for text in points[0].settings[:4]} | {"precision", "refine_method", "output", "resume"}
-    for point in {point.size: point for point in points}.values():
-        for text in point.settings:
-            key = text.split("=")[0]
-            if key in own and sum(other.split("=")[0] == key for other in point.settings) > 1:
-                raise ConfigError(f"settings: {key} is set by hood tradeoff itself; leave it out")
-        load_config("evaluate", point.settings)
-
-
-def _check(config: DictConfig) -> None:
-    if int(config.jobs) < 1:
-        raise ConfigError(f"jobs={config.jobs}: must be at least 1")
-    for key, known in (("refine_methods", METHODS), ("precisions", ("fp32", "bf16", "tf32"))):
-        strange = [str(name) for name in config[key] if str(name) not in known]
-        if strange or not len(config[key]):
-            raise ConfigError(f"{key}={plain(config[key])}: give some of {', '.join(known)}")
-    motions = expand_sequences([str(name) for name in config.sequences])
-    if not motions:
-        raise ConfigError("sequences=[]: give motions")
-    for motion in motions:
-        locate("motions", motion)
-    for size in SIZES:
-        _check_size(config, size)
-
-
-def _check_size(config: DictConfig, size: str) -> None:
-    for key, least, why in (("frames", 4, "the first frames are not timed"), ("states", 1, "γ is what the chart shows")):
-        if int(config[f"{key}_{size}"]) < least:
-            raise ConfigError(f"{key}_{size}={config[f'{key}_{size}']}: must be at least {least}, {why}")
-    for key, least in (("refine", 0), ("guess", 1)):
-        for value in plain(config[f"{key}_{size}"]):
-            if isinstance(value, bool) or not isinstance(value, int) or value < least:
-                raise ConfigError(f"{key}_{size}: {value!r} is no number of iterations; give whole numbers from {least} on")

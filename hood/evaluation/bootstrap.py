@@ -1,14 +1,18 @@
-"""Confidence intervals of quantiles over rollouts: rollouts are drawn again, then states within each."""
+"""Confidence intervals by bootstrap: how far a figure would move with other rollouts.
+
+Frames and states of one rollout resemble each other, so rollouts are what is drawn again: drawing single frames would promise
+more than they can hold. With a handful of rollouts the intervals are too narrow.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from hood.evaluation.interval import LEVEL
-
+#: Chance that an interval covers what infinitely many rollouts would give.
+LEVEL = 0.95
 #: Draws behind an interval.
 DRAWS = 2000
 
@@ -21,15 +25,51 @@ class Estimate(NamedTuple):
     high: float
 
 
-def resample(groups: Sequence[Sequence[float]], level: float, draws: int = DRAWS, seed: int = 0) -> np.ndarray:
-    """Quantile ``level`` of ``draws`` bootstrap samples, (draws,).
+def interval(samples: np.ndarray, level: float = LEVEL) -> tuple[float, float]:
+    """Ends between which the share ``level`` of the samples lies, as much outside on either side; they may be infinite.
 
-    ``groups`` holds the values of one rollout each. States of one rollout resemble each other, so every sample draws as many
-    rollouts as there are, with replacement, and from each of them as many states as it has. Samples depend on the seed and on
-    the numbers of values alone: settings measured on the same rollouts are drawn alike, and what these rollouts have in common
-    cancels where such settings are compared. NaN throughout without values.
+    Raises:
+        ValueError: no samples, or ``level`` is not between 0 and 1.
     """
-    filled = [np.asarray(group, dtype=float) for group in groups if len(group)]
+    if not len(samples) or not 0.0 < level < 1.0:
+        raise ValueError(f"interval: {len(samples)} draws, level {level}; give draws >= 1 and 0 < level < 1")
+    if np.isnan(samples).any():
+        return float("nan"), float("nan")
+    outside = (1.0 - level) / 2
+    # No interpolation: between a number and infinity there is nothing.
+    low = float(np.quantile(samples, outside, method="lower"))
+    return low, float(np.quantile(samples, 1.0 - outside, method="higher"))
+
+
+def pooled_interval(
+    groups: Sequence[Sequence[float]],
+    statistic: Callable[[np.ndarray], float],
+    draws: int = DRAWS,
+    seed: int = 0,
+    level: float = LEVEL,
+) -> tuple[float, float]:
+    """Interval (low, high) of ``statistic`` of all values, (n,) with n > 0, of ``groups``.
+
+    ``groups`` holds the values of one rollout each. Every sample draws as many rollouts as there are, with replacement and
+    whole, and pools their values; rollouts without values count for nothing. One rollout says nothing about the spread between
+    rollouts: with fewer than two the interval is (NaN, NaN). The same seed gives the same interval.
+    """
+    filled = _filled(groups)
+    if len(filled) < 2:
+        return float("nan"), float("nan")
+    drawn = np.random.default_rng(seed).integers(len(filled), size=(draws, len(filled)))
+    return interval(np.array([statistic(np.concatenate([filled[index] for index in row])) for row in drawn]), level)
+
+
+def resample(groups: Sequence[Sequence[float]], quantile: float, draws: int = DRAWS, seed: int = 0) -> np.ndarray:
+    """``quantile`` (0 to 1) of the values in each of ``draws`` bootstrap samples, (draws,).
+
+    ``groups`` holds the values of one rollout each. Every sample draws as many rollouts as there are, with replacement, and
+    from each of them as many states as it has: a single rollout has an interval too, of its states alone. Samples depend on the
+    seed and on the numbers of values alone: settings measured on the same rollouts are drawn alike, and what these rollouts
+    have in common cancels where such settings are compared. NaN throughout without values.
+    """
+    filled = _filled(groups)
     if not filled:
         return np.full(draws, np.nan)
     sizes = np.array([len(group) for group in filled])
@@ -42,34 +82,27 @@ def resample(groups: Sequence[Sequence[float]], level: float, draws: int = DRAWS
     drawn_sizes = sizes[rollouts][:, :, None]
     values = table[rollouts[:, :, None], (places * drawn_sizes).astype(int)]
     values[np.broadcast_to(np.arange(table.shape[1]) >= drawn_sizes, values.shape)] = np.nan
-    return _quantiles(values.reshape(draws, -1), level)
+    return _quantiles(values.reshape(draws, -1), quantile)
 
 
-def estimate(groups: Sequence[Sequence[float]], level: float, samples: np.ndarray | None = None) -> Estimate:
-    """Quantile ``level`` of all values with its interval; ``samples`` are those of :func:`resample` if they are there."""
-    values = np.concatenate([np.asarray(group, dtype=float) for group in groups]) if len(groups) else np.empty(0)
-    if not len(values):
+def estimate(groups: Sequence[Sequence[float]], quantile: float, samples: np.ndarray | None = None) -> Estimate:
+    """``quantile`` of all values with its interval; ``samples`` are those of :func:`resample` if they are there."""
+    filled = _filled(groups)
+    if not filled:
         return Estimate(np.nan, np.nan, np.nan)
-    samples = resample(groups, level) if samples is None else samples
-    return Estimate(float(np.quantile(values, level)), *interval(samples))
+    samples = resample(groups, quantile) if samples is None else samples
+    return Estimate(float(np.quantile(np.concatenate(filled), quantile)), *interval(samples))
 
 
-def interval(samples: np.ndarray, level: float = LEVEL) -> tuple[float, float]:
-    """Ends between which the share ``level`` of the samples lies, as much outside on either side; they may be infinite."""
-    if np.isnan(samples).any():
-        return float("nan"), float("nan")
-    outside = (1.0 - level) / 2
-    # No interpolation: between a number and infinity there is nothing.
-    low = float(np.quantile(samples, outside, method="lower"))
-    return low, float(np.quantile(samples, 1.0 - outside, method="higher"))
+def _filled(groups: Sequence[Sequence[float]]) -> list[np.ndarray]:
+    return [np.asarray(group, dtype=np.float64) for group in groups if len(group)]
 
 
-def _quantiles(values: np.ndarray, level: float) -> np.ndarray:
+def _quantiles(values: np.ndarray, quantile: float) -> np.ndarray:
     """Quantile of every row, NaN passed over; rows hold at least one number."""
     values = np.sort(values, axis=1)
-    place = level * (np.isfinite(values) | np.isinf(values)).sum(axis=1).clip(1) - level
-    below = np.floor(place).astype(int)
-    above = np.ceil(place).astype(int)
+    place = quantile * ((~np.isnan(values)).sum(axis=1) - 1)
+    below, above = np.floor(place).astype(int), np.ceil(place).astype(int)
     rows = np.arange(len(values))
     low, high = values[rows, below], values[rows, above]
     return np.where(below == above, low, low + (place - below) * (high - low))

@@ -1,12 +1,8 @@
-"""The evaluation table as text and as files."""
+"""The evaluation table as text."""
 
 from __future__ import annotations
 
-import csv
-import json
-import os
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from hood.evaluation.gap import AGREEMENT
@@ -55,21 +51,6 @@ def describe(rows: Sequence[Mapping[str, Any]]) -> str:
     if any(row["weights"] == "untrained" for row in rows):
         lines.append("untrained: random weights; steps, radius and times of these rows mean something, their accuracy does not")
     return "\n".join(lines)
-
-
-def write_table(rows: Sequence[Mapping[str, Any]], folder: Path) -> tuple[Path, Path]:
-    """Write ``table.csv`` and ``table.json`` atomically; returns their paths."""
-    csv_path, json_path = folder / "table.csv", folder / "table.json"
-    temporary = csv_path.with_name(csv_path.name + ".partial")
-    with open(temporary, "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, COLUMNS)
-        writer.writeheader()
-        writer.writerows({column: row.get(column) for column in COLUMNS} for row in rows)
-    os.replace(temporary, csv_path)
-    temporary = json_path.with_name(json_path.name + ".partial")
-    temporary.write_text(json.dumps(list(rows), indent=1), encoding="utf-8")
-    os.replace(temporary, json_path)
-    return csv_path, json_path
 
 
 def _fixed_width(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> str:

@@ -7,19 +7,14 @@ edges: few local sweeps polish what is short and hardly touch what is long.
 
 from __future__ import annotations
 
-import csv
-import io
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from hood.assets.atomic import write_atomically
 from hood.evaluation.gap import REFERENCE
 from hood.losses.potential import Potential, scale
 from hood.losses.problem import StepProblem
@@ -140,15 +135,3 @@ def bar_panels(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[st
         panel = panels.setdefault(f"{row['garment']}: RMS error [mm] by wavelength", {})
         panel.setdefault(band_name(row), {})[row["model"]] = row["rms"]
     return panels
-
-
-def write_spectrum(rows: Sequence[Mapping[str, Any]], folder: Path) -> tuple[Path, Path]:
-    """Write ``spectrum.csv`` and ``spectrum.json`` atomically; returns their paths."""
-    text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, COLUMNS)
-    writer.writeheader()
-    writer.writerows(rows)
-    csv_path, json_path = folder / "spectrum.csv", folder / "spectrum.json"
-    write_atomically(csv_path, text.getvalue().encode())
-    write_atomically(json_path, json.dumps(list(rows), indent=1).encode())
-    return csv_path, json_path

@@ -13,8 +13,8 @@ from hood.dynamics.refine import unrefined
 from hood.dynamics.rollout import Frame, simulate
 from hood.dynamics.simulator import Simulator
 from hood.dynamics.stepper import Stepper
+from hood.evaluation.bootstrap import pooled_interval
 from hood.evaluation.gap import AGREEMENT, REFERENCE, gap
-from hood.evaluation.interval import bootstrap_interval
 from hood.evaluation.radius import measured_radius
 from hood.evaluation.sample import StepSample
 from hood.evaluation.spectrum import error_spectrum, garment_bands
@@ -228,7 +228,7 @@ def _intervals(rollouts: Sequence[Measured]) -> dict[str, float]:
     found: dict[str, float] = {}
     for column, (key, statistic) in _STATISTICS.items():
         tables = [one.gaps if column == "gap" else one.frames for one in rollouts]
-        low, high = bootstrap_interval([np.array([item.get(key, 0.0) for item in table]) for table in tables], statistic)
+        low, high = pooled_interval([[item.get(key, 0.0) for item in table] for table in tables], statistic)
         if np.isfinite(low) and np.isfinite(high):
             found |= {f"{column}_low": low, f"{column}_high": high}
     return found

@@ -20,7 +20,8 @@ _BLUR = 1e-2
 _COLOURS = ("#2a6fbb", "#c8503c", "#3f8f4f", "#8c5bb0", "#c98a1b", "#2b9aa0", "#8a5a44", "#c2558f")
 _SOLVER = "#222222"
 _PART_COLOURS = {"search": "#8fb8de", "features": "#f2c078", "network": "#2a6fbb", "refine": "#c8503c", "rest": "#bbbbbb"}
-_STYLE = {
+#: Of matplotlib; versions differ in how they type its keys.
+_STYLE: Any = {
     "font.size": 9.0, "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True, "grid.color": "#e6e6e6",
     "axes.axisbelow": True, "svg.hashsalt": "hood", "legend.frameon": False, "axes.titlesize": 10.0, "axes.titleweight": "bold",
 }  # fmt: skip

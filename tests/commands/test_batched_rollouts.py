@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import importlib.util
 import json
 from pathlib import Path
 
@@ -202,9 +203,7 @@ def test_refined_candidates(motions: Path, capsys: pytest.CaptureFixture[str]) -
 def test_pictures_without_the_picture_library_are_refused_before_any_work(
     setting: str, motions: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from hood.commands import evaluate
-
-    monkeypatch.setattr(evaluate.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     given = [text for text in EVALUATE if not text.startswith(("gap_states", "output"))]
     assert main([*given, "gap_states=1", setting, "output=none"]) == 2
     assert f"{setting}: drawing needs Pillow" in capsys.readouterr().err

@@ -72,6 +72,11 @@ def store(jobs: int = 2) -> Points:
     return Points(Path("points"), jobs, "CPU (made up)", (sys.executable, "-I", "fake.py"))
 
 
+def write_model(path: Path) -> None:
+    torch.manual_seed(0)
+    save_simulator(path, build_simulator(features="physical", output="velocity_base", schedule="1x(mesh)", latent_dim=4))
+
+
 def calls() -> list[str]:
     path = Path("calls.txt")
     return path.read_text().splitlines() if path.exists() else []
@@ -206,7 +211,7 @@ def test_a_grown_grid_measures_the_new_points_alone() -> None:
 
 @pytest.mark.usefixtures("undrawn")
 def test_the_page_names_what_failed_and_what_is_not_measured_yet(capsys: pytest.CaptureFixture[str]) -> None:
-    Path("bad.safetensors").write_bytes(b"weights")
+    write_model(Path("bad.safetensors"))
     command = [*COMMAND, "models=[untrained:small,bad.safetensors]", "refine_1k=[0]"]
     assert main(command) == 1
     said = capsys.readouterr().err
@@ -239,6 +244,16 @@ REFUSED = {
     "the solver without iterations": (["guess_1k=[0]"], "whole numbers from 1 on"),
     "a setting that is no key": (['settings=["speed=2"]'], "'speed'"),
     "a setting of its own": (['settings=["num_frames=7"]'], "num_frames is set by hood tradeoff itself"),
+    "precision of its own": (['settings=["precision=bf16"]'], "precision is set by hood tradeoff itself"),
+    "output of its own": (['settings=["output=here"]'], "output is set by hood tradeoff itself"),
+    "a precision of other devices": (["precisions=[tf32]"], "tf32 needs device=cuda"),
+    "the solver as a model": (["models=[newton]"], "newton=true"),
+    "random weights of no model": (["models=[untrained:our]"], "'untrained:our' is no model"),
+    "iterations twice": (["refine_1k=[0,2,2]"], "refine_1k: 2 is given twice"),
+    "model twice": (["models=[quickstart,quickstart]"], "models: 'quickstart' is given twice"),
+    "precision twice": (["precisions=[fp32,fp32]"], "precisions: 'fp32' is given twice"),
+    "no folder": (["output="], "output: no folder is named"),
+    "nothing to chart": (["measure=false"], "measure=false: chart holds none of these points"),
     "nothing to measure": (["garments_1k=[]"], "no point is left to measure"),
     "unknown model at a size": (["models_1k=[ours]"], "models_1k: 'ours' is none of the models"),
 }
@@ -255,6 +270,13 @@ def test_what_cannot_be_measured_is_refused_before_anything_is_written(case: str
     assert calls() == []
 
 
+def test_a_file_that_is_no_model_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("text.safetensors").write_text("no weights")
+    assert main([*COMMAND, "models=[text.safetensors]"]) == 2
+    assert "text.safetensors: not a model file" in capsys.readouterr().err
+    assert not Path("chart").exists()
+
+
 def test_a_missing_matplotlib_is_told_before_any_work(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -269,14 +291,10 @@ def test_a_missing_matplotlib_is_told_before_any_work(
 def test_a_point_is_measured_by_hood_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tradeoff, "Points", Points)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
-    torch.manual_seed(0)
-    save_simulator(
-        tmp_path / "m.safetensors",
-        build_simulator(features="physical", output="velocity_base", schedule="1x(mesh)", latent_dim=4),
-    )
+    write_model(tmp_path / "m.safetensors")
     settings = [
-        "models=[m.safetensors]", "refine_1k=[0]", "guess_1k=[]", "newton=false", "frames_1k=5", "states_1k=1",
-        'settings=["gap_iterations=3"]', 
+        "models=[m.safetensors]", "refine_1k=[0]", "guess_1k=[]", "newton=false", "frames_1k=4", "states_1k=1",
+        'settings=["gap_iterations=1"]', 
     ]  # fmt: skip
     assert main([*COMMAND, *settings]) == 0
     row = json.loads(Path("chart/points.json").read_text())[0]

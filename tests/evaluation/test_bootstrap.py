@@ -1,11 +1,13 @@
-"""Confidence intervals of quantiles: they cover what they claim, know that states of a rollout are alike, and repeat."""
+"""Bootstrap intervals: they cover what they claim, know that states of a rollout are alike, and repeat."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import pytest
 
-from hood.evaluation.bootstrap import Estimate, estimate, interval, resample
+from hood.evaluation.bootstrap import Estimate, estimate, interval, pooled_interval, resample
 
 
 def test_the_interval_covers_the_true_median_as_often_as_it_says() -> None:
@@ -77,3 +79,51 @@ def test_nothing_measured_is_nan_and_infinity_survives() -> None:
     assert all(np.isnan(estimate([[], []], 0.5)))
     assert isinstance(estimate([[1.0]], 0.5), Estimate)
     assert interval(np.array([1.0] * 50 + [np.inf] * 50)) == (1.0, np.inf)
+
+
+def test_the_pooled_mean_of_a_normal_distribution() -> None:
+    """Width 2 · 1.96 σ/√n for independent values, each a group of its own."""
+    values = np.random.default_rng(0).normal(3.0, 2.0, 100)
+    low, high = pooled_interval([[value] for value in values], np.mean, draws=2000)
+    assert high - low == pytest.approx(2 * 1.96 * 2.0 / math.sqrt(100), rel=0.15)
+    assert low < values.mean() < high
+
+
+def test_the_pooled_interval_covers_the_truth_as_often_as_it_says() -> None:
+    rng = np.random.default_rng(1)
+    covered = 0
+    for _ in range(100):
+        groups = [rng.normal(rng.normal(), 0.1, 5).tolist() for _ in range(20)]
+        low, high = pooled_interval(groups, np.mean, draws=100, level=0.8)
+        covered += low <= 0.0 <= high
+    assert 0.65 <= covered / 100 <= 0.9
+
+
+def test_groups_are_drawn_whole() -> None:
+    """Copies of a value inside its group add no knowledge."""
+    values = np.random.default_rng(2).normal(size=20)
+    single = pooled_interval([[value] for value in values], np.mean)
+    copied = pooled_interval([[value] * 50 for value in values], np.mean)
+    assert copied == pytest.approx(single)
+
+
+def test_pooled_values_weigh_by_their_number() -> None:
+    """Two groups: the extremes are each of them alone, drawn twice."""
+    groups = [[0.0, 0.0, 0.0], [4.0]]
+    assert pooled_interval(groups, np.mean) == (0.0, 4.0)
+    assert pooled_interval(groups, np.mean, level=0.2) == (1.0, 1.0)
+
+
+def test_one_group_has_no_pooled_interval() -> None:
+    for groups in ([], [[1.0, 2.0, 3.0]], [[1.0, 2.0, 3.0], []]):
+        assert all(math.isnan(end) for end in pooled_interval(groups, np.mean))
+
+
+def test_the_seed_decides_and_wrong_settings_are_refused() -> None:
+    groups = [np.random.default_rng(i).normal(size=3).tolist() for i in range(8)]
+    assert pooled_interval(groups, np.median) == pooled_interval(groups, np.median)
+    assert pooled_interval(groups, np.mean) != pooled_interval(groups, np.mean, seed=1)
+    with pytest.raises(ValueError, match="level 1.5"):
+        pooled_interval(groups, np.mean, level=1.5)
+    with pytest.raises(ValueError, match="0 draws"):
+        pooled_interval(groups, np.mean, draws=0)

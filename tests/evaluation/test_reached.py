@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from measured_points import point, reached, rollout, solver, write_point
 
-from hood.dynamics.goals import floor_from_table
+from hood.dynamics.refine_table import floor_from_table
 from hood.evaluation.diary import Diary, Unit
 from hood.evaluation.reached import overstretched, read_reached, read_record, refinement_tables, summarise
 from hood.evaluation.study import Study

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from hood.assets.material import Material
+from hood.evaluation.rows import write_rows
 from hood.evaluation.spectrum import (
     COLUMNS,
     Bands,
@@ -21,7 +22,6 @@ from hood.evaluation.spectrum import (
     format_spectrum,
     garment_bands,
     spectrum_rows,
-    write_spectrum,
 )
 from hood.losses.potential import Potential, default_potential
 from hood.losses.problem import StepProblem
@@ -150,7 +150,7 @@ def test_rows_text_and_files(tmp_path: Path) -> None:
     assert {(row["states"], row["unconverged"]) for row in rows} == {(2, 0.5)}
     assert [band_name(row) for row in rows] == ["above 40 cm", "20 to 40 cm", "below 20 cm"]
     assert format_spectrum(rows).splitlines()[2].split() == ["above", "40", "cm", "2.000", "(", "68%;", "0.2)"]
-    csv_path, json_path = write_spectrum(rows, tmp_path)
+    csv_path, json_path = write_rows(rows, COLUMNS, tmp_path, "spectrum")
     assert json.loads(json_path.read_text()) == rows
     with open(csv_path, newline="") as file:
         table = list(csv.DictReader(file))

@@ -13,7 +13,8 @@ import torch
 from hood.dynamics.rollout import simulate
 from hood.dynamics.simulator import build_simulator
 from hood.dynamics.stepper import NewtonStepper
-from hood.evaluation.report import COLUMNS, describe, format_table, write_table
+from hood.evaluation.report import COLUMNS, describe, format_table
+from hood.evaluation.rows import write_rows
 from hood.evaluation.table import ALL, Candidate, GapSettings, evaluate
 from hood.evaluation.validation import Validation
 from hood.losses.potential import default_potential
@@ -146,7 +147,7 @@ def test_text_and_files(rows: list[dict], solver_rows: list[dict], tmp_path: Pat
     assert "untrained: random weights" in describe(rows)
     assert "untrained" not in describe(solver_rows)
     assert "did not converge" not in describe(rows)
-    csv_path, json_path = write_table(rows, tmp_path)
+    csv_path, json_path = write_rows(rows, COLUMNS, tmp_path, "table")
     with open(csv_path, newline="") as file:
         table = list(csv.DictReader(file))
     assert list(table[0]) == list(COLUMNS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -11,6 +12,7 @@ from measured_points import point, reached, solver
 
 from hood.evaluation.reached import overstretched
 from hood.evaluation.study import Study
+from hood.media import tradeoff_page
 from hood.media.tradeoff_page import write_page
 
 CURVE = {k: (10.0 * k, 1.0 / k**2) for k in (1, 2, 5, 10)}
@@ -82,7 +84,8 @@ def test_verdicts_are_given_where_intervals_separate(page: str) -> None:
     assert "refined more accurate" in text
 
 
-def test_without_the_converged_solver_nothing_is_called_too_much(tmp_path: Path) -> None:
+def test_without_the_converged_solver_nothing_is_called_too_much(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tradeoff_page, "_pictures", lambda study, folder: collections.defaultdict(str))
     items = [reached("net", 0, 10.0, 0.1, strain=5.0), reached("guess", 2, 10.0, 0.1)]
     text = words(write_page(Study(items, overstretched(items)), tmp_path).read_text(encoding="utf-8"))
     assert "The converged solver was not measured at this size" in text
