@@ -67,6 +67,7 @@ FIVE_PASSES = (
     "1x(mesh+coarse0) | 1x(coarse0+coarse1) 1x(mesh+coarse0) | 1x(coarse1+coarse2) 1x(coarse0+coarse1) 1x(mesh+coarse0) | "
     "1x(mesh+coarse0) | 2x(mesh)"
 )
+EIGHT_PASSES = fast("8 passes, 11 steps", SHORT, "model=passes")
 
 SUITES: dict[str, list[Recipe]] = {
     "baseline": [
@@ -78,6 +79,7 @@ SUITES: dict[str, list[Recipe]] = {
         fast("fast", 5 * SHORT, *SMALL),
         paper("paper trainer, passes", "model=passes"),
         fast("fast, passes, short", SHORT // 2, "model=passes"),
+        EIGHT_PASSES,
     ],
     "choices": [
         fast("fast, short", SHORT, *SMALL),
@@ -89,7 +91,7 @@ SUITES: dict[str, list[Recipe]] = {
         fast("batch of one", 4 * SHORT, *SMALL, "trainer.batch_size=1"),
     ],
     "passes": [
-        fast("8 passes, 11 steps", SHORT, "model=passes"),
+        EIGHT_PASSES,
         fast("5 passes, 9 steps", SHORT, "model=passes", f"model.schedule='{FIVE_PASSES}'"),
         fast("2 passes, 9 steps", SHORT, "model=passes", f"model.schedule='{TWO_PASSES}'"),
         fast("1 pass, 9 steps", SHORT, "model=passes", f"model.schedule='{TWO_PASSES.replace(' |', '')}'"),
