@@ -216,7 +216,8 @@ def _differences(rows: Sequence[Row], about: Circumstances) -> str:
     budgets = [f"{name}: {_budget(name, weights, about)}" for name, weights in models if weights != "none"]
     return "\n".join(
         (
-            f"- Data: {len(about.motions)} motion{'s' * (len(about.motions) > 1)} ({', '.join(about.motions)}) of at most {about.num_frames} frames at "
+            f"- Data: {len(about.motions)} motion{'s' * (len(about.motions) > 1)} ({', '.join(about.motions)}) of at most "
+            f"{about.num_frames} frames at "
             f"{about.fps:g} per second, {about.num_shapes} body shape(s); the paper trains on 52 captured sequences and shows "
             "other garments, its dress has 12,000 vertices. Vertices here: " + sizes + ".",
             f"- Body: {about.body} with contact against its triangles; the paper's is SMPL with contact against its vertices' "
