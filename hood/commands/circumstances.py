@@ -47,14 +47,15 @@ def command_line(command: str, overrides: Sequence[str]) -> str:
 
 
 def machine_name(device: str) -> str:
-    """Processor or accelerator by its own name, threads, torch version."""
+    """:func:`device_name`, threads of a processor, torch version."""
+    threads = "" if device.startswith("cuda") else f"{torch.get_num_threads()} thread(s), "
+    return f"{device_name(device)}, {threads}torch {torch.__version__}"
+
+
+def device_name(device: str) -> str:
+    """What the processor or the graphics card calls itself."""
     if device.startswith("cuda"):
-        return f"{torch.cuda.get_device_name(device)}, torch {torch.__version__}"
-    return f"{processor_name()}, {torch.get_num_threads()} thread(s), torch {torch.__version__}"
-
-
-def processor_name() -> str:
-    """What the processor calls itself."""
+        return torch.cuda.get_device_name(device)
     info = Path("/proc/cpuinfo")
     lines = info.read_text(encoding="utf-8", errors="replace").splitlines() if info.exists() else []
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name") and ":" in line]

@@ -45,7 +45,7 @@ from hood.dynamics.stepper import NewtonStepper
 from hood.evaluation.diary import Diary, Unit
 from hood.evaluation.drift import sideways_drift, standing_scene
 from hood.evaluation.gap import REFERENCE
-from hood.evaluation.grid import GUESS, NEWTON
+from hood.evaluation.grid import GUESS, NEWTON, model_name
 from hood.evaluation.spectrum import spectrum_rows
 from hood.evaluation.table import Candidate, GapSettings, Measured, candidate_rows, measure
 from hood.losses.potential import Potential
@@ -208,8 +208,7 @@ def _unrefined_candidate(name: str, config: DictConfig) -> Candidate:
     path = locate("weights", name)
     simulator = read_model(path, float(config.fps)).to(str(config.device))
     use_arithmetic(simulator, config)
-    name = path.stem if path.stem != "model" else path.parent.name
-    return Candidate(name, path.name, simulator, training_note(path))
+    return Candidate(model_name(str(path)), path.name, simulator, training_note(path))
 
 
 @dataclass

@@ -18,12 +18,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 from tqdm import tqdm
 
 from hood.assets.atomic import write_atomically
 from hood.assets.library import locate
-from hood.commands.circumstances import processor_name
 from hood.commands.common import UNTRAINED
 from hood.evaluation.grid import Point, quoted
 from hood.evaluation.reached import read_record
@@ -198,10 +196,3 @@ def weights_digest(point: Point) -> str:
     if point.alone or point.model.startswith(UNTRAINED + ":"):
         return "none"
     return hashlib.sha256(locate("weights", point.model).read_bytes()).hexdigest()
-
-
-def device_name(device: str) -> str:
-    """The processor's or graphics card's own name."""
-    if device == "cuda":
-        return f"GPU ({torch.cuda.get_device_name()})"
-    return f"CPU ({processor_name()})"

@@ -13,8 +13,9 @@ from omegaconf import DictConfig
 from hood.assets.atomic import write_atomically
 from hood.assets.garment import load_garment
 from hood.assets.library import names
+from hood.commands.circumstances import device_name
 from hood.commands.common import output_folder, prepare_folder, require_same_config
-from hood.commands.points import Failure, Points, device_name
+from hood.commands.points import Failure, Points
 from hood.commands.tradeoff_checks import check_config, check_models, check_points, check_settings
 from hood.config import ConfigError, load_config, plain, save_run_record
 from hood.evaluation.comparison import pareto_front
@@ -43,7 +44,8 @@ def run(overrides: Sequence[str]) -> int:
     grid = make_grid(config, models)
     points, vertices = grid.points(), _vertices(grid)
     check_points(points)
-    store = Points(folder / "points", int(config.jobs), device_name(str(config.device)))
+    device = str(config.device)
+    store = Points(folder / "points", int(config.jobs), f"{'CPU' if device == 'cpu' else 'GPU'} ({device_name(device)})")
     if not config.measure and not any(store.is_done(point) for point in points):
         raise ConfigError(f"measure=false: {folder} holds none of these points; leave measure out, or give their output")
     free = (*_FREE, *(f"{key}_{size}" for key in _FREE_BY_SIZE for size in SIZES))

@@ -60,7 +60,7 @@ class Point:
     @property
     def name(self) -> str:
         """Of the model: a path's last part that says something."""
-        return _name_of(self.model)
+        return model_name(self.model)
 
     @property
     def series(self) -> str:
@@ -114,14 +114,14 @@ class Grid:
         Raises:
             ValueError: two models have one name, or a size wants a model that is not among them.
         """
-        names = [_name_of(model) for model in self.models]
+        names = [model_name(model) for model in self.models]
         double = [name for name in names if names.count(name) > 1]
         if double:
             raise ValueError(f"models: two of them are called {double[0]!r} and could not be told apart; rename a file")
         return [point for size in self.sizes if size.garments for point in self._points_at(size)]
 
     def _points_at(self, size: Size) -> list[Point]:
-        names = {_name_of(model): model for model in self.models}
+        names = {model_name(model): model for model in self.models}
         absent = [name for name in size.models if name not in names and name not in self.models]
         if absent:
             raise ValueError(f"models_{size.name}: {absent[0]!r} is none of the models ({', '.join(names) or 'none'})")
@@ -150,7 +150,8 @@ class Grid:
         return Point(size.name, model, refine, precision, method, tuple(settings))
 
 
-def _name_of(model: str) -> str:
+def model_name(model: str) -> str:
+    """What weights are called, given by name or path: a run's ``model.safetensors`` by its folder."""
     path = Path(model)
     if path.suffix not in (".safetensors", ".pth"):
         return model
