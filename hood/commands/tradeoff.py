@@ -19,7 +19,7 @@ from hood.commands.points import Failure, Points
 from hood.commands.tradeoff_checks import check_config, check_models, check_points, check_settings
 from hood.config import ConfigError, load_config, plain, save_run_record
 from hood.evaluation.comparison import pareto_front
-from hood.evaluation.grid import Grid, Point, Size, listed
+from hood.evaluation.grid import Grid, Point, Size, listed, model_name
 from hood.evaluation.reached import Reached, overstretched, read_reached, read_record, refinement_tables
 from hood.evaluation.rows import write_rows
 from hood.evaluation.study import Study
@@ -29,9 +29,11 @@ KNOWN = ("fine15", "fine48", "ours", "small1", "small2", "small3", "quickstart")
 SIZES = ("1k", "4k", "12k")
 #: Measured on the largest garments where nothing else is said.
 _LARGEST = ("fine15", "ours")
+#: Measured with all iterations at every size where nothing else is said.
+_DIAL = "ours"
 #: Settings that may change from one call to the next: they add points or leave some out, and change none.
-_FREE = ("models", "precisions", "refine_methods", "newton", "jobs", "measure", "output")
-_FREE_BY_SIZE = ("refine", "guess", "models")
+_FREE = ("models", "precisions", "refine_methods", "newton", "dial", "jobs", "measure", "output")
+_FREE_BY_SIZE = ("refine", "guess", "models", "precisions")
 
 
 def run(overrides: Sequence[str]) -> int:
@@ -92,7 +94,19 @@ def _size(config: DictConfig, name: str, models: Sequence[str]) -> Size:
         wanted = tuple(model for model in models if model in _LARGEST) or tuple(models[:1])
     garments = tuple(map(str, values("garments")))
     numbers = int(config[f"frames_{name}"]), int(config[f"states_{name}"])
-    return Size(name, garments, values("refine"), values("guess"), *numbers, models=wanted)
+    precisions = tuple(map(str, values("precisions")))
+    further = () if name == SIZES[0] else tuple(plain(config[f"refine_{SIZES[0]}"]))
+    dial = (_dial(config, models), further)
+    return Size(name, garments, values("refine"), values("guess"), *numbers, wanted, precisions, dial)
+
+
+def _dial(config: DictConfig, models: Sequence[str]) -> str:
+    """The model that is measured with every number of iterations at every size; "" for none."""
+    if config.dial is None:
+        return next((model for model in models if model_name(model) == _DIAL), "")
+    if str(config.dial) not in (*models, *map(model_name, models)):
+        raise ConfigError(f"dial={config.dial}: is none of the models ({', '.join(models) or 'none'})")
+    return str(config.dial)
 
 
 def collect(

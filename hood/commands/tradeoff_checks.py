@@ -90,5 +90,5 @@ def _check_size(config: DictConfig, size: str) -> None:
         for value in plain(config[f"{key}_{size}"]):
             if isinstance(value, bool) or not isinstance(value, int) or value < least:
                 raise ConfigError(f"{key}_{size}: {value!r} is no number of iterations; give whole numbers from {least} on")
-    for key in ("garments", "models", "refine", "guess"):
+    for key in ("garments", "models", "precisions", "refine", "guess"):
         require_distinct(f"{key}_{size}", plain(config[f"{key}_{size}"]))

@@ -24,6 +24,8 @@ class Size:
         refine: iterations after the network, each a point of every model and precision.
         guess: iterations of the solver alone.
         models: names of the models that are measured at this size; empty for all.
+        precisions: those that are measured at this size; empty for all.
+        dial: a model that is measured with further numbers of iterations in the first precision, and these numbers.
     """
 
     name: str
@@ -33,6 +35,13 @@ class Size:
     num_frames: int
     gap_states: int
     models: tuple[str, ...] = ()
+    precisions: tuple[str, ...] = ()
+    dial: tuple[str, tuple[int, ...]] = ("", ())
+
+    def iterations(self, model: str) -> list[int]:
+        """All that this network is measured with in the first precision, in order."""
+        further = self.dial[1] if self.dial[0] in (model, model_name(model)) else ()
+        return sorted({*self.refine, *further}) if further else list(self.refine)
 
 
 @dataclass(frozen=True)
@@ -112,7 +121,7 @@ class Grid:
         """All points, small garments first.
 
         Raises:
-            ValueError: two models have one name, or a size wants a model that is not among them.
+            ValueError: two models have one name, or a size wants a model or a precision that is not among them.
         """
         names = [model_name(model) for model in self.models]
         double = [name for name in names if names.count(name) > 1]
@@ -125,10 +134,14 @@ class Grid:
         absent = [name for name in size.models if name not in names and name not in self.models]
         if absent:
             raise ValueError(f"models_{size.name}: {absent[0]!r} is none of the models ({', '.join(names) or 'none'})")
+        absent = [name for name in size.precisions if name not in self.precisions]
+        if absent:
+            raise ValueError(f"precisions_{size.name}: {absent[0]!r} is none of the precisions ({', '.join(self.precisions)})")
         models = [model for name, model in names.items() if not size.models or name in size.models or model in size.models]
+        precisions = [name for name in self.precisions if not size.precisions or name in size.precisions]
         points = []
-        for model, precision in product(models, self.precisions):
-            for refine in size.refine:
+        for model, precision in product(models, precisions):
+            for refine in size.iterations(model) if precision == precisions[0] else size.refine:
                 # Without iterations the methods are the same.
                 methods = self.methods if refine else self.methods[:1]
                 points += [self._point(size, model, refine, precision, method) for method in methods]

@@ -32,6 +32,8 @@ def measured_radius(simulator: Simulator, seed: int = 0) -> int:
     is the reach of all its steps together; what the potential tells it between two passes is not counted.
     """
     network = copy.deepcopy(simulator.network).double().eval()
+    network.use_precision("fp32")  # of products in float64: as they come
+    network.use_kernels("torch")
     columns = simulator.velocity_columns
     cloth = _strip()
     edges = cloth.edges.numpy()

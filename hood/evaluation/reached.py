@@ -27,6 +27,8 @@ PARTS = {
 }
 #: A process that had its processor for less than this share of the time was disturbed: reading files takes some as well.
 UNDISTURBED = 0.85
+#: Minima further apart than this share of γ make it doubtful.
+_DOUBT = 0.1
 #: Strain beyond this multiple of the solver's counts as too much.
 OVERSTRETCHED = 2.0
 
@@ -54,6 +56,7 @@ class Reached:
     states: int
     unconverged: int  # states whose reference missed its accuracy: their gaps are lower bounds
     disagreeing: int  # states where minimisations ended in different minima
+    doubtful: int  # those of them where that changes γ by more than a tenth
     failures: int  # rollouts that became non-finite
     record: Mapping[str, Any] = field(default_factory=dict)  # what was written down about the run
     ms_draws: np.ndarray = field(default_factory=lambda: np.empty(0), repr=False, compare=False)
@@ -86,7 +89,7 @@ class Reached:
             entries |= {name: value.value, f"{name}_low": value.low, f"{name}_high": value.high}
         entries |= {"rg": self.rg, "strain_p99": self.strain_p99}
         entries |= {f"ms_{name}": value for name, value in self.parts.items()}
-        for name in ("rollouts", "frames", "states", "unconverged", "disagreeing", "failures"):
+        for name in ("rollouts", "frames", "states", "unconverged", "disagreeing", "doubtful", "failures"):
             entries[name] = getattr(self, name)
         entries |= {"device": self.record.get("device"), "cpu_share": self.record.get("cpu_share"), "command": point.command}
         return {key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in entries.items()}
@@ -127,6 +130,7 @@ def summarise(point: Point, rollouts: Sequence[Measured], vertices: int, record:
         states=len(gaps),
         unconverged=sum(item["converged"] == 0.0 for item in gaps),
         disagreeing=sum(item["spread"] > AGREEMENT for item in gaps),
+        doubtful=sum(item["spread"] > max(AGREEMENT, _DOUBT * abs(item["gamma"])) for item in gaps),
         failures=sum(bool(measured.failures) for measured in rollouts),
         record=record,
         ms_draws=ms_draws,

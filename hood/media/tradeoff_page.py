@@ -133,6 +133,7 @@ def _all_points(study: Study) -> str:
             for count, what in (
                 (item.unconverged, "references unconverged"),
                 (item.disagreeing, "references disagree"),
+                (item.doubtful, "with doubt about γ"),
                 (item.failures, "rollouts broke down"),
             )
             if count

@@ -76,7 +76,9 @@ def _below(below: list[Reached], quantity: str, name: str) -> str:
 
 def method(study: Study) -> list[str]:
     """Paragraphs on how far the figures can be trusted."""
-    states, unsure, apart = (sum(getattr(i, name) for i in study.reached) for name in ("states", "unconverged", "disagreeing"))
+    states, unsure, apart, doubtful = (
+        sum(getattr(i, name) for i in study.reached) for name in ("states", "unconverged", "disagreeing", "doubtful")
+    )
     jobs = max((int(item.record.get("jobs", 1)) for item in study.reached), default=1)
     loads = [float(item.record["load_at_start"]) for item in study.reached if item.record.get("load_at_start") is not None]
     load = f" When a setting began the machine had {min(loads):.1f} to {max(loads):.1f} busy processes." if loads else ""
@@ -85,7 +87,8 @@ def method(study: Study) -> list[str]:
         f"the first frames are left out. Up to {jobs} settings were measured side by side.{load}",
         "The minimum is the lowest of three minimisations in float64, from the inertial guess, the previous positions and the "
         f"setting's own result. Of {states:,} states, the reference of {unsure:,} missed its accuracy (γ is a lower bound "
-        f"there) and minimisations of {apart:,} ended more than {AGREEMENT:g} e0 apart (the lowest counts); all are kept. "
+        f"there) and minimisations of {apart:,} ended more than {AGREEMENT:g} e0 apart (the lowest counts), of {doubtful:,} by "
+        "more than a tenth of γ as well; all are kept. "
         "γ is never clamped: a setting that beats every minimisation is itself the reference.",
         f"Intervals: rollouts are drawn again with replacement, then states within each, {DRAWS:,} times with a fixed seed, "
         "alike for all settings that were measured on the same rollouts.",

@@ -87,7 +87,9 @@ def test_the_default_grid_is_the_one_described() -> None:
     models = ["fine15", "fine48", "ours", "small1", "small2", "small3"]
     points = make_grid(config, models).points()
     by_size = {size: [p for p in points if p.size == size and not p.alone] for size in ("1k", "4k", "12k")}
-    assert {size: len(found) for size, found in by_size.items()} == {"1k": 6 * 2 * 6, "4k": 6 * 2 * 3, "12k": 2 * 2 * 2}
+    assert {size: len(found) for size, found in by_size.items()} == {"1k": 6 * 2 * 6, "4k": 6 * 2 * 3 + 3, "12k": 2 * 2 * 2 + 4}
+    for found in by_size.values():
+        assert {p.refine for p in found if (p.name, p.precision) == ("ours", "fp32")} == {0, 1, 2, 5, 10, 20}
     assert {p.name for p in by_size["12k"]} == {"fine15", "ours"}
     assert {p.refine for p in by_size["1k"]} == {0, 1, 2, 5, 10, 20}
     for size, least in (("1k", 30), ("4k", 30), ("12k", 10)):
@@ -255,6 +257,8 @@ REFUSED = {
     "no folder": (["output="], "output: no folder is named"),
     "nothing to chart": (["measure=false"], "measure=false: chart holds none of these points"),
     "nothing to measure": (["garments_1k=[]"], "no point is left to measure"),
+    "unknown model on the dial": (["dial=ours"], "dial=ours: is none of the models (untrained:small)"),
+    "unknown precision at a size": (["precisions_1k=[bf16]"], "precisions_1k: 'bf16' is none of the precisions (fp32)"),
     "unknown model at a size": (["models_1k=[ours]"], "models_1k: 'ours' is none of the models"),
 }
 
@@ -293,8 +297,8 @@ def test_a_point_is_measured_by_hood_itself(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
     write_model(tmp_path / "m.safetensors")
     settings = [
-        "models=[m.safetensors]", "refine_1k=[0]", "guess_1k=[]", "newton=false", "frames_1k=4", "states_1k=1",
-        'settings=["gap_iterations=1"]', 
+        "models=[m.safetensors]", "precisions=[bf16]", "refine_1k=[0]", "guess_1k=[]", "newton=false", "frames_1k=4",
+        "states_1k=1", 'settings=["gap_iterations=1"]',
     ]  # fmt: skip
     assert main([*COMMAND, *settings]) == 0
     row = json.loads(Path("chart/points.json").read_text())[0]

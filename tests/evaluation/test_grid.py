@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from dataclasses import replace
 
 import pytest
 
@@ -50,6 +51,20 @@ def test_without_iterations_methods_are_one() -> None:
         ("net", 0, "newton"), ("net", 5, "newton"), ("net", 5, "sweeps"), ("guess", 2, "newton"), ("guess", 2, "sweeps"),
     ]  # fmt: skip
     assert len({point.label for point in both.points()}) == 5
+
+
+def test_one_model_is_measured_with_every_number_of_iterations_and_a_size_with_some_precisions() -> None:
+    size = Size("4k", ("dress_4k",), (0, 5), (2,), 24, 5, dial=("ours", (0, 1, 10)))
+    grid = Grid(("runs/ours/model.safetensors", "fine15"), ("fp32", "bf16"), ("newton",), (size,), newton=False)
+    found = [(p.name, p.precision, p.refine) for p in grid.points() if not p.alone]
+    assert found == [
+        ("ours", "fp32", 0), ("ours", "fp32", 1), ("ours", "fp32", 5), ("ours", "fp32", 10), ("ours", "bf16", 0),
+        ("ours", "bf16", 5), ("fine15", "fp32", 0), ("fine15", "fp32", 5), ("fine15", "bf16", 0), ("fine15", "bf16", 5),
+    ]  # fmt: skip
+    half = Grid(("fine15",), ("fp32", "bf16"), ("newton",), (replace(size, precisions=("bf16",)),), newton=False)
+    assert [(p.precision, p.refine) for p in half.points() if not p.alone] == [("bf16", 0), ("bf16", 5)]
+    with pytest.raises(ValueError, match="precisions_4k: 'tf32' is none of the precisions \\(fp32, bf16\\)"):
+        replace(half, sizes=(replace(size, precisions=("tf32",)),)).points()
 
 
 def test_a_size_without_garments_is_left_out() -> None:

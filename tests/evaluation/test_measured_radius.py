@@ -28,3 +28,10 @@ def test_radius_of_several_passes_is_that_of_all_their_steps() -> None:
     simulator = build_simulator("local", "local_steps", schedule, latent_dim=8)
     plain = build_simulator("physical", "velocity_base", schedule.replace("|", ""), latent_dim=8)
     assert measured_radius(simulator) == measured_radius(plain) == 6
+
+
+def test_radius_of_a_network_in_half_precision_is_the_same_and_leaves_it_so() -> None:
+    simulator = build_simulator("physical", "velocity_base", "2x(mesh+coarse0) 1x(coarse0)", latent_dim=16)
+    simulator.network.use_precision("bf16")
+    assert measured_radius(simulator) == 6
+    assert simulator.network.precision == "bf16"

@@ -27,12 +27,19 @@ def test_a_folder_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert found.gap.value == pytest.approx(0.25)
     assert found.gap.low == pytest.approx(-0.1)
     assert (found.rollouts, found.frames, found.states) == (3, 4, 4)
-    assert (found.unconverged, found.disagreeing, found.failures) == (1, 1, 1)
+    assert (found.unconverged, found.disagreeing, found.doubtful, found.failures) == (1, 1, 1, 1)
     assert found.parts == pytest.approx({"search": 2.5, "features": 2.5, "network": 15.0, "refine": 2.5, "rest": 2.5})
     row = found.row()
     assert row["device"] == "CPU (made up)"
     assert row["command"] == one.command
     assert row["gap_low"] < 0
+
+
+def test_minima_apart_by_a_hundredth_of_the_gap_leave_no_doubt(tmp_path: Path) -> None:
+    one = point("guess", 2)
+    write_point(tmp_path, one, [rollout([10.0, 20.0], [4.0, 5.0], spread=0.05)])
+    found = read_reached(one, tmp_path, 1014)
+    assert (found.disagreeing, found.doubtful) == (2, 0)
 
 
 def test_negative_gaps_survive(tmp_path: Path) -> None:
