@@ -114,6 +114,34 @@ def at_equal_time(item: Reached, networks: Sequence[Reached]) -> AtEqualTime | N
     return AtEqualTime(item, best, gain, verdict)
 
 
+@dataclass(frozen=True)
+class Refined:
+    """A refined network beside the same one alone; ``stretched``: rollouts in which refinement raised the strain."""
+
+    reached: Reached
+    plain: Reached
+    stretched: int
+
+    @property
+    def worse(self) -> bool:
+        """Whether the median strain is higher than without refinement, or vertices deeper than 2 mm more frequent."""
+        return not (
+            self.reached.strain_p99 <= self.plain.strain_p99 and self.reached.penetration <= self.plain.penetration
+        )  # what is not finite is worse
+
+
+def refined_networks(reached: Sequence[Reached]) -> list[Refined]:
+    """Every refined network whose network alone was measured at that size as well."""
+    plain = {(i.point.model, i.point.precision, i.point.size): i for i in reached if not i.point.alone and not i.point.refine}
+    found = []
+    for item in (item for item in reached if not item.point.alone and item.point.refine):
+        own = plain.get((item.point.model, item.point.precision, item.point.size))
+        if own is not None:
+            pairs = zip(item.strains, own.strains, strict=False)
+            found.append(Refined(item, own, sum(not here <= there for here, there in pairs)))
+    return found
+
+
 def _same_network(one: Point, other: Point) -> bool:
     return (one.model, one.precision, one.size) == (other.model, other.precision, other.size)
 

@@ -50,6 +50,9 @@ class Reached:
     gap_p95: Estimate
     rg: float
     strain_p99: float
+    penetration: float  # mean share of vertices deeper than 2 mm
+    depth: float  # m, mean over frames of the deepest vertex
+    strains: tuple[float, ...]  # strain_p99 of every rollout, median over its frames
     parts: Mapping[str, float]  # ms, mean over frames, of PARTS
     rollouts: int
     frames: int
@@ -87,7 +90,7 @@ class Reached:
         for name in ("ms", "ms_p95", "gap", "gap_p95"):
             value: Estimate = getattr(self, name)
             entries |= {name: value.value, f"{name}_low": value.low, f"{name}_high": value.high}
-        entries |= {"rg": self.rg, "strain_p99": self.strain_p99}
+        entries |= {"rg": self.rg, "strain_p99": self.strain_p99, "penetration": self.penetration, "depth": self.depth}
         entries |= {f"ms_{name}": value for name, value in self.parts.items()}
         for name in ("rollouts", "frames", "states", "unconverged", "disagreeing", "doubtful", "failures"):
             entries[name] = getattr(self, name)
@@ -124,6 +127,9 @@ def summarise(point: Point, rollouts: Sequence[Measured], vertices: int, record:
         estimate(gammas, 0.95),
         float(np.median([frame["relative_gradient"] for frame in frames])),
         float(np.median([frame["strain_p99"] for frame in frames])),
+        float(np.mean([frame.get("penetration_share", 0.0) for frame in frames])),
+        float(np.mean([frame.get("penetration_depth", 0.0) for frame in frames])),
+        tuple(float(np.median([frame["strain_p99"] for frame in one.frames] or [np.nan])) for one in rollouts),
         {name: float(np.mean([sum(f.get(key, 0.0) for key in keys) for f in frames])) for name, keys in PARTS.items()},
         rollouts=len(rollouts),
         frames=len(frames),

@@ -7,7 +7,16 @@ from pathlib import Path
 
 from hood.assets.atomic import write_atomically
 from hood.evaluation.bootstrap import Estimate
-from hood.evaluation.comparison import NETWORK, OPEN, REFINED, SOLVER, at_equal_gap, at_equal_time, pareto_front
+from hood.evaluation.comparison import (
+    NETWORK,
+    OPEN,
+    REFINED,
+    SOLVER,
+    at_equal_gap,
+    at_equal_time,
+    pareto_front,
+    refined_networks,
+)
 from hood.evaluation.study import Study
 from hood.media import tradeoff_prose as prose
 from hood.media.charts import cost_chart, front_chart, inline_svg, series_colours, write_png
@@ -77,6 +86,7 @@ def _size_section(study: Study, size: str, pictures: dict[str, str]) -> str:
         _front_table(study, size),
         _equal_gap(study, size),
         _equal_time(study, size),
+        _refined(study, size),
         "<details><summary>Where the time goes, with the fewest and the most iterations</summary>"
         f"<figure>{pictures[f'cost_{size}']}</figure></details>",
     ]
@@ -123,6 +133,20 @@ def _equal_time(study: Study, size: str) -> str:
         return ""
     head = ["setting", "k", "ms", "γ", "network alone in that time", "its γ", "difference", "verdict"]
     return "<h3>Refined and alone at equal time</h3>" + paragraph(prose.EQUAL_TIME) + table(head, rows)
+
+
+def _refined(study: Study, size: str) -> str:
+    rows = []
+    for found in refined_networks(study.at(size)):
+        item, plain = found.reached, found.plain
+        rows.append([item.label, str(item.point.refine), *(f"{one.strain_p99:.2%}" for one in (plain, item)),
+                     f"{found.stretched} of {item.rollouts}", *(f"{one.penetration:.4%}" for one in (plain, item)),
+                     *(f"{1e3 * one.depth:.2f}" for one in (plain, item)), "worse" if found.worse else "no worse"])  # fmt: skip
+    if not rows:
+        return ""
+    head = ["setting", "k", "p99 strain alone", "refined", "rollouts with more", "deeper than 2 mm alone", "refined",
+            "deepest alone [mm]", "refined", "verdict"]  # fmt: skip
+    return "<h3>Does refinement ever make it worse?</h3>" + paragraph(prose.REFINED) + table(head, rows)
 
 
 def _all_points(study: Study) -> str:

@@ -23,6 +23,11 @@ EQUAL_TIME = (
     "Beside every refined setting the most accurate network alone that takes no longer. A verdict is given only where the "
     "interval of the difference leaves out 0."
 )
+REFINED = (
+    "Every iteration lowers the energy of its frame, but a rollout could still come out worse. So the same rollouts with and "
+    "without: median p99 strain, mean share of vertices deeper than 2 mm under the skin, and the deepest vertex, mean over "
+    "frames. Worse is what has more of the strain or of the share."
+)
 COMMANDS = (
     "Every point is one command; run it to check the point. It prints the point's table and writes it to outputs/evaluate. "
     "Flags say where figures are bounds or doubtful."

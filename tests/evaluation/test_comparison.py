@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from measured_points import reached, solver
@@ -15,6 +17,7 @@ from hood.evaluation.comparison import (
     at_equal_time,
     crossover,
     pareto_front,
+    refined_networks,
     standings,
 )
 from hood.evaluation.reached import Reached
@@ -150,3 +153,20 @@ def test_a_setting_that_overstretches_wins_nothing() -> None:
     items = scene("1k", 1000, 10.0)
     assert standings(items)[0].winner == NETWORK
     assert standings(items, {items[-1].point}) == []
+
+
+def test_refinement_is_held_against_the_same_network_at_the_same_size() -> None:
+    items = [
+        exact("net", 0, 100.0, 0.5), exact("net", 5, 200.0, 0.1, strain=0.08), exact("net", 2, 150.0, 0.2, strain=0.3),
+        exact("net", 5, 900.0, 0.1, strain=0.08, size="4k"), *solver(CURVE),
+    ]  # fmt: skip
+    found = refined_networks(items)
+    assert [(one.reached.point.refine, one.plain is items[0], one.stretched, one.worse) for one in found] == [
+        (5, True, 0, False), (2, True, 8, True),
+    ]  # fmt: skip
+
+
+def test_refinement_that_pushes_cloth_into_the_body_or_breaks_down_is_worse() -> None:
+    plain, deeper = exact("net", 0, 1.0, 1.0), replace(exact("net", 5, 1.0, 1.0), penetration=1e-3)
+    broken = exact("net", 10, 1.0, 1.0, strain=float("nan"))
+    assert [(one.worse, one.stretched) for one in refined_networks([plain, deeper, broken])] == [(True, 0), (True, 8)]
