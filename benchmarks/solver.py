@@ -29,12 +29,10 @@ that costs more than the iterations it saves, at every size and also to a thousa
 from __future__ import annotations
 
 import argparse
-import platform
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -42,6 +40,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from hood.assets.material import Material
+from hood.commands.circumstances import device_name
 from hood.evaluation.gap import AGREEMENT
 from hood.losses.potential import default_potential, scale
 from hood.losses.problem import StepProblem, inertial_guess
@@ -184,16 +183,6 @@ def time_sweep(side: int, device: str, setting: Setting) -> float:
     return 1e3 * (times[1] - times[0]) / 5
 
 
-def device_name(device: str) -> str:
-    """The processor's or the accelerator's own name."""
-    if device != "cpu":
-        return torch.cuda.get_device_name(device)
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.exists() else []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return f"{names[0] if names else platform.processor() or platform.machine()}, {torch.get_num_threads()} thread(s)"
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sides", type=int, nargs="+", default=[33, 64], help="vertices along a side of the sheet")
@@ -209,7 +198,8 @@ def main() -> None:
     torch.set_num_threads(args.threads)
     setting = Setting(args.stiffness, args.density, args.dt)
     print(
-        f"{device_name(args.device)}; sheet 1 m × 1 m on a sphere of radius 0.3 m, stiffness × {args.stiffness:g}, "
+        f"{device_name(args.device)}, {torch.get_num_threads()} thread(s); "
+        f"sheet 1 m × 1 m on a sphere of radius 0.3 m, stiffness × {args.stiffness:g}, "
         f"density × {args.density:g}, dt = {1e3 * args.dt:.3g} ms, {args.frames} frames, float64"
     )
     print("| one implicit step, median / p95 | " + " | ".join(TARGETS) + " |\n" + "|---" * (len(TARGETS) + 1) + "|")

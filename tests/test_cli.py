@@ -135,6 +135,12 @@ ERRORS: dict[str, tuple[list[str], tuple[str, ...], Prepare]] = {
     "evaluated kernels": (["evaluate", "models=[guess]", "kernels=fast", "output=run"], ("'fast'", "torch"), lambda: None),
     "evaluated rate": (["evaluate", "fps=0", "output=run"], ("fps=0", "above 0"), lambda: None),
     "evaluation nowhere": (["evaluate", "output=null"], ("output", "no folder"), lambda: None),
+    "rollout nowhere": (["rollout", *UNTRAINED, "output=null"], ("output", "no folder"), lambda: None),
+    "training nowhere": (["train", "output=null"], ("output", "no folder"), lambda: None),
+    "two models of one name": (
+        ["evaluate", "models=[untrained:small,small.safetensors]", "output=run"], ("names must differ", "small, small"),
+        lambda: tiny_model(Path("small.safetensors")),
+    ),
     "spectrum of nothing": (["evaluate", "spectrum=table", "gap_states=0", "output=run"], ("gap_states",), lambda: None),
     "evaluated frames": (["evaluate", "num_frames=1", "output=run"], ("num_frames=1",), lambda: None),
 }  # fmt: skip

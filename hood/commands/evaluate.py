@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -18,34 +16,28 @@ from tqdm import tqdm
 
 from hood.assets.body import load_body
 from hood.assets.garment import Garment, load_garment
-from hood.assets.library import locate, motion_split
+from hood.assets.library import motion_split
 from hood.assets.sequence import PoseSequence, load_sequence
 from hood.commands.batch import expand_sequences
-from hood.commands.circumstances import circumstances, training_note
+from hood.commands.candidates import digest, make_candidate
+from hood.commands.circumstances import circumstances
 from hood.commands.common import (
-    UNTRAINED,
     output_folder,
     prepare_folder,
-    read_model,
     require_device,
     require_distinct,
     require_package,
     require_same_config,
     together,
-    use_arithmetic,
 )
 from hood.commands.evaluation_files import report_spectrum, report_table
 from hood.commands.wardrobe import shape_coefficients
-from hood.config import ConfigError, build, load_config, options, plain, require_choice, save_run_record
-from hood.dynamics.goals import Count
+from hood.config import ConfigError, build, load_config, plain, require_choice, save_run_record
 from hood.dynamics.reel import Reel
-from hood.dynamics.refine import METHODS, GuessStepper, RefinedStepper, unrefined
-from hood.dynamics.simulator import Simulator
-from hood.dynamics.stepper import NewtonStepper
+from hood.dynamics.refine import METHODS
 from hood.evaluation.diary import Diary, Unit
 from hood.evaluation.drift import sideways_drift, standing_scene
 from hood.evaluation.gap import REFERENCE
-from hood.evaluation.grid import GUESS, NEWTON, model_name
 from hood.evaluation.spectrum import spectrum_rows
 from hood.evaluation.table import Candidate, GapSettings, Measured, candidate_rows, measure
 from hood.losses.potential import Potential
@@ -74,10 +66,10 @@ def run(overrides: Sequence[str]) -> int:
         raise ConfigError(
             f"spectrum={config.spectrum}: it is computed of the states of gap_states, which is 0; give gap_states >= 1"
         )
-    pictures = ("contact_sheets=true", bool(config.contact_sheets)), ("spectrum=picture", config.spectrum == "picture")
-    drawn = [setting for setting, wanted in pictures if wanted]
-    if drawn:
-        require_package("PIL", "Pillow", "pictures", drawn[0])
+    if bool(config.contact_sheets):
+        require_package("PIL", "Pillow", "pictures", "contact_sheets=true")
+    if config.spectrum == "picture":
+        require_package("matplotlib", "matplotlib", "charts", "spectrum=picture")
     return together(lambda: _evaluate(config, overrides))
 
 
@@ -173,44 +165,6 @@ def _prepare(config: DictConfig, folder: Path) -> None:
     save_run_record(folder, config, int(config.seed))
 
 
-def make_candidate(name: str, config: DictConfig) -> Candidate:
-    """A checkpoint by name or path, ``newton`` for the solver, ``guess`` for where it starts, or ``untrained:MODEL`` for seeded
-    random weights; all but the solver with ``+k`` behind the name: every step refined by k iterations."""
-    found = re.fullmatch(r"(.+)\+(\d+)", name)
-    if found is None:
-        return _unrefined_candidate(name, config)
-    if found[1] == NEWTON:
-        raise ConfigError(f"models: {name!r} refines what is solved already; {GUESS}+{found[2]} is the solver stopped early")
-    inner = _unrefined_candidate(found[1], config)
-    potential, settings = build(config.losses), build(config.solver)
-    stepper = RefinedStepper(inner.stepper, potential, Count(int(found[2])), str(config.refine_method), settings)
-    return Candidate(f"{inner.name}+{found[2]}", inner.weights, stepper, inner.training)
-
-
-def _unrefined_candidate(name: str, config: DictConfig) -> Candidate:
-    if name == GUESS:
-        guess = GuessStepper(build(config.losses))
-        guess.gravity = guess.gravity.to(str(config.device))
-        return Candidate(GUESS, "none", guess)
-    if name == NEWTON:
-        stepper = NewtonStepper(build(config.losses), build(config.solver))
-        stepper.gravity = stepper.gravity.to(str(config.device))
-        return Candidate(NEWTON, "none", stepper)
-    prefix = UNTRAINED + ":"
-    if name.startswith(prefix):
-        model = name[len(prefix) :]
-        if model not in options("model"):
-            raise ConfigError(f"models: unknown model {model!r} in {name!r}; known are {', '.join(options('model'))}")
-        torch.manual_seed(int(config.seed))
-        simulator = build(load_config("rollout", [f"model={model}"]).model)
-        use_arithmetic(simulator, config)
-        return Candidate(model, UNTRAINED, simulator.eval().to(str(config.device)))
-    path = locate("weights", name)
-    simulator = read_model(path, float(config.fps)).to(str(config.device))
-    use_arithmetic(simulator, config)
-    return Candidate(model_name(str(path)), path.name, simulator, training_note(path))
-
-
 @dataclass
 class Plan:
     """What is evaluated: every candidate with every garment on every motion."""
@@ -239,16 +193,19 @@ def make_plan(config: DictConfig) -> Plan:
     """Candidates, garments and motions named in the config.
 
     Raises:
-        ConfigError: two garments with one name.
+        ConfigError: two models or two garments with one name.
     """
     candidates = [make_candidate(str(name), config) for name in config.models]
+    titles = [candidate.name for candidate in candidates]
+    if len(set(titles)) < len(titles):
+        raise ConfigError(f"models={plain(config.models)}: names must differ, these are {', '.join(titles)}; rename a file")
     motions = expand_sequences([str(name) for name in config.sequences]) or motion_split()["validation"]
     garments = [load_garment(str(name)) for name in config.garments]
     names = [garment.name for garment in garments]
     if len(set(names)) < len(names):
         raise ConfigError(f"garments={plain(config.garments)}: names must differ, these are {', '.join(names)}")
     shapes = [shape_coefficients(given, "shapes") for given in config.shapes]
-    digests = [_digest(candidate) for candidate in candidates]
+    digests = [digest(candidate) for candidate in candidates]
     return Plan(config, candidates, digests, dict(zip(names, garments, strict=True)), motions, shapes)
 
 
@@ -264,18 +221,6 @@ def _scene(plan: Plan, unit: Unit) -> Scene:
         return standing_scene(garment, body, int(config.drift_frames), material, fps, device=str(config.device))
     sequence = _sequence(unit.motion, fps)
     return build_scene(garment, body, sequence, material, plan.shapes[unit.shape], device=str(config.device))
-
-
-def _digest(candidate: Candidate) -> str:
-    """SHA-256 of the weights: results are not taken over from others that had the same name."""
-    stepper = unrefined(candidate.stepper)
-    if not isinstance(stepper, Simulator):
-        return "none"
-    content = hashlib.sha256()
-    for name, value in stepper.state_dict().items():
-        content.update(name.encode())
-        content.update(value.detach().cpu().contiguous().numpy().tobytes())
-    return content.hexdigest()
 
 
 def _check_lists(config: DictConfig) -> None:

@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from hood.assets.library import locate
 from hood.commands.batch import Job, find_jobs, share
-from hood.commands.common import UNTRAINED, prepare_folder, read_model, require_device, together, use_arithmetic
+from hood.commands.common import UNTRAINED, output_folder, prepare_folder, read_model, require_device, together, use_arithmetic
 from hood.commands.dial import check_dial, exported, refined
 from hood.commands.performance import make_motion
 from hood.commands.summary import describe, describe_all, summarise
@@ -52,7 +52,7 @@ def run(overrides: Sequence[str]) -> int:
 
 def _run(config: DictConfig) -> int:
     """One motion, or each of many in a folder of its own; processes that torchrun started share the many."""
-    output = Path(str(config.output)).expanduser()
+    output = output_folder(config)
     jobs = distributed.on_main(lambda: find_jobs(str(config.sequence), output))
     if jobs is not None:
         return _run_all(config, jobs, output)
@@ -65,7 +65,7 @@ def _run_one(config: DictConfig, stepper: Stepper, digest: str) -> tuple[dict[st
     """The rollout of one motion with all its files: the summary, and whether the user interrupted it."""
     scene = make_scene(config)
     stepper = refined(stepper, config, scene.cloth.num_vertices)
-    folder = prepare_folder(Path(str(config.output)).expanduser())
+    folder = prepare_folder(output_folder(config))
     (folder / "summary.json").unlink(missing_ok=True)  # its presence says that everything is there
     save_run_record(folder, config, int(config.seed))
     interrupted = _simulate_to_disk(config, scene, stepper, digest, folder / "rollout.h5")

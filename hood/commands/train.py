@@ -17,7 +17,7 @@ from hood.assets.garment import load_garment
 from hood.assets.library import motion_split
 from hood.assets.motions import MotionFiles, find_motions
 from hood.assets.sequence import load_sequence
-from hood.commands.common import prepare_folder, require_device, require_same_config, together
+from hood.commands.common import output_folder, prepare_folder, require_device, require_same_config, together
 from hood.config import ConfigError, build, load_config, plain, require_choice, save_run_record
 from hood.dynamics.simulator import Simulator
 from hood.evaluation.validation import Validation
@@ -53,7 +53,7 @@ def run(overrides: Sequence[str]) -> int:
 def _train(config: DictConfig) -> int:
     trainer = make_trainer(config)
     main = distributed.rank() == 0
-    folder = Path(str(config.output)).expanduser()
+    folder = output_folder(config)
     if distributed.on_main(lambda: _is_resumed(config, prepare_folder(folder), trainer.checkpoint_path)):
         trainer.resume(trainer.checkpoint_path)
     distributed.on_main(lambda: save_run_record(folder, config, int(config.seed)))
@@ -101,7 +101,7 @@ def make_trainer(config: DictConfig) -> Trainer:
         device=str(config.device),
     )
     potential = build(config.losses)
-    folder = Path(str(config.output)).expanduser()
+    folder = output_folder(config)
     watch = _make_watch(config, sampler, potential, folder) if settings.validate_every else None
     return Trainer(simulator, potential, sampler, settings, folder, int(config.seed), watch)
 

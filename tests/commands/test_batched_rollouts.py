@@ -199,12 +199,12 @@ def test_refined_candidates(motions: Path, capsys: pytest.CaptureFixture[str]) -
     assert "guess+2 is the solver stopped early" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("setting", ["contact_sheets=true", "spectrum=picture"])
+@pytest.mark.parametrize("setting, library", [("contact_sheets=true", "Pillow"), ("spectrum=picture", "matplotlib")])
 def test_pictures_without_the_picture_library_are_refused_before_any_work(
-    setting: str, motions: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    setting: str, library: str, motions: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     given = [text for text in EVALUATE if not text.startswith(("gap_states", "output"))]
     assert main([*given, "gap_states=1", setting, "output=none"]) == 2
-    assert f"{setting}: drawing needs Pillow" in capsys.readouterr().err
+    assert f"{setting}: drawing needs {library}" in capsys.readouterr().err
     assert not (motions.parent / "none").exists()
