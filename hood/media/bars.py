@@ -26,6 +26,8 @@ def write_bars(panels: Mapping[str, Panel], path: Path) -> None:
     for axes, (title, panel) in zip(rows, panels.items(), strict=False):
         for index, name in enumerate(series):
             places = [place for place, values in enumerate(panel.values()) if name in values]
+            if not places:
+                continue
             axes.bar(
                 [place + index / (len(series) + 1) for place in places],
                 [values[name] for values in panel.values() if name in values],
@@ -37,6 +39,7 @@ def write_bars(panels: Mapping[str, Panel], path: Path) -> None:
             )
         axes.set_title(title, loc="left", fontsize=10)
         axes.set_xticks([place + 0.5 * len(series) / (len(series) + 1) for place in range(len(panel))], list(panel), fontsize=8)
+        axes.set_xlim(-0.1, len(panel))
         axes.legend(fontsize=8, frameon=False)
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(axis="y", color="#e6e6e6")
