@@ -5,6 +5,7 @@
     python benchmarks/recipes.py passes                     # how many times a model looks at what it predicts
     python benchmarks/recipes.py ablations                  # Fine15, Fine48 and Ours with equal updates and with equal time
     python benchmarks/recipes.py levels                     # the small model with one, two and three levels
+    python benchmarks/recipes.py shipped                    # both again, told what the potential asks of single vertices
 
 Every run is ``hood train`` in a process of its own with one thread, ``--jobs`` of them side by side; its time is the CPU time
 of that process, so that a busy machine changes nothing. Every finished run is evaluated by ``hood evaluate`` on motions it
@@ -27,6 +28,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 SMALL = ("model=small",)
+#: The small model's size, told what the potential asks of single vertices and taking a share of it: one pass of model=passes.
+ONE_PASS = (*SMALL, "model.features=local", "model.output=local_steps")
 #: The small model's size in the paper's parametrisation.
 SMALL_PAPER = (
     "model=ours",
@@ -35,6 +38,7 @@ SMALL_PAPER = (
 )
 PAPER_SCALE = 0.01  # of the paper's 150,000 iterations
 EQUAL_UPDATES = 600
+SHIPPED_UPDATES = 800
 
 EVALUATION = ("garments=[tshirt,trousers,dress,skirt]", "num_frames=60", "gap_states=4", "gap_iterations=100")
 COLUMNS = ("recipe", "seed", "updates", "cpu_s", "gap", "gap_p95", "strain_p99", "rg", "penetration", "ms", "failed_at")
@@ -67,6 +71,11 @@ FIVE_PASSES = (
     "1x(mesh+coarse0) | 1x(coarse0+coarse1) 1x(mesh+coarse0) | 1x(coarse1+coarse2) 1x(coarse0+coarse1) 1x(mesh+coarse0) | "
     "1x(mesh+coarse0) | 2x(mesh)"
 )
+LEVELS = {
+    "small1": "8x(mesh)",
+    "small2": "2x(mesh+coarse0) 4x(coarse0+coarse1) 2x(mesh+coarse0)",
+    "small3": "2x(mesh+coarse0) 1x(coarse0+coarse1) 2x(coarse1+coarse2) 1x(coarse0+coarse1) 2x(mesh+coarse0)",
+}
 EIGHT_PASSES = fast("8 passes, 11 steps", SHORT, "model=passes")
 
 SUITES: dict[str, list[Recipe]] = {
@@ -104,10 +113,10 @@ SUITES: dict[str, list[Recipe]] = {
         fast("ours, equal time", round(0.92 * EQUAL_UPDATES), *SMALL, "model.schedule=ours"),
         fast("fine48, equal time", round(0.36 * EQUAL_UPDATES), *SMALL, "model.schedule=fine48"),
     ],
-    "levels": [
-        fast("small1", EQUAL_UPDATES, *SMALL, "model.schedule='8x(mesh)'"),
-        fast("small2", EQUAL_UPDATES, *SMALL, "model.schedule='2x(mesh+coarse0) 4x(coarse0+coarse1) 2x(mesh+coarse0)'"),
-        fast("small3", EQUAL_UPDATES, *SMALL),
+    "levels": [fast(name, EQUAL_UPDATES, *SMALL, f"model.schedule='{schedule}'") for name, schedule in LEVELS.items()],
+    "shipped": [
+        fast(f"{name}, one pass", SHIPPED_UPDATES, *ONE_PASS, f"model.schedule='{schedule}'")
+        for name, schedule in ({name: name for name in ("fine15", "ours", "fine48")} | LEVELS).items()
     ],
 }
 
