@@ -142,6 +142,7 @@ ERRORS: dict[str, tuple[list[str], tuple[str, ...], Prepare]] = {
         lambda: tiny_model(Path("small.safetensors")),
     ),
     "spectrum of nothing": (["evaluate", "spectrum=table", "gap_states=0", "output=run"], ("gap_states",), lambda: None),
+    "no rollouts": (["evaluate", "max_rollouts=0", "output=run"], ("max_rollouts=0", "at least 1"), lambda: None),
     "evaluated frames": (["evaluate", "num_frames=1", "output=run"], ("num_frames=1",), lambda: None),
 }  # fmt: skip
 

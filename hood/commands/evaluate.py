@@ -79,13 +79,16 @@ def _evaluate(config: DictConfig, overrides: Sequence[str]) -> int:
     distributed.on_main(lambda: _prepare(config, folder))
     diary = Diary(folder, distributed.rank())
     done = {key: item for part in distributed.gather(diary.read(plan.digests)) for key, item in part.items()}
-    todo = [unit for unit in plan.units if unit not in done][distributed.rank() :: distributed.world_size()]
+    todo = [unit for unit in plan.units if unit not in done][: config.max_rollouts]
     if done and distributed.rank() == 0:
         print(f"{len(done)} of {len(plan.units)} rollouts were done before")
-    mine = _measure(config, plan, todo, diary)
+    mine = _measure(config, plan, todo[distributed.rank() :: distributed.world_size()], diary)
     measured = done | {key: item for part in distributed.gather(mine) for key, item in part.items()}
     if distributed.rank() == 0:
-        _report(plan, measured, folder, overrides)
+        if len(measured) < len(plan.units):
+            print(f"{len(measured)} of {len(plan.units)} rollouts are done; resume=true does the rest and writes the tables")
+        else:
+            _report(plan, measured, folder, overrides)
     return 0
 
 
@@ -158,7 +161,7 @@ def _report(plan: Plan, measured: Mapping[Unit, Measured], folder: Path, overrid
 def _prepare(config: DictConfig, folder: Path) -> None:
     prepare_folder(folder)
     if bool(config.resume):
-        require_same_config(config, folder, ("resume", "output"))
+        require_same_config(config, folder, ("resume", "output", "max_rollouts"))
     else:
         for path in folder.glob("rollouts.*.jsonl"):
             path.unlink()
@@ -233,6 +236,8 @@ def _check_lists(config: DictConfig) -> None:
 def _check_numbers(config: DictConfig) -> None:
     if not (math.isfinite(config.fps) and config.fps > 0):
         raise ConfigError(f"fps={config.fps:g}: must be a number of frames per second above 0, e.g. fps=30")
+    if config.max_rollouts is not None and int(config.max_rollouts) < 1:
+        raise ConfigError(f"max_rollouts={config.max_rollouts}: must be at least 1; null for all")
     for key, least, why in (
         ("num_frames", 4, "the first frames are not timed"),
         ("drift_frames", 0, "0 measures no drift"),

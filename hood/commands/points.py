@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import shlex
 import signal
@@ -28,6 +29,10 @@ from hood.evaluation.reached import read_record
 
 #: What a point is measured with, before the arguments of ``hood``.
 PROGRAM = (sys.executable, "-m", "hood.cli")
+#: Written by ``hood evaluate`` when all its rollouts are done.
+_TABLE = "table.json"
+#: Times of the turns that a point has had.
+_TURNS = "turns.json"
 #: Seconds that an interrupted process has to end.
 _PATIENCE = 20.0
 
@@ -63,14 +68,18 @@ class _Running:
 class Points:
     """The points of a chart on disk: one folder each below ``folder``.
 
+    A machine shared with others is faster at some hours than at others. So a point's rollouts are measured in several turns and
+    the points of a size take turns: what one of them meets, all meet, and it shows in the spread over rollouts.
+
     Args:
         jobs: points side by side, one thread each.
         device: its name, written down with every point.
+        turns: in which a point's rollouts are measured.
         program: what stands for ``hood``.
     """
 
-    def __init__(self, folder: Path, jobs: int, device: str, program: Sequence[str] = PROGRAM) -> None:
-        self.folder, self.jobs, self.device, self.program = folder, jobs, device, tuple(program)
+    def __init__(self, folder: Path, jobs: int, device: str, turns: int = 1, program: Sequence[str] = PROGRAM) -> None:
+        self.folder, self.jobs, self.device, self.turns, self.program = folder, jobs, device, turns, tuple(program)
 
     def folder_of(self, point: Point) -> Path:
         return self.folder / point.folder
@@ -88,39 +97,53 @@ class Points:
 
         An interruption ends the processes; the rollouts they had finished are not done again.
         """
-        waiting = deque(point for point in points if not self.is_done(point))
-        running: list[_Running] = []
+        todo = [point for point in points if not self.is_done(point)]
+        for point in todo:
+            (self.folder_of(point) / _TABLE).unlink(missing_ok=True)  # its presence says that all rollouts are there
         failures: list[Failure] = []
         with (
-            tqdm(total=len(points), initial=len(points) - len(waiting), desc="trade-off", unit="point") as bar,
+            tqdm(total=len(points), initial=len(points) - len(todo), desc="trade-off", unit="point") as bar,
             _interruptible(),
         ):
-            try:
-                while waiting or running:
-                    while waiting and len(running) < self.jobs:
-                        running.append(self._start(waiting.popleft()))
-                    text = ", ".join(self._progress(item.point) for item in running)
-                    if text != bar.postfix:
-                        bar.set_postfix_str(text)
-                    time.sleep(0.1)
-                    for item in [item for item in running if item.ended()]:
-                        running.remove(item)
-                        failures += self._finish(item)
-                        bar.update()
-            finally:
-                _end(running)
+            for size in dict.fromkeys(point.size for point in todo):
+                failures += self._take_turns([point for point in todo if point.size == size], bar)
+        return failures
+
+    def _take_turns(self, points: Sequence[Point], bar: tqdm[Any]) -> list[Failure]:
+        waiting, running, failures = deque(points), list[_Running](), list[Failure]()
+        try:
+            while waiting or running:
+                while waiting and len(running) < self.jobs:
+                    running.append(self._start(waiting.popleft()))
+                text = ", ".join(self._progress(item.point) for item in running)
+                if text != bar.postfix:
+                    bar.set_postfix_str(text)
+                time.sleep(0.1)
+                for item in [item for item in running if item.ended()]:
+                    running.remove(item)
+                    self._note_turn(item)
+                    if item.process.returncode == 0 and not (self.folder_of(item.point) / _TABLE).exists():
+                        waiting.append(item.point)
+                        continue
+                    failures += self._finish(item)
+                    bar.update()
+        finally:
+            _end(running)
         return failures
 
     def _start(self, point: Point) -> _Running:
         folder = self.folder_of(point)
         folder.mkdir(parents=True, exist_ok=True)
         begun = any(folder.glob("rollouts.*.jsonl"))
+        if not begun:
+            (folder / _TURNS).unlink(missing_ok=True)
         arguments = [
             *self.program,
             "evaluate",
             *point.settings,
             f"output={quoted(str(folder))}",
             f"resume={str(begun).lower()}",
+            f"max_rollouts={math.ceil(point.rollouts / self.turns)}",
         ]
         load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
         with open(self.log_of(point), "ab") as sink:
@@ -131,19 +154,27 @@ class Points:
             )
         return _Running(point, process, time.monotonic(), load)
 
+    def _note_turn(self, item: _Running) -> None:
+        turn = {"seconds": time.monotonic() - item.begin, "cpu_seconds": item.cpu_seconds, "load_at_start": item.load}
+        path = self.folder_of(item.point) / _TURNS
+        write_atomically(path, json.dumps([*_turns(path), turn]).encode())
+
     def _finish(self, item: _Running) -> list[Failure]:
         if item.process.returncode:
             return [Failure(item.point, self._complaint(item), self.log_of(item.point))]
-        seconds = time.monotonic() - item.begin
+        turns = _turns(self.folder_of(item.point) / _TURNS)
+        seconds = sum(turn["seconds"] for turn in turns)
+        spent = [turn["cpu_seconds"] for turn in turns]
         record: dict[str, Any] = {
             "command": item.point.command,
             "weights": weights_digest(item.point),
             "device": self.device,
             "jobs": self.jobs,
-            "load_at_start": item.load,
+            "turns": len(turns),
+            "load_at_start": max(turn["load_at_start"] for turn in turns),
             "seconds": seconds,
             # A process alone on its processor has all of its time.
-            "cpu_share": None if item.cpu_seconds is None else item.cpu_seconds / seconds,
+            "cpu_share": None if None in spent else sum(spent) / seconds,
         }
         write_atomically(self.folder_of(item.point) / "point.json", json.dumps(record, indent=1).encode())
         return []
@@ -160,6 +191,15 @@ class Points:
         folder = self.folder_of(point)
         lines = sum(path.read_bytes().count(b'"unit"') for path in folder.glob("rollouts.*.jsonl"))
         return f"{point.size} {point.label}: {lines} rollouts"
+
+
+def _turns(path: Path) -> list[dict[str, Any]]:
+    """The turns that a point has had."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return []
+    return found if isinstance(found, list) else []
 
 
 def _end(running: Sequence[_Running]) -> None:

@@ -13,6 +13,7 @@ from omegaconf import DictConfig
 from hood.assets.atomic import write_atomically
 from hood.assets.garment import load_garment
 from hood.assets.library import names
+from hood.commands.batch import expand_sequences
 from hood.commands.circumstances import device_name
 from hood.commands.common import output_folder, prepare_folder, require_same_config
 from hood.commands.points import Failure, Points
@@ -32,7 +33,7 @@ _LARGEST = ("fine15", "ours")
 #: Measured with all iterations at every size where nothing else is said.
 _DIAL = "ours"
 #: Settings that may change from one call to the next: they add points or leave some out, and change none.
-_FREE = ("models", "precisions", "refine_methods", "newton", "dial", "jobs", "measure", "output")
+_FREE = ("models", "precisions", "refine_methods", "newton", "dial", "jobs", "turns", "measure", "output")
 _FREE_BY_SIZE = ("refine", "guess", "models", "precisions")
 
 
@@ -47,7 +48,8 @@ def run(overrides: Sequence[str]) -> int:
     points, vertices = grid.points(), _vertices(grid)
     check_points(points)
     device = str(config.device)
-    store = Points(folder / "points", int(config.jobs), f"{'CPU' if device == 'cpu' else 'GPU'} ({device_name(device)})")
+    name = f"{'CPU' if device == 'cpu' else 'GPU'} ({device_name(device)})"
+    store = Points(folder / "points", int(config.jobs), name, int(config.turns))
     if not config.measure and not any(store.is_done(point) for point in points):
         raise ConfigError(f"measure=false: {folder} holds none of these points; leave measure out, or give their output")
     free = (*_FREE, *(f"{key}_{size}" for key in _FREE_BY_SIZE for size in SIZES))
@@ -76,13 +78,15 @@ def chosen_models(config: DictConfig) -> tuple[list[str], list[str]]:
 
 def make_grid(config: DictConfig, models: Sequence[str]) -> Grid:
     """The grid that the config describes."""
-    shared = [listed("sequences", [str(name) for name in config.sequences])]
+    sequences = [str(name) for name in config.sequences]
+    shared = [listed("sequences", sequences)]
     if str(config.device) != "cpu":
         shared.append(f"device={config.device}")
     sizes = tuple(_size(config, name, models) for name in SIZES)
     precisions, methods = (tuple(map(str, config[key])) for key in ("precisions", "refine_methods"))
     settings = (*shared, *(str(text) for text in config.settings))
-    return Grid(tuple(models), precisions, methods, sizes, settings, bool(config.newton))
+    motions = len(expand_sequences(sequences))
+    return Grid(tuple(models), precisions, methods, sizes, settings, bool(config.newton), motions)
 
 
 def _size(config: DictConfig, name: str, models: Sequence[str]) -> Size:

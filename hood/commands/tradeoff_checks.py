@@ -20,6 +20,7 @@ from hood.nn.precision import PRECISIONS, TF32, check_precision
 #: Keys of ``hood evaluate`` that every point sets by itself.
 _OWN = (
     "models", "garments", "sequences", "num_frames", "gap_states", "precision", "refine_method", "device", "output", "resume",
+    "max_rollouts",
 )  # fmt: skip
 
 
@@ -27,8 +28,9 @@ def check_config(config: DictConfig, sizes: Sequence[str]) -> None:
     """Raise ConfigError where a key cannot be meant; names it."""
     require_device(config)
     require_package("matplotlib", "matplotlib", "charts", "hood tradeoff")
-    if int(config.jobs) < 1:
-        raise ConfigError(f"jobs={config.jobs}: must be at least 1")
+    for key in ("jobs", "turns"):
+        if int(config[key]) < 1:
+            raise ConfigError(f"{key}={config[key]}: must be at least 1")
     for key, known in (("refine_methods", METHODS), ("precisions", (*PRECISIONS, TF32))):
         given = [str(name) for name in config[key]]
         if not given or not set(given) <= set(known):

@@ -116,18 +116,23 @@ def at_equal_time(item: Reached, networks: Sequence[Reached]) -> AtEqualTime | N
 
 @dataclass(frozen=True)
 class Refined:
-    """A refined network beside the same one alone; ``stretched``: rollouts in which refinement raised the strain."""
+    """A refined network beside the same one alone, rollout by rollout.
+
+    Args:
+        stretched: rollouts in which refinement raised the p99 strain.
+        deeper: rollouts in which it raised the share of vertices deeper than 2 mm.
+    """
 
     reached: Reached
     plain: Reached
     stretched: int
+    deeper: int
 
     @property
     def worse(self) -> bool:
-        """Whether the median strain is higher than without refinement, or vertices deeper than 2 mm more frequent."""
-        return not (
-            self.reached.strain_p99 <= self.plain.strain_p99 and self.reached.penetration <= self.plain.penetration
-        )  # what is not finite is worse
+        """Whether strain or penetration is higher than without refinement, as a median over rollouts; what is not finite is."""
+        pairs = ((self.reached.strains, self.plain.strains), (self.reached.penetrations, self.plain.penetrations))
+        return not all(np.median(here) <= np.median(there) for here, there in pairs)
 
 
 def refined_networks(reached: Sequence[Reached]) -> list[Refined]:
@@ -137,8 +142,9 @@ def refined_networks(reached: Sequence[Reached]) -> list[Refined]:
     for item in (item for item in reached if not item.point.alone and item.point.refine):
         own = plain.get((item.point.model, item.point.precision, item.point.size))
         if own is not None:
-            pairs = zip(item.strains, own.strains, strict=False)
-            found.append(Refined(item, own, sum(not here <= there for here, there in pairs)))
+            both = (item.strains, own.strains), (item.penetrations, own.penetrations)
+            counts = (sum(not here <= there for here, there in zip(*pair, strict=False)) for pair in both)
+            found.append(Refined(item, own, *counts))
     return found
 
 

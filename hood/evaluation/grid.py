@@ -52,6 +52,7 @@ class Point:
         model: name or path of the weights, or :data:`GUESS` or :data:`NEWTON`.
         method: of the refinement.
         settings: ``key=value`` of the command.
+        rollouts: how many that makes.
     """
 
     size: str
@@ -60,6 +61,7 @@ class Point:
     precision: str
     method: str
     settings: tuple[str, ...]
+    rollouts: int = 1
 
     @property
     def alone(self) -> bool:
@@ -108,6 +110,7 @@ class Grid:
 
     Args:
         settings: further ``key=value`` of every command: motions, device and the like.
+        motions: how many these are.
     """
 
     models: tuple[str, ...]
@@ -116,6 +119,7 @@ class Grid:
     sizes: tuple[Size, ...]
     settings: tuple[str, ...] = ()
     newton: bool = True
+    motions: int = 1
 
     def points(self) -> list[Point]:
         """All points, small garments first.
@@ -160,7 +164,7 @@ class Grid:
             *([f"refine_method={method}"] if refine else []),
             *self.settings,
         ]
-        return Point(size.name, model, refine, precision, method, tuple(settings))
+        return Point(size.name, model, refine, precision, method, tuple(settings), len(size.garments) * self.motions)
 
 
 def model_name(model: str) -> str:

@@ -53,6 +53,7 @@ class Reached:
     penetration: float  # mean share of vertices deeper than 2 mm
     depth: float  # m, mean over frames of the deepest vertex
     strains: tuple[float, ...]  # strain_p99 of every rollout, median over its frames
+    penetrations: tuple[float, ...]  # share of vertices deeper than 2 mm of every rollout, mean over its frames
     parts: Mapping[str, float]  # ms, mean over frames, of PARTS
     rollouts: int
     frames: int
@@ -130,6 +131,7 @@ def summarise(point: Point, rollouts: Sequence[Measured], vertices: int, record:
         float(np.mean([frame.get("penetration_share", 0.0) for frame in frames])),
         float(np.mean([frame.get("penetration_depth", 0.0) for frame in frames])),
         tuple(float(np.median([frame["strain_p99"] for frame in one.frames] or [np.nan])) for one in rollouts),
+        tuple(float(np.mean([frame.get("penetration_share", 0.0) for frame in one.frames] or [np.nan])) for one in rollouts),
         {name: float(np.mean([sum(f.get(key, 0.0) for key in keys) for f in frames])) for name, keys in PARTS.items()},
         rollouts=len(rollouts),
         frames=len(frames),

@@ -25,8 +25,8 @@ EQUAL_TIME = (
 )
 REFINED = (
     "Every iteration lowers the energy of its frame, but a rollout could still come out worse. So the same rollouts with and "
-    "without: median p99 strain, mean share of vertices deeper than 2 mm under the skin, and the deepest vertex, mean over "
-    "frames. Worse is what has more of the strain or of the share."
+    "without: p99 strain, median over rollouts; share of vertices deeper than 2 mm under the skin and the deepest vertex, "
+    "means over frames; and how many rollouts have more than without. Worse is where the median rollout has more of either."
 )
 COMMANDS = (
     "Every point is one command; run it to check the point. It prints the point's table and writes it to outputs/evaluate. "

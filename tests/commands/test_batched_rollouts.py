@@ -136,6 +136,21 @@ EVALUATE = ["evaluate", "models=[newton]", "garments=[tank]", "sequences=[motion
             "solver.max_iterations=1", "output=table"]  # fmt: skip
 
 
+def test_an_evaluation_in_several_calls_ends_with_the_tables_of_one(motions: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*EVALUATE, "max_rollouts=2"]) == 0
+    assert "2 of 3 rollouts are done" in capsys.readouterr().out
+    assert not (motions.parent / "table" / "table.json").exists()
+    assert main([*EVALUATE, "max_rollouts=2", "resume=true"]) == 0
+    parts = json.loads((motions.parent / "table" / "table.json").read_text())
+    assert main(EVALUATE) == 0
+    whole = json.loads((motions.parent / "table" / "table.json").read_text())
+    times = {"ms", "ms_p99", "fps"}
+    for one, other in zip(parts, whole, strict=True):
+        assert {k: v for k, v in one.items() if k.removesuffix("_low").removesuffix("_high") not in times} == {
+            k: v for k, v in other.items() if k.removesuffix("_low").removesuffix("_high") not in times
+        }
+
+
 def test_finished_rollouts_of_an_evaluation_survive(
     motions: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

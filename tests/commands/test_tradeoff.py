@@ -25,6 +25,7 @@ from hood.commands.points import Points
 from hood.commands.tradeoff import chosen_models, make_grid
 from hood.config import load_config
 from hood.dynamics.simulator import build_simulator, save_simulator
+from hood.evaluation.grid import Grid, Size
 from hood.media import tradeoff_page
 
 #: Stands for ``hood``: writes what ``hood evaluate`` would, and its own name into calls.txt. "bad" fails, "slow" sleeps.
@@ -46,6 +47,8 @@ measured = {"frames": frames, "failures": [], "gaps": gaps, "drifts": []}
 with open(folder / "rollouts.0.jsonl", "a") as file:
     file.write("\\n" + json.dumps({"unit": [0, "tank", "walk", 0], "weights": "none", "measured": measured}) + "\\n")
 if "slow" in name: time.sleep(60)
+rollouts = (folder / "rollouts.0.jsonl").read_text().count("unit")
+if "twice" not in name or rollouts > 1: (folder / "table.json").write_text("[]")
 """
 COMMAND = [
     "tradeoff", "models=[untrained:small]", "precisions=[fp32]", "garments_1k=[tank]", "refine_1k=[0,2]", "guess_1k=[2,5]",
@@ -68,8 +71,8 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tradeoff_page, "_pictures", lambda study, folder: collections.defaultdict(str))
 
 
-def store(jobs: int = 2) -> Points:
-    return Points(Path("points"), jobs, "CPU (made up)", (sys.executable, "-I", "fake.py"))
+def store(jobs: int = 2, turns: int = 1) -> Points:
+    return Points(Path("points"), jobs, "CPU (made up)", turns, (sys.executable, "-I", "fake.py"))
 
 
 def write_model(path: Path) -> None:
@@ -124,6 +127,25 @@ def test_what_is_done_is_not_done_again(tmp_path: Path, capsys: pytest.CaptureFi
     (store().folder_of(points[1]) / "point.json").unlink()
     store().measure(points)
     assert calls()[3:] == ["[untrained:small+2] true"]
+
+
+def test_the_points_of_a_size_take_turns() -> None:
+    for name in ("twice_a", "twice_b"):
+        Path(f"{name}.safetensors").write_bytes(b"weights")
+    points = tiny_grid("twice_a.safetensors", "twice_b.safetensors", refine=(0,)).points()
+    assert store(jobs=1, turns=2).measure(points) == []
+    a, b = "[twice_a.safetensors]", "[twice_b.safetensors]"
+    assert calls() == [f"{a} false", f"{b} false", "[guess+2] false", f"{a} true", f"{b} true"]
+    record = json.loads((store().folder_of(points[0]) / "point.json").read_text())
+    assert record["turns"] == 2
+    assert record["seconds"] > 0.0
+
+
+def test_a_turn_is_a_share_of_the_rollouts() -> None:
+    sizes = (Size("1k", ("tank", "dress"), (0,), (), 5, 1),)
+    points = Grid(("untrained:small",), ("fp32",), ("newton",), sizes, newton=False, motions=2).points()
+    store(turns=3).measure(points)
+    assert "max_rollouts=2" in store().log_of(points[0]).read_text()
 
 
 def test_other_weights_of_the_same_name_are_measured_anew() -> None:
@@ -240,6 +262,7 @@ REFUSED = {
     "no such method": (["refine_methods=[sweep]"], "give some of newton, sweeps"),
     "no such precision": (["precisions=[fp8]"], "give some of fp32, bf16, tf32"),
     "no jobs": (["jobs=0"], "jobs=0: must be at least 1"),
+    "no turns": (["turns=0"], "turns=0: must be at least 1"),
     "no states": (["states_1k=0"], "γ is what the chart shows"),
     "few frames": (["frames_1k=3"], "frames_1k=3: must be at least 4"),
     "half an iteration": (["refine_1k=[0.5]"], "refine_1k: 0.5 is no number of iterations"),

@@ -161,12 +161,14 @@ def test_refinement_is_held_against_the_same_network_at_the_same_size() -> None:
         exact("net", 5, 900.0, 0.1, strain=0.08, size="4k"), *solver(CURVE),
     ]  # fmt: skip
     found = refined_networks(items)
-    assert [(one.reached.point.refine, one.plain is items[0], one.stretched, one.worse) for one in found] == [
-        (5, True, 0, False), (2, True, 8, True),
+    assert [(one.reached.point.refine, one.plain is items[0], one.stretched, one.deeper, one.worse) for one in found] == [
+        (5, True, 0, 0, False), (2, True, 8, 0, True),
     ]  # fmt: skip
 
 
 def test_refinement_that_pushes_cloth_into_the_body_or_breaks_down_is_worse() -> None:
-    plain, deeper = exact("net", 0, 1.0, 1.0), replace(exact("net", 5, 1.0, 1.0), penetration=1e-3)
+    plain, deeper = exact("net", 0, 1.0, 1.0), replace(exact("net", 5, 1.0, 1.0), penetrations=(1e-3,) * 8)
+    once = replace(exact("net", 20, 1.0, 1.0), penetrations=(1e-3, *(0.0,) * 7))
     broken = exact("net", 10, 1.0, 1.0, strain=float("nan"))
-    assert [(one.worse, one.stretched) for one in refined_networks([plain, deeper, broken])] == [(True, 0), (True, 8)]
+    found = refined_networks([plain, deeper, once, broken])
+    assert [(one.worse, one.stretched, one.deeper) for one in found] == [(True, 0, 8), (False, 0, 1), (True, 8, 0)]
