@@ -17,8 +17,9 @@ from hood.assets.body import load_body
 from hood.assets.garment import load_garment
 from hood.assets.library import locate
 from hood.assets.sequence import load_sequence
+from hood.dynamics.checkpoint import load_simulator
 from hood.dynamics.rollout import prepare_stepper, simulate
-from hood.dynamics.simulator import Prediction, Simulator, load_simulator
+from hood.dynamics.simulator import Prediction, Simulator
 from hood.losses.potential import default_potential
 from hood.losses.problem import StepProblem
 from hood.scene.scene import build_scene

@@ -14,8 +14,9 @@ import torch
 from hood import __version__
 from hood.assets.library import names
 from hood.cli import main
+from hood.dynamics.checkpoint import save_simulator
 from hood.dynamics.recorder import read_rollout
-from hood.dynamics.simulator import build_simulator, save_simulator
+from hood.dynamics.simulator import build_simulator
 
 UNTRAINED = ["checkpoint=untrained", "model=small", "model.latent_dim=8", "model.schedule='1x(mesh+coarse0)'"]
 

@@ -11,8 +11,8 @@ import torch
 from omegaconf import DictConfig
 
 from hood.config import plain
+from hood.dynamics.checkpoint import read_header
 from hood.dynamics.reference import SUFFIXES
-from hood.dynamics.simulator import read_header
 from hood.evaluation.table_one import Circumstances
 
 #: Arguments that change nothing about the figures.

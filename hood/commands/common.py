@@ -13,8 +13,9 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from hood.config import ConfigError, plain, require_choice
+from hood.dynamics.checkpoint import load_simulator
 from hood.dynamics.reference import SUFFIXES, load_reference_checkpoint
-from hood.dynamics.simulator import Simulator, load_simulator
+from hood.dynamics.simulator import Simulator
 from hood.nn.compiled import check_kernels
 from hood.nn.precision import check_precision
 from hood.training import distributed

@@ -12,8 +12,9 @@ from omegaconf import DictConfig
 from hood.assets.library import locate
 from hood.commands.common import prepare_folder
 from hood.config import ConfigError, load_config
+from hood.dynamics.checkpoint import load_simulator, read_header, save_simulator
 from hood.dynamics.reference import SUFFIXES, read_reference_checkpoint
-from hood.dynamics.simulator import Simulator, load_simulator, read_header, save_simulator
+from hood.dynamics.simulator import Simulator
 
 _MODEL = ".safetensors"
 

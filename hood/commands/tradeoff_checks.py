@@ -11,9 +11,9 @@ from hood.assets.library import locate
 from hood.commands.batch import expand_sequences
 from hood.commands.common import UNTRAINED, require_device, require_distinct, require_package
 from hood.config import ConfigError, load_config, options, plain
+from hood.dynamics.checkpoint import read_header
 from hood.dynamics.reference import SUFFIXES
 from hood.dynamics.refine import METHODS
-from hood.dynamics.simulator import read_header
 from hood.evaluation.grid import GUESS, NEWTON, Point
 from hood.nn.precision import PRECISIONS, TF32, check_precision
 

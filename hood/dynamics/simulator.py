@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import inspect
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor, nn
 
-from hood.assets.atomic import write_atomically
 from hood.dynamics.frames import FrameRules
 from hood.dynamics.output import OUTPUTS, AccelerationOutput, LocalStepOutput, Output, VelocityBaseOutput
 from hood.dynamics.passes import Feedback, Passes
@@ -32,8 +27,6 @@ from hood.nn.schedule import edge_set_names, parse_passes, parse_schedule, set_l
 from hood.scene.cloth import Cloth
 from hood.scene.contact import find_nearest
 from hood.scene.state import State, StepInput
-
-_FORMAT = "hood-1"
 
 
 @dataclass(frozen=True)
@@ -324,68 +317,6 @@ _CONVENTIONS: dict[str, Any] = {
 def num_coarse_levels(schedule: Sequence[tuple[str, ...]]) -> int:
     """Coarse levels that a schedule works on."""
     return max(set_level(name) for name in edge_set_names(schedule))
-
-
-def save_simulator(path: Path, simulator: Simulator, metadata: Mapping[str, str] | None = None, half: bool = False) -> None:
-    """Write weights and model config as safetensors, atomically.
-
-    ``half`` stores what was learned in float16; statistics stay in float32, their counts are beyond its range.
-
-    Raises:
-        ValueError: a weight is beyond the range of float16.
-    """
-    learned = {name for name, _ in simulator.named_parameters()} if half else set()
-    tensors = {name: value.half() if name in learned else value for name, value in simulator.state_dict().items()}
-    for name in learned:
-        if not bool(torch.isfinite(tensors[name]).all()):
-            raise ValueError(f"{name}: a weight beyond the range of float16; keep this model in float32")
-    tensors = {name: value.contiguous() for name, value in tensors.items()}
-    header = {"format": _FORMAT, "model": json.dumps(simulator.config), **(metadata or {})}
-    write_atomically(path, save(tensors, header))
-
-
-def read_header(path: Path) -> dict[str, str]:
-    """What a model file says about itself beside its weights: ``model``, and where it comes from.
-
-    Raises:
-        ValueError: not a file written by :func:`save_simulator`.
-    """
-    return _read_file(path)[1]
-
-
-def load_simulator(path: Path) -> Simulator:
-    """Read a simulator written by :func:`save_simulator`.
-
-    Raises:
-        ValueError: not such a file, or weights that do not fit the model it names.
-    """
-    tensors, header = _read_file(path)
-    try:
-        simulator = build_simulator(**json.loads(header["model"]))
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: names a model that this version cannot build ({error}); train it again") from error
-    expected = simulator.state_dict()
-    wrong = [
-        name
-        for name in {*expected, *tensors}
-        if name not in tensors or name not in expected or tensors[name].shape != expected[name].shape
-    ]
-    if wrong:
-        raise ValueError(f"{path}: weights do not fit the model in the file, first at {sorted(wrong)[0]!r}; it is damaged")
-    simulator.load_state_dict({name: value.to(expected[name].dtype) for name, value in tensors.items()})
-    return simulator.eval()
-
-
-def _read_file(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    try:
-        with safe_open(path, framework="pt") as file:
-            header = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}
-    except SafetensorError as error:
-        raise ValueError(f"{path}: not a model file ({error}); give the model.safetensors of a run") from error
-    if header.get("format") != _FORMAT:
-        raise ValueError(f"{path}: not a hood model (format {header.get('format')!r}); give the model.safetensors of a run")
-    return tensors, header
 
 
 _HIERARCHIES: dict[tuple[int, int], tuple[Any, Tensor, Hierarchy]] = {}

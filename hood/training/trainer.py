@@ -14,8 +14,9 @@ import torch
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
+from hood.dynamics.checkpoint import save_simulator
 from hood.dynamics.output import AccelerationOutput
-from hood.dynamics.simulator import Simulator, save_simulator
+from hood.dynamics.simulator import Simulator
 from hood.features.normalizer import RunningNormalizer
 from hood.losses.potential import Potential, relative_gradient, scale
 from hood.losses.problem import StepProblem

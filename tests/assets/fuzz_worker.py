@@ -32,8 +32,9 @@ from hood.assets.motion_file import read_recording
 from hood.assets.pins import read_indices
 from hood.assets.standing import read_pose
 from hood.assets.torch_file import load_torch
+from hood.dynamics.checkpoint import load_simulator, save_simulator
 from hood.dynamics.recorder import read_rollout
-from hood.dynamics.simulator import build_simulator, load_simulator, save_simulator
+from hood.dynamics.simulator import build_simulator
 from hood.testing import cylinder
 
 MEMORY, SECONDS = 2 << 30, 10

@@ -12,8 +12,8 @@ import torch
 from safetensors import safe_open
 
 from hood.cli import main
+from hood.dynamics.checkpoint import load_simulator, read_header
 from hood.dynamics.recorder import read_rollout
-from hood.dynamics.simulator import load_simulator, read_header
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "dynamics"))
 from reference_oracle import make_state

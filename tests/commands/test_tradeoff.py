@@ -24,7 +24,8 @@ from hood.commands import tradeoff
 from hood.commands.points import Points
 from hood.commands.tradeoff import chosen_models, make_grid
 from hood.config import load_config
-from hood.dynamics.simulator import build_simulator, save_simulator
+from hood.dynamics.checkpoint import save_simulator
+from hood.dynamics.simulator import build_simulator
 from hood.evaluation.grid import Grid, Size
 from hood.media import tradeoff_page
 

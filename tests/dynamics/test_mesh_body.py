@@ -14,8 +14,8 @@ from hood.assets.body import Body
 from hood.assets.garment import Garment
 from hood.assets.library import locate
 from hood.assets.sequence import PoseSequence
+from hood.dynamics.checkpoint import load_simulator
 from hood.dynamics.rollout import simulate
-from hood.dynamics.simulator import load_simulator
 from hood.dynamics.stepper import NewtonStepper, Stepper
 from hood.losses.potential import default_potential
 from hood.scene.mesh_motion import NoBody, mesh_motion

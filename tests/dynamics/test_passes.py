@@ -5,7 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from hood.dynamics.simulator import Prediction, Simulator, build_simulator, load_simulator, save_simulator
+from hood.dynamics.checkpoint import load_simulator, save_simulator
+from hood.dynamics.simulator import Prediction, Simulator, build_simulator
 from hood.losses.potential import default_potential
 from hood.losses.problem import StepProblem
 from hood.scene.scene import Scene

@@ -13,8 +13,9 @@ from reference_oracle import LAYOUTS, Oracle, OracleScene, OracleStep, make_stat
 from torch import Tensor
 
 from hood.assets.material import Material
+from hood.dynamics.checkpoint import load_simulator, save_simulator
 from hood.dynamics.reference import import_reference_weights
-from hood.dynamics.simulator import Prepared, Simulator, build_simulator, load_simulator, save_simulator
+from hood.dynamics.simulator import Prepared, Simulator, build_simulator
 from hood.graph.given import given_hierarchy
 from hood.graph.hierarchy import build_hierarchy
 from hood.losses.problem import StepProblem

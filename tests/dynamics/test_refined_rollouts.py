@@ -9,10 +9,10 @@ from hood.assets.body import Body
 from hood.assets.garment import Garment
 from hood.assets.library import locate
 from hood.assets.sequence import PoseSequence
+from hood.dynamics.checkpoint import load_simulator
 from hood.dynamics.goals import Count
 from hood.dynamics.refine import RefinedStepper
 from hood.dynamics.rollout import simulate
-from hood.dynamics.simulator import load_simulator
 from hood.dynamics.stepper import Stepper
 from hood.losses.potential import default_potential
 from hood.scene.scene import build_scene

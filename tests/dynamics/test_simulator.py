@@ -16,7 +16,8 @@ from hood.assets.body import Body
 from hood.assets.garment import Garment
 from hood.assets.material import Material
 from hood.assets.sequence import PoseSequence, turn_world
-from hood.dynamics.simulator import Simulator, build_simulator, load_simulator, save_simulator
+from hood.dynamics.checkpoint import load_simulator, save_simulator
+from hood.dynamics.simulator import Simulator, build_simulator
 from hood.losses.problem import StepProblem
 from hood.scene.cloth import build_cloth, concatenate_cloths
 from hood.scene.scene import Scene, build_scene, concatenate_step_inputs

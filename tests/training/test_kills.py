@@ -14,7 +14,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from hood.dynamics.simulator import load_simulator
+from hood.dynamics.checkpoint import load_simulator
 from hood.training.checkpoint import load_checkpoint, load_last_good, previous
 
 _KILLS = 20

@@ -12,7 +12,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from hood.dynamics.simulator import build_simulator, load_simulator
+from hood.dynamics.checkpoint import load_simulator
+from hood.dynamics.simulator import build_simulator
 from hood.losses.potential import default_potential
 from hood.losses.problem import StepProblem
 from hood.scene.dataset import SceneSampler

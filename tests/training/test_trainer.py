@@ -14,8 +14,9 @@ from torch import Tensor
 from hood.assets.body import Body
 from hood.assets.garment import Garment
 from hood.assets.sequence import PoseSequence
+from hood.dynamics.checkpoint import load_simulator
 from hood.dynamics.output import AccelerationOutput
-from hood.dynamics.simulator import Simulator, build_simulator, load_simulator
+from hood.dynamics.simulator import Simulator, build_simulator
 from hood.losses.potential import Potential, default_potential
 from hood.scene.dataset import SceneSampler, Window
 from hood.training.curriculum import CollisionRamp, Horizon, WarmupCosine

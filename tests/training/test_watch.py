@@ -12,7 +12,8 @@ import pytest
 import torch
 from safetensors import safe_open
 
-from hood.dynamics.simulator import Simulator, build_simulator, load_simulator
+from hood.dynamics.checkpoint import load_simulator
+from hood.dynamics.simulator import Simulator, build_simulator
 from hood.evaluation.gap import REFERENCE
 from hood.evaluation.validation import Validation
 from hood.losses.potential import default_potential
