@@ -1,49 +1,25 @@
-"""The learned step: what holds for any weights, and models on disk."""
+"""The learned step: what holds for any weights."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import save_file
 from scipy.spatial.transform import Rotation
+from small_simulators import KINDS, SCHEDULE, make, take
 
 from hood.assets.body import Body
 from hood.assets.garment import Garment
 from hood.assets.material import Material
 from hood.assets.sequence import PoseSequence, turn_world
-from hood.dynamics.checkpoint import load_simulator, save_simulator
-from hood.dynamics.simulator import Simulator, build_simulator
+from hood.dynamics.simulator import build_simulator
 from hood.losses.problem import StepProblem
 from hood.scene.cloth import build_cloth, concatenate_cloths
 from hood.scene.scene import Scene, build_scene, concatenate_step_inputs
 from hood.scene.state import State, StepInput, concatenate_states
 from hood.testing import grid
-
-SCHEDULE = "1x(mesh+coarse0) 1x(coarse0)"
-KINDS = {
-    "paper": {"features": "paper", "output": "acceleration"},
-    "base": {"features": "paper", "output": "velocity_base"},
-    "physical": {"features": "physical", "output": "velocity_base"},
-}
-
-
-def make(kind: str, seed: int = 0, **options: object) -> Simulator:
-    torch.manual_seed(seed)
-    arguments = {"schedule": SCHEDULE, "latent_dim": 8, "output_init": 0.1, **KINDS[kind], **options}
-    return build_simulator(**arguments).eval()
-
-
-def take(simulator: Simulator, scene: Scene, frame: int = 0) -> tuple[State, State]:
-    """The start of ``scene`` and the state one step later."""
-    with torch.no_grad():
-        state = scene.start(frame)
-        prepared = simulator.prepare(scene.cloth, scene.garment.rest_pos)
-        return state, simulator.step(scene.cloth, prepared, state, scene.step_input(frame, state))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -223,31 +199,6 @@ def test_wrong_arguments_are_named(options: dict, words: tuple[str, ...]) -> Non
     assert all(word in str(error.value) for word in words), str(error.value)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_round_trip_through_a_file(kind: str, tmp_path: Path, tank_scene: Scene) -> None:
-    simulator = make(kind)
-    simulator.train()
-    take(simulator, tank_scene)  # statistics are part of the model
-    simulator.eval()
-    save_simulator(tmp_path / "m.safetensors", simulator, {"iteration": "7"})
-    loaded = load_simulator(tmp_path / "m.safetensors")
-    assert loaded.config == simulator.config
-    assert not loaded.training
-    assert torch.equal(take(loaded, tank_scene)[1].pos, take(simulator, tank_scene)[1].pos)
-    assert [path.name for path in tmp_path.iterdir()] == ["m.safetensors"]
-
-
-def test_half_precision_file(tmp_path: Path, tank_scene: Scene) -> None:
-    simulator = make("physical")
-    save_simulator(tmp_path / "full.safetensors", simulator)
-    save_simulator(tmp_path / "half.safetensors", simulator, half=True)
-    sizes = [(tmp_path / f"{name}.safetensors").stat().st_size for name in ("half", "full")]
-    assert sizes[0] < 0.75 * sizes[1]
-    loaded = load_simulator(tmp_path / "half.safetensors")
-    assert {p.dtype for p in loaded.parameters()} == {torch.float32}
-    assert float((take(loaded, tank_scene)[1].pos - take(simulator, tank_scene)[1].pos).abs().max()) < 1e-4
-
-
 def test_a_clone_is_equal_and_independent(tank_scene: Scene) -> None:
     simulator = make("paper")
     generator = torch.get_rng_state()
@@ -256,55 +207,3 @@ def test_a_clone_is_equal_and_independent(tank_scene: Scene) -> None:
     with torch.no_grad():
         next(clone.parameters()).add_(1.0)
     assert not torch.equal(next(clone.parameters()), next(simulator.parameters()))
-
-
-def damaged(path: Path, case: str) -> Path:
-    simulator = make("physical")
-    save_simulator(path, simulator)
-    content = path.read_bytes()
-    header = {"format": "hood-1", "model": json.dumps(simulator.config)}
-    weights = {name: value.clone() for name, value in simulator.state_dict().items()}
-    if case == "cut":
-        path.write_bytes(content[: len(content) // 2])
-    elif case == "empty":
-        path.write_bytes(b"")
-    elif case == "text":
-        path.write_text("hello")
-    elif case == "foreign":
-        save_file({"weight": torch.zeros(3)}, path)
-    elif case == "missing weight":
-        save_file(dict(list(weights.items())[1:]), path, header)
-    elif case == "wrong shape":
-        name = next(iter(weights))
-        save_file({**weights, name: torch.zeros(1)}, path, header)
-    elif case == "unknown option":
-        save_file(weights, path, {**header, "model": json.dumps({**simulator.config, "heads": 4})})
-    elif case == "no model":
-        save_file(weights, path, {"format": "hood-1"})
-    elif case == "model is no JSON":
-        save_file(weights, path, {**header, "model": "small"})
-    return path
-
-
-@pytest.mark.parametrize(
-    "case",
-    [
-        "cut", "empty", "text", "foreign", "missing weight", "wrong shape", "unknown option", "no model",
-        "model is no JSON",
-    ],
-)  # fmt: skip
-def test_damaged_and_foreign_files_are_refused_in_one_sentence(tmp_path: Path, case: str) -> None:
-    path = damaged(tmp_path / "m.safetensors", case)
-    with pytest.raises(ValueError, match=r"m\.safetensors: ") as error:
-        load_simulator(path)
-    assert "\n" not in str(error.value)
-
-
-def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
-    path = tmp_path / "m.safetensors"
-    save_simulator(path, make("physical"))
-    before = path.read_bytes()
-    with pytest.raises(TypeError):
-        save_simulator(path, make("physical", seed=1), {"iteration": 3})  # type: ignore[dict-item]
-    assert path.read_bytes() == before
-    assert [p.name for p in tmp_path.iterdir()] == ["m.safetensors"]
