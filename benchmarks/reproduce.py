@@ -4,7 +4,8 @@
 
 Points are taken evenly from ``points.json``; each one's command runs as it is printed, one after another with one thread, into
 a folder of its own. Printed is whether median γ, its 95th percentile and the median time fall into the chart's confidence
-intervals. γ of the same machine and version should be the same number; times say how far the machine can be trusted.
+intervals. Run it where the chart was made, if models were given by relative paths. γ of the same machine and version should be
+the same number; times say how far the machine can be trusted.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ def measured_again(row: Mapping[str, Any], folder: Path) -> Mapping[str, Any]:
     command = [sys.executable, "-m", "hood.cli", *words[1:], f"output={folder}"]
     done = subprocess.run(command, env=os.environ | {"OMP_NUM_THREADS": "1"}, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise SystemExit(f"{row['setting']}: exit code {done.returncode}\n{done.stderr.splitlines()[-1]}")
+        raise SystemExit(f"{row['setting']}: exit code {done.returncode}\n{done.stderr[-2000:]}")
     table = json.loads((folder / "table.json").read_text())
     found: Mapping[str, Any] = next(line for line in table if line["garment"] == "all")
     return found
@@ -55,9 +56,10 @@ def main() -> None:
         text = []
         for name in FIGURES:
             low, high = row[f"{name}_low"], row[f"{name}_high"]
-            within = low is not None and low <= again[name] <= high
+            within = None not in (low, high) and low <= again[name] <= high
             inside[name] += within
-            text.append(f"{name} {row[name]:.3g} ({low:.3g} to {high:.3g}) now {again[name]:.3g}{'' if within else ' OUTSIDE'}")
+            ends = " to ".join("?" if end is None else f"{end:.3g}" for end in (low, high))
+            text.append(f"{name} {row[name]:.3g} ({ends}) now {again[name]:.3g}{'' if within else ' OUTSIDE'}")
         print(f"{row['size']:>4} {row['setting']:<28} {'; '.join(text)}", flush=True)
     print(", ".join(f"{name}: {count} of {len(rows)} inside" for name, count in inside.items()))
 

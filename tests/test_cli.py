@@ -35,6 +35,12 @@ def tiny_model(path: Path, **options: object) -> Path:
     return path
 
 
+def folder(name: str) -> Path:
+    path = Path(name)
+    path.mkdir()
+    return path
+
+
 def quads(path: Path) -> Path:
     path.write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n")
     return path
@@ -139,8 +145,8 @@ ERRORS: dict[str, tuple[list[str], tuple[str, ...], Prepare]] = {
     "rollout nowhere": (["rollout", *UNTRAINED, "output=null"], ("output", "no folder"), lambda: None),
     "training nowhere": (["train", "output=null"], ("output", "no folder"), lambda: None),
     "two models of one name": (
-        ["evaluate", "models=[untrained:small,small.safetensors]", "output=run"], ("names must differ", "small, small"),
-        lambda: tiny_model(Path("small.safetensors")),
+        ["evaluate", "models=[a/small.safetensors,b/small.safetensors]", "output=run"], ("names must differ", "small, small"),
+        lambda: [tiny_model(folder(name) / "small.safetensors") for name in "ab"],
     ),
     "spectrum of nothing": (["evaluate", "spectrum=table", "gap_states=0", "output=run"], ("gap_states",), lambda: None),
     "no rollouts": (["evaluate", "max_rollouts=0", "output=run"], ("max_rollouts=0", "at least 1"), lambda: None),

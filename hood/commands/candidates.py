@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from omegaconf import DictConfig
@@ -56,6 +58,15 @@ def _unrefined_candidate(name: str, config: DictConfig) -> Candidate:
     simulator = read_model(path, float(config.fps)).to(str(config.device))
     use_arithmetic(simulator, config)
     return Candidate(model_name(str(path)), path.name, simulator, training_note(path))
+
+
+def distinct(candidates: Sequence[Candidate]) -> list[Candidate]:
+    """The same; random weights are called so where others have their model's name."""
+    trained = {candidate.name for candidate in candidates if candidate.weights != UNTRAINED}
+    return [
+        replace(one, name=f"{UNTRAINED}:{one.name}") if one.weights == UNTRAINED and one.name in trained else one
+        for one in candidates
+    ]
 
 
 def digest(candidate: Candidate) -> str:

@@ -16,7 +16,7 @@ from hood.dynamics.reference import SUFFIXES
 from hood.evaluation.table_one import Circumstances
 
 #: Arguments that change nothing about the figures.
-_ASIDE = ("output", "resume", "contact_sheets")
+_ASIDE = ("output", "resume", "max_rollouts", "contact_sheets")
 
 
 def circumstances(

@@ -19,7 +19,7 @@ from hood.assets.garment import Garment, load_garment
 from hood.assets.library import motion_split
 from hood.assets.sequence import PoseSequence, load_sequence
 from hood.commands.batch import expand_sequences
-from hood.commands.candidates import digest, make_candidate
+from hood.commands.candidates import digest, distinct, make_candidate
 from hood.commands.circumstances import circumstances
 from hood.commands.common import (
     output_folder,
@@ -198,7 +198,7 @@ def make_plan(config: DictConfig) -> Plan:
     Raises:
         ConfigError: two models or two garments with one name.
     """
-    candidates = [make_candidate(str(name), config) for name in config.models]
+    candidates = distinct([make_candidate(str(name), config) for name in config.models])
     titles = [candidate.name for candidate in candidates]
     if len(set(titles)) < len(titles):
         raise ConfigError(f"models={plain(config.models)}: names must differ, these are {', '.join(titles)}; rename a file")
@@ -236,8 +236,9 @@ def _check_lists(config: DictConfig) -> None:
 def _check_numbers(config: DictConfig) -> None:
     if not (math.isfinite(config.fps) and config.fps > 0):
         raise ConfigError(f"fps={config.fps:g}: must be a number of frames per second above 0, e.g. fps=30")
-    if config.max_rollouts is not None and int(config.max_rollouts) < 1:
-        raise ConfigError(f"max_rollouts={config.max_rollouts}: must be at least 1; null for all")
+    most = config.max_rollouts
+    if most is not None and (isinstance(most, bool) or not isinstance(most, int) or most < 1):
+        raise ConfigError(f"max_rollouts={most}: must be a whole number of at least 1; null for all")
     for key, least, why in (
         ("num_frames", 4, "the first frames are not timed"),
         ("drift_frames", 0, "0 measures no drift"),

@@ -31,6 +31,8 @@ from hood.evaluation.reached import read_record
 PROGRAM = (sys.executable, "-m", "hood.cli")
 #: Written by ``hood evaluate`` when all its rollouts are done.
 _TABLE = "table.json"
+#: By which command and weights a point was begun.
+_BEGUN = "begun.json"
 #: Times of the turns that a point has had.
 _TURNS = "turns.json"
 #: Seconds that an interrupted process has to end.
@@ -99,7 +101,7 @@ class Points:
         """
         todo = [point for point in points if not self.is_done(point)]
         for point in todo:
-            (self.folder_of(point) / _TABLE).unlink(missing_ok=True)  # its presence says that all rollouts are there
+            self._clear(point)
         failures: list[Failure] = []
         with (
             tqdm(total=len(points), initial=len(points) - len(todo), desc="trade-off", unit="point") as bar,
@@ -131,12 +133,21 @@ class Points:
             _end(running)
         return failures
 
+    def _clear(self, point: Point) -> None:
+        """Take away what says that the point is done, and all of it that other weights or another command gave."""
+        folder, begun = self.folder_of(point), {"command": point.command, "weights": weights_digest(point)}
+        for name in (_TABLE, "point.json"):  # the table's presence says that all rollouts are there
+            (folder / name).unlink(missing_ok=True)
+        if _read(folder / _BEGUN) != begun:
+            for path in (*folder.glob("rollouts.*.jsonl"), folder / _TURNS):
+                path.unlink(missing_ok=True)
+            folder.mkdir(parents=True, exist_ok=True)
+            write_atomically(folder / _BEGUN, json.dumps(begun).encode())
+
     def _start(self, point: Point) -> _Running:
         folder = self.folder_of(point)
         folder.mkdir(parents=True, exist_ok=True)
         begun = any(folder.glob("rollouts.*.jsonl"))
-        if not begun:
-            (folder / _TURNS).unlink(missing_ok=True)
         arguments = [
             *self.program,
             "evaluate",
@@ -157,12 +168,12 @@ class Points:
     def _note_turn(self, item: _Running) -> None:
         turn = {"seconds": time.monotonic() - item.begin, "cpu_seconds": item.cpu_seconds, "load_at_start": item.load}
         path = self.folder_of(item.point) / _TURNS
-        write_atomically(path, json.dumps([*_turns(path), turn]).encode())
+        write_atomically(path, json.dumps([*(_read(path) or []), turn]).encode())
 
     def _finish(self, item: _Running) -> list[Failure]:
         if item.process.returncode:
             return [Failure(item.point, self._complaint(item), self.log_of(item.point))]
-        turns = _turns(self.folder_of(item.point) / _TURNS)
+        turns = _read(self.folder_of(item.point) / _TURNS)
         seconds = sum(turn["seconds"] for turn in turns)
         spent = [turn["cpu_seconds"] for turn in turns]
         record: dict[str, Any] = {
@@ -193,13 +204,12 @@ class Points:
         return f"{point.size} {point.label}: {lines} rollouts"
 
 
-def _turns(path: Path) -> list[dict[str, Any]]:
-    """The turns that a point has had."""
+def _read(path: Path) -> Any:
+    """What a JSON file holds; None where there is none."""
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
-        return []
-    return found if isinstance(found, list) else []
+        return None
 
 
 def _end(running: Sequence[_Running]) -> None:

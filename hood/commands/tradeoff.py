@@ -95,19 +95,23 @@ def _size(config: DictConfig, name: str, models: Sequence[str]) -> Size:
 
     wanted = tuple(map(str, values("models")))
     if not wanted and name == SIZES[-1]:
-        wanted = tuple(model for model in models if model in _LARGEST) or tuple(models[:1])
+        most = (*_LARGEST, _dial(config, models))
+        wanted = tuple(model for model in models if {model, model_name(model)} & {*most}) or tuple(models[:1])
     garments = tuple(map(str, values("garments")))
     numbers = int(config[f"frames_{name}"]), int(config[f"states_{name}"])
     precisions = tuple(map(str, values("precisions")))
     further = () if name == SIZES[0] else tuple(plain(config[f"refine_{SIZES[0]}"]))
     dial = (_dial(config, models), further)
-    return Size(name, garments, values("refine"), values("guess"), *numbers, wanted, precisions, dial)
+    shapes = tuple(tuple(map(float, shape)) for shape in values("shapes"))
+    return Size(name, garments, values("refine"), values("guess"), *numbers, wanted, precisions, dial, shapes)
 
 
 def _dial(config: DictConfig, models: Sequence[str]) -> str:
     """The model that is measured with every number of iterations at every size; "" for none."""
     if config.dial is None:
         return next((model for model in models if model_name(model) == _DIAL), "")
+    if str(config.dial) == "none":
+        return ""
     if str(config.dial) not in (*models, *map(model_name, models)):
         raise ConfigError(f"dial={config.dial}: is none of the models ({', '.join(models) or 'none'})")
     return str(config.dial)

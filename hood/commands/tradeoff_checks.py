@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 from hood.assets.library import locate
 from hood.commands.batch import expand_sequences
 from hood.commands.common import UNTRAINED, require_device, require_distinct, require_package
+from hood.commands.wardrobe import shape_coefficients
 from hood.config import ConfigError, load_config, options, plain
 from hood.dynamics.checkpoint import read_header
 from hood.dynamics.reference import SUFFIXES
@@ -92,5 +93,9 @@ def _check_size(config: DictConfig, size: str) -> None:
         for value in plain(config[f"{key}_{size}"]):
             if isinstance(value, bool) or not isinstance(value, int) or value < least:
                 raise ConfigError(f"{key}_{size}: {value!r} is no number of iterations; give whole numbers from {least} on")
-    for key in ("garments", "models", "precisions", "refine", "guess"):
+    if not plain(config[f"shapes_{size}"]):
+        raise ConfigError(f"shapes_{size}=[]: give shape coefficients; [[]] is the mean body")
+    for shape in plain(config[f"shapes_{size}"]):
+        shape_coefficients(shape, f"shapes_{size}")
+    for key in ("garments", "models", "precisions", "refine", "guess", "shapes"):
         require_distinct(f"{key}_{size}", plain(config[f"{key}_{size}"]))

@@ -28,7 +28,7 @@ def strain_metrics(cloth: Cloth, pos: Tensor) -> dict[str, float]:
     strain = edge_strain(cloth, pos).abs()
     if not bool(torch.isfinite(strain).all()):
         return {"strain_p50": float("nan"), "strain_p99": float("nan"), "strain_max": float("nan")}
-    quantiles = torch.quantile(strain.double(), torch.tensor([0.5, 0.99, 1.0], dtype=torch.float64))
+    quantiles = torch.quantile(strain.double(), torch.tensor([0.5, 0.99, 1.0], dtype=torch.float64, device=strain.device))
     return dict(zip(("strain_p50", "strain_p99", "strain_max"), quantiles.tolist(), strict=True))
 
 

@@ -17,6 +17,10 @@ from hood.evaluation.grid import Point
 from hood.evaluation.reached import Reached
 
 NETWORK, SOLVER, REFINED, OPEN = "network", "solver", "refined", "open"
+#: Fewer rollouts than these do not tell how far rollouts differ: no verdict.
+LEAST_ROLLOUTS = 6
+#: A setting whose γ is not surely below this is no choice, however fast: √0.3 is half of free fall.
+USEFUL = 0.3
 
 
 def pareto_front(reached: Sequence[Reached], rejected: Collection[Point] = ()) -> list[Reached]:
@@ -63,8 +67,10 @@ def at_equal_gap(item: Reached, alone: Sequence[Reached], level: float = LEVEL) 
         [_ratio(*draw) for draw in zip(item.ms_draws, item.gap_draws, times.T, gaps.T, strict=True)],
     )
     here = _ratio(item.ms.value, item.gap.value, np.array([o.ms.value for o in alone]), np.array([o.gap.value for o in alone]))
-    low, high = interval(bounds[:, 0], level)[0], interval(bounds[:, 1], level)[1]
+    rollouts = min(one.rollouts for one in (item, *alone))
+    low, high = interval(bounds[:, 0], level, rollouts)[0], interval(bounds[:, 1], level, rollouts)[1]
     verdict = NETWORK if low > 1.0 else SOLVER if high < 1.0 else OPEN
+    verdict = verdict if rollouts >= LEAST_ROLLOUTS else OPEN
     return AtEqualGap(item, low, high, here.low if here.low == here.high else None, verdict)
 
 
@@ -109,8 +115,10 @@ def at_equal_time(item: Reached, networks: Sequence[Reached]) -> AtEqualTime | N
     own = np.array([_same_network(other.point, item.point) for other in networks])
     fits = (times <= item.ms_draws) | own[:, None] | np.array([other is best for other in networks])[:, None]
     draws = np.where(fits, gaps, np.inf).min(axis=0) - item.gap_draws
-    gain = Estimate(best.gap.value - item.gap.value, *interval(draws))
+    rollouts = min(one.rollouts for one in (item, *networks))
+    gain = Estimate(best.gap.value - item.gap.value, *interval(draws, rollouts=rollouts))
     verdict = REFINED if gain.low > 0.0 else NETWORK if gain.high < 0.0 else OPEN
+    verdict = verdict if rollouts >= LEAST_ROLLOUTS else OPEN
     return AtEqualTime(item, best, gain, verdict)
 
 
@@ -130,9 +138,9 @@ class Refined:
 
     @property
     def worse(self) -> bool:
-        """Whether strain or penetration is higher than without refinement, as a median over rollouts; what is not finite is."""
+        """Whether strain or penetration is higher than without refinement, in the median rollout; breakdowns are infinite."""
         pairs = ((self.reached.strains, self.plain.strains), (self.reached.penetrations, self.plain.penetrations))
-        return not all(np.median(here) <= np.median(there) for here, there in pairs)
+        return any(np.median(here) > np.median(there) for here, there in pairs)
 
 
 def refined_networks(reached: Sequence[Reached]) -> list[Refined]:
@@ -143,7 +151,7 @@ def refined_networks(reached: Sequence[Reached]) -> list[Refined]:
         own = plain.get((item.point.model, item.point.precision, item.point.size))
         if own is not None:
             both = (item.strains, own.strains), (item.penetrations, own.penetrations)
-            counts = (sum(not here <= there for here, there in zip(*pair, strict=False)) for pair in both)
+            counts = (sum(here > there for here, there in zip(*pair, strict=False)) for pair in both)
             found.append(Refined(item, own, *counts))
     return found
 
@@ -159,27 +167,35 @@ class Standing:
     size: str
     vertices: int
     winner: str
-    best: AtEqualGap | None  # the network's setting that does best beside the solver
+    best: AtEqualGap | None  # the network's setting that does best beside the solver; None: none is a choice at all
 
 
 def standings(reached: Sequence[Reached], rejected: Collection[Point] = ()) -> list[Standing]:
     """Per size, smallest first, whether a network earns its place beside the solver.
 
     The network does where one of its settings is faster than the solver at equal γ, the solver where it is faster than all of
-    them. Settings that overstretch the cloth (``rejected``) stand outside. The more settings are tried, the more likely one of
-    them looks good by chance, so the intervals are as much wider as there are settings (Bonferroni).
+    them. Settings that overstretch the cloth (``rejected``) or are not surely below :data:`USEFUL` are no choice: where a
+    network has none and the solver has one, the solver is the better choice. The more settings are tried, the more likely one
+    of them looks good by chance, so the intervals are as much wider as there are settings (Bonferroni). Sizes without networks
+    are left out.
     """
     found = []
     for size in dict.fromkeys(item.point.size for item in reached):
-        here = [item for item in reached if item.point.size == size and item.charted and item.point not in rejected]
-        alone, learned = [r for r in here if r.point.alone], [r for r in here if not r.point.alone]
+        here = [item for item in reached if item.point.size == size and item.charted]
+        if all(item.point.alone for item in here):
+            continue
+        sound = [item for item in here if item.point not in rejected]
+        alone = [item for item in sound if item.point.alone]
+        learned = [item for item in sound if not item.point.alone and item.gap.high <= USEFUL]
         level = 1.0 - (1.0 - LEVEL) / max(len(learned), 1)
         compared = [c for c in (at_equal_gap(item, alone, level) for item in learned) if c is not None]
+        vertices = round(float(np.mean([item.vertices for item in here])))
         if not compared:
+            useful = not learned and any(item.gap.high <= USEFUL for item in alone)
+            found.append(Standing(size, vertices, SOLVER if useful else OPEN, None))
             continue
         best = max(compared, key=lambda c: (c.verdict == NETWORK, c.ratio if c.ratio is not None else c.low))
         won, lost = best.verdict == NETWORK, all(c.verdict == SOLVER for c in compared)
-        vertices = round(float(np.mean([item.vertices for item in here])))
         found.append(Standing(size, vertices, NETWORK if won else SOLVER if lost else OPEN, best))
     return sorted(found, key=lambda standing: standing.vertices)
 
@@ -187,55 +203,40 @@ def standings(reached: Sequence[Reached], rejected: Collection[Point] = ()) -> l
 def crossover(found: Sequence[Standing], device: str) -> str:
     """In a sentence: from which size on a network is worth its time on this device, as far as the intervals say."""
     if not found:
-        return "No network was measured beside the solver alone, so nothing can be said about which is the better choice."
-    open_sizes = [s for s in found if s.winner == OPEN]
+        return "No network was measured, so nothing can be said about network or solver."
+    won, lost, undecided = ([s for s in found if s.winner == who] for who in (NETWORK, SOLVER, OPEN))
     doubt = ""
-    if open_sizes:
-        doubt = f" At {_sizes(open_sizes)} the intervals overlap or the solver was not measured at equal γ: no claim is made."
-    won, lost = [s for s in found if s.winner == NETWORK], [s for s in found if s.winner == SOLVER]
-    if lost and won and max(s.vertices for s in lost) < min(s.vertices for s in won):
-        below, above = lost[-1], won[0]
-        assert above.best is not None
-        number = _crossing(below, above)
-        start = f"Up to {below.vertices:,}" if number is None else f"Below {number:,}"
-        how = f" ({number:,} is interpolated between these sizes.)" if number is not None else ""
-        return (
-            f"{start} vertices on this {device} the solver alone is the better choice: it is at {_sizes(lost)}, while at "
-            f"{_sizes(won)} {above.best.reached.label} reaches the same γ in less time.{how}{doubt}"
+    if undecided:
+        doubt = (
+            f" At {_sizes(undecided)} no claim is made: the intervals overlap, rollouts are fewer than {LEAST_ROLLOUTS}, or "
+            "the solver was not measured at equal γ."
         )
-    if lost and not won:
+    winners = "; ".join(
+        f"{s.best.reached.label} at {s.vertices:,} vertices (γ = {s.best.reached.gap.value:.2g})" for s in won if s.best
+    )
+    if lost and won and max(s.vertices for s in lost) < min(s.vertices for s in won):
+        return (
+            f"Up to {lost[-1].vertices:,} vertices on this {device} the solver alone is the better choice, from "
+            f"{won[0].vertices:,} on a network that reaches the same γ in less time: {winners}.{doubt}"
+        )
+    if lost and won:
+        return (
+            f"On this {device} the solver alone is the better choice at {_sizes(lost)} and a network elsewhere ({winners}): "
+            f"there is no single size at which one gives way to the other." + doubt
+        )
+    if lost:
         return (
             f"At {_sizes(lost)} on this {device} the solver alone is the better choice; no crossover to a network was seen."
             + doubt
         )
-    if won and not lost:
-        names = ", ".join(dict.fromkeys(s.best.reached.label for s in won if s.best is not None))
-        return (
-            f"At {_sizes(won)} on this {device} a network is the better choice ({names}); no size was seen below which the "
-            f"solver alone is." + doubt
-        )
     if won:
         return (
-            f"On this {device} the solver alone is the better choice at {_sizes(lost)} and a network at {_sizes(won)}: there "
-            f"is no single size at which one gives way to the other." + doubt
+            f"On this {device} a network is the better choice: {winners}. No size was seen below which the solver alone is."
+            + doubt
         )
-    return (
-        f"On this {device} no crossover was seen: at {_sizes(open_sizes)} neither the solver alone nor a network is the better "
-        "choice by its intervals, or the solver was not measured at equal γ."
-    )
+    return f"On this {device} no crossover was seen." + doubt
 
 
 def _sizes(found: Sequence[Standing]) -> str:
     numbers = [f"{standing.vertices:,}" for standing in found]
     return (numbers[0] if len(numbers) == 1 else f"{', '.join(numbers[:-1])} and {numbers[-1]}") + " vertices"
-
-
-def _crossing(below: Standing, above: Standing) -> int | None:
-    """Vertices at which both take equally long, on a straight line in logarithms, to two digits; None without both ratios."""
-    low, high = (standing.best.ratio if standing.best is not None else None for standing in (below, above))
-    if low is None or high is None or not low < 1.0 < high:
-        return None
-    share = -math.log(low) / math.log(high / low)
-    crossing = below.vertices * (above.vertices / below.vertices) ** share
-    digits = 10 ** (math.floor(math.log10(crossing)) - 1)
-    return round(crossing / digits) * digits

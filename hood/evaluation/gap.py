@@ -32,8 +32,8 @@ AGREEMENT = 1e-2
 class Gap:
     """Gap of a method's positions, scene by scene.
 
-    γ = (Φ(x) − Φ*) / e0 with e0 = ½ M g² dt²; √γ is about the RMS error of the acceleration in g. Not clamped: positions
-    that beat every minimisation become the reference themselves, and ``converged`` is then False.
+    γ = (Φ(x) − Φ*) / e0 with e0 = ½ M g² dt²; √γ is about the RMS error of the acceleration in g. Positions that beat every
+    minimisation become the reference themselves: γ is 0 then, and ``converged`` is False.
     """
 
     gamma: Tensor  # (B,) float64

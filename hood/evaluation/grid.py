@@ -26,6 +26,7 @@ class Size:
         models: names of the models that are measured at this size; empty for all.
         precisions: those that are measured at this size; empty for all.
         dial: a model that is measured with further numbers of iterations in the first precision, and these numbers.
+        shapes: coefficients of the bodies; every motion is done by each.
     """
 
     name: str
@@ -37,6 +38,7 @@ class Size:
     models: tuple[str, ...] = ()
     precisions: tuple[str, ...] = ()
     dial: tuple[str, tuple[int, ...]] = ("", ())
+    shapes: tuple[tuple[float, ...], ...] = ((),)
 
     def iterations(self, model: str) -> list[int]:
         """All that this network is measured with in the first precision, in order."""
@@ -160,11 +162,13 @@ class Grid:
             f"garments=[{','.join(map(quoted, size.garments))}]",
             f"num_frames={size.num_frames}",
             f"gap_states={size.gap_states}",
+            *([f"shapes={[list(shape) for shape in size.shapes]}".replace(" ", "")] if size.shapes != ((),) else []),
             *([f"precision={precision}"] if model not in (GUESS, NEWTON) else []),
             *([f"refine_method={method}"] if refine else []),
             *self.settings,
         ]
-        return Point(size.name, model, refine, precision, method, tuple(settings), len(size.garments) * self.motions)
+        rollouts = len(size.garments) * self.motions * len(size.shapes)
+        return Point(size.name, model, refine, precision, method, tuple(settings), rollouts)
 
 
 def model_name(model: str) -> str:

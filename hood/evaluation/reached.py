@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,7 @@ class Reached:
     """Cost and accuracy of one point, on the states that it reaches itself.
 
     ``ms`` and ``gap`` are medians, ``ms_p95`` and ``gap_p95`` 95th percentiles, over frames and over the states looked at;
-    ``rg`` and ``strain_p99`` are medians over frames. Nothing is clamped: a gap may be negative. The draws are those of the
+    ``rg`` and ``strain_p99`` are medians over frames. The draws are those of the
     bootstrap, alike for points that were measured on the same rollouts.
     """
 
@@ -52,8 +52,8 @@ class Reached:
     strain_p99: float
     penetration: float  # mean share of vertices deeper than 2 mm
     depth: float  # m, mean over frames of the deepest vertex
-    strains: tuple[float, ...]  # strain_p99 of every rollout, median over its frames
-    penetrations: tuple[float, ...]  # share of vertices deeper than 2 mm of every rollout, mean over its frames
+    strains: tuple[float, ...]  # strain_p99 of every rollout, median over its frames; infinite after a breakdown
+    penetrations: tuple[float, ...]  # share of vertices deeper than 2 mm of every rollout, mean over its frames; likewise
     parts: Mapping[str, float]  # ms, mean over frames, of PARTS
     rollouts: int
     frames: int
@@ -62,6 +62,7 @@ class Reached:
     disagreeing: int  # states where minimisations ended in different minima
     doubtful: int  # those of them where that changes γ by more than a tenth
     failures: int  # rollouts that became non-finite
+    unsolved: float  # share of the converged solver's steps that missed their accuracy; 0 for all others
     record: Mapping[str, Any] = field(default_factory=dict)  # what was written down about the run
     ms_draws: np.ndarray = field(default_factory=lambda: np.empty(0), repr=False, compare=False)
     gap_draws: np.ndarray = field(default_factory=lambda: np.empty(0), repr=False, compare=False)
@@ -93,7 +94,7 @@ class Reached:
             entries |= {name: value.value, f"{name}_low": value.low, f"{name}_high": value.high}
         entries |= {"rg": self.rg, "strain_p99": self.strain_p99, "penetration": self.penetration, "depth": self.depth}
         entries |= {f"ms_{name}": value for name, value in self.parts.items()}
-        for name in ("rollouts", "frames", "states", "unconverged", "disagreeing", "doubtful", "failures"):
+        for name in ("rollouts", "frames", "states", "unconverged", "disagreeing", "doubtful", "failures", "unsolved"):
             entries[name] = getattr(self, name)
         entries |= {"device": self.record.get("device"), "cpu_share": self.record.get("cpu_share"), "command": point.command}
         return {key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in entries.items()}
@@ -113,7 +114,8 @@ def read_reached(point: Point, folder: Path, vertices: int, record: Mapping[str,
 
 
 def summarise(point: Point, rollouts: Sequence[Measured], vertices: int, record: Mapping[str, Any]) -> Reached:
-    """The rollouts of a point in numbers."""
+    """The rollouts of a point in numbers; those on a standing body, for drift alone, are left out."""
+    rollouts = [measured for measured in rollouts if measured.frames or measured.failures or measured.gaps]
     frames = [frame for measured in rollouts for frame in measured.frames]
     gaps = [item for measured in rollouts for item in measured.gaps]
     times = [[frame["ms_total"] for frame in measured.frames] for measured in rollouts]
@@ -130,8 +132,8 @@ def summarise(point: Point, rollouts: Sequence[Measured], vertices: int, record:
         float(np.median([frame["strain_p99"] for frame in frames])),
         float(np.mean([frame.get("penetration_share", 0.0) for frame in frames])),
         float(np.mean([frame.get("penetration_depth", 0.0) for frame in frames])),
-        tuple(float(np.median([frame["strain_p99"] for frame in one.frames] or [np.nan])) for one in rollouts),
-        tuple(float(np.mean([frame.get("penetration_share", 0.0) for frame in one.frames] or [np.nan])) for one in rollouts),
+        tuple(_unless_broken(one, "strain_p99", np.median) for one in rollouts),
+        tuple(_unless_broken(one, "penetration_share", np.mean) for one in rollouts),
         {name: float(np.mean([sum(f.get(key, 0.0) for key in keys) for f in frames])) for name, keys in PARTS.items()},
         rollouts=len(rollouts),
         frames=len(frames),
@@ -140,10 +142,19 @@ def summarise(point: Point, rollouts: Sequence[Measured], vertices: int, record:
         disagreeing=sum(item["spread"] > AGREEMENT for item in gaps),
         doubtful=sum(item["spread"] > max(AGREEMENT, _DOUBT * abs(item["gamma"])) for item in gaps),
         failures=sum(bool(measured.failures) for measured in rollouts),
+        unsolved=float(np.mean([1.0 - frame.get("solver_converged", 1.0) for frame in frames])),
         record=record,
         ms_draws=ms_draws,
         gap_draws=gap_draws,
     )
+
+
+def _unless_broken(measured: Measured, key: str, statistic: Callable[[list[float]], Any]) -> float:
+    """Of a rollout's frames; infinite where one of them is not finite."""
+    if measured.failures or not measured.frames:
+        return float("inf")
+    value = float(statistic([frame.get(key, 0.0) for frame in measured.frames]))
+    return value if math.isfinite(value) else float("inf")
 
 
 def overstretched(reached: Iterable[Reached]) -> set[Point]:

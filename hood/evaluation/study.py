@@ -39,11 +39,18 @@ class Study:
     @property
     def warning(self) -> str:
         """Whether times can be trusted; empty where they can."""
+        ways = {(item.record.get("device"), item.record.get("jobs")) for item in self.reached}
+        text = ""
+        if len(ways) > 1:
+            text = (
+                "The settings were not all measured on one machine with equally many side by side: comparisons of time between "
+                "them do not hold. "
+            )
         disturbed = [item for item in self.reached if item.disturbed]
         if not disturbed:
-            return ""
+            return text.rstrip()
         least = min(item.record["cpu_share"] for item in disturbed)
-        return (
+        return text + (
             f"The machine was busy with other work: {len(disturbed)} of {len(self.reached)} settings had their processor for "
             f"only a part of the time (down to {least:.0%}), so times are too long and comparisons of time do not hold. "
             "Measure again on a machine that is free, or with fewer jobs."

@@ -153,7 +153,8 @@ def _limits(axes: Any, reached: Sequence[Reached], quantity: str) -> None:
     values = [getattr(item, name) for item in reached for name in ("gap", "gap_p95")]
     shown = [value.value for value in values if value.value >= FLOOR]
     lowest = FLOOR if below_floor(reached, quantity) or not shown else min(shown) / 2
-    axes.set_ylim(max(lowest, FLOOR), 2 * max([value.high for value in values if value.high > 0], default=1.0))
+    highest = max([value.high for value in values if value.high > 0], default=1.0)
+    axes.set_ylim(max(lowest, FLOOR), max(2 * highest, 10 * FLOOR))
 
 
 def cost_chart(reached: Sequence[Reached], title: str) -> Any:

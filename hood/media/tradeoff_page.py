@@ -124,9 +124,9 @@ def _equal_gap(study: Study, size: str) -> str:
 
 def _equal_time(study: Study, size: str) -> str:
     items = [item for item in study.at(size) if item.charted and not item.point.alone]
-    networks = [item for item in items if item.point.refine == 0]
+    networks = [item for item in items if item.point.refine == 0 and item.point not in study.rejected]
     rows = []
-    for item in (i for i in items if i.point.refine):
+    for item in (i for i in items if i.point.refine and i.point not in study.rejected):
         found = at_equal_time(item, networks)
         if found is not None:
             rows.append([item.label, str(item.point.refine), f"{item.ms.value:.1f}", f"{item.gap.value:.2g}", found.best.label,
@@ -165,6 +165,7 @@ def _all_points(study: Study) -> str:
             )
             if count
         ]
+        flags += [f"{item.unsolved:.1%} of the steps not converged"] if item.unsolved else []
         flags += [f"processor {item.record['cpu_share']:.0%} of the time"] if item.disturbed else []
         flags += ["overstretched"] if item.point in study.rejected and not item.failures else []
         rows.append([item.point.size, item.label, _range(item.ms, ".1f"), _range(item.ms_p95, ".1f"), _range(item.gap),

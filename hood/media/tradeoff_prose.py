@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from hood.evaluation.bootstrap import DRAWS, LEVEL
+from hood.evaluation.comparison import LEAST_ROLLOUTS, USEFUL
 from hood.evaluation.gap import AGREEMENT
 from hood.evaluation.grid import NEWTON
 from hood.evaluation.reached import OVERSTRETCHED, Reached
@@ -94,9 +95,13 @@ def method(study: Study) -> list[str]:
         f"setting's own result. Of {states:,} states, the reference of {unsure:,} missed its accuracy (γ is a lower bound "
         f"there) and minimisations of {apart:,} ended more than {AGREEMENT:g} e0 apart (the lowest counts), of {doubtful:,} by "
         "more than a tenth of γ as well; all are kept. "
-        "γ is never clamped: a setting that beats every minimisation is itself the reference.",
+        "A setting that beats every minimisation is the reference itself, with γ = 0, and counts as unconverged.",
         f"Intervals: rollouts are drawn again with replacement, then states within each, {DRAWS:,} times with a fixed seed, "
-        "alike for all settings that were measured on the same rollouts.",
+        "alike for all settings that were measured on the same rollouts; fewer rollouts give wider intervals. With a handful "
+        f"they are too narrow all the same, so below {LEAST_ROLLOUTS} rollouts no verdict is given. They say how far other "
+        f"rollouts of this kind would move a figure. Tables compare settings one by one at {LEVEL:.0%}; the sentence at the "
+        "top looks at all settings of a size at once and asks for more certainty of each, so it may leave open what a table "
+        f"decides. It considers settings whose γ is surely below {USEFUL:g}: faster ones that are further off are no choice.",
         "rg is the unbalanced force in units of the weight; p99 strain the 99th percentile of the change of edge lengths; both "
         "are medians over frames.",
     ]

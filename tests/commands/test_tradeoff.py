@@ -26,6 +26,7 @@ from hood.commands.tradeoff import chosen_models, make_grid
 from hood.config import load_config
 from hood.dynamics.checkpoint import save_simulator
 from hood.dynamics.simulator import build_simulator
+from hood.evaluation.comparison import LEAST_ROLLOUTS
 from hood.evaluation.grid import Grid, Size
 from hood.media import tradeoff_page
 
@@ -97,8 +98,23 @@ def test_the_default_grid_is_the_one_described() -> None:
     assert {p.name for p in by_size["12k"]} == {"fine15", "ours"}
     assert {p.refine for p in by_size["1k"]} == {0, 1, 2, 5, 10, 20}
     for size, least in (("1k", 30), ("4k", 30), ("12k", 10)):
-        states = len(config[f"garments_{size}"]) * len(config.sequences) * config[f"states_{size}"]
-        assert states >= least
+        rollouts = len(config[f"garments_{size}"]) * len(config.sequences) * len(config[f"shapes_{size}"])
+        assert rollouts >= LEAST_ROLLOUTS
+        assert rollouts * config[f"states_{size}"] >= least
+        assert {p.rollouts for p in points if p.size == size} == {rollouts}
+
+
+def test_the_dial_brings_its_model_to_every_size_or_is_off() -> None:
+    models = ["fine15", "ours", "quickstart"]
+
+    def most(*overrides: str) -> dict[str, set[int]]:
+        points = make_grid(load_config("tradeoff", ["precisions=[fp32]", *overrides]), models).points()
+        return {name: {p.refine for p in points if (p.size, p.name) == ("12k", name)} for name in models}
+
+    every = {0, 1, 2, 5, 10, 20}
+    assert most() == {"fine15": {0, 5}, "ours": every, "quickstart": set()}
+    assert most("dial=quickstart") == {"fine15": {0, 5}, "ours": {0, 5}, "quickstart": every}
+    assert most("dial=none") == {"fine15": {0, 5}, "ours": {0, 5}, "quickstart": set()}
 
 
 def test_every_command_is_one_that_evaluate_reads() -> None:
@@ -158,7 +174,11 @@ def test_other_weights_of_the_same_name_are_measured_anew() -> None:
     model.write_bytes(b"two")
     assert not store().is_done(points[0])
     store().measure(points)
-    assert calls().count("[m.safetensors] true") == 1
+    assert calls().count("[m.safetensors] false") == 2
+    lines = (store().folder_of(points[0]) / "rollouts.0.jsonl").read_text().split("\n")
+    assert sum("unit" in line for line in lines) == 1  # those of the first weights are gone
+    model.write_bytes(b"one")
+    assert not store().is_done(points[0])
 
 
 def test_a_failing_point_is_reported_with_its_log_and_the_others_go_on() -> None:
@@ -209,7 +229,7 @@ def test_an_interruption_ends_the_processes_and_keeps_what_they_wrote() -> None:
 def test_the_command_writes_page_tables_and_charts(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(COMMAND) == 0
     printed = capsys.readouterr().out
-    assert "the solver alone is the better choice; no crossover to a network was seen" in printed
+    assert "vertices no claim is made" in printed  # a single rollout
     page = ElementTree.parse("chart/index.html").getroot()
     text = "".join(page.itertext())
     rows = json.loads(Path("chart/points.json").read_text())
@@ -281,6 +301,8 @@ REFUSED = {
     "no folder": (["output="], "output: no folder is named"),
     "nothing to chart": (["measure=false"], "measure=false: chart holds none of these points"),
     "nothing to measure": (["garments_1k=[]"], "no point is left to measure"),
+    "no bodies": (["shapes_1k=[]"], "shapes_1k=[]: give shape coefficients"),
+    "a body that is none": (["shapes_1k=[[tall]]"], "shapes_1k"),
     "unknown model on the dial": (["dial=ours"], "dial=ours: is none of the models (untrained:small)"),
     "unknown precision at a size": (["precisions_1k=[bf16]"], "precisions_1k: 'bf16' is none of the precisions (fp32)"),
     "unknown model at a size": (["models_1k=[ours]"], "models_1k: 'ours' is none of the models"),

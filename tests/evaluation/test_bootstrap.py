@@ -55,6 +55,24 @@ def test_rollouts_of_different_lengths_are_drawn_with_their_own_states() -> None
     assert (draws == 3.0).any()
 
 
+def test_a_rollout_without_values_keeps_its_place() -> None:
+    whole, gap = [[1.0], [2.0], [3.0], [4.0]], [[1.0], [], [3.0], [4.0]]
+    random = np.random.default_rng(0)
+    drawn = random.integers(4, size=(2000, 4))
+    np.testing.assert_array_equal(resample(whole, 1.0), (drawn + 1.0).max(axis=1))
+    expected = np.where(drawn == 1, 0.0, drawn + 1.0).max(axis=1)
+    np.testing.assert_array_equal(resample(gap, 1.0), np.where(expected == 0.0, 4.0, expected))
+
+
+def test_few_rollouts_widen_the_interval() -> None:
+    samples = np.random.default_rng(0).normal(size=20000)
+    widths = [np.diff(interval(samples, 0.9, rollouts))[0] for rollouts in (None, 1000, 12, 6)]
+    assert widths[0] == pytest.approx(widths[1], rel=0.01)
+    # √(n / (n − 1)) times the ratio of Student's quantile to the normal one.
+    assert widths[2] / widths[0] == pytest.approx(np.sqrt(12 / 11) * 1.796 / 1.645, rel=0.03)
+    assert widths[3] / widths[0] == pytest.approx(np.sqrt(6 / 5) * 2.015 / 1.645, rel=0.03)
+
+
 @pytest.mark.parametrize("level", [0.0, 0.37, 0.5, 0.95, 1.0])
 def test_quantiles_are_those_of_numpy(level: float) -> None:
     values = np.random.default_rng(0).normal(size=9)

@@ -9,6 +9,7 @@ import pytest
 from measured_points import reached, solver
 
 from hood.evaluation.comparison import (
+    LEAST_ROLLOUTS,
     NETWORK,
     OPEN,
     REFINED,
@@ -126,16 +127,39 @@ def test_the_crossover_is_named_where_the_solver_gives_way() -> None:
     found = standings(items)
     assert [(s.size, s.winner) for s in found] == [("1k", SOLVER), ("4k", NETWORK)]
     said = crossover(found, "CPU (made up)")
-    # Four times too slow at 1,000, four times faster at 4,000: equal half way, in logarithms.
-    assert said.startswith("Below 2,000 vertices on this CPU (made up) the solver alone is the better choice")
-    assert "at 4,000 vertices net, fp32 reaches the same γ in less time" in said
+    assert said == (
+        "Up to 1,000 vertices on this CPU (made up) the solver alone is the better choice, from 4,000 on a network that "
+        "reaches the same γ in less time: net, fp32 at 4,000 vertices (γ = 0.04)."
+    )
+
+
+def test_an_undecided_size_between_is_named_and_every_winner_has_its_own_size() -> None:
+    sizes = scene("1k", 1000, 200.0), scene("4k", 4000, 50.0, noise=0.4), scene("12k", 12000, 12.5), scene("40k", 40000, 10.0)
+    said = crossover(standings([item for size in sizes for item in size]), "CPU")
+    assert said.startswith("Up to 1,000 vertices on this CPU the solver alone is the better choice, from 12,000 on a network")
+    assert "net, fp32 at 12,000 vertices (γ = 0.04); net, fp32 at 40,000 vertices (γ = 0.04)." in said
+    assert "At 4,000 vertices no claim is made" in said
+
+
+def test_a_fast_network_that_is_far_off_is_no_choice() -> None:
+    found = standings([*solver(CURVE), reached("net", 0, 1.0, 2.3), reached("net", 1, 2.0, 0.9)])
+    assert [(one.winner, one.best) for one in found] == [(SOLVER, None)]
+
+
+def test_few_rollouts_allow_no_verdict() -> None:
+    few = [replace(item, rollouts=LEAST_ROLLOUTS - 1) for item in scene("1k", 1000, 10.0)]
+    assert standings(few)[0].winner == OPEN
+    assert "rollouts are fewer than 6" in crossover(standings(few), "CPU")
+    found = at_equal_time(replace(exact("net", 1, 9.9, 0.05), rollouts=3), [exact("net", 0, 10.0, 0.5)])
+    assert found is not None
+    assert found.verdict == OPEN
 
 
 def test_no_crossover_is_said_as_well() -> None:
     all_lost = crossover(standings(scene("1k", 1000, 200.0) + scene("4k", 4000, 300.0)), "CPU")
     assert "At 1,000 vertices and 4,000" not in all_lost
     assert "At 1,000 and 4,000 vertices on this CPU the solver alone is the better choice; no crossover" in all_lost
-    assert "no size was seen below which" in crossover(standings(scene("1k", 1000, 10.0)), "CPU")
+    assert "No size was seen below which" in crossover(standings(scene("1k", 1000, 10.0)), "CPU")
     backwards = crossover(standings(scene("1k", 1000, 10.0) + scene("4k", 4000, 300.0)), "CPU")
     assert "there is no single size" in backwards
 
@@ -143,16 +167,17 @@ def test_no_crossover_is_said_as_well() -> None:
 def test_intervals_that_overlap_make_no_claim() -> None:
     found = standings(scene("1k", 1000, 50.0, noise=0.4))
     assert found[0].winner == OPEN
-    assert "neither the solver alone nor a network" in crossover(found, "CPU")
+    assert crossover(found, "CPU").startswith("On this CPU no crossover was seen. At 1,000 vertices no claim is made")
     mixed = crossover(standings(scene("1k", 1000, 200.0) + scene("4k", 4000, 50.0, noise=0.4)), "CPU")
-    assert "At 4,000 vertices the intervals overlap" in mixed
+    assert "At 4,000 vertices no claim is made: the intervals overlap" in mixed
     assert crossover([], "CPU").startswith("No network was measured")
 
 
 def test_a_setting_that_overstretches_wins_nothing() -> None:
     items = scene("1k", 1000, 10.0)
     assert standings(items)[0].winner == NETWORK
-    assert standings(items, {items[-1].point}) == []
+    assert [(one.winner, one.best) for one in standings(items, {items[-1].point})] == [(SOLVER, None)]
+    assert standings(solver(CURVE)) == []
 
 
 def test_refinement_is_held_against_the_same_network_at_the_same_size() -> None:
@@ -172,3 +197,9 @@ def test_refinement_that_pushes_cloth_into_the_body_or_breaks_down_is_worse() ->
     broken = exact("net", 10, 1.0, 1.0, strain=float("nan"))
     found = refined_networks([plain, deeper, once, broken])
     assert [(one.worse, one.stretched, one.deeper) for one in found] == [(True, 0, 8), (False, 0, 1), (True, 8, 0)]
+
+
+def test_refinement_that_saves_a_rollout_from_breaking_down_is_no_worse() -> None:
+    plain = replace(exact("net", 0, 1.0, 1.0), strains=(float("inf"),) * 8, penetrations=(float("inf"),) * 8)
+    (found,) = refined_networks([plain, exact("net", 5, 1.0, 1.0)])
+    assert (found.worse, found.stretched, found.deeper) == (False, 0, 0)

@@ -79,10 +79,27 @@ def test_too_much_strain_is_twice_the_converged_solvers_at_that_size() -> None:
     assert overstretched(items) == {stretched.point}
 
 
+def test_points_of_different_machines_are_not_compared_silently() -> None:
+    records = {"device": "CPU (a)", "jobs": 2}, {"device": "CPU (a)", "jobs": 1}, {"device": "CPU (b)", "jobs": 2}
+    items = [summarise(point("net", k), [rollout([1.0], [0.1])], 1000, record) for k, record in enumerate(records)]
+    assert "not all measured on one machine" in Study([items[0], items[1]], set()).warning
+    assert "not all measured on one machine" in Study([items[0], items[2]], set()).warning
+    assert Study([items[0]], set()).warning == ""
+
+
+def test_steps_that_the_solver_left_unsolved_are_counted() -> None:
+    measured = rollout([1.0, 1.0], [0.1])
+    measured.frames[0]["solver_converged"] = 0.0
+    measured.frames[1]["solver_converged"] = 1.0
+    assert summarise(point("newton"), [measured], 1000, {}).unsolved == 0.5
+    assert summarise(point(), [rollout([1.0], [0.1])], 1000, {}).unsolved == 0.0
+
+
 def test_a_shared_processor_is_noticed_on_a_cpu() -> None:
     def measured(device: str, share: float | None) -> Study:
         item = summarise(point(), [rollout([1.0], [0.1])], 1000, {"device": device, "cpu_share": share})
-        return Study([item, reached("net", 5, 1.0, 0.1)], set())
+        other = summarise(point("net", 5), [rollout([1.0], [0.1])], 1000, {"device": device, "cpu_share": 0.99})
+        return Study([item, other], set())
 
     assert "1 of 2 settings had their processor for only a part of the time (down to 40%)" in measured("CPU (a)", 0.4).warning
     assert measured("CPU (a)", 0.97).warning == measured("CPU (a)", None).warning == measured("GPU (b)", 0.4).warning == ""
