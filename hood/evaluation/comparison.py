@@ -7,18 +7,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
 from hood.evaluation.bootstrap import LEVEL, Estimate, interval
-from hood.evaluation.grid import Point
+from hood.evaluation.grid import NEWTON, Point
 from hood.evaluation.reached import Reached
 
 NETWORK, SOLVER, REFINED, OPEN = "network", "solver", "refined", "open"
 #: Fewer rollouts than these do not tell how far rollouts differ: no verdict.
 LEAST_ROLLOUTS = 6
+#: Strain within this multiple of the converged solver's is its strain: rollouts that differ a little fold otherwise.
+_LIKE_THE_SOLVER = 1.05
+#: γ below this is compared as if it were this: minima are not known more exactly, nor is anything gained.
+RESOLUTION = 1e-4
 #: A setting whose γ is not surely below this is no choice, however fast: √0.3 is half of free fall.
 USEFUL = 0.3
 
@@ -37,7 +41,8 @@ class AtEqualGap:
     """The solver alone made as accurate as a network's setting: ``ratio`` is its time over that of the setting.
 
     ``low`` is the bound that a verdict for the network needs and ``high`` the one for the solver: where the solver was not
-    measured as inaccurate or as accurate as the setting, its time there is bounded on one side only.
+    measured as inaccurate or as accurate as the setting, its time there is bounded on one side only. The draws (n, 2) are those
+    bounds in every sample of the bootstrap.
     """
 
     reached: Reached
@@ -45,6 +50,7 @@ class AtEqualGap:
     high: float
     ratio: float | None  # None: bounded on one side only
     verdict: str
+    draws: np.ndarray = field(default_factory=lambda: np.empty((0, 2)), repr=False, compare=False)
 
 
 class _Bounds(NamedTuple):
@@ -55,8 +61,8 @@ class _Bounds(NamedTuple):
 def at_equal_gap(item: Reached, alone: Sequence[Reached], level: float = LEVEL) -> AtEqualGap | None:
     """``item`` against the measured settings of the solver ``alone`` of the same size; None where nothing can be compared.
 
-    Between two settings of the solver its time follows a straight line in the log–log chart; where the more accurate of them
-    has no logarithm (γ ≤ 0) its own time counts.
+    Between two settings of the solver its time follows a straight line in the log–log chart; all that is below
+    :data:`RESOLUTION` is equally accurate.
     """
     alone = [other for other in alone if other.charted]
     if not item.charted or not alone:
@@ -71,19 +77,19 @@ def at_equal_gap(item: Reached, alone: Sequence[Reached], level: float = LEVEL) 
     low, high = interval(bounds[:, 0], level, rollouts)[0], interval(bounds[:, 1], level, rollouts)[1]
     verdict = NETWORK if low > 1.0 else SOLVER if high < 1.0 else OPEN
     verdict = verdict if rollouts >= LEAST_ROLLOUTS else OPEN
-    return AtEqualGap(item, low, high, here.low if here.low == here.high else None, verdict)
+    return AtEqualGap(item, low, high, here.low if here.low == here.high else None, verdict, bounds)
 
 
 def _ratio(ms: float, gap: float, times: np.ndarray, gaps: np.ndarray) -> _Bounds:
     """Bounds of the time the solver needs for ``gap``, over ``ms``."""
     last: tuple[float, float] | None = None  # the most accurate setting so far that is not accurate enough
-    for time, reached in sorted(zip(times.tolist(), gaps.tolist(), strict=True)):
+    gap = max(gap, RESOLUTION)
+    for time, reached in sorted(zip(times.tolist(), np.maximum(gaps, RESOLUTION).tolist(), strict=True)):
         if reached <= gap:
             if last is None:
                 return _Bounds(0.0, time / ms)
-            if reached > 0.0:
-                share = math.log(last[1] / gap) / math.log(last[1] / reached)
-                time = last[0] * (time / last[0]) ** share
+            share = math.log(last[1] / gap) / math.log(last[1] / reached)
+            time = last[0] * (time / last[0]) ** share
             return _Bounds(time / ms, time / ms)
         if last is None or reached < last[1]:
             last = time, reached
@@ -136,23 +142,30 @@ class Refined:
     stretched: int
     deeper: int
 
+    solver: float  # p99 strain of the converged solver at that size; NaN where it was not measured
+
     @property
     def worse(self) -> bool:
-        """Whether strain or penetration is higher than without refinement, in the median rollout; breakdowns are infinite."""
-        pairs = ((self.reached.strains, self.plain.strains), (self.reached.penetrations, self.plain.penetrations))
-        return any(np.median(here) > np.median(there) for here, there in pairs)
+        """Whether the median p99 strain is higher than without refinement and not that of the solver either, which refinement
+        leads to, or the penetration of the median rollout is higher; breakdowns are infinite."""
+        here, there = (
+            np.inf if one.failures else np.nan_to_num(one.strain_p99, nan=np.inf) for one in (self.reached, self.plain)
+        )
+        stretched = here > there and not here <= _LIKE_THE_SOLVER * self.solver
+        return bool(stretched or np.median(self.reached.penetrations) > np.median(self.plain.penetrations))
 
 
 def refined_networks(reached: Sequence[Reached]) -> list[Refined]:
     """Every refined network whose network alone was measured at that size as well."""
+    solver = {item.point.size: item.strain_p99 for item in reached if item.point.model == NEWTON}
     plain = {(i.point.model, i.point.precision, i.point.size): i for i in reached if not i.point.alone and not i.point.refine}
     found = []
     for item in (item for item in reached if not item.point.alone and item.point.refine):
         own = plain.get((item.point.model, item.point.precision, item.point.size))
         if own is not None:
             both = (item.strains, own.strains), (item.penetrations, own.penetrations)
-            counts = (sum(here > there for here, there in zip(*pair, strict=False)) for pair in both)
-            found.append(Refined(item, own, *counts))
+            stretched, deeper = (sum(here > there for here, there in zip(*pair, strict=False)) for pair in both)
+            found.append(Refined(item, own, stretched, deeper, solver.get(item.point.size, float("nan"))))
     return found
 
 
@@ -173,11 +186,11 @@ class Standing:
 def standings(reached: Sequence[Reached], rejected: Collection[Point] = ()) -> list[Standing]:
     """Per size, smallest first, whether a network earns its place beside the solver.
 
-    The network does where one of its settings is faster than the solver at equal γ, the solver where it is faster than all of
-    them. Settings that overstretch the cloth (``rejected``) or are not surely below :data:`USEFUL` are no choice: where a
-    network has none and the solver has one, the solver is the better choice. The more settings are tried, the more likely one
-    of them looks good by chance, so the intervals are as much wider as there are settings (Bonferroni). Sizes without networks
-    are left out.
+    The network does where one of its settings is faster than the solver at equal γ; the more settings are tried, the more
+    likely one of them looks good by chance, so these intervals are as much wider as there are settings (Bonferroni). The solver
+    does where it is faster than the best of them, whichever that is in a sample. Settings that overstretch the cloth
+    (``rejected``) or are not surely below :data:`USEFUL` are no choice: where a network has none and the solver has one, the
+    solver is the better choice. Sizes without networks are left out.
     """
     found = []
     for size in dict.fromkeys(item.point.size for item in reached):
@@ -195,9 +208,16 @@ def standings(reached: Sequence[Reached], rejected: Collection[Point] = ()) -> l
             found.append(Standing(size, vertices, SOLVER if useful else OPEN, None))
             continue
         best = max(compared, key=lambda c: (c.verdict == NETWORK, c.ratio if c.ratio is not None else c.low))
-        won, lost = best.verdict == NETWORK, all(c.verdict == SOLVER for c in compared)
+        won, lost = best.verdict == NETWORK, _all_lost(compared, alone)
         found.append(Standing(size, vertices, NETWORK if won else SOLVER if lost else OPEN, best))
     return sorted(found, key=lambda standing: standing.vertices)
+
+
+def _all_lost(compared: Sequence[AtEqualGap], alone: Sequence[Reached]) -> bool:
+    """Whether the solver is surely faster than the network's best setting."""
+    rollouts = min(one.rollouts for one in (*(c.reached for c in compared), *alone))
+    best = np.max([c.draws[:, 1] for c in compared], axis=0)
+    return rollouts >= LEAST_ROLLOUTS and interval(best, rollouts=rollouts)[1] < 1.0
 
 
 def crossover(found: Sequence[Standing], device: str) -> str:

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from hood.assets.atomic import write_atomically
-from hood.evaluation.comparison import pareto_front
+from hood.evaluation.comparison import RESOLUTION, pareto_front
 from hood.evaluation.grid import NEWTON, Point
 from hood.evaluation.reached import PARTS, Reached
 
 #: Gaps below are not drawn in their place: a logarithm has none for γ ≤ 0, and minima are not known that exactly.
-FLOOR = 1e-4
+FLOOR = RESOLUTION
 #: Below, γ says little: minimisations from different starts end that far apart.
 _BLUR = 1e-2
 _COLOURS = ("#2a6fbb", "#c8503c", "#3f8f4f", "#8c5bb0", "#c98a1b", "#2b9aa0", "#8a5a44", "#c2558f")

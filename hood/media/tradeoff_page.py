@@ -5,8 +5,6 @@ from __future__ import annotations
 from html import escape
 from pathlib import Path
 
-import numpy as np
-
 from hood.assets.atomic import write_atomically
 from hood.evaluation.bootstrap import Estimate
 from hood.evaluation.comparison import (
@@ -141,14 +139,14 @@ def _refined(study: Study, size: str) -> str:
     rows = []
     for found in refined_networks(study.at(size)):
         item, plain = found.reached, found.plain
-        rows.append([item.label, str(item.point.refine), *(f"{np.median(one.strains):.2%}" for one in (plain, item)),
+        rows.append([item.label, str(item.point.refine), *(f"{strain:.2%}" for strain in (plain.strain_p99, item.strain_p99, found.solver)),
                      f"{found.stretched} of {item.rollouts}", *(f"{one.penetration:.4%}" for one in (plain, item)),
                      f"{found.deeper} of {item.rollouts}", *(f"{1e3 * one.depth:.2f}" for one in (plain, item)),
                      "worse" if found.worse else "no worse"])  # fmt: skip
     if not rows:
         return ""
-    head = ["setting", "k", "p99 strain alone", "refined", "rollouts with more", "deeper than 2 mm alone", "refined",
-            "rollouts with more", "deepest alone [mm]", "refined", "verdict"]  # fmt: skip
+    head = ["setting", "k", "p99 strain alone", "refined", "solver's", "rollouts with more", "deeper than 2 mm alone",
+            "refined", "rollouts with more", "deepest alone [mm]", "refined", "verdict"]  # fmt: skip
     return "<h3>Does refinement ever make it worse?</h3>" + paragraph(prose.REFINED) + table(head, rows)
 
 

@@ -26,8 +26,10 @@ EQUAL_TIME = (
 )
 REFINED = (
     "Every iteration lowers the energy of its frame, but a rollout could still come out worse. So the same rollouts with and "
-    "without: p99 strain, median over rollouts; share of vertices deeper than 2 mm under the skin and the deepest vertex, "
-    "means over frames; and how many rollouts have more than without. Worse is where the median rollout has more of either."
+    "without: p99 strain, median over frames, beside that of the converged solver; share of vertices deeper than 2 mm under "
+    "the skin and the deepest vertex, means over frames; and how many rollouts have more than without. Refinement leads to the "
+    "solver's strain, up or down: worse is what has more strain than without and than the solver, or more penetration in the "
+    "median rollout."
 )
 COMMANDS = (
     "Every point is one command; run it to check the point. It prints the point's table and writes it to outputs/evaluate. "

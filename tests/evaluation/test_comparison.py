@@ -13,6 +13,7 @@ from hood.evaluation.comparison import (
     NETWORK,
     OPEN,
     REFINED,
+    RESOLUTION,
     SOLVER,
     at_equal_gap,
     at_equal_time,
@@ -68,16 +69,26 @@ def test_beyond_the_measured_settings_only_a_bound_is_known() -> None:
     crude_and_slow = at_equal_gap(exact("net", 0, 20.0, 4.0), alone)
     assert crude_and_slow is not None
     assert (crude_and_slow.ratio, crude_and_slow.high, crude_and_slow.verdict) == (None, 0.5, SOLVER)
-    accurate = at_equal_gap(exact("net", 9, 100.0, -1.0), alone)
+    accurate = at_equal_gap(exact("net", 9, 100.0, 0.005), alone[:-1])
     assert accurate is not None
-    assert (accurate.ratio, accurate.low, accurate.high, accurate.verdict) == (None, 3.0, np.inf, NETWORK)
+    assert (accurate.ratio, accurate.low, accurate.high, accurate.verdict) == (None, 1.0, np.inf, OPEN)
 
 
-def test_a_setting_of_the_solver_without_logarithm_counts_with_its_own_time() -> None:
+@pytest.mark.parametrize("gap", [RESOLUTION, 1e-7, 0.0, -1.0])
+def test_what_is_below_the_resolution_is_equally_accurate(gap: float) -> None:
     alone = [exact("guess", 1, 10.0, 1.0), exact("guess", 2, 20.0, -1e-9)]
-    found = at_equal_gap(exact("net", 0, 10.0, 0.1), alone)
+    found = at_equal_gap(exact("net", 0, 10.0, gap), alone)
     assert found is not None
-    assert found.ratio == 2.0
+    assert found.ratio == pytest.approx(2.0)
+    half_way = at_equal_gap(exact("net", 0, 10.0, RESOLUTION**0.5), alone)
+    assert half_way is not None
+    assert half_way.ratio == pytest.approx(2.0**0.5)
+
+
+def test_the_solver_wins_a_size_only_if_it_beats_the_best_setting() -> None:
+    slow, level = exact("net", 0, 200.0, 0.04), reached("net", 2, 50.0, 0.04, noise=0.3)
+    assert standings([*solver(CURVE), slow])[0].winner == SOLVER
+    assert standings([*solver(CURVE), slow, level])[0].winner == OPEN
 
 
 @pytest.mark.parametrize("ms, verdict", [(20.0, NETWORK), (48.0, OPEN), (52.0, OPEN), (120.0, SOLVER)])
@@ -197,6 +208,17 @@ def test_refinement_that_pushes_cloth_into_the_body_or_breaks_down_is_worse() ->
     broken = exact("net", 10, 1.0, 1.0, strain=float("nan"))
     found = refined_networks([plain, deeper, once, broken])
     assert [(one.worse, one.stretched, one.deeper) for one in found] == [(True, 0, 8), (False, 0, 1), (True, 8, 0)]
+
+
+@pytest.mark.parametrize("strain, worse", [(0.12, False), (0.104, False), (0.16, True)])
+def test_refinement_may_raise_the_strain_to_the_solvers(strain: float, worse: bool) -> None:
+    items = [
+        exact("net", 0, 1.0, 1.0, strain=0.05),
+        exact("net", 5, 1.0, 1.0, strain=strain),
+        exact("newton", 0, 1.0, 0.0, strain=0.12),
+    ]
+    assert [one.worse for one in refined_networks(items)] == [worse]
+    assert [one.worse for one in refined_networks(items[:2])] == [True]  # nobody says what the strain should be
 
 
 def test_refinement_that_saves_a_rollout_from_breaking_down_is_no_worse() -> None:
