@@ -139,7 +139,8 @@ def _refined(study: Study, size: str) -> str:
     rows = []
     for found in refined_networks(study.at(size)):
         item, plain = found.reached, found.plain
-        rows.append([item.label, str(item.point.refine), *(f"{strain:.2%}" for strain in (plain.strain_p99, item.strain_p99, found.solver)),
+        strains = plain.strain_p99, item.strain_p99, found.solver
+        rows.append([item.label, str(item.point.refine), *(f"{strain:.2%}" for strain in strains),
                      f"{found.stretched} of {item.rollouts}", *(f"{one.penetration:.4%}" for one in (plain, item)),
                      f"{found.deeper} of {item.rollouts}", *(f"{1e3 * one.depth:.2f}" for one in (plain, item)),
                      "worse" if found.worse else "no worse"])  # fmt: skip
