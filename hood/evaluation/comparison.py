@@ -230,7 +230,7 @@ def crossover(found: Sequence[Standing], device: str) -> str:
         doubt = (
             f" At {_sizes(undecided)} no claim is made: the intervals overlap, rollouts are fewer than {LEAST_ROLLOUTS}, or "
             "the solver was not measured at equal γ."
-        )
+        ) + "".join(map(_undecided, undecided))
     winners = "; ".join(
         f"{s.best.reached.label} at {s.vertices:,} vertices (γ = {s.best.reached.gap.value:.2g})" for s in won if s.best
     )
@@ -255,6 +255,18 @@ def crossover(found: Sequence[Standing], device: str) -> str:
             + doubt
         )
     return f"On this {device} no crossover was seen." + doubt
+
+
+def _undecided(standing: Standing) -> str:
+    """What was measured where nothing is claimed."""
+    best = standing.best
+    if best is None or best.ratio is None:
+        return ""
+    high = f"{1 / best.low:.2g}" if best.low > 0 else "∞"
+    return (
+        f" The network's best setting at {standing.vertices:,} vertices, {best.reached.label}, took {1 / best.ratio:.2g} times "
+        f"the solver's time ({1 / best.high:.2g} to {high})."
+    )
 
 
 def _sizes(found: Sequence[Standing]) -> str:

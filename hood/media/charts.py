@@ -43,7 +43,7 @@ def front_chart(reached: Sequence[Reached], rejected: Collection[Point], colours
     """Figure of one size: milliseconds a frame against γ, median and 95th percentile, log–log, with confidence intervals.
 
     One line per model and precision; the numbers at it are iterations. Hollow: ``rejected``. The staircase is the Pareto front
-    of the medians. Points below :data:`FLOOR` stand at the lower edge as triangles with their value.
+    of the medians. Points below :data:`FLOOR` stand at the lower edge as triangles.
     """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
@@ -99,7 +99,7 @@ def _series(axes: Any, items: list[Reached], rejected: Collection[Point], colour
     named = line if len(line) < 5 else [line[0], line[-1]]
     for item in items:
         if getattr(item, quantity).value < FLOOR:
-            _at_the_edge(axes, item, getattr(item, quantity).value, colour)
+            _at_the_edge(axes, item, colour)
             continue
         face = "white" if item.point in rejected else colour
         _marker(axes, item, getattr(item, quantity), style | {"markerfacecolor": face}, item in named)
@@ -131,13 +131,13 @@ def _errors(axes: Any, item: Reached, value: Any, colour: str) -> None:
     axes.errorbar([item.ms.value], [value.value], xerr=across, yerr=up, color=colour, linewidth=0.8, alpha=0.55, zorder=2)
 
 
-def _at_the_edge(axes: Any, item: Reached, value: float, colour: str) -> None:
+def _at_the_edge(axes: Any, item: Reached, colour: str) -> None:
     axes.plot(
         [item.ms.value], [0.02], marker="v", color=colour, markersize=7, transform=axes.get_xaxis_transform(), clip_on=False
     )
     name = "converged" if item.point.model == NEWTON else str(item.point.refine)
-    axes.annotate(f"{name}: γ = {value:.0e}", (item.ms.value, 0.03), (0, 6), xycoords=axes.get_xaxis_transform(),
-                  textcoords="offset points", fontsize=7, color=colour, rotation=90, ha="center", va="bottom")  # fmt: skip
+    axes.annotate(name, (item.ms.value, 0.03), (0, 6), xycoords=axes.get_xaxis_transform(), textcoords="offset points",
+                  fontsize=7, color=colour, rotation=90, ha="center", va="bottom")  # fmt: skip
 
 
 def _staircase(axes: Any, front: Sequence[Reached]) -> None:

@@ -178,7 +178,11 @@ def test_no_crossover_is_said_as_well() -> None:
 def test_intervals_that_overlap_make_no_claim() -> None:
     found = standings(scene("1k", 1000, 50.0, noise=0.4))
     assert found[0].winner == OPEN
-    assert crossover(found, "CPU").startswith("On this CPU no crossover was seen. At 1,000 vertices no claim is made")
+    said = crossover(found, "CPU")
+    assert said.startswith("On this CPU no crossover was seen. At 1,000 vertices no claim is made")
+    assert "The network's best setting at 1,000 vertices, net, fp32, took" in said
+    assert found[0].best is not None
+    assert f"({1 / found[0].best.high:.2g} to {1 / found[0].best.low:.2g})." in said
     mixed = crossover(standings(scene("1k", 1000, 200.0) + scene("4k", 4000, 50.0, noise=0.4)), "CPU")
     assert "At 4,000 vertices no claim is made: the intervals overlap" in mixed
     assert crossover([], "CPU").startswith("No network was measured")

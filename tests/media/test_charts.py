@@ -24,13 +24,14 @@ def texts(figure: object) -> str:
     return "\n".join(item.get_text() for item in figure.findobj(Text))  # type: ignore[attr-defined]
 
 
-def test_points_below_the_floor_are_marked_with_their_value_and_not_moved() -> None:
+def test_points_below_the_floor_stand_at_the_edge_and_are_not_moved() -> None:
     assert [item.label for item in below_floor(ITEMS)] == ["solver alone, converged"]
     negative = reached("net", 20, 300.0, -1e-3)
     assert below_floor([negative]) == [negative]
     figure = front_chart([*ITEMS, negative], [], COLOURS, "title")
-    assert "20: γ = -1e-03" in texts(figure)
-    assert "converged: γ = 1e-07" in texts(figure)
+    edge = [line for line in figure.axes[0].lines if line.get_marker() == "v"]
+    assert sorted(float(line.get_xdata()[0]) for line in edge) == sorted([negative.ms.value, below_floor(ITEMS)[0].ms.value])
+    assert "converged" in texts(figure)
     for axes in figure.axes:
         assert axes.get_ylim()[0] == FLOOR
         assert axes.get_xscale() == axes.get_yscale() == "log"
