@@ -31,9 +31,7 @@ from hood.evaluation.reached import read_record
 PROGRAM = (sys.executable, "-m", "hood.cli")
 #: Written by ``hood evaluate`` when all its rollouts are done.
 _TABLE = "table.json"
-#: By which command and weights a point was begun.
-_BEGUN = "begun.json"
-#: Times of the turns that a point has had.
+#: By which command and weights a point was begun, and the times of its turns.
 _TURNS = "turns.json"
 #: Seconds that an interrupted process has to end.
 _PATIENCE = 20.0
@@ -54,6 +52,7 @@ class _Running:
     process: subprocess.Popen[bytes]
     begin: float
     load: float
+    rollouts: int  # that were there before
     cpu_seconds: float | None = None  # of the process; known when it has ended
 
     def ended(self) -> bool:
@@ -124,7 +123,8 @@ class Points:
                 for item in [item for item in running if item.ended()]:
                     running.remove(item)
                     self._note_turn(item)
-                    if item.process.returncode == 0 and not (self.folder_of(item.point) / _TABLE).exists():
+                    unfinished = not (self.folder_of(item.point) / _TABLE).exists()
+                    if item.process.returncode == 0 and unfinished and self._count(item.point) > item.rollouts:
                         waiting.append(item.point)
                         continue
                     failures += self._finish(item)
@@ -138,22 +138,23 @@ class Points:
         folder, begun = self.folder_of(point), {"command": point.command, "weights": weights_digest(point)}
         for name in (_TABLE, "point.json"):  # the table's presence says that all rollouts are there
             (folder / name).unlink(missing_ok=True)
-        if _read(folder / _BEGUN) != begun:
-            for path in (*folder.glob("rollouts.*.jsonl"), folder / _TURNS):
+        before = read_record(folder, _TURNS)
+        if {key: before.get(key) for key in begun} != begun:
+            for path in folder.glob("rollouts.*.jsonl"):
                 path.unlink(missing_ok=True)
             folder.mkdir(parents=True, exist_ok=True)
-            write_atomically(folder / _BEGUN, json.dumps(begun).encode())
+            write_atomically(folder / _TURNS, json.dumps({**begun, "turns": []}).encode())
 
     def _start(self, point: Point) -> _Running:
         folder = self.folder_of(point)
         folder.mkdir(parents=True, exist_ok=True)
-        begun = any(folder.glob("rollouts.*.jsonl"))
+        count = self._count(point)
         arguments = [
             *self.program,
             "evaluate",
             *point.settings,
             f"output={quoted(str(folder))}",
-            f"resume={str(begun).lower()}",
+            f"resume={str(count > 0).lower()}",
             f"max_rollouts={math.ceil(point.rollouts / self.turns)}",
         ]
         load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
@@ -163,17 +164,20 @@ class Points:
             process = subprocess.Popen(
                 arguments, stdin=subprocess.DEVNULL, stdout=sink, stderr=sink, env=os.environ | {"OMP_NUM_THREADS": "1"}
             )
-        return _Running(point, process, time.monotonic(), load)
+        return _Running(point, process, time.monotonic(), load, count)
 
     def _note_turn(self, item: _Running) -> None:
         turn = {"seconds": time.monotonic() - item.begin, "cpu_seconds": item.cpu_seconds, "load_at_start": item.load}
-        path = self.folder_of(item.point) / _TURNS
-        write_atomically(path, json.dumps([*(_read(path) or []), turn]).encode())
+        folder = self.folder_of(item.point)
+        record = read_record(folder, _TURNS)
+        write_atomically(folder / _TURNS, json.dumps({**record, "turns": [*record["turns"], turn]}).encode())
 
     def _finish(self, item: _Running) -> list[Failure]:
         if item.process.returncode:
             return [Failure(item.point, self._complaint(item), self.log_of(item.point))]
-        turns = _read(self.folder_of(item.point) / _TURNS)
+        if not (self.folder_of(item.point) / _TABLE).exists():
+            return [Failure(item.point, "a turn added no rollout and wrote no table", self.log_of(item.point))]
+        turns = read_record(self.folder_of(item.point), _TURNS)["turns"]
         seconds = sum(turn["seconds"] for turn in turns)
         spent = [turn["cpu_seconds"] for turn in turns]
         record: dict[str, Any] = {
@@ -199,17 +203,11 @@ class Points:
         return f"{ending}: {errors[-1] if errors else 'no error was told'}"
 
     def _progress(self, point: Point) -> str:
-        folder = self.folder_of(point)
-        lines = sum(path.read_bytes().count(b'"unit"') for path in folder.glob("rollouts.*.jsonl"))
-        return f"{point.size} {point.label}: {lines} rollouts"
+        return f"{point.size} {point.label}: {self._count(point)} rollouts"
 
-
-def _read(path: Path) -> Any:
-    """What a JSON file holds; None where there is none."""
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
+    def _count(self, point: Point) -> int:
+        """Rollouts written down."""
+        return sum(path.read_bytes().count(b'"unit"') for path in self.folder_of(point).glob("rollouts.*.jsonl"))
 
 
 def _end(running: Sequence[_Running]) -> None:

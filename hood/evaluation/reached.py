@@ -185,10 +185,10 @@ def refinement_tables(reached: Sequence[Reached]) -> dict[str, dict[str, list[di
     return tables
 
 
-def read_record(folder: Path) -> dict[str, Any]:
-    """What was written down when the point was done; empty where it is not."""
+def read_record(folder: Path, name: str = "point.json") -> dict[str, Any]:
+    """What was written down about a point, by default when it was done; empty where nothing was."""
     try:
-        record = json.loads((folder / "point.json").read_text(encoding="utf-8"))
+        record = json.loads((folder / name).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
     return record if isinstance(record, dict) else {}

@@ -158,6 +158,12 @@ def test_the_points_of_a_size_take_turns() -> None:
     assert record["seconds"] > 0.0
 
 
+def test_a_point_that_does_not_go_on_is_a_failure_and_ends() -> None:
+    Path("fake.py").write_text("print('nothing')")
+    (failure,) = store(turns=2).measure(tiny_grid("untrained:small", refine=(0,)).points()[:1])
+    assert failure.reason == "a turn added no rollout and wrote no table"
+
+
 def test_a_turn_is_a_share_of_the_rollouts() -> None:
     sizes = (Size("1k", ("tank", "dress"), (0,), (), 5, 1),)
     points = Grid(("untrained:small",), ("fp32",), ("newton",), sizes, newton=False, motions=2).points()
