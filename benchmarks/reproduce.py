@@ -5,7 +5,11 @@
 Points are taken evenly from ``points.json``; each one's command runs as it is printed, one after another with one thread, into
 a folder of its own. Printed is whether median γ, its 95th percentile and the median time fall into the chart's confidence
 intervals. Run it where the chart was made, if models were given by relative paths. γ of the same machine and version should be
-the same number; times say how far the machine can be trusted.
+the same number.
+
+A machine is not equally fast at all hours. So a setting of the solver alone, the yardstick of its size, is timed before and
+after each point, and the point's time is held against the chart as measured and divided by what the yardstick takes now as a
+multiple of what it took then (``ms_scaled``).
 """
 
 from __future__ import annotations
@@ -21,7 +25,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-FIGURES = ("gap", "gap_p95", "ms")
+FIGURES = ("gap", "gap_p95", "ms", "ms_scaled")
 
 
 def chosen(rows: Sequence[Mapping[str, Any]], count: int) -> list[Mapping[str, Any]]:
@@ -31,14 +35,22 @@ def chosen(rows: Sequence[Mapping[str, Any]], count: int) -> list[Mapping[str, A
     return [measured[round(i * (len(measured) - 1) / max(count - 1, 1))] for i in range(count)]
 
 
-def measured_again(row: Mapping[str, Any], folder: Path) -> Mapping[str, Any]:
+def yardstick(rows: Sequence[Mapping[str, Any]], size: str) -> Mapping[str, Any] | None:
+    """The solver alone at the middle of its iteration counts; None where the chart has no such point of this size."""
+    alone = sorted((row for row in rows if row["size"] == size and row["model"] == "guess"), key=lambda row: row["refine"])
+    return alone[len(alone) // 2] if alone else None
+
+
+def measured_again(row: Mapping[str, Any], *overrides: str) -> Mapping[str, Any]:
     """The row over all garments of the table that the point's command writes."""
-    words = shlex.split(row["command"])
-    command = [sys.executable, "-m", "hood.cli", *words[1:], f"output={folder}"]
-    done = subprocess.run(command, env=os.environ | {"OMP_NUM_THREADS": "1"}, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise SystemExit(f"{row['setting']}: exit code {done.returncode}\n{done.stderr[-2000:]}")
-    table = json.loads((folder / "table.json").read_text())
+    words = [word for word in shlex.split(row["command"])[1:] if word.split("=")[0] not in {o.split("=")[0] for o in overrides}]
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary) / "again"
+        command = [sys.executable, "-m", "hood.cli", *words, *overrides, f"output={folder}"]
+        done = subprocess.run(command, env=os.environ | {"OMP_NUM_THREADS": "1"}, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise SystemExit(f"{row['setting']}: exit code {done.returncode}\n{done.stderr[-2000:]}")
+        table = json.loads((folder / "table.json").read_text())
     found: Mapping[str, Any] = next(line for line in table if line["garment"] == "all")
     return found
 
@@ -48,20 +60,31 @@ def main() -> None:
     parser.add_argument("chart", type=Path, help="folder that hood tradeoff wrote")
     parser.add_argument("--points", type=int, default=6)
     arguments = parser.parse_args()
-    inside = dict.fromkeys(FIGURES, 0)
-    rows = chosen(json.loads((arguments.chart / "points.json").read_text()), arguments.points)
+    measured = json.loads((arguments.chart / "points.json").read_text())
+    rows = chosen(measured, arguments.points)
+    found, compared = dict.fromkeys(FIGURES, 0), dict.fromkeys(FIGURES, 0)
     for row in rows:
-        with tempfile.TemporaryDirectory() as folder:
-            again = measured_again(row, Path(folder) / "again")
+        rule = yardstick(measured, row["size"])
+        before = rule and measured_again(rule, "gap_states=0")["ms"]
+        again = {**measured_again(row), "ms_scaled": None}
+        if rule:
+            slower = 0.5 * (before + measured_again(rule, "gap_states=0")["ms"]) / rule["ms"]
+            again["ms_scaled"] = again["ms"] / slower
         text = []
         for name in FIGURES:
-            low, high = row[f"{name}_low"], row[f"{name}_high"]
+            if again[name] is None:
+                continue
+            key = "ms" if name == "ms_scaled" else name
+            low, high = row[f"{key}_low"], row[f"{key}_high"]
             within = None not in (low, high) and low <= again[name] <= high
-            inside[name] += within
+            compared[name] += 1
+            found[name] += within
             ends = " to ".join("?" if end is None else f"{end:.3g}" for end in (low, high))
-            text.append(f"{name} {row[name]:.3g} ({ends}) now {again[name]:.3g}{'' if within else ' OUTSIDE'}")
+            text.append(f"{name} {row[key]:.3g} ({ends}) now {again[name]:.3g}{'' if within else ' OUTSIDE'}")
+        if rule:
+            text.append(f"yardstick {slower:.2f} times as long")
         print(f"{row['size']:>4} {row['setting']:<28} {'; '.join(text)}", flush=True)
-    print(", ".join(f"{name}: {count} of {len(rows)} inside" for name, count in inside.items()))
+    print(", ".join(f"{name}: {found[name]} of {compared[name]} inside" for name in FIGURES))
 
 
 if __name__ == "__main__":
