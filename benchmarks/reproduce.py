@@ -42,8 +42,9 @@ def yardstick(rows: Sequence[Mapping[str, Any]], size: str) -> Mapping[str, Any]
 
 
 def measured_again(row: Mapping[str, Any], *overrides: str) -> Mapping[str, Any]:
-    """The row over all garments of the table that the point's command writes."""
-    words = [word for word in shlex.split(row["command"])[1:] if word.split("=")[0] not in {o.split("=")[0] for o in overrides}]
+    """The row over all garments of the table that the point's command writes; ``overrides`` take the place of its own keys."""
+    replaced = {override.split("=")[0] for override in overrides}
+    words = [word for word in shlex.split(row["command"])[1:] if word.split("=")[0] not in replaced]
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / "again"
         command = [sys.executable, "-m", "hood.cli", *words, *overrides, f"output={folder}"]
@@ -62,29 +63,26 @@ def main() -> None:
     arguments = parser.parse_args()
     measured = json.loads((arguments.chart / "points.json").read_text())
     rows = chosen(measured, arguments.points)
-    found, compared = dict.fromkeys(FIGURES, 0), dict.fromkeys(FIGURES, 0)
+    verdicts: dict[str, list[bool]] = {name: [] for name in FIGURES}
     for row in rows:
         rule = yardstick(measured, row["size"])
-        before = rule and measured_again(rule, "gap_states=0")["ms"]
-        again = {**measured_again(row), "ms_scaled": None}
+        before = measured_again(rule, "gap_states=0")["ms"] if rule else None
+        again = dict(measured_again(row))
+        text = []
         if rule:
             slower = 0.5 * (before + measured_again(rule, "gap_states=0")["ms"]) / rule["ms"]
             again["ms_scaled"] = again["ms"] / slower
-        text = []
-        for name in FIGURES:
-            if again[name] is None:
-                continue
-            key = "ms" if name == "ms_scaled" else name
+        for name in (name for name in FIGURES if name in again):
+            key = name.removesuffix("_scaled")
             low, high = row[f"{key}_low"], row[f"{key}_high"]
             within = None not in (low, high) and low <= again[name] <= high
-            compared[name] += 1
-            found[name] += within
+            verdicts[name].append(within)
             ends = " to ".join("?" if end is None else f"{end:.3g}" for end in (low, high))
             text.append(f"{name} {row[key]:.3g} ({ends}) now {again[name]:.3g}{'' if within else ' OUTSIDE'}")
         if rule:
             text.append(f"yardstick {slower:.2f} times as long")
         print(f"{row['size']:>4} {row['setting']:<28} {'; '.join(text)}", flush=True)
-    print(", ".join(f"{name}: {found[name]} of {compared[name]} inside" for name in FIGURES))
+    print(", ".join(f"{name}: {sum(inside)} of {len(inside)} inside" for name, inside in verdicts.items()))
 
 
 if __name__ == "__main__":
