@@ -15,6 +15,8 @@ from hood.scene.scene import RELAXING_DT
 
 #: Iterations at most where a goal is not reached.
 MOST = 50
+#: Where the relative gradient is this small nothing that shows is left to gain.
+CONVERGED = 1e-4
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,7 @@ class Goal(Protocol):
     """Decides, iteration by iteration, how far a frame is refined; learns from frame to frame."""
 
     most: int  # iterations of a frame at most
+    accuracy: float  # relative gradient at which every frame is done
     wants_residual: bool  # whether it reads ``Standing.residual`` before every iteration
     metrics: tuple[str, ...]  # names of what ``end`` returns
 
@@ -56,6 +59,7 @@ class Goal(Protocol):
 class Count:
     """``count`` iterations in every frame, fewer only where nothing is left to gain."""
 
+    accuracy = CONVERGED
     wants_residual = False
     metrics: tuple[str, ...] = ()
 
@@ -83,7 +87,7 @@ class TargetResidual:
     def __init__(self, target: float, most: int = MOST) -> None:
         if not target > 0:
             raise ValueError(f"target_rg is {target:g}; give a relative gradient > 0 (0.1: a tenth of the weight)")
-        self.target, self.most = target, most
+        self.target, self.most, self.accuracy = target, most, min(target, CONVERGED)
 
     def begin(self, standing: Standing) -> bool:
         return True
@@ -105,6 +109,7 @@ class MaxStrain:
         floor: iterations to begin with, see :func:`hood.dynamics.refine_table.floor_from_table`.
     """
 
+    accuracy = CONVERGED
     wants_residual = False
     metrics: tuple[str, ...] = ("refine_met",)
     _COMFORT = 0.7
@@ -147,6 +152,7 @@ class Budget:
             it, scaled by what a frame takes here before it is refined. Without it one iteration is tried.
     """
 
+    accuracy = CONVERGED
     wants_residual = False
     metrics: tuple[str, ...] = ()
     _LATE = 0.03

@@ -25,8 +25,6 @@ from hood.solver.plan import plan_for
 from hood.solver.sweeps import sweep
 
 METHODS = ("newton", "sweeps")
-#: Where the relative gradient is this small nothing is left to gain.
-_CONVERGED = 1e-4
 
 
 class GuessStepper:
@@ -94,7 +92,7 @@ class RefinedStepper:
             raise ValueError(f"refine_method is {method!r}; choose {' or '.join(METHODS)}")
         self.inner, self.potential, self.goal, self.method = inner, potential, goal, method
         self._fresh_goal = deepcopy(goal)
-        self.settings = replace(settings or NewtonSettings(), target_rg=_CONVERGED, max_iterations=goal.most, budget_ms=None)
+        self.settings = replace(settings or NewtonSettings(), target_rg=goal.accuracy, max_iterations=goal.most, budget_ms=None)
         self.gravity = inner.gravity
         self.config: dict[str, Any] = {**inner.config, "refined": f"{method}, {type(goal).__name__}"}
         own = ("refine_iterations", "refine_rg", "refine_phi_before", "refine_phi_after")

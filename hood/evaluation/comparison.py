@@ -204,7 +204,8 @@ def standings(reached: Sequence[Reached], rejected: Collection[Point] = ()) -> l
         compared = [c for c in (at_equal_gap(item, alone, level) for item in learned) if c is not None]
         vertices = round(float(np.mean([item.vertices for item in here])))
         if not compared:
-            useful = not learned and any(item.gap.high <= USEFUL for item in alone)
+            enough = min(item.rollouts for item in here) >= LEAST_ROLLOUTS
+            useful = enough and not learned and any(item.gap.high <= USEFUL for item in alone)
             found.append(Standing(size, vertices, SOLVER if useful else OPEN, None))
             continue
         best = max(compared, key=lambda c: (c.verdict == NETWORK, c.ratio if c.ratio is not None else c.low))

@@ -55,7 +55,7 @@ def front_chart(reached: Sequence[Reached], rejected: Collection[Point], colours
         for axes, quantity, name in zip(panels, ("gap", "gap_p95"), ("median", "95th percentile"), strict=True):
             _panel(axes, [item for item in reached if item.charted], rejected, colours, quantity)
             axes.set_title(f"γ, {name} over states")
-            axes.set_xlabel("milliseconds per frame (median; everything included)")
+            axes.set_xlabel("milliseconds per frame (median; search and features included)")
             axes.tick_params(labelleft=True)
         panels[0].set_ylabel("γ: energy above the exact step, in e0   (down is better)")
         if any(item.point in rejected for item in reached):

@@ -153,8 +153,10 @@ def test_an_undecided_size_between_is_named_and_every_winner_has_its_own_size() 
 
 
 def test_a_fast_network_that_is_far_off_is_no_choice() -> None:
-    found = standings([*solver(CURVE), reached("net", 0, 1.0, 2.3), reached("net", 1, 2.0, 0.9)])
-    assert [(one.winner, one.best) for one in found] == [(SOLVER, None)]
+    items = [*solver(CURVE), reached("net", 0, 1.0, 2.3), reached("net", 1, 2.0, 0.9)]
+    assert [(one.winner, one.best) for one in standings(items)] == [(SOLVER, None)]
+    few = [replace(item, rollouts=LEAST_ROLLOUTS - 1) for item in items]
+    assert [(one.winner, one.best) for one in standings(few)] == [(OPEN, None)]
 
 
 def test_few_rollouts_allow_no_verdict() -> None:
