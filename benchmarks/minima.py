@@ -1,0 +1,72 @@
+"""How many minima a step has, and how far apart: what limits the certainty of γ.
+
+    python benchmarks/minima.py dress_4k walk_proud
+    python benchmarks/minima.py tshirt_4k dance_mixed
+
+A network alone dresses the body. At five of its steps the potential is minimised from three starts, as for γ: the inertial
+guess, the positions before the step and those after it. Then every minimum is shaken twice, by 2 mm at every vertex, and
+minimised again; the lower one is kept. Printed is how far the minima lie above the lowest of the three [e0], how far single
+vertices are from where they are in the first one, and where shaking led.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import torch
+
+from hood.assets.body import load_body
+from hood.assets.garment import load_garment
+from hood.assets.library import locate
+from hood.assets.sequence import load_sequence
+from hood.dynamics.checkpoint import load_simulator
+from hood.dynamics.rollout import simulate
+from hood.evaluation.gap import REFERENCE
+from hood.evaluation.sample import StepSample
+from hood.losses.potential import default_potential, scale
+from hood.scene.scene import build_scene
+from hood.solver.iterate import in_double
+from hood.solver.newton import minimize
+
+FRAMES, STATES, SHAKES, SHAKE = 24, 5, 2, 2e-3
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("garment", nargs="?", default="dress_4k")
+    parser.add_argument("sequence", nargs="?", default="walk_proud")
+    parser.add_argument("--checkpoint", default="ours")
+    arguments = parser.parse_args()
+    potential, sample = default_potential(), StepSample(range(3, FRAMES), STATES)
+    scene = build_scene(load_garment(arguments.garment), load_body(), load_sequence(arguments.sequence))
+    for _ in simulate(
+        load_simulator(locate("weights", arguments.checkpoint)), scene, potential, num_frames=FRAMES, observe=sample
+    ):
+        pass
+    generator = torch.Generator().manual_seed(0)
+    print(f"{'above the lowest [e0]':28}{'apart [mm]':22}{'shaken [e0]':28}lower by")
+    for problem, prediction in sample.steps:
+        work = in_double(potential.prepare(problem))
+        e0 = float(scale(work))
+        minima = []
+        for start in (None, work.state.pos, prediction.next_pos.double()):
+            pos, report = minimize(potential, work, start, REFERENCE)
+            minima.append((float(report.phi) / e0, pos))
+        lowest = min(phi for phi, _ in minima)
+        shaken = []
+        for phi, pos in minima:
+            for _ in range(SHAKES):
+                noise = SHAKE * torch.randn(pos.shape, generator=generator, dtype=pos.dtype)
+                found, report = minimize(potential, work, pos + noise, REFERENCE)
+                if float(report.phi) / e0 < phi:
+                    phi, pos = float(report.phi) / e0, found
+            shaken.append(phi)
+        apart = [1e3 * float((pos - minima[0][1]).norm(dim=1).max()) for _, pos in minima]
+        columns = " ".join(f"{phi - lowest:8.4f}" for phi, _ in minima), " ".join(f"{mm:6.1f}" for mm in apart)
+        print(
+            f"{columns[0]:28}{columns[1]:22}{' '.join(f'{phi - lowest:8.4f}' for phi in shaken):28}{lowest - min(shaken):.4f}"
+        )
+
+
+if __name__ == "__main__":
+    main()
