@@ -6,7 +6,7 @@
 A network alone dresses the body. At five of its steps the potential is minimised from three starts, as for γ: the inertial
 guess, the positions before the step and those after it. Then every minimum is shaken twice, by 2 mm at every vertex, and
 minimised again; the lower one is kept. Printed is how far the minima lie above the lowest of the three [e0], how far single
-vertices are from where they are in the first one, and where shaking led.
+vertices are from where they are in the first one, where shaking led, and how many minimisations did not converge.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 
 import torch
+from torch import Tensor
 
 from hood.assets.body import load_body
 from hood.assets.garment import load_garment
@@ -21,9 +22,10 @@ from hood.assets.library import locate
 from hood.assets.sequence import load_sequence
 from hood.dynamics.checkpoint import load_simulator
 from hood.dynamics.rollout import simulate
-from hood.evaluation.gap import REFERENCE
+from hood.evaluation.gap import REFERENCE, starts
 from hood.evaluation.sample import StepSample
 from hood.losses.potential import default_potential, scale
+from hood.losses.problem import StepProblem
 from hood.scene.scene import build_scene
 from hood.solver.iterate import in_double
 from hood.solver.newton import minimize
@@ -39,33 +41,34 @@ def main() -> None:
     arguments = parser.parse_args()
     potential, sample = default_potential(), StepSample(range(3, FRAMES), STATES)
     scene = build_scene(load_garment(arguments.garment), load_body(), load_sequence(arguments.sequence))
-    for _ in simulate(
-        load_simulator(locate("weights", arguments.checkpoint)), scene, potential, num_frames=FRAMES, observe=sample
-    ):
+    simulator = load_simulator(locate("weights", arguments.checkpoint))
+    for _ in simulate(simulator, scene, potential, num_frames=FRAMES, observe=sample):
         pass
     generator = torch.Generator().manual_seed(0)
-    print(f"{'above the lowest [e0]':28}{'apart [mm]':22}{'shaken [e0]':28}lower by")
+    print(f"{'above the lowest [e0]':28}{'apart [mm]':22}{'shaken [e0]':28}{'lower by':10}unconverged")
     for problem, prediction in sample.steps:
         work = in_double(potential.prepare(problem))
-        e0 = float(scale(work))
-        minima = []
-        for start in (None, work.state.pos, prediction.next_pos.double()):
+        unconverged = 0
+
+        def minimum(start: Tensor | None, work: StepProblem = work) -> tuple[float, Tensor]:
+            """Potential [e0] and positions (V, 3) m where the minimisation from ``start`` ends."""
+            nonlocal unconverged
             pos, report = minimize(potential, work, start, REFERENCE)
-            minima.append((float(report.phi) / e0, pos))
-        lowest = min(phi for phi, _ in minima)
+            unconverged += int(not bool(report.converged.all()))
+            return float(report.phi / scale(work)), pos
+
+        minima = [minimum(start) for start in starts(work, prediction.next_pos)]
         shaken = []
-        for phi, pos in minima:
+        for best in minima:
             for _ in range(SHAKES):
-                noise = SHAKE * torch.randn(pos.shape, generator=generator, dtype=pos.dtype)
-                found, report = minimize(potential, work, pos + noise, REFERENCE)
-                if float(report.phi) / e0 < phi:
-                    phi, pos = float(report.phi) / e0, found
-            shaken.append(phi)
-        apart = [1e3 * float((pos - minima[0][1]).norm(dim=1).max()) for _, pos in minima]
-        columns = " ".join(f"{phi - lowest:8.4f}" for phi, _ in minima), " ".join(f"{mm:6.1f}" for mm in apart)
-        print(
-            f"{columns[0]:28}{columns[1]:22}{' '.join(f'{phi - lowest:8.4f}' for phi in shaken):28}{lowest - min(shaken):.4f}"
-        )
+                noise = SHAKE * torch.randn(best[1].shape, generator=generator, dtype=torch.float64)
+                best = min(best, minimum(best[1] + noise), key=lambda found: found[0])
+            shaken.append(best[0])
+        lowest = min(phi for phi, _ in minima)
+        above = " ".join(f"{phi - lowest:8.4f}" for phi, _ in minima)
+        apart = " ".join(f"{1e3 * float((pos - minima[0][1]).norm(dim=1).max()):6.1f}" for _, pos in minima)
+        after = " ".join(f"{phi - lowest:8.4f}" for phi in shaken)
+        print(f"{above:28}{apart:22}{after:28}{lowest - min(shaken):<10.4f}{unconverged} of {3 * (1 + SHAKES)}", flush=True)
 
 
 if __name__ == "__main__":

@@ -72,7 +72,7 @@ def main() -> None:
         if rule:
             slower = 0.5 * (before + measured_again(rule, "gap_states=0")["ms"]) / rule["ms"]
             again["ms_scaled"] = again["ms"] / slower
-        for name in (name for name in FIGURES if name in again):
+        for name in [name for name in FIGURES if name in again]:
             key = name.removesuffix("_scaled")
             low, high = row[f"{key}_low"], row[f"{key}_high"]
             within = None not in (low, high) and low <= again[name] <= high

@@ -11,7 +11,6 @@ swinging it 1 cm too far. So both are reported, on the states that the method it
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -48,18 +47,24 @@ class Gap:
         return self.spread <= AGREEMENT
 
 
+def starts(problem: StepProblem, next_pos: Tensor) -> tuple[Tensor | None, ...]:
+    """Where minimisations of the step ``problem`` (float64) begin; the potential is not convex, so one start is not enough.
+
+    The contact-projected inertial guess (None: :func:`hood.solver.newton.minimize` makes it), the previous positions (V, 3) m
+    and a method's own ``next_pos`` (V, 3) m.
+    """
+    return None, problem.state.pos, next_pos.detach().double()
+
+
 def gap(
     potential: Potential,
     problem: StepProblem,
     next_pos: Tensor,
-    starts: Sequence[Tensor] = (),
     settings: NewtonSettings = REFERENCE,
 ) -> Gap:
     """Gap γ of ``next_pos`` (V, 3) for the step ``problem``.
 
-    The reference Φ* is the lowest of at least three minimisations: from the contact-projected inertial guess, from the previous
-    positions and from ``next_pos`` itself; ``starts`` adds more. The potential is not convex, so one start is not enough.
-    Computed in float64.
+    The reference Φ* is the lowest of the minimisations from :func:`starts`. Computed in float64.
     """
     work = in_double(potential.prepare(problem))
     pos = next_pos.detach().double()
@@ -67,7 +72,7 @@ def gap(
     noise = Unknowns(potential, work).at(pos).noise
     e0 = scale(work)
     values, converged = [], []
-    for start in (None, work.state.pos, pos, *(s.detach().double() for s in starts)):
+    for start in starts(work, pos):
         _, report = minimize(potential, work, start, settings)
         values.append(report.phi)
         converged.append(report.converged)
