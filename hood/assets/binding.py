@@ -125,6 +125,12 @@ def signed_distances(points: np.ndarray, surface: np.ndarray, faces: np.ndarray)
     return _search(points, surface, faces).dist
 
 
+def closest_points(points: np.ndarray, surface: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """:func:`signed_distances`, and the places (V, 3) [m] on the surface that ``points`` are nearest to."""
+    hit = _search(points, surface, faces)
+    return hit.dist, hit.closest(surface)
+
+
 def push_out(points: np.ndarray, surface: np.ndarray, faces: np.ndarray, clearance: float) -> Pushed:
     """``points`` (V, 3) with those inside the closed surface, or nearer than ``clearance`` [m], moved straight out to it."""
     pos, inside, depth = points.copy(), 0, 0.0
@@ -135,7 +141,7 @@ def push_out(points: np.ndarray, surface: np.ndarray, faces: np.ndarray, clearan
         near = hit.dist < clearance - 1e-6
         if not near.any():
             break
-        closest = (hit.bary[near, :, None] * surface[hit.corners[near]]).sum(axis=1)
+        closest = hit.closest(surface)[near]
         away = (pos[near] - closest) * np.sign(hit.dist[near])[:, None]
         length = np.linalg.norm(away, axis=1, keepdims=True)
         normal = _face_normals(surface, hit.corners[near])
@@ -150,6 +156,9 @@ class _Nearest:
     corners: np.ndarray
     bary: np.ndarray
     dist: np.ndarray
+
+    def closest(self, vertices: np.ndarray) -> np.ndarray:
+        return np.asarray((self.bary[:, :, None] * vertices[self.corners]).sum(axis=1))
 
 
 def _search(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> _Nearest:

@@ -1,0 +1,53 @@
+"""Whether a garment mesh lies around a body."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from hood.assets.binding import closest_points
+
+#: A garment around the body has its middle vertex nearer to the skin than this [m] ...
+_FARTHEST = 0.35
+#: ... at most this share of its vertices inside the body ...
+_MOST_INSIDE = 0.25
+#: ... and at least this much cloth on the sides opposite to its main side: a cape on the back alone has 0.36.
+_LEAST_ROUND = 0.3
+
+
+class Surrounding(NamedTuple):
+    """How a garment lies around a body."""
+
+    inside: float  # share of its vertices inside the body, 0 to 1
+    depth: float  # m, of the deepest of them
+    middle: float  # m, median distance to the skin
+    roundness: float  # 1: cloth on all sides of what it covers; 0: beside the body
+
+    @property
+    def problem(self) -> str | None:
+        """Why it does not surround the body, in words that follow "the garment"; None: it does."""
+        if self.middle > _FARTHEST:
+            return f"is away from the body: its middle vertex is {self.middle:.2f} m from the skin"
+        if self.inside > _MOST_INSIDE:
+            return f"does not surround the body: {100 * self.inside:.0f}% of its vertices are inside it"
+        if self.roundness < _LEAST_ROUND:
+            return f"lies on one side of the body ({100 * self.roundness:.0f}% of a garment that goes around it)"
+        return None
+
+
+def surrounds(points: np.ndarray, surface: np.ndarray, faces: np.ndarray) -> Surrounding:
+    """How the garment ``points`` (V, 3) [m] lies around the closed ``surface`` (W, 3) [m] with ``faces`` (G, 3).
+
+    The directions from the skin to a garment that goes around a limb or the trunk cancel: ``roundness`` is one less the length
+    of their mean. Invariant to rigid motion of both, and to the order of the vertices.
+    """
+    dist, closest = closest_points(points, surface, faces)
+    away = (points - closest) * np.sign(dist)[:, None]
+    away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
+    return Surrounding(
+        inside=float((dist < 0).mean()),
+        depth=float(max(-dist.min(initial=0.0), 0.0)),
+        middle=float(np.median(np.abs(dist))),
+        roundness=1.0 - float(np.linalg.norm(away.mean(axis=0))),
+    )
