@@ -119,6 +119,20 @@ def plane_contact(pos: Tensor, normal: Tensor | None = None, height: float = 0.0
     )
 
 
+def assert_nearest(points: Tensor, targets: Tensor, found: Tensor) -> None:
+    """``targets[found]`` (N, 3) are as near to ``points`` (N, 3) as any of ``targets`` (M, 3), to ten roundings of float64.
+
+    Which of several equally near targets is found is not promised: it follows from roundings, which differ between CPUs.
+    The distances come from differences: the matrix product form |x|² − 2 x·y + |y|² cancels.
+    """
+    exact = (points.double()[:, None] - targets.double()).square().sum(dim=2).sqrt()
+    taken = exact.gather(1, found[:, None]).squeeze(1)
+    excess = taken - exact.amin(dim=1)
+    bound = 10 * torch.finfo(torch.float64).eps * (taken + points.double().norm(dim=1))
+    worst = int((excess - bound).argmax())
+    assert bool((excess <= bound).all()), f"point {worst}: found {int(found[worst])}, {float(excess[worst]):.2g} m too far"
+
+
 def without_values(item: Any) -> Any:
     """A tensor, a module (changed in place) or a record of such, without values and not on the CPU; under a FakeTensorMode."""
     if isinstance(item, Tensor):

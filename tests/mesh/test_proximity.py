@@ -4,7 +4,7 @@ import torch
 
 from hood.mesh import proximity, topology
 from hood.mesh.proximity import closest_point_on_triangles, search_surface
-from hood.testing import box, grid, sphere
+from hood.testing import assert_nearest, box, grid, sphere
 
 
 def search(points, mesh, dtype=torch.float64):
@@ -117,9 +117,9 @@ def test_nearest_vertex_and_distance():
     mesh = sphere(2)
     points = near_surface(np.random.default_rng(2), mesh, 200, 0.1)
     hit = search(points, mesh)
-    dist = np.linalg.norm(points[:, None] - mesh[0][None], axis=2)
-    np.testing.assert_array_equal(hit.vertex.numpy(), dist.argmin(axis=1))
-    np.testing.assert_allclose(hit.vertex_dist.numpy(), dist.min(axis=1), rtol=1e-12)
+    assert_nearest(torch.as_tensor(points), torch.as_tensor(mesh[0]), hit.vertex)
+    expected = np.linalg.norm(points - mesh[0][hit.vertex.numpy()], axis=1)
+    np.testing.assert_allclose(hit.vertex_dist.numpy(), expected, rtol=1e-12)
 
 
 def test_scenes_see_only_their_own_surface():

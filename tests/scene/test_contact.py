@@ -8,7 +8,7 @@ import torch
 
 from hood.scene.contact import find_centroid_contact, find_contact
 from hood.scene.state import Obstacle, concatenate_obstacles
-from hood.testing import sphere
+from hood.testing import assert_nearest, sphere
 
 
 def ball(radius: float = 0.3, motion: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Obstacle:
@@ -38,9 +38,8 @@ def test_distance_normal_and_point_of_a_sphere(height: float) -> None:
     torch.testing.assert_close(contact.normal.norm(dim=1), torch.ones(200).double())
     torch.testing.assert_close((points - contact.point).norm(dim=1), contact.dist.abs())
     torch.testing.assert_close(contact.bary.sum(dim=1), torch.ones(200).double())
-    nearest = torch.cdist(points, ball().pos)
-    assert torch.equal(contact.vertex, nearest.argmin(dim=1))
-    torch.testing.assert_close(contact.vertex_dist, nearest.amin(dim=1))
+    assert_nearest(points, ball().pos, contact.vertex)
+    torch.testing.assert_close(contact.vertex_dist, (points - ball().pos[contact.vertex]).norm(dim=1))
 
 
 def test_the_matched_point_moves_with_the_body() -> None:
@@ -90,7 +89,7 @@ def test_the_face_with_the_nearest_centroid() -> None:
     contact = find_contact(points, scenes(points), body)
     found = find_centroid_contact(contact, points, scenes(points), body)
     centroids = body.pos[body.faces].mean(dim=1)
-    assert torch.equal(found.centroid_face, torch.cdist(points, centroids).argmin(dim=1))
+    assert_nearest(points, centroids, found.centroid_face)
     assert bool(found.facing.all())
     move = torch.tensor([0.02, 0.01, 0.0]).double()
     torch.testing.assert_close(found.next_centroid, centroids[found.centroid_face] + move)
