@@ -17,7 +17,7 @@ from hood.dynamics.stopwatch import Stopwatch, timed
 from hood.features import groups, local, physical
 from hood.features.inputs import Inputs
 from hood.graph.builder import StaticGraph, build_graph, build_static
-from hood.graph.cache import cached_hierarchy
+from hood.graph.cache import template_hierarchy
 from hood.graph.hierarchy import Hierarchy, concatenate_hierarchies
 from hood.losses.potential import default_potential
 from hood.losses.problem import StepProblem
@@ -111,7 +111,7 @@ class Simulator(nn.Module):
         A ``hierarchy`` that came with the garment (:func:`hood.graph.given.given_hierarchy`) is used as it is.
         """
         if hierarchy is None:
-            hierarchy = _cached_hierarchy(cloth, rest_pos, self.num_coarse)
+            hierarchy = template_hierarchy(cloth.num_vertices, cloth.edges.cpu().numpy(), rest_pos, self.num_coarse)
         return Prepared(hierarchy, build_static(cloth, hierarchy, self.network.edge_set_names))
 
     def concatenate(self, cloth: Cloth, prepared: Sequence[Prepared], vertex_counts: Sequence[int]) -> Prepared:
@@ -317,18 +317,3 @@ _CONVENTIONS: dict[str, Any] = {
 def num_coarse_levels(schedule: Sequence[tuple[str, ...]]) -> int:
     """Coarse levels that a schedule works on."""
     return max(set_level(name) for name in edge_set_names(schedule))
-
-
-_HIERARCHIES: dict[tuple[int, int], tuple[Any, Tensor, Hierarchy]] = {}
-
-
-def _cached_hierarchy(cloth: Cloth, rest_pos: Any, num_coarse: int) -> Hierarchy:
-    """Hierarchies are kept per template array: training meets the same garments thousands of times."""
-    key = (id(rest_pos), num_coarse)
-    entry = _HIERARCHIES.get(key)
-    edges = cloth.edges.cpu()
-    # Holding the array keeps its id from being reused; other faces may still share it.
-    if entry is None or entry[0] is not rest_pos or not torch.equal(entry[1], edges):
-        entry = (rest_pos, edges, cached_hierarchy(cloth.num_vertices, edges.numpy(), rest_pos, num_coarse))
-        _HIERARCHIES[key] = entry
-    return entry[2]

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from hood.graph import cache
-from hood.graph.cache import cache_folder, cached_hierarchy
+from hood.graph.cache import cache_folder, cached_hierarchy, template_hierarchy
 from hood.graph.hierarchy import Hierarchy, build_hierarchy
 from hood.mesh.topology import unique_edges
 from hood.testing import grid
@@ -123,3 +123,25 @@ def test_default_folder_follows_the_platform(monkeypatch: pytest.MonkeyPatch, tm
     monkeypatch.setattr("sys.platform", "darwin")
     monkeypatch.setattr(Path, "home", lambda: tmp_path)
     assert cache_folder() == tmp_path / "Library" / "Caches" / "hood"
+
+
+def test_a_process_keeps_the_garments_met_last(builds: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cache, "MAX_TEMPLATES", 3)
+    monkeypatch.setattr(cache, "_TEMPLATES", type(cache._TEMPLATES)())
+
+    def meet(pos: np.ndarray, edges: np.ndarray = EDGES) -> Hierarchy:
+        return template_hierarchy(len(pos), edges, pos, 2)
+
+    first, *others = (POS + k for k in range(6))
+    kept = meet(first)
+    assert meet(first) is kept
+    for other in others:
+        meet(other)
+        assert meet(first) is kept  # met again and again, so it stays
+        assert len(cache._TEMPLATES) <= 3
+    assert len(builds) == 6
+    meet(others[-1])
+    assert len(builds) == 6
+    meet(others[0])
+    assert len(builds) == 7  # the one that was not met for longest had to go
+    assert_same(meet(first, EDGES[1:]), build_hierarchy(len(POS), EDGES[1:], first, 2))  # other faces of the same vertices

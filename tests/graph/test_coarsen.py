@@ -3,8 +3,13 @@
 import numpy as np
 import pytest
 from scipy.sparse import csgraph
+from scipy.spatial import Delaunay
 
+from hood.assets.garment import load_garment
+from hood.assets.library import names
 from hood.graph import coarsen
+from hood.mesh.topology import unique_edges
+from hood.testing import cylinder
 
 
 def edges_of(graph) -> set[tuple[int, int]]:
@@ -73,3 +78,90 @@ def test_centre_is_exact(seed):
 def test_distances_from_a_root():
     graph = coarsen.adjacency(6, np.array([(0, 1), (1, 2), (2, 3), (0, 3)]))
     assert coarsen.distances(graph, 0).tolist() == [0, 1, 2, 1, -1, -1]
+
+
+# ---- the rules once more, naively: sets and breadth-first searches, no matrices ------------------------------------------
+
+
+def naive_graph(graph) -> list[set[int]]:
+    return [set(graph.indices[graph.indptr[a] : graph.indptr[a + 1]].tolist()) for a in range(graph.shape[0])]
+
+
+def naive_distances(near: list[set[int]], roots: list[int], limit: int | None = None) -> dict[int, int]:
+    """Hops from the nearest of ``roots`` to everything within ``limit`` hops."""
+    dist, front = dict.fromkeys(roots, 0), list(roots)
+    while front and (limit is None or dist[front[0]] < limit):
+        reached = {b for a in front for b in near[a]} - dist.keys()
+        dist |= dict.fromkeys(reached, dist[front[0]] + 1)
+        front = sorted(reached)
+    return dist
+
+
+def is_far(near: list[set[int]], a: int, b: int) -> bool:
+    return b not in naive_distances(near, [a], limit=2)
+
+
+def join(graph: list[set[int]], a: int, b: int) -> None:
+    graph[a].add(b)
+    graph[b].add(a)
+
+
+def naive_coarsen(near: list[set[int]], roots: list[int]) -> list[set[int]]:
+    """The three rules in their order, pair by pair."""
+    dist = naive_distances(near, roots)
+    odd = sorted(a for a, d in dist.items() if d % 2 == 1)
+    inner, outer = ({a: sorted(b for b in near[a] if dist[b] == dist[a] + side) for a in odd} for side in (-1, 1))
+    level: list[set[int]] = [set() for _ in near]
+    for a, b in ((a, b) for k in odd for a in inner[k] for b in outer[k]):
+        join(level, a, b)
+    leaves = [inner[k] for k in odd if not outer[k]]
+    for a, b in [(a, b) for ring in leaves for a in ring for b in ring if a < b and is_far(level, a, b)]:
+        join(level, a, b)
+    even = sorted((a, b) for a in dist for b in near[a] if a < b and dist[a] == dist[b] and dist[a] % 2 == 0)
+    for a, b in even:
+        if is_far(level, a, b):
+            join(level, a, b)
+    return level
+
+
+def assert_levels_follow_the_rules(num_vertices: int, edges: np.ndarray, num_levels: int = 3) -> None:
+    graph = coarsen.adjacency(num_vertices, edges)
+    roots = coarsen.centres(graph)
+    for _ in range(num_levels):
+        expected = naive_coarsen(naive_graph(graph), roots.tolist())
+        graph = coarsen.coarsen(graph, roots)
+        assert (graph != graph.T).nnz == 0
+        assert naive_graph(graph) == expected
+
+
+def by_rest_position(pos: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Edges in the numbers that :func:`hood.graph.hierarchy.build_hierarchy` gives the vertices."""
+    rank = np.empty(len(pos), dtype=np.int64)
+    rank[np.lexsort(pos.T[::-1])] = np.arange(len(pos))
+    return rank[unique_edges(faces)]
+
+
+@pytest.mark.parametrize("name", names("garments"))
+def test_levels_of_the_default_garments_follow_the_rules(name):
+    garment = load_garment(name)
+    assert_levels_follow_the_rules(len(garment.rest_pos), by_rest_position(garment.rest_pos, garment.faces))
+
+
+def random_mesh(seed: int) -> tuple[int, np.ndarray]:
+    """A triangulated cloud, a tube with holes, or triangles without any order; numbered at random."""
+    rng = np.random.default_rng(seed)
+    if seed % 3 == 0:
+        count = int(rng.integers(4, 80))
+        faces = Delaunay(rng.random((count, 2)) * [1.0, rng.uniform(0.1, 1.0)]).simplices
+    elif seed % 3 == 1:
+        pos, faces = cylinder(int(rng.integers(3, 12)), int(rng.integers(2, 8)))
+        count, faces = len(pos), faces[rng.random(len(faces)) < 0.9]
+    else:
+        count = int(rng.integers(4, 60))
+        faces = np.stack([rng.permutation(count)[:3] for _ in range(int(rng.integers(2, count)))])
+    return count, rng.permutation(count)[unique_edges(faces)]
+
+
+def test_levels_of_random_meshes_follow_the_rules():
+    for seed in range(200):
+        assert_levels_follow_the_rules(*random_mesh(seed))
