@@ -10,7 +10,9 @@ import torch
 from torch import Tensor
 
 from hood.dynamics.fixed_step import FixedStep, StepResult, check_model, step_inputs, step_shape
+from hood.dynamics.refine import unrefined
 from hood.dynamics.simulator import Prediction, Prepared, Simulator
+from hood.dynamics.stepper import Stepper
 from hood.dynamics.stopwatch import Stopwatch, timed
 from hood.dynamics.trace import trace
 from hood.graph.fixed import Capacity, Layout, capacity_for, lay_out
@@ -128,6 +130,14 @@ class CapturedSimulator:
         nearest = find_nearest(seen.cloth, seen.state.pos, obstacle, self.simulator.body_radius)
         near = torch.isfinite(nearest.dist)
         return capacity_for((int(near.sum()), len(nearest.vertex[near].unique())), _limits(problem))
+
+
+def network_of(stepper: Stepper) -> Simulator | None:
+    """The simulator that takes a stepper's steps, refined or not, in fixed shapes or not; None where a solver does."""
+    stepper = unrefined(stepper)
+    if isinstance(stepper, CapturedSimulator):
+        return stepper.simulator
+    return stepper if isinstance(stepper, Simulator) else None
 
 
 class _Plan:

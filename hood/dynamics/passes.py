@@ -21,6 +21,7 @@ class Feedback:
     """What the potential of one step says about positions, as features read it; constants of the step are gathered once."""
 
     def __init__(self, potential: Potential, problem: StepProblem) -> None:
+        self.potential = potential
         self._terms = LocalTerms(potential, problem)
         self._diffusion = Diffusion(problem.cloth.edges, problem.cloth.num_vertices)
         self._mass = problem.cloth.mass.clamp_min(1e-12).unsqueeze(1)

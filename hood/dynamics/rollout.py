@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from hood.dynamics.captured import network_of
 from hood.dynamics.measure import (
     PENETRATION_METRICS,
     STRAIN_METRICS,
@@ -92,8 +93,10 @@ def simulate(
     changes nothing about it; its time is ``ms_metrics``, which ``ms_total`` leaves out as it does the caller's work. The same
     holds for ``fields``, names of :data:`FIELD_CHOICES`.
 
+    A network that looks at a potential looks at ``potential``; a solver keeps its own.
+
     Raises:
-        ValueError: ``metrics`` or a field is none of the choices.
+        ValueError: ``metrics`` or a field is none of the choices, or the network cannot look at this potential.
     """
     if metrics not in METRIC_CHOICES:
         raise ValueError(f"metrics is {metrics!r}; choose {', '.join(METRIC_CHOICES)}")
@@ -101,6 +104,9 @@ def simulate(
     if strange:
         raise ValueError(f"export holds {strange[0]!r}; choose of {', '.join(FIELD_CHOICES)}")
     count = scene.num_frames - start_frame if num_frames is None else min(num_frames, scene.num_frames - start_frame)
+    network = network_of(stepper)
+    if network is not None:
+        network.use_potential(potential)
     prepared = prepare_stepper(stepper, scene)
     state = start_state(stepper, scene, potential, relaxing_steps, start_frame)
     stepped: dict[str, float] = {}

@@ -19,7 +19,7 @@ from hood.features.inputs import Inputs
 from hood.graph.builder import StaticGraph, build_graph, build_static
 from hood.graph.cache import template_hierarchy
 from hood.graph.hierarchy import Hierarchy, concatenate_hierarchies
-from hood.losses.potential import default_potential
+from hood.losses.potential import Potential, default_potential
 from hood.losses.problem import StepProblem
 from hood.mesh.nearest import Nearest
 from hood.nn.model import MeshGraphNet
@@ -27,6 +27,7 @@ from hood.nn.schedule import edge_set_names, parse_passes, parse_schedule, set_l
 from hood.scene.cloth import Cloth
 from hood.scene.contact import find_nearest
 from hood.scene.state import State, StepInput
+from hood.solver.local import check_local
 
 
 @dataclass(frozen=True)
@@ -75,11 +76,34 @@ class Simulator(nn.Module):
         self._embedded_levels = embedded_levels
         self.config = config
         self.register_buffer("gravity", torch.tensor([0.0, -9.81, 0.0]), persistent=False)
-        # The residual feature asks the physics where the base guess is wrong; its parameters are part of the model.
-        self._residual = default_potential()
+        self._potential = default_potential()
         self._wants_feedback = isinstance(output, LocalStepOutput)
         self._wants_residual = not self._wants_feedback and any(isinstance(group, physical.Residual) for group in features.node)
         self._wants_base = any(isinstance(group, physical.RelativeVelocity) for group in features.node)
+
+    @property
+    def looks_at_potential(self) -> bool:
+        """Whether the network is told what the potential says about positions; another potential then changes its steps."""
+        return self._wants_feedback or self._wants_residual
+
+    def use_potential(self, potential: Potential) -> None:
+        """Look at ``potential`` from now on, where :attr:`looks_at_potential`; until then at the default one.
+
+        Who takes steps hands over what they are judged by: :func:`hood.dynamics.rollout.simulate` the potential of the
+        rollout, training the one that is trained.
+
+        Raises:
+            ValueError: the features cannot say what this potential does; names the term.
+        """
+        if self._wants_feedback:
+            try:
+                check_local(potential)
+            except ValueError as error:
+                raise ValueError(
+                    f"{error}; models of features={self.config['features']} look at it: leave the term out, or use "
+                    "stepper=newton or another model"
+                ) from error
+        self._potential = potential
 
     @property
     def schedule(self) -> tuple[tuple[str, ...], ...]:
@@ -125,8 +149,10 @@ class Simulator(nn.Module):
         return self.output.needs_contact or any(group.needs_contact for group in self.features.node)
 
     def search(self, problem: StepProblem) -> StepProblem:
-        """The problem with its contact where the step needs it; :meth:`predict` does so if it has not been done."""
-        return problem.with_contact() if self.needs_contact else problem
+        """The problem with its contact where the step needs it, and with what the potential asks for that it looks at;
+        :meth:`predict` does so if it has not been done."""
+        problem = problem.with_contact() if self.needs_contact else problem
+        return self._potential.prepare(problem) if self.looks_at_potential else problem
 
     def nearest(self, problem: StepProblem, seen: StepProblem) -> Nearest | None:
         """Nearest body vertices of the positions the network sees: those of the contact, where that is of the same ones."""
@@ -152,7 +178,7 @@ class Simulator(nn.Module):
                 graph = build_graph(prepared.static, seen.step, nearest, self.body_radius)
                 guess = base if self._wants_base else None
                 inputs = Inputs(cloth, seen.state, seen.step, seen.contact, graph, guess, residual, timestep=step.dt)
-                feedback = Feedback(self._residual, seen) if self._wants_feedback else None
+                feedback = Feedback(self._potential, seen) if self._wants_feedback else None
                 if feedback is not None:
                     inputs, _ = feedback(inputs, base)
             nodes, edges = self.features(inputs)
@@ -200,17 +226,18 @@ class Simulator(nn.Module):
         return State(prediction.next_pos, self.next_velocity(problem, prediction), state.origin)
 
     def clone(self) -> Simulator:
-        """A new simulator of the same model with the same weights."""
+        """A new simulator of the same model with the same weights, which looks at the same potential."""
         # A copy must not move the generator that a resumed run shares with an uninterrupted one.
         with torch.random.fork_rng(devices=[]):
             copy = build_simulator(**self.config)
         copy.load_state_dict(self.state_dict())
         copy.network.use_precision(self.network.precision)
         copy.network.use_kernels(self.network.kernels)
+        copy.use_potential(self._potential)
         return copy.to(self.gravity.device)
 
     def _residual_acceleration(self, problem: StepProblem, base: Tensor) -> Tensor:
-        gradient, _ = self._residual.gradient(problem, base)
+        gradient, _ = self._potential.gradient(problem, base)
         return -gradient / problem.cloth.mass.clamp_min(1e-12).unsqueeze(1) * problem.cloth.free.unsqueeze(1)
 
 

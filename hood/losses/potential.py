@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -53,6 +53,15 @@ class Potential:
     def with_terms(self, **terms: Term) -> Potential:
         """The same potential with some terms replaced or added."""
         return Potential({**self.terms, **terms})
+
+    @property
+    def settings(self) -> dict[str, dict[str, Any]]:
+        """Class and plain values of every term, by its name: what tells two potentials apart, and can be written down."""
+        return {
+            name: {"term": f"{type(term).__module__}.{type(term).__qualname__}"}
+            | {key: value for key, value in vars(term).items() if isinstance(value, (bool, int, float, str))}
+            for name, term in self.terms.items()
+        }
 
     def prepare(self, problem: StepProblem) -> StepProblem:
         """The problem with what the terms found out about it, once per step: call it before the first energy.

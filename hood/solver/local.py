@@ -9,9 +9,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from hood.losses.inertia import Inertia
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
 from hood.scene.cloth import Cloth
+from hood.solver.forces import CLOSED_FORM
 from hood.solver.linear import invert_blocks
 from hood.solver.terms import StepTerms
 
@@ -65,6 +67,19 @@ class LocalTerms:
         force = torch.where(cloth.free.unsqueeze(1), -gradient, 0.0)
         step = torch.bmm(invert_blocks(matrix), force.unsqueeze(2)).squeeze(2)
         return LocalView(force, torch.where(cloth.free.unsqueeze(1), step, 0.0))
+
+
+def check_local(potential: Potential) -> None:
+    """Raise ValueError where local steps of ``potential`` are not known: they take second derivatives of every term, and a
+    positive one of every vertex, which inertia alone is sure to have."""
+    for name, term in potential.terms.items():
+        if type(term) not in CLOSED_FORM:
+            raise ValueError(
+                f"losses.terms.{name} is a {type(term).__name__}: its second derivatives are not written out "
+                f"(hood/solver/forces.py, elements.py), and what single vertices would do about it is not known"
+            )
+    if not any(type(term) is Inertia for term in potential.terms.values()):
+        raise ValueError("losses.terms: no inertia, without which what single vertices would do is not determined")
 
 
 def _diagonal(upper: Tensor) -> Tensor:

@@ -61,6 +61,7 @@ class Trainer:
         watch: Watch | None = None,
     ) -> None:
         settings = settings.compressed()
+        simulator.use_potential(potential)
         self.simulator, self.potential, self.settings = simulator, potential, settings
         self.folder, self.seed, self.watch = folder, seed, watch
         simulator.network.use_precision(settings.precision)
@@ -142,6 +143,7 @@ class Trainer:
         horizon = settings.horizon(self.iteration)
         cloth, prepared, state, step = self.slots.batch(horizon)
         potential = settings.collision.apply(self.potential, self.iteration)
+        simulator.use_potential(potential)
         problem = potential.prepare(StepProblem(cloth, state, step, gravity=simulator.gravity))
         collecting = self.iteration < settings.statistics_iterations and simulator.uses_statistics
         if collecting and isinstance(simulator.output, AccelerationOutput):

@@ -16,7 +16,9 @@ from hood.assets.garment import Garment
 from hood.assets.sequence import PoseSequence
 from hood.dynamics.checkpoint import load_simulator
 from hood.dynamics.output import AccelerationOutput
+from hood.dynamics.passes import Feedback
 from hood.dynamics.simulator import Simulator, build_simulator
+from hood.features.inputs import Inputs
 from hood.losses.potential import Potential, default_potential
 from hood.scene.dataset import SceneSampler, Window
 from hood.training.curriculum import CollisionRamp, Horizon, WarmupCosine
@@ -70,6 +72,26 @@ def test_the_signal_goes_down_on_a_fixed_scene(
     assert (np.diff(totals) < 1e-6).all()
     assert totals[-1] < totals[0] - 1e-3
     assert all(p.dtype == torch.float32 for p in trainer.averaged().parameters())
+
+
+def test_features_look_at_the_potential_that_is_trained(
+    tmp_path: Path, sampler: SceneSampler, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its ramp included, so that every pass answers to the potential of the last one."""
+    settings = replace(SETTINGS, collision=CollisionRamp(5e3, 5e5, 0, 2))
+    trainer = make(tmp_path, sampler, PASSES, settings, potential=default_potential(friction_coefficient=3.0))
+    looked_at: list[dict] = []
+    gradient = Feedback.__call__
+
+    def watched(feedback: Feedback, inputs: Inputs, pos: Tensor) -> tuple[Inputs, Tensor]:
+        looked_at.append(feedback.potential.settings)
+        return gradient(feedback, inputs, pos)
+
+    monkeypatch.setattr(Feedback, "__call__", watched)
+    for _ in range(3):
+        trainer.update()
+    assert [one["collision"]["weight"] for one in looked_at] == [5e3, 5e3, 252500.0, 252500.0, 5e5, 5e5]
+    assert {one["friction"]["coefficient"] for one in looked_at} == {3.0}
 
 
 def test_the_loss_that_is_reported_is_the_one_that_is_trained(tmp_path: Path, sampler: SceneSampler) -> None:
