@@ -21,6 +21,12 @@ torch.set_num_threads(1)
 os.environ["HOOD_CACHE"] = "off"  # tests leave nothing in the user's folder
 
 
+@pytest.fixture(autouse=True)
+def own_random_numbers() -> None:
+    """Weights and inputs drawn from torch's generator do not depend on the tests before."""
+    torch.manual_seed(0)
+
+
 @pytest.fixture(scope="session")
 def body_file() -> Path:
     return DATA_FOLDER / "body" / "default.npz"

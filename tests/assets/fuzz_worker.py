@@ -104,6 +104,7 @@ def samples(folder: Path) -> list[Sample]:
     import torch
 
     torch.save({"training_module": {"a": torch.zeros(3, 4)}}, torch_file)
+    torch.manual_seed(0)  # the same bytes are damaged every time
     save_simulator(folder / "m.safetensors", build_simulator(schedule="1x(mesh)", latent_dim=2))
     return [
         ("obj", _obj(pos, quads), mesh),

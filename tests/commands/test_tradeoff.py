@@ -48,7 +48,7 @@ gaps = [{"gamma": gap * f, "converged": 1.0, "spread": 0.0} for f in (0.9, 1.0, 
 measured = {"frames": frames, "failures": [], "gaps": gaps, "drifts": []}
 with open(folder / "rollouts.0.jsonl", "a") as file:
     file.write("\\n" + json.dumps({"unit": [0, "tank", "walk", 0], "weights": "none", "measured": measured}) + "\\n")
-if "slow" in name: time.sleep(60)
+if "slow" in name: time.sleep(600)
 rollouts = (folder / "rollouts.0.jsonl").read_text().count("unit")
 if "twice" not in name or rollouts > 1: (folder / "table.json").write_text("[]")
 """
@@ -212,7 +212,7 @@ def test_an_interruption_ends_the_processes_and_keeps_what_they_wrote() -> None:
     rollouts = store().folder_of(points[0]) / "rollouts.0.jsonl"
 
     def interrupt() -> None:
-        for _ in range(600):
+        for _ in range(4000):
             if rollouts.exists():
                 break
             time.sleep(0.05)
@@ -224,10 +224,10 @@ def test_an_interruption_ends_the_processes_and_keeps_what_they_wrote() -> None:
     with pytest.raises(KeyboardInterrupt):
         store().measure(points)
     thread.join()
-    assert time.monotonic() - begin < 50  # the process would have slept for longer
+    assert time.monotonic() - begin < 300  # the process would have slept for longer
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
     assert not store().is_done(points[0])
-    Path("fake.py").write_text(FAKE.replace("time.sleep(60)", "pass"))
+    Path("fake.py").write_text(FAKE.replace("time.sleep(600)", "pass"))
     assert store().measure(points) == []
     assert calls() == ["[slow.safetensors] false", "[slow.safetensors] true"]
 

@@ -13,6 +13,12 @@ def search(points, mesh, dtype=torch.float64):
     return search_surface(torch.as_tensor(points).to(dtype), scene[0], vertices, faces, scene[1], scene[2])
 
 
+def closest_points(hit, mesh):
+    """Where the hits lie (N, 3)."""
+    corners = torch.as_tensor(mesh[0])[torch.as_tensor(mesh[1])[hit.face]]
+    return (hit.bary.unsqueeze(-1) * corners).sum(dim=1)
+
+
 def brute_force(points, mesh):
     """Distance to the whole surface (N,), by minimising over faces, edges and vertices separately."""
     corners = mesh[0][mesh[1]]
@@ -45,8 +51,8 @@ def test_distances_equal_brute_force_and_signs_are_right(mesh):
     hit = search(points, mesh)
     expected = brute_force(points, mesh)
     np.testing.assert_allclose(hit.dist.abs().numpy(), expected, atol=1e-12)
-    closest = (hit.bary.unsqueeze(-1) * torch.as_tensor(mesh[0])[torch.as_tensor(mesh[1])[hit.face]]).sum(dim=1)
-    np.testing.assert_allclose(np.linalg.norm(points - closest.numpy(), axis=1), expected, atol=1e-12)
+    closest = closest_points(hit, mesh).numpy()
+    np.testing.assert_allclose(np.linalg.norm(points - closest, axis=1), expected, atol=1e-12)
 
 
 def spike(uneven):
@@ -145,9 +151,11 @@ def test_scenes_see_only_their_own_surface():
         vertex_scene,
         face_scene,
     )
-    torch.testing.assert_close(hit.dist, torch.cat([a.dist for a in alone])[order], rtol=0, atol=0)
-    faces_alone = torch.cat([alone[0].face, alone[1].face + len(small[1])])
-    torch.testing.assert_close(hit.face, faces_alone[order])
+    torch.testing.assert_close(hit.dist, torch.cat([a.dist for a in alone])[order], rtol=0, atol=1e-14)
+    # Faces that share the nearest edge or corner are equally near: the point is unique, not the face.
+    expected = torch.cat([closest_points(*both) for both in zip(alone, (small, large), strict=True)])
+    torch.testing.assert_close(closest_points(hit, (vertices, faces)), expected[order], rtol=0, atol=1e-12)
+    assert torch.equal(face_scene[hit.face], scene[order])
 
 
 def test_oversized_faces_are_found_next_to_fine_ones():

@@ -71,7 +71,8 @@ def test_a_batch_searches_each_scene_in_its_own_body() -> None:
         rows = slice(40 * index, 40 * index + 40)
         torch.testing.assert_close(together.dist[rows], single.dist, rtol=0, atol=1e-12)
         torch.testing.assert_close(together.normal[rows], single.normal, rtol=0, atol=1e-12)
-        assert torch.equal(together.face[rows] - index * len(small.faces), single.face)
+        torch.testing.assert_close(together.point[rows], single.point, rtol=0, atol=1e-12)
+        assert bool((both.face_scene[together.face[rows]] == index).all())
         assert torch.equal(together.vertex[rows] - index * len(small.pos), single.vertex)
 
 

@@ -135,11 +135,11 @@ def test_workers_do_not_outlive_a_killed_training_process() -> None:
     assert Path(f"/proc/{worker}").exists()
     process.kill()
     process.wait()
-    for _ in range(100):
+    for _ in range(600):
         if not Path(f"/proc/{worker}").exists() or " Z " in Path(f"/proc/{worker}/stat").read_text():
             return
         time.sleep(0.1)
-    raise AssertionError("the worker is still there 10 s later")
+    raise AssertionError("the worker is still there a minute later")
 
 
 def test_packing_keeps_every_bit(sampler: SceneSampler) -> None:
