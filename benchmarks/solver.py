@@ -14,8 +14,8 @@ OpenBLAS has threads of its own: without OMP_NUM_THREADS=1 the direct solver tak
 
 Why block-Jacobi. The levels of :mod:`hood.graph.hierarchy` were tried as a second preconditioner: interpolation from kept
 vertices to their dropped neighbours, Galerkin matrices, the coarsest factorised, added to block-Jacobi or in a V-cycle with
-one damped block-Jacobi step before and after. On Newton systems of this drape, mean over 4 to 14 systems, one thread, to a
-tenth of the residual, iterations and ms without the set-up (which took 16, 99 and 1,028 ms):
+one damped block-Jacobi step before and after. On Newton systems of this drape, mean over 4 to 14 systems, one thread of an
+AMD server CPU, to a tenth of the residual, iterations and ms without the set-up (which took 16, 99 and 1,028 ms):
 
     vertices        1,089          4,096          16,384
     block-Jacobi    18, 1.7        60, 15.5       93, 97

@@ -7,7 +7,8 @@ import sys
 from collections.abc import Callable, Sequence
 
 # Read by the C library and OpenMP at process start. Cloth steps allocate and free tensors of a few MB many times a frame:
-# keeping them mapped is worth 1.15–1.9×. Waiting threads that spin slow a busy machine down 6× and more.
+# keeping them mapped is worth 1.15–1.9×. Waiting threads that spin slow a busy machine down 6× and more. Both figures and the
+# times below are of an AMD server CPU.
 ENVIRONMENT = {
     "OMP_WAIT_POLICY": "PASSIVE",
     # One step of a 1k garment takes 45 ms on one thread and 100 ms on two: its operations are too small to share.

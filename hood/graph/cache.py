@@ -22,8 +22,8 @@ from hood.graph.hierarchy import Hierarchy, build_hierarchy
 
 #: Part of every name: raise it with any change to what :func:`hood.graph.hierarchy.build_hierarchy` returns.
 VERSION = 2
-#: Smaller meshes are not kept. Refined dress on one busy core, building / reading: 28 / 0.4 ms at 1k vertices, 87 / 0.5 ms at
-#: 5k, 190 / 1 ms at 12k and 2200 / 7 ms at 100k: below, a process's start would save some 30 ms.
+#: Smaller meshes are not kept. Refined dress on one busy core of an AMD server CPU, building / reading: 28 / 0.4 ms at 1k
+#: vertices, 87 / 0.5 ms at 5k, 190 / 1 ms at 12k and 2200 / 7 ms at 100k: below, a process's start would save some 30 ms.
 MIN_VERTICES = 2000
 #: Entries beyond this many are removed, the oldest first.
 MAX_ENTRIES = 200

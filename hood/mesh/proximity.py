@@ -132,7 +132,7 @@ def closest_point_on_triangles(points: Tensor, corners: Tensor) -> Tensor:
     exactly 0. A degenerate triangle is treated as its three edges.
     """
     a, b, c, point = corners[:, 0].t(), corners[:, 1].t(), corners[:, 2].t(), points.t()
-    u, v, p, w, q = b - a, c - a, point - a, c - b, point - b  # rows are components: three times faster than columns
+    u, v, p, w, q = b - a, c - a, point - a, c - b, point - b  # rows are components: on an AMD CPU 3× as fast as columns
     uu, vv, uv, pu, pv = _dot(u, u), _dot(v, v), _dot(u, v), _dot(p, u), _dot(p, v)
     det = uu * vv - uv * uv
     regular = det > _det_floor(uu, vv)
@@ -253,7 +253,7 @@ def _search_dense(points: Tensor, vertices: Tensor) -> tuple[Tensor, Tensor]:
 def _closest_of_fans(points: Tensor, vertices: Tensor, nearest: Tensor, incidence: Incidence, fans: _Fans) -> Tensor:
     """The face (N,) with the smallest distance among those around the vertices ``nearest`` (N, 3)."""
     num_slots = incidence.face.shape[1]
-    # On a CPU, blocks whose temporaries stay in the cache: a fifth faster in all.
+    # On a CPU, blocks whose temporaries stay in the cache: 1.2× as fast in all (AMD).
     block = _BLOCK_PAIRS // num_slots + 1 if points.device.type == "cpu" else len(points)
     best = []
     for rows, around in zip(points.split(block), nearest.split(block), strict=True):
@@ -270,8 +270,8 @@ def _gain(p: Sequence[Tensor], fan: _Span) -> Tensor:
 
     With p relative to the triangle's first corner, the squared distance from p to the point su + tv is
     ‖p‖² - 2s p·u - 2t p·v + s² uu + 2st uv + t² vv. Its minimum over a triangle is the free one where that
-    lies inside, else the lowest of the three edges' minima. Component arrays instead of (…, 3) vectors: three
-    times faster.
+    lies inside, else the lowest of the three edges' minima. Component arrays instead of (…, 3) vectors: 3× as
+    fast on an AMD CPU.
     """
     uu, vv, uv = fan.uu, fan.vv, fan.uv
     pu, pv = _sum_products(p, fan.u), _sum_products(p, fan.v)
