@@ -6,6 +6,8 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 
+from hood.commands.exit_codes import exit_code_lines
+
 # Read by the C library and OpenMP at process start. Cloth steps allocate and free tensors of a few MB many times a frame:
 # keeping them mapped is worth 1.15–1.9×. Waiting threads that spin slow a busy machine down 6× and more. Both figures and the
 # times below are of an AMD server CPU.
@@ -30,7 +32,7 @@ COMMANDS = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit code (0 done, 2 user error, 130 interrupted)."""
+    """Run one command; returns the exit code, see :mod:`hood.commands.exit_codes`."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_usage())
@@ -99,7 +101,7 @@ def _command(name: str) -> Callable[[Sequence[str]], int]:
 def _usage() -> str:
     lines = ["usage: hood COMMAND [key=value ...]", ""]
     lines += [f"  {name:<10}{text}" for name, text in COMMANDS.items()]
-    lines += ["", "hood COMMAND --help lists the keys, their defaults and the names that can be given."]
+    lines += ["", "hood COMMAND --help lists the keys, their defaults and the names that can be given.", "", *exit_code_lines()]
     return "\n".join(lines)
 
 

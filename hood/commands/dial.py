@@ -153,7 +153,9 @@ def describe_refinement(summary: Mapping[str, Any]) -> list[str]:
         return []
     iterations, residual = entry["iterations_median"], entry["rg_median"]
     text = f"refined, {entry['dial']}: median {iterations or 0:.0f} iterations ({entry['method']})"
-    text += "" if residual is None else f", relative gradient {residual:.2g}"
+    # Where every frame's is measured, it is told with its worst.
+    told = residual is None or summary.get("relative_gradient_median") is not None
+    text += "" if told else f", relative gradient {residual:.2g}"
     if "frames_met" in entry:
         text += f"; {entry['frames_met']} frames met it, {entry['frames_missed']} missed it"
     return [text]

@@ -23,6 +23,7 @@ from hood.assets.units import find_scale, size_ratio, used
 from hood.assets.unpickle import load_pickle
 from hood.commands.common import read_model
 from hood.dynamics.recorder import read_rollout
+from hood.dynamics.soundness import judge_rollout, worst_frame
 from hood.mesh.defects import Defects, find_defects
 from hood.mesh.quality import check_triangles
 from hood.mesh.topology import boundary_loops
@@ -34,6 +35,10 @@ _TURN_GAIN = 0.6
 _NEAR = 0.2
 #: Openings beyond this number are torn seams: they are counted, not named.
 _MOST_OPENINGS = 12
+_SIMULATE_AGAIN = (
+    "simulate again: with stepper=newton or refine=5 where a network went alone, with more solver.max_iterations where the "
+    "solver missed its target, with a motion that does not jump there"
+)
 
 
 @dataclass
@@ -251,7 +256,6 @@ def inspect_rollout(name: str) -> Finding:
     """A simulated motion on disk."""
     data = read_rollout(Path(name))
     finding = Finding(name, "rollout")
-    finite = np.isfinite(data.cloth_pos).all(axis=(1, 2))
     finding.facts = {
         "frames": len(data.cloth_pos),
         "complete": bool(data.attributes.get("complete", False)),
@@ -261,8 +265,14 @@ def inspect_rollout(name: str) -> Finding:
             key: str(data.attributes[key]) for key in ("garment", "sequence", "checkpoint", "stepper") if key in data.attributes
         },
     }
-    if not finite.all():
-        finding.problem(f"frame {int(np.argmin(finite))} is not finite", "simulate again with stepper=newton or a smaller step")
+    verdict = judge_rollout(data)
+    finding.facts["sound"] = verdict.sound
+    worst = worst_frame(data.metrics.get("strain_p99", np.zeros(0)))
+    if worst is not None:
+        finding.facts["worst strain p99"] = f"{worst[0]:.1%} in frame {worst[1]}"
+    if not verdict.sound:
+        state = "not judged" if verdict.sound is None else "unsound"
+        finding.problem(f"{state}: {'; '.join(verdict.reasons)}", _SIMULATE_AGAIN)
     if not finding.facts["complete"]:
         finding.problem("it was interrupted", "run hood rollout again")
     return finding

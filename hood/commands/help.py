@@ -6,6 +6,7 @@ import re
 import textwrap
 
 from hood.assets import library
+from hood.commands.exit_codes import exit_code_lines
 from hood.config import CONFIG_FOLDER, load_config, options, plain
 
 _EXAMPLES = {
@@ -63,7 +64,7 @@ def describe(name: str) -> str:
         lines += ["", "embedded names:"]
         for kind, label in (("garments", "garment"), ("motions", "sequence"), ("body", "body"), ("weights", "checkpoint")):
             lines.append(textwrap.fill(f"  {label + '=':<14}{' '.join(library.names(kind))}", 118, subsequent_indent=" " * 16))
-    lines += ["", "examples:", *(f"  {example}" for example in _EXAMPLES[name])]
+    lines += ["", "examples:", *(f"  {example}" for example in _EXAMPLES[name]), "", *exit_code_lines()]
     return "\n".join(lines)
 
 

@@ -22,6 +22,7 @@ from hood.commands.common import UNTRAINED, output_folder, prepare_folder, read_
 from hood.commands.dial import check_dial, exported, refined
 from hood.commands.performance import make_motion
 from hood.commands.summary import describe, describe_all, summarise
+from hood.commands.verdict import exit_code
 from hood.commands.wardrobe import read_outfit
 from hood.config import ConfigError, build, load_config, plain, require_choice, save_run_record
 from hood.dynamics.captured import MODES, CapturedSimulator
@@ -38,7 +39,8 @@ PLAIN = "plain"
 
 
 def run(overrides: Sequence[str]) -> int:
-    """Run the command; returns the exit code."""
+    """Run the command; returns the exit code: 130 where the user interrupted it, else 2 where a motion of many could not be
+    used, else 3 where a result is unsound (:mod:`hood.dynamics.soundness`), else 0."""
     config = load_config("rollout", overrides)
     require_device(config)
     require_choice(config, "video", ("mp4", "gif", "none"))
@@ -58,7 +60,8 @@ def _run(config: DictConfig) -> int:
         return _run_all(config, jobs, output)
     if distributed.rank() != 0:
         return 0
-    return 130 if _run_one(config, *make_stepper(config))[1] else 0
+    summary, interrupted = _run_one(config, *make_stepper(config))
+    return 130 if interrupted else exit_code([summary], bool(config.allow_unsound))
 
 
 def _run_one(config: DictConfig, stepper: Stepper, digest: str) -> tuple[dict[str, Any], bool]:
@@ -107,7 +110,9 @@ def _run_all(config: DictConfig, jobs: list[Job], output: Path) -> int:
         raise outcome.hopeless
     if outcome.interrupted:
         return 130
-    return 2 if any("error" in row for row in outcome.rows.values()) else 0
+    if any("error" in row for row in outcome.rows.values()):
+        return 2
+    return exit_code(outcome.rows.values(), bool(config.allow_unsound))
 
 
 def _finished(config: DictConfig, digest: str, folder: Path) -> dict[str, Any] | None:
@@ -120,8 +125,10 @@ def _finished(config: DictConfig, digest: str, folder: Path) -> dict[str, Any] |
     except (OSError, ValueError, KeyError):
         return None
     now = plain(config)
-    same = all(before.get(key) == now[key] for key in now if key not in ("resume", "output"))
-    return summary if same and bool(attributes["complete"]) and attributes["checkpoint_sha256"] == digest else None
+    same = all(before.get(key) == now[key] for key in now if key not in ("resume", "output", "allow_unsound"))
+    if not same or not bool(attributes["complete"]) or attributes["checkpoint_sha256"] != digest:
+        return None
+    return summary if "sound" in summary else summarise(folder / "rollout.h5")
 
 
 def make_scene(config: DictConfig) -> Scene:

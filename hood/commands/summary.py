@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from hood.commands.dial import describe_refinement, summarise_refinement
+from hood.commands.verdict import describe_verdict, describe_worst, summarise_verdict
 from hood.dynamics.recorder import read_rollout
 
 
@@ -45,11 +46,12 @@ def summarise(path: Path) -> dict[str, Any]:
         "ms_per_frame": times,
         **solver,
         **summarise_refinement(json.loads(data.attributes["config"]), data.metrics),
+        **summarise_verdict(data),
     }
 
 
 def describe(summary: dict[str, Any]) -> str:
-    """The summary in three lines, and one more where steps were refined and where the solver missed its target."""
+    """The summary in a few lines: frames, strain and penetration, times, how far steps were taken, the verdict."""
     missed = summary.get("solver_steps_not_converged", 0)
     first = summary["first_nonfinite_frame"]
     times = {name: value["median"] for name, value in summary["ms_per_frame"].items()}
@@ -57,10 +59,11 @@ def describe(summary: dict[str, Any]) -> str:
         [
             f"{summary['garment']}: {summary['num_frames']} frames, "
             + ("all finite" if first is None else f"first non-finite frame {first}"),
-            f"strain p50 {_percent(summary['strain_p50'])} p99 {_percent(summary['strain_p99'])}, {_penetration(summary)}",
+            f"strain p50 {_percent(summary['strain_p50'])} p99 {_worst_strain(summary)}, {_penetration(summary)}",
             "ms per frame (median): " + ", ".join(f"{name} {value or 0.0:.1f}" for name, value in times.items()),
             *describe_refinement(summary),
             *([f"{missed} steps did not reach solver.target_rg; their frames are kept as far as they got"] if missed else []),
+            *describe_verdict(summary),
         ]
     )
 
@@ -75,10 +78,14 @@ def describe_all(rows: Mapping[str, Mapping[str, Any]], total: int) -> str:
         first = row["first_nonfinite_frame"]
         state = f"{row['num_frames']} frames, " + ("all finite" if first is None else f"first non-finite frame {first}")
         lines.append(
-            f"{name}: {state}, strain p99 {_percent(row['strain_p99'])}, penetration {_percent(row['penetration_share_mean'])}"
+            f"{name}: {state}, strain p99 {_worst_strain(row)}, penetration {_percent(row['penetration_share_mean'])}"
+            + (f"; UNSOUND: {row['unsound_reasons'][0]}" if row["sound"] is False else "")
         )
     failed = sum("error" in row for row in rows.values())
-    return "\n".join([*lines, f"{len(rows) - failed} of {total} motions simulated" + (f", {failed} failed" if failed else "")])
+    unsound = sum(row.get("sound") is False for row in rows.values())
+    parts = [f"{len(rows) - failed} of {total} motions simulated"]
+    parts += [f"{count} {what}" for count, what in ((failed, "failed"), (unsound, "unsound")) if count]
+    return "\n".join([*lines, ", ".join(parts)])
 
 
 def _quantiles(values: np.ndarray) -> dict[str, float | None]:
@@ -111,6 +118,10 @@ def _largest(values: np.ndarray) -> float | None:
 
 def _percent(value: float | None) -> str:
     return "n/a" if value is None else f"{100 * value:.1f}%"
+
+
+def _worst_strain(summary: Mapping[str, Any]) -> str:
+    return _percent(summary["strain_p99"]) + describe_worst(summary, "strain_p99", ".1%")
 
 
 def _penetration(summary: dict[str, Any]) -> str:

@@ -1,0 +1,22 @@
+"""What the exit codes mean: one table, for the commands and for the help."""
+
+from __future__ import annotations
+
+#: A rollout that ran to its end and cannot be trusted.
+UNSOUND = 3
+#: Where several hold, 130 comes before 2, and 2 before 3.
+EXIT_CODES = {
+    0: "done",
+    1: "inspect: something needs repair",
+    2: "an error, told in one line",
+    UNSOUND: "rollout: a result is unsound, see sound and unsound_reasons in summary.json",
+    130: "interrupted",
+}
+
+
+def exit_code_lines() -> list[str]:
+    """The table for a terminal."""
+    return [
+        "exit codes (where several hold: 130, then 2, then 3):",
+        *(f"  {code:<6}{text}" for code, text in EXIT_CODES.items()),
+    ]
