@@ -20,6 +20,7 @@ _ROWS: dict[str, tuple[int | None, ...]] = {
     "skin_pos": (3,),
     "rest_turn": (3, 3),
     "colours": (3,),
+    "piece": (),
 }
 _CORNERS = ("uv_faces", "normal_faces")
 _LEVEL = "coarse_edges_"
@@ -46,6 +47,8 @@ def read_fields(path: Path) -> dict[str, Any]:
             fields[key] = _reals(path, key, arrays[key])
             check_rows(str(path), key, fields[key], num_vertices)
     fields["pinned"] = fields.get("pinned", np.zeros(num_vertices)).astype(bool)
+    if "piece" in fields:
+        fields["piece"] = fields["piece"].astype(np.int64)
     if "lbs_weights" in fields:
         fields["lbs_weights"] = normalised(str(path), fields["lbs_weights"])
     if "uv" in arrays and "uv_faces" in arrays:

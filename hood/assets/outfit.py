@@ -13,7 +13,8 @@ def join_garments(garments: Sequence[Garment]) -> Garment:
     """The garments as one garment of several components, in their order; bound if all of them are, to the same body.
 
     The name joins theirs by ``+``. Garments without texture coordinates get the corner (0, 0) if another has some, those
-    without colours become white. Coarse edges are kept if all have as many levels. A single garment is returned as it is.
+    without colours become white. Coarse edges are kept if all have as many levels; ``piece`` says which garment a vertex is
+    of. A single garment is returned as it is.
     """
     if len(garments) == 1:
         return garments[0]
@@ -39,6 +40,7 @@ def join_garments(garments: Sequence[Garment]) -> Garment:
         skin_pos=_join_rows(garments, "skin_pos", lambda garment: garment.rest_pos),
         rest_turn=_join_rows(garments, "rest_turn", lambda garment: np.tile(np.eye(3), (len(garment.rest_pos), 1, 1))),
         coarse_edges=_join_levels(garments, starts),
+        piece=np.repeat(np.arange(len(garments)), counts),
     )
 
 

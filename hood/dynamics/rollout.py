@@ -21,6 +21,7 @@ from hood.dynamics.refine import RefinedStepper, unrefined
 from hood.dynamics.simulator import Prediction, Simulator
 from hood.dynamics.stepper import Stepper
 from hood.dynamics.stopwatch import Stopwatch
+from hood.dynamics.surface import SURFACE_METRICS, SURFACE_STRIDE, SurfaceMeter
 from hood.graph.given import given_hierarchy
 from hood.losses.potential import Potential, relative_gradient, scale
 from hood.losses.problem import StepProblem, inertial_guess
@@ -49,8 +50,8 @@ class Frame:
     fields: dict[str, Tensor] = field(default_factory=dict)  # (V,) by name, of the step that led here; NaN in frame 0
 
 
-#: What is measured of a frame besides its time and what the stepper reports: strain, penetration and energies, strain
-#: alone, or nothing. Only ``all`` needs contact with the body's surface.
+#: What is measured of a frame besides its time and what the stepper reports: strain, penetration, cut surface and energies,
+#: strain alone, or nothing. Only ``all`` needs contact with the body's surface.
 METRIC_CHOICES = ("all", "strain", "none")
 #: What can be had of every vertex: the relative gradient, see :func:`hood.dynamics.measure.vertex_residual`.
 FIELD_CHOICES = ("rg",)
@@ -66,7 +67,7 @@ def metric_names(potential: Potential, stepper: Stepper, metrics: str = "all") -
         "relative_gradient",
         "e0",
     )
-    measured = {"all": (*STRAIN_METRICS, *PENETRATION_METRICS, *energies), "strain": STRAIN_METRICS, "none": ()}
+    measured = {"all": (*STRAIN_METRICS, *PENETRATION_METRICS, *SURFACE_METRICS, *energies), "strain": STRAIN_METRICS, "none": ()}
     return (*measured[metrics], *stepper.metrics, *(f"ms_{part}" for part in stepper.times), "ms_metrics")
 
 
@@ -82,6 +83,7 @@ def simulate(
     observe: Observer | None = None,
     metrics: str = "all",
     fields: Sequence[str] = (),
+    surface_stride: int = SURFACE_STRIDE,
 ) -> Iterator[Frame]:
     """Frames 0, 1, … of the garment on the moving body.
 
@@ -91,18 +93,22 @@ def simulate(
 
     ``metrics`` is one of :data:`METRIC_CHOICES`. What only they need to know, contact included, is no part of the step and
     changes nothing about it; its time is ``ms_metrics``, which ``ms_total`` leaves out as it does the caller's work. The same
-    holds for ``fields``, names of :data:`FIELD_CHOICES`.
+    holds for ``fields``, names of :data:`FIELD_CHOICES`. The metrics of :class:`hood.dynamics.surface.SurfaceMeter` belong to
+    every ``surface_stride``-th frame, the first and the last; other frames lack them.
 
     A network that looks at a potential looks at ``potential``; a solver keeps its own.
 
     Raises:
-        ValueError: ``metrics`` or a field is none of the choices, or the network cannot look at this potential.
+        ValueError: ``metrics`` or a field is none of the choices, ``surface_stride`` is less than 1, or the network cannot look
+            at this potential.
     """
     if metrics not in METRIC_CHOICES:
         raise ValueError(f"metrics is {metrics!r}; choose {', '.join(METRIC_CHOICES)}")
     strange = [name for name in fields if name not in FIELD_CHOICES]
     if strange:
         raise ValueError(f"export holds {strange[0]!r}; choose of {', '.join(FIELD_CHOICES)}")
+    if surface_stride < 1:
+        raise ValueError(f"surface_stride={surface_stride}: must be at least 1, every frame")
     count = scene.num_frames - start_frame if num_frames is None else min(num_frames, scene.num_frames - start_frame)
     network = network_of(stepper)
     if network is not None:
@@ -112,6 +118,7 @@ def simulate(
     stepped: dict[str, float] = {}
     known_fields = {name: torch.full((scene.cloth.num_vertices,), torch.nan) for name in fields}
     wants_potential = metrics == "all" or bool(fields)
+    meter = SurfaceMeter(scene.garment, scene.motion.faces) if metrics == "all" else None
     watch = Stopwatch()
     for index in range(count):
         body_frame = start_frame + index
@@ -127,6 +134,8 @@ def simulate(
         with watch.aside("metrics"):
             known = potential.prepare(problem) if problem is not None and wants_potential else problem
             row = {**_state_metrics(scene, state, body_frame, known, metrics), **stepped}
+            if meter is not None and (index % surface_stride == 0 or index + 1 == count):
+                row |= _surface_now(meter, scene, state, body_frame)
         row["ms_metrics"] = watch.spent_aside("metrics")
         with watch.aside("caller"):
             origin = state.origin[0]
@@ -222,6 +231,10 @@ def energy_metrics(
     result["relative_gradient"] = float(relative_gradient(problem, gradient * free.unsqueeze(1)).mean())
     result["e0"] = float(scale(problem).sum())
     return result
+
+
+def _surface_now(meter: SurfaceMeter, scene: Scene, state: State, frame: int) -> dict[str, float]:
+    return meter(state.pos.cpu().numpy(), scene.motion.surface(frame, state.origin[0].numpy()).cpu().numpy())
 
 
 def _contact_now(scene: Scene, state: State, frame: int) -> Contact | None:
