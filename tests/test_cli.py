@@ -242,6 +242,8 @@ def test_rollout_file_has_the_documented_content(run_folder: Path) -> None:
         np.testing.assert_allclose(file["time"][:], np.arange(3) / 30)
         for name in ("strain_p50", "strain_p99", "strain_max", "penetration_count", "penetration_share", "penetration_depth"):
             assert np.isfinite(file[f"metrics/{name}"][:]).all()
+        for name in ("cut_face_share", "cut_edge_share", "skin_depth", "self_crossings", "garment_crossings"):
+            assert np.isfinite(file[f"metrics/{name}"][:]).tolist() == [True, False, True]  # first and last
         for name in ("energy_stretching", "energy_total", "gradient_norm", "relative_gradient", "e0", "ms_total"):
             values = file[f"metrics/{name}"][:]
             assert np.isnan(values[0])
@@ -256,12 +258,13 @@ def test_rollout_file_has_the_documented_content(run_folder: Path) -> None:
     assert json.loads(attributes["config"])["num_frames"] == 3
     assert json.loads(attributes["model"])["latent_dim"] == 8
     assert attributes["dt"] == pytest.approx(1 / 30)
+    assert attributes["surface_stride"] == 5
 
 
 def test_a_rollout_without_metrics_holds_times_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["garment=tank", "num_frames=3", "video=none", "sheet=false", f"output={tmp_path / 'run'}"]
     assert main(["rollout", *UNTRAINED, *arguments, "metrics=none"]) == 0
-    assert "strain p50 n/a p99 n/a, penetration n/a\n" in capsys.readouterr().out
+    assert "strain p50 n/a p99 n/a, vertices inside the body n/a\n" in capsys.readouterr().out
     names = set(read_rollout(tmp_path / "run" / "rollout.h5").metrics)
     assert names == {f"ms_{part}" for part in ("search", "features", "network", "rest", "total", "metrics")}
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())

@@ -40,7 +40,7 @@ def join_garments(garments: Sequence[Garment]) -> Garment:
         skin_pos=_join_rows(garments, "skin_pos", lambda garment: garment.rest_pos),
         rest_turn=_join_rows(garments, "rest_turn", lambda garment: np.tile(np.eye(3), (len(garment.rest_pos), 1, 1))),
         coarse_edges=_join_levels(garments, starts),
-        piece=np.repeat(np.arange(len(garments)), counts),
+        piece=_join_pieces(garments),
     )
 
 
@@ -81,6 +81,15 @@ def _join_normals(garments: Sequence[Garment]) -> np.ndarray | None:
         tables.append(table + start)
         start += int(table.max(initial=-1)) + 1
     return np.concatenate(tables)
+
+
+def _join_pieces(garments: Sequence[Garment]) -> np.ndarray:
+    """Numbers of the single garments; those of an outfit among them go on counting."""
+    pieces: list[np.ndarray] = []
+    for garment in garments:
+        own = np.zeros(len(garment.rest_pos), dtype=np.int64) if garment.piece is None else garment.piece
+        pieces.append(own + (1 + int(pieces[-1].max()) if pieces else 0))
+    return np.concatenate(pieces)
 
 
 def _join_levels(garments: Sequence[Garment], starts: np.ndarray) -> tuple[np.ndarray, ...] | None:

@@ -22,6 +22,8 @@ from hood.training import distributed
 
 #: ``checkpoint=untrained``: seeded random weights instead of a file.
 UNTRAINED = "untrained"
+#: A body drawn thinner than this [mm] is another body.
+_THINNEST = 20.0
 
 
 def together(command: Callable[[], int]) -> int:
@@ -61,6 +63,18 @@ def require_distinct(key: str, values: Sequence[Any]) -> None:
     twice = next((value for place, value in enumerate(values) if value in values[:place]), None)
     if twice is not None:
         raise ConfigError(f"{key}: {twice!r} is given twice; leave one out")
+
+
+def thinning(config: DictConfig) -> float:
+    """[m] of ``config.thin_body``, which is in millimetres.
+
+    Raises:
+        ConfigError: it is no such number.
+    """
+    value = config.thin_body
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value <= _THINNEST:
+        raise ConfigError(f"thin_body={value}: give millimetres, 0 (the body as it is) to {_THINNEST:g}")
+    return 1e-3 * float(value)
 
 
 def prepare_folder(folder: Path) -> Path:

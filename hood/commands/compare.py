@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from hood.assets.atomic import write_atomically
-from hood.commands.common import output_folder, prepare_folder, require_package
+from hood.commands.common import output_folder, prepare_folder, require_package, thinning
 from hood.config import ConfigError, load_config, require_choice
 from hood.dynamics.recorder import RolloutData, read_rollout
 
@@ -46,6 +46,7 @@ def run(arguments: Sequence[str]) -> int:
     for key, least in (("num_frames", 1), ("video_stride", 1), ("seed", 0), ("height", 64)):
         if config[key] is not None and (not isinstance(config[key], int) or config[key] < least):
             raise ConfigError(f"{key}={config[key]}: must be a whole number, at least {least}")
+    thinning(config)
     if str(config.video) == "none" and not bool(config.sheet):
         raise ConfigError("video=none and sheet=false leave nothing to draw; leave one of them out")
     folder = output_folder(config)
@@ -131,7 +132,7 @@ def _draw(entries: Sequence[_Entry], config: DictConfig, folder: Path) -> None:
     rows = [{"title": _letter(i) if blind else e.name, **_facts(e)} for i, e in enumerate(entries)]
     panels = [Panel(e.data, str(r["title"]), "" if blind else _note(r)) for e, r in zip(entries, rows, strict=True)]
     height = int(config.height)
-    view = SideBySide(panels, "none" if colour == "fabric" else colour, round(height / 1.4), height)
+    view = SideBySide(panels, "none" if colour == "fabric" else colour, round(height / 1.4), height, thinning(config))
     written = []
     if bool(config.sheet):
         written.append(save_png(folder / "contact_sheet.png", view.sheet()))

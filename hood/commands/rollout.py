@@ -18,7 +18,16 @@ from tqdm import tqdm
 
 from hood.assets.library import locate
 from hood.commands.batch import Job, find_jobs, share
-from hood.commands.common import UNTRAINED, output_folder, prepare_folder, read_model, require_device, together, use_arithmetic
+from hood.commands.common import (
+    UNTRAINED,
+    output_folder,
+    prepare_folder,
+    read_model,
+    require_device,
+    thinning,
+    together,
+    use_arithmetic,
+)
 from hood.commands.dial import check_dial, exported, refined
 from hood.commands.performance import make_motion
 from hood.commands.summary import describe, describe_all, summarise
@@ -189,6 +198,7 @@ def _simulate_to_disk(config: DictConfig, scene: Scene, stepper: Stepper, digest
         "stepper": str(config.stepper),
         "garment": scene.garment.name,
         "sequence": scene.motion.name,
+        "surface_stride": int(config.surface_stride),
     }
     writer = RolloutWriter(
         path,
@@ -204,7 +214,14 @@ def _simulate_to_disk(config: DictConfig, scene: Scene, stepper: Stepper, digest
         fields=exported(config),
     )
     frames = simulate(
-        stepper, scene, potential, count, int(config.relaxing_steps), metrics=str(config.metrics), fields=exported(config)
+        stepper,
+        scene,
+        potential,
+        count,
+        int(config.relaxing_steps),
+        metrics=str(config.metrics),
+        fields=exported(config),
+        surface_stride=int(config.surface_stride),
     )
     try:
         with writer:
@@ -227,18 +244,19 @@ def _draw(config: DictConfig, folder: Path) -> None:
     except ImportError as error:
         print(f"no pictures: {error}", file=sys.stderr)
         return
-    data, colour = read_rollout(folder / "rollout.h5"), str(config.colour)
+    data, colour, thinner = read_rollout(folder / "rollout.h5"), str(config.colour), thinning(config)
     if bool(config.sheet):
-        write_sheet(data, folder / "contact_sheet.png", colour)
+        write_sheet(data, folder / "contact_sheet.png", colour, thinner)
     if str(config.video) != "none":
         frames = tqdm(range(0, len(data.cloth_pos), int(config.video_stride)), desc="video", unit="frame", disable=_quiet())
-        write_video(data, folder / f"rollout.{config.video}", frames, int(config.video_stride), colour)
+        write_video(data, folder / f"rollout.{config.video}", frames, int(config.video_stride), colour, thinner)
 
 
 def _check_numbers(config: DictConfig) -> None:
-    for key, least in (("num_frames", 1), ("relaxing_steps", 0), ("video_stride", 1), ("seed", 0)):
+    for key, least in (("num_frames", 1), ("relaxing_steps", 0), ("video_stride", 1), ("surface_stride", 1), ("seed", 0)):
         if int(config[key]) < least:
             raise ConfigError(f"{key}={config[key]}: must be at least {least}")
+    thinning(config)
     if not 1.0 <= float(config.fps) <= 1000.0:
         raise ConfigError(f"fps={config.fps}: give the simulation's frames per second, 1 to 1000")
 

@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 
 from hood.commands.dial import describe_refinement, summarise_refinement
+from hood.commands.surface_report import cut_at_worst, describe_surface, summarise_surface
 from hood.commands.verdict import describe_verdict, describe_worst, summarise_verdict
 from hood.dynamics.recorder import read_rollout
 
 
 def summarise(path: Path) -> dict[str, Any]:
-    """Summary of a rollout file: strain, penetration, times, first non-finite frame; None for what was not measured."""
+    """Summary of a rollout file: strain, penetration, surface, times, first non-finite frame; None if not measured."""
     data = read_rollout(path)
     finite = np.isfinite(data.cloth_pos).all(axis=(1, 2))
     metrics = defaultdict(lambda: np.full(len(finite), np.nan), data.metrics)
@@ -40,6 +41,7 @@ def summarise(path: Path) -> dict[str, Any]:
         "penetration_share_max": _largest(metrics["penetration_share"]),
         "penetration_count_max": _largest(metrics["penetration_count"]),
         "penetration_depth_max_m": _largest(metrics["penetration_depth"]),
+        "surface": summarise_surface(data.metrics, _stride(data.attributes)),
         "potential_mean_J": _mean(metrics["energy_total"]),
         "potential_inertial_guess_mean_J": _mean(metrics["energy_inertial_guess"]),
         "relative_gradient_median": _median(metrics["relative_gradient"]),
@@ -51,7 +53,8 @@ def summarise(path: Path) -> dict[str, Any]:
 
 
 def describe(summary: dict[str, Any]) -> str:
-    """The summary in a few lines: frames, strain and penetration, times, how far steps were taken, the verdict."""
+    """The summary in a few lines: frames, strain, vertices inside the body, times, how far steps were taken, the cut surface
+    with its warnings, the verdict."""
     missed = summary.get("solver_steps_not_converged", 0)
     first = summary["first_nonfinite_frame"]
     times = {name: value["median"] for name, value in summary["ms_per_frame"].items()}
@@ -62,6 +65,7 @@ def describe(summary: dict[str, Any]) -> str:
             f"strain p50 {_percent(summary['strain_p50'])} p99 {_worst_strain(summary)}, {_penetration(summary)}",
             "ms per frame (median): " + ", ".join(f"{name} {value or 0.0:.1f}" for name, value in times.items()),
             *describe_refinement(summary),
+            *describe_surface(summary["surface"]),
             *([f"{missed} steps did not reach solver.target_rg; their frames are kept as far as they got"] if missed else []),
             *describe_verdict(summary),
         ]
@@ -78,7 +82,8 @@ def describe_all(rows: Mapping[str, Mapping[str, Any]], total: int) -> str:
         first = row["first_nonfinite_frame"]
         state = f"{row['num_frames']} frames, " + ("all finite" if first is None else f"first non-finite frame {first}")
         lines.append(
-            f"{name}: {state}, strain p99 {_worst_strain(row)}, penetration {_percent(row['penetration_share_mean'])}"
+            f"{name}: {state}, strain p99 {_worst_strain(row)}, "
+            f"{_percent(row['penetration_share_mean'])} of the vertices inside the body, {cut_at_worst(row.get('surface'))}"
             + (f"; UNSOUND: {row['unsound_reasons'][0]}" if row["sound"] is False else "")
         )
     failed = sum("error" in row for row in rows.values())
@@ -127,5 +132,10 @@ def _worst_strain(summary: Mapping[str, Any]) -> str:
 def _penetration(summary: dict[str, Any]) -> str:
     share, depth = summary["penetration_share_mean"], summary["penetration_depth_max_m"]
     if share is None or depth is None:
-        return "penetration n/a"
-    return f"penetration {_percent(share)} of the vertices deeper than 2 mm, deepest {1e3 * depth:.1f} mm"
+        return "vertices inside the body n/a"
+    return f"vertices inside the body: {_percent(share)} deeper than 2 mm, deepest {1e3 * depth:.1f} mm"
+
+
+def _stride(attributes: dict[str, Any]) -> int | None:
+    """Frames from one measurement of the surface to the next; None of files that do not say."""
+    return int(attributes["surface_stride"]) if "surface_stride" in attributes else None

@@ -67,7 +67,11 @@ def metric_names(potential: Potential, stepper: Stepper, metrics: str = "all") -
         "relative_gradient",
         "e0",
     )
-    measured = {"all": (*STRAIN_METRICS, *PENETRATION_METRICS, *SURFACE_METRICS, *energies), "strain": STRAIN_METRICS, "none": ()}
+    measured = {
+        "all": (*STRAIN_METRICS, *PENETRATION_METRICS, *SURFACE_METRICS, *energies),
+        "strain": STRAIN_METRICS,
+        "none": (),
+    }
     return (*measured[metrics], *stepper.metrics, *(f"ms_{part}" for part in stepper.times), "ms_metrics")
 
 

@@ -12,7 +12,7 @@ _NAMES = ("model", "weights", "garment")
 _MAIN = ("steps", "radius", "ms", "ms_p99", "fps", "L_total", "gradient_norm", "rg")
 _GAP = ("gap", "gap_p95", "unconverged", "disagree")
 _TERMS = ("L_guess", "L_stretching", "L_bending", "L_inertia", "L_gravity", "L_collision", "L_friction")
-_STATE = ("strain_p99", "penetration", "penetration_worst", "drift")
+_STATE = ("strain_p99", "penetration", "penetration_worst", "cut_faces", "cut_faces_worst", "crossings", "drift")
 _FAILURE = ("failed_at", "failed", "frames_to_failure")
 _ENDS = tuple(f"{column}_{end}" for column in INTERVALS for end in ("low", "high"))
 COLUMNS = (*_NAMES, *_MAIN, *_GAP, *_TERMS, *_STATE, *_FAILURE, "rollouts", "frames", "gap_states", "gap_spread", *_ENDS)
@@ -28,8 +28,9 @@ def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
 def describe(rows: Sequence[Mapping[str, Any]]) -> str:
     """Meaning and units of the columns, and how far the figures of these rows can be trusted."""
     lines = [
-        "ms per frame; L [J], L_guess of the inertial guess, gradient_norm [N] and penetration, the share of vertices deeper "
-        "than 2 mm, are means; rg = ‖∇Φ‖ / ‖M g‖ and strain_p99 are medians over frames; drift [m] is to the side",
+        "ms per frame; means: L [J], L_guess of the inertial guess, gradient_norm [N], penetration, the share of vertices "
+        "deeper than 2 mm, cut_faces, the share of the cloth's triangles that the body cuts, crossings, the pairs of triangles "
+        "that pass through each other; medians over frames: rg = ‖∇Φ‖ / ‖M g‖ and strain_p99; drift [m] is to the side",
         "gap = (Φ - Φ*) / e0, the energy above the minimum of the same step: median and 95th percentile; √gap is about the "
         "error of the accelerations in g",
         f"failed: share of the rollouts with a frame that is not finite or whose strain_p99 exceeds {FAILURE_STRAIN:.0%}; "

@@ -101,7 +101,10 @@ def evaluate(
     later than all (None: less than half failed). ``steps`` and ``radius`` are None without a network. ``L_guess`` is the
     potential of the inertial guess on the same states. ``gradient_norm`` [N] is the mean over vertices of ‖∂L/∂x_v‖₂, averaged
     over frames; ``rg`` and ``strain_p99`` are medians over frames; ``penetration`` is the mean share of vertices deeper than
-    2 mm, ``penetration_worst`` that of the worst frame; ``drift`` [m] is the largest of those measured (None: none was). Of
+    2 mm, ``penetration_worst`` that of the worst frame; ``cut_faces`` is the mean share of the cloth's triangles that the
+    body cuts, ``cut_faces_worst`` that of the worst frame, ``crossings`` the mean number of pairs of cloth triangles that pass
+    through each other, all three of the frames where they are measured; ``drift`` [m] is the largest of those measured (None:
+    none was). Of
     the states whose gap is computed (``gap_states`` of them): ``gap`` is the median, ``gap_p95`` the 95th percentile,
     ``unconverged`` the share whose reference missed its accuracy and ``disagree`` the share where minimisations ended in
     different minima, ``gap_spread`` [e0] the 95th percentile of how far these are apart. Columns of :data:`INTERVALS` have 95%
@@ -206,9 +209,22 @@ def _row(measured: Measured) -> dict[str, Any]:
     row["gradient_norm"] = _mean(frames, "gradient_norm")
     row["penetration"] = _mean(frames, "penetration_share")
     row["penetration_worst"] = max(frame.get("penetration_share", 0.0) for frame in frames)
+    row |= _surface_columns(frames)
     row["strain_p99"] = float(np.median([frame["strain_p99"] for frame in frames]))
     row["rg"] = float(np.median([frame["relative_gradient"] for frame in frames]))
     return row
+
+
+def _surface_columns(frames: Sequence[Mapping[str, float]]) -> dict[str, Any]:
+    """Of the frames whose surface was measured; nothing where none was."""
+    measured = [frame for frame in frames if np.isfinite(frame.get("cut_face_share", np.nan))]
+    if not measured:
+        return {}
+    return {
+        "cut_faces": _mean(measured, "cut_face_share"),
+        "cut_faces_worst": max(frame["cut_face_share"] for frame in measured),
+        "crossings": _mean(measured, "self_crossings") + _mean(measured, "garment_crossings"),
+    }
 
 
 def _failure_columns(ends: Sequence[int | None]) -> dict[str, Any]:

@@ -42,6 +42,7 @@ _MORE = (
     ("model", "model"), ("garment", "garment"), ("L_stretching", "stretching"), ("L_bending", "bending"),
     ("L_inertia", "inertia"), ("L_gravity", "gravity"), ("L_collision", "collision"), ("L_friction", "friction"),
     ("L_guess", "L_total of the inertial guess"), ("penetration", "penetrating"), ("penetration_worst", "worst frame"),
+    ("cut_faces", "triangles cut by the skin"), ("cut_faces_worst", "worst frame"), ("crossings", "crossing pairs"),
     ("drift", "drift [m]"), ("failed", "failed rollouts"), ("frames_to_failure", "frames to failure"),
     ("unconverged", "γ unconverged"), ("disagree", "γ disagree"), ("gap_spread", "γ spread p95"), ("gap_states", "γ states"),
 )  # fmt: skip

@@ -22,6 +22,8 @@ from hood.solver.newton import NewtonSettings
 _MEANS: dict[str, Callable[..., float]] = {
     "strain_p99": np.median,
     "penetration_share": np.mean,
+    "cut_face_share": np.mean,
+    "self_crossings": np.mean,
     "relative_gradient": np.median,
 }
 
@@ -74,11 +76,13 @@ class Validation:
         finite = bool(np.isfinite(table["strain_p99"]).all())
         gaps = [gap(self.potential, problem, step.next_pos, settings=self.reference) for problem, step in sample.steps]
         metrics = {key: _reduce(_MEANS[key], values) for key, values in table.items()}
+        metrics["cut_face_share_worst"] = _reduce(np.max, table["cut_face_share"])
         return Rollout(self.garments[index].name, metrics, tuple(float(item.gamma) for item in gaps), finite)
 
 
 def summarise(rollouts: Sequence[Rollout]) -> dict[str, float]:
-    """Medians over garments of p99 strain and rg, mean penetrating share, worst strain, number of non-finite rollouts, gap γ
+    """Medians over garments of p99 strain and rg, mean shares of vertices inside the body and of triangles
+    cut by it, the worst such frame, crossing pairs of triangles, worst strain, number of non-finite rollouts, gap γ
     (median and 95th percentile over all states) and ``score``."""
     strain = [item.metrics["strain_p99"] for item in rollouts]
     gaps = np.array([value for item in rollouts for value in item.gaps])
@@ -86,6 +90,9 @@ def summarise(rollouts: Sequence[Rollout]) -> dict[str, float]:
         "strain_p99": _reduce(np.median, strain),
         "strain_p99_worst": _reduce(np.max, strain),
         "penetration_share": _reduce(np.mean, [item.metrics["penetration_share"] for item in rollouts]),
+        "cut_face_share": _reduce(np.mean, [item.metrics["cut_face_share"] for item in rollouts]),
+        "cut_face_share_worst": _reduce(np.max, [item.metrics["cut_face_share_worst"] for item in rollouts]),
+        "self_crossings": _reduce(np.mean, [item.metrics["self_crossings"] for item in rollouts]),
         "relative_gradient": _reduce(np.median, [item.metrics["relative_gradient"] for item in rollouts]),
         "non_finite": float(sum(not item.finite for item in rollouts)),
     }

@@ -41,19 +41,22 @@ class SideBySide:
         panels: two or more rollouts with as many frames each, see :func:`require_same_motion`.
         colour: ``strain``, ``rg``, or ``none`` for the garments' own colours.
         width, height: pixels of one rollout's picture, titles apart.
+        thinner: [m] by which the bodies are drawn thinner near the cloth, as in :class:`hood.media.film.Film`.
 
     Raises:
         ValueError: fewer than two rollouts, or one that does not hold the values asked for.
     """
 
-    def __init__(self, panels: Sequence[Panel], colour: str = "none", width: int = 400, height: int = 560) -> None:
+    def __init__(
+        self, panels: Sequence[Panel], colour: str = "none", width: int = 400, height: int = 560, thinner: float = 0.0
+    ) -> None:
         if len(panels) < 2:
             raise ValueError(f"{len(panels)} rollouts cannot be compared; give two or more")
         self.panels, self.width = panels, width
         self._size = max(12, height // 30)
         every = [panel.data for panel in panels]
         self._films = [
-            Film(data, width, height, colour=colour, beside=every[:index] + every[index + 1 :])
+            Film(data, width, height, colour=colour, beside=every[:index] + every[index + 1 :], thinner=thinner)
             for index, data in enumerate(every)
         ]
 

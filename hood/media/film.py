@@ -12,13 +12,12 @@ from scipy.spatial import cKDTree
 from hood.dynamics.recorder import RolloutData
 from hood.media.colouring import colouring_of
 from hood.media.palette import outfit_colours
-from hood.media.render import BODY_COLOR, Camera, RenderMesh, contact_sheet, render_frame
+from hood.media.render import BODY_COLOR, Camera, RenderMesh, captioned, contact_sheet, render_frame
 from hood.media.video import VideoWriter, save_png
 
 _SHEET_FRAMES = 12
-#: Contact acts at cloth vertices; the flat triangles between them cut the skin's curve by some millimetres. The body is drawn
-#: this much [m] thinner where cloth is within the reach, so that pictures show the cloth; numbers are of the true body.
-_THINNER, _REACH = 0.008, 0.04
+#: Where the body is to be drawn thinner, it is where cloth is this near [m].
+_REACH = 0.04
 _SMOOTHING = 15  # frames over which the camera averages the walker's path
 
 
@@ -30,6 +29,8 @@ class Film:
         width, height: pixels.
         azimuth_deg: viewing direction, 0 is the front of the first frame.
         colour: what the garment's colour shows, with a bar that says so: ``strain``, ``rg``, or ``none``, its own.
+        thinner: [m] by which the body is drawn thinner near the cloth, which hides skin that sticks out through it; the picture
+            says so. 0: as it is.
         beside: rollouts whose films are shown next to this one: a colour means the same in all of them, and without a body
             the camera sees the cloth of all of them.
     """
@@ -42,10 +43,12 @@ class Film:
         azimuth_deg: float = 25.0,
         colour: str = "none",
         beside: Sequence[RolloutData] = (),
+        thinner: float = 0.0,
     ) -> None:
         if len(data.cloth_pos) == 0:
             raise ValueError("the rollout has no frames to draw")
         self.data, self.width, self.height = data, width, height
+        self.thinner = thinner
         self.colouring = colouring_of(data, colour, beside)
         self._own_colour = outfit_colours(str(data.attributes.get("garment", "")), data.cloth_faces, data.cloth_pos.shape[1])
         # Without a body the camera looks at the cloth, as far as that is finite.
@@ -71,12 +74,15 @@ class Film:
         dressed = bool(np.isfinite(cloth).all())
         meshes = []
         if len(body):
-            thinner = _beneath(body, self.data.body_faces, cloth) if dressed else body
-            meshes.append(RenderMesh(thinner, self.data.body_faces, BODY_COLOR))
+            thin = dressed and self.thinner > 0
+            shown_body = _beneath(body, self.data.body_faces, cloth, self.thinner) if thin else body
+            meshes.append(RenderMesh(shown_body, self.data.body_faces, BODY_COLOR))
         if dressed:
             shown = self._own_colour if self.colouring is None else self.colouring.colours(index)
             meshes.append(RenderMesh(cloth, self.data.cloth_faces, shown))
-        return render_frame(meshes, camera, width=self.width, height=self.height, floor=self._floor)
+        picture = render_frame(meshes, camera, width=self.width, height=self.height, floor=self._floor)
+        told = f"body drawn {1e3 * self.thinner:g} mm thinner" if self.thinner > 0 and len(body) else ""
+        return captioned(picture, told) if told else picture
 
     def sheet(self, count: int = _SHEET_FRAMES, columns: int = 6) -> np.ndarray:
         """Contact sheet of ``count`` evenly spaced frames."""
@@ -89,19 +95,24 @@ def sheet_frames(num_frames: int, count: int = _SHEET_FRAMES) -> list[int]:
     return sorted({int(i) for i in np.linspace(0, num_frames - 1, min(count, num_frames)).round()})
 
 
-def write_sheet(data: RolloutData, path: Path, colour: str = "none") -> Path:
-    """Contact sheet of the rollout as PNG; ``colour`` as in :class:`Film`."""
-    return save_png(path, Film(data, colour=colour).sheet())
+def write_sheet(data: RolloutData, path: Path, colour: str = "none", thinner: float = 0.0) -> Path:
+    """Contact sheet of the rollout as PNG; ``colour`` and ``thinner`` as in :class:`Film`."""
+    return save_png(path, Film(data, colour=colour, thinner=thinner).sheet())
 
 
 def write_video(
-    data: RolloutData, path: Path, frames: Iterable[int] | None = None, stride: int = 1, colour: str = "none"
+    data: RolloutData,
+    path: Path,
+    frames: Iterable[int] | None = None,
+    stride: int = 1,
+    colour: str = "none",
+    thinner: float = 0.0,
 ) -> Path:
     """Video of the rollout at its own speed; every ``stride``-th frame is drawn. Returns the file written.
 
     ``frames`` is the iterable that drives the loop (a progress bar, say); all frames by default.
     """
-    film = Film(data, colour=colour)
+    film = Film(data, colour=colour, thinner=thinner)
     step = seconds_per_frame(data)
     chosen: Sequence[int] | Iterable[int] = range(0, len(data.cloth_pos), stride) if frames is None else frames
     with VideoWriter(path, fps=1.0 / (step * stride)) as writer:
@@ -115,8 +126,8 @@ def seconds_per_frame(data: RolloutData) -> float:
     return float(data.time[1] - data.time[0]) if len(data.time) > 1 else 1.0 / 30.0
 
 
-def _beneath(body: np.ndarray, faces: np.ndarray, cloth: np.ndarray) -> np.ndarray:
-    """Body vertices (W, 3) moved inwards under cloth (V, 3), fading out over the reach."""
+def _beneath(body: np.ndarray, faces: np.ndarray, cloth: np.ndarray, thinner: float) -> np.ndarray:
+    """Body vertices (W, 3) moved inwards by ``thinner`` [m] under cloth (V, 3), fading out over the reach."""
     corners = body[faces]
     face_normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal = np.zeros_like(body)
@@ -125,7 +136,7 @@ def _beneath(body: np.ndarray, faces: np.ndarray, cloth: np.ndarray) -> np.ndarr
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     dist, _ = cKDTree(cloth).query(body, distance_upper_bound=_REACH)
     share = np.clip(2.0 * (1.0 - np.where(np.isfinite(dist), dist, _REACH) / _REACH), 0.0, 1.0)
-    return body - _THINNER * share[:, None] * normal
+    return body - thinner * share[:, None] * normal
 
 
 def _smooth_path(body_pos: np.ndarray) -> np.ndarray:

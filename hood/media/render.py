@@ -84,15 +84,25 @@ def contact_sheet(images: Sequence[Picture], columns: int, labels: Sequence[str]
     return sheet
 
 
+def captioned(image: Picture, text: str) -> Picture:
+    """A copy of the picture with a line of small text in its upper right corner."""
+    size = max(11, image.shape[0] // 40)
+    return _written(image, text, size, (image.shape[1] - size // 2, size // 3), "ra")
+
+
 def _labelled(image: Picture, label: str) -> Picture:
+    size = max(12, image.shape[0] // 28)
+    return _written(image, label, size, (size // 2, size // 3), "la")
+
+
+def _written(image: Picture, text: str, size: int, place: tuple[int, int], anchor: str) -> Picture:
     try:
         from PIL import Image, ImageDraw, ImageFont
     except ImportError as error:
         raise ImportError("labels on pictures need Pillow: pip install hood[pictures]") from error
     canvas = Image.fromarray(image)
-    size = max(12, image.shape[0] // 28)
     font = ImageFont.load_default(size)
-    ImageDraw.Draw(canvas).text((size // 2, size // 3), label, fill=(60, 62, 66), font=font)
+    ImageDraw.Draw(canvas).text(place, text, fill=(60, 62, 66), font=font, anchor=anchor)
     return np.asarray(canvas)
 
 

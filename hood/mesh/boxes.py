@@ -15,9 +15,7 @@ _MANY_CELLS = 512
 _BLOCK = 1 << 20
 
 
-def overlapping_boxes(
-    low: np.ndarray, high: np.ndarray, other_low: np.ndarray, other_high: np.ndarray
-) -> Iterator[np.ndarray]:
+def overlapping_boxes(low: np.ndarray, high: np.ndarray, other_low: np.ndarray, other_high: np.ndarray) -> Iterator[np.ndarray]:
     """Pairs (N, 2) of boxes and other boxes that overlap or touch, each once, in blocks of bounded size.
 
     Corners are (A, 3) and (B, 3), finite, in one unit. The order of the pairs is fixed by the input.
@@ -48,11 +46,11 @@ class _Cells(NamedTuple):
     """First cell and number of cells of boxes along each axis, both (N, 3)."""
 
     first: np.ndarray
-    count: np.ndarray
+    number: np.ndarray
 
     def split(self) -> tuple[np.ndarray, np.ndarray]:
         """Numbers of the boxes that cover few cells, and of those that cover many."""
-        many = self.count.prod(axis=1) > _MANY_CELLS
+        many = self.number.prod(axis=1) > _MANY_CELLS
         return np.flatnonzero(~many), np.flatnonzero(many)
 
 
@@ -70,7 +68,7 @@ class _Grid(NamedTuple):
 
     def entries(self, cells: _Cells, boxes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Every cell of every one of ``boxes``: the box and the number of the cell, box after box."""
-        first, count = cells.first[boxes], cells.count[boxes]
+        first, count = cells.first[boxes], cells.number[boxes]
         total = count.prod(axis=1)
         row = np.repeat(np.arange(len(boxes)), total)
         place = _within(total)
@@ -138,4 +136,3 @@ def _parts(owner: np.ndarray, count: np.ndarray) -> Iterator[slice]:
 def _within(counts: np.ndarray) -> np.ndarray:
     """0, 1, … of every group, groups one after another."""
     return np.arange(int(counts.sum())) - np.repeat(np.cumsum(counts) - counts, counts)
-

@@ -32,8 +32,8 @@ _EDGES = np.array([[0, 1], [1, 2], [0, 2]])
 class Crossings(NamedTuple):
     """What crosses between a first and a second mesh; rows are unique and sorted.
 
-    ``pairs`` (N, 2): faces of the first, faces of the second. ``first_edges`` (K, 3): edges of the first (smaller vertex, larger
-    vertex) and the face of the second that they pass through; ``second_edges`` (L, 3) the other way round.
+    ``pairs`` (N, 2): faces of the first, faces of the second. ``first_edges`` (K, 3): edges of the first (smaller
+    vertex, larger vertex) and the face of the second that they pass through; ``second_edges`` (L, 3) the other way round.
     """
 
     pairs: np.ndarray

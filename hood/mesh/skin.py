@@ -12,6 +12,7 @@ from hood.mesh.crossing import Crossings
 #: Skin farther than this [m] from all cloth is bare.
 REACH = 0.1
 _BEHIND = 0.5  # cosine of 60 degrees
+_NEAREST = 0.8
 
 
 def skin_depth(pos: np.ndarray, faces: np.ndarray, skin_pos: np.ndarray, skin_faces: np.ndarray, cut: Crossings) -> float:
@@ -22,11 +23,14 @@ def skin_depth(pos: np.ndarray, faces: np.ndarray, skin_pos: np.ndarray, skin_fa
     - belongs to a face that the skin cuts, or to one whose corners are all under the skin (:func:`sunken`);
     - is not on the rim of the cloth: skin beside a hem is bare, it does not stick out through anything;
     - lies behind the skin, within 60 degrees of straight inwards: in the bend of a knee the skin looks along the cloth;
+    - is not under another part of the skin: no vertex of the skin is nearer to it than 0.8 times as far, as the back of a hand
+      is farther from cloth that cuts the palm;
     - and is no farther away than :data:`REACH`.
 
     Its height is the distance to that point. It is taken at vertices: of a skin that is coarser than the cloth it is too small.
 
     Args:
+        skin_faces: wound so that normals point outwards; the winding of the cloth plays no role.
         cut: the crossings of the cloth with the skin, all positions finite.
     """
     suspect = np.zeros(len(faces), dtype=bool)
@@ -51,6 +55,8 @@ def skin_depth(pos: np.ndarray, faces: np.ndarray, skin_pos: np.ndarray, skin_fa
     kept = np.flatnonzero(behind & ~_on_rim(faces, face, weights))
     if len(kept) == 0:
         return 0.0
+    around, _ = cKDTree(skin_pos).query(point[kept])
+    kept = kept[around >= _NEAREST * dist[kept]]
     # Where another face is nearer still, the vertex is under cloth that is not cut.
     other = _nearest(skin_pos[vertex[kept]], dist[kept], corners, np.flatnonzero(~suspect))
     if other is not None:
@@ -104,7 +110,7 @@ def closest_on_triangles(points: np.ndarray, corners: np.ndarray) -> tuple[np.nd
         edge[:, i], edge[:, j] = 1.0 - share, share
         weights = np.where(better[:, None], edge, weights)
     inside = _interior_weights(points, corners)
-    weights = np.where((inside > 0).all(axis=1)[:, None], inside, weights)
+    weights = np.where(inside.min(axis=1, keepdims=True) > 0, inside, weights)
     return np.einsum("ni,nij->nj", weights, corners), weights
 
 
@@ -114,7 +120,9 @@ def _interior_weights(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     offset = points - corners[:, 0]
     normal = np.cross(first, second)
     area_sq = np.einsum("ni,ni->n", normal, normal)
-    flat = area_sq <= (16 * np.finfo(float).eps) ** 2 * np.einsum("ni,ni->n", first, first) * np.einsum("ni,ni->n", second, second)
+    flat = area_sq <= (16 * np.finfo(float).eps) ** 2 * np.einsum("ni,ni->n", first, first) * np.einsum(
+        "ni,ni->n", second, second
+    )
     scale = 1.0 / np.where(flat, 1.0, area_sq)
     b = np.einsum("ni,ni->n", np.cross(offset, second), normal) * scale
     c = np.einsum("ni,ni->n", np.cross(first, offset), normal) * scale

@@ -40,9 +40,13 @@ def test_gap_and_frames_are_those_of_the_rollout(idle: Simulator, band_scene: Sc
     assert values["score"] == pytest.approx(values["gap"] * values["strain_p99"])
 
 
+def figures(strain: float, share: float) -> dict[str, float]:
+    surface = {"cut_face_share": share, "cut_face_share_worst": 3 * share, "self_crossings": 100 * share}
+    return {"strain_p99": strain, "penetration_share": share, "relative_gradient": 1.0, **surface}
+
+
 def result(gap: float, strain: float, finite: bool = True) -> dict[str, float]:
-    metrics = {"strain_p99": strain, "penetration_share": 0.0, "relative_gradient": 1.0}
-    return summarise([Rollout("band", metrics, (gap,), finite)])
+    return summarise([Rollout("band", figures(strain, 0.0), (gap,), finite)])
 
 
 def test_better_in_either_is_better_and_broken_is_worst() -> None:
@@ -56,10 +60,12 @@ def test_better_in_either_is_better_and_broken_is_worst() -> None:
 
 def test_several_garments_are_summed_up() -> None:
     rows = [
-        Rollout(f"g{i}", {"strain_p99": s, "penetration_share": p, "relative_gradient": 1.0}, (g, 3 * g), True)
+        Rollout(f"g{i}", figures(s, p), (g, 3 * g), True)
         for i, (s, p, g) in enumerate([(0.1, 0.0, 1.0), (0.3, 0.06, 2.0), (0.2, 0.0, 10.0)])
     ]
     values = summarise(rows)
     assert (values["strain_p99"], values["strain_p99_worst"], values["penetration_share"]) == pytest.approx((0.2, 0.3, 0.02))
+    surface = [values[key] for key in ("cut_face_share", "cut_face_share_worst", "self_crossings")]
+    assert surface == pytest.approx([0.02, 0.18, 2.0])
     assert values["gap"] == pytest.approx(4.5)  # of 1, 2, 3, 6, 10, 30
     assert values["gap_p95"] == pytest.approx(25.0)

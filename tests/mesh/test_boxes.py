@@ -42,8 +42,12 @@ def test_boxes_of_many_cells_among_small_ones_and_small_blocks(monkeypatch: pyte
     monkeypatch.setattr(boxes, "_BLOCK", 100)
     monkeypatch.setattr(boxes, "_MANY_CELLS", 20)
     rng = np.random.default_rng(4)
-    groups = [np.concatenate(two) for two in zip(random_boxes(rng, 200, (0.01, 0.03)), random_boxes(rng, 5, (0.5, 2.0)), strict=True)]
-    others = [np.concatenate(two) for two in zip(random_boxes(rng, 300, (0.01, 0.03)), random_boxes(rng, 7, (0.5, 2.0)), strict=True)]
+    groups = [
+        np.concatenate(two) for two in zip(random_boxes(rng, 200, (0.01, 0.03)), random_boxes(rng, 5, (0.5, 2.0)), strict=True)
+    ]
+    others = [
+        np.concatenate(two) for two in zip(random_boxes(rng, 300, (0.01, 0.03)), random_boxes(rng, 7, (0.5, 2.0)), strict=True)
+    ]
     blocks = list(overlapping_boxes(*groups, *others))
     assert len(blocks) > 5
     np.testing.assert_array_equal(found(*groups, *others), every_pair(*groups, *others))

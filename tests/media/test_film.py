@@ -1,0 +1,47 @@
+"""Films draw the body as it is, or thinner by as much as the picture says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hood.dynamics.recorder import RolloutData
+from hood.media.film import Film
+from hood.testing import cylinder, sphere
+
+pytest.importorskip("PIL")
+
+
+def ball_in_a_tube() -> RolloutData:
+    """A ball that sticks out of a coarse tube by up to 5 mm."""
+    pos, faces = cylinder(24, 12, 0.1, 0.4)
+    ball, ball_faces = sphere(3, 0.105)
+    ball = ball + pos.mean(axis=0)
+    return RolloutData(pos[None], faces, pos, ball[None], ball_faces, np.zeros(1), {}, {})
+
+
+def skin(picture: np.ndarray) -> int:
+    """Pixels of the body's colour in the middle of the picture, where the cloth is."""
+    height, width = picture.shape[:2]
+    part = picture[height // 3 : 2 * height // 3, width // 3 : 2 * width // 3].astype(int)
+    return int((part[..., 0] > part[..., 2] + 5).sum())
+
+
+def test_skin_through_cloth_is_seen_unless_the_body_is_thinner() -> None:
+    data = ball_in_a_tube()
+    true, thin = Film(data, 160, 224).frame(0), Film(data, 160, 224, thinner=0.02).frame(0)
+    assert skin(true) > 500
+    assert skin(thin) == 0
+
+
+def test_the_picture_says_so() -> None:
+    """In its upper right corner, where nothing is drawn; a rollout without a body has nothing to be thinned."""
+    data = ball_in_a_tube()
+    drawn = (0.0, 1e-9, 0.002)
+    plain, hardly, told = (Film(data, 160, 224, thinner=thinner).frame(0)[:14, 60:].astype(int) for thinner in drawn)
+    assert (plain - told).max() > 80
+    assert (plain - hardly).max() > 80
+    bare = replace(data, body_pos=np.empty((1, 0, 3)), body_faces=np.empty((0, 3), dtype=np.int64))
+    assert (Film(bare, 160, 224, thinner=0.002).frame(0) == Film(bare, 160, 224).frame(0)).all()
