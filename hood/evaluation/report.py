@@ -12,16 +12,30 @@ _NAMES = ("model", "weights", "garment")
 _MAIN = ("steps", "radius", "ms", "ms_p99", "fps", "L_total", "gradient_norm", "rg")
 _GAP = ("gap", "gap_p95", "unconverged", "disagree")
 _TERMS = ("L_guess", "L_stretching", "L_bending", "L_inertia", "L_gravity", "L_collision", "L_friction")
-_STATE = ("strain_p99", "penetration", "penetration_worst", "cut_faces", "cut_faces_worst", "crossings", "drift")
+_STATE = ("strain_p99", "penetration", "penetration_worst", "drift")
+_SURFACE = ("cut_faces", "cut_faces_worst", "crossings")
 _FAILURE = ("failed_at", "failed", "frames_to_failure")
 _ENDS = tuple(f"{column}_{end}" for column in INTERVALS for end in ("low", "high"))
-COLUMNS = (*_NAMES, *_MAIN, *_GAP, *_TERMS, *_STATE, *_FAILURE, "rollouts", "frames", "gap_states", "gap_spread", *_ENDS)
+COLUMNS = (
+    *_NAMES,
+    *_MAIN,
+    *_GAP,
+    *_TERMS,
+    *_STATE,
+    *_SURFACE,
+    *_FAILURE,
+    "rollouts",
+    "frames",
+    "gap_states",
+    "gap_spread",
+    *_ENDS,
+)
 #: Columns of the printed tables; all in one would be wider than a screen.
-_PRINTED = ((*_NAMES, *_MAIN, *_GAP, "failed"), (*_NAMES, *_TERMS, *_STATE))
+_PRINTED = ((*_NAMES, *_MAIN, *_GAP, "failed"), (*_NAMES, *_TERMS), (*_NAMES, *_STATE, *_SURFACE))
 
 
 def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The rows as two fixed-width tables, cost and accuracy first, then energies and state of the cloth."""
+    """The rows as three fixed-width tables: cost and accuracy, energies, state of the cloth."""
     return "\n\n".join(_fixed_width(rows, columns) for columns in _PRINTED)
 
 
