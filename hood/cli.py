@@ -61,8 +61,11 @@ def script(name: str) -> None:
 
 
 def _run(command: Callable[[Sequence[str]], int], overrides: Sequence[str]) -> int:
+    from hood.commands.notices import heard
+
     try:
-        return command(overrides)
+        with heard():
+            return command(overrides)
     except KeyboardInterrupt:
         print("hood: interrupted", file=sys.stderr)
         return 130

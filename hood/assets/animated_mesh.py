@@ -19,6 +19,7 @@ from hood.assets.mesh_file import read_mesh
 from hood.assets.mesh_sequence import MeshSequence, loop_mesh, resample_mesh, trim_mesh, turn_mesh
 from hood.assets.vertex_files import FACE_KEYS, FOLDER_SUFFIXES, VERTEX_KEYS, VertexFile
 from hood.mesh import topology
+from hood.mesh.repair import sew_moving
 
 NO_BODY = "none"
 _STILL_SUFFIXES = (".obj", ".ply", ".off", ".stl")
@@ -91,6 +92,7 @@ def load_mesh_sequence(
     sequence = turn_mesh(sequence, 1.0 if scale is None else float(scale), up)
     _check_size(path, sequence, scale)
     sequence = resample_mesh(trim_mesh(sequence, start, stop), fps)
+    sequence = replace(sequence, faces=_sewn(path, sequence))
     return replace(loop_mesh(sequence, loop), faces=_outward(path, sequence))
 
 
@@ -187,6 +189,26 @@ def _check_size(path: Path, sequence: MeshSequence, scale: float | None) -> None
             f"{path}: the mesh is {extent:.4g} m large; its unit is not the metre, pass body_scale={factor:g} "
             "(body_scale=1 takes it as it is)"
         )
+
+
+def _sewn(path: Path, sequence: MeshSequence) -> np.ndarray:
+    """The faces, with vertices that seams double joined: inside and outside need a closed body."""
+    before = len(topology.boundary_loops(sequence.faces))
+    if not before:
+        return sequence.faces
+    faces = sew_moving(sequence.verts, sequence.faces)
+    after = len(topology.boundary_loops(faces))
+    if after < before:
+        warnings.warn(
+            f"{path}: the body has {before} openings where seams double its vertices; joined, it has {after}", stacklevel=3
+        )
+    if after:
+        warnings.warn(
+            f"{path}: the body has {after} opening{'s' if after > 1 else ''}, and inside and outside need a closed one; "
+            "close them where it was made",
+            stacklevel=3,
+        )
+    return faces
 
 
 def _outward(path: Path, sequence: MeshSequence) -> np.ndarray:

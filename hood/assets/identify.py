@@ -9,8 +9,9 @@ from pathlib import Path
 import h5py
 
 from hood.assets.animated_mesh import body_kind
+from hood.assets.foreign import require_readable
 from hood.assets.gltf import read_gltf
-from hood.assets.library import names
+from hood.assets.library import names, nearest
 from hood.assets.mesh_file import MESH_SUFFIXES
 from hood.assets.reference_garments import garment_names
 from hood.assets.unpickle import guarded, load_pickle
@@ -41,9 +42,12 @@ def identify(name: str) -> str:
     head, colon, _ = name.rpartition(":")
     path = Path(head if colon and head.lower().endswith(".pkl") else name).expanduser()
     if not path.exists():
-        raise FileNotFoundError(f"{path}: no such file, and no embedded asset of that name")
+        near = nearest(name, [known for folder in _EMBEDDED for known in names(folder)])
+        hint = f"; did you mean {near}?" if near else ""
+        raise FileNotFoundError(f"{path}: no such file, and no embedded asset of that name{hint}")
     if path.is_dir():
         return MOVING_MESH if body_kind(path) == "mesh" else BODY
+    require_readable(path, "file")
     suffix = path.suffix.lower()
     if suffix in (".glb", ".gltf"):
         gltf = read_gltf(path)

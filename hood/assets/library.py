@@ -12,6 +12,8 @@ from typing import IO
 
 import numpy as np
 
+from hood.assets.foreign import require_readable
+
 DATA_FOLDER = Path(__file__).resolve().parent.parent / "data"
 #: Content beyond this size [bytes] is not read into memory.
 SIZE_LIMIT = 3 << 29
@@ -29,12 +31,14 @@ def locate(kind: str, name: str | Path, folders: bool = False) -> Path:
 
     Raises:
         FileNotFoundError: neither an embedded name nor an existing file; the message lists the nearest names.
+        ValueError: a file of another program's format; names the way out.
     """
     embedded = DATA_FOLDER / kind / f"{name}{_SUFFIX[kind]}"
     if embedded.is_file():
         return embedded
     path = Path(name).expanduser()
     if path.is_file() or (folders and path.is_dir()):
+        require_readable(path, kind)
         return path
     if path.is_dir():
         raise FileNotFoundError(f"{path}: a folder; give the path of a {_LABEL[kind]} file in it")
@@ -46,9 +50,14 @@ def locate(kind: str, name: str | Path, folders: bool = False) -> Path:
 def unknown(what: str, given: str, known: Iterable[str]) -> str:
     """The sentence for a misspelt name: the nearest known one first."""
     known = list(known)
-    near = difflib.get_close_matches(given, known, n=1, cutoff=0.5)
-    hint = f"did you mean {near[0]!r}? " if near else ""
+    near = nearest(given, known)
+    hint = f"did you mean {near!r}? " if near else ""
     return f"unknown {what} {given!r}: {hint}known are {', '.join(known) or 'none'}"
+
+
+def nearest(given: str, known: Iterable[str]) -> str | None:
+    """The known name that a misspelt one is likeliest to mean; None where none is near."""
+    return next(iter(difflib.get_close_matches(given, list(known), n=1, cutoff=0.5)), None)
 
 
 def motion_split() -> dict[str, list[str]]:

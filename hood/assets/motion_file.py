@@ -21,6 +21,8 @@ MOTION_SUFFIXES = (".npz", ".pkl")
 _SILENT_FPS = 30.0
 #: No rotation [rad] or place [m] is farther from zero, no shape coefficient than a thousandth of it.
 _LARGEST = 1e6
+#: Joint rotations beyond a full turn [rad] are rare (an unwound root), and in degrees most of them are.
+_FULL_TURN, _MOST_BEYOND = 2 * np.pi, 0.2
 
 _RATE_KEYS = ("mocap_framerate", "mocap_frame_rate", "fps", "frame_rate")
 _TRANSL_KEYS = ("trans", "transl", "translation")
@@ -76,6 +78,7 @@ def read_recording(path: Path, file_fps: float | None = None) -> Recording:
         raise ValueError(f"{path}: not an AMASS motion: key 'trans' is missing (found {sorted(fields)[:8]})")
     transl = _table(path, transl_key, fields[transl_key], (3,))
     _check_frames(path, " and ".join(keys), flat, transl_key, transl)
+    _require_radians(path, " and ".join(keys), flat)
     return Recording(
         poses=_body_poses(flat),
         fingers=_fingers(path, fields, flat),
@@ -143,6 +146,16 @@ def _require_sound(path: Path, name: str, values: np.ndarray) -> None:
         frames = bad.any(axis=1)
         if frames.any():
             raise ValueError(f"{path}: {name} is {word} in frame {int(np.argmax(frames))}; remove or repair that frame")
+
+
+def _require_radians(path: Path, name: str, flat: np.ndarray) -> None:
+    angle = np.linalg.norm(flat[:, : 3 * NUM_BODY_JOINTS].reshape(len(flat), -1, 3), axis=2)
+    turned = angle[angle > 0]
+    if len(turned) and float((turned > _FULL_TURN).mean()) > _MOST_BEYOND:
+        raise ValueError(
+            f"{path}: {name} holds degrees (half of the joint rotations are beyond {np.median(turned):.3g}, a full turn is "
+            f"{_FULL_TURN:.3g}); multiply it by pi / 180"
+        )
 
 
 def _body_poses(flat: np.ndarray) -> np.ndarray:

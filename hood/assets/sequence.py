@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from hood.assets.bearing import bearing_notice
 from hood.assets.library import locate
-from hood.assets.motion_file import NUM_BODY_JOINTS, read_recording
+from hood.assets.motion_file import NUM_BODY_JOINTS, Recording, read_recording
 
 __all__ = ["HANDS", "NUM_BODY_JOINTS", "Z_UP_TO_Y_UP", "PoseSequence", "load_sequence", "resample", "turn_world"]
 
@@ -63,7 +65,8 @@ def load_sequence(
 
     Args:
         fps: frames per second of the result; rotations are interpolated by slerp, translations linearly.
-        up: axis of the file's world that points up: "z", "y", or "auto", z for AMASS layouts and y for the others.
+        up: axis of the file's world that points up: "z", "y", or "auto", along which the body stands; z for AMASS layouts and
+            y for the others where that is open.
         start, stop: part of the file to keep, in seconds, or in frames of the file as "120f".
         loop: times the motion is played; each play goes on from where the last one ended.
         blend_in: seconds of moving from a standing pose into the first frame, put before it.
@@ -99,9 +102,17 @@ def load_sequence(
         recording.family,
     )
     sequence = resample(edit.trim(sequence, start, stop), fps)
-    if (recording.up if up == "auto" else up) == "z":
+    if (_up_axis(path, recording) if up == "auto" else up) == "z":
         sequence = turn_world(sequence, Z_UP_TO_Y_UP)
     return edit.blend_in(edit.loop(sequence, loop), blend_in, blend_from)
+
+
+def _up_axis(path: Path, recording: Recording) -> str:
+    """The axis along which the body stands; a warning where it is not that of the layout."""
+    axis, notice = bearing_notice(path, recording)
+    if notice is not None:
+        warnings.warn(notice, stacklevel=3)
+    return axis
 
 
 def resample(sequence: PoseSequence, fps: float) -> PoseSequence:

@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from hood.assets.animated_mesh import load_mesh_sequence
+from hood.assets.bearing import bearing_notice
 from hood.assets.binding import signed_distances
 from hood.assets.body import Body, load_body
 from hood.assets.garment import Garment, garment_of_mesh, load_garment, locate_garment
@@ -19,14 +18,18 @@ from hood.assets.motion_file import read_recording
 from hood.assets.pins import opening_names, read_indices
 from hood.assets.sequence import Z_UP_TO_Y_UP
 from hood.assets.standing import find_standing_pose
+from hood.assets.suspicions import suspect_kind
 from hood.assets.units import find_scale, size_ratio, used
 from hood.assets.unpickle import load_pickle
+from hood.commands.beside_mesh import place_beside_mesh
 from hood.commands.common import read_model
 from hood.dynamics.recorder import read_rollout
 from hood.dynamics.soundness import judge_rollout, worst_frame
 from hood.mesh.defects import Defects, find_defects
 from hood.mesh.quality import check_triangles
 from hood.mesh.topology import boundary_loops
+from hood.scene.cast import NO_MOTION, MotionOptions, load_motion
+from hood.scene.mesh_motion import MeshMotion
 
 _UNITS = {1.0: "metres", 0.01: "centimetres", 0.001: "millimetres"}
 #: A mesh turned by a quarter must lie this much nearer to the body to be taken for z-up.
@@ -63,8 +66,14 @@ class Finding:
             self.repairs.append(repair or "weld=auto")
 
 
-def inspect_garment(name: str, body: Body) -> Finding:
-    """A garment file beside ``body`` in its T-pose."""
+def unreadable(name: str, kind: str, error: Exception) -> Finding:
+    """A file that cannot be read: why is its problem."""
+    sentence = " ".join(str(error).split()) or type(error).__name__
+    return Finding(name, kind, problems=[(sentence.removeprefix(f"{name}: "), "")])
+
+
+def inspect_garment(name: str, body: Body | MeshMotion) -> Finding:
+    """A garment file beside ``body``: a model in its T-pose, or a mesh in its first frame."""
     finding = Finding(name, "garment")
     path, _ = locate_garment(name)
     if path.suffix.lower() in MESH_SUFFIXES:
@@ -82,8 +91,12 @@ def inspect_garment(name: str, body: Body) -> Finding:
         check_triangles(garment.rest_pos, garment.faces, name)
     finding.facts |= _garment_facts(garment)
     defects = find_defects(garment.rest_pos, garment.faces)
-    _describe_defects(finding, defects, garment, body)
-    if garment.bound:
+    _describe_defects(finding, defects)
+    if _is_suspect(finding, garment, body):
+        return finding
+    if isinstance(body, MeshMotion):
+        place_beside_mesh(finding, garment, body, _UNITS)
+    elif garment.bound:
         _name_openings(finding, garment.rest_pos if garment.skin_pos is None else garment.skin_pos, garment.faces, body)
     else:
         _place_beside(finding, garment, body)
@@ -104,7 +117,21 @@ def _garment_facts(garment: Garment) -> dict[str, Any]:
     }
 
 
-def _describe_defects(finding: Finding, defects: Defects, garment: Garment, body: Body) -> None:
+def _is_suspect(finding: Finding, garment: Garment, body: Body | MeshMotion) -> bool:
+    """Record what the garment seems to be, if that is not a garment; whether it is no use to look where it lies."""
+    if garment.bound:
+        return False
+    surface = body.points(0) if isinstance(body, MeshMotion) else body.v_template
+    found = suspect_kind(garment.rest_pos, garment.faces, surface)
+    for suspicion in found:
+        finding.problem(f"it {suspicion.what}", suspicion.fix)
+    if any(suspicion.grave for suspicion in found):
+        finding.repairs.clear()  # nothing that prepare could do
+        return True
+    return False
+
+
+def _describe_defects(finding: Finding, defects: Defects) -> None:
     finding.facts |= {
         "components": defects.num_components,
         "openings": defects.openings,
@@ -199,8 +226,7 @@ def inspect_motion(name: str) -> Finding:
     """A motion of joint rotations."""
     recording = read_recording(locate("motions", name))
     finding = Finding(name, "motion")
-    up = Rotation.from_rotvec(recording.poses[:, 0]).apply([0.0, 1.0, 0.0]).mean(axis=0)
-    axis = "xyz"[int(np.abs(up).argmax())]
+    axis, notice = bearing_notice(Path(name), recording)
     speed = np.linalg.norm(np.diff(recording.transl, axis=0), axis=1) * recording.fps
     finding.facts = {
         "frames": len(recording.poses),
@@ -214,28 +240,28 @@ def inspect_motion(name: str) -> Finding:
         "greatest root speed [m/s]": round(float(speed.max(initial=0.0)), 2),
         "fingers": recording.fingers is not None,
     }
-    if axis in "yz" and axis != recording.up:
-        finding.problem(f"the body stands along {axis}, its layout says {recording.up}", f"up={axis}")
+    if notice is not None:
+        what, _, fix = notice.removeprefix(f"{name}: ").partition("; ")
+        finding.problem(what, fix)
     if float(np.quantile(speed, 0.99)) > 20.0:
         finding.problem("the root moves faster than 20 m/s", "trans may be in centimetres: divide it by 100")
     return finding
 
 
-def inspect_moving_mesh(name: str, fps: float) -> Finding:
-    """A mesh that moves, or stands, as a body."""
-    mesh = load_mesh_sequence(name, fps)
-    finding = Finding(name, "moving mesh")
+def inspect_moving_mesh(name: str, options: MotionOptions) -> Finding:
+    """A mesh that moves, or stands, as a body; what is repaired or wrong there is warned about by its reader."""
+    motion = load_motion(name, NO_MOTION, options)
+    assert isinstance(motion, MeshMotion)
+    mesh, finding = motion.sequence, Finding(name, "moving mesh")
     defects = find_defects(mesh.verts[0].astype(np.float64), mesh.faces)
     finding.facts = {
         "vertices": mesh.verts.shape[1],
         "triangles": len(mesh.faces),
-        f"frames at {fps:g} fps": mesh.num_frames,
+        f"frames at {mesh.fps:g} fps": mesh.num_frames,
         "size": np.round(np.ptp(mesh.verts[0], axis=0), 3).tolist(),
         "components": defects.num_components,
         "openings": defects.openings,
     }
-    if defects.openings:
-        finding.problem(f"the mesh has {len(defects.openings)} openings", "close them: inside and outside need a closed body")
     return finding
 
 

@@ -3,24 +3,32 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from hood.assets import identify as kinds
-from hood.assets.animated_mesh import body_kind
-from hood.assets.body import load_body
+from hood.assets.animated_mesh import NO_BODY, body_kind
+from hood.assets.body import Body, load_body
 from hood.commands import findings
 from hood.commands.findings import Finding
+from hood.commands.notices import heard
+from hood.commands.performance import motion_options
 from hood.commands.wardrobe import read_outfit
-from hood.config import ConfigError, load_config, require_choice
-from hood.scene.cast import MotionOptions, load_motion
-from hood.scene.fitting import fit_figures
+from hood.config import ConfigError, load_config, plain, require_choice
+from hood.scene.cast import NO_MOTION, MotionOptions, load_motion
+from hood.scene.fitting import fit_figures, misplacement
+from hood.scene.mesh_motion import MeshMotion
 from hood.scene.scene import dress
 
-_KEYS = ("body", "up", "fps", "format")
+_UNREADABLE = "unreadable"
+_BODIES = (kinds.BODY, kinds.MOVING_MESH)
+#: Entries of a list that are printed; JSON has all.
+_MOST_SHOWN = 10
 #: A start beyond these does not fit: edges stretched by this share, vertices this deep [m].
 _STRETCH_LIMIT, _DEPTH_LIMIT = 0.10, 2e-3
 
@@ -29,8 +37,12 @@ def run(arguments: Sequence[str]) -> int:
     """Run the command; returns the exit code: 0 where nothing needs repair, 1 where something does."""
     files, config = _split(arguments)
     require_choice(config, "format", ("text", "json"))
-    found = [_inspect(name, config) for name in files]
-    fit = _fit(found, config)
+    known = [_identify(name, str(config.body)) for name in files]
+    beside = next((finding.file for finding in known if finding.kind in _BODIES), str(config.body))
+    if body_kind(beside) == "mesh" and beside not in files:  # what is wrong with it is told as well
+        known.append(Finding(beside, kinds.MOVING_MESH))
+    found = [_inspect(finding, beside, config) for finding in known]
+    fit = _fit(found, beside, config)
     report = {"files": [_as_dict(finding) for finding in found], "fit": fit}
     print(json.dumps(report, indent=1) if str(config.format) == "json" else _text(found, fit))
     sound = all(not finding.problems for finding in found) and (fit is None or fit["fits"])
@@ -38,26 +50,49 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def _split(arguments: Sequence[str]) -> tuple[list[str], DictConfig]:
-    """Files and the config: a word ``key=value`` is an override, every other word a file."""
+    """Files and the config: a word ``key=value`` is an override unless there is such a file, every other word a file."""
     words = ["format=json" if word == "--json" else word for word in arguments]
-    overrides = [word for word in words if word.split("=")[0] in _KEYS and "=" in word]
+    overrides = [word for word in words if re.match(r"[a-z_.]+=", word) and not Path(word).exists()]
     files = [word for word in words if word not in overrides]
-    if not files:
-        raise ConfigError("no file is given: hood inspect shirt.obj walk.npz")
+    config = load_config("inspect", overrides)
     if any(word.startswith("-") for word in files):
         raise ConfigError(
-            f"unknown option {next(w for w in files if w.startswith('-'))!r}; known are --json, {', '.join(_KEYS)}"
+            f"unknown option {next(w for w in files if w.startswith('-'))!r}; known are --json, {', '.join(map(str, config))}"
         )
-    return files, load_config("inspect", overrides)
+    if not files:
+        raise ConfigError("no file is given: hood inspect shirt.obj walk.npz")
+    return files, config
 
 
-def _inspect(name: str, config: DictConfig) -> Finding:
-    kind = kinds.identify(name)
+def _identify(name: str, body: str) -> Finding:
+    """What a file is; a mesh that is also given as ``body`` is one. A file that cannot be told has that for its problem."""
+    try:
+        kind = kinds.identify(name)
+        return Finding(name, kinds.MOVING_MESH if name == body and body_kind(body) == "mesh" else kind)
+    except (ValueError, OSError) as error:
+        return findings.unreadable(name, _UNREADABLE, error)
+
+
+def _inspect(known: Finding, beside: str, config: DictConfig) -> Finding:
+    """Facts and problems of a file; one that cannot be read has that for its problem."""
+    if known.kind == _UNREADABLE:
+        return known
+    try:
+        with heard(aloud=False) as said:
+            finding = _read(known.file, known.kind, beside, config)
+    except (ValueError, OSError) as error:
+        return findings.unreadable(known.file, known.kind, error)
+    for sentence in said:
+        what, _, fix = sentence.rpartition("; ")
+        finding.problem(what or sentence, fix)
+    return finding
+
+
+def _read(name: str, kind: str, beside: str, config: DictConfig) -> Finding:
     if kind == kinds.GARMENT:
-        body = str(config.body)
-        return findings.inspect_garment(name, load_body(body if body_kind(body) == "model" else "default"))
+        return findings.inspect_garment(name, _body(beside, config))
     if kind == kinds.MOVING_MESH:
-        return findings.inspect_moving_mesh(name, float(config.fps))
+        return findings.inspect_moving_mesh(name, _options(config))
     if kind == kinds.REFERENCE_ROLLOUT:
         return findings.inspect_pickle(name, kind)
     readers = {
@@ -70,24 +105,41 @@ def _inspect(name: str, config: DictConfig) -> Finding:
     return readers[kind](name)
 
 
-def _fit(found: list[Finding], config: DictConfig) -> dict[str, Any] | None:
-    """How the garments among the files sit on the body in the motion's first frame; None without garment or motion."""
+def _options(config: DictConfig) -> MotionOptions:
+    """How the first frames of a motion are performed; the keys are those of ``hood rollout``."""
+    return motion_options(OmegaConf.create({**plain(config), "stop": None, "loop": 1, "num_frames": 2}))
+
+
+def _body(name: str, config: DictConfig) -> Body | MeshMotion:
+    """What a garment is measured against: a model, or a mesh in its first frame."""
+    if body_kind(name) != "mesh":
+        return load_body("default" if body_kind(name) == NO_BODY else name)
+    motion = load_motion(name, NO_MOTION, _options(config))
+    assert isinstance(motion, MeshMotion)
+    return motion
+
+
+def _fit(found: list[Finding], body: str, config: DictConfig) -> dict[str, Any] | None:
+    """How the garments among the files sit on the body in the motion's first frame; None without garment, or without one of
+    motion and body."""
     garments = [finding.file for finding in found if finding.kind.startswith("garment")]
-    motions = [finding.file for finding in found if finding.kind == "motion"]
-    bodies = [finding.file for finding in found if finding.kind in ("body model", "moving mesh")]
-    if not garments or not (motions or bodies):
+    motions = [finding.file for finding in found if finding.kind == kinds.MOTION]
+    if not garments or not (motions or any(finding.kind in _BODIES for finding in found) or body_kind(body) == "mesh"):
         return None
-    body, motion = (bodies or [str(config.body)])[0], (motions or ["stand_sway"])[0]
+    motion = NO_MOTION if body_kind(body) == "mesh" else (motions or ["stand_sway"])[0]
     names = {"garments": garments, "body": body, "motion": motion}
     try:
-        performed = load_motion(body, motion, MotionOptions(fps=float(config.fps), up=str(config.up), num_frames=2))
-        scene = dress(read_outfit(garments, performed, triangulate=True), performed)
+        with heard(aloud=False):  # what single files are warned about stands with them
+            performed = load_motion(body, motion, _options(config))
+            scene = dress(read_outfit(garments, performed, triangulate=True), performed)
+        misplaced = misplacement(scene)
         skinned, start = fit_figures(scene, settled=False), fit_figures(scene)
     except (ValueError, OSError) as error:
         return {**names, "fits": False, "reason": " ".join(str(error).split())}
-    height = float(
-        performed.surface(0, performed.translation[0])[:, 1].max() - performed.surface(0, performed.translation[0])[:, 1].min()
-    )
+    if misplaced is not None:
+        return {**names, "fits": False, "reason": misplaced.sentence}
+    surface = performed.surface(0, performed.translation[0])
+    height = float(surface[:, 1].max() - surface[:, 1].min()) if len(surface) else 0.0
     fits = start.stretch_max <= _STRETCH_LIMIT and start.depth_max <= _DEPTH_LIMIT
     return {**names, "fits": fits, "body_height": height, "skinned": asdict(skinned), "start": asdict(start)}
 
@@ -107,14 +159,15 @@ def _text(found: list[Finding], fit: dict[str, Any] | None) -> str:
     for finding in found:
         lines.append(f"{finding.file}: {finding.kind}")
         lines += [f"  {name}: {_show(value)}" for name, value in finding.facts.items() if value not in (None, False)]
-        lines += [f"  ! {what}; {fix}" for what, fix in finding.problems] or ["  nothing to repair"]
+        lines += [f"  ! {what}" + (f"; {fix}" if fix else "") for what, fix in finding.problems] or ["  nothing to repair"]
         if finding.command:
             lines.append(f"  repair: {finding.command}")
     return "\n".join([*lines, *(_fit_lines(fit) if fit else [])])
 
 
 def _fit_lines(fit: dict[str, Any]) -> list[str]:
-    head = f"{' + '.join(fit['garments'])} on {fit['body']} in the first frame of {fit['motion']}:"
+    frame = "its first frame" if fit["motion"] == NO_MOTION else f"the first frame of {fit['motion']}"
+    head = f"{' + '.join(fit['garments'])} on {fit['body']} in {frame}:"
     if "reason" in fit:
         return [head, f"  ! does not start: {fit['reason']}"]
     skinned, start = fit["skinned"], fit["start"]
@@ -132,4 +185,7 @@ def _fit_lines(fit: dict[str, Any]) -> list[str]:
 
 
 def _show(value: Any) -> str:
-    return ", ".join(_show(item) for item in value) or "none" if isinstance(value, (list, tuple)) else str(value)
+    if not isinstance(value, (list, tuple)):
+        return str(value)
+    rest = [f"… and {len(value) - _MOST_SHOWN} more"] if len(value) > _MOST_SHOWN else []
+    return ", ".join([*map(_show, value[:_MOST_SHOWN]), *rest]) or "none"

@@ -22,8 +22,9 @@ from hood.assets.outfit import join_garments
 from hood.assets.pins import pin_mask, pin_numbers
 from hood.assets.sequence import PoseSequence, load_sequence
 from hood.assets.standing import A_POSE_ANGLE, POSE_SUFFIXES, arms_down, find_standing_pose, read_pose
+from hood.assets.suspicions import suspect_kind
 from hood.commands.common import prepare_folder
-from hood.commands.wardrobe import checked_pins, names_of, shape_coefficients
+from hood.commands.wardrobe import checked_pins, heed, names_of, shape_coefficients
 from hood.config import ConfigError, load_config, plain, require_choice
 from hood.media.mesh_export import write_obj
 from hood.mesh.quality import check_triangles
@@ -81,6 +82,8 @@ def _mesh_target(config: DictConfig) -> Path:
 def _fit(name: str, config: DictConfig, body: Body, betas: np.ndarray) -> Fitting:
     """One garment, read, repaired and bound."""
     fitting = _read(name)
+    if not fitting.garment.bound:
+        heed(fitting.garment.name, suspect_kind(fitting.garment.rest_pos, fitting.garment.faces, body.v_template))
     surface = body.shaped(betas)[0]
     alterations.scale_to_metres(fitting, _number(config, "scale", "auto"), surface)
     alterations.place(fitting, str(config.up), _offset(config))

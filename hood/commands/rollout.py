@@ -29,10 +29,11 @@ from hood.commands.common import (
     use_arithmetic,
 )
 from hood.commands.dial import check_dial, exported, refined
+from hood.commands.notices import heard
 from hood.commands.performance import make_motion
 from hood.commands.summary import describe, describe_all, summarise
 from hood.commands.verdict import exit_code
-from hood.commands.wardrobe import read_outfit
+from hood.commands.wardrobe import heed, read_outfit
 from hood.config import ConfigError, build, load_config, plain, require_choice, save_run_record
 from hood.dynamics.captured import MODES, CapturedSimulator
 from hood.dynamics.recorder import RolloutWriter, read_rollout
@@ -40,6 +41,7 @@ from hood.dynamics.refine import GuessStepper
 from hood.dynamics.rollout import METRIC_CHOICES, metric_names, simulate
 from hood.dynamics.simulator import Simulator
 from hood.dynamics.stepper import NewtonStepper, Stepper
+from hood.scene.fitting import misplacement
 from hood.scene.scene import Scene, dress
 from hood.training import distributed
 
@@ -75,6 +77,12 @@ def _run(config: DictConfig) -> int:
 
 def _run_one(config: DictConfig, stepper: Stepper, digest: str) -> tuple[dict[str, Any], bool]:
     """The rollout of one motion with all its files: the summary, and whether the user interrupted it."""
+    with heard() as warned:
+        return _run_heard(config, stepper, digest, warned)
+
+
+def _run_heard(config: DictConfig, stepper: Stepper, digest: str, warned: list[str]) -> tuple[dict[str, Any], bool]:
+    """The rollout of one motion; ``warned`` is what has been warned about when the summary is written."""
     scene = make_scene(config)
     stepper = refined(stepper, config, scene.cloth.num_vertices)
     folder = prepare_folder(output_folder(config))
@@ -87,6 +95,7 @@ def _run_one(config: DictConfig, stepper: Stepper, digest: str) -> tuple[dict[st
         if not interrupted:
             _draw(config, folder)
     finally:
+        summary["warnings"] = list(warned)
         _write_json(folder / "summary.json", summary)
     print(f"files in {folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
     if interrupted:
@@ -144,7 +153,9 @@ def make_scene(config: DictConfig) -> Scene:
     """Assets named in the config, put together."""
     motion = make_motion(config)
     garment = read_outfit(config.garment, motion, bool(config.triangulate), config.pins)
-    return dress(garment, motion, build(config.material))
+    scene = dress(garment, motion, build(config.material))
+    heed(scene.garment.name, [found] if (found := misplacement(scene)) is not None else [])
+    return scene
 
 
 def make_stepper(config: DictConfig) -> tuple[Stepper, str]:

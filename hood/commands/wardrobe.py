@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 from hood.assets.garment import Garment, load_garment
 from hood.assets.outfit import join_garments
 from hood.assets.pins import pin_mask
+from hood.assets.suspicions import Suspicion, suspect_kind, suspect_seams
 from hood.assets.units import require_metres, used
 from hood.config import ConfigError, plain
 from hood.scene.motion import BodyMotion, Motion
@@ -41,6 +43,9 @@ def read_outfit(given: Any, motion: Motion, triangulate: bool = False, pins: Any
         ValueError: a garment that cannot be read, is not in metres or does not fit, or pins it does not have.
     """
     garments = [load_garment(name, triangulate=triangulate) for name in names_of(given)]
+    for garment in garments:
+        if not garment.bound:
+            heed(garment.name, suspect_seams(garment.rest_pos, garment.faces))
     pins = plain(pins)
     if pins is not None:  # what is held differs in how it follows the body
         garments = [replace(garment, pinned=np.zeros_like(garment.pinned)) for garment in garments]
@@ -49,11 +54,24 @@ def read_outfit(given: Any, motion: Motion, triangulate: bool = False, pins: Any
         for garment in garments:
             if not garment.bound:
                 require_metres(used(garment.rest_pos, garment.faces), surface, garment.name)
+                heed(garment.name, suspect_kind(garment.rest_pos, garment.faces, surface))
     outfit = join_garments([motion.dressed(garment) for garment in garments])
     if pins is None:
         return outfit
     body = motion.body if isinstance(motion, BodyMotion) else None
     return replace(outfit, pinned=pin_mask(checked_pins(pins), outfit, body))
+
+
+def heed(name: str, suspicions: Sequence[Suspicion]) -> None:
+    """Warn about what the garment ``name`` seems to be.
+
+    Raises:
+        ValueError: a grave suspicion.
+    """
+    for suspicion in suspicions:
+        if suspicion.grave:
+            raise ValueError(f"garment {name!r} {suspicion.sentence}")
+        warnings.warn(f"garment {name!r} {suspicion.sentence}", stacklevel=2)
 
 
 def checked_pins(pins: Any) -> str | int | Sequence[str | int]:

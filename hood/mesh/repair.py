@@ -63,6 +63,25 @@ def merge(num_vertices: int, pairs: np.ndarray) -> Welded:
     return Welded(np.searchsorted(kept, first)[inverse.reshape(-1)], kept)
 
 
+def sew_moving(verts: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Faces (F', 3) of a moving mesh (T, W, 3) with doubled boundary vertices joined: the first of those that lie on each
+    other in every frame stands for all. Vertices and their numbers stay; faces that lose a corner are left out.
+    """
+    tolerance = weld_tolerance(verts[0], faces)
+    welded = weld(verts[0], faces, tolerance)
+    first = welded.kept[welded.vertex_map]
+    doubled = np.flatnonzero(first != np.arange(len(first)))
+    # Lips that are closed in the first frame may open later. A chain of near pairs is a few tolerances long.
+    apart = np.zeros(len(doubled))
+    for frame in verts:
+        apart = np.maximum(apart, np.linalg.norm(frame[doubled] - frame[first[doubled]], axis=1))
+    opened = doubled[apart > 10.0 * tolerance]
+    first[opened] = opened
+    joined = first[faces]
+    ordered = np.sort(joined, axis=1)
+    return np.asarray(joined[(ordered[:, 1:] != ordered[:, :-1]).all(axis=1)])
+
+
 def broken_faces(pos: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(F,) bool: faces that repeat a vertex or have no area."""
     a, b, c = (pos[faces[:, k]] for k in range(3))

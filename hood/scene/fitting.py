@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from hood.assets.suspicions import Suspicion, suspect_place
 from hood.scene.contact import find_contact
+from hood.scene.motion import BodyMotion
 from hood.scene.scene import Scene
 from hood.scene.start import settle
 
@@ -41,6 +43,20 @@ def fit_figures(scene: Scene, frame: int = 0, settled: bool = True) -> FitFigure
         depth_max=float((-dist).max().clamp_min(0.0)),
         dist_median=float(dist.abs().median()),
     )
+
+
+def misplacement(scene: Scene, frame: int = 0) -> Suspicion | None:
+    """Why the garment is not worn where ``frame`` puts it, not yet settled; None: it is, or there is no body.
+
+    Of sheets far from a mesh that mesh warns itself, see :meth:`hood.scene.mesh_motion.MeshMotion.dressed`.
+    """
+    origin = scene.motion.translation[frame]
+    surface = scene.motion.surface(frame, origin).double().cpu().numpy()
+    if not len(surface):
+        return None
+    pos = scene.motion.skinned(scene.garment, frame, origin).double().cpu().numpy()
+    found = suspect_place(pos, scene.garment.faces, surface, scene.motion.faces)
+    return next((one for one in found if one.grave or isinstance(scene.motion, BodyMotion)), None)
 
 
 #: torch.quantile refuses longer inputs.

@@ -75,7 +75,7 @@ def loaded_places(body: Body, sequence) -> tuple[np.ndarray, np.ndarray]:
 def test_places_at_common_time_stamps(tmp_path: Path, body: Body, fps: float, layout: str) -> None:
     """Joints and vertices in metres, pelvis offset of the axis change included."""
     poses, transl = recorded(fps, 1.0)
-    sequence = load_sequence(write_amass(tmp_path / "m.npz", poses, transl, fps, layout), fps=30.0)
+    sequence = load_sequence(write_amass(tmp_path / "m.npz", poses, transl, fps, layout), fps=30.0, up="z")
     assert sequence.num_frames == 31
     assert sequence.fps == 30.0
     # Frames whose time stamp k / 30 is one of the file's.

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from wild import write_wild_garment
+from workshop import write_obj
 
 from hood.assets.body import Body
 from hood.assets.garment import Garment
@@ -99,15 +100,73 @@ def test_kinds(tmp_path: Path) -> None:
 
 
 def test_errors_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    np.savez("odd.npz", things=np.zeros(3))
-    Path("note.docx").write_text("hello")
     for words, expected in (
         ([], "no file is given"),
-        (["odd.npz"], "things"),
-        (["note.docx"], ".docx"),
-        (["gone.obj"], "no such file"),
+        (["tank", "body_scal=0.01"], "unknown key 'body_scal': did you mean 'body_scale'"),
+        (["tank", "scale=0.01"], "unknown key 'scale'"),
+        (["tank", "--fast"], "unknown option '--fast'"),
     ):
         assert main(["inspect", *words]) == 2
         error = capsys.readouterr().err
         assert expected in error
         assert error.count("\n") == 1
+
+
+def test_one_unreadable_file_does_not_end_the_report(capsys: pytest.CaptureFixture[str]) -> None:
+    np.savez("odd.npz", things=np.zeros(3))
+    np.savez("bent.npz", poses=np.zeros((2, 5)), trans=np.zeros((2, 3)))
+    Path("note.docx").write_text("hello")
+    code, report = inspect(capsys, "odd.npz", "note.docx", "gone.obj", "tshrt", "bent.npz", "tank")
+    assert code == 1
+    told = [(found["kind"], " ".join(entry["problem"] for entry in found["problems"])) for found in report["files"]]
+    for (kind, problem), expected in zip(
+        told,
+        (
+            ("unreadable", "has the keys things"),
+            ("unreadable", "unknown file type '.docx'"),
+            ("unreadable", "no such file"),
+            ("unreadable", "no such file, and no embedded asset of that name; did you mean tshirt?"),
+            ("motion", "poses has shape (2, 5)"),
+            ("garment", ""),
+        ),
+        strict=True,
+    ):
+        assert kind == expected[0]
+        assert expected[1] in problem
+    assert main(["inspect", "gone.obj", "tank"]) == 1
+    said = capsys.readouterr()
+    assert "gone.obj: unreadable\n  ! no such file" in said.out
+    assert "tank: garment\n  vertices: 1021" in said.out
+    assert said.err == ""
+
+
+@pytest.mark.parametrize("suffix", ["fbx", "bvh"])
+def test_other_programs_formats_name_the_way_out(capsys: pytest.CaptureFixture[str], suffix: str) -> None:
+    name = f"hero.{suffix}"
+    Path(name).write_bytes(b"content")
+    for words, way in (
+        (["rollout", f"garment={name}"], "as OBJ or GLB"),
+        (["rollout", f"body={name}"], "body=hero.glb"),
+        (["rollout", f"sequence={name}"], "body=hero.glb"),
+        (["prepare", f"garment={name}"], "as OBJ or GLB"),
+        (["prepare", "garment=tank", f"body={name}"], "body=hero.glb"),
+        (["prepare", "garment=tank", f"pose={name}"], "body=hero.glb"),
+    ):
+        assert main([*words, *(["checkpoint=untrained", "model=small"] if words[0] == "rollout" else [])]) == 2
+        error = capsys.readouterr().err
+        assert f"{name}: " in error
+        assert "files are not read; " in error
+        assert way in error
+        assert error.count("\n") == 1
+    assert main(["inspect", name]) == 1
+    assert "files are not read; " in capsys.readouterr().out
+
+
+def test_long_lists_are_cut(capsys: pytest.CaptureFixture[str], garments: dict[str, Garment]) -> None:
+    tank = garments["tank"]
+    loose = np.arange(tank.faces.size).reshape(-1, 3)[:33]
+    write_obj(Path("loose.obj"), tank.rest_pos[tank.faces].reshape(-1, 3)[:99], loose)
+    assert main(["inspect", "loose.obj"]) == 1
+    assert "openings: 3, 3, 3, 3, 3, 3, 3, 3, 3, 3, … and 23 more\n" in capsys.readouterr().out
+    _, report = inspect(capsys, "loose.obj")
+    assert len(report["files"][0]["facts"]["openings"]) == 33

@@ -1,0 +1,43 @@
+"""Warnings as sentences: one line each on the error stream, never Python's own form, and in lists for summaries."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+#: Lists that are open, outermost first, and whether what they hear is printed and passed on.
+_OPEN: list[tuple[list[str], bool]] = []
+
+
+@contextmanager
+def heard(aloud: bool = True) -> Iterator[list[str]]:
+    """What is warned about inside (:func:`warnings.warn`), as a list of sentences in their order, none twice.
+
+    Each is printed as ``hood: warning: …`` when it comes. Calls nest: an inner list is part of the outer ones, and what an
+    outer one holds already is not printed again. With ``aloud=False`` it stays in this list: the caller tells it.
+    """
+    said: list[str] = []
+    _OPEN.append((said, aloud))
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", UserWarning)  # else a place in the code speaks once a process
+            warnings.showwarning = _tell
+            yield said
+    finally:
+        _OPEN.pop()
+
+
+def _tell(message: Warning | str, *_: Any, **__: Any) -> None:
+    sentence = " ".join(str(message).split())
+    known = False
+    for said, aloud in reversed(_OPEN):
+        known = sentence in said
+        if not known:
+            said.append(sentence)
+        if not aloud:
+            return
+    if not known:
+        print(f"hood: warning: {sentence}", file=sys.stderr)

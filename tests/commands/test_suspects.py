@@ -1,0 +1,109 @@
+"""What can be read and is not what it is given as: inspect, prepare and rollout each say so, and none goes on in silence.
+
+The table holds what each command says and its exit code; every case went through all three without a word once.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+import suspects
+
+from hood.assets.body import Body
+from hood.assets.garment import Garment
+from hood.cli import main
+
+QUICK = (
+    "checkpoint=untrained", "model=small", "model.latent_dim=4", "model.schedule='1x(mesh)'", "video=none", "sheet=false",
+    "metrics=none", "num_frames=2", "output=out",
+)  # fmt: skip
+
+
+class Case(NamedTuple):
+    """Words of each command, and what it says with which exit code."""
+
+    inspect: tuple[list[str], str, int]
+    prepare: tuple[list[str], str, int]
+    rollout: tuple[list[str], str, int]
+
+
+EMPTY = "does not surround the body: none of its 4 openings has a part of the body in it"
+FLAT = "is flat: all 2 of its parts lie in planes, as sewing patterns do, and nobody can wear them"
+SOLID = "is a closed solid 1.72 m large, which is a body, not a garment"
+UP = "its body stands along y, though z is up in files with its keys; it is taken as y up"
+DEGREES = "poses holds degrees"
+TORN = "4812 of its 5826 vertices lie on another one along open seams (1942 parts)"
+SEAMS = "openings where seams double its vertices; joined, it has 0"
+CASES = {
+    "far": Case(
+        (["far.obj", "stand_sway"], EMPTY, 1),
+        (["garment=far.obj"], "far", 2),
+        (["garment=far.obj"], EMPTY, 2),
+    ),
+    "stranger": Case(
+        (["tshirt", "character.glb"], "3 of its 4 openings have no part of the body in them", 1),
+        (["garment=tshirt", "body=character.glb"], "unknown body model format", 2),
+        (["garment=tshirt", "body=character.glb"], "3 of its 4 openings have no part of the body in them", 2),
+    ),
+    "y_up": Case(
+        (["y_up.npz"], UP.partition(";")[0], 1),
+        (["garment=tshirt", "pose=y_up.npz"], UP, 0),
+        (["garment=tshirt", "sequence=y_up.npz"], UP, 0),
+    ),
+    "degrees": Case(
+        (["degrees.npz"], DEGREES, 1),
+        (["garment=tshirt", "pose=degrees.npz"], DEGREES, 2),
+        (["garment=tshirt", "sequence=degrees.npz"], DEGREES, 2),
+    ),
+    "soup": Case(
+        (["soup.obj"], "4812 vertices lie on another one along open seams", 1),
+        (["garment=soup.obj"], "welded 4812 vertices on seams", 0),
+        (["garment=soup.obj"], TORN, 2),
+    ),
+    "flat": Case((["flat.obj"], FLAT, 1), (["garment=flat.obj"], FLAT, 2), (["garment=flat.obj"], FLAT, 2)),
+    "body": Case((["body.obj"], SOLID, 1), (["garment=body.obj"], SOLID, 2), (["garment=body.obj"], SOLID, 2)),
+    "torn_body": Case(
+        (["tshirt", "body=torn.obj"], SEAMS, 1),
+        (["garment=tshirt", "body=torn.obj"], "unknown body model format", 2),
+        (["garment=tshirt", "body=torn.obj"], SEAMS, 0),
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory, garments: dict[str, Garment], body: Body) -> Path:
+    folder, shirt = tmp_path_factory.mktemp("suspects"), garments["tshirt"]
+    suspects.far_garment(folder / "far.obj", shirt)
+    suspects.soup(folder / "soup.obj", shirt)
+    suspects.pattern_pieces(folder / "flat.obj", shirt)
+    suspects.body_as_garment(folder / "body.obj", body)
+    suspects.torn_body(folder / "torn.obj", body)
+    suspects.character(folder / "character.glb", body)
+    suspects.y_up_poses(folder / "y_up.npz")
+    suspects.poses_in_degrees(folder / "degrees.npz")
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(files)
+    monkeypatch.delenv("HOOD_TRACEBACK", raising=False)
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("command", ["inspect", "prepare", "rollout"])
+def test_each_command_says_it(capsys: pytest.CaptureFixture[str], case: str, command: str) -> None:
+    words, expected, code = getattr(CASES[case], command)
+    options = {"inspect": (), "prepare": ("output=prepared.npz",), "rollout": QUICK}[command]
+    returned = main([command, *words, *options])
+    said = capsys.readouterr()
+    lines = [line for line in (said.out + said.err).splitlines() if expected in line]
+    assert lines, said.out + said.err
+    assert returned == code
+    print(f"{case} | {command} | exit {code} | {lines[0].strip()}")  # pytest -rP
+    if command == "rollout":
+        sentences = json.loads(Path("out/summary.json").read_text())["warnings"] if code == 0 else []
+        assert code == 2 or any(expected in sentence for sentence in sentences)
