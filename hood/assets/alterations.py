@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -24,6 +25,7 @@ class Fitting:
     """A garment on its way from a file to a body, with a record of every change."""
 
     garment: Garment
+    file: Garment  # as it was read
     vertex_map: np.ndarray  # (V of the file,) present number of each vertex of the file; -1: removed
     changes: list[Change] = field(default_factory=list)
 
@@ -45,7 +47,7 @@ class Change:
 
 def start_fitting(garment: Garment) -> Fitting:
     """A fitting of a garment as it was read."""
-    return Fitting(garment, np.arange(len(garment.rest_pos)))
+    return Fitting(garment, garment, np.arange(len(garment.rest_pos)))
 
 
 def scale_to_metres(fitting: Fitting, scale: float | None, body_pos: np.ndarray) -> None:
@@ -119,8 +121,10 @@ def clean(fitting: Fitting) -> None:
         fitting.note(what, int(mask.sum()), text.format(int(mask.sum())))
 
 
-def leave_body(fitting: Fitting, posed: PosedBody, clearance: float) -> None:
-    """Push vertices that lie inside the posed body out to ``clearance`` [m]: the moved mesh is the rest shape.
+def leave_body(fitting: Fitting, posed: PosedBody, clearance: float) -> np.ndarray:
+    """Positions (V, 3) [m] with the vertices that lie inside the posed body moved straight out to ``clearance`` [m].
+
+    Only these positions move. The garment keeps its rest shape: the lengths and angles that it was made with.
 
     Raises:
         ValueError: the garment is not around this body at all.
@@ -136,20 +140,39 @@ def leave_body(fitting: Fitting, posed: PosedBody, clearance: float) -> None:
             "check scale, up, offset and pose"
         )
     pushed = push_out(garment.rest_pos, posed.surface, posed.faces, clearance)
-    # Vertices that are merely nearer than the clearance were where their maker wanted them.
-    pos = np.where((dist < 0)[:, None], pushed.pos, garment.rest_pos)
-    fitting.garment = replace(garment, rest_pos=pos)
     fitting.note(
         "pushed_out",
         pushed.num_inside,
-        f"pushed {pushed.num_inside} vertices ({100 * inside:.1f}%) out of the body, the deepest {1e3 * pushed.depth:.1f} mm",
+        f"{pushed.num_inside} vertices ({100 * inside:.1f}%) lie inside the body, the deepest {1e3 * pushed.depth:.1f} mm: "
+        "they start outside, the rest shape stays",
         depth=pushed.depth,
     )
+    # Vertices that are merely nearer than the clearance were where their maker wanted them.
+    return np.where((dist < 0)[:, None], pushed.pos, garment.rest_pos)
 
 
-def bind(fitting: Fitting, posed: PosedBody) -> None:
-    """Bind to the body in the pose and shape the garment was made in."""
-    fitting.garment = bind_posed(fitting.garment, posed)
+def bind(fitting: Fitting, posed: PosedBody, worn_pos: np.ndarray) -> None:
+    """Bind to the body in the pose and shape the garment was made in, worn at ``worn_pos`` (V, 3) [m] there."""
+    fitting.garment = bind_posed(fitting.garment, posed, worn_pos)
+
+
+def length_ratios(fitting: Fitting, betas: np.ndarray) -> np.ndarray:
+    """Rest lengths (E',) of the garment on a body of shape ``betas``, over those in its file, scaled to metres.
+
+    Edges that are no longer there do not count: those that welding closed and those of removed vertices.
+    """
+    file, garment = fitting.file, fitting.garment
+    edges = topology.unique_edges(file.faces)
+    factor = math.prod(change.details["factor"] for change in fitting.changes if change.what == "scaled")
+    before = factor * _lengths(file.rest_pos, edges)
+    ends = fitting.vertex_map[edges]
+    kept = (ends >= 0).all(axis=1) & (ends[:, 0] != ends[:, 1]) & (before > 0)
+    rest_pos = garment.shaped(betas) if garment.bound and not file.bound else garment.rest_pos
+    return _lengths(rest_pos, ends[kept]) / before[kept]
+
+
+def _lengths(pos: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    return np.asarray(np.linalg.norm(pos[edges[:, 1]] - pos[edges[:, 0]], axis=1))
 
 
 def summary(garment: Garment) -> str:

@@ -93,26 +93,31 @@ def hold_on_trunk(garment: Garment, body: Body) -> Garment:
     return replace(garment, lbs_weights=weights)
 
 
-def bind_posed(garment: Garment, posed: PosedBody) -> Garment:
+def bind_posed(garment: Garment, posed: PosedBody, worn_pos: np.ndarray | None = None) -> Garment:
     """A garment modelled around ``posed``, bound to its body: the mesh as it is given is the rest shape.
 
     Weights come from the posed skin as in :func:`bind_garment`; linear blend skinning is then undone vertex by vertex,
-    so that skinning the result back into the same pose gives the given mesh. Where blended rotations all but cancel
+    so that skinning the result back into the same pose gives ``worn_pos``. Where blended rotations all but cancel
     (deep folds of a joint) the inverse is limited, and only nearly so.
+
+    Args:
+        worn_pos: (V, 3) [m], where the garment is worn in that pose; None: where it is given. The rest shape stays.
     """
-    weights, shapedirs = _spread_skin(garment.rest_pos, garment.faces, posed.body, posed.surface)
+    worn_pos = garment.rest_pos if worn_pos is None else worn_pos
+    weights, shapedirs = _spread_skin(worn_pos, garment.faces, posed.body, posed.surface)
     blended = (weights @ posed.transforms.reshape(len(posed.transforms), 12)).reshape(-1, 3, 4)
     left, stretch, right = np.linalg.svd(blended[:, :, :3])
     inverse = right.transpose(0, 2, 1) / np.maximum(stretch, _LEAST_STRETCH)[:, None, :] @ left.transpose(0, 2, 1)
-    grown = np.einsum("vij,vj->vi", inverse, garment.rest_pos - blended[:, :, 3])
+    grown = np.einsum("vij,vj->vi", inverse, worn_pos - blended[:, :, 3])
     count = min(len(posed.betas), shapedirs.shape[2])
     offset = shapedirs[..., :count] @ posed.betas[:count]
     turn = left @ right
     straight = np.allclose(turn, np.eye(3), atol=1e-9)
+    as_given = straight and np.array_equal(worn_pos, garment.rest_pos)
     return replace(
         garment,
         rest_pos=garment.rest_pos - np.einsum("vij,vj->vi", turn, offset),
-        skin_pos=None if straight else grown - offset,
+        skin_pos=None if as_given else grown - offset,
         rest_turn=None if straight else turn,
         lbs_weights=weights,
         shapedirs=shapedirs,

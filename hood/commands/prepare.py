@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,10 +30,26 @@ from hood.media.mesh_export import write_obj
 from hood.mesh.quality import check_triangles
 from hood.scene.fitting import FitFigures, fit_figures
 from hood.scene.scene import build_scene
+from hood.scene.wear import STRETCHED, Worn, put_on
 
 _STANDING = ("auto", "tpose", "apose")
 #: A start beyond these is warned about: edges stretched by this share, vertices this deep [m].
 _STRETCH_LIMIT, _DEPTH_LIMIT = 0.10, 2e-3
+#: A rest length counts as changed beyond this; a file may have at most this share of its edges changed.
+_CHANGED, _MOST_CHANGED = 0.01, 0.01
+#: Share of the edges that may be stretched where the garment is worn. Measured: 0 for garments shrunk by up to 10%, 1% to 19%
+#: for those shrunk by a fifth or shifted by 10 cm.
+_MOST_STRETCHED = 0.005
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """One garment of the command, ready to be written, and what it took."""
+
+    fitting: Fitting
+    worn: Worn | None  # None: it came bound, and is worn as it was
+    length_change: float  # greatest relative change of a rest length against the file
+    changed_share: float  # of the edges, by more than ``_CHANGED``
 
 
 def run(overrides: Sequence[str]) -> int:
@@ -48,15 +64,15 @@ def run(overrides: Sequence[str]) -> int:
     if config.mesh is not None:
         _mesh_target(config)
     body, betas = load_body(str(config.body)), shape_coefficients(config.betas)
-    fittings = [_fit(name, config, body, betas) for name in names]
-    outfit = join_garments([bind_garment(fitting.garment, body) for fitting in fittings])
-    outfit = _pin(outfit, fittings, config, body)
+    fitted = [_fit(name, config, body, betas) for name in names]
+    outfit = join_garments([bind_garment(one.fitting.garment, body) for one in fitted])
+    outfit = _pin(outfit, [one.fitting for one in fitted], config, body)
     starts = _starts(outfit, config, body, betas)
     prepare_folder(target.parent)
     save_garment(target, outfit)
     if config.mesh is not None:
         write_obj(_mesh_target(config), outfit)
-    report = _report(names, fittings, outfit, starts, target)
+    report = _report(names, fitted, outfit, starts, target)
     print(json.dumps(report, indent=1) if str(config.format) == "json" else _text(report))
     return 0
 
@@ -79,8 +95,8 @@ def _mesh_target(config: DictConfig) -> Path:
     return target
 
 
-def _fit(name: str, config: DictConfig, body: Body, betas: np.ndarray) -> Fitting:
-    """One garment, read, repaired and bound."""
+def _fit(name: str, config: DictConfig, body: Body, betas: np.ndarray) -> _Fitted:
+    """One garment, read, repaired, put on and bound."""
     fitting = _read(name)
     if not fitting.garment.bound:
         heed(fitting.garment.name, suspect_kind(fitting.garment.rest_pos, fitting.garment.faces, body.v_template))
@@ -93,13 +109,39 @@ def _fit(name: str, config: DictConfig, body: Body, betas: np.ndarray) -> Fittin
     check_triangles(fitting.garment.rest_pos, fitting.garment.faces, name)
     clearance = _number(config, "clearance", "")
     assert clearance is not None
-    if fitting.garment.bound:
-        return fitting
-    posed = _pose(fitting, config, body, betas)
-    alterations.leave_body(fitting, posed, clearance)
-    check_triangles(fitting.garment.rest_pos, fitting.garment.faces, name)
-    alterations.bind(fitting, posed)
-    return fitting
+    worn = None
+    if not fitting.garment.bound:
+        worn = _wear(fitting, _pose(fitting, config, body, betas), clearance, bool(config.allow_misfit))
+    ratios = alterations.length_ratios(fitting, betas)
+    change = np.abs(ratios - 1)
+    fitted = _Fitted(fitting, worn, float(change.max(initial=0.0)), float((change > _CHANGED).mean()) if len(change) else 0.0)
+    if fitted.changed_share > _MOST_CHANGED:
+        raise ValueError(
+            f"{name}: welding changes {100 * fitted.changed_share:.1f}% of the rest lengths by more than "
+            f"{100 * _CHANGED:.0f}%, the most by {100 * fitted.length_change:.0f}%; give a smaller weld, "
+            "metres between vertices that are one"
+        )
+    return fitted
+
+
+def _wear(fitting: Fitting, posed: PosedBody, clearance: float, allow_misfit: bool) -> Worn:
+    """Bind the garment to the posed body where it is worn: outside the skin, settled towards the lengths of its file.
+
+    Raises:
+        ValueError: there it is stretched more than cloth is, and ``allow_misfit`` is not given.
+    """
+    pos = alterations.leave_body(fitting, posed, clearance)
+    worn = put_on(fitting.garment, pos, posed, clearance)
+    if worn.stretched_share > _MOST_STRETCHED and not allow_misfit:
+        raise ValueError(
+            f"{fitting.garment.name}: too small for the body, or not placed on it: outside of it "
+            f"{100 * worn.stretched_share:.1f}% of the edges are stretched by more than {100 * STRETCHED:.0f}%, one by "
+            f"{100 * worn.stretch_max:.0f}%; at most {100 * _MOST_STRETCHED:g}% may be; check body and betas (its size), "
+            "scale, offset, up and pose, or write it all the same with allow_misfit=true"
+        )
+    inside = any(change.what == "pushed_out" for change in fitting.changes)
+    alterations.bind(fitting, posed, worn.pos if inside else pos)
+    return worn
 
 
 def _read(name: str) -> Fitting:
@@ -171,16 +213,18 @@ def _starts(outfit: Garment, config: DictConfig, body: Body, betas: np.ndarray) 
 
 
 def _report(
-    names: list[str], fittings: list[Fitting], outfit: Garment, starts: dict[str, FitFigures], target: Path
+    names: list[str], fitted: list[_Fitted], outfit: Garment, starts: dict[str, FitFigures], target: Path
 ) -> dict[str, Any]:
     return {
         "garments": [
             {
                 "file": name,
-                "result": alterations.summary(fitting.garment),
-                "changes": [asdict(change) for change in fitting.changes],
+                "result": alterations.summary(one.fitting.garment),
+                "changes": [asdict(change) for change in one.fitting.changes],
+                "rest_lengths": {"change_max": one.length_change, "changed_share": one.changed_share},
+                "worn": None if one.worn is None else {key: value for key, value in vars(one.worn).items() if key != "pos"},
             }
-            for name, fitting in zip(names, fittings, strict=True)
+            for name, one in zip(names, fitted, strict=True)
         ],
         "num_vertices": len(outfit.rest_pos),
         "num_faces": len(outfit.faces),
@@ -195,6 +239,7 @@ def _text(report: dict[str, Any]) -> str:
     for part in report["garments"]:
         lines.append(f"{part['file']}:")
         lines += [f"  {change['text']}" for change in part["changes"]] or ["  nothing to repair"]
+        lines += _length_lines(part)
         lines.append(f"  now {part['result']}")
     if report["num_pinned"]:
         lines.append(f"holds {report['num_pinned']} of {report['num_vertices']} vertices")
@@ -207,6 +252,24 @@ def _text(report: dict[str, Any]) -> str:
             lines.append("  that is far from rest: check that pose, scale and body are those the garment was made for")
     lines.append(f"written to {report['output']}; run it with: hood rollout garment={report['output']}")
     return "\n".join(lines)
+
+
+def _length_lines(part: dict[str, Any]) -> list[str]:
+    """What became of a garment's edges: at rest, and where it is worn."""
+    rest, worn = part["rest_lengths"], part["worn"]
+    lines = [
+        f"  rest lengths: the file's to {100 * rest['change_max']:.2f}%; {100 * rest['changed_share']:.1f}% of the edges "
+        f"changed by more than {100 * _CHANGED:.0f}%"
+    ]
+    if worn is not None:
+        lines.append(
+            f"  worn outside of the body: edges stretched by at most {100 * worn['stretch_max']:.1f}%, compressed by at most "
+            f"{100 * worn['compression_max']:.1f}%; {100 * worn['stretched_share']:.1f}% stretched by more than "
+            f"{100 * STRETCHED:.0f}%"
+        )
+        if worn["stretched_share"] > _MOST_STRETCHED:
+            lines.append("  it does not fit: too small for the body, or not placed on it; written as allow_misfit=true asks")
+    return lines
 
 
 def _number(config: DictConfig, key: str, word: str) -> float | None:

@@ -26,6 +26,19 @@ def bare(garment: Garment) -> Garment:
     return Garment(garment.name, garment.rest_pos, garment.faces, garment.pinned)
 
 
+@pytest.mark.parametrize("angle", [0.0, 45.0])
+def test_where_it_is_worn_is_apart_from_its_rest_shape(garments: dict[str, Garment], body: Body, angle: float) -> None:
+    """Moved vertices are where skinning leads to; the mesh as it is given stays the rest shape."""
+    betas = np.array([0.8, -1.0, *[0.0] * 8])
+    posed = posed_body(body, arms_down(angle), 0, betas)
+    given = bare(garments["tank"])
+    worn = given.rest_pos + 0.01 * np.random.default_rng(0).normal(size=given.rest_pos.shape)
+    bound = bind_posed(given, posed, worn)
+    skin = np.c_[bound.tpose(betas), np.ones(len(worn))]
+    np.testing.assert_allclose(np.einsum("vj,jab,vb->va", bound.lbs_weights, posed.transforms, skin), worn, atol=1e-9)
+    np.testing.assert_allclose(bound.shaped(betas), given.rest_pos, atol=1e-9)
+
+
 @pytest.mark.parametrize("frame", [0, 40])
 def test_undoing_a_pose_is_exact(garments: dict[str, Garment], body: Body, walk: PoseSequence, frame: int) -> None:
     """Skinned back into the pose it was given in, every vertex is where it was given, in the world."""

@@ -8,16 +8,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from wild import write_wild_garment
 
-from hood.assets.binding import posed_body
+from hood.assets.binding import posed_body, signed_distances
 from hood.assets.body import Body
 from hood.assets.garment import Garment, load_garment
 from hood.assets.sequence import PoseSequence
 from hood.assets.standing import arms_down
 from hood.cli import main
 from hood.dynamics.recorder import read_rollout
-from hood.mesh import topology
+from hood.mesh import geometry, topology
 from hood.scene.scene import build_scene
 from hood.testing import cylinder
 
@@ -29,6 +30,8 @@ UNTRAINED = [
     "video=none",
     "sheet=false",
 ]
+#: Nothing about the garment's place is looked for.
+AS_GIVEN = ("scale=1", "up=y", "offset=[0,0,0]")
 
 
 @pytest.fixture(autouse=True)
@@ -66,6 +69,7 @@ def test_a_garment_from_the_wild_runs(capsys: pytest.CaptureFixture[str], garmen
     assert len(np.unique(topology.connected_components(len(garment.rest_pos), topology.unique_edges(garment.faces)))) == 3
     assert np.ptp(garment.rest_pos[:, 1]) == pytest.approx(np.ptp(wild.garment.rest_pos[:, 1]), rel=0.02)
     assert garment.uv is not None
+    assert report["garments"][0]["rest_lengths"]["change_max"] < 1e-3
     start = report["starts"]["tpose"]
     assert start["stretch_max"] < 0.1
     assert start["depth_max"] < 2e-3
@@ -73,6 +77,97 @@ def test_a_garment_from_the_wild_runs(capsys: pytest.CaptureFixture[str], garmen
     data = read_rollout(Path("out/rollout.h5"))
     assert data.cloth_pos.shape == (3, len(garment.rest_pos), 3)
     assert np.isfinite(data.cloth_pos).all()
+
+
+def shrunk(pos: np.ndarray, factor: float) -> np.ndarray:
+    """``pos`` smaller by ``factor``, about the middle of its box."""
+    middle = (pos.min(axis=0) + pos.max(axis=0)) / 2
+    return middle + factor * (pos - middle)
+
+
+def lengths(pos: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    return np.asarray(np.linalg.norm(pos[edges[:, 0]] - pos[edges[:, 1]], axis=1))
+
+
+@pytest.mark.parametrize(("name", "angle", "factor"), [("tank", 0.0, 0.95), ("shorts", 0.0, 0.95), ("longsleeve", 45.0, 0.97)])
+def test_the_rest_shape_is_that_of_the_file(
+    capsys: pytest.CaptureFixture[str], garments: dict[str, Garment], body: Body, name: str, angle: float, factor: float
+) -> None:
+    """A garment too tight by 3 to 5%: vertices inside the body start outside; lengths and angles at rest are the file's."""
+    scene = build_scene(garments[name], body, arms_down(angle))
+    state = scene.start(0, relaxed=False)
+    pos, faces = shrunk(state.pos.double().numpy() + state.origin[0].numpy(), factor), garments[name].faces
+    write_obj(Path("tight.obj"), pos, faces)
+    report = prepare(capsys, "garment=tight.obj", "output=tight.npz", f"pose={'apose' if angle else 'tpose'}", *AS_GIVEN)
+    tight = load_garment("tight.npz")
+    edges = topology.unique_edges(faces)
+    np.testing.assert_allclose(lengths(tight.shaped(np.zeros(10)), edges), lengths(pos, edges), rtol=1e-6)
+    hinges = torch.as_tensor(topology.hinges(faces).vertices)
+    angles = [geometry.dihedral_angles(torch.as_tensor(p), hinges) for p in (tight.shaped(np.zeros(10)), pos)]
+    torch.testing.assert_close(angles[0], angles[1], atol=1e-6, rtol=0.0)
+    posed = posed_body(body, arms_down(angle), 0, np.zeros(10))
+    assert changes(report)["pushed_out"] == (signed_distances(pos, posed.surface, posed.faces) < 0).sum() > 0.03 * len(pos)
+    worn = np.einsum("vj,jab->vab", tight.lbs_weights, posed.transforms)
+    skin = np.c_[tight.tpose(np.zeros(10)), np.ones(len(pos))]
+    worn_pos = np.einsum("vab,vb->va", worn, skin)
+    assert signed_distances(worn_pos, posed.surface, posed.faces).min() > 1e-3
+    stretch = lengths(worn_pos, edges) / lengths(pos, edges) - 1
+    part = report["garments"][0]
+    assert part["rest_lengths"] == {"change_max": pytest.approx(0.0, abs=1e-6), "changed_share": 0.0}
+    assert part["worn"]["stretch_max"] == pytest.approx(stretch.max(), abs=1e-3)
+    assert part["worn"]["compression_max"] == pytest.approx(-stretch.min(), abs=1e-3)
+    assert 0.03 < stretch.max() < 0.1
+
+
+def test_a_tight_garment_is_simulated(capsys: pytest.CaptureFixture[str], garments: dict[str, Garment]) -> None:
+    """Cloth with the lengths of its file, on a body that it is too tight for, is at rest nowhere, but sound."""
+    write_obj(Path("tight.obj"), shrunk(garments["skirt"].rest_pos, 0.95), garments["skirt"].faces)
+    assert changes(prepare(capsys, "garment=tight.obj", "output=tight.npz", *AS_GIVEN))["pushed_out"] > 20
+    assert (
+        main(["rollout", "garment=tight.npz", "stepper=newton", "num_frames=4", "output=out", "video=none", "sheet=false"]) == 0
+    )
+    summary = json.loads(Path("out/summary.json").read_text())
+    assert summary["solver_steps_not_converged"] == 0
+    assert summary["strain_p99"] < 0.12
+    assert summary["penetration_share_max"] == 0.0
+
+
+def squeezed_tube() -> tuple[np.ndarray, np.ndarray]:
+    """A tube around the waist with two rings that are too narrow for it."""
+    pos, faces = cylinder(24, 10, radius=0.25, height=0.3)
+    pos = pos + [0, 0.05, 0]
+    heights = np.unique(pos[:, 1].round(6))
+    pos[np.isin(pos[:, 1].round(6), heights[4:6])] *= [0.35, 1.0, 0.35]
+    return pos, faces
+
+
+def test_what_is_too_small_is_refused_unless_it_is_asked_for(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hood.scene.start._MOST_ITERATIONS", 60)  # no number of them makes it fit
+    write_obj(Path("tube.obj"), *squeezed_tube())
+    words = ["garment=tube.obj", "output=tube.npz", "pose=tpose", *AS_GIVEN]
+    assert main(["prepare", *words]) == 2
+    error = capsys.readouterr().err
+    assert "too small for the body" in error
+    assert "allow_misfit=true" in error
+    assert not Path("tube.npz").exists()
+    assert main(["prepare", *words, "allow_misfit=true"]) == 0
+    assert "it does not fit" in capsys.readouterr().out
+    assert load_garment("tube.npz").skin_pos is not None
+
+
+def test_a_weld_that_changes_lengths_is_refused(capsys: pytest.CaptureFixture[str], garments: dict[str, Garment]) -> None:
+    """Triangles torn apart: where their corners coincide welding changes nothing, where they lie 3 mm apart it does."""
+    tank = garments["tank"]
+    torn, faces = 100.0 * tank.rest_pos[tank.faces].reshape(-1, 3), np.arange(tank.faces.size).reshape(-1, 3)
+    write_obj(Path("torn.obj"), torn, faces)
+    report = prepare(capsys, "garment=torn.obj", "output=torn.npz")
+    assert report["num_vertices"] == len(tank.rest_pos)
+    assert report["garments"][0]["rest_lengths"]["change_max"] < 1e-3
+    write_obj(Path("torn.obj"), torn + np.random.default_rng(0).uniform(-0.15, 0.15, torn.shape), faces)
+    assert main(["prepare", "garment=torn.obj", "output=loose.npz", "weld=0.006"]) == 2
+    assert "give a smaller weld" in capsys.readouterr().err
 
 
 def test_the_file_itself_is_refused_with_the_factor(capsys: pytest.CaptureFixture[str], garments: dict[str, Garment]) -> None:
