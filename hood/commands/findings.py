@@ -72,8 +72,11 @@ def unreadable(name: str, kind: str, error: Exception) -> Finding:
     return Finding(name, kind, problems=[(sentence.removeprefix(f"{name}: "), "")])
 
 
-def inspect_garment(name: str, body: Body | MeshMotion) -> Finding:
-    """A garment file beside ``body``: a model in its T-pose, or a mesh in its first frame."""
+def inspect_garment(name: str, body: Body | MeshMotion, wearer: str) -> Finding:
+    """A garment file beside ``body``: a model in its T-pose, or a mesh in its first frame.
+
+    ``wearer`` are the words of prepare that name a mesh.
+    """
     finding = Finding(name, "garment")
     path, _ = locate_garment(name)
     if path.suffix.lower() in MESH_SUFFIXES:
@@ -96,6 +99,8 @@ def inspect_garment(name: str, body: Body | MeshMotion) -> Finding:
         return finding
     if isinstance(body, MeshMotion):
         place_beside_mesh(finding, garment, body, _UNITS)
+        if finding.repairs:
+            finding.repairs.insert(0, wearer)
     elif garment.bound:
         _name_openings(finding, garment.rest_pos if garment.skin_pos is None else garment.skin_pos, garment.faces, body)
     else:

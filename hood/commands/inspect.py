@@ -90,7 +90,7 @@ def _inspect(known: Finding, beside: str, config: DictConfig) -> Finding:
 
 def _read(name: str, kind: str, beside: str, config: DictConfig) -> Finding:
     if kind == kinds.GARMENT:
-        return findings.inspect_garment(name, _body(beside, config))
+        return findings.inspect_garment(name, _body(beside, config), _wearer(beside, config))
     if kind == kinds.MOVING_MESH:
         return findings.inspect_moving_mesh(name, _options(config))
     if kind == kinds.REFERENCE_ROLLOUT:
@@ -117,6 +117,12 @@ def _body(name: str, config: DictConfig) -> Body | MeshMotion:
     motion = load_motion(name, NO_MOTION, _options(config))
     assert isinstance(motion, MeshMotion)
     return motion
+
+
+def _wearer(body: str, config: DictConfig) -> str:
+    """The words of ``hood prepare`` for a mesh body as it is looked at here."""
+    scale = [] if config.body_scale is None else [f"body_scale={config.body_scale:g}"]
+    return " ".join([f"body={body}", *scale, *([f"body_up={config.up}"] if str(config.up) != "auto" else [])])
 
 
 def _fit(found: list[Finding], body: str, config: DictConfig) -> dict[str, Any] | None:

@@ -13,6 +13,7 @@ from omegaconf import DictConfig
 
 from hood.assets import alterations
 from hood.assets.alterations import Fitting
+from hood.assets.animated_mesh import body_kind
 from hood.assets.binding import PosedBody, bind_garment, posed_body
 from hood.assets.body import Body, load_body
 from hood.assets.garment import Garment, garment_of_mesh, load_garment, locate_garment, save_garment
@@ -24,6 +25,7 @@ from hood.assets.sequence import PoseSequence, load_sequence
 from hood.assets.standing import A_POSE_ANGLE, POSE_SUFFIXES, arms_down, find_standing_pose, read_pose
 from hood.assets.suspicions import suspect_kind
 from hood.commands.common import prepare_folder
+from hood.commands.prepare_mesh import prepare_for_mesh
 from hood.commands.wardrobe import checked_pins, heed, names_of, shape_coefficients
 from hood.config import ConfigError, load_config, plain, require_choice
 from hood.media.mesh_export import write_obj
@@ -61,6 +63,10 @@ def run(overrides: Sequence[str]) -> int:
         raise ConfigError("garment is not given: hood prepare garment=shirt.obj output=shirt.npz")
     names = names_of(config.garment)
     target = _target(config, names)
+    if body_kind(str(config.body)) == "mesh":
+        if config.mesh is not None:
+            raise ConfigError("mesh=…: is written for bodies of the SMPL family only")
+        return prepare_for_mesh(config, names, target, _read)
     if config.mesh is not None:
         _mesh_target(config)
     body, betas = load_body(str(config.body)), shape_coefficients(config.betas)

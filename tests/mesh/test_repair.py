@@ -91,3 +91,18 @@ def test_an_edge_of_three_faces_is_reported() -> None:
     found = find_defects(pos, np.array([[0, 1, 2], [1, 0, 3], [0, 1, 4]]))
     assert found.non_manifold_edges == 1
     assert find_defects(pos * [1, 1e-3, 1], np.array([[0, 1, 2]])).slivers == 1
+
+
+def test_seams_of_a_moving_mesh_are_sewn_where_they_stay_closed() -> None:
+    pos, faces = grid(4, 4, 1.0)
+    soup = pos[faces].reshape(-1, 3)
+    loose = np.arange(len(soup)).reshape(-1, 3)
+    sewn = repair.sew_moving(np.stack([soup, soup + 1.0]), loose)
+    np.testing.assert_allclose(soup[sewn], pos[faces])
+    assert len(topology.boundary_loops(sewn)) == 1
+    assert len(topology.unique_edges(sewn)) == len(topology.unique_edges(faces))
+    apart = soup.copy()
+    apart[:3] += [0.0, 0.0, 0.5]  # the first face leaves its neighbours
+    opened = repair.sew_moving(np.stack([soup, apart]), loose)
+    others = opened[1:]
+    assert not np.isin(opened[0], others).any()

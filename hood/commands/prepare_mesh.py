@@ -1,0 +1,163 @@
+"""``hood prepare body=MESH``: a garment repaired and placed on a mesh as it stands in its first frame.
+
+A mesh has no skeleton of the family to bind to: the garment is written as it is worn there, which is how rollouts with the
+same body take it. Its rest lengths are those of its file.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig
+
+from hood.assets import alterations
+from hood.assets.alterations import Fitting
+from hood.assets.binding import push_out, signed_distances
+from hood.assets.garment import Garment, save_garment
+from hood.assets.outfit import join_garments
+from hood.assets.pins import pin_mask, pin_numbers
+from hood.assets.sequence import Z_UP_TO_Y_UP
+from hood.assets.suspicions import suspect_kind, suspect_place, suspect_seams
+from hood.assets.units import find_scale, used
+from hood.commands.common import prepare_folder
+from hood.commands.wardrobe import checked_pins, heed
+from hood.config import ConfigError, plain
+from hood.mesh.quality import check_triangles
+from hood.scene.cast import NO_MOTION, MotionOptions, load_motion
+from hood.scene.fitting import FitFigures, fit_figures
+from hood.scene.mesh_motion import MeshMotion, worn_pos
+from hood.scene.scene import dress
+
+_AUTO = "auto"
+#: Keys that say in which pose and shape of a model a garment was made: a mesh has one of each.
+_OF_MODELS = {"pose": _AUTO, "betas": []}
+
+
+def prepare_for_mesh(config: DictConfig, names: list[str], target: Path, read: Callable[[str], Fitting]) -> int:
+    """Prepare the garments ``names`` for the mesh that ``config.body`` names; ``read`` reads one as it is.
+
+    Raises:
+        ValueError: a garment that is none, or is not worn by the mesh where it is.
+    """
+    for key, usual in _OF_MODELS.items():
+        if plain(config[key]) != usual:
+            raise ConfigError(f"{key}={config[key]}: body={config.body} is a mesh, which has one pose and shape; leave it out")
+    options = MotionOptions(
+        fps=float(config.fps), up=str(config.body_up), num_frames=2,
+        scale=None if config.body_scale is None else float(config.body_scale),
+    )  # fmt: skip
+    motion = load_motion(str(config.body), NO_MOTION, options)
+    assert isinstance(motion, MeshMotion)
+    fittings = [_fit(read(name), name, config, motion) for name in names]
+    outfit = _pin(join_garments([fitting.garment for fitting in fittings]), fittings, config)
+    scene = dress(outfit, motion)
+    scene.start(0, thorough=True)  # refuses what a limb passes through
+    figures = fit_figures(scene)
+    prepare_folder(target.parent)
+    save_garment(target, outfit)
+    report = _report(names, fittings, outfit, figures, target)
+    print(json.dumps(report, indent=1) if str(config.format) == "json" else _text(report, str(config.body)))
+    return 0
+
+
+def _fit(fitting: Fitting, name: str, config: DictConfig, motion: MeshMotion) -> Fitting:
+    """One garment on the mesh: in metres, y up, sewn, clean, outside the skin."""
+    garment, surface, clearance = fitting.garment, motion.points(0), float(config.clearance)
+    heed(garment.name, suspect_kind(garment.rest_pos, garment.faces, surface))
+    if not clearance >= 0:
+        raise ConfigError(f"clearance={config.clearance}: give a number ≥ 0")
+    _to_metres(fitting, config, surface)
+    if str(config.weld) == "none":
+        heed(garment.name, suspect_seams(fitting.garment.rest_pos, fitting.garment.faces))
+    else:
+        alterations.sew(fitting, None if str(config.weld) == _AUTO else float(config.weld))
+    alterations.clean(fitting)
+    check_triangles(fitting.garment.rest_pos, fitting.garment.faces, name)
+    # What another body's weights say does not hold here: the place of a garment is where it is worn.
+    fitting.garment = replace(
+        fitting.garment, lbs_weights=None, shapedirs=None, bound_to=None, rest_turn=None, skin_pos=worn_pos(fitting.garment)
+    )
+    _leave_mesh(fitting, motion, clearance)
+    return fitting
+
+
+def _to_metres(fitting: Fitting, config: DictConfig, surface: np.ndarray) -> None:
+    """Scaled, turned and moved as the config asks; the unit by the size beside the mesh where it does not."""
+    garment = fitting.garment
+    factor = find_scale(used(garment.rest_pos, garment.faces), surface) if str(config.scale) == _AUTO else float(config.scale)
+    if factor is None or not (np.isfinite(factor) and factor > 0):
+        raise ConfigError(f"scale={config.scale}: {garment.name} is of no usual size; give metres per unit of the file")
+    turn = Z_UP_TO_Y_UP if str(config.up) == "z" else np.eye(3)
+    offset = np.zeros(3) if str(config.offset) == _AUTO else np.array(plain(config.offset), dtype=np.float64)
+    if offset.shape != (3,) or not np.isfinite(offset).all():
+        raise ConfigError(f"offset={config.offset}: give metres along x, y and z, offset=[0,1.2,0]")
+    skin_pos = None if garment.skin_pos is None else factor * garment.skin_pos @ turn.T + offset
+    fitting.garment = replace(garment, rest_pos=factor * garment.rest_pos @ turn.T + offset, skin_pos=skin_pos)
+    count = len(garment.rest_pos)
+    fitting.note("scaled", count * (factor != 1.0), f"scaled by {factor:g}", factor=factor)
+    fitting.note("turned", count * (str(config.up) == "z"), "turned from z up to y up")
+    fitting.note("moved", count * bool(offset.any()), f"moved by {np.round(offset, 4).tolist()} m", offset=offset.tolist())
+
+
+def _leave_mesh(fitting: Fitting, motion: MeshMotion, clearance: float) -> None:
+    """Where the garment is worn, outside the mesh in its first frame, or in its rest pose where that is nearer."""
+    garment, rest = fitting.garment, motion.sequence.rest
+    pos = worn_pos(garment)
+    surfaces = [motion.points(0)] if rest is None else [motion.points(0), rest]
+    dist, surface = min(
+        ((signed_distances(pos, surface, motion.faces), surface) for surface in surfaces),
+        key=lambda pair: float(np.median(np.abs(pair[0]))),
+    )
+    heed(garment.name, suspect_place(pos, garment.faces, surface, motion.faces))
+    pushed = push_out(pos, surface, motion.faces, clearance)
+    fitting.garment = replace(garment, skin_pos=np.where((dist < 0)[:, None], pushed.pos, pos))
+    share = 100 * pushed.num_inside / len(pos)
+    text = f"worn outside the body: {pushed.num_inside} vertices ({share:.1f}%) were inside, to {1e3 * pushed.depth:.1f} mm"
+    fitting.note("pushed_out", pushed.num_inside, text, depth=pushed.depth)
+
+
+def _pin(outfit: Garment, fittings: list[Fitting], config: DictConfig) -> Garment:
+    if config.pins is None:
+        return outfit
+    given = checked_pins(plain(config.pins))
+    numbers, _ = pin_numbers(given)
+    if len(numbers) and any(len(fitting.vertex_map) != len(fitting.garment.rest_pos) for fitting in fittings):
+        raise ConfigError("pins: vertices were joined or removed, and numbers are those of the file; pin with hood rollout")
+    return replace(outfit, pinned=pin_mask(given, outfit, None))
+
+
+def _report(names: list[str], fittings: list[Fitting], outfit: Garment, figures: FitFigures, target: Path) -> dict[str, Any]:
+    garments = [
+        {"file": name, "result": alterations.summary(one.garment), "changes": [asdict(change) for change in one.changes]}
+        for name, one in zip(names, fittings, strict=True)
+    ]
+    return {
+        "garments": garments,
+        "num_vertices": len(outfit.rest_pos),
+        "num_faces": len(outfit.faces),
+        "num_pinned": int(outfit.pinned.sum()),
+        "starts": {"first frame": asdict(figures)},
+        "output": str(target),
+    }
+
+
+def _text(report: dict[str, Any], body: str) -> str:
+    lines = []
+    for part in report["garments"]:
+        lines.append(f"{part['file']}:")
+        lines += [f"  {change['text']}" for change in part["changes"]] or ["  nothing to repair"]
+        lines.append(f"  now {part['result']}")
+    start = report["starts"]["first frame"]
+    return "\n".join(
+        [
+            *lines,
+            f"start in the first frame of {body}: edges stretched by at most {100 * start['stretch_max']:.1f}%, "
+            f"deepest vertex {1e3 * start['depth_max']:.1f} mm",
+            f"written to {report['output']}; run it with: hood rollout garment={report['output']} body={body}",
+        ]
+    )
