@@ -66,7 +66,7 @@ def training_note(path: Path) -> str:
     """What a model file says about its training; empty where it says nothing."""
     if path.suffix.lower() in SUFFIXES:
         return "published weights"
-    header = {key: value for key, value in read_header(path).items() if key not in ("format", "model", "validation")}
+    header = {key: value for key, value in read_header(path).items() if key not in ("format", "model", "ranges", "validation")}
     iteration = header.pop("iteration", None)
     notes = [] if iteration is None else [f"{int(iteration):,} updates"]
     return ", ".join([*notes, *(f"{key} {value}" for key, value in sorted(header.items()))])

@@ -20,6 +20,7 @@ from hood.assets.library import motion_split
 from hood.assets.sequence import PoseSequence, load_sequence
 from hood.commands.batch import expand_sequences
 from hood.commands.candidates import digest, distinct, make_candidate
+from hood.commands.cautions import evaluation_cautions, warn
 from hood.commands.circumstances import circumstances
 from hood.commands.common import (
     output_folder,
@@ -33,6 +34,7 @@ from hood.commands.common import (
 from hood.commands.evaluation_files import report_spectrum, report_table
 from hood.commands.wardrobe import shape_coefficients
 from hood.config import ConfigError, build, load_config, plain, require_choice, save_run_record
+from hood.dynamics.ranges import Conditions, scene_conditions
 from hood.dynamics.reel import Reel
 from hood.dynamics.refine import METHODS
 from hood.evaluation.diary import Diary, Unit
@@ -43,6 +45,7 @@ from hood.evaluation.table import Candidate, GapSettings, Measured, candidate_ro
 from hood.losses.potential import Potential
 from hood.nn.compiled import KERNELS
 from hood.nn.precision import check_precision
+from hood.scene.cloth import build_cloth
 from hood.scene.scene import Scene, build_scene
 from hood.training import distributed
 
@@ -77,6 +80,8 @@ def _evaluate(config: DictConfig, overrides: Sequence[str]) -> int:
     folder = output_folder(config)
     plan = make_plan(config)
     distributed.on_main(lambda: _prepare(config, folder))
+    if distributed.rank() == 0:
+        warn(evaluation_cautions({one.name: one.stepper for one in plan.candidates}, plan.conditions()))
     diary = Diary(folder, distributed.rank())
     done = {key: item for part in distributed.gather(diary.read(plan.digests)) for key, item in part.items()}
     todo = [unit for unit in plan.units if unit not in done][: config.max_rollouts]
@@ -186,6 +191,18 @@ class Plan:
         if int(self.config.drift_frames):
             performed.append((STANDING, 0))
         return [Unit(m, g, *one) for m in range(len(self.candidates)) for g in self.garments for one in performed]
+
+    def conditions(self) -> dict[str, Conditions]:
+        """What every garment, on all bodies, asks of a model."""
+        config, potential, betas = self.config, build(self.config.losses), np.concatenate(self.shapes)
+        cloths = {
+            name: build_cloth(garment.rest_pos, garment.faces, build(config.material))
+            for name, garment in self.garments.items()
+        }
+        fps = float(config.fps)
+        return {
+            name: scene_conditions(self.garments[name], cloth, 1.0 / fps, potential, betas) for name, cloth in cloths.items()
+        }
 
     def scene(self, unit: Unit) -> Scene:
         """The scene of a rollout; the last one is kept, and so is its motion."""

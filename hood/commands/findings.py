@@ -23,6 +23,7 @@ from hood.assets.units import find_scale, size_ratio, used
 from hood.assets.unpickle import load_pickle
 from hood.commands.beside_mesh import place_beside_mesh
 from hood.commands.common import read_model
+from hood.dynamics import ranges
 from hood.dynamics.recorder import read_rollout
 from hood.dynamics.soundness import judge_rollout, worst_frame
 from hood.mesh.defects import Defects, find_defects
@@ -279,6 +280,7 @@ def inspect_checkpoint(name: str) -> Finding:
         "parameters": sum(parameter.numel() for parameter in simulator.parameters()),
         "message-passing steps": len(simulator.schedule),
         **{key: simulator.config[key] for key in ("features", "output", "latent_dim")},
+        **ranges.describe(simulator.trained_for),
     }
     return finding
 

@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 from hood.assets.library import locate
 from hood.commands.batch import Job, find_jobs, share
+from hood.commands.cautions import scene_cautions, warn
 from hood.commands.common import (
     UNTRAINED,
     output_folder,
@@ -85,6 +86,7 @@ def _run_heard(config: DictConfig, stepper: Stepper, digest: str, warned: list[s
     """The rollout of one motion; ``warned`` is what has been warned about when the summary is written."""
     scene = make_scene(config)
     stepper = refined(stepper, config, scene.cloth.num_vertices)
+    warn(scene_cautions(stepper, scene, build(config.losses), str(config.checkpoint)))
     folder = prepare_folder(output_folder(config))
     (folder / "summary.json").unlink(missing_ok=True)  # its presence says that everything is there
     save_run_record(folder, config, int(config.seed))

@@ -12,9 +12,11 @@ from safetensors.torch import save
 from torch import Tensor
 
 from hood.assets.atomic import write_atomically
+from hood.dynamics.ranges import Conditions
 from hood.dynamics.simulator import Simulator, build_simulator
 
 _FORMAT = "hood-1"
+_RANGES = "ranges"
 
 
 def save_simulator(path: Path, simulator: Simulator, metadata: Mapping[str, str] | None = None, half: bool = False) -> None:
@@ -31,12 +33,29 @@ def save_simulator(path: Path, simulator: Simulator, metadata: Mapping[str, str]
         if not bool(torch.isfinite(tensors[name]).all()):
             raise ValueError(f"{name}: a weight beyond the range of float16; keep this model in float32")
     tensors = {name: value.contiguous() for name, value in tensors.items()}
-    header = {"format": _FORMAT, "model": json.dumps(simulator.config), **(metadata or {})}
+    known = {} if simulator.trained_for is None else {_RANGES: simulator.trained_for.to_json()}
+    header = {"format": _FORMAT, "model": json.dumps(simulator.config), **known, **(metadata or {})}
     write_atomically(path, save(tensors, header))
 
 
+def record_ranges(path: Path, trained_for: Conditions) -> None:
+    """Write into a model file what it was trained for; its tensors stay as they are, to the bit.
+
+    Raises:
+        ValueError: not a file written by :func:`save_simulator`.
+    """
+    _read_file(path)
+    content = path.read_bytes()
+    begin = 8 + int.from_bytes(content[:8], "little")  # of the tensors, after the size of the header and the header
+    header = json.loads(content[8:begin])
+    header["__metadata__"][_RANGES] = trained_for.to_json()
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)  # the format's alignment
+    write_atomically(path, len(text).to_bytes(8, "little") + text + content[begin:])
+
+
 def read_header(path: Path) -> dict[str, str]:
-    """What a model file says about itself beside its weights: ``model``, and where it comes from.
+    """What a model file says about itself beside its weights: ``model``, ``ranges``, and where it comes from.
 
     Raises:
         ValueError: not a file written by :func:`save_simulator`.
@@ -52,6 +71,10 @@ def load_simulator(path: Path) -> Simulator:
     """
     tensors, header = _read_file(path)
     try:
+        trained_for = Conditions.from_json(header[_RANGES]) if _RANGES in header else None
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}; the file is damaged") from error
+    try:
         simulator = build_simulator(**json.loads(header["model"]))
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: names a model that this version cannot build ({error}); train it again") from error
@@ -64,6 +87,7 @@ def load_simulator(path: Path) -> Simulator:
     if wrong:
         raise ValueError(f"{path}: weights do not fit the model in the file, first at {sorted(wrong)[0]!r}; it is damaged")
     simulator.load_state_dict({name: value.to(expected[name].dtype) for name, value in tensors.items()})
+    simulator.trained_for = trained_for
     return simulator.eval()
 
 

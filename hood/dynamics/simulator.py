@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from hood.dynamics.frames import FrameRules
 from hood.dynamics.output import OUTPUTS, AccelerationOutput, LocalStepOutput, Output, VelocityBaseOutput
 from hood.dynamics.passes import Feedback, Passes
+from hood.dynamics.ranges import Conditions
 from hood.dynamics.stopwatch import Stopwatch, timed
 from hood.features import groups, local, physical
 from hood.features.inputs import Inputs
@@ -76,6 +77,7 @@ class Simulator(nn.Module):
         self._embedded_levels = embedded_levels
         self.config = config
         self.register_buffer("gravity", torch.tensor([0.0, -9.81, 0.0]), persistent=False)
+        self.trained_for: Conditions | None = None  # None: unknown
         self._potential = default_potential()
         self._wants_feedback = isinstance(output, LocalStepOutput)
         self._wants_residual = not self._wants_feedback and any(isinstance(group, physical.Residual) for group in features.node)
@@ -234,6 +236,7 @@ class Simulator(nn.Module):
         copy.network.use_precision(self.network.precision)
         copy.network.use_kernels(self.network.kernels)
         copy.use_potential(self._potential)
+        copy.trained_for = self.trained_for
         return copy.to(self.gravity.device)
 
     def _residual_acceleration(self, problem: StepProblem, base: Tensor) -> Tensor:

@@ -16,6 +16,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from hood.dynamics.checkpoint import save_simulator
 from hood.dynamics.output import AccelerationOutput
+from hood.dynamics.ranges import training_conditions
 from hood.dynamics.simulator import Simulator
 from hood.features.normalizer import RunningNormalizer
 from hood.losses.potential import Potential, relative_gradient, scale
@@ -62,6 +63,7 @@ class Trainer:
     ) -> None:
         settings = settings.compressed()
         simulator.use_potential(potential)
+        simulator.trained_for = training_conditions(sampler, settings.collision.apply(potential, settings.iterations))
         self.simulator, self.potential, self.settings = simulator, potential, settings
         self.folder, self.seed, self.watch = folder, seed, watch
         simulator.network.use_precision(settings.precision)

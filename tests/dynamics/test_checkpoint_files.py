@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import save_file
 from small_simulators import KINDS, make, take
 
-from hood.dynamics.checkpoint import load_simulator, save_simulator
+from hood.dynamics.checkpoint import load_simulator, read_header, record_ranges, save_simulator
+from hood.dynamics.ranges import Conditions
+from hood.losses.potential import default_potential
 from hood.scene.scene import Scene
 
 
@@ -62,6 +66,8 @@ def damaged(path: Path, case: str) -> Path:
         save_file(weights, path, {**header, "model": json.dumps({**simulator.config, "heads": 4})})
     elif case == "no model":
         save_file(weights, path, {"format": "hood-1"})
+    elif case == "ranges are no ranges":
+        save_file(weights, path, {**header, "ranges": "[30, 60]"})
     elif case == "model is no JSON":
         save_file(weights, path, {**header, "model": "small"})
     return path
@@ -71,7 +77,7 @@ def damaged(path: Path, case: str) -> Path:
     "case",
     [
         "cut", "empty", "text", "foreign", "missing weight", "wrong shape", "unknown option", "no model",
-        "model is no JSON",
+        "model is no JSON", "ranges are no ranges",
     ],
 )  # fmt: skip
 def test_damaged_and_foreign_files_are_refused_in_one_sentence(tmp_path: Path, case: str) -> None:
@@ -79,6 +85,35 @@ def test_damaged_and_foreign_files_are_refused_in_one_sentence(tmp_path: Path, c
     with pytest.raises(ValueError, match=r"m\.safetensors: ") as error:
         load_simulator(path)
     assert "\n" not in str(error.value)
+
+
+def test_ranges_travel_with_the_weights(tmp_path: Path) -> None:
+    trained_for = Conditions({"fps": (24.0, 30.0)}, default_potential().settings)
+    simulator = make("physical")
+    assert simulator.trained_for is None
+    save_simulator(tmp_path / "old.safetensors", simulator)
+    assert load_simulator(tmp_path / "old.safetensors").trained_for is None
+    simulator.trained_for = trained_for
+    save_simulator(tmp_path / "new.safetensors", simulator.clone(), half=True)
+    assert load_simulator(tmp_path / "new.safetensors").trained_for == trained_for
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_ranges_are_recorded_without_touching_the_tensors(half: bool, tmp_path: Path) -> None:
+    path, trained_for = tmp_path / "m.safetensors", Conditions({"fps": (24.0, 30.0)}, default_potential().settings)
+    save_simulator(path, make("paper"), {"iteration": "7"}, half=half)
+    with safe_open(path, "pt") as file:
+        before = {name: file.get_tensor(name) for name in file.keys()}
+    for ranges in (replace(trained_for, spans={}), trained_for):  # a second time they are replaced
+        record_ranges(path, ranges)
+    assert load_simulator(path).trained_for == trained_for
+    assert read_header(path)["iteration"] == "7"
+    with safe_open(path, "pt") as file:
+        assert set(file.keys()) == set(before)
+        assert all(
+            value.dtype == file.get_tensor(n).dtype and torch.equal(value, file.get_tensor(n)) for n, value in before.items()
+        )
+    assert [file.name for file in tmp_path.iterdir()] == ["m.safetensors"]
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from hood.assets.sequence import PoseSequence
 from hood.dynamics.checkpoint import load_simulator
 from hood.dynamics.output import AccelerationOutput
 from hood.dynamics.passes import Feedback
+from hood.dynamics.ranges import training_conditions
 from hood.dynamics.simulator import Simulator, build_simulator
 from hood.features.inputs import Inputs
 from hood.losses.potential import Potential, default_potential
@@ -92,6 +93,14 @@ def test_features_look_at_the_potential_that_is_trained(
         trainer.update()
     assert [one["collision"]["weight"] for one in looked_at] == [5e3, 5e3, 252500.0, 252500.0, 5e5, 5e5]
     assert {one["friction"]["coefficient"] for one in looked_at} == {3.0}
+
+
+def test_the_model_file_says_what_it_was_trained_for(tmp_path: Path, sampler: SceneSampler) -> None:
+    settings = replace(SETTINGS, collision=CollisionRamp(5e3, 4e5, 0, 2))
+    trainer = make(tmp_path, sampler, settings=settings, potential=default_potential(friction_coefficient=3.0))
+    trainer.save()
+    trained_for = load_simulator(tmp_path / "model.safetensors").trained_for
+    assert trained_for == training_conditions(sampler, default_potential(4e5, friction_coefficient=3.0))
 
 
 def test_the_loss_that_is_reported_is_the_one_that_is_trained(tmp_path: Path, sampler: SceneSampler) -> None:

@@ -1,0 +1,142 @@
+"""Values that a network was not trained for, and potentials that it does not look at, are named in one line."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from hood.assets.body import Body
+from hood.assets.garment import load_garment
+from hood.assets.library import locate
+from hood.assets.sequence import PoseSequence
+from hood.cli import main
+from hood.commands.cautions import evaluation_cautions, scene_cautions
+from hood.dynamics.checkpoint import load_simulator, save_simulator
+from hood.dynamics.goals import Count
+from hood.dynamics.ranges import Conditions, scene_conditions
+from hood.dynamics.refine import GuessStepper, RefinedStepper
+from hood.dynamics.simulator import Simulator, build_simulator
+from hood.losses.potential import default_potential
+from hood.scene.scene import Scene, build_scene
+from hood.solver.newton import NewtonSettings
+
+DEFAULT, ROUGH = default_potential(), default_potential(friction_coefficient=10.0)
+
+
+@pytest.fixture(scope="module")
+def quickstart() -> Simulator:
+    return load_simulator(locate("weights", "quickstart"))
+
+
+@pytest.fixture(scope="module")
+def paper() -> Simulator:
+    torch.manual_seed(0)
+    return build_simulator("paper", "acceleration", "1x(mesh)", latent_dim=8).eval()
+
+
+def refined(stepper: Simulator) -> RefinedStepper:
+    return RefinedStepper(stepper, DEFAULT, Count(1), "newton", NewtonSettings())
+
+
+def test_nothing_is_said_of_what_was_trained(quickstart: Simulator, tank_scene: Scene) -> None:
+    assert scene_cautions(quickstart, tank_scene, DEFAULT, "quickstart") == []
+
+
+@pytest.mark.parametrize("garment, count", [("dress_4k", "4,423"), ("dress_12k", "11,935")])
+def test_finer_garments_are_named_with_the_way_out(
+    garment: str, count: str, quickstart: Simulator, body: Body, walk: PoseSequence
+) -> None:
+    scene = build_scene(load_garment(garment), body, walk.window(0, 4))
+    (sentence,) = scene_cautions(quickstart, scene, DEFAULT, "quickstart")
+    assert sentence.startswith(
+        f"quickstart was not trained for garment vertices={count} (trained on 969 to 1,026), garment mean "
+    )
+    assert "stepper=newton" in sentence
+    assert "refine=10" in sentence
+    (sentence,) = scene_cautions(refined(quickstart), scene, DEFAULT, "quickstart")
+    assert "refine=" not in sentence
+    assert scene_cautions(GuessStepper(DEFAULT), scene, DEFAULT, "") == []
+
+
+def test_the_potential_of_a_network_that_looks_at_it(quickstart: Simulator, tank_scene: Scene) -> None:
+    (sentence,) = scene_cautions(quickstart, tank_scene, ROUGH, "quickstart")
+    assert sentence.startswith(
+        "quickstart was not trained for losses.terms.friction.coefficient=10 (trained on 0.5); the motion may be wrong"
+    )
+
+
+def test_the_potential_of_a_network_that_does_not(paper: Simulator, tank_scene: Scene) -> None:
+    assert scene_cautions(paper, tank_scene, DEFAULT, "old.pth") == []
+    (sentence,) = scene_cautions(paper, tank_scene, ROUGH, "old.pth")
+    assert sentence.startswith(
+        "losses.terms.friction.coefficient=10 (default 0.5) changes only what is measured, not the motion: old.pth does not"
+    )
+    (sentence,) = scene_cautions(refined(paper), tank_scene, ROUGH, "old.pth")
+    assert "changes only what is measured and how steps are refined, not what is predicted" in sentence
+
+
+def test_such_a_networks_own_potential_is_the_one_it_was_trained_with(paper: Simulator, tank_scene: Scene) -> None:
+    trained = paper.clone().eval()
+    trained.trained_for = scene_conditions(tank_scene.garment, tank_scene.cloth, tank_scene.dt, ROUGH)
+    assert scene_cautions(trained, tank_scene, ROUGH, "mine") == []
+    (sentence,) = scene_cautions(trained, tank_scene, DEFAULT, "mine")
+    assert sentence.startswith("losses.terms.friction.coefficient=0.5 (trained on 10) changes only what is measured")
+
+
+def test_an_evaluation_says_it_once(quickstart: Simulator, paper: Simulator, tank_scene: Scene) -> None:
+    tank = scene_conditions(tank_scene.garment, tank_scene.cloth, 1 / 60, DEFAULT)
+    fine = Conditions({**tank.spans, "vertices": (4e3, 4e3)}, tank.potential)
+    steppers = {"quickstart": quickstart, "copy": quickstart.clone(), "old": paper, "guess": GuessStepper(DEFAULT)}
+    (sentence,) = evaluation_cautions(steppers, {"tank": tank, "tank_4k": fine})
+    assert sentence.startswith(
+        "quickstart, copy: not trained for fps=60 (trained on 30); garment vertices=4,000 (trained on 969 to 1,026) of tank_4k;"
+    )
+    assert "stepper=newton" in sentence
+    rough = replace(tank, potential=ROUGH.settings)
+    assert [text.split(":")[0] for text in evaluation_cautions(steppers, {"tank": rough})] == ["quickstart, copy", "old"]
+
+
+def test_a_rollout_warns_once_and_writes_it_down(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    paper: Simulator,
+    tank_scene: Scene,
+) -> None:
+    known = paper.clone().eval()
+    known.trained_for = scene_conditions(tank_scene.garment, tank_scene.cloth, 1 / 30, DEFAULT)
+    save_simulator(tmp_path / "paper.safetensors", known)
+    quick = ["num_frames=2", "video=none", "sheet=false", "metrics=none", "allow_unsound=true", "garment=tank"]
+    quick += [f"checkpoint={tmp_path}/paper.safetensors", f"output={tmp_path}/out"]
+    (tmp_path / "list.txt").write_text("walk_proud\nplie\n")
+    monkeypatch.chdir(tmp_path)
+    for extra, expected in (([], []), (["fps=60", "sequence=list.txt"], ["fps=60 (trained on 30)"])):
+        assert main(["rollout", *quick, *extra]) == 0
+        lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("hood: warning: ")]
+        assert [re.findall(r"for (fps=\d+ \(trained on \d+\))", line)[0] for line in lines] == expected
+        folders = ["out/walk_proud", "out/plie"] if extra else ["out"]
+        for folder in folders:
+            warned = json.loads((tmp_path / folder / "summary.json").read_text())["warnings"]
+            assert [f"hood: warning: {text}" for text in warned] == lines
+
+
+def test_an_evaluation_warns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["models=[fine15]", "garments=[tank]", "num_frames=4", "gap_states=0", "fps=25", f"output={tmp_path}"]
+    assert main(["evaluate", *arguments]) == 0
+    assert "hood: warning: fine15: not trained for fps=25 (trained on 30);" in capsys.readouterr().err
+
+
+def test_inspect_prints_the_ranges(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["inspect", str(locate("weights", "quickstart"))]) == 0
+    shown = capsys.readouterr().out
+    for line in ("fps: 30", "betas: -2 to 2", "garment vertices: 969 to 1,026", "material.lame_mu: 15909 to 63636"):
+        assert f"  trained on {line}\n" in shown
+    torch.manual_seed(0)
+    save_simulator(tmp_path / "old.safetensors", build_simulator("paper", "acceleration", "1x(mesh)", latent_dim=8))
+    assert main(["inspect", str(tmp_path / "old.safetensors")]) == 0
+    assert "trained on: unknown" in capsys.readouterr().out
