@@ -12,7 +12,6 @@ from scipy.spatial import cKDTree
 
 from hood.assets.openings import find_openings
 from hood.assets.placement import surrounds
-from hood.assets.units import find_scale, used
 from hood.mesh import repair, topology
 
 #: A part is flat where its least extent is below this share of its greatest.
@@ -24,6 +23,8 @@ _TORN = 0.5
 _BODY_SIZE, _BODY_THICKNESS = 0.8, 0.02
 #: A mesh nearer than this [body heights] to this share of the body's vertices, head, hands and feet included, is the body.
 _ON_SKIN, _ALL_SKIN = 0.006, 0.95
+#: Metres per unit of the files that bodies come in.
+_UNITS = (1.0, 0.01, 0.001)
 #: A sheet farther from the skin than this [m] in the middle does not lie on the body at first.
 _FAR = 0.35
 
@@ -63,8 +64,9 @@ def suspect_kind(pos: np.ndarray, faces: np.ndarray, surface: np.ndarray) -> lis
         what = f"is flat: all {num} of its parts lie in planes, as sewing patterns do, and nobody can wear them"
         return [Suspicion(what, "sew and drape it where it was made, and export the draped garment", True)]
     height = float(np.ptp(surface, axis=0).max())
-    pos = pos * (find_scale(used(pos, faces), surface) or 1.0)
-    size = float(np.ptp(pos, axis=0).max())
+    size = float(np.ptp(pos[np.unique(faces)], axis=0).max())
+    factor = min(_UNITS, key=lambda unit: abs(np.log(max(unit * size, 1e-12) / height)))  # a body is as large as a body
+    pos, size = factor * pos, factor * size
     if size < _BODY_SIZE * height:
         return []
     closed = 2 * len(topology.unique_edges(faces)) == 3 * len(faces)
