@@ -122,7 +122,10 @@ def _apart(mesh: _Triangles, pairs: np.ndarray) -> np.ndarray:
     """Pairs of different triangles, each once, without a common vertex."""
     pairs = pairs[pairs[:, 0] < pairs[:, 1]]
     a, b = mesh.faces[pairs[:, 0]], mesh.faces[pairs[:, 1]]
-    shared = (a[:, :, None] == b[:, None, :]).any(axis=(1, 2))
+    shared = np.zeros(len(pairs), dtype=bool)
+    for corner in a.T:
+        for other in b.T:
+            shared |= corner == other
     return pairs[~shared]
 
 
@@ -185,4 +188,10 @@ def _edges(faces: np.ndarray, through: np.ndarray, hits: np.ndarray) -> np.ndarr
 
 def _collect(parts: Iterator[Crossings]) -> Crossings:
     empty = Crossings(np.empty((0, 2), dtype=np.int64), *(np.empty((0, 3), dtype=np.int64) for _ in range(2)))
-    return Crossings(*(np.unique(np.concatenate(group), axis=0) for group in zip(empty, *parts, strict=True)))
+    return Crossings(*(_unique_rows(np.concatenate(group)) for group in zip(empty, *parts, strict=True)))
+
+
+def _unique_rows(rows: np.ndarray) -> np.ndarray:
+    """Sorted, each once; several times as fast as :func:`numpy.unique` by rows."""
+    rows = rows[np.lexsort(rows.T[::-1])]
+    return rows[np.r_[True, (rows[1:] != rows[:-1]).any(axis=1)][: len(rows)]]

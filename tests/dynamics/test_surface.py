@@ -57,6 +57,13 @@ def test_nothing_is_said_about_frames_that_are_not_finite() -> None:
     assert all(np.isnan(value) for value in meter(TUBE, np.full_like(BALL, np.nan)).values())
 
 
+def test_nothing_is_said_about_tatters() -> None:
+    """A blown-up garment, which would take minutes; stretched to twice its size it is measured."""
+    meter = SurfaceMeter(tube("tube"), BALL_FACES)
+    assert meter(2 * TUBE, BALL + 2 * TUBE.mean(axis=0))["cut_face_share"] == 0.0
+    assert all(np.isnan(value) for value in meter(4 * TUBE, BALL).values())
+
+
 def test_rollouts_measure_at_a_stride_first_and_last(band_scene: Scene) -> None:
     stepper = NewtonStepper(default_potential(), NewtonSettings(max_iterations=1))
     frames = list(simulate(stepper, band_scene, default_potential(), 6, relaxing_steps=0, surface_stride=2))
