@@ -35,7 +35,7 @@ def describe_surface(surface: Mapping[str, Any] | None) -> list[str]:
     cut, depth, stride = surface["cut_face_share"], surface["skin_depth_m"], surface["stride"]
     every = "" if stride is None else " (every frame)" if stride == 1 else f" (one frame in {stride}, first and last)"
     crossed = [
-        f"{surface[key]['mean']:.1f} pairs of triangles of {what} pass through each other"
+        f"{surface[key]['mean']:.1f} pairs of triangles of {what} pass through each other on average"
         for key, what in (("self_crossings", "one garment"), ("garment_crossings", "two garments"))
         if surface[key]["worst"] > 0
     ]

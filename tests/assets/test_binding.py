@@ -148,6 +148,8 @@ def test_an_outfit_is_its_parts(garments: dict[str, Garment], body: Body) -> Non
     assert outfit.uv_faces.max() < len(outfit.uv)
     assert outfit.pinned[start : start + len(skirt.rest_pos)].sum() == skirt.pinned.sum()
     np.testing.assert_array_equal(outfit.colours[:start], 1.0)
+    np.testing.assert_array_equal(outfit.piece, np.repeat([0, 1, 2], [start, len(skirt.rest_pos), start]))
+    np.testing.assert_array_equal(join_garments([plain, outfit]).piece[len(skirt.rest_pos) :], outfit.piece + 1)
     assert join_garments([top]) is top
     assert not join_garments([top, bare(skirt)]).bound
 

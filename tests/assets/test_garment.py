@@ -43,9 +43,11 @@ def test_shape_offsets_follow_the_body(garments: dict[str, Garment], body: Body)
 
 
 def test_npz_round_trip(tmp_path: Path, arrays: dict[str, np.ndarray]) -> None:
-    np.savez(tmp_path / "rag.npz", **arrays)
+    piece = np.arange(len(arrays["rest_pos"])) % 2
+    np.savez(tmp_path / "rag.npz", **arrays, piece=piece)
     garment = load_garment(tmp_path / "rag.npz")
     assert garment.name == "rag"
+    np.testing.assert_array_equal(garment.piece, piece)
     assert not garment.bound
     assert not garment.pinned.any()
     np.testing.assert_array_equal(garment.faces, arrays["faces"])
