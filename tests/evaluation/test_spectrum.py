@@ -132,7 +132,7 @@ def test_a_minimisation_that_stops_early_is_flagged(problem: StepProblem, bands:
     wild = problem.state.pos + wave(problem, 5)
     found = error_spectrum(default_potential(), problem, wild, bands, replace(EXACT, max_iterations=0))
     assert found["converged"] == 0.0
-    assert max(found["rms"]) == 0.0
+    assert max(found["rms"]) < 1e-15  # nothing moved; coordinates are rounded to 5e-17 m
 
 
 SPECTRA = [
