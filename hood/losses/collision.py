@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from hood.losses.problem import StepProblem
-from hood.scene.contact import CentroidContact, find_centroid_contact
+from hood.scene.contact import CentroidContact, LaggedContact, find_centroid_contact, find_lagged_contact
 
 
 class Planes(NamedTuple):
@@ -77,25 +77,67 @@ class CentroidCollision(Collision):
     (:class:`hood.scene.contact.CentroidContact`). A facet's plane jumps from face to face, the nearest centroid need
     not belong to the nearest face, and a plane found far away cuts through cloth beside the body: the default
     uses the closest point of the surface within a cap. For comparisons with that code only.
+
+    Args:
+        lagged: the body one frame behind, as the code of the ``cvpr`` weights has it: the face nearest at t - 1, its plane at
+            t. That of the ``postcvpr`` weights has the face nearest at t and its plane at t + 1.
     """
+
+    def __init__(self, weight: float = 5e5, epsilon: float = 2e-3, lagged: bool = False) -> None:
+        super().__init__(weight, epsilon)
+        self.lagged = lagged
+
+    def with_weight(self, weight: float) -> CentroidCollision:
+        """The same term with another weight, for a ramp during training."""
+        return type(self)(weight, self.epsilon, self.lagged)
 
     def prepare(self, problem: StepProblem) -> StepProblem:
         """The problem with the centroid search done, once per step."""
-        problem = super().prepare(problem)
-        if problem.contact is None or isinstance(problem.contact, CentroidContact):
-            return problem
-        obstacle = problem.step.obstacle
-        if obstacle is None:
-            raise ValueError("collision with centroids: the step has contact data but no obstacle; give StepInput.obstacle")
-        contact = find_centroid_contact(problem.contact, problem.state.pos, problem.cloth.vertex_scene, obstacle)
-        return replace(problem, contact=contact)
+        return with_lagged_centroids(problem) if self.lagged else with_centroids(problem)
 
     def planes(self, problem: StepProblem) -> Planes:
         """The planes that d is measured from; the problem must have been prepared."""
         contact = problem.contact
+        if self.lagged:
+            contact = lagged_contact(problem)
+            return _planes(problem, contact.lagged_facing, contact.lagged_centroid, contact.lagged_normal)
         if not isinstance(contact, CentroidContact):
             raise ValueError("collision with centroids: not searched for yet; pass the problem through Potential.prepare once")
         return _planes(problem, contact.facing, contact.next_centroid, contact.next_face_normal)
+
+
+def with_centroids(problem: StepProblem) -> StepProblem:
+    """The problem with the nearest face centroids of the body at t searched for; itself where that is done, or without a
+    body."""
+    problem = problem.with_contact()
+    if problem.contact is None or isinstance(problem.contact, CentroidContact):
+        return problem
+    obstacle = problem.step.obstacle
+    if obstacle is None:
+        raise ValueError("collision with centroids: the step has contact data but no obstacle; give StepInput.obstacle")
+    contact = find_centroid_contact(problem.contact, problem.state.pos, problem.cloth.vertex_scene, obstacle)
+    return replace(problem, contact=contact)
+
+
+def with_lagged_centroids(problem: StepProblem) -> StepProblem:
+    """The same, and those of the body at t - 1."""
+    problem = with_centroids(problem)
+    contact, obstacle = problem.contact, problem.step.obstacle
+    if not isinstance(contact, CentroidContact) or isinstance(contact, LaggedContact):
+        return problem
+    assert obstacle is not None
+    return replace(problem, contact=find_lagged_contact(contact, problem.state.pos, problem.cloth.vertex_scene, obstacle))
+
+
+def lagged_contact(problem: StepProblem) -> LaggedContact:
+    """The contact of a problem that :func:`with_lagged_centroids` has made.
+
+    Raises:
+        ValueError: nobody searched the body at t - 1.
+    """
+    if not isinstance(problem.contact, LaggedContact):
+        raise ValueError("contact one frame back: not searched for yet; pass the problem through Potential.prepare once")
+    return problem.contact
 
 
 def _planes(problem: StepProblem, valid: Tensor, point: Tensor, normal: Tensor) -> Planes:

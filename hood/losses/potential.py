@@ -11,7 +11,7 @@ from torch import Tensor
 from hood.losses.attachment import Attachment
 from hood.losses.bending import Bending, CurrentLengthBending
 from hood.losses.collision import CentroidCollision, Collision
-from hood.losses.friction import Friction, WeightFriction
+from hood.losses.friction import CodedFriction, Friction, WeightFriction
 from hood.losses.gravity import Gravity
 from hood.losses.inertia import Inertia
 from hood.losses.problem import STANDARD_GRAVITY, StepProblem, sum_per_scene
@@ -138,11 +138,29 @@ def reference_potential(
     friction_radius: float = 3e-3,
     attachment_stiffness: float = 1e3,
 ) -> Potential:
-    """The energies of HOOD's published code, where they differ from :func:`default_potential`: for comparisons."""
+    """The energies of HOOD's published code as they are meant, where they differ from :func:`default_potential`: for
+    comparisons. Its friction computes something else, see :func:`coded_potential`."""
     return default_potential(collision_weight, collision_epsilon, attachment_stiffness=attachment_stiffness).with_terms(
         bending=CurrentLengthBending(),
         collision=CentroidCollision(collision_weight, collision_epsilon),
         friction=WeightFriction(friction_coefficient, friction_slip_speed, friction_radius),
+    )
+
+
+def coded_potential(
+    collision_weight: float = 5e5,
+    collision_epsilon: float = 2e-3,
+    collision_lagged: bool = False,
+    friction_coefficient: float = 0.5,
+    friction_slip_speed: float = 5e-3,
+    friction_radius: float = 3e-3,
+    attachment_stiffness: float = 1e3,
+) -> Potential:
+    """The energies that HOOD's published code computes: :func:`reference_potential` with its friction as coded, and with
+    ``collision_lagged`` its ``cvpr`` collision."""
+    return reference_potential(attachment_stiffness=attachment_stiffness).with_terms(
+        collision=CentroidCollision(collision_weight, collision_epsilon, collision_lagged),
+        friction=CodedFriction(friction_coefficient, friction_slip_speed, friction_radius),
     )
 
 

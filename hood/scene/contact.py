@@ -120,6 +120,40 @@ def find_centroid_contact(contact: Contact, pos: Tensor, vertex_scene: Tensor, o
     )
 
 
+@dataclass(frozen=True)
+class LaggedContact(CentroidContact):
+    """Contact that also knows the nearest face centroid on the body at t - 1, and where that face is at t.
+
+    Terms of HOOD's published code that look one frame back read it. In the first frame of a motion and in a relaxing step
+    with a still body t - 1 is t.
+    """
+
+    lagged_facing: Tensor  # (V,) bool
+    lagged_dist: Tensor  # (V,) m, from x_t to the centroid at t - 1
+    lagged_centroid: Tensor  # (V, 3) m, the same centroid at t
+    lagged_motion: Tensor  # (V, 3) m, of the centroid from t - 1 to t
+    lagged_normal: Tensor  # (V, 3) the face's outward unit normal at t
+
+
+def find_lagged_contact(contact: CentroidContact, pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle) -> LaggedContact:
+    """``contact`` of the positions ``pos`` (V, 3) at t, extended by a search among the centroids of the body at t - 1."""
+    face, dist = nearest_centroids(pos, vertex_scene, obstacle.prev_pos, obstacle.faces, obstacle.face_scene)
+    matched = torch.isfinite(dist)
+    if len(obstacle.faces) == 0:
+        nowhere = torch.zeros_like(pos)
+        return LaggedContact(
+            **vars(contact), lagged_facing=matched, lagged_dist=dist, lagged_centroid=nowhere, lagged_motion=nowhere,
+            lagged_normal=nowhere,
+        )  # fmt: skip
+    corners = obstacle.faces[face]
+    centroid, before = obstacle.pos[corners].mean(dim=1), obstacle.prev_pos[corners].mean(dim=1)
+    normal = geometry.face_normals(obstacle.pos, corners)
+    return LaggedContact(
+        **vars(contact), lagged_facing=matched & normal.any(dim=1), lagged_dist=dist, lagged_centroid=centroid,
+        lagged_motion=centroid - before, lagged_normal=normal,
+    )  # fmt: skip
+
+
 def _weigh(bary: Tensor, corner_values: Tensor) -> Tensor:
     return (bary.unsqueeze(-1) * corner_values).sum(dim=1)
 

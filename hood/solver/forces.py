@@ -9,7 +9,7 @@ from torch import Tensor
 
 from hood.losses.attachment import Attachment
 from hood.losses.collision import CentroidCollision, Collision
-from hood.losses.friction import Friction, LaggedFriction, WeightFriction, mollified_norm
+from hood.losses.friction import CodedFriction, Friction, LaggedFriction, WeightFriction, mollified_norm
 from hood.losses.gravity import Gravity
 from hood.losses.inertia import Inertia
 from hood.losses.potential import Potential, Term
@@ -18,7 +18,7 @@ from hood.losses.stretching import Stretching
 from hood.solver.elements import BENDINGS
 
 COLLISIONS = (Collision, CentroidCollision)
-FRICTIONS = (Friction, WeightFriction)
+FRICTIONS = (Friction, WeightFriction, CodedFriction)
 #: Terms whose derivatives are written out. A subclass may compute something else and does not count.
 CLOSED_FORM = (Stretching, *BENDINGS, Attachment, Inertia, Gravity, *COLLISIONS, *FRICTIONS)
 
@@ -149,9 +149,10 @@ def _grip(term: LaggedFriction, problem: StepProblem) -> Grip:
     force = term.coefficient * term.normal_force(problem, contact)
     # Rows without a match may hold infinite or undefined numbers.
     sliding = (force > 0)[:, None]
-    anchor = problem.state.pos + torch.where(sliding, contact.next_point - contact.point, 0.0)
+    carried, normal = term.carrier(contact)
+    anchor = problem.state.pos + torch.where(sliding, carried, 0.0)
     limit = term.slip_speed * problem.vertex_dt.squeeze(1)
-    return Grip(force, torch.where(sliding, contact.next_normal, 0.0), anchor, limit)
+    return Grip(force, torch.where(sliding, normal, 0.0), anchor, limit)
 
 
 def _friction(grip: Grip, pos: Tensor) -> tuple[Tensor, Tensor, Tensor]:
