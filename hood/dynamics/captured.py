@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from hood.dynamics.fixed_step import FixedStep, StepResult, check_model, step_inputs, step_shape
+from hood.dynamics.frames import Relaxing
 from hood.dynamics.refine import unrefined
 from hood.dynamics.simulator import Prediction, Prepared, Simulator
 from hood.dynamics.stepper import Stepper
@@ -75,8 +76,8 @@ class CapturedSimulator:
         self._plans: dict[Any, _Plan] = {}
 
     @property
-    def keeps_relaxing_step(self) -> bool:
-        return self.simulator.keeps_relaxing_step
+    def relaxing(self) -> Relaxing:
+        return self.simulator.relaxing
 
     def prepare(self, cloth: Cloth, rest_pos: Any) -> Prepared:
         """As :meth:`hood.dynamics.simulator.Simulator.prepare`."""

@@ -6,6 +6,7 @@ The defaults change nothing: a step lasts its dt, pinned vertices are where they
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from enum import Enum
 
 import torch
 from torch import Tensor
@@ -17,17 +18,30 @@ from hood.scene.state import State
 VELOCITIES = ("displacement", "carried")
 
 
+class Relaxing(Enum):
+    """What a rollout makes of the relaxing first step, the one that is told a dt of 1/3 s."""
+
+    #: The body stands still in frame 0. The step is taken only where it helps; frame 0 has the skinned garment's velocity.
+    SETTLE = "settle"
+    #: The body stands still in frame 0. The rollout goes on from the step as it is, its displacement included: that is the
+    #: velocity of frame 0.
+    CARRY = "carry"
+    #: The body moves: the step leads from frame 0, at rest, to frame 1. There the cloth is at rest again.
+    RESTART = "restart"
+
+
 @dataclass(frozen=True)
 class FrameRules:
     """Conventions of a model about time, pinned vertices and velocities.
 
     Args:
         frame_dt: [s] a step is one frame of this length whatever its dt: velocities and accelerations are displacements per
-            frame. dt is then the timestep feature alone, and the velocity of the relaxing first step goes on into the
-            rollout. None: a step lasts its dt.
+            frame, and dt is the timestep feature alone. None: a step lasts its dt.
         pins_ahead: pinned vertices stand at their targets, the positions at t + 1, when the graph is built.
         velocity: ``displacement`` x_t − x_{t−1}, of pinned vertices that stand ahead the motion to their targets; or
             ``carried``, the velocity the last step predicted, which is 0 for pinned vertices.
+
+    The two also say what becomes of the relaxing step, see :attr:`relaxing`.
     """
 
     frame_dt: float | None = None
@@ -39,6 +53,18 @@ class FrameRules:
             raise ValueError(f"model.frame_dt is {self.frame_dt!r}; it must be > 0, or null for steps that last their dt")
         if self.velocity not in VELOCITIES:
             raise ValueError(f"model.velocity is {self.velocity!r}; choose {' or '.join(VELOCITIES)}")
+
+    @property
+    def relaxing(self) -> Relaxing:
+        """What a rollout makes of the relaxing step.
+
+        Models in frames were trained with either of two loops. One that carries velocities (postcvpr) holds the body still
+        during the step and carries its displacement on. One that takes differences of positions (cvpr, Fine15, Fine48) lets
+        the body move, and drops the displacement, which 1/3 s of a step says nothing about.
+        """
+        if self.frame_dt is None:
+            return Relaxing.SETTLE
+        return Relaxing.CARRY if self.velocity == "carried" else Relaxing.RESTART
 
     def enter(self, problem: StepProblem) -> StepProblem:
         """The step as the network sees it."""
@@ -65,11 +91,15 @@ class FrameRules:
         return (displacement + (self.frame_dt - dt) * problem.state.vel) / dt**2
 
     def next_velocity(self, problem: StepProblem, acc: Tensor) -> Tensor:
-        """(V, 3) m/s at t + 1 of a step with acceleration ``acc``: (x_{t+1} − x_t) over the duration of the step."""
+        """(V, 3) m/s at t + 1 of a step with acceleration ``acc``: (x_{t+1} − x_t) over the duration of the step; 0 after a
+        relaxing step from which the model restarts."""
         dt = problem.vertex_dt
         vel = problem.state.vel + dt * acc
         if self.frame_dt is not None:
             vel = vel * (dt / torch.full_like(dt, self.frame_dt))
+            if self.relaxing is Relaxing.RESTART:
+                relaxed = (dt - RELAXING_DT).abs() < (dt - self.frame_dt).abs()
+                vel = torch.where(relaxed, 0.0, vel)
         return torch.where(problem.cloth.pinned.unsqueeze(1), 0.0, vel) if self.velocity == "carried" else vel
 
 

@@ -2,7 +2,8 @@
 
 Four files exist: ``postcvpr`` (the authors' later training), ``cvpr`` (the paper's), and the paper's single-level baselines
 ``fine15`` and ``fine48``. The function computed is that of the reference implementation: the same features in the same
-units, the same networks, the same treatment of pinned vertices and velocities.
+units, the same networks, the same treatment of pinned vertices, velocities and the relaxing first step
+(:class:`hood.dynamics.frames.Relaxing`).
 """
 
 from __future__ import annotations

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from hood.dynamics.frames import Relaxing
 from hood.dynamics.goals import Goal, Standing
 from hood.dynamics.simulator import Prediction
 from hood.dynamics.stepper import Stepper
@@ -35,7 +36,7 @@ class GuessStepper:
 
     times: tuple[str, ...] = ("search", "guess", "rest", "total")
     metrics: tuple[str, ...] = ()
-    keeps_relaxing_step = False
+    relaxing = Relaxing.SETTLE
 
     def __init__(self, potential: Potential) -> None:
         self.potential = potential
@@ -101,8 +102,8 @@ class RefinedStepper:
         self.times: tuple[str, ...] = (*dict.fromkeys([*parts, "search"]), "refine", "rest", "total")
 
     @property
-    def keeps_relaxing_step(self) -> bool:
-        return self.inner.keeps_relaxing_step
+    def relaxing(self) -> Relaxing:
+        return self.inner.relaxing
 
     def prepare(self, cloth: Cloth, rest_pos: Any) -> Any:
         """What the inner stepper computes once per cloth."""
@@ -126,7 +127,7 @@ class RefinedStepper:
         with timed(watch, "search"):
             problem = self.search(problem)
         prediction = self.inner.predict(problem, prepared, watch)
-        if self.keeps_relaxing_step and bool(((problem.step.dt - RELAXING_DT).abs() < 1e-6).all()):
+        if self.relaxing is Relaxing.CARRY and bool(((problem.step.dt - RELAXING_DT).abs() < 1e-6).all()):
             # Such models turn the way that they went into a velocity: a refined one would be a blow.
             return prediction
         with timed(watch, "refine"):

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from hood.dynamics.captured import network_of
+from hood.dynamics.frames import Relaxing
 from hood.dynamics.measure import (
     PENETRATION_METRICS,
     STRAIN_METRICS,
@@ -26,7 +27,7 @@ from hood.graph.given import given_hierarchy
 from hood.losses.potential import Potential, relative_gradient, scale
 from hood.losses.problem import StepProblem, inertial_guess
 from hood.scene.contact import Contact, find_contact
-from hood.scene.scene import Scene, recentre
+from hood.scene.scene import RELAXING_DT, Scene, recentre
 from hood.scene.start import free_stretch, push_out
 from hood.scene.state import Attachments, State
 
@@ -92,8 +93,10 @@ def simulate(
     """Frames 0, 1, … of the garment on the moving body.
 
     Frame 0 is the settled start after ``relaxing_steps`` relaxing steps (paper, section 3.4), vertices pushed out of the
-    body. A frame's energies belong to the step that led to it, as do its times. The simulation goes on over non-finite
-    frames, so that their number and place are seen. ``observe`` sees every step outside its time.
+    body. Where the stepper restarts from the relaxing step (:class:`hood.dynamics.frames.Relaxing`), the last one leads from
+    frame 0 to frame 1 instead. The cloth of a frame always belongs to the body of the same frame. A frame's energies belong
+    to the step that led to it, as do its times. The simulation goes on over non-finite frames, so that their number and
+    place are seen. ``observe`` sees every step from frame to frame, outside its time.
 
     ``metrics`` is one of :data:`METRIC_CHOICES`. What only they need to know, contact included, is no part of the step and
     changes nothing about it; its time is ``ms_metrics``, which ``ms_total`` leaves out as it does the caller's work. The same
@@ -119,6 +122,7 @@ def simulate(
         network.use_potential(potential)
     prepared = prepare_stepper(stepper, scene)
     state = start_state(stepper, scene, potential, relaxing_steps, start_frame)
+    relaxing = relaxing_steps > 0 and stepper.relaxing is Relaxing.RESTART
     stepped: dict[str, float] = {}
     known_fields = {name: torch.full((scene.cloth.num_vertices,), torch.nan) for name in fields}
     wants_potential = metrics == "all" or bool(fields)
@@ -132,6 +136,8 @@ def simulate(
             with watch.part("posing"):
                 closed = None if attachments is None else attachments(index)
                 step = scene.step_input(body_frame, state, attachments=closed)
+                if relaxing and index == 0:
+                    step = replace(step, dt=torch.full_like(step.dt, RELAXING_DT))
                 problem = StepProblem(scene.cloth, state, step, gravity=stepper.gravity.to(state.pos))
             with watch.part("search"):
                 problem = stepper.search(problem)
@@ -193,16 +199,20 @@ def start_state(stepper: Stepper, scene: Scene, potential: Potential, relaxing_s
     """Settled, relaxed start: the relaxing step is kept only where it lowers the potential of its own problem and leaves no
     edge stretched by more than a tenth that was not before.
 
-    A stepper with ``keeps_relaxing_step`` goes on from it as it left it, with its positions and its velocity.
+    Steppers that carry on or restart from it (:class:`hood.dynamics.frames.Relaxing`) get its positions as they are, and the
+    velocity of their own rule. Those that restart take the last of the relaxing steps on the way to the next frame: it is not
+    taken here, and the start is at rest.
     """
     state = scene.start(frame, relaxed=False, thorough=True)
     prepared = prepare_stepper(stepper, scene)
     velocity = scene.start_velocity(frame)
+    if stepper.relaxing is Relaxing.RESTART and relaxing_steps > 0:
+        velocity, relaxing_steps = torch.zeros_like(velocity), relaxing_steps - 1
     for _ in range(relaxing_steps):
         step = scene.step_input(frame, state, relaxing=True)
         problem = stepper.search(StepProblem(scene.cloth, state, step, gravity=stepper.gravity.to(state.pos)))
         prediction = stepper.predict(problem, prepared)
-        if stepper.keeps_relaxing_step:
+        if stepper.relaxing is not Relaxing.SETTLE:
             state = State(prediction.next_pos, state.vel, state.origin)
             velocity = stepper.next_velocity(problem, prediction)
             continue

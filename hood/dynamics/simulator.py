@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from hood.dynamics.frames import FrameRules
+from hood.dynamics.frames import FrameRules, Relaxing
 from hood.dynamics.output import OUTPUTS, AccelerationOutput, LocalStepOutput, Output, VelocityBaseOutput
 from hood.dynamics.passes import Feedback, Passes
 from hood.dynamics.ranges import Conditions
@@ -122,9 +122,9 @@ class Simulator(nn.Module):
         return isinstance(self.output, AccelerationOutput) or self.features.node_normalizer is not None
 
     @property
-    def keeps_relaxing_step(self) -> bool:
-        """Models that count in frames (:class:`hood.dynamics.frames.FrameRules`) go on from it as they left it."""
-        return self.rules.frame_dt is not None
+    def relaxing(self) -> Relaxing:
+        """What a rollout makes of the relaxing step."""
+        return self.rules.relaxing
 
     @property
     def velocity_columns(self) -> slice:

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from hood.dynamics.frames import Relaxing
 from hood.dynamics.simulator import Prediction
 from hood.dynamics.stopwatch import Stopwatch, timed
 from hood.losses.potential import Potential
@@ -25,8 +26,8 @@ class Stepper(Protocol):
     metrics: tuple[str, ...]  # names of the entries of ``Prediction.metrics``
 
     @property
-    def keeps_relaxing_step(self) -> bool:
-        """Whether a rollout goes on from the relaxing step as it is, velocity included."""
+    def relaxing(self) -> Relaxing:
+        """What a rollout makes of the relaxing step."""
         ...
 
     def prepare(self, cloth: Cloth, rest_pos: Any) -> Any:
@@ -54,7 +55,7 @@ class NewtonStepper:
 
     times: tuple[str, ...] = ("search", "solver", "rest", "total")
     metrics: tuple[str, ...] = ("solver_iterations", "solver_converged")
-    keeps_relaxing_step = False
+    relaxing = Relaxing.SETTLE
 
     def __init__(self, potential: Potential, settings: NewtonSettings | None = None) -> None:
         self.potential, self.settings = potential, settings or NewtonSettings()

@@ -257,22 +257,28 @@ class Oracle:
     def rollout(
         self, scene: OracleScene, start: Tensor, body: list[Tensor], targets: list[Tensor], held: Tensor
     ) -> Iterator[tuple[Tensor, Tensor]]:
-        """Accelerations and positions: one relaxing step at frame 0 (static body, no velocity), then frames 0, 1, ….
+        """Accelerations and positions of one relaxing step, from rest, and of the regular ones that follow, as far as the
+        body goes.
+
+        postcvpr holds the body still in frame 0 while the cloth relaxes, then goes 0 → 1, 1 → 2, …, and carries the velocity
+        of every step into the next. The other three take body and pins from 0 to 1 in the relaxing step, then go 1 → 2,
+        2 → 3, …; after the relaxing step the position before is set to the present one, so that the velocity is 0.
 
         ``body`` and ``targets`` by frame; vertices ``held`` (V,) bool are massless and stay.
         """
+        still = self.layout == "postcvpr"
+        frames = [(0, 0), *((t, t + 1) for t in range(len(body) - 1))] if still else [(t, t + 1) for t in range(len(body) - 1)]
         x, before, carried = start, start, None
-        for step in range(len(body)):
-            relaxing = step == 0
-            frame = max(step - 1, 0)
-            now, after = body[frame], body[frame] if relaxing else body[frame + 1]
-            target = targets[frame] if relaxing else targets[frame + 1]
-            inputs = OracleStep(x, before, carried, target, body[max(frame - 1, 0)], now, after, 1 / 3 if relaxing else 1 / 30)
+        for step, (now, after) in enumerate(frames):
+            timestep, target = 1 / 30 if step else 1 / 3, targets[after]
+            inputs = OracleStep(x, before, carried, target, body[max(now - 1, 0)], body[now], body[after], timestep)
             acceleration, following, carried = self.predict(scene, inputs)
             following = torch.where(held[:, None], x, following)
             carried = torch.where(held[:, None], 0.0, carried)
             # The pinned vertices' position before the step is the one they were moved to.
             before = torch.where(torch.as_tensor(scene.pinned)[:, None], target, x)
+            if step == 0 and not still:
+                before = following
             x = following
             yield acceleration, following
 

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from hood.assets.material import Material
-from hood.dynamics.frames import FrameRules
-from hood.dynamics.rollout import start_state
-from hood.dynamics.simulator import Simulator, build_simulator
+from hood.dynamics.frames import FrameRules, Relaxing
+from hood.dynamics.rollout import simulate, start_state
+from hood.dynamics.simulator import Prediction, Simulator, build_simulator
 from hood.losses.potential import default_potential
 from hood.losses.problem import StepProblem
 from hood.scene.cloth import build_cloth
@@ -67,14 +67,39 @@ def test_pinned_vertices_stand_at_their_targets() -> None:
 @pytest.mark.parametrize("dt", [DT, 1 / 3])
 def test_a_step_in_frames_lasts_a_frame_whatever_its_dt(dt: float) -> None:
     """x_{t+1} − x_t = (v + a) frames, and that is the next velocity; the acceleration still is that of the step's own dt."""
-    problem, rules = make_problem(dt), FrameRules(frame_dt=DT)
+    problem, rules = make_problem(dt), FrameRules(frame_dt=DT, velocity="carried")
     seen = rules.enter(problem)
     assert seen.vertex_dt.unique().item() == pytest.approx(DT)
     displacement = torch.full_like(problem.state.pos, 3e-3)
     acc = rules.acceleration(problem, displacement)
     moved = problem.state.vel * DT + displacement
     torch.testing.assert_close(problem.vertex_dt * problem.state.vel + problem.vertex_dt**2 * acc, moved)
-    torch.testing.assert_close(rules.next_velocity(problem, acc) * DT, moved)
+    expected = torch.where(problem.cloth.pinned.unsqueeze(1), 0.0, moved)
+    torch.testing.assert_close(rules.next_velocity(problem, acc) * DT, expected)
+
+
+def test_differences_of_positions_drop_the_relaxing_displacement() -> None:
+    """The velocity after the relaxing step is 0, in its scene alone; the displacement itself stays."""
+    rules, acc = FrameRules(frame_dt=DT), torch.ones(25, 3).double()
+    relaxed, regular = (rules.next_velocity(make_problem(dt), acc) for dt in (1 / 3, DT))
+    assert not bool(relaxed.any())
+    torch.testing.assert_close(regular, 1 + DT * acc)
+    slow = FrameRules(frame_dt=1 / 3)  # frames as long as a relaxing step: nothing tells them apart, and nothing is dropped
+    assert bool(slow.next_velocity(make_problem(1 / 3), acc).all())
+
+
+@pytest.mark.parametrize(
+    "options, relaxing",
+    [
+        ({}, Relaxing.SETTLE),
+        ({"velocity": "carried"}, Relaxing.SETTLE),
+        ({"frame_dt": DT, "velocity": "carried"}, Relaxing.CARRY),
+        ({"frame_dt": DT}, Relaxing.RESTART),
+    ],
+)
+def test_what_becomes_of_the_relaxing_step(options: dict, relaxing: Relaxing) -> None:
+    assert FrameRules(**options).relaxing is relaxing
+    assert tiny(**options).relaxing is relaxing
 
 
 def test_another_frame_rate_is_refused() -> None:
@@ -115,6 +140,35 @@ def test_the_relaxing_step_of_a_model_in_frames_is_kept(skirt_scene: Scene) -> N
     assert not bool(state.vel[pinned].any())
     unrelaxed = start_state(simulator, skirt_scene, default_potential(), 0)
     assert torch.equal(unrelaxed.vel, skirt_scene.start_velocity(0))
+
+
+@torch.no_grad()
+def test_a_restart_relaxes_on_the_way_to_the_first_frame(skirt_scene: Scene) -> None:
+    """Frame 0 is the settled start; the step to frame 1 moves body and pins, sees 1/3 s, and ends at rest."""
+    simulator = tiny(frame_dt=DT, pins_ahead=True, body_velocity="next")
+    steps: list[tuple[StepProblem, torch.Tensor]] = []
+
+    def keep(frame: int, problem: StepProblem, prediction: Prediction) -> None:
+        steps.append((problem, simulator.next_velocity(problem, prediction)))
+
+    frames = list(simulate(simulator, skirt_scene, default_potential(), 3, observe=keep))
+    start = skirt_scene.start(0, relaxed=False, thorough=True)
+    assert torch.equal(frames[0].state.pos, start.pos)
+    assert not bool(frames[0].state.vel.any())
+    (relaxing, after), (regular, _) = steps
+    assert [float(problem.step.dt) for problem in (relaxing, regular)] == pytest.approx([1 / 3, DT])
+    assert not torch.equal(relaxing.step.obstacle.pos, relaxing.step.obstacle.next_pos)
+    pinned = skirt_scene.cloth.pinned
+    assert torch.equal(frames[1].state.pos[pinned], relaxing.step.pin_target[pinned])
+    assert not bool(after.any())
+    assert torch.equal(regular.state.vel, after)
+    assert bool((frames[1].state.pos[~pinned] != frames[0].state.pos[~pinned]).all())
+    unrelaxed = list(simulate(simulator, skirt_scene, default_potential(), 2, relaxing_steps=0, observe=keep))
+    assert torch.equal(unrelaxed[0].state.vel, skirt_scene.start_velocity(0))
+    assert float(steps[-1][0].step.dt) == pytest.approx(DT)
+    twice = next(simulate(simulator, skirt_scene, default_potential(), 1, relaxing_steps=2))
+    assert not torch.equal(twice.state.pos, start.pos)
+    assert not bool(twice.state.vel.any())
 
 
 def test_the_level_feature_asks_for_its_levels() -> None:

@@ -35,8 +35,8 @@ def passes() -> Stepper:
     return build_simulator("local", "local_steps", "1x(mesh) | 1x(mesh)", latent_dim=8, output_init=0.3).eval()
 
 
-def reference() -> Stepper:
-    return import_reference_weights(make_state("fine15", 4))[0].eval()
+def reference(layout: str = "fine15") -> Stepper:
+    return import_reference_weights(make_state(layout, 4))[0].eval()
 
 
 def fixed_shapes() -> Stepper:
@@ -187,8 +187,8 @@ def test_a_network_that_fails_is_left_alone(band_scene: Scene) -> None:
 
 
 def test_models_that_keep_their_relaxing_step_keep_it_as_it_is(band_scene: Scene) -> None:
-    plain = start_state(reference(), band_scene, POTENTIAL, 1)
-    refined = start_state(RefinedStepper(reference(), POTENTIAL, Count(4)), band_scene, POTENTIAL, 1)
+    plain = start_state(reference("postcvpr"), band_scene, POTENTIAL, 1)
+    refined = start_state(RefinedStepper(reference("postcvpr"), POTENTIAL, Count(4)), band_scene, POTENTIAL, 1)
     assert torch.equal(plain.pos, refined.pos)
     assert torch.equal(plain.vel, refined.vel)
 
