@@ -15,6 +15,7 @@ from hood.assets.ply_file import read_ply
 from hood.assets.raw_mesh import RawMesh, Unreadable
 from hood.assets.unpickle import check_size, guarded
 from hood.mesh.polygons import MAX_CORNERS, triangulate
+from hood.mesh.quality import far_vertex
 
 _READERS: dict[str, Callable[[Path], RawMesh]] = {
     ".obj": read_obj,
@@ -107,6 +108,9 @@ def _finish(raw: RawMesh, split_polygons: bool, join: bool) -> MeshFile:
 
 def _check(raw: RawMesh, split_polygons: bool) -> None:
     """Corner counts and vertex indices; with them in order the polygons can be split."""
+    far = far_vertex(raw.pos) if np.isfinite(raw.pos).all() else None
+    if far is not None:
+        raise Unreadable(far)
     counts, num_vertices = raw.counts, len(raw.pos)
     bad = (counts < 3) | (counts > (MAX_CORNERS if split_polygons else 3))
     outside = (raw.corners < 0) | (raw.corners >= num_vertices)

@@ -6,6 +6,8 @@ import numpy as np
 
 #: A face counts as zero-area when its area is below this fraction of its longest edge squared.
 ZERO_AREA_RATIO = 1e-10
+#: No coordinate of a garment or body is farther from zero, in any unit: beyond it areas and volumes overflow.
+FARTHEST = 1e9
 
 
 def check_triangles(pos: np.ndarray, faces: np.ndarray, name: str) -> None:
@@ -31,7 +33,19 @@ def check_triangles(pos: np.ndarray, faces: np.ndarray, name: str) -> None:
     if bad.any():
         index = int(np.argmax(bad))
         raise ValueError(f"{name}: vertex {index} is {pos[index].tolist()}; positions must be finite, fix or remove it")
+    far = far_vertex(pos)
+    if far is not None:
+        raise ValueError(f"{name}: {far}")
     _check_areas(pos.astype(np.float64), faces, name)
+
+
+def far_vertex(pos: np.ndarray) -> str | None:
+    """The sentence about the first vertex of ``pos`` (V, 3) beyond any unit; None where there is none. NaN is not looked at."""
+    far = (np.abs(pos) > FARTHEST).any(axis=1)
+    if not far.any():
+        return None
+    index = int(np.argmax(far))
+    return f"vertex {index} is {pos[index].tolist()}; no unit has coordinates beyond ±{FARTHEST:g}, fix or remove it"
 
 
 def _check_shapes(pos: np.ndarray, faces: np.ndarray, name: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 import shlex
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -170,3 +171,28 @@ def test_long_lists_are_cut(capsys: pytest.CaptureFixture[str], garments: dict[s
     assert "openings: 3, 3, 3, 3, 3, 3, 3, 3, 3, 3, … and 23 more\n" in capsys.readouterr().out
     _, report = inspect(capsys, "loose.obj")
     assert len(report["files"][0]["facts"]["openings"]) == 33
+
+
+@pytest.mark.parametrize("factor", [1e200, 1e308, 1e-200, 0.0])
+def test_no_warning_of_python_reaches_the_user(
+    capsys: pytest.CaptureFixture[str], garments: dict[str, Garment], factor: float
+) -> None:
+    """Numbers that overflow are refused before anything is computed with them."""
+    tank = garments["tank"]
+    Path("odd.obj").write_text(
+        "\n".join([*(f"v {x!r} {y!r} {z!r}" for x, y, z in (factor * tank.rest_pos).tolist())]
+                  + [f"f {a} {b} {c}" for a, b, c in (tank.faces + 1).tolist()])
+    )  # fmt: skip
+    for words in (
+        ["inspect", "odd.obj"],
+        ["prepare", "garment=odd.obj"],
+        ["rollout", "garment=odd.obj", "checkpoint=untrained"],
+    ):
+        with warnings.catch_warnings(record=True) as caught:
+            code = main(words)
+        said = capsys.readouterr()
+        assert code == (1 if words[0] == "inspect" else 2), said
+        assert "Warning" not in said.err
+        assert "encountered" not in said.err + said.out
+        assert said.err.count("\n") == (0 if words[0] == "inspect" else 1)
+        assert caught == []
