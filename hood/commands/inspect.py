@@ -143,7 +143,7 @@ def _fit(found: list[Finding], body: str, config: DictConfig) -> dict[str, Any] 
     except (ValueError, OSError) as error:
         return {**names, "fits": False, "reason": " ".join(str(error).split())}
     if misplaced is not None:
-        return {**names, "fits": False, "reason": misplaced.sentence}
+        return {**names, "fits": False, "reason": f"the garment {misplaced.what}"}
     surface = performed.surface(0, performed.translation[0])
     height = float(surface[:, 1].max() - surface[:, 1].min()) if len(surface) else 0.0
     fits = start.stretch_max <= _STRETCH_LIMIT and start.depth_max <= _DEPTH_LIMIT
