@@ -26,7 +26,7 @@ def scene_cautions(stepper: Stepper, scene: Scene, potential: Potential, name: s
         sentences.append(f"{name} was not trained for {strange}; the motion may be wrong: {way_out}")
     unseen = unseen_potential(stepper, asked)
     if unseen:
-        sentences.append(f"{unseen}: {name} does not look at the potential; {way_out}, and both follow it")
+        sentences.append(f"{unseen}: {name} does not look at the potential; moved by it: stepper=newton{_or_refined(stepper)}")
     return sentences
 
 
@@ -42,7 +42,7 @@ def evaluation_cautions(steppers: Mapping[str, Stepper], asked: Mapping[str, Con
             sentences.setdefault(text, []).append(name)
         unseen = unseen_potential(stepper, next(iter(asked.values())))
         if unseen:
-            text = f"{unseen}: the model does not look at the potential; {way_out}, and both follow it"
+            text = f"{unseen}: the model does not look at the potential; moved by it: stepper=newton{_or_refined(stepper)}"
             sentences.setdefault(text, []).append(name)
     return [f"{', '.join(names)}: {text}" for text, names in sentences.items()]
 
@@ -87,6 +87,10 @@ def warn(sentences: Iterable[str]) -> None:
     """Warn of each, see :func:`hood.commands.notices.heard`."""
     for sentence in sentences:
         warnings.warn(sentence, stacklevel=2)
+
+
+def _or_refined(stepper: Stepper) -> str:
+    return "" if _is_refined(stepper) else ", refine=10"
 
 
 def _is_refined(stepper: Stepper) -> bool:

@@ -78,6 +78,7 @@ def test_the_potential_of_a_network_that_does_not(paper: Simulator, tank_scene: 
     )
     (sentence,) = scene_cautions(refined(paper), tank_scene, ROUGH, "old.pth")
     assert "changes only what is measured and how steps are refined, not what is predicted" in sentence
+    assert sentence.endswith("old.pth does not look at the potential; moved by it: stepper=newton")
 
 
 def test_such_a_networks_own_potential_is_the_one_it_was_trained_with(paper: Simulator, tank_scene: Scene) -> None:
