@@ -15,6 +15,7 @@ from hood.dynamics.refine import METHODS, RefinedStepper
 from hood.dynamics.refine_table import costs_from_table, floor_from_table
 from hood.dynamics.rollout import FIELD_CHOICES
 from hood.dynamics.stepper import Stepper
+from hood.solver.reasons import count_reasons, name_counts
 
 #: The ways to say how far a step is refined; a user gives one of them.
 DIALS = ("refine", "target_rg", "budget_ms", "max_strain")
@@ -133,6 +134,7 @@ def summarise_refinement(config: Mapping[str, Any], metrics: Mapping[str, np.nda
         "iterations_max": _of(np.max, iterations),
         "rg_median": _of(np.median, residual),
         "rg_p95": _of(lambda values: np.quantile(values, 0.95), residual),
+        "steps_ended": count_reasons(metrics.get("refine_reason", np.zeros(0))),
     }
     met = metrics.get("refine_met")
     if name == "budget_ms":
@@ -156,6 +158,8 @@ def describe_refinement(summary: Mapping[str, Any]) -> list[str]:
     # Where every frame's is measured, it is told with its worst.
     told = residual is None or summary.get("relative_gradient_median") is not None
     text += "" if told else f", relative gradient {residual:.2g}"
+    if entry["steps_ended"]:
+        text += "; steps ended: " + name_counts(entry["steps_ended"])
     if "frames_met" in entry:
         text += f"; {entry['frames_met']} frames met it, {entry['frames_missed']} missed it"
     return [text]

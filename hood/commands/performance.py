@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from typing import Any
 
+import torch
 from omegaconf import DictConfig
 
 from hood.assets.animated_mesh import body_kind
@@ -14,8 +15,8 @@ from hood.scene.cast import NO_MOTION, MotionOptions, load_motion
 from hood.scene.motion import Motion
 
 
-def make_motion(config: DictConfig) -> Motion:
-    """What moves in the scene, on the config's device.
+def make_motion(config: DictConfig, dtype: torch.dtype = torch.float32) -> Motion:
+    """What moves in the scene, in ``dtype`` on the config's device.
 
     A body that performs no motion but its own does so beside an embedded motion, the default, and says that; a file was
     meant.
@@ -32,7 +33,7 @@ def make_motion(config: DictConfig) -> Motion:
                 f"sequence={config.sequence}: body={config.body} {has}; leave sequence out, or give a body of the SMPL family"
             )
         print(f"body={config.body} {has}: sequence={config.sequence} is not used", file=sys.stderr)
-    return load_motion(str(config.body), str(config.sequence), motion_options(config), device=str(config.device))
+    return load_motion(str(config.body), str(config.sequence), motion_options(config), dtype, str(config.device))
 
 
 def motion_options(config: DictConfig) -> MotionOptions:

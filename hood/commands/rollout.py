@@ -29,7 +29,7 @@ from hood.commands.common import (
     together,
     use_arithmetic,
 )
-from hood.commands.dial import check_dial, exported, refined
+from hood.commands.dial import check_dial, chosen, exported, refined
 from hood.commands.notices import heard
 from hood.commands.performance import make_motion
 from hood.commands.summary import describe, describe_all, summarise
@@ -153,11 +153,16 @@ def _finished(config: DictConfig, digest: str, folder: Path) -> dict[str, Any] |
 
 def make_scene(config: DictConfig) -> Scene:
     """Assets named in the config, put together."""
-    motion = make_motion(config)
+    motion = make_motion(config, torch.float64 if _solves_in_double(config) else torch.float32)
     garment = read_outfit(config.garment, motion, bool(config.triangulate), config.pins)
     scene = dress(garment, motion, build(config.material))
     heed(scene.garment.name, [found] if (found := misplacement(scene)) is not None else [])
     return scene
+
+
+def _solves_in_double(config: DictConfig) -> bool:
+    """Whether steps are judged in float64: then states are kept in it, rounded ones would not meet what is said of them."""
+    return bool(config.solver.double) and (str(config.stepper) != "network" or chosen(config) is not None)
 
 
 def make_stepper(config: DictConfig) -> tuple[Stepper, str]:
@@ -225,6 +230,7 @@ def _simulate_to_disk(config: DictConfig, scene: Scene, stepper: Stepper, digest
         attributes,
         farthest=float(np.abs(scene.motion.translation).max()),
         fields=exported(config),
+        double=_solves_in_double(config),
     )
     frames = simulate(
         stepper,

@@ -14,6 +14,7 @@ from hood.commands.dial import describe_refinement, summarise_refinement
 from hood.commands.surface_report import cut_at_worst, describe_surface, summarise_surface
 from hood.commands.verdict import describe_verdict, describe_worst, summarise_verdict
 from hood.dynamics.recorder import read_rollout
+from hood.solver.reasons import MET, count_reasons, name_counts
 
 
 def summarise(path: Path) -> dict[str, Any]:
@@ -23,7 +24,10 @@ def summarise(path: Path) -> dict[str, Any]:
     metrics = defaultdict(lambda: np.full(len(finite), np.nan), data.metrics)
     times = {name[3:]: _quantiles(metrics[name][2:]) for name in sorted(metrics) if name.startswith("ms_")}
     converged = metrics.get("solver_converged")
-    solver = {} if converged is None else {"solver_steps_not_converged": int((converged == 0).sum())}
+    solver: dict[str, Any] = {}
+    if converged is not None:
+        solver["solver_steps_not_converged"] = int((converged == 0).sum())
+        solver["solver_steps_ended"] = count_reasons(metrics["solver_reason"])
     return {
         "num_frames": int(len(finite)),
         "complete": bool(data.attributes["complete"]),
@@ -55,7 +59,6 @@ def summarise(path: Path) -> dict[str, Any]:
 def describe(summary: dict[str, Any]) -> str:
     """The summary in a few lines: frames, strain, vertices inside the body, times, how far steps were taken, the cut surface
     with its warnings, the verdict."""
-    missed = summary.get("solver_steps_not_converged", 0)
     first = summary["first_nonfinite_frame"]
     times = {name: value["median"] for name, value in summary["ms_per_frame"].items()}
     return "\n".join(
@@ -66,7 +69,7 @@ def describe(summary: dict[str, Any]) -> str:
             "ms per frame (median): " + ", ".join(f"{name} {value or 0.0:.1f}" for name, value in times.items()),
             *describe_refinement(summary),
             *describe_surface(summary["surface"]),
-            *([f"{missed} steps did not reach solver.target_rg; their frames are kept as far as they got"] if missed else []),
+            *_missed(summary),
             *describe_verdict(summary),
         ]
     )
@@ -91,6 +94,16 @@ def describe_all(rows: Mapping[str, Mapping[str, Any]], total: int) -> str:
     parts = [f"{len(rows) - failed} of {total} motions simulated"]
     parts += [f"{count} {what}" for count, what in ((failed, "failed"), (unsound, "unsound")) if count]
     return "\n".join([*lines, ", ".join(parts)])
+
+
+def _missed(summary: Mapping[str, Any]) -> list[str]:
+    """A line where the solver missed its target, with the reasons."""
+    missed = summary.get("solver_steps_not_converged", 0)
+    if not missed:
+        return []
+    reasons = name_counts({name: count for name, count in summary["solver_steps_ended"].items() if name != MET})
+    why = f" ({reasons})" if reasons else ""  # earlier files have none
+    return [f"{missed} steps did not reach solver.target_rg{why}; their frames are kept as far as they got"]
 
 
 def _quantiles(values: np.ndarray) -> dict[str, float | None]:

@@ -23,7 +23,8 @@ class RolloutWriter:
 
     Datasets: ``cloth/pos (T,V,3)``, ``cloth/faces``, ``cloth/rest_pos``, ``body/pos (T,W,3)``, ``body/faces``, ``time (T,)``,
     ``metrics/* (T,)``, and of every vertex ``cloth/NAME (T,V)`` for each name in ``fields``; attributes: ``num_frames`` done
-    so far, ``complete``, and what is given as ``attributes``.
+    so far, ``complete``, and what is given as ``attributes``. Real numbers are float32, positions far from the origin
+    float64; with ``double`` the cloth's are float64 anyway, for states that meet an accuracy which float32 does not resolve.
 
     All datasets are laid out, filled with NaN, when the file is made: a full disk shows at once, and later writes never
     touch the file's structure, so a killed process leaves a file that opens; its frames end at ``num_frames``.
@@ -43,22 +44,24 @@ class RolloutWriter:
         attributes: Mapping[str, Any],
         farthest: float = 0.0,
         fields: Sequence[str] = (),
+        double: bool = False,
     ) -> None:
         self.path = path
         self.frames_done = 0
         self._file = h5py.File(path, "w")
         try:
             real = np.float64 if farthest > _FAR else np.float32
-            shapes = {"cloth/pos": (num_frames, len(cloth_rest_pos), 3), "body/pos": (num_frames, num_body_vertices, 3)}
-            for name, shape in shapes.items():
-                self._file.create_dataset(name, shape, dtype=real, fillvalue=np.nan)
+            cloth_real = np.float64 if double else real
+            cloth, body = (num_frames, len(cloth_rest_pos), 3), (num_frames, num_body_vertices, 3)
+            for name, shape, kind in (("cloth/pos", cloth, cloth_real), ("body/pos", body, real)):
+                self._file.create_dataset(name, shape, dtype=kind, fillvalue=np.nan)
             for name in fields:
                 by_vertex = (num_frames, len(cloth_rest_pos))
                 self._file.create_dataset(f"cloth/{name}", by_vertex, dtype=np.float32, fillvalue=np.nan)
             for name in metric_names:
                 self._file.create_dataset(f"metrics/{name}", (num_frames,), dtype=np.float64, fillvalue=np.nan)
             self._file["cloth/faces"] = np.asarray(cloth_faces, dtype=np.int32)
-            self._file["cloth/rest_pos"] = np.asarray(cloth_rest_pos, dtype=np.float32)
+            self._file["cloth/rest_pos"] = np.asarray(cloth_rest_pos, dtype=np.float64 if double else np.float32)
             self._file["body/faces"] = np.asarray(body_faces, dtype=np.int32)
             self._file["time"] = np.arange(num_frames) * dt
             for key, value in {"dt": dt, "num_frames": 0, "complete": False, **attributes}.items():

@@ -17,12 +17,14 @@ from hood.dynamics.stepper import Stepper
 from hood.dynamics.stopwatch import Stopwatch, timed
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
+from hood.scene.batch import to_device
 from hood.scene.cloth import Cloth
 from hood.scene.scene import RELAXING_DT
 from hood.solver.colouring import colours_of
-from hood.solver.iterate import Progress, Unknowns, first_iterate, in_double, rounded
+from hood.solver.iterate import Progress, Unknowns, first_iterate, in_double, in_single, rounded
 from hood.solver.newton import NewtonSettings, minimize
 from hood.solver.plan import plan_for
+from hood.solver.reasons import reason_number
 from hood.solver.sweeps import sweep
 
 METHODS = ("newton", "sweeps")
@@ -70,8 +72,11 @@ class RefinedStepper:
     The potential of a step never rises: what an iteration leads to is kept where it is lower, and a step for which there is no
     such place stays, to the bit, what the inner stepper made of it. Pinned vertices stay on their targets. Of every frame
     the metrics hold ``refine_iterations`` (those that were kept), ``refine_rg`` (the relative gradient reached),
-    ``refine_phi_before`` and ``refine_phi_after`` [J] and what the goal reports; its time is ``ms_refine``. Where a goal wants
-    no refinement of a frame, nothing is computed and the last three are NaN.
+    ``refine_phi_before`` and ``refine_phi_after`` [J], ``refine_reason`` (the number of what ended it,
+    :mod:`hood.solver.reasons`) and what the goal reports; its time is ``ms_refine``. Where a goal wants no refinement of a
+    frame, nothing is computed and the last four are NaN.
+
+    In a scene of float64 a network sees the problem in its own precision; its positions are refined and kept in float64.
 
     Args:
         inner: a network's :class:`hood.dynamics.simulator.Simulator`, or :class:`GuessStepper`.
@@ -95,8 +100,11 @@ class RefinedStepper:
         self._fresh_goal = deepcopy(goal)
         self.settings = replace(settings or NewtonSettings(), target_rg=goal.accuracy, max_iterations=goal.most, budget_ms=None)
         self.gravity = inner.gravity
+        # The guess can be made in any precision, a network computes in that of its weights.
+        self._inner_type = None if isinstance(inner, GuessStepper) else inner.gravity.dtype
+        self._cloths: tuple[Cloth, Cloth] | None = None
         self.config: dict[str, Any] = {**inner.config, "refined": f"{method}, {type(goal).__name__}"}
-        own = ("refine_iterations", "refine_rg", "refine_phi_before", "refine_phi_after")
+        own = ("refine_iterations", "refine_rg", "refine_phi_before", "refine_phi_after", "refine_reason")
         self.metrics: tuple[str, ...] = (*inner.metrics, *own, *goal.metrics)
         parts = [part for part in inner.times if part not in ("rest", "total")]
         self.times: tuple[str, ...] = (*dict.fromkeys([*parts, "search"]), "refine", "rest", "total")
@@ -107,7 +115,15 @@ class RefinedStepper:
 
     def prepare(self, cloth: Cloth, rest_pos: Any) -> Any:
         """What the inner stepper computes once per cloth."""
-        return self.inner.prepare(cloth, rest_pos)
+        return self.inner.prepare(self.inner_cloth(cloth), rest_pos)
+
+    def inner_cloth(self, cloth: Cloth) -> Cloth:
+        """The cloth in the inner stepper's precision, the same object every time: itself where it has that, or any will do."""
+        if self._inner_type in (None, cloth.rest_pos.dtype):
+            return cloth
+        if self._cloths is None or self._cloths[0] is not cloth:
+            self._cloths = cloth, to_device(cloth, dtype=self._inner_type)
+        return self._cloths[1]
 
     def begin_rollout(self) -> None:
         """Forget what the goal has learned in the last one."""
@@ -126,7 +142,7 @@ class RefinedStepper:
         """Positions at t + 1."""
         with timed(watch, "search"):
             problem = self.search(problem)
-        prediction = self.inner.predict(problem, prepared, watch)
+        prediction = self._inner_step(problem, prepared, watch)
         if self.relaxing is Relaxing.CARRY and bool(((problem.step.dt - RELAXING_DT).abs() < 1e-6).all()):
             # Such models turn the way that they went into a velocity: a refined one would be a blow.
             return prediction
@@ -137,12 +153,20 @@ class RefinedStepper:
             # A relaxing step is no frame and keeps no time: the refinement alone counts for its goal.
             return self._refine(problem, prediction, (Stopwatch() if watch is None else watch).elapsed)
 
+    def _inner_step(self, problem: StepProblem, prepared: Any, watch: Stopwatch | None) -> Prediction:
+        cloth = self.inner_cloth(problem.cloth)
+        if cloth is problem.cloth:
+            return self.inner.predict(problem, prepared, watch)
+        prediction = self.inner.predict(in_single(problem, cloth), prepared, watch)
+        pos = rounded(problem, prediction.next_pos)
+        return Prediction(pos, problem.acceleration(pos), prediction.metrics)
+
     def _refine(self, problem: StepProblem, prediction: Prediction, elapsed: Callable[[], float]) -> Prediction:
         goal, nan = self.goal, float("nan")
         standing = Standing(problem, prediction.next_pos, 0, nan, elapsed())
-        before = after = nan
+        before = after = reason = nan
         if goal.begin(standing):
-            prediction, history = self._descend(problem, prediction, elapsed)
+            prediction, history, reason = self._descend(problem, prediction, elapsed)
             before, after = _sum(history[0].phi), _sum(history[-1].phi)
             kept = sum(_sum(b.phi) < _sum(a.phi) for a, b in zip(history, history[1:], strict=False))
             residual = float(history[-1].relative_gradient.max())
@@ -152,13 +176,14 @@ class RefinedStepper:
             "refine_rg": standing.residual,
             "refine_phi_before": before,
             "refine_phi_after": after,
+            "refine_reason": reason,
         }
         return replace(prediction, metrics={**prediction.metrics, **own, **goal.end(standing)})
 
     def _descend(
         self, problem: StepProblem, prediction: Prediction, elapsed: Callable[[], float]
-    ) -> tuple[Prediction, list[Progress]]:
-        """The prediction after the iterations that the goal asks for, and where each of them began."""
+    ) -> tuple[Prediction, list[Progress], float]:
+        """The prediction after the iterations that the goal asks for, where each of them began, and what ended them."""
         done = -1
 
         def proceed(progress: Progress, pos: Tensor) -> bool:
@@ -170,21 +195,21 @@ class RefinedStepper:
         start = prediction.next_pos
         if self.method == "newton":
             pos, report = minimize(self.potential, problem, start, self.settings, proceed=proceed)
-            acc, history = report.acc, report.history
+            acc, history, reason = report.acc, report.history, reason_number(report.reason)
         else:
             wants = self.goal.wants_residual
             pos, swept = sweep(
                 self.potential, problem, start, self.goal.most, self.settings.double, proceed=proceed, residuals=wants
             )
-            acc, history = swept.acc, swept.history
+            acc, history, reason = swept.acc, swept.history, reason_number(swept.reason)
         lower = history[-1].phi < history[0].phi
         if not bool(lower.any()):
             # Newton may move within the rounding of the potential; its first entry says what holds where it began.
-            return replace(prediction, early=()), history[:1] if self.method == "newton" else history[-1:]
+            return replace(prediction, early=()), history[:1] if self.method == "newton" else history[-1:], reason
         # Scenes of a batch are refined each for itself.
         moved = lower[problem.cloth.vertex_scene].unsqueeze(1)
         refined = torch.where(moved, pos, prediction.next_pos), torch.where(moved, acc, prediction.acc)
-        return Prediction(*refined, metrics=prediction.metrics), history
+        return Prediction(*refined, metrics=prediction.metrics), history, reason
 
 
 def unrefined(stepper: Stepper) -> Stepper:

@@ -186,12 +186,13 @@ def _state_metrics(scene: Scene, state: State, frame: int, problem: StepProblem 
 def prepare_stepper(stepper: Stepper, scene: Scene) -> Any:
     """What the stepper computes once per cloth. Coarse levels that came with the garment are used where there are enough."""
     levels = scene.garment.coarse_edges
-    network = unrefined(stepper)
+    network, cloth = unrefined(stepper), scene.cloth
     if isinstance(stepper, RefinedStepper):
         stepper.begin_rollout()
+        cloth = stepper.inner_cloth(cloth)
     if isinstance(network, Simulator) and levels is not None and len(levels) >= network.num_coarse:
-        hierarchy = given_hierarchy(scene.cloth.num_vertices, levels, network.num_coarse)
-        return network.prepare(scene.cloth, scene.garment.rest_pos, hierarchy)
+        hierarchy = given_hierarchy(cloth.num_vertices, levels, network.num_coarse)
+        return network.prepare(cloth, scene.garment.rest_pos, hierarchy)
     return stepper.prepare(scene.cloth, scene.garment.rest_pos)
 
 

@@ -12,6 +12,7 @@ from hood.losses.collision import Collision
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem, inertial_guess
 from hood.scene.batch import to_device
+from hood.scene.cloth import Cloth
 from hood.solver.terms import StepTerms
 
 
@@ -118,16 +119,30 @@ def fixed_positions(problem: StepProblem) -> Tensor:
 
 
 def in_double(problem: StepProblem) -> StepProblem:
-    """The same problem in float64."""
+    """The same problem in float64; of the body only the contact is read then."""
     if problem.state.pos.dtype == torch.float64:
         return problem
-    double, step = torch.float64, problem.step
+    return _in_precision(problem, to_device(problem.cloth, dtype=torch.float64))
+
+
+def in_single(problem: StepProblem, cloth: Cloth) -> StepProblem:
+    """The same problem in float32, with its ``cloth`` in float32: what is known of a cloth is found by the object."""
+    single = _in_precision(problem, cloth)
+    obstacle = problem.step.obstacle
+    if obstacle is None:
+        return single
+    return replace(single, step=replace(single.step, obstacle=to_device(obstacle, dtype=torch.float32)))
+
+
+def _in_precision(problem: StepProblem, cloth: Cloth) -> StepProblem:
+    """The problem in the precision of ``cloth``, but for the obstacle."""
+    step, real = problem.step, cloth.rest_pos.dtype
     return StepProblem(
-        to_device(problem.cloth, dtype=double),
-        to_device(problem.state, dtype=double),
-        replace(step, dt=step.dt.to(double), pin_target=None if step.pin_target is None else step.pin_target.to(double)),
-        None if problem.contact is None else to_device(problem.contact, dtype=double),
-        problem.gravity.to(double),
+        cloth,
+        to_device(problem.state, dtype=real),
+        replace(step, dt=step.dt.to(real), pin_target=None if step.pin_target is None else step.pin_target.to(real)),
+        None if problem.contact is None else to_device(problem.contact, dtype=real),
+        problem.gravity.to(real),
     )
 
 

@@ -13,6 +13,7 @@ from hood.losses.problem import StepProblem
 from hood.solver.direction import Directions
 from hood.solver.iterate import Iterate, Proceed, Progress, Unknowns, first_iterate, in_double, rounded
 from hood.solver.plan import ModelBuilder, QuadraticModel, SolverPlan, plan_for
+from hood.solver.reasons import CONVERGED, LATE, MOST_ITERATIONS, NOT_FINITE, STOPPED, STUCK
 from hood.solver.search import Path, backtrack
 
 
@@ -57,7 +58,7 @@ class Report:
     phi: Tensor  # (B,) J
     relative_gradient: Tensor  # (B,)
     converged: Tensor  # (B,) bool
-    reason: tuple[str, ...]  # (B) "" or "max iterations", "time budget", "stopped", "line search failed", "not finite"
+    reason: tuple[str, ...]  # (B) of :mod:`hood.solver.reasons`
     acc: Tensor  # (V, 3) m/s² that leads to the positions, without their cancellation in float32
     history: list[Progress] = field(default_factory=list)
 
@@ -107,7 +108,7 @@ class _Newton:
         build = ModelBuilder(self.unknowns.terms, self.plan)
         now = first_iterate(self.unknowns) if start is None else self.unknowns.at(start)
         active = torch.isfinite(now.phi)
-        finite, stuck, late, why = active, ~active, False, "max iterations"
+        finite, stuck, late, why = active, ~active, False, MOST_ITERATIONS
         history: list[Progress] = []
         iteration = 0
         while True:
@@ -118,10 +119,10 @@ class _Newton:
             history.append(Progress(time.perf_counter() - began, now.phi, residual))
             late = settings.budget_ms is not None and 1e3 * history[-1].seconds > settings.budget_ms
             if late or iteration >= settings.max_iterations or not bool(active.any()):
-                why = "time budget" if late else why
+                why = LATE if late else why
                 break
             if proceed is not None and not proceed(history[-1], now.pos):
-                why = "stopped"
+                why = STOPPED
                 break
             now, moved = self._step(now, model, residual, active)
             stuck = stuck | (active & ~moved)
@@ -141,5 +142,5 @@ class _Newton:
 def _reasons(converged: Tensor, finite: Tensor, stuck: Tensor, otherwise: str) -> tuple[str, ...]:
     reasons = []
     for done, sound, halted in zip(converged.tolist(), finite.tolist(), stuck.tolist(), strict=True):
-        reasons.append("" if done else "not finite" if not sound else "line search failed" if halted else otherwise)
+        reasons.append(CONVERGED if done else NOT_FINITE if not sound else STUCK if halted else otherwise)
     return tuple(reasons)

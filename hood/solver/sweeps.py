@@ -18,6 +18,7 @@ from hood.solver.forces import VertexForces, Walls
 from hood.solver.iterate import Iterate, Proceed, Progress, Unknowns, first_iterate, in_double, rounded
 from hood.solver.linear import invert_blocks
 from hood.solver.plan import plan_for
+from hood.solver.reasons import MOST_ITERATIONS, NO_PROGRESS, NOT_FINITE, STOPPED
 from hood.solver.terms import StepTerms
 
 #: Shares of a sweep's displacement that are tried, in this order.
@@ -31,6 +32,7 @@ class SweepReport:
     kept: Tensor  # (B,) sweeps that lowered the potential and were kept
     phi: Tensor  # (B,) J
     relative_gradient: Tensor  # (B,)
+    reason: tuple[str, ...]  # (B) of :mod:`hood.solver.reasons`
     acc: Tensor  # (V, 3) m/s² that leads to the positions
     history: list[Progress] = field(default_factory=list)  # before every sweep, and at the end
 
@@ -77,16 +79,22 @@ def sweep(
         history.append(Progress(time.perf_counter() - began, now.phi, residual))
         return history[-1]
 
-    unknown = torch.full_like(now.phi, torch.nan)
+    unknown, why = torch.full_like(now.phi, torch.nan), MOST_ITERATIONS
     for _ in range(count):
         progress = record(residuals)
         if not bool(active.any()) or (proceed is not None and not proceed(progress, now.pos)):
             history.pop()
+            why = STOPPED
             break
         now, active = _improve(unknowns, now, _sweep(unknowns, groups, now), active)
         kept += active
     last = record(True)
-    report = SweepReport(kept, now.phi, last.relative_gradient, now.acc.to(problem.state.pos.dtype), history)
+    finite = torch.isfinite(now.phi)
+    reason = tuple(
+        NOT_FINITE if not sound else why if moves else NO_PROGRESS
+        for sound, moves in zip(finite.tolist(), active.tolist(), strict=True)
+    )
+    report = SweepReport(kept, now.phi, last.relative_gradient, reason, now.acc.to(problem.state.pos.dtype), history)
     return rounded(problem, now.pos), report
 
 

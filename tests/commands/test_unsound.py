@@ -6,14 +6,10 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
+from belt import write_belt, write_walk
 
-from hood.assets.body import load_body
-from hood.assets.library import locate
-from hood.assets.motion_file import read_recording
 from hood.cli import main
-from hood.testing import cylinder
 
 #: A step that costs little: one iteration, and no search for contact but its own.
 CHEAP = ["rollout", "stepper=refine", "refine=1", "metrics=strain", "garment=belt.obj", "video=none", "sheet=false",
@@ -21,26 +17,9 @@ CHEAP = ["rollout", "stepper=refine", "refine=1", "metrics=strain", "garment=bel
 
 
 @pytest.fixture(autouse=True)
-def belt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A ring of cloth round the waist, in an empty folder."""
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    waist = load_body().shaped(np.zeros(10))[1][3]
-    pos, faces = cylinder(around=20, rows=5, radius=0.19, height=0.16)
-    rows = [f"v {x} {y} {z}" for x, y, z in pos - pos.mean(axis=0) + waist] + [f"f {a} {b} {c}" for a, b, c in faces + 1]
-    Path("belt.obj").write_text("\n".join(rows) + "\n")
-
-
-def walk(path: Path, num_frames: int, jump_at: int | None = None) -> None:
-    """Steps of an embedded walk at 30 fps; from frame ``jump_at`` on the body is 0.5 m to the side."""
-    recording = read_recording(locate("motions", "walk_proud"))
-    every = round(recording.fps / 30.0)
-    poses = recording.poses[: num_frames * every : every, :22].reshape(num_frames, 66)
-    transl = recording.transl[: num_frames * every : every].copy()
-    if jump_at is not None:
-        transl[jump_at:, 0] += 0.5
-    path.parent.mkdir(parents=True, exist_ok=True)
-    hands = np.zeros((num_frames, 90))
-    np.savez(path, poses=np.c_[poses, hands], trans=transl, mocap_framerate=30.0, betas=np.zeros(16), gender="neutral")
+    write_belt(Path("belt.obj"))
 
 
 def summary(folder: str = "out") -> dict[str, Any]:
@@ -48,7 +27,7 @@ def summary(folder: str = "out") -> dict[str, Any]:
 
 
 def test_a_body_that_jumps_ends_with_3(capsys: pytest.CaptureFixture[str]) -> None:
-    walk(Path("jump.npz"), 32, jump_at=24)
+    write_walk(Path("jump.npz"), 32, jump_at=24)
     command = [*CHEAP, "sequence=jump.npz", "num_frames=32"]
     assert main(command) == 3
     found, shown = summary(), capsys.readouterr()
@@ -70,7 +49,7 @@ def test_a_body_that_jumps_ends_with_3(capsys: pytest.CaptureFixture[str]) -> No
 
 
 def test_a_study_may_allow_it(capsys: pytest.CaptureFixture[str]) -> None:
-    walk(Path("jump.npz"), 9, jump_at=7)
+    write_walk(Path("jump.npz"), 9, jump_at=7)
     command = [*CHEAP, "sequence=jump.npz", "num_frames=9"]
     assert main(command) == 3
     assert main([*command, "allow_unsound=true"]) == 0
@@ -79,7 +58,7 @@ def test_a_study_may_allow_it(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_quiet_walk_is_sound(capsys: pytest.CaptureFixture[str]) -> None:
-    walk(Path("walk.npz"), 7)
+    write_walk(Path("walk.npz"), 7)
     assert main([*CHEAP, "sequence=walk.npz", "refine=20"]) == 0
     assert summary()["sound"] is True
     assert summary()["unsound_reasons"] == []
@@ -90,14 +69,14 @@ def test_a_quiet_walk_is_sound(capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.parametrize("metrics", ["all", "strain", "none"])
 def test_a_solver_that_misses_every_step(metrics: str, capsys: pytest.CaptureFixture[str]) -> None:
-    walk(Path("walk.npz"), 4)
+    write_walk(Path("walk.npz"), 4)
     command = [*CHEAP, "sequence=walk.npz", "stepper=newton", "refine=0", "solver.max_iterations=0", f"metrics={metrics}"]
     assert main(command) == 3
     assert "UNSOUND: the solver missed its target in 3 of 3 frames: frames 1–3\n" in capsys.readouterr().out
 
 
 def test_what_nobody_measured_is_not_judged(capsys: pytest.CaptureFixture[str]) -> None:
-    walk(Path("walk.npz"), 7)
+    write_walk(Path("walk.npz"), 7)
     command = [*CHEAP, "sequence=walk.npz", "refine=0", "budget_ms=0.001"]  # nothing is refined, no gradient computed
     assert main(command) == 0
     assert summary()["sound"] is None
@@ -105,8 +84,8 @@ def test_what_nobody_measured_is_not_judged(capsys: pytest.CaptureFixture[str]) 
 
 
 def test_batches_count_the_unsound(capsys: pytest.CaptureFixture[str]) -> None:
-    walk(Path("motions/calm.npz"), 8)
-    walk(Path("motions/jump.npz"), 8, jump_at=6)
+    write_walk(Path("motions/calm.npz"), 8)
+    write_walk(Path("motions/jump.npz"), 8, jump_at=6)
     command = [*CHEAP, "sequence=motions", "num_frames=8", "refine=5"]
     assert main(command) == 3
     shown = capsys.readouterr()
