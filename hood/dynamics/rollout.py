@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -27,7 +28,7 @@ from hood.graph.given import given_hierarchy
 from hood.losses.potential import Potential, relative_gradient, scale
 from hood.losses.problem import StepProblem, inertial_guess
 from hood.scene.contact import Contact, find_contact
-from hood.scene.scene import RELAXING_DT, Scene, recentre
+from hood.scene.scene import LEAD_IN, RELAXING_DT, NotWornError, Scene, recentre
 from hood.scene.start import free_stretch, push_out
 from hood.scene.state import Attachments, State
 
@@ -203,8 +204,17 @@ def start_state(stepper: Stepper, scene: Scene, potential: Potential, relaxing_s
     Steppers that carry on or restart from it (:class:`hood.dynamics.frames.Relaxing`) get its positions as they are, and the
     velocity of their own rule. Those that restart take the last of the relaxing steps on the way to the next frame: it is not
     taken here, and the start is at rest.
+
+    Where the garment cannot be put on in the pose of ``frame``, the body moves into it from the T-pose first: that second is
+    simulated and dropped, and a warning says so. What it leads to is the start, velocity included.
+
+    Raises:
+        NotWornError: nor can it be put on in the T-pose, or the way from there stretches it as much.
     """
-    state = scene.start(frame, relaxed=False, thorough=True)
+    try:
+        state = scene.start(frame, relaxed=False, thorough=True)
+    except NotWornError as refusal:
+        return _led_in(stepper, scene, potential, relaxing_steps, frame, refusal)
     prepared = prepare_stepper(stepper, scene)
     velocity = scene.start_velocity(frame)
     if stepper.relaxing is Relaxing.RESTART and relaxing_steps > 0:
@@ -223,6 +233,29 @@ def start_state(stepper: Stepper, scene: Scene, potential: Potential, relaxing_s
         if lower and bool(torch.isfinite(pos).all()) and _longest(scene, pos) <= max(_STRETCH, _longest(scene, state.pos)):
             state = State(pos, state.vel, state.origin)
     return State(state.pos, velocity, state.origin)
+
+
+def _led_in(
+    stepper: Stepper, scene: Scene, potential: Potential, relaxing_steps: int, frame: int, refusal: NotWornError
+) -> State:
+    """The state at ``frame`` after moving there from the T-pose; ``refusal`` is raised where that does not help."""
+    try:
+        lead = scene.lead_in(frame)
+    except NotWornError:
+        lead = None
+    if lead is None:
+        raise refusal
+    *_, last = simulate(stepper, lead, potential, relaxing_steps=relaxing_steps, metrics="none")
+    if isinstance(stepper, RefinedStepper):
+        stepper.begin_rollout()  # the frames that are dropped are none of its frames
+    if not bool(torch.isfinite(last.state.pos).all()) or _longest(scene, last.state.pos) >= refusal.stretch:
+        raise refusal
+    warnings.warn(
+        f"garment {scene.garment.name!r} cannot be put on in the pose of frame {frame} of {scene.motion.name!r}: the body "
+        f"moves into it from the T-pose in {LEAD_IN:g} s that are simulated and dropped; frame 0 is that of the motion",
+        stacklevel=2,
+    )
+    return last.state
 
 
 def _longest(scene: Scene, pos: Tensor) -> float:

@@ -14,6 +14,7 @@ from hood.assets.binding import bind_garment, hold_on_trunk
 from hood.assets.body import Body
 from hood.assets.garment import Garment
 from hood.assets.sequence import PoseSequence
+from hood.assets.sequence_edit import blend_in
 from hood.assets.skinning import linear_blend_skinning
 from hood.scene.state import Obstacle
 
@@ -174,6 +175,11 @@ class BodyMotion:
     def rest_pos(self, garment: Garment) -> np.ndarray:
         """(V, 3) m: the garment grown with the body's shape."""
         return garment.shaped(self.betas)
+
+    def lead_in(self, frame: int, seconds: float) -> BodyMotion:
+        """The same body moving from the T-pose into ``frame``, its last."""
+        sequence = blend_in(self.sequence.window(frame, frame + 1), seconds)
+        return body_motion(self.body, sequence, self.betas, self.dtype, self.device)
 
     def skinned(self, garment: Garment, frame: int, origin: np.ndarray) -> Tensor:
         """(V, 3) m: the garment posed with the body at ``frame`` by its skinning weights, relative to ``origin``."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from hood.assets.material import Material
 from hood.assets.sequence import PoseSequence
 from hood.scene.batch import to_device
 from hood.scene.cloth import Cloth, build_cloth
-from hood.scene.motion import Motion, body_motion
+from hood.scene.motion import BodyMotion, Motion, body_motion
 from hood.scene.start import free_stretch, settle
 from hood.scene.state import Attachments, State, StepInput, concatenate_obstacles
 
@@ -26,6 +26,17 @@ _GRID = 0.25
 #: A garment that is worn stretches no edge by so much more when it is taken out of the body; measured: 0 there, 0.9 to 2.1
 #: where it was made for another pose.
 _TORN = 0.4
+#: Seconds in which a body moves from the T-pose into a frame that a garment cannot be put on in.
+LEAD_IN = 1.0
+
+
+class NotWornError(ValueError):
+    """A garment passes through the body in the frame that it is to start in; ``stretch`` is the greatest relative lengthening
+    of an edge where it is taken out of it."""
+
+    def __init__(self, message: str, stretch: float) -> None:
+        super().__init__(message)
+        self.stretch = stretch
 
 
 @dataclass(frozen=True)
@@ -52,7 +63,7 @@ class Scene:
         :func:`hood.scene.start.settle`.
 
         Raises:
-            ValueError: a thorough start finds the garment passing through the body, as one does that was made for another
+            NotWornError: a thorough start finds the garment passing through the body, as one does that was made for another
                 pose: out of the body, it is torn.
         """
         vel = self.start_velocity(frame) if relaxed else torch.zeros_like(self.cloth.rest_pos)
@@ -74,11 +85,25 @@ class Scene:
             return
         given, now = (float(free_stretch(self.cloth, pos).max()) for pos in (skinned, settled))
         if now - max(given, 0.0) > _TORN:
-            raise ValueError(
+            raise NotWornError(
                 f"garment {self.garment.name!r}: passes through {self.motion.name!r} in frame {frame} (taken out of it, edges "
                 f"are stretched by {100 * now:.0f}%); give it as it is worn there, bind it to a body with the pose it was made "
-                "in (hood prepare pose=…), or start from another frame or a standing pose (start=…, blend_in=1)"
+                "in (hood prepare pose=…), or start from another frame or a standing pose (start=…, blend_in=3)",
+                now,
             )
+
+    def lead_in(self, frame: int) -> Scene | None:
+        """The ``LEAD_IN`` seconds before ``frame``, in which the body moves there from the T-pose and its garment is worn from
+        the start; the last frame is ``frame``. None for a body that is not posed by joints.
+
+        Raises:
+            NotWornError: the garment passes through the body in the T-pose too.
+        """
+        if not isinstance(self.motion, BodyMotion):
+            return None
+        lead = replace(self, motion=self.motion.lead_in(frame, LEAD_IN), start_pos=None, start_vel=None)
+        start = lead.start(0, relaxed=False, thorough=True)
+        return replace(lead, start_pos=start.pos.cpu().double().numpy() + start.origin[0].numpy())
 
     def start_velocity(self, frame: int) -> Tensor:
         """(V, 3) m/s of the skinned garment at ``frame``."""

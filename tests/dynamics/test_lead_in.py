@@ -1,0 +1,99 @@
+"""Starts in poses that a garment cannot be put on in: the body moves into them from the T-pose, unseen."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hood.assets.body import Body
+from hood.assets.garment import Garment, load_garment
+from hood.assets.library import locate
+from hood.assets.sequence import load_sequence
+from hood.assets.sequence_edit import blend_in
+from hood.dynamics.checkpoint import load_simulator
+from hood.dynamics.goals import Count
+from hood.dynamics.refine import GuessStepper, RefinedStepper
+from hood.dynamics.rollout import simulate
+from hood.losses.potential import default_potential
+from hood.scene.scene import LEAD_IN, NotWornError, build_scene
+
+POTENTIAL = default_potential()
+
+
+def stepper() -> RefinedStepper:
+    """No network: three iterations a frame."""
+    return RefinedStepper(GuessStepper(POTENTIAL), POTENTIAL, Count(3))
+
+
+def write_seated(path: Path) -> Path:
+    """An AMASS file (SMPL-H, z up, 60 fps): sitting upright with hanging arms, the chest swaying a little."""
+    time = np.arange(40) / 60
+    poses = np.zeros((len(time), 52, 3))
+    poses[:, 0] = Rotation.from_euler("x", 90, degrees=True).as_rotvec()
+    poses[:, [1, 2], 0], poses[:, [4, 5], 0] = -np.pi / 2, np.pi / 2
+    poses[:, 16, 2], poses[:, 17, 2] = -np.pi / 2, np.pi / 2
+    poses[:, 9, 1] = 0.05 * np.sin(2 * np.pi * time)
+    trans = np.tile([0.0, 0.0, 0.5], (len(time), 1))
+    np.savez(path, poses=poses.reshape(len(time), 156), trans=trans, mocap_framerate=60.0, betas=np.zeros(16), gender="neutral")
+    return path
+
+
+def test_the_way_from_the_t_pose_is_that_of_blend_in(tmp_path: Path, garments: dict[str, Garment], body: Body) -> None:
+    """It ends in the frame that is asked for."""
+    sequence = load_sequence(write_seated(tmp_path / "seated.npz"))
+    scene, shown = (build_scene(garments["tank"], body, motion) for motion in (sequence, blend_in(sequence, LEAD_IN)))
+    lead = scene.lead_in(0)
+    assert lead is not None
+    assert lead.num_frames == round(LEAD_IN * sequence.fps) + 1
+    for frame, of, other in ((lead.num_frames - 1, scene, 0), (3, shown, 3)):
+        where = scene.motion.translation[0]
+        np.testing.assert_allclose(lead.motion.surface(frame, where), of.motion.surface(other, where), atol=1e-6)
+    states = [each.start(0, relaxed=False, thorough=True) for each in (lead, shown)]
+    pos = [state.pos.double().numpy() + state.origin[0].numpy() for state in states]
+    np.testing.assert_allclose(pos[0], pos[1], atol=1e-6)
+
+
+def test_the_garment_is_put_on_in_the_t_pose(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, garments: dict[str, Garment], body: Body
+) -> None:
+    """Frame 0 is the motion's first; the cloth starts as the way there, shortened here, leaves it."""
+    monkeypatch.setattr("hood.scene.scene._TORN", 0.1)  # in 60 iterations this T-shirt is stretched by more
+    monkeypatch.setattr("hood.scene.start._MOST_ITERATIONS", 60)
+    monkeypatch.setattr("hood.scene.scene.LEAD_IN", 0.4)
+    scene = build_scene(garments["tshirt"], body, load_sequence(write_seated(tmp_path / "seated.npz")))
+    with pytest.raises(NotWornError, match="passes through 'seated' in frame 0"):
+        scene.start(0, relaxed=False, thorough=True)
+    with pytest.warns(UserWarning, match="moves into it from the T-pose"):
+        frames = list(simulate(stepper(), scene, POTENTIAL, 2, metrics="none"))
+    assert [frame.index for frame in frames] == [0, 1]
+    for frame in frames:
+        np.testing.assert_allclose(frame.body_pos, scene.motion.surface(frame.index, np.zeros(3)).double(), atol=1e-5)
+    lead = scene.lead_in(0)
+    assert lead is not None
+    *_, last = simulate(stepper(), lead, POTENTIAL, metrics="none")
+    assert last.index == 12
+    np.testing.assert_array_equal(frames[0].world_pos, last.world_pos)
+
+
+def test_what_the_t_pose_does_not_help_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, garments: dict[str, Garment], body: Body
+) -> None:
+    monkeypatch.setattr("hood.scene.scene._TORN", -1.0)  # nothing is taken for worn
+    monkeypatch.setattr("hood.scene.start._MOST_ITERATIONS", 1)
+    scene = build_scene(garments["tank"], body, load_sequence(write_seated(tmp_path / "seated.npz")))
+    with pytest.raises(NotWornError, match="passes through 'seated' in frame 0"):
+        next(simulate(stepper(), scene, POTENTIAL, 3))
+
+
+@pytest.mark.slow
+def test_a_fine_t_shirt_on_a_seated_body(tmp_path: Path, body: Body) -> None:
+    """Settled there its edges are stretched by more than the double; after the second that is dropped it is sound."""
+    scene = build_scene(load_garment("tshirt_4k"), body, load_sequence(write_seated(tmp_path / "seated.npz")))
+    simulator = load_simulator(locate("weights", "quickstart"))
+    with pytest.warns(UserWarning, match="T-pose"):
+        frames = list(simulate(simulator, scene, POTENTIAL, 3, metrics="strain"))
+    assert max(frame.metrics["strain_p99"] for frame in frames) < 0.3
+    assert all(bool(frame.world_pos.isfinite().all()) for frame in frames)
