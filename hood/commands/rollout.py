@@ -156,7 +156,13 @@ def make_scene(config: DictConfig) -> Scene:
     motion = make_motion(config, torch.float64 if _solves_in_double(config) else torch.float32)
     garment = read_outfit(config.garment, motion, bool(config.triangulate), config.pins)
     scene = dress(garment, motion, build(config.material))
-    heed(scene.garment.name, [found] if (found := misplacement(scene)) is not None else [])
+    found = misplacement(scene)
+    if found is not None and found.grave:
+        raise ValueError(
+            f"garment {garment.name!r}: not worn by {motion.name!r} in its first frame: it {found.what}; give it as it is worn "
+            f"there, {found.fix}"
+        )
+    heed(garment.name, [found] if found is not None else [])
     return scene
 
 
