@@ -209,7 +209,7 @@ def start_state(stepper: Stepper, scene: Scene, potential: Potential, relaxing_s
     simulated and dropped, and a warning says so. What it leads to is the start, velocity included.
 
     Raises:
-        NotWornError: nor can it be put on in the T-pose, or the way from there stretches it as much.
+        NotWornError: nor can it be put on in the T-pose, or the way from there ends in numbers that are not finite.
     """
     try:
         state = scene.start(frame, relaxed=False, thorough=True)
@@ -248,7 +248,7 @@ def _led_in(
     *_, last = simulate(stepper, lead, potential, relaxing_steps=relaxing_steps, metrics="none")
     if isinstance(stepper, RefinedStepper):
         stepper.begin_rollout()  # the frames that are dropped are none of its frames
-    if not bool(torch.isfinite(last.state.pos).all()) or _longest(scene, last.state.pos) >= refusal.stretch:
+    if not bool(torch.isfinite(last.state.pos).all()):
         raise refusal
     warnings.warn(
         f"garment {scene.garment.name!r} cannot be put on in the pose of frame {frame} of {scene.motion.name!r}: the body "

@@ -31,12 +31,7 @@ LEAD_IN = 1.0
 
 
 class NotWornError(ValueError):
-    """A garment passes through the body in the frame that it is to start in; ``stretch`` is the greatest relative lengthening
-    of an edge where it is taken out of it."""
-
-    def __init__(self, message: str, stretch: float) -> None:
-        super().__init__(message)
-        self.stretch = stretch
+    """A garment passes through the body in the frame that it is to start in."""
 
 
 @dataclass(frozen=True)
@@ -88,8 +83,7 @@ class Scene:
             raise NotWornError(
                 f"garment {self.garment.name!r}: passes through {self.motion.name!r} in frame {frame} (taken out of it, edges "
                 f"are stretched by {100 * now:.0f}%); give it as it is worn there, bind it to a body with the pose it was made "
-                "in (hood prepare pose=…), or start from another frame or a standing pose (start=…, blend_in=3)",
-                now,
+                "in (hood prepare pose=…), or start from another frame or a standing pose (start=…, blend_in=3)"
             )
 
     def lead_in(self, frame: int) -> Scene | None:
