@@ -10,8 +10,7 @@ import numpy as np
 
 from hood.assets.binding import PosedBody, bind_posed, push_out, signed_distances
 from hood.assets.garment import Garment
-from hood.assets.sequence import Z_UP_TO_Y_UP
-from hood.assets.units import find_scale, size_ratio, used
+from hood.assets.placement import Placement
 from hood.mesh import repair, topology
 
 #: A garment whose middle vertex is farther from the skin than this [m] was made for another place or body.
@@ -50,38 +49,25 @@ def start_fitting(garment: Garment) -> Fitting:
     return Fitting(garment, garment, np.arange(len(garment.rest_pos)))
 
 
-def scale_to_metres(fitting: Fitting, scale: float | None, body_pos: np.ndarray) -> None:
-    """Multiply by ``scale``, or by what the size beside the body asks for.
-
-    Raises:
-        ValueError: no known unit fits, or ``scale`` is not positive.
-    """
+def place(fitting: Fitting, placement: Placement) -> None:
+    """Bring the coordinates of the file to the body: scaled to metres, turned, moved."""
     garment = fitting.garment
-    pos = used(garment.rest_pos, garment.faces)
-    factor = find_scale(pos, body_pos) if scale is None else scale
-    if factor is None:
-        ratio = size_ratio(pos, body_pos)
-        raise ValueError(
-            f"{garment.name}: {ratio:.3g} times the body's height fits no unit; give scale=FACTOR, metres per unit"
-        )
-    if not (np.isfinite(factor) and factor > 0):
-        raise ValueError(f"scale={factor:g}: give metres per unit of the file, such as 0.01 for centimetres")
-    if factor != 1.0:
-        moved = {key: getattr(garment, key) * factor for key in ("rest_pos", "skin_pos") if getattr(garment, key) is not None}
-        fitting.garment = replace(garment, **moved)
-        fitting.note("scaled", len(garment.rest_pos), f"scaled by {factor:g}", factor=factor)
-
-
-def place(fitting: Fitting, up: str, offset: np.ndarray) -> None:
-    """Turn a z-up mesh y up and move it by ``offset`` (3,) [m]."""
-    garment = fitting.garment
-    if up == "z":
-        garment = replace(garment, rest_pos=garment.rest_pos @ Z_UP_TO_Y_UP.T)
-        fitting.note("turned", len(garment.rest_pos), "turned from z up to y up")
-    if np.any(offset):
-        garment = replace(garment, rest_pos=garment.rest_pos + offset)
-        fitting.note("moved", len(garment.rest_pos), f"moved by {np.round(offset, 4).tolist()} m", offset=offset.tolist())
-    fitting.garment = garment
+    turn, skin_pos, rest_turn = placement.rotation, garment.skin_pos, garment.rest_turn
+    fitting.garment = replace(
+        garment,
+        rest_pos=placement.apply(garment.rest_pos),
+        skin_pos=None if skin_pos is None else placement.apply(skin_pos),
+        rest_turn=None if rest_turn is None else turn @ rest_turn @ turn.T,
+    )
+    count, offset = len(garment.rest_pos), np.round(placement.offset, 4).tolist()
+    if placement.scale != 1.0:
+        fitting.note("scaled", count, f"scaled by {placement.scale:g}", factor=placement.scale)
+    if placement.up != "y":
+        fitting.note("turned", count, f"turned from {placement.up} up to y up")
+    if placement.turn:
+        fitting.note("faced", count, f"turned by {placement.turn:g} degrees about the vertical", degrees=placement.turn)
+    if np.any(placement.offset):
+        fitting.note("moved", count, f"moved by {offset} m", offset=offset)
 
 
 def sew(fitting: Fitting, tolerance: float | None) -> None:

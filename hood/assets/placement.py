@@ -1,12 +1,15 @@
-"""Whether a garment mesh lies around a body."""
+"""Placements of a garment mesh beside a body, and whether it lies around it."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from hood.assets.binding import closest_points
+from hood.assets.sequence import Z_UP_TO_Y_UP
 
 #: A garment around the body has its middle vertex nearer to the skin than this [m] ...
 _FARTHEST = 0.35
@@ -14,6 +17,34 @@ _FARTHEST = 0.35
 _MOST_INSIDE = 0.25
 #: ... and at least this much cloth on the sides opposite to its main side: a cape on the back alone has 0.36.
 _LEAST_ROUND = 0.3
+
+#: Rotations (3, 3) that turn the up axis of a file to y.
+UP_AXES = {"y": np.eye(3), "z": Z_UP_TO_Y_UP, "x": np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])}
+
+
+@dataclass(frozen=True)
+class Placement:
+    """How the coordinates of a garment's file become metres beside a body that stands at its origin and looks along +z."""
+
+    scale: float  # metres per unit of the file
+    up: str  # axis of the file that points up: a key of UP_AXES
+    turn: float  # degrees about the vertical, counterclockwise from above, after the up axis is y
+    offset: np.ndarray  # (3,) m, added last
+    angle: float = 0.0  # degrees of the arms below the T-pose's
+
+    def keys(self) -> list[str]:
+        """The placement as keys of ``hood prepare``, to a tenth of a millimetre."""
+        offset = ",".join(f"{round(float(value), 4) + 0.0:g}" for value in self.offset)
+        return [f"scale={self.scale:g}", f"up={self.up}", f"turn={self.turn:g}", f"offset=[{offset}]"]
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """(3, 3) from the axes of the file to those of the body; exact for quarter turns."""
+        return np.asarray(np.round(Rotation.from_euler("y", self.turn, degrees=True).as_matrix(), 15) @ UP_AXES[self.up])
+
+    def apply(self, pos: np.ndarray) -> np.ndarray:
+        """``pos`` (V, 3), in units of the file, on the body [m]."""
+        return self.scale * (pos @ self.rotation.T) + self.offset
 
 
 class Surrounding(NamedTuple):

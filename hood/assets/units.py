@@ -1,9 +1,11 @@
-"""Units of a garment by its size beside the body: metres, or centimetres or millimetres taken for metres."""
+"""Units of a garment by its size beside the body."""
 
 from __future__ import annotations
 
 import numpy as np
 
+#: Metres per unit of files, by name.
+UNITS = {1.0: "metres", 0.1: "decimetres", 0.0254: "inches", 0.01: "centimetres", 0.001: "millimetres"}
 #: Metres per unit of the file that are tried when metres do not fit.
 _FACTORS = {0.01: "centimetres", 0.001: "millimetres"}
 #: Diagonals taken as they are, in body heights: from a baby's sock to a bridal train.
@@ -31,6 +33,13 @@ def find_scale(pos: np.ndarray, body_pos: np.ndarray) -> float | None:
     if _POSSIBLE[0] <= ratio <= _POSSIBLE[1]:
         return 1.0
     return next((factor for factor in _FACTORS if _USUAL[0] <= ratio * factor < _USUAL[1]), None)
+
+
+def possible(pos: np.ndarray, body_pos: np.ndarray) -> list[float]:
+    """Units in which a garment ``pos`` (V, 3) has a usual size beside ``body_pos`` (W, 3); where none, a possible one."""
+    ratio = size_ratio(pos, body_pos)
+    usual = [unit for unit in UNITS if _USUAL[0] <= ratio * unit < _USUAL[1]]
+    return usual or [unit for unit in UNITS if _POSSIBLE[0] <= ratio * unit <= _POSSIBLE[1]]
 
 
 def require_metres(pos: np.ndarray, body_pos: np.ndarray, name: str) -> None:

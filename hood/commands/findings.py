@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -9,20 +11,22 @@ from typing import Any
 import numpy as np
 
 from hood.assets.bearing import bearing_notice
-from hood.assets.binding import signed_distances
+from hood.assets.binding import posed_body
 from hood.assets.body import Body, load_body
+from hood.assets.fit_search import Asked
 from hood.assets.garment import Garment, garment_of_mesh, load_garment, locate_garment
 from hood.assets.library import locate
 from hood.assets.mesh_file import MESH_SUFFIXES, read_mesh_file
 from hood.assets.motion_file import read_recording
 from hood.assets.pins import opening_names, read_indices
-from hood.assets.sequence import Z_UP_TO_Y_UP
-from hood.assets.standing import find_standing_pose
+from hood.assets.placement import Placement, surrounds
+from hood.assets.standing import arms_down
 from hood.assets.suspicions import suspect_kind
-from hood.assets.units import find_scale, size_ratio, used
+from hood.assets.units import UNITS, size_ratio, used
 from hood.assets.unpickle import load_pickle
 from hood.commands.beside_mesh import place_beside_mesh
 from hood.commands.common import read_model
+from hood.commands.placing import find_place
 from hood.dynamics import ranges
 from hood.dynamics.recorder import read_rollout
 from hood.dynamics.soundness import judge_rollout, worst_frame
@@ -32,11 +36,7 @@ from hood.mesh.topology import boundary_loops
 from hood.scene.cast import NO_MOTION, MotionOptions, load_motion
 from hood.scene.mesh_motion import MeshMotion
 
-_UNITS = {1.0: "metres", 0.01: "centimetres", 0.001: "millimetres"}
-#: A mesh turned by a quarter must lie this much nearer to the body to be taken for z-up.
-_TURN_GAIN = 0.6
-#: A garment whose vertices are farther from the skin than this [m] in the middle lies elsewhere.
-_NEAR = 0.2
+_UNPLACED = "give prepare the body that it was made for (body=…, betas=…), or scale, up, turn, offset and pose"
 #: Openings beyond this number are torn seams: they are counted, not named.
 _MOST_OPENINGS = 12
 _SIMULATE_AGAIN = (
@@ -54,11 +54,16 @@ class Finding:
     facts: dict[str, Any] = field(default_factory=dict)
     problems: list[tuple[str, str]] = field(default_factory=list)
     repairs: list[str] = field(default_factory=list)
+    wearer: list[str] = field(default_factory=list)  # overrides of prepare that name the body, where it is not the default
+    refused: bool = False  # prepare would refuse it
 
     @property
     def command(self) -> str | None:
-        """The command that repairs a garment; None where nothing needs repair."""
-        return None if not self.repairs else " ".join(["hood prepare", f"garment={self.file}", *dict.fromkeys(self.repairs)])
+        """The command that repairs a garment; None where nothing needs repair, or no command can."""
+        if self.refused or not self.repairs:
+            return None
+        words = [f"garment={self.file}", *self.wearer, *dict.fromkeys(self.repairs)]
+        return " ".join(["hood prepare", *map(shlex.quote, words)])
 
     def problem(self, what: str, fix: str, repair: str | None = None) -> None:
         """Record a problem; ``repair`` is what prepare needs to be told, "" where it does it unasked."""
@@ -73,12 +78,12 @@ def unreadable(name: str, kind: str, error: Exception) -> Finding:
     return Finding(name, kind, problems=[(sentence.removeprefix(f"{name}: "), "")])
 
 
-def inspect_garment(name: str, body: Body | MeshMotion, wearer: str) -> Finding:
-    """A garment file beside ``body``: a model in its T-pose, or a mesh in its first frame.
+def inspect_garment(name: str, body: Body | MeshMotion, wearer: Sequence[str], betas: np.ndarray | None = None) -> Finding:
+    """A garment file beside ``body``: a model of shape ``betas`` in its T-pose, or a mesh in its first frame.
 
-    ``wearer`` are the words of prepare that name a mesh.
+    ``wearer`` are the words of prepare that name this body.
     """
-    finding = Finding(name, "garment")
+    finding = Finding(name, "garment", wearer=list(wearer))
     path, _ = locate_garment(name)
     if path.suffix.lower() in MESH_SUFFIXES:
         mesh = read_mesh_file(path, split_polygons=True)
@@ -99,13 +104,11 @@ def inspect_garment(name: str, body: Body | MeshMotion, wearer: str) -> Finding:
     if _is_suspect(finding, garment, body):
         return finding
     if isinstance(body, MeshMotion):
-        place_beside_mesh(finding, garment, body, _UNITS)
-        if finding.repairs:
-            finding.repairs.insert(0, wearer)
+        place_beside_mesh(finding, garment, body, UNITS)
     elif garment.bound:
         _name_openings(finding, garment.rest_pos if garment.skin_pos is None else garment.skin_pos, garment.faces, body)
     else:
-        _place_beside(finding, garment, body)
+        _place_beside(finding, garment, body, np.zeros(10) if betas is None else betas)
     return finding
 
 
@@ -163,53 +166,50 @@ def _describe_defects(finding: Finding, defects: Defects) -> None:
         )
 
 
-def _place_beside(finding: Finding, garment: Garment, body: Body) -> None:
-    """Units, up axis, pose and place of an unbound garment."""
-    surface, pos = body.v_template, used(garment.rest_pos, garment.faces)
-    factor = find_scale(pos, surface)
-    finding.facts["size in body heights"] = float(f"{size_ratio(pos, surface):.3g}")
-    finding.facts["units"] = "unknown" if factor is None else _UNITS[factor]
-    if factor is None:
-        finding.problem("its size fits no unit", "scale=FACTOR, metres per unit", "scale=FACTOR")
+def _place_beside(finding: Finding, garment: Garment, body: Body, betas: np.ndarray) -> None:
+    """Units, up axis, facing, place and pose of an unbound garment: what ``hood prepare`` finds for itself."""
+    found = find_place(garment, body, betas, Asked(), None)
+    placement = found.placement
+    finding.facts |= {
+        "size in body heights": float(f"{size_ratio(used(garment.rest_pos, garment.faces), body.shaped(betas)[0]):.3g}"),
+        "units": UNITS.get(placement.scale, "unknown"),
+        "up axis": placement.up,
+        "turned by [degrees]": placement.turn,
+        "arms below the T-pose [degrees]": placement.angle,
+        "misfit on the body, 0 to 1": round(found.misfit, 3),
+        "misfit of the next place, beyond": round(found.margin, 3),
+    }
+    if found.refusal is not None:
+        finding.problem(f"no place on {body.name!r} is sure: {found.refusal}", _UNPLACED)
+        finding.refused = True
         return
-    if factor != 1.0:
-        finding.problem(f"it is in {_UNITS[factor]}", f"scale={factor:g}, or scale=auto", f"scale={factor:g}")
-    pos = pos * factor
-    turned = pos @ Z_UP_TO_Y_UP.T
-    far = float(np.median(np.abs(signed_distances(pos, surface, body.faces))))
-    far_turned = float(np.median(np.abs(signed_distances(turned, surface, body.faces))))
-    up = "z" if far > 0.03 and far_turned < _TURN_GAIN * far else "y"
-    finding.facts["up axis"] = up
-    if up == "z":
-        finding.problem("it lies as if z were up", "up=z", "up=z")
-        pos = turned
-    standing = find_standing_pose(pos, body, np.zeros(10))
-    dist = signed_distances(pos, standing.pose.surface, body.faces)
-    middle, inside = float(np.median(np.abs(dist))), int((dist < 0).sum())
-    finding.facts["arms below the T-pose [degrees]"] = standing.angle
-    finding.facts["distance to the skin, median [m]"] = round(middle, 4)
-    finding.facts["vertices inside the body"] = inside
-    if middle > _NEAR:
-        gap = np.round(_centre(standing.pose.surface) - _centre(pos), 2).tolist()
-        finding.problem(
-            f"it is {middle:.2f} m away from {body.name!r} in T-pose",
-            "offset=[x,y,z] or pose=…",
-            f"offset={gap}".replace(" ", ""),
-        )
-        return
-    placed = garment.rest_pos * factor
-    _name_openings(finding, placed @ Z_UP_TO_Y_UP.T if up == "z" else placed, garment.faces, body)
-    if standing.angle:
-        finding.problem(f"its arms hang {standing.angle:g} degrees below the T-pose's", "pose=auto binds it so", "pose=auto")
-    if inside:
-        share, depth = 100 * inside / len(dist), -1e3 * float(dist.min())
-        finding.problem(
-            f"{inside} vertices ({share:.1f}%) are inside the body, to {depth:.1f} mm", "prepare pushes them out", ""
-        )
+    _describe_place(finding, placement, body)
+    posed = posed_body(body, arms_down(placement.angle), 0, betas)
+    around = surrounds(placement.apply(used(garment.rest_pos, garment.faces)), posed.surface, posed.faces)
+    finding.facts["distance to the skin, median [m]"] = round(around.middle, 4)
+    finding.facts["vertices inside the body"] = f"{100 * around.inside:.1f}%"
+    _name_openings(finding, placement.apply(garment.rest_pos), garment.faces, body)
+    if around.inside:
+        what = f"{100 * around.inside:.1f}% of its vertices are inside the body, to {1e3 * around.depth:.1f} mm"
+        finding.problem(what, "prepare lets them start outside", "")
 
 
-def _centre(pos: np.ndarray) -> np.ndarray:
-    return np.asarray((pos.min(axis=0) + pos.max(axis=0)) / 2)
+def _describe_place(finding: Finding, placement: Placement, body: Body) -> None:
+    """What keeps the garment from lying where it belongs, and the keys that put it there, all of them where one is needed."""
+    scale, up, turn, offset = placement.keys()
+    far = float(np.linalg.norm(placement.offset))
+    problems = (
+        (placement.scale != 1.0, f"it is in {UNITS.get(placement.scale, 'another unit')}", scale),
+        (placement.up != "y", f"it lies as if {placement.up} were up", up),
+        (placement.turn != 0, f"it faces {placement.turn:g} degrees away from {body.name!r}", turn),
+        (far > 0, f"it is {far:.2f} m away from where it fits {body.name!r}", offset),
+        (placement.angle != 0, f"its arms hang {placement.angle:g} degrees below the T-pose's", f"pose={placement.angle:g}"),
+    )
+    wrong = [(what, key) for is_so, what, key in problems if is_so]
+    for what, key in wrong:
+        finding.problem(what, f"{key}, or leave it to prepare")
+    if wrong:
+        finding.repairs += [key for _, _, key in problems]
 
 
 def inspect_body(name: str) -> Finding:

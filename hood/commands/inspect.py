@@ -18,7 +18,7 @@ from hood.commands import findings
 from hood.commands.findings import Finding
 from hood.commands.notices import heard
 from hood.commands.performance import motion_options
-from hood.commands.wardrobe import read_outfit
+from hood.commands.wardrobe import read_outfit, shape_coefficients
 from hood.config import ConfigError, load_config, plain, require_choice
 from hood.scene.cast import NO_MOTION, MotionOptions, load_motion
 from hood.scene.fitting import fit_figures, misplacement
@@ -90,7 +90,8 @@ def _inspect(known: Finding, beside: str, config: DictConfig) -> Finding:
 
 def _read(name: str, kind: str, beside: str, config: DictConfig) -> Finding:
     if kind == kinds.GARMENT:
-        return findings.inspect_garment(name, _body(beside, config), _wearer(beside, config))
+        betas = None if config.betas is None else shape_coefficients(config.betas)
+        return findings.inspect_garment(name, _body(beside, config), _wearer(beside, config), betas)
     if kind == kinds.MOVING_MESH:
         return findings.inspect_moving_mesh(name, _options(config))
     if kind == kinds.REFERENCE_ROLLOUT:
@@ -119,10 +120,15 @@ def _body(name: str, config: DictConfig) -> Body | MeshMotion:
     return motion
 
 
-def _wearer(body: str, config: DictConfig) -> str:
-    """The words of ``hood prepare`` for a mesh body as it is looked at here."""
+def _wearer(body: str, config: DictConfig) -> list[str]:
+    """The words of ``hood prepare`` for the body that a garment is looked at beside; none for the default."""
+    if body_kind(body) == "model":
+        betas = [] if config.betas is None else [f"betas={plain(config.betas)}".replace(" ", "")]
+        return [f"body={body}"] * (body != "default") + betas
+    if body_kind(body) == NO_BODY:
+        return []
     scale = [] if config.body_scale is None else [f"body_scale={config.body_scale:g}"]
-    return " ".join([f"body={body}", *scale, *([f"body_up={config.up}"] if str(config.up) != "auto" else [])])
+    return [f"body={body}", *scale, *([f"body_up={config.up}"] if str(config.up) != "auto" else [])]
 
 
 def _fit(found: list[Finding], body: str, config: DictConfig) -> dict[str, Any] | None:

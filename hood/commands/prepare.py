@@ -22,9 +22,10 @@ from hood.assets.mesh_file import MESH_SUFFIXES, read_mesh_file
 from hood.assets.outfit import join_garments
 from hood.assets.pins import pin_mask, pin_numbers
 from hood.assets.sequence import PoseSequence, load_sequence
-from hood.assets.standing import A_POSE_ANGLE, POSE_SUFFIXES, arms_down, find_standing_pose, read_pose
+from hood.assets.standing import POSE_SUFFIXES, arms_down, read_pose
 from hood.assets.suspicions import suspect_kind
 from hood.commands.common import prepare_folder
+from hood.commands.placing import AUTO, arm_angle, asked_keys, find_place, keep_place
 from hood.commands.prepare_mesh import prepare_for_mesh
 from hood.commands.wardrobe import checked_pins, heed, names_of, shape_coefficients
 from hood.config import ConfigError, load_config, plain, require_choice
@@ -34,7 +35,6 @@ from hood.scene.fitting import FitFigures, fit_figures
 from hood.scene.scene import build_scene
 from hood.scene.wear import STRETCHED, Worn, put_on
 
-_STANDING = ("auto", "tpose", "apose")
 #: A start beyond these is warned about: edges stretched by this share, vertices this deep [m].
 _STRETCH_LIMIT, _DEPTH_LIMIT = 0.10, 2e-3
 #: A rest length counts as changed beyond this; a file may have at most this share of its edges changed.
@@ -58,7 +58,6 @@ def run(overrides: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     config = load_config("prepare", overrides)
     require_choice(config, "format", ("text", "json"))
-    require_choice(config, "up", ("y", "z"))
     if config.garment is None:
         raise ConfigError("garment is not given: hood prepare garment=shirt.obj output=shirt.npz")
     names = names_of(config.garment)
@@ -106,18 +105,17 @@ def _fit(name: str, config: DictConfig, body: Body, betas: np.ndarray) -> _Fitte
     fitting = _read(name)
     if not fitting.garment.bound:
         heed(fitting.garment.name, suspect_kind(fitting.garment.rest_pos, fitting.garment.faces, body.v_template))
-    surface = body.shaped(betas)[0]
-    alterations.scale_to_metres(fitting, _number(config, "scale", "auto"), surface)
-    alterations.place(fitting, str(config.up), _offset(config))
+    tolerance = None if str(config.weld) == "none" else _number(config, "weld", "auto")
+    posed = _place(fitting, config, body, betas)
     if str(config.weld) != "none":
-        alterations.sew(fitting, _number(config, "weld", "auto"))
+        alterations.sew(fitting, tolerance)
     alterations.clean(fitting)
     check_triangles(fitting.garment.rest_pos, fitting.garment.faces, name)
     clearance = _number(config, "clearance", "")
     assert clearance is not None
     worn = None
-    if not fitting.garment.bound:
-        worn = _wear(fitting, _pose(fitting, config, body, betas), clearance, bool(config.allow_misfit))
+    if posed is not None:
+        worn = _wear(fitting, posed, clearance, bool(config.allow_misfit))
     ratios = alterations.length_ratios(fitting, betas)
     change = np.abs(ratios - 1)
     fitted = _Fitted(fitting, worn, float(change.max(initial=0.0)), float((change > _CHANGED).mean()) if len(change) else 0.0)
@@ -167,18 +165,35 @@ def _read(name: str) -> Fitting:
     return fitting
 
 
-def _pose(fitting: Fitting, config: DictConfig, body: Body, betas: np.ndarray) -> PosedBody:
-    """The body in the pose that the garment was made in."""
-    given = str(config.pose)
-    if given == "auto":
-        found = find_standing_pose(fitting.garment.rest_pos, body, betas)
-        if found.angle:
-            text = f"made around a pose with the arms {found.angle:g} degrees below the T-pose's"
-            fitting.note("pose", len(fitting.garment.rest_pos), text, angle=found.angle)
-        return found.pose
-    if given in _STANDING:
-        return posed_body(body, arms_down(A_POSE_ANGLE if given == "apose" else 0.0), 0, betas)
-    return posed_body(body, *_named_pose(given, config), betas)
+def _place(fitting: Fitting, config: DictConfig, body: Body, betas: np.ndarray) -> PosedBody | None:
+    """Bring the garment to the body; the body in the pose that the garment was made in, None for one that is bound already.
+
+    Raises:
+        ValueError: the garment fits nowhere, or in several places alike.
+    """
+    garment, asked = fitting.garment, asked_keys(config)
+    if garment.bound:
+        alterations.place(fitting, keep_place(garment, body.shaped(betas)[0], asked))
+        return None
+    posed = _given_pose(config, body, betas)
+    found = find_place(garment, body, betas, asked, posed)
+    if found.refusal is not None:
+        raise ValueError(f"{garment.name}: {found.refusal}")
+    alterations.place(fitting, found.placement)
+    angle = found.placement.angle
+    if posed is None and angle:
+        text = f"made around a pose with the arms {angle:g} degrees below the T-pose's"
+        fitting.note("pose", len(garment.rest_pos), text, angle=angle)
+    return posed or posed_body(body, arms_down(angle), 0, betas)
+
+
+def _given_pose(config: DictConfig, body: Body, betas: np.ndarray) -> PosedBody | None:
+    """The body in the pose that the config names; None for auto."""
+    if str(config.pose) == AUTO:
+        return None
+    angle = arm_angle(config.pose)
+    pose = _named_pose(str(config.pose), config) if angle is None else (arms_down(angle), 0)
+    return posed_body(body, *pose, betas)
 
 
 def _named_pose(given: str, config: DictConfig) -> tuple[PoseSequence, int]:
@@ -210,7 +225,7 @@ def _pin(outfit: Garment, fittings: list[Fitting], config: DictConfig, body: Bod
 def _starts(outfit: Garment, config: DictConfig, body: Body, betas: np.ndarray) -> dict[str, FitFigures]:
     """Figures of a rollout's start from the T-pose and, if it is another, from the pose of the garment."""
     poses: dict[str, tuple[PoseSequence, int]] = {"tpose": (arms_down(0.0), 0)}
-    if str(config.pose) not in _STANDING:
+    if str(config.pose) != AUTO and arm_angle(config.pose) is None:
         poses[str(config.pose)] = _named_pose(str(config.pose), config)
     return {
         name: fit_figures(build_scene(outfit, body, sequence.window(frame, frame + 1), betas=betas))
@@ -289,10 +304,3 @@ def _number(config: DictConfig, key: str, word: str) -> float | None:
     if not (np.isfinite(value) and value >= 0):
         raise ConfigError(f"{key}={config[key]}: give a number ≥ 0" + (f" or {word}" if word else ""))
     return value
-
-
-def _offset(config: DictConfig) -> np.ndarray:
-    values = plain(config.offset)
-    if len(values) != 3 or not all(isinstance(x, (int, float)) and np.isfinite(x) for x in values):
-        raise ConfigError(f"offset={values}: give metres along x, y and z, offset=[0,1.2,0]")
-    return np.array(values, dtype=np.float64)

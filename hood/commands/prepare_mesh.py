@@ -21,10 +21,9 @@ from hood.assets.binding import push_out, signed_distances
 from hood.assets.garment import Garment, save_garment
 from hood.assets.outfit import join_garments
 from hood.assets.pins import pin_mask, pin_numbers
-from hood.assets.sequence import Z_UP_TO_Y_UP
 from hood.assets.suspicions import suspect_kind, suspect_place, suspect_seams
-from hood.assets.units import find_scale, used
 from hood.commands.common import prepare_folder
+from hood.commands.placing import AUTO, asked_keys, keep_place
 from hood.commands.wardrobe import checked_pins, heed
 from hood.config import ConfigError, plain
 from hood.mesh.quality import check_triangles
@@ -33,9 +32,8 @@ from hood.scene.fitting import FitFigures, fit_figures
 from hood.scene.mesh_motion import MeshMotion, worn_pos
 from hood.scene.scene import dress
 
-_AUTO = "auto"
 #: Keys that say in which pose and shape of a model a garment was made: a mesh has one of each.
-_OF_MODELS = {"pose": _AUTO, "betas": []}
+_OF_MODELS = {"pose": AUTO, "betas": []}
 
 
 def prepare_for_mesh(config: DictConfig, names: list[str], target: Path, read: Callable[[str], Fitting]) -> int:
@@ -66,16 +64,16 @@ def prepare_for_mesh(config: DictConfig, names: list[str], target: Path, read: C
 
 
 def _fit(fitting: Fitting, name: str, config: DictConfig, motion: MeshMotion) -> Fitting:
-    """One garment on the mesh: in metres, y up, sewn, clean, outside the skin."""
+    """One garment on the mesh: in metres, y up, sewn, clean, outside the skin; auto leaves it where it is, for the unit."""
     garment, surface, clearance = fitting.garment, motion.points(0), float(config.clearance)
     heed(garment.name, suspect_kind(garment.rest_pos, garment.faces, surface))
     if not clearance >= 0:
         raise ConfigError(f"clearance={config.clearance}: give a number ≥ 0")
-    _to_metres(fitting, config, surface)
+    alterations.place(fitting, keep_place(garment, surface, asked_keys(config)))
     if str(config.weld) == "none":
         heed(garment.name, suspect_seams(fitting.garment.rest_pos, fitting.garment.faces))
     else:
-        alterations.sew(fitting, None if str(config.weld) == _AUTO else float(config.weld))
+        alterations.sew(fitting, None if str(config.weld) == AUTO else float(config.weld))
     alterations.clean(fitting)
     check_triangles(fitting.garment.rest_pos, fitting.garment.faces, name)
     # What another body's weights say does not hold here: the place of a garment is where it is worn.
@@ -84,24 +82,6 @@ def _fit(fitting: Fitting, name: str, config: DictConfig, motion: MeshMotion) ->
     )
     _leave_mesh(fitting, motion, clearance)
     return fitting
-
-
-def _to_metres(fitting: Fitting, config: DictConfig, surface: np.ndarray) -> None:
-    """Scaled, turned and moved as the config asks; the unit by the size beside the mesh where it does not."""
-    garment = fitting.garment
-    factor = find_scale(used(garment.rest_pos, garment.faces), surface) if str(config.scale) == _AUTO else float(config.scale)
-    if factor is None or not (np.isfinite(factor) and factor > 0):
-        raise ConfigError(f"scale={config.scale}: {garment.name} is of no usual size; give metres per unit of the file")
-    turn = Z_UP_TO_Y_UP if str(config.up) == "z" else np.eye(3)
-    offset = np.zeros(3) if str(config.offset) == _AUTO else np.array(plain(config.offset), dtype=np.float64)
-    if offset.shape != (3,) or not np.isfinite(offset).all():
-        raise ConfigError(f"offset={config.offset}: give metres along x, y and z, offset=[0,1.2,0]")
-    skin_pos = None if garment.skin_pos is None else factor * garment.skin_pos @ turn.T + offset
-    fitting.garment = replace(garment, rest_pos=factor * garment.rest_pos @ turn.T + offset, skin_pos=skin_pos)
-    count = len(garment.rest_pos)
-    fitting.note("scaled", count * (factor != 1.0), f"scaled by {factor:g}", factor=factor)
-    fitting.note("turned", count * (str(config.up) == "z"), "turned from z up to y up")
-    fitting.note("moved", count * bool(offset.any()), f"moved by {np.round(offset, 4).tolist()} m", offset=offset.tolist())
 
 
 def _leave_mesh(fitting: Fitting, motion: MeshMotion, clearance: float) -> None:

@@ -15,7 +15,7 @@ from hood.assets.garment import Garment, load_garment, save_garment
 from hood.assets.outfit import join_garments
 from hood.assets.sequence import PoseSequence, load_sequence
 from hood.assets.skinning import linear_blend_skinning
-from hood.assets.standing import arms_down, find_standing_pose, read_pose
+from hood.assets.standing import arms_down, read_pose
 from hood.assets.units import find_scale, require_metres, used
 from hood.mesh import topology
 from hood.testing import sphere
@@ -100,19 +100,6 @@ def test_pushing_out_of_a_ball() -> None:
     np.testing.assert_allclose(signed_distances(pushed.pos[:60], surface, faces), 2e-3, atol=2e-4)
     moved = pushed.pos[:60] - points[:60]
     assert (np.einsum("vi,vi->v", moved, direction[:60]) > 0.99 * np.linalg.norm(moved, axis=1)).all()
-
-
-@pytest.mark.parametrize("angle", [0.0, 30.0, 45.0, 65.0])
-def test_the_angle_of_the_arms_is_found(garments: dict[str, Garment], body: Body, angle: float) -> None:
-    posed = posed_body(body, arms_down(angle), 0, np.zeros(10))
-    top = garments["longsleeve"]
-    points = np.concatenate([top.rest_pos, np.ones((len(top.rest_pos), 1))], axis=1)
-    found = find_standing_pose(np.einsum("vj,jab,vb->va", top.lbs_weights, posed.transforms, points), body, np.zeros(10))
-    assert abs(found.angle - angle) <= 7.5
-
-
-def test_sleeveless_garments_are_taken_for_t_posed(garments: dict[str, Garment], body: Body) -> None:
-    assert find_standing_pose(garments["skirt"].rest_pos, body, np.zeros(10)).angle == 0.0
 
 
 @pytest.mark.parametrize("factor", [1.0, 0.01, 0.001])

@@ -1,0 +1,107 @@
+"""Where a garment belongs: one search for ``hood prepare``, which puts it there, and ``hood inspect``, which names the keys."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig
+
+from hood.assets.binding import PosedBody, posed_body
+from hood.assets.body import Body
+from hood.assets.fit_search import Asked, Found, Wearer, find_placement
+from hood.assets.garment import Garment
+from hood.assets.placement import UP_AXES, Placement
+from hood.assets.standing import A_POSE_ANGLE, arms_down
+from hood.assets.units import find_scale, size_ratio, used
+from hood.config import ConfigError, plain, require_choice
+
+AUTO = "auto"
+_TURNS = (0, 90, 180, 270)
+_ANGLES = {"tpose": 0.0, "apose": A_POSE_ANGLE}
+
+
+def asked_keys(config: DictConfig) -> Asked:
+    """What ``scale``, ``up``, ``turn`` and ``offset`` of a config fix.
+
+    Raises:
+        ConfigError: a value of the wrong kind; names the key.
+    """
+    require_choice(config, "up", (AUTO, *UP_AXES))
+    given = {key: plain(config[key]) for key in ("scale", "up", "turn", "offset")}
+    if given["turn"] != AUTO and given["turn"] not in _TURNS:
+        raise ConfigError(
+            f"turn={given['turn']}: give auto or one of {', '.join(map(str, _TURNS))}, degrees about the vertical"
+        )
+    return Asked(
+        scale=None if given["scale"] == AUTO else _scale(given["scale"]),
+        up=None if given["up"] == AUTO else given["up"],
+        turn=None if given["turn"] == AUTO else float(given["turn"]),
+        offset=None if given["offset"] == AUTO else _offset(given["offset"]),
+    )
+
+
+def arm_angle(pose: Any) -> float | None:
+    """The angle [degrees] that a value of ``pose`` names: ``tpose``, ``apose`` or a number; None: auto, a motion or a file.
+
+    Raises:
+        ConfigError: more than the arms can be lowered.
+    """
+    word = str(pose)
+    try:
+        angle = _ANGLES[word] if word in _ANGLES else float(word)
+    except ValueError:
+        return None
+    if not 0 <= angle <= 90:
+        raise ConfigError(f"pose={word}: give 0 to 90, degrees of the arms below those of the T-pose")
+    return angle
+
+
+def find_place(garment: Garment, body: Body, betas: np.ndarray, asked: Asked, posed: PosedBody | None) -> Found:
+    """The placement of an unbound garment on ``body`` of shape ``betas``, in a pose between T and arms hanging or in ``posed``.
+
+    Nothing is searched where everything is asked for.
+    """
+    given = (asked.scale, asked.up, asked.turn, asked.offset)
+    if posed is not None and all(value is not None for value in given):
+        return Found(_as_asked(asked), 0.0, 1.0)
+    if posed is not None:
+        surface = posed.surface
+        wearer = Wearer(lambda angle: surface, body.faces, angles=(0.0,))
+    else:
+        wearer = Wearer(lambda angle: posed_body(body, arms_down(angle), 0, betas).surface, body.faces)
+    return find_placement(garment.rest_pos, garment.faces, wearer, asked)
+
+
+def keep_place(garment: Garment, surface: np.ndarray, asked: Asked) -> Placement:
+    """The placement of a bound garment: it stays where its binding has it, but for what is asked and its unit.
+
+    Raises:
+        ValueError: its size fits no unit.
+    """
+    pos = used(garment.rest_pos, garment.faces)
+    scale = find_scale(pos, surface) if asked.scale is None else asked.scale
+    if scale is None:
+        ratio = size_ratio(pos, surface)
+        raise ValueError(
+            f"{garment.name}: {ratio:.3g} times the body's height fits no unit; give scale=FACTOR, metres per unit"
+        )
+    return _as_asked(Asked(scale, asked.up, asked.turn, asked.offset))
+
+
+def _as_asked(asked: Asked) -> Placement:
+    offset = np.zeros(3) if asked.offset is None else asked.offset
+    return Placement(asked.scale or 1.0, asked.up or "y", asked.turn or 0.0, offset)
+
+
+def _scale(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not (np.isfinite(value) and value > 0):
+        raise ConfigError(f"scale={value}: give metres per unit of the file, such as 0.01 for centimetres, or auto")
+    return float(value)
+
+
+def _offset(value: Any) -> np.ndarray:
+    numbers = isinstance(value, list) and all(isinstance(x, (int, float)) and np.isfinite(x) for x in value)
+    if not numbers or len(value) != 3:
+        raise ConfigError(f"offset={value}: give metres along x, y and z, offset=[0,1.2,0], or auto")
+    return np.array(value, dtype=np.float64)
