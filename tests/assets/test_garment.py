@@ -103,8 +103,11 @@ def test_quads_of_an_obj_are_split_only_on_request(tmp_path: Path) -> None:
 
 
 def test_unknown_format_and_missing_file(tmp_path: Path) -> None:
+    (tmp_path / "g.cloth").write_text("x")
+    with pytest.raises(ValueError, match=r"g\.cloth: unknown garment format '\.cloth'"):
+        load_garment(tmp_path / "g.cloth")
     (tmp_path / "g.fbx").write_text("x")
-    with pytest.raises(ValueError, match=r"g\.fbx: unknown garment format '\.fbx'"):
+    with pytest.raises(ValueError, match=r"g\.fbx: FBX files are not read; export the garment as OBJ or GLB"):
         load_garment(tmp_path / "g.fbx")
     with pytest.raises(FileNotFoundError, match=r"none\.obj: no such file"):
         load_garment(tmp_path / "none.obj")

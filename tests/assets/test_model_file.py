@@ -192,6 +192,9 @@ def test_other_files(tmp_path: Path) -> None:
     (tmp_path / "list.pkl").write_bytes(pickle.dumps([1]))
     with pytest.raises(ValueError, match="holds a list, not a body model"):
         read_model(tmp_path / "list.pkl")
-    (tmp_path / "body.fbx").write_text("x")
+    (tmp_path / "body.other").write_text("x")
     with pytest.raises(ValueError, match="unknown body model format"):
+        load_body(tmp_path / "body.other")
+    (tmp_path / "body.fbx").write_text("x")
+    with pytest.raises(ValueError, match=r"body\.fbx: FBX files are not read; export .* as GLB"):
         load_body(tmp_path / "body.fbx")
