@@ -46,14 +46,18 @@ def require_metres(pos: np.ndarray, body_pos: np.ndarray, name: str) -> None:
     """Refuse a garment whose size shows that it is not in metres.
 
     Raises:
-        ValueError: naming the factor and the command that applies it.
+        ValueError: naming the units that it may be in, and the command that brings it to metres.
     """
-    factor = find_scale(pos, body_pos)
-    if factor == 1.0:
+    if find_scale(pos, body_pos) == 1.0:
         return
     size = f"garment {name!r} is {size_ratio(pos, body_pos):.3g} times the body's height"
-    if factor is None:
+    fitting = possible(pos, body_pos)
+    if not fitting:
         raise ValueError(f"{size}; scale it to metres, hood prepare garment=… scale=FACTOR")
+    if len(fitting) > 1:
+        units = " or ".join(f"{UNITS[unit]} (scale={unit:g})" for unit in fitting)
+        raise ValueError(f"{size}: it may be in {units}; hood prepare garment=… finds out which fits, hood inspect says it")
+    (unit,) = fitting
     raise ValueError(
-        f"{size}: it is in {_FACTORS[factor]}; multiply it by {factor:g}, hood prepare garment=… scale={factor:g} (or auto)"
+        f"{size}: it is in {UNITS[unit]}; multiply it by {unit:g}, hood prepare garment=… scale={unit:g} (or auto)"
     )

@@ -113,6 +113,12 @@ def test_units(garments: dict[str, Garment], body: Body, factor: float) -> None:
             require_metres(garment.rest_pos / factor, body.v_template, "g")
 
 
+def test_units_that_are_alike_are_all_named(garments: dict[str, Garment], body: Body) -> None:
+    """The size alone cannot tell a shirt in inches from a smaller one in centimetres."""
+    with pytest.raises(ValueError, match=r"may be in inches \(scale=0.0254\) or centimetres .* finds out which fits"):
+        require_metres(garments["tank"].rest_pos / 0.0254, body.v_template, "g")
+
+
 def test_sizes_of_no_unit_and_strays(body: Body, garments: dict[str, Garment]) -> None:
     tank = garments["tank"]
     assert find_scale(tank.rest_pos * 1e6, body.v_template) is None
