@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import sys
 import tempfile
 import zipfile
 from collections import OrderedDict
@@ -19,6 +18,7 @@ import numpy as np
 import torch
 
 from hood.graph.hierarchy import Hierarchy, build_hierarchy
+from hood.native.cache import cache_folder
 
 #: Part of every name: raise it with any change to what :func:`hood.graph.hierarchy.build_hierarchy` returns.
 VERSION = 2
@@ -59,22 +59,6 @@ def cached_hierarchy(num_vertices: int, edges: np.ndarray, rest_pos: np.ndarray,
     built = build_hierarchy(num_vertices, edges, rest_pos, num_coarse)
     _write(path, built)
     return built
-
-
-def cache_folder() -> Path | None:
-    """The user's cache folder as the platform has it, or ``HOOD_CACHE``; None where that turns caching off."""
-    chosen = os.environ.get("HOOD_CACHE")
-    if chosen is not None:
-        return None if chosen.strip().lower() in ("", "off") else Path(chosen).expanduser()
-    try:
-        home = Path.home()
-    except RuntimeError:  # a user without a home
-        return None
-    if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA", home / "AppData" / "Local")) / "hood" / "Cache"
-    if sys.platform == "darwin":
-        return home / "Library" / "Caches" / "hood"
-    return Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache") / "hood"
 
 
 def _digest(num_vertices: int, edges: np.ndarray, rest_pos: np.ndarray, num_coarse: int) -> str:

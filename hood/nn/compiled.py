@@ -9,18 +9,13 @@ user's cache folder. They work on one thread.
 from __future__ import annotations
 
 import ctypes
-import hashlib
-import os
-import shutil
-import subprocess
-import tempfile
 from functools import cache
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from hood.graph.cache import cache_folder
+from hood.native.build import BuildError, build
 
 #: ``torch``: torch's operations, everywhere; ``compiled``: the blocks of the network in C++.
 KERNELS = ("torch", "compiled")
@@ -97,46 +92,11 @@ def library(width: int, half: bool) -> ctypes.CDLL:
     Raises:
         ValueError: there is no compiler, or it fails.
     """
-    compiler = find_compiler()
     flags = [*_FLAGS, f"-DWIDTH={width}", f"-DPANEL={panel(width)}", f"-DHALF={int(half)}", *(["-mavx512bf16"] if half else [])]
-    version = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
-    digest = hashlib.sha256("\0".join([compiler, version, *flags, SOURCE.read_text()]).encode()).hexdigest()
-    folder = cache_folder()
-    if folder is not None:
-        path = folder / "kernels" / f"{digest}.so"
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            return ctypes.CDLL(str(path)) if path.exists() else _compile(compiler, flags, path)
-        except OSError:  # a folder that cannot be written to, a file of another machine: done without
-            pass
-    with tempfile.TemporaryDirectory() as temporary:
-        return _compile(compiler, flags, Path(temporary) / "block.so")
-
-
-def find_compiler() -> str:
-    """The C++ compiler: ``CXX`` of the environment, else g++ or clang++.
-
-    Raises:
-        ValueError: there is none.
-    """
-    for name in [os.environ["CXX"]] if os.environ.get("CXX") else ["g++", "clang++"]:
-        found = shutil.which(name)
-        if found is not None:
-            return found
-    raise ValueError("kernels=compiled need a C++ compiler: install g++ or clang++ (or name one in CXX), or use kernels=torch")
-
-
-def _compile(compiler: str, flags: list[str], path: Path) -> ctypes.CDLL:
-    """Compile under another name and rename: other processes may be doing the same."""
-    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        made = Path(folder) / path.name
-        run = subprocess.run([compiler, *flags, str(SOURCE), "-o", str(made)], capture_output=True, text=True, check=False)
-        if run.returncode:
-            lines = run.stderr.strip().splitlines() or [f"exit code {run.returncode}"]
-            first = next((line for line in lines if "error" in line), lines[0])
-            raise ValueError(f"kernels=compiled: {compiler} fails ({first.strip()}); name another in CXX or use kernels=torch")
-        os.replace(made, path)
-    return ctypes.CDLL(str(path))
+    try:
+        return build(SOURCE, flags)
+    except BuildError as error:
+        raise ValueError(f"kernels=compiled: {error} or use kernels=torch") from error
 
 
 def _multiplies_bfloat16() -> bool:

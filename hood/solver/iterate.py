@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -122,7 +123,7 @@ def in_double(problem: StepProblem) -> StepProblem:
     """The same problem in float64; of the body only the contact is read then."""
     if problem.state.pos.dtype == torch.float64:
         return problem
-    return _in_precision(problem, to_device(problem.cloth, dtype=torch.float64))
+    return _in_precision(problem, _double_cloth(problem.cloth))
 
 
 def in_single(problem: StepProblem, cloth: Cloth) -> StepProblem:
@@ -144,6 +145,19 @@ def _in_precision(problem: StepProblem, cloth: Cloth) -> StepProblem:
         None if problem.contact is None else to_device(problem.contact, dtype=real),
         problem.gravity.to(real),
     )
+
+
+_DOUBLES: dict[int, tuple[weakref.ref[Cloth], Cloth]] = {}
+
+
+def _double_cloth(cloth: Cloth) -> Cloth:
+    """The same cloth in float64, kept as long as the cloth lives."""
+    key = id(cloth)
+    if key in _DOUBLES and _DOUBLES[key][0]() is cloth:
+        return _DOUBLES[key][1]
+    double = to_device(cloth, dtype=torch.float64)
+    _DOUBLES[key] = (weakref.ref(cloth, lambda _: _DOUBLES.pop(key, None)), double)
+    return double
 
 
 def rounded(problem: StepProblem, pos: Tensor) -> Tensor:

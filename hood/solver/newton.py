@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from hood.losses.potential import Potential, relative_gradient
 from hood.losses.problem import StepProblem
+from hood.native.build import BuildError
+from hood.solver import engine
 from hood.solver.direction import Directions
-from hood.solver.iterate import Iterate, Proceed, Progress, Unknowns, first_iterate, in_double, rounded
-from hood.solver.plan import ModelBuilder, QuadraticModel, SolverPlan, plan_for
+from hood.solver.iterate import Proceed, Progress, Unknowns, first_iterate, in_double, rounded
+from hood.solver.plan import ModelBuilder, SolverPlan, plan_for
 from hood.solver.reasons import CONVERGED, LATE, MOST_ITERATIONS, NOT_FINITE, STOPPED, STUCK
 from hood.solver.search import Path, backtrack
+
+#: Forms of the solver.
+ENGINES = ("auto", "compiled", "torch")
 
 
 @dataclass(frozen=True)
@@ -30,6 +36,8 @@ class NewtonSettings:
         cg_iterations: at most as many per Newton iteration.
         double: compute in float64 whatever the problem's type. In float32 the potential of a garment is known to
             1e-7 of its value, which stops a line search early; the result comes back in the problem's type anyway.
+        engine: ``compiled`` (C++, compiled at its first use, on a CPU), ``torch``, or ``auto``: compiled where there is a
+            compiler. Settings and terms that the compiled form does not know go to torch whatever is said here.
     """
 
     target_rg: float = 1e-3
@@ -38,6 +46,7 @@ class NewtonSettings:
     linear: str = "cg"
     cg_iterations: int = 100
     double: bool = True
+    engine: str = "auto"
 
     def __post_init__(self) -> None:
         if not self.target_rg > 0 or self.max_iterations < 0 or self.cg_iterations < 1:
@@ -45,6 +54,8 @@ class NewtonSettings:
                 f"solver: target_rg is {self.target_rg}, max_iterations {self.max_iterations}, cg_iterations "
                 f"{self.cg_iterations}; give target_rg > 0, max_iterations >= 0 and cg_iterations >= 1"
             )
+        if self.engine not in ENGINES:
+            raise ValueError(f"solver: engine is {self.engine!r}; choose {', '.join(ENGINES)}")
         if self.linear not in ("cg", "direct"):
             raise ValueError(f"solver: linear is {self.linear!r}; choose cg or direct")
 
@@ -93,50 +104,112 @@ def minimize(
     plan = plan or plan_for(work)
     if start is not None:
         start = start.detach().to(work.state.pos.dtype)
-    pos, report = _Newton(potential, work, plan, settings).run(start, began, proceed)
-    return rounded(problem, pos), replace(report, acc=report.acc.to(problem.state.pos.dtype))
+    system = _system(potential, work, plan, settings)
+    system.begin(start)
+    report = _run(system, settings, began, proceed)
+    return rounded(problem, system.state()[0]), replace(report, acc=report.acc.to(problem.state.pos.dtype))
 
 
-class _Newton:
+class System(Protocol):
+    """The unknowns of a step: where they are, the model there, and the way on. :func:`minimize` decides when to stop."""
+
+    def begin(self, start: Tensor | None) -> None:
+        """Take up positions (V, 3); None: the default of :func:`minimize`."""
+        ...
+
+    @property
+    def phi(self) -> Tensor:
+        """(B,) J."""
+        ...
+
+    @property
+    def used(self) -> int:
+        """Conjugate gradient iterations so far."""
+        ...
+
+    def model(self) -> Tensor:
+        """Make the quadratic model of the state; the relative gradients (B,)."""
+        ...
+
+    def move(self, residual: Tensor, active: Tensor) -> Tensor:
+        """Take a Newton step in the scenes ``active`` (B,); which of them moved (B,)."""
+        ...
+
+    def state(self) -> tuple[Tensor, Tensor]:
+        """Positions (V, 3) and the accelerations (V, 3) that lead there."""
+        ...
+
+
+class TorchSystem:
+    """The unknowns in torch's operations: the reference, on any device."""
+
     def __init__(self, potential: Potential, problem: StepProblem, plan: SolverPlan, settings: NewtonSettings) -> None:
-        self.problem, self.plan, self.settings = problem, plan, settings
+        self.problem, self.plan = problem, plan
         self.unknowns = Unknowns(potential, problem)
         self.directions = Directions(plan, problem.num_scenes, settings.linear, settings.cg_iterations)
+        self._build = ModelBuilder(self.unknowns.terms, plan)
 
-    def run(self, start: Tensor | None, began: float, proceed: Proceed | None) -> tuple[Tensor, Report]:
-        settings, problem = self.settings, self.problem
-        build = ModelBuilder(self.unknowns.terms, self.plan)
-        now = first_iterate(self.unknowns) if start is None else self.unknowns.at(start)
-        active = torch.isfinite(now.phi)
-        finite, stuck, late, why = active, ~active, False, MOST_ITERATIONS
-        history: list[Progress] = []
-        iteration = 0
-        while True:
-            model = build(now.pos, now.acc)
-            residual = relative_gradient(problem, model.gradient)
-            finite = finite & torch.isfinite(residual)
-            active = finite & ~stuck & (residual > settings.target_rg)
-            history.append(Progress(time.perf_counter() - began, now.phi, residual))
-            late = settings.budget_ms is not None and 1e3 * history[-1].seconds > settings.budget_ms
-            if late or iteration >= settings.max_iterations or not bool(active.any()):
-                why = LATE if late else why
-                break
-            if proceed is not None and not proceed(history[-1], now.pos):
-                why = STOPPED
-                break
-            now, moved = self._step(now, model, residual, active)
-            stuck = stuck | (active & ~moved)
-            iteration += 1
-        converged = finite & (residual <= settings.target_rg)
-        reason = _reasons(converged, finite, stuck, why)
-        return now.pos, Report(iteration, self.directions.used, now.phi, residual, converged, reason, now.acc, history)
+    def begin(self, start: Tensor | None) -> None:
+        self._now = first_iterate(self.unknowns) if start is None else self.unknowns.at(start)
 
-    def _step(self, now: Iterate, model: QuadraticModel, residual: Tensor, active: Tensor) -> tuple[Iterate, Tensor]:
-        """The next iterate, and the scenes (B,) that moved."""
+    @property
+    def phi(self) -> Tensor:
+        return self._now.phi
+
+    @property
+    def used(self) -> int:
+        return self.directions.used
+
+    def model(self) -> Tensor:
+        self._model = self._build(self._now.pos, self._now.acc)
+        return relative_gradient(self.problem, self._model.gradient)
+
+    def move(self, residual: Tensor, active: Tensor) -> Tensor:
+        now, model = self._now, self._model
         direction, inverse = self.directions(model, residual, active)
         slope = self.problem.sum_vertices((model.gradient * direction).sum(1))
         path = Path(self.unknowns, now, direction, inverse, self.plan.vertices)
-        return backtrack(self.unknowns, path, now, slope, active)
+        self._now, moved = backtrack(self.unknowns, path, now, slope, active)
+        return moved
+
+    def state(self) -> tuple[Tensor, Tensor]:
+        return self._now.pos, self._now.acc
+
+
+def _system(potential: Potential, problem: StepProblem, plan: SolverPlan, settings: NewtonSettings) -> System:
+    """The fastest form of the solver that does what ``settings`` ask for."""
+    if settings.engine != "torch" and settings.double and settings.linear == "cg" and engine.applies(potential, problem):
+        try:
+            return engine.EngineSystem(potential, problem, plan, settings.cg_iterations)
+        except BuildError as error:
+            if settings.engine == "compiled":
+                raise BuildError(f"solver.engine=compiled: {error} or use solver.engine=torch") from error
+    return TorchSystem(potential, problem, plan, settings)
+
+
+def _run(system: System, settings: NewtonSettings, began: float, proceed: Proceed | None) -> Report:
+    phi = system.phi
+    active = torch.isfinite(phi)
+    finite, stuck, late, why = active, ~active, False, MOST_ITERATIONS
+    history: list[Progress] = []
+    iteration = 0
+    while True:
+        residual = system.model()
+        finite = finite & torch.isfinite(residual)
+        active = finite & ~stuck & (residual > settings.target_rg)
+        history.append(Progress(time.perf_counter() - began, system.phi, residual))
+        late = settings.budget_ms is not None and 1e3 * history[-1].seconds > settings.budget_ms
+        if late or iteration >= settings.max_iterations or not bool(active.any()):
+            why = LATE if late else why
+            break
+        if proceed is not None and not proceed(history[-1], system.state()[0]):
+            why = STOPPED
+            break
+        stuck = stuck | (active & ~system.move(residual, active))
+        iteration += 1
+    converged = finite & (residual <= settings.target_rg)
+    reason = _reasons(converged, finite, stuck, why)
+    return Report(iteration, system.used, system.phi, residual, converged, reason, system.state()[1], history)
 
 
 def _reasons(converged: Tensor, finite: Tensor, stuck: Tensor, otherwise: str) -> tuple[str, ...]:

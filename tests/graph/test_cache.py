@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from hood.graph import cache
-from hood.graph.cache import cache_folder, cached_hierarchy, template_hierarchy
+from hood.graph.cache import cached_hierarchy, template_hierarchy
 from hood.graph.hierarchy import Hierarchy, build_hierarchy
 from hood.mesh.topology import unique_edges
+from hood.native.cache import cache_folder
 from hood.testing import grid
 
 POS, FACES = grid(12, 9)

@@ -1,0 +1,793 @@
+// One scene's implicit step by projected Newton: energies, gradient, Hessian, conjugate gradients and line search.
+//
+// Everything lives in arrays that the caller owns (hood/solver/engine.py), so nothing here allocates. Vertices are numbered anew:
+// the free ones first, in an order that keeps neighbours near each other, then the fixed ones. A table of triples is padded to four
+// numbers a row. Elements are taken eight at a time, one per lane, in float64; a row of 3 x 3 blocks is then gathered from the
+// elements at its vertex, in cache, and written once: no two writers, a fixed order, the same bits in every run.
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+
+namespace {
+
+constexpr int LANES = 8;
+
+typedef double V8 __attribute__((vector_size(64)));
+typedef decltype(V8{} < V8{}) I8;
+typedef double D4 __attribute__((vector_size(32)));
+typedef float F4 __attribute__((vector_size(16)));
+
+template <class T> struct Four;
+template <> struct Four<float> { typedef F4 type; };
+template <> struct Four<double> { typedef D4 type; };
+
+template <class V, class T> inline V load(const T* p) {
+    V v;
+    std::memcpy(&v, p, sizeof(V));
+    return v;
+}
+template <class T, class V> inline void store(T* p, V v) { std::memcpy(p, &v, sizeof(V)); }
+
+template <class V> inline double first_three(V a) { return (double)a[0] + (double)a[1] + (double)a[2]; }
+inline double dot3(const double* a, const double* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+
+inline V8 all(double x) { return V8{x, x, x, x, x, x, x, x}; }
+inline double total(V8 v) { return ((v[0] + v[4]) + (v[1] + v[5])) + ((v[2] + v[6]) + (v[3] + v[7])); }
+inline V8 root(V8 v) {
+    alignas(64) double lanes[LANES];
+    store(lanes, v);
+    for (int i = 0; i < LANES; ++i) lanes[i] = std::sqrt(lanes[i]);
+    return load<V8>(lanes);
+}
+inline V8 magnitude(V8 v) { return v < 0.0 ? -v : v; }
+inline V8 dot(const V8* a, const V8* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+inline void cross(const V8* a, const V8* b, V8* c) {
+    c[0] = a[1] * b[2] - a[2] * b[1];
+    c[1] = a[2] * b[0] - a[0] * b[2];
+    c[2] = a[0] * b[1] - a[1] * b[0];
+}
+
+// Coefficients of (atan(t) / t - 1) / t^2 in t^2 up to tan(pi / 8), a Chebyshev fit with an error of 5e-18.
+constexpr double ATAN[] = {
+    -0.333333333333333302,  0.199999999999955207,   -0.142857142846665429,  0.111111110152563617,
+    -0.0909090457812390186, 0.0769218319082608591,  -0.0666451144738193878, 0.0585814891280212981,
+    -0.0508544973793984085, 0.0392316582955750863,  -0.0191768871190474343};
+
+V8 angle_of(V8 y, V8 x) {
+    const double quarter = 0.78539816339744830962, pi = 3.14159265358979323846;
+    const V8 a = magnitude(y), b = magnitude(x), zero = all(0.0), one = all(1.0);
+    const I8 steep = a > b;
+    const V8 low = steep ? b : a, high = steep ? a : b;
+    const I8 wide = low > 0.41421356237309504880 * high;
+    const V8 top = wide ? low - high : low, bottom = wide ? low + high : high;
+    const V8 t = top / (bottom > zero ? bottom : one), z = t * t;
+    V8 sum = all(ATAN[10]);
+    for (int i = 9; i >= 0; --i) sum = sum * z + ATAN[i];
+    V8 angle = t + t * z * sum;
+    angle = wide ? angle + quarter : angle;
+    angle = steep ? 0.5 * pi - angle : angle;
+    angle = x < 0.0 ? pi - angle : angle;
+    return y < 0.0 ? -angle : angle;
+}
+
+}  // namespace
+
+extern "C" {
+
+// A collision term as planes, or a friction term; rows of original vertices, zero where nothing acts.
+struct Wall {
+    const double *point, *normal, *reach;  // (V, 3), (V, 3), (V)
+    double weight;
+};
+struct Grip {
+    const double *force, *normal, *anchor, *limit;  // (V), (V, 3), (V, 3), (V)
+};
+
+struct Engine {
+    // The cloth: constant as long as its plan.
+    int64_t num_vertices, num_rows, num_faces, num_hinges, num_blocks, num_springs;  // elements padded to a multiple of 8
+    const int64_t* vertex;                        // (V) original number of each vertex
+    const int32_t *face_corners, *hinge_corners;  // (3, F), (4, H)
+    const int32_t *row_starts, *cols;             // (N + 1), (R) block rows and columns
+    const int32_t* diagonal;                      // (N) block of every row on the diagonal
+    const int32_t *face_starts, *face_uses;       // (N + 1), (., 5): face, corner, the places of its corners in the row
+    const int32_t *hinge_starts, *hinge_uses;     // (N + 1), (., 6)
+    const int32_t *spring_ends, *spring_blocks;   // (A, 2) vertices, (A, 4) blocks aa, bb, ab, ba; -1 where fixed
+    // The fabric: constant as long as the cloth's numbers.
+    const double *shape, *area, *mu, *lambda, *bulk, *soft;  // (6, F) 1/m, (F) m^3, Pa, Pa and roots of moduli times area
+    const double *rest_angle, *hinge_weight, *rest_length;   // (H)
+    // The step.
+    const double *base, *fixed;  // (V, 3) m original: free flight, and where fixed vertices are
+    const double *inertia, *weight;  // (V) kg, (V, 3) N original
+    const double* spring_stiffness;  // (A) N/m
+    const Wall* walls;
+    const Grip* grips;
+    int64_t num_walls, num_grips;
+    int64_t bending;  // 0 none, 1 about the rest shape, 2 with the current length about flat
+    int64_t membrane;
+    double dt_sq;
+    // The state.
+    double *pos, *acc;              // (V, 4), (N, 4)
+    double *trial_pos, *trial_acc;  // the same
+    double *gradient, *direction;   // (N, 4)
+    double *path;                   // (W, N, 8) stops of the line search: give, compliance, depth, of every wall
+    void *face_model, *hinge_model; // records of the elements, see below
+    void *matrix, *slack, *own_slack;  // (R, 9) + 1, (R), (N, 6), of float or double
+    void *inverse, *x, *r, *z, *p, *q; // (N, 12), (N, 4) five times, of float or double
+    double sharpness, raised;       // of the matrix as it stands, and of the next one
+    double phi, noise;
+    int64_t wide;                   // matrix and linear solver in float64
+    int64_t cg_used;
+};
+}
+
+namespace {
+
+// ---- elements ------------------------------------------------------------------------------------------------------------
+
+template <class T> struct FaceRecord {
+    double gradient[10];  // by corner, then axis; a spare one for loads of four
+    T root[28];           // three vectors over the corners whose outer products are the material part
+    T axial[6], slack[6]; // pairs of corners 00 01 02 11 12 22: what acts on the three axes alike
+};
+template <class T> struct HingeRecord {
+    double gradient[14];
+    T row[14];
+};
+
+inline void gather(const double* pos, const int32_t* index, V8* x) {
+    alignas(64) double axes[3][LANES];
+    for (int lane = 0; lane < LANES; ++lane) {
+        const double* p = pos + 4 * (int64_t)index[lane];
+        for (int k = 0; k < 3; ++k) axes[k][lane] = p[k];
+    }
+    for (int k = 0; k < 3; ++k) x[k] = load<V8>(axes[k]);
+}
+
+struct Strain {
+    V8 f[2][3], g00, g01, g11;
+};
+
+inline void strain_of(const Engine& e, const double* pos, int64_t i, Strain& s) {
+    V8 x[3][3];
+    for (int c = 0; c < 3; ++c) gather(pos, e.face_corners + c * e.num_faces + i, x[c]);
+    for (int a = 0; a < 2; ++a) {
+        const V8 one = load<V8>(e.shape + (3 * a + 1) * e.num_faces + i), two = load<V8>(e.shape + (3 * a + 2) * e.num_faces + i);
+        for (int k = 0; k < 3; ++k) s.f[a][k] = (x[1][k] - x[0][k]) * one + (x[2][k] - x[0][k]) * two;
+    }
+    s.g00 = 0.5 * (dot(s.f[0], s.f[0]) - 1.0);
+    s.g01 = 0.5 * dot(s.f[0], s.f[1]);
+    s.g11 = 0.5 * (dot(s.f[1], s.f[1]) - 1.0);
+}
+
+double face_energy(const Engine& e, const double* pos) {
+    double sum = 0.0;
+    for (int64_t i = 0; i < e.num_faces; i += LANES) {
+        Strain s;
+        strain_of(e, pos, i, s);
+        const V8 trace = s.g00 + s.g11, square = s.g00 * s.g00 + s.g11 * s.g11 + 2.0 * s.g01 * s.g01;
+        const V8 density = load<V8>(e.mu + i) * square + 0.5 * load<V8>(e.lambda + i) * trace * trace;
+        sum += total(load<V8>(e.area + i) * density);
+    }
+    return sum;
+}
+
+template <class T> void face_models(const Engine& e, const double* pos) {
+    FaceRecord<T>* records = (FaceRecord<T>*)e.face_model;
+    const V8 zero = all(0.0), one = all(1.0);
+    for (int64_t i = 0; i < e.num_faces; i += LANES) {
+        Strain s;
+        strain_of(e, pos, i, s);
+        const V8 mu = load<V8>(e.mu + i), area = load<V8>(e.area + i);
+        const V8 pressure = load<V8>(e.lambda + i) * (s.g00 + s.g11);
+        const V8 s00 = 2.0 * mu * s.g00 + pressure, s01 = 2.0 * mu * s.g01, s11 = 2.0 * mu * s.g11 + pressure;
+        // The positive part of the stress, from the eigenvalues of a 2 x 2 matrix.
+        const V8 mean = 0.5 * (s00 + s11), half = 0.5 * (s00 - s11), radius = root(half * half + s01 * s01);
+        const V8 most = mean + radius, least = mean - radius;
+        const V8 high = most > zero ? most : zero, low = least > zero ? least : zero;
+        const V8 centre = 0.5 * (high + low), slope = radius > zero ? 0.5 * (high - low) / (radius > zero ? radius : one) : zero;
+        const V8 t00 = centre + slope * half, t01 = slope * s01, t11 = centre - slope * half;
+        const V8 bulk = load<V8>(e.bulk + i), soft = load<V8>(e.soft + i);
+        V8 b0[3], b1[3], pull0[3], pull1[3], ten0[3], ten1[3];
+        for (int c = 0; c < 3; ++c) {
+            b0[c] = load<V8>(e.shape + c * e.num_faces + i);
+            b1[c] = load<V8>(e.shape + (3 + c) * e.num_faces + i);
+            const V8 w0 = area * b0[c], w1 = area * b1[c];
+            pull0[c] = s00 * w0 + s01 * w1, pull1[c] = s01 * w0 + s11 * w1;
+            ten0[c] = t00 * w0 + t01 * w1, ten1[c] = t01 * w0 + t11 * w1;
+        }
+        for (int c = 0; c < 3; ++c) {
+            for (int k = 0; k < 3; ++k) {
+                const V8 force = pull0[c] * s.f[0][k] + pull1[c] * s.f[1][k];
+                const V8 along = b0[c] * s.f[0][k], across = b1[c] * s.f[1][k];
+                const V8 roots[3] = {bulk * (along + across), soft * (along - across),
+                                     soft * (b0[c] * s.f[1][k] + b1[c] * s.f[0][k])};
+                for (int lane = 0; lane < LANES; ++lane) {
+                    FaceRecord<T>& record = records[i + lane];
+                    record.gradient[3 * c + k] = force[lane];
+                    for (int m = 0; m < 3; ++m) record.root[9 * m + 3 * c + k] = (T)roots[m][lane];
+                }
+            }
+        }
+        int place = 0;
+        for (int c = 0; c < 3; ++c)
+            for (int d = c; d < 3; ++d, ++place) {
+                const V8 axial = ten0[c] * b0[d] + ten1[c] * b1[d], slack = pull0[c] * b0[d] + pull1[c] * b1[d] - axial;
+                for (int lane = 0; lane < LANES; ++lane) {
+                    records[i + lane].axial[place] = (T)axial[lane];
+                    records[i + lane].slack[place] = (T)slack[lane];
+                }
+            }
+    }
+}
+
+struct Hinge {
+    V8 unit, edge[3], a[3], b[3], n1[3], n2[3], edge_sq, n1_sq, n2_sq, angle;
+    I8 regular;
+};
+
+inline I8 regular(V8 cross_sq, V8 product_sq) {
+    const double eps = 2.220446049250313e-16, tiny = 2.2250738585072014e-308, ulps = 8.0 * eps;
+    return (cross_sq > ulps * ulps * product_sq) & (cross_sq > all(tiny / eps));
+}
+
+inline void hinge_of(const Engine& e, const double* pos, int64_t i, Hinge& h, V8* span) {
+    V8 x[4][3];
+    for (int c = 0; c < 4; ++c) gather(pos, e.hinge_corners + c * e.num_hinges + i, x[c]);
+    h.unit = load<V8>(e.rest_length + i);
+    for (int k = 0; k < 3; ++k) {
+        span[k] = x[1][k] - x[0][k];
+        h.edge[k] = span[k] / h.unit;
+        h.a[k] = (x[2][k] - x[0][k]) / h.unit;
+        h.b[k] = (x[3][k] - x[0][k]) / h.unit;
+    }
+    cross(h.edge, h.a, h.n1);
+    cross(h.b, h.edge, h.n2);
+    const V8 one = all(1.0), edge_sq = dot(h.edge, h.edge), n1_sq = dot(h.n1, h.n1), n2_sq = dot(h.n2, h.n2);
+    h.regular = regular(n1_sq, edge_sq * dot(h.a, h.a)) & regular(n2_sq, edge_sq * dot(h.b, h.b));
+    h.edge_sq = h.regular ? edge_sq : one;
+    h.n1_sq = h.regular ? n1_sq : one;
+    h.n2_sq = h.regular ? n2_sq : one;
+    const V8 sine = h.regular ? -root(h.edge_sq) * dot(h.n1, h.b) : all(0.0);
+    h.angle = angle_of(sine, h.regular ? dot(h.n1, h.n2) : one);
+}
+
+inline V8 bend_of(V8 angle, V8 rest_angle) {
+    const double turn = 6.283185307179586476925;
+    const V8 bend = angle - rest_angle, zero = all(0.0);
+    // Both angles are within a half turn, so at most one turn is off.
+    const V8 off = bend > 0.5 * turn ? all(turn) : bend < -0.5 * turn ? all(-turn) : zero;
+    return bend - off;
+}
+
+double hinge_energy(const Engine& e, const double* pos) {
+    double sum = 0.0;
+    for (int64_t i = 0; i < e.num_hinges; i += LANES) {
+        Hinge h;
+        V8 span[3];
+        hinge_of(e, pos, i, h, span);
+        const V8 weight = load<V8>(e.hinge_weight + i);
+        if (e.bending == 2) {
+            const V8 bend = h.angle / h.unit;
+            sum += total(0.5 * weight * bend * bend * dot(span, span));
+        } else {
+            const V8 bend = bend_of(h.angle, load<V8>(e.rest_angle + i));
+            sum += total(0.5 * weight * bend * bend);
+        }
+    }
+    return sum;
+}
+
+template <class T> void hinge_models(const Engine& e, const double* pos) {
+    HingeRecord<T>* records = (HingeRecord<T>*)e.hinge_model;
+    const V8 zero = all(0.0), one = all(1.0);
+    for (int64_t i = 0; i < e.num_hinges; i += LANES) {
+        Hinge h;
+        V8 span[3], slope[4][3];
+        hinge_of(e, pos, i, h, span);
+        const V8 scale = (h.regular ? -root(h.edge_sq) : zero) / h.unit;
+        const V8 share_a = dot(h.edge, h.a) / h.edge_sq, share_b = dot(h.edge, h.b) / h.edge_sq;
+        const V8 by_a = scale / h.n1_sq, by_b = scale / h.n2_sq;
+        for (int k = 0; k < 3; ++k) {
+            const V8 at_a = by_a * h.n1[k], at_b = by_b * h.n2[k], at_end = -(share_a * at_a + share_b * at_b);
+            slope[0][k] = -at_a - at_b - at_end;
+            slope[1][k] = at_end;
+            slope[2][k] = at_a;
+            slope[3][k] = at_b;
+        }
+        V8 residual;
+        if (e.bending == 2) {
+            const V8 length = root(dot(span, span)), ratio = length / h.unit;
+            residual = h.angle * ratio;
+            const V8 along = h.angle / (h.unit * (length > zero ? length : one));
+            for (int k = 0; k < 3; ++k) {
+                for (int c = 0; c < 4; ++c) slope[c][k] *= ratio;
+                slope[0][k] -= along * span[k];
+                slope[1][k] += along * span[k];
+            }
+        } else {
+            residual = bend_of(h.angle, load<V8>(e.rest_angle + i));
+        }
+        const V8 weight = load<V8>(e.hinge_weight + i), force = weight * residual, size = root(weight);
+        for (int c = 0; c < 4; ++c)
+            for (int k = 0; k < 3; ++k) {
+                const V8 pull = force * slope[c][k], row = size * slope[c][k];
+                for (int lane = 0; lane < LANES; ++lane) {
+                    records[i + lane].gradient[3 * c + k] = pull[lane];
+                    records[i + lane].row[3 * c + k] = (T)row[lane];
+                }
+            }
+    }
+}
+
+// ---- single vertices -----------------------------------------------------------------------------------------------------
+
+inline double depth_of(const Wall& wall, int64_t v, const double* pos) {
+    const double *point = wall.point + 3 * v, *normal = wall.normal + 3 * v;
+    const double gap[3] = {pos[0] - point[0], pos[1] - point[1], pos[2] - point[2]};
+    return wall.reach[v] - dot3(gap, normal);
+}
+
+// Tangential slip; returns its length.
+inline double slip_of(const Grip& grip, int64_t v, const double* pos, double* slip) {
+    const double *anchor = grip.anchor + 3 * v, *normal = grip.normal + 3 * v;
+    for (int k = 0; k < 3; ++k) slip[k] = pos[k] - anchor[k];
+    const double along = dot3(slip, normal);
+    for (int k = 0; k < 3; ++k) slip[k] -= along * normal[k];
+    return std::sqrt(dot3(slip, slip));
+}
+
+// Upper triangles 00 01 02 11 12 22.
+inline void add_outer(double* upper, double factor, const double* n) {
+    int place = 0;
+    for (int a = 0; a < 3; ++a)
+        for (int b = a; b < 3; ++b) upper[place++] += factor * n[a] * n[b];
+}
+
+inline void vertex_model(const Engine& e, int64_t row, double* gradient, double* upper, double* slack) {
+    const int64_t v = e.vertex[row];
+    const double *pos = e.pos + 4 * row, *acc = e.acc + 4 * row, *weight = e.weight + 3 * v;
+    for (int k = 0; k < 3; ++k) gradient[k] = e.inertia[v] * acc[k] - weight[k];
+    for (int k = 0; k < 6; ++k) upper[k] = slack[k] = 0.0;
+    upper[0] = upper[3] = upper[5] = e.inertia[v] / e.dt_sq;
+    for (int64_t w = 0; w < e.num_walls; ++w) {
+        const Wall& wall = e.walls[w];
+        const double depth = depth_of(wall, v, pos);
+        if (!(depth > 0.0)) continue;
+        const double* normal = wall.normal + 3 * v;
+        for (int k = 0; k < 3; ++k) gradient[k] -= 3.0 * wall.weight * depth * depth * normal[k];
+        add_outer(upper, 6.0 * wall.weight * depth, normal);
+    }
+    for (int64_t w = 0; w < e.num_grips; ++w) {
+        const Grip& grip = e.grips[w];
+        const double force = grip.force[v];
+        if (!(force > 0.0)) continue;
+        double slip[3];
+        const double *normal = grip.normal + 3 * v, limit = grip.limit[v], size = slip_of(grip, v, pos, slip);
+        const double ratio = size / limit;
+        const double slope = force * (size < limit ? (2.0 - ratio) / limit : 1.0 / size);
+        const double along = size < limit ? force * 2.0 * (1.0 - ratio) / limit : 0.0;
+        for (int k = 0; k < 3; ++k) gradient[k] += slope * slip[k];
+        upper[0] += slope, upper[3] += slope, upper[5] += slope;
+        add_outer(upper, -slope, normal);
+        if (size > 0.0) {
+            const double heading[3] = {slip[0] / size, slip[1] / size, slip[2] / size};
+            add_outer(slack, along - slope, heading);
+        }
+    }
+}
+
+// ---- the potential -------------------------------------------------------------------------------------------------------
+
+void place(const Engine& e, const double* acc, double* pos) {
+    for (int64_t row = 0; row < e.num_rows; ++row) {
+        const double* base = e.base + 3 * e.vertex[row];
+        for (int k = 0; k < 3; ++k) pos[4 * row + k] = base[k] + e.dt_sq * acc[4 * row + k];
+    }
+}
+
+// Potential at a placed state, and the rounding it is known to.
+void energy(const Engine& e, const double* pos, const double* acc, double* phi, double* noise) {
+    double inertia = 0.0, gravity = 0.0, sum = 0.0, size = 0.0;
+    for (int64_t row = 0; row < e.num_rows; ++row) {
+        const int64_t v = e.vertex[row];
+        inertia += 0.5 * e.inertia[v] * e.dt_sq * dot3(acc + 4 * row, acc + 4 * row);
+        gravity -= dot3(e.weight + 3 * v, pos + 4 * row);
+    }
+    for (int64_t row = e.num_rows; row < e.num_vertices; ++row) {
+        const int64_t v = e.vertex[row];
+        double moved[3];
+        for (int k = 0; k < 3; ++k) moved[k] = pos[4 * row + k] - e.base[3 * v + k];
+        inertia += 0.5 * e.inertia[v] / e.dt_sq * dot3(moved, moved);
+        gravity -= dot3(e.weight + 3 * v, pos + 4 * row);
+    }
+    const auto add = [&](double part) { sum += part, size += std::fabs(part); };
+    add(inertia);
+    add(gravity);
+    for (int64_t w = 0; w < e.num_walls; ++w) {
+        double part = 0.0;
+        for (int64_t row = 0; row < e.num_vertices; ++row) {
+            const double depth = depth_of(e.walls[w], e.vertex[row], pos + 4 * row);
+            // Not-a-number is no depth to leave out.
+            if (!(depth <= 0.0)) part += e.walls[w].weight * depth * depth * depth;
+        }
+        add(part);
+    }
+    for (int64_t w = 0; w < e.num_grips; ++w) {
+        const Grip& grip = e.grips[w];
+        double part = 0.0;
+        for (int64_t row = 0; row < e.num_vertices; ++row) {
+            const int64_t v = e.vertex[row];
+            if (!(grip.force[v] > 0.0)) continue;
+            double slip[3];
+            const double limit = grip.limit[v], y = slip_of(grip, v, pos + 4 * row, slip);
+            part += grip.force[v] * (y < limit ? y * y / limit * (1.0 - y / (3.0 * limit)) + limit / 3.0 : y);
+        }
+        add(part);
+    }
+    if (e.membrane) add(face_energy(e, pos));
+    if (e.bending) add(hinge_energy(e, pos));
+    double springs = 0.0;
+    for (int64_t s = 0; s < e.num_springs; ++s) {
+        double gap[3];
+        for (int k = 0; k < 3; ++k) gap[k] = pos[4 * e.spring_ends[2 * s] + k] - pos[4 * e.spring_ends[2 * s + 1] + k];
+        springs += 0.5 * e.spring_stiffness[s] * dot3(gap, gap);
+    }
+    if (e.num_springs) add(springs);
+    *phi = sum;
+    *noise = 8.0 * 2.220446049250313e-16 * size;
+}
+
+// ---- the matrix ----------------------------------------------------------------------------------------------------------
+
+constexpr int MOST_BLOCKS = 512;  // in a row; rows with more are refused when the plan is made
+
+// Rows of blocks, column by column of a block, and the gradient; the records of the elements have been made.
+template <class T> void gather_rows(const Engine& e) {
+    typedef typename Four<T>::type V4;
+    const FaceRecord<T>* faces = (const FaceRecord<T>*)e.face_model;
+    const HingeRecord<T>* hinges = (const HingeRecord<T>*)e.hinge_model;
+    T *matrix = (T*)e.matrix, *slack = (T*)e.slack, *own_slack = (T*)e.own_slack;
+    V4 block[3 * MOST_BLOCKS];
+    T axial[MOST_BLOCKS], less[MOST_BLOCKS];
+    constexpr int PAIR[3][3] = {{0, 1, 2}, {1, 3, 4}, {2, 4, 5}};
+    const V4 unit[3] = {V4{1, 0, 0, 0}, V4{0, 1, 0, 0}, V4{0, 0, 1, 0}};
+    for (int64_t row = 0; row < e.num_rows; ++row) {
+        const int64_t start = e.row_starts[row], degree = e.row_starts[row + 1] - start;
+        // One place more than there are blocks: what belongs to fixed corners goes there.
+        for (int64_t i = 0; i < 3 * (degree + 1); ++i) block[i] = V4{};
+        for (int64_t i = 0; i <= degree; ++i) axial[i] = less[i] = T(0);
+        D4 force = D4{};
+        if (e.membrane)
+            for (int64_t i = e.face_starts[row]; i < e.face_starts[row + 1]; ++i) {
+                const int32_t* use = e.face_uses + 5 * i;
+                const FaceRecord<T>& face = faces[use[0]];
+                const int c = use[1];
+                force += load<D4>(face.gradient + 3 * c);
+                V4 own[3];
+                for (int m = 0; m < 3; ++m) own[m] = load<V4>(face.root + 9 * m + 3 * c);
+                for (int d = 0; d < 3; ++d) {
+                    V4* target = block + 3 * use[2 + d];
+                    for (int k = 0; k < 3; ++k)
+                        target[k] += own[0] * face.root[3 * d + k] + own[1] * face.root[9 + 3 * d + k] +
+                                     own[2] * face.root[18 + 3 * d + k];
+                    axial[use[2 + d]] += face.axial[PAIR[c][d]];
+                    less[use[2 + d]] += face.slack[PAIR[c][d]];
+                }
+            }
+        if (e.bending)
+            for (int64_t i = e.hinge_starts[row]; i < e.hinge_starts[row + 1]; ++i) {
+                const int32_t* use = e.hinge_uses + 6 * i;
+                const HingeRecord<T>& hinge = hinges[use[0]];
+                force += load<D4>(hinge.gradient + 3 * use[1]);
+                const V4 own = load<V4>(hinge.row + 3 * use[1]);
+                for (int d = 0; d < 4; ++d) {
+                    V4* target = block + 3 * use[2 + d];
+                    for (int k = 0; k < 3; ++k) target[k] += own * hinge.row[3 * d + k];
+                }
+            }
+        double gradient[3], upper[6], own[6];
+        vertex_model(e, row, gradient, upper, own);
+        const int64_t self = e.diagonal[row] - start;
+        for (int a = 0; a < 3; ++a) {
+            e.gradient[4 * row + a] = gradient[a] + force[a];
+            // Whole vectors: a load of four that follows a store of one waits for it.
+            block[3 * self + a] += V4{(T)upper[PAIR[a][0]], (T)upper[PAIR[a][1]], (T)upper[PAIR[a][2]], T(0)};
+        }
+        for (int k = 0; k < 6; ++k) own_slack[6 * row + k] = (T)own[k];
+        for (int64_t i = 0; i < degree; ++i) {
+            T* target = matrix + 9 * (start + i);
+            for (int k = 0; k < 3; ++k)  // the fourth number is overwritten by the next store
+                store(target + 3 * k, block[3 * i + k] + axial[i] * unit[k]);
+            slack[start + i] = less[i];
+        }
+    }
+}
+
+template <class T> void add_springs(const Engine& e) {
+    T* matrix = (T*)e.matrix;
+    for (int64_t s = 0; s < e.num_springs; ++s) {
+        const double stiffness = e.spring_stiffness[s];
+        const int32_t *ends = e.spring_ends + 2 * s, *blocks = e.spring_blocks + 4 * s;
+        for (int k = 0; k < 3; ++k) {
+            const double pull = stiffness * (e.pos[4 * ends[0] + k] - e.pos[4 * ends[1] + k]);
+            if (ends[0] < e.num_rows) e.gradient[4 * ends[0] + k] += pull;
+            if (ends[1] < e.num_rows) e.gradient[4 * ends[1] + k] -= pull;
+            for (int b = 0; b < 4; ++b)
+                if (blocks[b] >= 0) matrix[9 * (int64_t)blocks[b] + 4 * k] += (T)(b < 2 ? stiffness : -stiffness);
+        }
+    }
+}
+
+template <class T> void assemble(Engine& e) {
+    if (e.membrane) face_models<T>(e, e.pos);
+    if (e.bending) hinge_models<T>(e, e.pos);
+    gather_rows<T>(e);
+    add_springs<T>(e);
+    e.sharpness = 0.0;
+}
+
+// The share of the slack that is in the matrix, from what it was to what it shall be.
+template <class T> void sharpen(Engine& e, double sharpness) {
+    T *matrix = (T*)e.matrix, *slack = (T*)e.slack, *own_slack = (T*)e.own_slack;
+    const T change = (T)(sharpness - e.sharpness);
+    e.sharpness = sharpness;
+    if (change == T(0)) return;
+    for (int64_t i = 0; i < e.num_blocks; ++i)
+        for (int k = 0; k < 3; ++k) matrix[9 * i + 4 * k] += change * slack[i];
+    constexpr int PAIR[3][3] = {{0, 1, 2}, {1, 3, 4}, {2, 4, 5}};
+    if (e.num_grips)
+        for (int64_t row = 0; row < e.num_rows; ++row)
+            for (int a = 0; a < 3; ++a)
+                for (int b = 0; b < 3; ++b)
+                    matrix[9 * (int64_t)e.diagonal[row] + 3 * a + b] += change * own_slack[6 * row + PAIR[a][b]];
+}
+
+// ---- the linear system ---------------------------------------------------------------------------------------------------
+
+// Inverses of the diagonal blocks by cofactors, scaled to a diagonal of ones first; columns of four numbers.
+template <class T> void invert_diagonal(const Engine& e) {
+    const T* matrix = (const T*)e.matrix;
+    T* inverse = (T*)e.inverse;
+    for (int64_t row = 0; row < e.num_rows; ++row) {
+        const T* m = matrix + 9 * (int64_t)e.diagonal[row];
+        double scale[3], a[3][3], c[3][3];
+        for (int i = 0; i < 3; ++i) scale[i] = 1.0 / std::sqrt(m[4 * i] > T(0) ? (double)m[4 * i] : 2.2250738585072014e-308);
+        for (int i = 0; i < 3; ++i)
+            for (int j = 0; j < 3; ++j) a[i][j] = (double)m[3 * i + j] * scale[i] * scale[j];
+        for (int i = 0; i < 3; ++i) {
+            const double *u = a[(i + 1) % 3], *v = a[(i + 2) % 3];
+            c[i][0] = u[1] * v[2] - u[2] * v[1], c[i][1] = u[2] * v[0] - u[0] * v[2], c[i][2] = u[0] * v[1] - u[1] * v[0];
+        }
+        double determinant = dot3(a[0], c[0]);
+        if (!(determinant > 2.220446049250313e-16)) determinant = 2.220446049250313e-16;
+        for (int i = 0; i < 3; ++i) {
+            for (int j = 0; j < 3; ++j) inverse[12 * row + 4 * i + j] = (T)(c[i][j] / determinant * scale[i] * scale[j]);
+            inverse[12 * row + 4 * i + 3] = T(0);
+        }
+    }
+}
+
+// q = H p and p . q.
+template <class T> double multiply(const Engine& e, const T* p, T* q) {
+    typedef typename Four<T>::type V4;
+    const T* matrix = (const T*)e.matrix;
+    double sum = 0.0;
+    for (int64_t row = 0; row < e.num_rows; ++row) {
+        V4 a = V4{}, b = V4{}, c = V4{};
+        for (int32_t i = e.row_starts[row]; i < e.row_starts[row + 1]; ++i) {
+            const T *m = matrix + 9 * (int64_t)i, *x = p + 4 * (int64_t)e.cols[i];
+            a += load<V4>(m) * x[0];
+            b += load<V4>(m + 3) * x[1];
+            c += load<V4>(m + 6) * x[2];
+        }
+        const V4 y = a + b + c, own = load<V4>(p + 4 * row);
+        T* out = q + 4 * row;
+        out[0] = y[0], out[1] = y[1], out[2] = y[2], out[3] = T(0);
+        sum += first_three(y * own);
+    }
+    return sum;
+}
+
+// z = P r and r . z.
+template <class T> double precondition(const Engine& e, const T* r, T* z) {
+    typedef typename Four<T>::type V4;
+    const T* inverse = (const T*)e.inverse;
+    double sum = 0.0;
+    for (int64_t row = 0; row < e.num_rows; ++row) {
+        const T *m = inverse + 12 * row, *x = r + 4 * row;
+        const V4 y = load<V4>(m) * x[0] + load<V4>(m + 4) * x[1] + load<V4>(m + 8) * x[2];
+        store(z + 4 * row, y);
+        sum += first_three(y * load<V4>(x));
+    }
+    return sum;
+}
+
+// Conjugate gradients for the direction; false where the matrix turned out not to be positive definite.
+template <class T> bool solve(Engine& e, double tolerance, int64_t most) {
+    typedef typename Four<T>::type V4;
+    T *x = (T*)e.x, *r = (T*)e.r, *z = (T*)e.z, *p = (T*)e.p, *q = (T*)e.q;
+    const int64_t size = e.num_rows;
+    double norm = 0.0;  // the right-hand side is scaled to 1: nothing overflows in float32
+    for (int64_t row = 0; row < size; ++row) norm += dot3(e.gradient + 4 * row, e.gradient + 4 * row);
+    norm = std::sqrt(norm);
+    const double scale = norm > 0.0 ? 1.0 / norm : 0.0;
+    for (int64_t row = 0; row < size; ++row)
+        for (int k = 0; k < 4; ++k) {
+            x[4 * row + k] = T(0);
+            r[4 * row + k] = k < 3 ? (T)(-scale * e.gradient[4 * row + k]) : T(0);
+        }
+    double rz = precondition<T>(e, r, z);
+    std::memcpy(p, z, sizeof(T) * 4 * size);
+    const double limit = tolerance * tolerance * rz;
+    bool definite = true;
+    for (int64_t iteration = 0; iteration < most && rz > limit; ++iteration) {
+        const double curvature = multiply<T>(e, p, q);
+        if (!(curvature > 0.0)) {
+            definite = false;
+            break;
+        }
+        const T length = (T)(rz / curvature);
+        for (int64_t row = 0; row < size; ++row) {
+            store(x + 4 * row, load<V4>(x + 4 * row) + length * load<V4>(p + 4 * row));
+            store(r + 4 * row, load<V4>(r + 4 * row) - length * load<V4>(q + 4 * row));
+        }
+        const double before = rz;
+        rz = precondition<T>(e, r, z);
+        const T share = (T)(rz / before);
+        for (int64_t row = 0; row < size; ++row) store(p + 4 * row, load<V4>(z + 4 * row) + share * load<V4>(p + 4 * row));
+        ++e.cg_used;
+    }
+    for (int64_t row = 0; row < size; ++row)
+        for (int k = 0; k < 3; ++k) e.direction[4 * row + k] = norm * (double)x[4 * row + k];
+    return definite;
+}
+
+// As much of the slack as the system bears, see hood.solver.direction.Directions.
+template <class T> void direct(Engine& e, double residual, int64_t most) {
+    invert_diagonal<T>(e);
+    double tolerance = std::sqrt(residual);
+    tolerance = tolerance < 1e-3 ? 1e-3 : tolerance > 0.1 ? 0.1 : tolerance;
+    double sharpness = e.raised;
+    bool halved = false;
+    while (true) {
+        sharpen<T>(e, sharpness);
+        if (solve<T>(e, tolerance, most) || !(sharpness > 0.0)) break;
+        sharpness = sharpness > 0.2 ? 0.5 * sharpness : 0.0;
+        halved = true;
+    }
+    const double raised = 2.0 * sharpness;
+    e.raised = halved ? sharpness : raised < 0.25 ? 0.25 : raised > 1.0 ? 1.0 : raised;
+}
+
+// ---- the line search -----------------------------------------------------------------------------------------------------
+
+// What stops vertices at walls on the way of a step: give (3), compliance, depth at the start, 1 where it acts.
+template <class T> void prepare_path(const Engine& e) {
+    const T* inverse = (const T*)e.inverse;
+    for (int64_t w = 0; w < e.num_walls; ++w)
+        for (int64_t row = 0; row < e.num_rows; ++row) {
+            const int64_t v = e.vertex[row];
+            const double *pos = e.pos + 4 * row, *step = e.direction + 4 * row, *normal = e.walls[w].normal + 3 * v;
+            const double end[3] = {pos[0] + step[0], pos[1] + step[1], pos[2] + step[2]};
+            const double here = depth_of(e.walls[w], v, pos), there = depth_of(e.walls[w], v, end);
+            double* stop = e.path + 8 * (w * e.num_rows + row);
+            stop[5] = here > 0.0 || there > 0.0;
+            if (stop[5] == 0.0) continue;
+            for (int k = 0; k < 3; ++k) {
+                const T* m = inverse + 12 * row + k;
+                stop[k] = (double)m[0] * normal[0] + (double)m[4] * normal[1] + (double)m[8] * normal[2];
+            }
+            stop[3] = dot3(stop, normal);
+            stop[4] = here > 0.0 ? here : 0.0;
+        }
+}
+
+void walk(const Engine& e, double length) {
+    const double step = length / e.dt_sq;
+    for (int64_t row = 0; row < e.num_rows; ++row)
+        for (int k = 0; k < 3; ++k) e.trial_acc[4 * row + k] = e.acc[4 * row + k] + step * e.direction[4 * row + k];
+    for (int64_t w = 0; w < e.num_walls; ++w) {
+        const Wall& wall = e.walls[w];
+        const double cubic = 3.0 * wall.weight;
+        for (int64_t row = 0; row < e.num_rows; ++row) {
+            const double* stop = e.path + 8 * (w * e.num_rows + row);
+            if (stop[5] == 0.0) continue;
+            const int64_t v = e.vertex[row];
+            double *acc = e.trial_acc + 4 * row, pos[3];
+            for (int k = 0; k < 3; ++k) pos[k] = e.base[3 * v + k] + e.dt_sq * acc[k];
+            const double compliance = stop[3], start = stop[4], end = depth_of(wall, v, pos);
+            // The model's own force at the end, and the stiffness of everything else.
+            const double force = cubic * start * (2.0 * end - start);
+            double rest = 1.0 / compliance - 2.0 * cubic * start;
+            if (rest < 0.1 / compliance) rest = 0.1 / compliance;
+            double load = force + rest * end;
+            if (load < 0.0) load = 0.0;
+            // cubic q^2 + rest (q - end) = force for the depth q >= 0.
+            const double balance = 2.0 * load / (rest + std::sqrt(rest * rest + 4.0 * cubic * load));
+            if (!(end > balance)) continue;
+            const double push = (end - balance) / compliance / e.dt_sq;
+            for (int k = 0; k < 3; ++k) acc[k] += push * stop[k];
+        }
+    }
+    place(e, e.trial_acc, e.trial_pos);
+}
+
+bool backtrack(Engine& e) {
+    double slope = 0.0, length = 1.0;
+    for (int64_t row = 0; row < e.num_rows; ++row) slope += dot3(e.gradient + 4 * row, e.direction + 4 * row);
+    if (!(slope < 0.0)) return false;
+    for (int attempt = 0; attempt < 40; ++attempt) {
+        double phi, noise;
+        walk(e, length);
+        energy(e, e.trial_pos, e.trial_acc, &phi, &noise);
+        if (phi <= e.phi + 1e-4 * length * slope + e.noise) {
+            std::memcpy(e.pos, e.trial_pos, sizeof(double) * 4 * e.num_rows);
+            std::memcpy(e.acc, e.trial_acc, sizeof(double) * 4 * e.num_rows);
+            e.phi = phi, e.noise = noise;
+            return true;
+        }
+        // The minimum of the parabola through what is known, between a tenth and a half of the last length.
+        const double excess = phi - e.phi - length * slope;
+        double shorter = std::isfinite(excess) && excess > 0.0 ? -0.5 * slope * length * length / excess : 0.1 * length;
+        if (!(shorter > 0.1 * length)) shorter = 0.1 * length;
+        length = shorter < 0.5 * length ? shorter : 0.5 * length;
+    }
+    return false;
+}
+
+}  // namespace
+
+// ---- what is called ------------------------------------------------------------------------------------------------------
+
+extern "C" {
+
+// Accelerations (V, 3) in the original order become the state; potential and rounding with them.
+void newton_start(Engine* e, const double* acc) {
+    for (int64_t i = 0; i < e->num_vertices; ++i) {
+        const int64_t v = e->vertex[i];
+        for (int k = 0; k < 3; ++k) {
+            if (i < e->num_rows) e->acc[4 * i + k] = acc[3 * v + k];
+            else e->pos[4 * i + k] = e->trial_pos[4 * i + k] = e->fixed[3 * v + k];
+        }
+        if (i < e->num_rows) e->acc[4 * i + 3] = 0.0;
+    }
+    place(*e, e->acc, e->pos);
+    energy(*e, e->pos, e->acc, &e->phi, &e->noise);
+}
+
+// Gradient, matrix and slack at the state; returns the norm of the gradient.
+double newton_model(Engine* e) {
+    if (e->wide) assemble<double>(*e);
+    else assemble<float>(*e);
+    double sum = 0.0;
+    for (int64_t row = 0; row < e->num_rows; ++row) sum += dot3(e->gradient + 4 * row, e->gradient + 4 * row);
+    return std::sqrt(sum);
+}
+
+// From the model to the next state; 1 where it moved.
+int64_t newton_move(Engine* e, double residual, int64_t cg_iterations) {
+    if (e->wide) {
+        direct<double>(*e, residual, cg_iterations);
+        prepare_path<double>(*e);
+    } else {
+        direct<float>(*e, residual, cg_iterations);
+        prepare_path<float>(*e);
+    }
+    return backtrack(*e);
+}
+
+// The state in the original order: positions (V, 3), accelerations (V, 3) of free vertices.
+void newton_state(const Engine* e, double* pos, double* acc) {
+    for (int64_t i = 0; i < e->num_vertices; ++i)
+        for (int k = 0; k < 3; ++k) {
+            const int64_t v = e->vertex[i];
+            pos[3 * v + k] = e->pos[4 * i + k];
+            if (i < e->num_rows) acc[3 * v + k] = e->acc[4 * i + k];
+        }
+}
+
+int64_t newton_face_record(int64_t wide) { return wide ? sizeof(FaceRecord<double>) : sizeof(FaceRecord<float>); }
+int64_t newton_hinge_record(int64_t wide) { return wide ? sizeof(HingeRecord<double>) : sizeof(HingeRecord<float>); }
+int64_t newton_most_blocks() { return MOST_BLOCKS; }
+}

@@ -1,0 +1,369 @@
+"""The compiled form of Newton's method: ``hood/native/newton.cpp`` with the arrays it works on.
+
+The same potential, the same rules as the torch form (:mod:`hood.solver.newton`), which stays the reference. Energies and
+gradients are float64; the matrix and the linear solver are float32, and float64 from where a step in float32 leads nowhere.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hood import native
+from hood.losses.attachment import Attachment
+from hood.losses.bending import CurrentLengthBending
+from hood.losses.potential import Potential
+from hood.losses.problem import STANDARD_GRAVITY, StepProblem, inertial_guess
+from hood.losses.stretching import Stretching
+from hood.native.build import build
+from hood.scene.cloth import Cloth
+from hood.solver.elements import BENDINGS, face_constants, hinge_constants
+from hood.solver.engine_tables import Tables, build_tables
+from hood.solver.forces import Grip, VertexForces, Walls, attachment_stiffness, other_terms, vertex_forces
+from hood.solver.iterate import fixed_positions, projected_guess
+from hood.solver.plan import SolverPlan
+
+SOURCE = Path(native.__file__).with_name("newton.cpp")
+_FLAGS = ("-O3", "-std=c++17", "-shared", "-fPIC", "-fno-math-errno", "-Wno-psabi", "-march=native")
+_POINTER, _COUNT, _REAL = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
+
+
+class _Wall(ctypes.Structure):
+    _fields_ = [("point", _POINTER), ("normal", _POINTER), ("reach", _POINTER), ("weight", _REAL)]
+
+
+class _Grip(ctypes.Structure):
+    _fields_ = [(name, _POINTER) for name in ("force", "normal", "anchor", "limit")]
+
+
+def _fields(text: str, kind: type) -> list[tuple[str, type]]:
+    return [(name, kind) for name in text.split()]
+
+
+class _Engine(ctypes.Structure):
+    """``Engine`` of ``newton.cpp``."""
+
+    _fields_ = [
+        *_fields("num_vertices num_rows num_faces num_hinges num_blocks num_springs", _COUNT),
+        *_fields("vertex face_corners hinge_corners row_starts cols diagonal", _POINTER),
+        *_fields("face_starts face_uses hinge_starts hinge_uses spring_ends spring_blocks", _POINTER),
+        *_fields("shape area mu lambda bulk soft rest_angle hinge_weight rest_length", _POINTER),
+        *_fields("base fixed inertia weight spring_stiffness walls grips", _POINTER),
+        *_fields("num_walls num_grips bending membrane", _COUNT),
+        ("dt_sq", _REAL),
+        *_fields("pos acc trial_pos trial_acc gradient direction path face_model hinge_model", _POINTER),
+        *_fields("matrix slack own_slack inverse x r z p q", _POINTER),
+        *_fields("sharpness raised phi noise", _REAL),
+        *_fields("wide cg_used", _COUNT),
+    ]
+
+
+@cache
+def library() -> ctypes.CDLL:
+    """The compiled solver.
+
+    Raises:
+        hood.native.build.BuildError: there is no compiler, or it fails.
+    """
+    lib = build(SOURCE, _FLAGS)
+    lib.newton_model.restype = _REAL
+    lib.newton_move.argtypes = [_POINTER, _REAL, _COUNT]
+    for name in ("newton_move", "newton_face_record", "newton_hinge_record", "newton_most_blocks"):
+        getattr(lib, name).restype = _COUNT
+    return lib
+
+
+def applies(potential: Potential, problem: StepProblem) -> bool:
+    """Whether the compiled solver knows every term of the potential that plays a role in ``problem``, on a CPU."""
+    bendings = [term for term in potential.terms.values() if type(term) in BENDINGS and term.applies(problem)]
+    return problem.state.pos.device.type == "cpu" and len(bendings) <= 1 and other_terms(potential, problem) is None
+
+
+@dataclass(frozen=True)
+class Fabric:
+    """What the elements of one scene depend on but their corners; float64, in the order of the tables."""
+
+    shape: np.ndarray
+    area: np.ndarray
+    mu: np.ndarray
+    lam: np.ndarray
+    bulk: np.ndarray
+    soft: np.ndarray
+    rest_angle: np.ndarray
+    hinge_weight: np.ndarray
+    rest_length: np.ndarray
+
+
+def build_fabric(cloth: Cloth, tables: Tables, factor: float) -> Fabric:
+    """Constants of a scene's elements, with a ``factor`` to the membrane; ``cloth`` is in float64."""
+    faces, hinges = face_constants(cloth, factor), hinge_constants(cloth)
+    mu, lam, weight = (value.numpy() for value in (faces.lame_mu, faces.lame_lambda, faces.weight))
+    padded, about = tables.faces.padded, tables.hinges.padded
+    return Fabric(
+        shape=padded(faces.shape.reshape(6, -1).numpy()),
+        area=padded(weight),
+        mu=padded(mu),
+        lam=padded(lam),
+        bulk=padded(np.sqrt(weight * (lam + mu))),
+        soft=padded(np.sqrt(weight * mu)),
+        rest_angle=about(hinges.rest_angle.numpy()),
+        hinge_weight=about(hinges.weight.numpy()),
+        rest_length=about(hinges.rest_length.numpy(), padding=1.0),
+    )
+
+
+@dataclass(frozen=True)
+class EngineStep:
+    """One step of a whole batch as the compiled solver reads it: float64, vertices in their own order."""
+
+    cloth: Cloth
+    dt: Tensor  # (B,) s
+    base: np.ndarray  # (V, 3) m, free flight
+    fixed: np.ndarray  # (V, 3) m, where vertices are that do not move
+    inertia: np.ndarray  # (V,) kg
+    weight: np.ndarray  # (V, 3) N
+    spring_stiffness: np.ndarray  # (A,) N/m
+    walls: tuple[Walls, ...]
+    grips: tuple[Grip, ...]
+    bending: int  # 0 none, 1 about the rest shape, 2 with the current length
+    membrane: int  # how many such terms
+
+
+def engine_step(potential: Potential, problem: StepProblem) -> EngineStep:
+    """The step ``problem``, in float64 and prepared, with the terms of ``potential``."""
+    terms = [term for term in potential.terms.values() if term.applies(problem)]
+    forces: VertexForces = vertex_forces(potential, problem)
+    bending = next((term for term in terms if type(term) in BENDINGS), None)
+    springs = [attachment_stiffness(term, problem) for term in terms if type(term) is Attachment]
+    stiffness = torch.stack(springs).sum(0) if springs else problem.state.pos.new_zeros(_num_attachments(problem))
+    base = inertial_guess(problem.state, problem.step, problem.cloth.vertex_scene)
+    return EngineStep(
+        cloth=problem.cloth,
+        dt=problem.step.dt,
+        base=_array(base),
+        fixed=_array(fixed_positions(problem)),
+        inertia=_array(forces.inertia.squeeze(1)),
+        weight=_array(forces.weight),
+        spring_stiffness=_array(stiffness),
+        walls=tuple(Walls(w.weight, *(_whole(t) for t in (w.point, w.normal, w.reach))) for w in forces.walls),
+        grips=tuple(Grip(*(_whole(t) for t in (g.force, g.normal, g.anchor, g.limit))) for g in forces.grips),
+        bending=0 if bending is None else 2 if type(bending) is CurrentLengthBending else 1,
+        membrane=sum(type(term) is Stretching for term in terms),
+    )
+
+
+def _num_attachments(problem: StepProblem) -> int:
+    return 0 if problem.step.attachments is None else len(problem.step.attachments.edges)
+
+
+def _whole(values: Tensor) -> Tensor:
+    return values.detach().double().contiguous()
+
+
+def _array(values: Tensor) -> np.ndarray:
+    return _whole(values).numpy()
+
+
+class SceneEngine:
+    """One scene of a cloth in the compiled solver: memory that every step uses again, and the step's own numbers."""
+
+    def __init__(self, cloth: Cloth, tables: Tables) -> None:
+        self.tables = tables
+        self._lib = library()
+        self._kept: dict[str, Any] = {}  # what the structure points to
+        self._fabric: tuple[tuple[Tensor | float, ...], Fabric] | None = None
+        self.values = _Engine(
+            num_vertices=len(tables.vertex),
+            num_rows=tables.num_rows,
+            num_faces=tables.faces.corners.shape[1],
+            num_hinges=tables.hinges.corners.shape[1],
+            num_blocks=len(tables.cols),
+            num_springs=len(tables.springs),
+        )
+        self._address = ctypes.byref(self.values)
+        self._point(
+            vertex=tables.vertex,
+            face_corners=tables.faces.corners,
+            hinge_corners=tables.hinges.corners,
+            row_starts=tables.row_starts,
+            cols=tables.cols,
+            diagonal=tables.diagonal,
+            face_starts=tables.faces.starts,
+            face_uses=tables.faces.uses,
+            hinge_starts=tables.hinges.starts,
+            hinge_uses=tables.hinges.uses,
+            spring_ends=tables.spring_ends,
+            spring_blocks=tables.spring_blocks,
+        )
+        size, rows = len(tables.vertex), tables.num_rows
+        self._point(**{name: np.zeros((size, 4)) for name in ("pos", "trial_pos")})
+        self._point(**{name: np.zeros((rows, 4)) for name in ("acc", "trial_acc", "gradient", "direction")})
+        self._memory: dict[bool, dict[str, np.ndarray]] = {}
+        self.widen(False)
+
+    def widen(self, wide: bool) -> None:
+        """Matrix and linear solver in float64, or in float32."""
+        if wide not in self._memory:
+            self._memory[wide] = self._working_memory(wide)
+        self._point(**self._memory[wide])
+        self.values.wide = wide
+
+    def _working_memory(self, wide: bool) -> dict[str, np.ndarray]:
+        values, kind = self.values, np.float64 if wide else np.float32
+        rows, blocks = values.num_rows, values.num_blocks
+        sizes = {"matrix": 9 * blocks + 1, "slack": blocks, "own_slack": 6 * rows, "inverse": 12 * rows}
+        memory = {name: np.zeros(count, kind) for name, count in sizes.items()}
+        memory |= {name: np.zeros(4 * rows, kind) for name in "xrzpq"}
+        memory["face_model"] = np.zeros(values.num_faces * self._lib.newton_face_record(int(wide)), np.uint8)
+        memory["hinge_model"] = np.zeros(values.num_hinges * self._lib.newton_hinge_record(int(wide)), np.uint8)
+        return memory
+
+    def enter(self, step: EngineStep, scene: int) -> None:
+        """Take up scene ``scene`` of a step; the state is undefined until :meth:`start`."""
+        values = self.values
+        self._take_fabric(step)
+        self._point(base=step.base, fixed=step.fixed, inertia=step.inertia, weight=step.weight)
+        self._point(spring_stiffness=step.spring_stiffness[self.tables.springs])
+        walls, grips = (_Wall * len(step.walls))(), (_Grip * len(step.grips))()
+        for structure, wall in zip(walls, step.walls, strict=True):
+            for name in ("point", "normal", "reach"):
+                setattr(structure, name, getattr(wall, name).data_ptr())
+            structure.weight = wall.weight
+        for structure, grip in zip(grips, step.grips, strict=True):
+            for name in ("force", "normal", "anchor", "limit"):
+                setattr(structure, name, getattr(grip, name).data_ptr())
+        self._kept |= {"walls": walls, "grips": grips, "step": step}
+        values.walls, values.grips = ctypes.addressof(walls), ctypes.addressof(grips)
+        if values.num_walls != len(walls) or "path" not in self._kept:
+            self._point(path=np.zeros((len(walls), values.num_rows, 8)))
+        values.num_walls, values.num_grips = len(walls), len(grips)
+        values.bending, values.membrane = step.bending, step.membrane > 0
+        values.dt_sq = float(step.dt[scene]) ** 2
+        values.raised, values.cg_used = 1.0, 0
+        self.widen(False)
+
+    def start(self, acc: np.ndarray) -> float:
+        """Take up accelerations (V, 3) of all vertices of the cloth; the potential there."""
+        self._lib.newton_start(self._address, acc.ctypes.data_as(_POINTER))
+        return float(self.values.phi)
+
+    def model(self) -> float:
+        """Gradient and matrix at the state; the norm of the gradient [N]."""
+        return float(self._lib.newton_model(self._address))
+
+    def move(self, residual: float, cg_iterations: int) -> bool:
+        """Take a Newton step from a state whose model has been made; whether it led anywhere."""
+        return bool(self._lib.newton_move(self._address, residual, cg_iterations))
+
+    def read(self, pos: np.ndarray, acc: np.ndarray) -> None:
+        """Write positions and accelerations (V, 3) of this scene's vertices into arrays of the whole cloth."""
+        self._lib.newton_state(self._address, pos.ctypes.data_as(_POINTER), acc.ctypes.data_as(_POINTER))
+
+    def array(self, name: str) -> np.ndarray:
+        """An array that the structure points to, by its name there."""
+        return np.asarray(self._kept[name])
+
+    def _take_fabric(self, step: EngineStep) -> None:
+        cloth = step.cloth
+        now = (cloth.rest_inverse, cloth.rest_area, cloth.thickness, cloth.lame_mu, cloth.lame_lambda, cloth.bending_stiffness,
+               cloth.rest_angle, cloth.rest_length, cloth.hinge_area, float(step.membrane))  # fmt: skip
+        known = self._fabric
+        if known is None or not all(_identical(a, b) for a, b in zip(now, known[0], strict=True)):
+            self._fabric = known = now, build_fabric(cloth, self.tables, float(step.membrane))
+        fabric = vars(known[1])
+        self._point(**{("lambda" if name == "lam" else name): value for name, value in fabric.items()})
+
+    def _point(self, **arrays: np.ndarray) -> None:
+        for name, array in arrays.items():
+            assert array.flags.c_contiguous, f"{name} has gaps"
+            self._kept[name] = array
+            setattr(self.values, name, array.ctypes.data)
+
+
+def _identical(a: object, b: object) -> bool:
+    return a is b or (isinstance(a, float) and a == b)
+
+
+def scene_engines(problem: StepProblem, plan: SolverPlan) -> list[SceneEngine]:
+    """The engines of a cloth's scenes, made once per plan; ``problem`` has the plan's cloth and attachments."""
+    engines = plan.cache.get("engines")
+    if engines is None:
+        parts = [build_tables(problem.cloth, problem.step.attachments, scene) for scene in range(problem.num_scenes)]
+        engines = plan.cache["engines"] = [SceneEngine(problem.cloth, tables) for tables in parts]
+    assert isinstance(engines, list)
+    return engines
+
+
+class EngineSystem:
+    """The unknowns of a step in the compiled solver, scene by scene; see :class:`hood.solver.newton.System`."""
+
+    def __init__(self, potential: Potential, problem: StepProblem, plan: SolverPlan, cg_iterations: int) -> None:
+        self.problem, self._potential, self._cg_iterations = problem, potential, cg_iterations
+        self._engines = scene_engines(problem, plan)
+        self._step = engine_step(potential, problem)
+        for scene, engine in enumerate(self._engines):
+            engine.enter(self._step, scene)
+        self._dt_sq = _array(problem.vertex_dt**2)
+        gravity = float(problem.gravity.norm()) or STANDARD_GRAVITY
+        weight = problem.cloth.free * problem.cloth.mass * gravity
+        self._weight = problem.sum_vertices(weight**2).sqrt().tolist()
+
+    def begin(self, start: Tensor | None) -> None:
+        """Take up positions (V, 3), or the better of the two first guesses."""
+        if start is not None:
+            self._start(_array(start), range(len(self._engines)))
+            return
+        everywhere = range(len(self._engines))
+        falling, held = (_array(projected_guess(self._potential, self.problem, falls)) for falls in (True, False))
+        fallen = self._start(falling, everywhere)
+        better = [scene for scene, phi in enumerate(self._start(held, everywhere)) if not phi < fallen[scene]]
+        self._start(falling, better)
+
+    def _start(self, pos: np.ndarray, scenes: Iterable[int]) -> list[float]:
+        acc = (pos - self._step.base) / self._dt_sq
+        return [self._engines[scene].start(acc) for scene in scenes]
+
+    @property
+    def phi(self) -> Tensor:
+        """(B,) J."""
+        return torch.tensor([engine.values.phi for engine in self._engines], dtype=torch.float64)
+
+    @property
+    def used(self) -> int:
+        """Conjugate gradient iterations so far."""
+        return sum(engine.values.cg_used for engine in self._engines)
+
+    def model(self) -> Tensor:
+        """Make the models of the state; the relative gradients (B,)."""
+        norms = [engine.model() for engine in self._engines]
+        shares = [norm / weight if weight > 0 else 0.0 for norm, weight in zip(norms, self._weight, strict=True)]
+        return torch.tensor(shares, dtype=torch.float64)
+
+    def move(self, residual: Tensor, active: Tensor) -> Tensor:
+        """Take a Newton step in the scenes ``active`` (B,); which of them moved (B,)."""
+        moving = zip(self._engines, residual.tolist(), active.tolist(), strict=True)
+        return torch.tensor([wanted and self._move(engine, share) for engine, share, wanted in moving])
+
+    def _move(self, engine: SceneEngine, residual: float) -> bool:
+        if engine.move(residual, self._cg_iterations):
+            return True
+        if engine.values.wide:
+            return False
+        engine.widen(True)
+        engine.model()
+        return engine.move(residual, self._cg_iterations)
+
+    def state(self) -> tuple[Tensor, Tensor]:
+        """Positions (V, 3) and accelerations (V, 3)."""
+        pos, acc = self._step.fixed.copy(), (self._step.fixed - self._step.base) / self._dt_sq
+        for engine in self._engines:
+            engine.read(pos, acc)
+        return torch.from_numpy(pos), torch.from_numpy(acc)

@@ -1,0 +1,234 @@
+"""The compiled solver is the torch solver."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from test_newton import batch, falling, hanging, pieces
+from test_plan import states, touching_sheet
+
+from hood.assets.material import Material
+from hood.losses.gravity import Gravity
+from hood.losses.potential import default_potential, reference_potential
+from hood.native import build as native_build
+from hood.native.build import BuildError
+from hood.scene.batch import to_device
+from hood.scene.cloth import build_cloth
+from hood.solver import engine
+from hood.solver.engine import EngineSystem, SceneEngine
+from hood.solver.iterate import Unknowns
+from hood.solver.newton import NewtonSettings, TorchSystem, minimize
+from hood.solver.plan import plan_for, quadratic_model
+from hood.testing import grid, make_problem
+
+pytestmark = pytest.mark.usefixtures("compiler")
+TORCH, COMPILED = NewtonSettings(engine="torch"), NewtonSettings(engine="compiled")
+
+
+@pytest.fixture(scope="module")
+def compiler():
+    try:
+        engine.library()
+    except BuildError as error:
+        pytest.skip(str(error))
+
+
+def model_at(problem, potential, pos, wide):
+    """Engine of a problem with one scene, with the model at ``pos`` made."""
+    system = EngineSystem(potential, problem, plan_for(problem), 100)
+    (scene,) = system._engines
+    scene.widen(wide)
+    system.begin(pos)
+    scene.model()
+    return scene
+
+
+def dense(scene: SceneEngine, name: str) -> np.ndarray:
+    """``matrix`` or ``slack`` of an engine as (3N, 3N), unknowns in the order of the cloth."""
+    tables, size = scene.tables, scene.tables.num_rows
+    blocks = np.zeros((len(tables.cols), 3, 3))
+    if name == "matrix":
+        blocks += scene.array("matrix")[: 9 * len(tables.cols)].reshape(-1, 3, 3).transpose(0, 2, 1)
+    else:
+        blocks += scene.array("slack")[:, None, None] * np.eye(3)
+        upper = scene.array("own_slack").reshape(-1, 6)
+        blocks[tables.diagonal] += upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    rows = np.repeat(np.arange(size), np.diff(tables.row_starts))
+    rank = np.argsort(np.argsort(tables.vertex[:size]))
+    result = np.zeros((size, 3, size, 3))
+    result[rank[rows], :, rank[tables.cols], :] = blocks
+    return result.reshape(3 * size, 3 * size)
+
+
+def dense_of(plan, triples) -> np.ndarray:
+    result = np.zeros((3 * plan.pattern.size, plan.pattern.size, 3))
+    result[plan.pattern.triple_rows, plan.pattern.triple_cols] = triples.numpy()
+    return result.reshape(3 * plan.pattern.size, -1)
+
+
+POTENTIALS = {"default": default_potential(), "reference": reference_potential()}
+
+
+@pytest.mark.parametrize("name", ["near", "stretched", "compressed", "folded", "coincident vertices"])
+@pytest.mark.parametrize("kind", POTENTIALS)
+def test_potential_gradient_and_matrix_are_those_of_the_torch_form(name, kind):
+    problem, potential = touching_sheet(), POTENTIALS[kind]
+    if kind == "reference":
+        potential = potential.with_terms(collision=default_potential().terms["collision"])  # the sheet has no obstacle
+    pos = states(problem)[name]
+    if name == "coincident vertices":  # and stay so to the last bit: reached without acceleration
+        problem = replace(problem, state=replace(problem.state, pos=pos, vel=torch.zeros_like(pos)))
+    unknowns, plan = Unknowns(potential, problem), plan_for(problem)
+    there = unknowns.at(pos)
+    model = quadratic_model(potential, problem, plan, there.pos, there.acc)
+    scene = model_at(problem, potential, pos, wide=True)
+    assert scene.values.phi == pytest.approx(float(there.phi), rel=1e-15, abs=float(there.noise))
+    assert scene.values.noise == pytest.approx(float(there.noise), rel=1e-12)
+    free = scene.tables.vertex[: scene.tables.num_rows]
+    expected, found = model.gradient.numpy()[free], scene.array("gradient")[:, :3]
+    assert np.abs(found - expected).max() <= 2e-14 * np.abs(expected).max()
+    matrix = dense(scene, "matrix")
+    for part, triples in (("matrix", model.triples), ("slack", model.slack)):
+        error = np.abs(dense(scene, part) - dense_of(plan, triples)).max()
+        assert error <= 2e-15 * np.abs(matrix).max(), part
+    half = model_at(problem, potential, pos, wide=False)
+    assert np.abs(dense(half, "matrix") - matrix).max() <= 1e-6 * np.abs(matrix).max()
+
+
+@pytest.mark.parametrize("make", [hanging, falling, touching_sheet])
+def test_iterations_are_those_of_the_torch_form(make):
+    """With its linear solver in float32; sums in another order part slowly."""
+    problem = make()
+    for count in range(4):
+        there, expected = minimize(default_potential(), problem, settings=replace(TORCH, max_iterations=count))
+        here, report = minimize(default_potential(), problem, settings=replace(COMPILED, max_iterations=count))
+        assert report.iterations == expected.iterations
+        assert float((here - there).norm()) <= 1e-4 * float((there - problem.state.pos).norm())
+        torch.testing.assert_close(report.phi, expected.phi, rtol=1e-5, atol=1e-9)
+
+
+def test_scenes_of_a_batch_do_not_touch_each_other():
+    problems = pieces()
+    alone = [minimize(default_potential(), problem, settings=COMPILED) for problem in problems]
+    pos, report = minimize(default_potential(), batch(problems), settings=COMPILED)
+    assert torch.equal(pos, torch.cat([positions for positions, _ in alone]))
+    assert torch.equal(report.phi, torch.cat([single.phi for _, single in alone]))
+    assert torch.equal(report.acc, torch.cat([single.acc for _, single in alone]))
+    assert report.converged.all()
+
+
+def test_runs_are_bit_identical_whatever_came_between():
+    problem = touching_sheet()
+    first, _ = minimize(default_potential(), problem, settings=COMPILED)
+    minimize(default_potential(collision_weight=1e3), problem, 2.0 * problem.state.pos, COMPILED)
+    assert torch.equal(minimize(default_potential(), problem, settings=COMPILED)[0], first)
+    copy = replace(problem, cloth=to_device(problem.cloth, dtype=torch.float64), contact=problem.contact)
+    assert torch.equal(minimize(default_potential(), copy, settings=COMPILED)[0], first)
+
+
+def test_pins_are_where_they_shall_be_and_a_changed_fabric_is_seen():
+    problem = hanging()
+    pinned = problem.cloth.pinned
+    soft, _ = minimize(default_potential(), problem, settings=COMPILED)
+    assert torch.equal(soft[pinned], problem.state.pos[pinned])
+    stiff = replace(problem, cloth=replace(problem.cloth, bending_stiffness=1e4 * problem.cloth.bending_stiffness))
+    harder, report = minimize(default_potential(), stiff, settings=COMPILED)
+    assert report.converged.all()
+    assert float((harder - soft).abs().max()) > 1e-5
+
+
+def test_what_the_compiled_form_does_not_know_goes_to_torch():
+    class Wind(Gravity):
+        """No closed form is known of subclasses."""
+
+    problem, plan = hanging(), None
+    blown = default_potential().with_terms(wind=Wind())
+    assert not engine.applies(blown, problem)
+    for potential, settings in (
+        (blown, COMPILED),
+        (default_potential(), replace(COMPILED, linear="direct")),
+        (default_potential(), replace(COMPILED, double=False)),
+    ):
+        plan = plan_for(problem)
+        plan.cache.pop("engines", None)
+        _, report = minimize(potential, problem, settings=replace(settings, target_rg=1e-2))
+        assert report.converged.all()
+        assert "engines" not in plan.cache
+
+
+def test_without_a_compiler_auto_is_torch_and_compiled_is_refused(monkeypatch, tmp_path):
+    monkeypatch.setenv("HOOD_CACHE", str(tmp_path))
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    engine.library.cache_clear()
+    problem = falling()
+    problem.cloth.faces.add_(0)
+    try:
+        plan_for(problem).cache.clear()
+        expected, _ = minimize(default_potential(), problem, settings=TORCH)
+        assert torch.equal(minimize(default_potential(), problem)[0], expected)
+        with pytest.raises(
+            BuildError, match=r"solver.engine=compiled: no C\+\+ compiler: install .* or use solver.engine=torch"
+        ):
+            minimize(default_potential(), problem, settings=COMPILED)
+    finally:
+        engine.library.cache_clear()
+
+
+def test_a_damaged_library_is_built_anew(monkeypatch, tmp_path):
+    monkeypatch.setenv("HOOD_CACHE", str(tmp_path))
+    native_build.build(engine.SOURCE, (*engine._FLAGS, "-O0"))
+    (kept,) = tmp_path.rglob("*.so")
+    kept.unlink()
+    kept.write_bytes(b"half a file")
+    assert native_build.build(engine.SOURCE, (*engine._FLAGS, "-O0")).newton_most_blocks() > 0
+
+
+def test_float64_takes_over_where_a_step_in_float32_leads_nowhere(monkeypatch):
+    problem = hanging()
+    system = EngineSystem(default_potential(), problem, plan_for(problem), 100)
+    (scene,) = system._engines
+    system.begin(None)
+    residual = system.model()
+    move, tried = scene.move, []
+    monkeypatch.setattr(scene, "move", lambda *args: tried.append(scene.values.wide) or (scene.values.wide and move(*args)))
+    assert system.move(residual, torch.tensor([True])).all()
+    assert tried == [0, 1]
+    assert system.move(system.model(), torch.tensor([True])).all()
+    assert tried == [0, 1, 1]
+
+
+def test_a_scene_that_is_not_finite_is_left_alone():
+    problem = batch([falling(), falling()])
+    pos = problem.state.pos.clone()
+    pos[3] = torch.nan
+    broken = replace(problem, state=replace(problem.state, pos=pos))
+    _, report = minimize(default_potential(), broken, settings=COMPILED)
+    assert report.reason[0] == "not finite"
+    assert report.reason[1] == ""
+
+
+def test_the_torch_system_and_the_engine_tell_the_same_of_a_state():
+    problem = falling()
+    plan = plan_for(problem)
+    systems = [TorchSystem(default_potential(), problem, plan, TORCH), EngineSystem(default_potential(), problem, plan, 100)]
+    for system in systems:
+        system.begin(None)
+    plain, compiled = systems
+    torch.testing.assert_close(plain.phi, compiled.phi, rtol=1e-14, atol=0)
+    torch.testing.assert_close(plain.model(), compiled.model(), rtol=1e-12, atol=0)
+    for a, b in zip(plain.state(), compiled.state(), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-13, atol=1e-13)
+
+
+def test_a_cloth_without_free_vertices_or_hinges_is_left_as_it_is():
+    pos, faces = grid(2, 2, 0.1)
+    for pinned, mesh in ((np.ones(4, bool), faces), (np.zeros(4, bool), faces[:1])):
+        cloth = build_cloth(pos, mesh, Material(), pinned, dtype=torch.float64)
+        problem = make_problem(cloth)
+        expected, _ = minimize(default_potential(), problem, settings=TORCH)
+        found, report = minimize(default_potential(), problem, settings=COMPILED)
+        assert report.converged.all()
+        torch.testing.assert_close(found, expected, rtol=0, atol=1e-7)
