@@ -1,8 +1,9 @@
 """Closest points on triangle surfaces, with sign: the one search behind body contact.
 
-Candidates are the faces around the three nearest vertices of each point. That is the closest face on surfaces
-whose neighbouring triangles are of similar size; faces much larger than the rest of their scene (a floor
-under a body) and surfaces of a few faces are tested against every point. Distances to candidates are exact.
+On a CPU with a compiler an exact search by a tree of boxes (:mod:`hood.mesh.surface_tree`). Elsewhere candidates are
+the faces around the three nearest vertices of each point. That is the closest face on surfaces whose neighbouring
+triangles are of similar size; faces much larger than the rest of their scene (a floor under a body) and surfaces of a few
+faces are tested against every point. Distances to candidates are exact.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from hood.mesh import topology
+from hood.mesh import surface_tree, topology
 
 _NUM_NEAREST = 3
 #: Scenes up to this many faces, and faces with an edge longer than this many mean edges, are tested
@@ -52,6 +53,11 @@ class Incidence(NamedTuple):
     first: Tensor  # (W,) where those of each vertex begin
     face_edges: Tensor  # (G, 3) the edge opposite each corner
     edge_faces: Tensor  # (E, M) faces at an edge, -1 where there is none
+
+    @property
+    def adjacency(self) -> tuple[Tensor, ...]:
+        """What :func:`hood.mesh.surface_tree.search` needs of it."""
+        return self.around, self.first, self.valence, self.face_edges, self.edge_faces
 
 
 class _Span(NamedTuple):
@@ -109,6 +115,9 @@ def search_surface(
     if len(faces) == 0 or len(points) == 0:
         return _no_hit(points)
     incidence = build_incidence(faces, len(vertices))
+    found = surface_tree.search(points, point_scene, vertices, faces, face_scene, incidence.adjacency)
+    if found is not None:
+        return SurfaceHit(found.vertex, found.vertex_dist, found.face, found.bary, found.dist)
     fans = _build_fans(vertices, incidence)
     nearest, nearest_dist = _nearest_vertices(points, point_scene, vertices, vertex_scene, incidence.valence > 0)
     face = _closest_of_fans(points, vertices, nearest, incidence, fans)

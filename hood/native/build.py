@@ -15,6 +15,9 @@ from pathlib import Path
 
 from hood.native.cache import cache_folder
 
+#: For sources that use what the processor has; arithmetic as IEEE has it.
+NATIVE_FLAGS = ("-O3", "-std=c++17", "-shared", "-fPIC", "-fno-math-errno", "-Wno-psabi", "-march=native")
+
 
 class BuildError(ValueError):
     """There is no compiler, or it fails."""

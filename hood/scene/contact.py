@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from hood.mesh import geometry
+from hood.mesh import geometry, surface_tree
 from hood.mesh.centroids import nearest_centroids
 from hood.mesh.nearest import Nearest, nearest_dense, nearest_vertices
 from hood.mesh.proximity import build_incidence, search_surface
@@ -65,6 +65,9 @@ def find_contact(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, cap: flo
 
     Matches farther than ``cap`` [m] are kept but marked invalid.
     """
+    found = _compiled_search(pos, vertex_scene, obstacle)
+    if found is not None:
+        return Contact(**found._asdict(), valid=found.dist.abs() <= cap)
     hit = search_surface(pos, vertex_scene, obstacle.pos, obstacle.faces, obstacle.vertex_scene, obstacle.face_scene)
     corners = obstacle.faces[hit.face]
     point = _weigh(hit.bary, obstacle.pos[corners])
@@ -83,6 +86,15 @@ def find_contact(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, cap: flo
         normal=normal,
         next_point=next_point,
         next_normal=next_normal,
+    )
+
+
+def _compiled_search(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle) -> surface_tree.Found | None:
+    if len(obstacle.faces) == 0 or len(pos) == 0:
+        return None
+    incidence = build_incidence(obstacle.faces, len(obstacle.pos))
+    return surface_tree.search(
+        pos, vertex_scene, obstacle.pos, obstacle.faces, obstacle.face_scene, incidence.adjacency, obstacle.next_pos
     )
 
 

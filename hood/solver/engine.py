@@ -23,7 +23,7 @@ from hood.losses.bending import CurrentLengthBending
 from hood.losses.potential import Potential
 from hood.losses.problem import STANDARD_GRAVITY, StepProblem, inertial_guess
 from hood.losses.stretching import Stretching
-from hood.native.build import build
+from hood.native.build import NATIVE_FLAGS, build
 from hood.scene.cloth import Cloth
 from hood.solver.elements import BENDINGS, face_constants, hinge_constants
 from hood.solver.engine_tables import Tables, build_tables
@@ -32,7 +32,7 @@ from hood.solver.iterate import fixed_positions, projected_guess
 from hood.solver.plan import SolverPlan
 
 SOURCE = Path(native.__file__).with_name("newton.cpp")
-_FLAGS = ("-O3", "-std=c++17", "-shared", "-fPIC", "-fno-math-errno", "-Wno-psabi", "-march=native")
+
 _POINTER, _COUNT, _REAL = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
 
 
@@ -73,7 +73,7 @@ def library() -> ctypes.CDLL:
     Raises:
         hood.native.build.BuildError: there is no compiler, or it fails.
     """
-    lib = build(SOURCE, _FLAGS)
+    lib = build(SOURCE, NATIVE_FLAGS)
     lib.newton_model.restype = _REAL
     lib.newton_move.argtypes = [_POINTER, _REAL, _COUNT]
     for name in ("newton_move", "newton_face_record", "newton_hinge_record", "newton_most_blocks"):

@@ -2,9 +2,18 @@ import numpy as np
 import pytest
 import torch
 
-from hood.mesh import proximity, topology
+from hood.mesh import proximity, surface_tree, topology
 from hood.mesh.proximity import closest_point_on_triangles, search_surface
 from hood.testing import assert_nearest, box, grid, sphere
+
+
+@pytest.fixture(autouse=True, params=["compiled", "torch"])
+def form(request, monkeypatch):
+    """Every test runs with either form of the search."""
+    if request.param == "torch":
+        monkeypatch.setattr(surface_tree, "library", lambda: None)
+    elif surface_tree.library() is None:
+        pytest.skip("no C++ compiler")
 
 
 def search(points, mesh, dtype=torch.float64):

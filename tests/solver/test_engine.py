@@ -179,11 +179,11 @@ def test_without_a_compiler_auto_is_torch_and_compiled_is_refused(monkeypatch, t
 
 def test_a_damaged_library_is_built_anew(monkeypatch, tmp_path):
     monkeypatch.setenv("HOOD_CACHE", str(tmp_path))
-    native_build.build(engine.SOURCE, (*engine._FLAGS, "-O0"))
+    native_build.build(engine.SOURCE, (*native_build.NATIVE_FLAGS, "-O0"))
     (kept,) = tmp_path.rglob("*.so")
     kept.unlink()
     kept.write_bytes(b"half a file")
-    assert native_build.build(engine.SOURCE, (*engine._FLAGS, "-O0")).newton_most_blocks() > 0
+    assert native_build.build(engine.SOURCE, (*native_build.NATIVE_FLAGS, "-O0")).newton_most_blocks() > 0
 
 
 def test_float64_takes_over_where_a_step_in_float32_leads_nowhere(monkeypatch):

@@ -1,0 +1,106 @@
+"""The compiled search: what a surface in motion, a batch and a history of searches must not change."""
+
+import numpy as np
+import pytest
+import torch
+
+from hood.mesh import surface_tree
+from hood.mesh.proximity import build_incidence, search_surface
+from hood.scene.contact import find_contact
+from hood.scene.state import Obstacle
+from hood.testing import box, sphere
+
+pytestmark = pytest.mark.skipif(surface_tree.library() is None, reason="no C++ compiler")
+
+
+def zeros(count):
+    return torch.zeros(count, dtype=torch.int64)
+
+
+def found(points, pos, faces):
+    return surface_tree.search(
+        points, zeros(len(points)), pos, faces, zeros(len(faces)), build_incidence(faces, len(pos)).adjacency
+    )
+
+
+def surface(mesh=None):
+    pos, faces = mesh or sphere(3)
+    return torch.as_tensor(pos), torch.as_tensor(faces)
+
+
+def points(count, seed=0, spread=1.5):
+    return spread * torch.as_tensor(np.random.default_rng(seed).normal(size=(count, 3)))
+
+
+def test_a_search_does_not_depend_on_those_before_it():
+    pos, faces = surface()
+    where = points(200)
+    fresh = found(where, pos, faces.clone() + 0)
+    for seed in (1, 2):  # other places, a crushed surface, another count
+        found(points(200, seed), pos, faces)
+        found(where, 0.1 * pos.flip(1), faces)
+        found(points(7, seed), pos, faces)
+    again = found(where, pos, faces)
+    for name in ("vertex", "face", "dist", "bary", "vertex_dist"):
+        assert torch.equal(getattr(again, name), getattr(fresh, name)), name
+
+
+def test_of_faces_at_the_same_distance_the_first_is_taken():
+    pos, faces = surface(box(4))
+    corners = pos[:: max(len(pos) // 40, 1)]
+    hit = found(2.0 * corners, pos, faces)
+    for row, point in enumerate(2.0 * corners):
+        alone = [float(found(point[None], pos, faces[[k]]).dist.abs()) for k in range(len(faces))]
+        assert int(hit.face[row]) == int(np.flatnonzero(np.array(alone) == min(alone))[0])
+
+
+def test_nearest_vertices_are_those_of_all():
+    pos, faces = surface()
+    where = points(300)
+    dist = (where[:, None] - pos[None]).norm(dim=2)
+    hit = found(where, pos, faces)
+    torch.testing.assert_close(hit.vertex_dist, dist.min(dim=1).values, rtol=1e-13, atol=0)
+
+
+@pytest.mark.parametrize("count", [1, 7, 8, 9, 63, 64, 65, 200])
+def test_surfaces_of_any_size(count):
+    pos, faces = surface()
+    part, where = faces[:count], points(50)
+    expected = torch.stack([found(where, pos, part[[k]]).dist.abs() for k in range(len(part))]).min(dim=0).values
+    torch.testing.assert_close(found(where, pos, part).dist.abs(), expected, rtol=0, atol=0)
+
+
+def test_contact_of_a_moving_batch_is_that_of_the_torch_form(monkeypatch):
+    pos, faces = surface()
+    both = torch.cat([pos, pos + 5.0])
+    turned = both + 0.01 * both.flip(1)
+    scene, face_scene = torch.arange(2).repeat_interleave(len(pos)), torch.arange(2).repeat_interleave(len(faces))
+    obstacle = Obstacle(both, turned, both, torch.cat([faces, faces + len(pos)]), scene, face_scene)
+    where = torch.cat([points(100, spread=0.7), points(80, 1, spread=0.7) + 5.0])
+    owner = torch.tensor([0] * 100 + [1] * 80)
+    compiled = find_contact(where, owner, obstacle)
+    monkeypatch.setattr(surface_tree, "library", lambda: None)
+    plain = find_contact(where, owner, obstacle)
+    for name in ("dist", "point", "normal", "next_point", "next_normal", "vertex_dist"):
+        torch.testing.assert_close(getattr(compiled, name), getattr(plain, name), rtol=0, atol=1e-11)
+    assert torch.equal(compiled.valid, plain.valid)
+    assert compiled.dist.dtype == where.dtype
+
+
+def test_points_and_surfaces_that_are_not_finite_break_nothing():
+    pos, faces = surface()
+    where = points(4)
+    where[1] = torch.nan
+    hit = found(where, pos, faces)
+    assert torch.isnan(hit.dist[1])
+    assert torch.isfinite(hit.dist[[0, 2, 3]]).all()
+    lost = found(points(4), torch.full_like(pos, torch.nan), faces)
+    assert int(lost.face.max()) < len(faces)
+    assert int(lost.vertex.max()) < len(pos)
+
+
+def test_scenes_without_a_surface_are_infinitely_far():
+    pos, faces = surface()
+    owner = torch.tensor([0, 1, 0])
+    hit = search_surface(points(3), owner, pos, faces, zeros(len(pos)), zeros(len(faces)))
+    assert torch.isinf(hit.dist).tolist() == [False, True, False]
