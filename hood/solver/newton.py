@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+import warnings
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Protocol
 
 import torch
@@ -184,7 +186,13 @@ def _system(potential: Potential, problem: StepProblem, plan: SolverPlan, settin
         except BuildError as error:
             if settings.engine == "compiled":
                 raise BuildError(f"solver.engine=compiled: {error} or use solver.engine=torch") from error
+            _say_once(f"the solver runs in torch, about six times slower than compiled: {error}")
     return TorchSystem(potential, problem, plan, settings)
+
+
+@cache
+def _say_once(sentence: str) -> None:
+    warnings.warn(sentence, stacklevel=4)
 
 
 def _run(system: System, settings: NewtonSettings, began: float, proceed: Proceed | None) -> Report:

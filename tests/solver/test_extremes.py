@@ -305,16 +305,20 @@ def rollouts_here_and_there(
     return list(zip(*runs, strict=True))
 
 
-@pytest.mark.parametrize("offset, dtype, tolerance", [
-    ((1e4, -5e3, 1e4), torch.float32, 1e-6),
-    ((1e4 + 0.137, -5e3 - 0.311, 1e4 + 0.063), torch.float32, 1e-4),
-    ((1e4 + 0.137, -5e3 - 0.311, 1e4 + 0.063), torch.float64, 1e-8),
+@pytest.mark.parametrize("offset, dtype, tolerance, engine", [
+    ((1e4, -5e3, 1e4), torch.float32, 1e-6, "torch"),
+    ((1e4 + 0.137, -5e3 - 0.311, 1e4 + 0.063), torch.float32, 1e-4, "torch"),
+    ((1e4 + 0.137, -5e3 - 0.311, 1e4 + 0.063), torch.float64, 1e-8, "torch"),
+    # Its linear solver in float32 amplifies what differs in the last digit.
+    ((1e4, -5e3, 1e4), torch.float32, 2e-5, "auto"),
+    ((1e4 + 0.137, -5e3 - 0.311, 1e4 + 0.063), torch.float32, 1e-4, "auto"),
+    ((1e4 + 0.137, -5e3 - 0.311, 1e4 + 0.063), torch.float64, 2e-5, "auto"),
 ])  # fmt: skip
-def test_world_offset(offset, dtype, tolerance, garments: dict[str, Garment], body: Body, walk: PoseSequence):
+def test_world_offset(offset, dtype, tolerance, engine, garments: dict[str, Garment], body: Body, walk: PoseSequence):
     """The same rollout anywhere within 10 km. Few iterations: where the minimum itself hangs on rounding (a fold may go
     either way) two converged runs in float32 can part by millimetres at single vertices, near the origin as well."""
     # The start needs no thorough settling, whose accelerated projections amplify rounding some hundred times.
-    settings = NewtonSettings(max_iterations=8)
+    settings = NewtonSettings(max_iterations=8, engine=engine)
     pairs = rollouts_here_and_there(garments["tank"], body, walk.window(10, 14), np.array(offset), settings, 0, dtype)
     for here, there in pairs:
         torch.testing.assert_close(there, here, rtol=0, atol=tolerance)
