@@ -115,7 +115,7 @@ def search_surface(
     if len(faces) == 0 or len(points) == 0:
         return _no_hit(points)
     incidence = build_incidence(faces, len(vertices))
-    found = surface_tree.search(points, point_scene, vertices, faces, face_scene, incidence.adjacency)
+    found = surface_tree.search(points, point_scene, vertices, faces, face_scene, incidence.adjacency, vertices)
     if found is not None:
         return SurfaceHit(found.vertex, found.vertex_dist, found.face, found.bary, found.dist)
     fans = _build_fans(vertices, incidence)

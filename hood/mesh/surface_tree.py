@@ -45,18 +45,23 @@ class _Query(ctypes.Structure):
     ]
 
 
-class Found(NamedTuple):
-    """What a search found, as in :class:`hood.mesh.proximity.SurfaceHit` and :class:`hood.scene.contact.Contact`."""
+#: What is known of a matched point, then and now.
+_PLACES = ("point", "normal", "next_point", "next_normal")
 
-    vertex: Tensor
-    vertex_dist: Tensor
-    face: Tensor
-    bary: Tensor
-    dist: Tensor
-    point: Tensor | None = None  # (N, 3) m, and the normals there; these four where they were asked for
-    normal: Tensor | None = None
-    next_point: Tensor | None = None
-    next_normal: Tensor | None = None
+
+class Match(NamedTuple):
+    """Closest surface points of N points, as in :class:`hood.mesh.proximity.SurfaceHit`, and the same material points when the
+    surface has moved on."""
+
+    vertex: Tensor  # (N,)
+    vertex_dist: Tensor  # (N,) m
+    face: Tensor  # (N,)
+    bary: Tensor  # (N, 3)
+    dist: Tensor  # (N,) m
+    point: Tensor  # (N, 3) m
+    normal: Tensor  # (N, 3) outward unit normals there, interpolated over the face
+    next_point: Tensor  # (N, 3) m
+    next_normal: Tensor  # (N, 3)
 
 
 @cache
@@ -101,21 +106,18 @@ class SurfaceTree:
         lib.surface_build(ctypes.byref(self._tree), centre.ctypes.data_as(_POINTER))
         self._guess = np.zeros(0, np.int32)
 
-    def search(self, points: np.ndarray, pos: np.ndarray, next_pos: np.ndarray | None = None) -> dict[str, np.ndarray]:
-        """Fields of :class:`Found` for ``points`` (N, 3) on the surface at ``pos`` (W, 3), all float64 and C-contiguous."""
+    def search(self, points: np.ndarray, pos: np.ndarray, next_pos: np.ndarray) -> dict[str, np.ndarray]:
+        """Fields of :class:`Match` for ``points`` (N, 3) on the surface at ``pos`` (W, 3), all float64 and C-contiguous."""
         count = len(points)
         self._arrays["pos"][...] = pos
         self._lib.surface_refit(ctypes.byref(self._tree))
         if len(self._guess) != count:
             self._guess = np.full(count, -1, np.int32)
         found: dict[str, np.ndarray] = {name: np.empty(count, np.int64) for name in ("vertex", "face")}
-        found |= {"vertex_dist": np.empty(count), "bary": np.empty((count, 3)), "dist": np.empty(count)}
-        if next_pos is not None:
-            found |= {name: np.empty((count, 3)) for name in ("point", "normal", "next_point", "next_normal")}
+        found |= {"vertex_dist": np.empty(count), "dist": np.empty(count)}
+        found |= {name: np.empty((count, 3)) for name in ("bary", *_PLACES)}
         query = _Query(count=count)
-        _point(query, {"points": points, "guess": self._guess, **found})
-        if next_pos is not None:
-            _point(query, {"next_pos": next_pos})
+        _point(query, {"points": points, "next_pos": next_pos, "guess": self._guess, **found})
         self._lib.surface_search(ctypes.byref(self._tree), ctypes.byref(query))
         return found
 
@@ -134,22 +136,21 @@ def search(
     faces: Tensor,
     face_scene: Tensor,
     incidence: Sequence[Tensor],
-    next_vertices: Tensor | None = None,
-) -> Found | None:
+    next_vertices: Tensor,
+) -> Match | None:
     """Closest points, scene by scene; None where there is no compiled search, or not for these tensors.
 
     Args:
         incidence: as for :class:`SurfaceTree`.
-        next_vertices: (W, 3) m at t + 1: points and normals are wanted as well.
+        next_vertices: (W, 3) m, where the surface goes.
     """
     if type(points) is not Tensor or points.device.type != "cpu" or library() is None:
         return None
-    given, pos = _double(points), _double(vertices)
-    later = None if next_vertices is None else _double(next_vertices)
+    given, pos, later = _double(points), _double(vertices), _double(next_vertices)
     single = bool((face_scene == face_scene[0]).all()) and bool((point_scene == face_scene[0]).all())
     if single:
         return _found(points, _tree_of(faces, None, face_scene, incidence, pos).search(given, pos, later))
-    result = _nothing(len(points), later is not None)
+    result = _nothing(len(points))
     for scene in point_scene.unique().tolist():
         rows = (point_scene == scene).numpy().nonzero()[0]
         if bool((face_scene == scene).any()):
@@ -163,18 +164,16 @@ def _double(values: Tensor) -> np.ndarray:
     return np.ascontiguousarray(values.detach().numpy(), np.float64)
 
 
-def _nothing(count: int, surface: bool) -> dict[str, np.ndarray]:
+def _nothing(count: int) -> dict[str, np.ndarray]:
     result: dict[str, np.ndarray] = {name: np.zeros(count, np.int64) for name in ("vertex", "face")}
     result |= {name: np.full(count, np.inf) for name in ("vertex_dist", "dist")}
-    for name in ("bary", *(("point", "normal", "next_point", "next_normal") if surface else ())):
-        result[name] = np.zeros((count, 3))
-    return result
+    return result | {name: np.zeros((count, 3)) for name in ("bary", *_PLACES)}
 
 
-def _found(points: Tensor, arrays: dict[str, np.ndarray]) -> Found:
+def _found(points: Tensor, arrays: dict[str, np.ndarray]) -> Match:
     """The arrays as tensors, numbers in the type of ``points``."""
     tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
-    return Found(**{name: value.to(points.dtype) if value.is_floating_point() else value for name, value in tensors.items()})
+    return Match(**{name: value.to(points.dtype) if value.is_floating_point() else value for name, value in tensors.items()})
 
 
 #: Incidence, scene and tree of the last topologies.

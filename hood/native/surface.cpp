@@ -58,11 +58,11 @@ struct Tree {
 struct Query {
     int64_t count;
     const double* points;      // (N, 3)
-    const double* next_pos;    // (W, 3) m at t + 1, or null where normals are not asked for
+    const double* next_pos;    // (W, 3) m, where the surface goes
     int32_t* guess;            // (N) faces to begin with; those found come back
     int64_t *vertex, *face;    // (N)
     double *vertex_dist, *bary, *dist;                         // (N), (N, 3), (N)
-    double *point, *normal, *next_point, *next_normal;         // (N, 3) each, where next_pos is given
+    double *point, *normal, *next_point, *next_normal;         // (N, 3) each
 };
 }
 
@@ -281,10 +281,8 @@ void search(const Tree& tree, const Query& query, int64_t i) {
     std::memcpy(query.bary + 3 * i, best.bary, sizeof(best.bary));
     const double side = dot(best.offset, pseudonormal(tree, best.face, best.bary));
     query.dist[i] = finite ? (side < 0.0 ? -1.0 : 1.0) * std::sqrt(best.dist_sq) : NAN;
-    if (query.next_pos) {
-        interpolate(tree, tree.pos, best.face, best.bary, query.point + 3 * i, query.normal + 3 * i);
-        interpolate(tree, query.next_pos, best.face, best.bary, query.next_point + 3 * i, query.next_normal + 3 * i);
-    }
+    interpolate(tree, tree.pos, best.face, best.bary, query.point + 3 * i, query.normal + 3 * i);
+    interpolate(tree, query.next_pos, best.face, best.bary, query.next_point + 3 * i, query.next_normal + 3 * i);
 }
 
 // Halves the faces ``begin`` to ``end`` of the order along the longest side of their centres, into whole leaves as far as they go;

@@ -15,6 +15,7 @@ from hood.mesh import geometry, surface_tree
 from hood.mesh.centroids import nearest_centroids
 from hood.mesh.nearest import Nearest, nearest_dense, nearest_vertices
 from hood.mesh.proximity import build_incidence, search_surface
+from hood.mesh.surface_tree import Match
 from hood.scene.cloth import Cloth
 from hood.scene.state import Obstacle
 
@@ -65,37 +66,24 @@ def find_contact(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, cap: flo
 
     Matches farther than ``cap`` [m] are kept but marked invalid.
     """
-    found = _compiled_search(pos, vertex_scene, obstacle)
-    if found is not None:
-        return Contact(**found._asdict(), valid=found.dist.abs() <= cap)
+    match = match_surface(pos, vertex_scene, obstacle)
+    return Contact(**match._asdict(), valid=match.dist.abs() <= cap)
+
+
+def match_surface(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle) -> Match:
+    """The closest body points at t of positions (V, 3), and where they go: by the compiled search where there is one."""
+    incidence = build_incidence(obstacle.faces, len(obstacle.pos)) if len(obstacle.faces) and len(pos) else None
+    if incidence is not None:
+        surface = obstacle.pos, obstacle.faces, obstacle.face_scene, incidence.adjacency, obstacle.next_pos
+        found = surface_tree.search(pos, vertex_scene, *surface)
+        if found is not None:
+            return found
     hit = search_surface(pos, vertex_scene, obstacle.pos, obstacle.faces, obstacle.vertex_scene, obstacle.face_scene)
     corners = obstacle.faces[hit.face]
-    point = _weigh(hit.bary, obstacle.pos[corners])
-    next_point = _weigh(hit.bary, obstacle.next_pos[corners])
-    normal, next_normal = (
-        _interpolated_normal(at, obstacle.faces, corners, hit.bary) for at in (obstacle.pos, obstacle.next_pos)
-    )
-    return Contact(
-        vertex=hit.vertex,
-        vertex_dist=hit.vertex_dist,
-        face=hit.face,
-        bary=hit.bary,
-        dist=hit.dist,
-        valid=hit.dist.abs() <= cap,
-        point=point,
-        normal=normal,
-        next_point=next_point,
-        next_normal=next_normal,
-    )
-
-
-def _compiled_search(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle) -> surface_tree.Found | None:
-    if len(obstacle.faces) == 0 or len(pos) == 0:
-        return None
-    incidence = build_incidence(obstacle.faces, len(obstacle.pos))
-    return surface_tree.search(
-        pos, vertex_scene, obstacle.pos, obstacle.faces, obstacle.face_scene, incidence.adjacency, obstacle.next_pos
-    )
+    points = (_weigh(hit.bary, at[corners]) for at in (obstacle.pos, obstacle.next_pos))
+    normals = (_interpolated_normal(at, obstacle.faces, corners, hit.bary) for at in (obstacle.pos, obstacle.next_pos))
+    (point, next_point), (normal, next_normal) = points, normals
+    return Match(*hit, point=point, normal=normal, next_point=next_point, next_normal=next_normal)
 
 
 @dataclass(frozen=True)

@@ -139,13 +139,13 @@ def test_metrics_are_finite_and_named(rollout: list[Frame]) -> None:
 def surface_searches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Number of points of every search for contact with the body's surface so far."""
     calls: list[int] = []
-    search = contact.search_surface
+    search = contact.match_surface
 
-    def counted(points: Tensor, *rest: Tensor) -> object:
+    def counted(points: Tensor, *rest: object) -> object:
         calls.append(len(points))
         return search(points, *rest)
 
-    monkeypatch.setattr(contact, "search_surface", counted)
+    monkeypatch.setattr(contact, "match_surface", counted)
     return calls
 
 

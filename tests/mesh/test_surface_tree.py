@@ -19,7 +19,7 @@ def zeros(count):
 
 def found(points, pos, faces):
     return surface_tree.search(
-        points, zeros(len(points)), pos, faces, zeros(len(faces)), build_incidence(faces, len(pos)).adjacency
+        points, zeros(len(points)), pos, faces, zeros(len(faces)), build_incidence(faces, len(pos)).adjacency, pos
     )
 
 
