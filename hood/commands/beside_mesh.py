@@ -57,7 +57,7 @@ def place_beside_mesh(finding: Finding, garment: Garment, motion: MeshMotion, un
     if inside and not misplaced:
         depth = -1e3 * float(dist.min())
         what = f"{inside} vertices ({100 * inside / len(dist):.1f}%) are inside the body, to {depth:.1f} mm"
-        finding.problem(what, "prepare pushes them out", "")
+        finding.problem(what, "prepare starts them outside, and the rest shape stays", "")
 
 
 def _middle(pos: np.ndarray, surface: np.ndarray, faces: np.ndarray) -> float:
