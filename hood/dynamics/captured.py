@@ -66,7 +66,7 @@ class CapturedSimulator:
             raise ValueError(f"step is {mode!r}; choose plain, {', '.join(MODES[:-1])} or {MODES[-1]}")
         if mode == "captured" and simulator.gravity.device.type != "cuda":
             raise ValueError("step=captured needs device=cuda, a CPU has no graphs to replay; use step=fixed or step=plain")
-        if mode == "compiled" and simulator.network.kernels == "compiled":
+        if mode == "compiled" and simulator.network.kernels != "torch":
             raise ValueError("step=compiled compiles torch's operations and needs kernels=torch; or use step=plain")
         check_model(simulator)
         check_precision(simulator.network.precision, simulator.gravity.device)

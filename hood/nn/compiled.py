@@ -16,9 +16,11 @@ import torch
 from torch import Tensor
 
 from hood.native.build import BuildError, build
+from hood.nn import compiled_network
 
-#: ``torch``: torch's operations, everywhere; ``compiled``: the blocks of the network in C++.
-KERNELS = ("torch", "compiled")
+#: ``torch``: torch's operations, everywhere; ``compiled``: the blocks of the network in C++; ``fused``: whole passes of an
+#: inference in C++ (:mod:`hood.nn.compiled_network`), gradients by torch's operations.
+KERNELS = ("torch", "compiled", "fused")
 #: Widths of latents are a multiple of this: numbers in a register.
 LANES = 16
 SOURCE = Path(__file__).with_name("block.cpp")
@@ -54,11 +56,14 @@ class Gradient(ctypes.Structure):
 def check_kernels(name: str, precision: str, width: int, device: torch.device | None = None) -> None:
     """Raise ValueError unless ``name`` is a choice that works here for latents of ``width`` columns in ``precision``."""
     if name not in KERNELS:
-        raise ValueError(f"kernels is {name!r}; choose {' or '.join(KERNELS)}")
+        raise ValueError(f"kernels is {name!r}; choose {', '.join(KERNELS[:-1])} or {KERNELS[-1]}")
     if name == "torch":
         return
     if device is not None and device.type != "cpu":
-        raise ValueError(f"kernels=compiled are for device=cpu, not {device.type}; use kernels=torch")
+        raise ValueError(f"kernels={name} are for device=cpu, not {device.type}; use kernels=torch")
+    if name == "fused":
+        _check_fused(precision, width)
+        return
     if width % LANES:
         raise ValueError(f"kernels=compiled need latents of a multiple of {LANES} columns, not {width}; use kernels=torch")
     if torch.backends.cpu.get_cpu_capability() != "AVX512":
@@ -66,6 +71,15 @@ def check_kernels(name: str, precision: str, width: int, device: torch.device | 
     if precision == "bf16" and not _multiplies_bfloat16():
         raise ValueError("kernels=compiled with precision=bf16 need a processor with AVX512_BF16; use kernels=torch")
     library(width, precision == "bf16")
+
+
+def _check_fused(precision: str, width: int) -> None:
+    if precision != "fp32":
+        raise ValueError(f"kernels=fused compute in precision=fp32, not {precision}; use kernels=compiled or kernels=torch")
+    try:
+        compiled_network.check_width(width)
+    except BuildError as error:
+        raise ValueError(f"kernels=fused: {error} or use kernels=torch") from error
 
 
 def panel(width: int) -> int:

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from hood.graph.builder import BODY, MESH, Graph, Subset, coarse_name, set_level
+from hood.nn import compiled_network
 from hood.nn.compiled import check_kernels
 from hood.nn.dense import pad_rows
 from hood.nn.message_passing import ProcessorStep
@@ -104,7 +105,8 @@ class MeshGraphNet(nn.Module):
 
     def use_kernels(self, name: str) -> None:
         """``torch`` computes by torch's operations, ``compiled`` by kernels that are compiled here, once per user: the same
-        function, faster, on a CPU with AVX-512 and a C++ compiler.
+        function, faster, on a CPU with AVX-512 and a C++ compiler. ``fused`` takes every pass of an inference in one call, on
+        any CPU with a compiler; gradients go by torch's operations.
 
         Raises:
             ValueError: no such choice, or it does not work here.
@@ -140,6 +142,8 @@ class MeshGraphNet(nn.Module):
         """
         check_precision(self.precision, node_features.device)
         check_kernels(self.kernels, self.precision, self.latent_dim, node_features.device)
+        if self.kernels == "fused" and compiled_network.applies(self, node_features):
+            return compiled_network.infer(self, graph, node_features, edge_features, look)
         with products(self.precision):
             return self._forward(graph, node_features, edge_features, look)
 

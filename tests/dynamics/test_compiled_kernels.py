@@ -23,7 +23,8 @@ REASON = reason()
 pytestmark = pytest.mark.skipif(bool(REASON), reason=REASON)
 
 
-def test_steps_of_any_shape_are_those_of_the_plain_network(skirt_scene: Scene) -> None:
+@pytest.mark.parametrize("kernels", ["compiled", "fused"])
+def test_steps_of_any_shape_are_those_of_the_plain_network(kernels: str, skirt_scene: Scene) -> None:
     torch.manual_seed(0)
     simulator = build_simulator(schedule="2x(mesh+coarse0)", latent_dim=64).eval()
     state = skirt_scene.start(0)
@@ -32,8 +33,8 @@ def test_steps_of_any_shape_are_those_of_the_plain_network(skirt_scene: Scene) -
     problem = StepProblem(skirt_scene.cloth, state, step, gravity=simulator.gravity)
     with torch.no_grad():
         plain = simulator.predict(problem, prepared).acc
-        simulator.network.use_kernels("compiled")
-        assert simulator.clone().network.kernels == "compiled"
+        simulator.network.use_kernels(kernels)
+        assert simulator.clone().network.kernels == kernels
         for stepper in (simulator, CapturedSimulator(simulator, "fixed")):
             found = stepper.predict(problem, prepared).acc
             assert not torch.equal(found, plain)

@@ -169,7 +169,7 @@ def fresh(tmp_path, monkeypatch):
 
 def test_who_is_refused(fresh, monkeypatch):
     network = MeshGraphNet(3, {"mesh": 2, "body": 2}, WIDTH, "1x(mesh)")
-    with pytest.raises(ValueError, match="kernels is 'fast'; choose torch or compiled"):
+    with pytest.raises(ValueError, match="kernels is 'fast'; choose torch, compiled or fused"):
         network.use_kernels("fast")
     with pytest.raises(ValueError, match="for device=cpu, not cuda; use kernels=torch"):
         compiled.check_kernels("compiled", "fp32", WIDTH, torch.device("cuda"))

@@ -1,0 +1,321 @@
+// A network's inference in float32: perceptrons over rows, and whole processor steps (edge networks, sums at the receivers, node
+// network) in one call. Rows are taken in tiles that stay in cache from the first layer to the layer norm; nothing is allocated.
+// Weights lie in panels (network_pack), so that any width is a loop over full vectors. Every sum has a fixed order.
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+
+namespace {
+
+#if defined(__AVX512F__)
+constexpr int LANES = 16, SUMS = 24;  // numbers in a vector, and sums that are in registers at a time
+#elif defined(__AVX__)
+constexpr int LANES = 8, SUMS = 12;
+#elif defined(__aarch64__)
+constexpr int LANES = 4, SUMS = 24;
+#else
+constexpr int LANES = 4, SUMS = 12;
+#endif
+constexpr int TILE = 96;       // rows: a multiple of every group of rows below
+constexpr int MOST = 512;      // columns of a latent
+
+typedef float V __attribute__((vector_size(4 * LANES)));
+typedef decltype(V{} > V{}) Mask;
+
+inline V load(const float* p) {
+    V v;
+    std::memcpy(&v, p, sizeof v);
+    return v;
+}
+inline void store(float* p, V v) { std::memcpy(p, &v, sizeof v); }
+inline V all(float x) { return V{} + x; }
+inline V relu(V v) { return v < 0.0f ? V{} : v; }  // keeps a NaN
+inline float total(V v) {
+    float half[LANES];
+    store(half, v);
+    for (int width = LANES / 2; width > 0; width /= 2)
+        for (int i = 0; i < width; ++i) half[i] += half[i + width];
+    return half[0];
+}
+
+constexpr int padded(int64_t count) { return (int)((count + LANES - 1) / LANES * LANES); }
+
+// Vectors of a panel of columns.
+constexpr int panel_of(int64_t columns) {
+    const int vectors = padded(columns) / LANES;
+    return vectors % 4 == 0 ? 4 : vectors % 3 == 0 ? 3 : vectors % 2 == 0 ? 2 : 1;
+}
+
+// ---- products ------------------------------------------------------------------------------------------------------------
+
+// emit(row, column, a vector of x W) for R rows and the panel of P vectors that begins at a column.
+template <int R, int P, class Emit>
+inline void rows_product(const float* x, int64_t stride, int terms, const float* panel, int row, int column, const Emit& emit) {
+    V sum[R][P];
+#pragma GCC unroll 24
+    for (int r = 0; r < R; ++r)
+#pragma GCC unroll 4
+        for (int j = 0; j < P; ++j) sum[r][j] = V{};
+    const float* from = x + row * stride;
+    for (int k = 0; k < terms; ++k) {
+        V weight[P];
+#pragma GCC unroll 4
+        for (int j = 0; j < P; ++j) weight[j] = load(panel + (k * P + j) * LANES);
+#pragma GCC unroll 24
+        for (int r = 0; r < R; ++r)
+#pragma GCC unroll 4
+            for (int j = 0; j < P; ++j) sum[r][j] += from[r * stride + k] * weight[j];
+    }
+#pragma GCC unroll 24
+    for (int r = 0; r < R; ++r)
+#pragma GCC unroll 4
+        for (int j = 0; j < P; ++j) emit(row + r, column + j * LANES, sum[r][j]);
+}
+
+template <int P, class Emit>
+inline void panels_product(const float* x, int64_t stride, int rows, int terms, const float* weight, int columns, const Emit& emit) {
+    constexpr int GROUP = SUMS / P;
+    for (int column = 0; column < columns; column += P * LANES, weight += (int64_t)terms * P * LANES) {
+        int row = 0;
+        for (; row + GROUP <= rows; row += GROUP) rows_product<GROUP, P>(x, stride, terms, weight, row, column, emit);
+        for (; row < rows; ++row) rows_product<1, P>(x, stride, terms, weight, row, column, emit);
+    }
+}
+
+// All rows of a tile by all columns of a packed weight.
+template <class Emit>
+inline void product(const float* x, int64_t stride, int rows, int64_t terms, const float* weight, int64_t columns, const Emit& emit) {
+    const int wide = padded(columns);
+    switch (panel_of(columns)) {
+        case 4: return panels_product<4>(x, stride, rows, (int)terms, weight, wide, emit);
+        case 3: return panels_product<3>(x, stride, rows, (int)terms, weight, wide, emit);
+        case 2: return panels_product<2>(x, stride, rows, (int)terms, weight, wide, emit);
+        default: return panels_product<1>(x, stride, rows, (int)terms, weight, wide, emit);
+    }
+}
+
+}  // namespace
+
+extern "C" {
+
+// in -> width -> width -> out; weights in panels, biases padded with zeros to whole vectors.
+struct Perceptron {
+    const float *first, *second, *third, *bias_1, *bias_2, *bias_3;
+    const float *scale, *shift;  // of the layer norm, or null
+    int64_t in, width, out;
+    double eps;
+};
+
+// Which edges of a set take part, their ends among the nodes that have one, and those nodes.
+struct Edges {
+    int64_t num_edges, num_nodes;
+    const int64_t *senders, *receivers;  // (E) into nodes, receivers ascending
+    const int64_t* nodes;                // (M)
+    const int64_t* rows;                 // (E) of the latents, or null for all of them
+    const int64_t* offsets;              // (M + 1)
+};
+
+// The part of one edge set in a processor step.
+struct Part {
+    const float *to_receiver, *to_sender, *to_edge, *to_node;  // blocks of columns of the first layers
+    Perceptron network;                                        // of the edges; its first weight is not read
+    int64_t edges, latent;                                     // which of the lists given
+};
+
+struct Step {
+    const Part* parts;
+    const float* own;     // the nodes' block of columns of the node network's first layer
+    Perceptron network;   // of the nodes; its first weight is not read
+    int64_t num_parts, mean;
+};
+
+// Memory of a step: two tables (N, d) of the nodes' parts of a first layer, sums and hidden layer (N, d).
+struct Memory {
+    float *receiver, *sender, *received, *hidden;
+};
+}
+
+namespace {
+
+// The layers behind the first, from its output before the ReLU (in `one`, which is overwritten); finish(row, result of a row).
+template <class Finish> void tail(const Perceptron& p, float* one, int rows, const Finish& finish) {
+    alignas(64) static thread_local float two[TILE * MOST], raw[TILE * MOST];
+    const int d = (int)p.width, out = padded(p.out);
+    for (int i = 0; i < rows * d; i += LANES) store(one + i, relu(load(one + i)));
+    product(one, d, rows, d, p.second, d, [&](int r, int c, V v) { store(two + r * d + c, relu(v + load(p.bias_2 + c))); });
+    product(two, d, rows, d, p.third, p.out, [&](int r, int c, V v) { store(raw + r * out + c, v + load(p.bias_3 + c)); });
+    for (int r = 0; r < rows; ++r) {
+        float* row = raw + r * out;
+        if (p.scale) {
+            V sum = V{}, square = V{};
+            for (int c = 0; c < d; c += LANES) sum += load(row + c);
+            const V mean = all(total(sum) / (float)d);
+            for (int c = 0; c < d; c += LANES) {
+                const V centred = load(row + c) - mean;
+                store(row + c, centred);
+                square += centred * centred;
+            }
+            const V factor = all(1.0f / std::sqrt(total(square) / (float)d + (float)p.eps));
+            for (int c = 0; c < d; c += LANES) store(row + c, load(row + c) * factor * load(p.scale + c) + load(p.shift + c));
+        }
+        finish(r, row);
+    }
+}
+
+inline void gather(const float* x, const int64_t* rows, int count, int d, float* out) {
+    for (int r = 0; r < count; ++r) std::memcpy(out + r * d, x + rows[r] * d, sizeof(float) * d);
+}
+
+inline int tile_of(int64_t count, int64_t start) { return count - start < TILE ? (int)(count - start) : TILE; }
+
+// Sums of consecutive rows of one receiver.
+struct Sums {
+    float* out;
+    int d;
+    int64_t node = -1;
+    alignas(64) float sum[MOST];
+    Sums(float* out, int d) : out(out), d(d) {}
+    void add(int64_t receiver, const float* row) {
+        if (receiver != node) {
+            flush();
+            node = receiver;
+            std::memcpy(sum, row, sizeof(float) * d);
+        } else {
+            for (int c = 0; c < d; c += LANES) store(sum + c, load(sum + c) + load(row + c));
+        }
+    }
+    void flush() {
+        if (node >= 0) std::memcpy(out + node * d, sum, sizeof(float) * d);
+    }
+};
+
+// Node parts of the edge network's first layer, at the nodes that have an edge.
+void node_parts(const Part& part, const Edges& edges, const float* nodes, const Memory& memory) {
+    alignas(64) static thread_local float tile[TILE * MOST];
+    const int d = (int)part.network.width;
+    for (int64_t start = 0; start < edges.num_nodes; start += TILE) {
+        const int rows = tile_of(edges.num_nodes, start);
+        gather(nodes, edges.nodes + start, rows, d, tile);
+        float *receiver = memory.receiver + start * d, *sender = memory.sender + start * d;
+        product(tile, d, rows, d, part.to_receiver, d,
+                [&](int r, int c, V v) { store(receiver + r * d + c, v + load(part.network.bias_1 + c)); });
+        product(tile, d, rows, d, part.to_sender, d, [&](int r, int c, V v) { store(sender + r * d + c, v); });
+    }
+}
+
+// e' = e + m and the sums of m at the receivers.
+void update_edges(const Part& part, const Edges& edges, float* latent, const Memory& memory) {
+    alignas(64) static thread_local float tile[TILE * MOST], one[TILE * MOST];
+    const int d = (int)part.network.width;
+    Sums sums(memory.received, d);
+    for (int64_t start = 0; start < edges.num_edges; start += TILE) {
+        const int rows = tile_of(edges.num_edges, start);
+        const int64_t *receivers = edges.receivers + start, *senders = edges.senders + start;
+        const int64_t* places = edges.rows ? edges.rows + start : nullptr;
+        const float* x = latent + start * d;
+        if (places) {
+            gather(latent, places, rows, d, tile);
+            x = tile;
+        }
+        product(x, d, rows, d, part.to_edge, d, [&](int r, int c, V v) {
+            store(one + r * d + c, v + load(memory.receiver + receivers[r] * d + c) + load(memory.sender + senders[r] * d + c));
+        });
+        tail(part.network, one, rows, [&](int r, const float* message) {
+            float* at = latent + (places ? places[r] : start + r) * d;
+            for (int c = 0; c < d; c += LANES) store(at + c, load(at + c) + load(message + c));
+            sums.add(receivers[r], message);
+        });
+    }
+    sums.flush();
+}
+
+// The sums' part of the node network's first layer.
+void add_received(const Part& part, const Edges& edges, bool mean, const Memory& memory) {
+    const int d = (int)part.network.width;
+    for (int64_t start = 0; start < edges.num_nodes; start += TILE) {
+        const int rows = tile_of(edges.num_nodes, start);
+        float* received = memory.received + start * d;
+        for (int r = 0; mean && r < rows; ++r) {
+            const int64_t degree = edges.offsets[start + r + 1] - edges.offsets[start + r];
+            for (int c = 0; c < d; c += LANES) store(received + r * d + c, load(received + r * d + c) / (float)(degree > 1 ? degree : 1));
+        }
+        product(received, d, rows, d, part.to_node, d, [&](int r, int c, V v) {
+            float* at = memory.hidden + edges.nodes[start + r] * d + c;
+            store(at, load(at) + v);
+        });
+    }
+}
+
+void take_step(const Step& step, const Edges* edges, float* const* latents, float* nodes, int64_t num_nodes, const Memory& memory) {
+    alignas(64) static thread_local float tile[TILE * MOST];
+    const int d = (int)step.network.width;
+    for (int64_t start = 0; start < num_nodes; start += TILE)
+        product(nodes + start * d, d, tile_of(num_nodes, start), d, step.own, d,
+                [&](int r, int c, V v) { store(memory.hidden + (start + r) * d + c, v + load(step.network.bias_1 + c)); });
+    for (int64_t i = 0; i < step.num_parts; ++i) {
+        const Part& part = step.parts[i];
+        const Edges& set = edges[part.edges];
+        if (set.num_edges == 0) continue;
+        node_parts(part, set, nodes, memory);
+        update_edges(part, set, latents[part.latent], memory);
+        add_received(part, set, step.mean, memory);
+    }
+    for (int64_t start = 0; start < num_nodes; start += TILE) {
+        const int rows = tile_of(num_nodes, start);
+        std::memcpy(tile, memory.hidden + start * d, sizeof(float) * rows * d);
+        tail(step.network, tile, rows, [&](int r, const float* change) {
+            float* at = nodes + (start + r) * d;
+            for (int c = 0; c < d; c += LANES) store(at + c, load(at + c) + load(change + c));
+        });
+    }
+}
+
+}  // namespace
+
+extern "C" {
+
+// ---- what is called ------------------------------------------------------------------------------------------------------
+
+int64_t network_most() { return MOST; }
+int64_t network_padded(int64_t columns) { return padded(columns); }
+// Latents have to fill whole vectors.
+int64_t network_lanes() { return LANES; }
+
+// Columns first .. first + terms of a weight (columns, stride) as panels: of each its vectors, term by term.
+void network_pack(const float* weight, int64_t columns, int64_t stride, int64_t first, int64_t terms, float* out) {
+    const int panel = panel_of(columns) * LANES;
+    for (int64_t start = 0; start < padded(columns); start += panel)
+        for (int64_t k = 0; k < terms; ++k)
+            for (int64_t c = start; c < start + panel; ++c) *out++ = c < columns ? weight[c * stride + first + k] : 0.0f;
+}
+
+// A perceptron over rows of x (count, in) into out (count, p.out), on top of what is there if `add`.
+void network_rows(const Perceptron* p, const float* x, int64_t count, float* out, int64_t add) {
+    alignas(64) static thread_local float one[TILE * MOST];
+    const int d = (int)p->width;
+    for (int64_t start = 0; start < count; start += TILE) {
+        const int rows = tile_of(count, start);
+        product(x + start * p->in, p->in, rows, p->in, p->first, d,
+                [&](int r, int c, V v) { store(one + r * d + c, v + load(p->bias_1 + c)); });
+        tail(*p, one, rows, [&](int r, const float* row) {
+            float* at = out + (start + r) * p->out;
+            for (int64_t c = 0; c < p->out; ++c) at[c] = add ? at[c] + row[c] : row[c];
+        });
+    }
+}
+
+// latent (count, d) += x (count) times weight (d), plus bias (d).
+void network_lift(const float* x, int64_t count, int64_t d, const float* weight, const float* bias, float* latent) {
+    for (int64_t i = 0; i < count; ++i)
+        for (int64_t c = 0; c < d; c += LANES) {
+            float* at = latent + i * d + c;
+            store(at, load(at) + (all(x[i]) * load(weight + c) + load(bias + c)));
+        }
+}
+
+// Processor steps one after the other, in place.
+void network_steps(const Step* steps, int64_t count, const Edges* edges, float* const* latents, float* nodes, int64_t num_nodes,
+                   const Memory* memory) {
+    for (int64_t i = 0; i < count; ++i) take_step(steps[i], edges, latents, nodes, num_nodes, *memory);
+}
+}
