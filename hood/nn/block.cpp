@@ -1,9 +1,20 @@
 // One network block over rows, tile by tile, in registers and first-level cache: first layer (of an edge network), second and
 // third layer, layer norm, residual and the sums at the receivers; forward and backward. Built by hood/nn/compiled.py with
-// WIDTH, a multiple of 16, PANEL, 16 to 64 columns that divide it, and HALF, 1 for bfloat16 and 0 for float32.
+// WIDTH, a multiple of 16, PANEL, 16 to 64 columns that divide it, and HALF, 1 for bfloat16 and 0 for float32. Where the compiler
+// is told of AMX, products of bfloat16 with widths of a multiple of 32 are by its tiles.
 #include <immintrin.h>
 
 #include <cstdint>
+#include <cstring>
+#include <initializer_list>
+
+#if HALF && defined(__AMX_BF16__) && WIDTH % 32 == 0
+#define TILES 1
+#include <sys/syscall.h>
+#include <unistd.h>
+#else
+#define TILES 0
+#endif
 
 namespace {
 
@@ -68,6 +79,79 @@ inline void rows_product(const T* x, const T* weight, int row, int column, const
         for (int j = 0; j < V; ++j) emit(row + r, column + 16 * j, sum[r][j]);
 }
 
+#if TILES
+
+// Tiles 0 to 3 hold sums, (16, 16) float32 each; 4 and 5 rows of the left factor, 6 and 7 columns of the right one, in both of
+// them 32 terms of the sums.
+struct alignas(64) TileShapes {
+    uint8_t palette = 1, start = 0, reserved[14] = {};
+    uint16_t bytes[16] = {64, 64, 64, 64, 64, 64, 64, 64};
+    uint8_t rows[16] = {16, 16, 16, 16, 16, 16, 16, 16};
+};
+
+// what was written is in memory before tiles read it: to compilers they do not
+inline void settle() { asm volatile("" ::: "memory"); }
+
+struct Tiles {  // for the length of a call: other libraries give tiles their own shapes
+    Tiles() {
+        const TileShapes shapes;
+        settle();
+        _tile_loadconfig(&shapes);
+    }
+    ~Tiles() { _tile_release(); }
+};
+
+// tiles 0 to 3 += (32, D) (D, 32) for D terms; strides in bytes from row to row, of the right factor from pair to pair of rows
+inline void accumulate_tiles(const T* left, int64_t left_row, const Word* right, int64_t right_pair, int terms) {
+    settle();
+    for (int k = 0; k < terms; k += 32) {
+        _tile_loadd(4, left + k, left_row);
+        _tile_loadd(6, (const char*)right + k / 2 * right_pair, right_pair);
+        _tile_loadd(7, (const char*)right + k / 2 * right_pair + 64, right_pair);
+        _tile_dpbf16ps(0, 4, 6);
+        _tile_loadd(5, (const char*)(left + k) + 16 * left_row, left_row);
+        _tile_dpbf16ps(1, 4, 7);
+        _tile_dpbf16ps(2, 5, 6);
+        _tile_dpbf16ps(3, 5, 7);
+    }
+}
+
+template <class Emit>
+void product(const T* x, int rows, const T* weight, const Emit& emit) {
+    alignas(64) static thread_local T last[32 * D];
+    alignas(64) float sum[32][32];
+    for (int row = 0; row < rows; row += 32) {
+        const T* left = x + (int64_t)row * D;
+        const int present = rows - row < 32 ? rows - row : 32;
+        if (present < 32) {
+            memcpy(last, left, (size_t)present * D * sizeof(T));
+            memset(last + present * D, 0, (size_t)(32 - present) * D * sizeof(T));
+            left = last;
+        }
+        for (int column = 0; column < D; column += 32) {
+            const Word* panel = (const Word*)weight + (int64_t)(column / PANEL) * PANEL * WORDS + column % PANEL;
+            _tile_zero(0);
+            _tile_zero(1);
+            _tile_zero(2);
+            _tile_zero(3);
+            accumulate_tiles(left, D * sizeof(T), panel, PANEL * sizeof(Word), D);
+            _tile_stored(0, sum[0], sizeof sum[0]);
+            _tile_stored(1, sum[0] + 16, sizeof sum[0]);
+            _tile_stored(2, sum[16], sizeof sum[0]);
+            _tile_stored(3, sum[16] + 16, sizeof sum[0]);
+            settle();
+            for (int r = 0; r < present; ++r) {
+                emit(row + r, column, _mm512_load_ps(sum[r]));
+                emit(row + r, column + 16, _mm512_load_ps(sum[r] + 16));
+            }
+        }
+    }
+}
+
+#else
+
+struct Tiles {};
+
 // emit(row, column, 16 values) of x W for all rows of a tile; the weight lies in panels of columns
 template <class Emit>
 void product(const T* x, int rows, const T* weight, const Emit& emit) {
@@ -78,7 +162,9 @@ void product(const T* x, int rows, const T* weight, const Emit& emit) {
     }
 }
 
-// rows of a tile by their terms: with bfloat16 two rows share a word
+#endif
+
+// rows of a tile by their terms: with bfloat16 two rows share a word; one without a partner gets zeros
 void interleave(const T* x, int rows, T* out) {
 #if HALF
     for (int row = 0; row < rows; row += 2)
@@ -90,6 +176,64 @@ void interleave(const T* x, int rows, T* out) {
         }
 #endif
 }
+
+#if TILES
+
+// (16, 16) words, rows D words apart, to out (16, 16), rows `out_row` words apart
+inline void transpose(const Word* x, Word* out, int64_t out_row) {
+    __m512i a[16], b[16];
+#pragma GCC unroll 16
+    for (int i = 0; i < 16; ++i) a[i] = _mm512_load_si512(x + i * D);
+#pragma GCC unroll 8
+    for (int i = 0; i < 16; i += 2) {
+        b[i] = _mm512_unpacklo_epi32(a[i], a[i + 1]);
+        b[i + 1] = _mm512_unpackhi_epi32(a[i], a[i + 1]);
+    }
+#pragma GCC unroll 4
+    for (int i = 0; i < 16; i += 4) {
+        a[i] = _mm512_unpacklo_epi64(b[i], b[i + 2]);
+        a[i + 1] = _mm512_unpackhi_epi64(b[i], b[i + 2]);
+        a[i + 2] = _mm512_unpacklo_epi64(b[i + 1], b[i + 3]);
+        a[i + 3] = _mm512_unpackhi_epi64(b[i + 1], b[i + 3]);
+    }
+#pragma GCC unroll 4
+    for (int i = 0; i < 4; ++i) {  // a[4 j + i] holds in its lane l column 4 l + i of rows 4 j to 4 j + 3
+        const __m512i low01 = _mm512_shuffle_i32x4(a[i], a[4 + i], 0x88), high01 = _mm512_shuffle_i32x4(a[i], a[4 + i], 0xdd);
+        const __m512i low23 = _mm512_shuffle_i32x4(a[8 + i], a[12 + i], 0x88), high23 = _mm512_shuffle_i32x4(a[8 + i], a[12 + i], 0xdd);
+        _mm512_store_si512(out + i * out_row, _mm512_shuffle_i32x4(low01, low23, 0x88));
+        _mm512_store_si512(out + (4 + i) * out_row, _mm512_shuffle_i32x4(high01, high23, 0x88));
+        _mm512_store_si512(out + (8 + i) * out_row, _mm512_shuffle_i32x4(low01, low23, 0xdd));
+        _mm512_store_si512(out + (12 + i) * out_row, _mm512_shuffle_i32x4(high01, high23, 0xdd));
+    }
+}
+
+// total += leftᵀ right over the rows of a tile
+void gram(const T* left, const T* right, int rows, float* total) {
+    constexpr int PAIRS = TILE / 2;
+    alignas(64) static thread_local Word pairs[PAIRS * D], turned[D * PAIRS], other[PAIRS * D];
+    const int terms = (rows + 31) / 32 * 32;
+    interleave(left, rows, (T*)pairs);
+    interleave(right, rows, (T*)other);
+    for (Word* one : {pairs, other}) memset(one + (rows + 1) / 2 * D, 0, (size_t)(terms / 2 - (rows + 1) / 2) * D * sizeof(Word));
+    for (int pair = 0; pair < terms / 2; pair += 16)
+        for (int c = 0; c < D; c += 16) transpose(pairs + pair * D + c, turned + c * PAIRS + pair, PAIRS);
+    const int64_t total_row = D * sizeof(float);
+    for (int row = 0; row < D; row += 32)
+        for (int column = 0; column < D; column += 32) {
+            float *at = total + (int64_t)row * D + column, *below = at + 16 * D;
+            _tile_loadd(0, at, total_row);
+            _tile_loadd(1, at + 16, total_row);
+            _tile_loadd(2, below, total_row);
+            _tile_loadd(3, below + 16, total_row);
+            accumulate_tiles((const T*)(turned + row * PAIRS), PAIRS * sizeof(Word), other + column, D * sizeof(Word), terms);
+            _tile_stored(0, at, total_row);
+            _tile_stored(1, at + 16, total_row);
+            _tile_stored(2, below, total_row);
+            _tile_stored(3, below + 16, total_row);
+        }
+}
+
+#else
 
 // total += leftᵀ right over the rows of a tile
 void gram(const T* left, const T* right, int rows, float* total) {
@@ -115,6 +259,8 @@ void gram(const T* left, const T* right, int rows, float* total) {
                 for (int j = 0; j < V; ++j) _mm512_storeu_ps(at + r * D + 16 * j, sum[r][j]);
         }
 }
+
+#endif
 
 inline void add_to(float* total, __m512 v) { _mm512_storeu_ps(total, _mm512_add_ps(_mm512_loadu_ps(total), v)); }
 
@@ -154,6 +300,16 @@ struct Sums {
 
 }  // namespace
 
+// whether this process may use tiles: Linux gives them to those that ask
+extern "C" int tiles_are_given() {
+#if TILES
+    constexpr int ARCH_REQ_XCOMP_PERM = 0x1023, XFEATURE_XTILEDATA = 18;
+    return syscall(SYS_arch_prctl, ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA) == 0;
+#else
+    return 0;
+#endif
+}
+
 struct Block {
     int64_t count;
     const T* x;      // edge latents, or the first layer's outputs before their ReLU
@@ -173,6 +329,7 @@ struct Block {
 extern "C" void forward(const Block* b) {
     alignas(64) static thread_local T one_tile[TILE * D], two_tile[TILE * D];
     alignas(64) static thread_local float raw[TILE * D];
+    [[maybe_unused]] const Tiles tiles;
     Sums sums(b->received);
     for (int64_t start = 0; start < b->count; start += TILE) {
         const int rows = b->count - start < TILE ? (int)(b->count - start) : TILE;
@@ -243,6 +400,7 @@ struct Gradient {
 
 extern "C" void backward(const Gradient* b) {
     alignas(64) static thread_local T third[TILE * D], second[TILE * D];
+    [[maybe_unused]] const Tiles tiles;
     for (int64_t start = 0; start < b->count; start += TILE) {
         const int rows = b->count - start < TILE ? (int)(b->count - start) : TILE;
         const T *one = b->one + start * D, *two = b->two + start * D, *hat = b->hat + start * D;

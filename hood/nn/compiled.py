@@ -3,19 +3,20 @@
 The compiled ones take a tile of rows through all layers of a block in registers and first-level cache, forward and backward:
 no array between two layers is written to memory unless the gradient needs it, and nothing passes over a tile twice. They need a
 C++ compiler and a processor with AVX-512, are compiled once per user, width and precision (some seconds) and kept in the
-user's cache folder. They work on one thread.
+user's cache folder. They work on one thread. Products of bfloat16 are by AMX where the processor has it.
 """
 
 from __future__ import annotations
 
 import ctypes
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from hood.native.build import BuildError, build
+from hood.native.build import BuildError, build, processor
 from hood.nn import compiled_network
 
 #: ``torch``: torch's operations, everywhere; ``compiled``: the blocks of the network in C++; ``fused``: whole passes of an
@@ -25,6 +26,10 @@ KERNELS = ("torch", "compiled", "fused")
 LANES = 16
 SOURCE = Path(__file__).with_name("block.cpp")
 _FLAGS = ("-O3", "-std=c++17", "-shared", "-fPIC", "-mfma", *(f"-mavx512{part}" for part in ("f", "bw", "dq", "vl")))
+_HALF_FLAGS = ("-mavx512bf16",)
+_TILE_FLAGS = ("-mamx-tile", "-mamx-bf16")
+#: Widths of latents are a multiple of this for AMX: the terms that one of its instructions adds up.
+TILE_LANES = 32
 _POINTER, _COUNT = ctypes.c_void_p, ctypes.c_int64
 
 
@@ -83,8 +88,8 @@ def _check_fused(precision: str, width: int) -> None:
 
 
 def panel(width: int) -> int:
-    """Columns of ``width`` whose sums are in registers at a time."""
-    return next(columns for columns in (64, 48, 32, LANES) if width % columns == 0)
+    """Columns of ``width`` whose sums are in registers at a time; tiles of AMX take 32."""
+    return next(columns for columns in (64, 32, 48, LANES) if width % columns == 0)
 
 
 def call(function: str, values: ctypes.Structure, width: int, half: bool) -> None:
@@ -106,7 +111,12 @@ def library(width: int, half: bool) -> ctypes.CDLL:
     Raises:
         ValueError: there is no compiler, or it fails.
     """
-    flags = [*_FLAGS, f"-DWIDTH={width}", f"-DPANEL={panel(width)}", f"-DHALF={int(half)}", *(["-mavx512bf16"] if half else [])]
+    flags = [*_FLAGS, f"-DWIDTH={width}", f"-DPANEL={panel(width)}", f"-DHALF={int(half)}", *(_HALF_FLAGS if half else [])]
+    if half and width % TILE_LANES == 0 and "amx_bf16" in processor().split():
+        with suppress(BuildError):  # a compiler that does not know of them
+            lib = build(SOURCE, [*flags, *_TILE_FLAGS])
+            if lib.tiles_are_given():
+                return lib
     try:
         return build(SOURCE, flags)
     except BuildError as error:

@@ -65,10 +65,10 @@ def formulas(mlp: MLP, nodes: Tensor, latent: Tensor, edges: EdgeSet) -> tuple[T
 
 
 @needs_compiler
-@pytest.mark.parametrize("width", [16, 32, 48, WIDTH])
+@pytest.mark.parametrize("width", [16, 32, 48, WIDTH, 96])
 @pytest.mark.parametrize("dtype, bound, bound_gradient", BOUNDS)
 def test_an_edge_update_and_its_gradients_are_the_formulas(dtype, bound, bound_gradient, width):
-    """Widths have panels of one to four registers."""
+    """Widths have panels of one to four registers; those of a multiple of 32 are by AMX where the processor has it."""
     mlp, edges = perceptron(3 * width, width), hub_and_gaps()
     nodes = torch.randn(len(edges.nodes) + 5, width).to(dtype)
     latent = torch.randn(edges.num_edges, width).to(dtype)
@@ -158,6 +158,15 @@ def test_double_precision_and_traces_go_the_plain_way():
 
 
 @pytest.fixture
+def plain_processor(monkeypatch):
+    """One without AMX."""
+    monkeypatch.setattr(compiled, "processor", lambda: "Linux x86_64 flags : avx512f")
+    compiled.library.cache_clear()
+    yield
+    compiled.library.cache_clear()
+
+
+@pytest.fixture
 def fresh(tmp_path, monkeypatch):
     """Nothing compiled so far, here or on disk."""
     monkeypatch.setenv("HOOD_CACHE", str(tmp_path))
@@ -165,6 +174,40 @@ def fresh(tmp_path, monkeypatch):
     compiled.library.cache_clear()
     yield tmp_path
     compiled.library.cache_clear()
+
+
+@needs_compiler
+@pytest.mark.parametrize("rows", [1, 33, 205])
+def test_processors_without_amx_have_the_same_products_of_bfloat16(plain_processor, rows):
+    mlp = perceptron(8)
+    hidden, residual = torch.randn(rows, WIDTH).bfloat16(), torch.randn(rows, WIDTH)
+    exact = copy.deepcopy(mlp).double()
+    expected = exact.tail(hidden.double(), residual.double())
+    mlp.compiled = True
+    found = mlp.tail(hidden, residual)
+    assert relative(found.detach().double(), expected.detach()) < 0.01
+    found.sum().backward()
+    expected.sum().backward()
+    assert relative(mlp.second.weight.grad.double(), exact.second.weight.grad) < (0.045 if rows > 1 else 0.15)
+    assert not compiled.library(WIDTH, True).tiles_are_given()
+
+
+@needs_compiler
+def test_compilers_that_do_not_know_amx_build_the_rest(fresh, monkeypatch):
+    built = []
+
+    def build(source, flags):
+        built.append(flags)
+        if "-mamx-tile" in flags:
+            raise native_build.BuildError("unknown flag")
+
+    monkeypatch.setattr(compiled, "build", build)
+    monkeypatch.setattr(compiled, "processor", lambda: "Linux x86_64 flags : avx512f amx_bf16 amx_tile")
+    compiled.library(WIDTH, True)
+    assert ["-mamx-tile" in flags for flags in built] == [True, False]
+    compiled.library(48, True)  # no multiple of 32
+    compiled.library(WIDTH, False)
+    assert ["-mamx-tile" in flags for flags in built] == [True, False, False, False]
 
 
 def test_who_is_refused(fresh, monkeypatch):
