@@ -62,7 +62,9 @@ def script(name: str) -> None:
 
 def _run(command: Callable[[Sequence[str]], int], overrides: Sequence[str]) -> int:
     from hood.commands.notices import heard
+    from hood.native import build
 
+    build.announce = lambda sentence: print(f"hood: {sentence}", file=sys.stderr)
     try:
         with heard():
             return command(overrides)

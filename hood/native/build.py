@@ -1,4 +1,4 @@
-"""C++ sources as libraries: compiled at their first use and kept in the user's cache folder."""
+"""C++ sources as libraries: those that came with the installation, else compiled at their first use and kept."""
 
 from __future__ import annotations
 
@@ -9,43 +9,52 @@ import platform
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 
 from hood.native.cache import cache_folder
+from hood.native.prebuilt import FOLDER, prebuilt
 
 #: For sources that use what the processor has; arithmetic as IEEE has it.
 NATIVE_FLAGS = ("-O3", "-std=c++17", "-shared", "-fPIC", "-fno-math-errno", "-Wno-psabi", "-march=native")
+#: What ``-march=native`` asks of a compiler that does not know the processor it runs on, or not the option.
+_UNKNOWN_PROCESSOR = ("unknown architecture", "unknown value", "unsupported argument", "unsupported option", "bad value")
+
+#: Called with one sentence when a compiler starts, which takes some seconds; commands print it.
+announce: Callable[[str], None] = lambda sentence: None  # noqa: E731
 
 
 class BuildError(ValueError):
-    """There is no compiler, or it fails."""
+    """There is no compiler, it fails, or what it made cannot be loaded."""
 
 
 def build(source: Path, flags: Sequence[str]) -> ctypes.CDLL:
-    """The library that a compiler makes of ``source`` with ``flags``.
+    """The library of ``source`` with ``flags``: prebuilt if the installation has it for this processor, else compiled.
 
-    What is kept is known by the source, the compiler, the flags and the processor; a kept file that does not load is made anew.
-    Several processes may build the same at once.
+    What is compiled is kept, known by the source, the compiler, the flags and the processor; a kept file that does not load is
+    made anew. Several processes may build the same at once.
 
     Raises:
-        BuildError: there is no compiler, or it fails.
+        BuildError: there is no compiler, it fails, or what it made cannot be loaded.
     """
+    library = prebuilt(FOLDER, source, flags)
+    if library is not None:
+        return library
     compiler = find_compiler()
-    version = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
-    parts = [compiler, version, processor(), *flags, source.read_text(encoding="utf-8")]
-    digest = hashlib.sha256("\0".join(parts).encode()).hexdigest()
     folder = cache_folder()
     if folder is not None:
-        path = folder / "kernels" / f"{digest}.so"
+        path = folder / "kernels" / f"{_digest(compiler, source, flags)}.so"
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             return _kept(path) or _compile(compiler, flags, source, path)
-        except OSError:  # a folder that cannot be written to: done without
+        except OSError:  # a folder that cannot be written to, or whose files may not be run: done without
             pass
-    with tempfile.TemporaryDirectory() as temporary:
-        return _compile(compiler, flags, source, Path(temporary) / "library.so")
+    try:
+        with tempfile.TemporaryDirectory() as temporary:
+            return _compile(compiler, flags, source, Path(temporary) / "library.so")
+    except OSError as error:
+        raise BuildError(f"a compiled library cannot be loaded ({error}); name a folder for it in HOOD_CACHE") from error
 
 
 def find_compiler() -> str:
@@ -70,6 +79,35 @@ def processor() -> str:
     return f"{platform.system()} {platform.machine()} {abilities}"
 
 
+def compile_library(compiler: str, flags: Sequence[str], source: Path, path: Path) -> None:
+    """Write the library to ``path``; under another name first, since other processes may be doing the same.
+
+    Raises:
+        BuildError: the compiler fails.
+    """
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        made = Path(folder) / path.name
+        lines = _run(compiler, flags, source, made)
+        if lines and "-march=native" in flags and any(word in line for line in lines for word in _UNKNOWN_PROCESSOR):
+            lines = _run(compiler, [flag for flag in flags if flag != "-march=native"], source, made)
+        if lines:
+            first = next((line for line in lines if "error" in line), lines[0])
+            raise BuildError(f"{compiler} fails ({first.strip()}); name another in CXX")
+        os.replace(made, path)
+
+
+def _run(compiler: str, flags: Sequence[str], source: Path, made: Path) -> list[str]:
+    """What the compiler complains about; nothing where it succeeds."""
+    run = subprocess.run([compiler, *flags, str(source), "-o", str(made)], capture_output=True, text=True, check=False)
+    return (run.stderr.strip().splitlines() or [f"exit code {run.returncode}"]) if run.returncode else []
+
+
+def _digest(compiler: str, source: Path, flags: Sequence[str]) -> str:
+    version = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
+    parts = [compiler, version, processor(), *flags, source.read_text(encoding="utf-8")]
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()
+
+
 def _kept(path: Path) -> ctypes.CDLL | None:
     """The library at ``path``; None where there is none, or where it is damaged."""
     try:
@@ -79,13 +117,7 @@ def _kept(path: Path) -> ctypes.CDLL | None:
 
 
 def _compile(compiler: str, flags: Sequence[str], source: Path, path: Path) -> ctypes.CDLL:
-    """Compile under another name and rename: other processes may be doing the same."""
-    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        made = Path(folder) / path.name
-        run = subprocess.run([compiler, *flags, str(source), "-o", str(made)], capture_output=True, text=True, check=False)
-        if run.returncode:
-            lines = run.stderr.strip().splitlines() or [f"exit code {run.returncode}"]
-            first = next((line for line in lines if "error" in line), lines[0])
-            raise BuildError(f"{compiler} fails ({first.strip()}); name another in CXX")
-        os.replace(made, path)
+    """Compile and load."""
+    announce(f"compiling {source.name} for this processor; this happens once and takes some seconds")
+    compile_library(compiler, flags, source, path)
     return ctypes.CDLL(str(path))

@@ -1,0 +1,38 @@
+"""What a wheel carries compiled: the C++ sources of the library and their flags. Standard library only, for the build."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from hood.native.build import NATIVE_FLAGS, BuildError, compile_library, find_compiler
+from hood.native.prebuilt import file_name, flags_for, levels
+
+_HERE = Path(__file__).parent
+#: Source and flags of each library, as the modules ask :func:`hood.native.build.build` for them.
+LIBRARIES: tuple[tuple[Path, tuple[str, ...]], ...] = (
+    (_HERE / "newton.cpp", NATIVE_FLAGS),
+    (_HERE / "surface.cpp", NATIVE_FLAGS),
+)
+
+
+def make(folder: Path) -> tuple[list[Path], list[str]]:
+    """Compile all of them into ``folder``, for each generation of processors of this architecture.
+
+    Returns:
+        The files, and a sentence for each that is left out.
+    """
+    try:
+        compiler = find_compiler()
+    except BuildError as error:
+        return [], [f"the wheel carries no compiled parts: {error}"]
+    made, left_out = [], []
+    for source, flags in LIBRARIES:
+        for level in levels():
+            path = folder / file_name(source, flags, level)
+            try:
+                compile_library(compiler, flags_for(flags, level), source, path)
+            except BuildError as error:
+                left_out.append(f"the wheel is without {path.name}: {error}")
+                continue
+            made.append(path)
+    return made, left_out
