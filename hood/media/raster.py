@@ -1,4 +1,4 @@
-"""Vectorised triangle rasteriser: the only part of the renderer that touches every covered pixel.
+"""Triangle rasteriser in numpy; compiled where there is a compiler (:mod:`hood.media.drawing`).
 
 Triangles are expanded twice into flat arrays, first into (triangle, row) pairs and then into the pixels
 of each row, whose first and last column follow from the three edge functions in closed form. So no pixel
@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from hood.media.drawing import address, library, packed
 
 FloatArray = NDArray[np.floating]
 IntArray = NDArray[np.integer]
@@ -47,6 +49,12 @@ def rasterise(
     """
     best = np.full(width * height, -np.inf, dtype=np.float64)
     owner = np.full(width * height, -1, dtype=np.int32)
+    lib = library()
+    if lib is not None:
+        points, near, corners = packed(screen), packed(nearness), packed(faces, np.int64)
+        inputs = address(points), address(near), address(corners), len(corners), width, height
+        lib.picture_rasterise(*inputs, _EDGE_TOLERANCE, _MIN_AREA_PIXELS_SQ, address(best), address(owner))
+        return VisibilityBuffer(owner.reshape(height, width), best.reshape(height, width))
     for start in range(0, len(faces), chunk_faces):
         pixel, value, face = _expand(screen, nearness, faces[start : start + chunk_faces], width, height)
         np.maximum.at(best, pixel, value)

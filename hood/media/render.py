@@ -1,4 +1,4 @@
-"""Shaded pictures of a body and its clothing, in numpy: no display, no graphics card.
+"""Shaded pictures of a body and its clothing on a CPU: no display, no graphics card.
 
 Deferred shading: `raster.rasterise` finds the nearest face of every pixel at twice the resolution, then
 one vectorised pass lights the covered pixels (key light with a soft shadow map, sky and bounce light, a
@@ -8,13 +8,15 @@ left.
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hood.media.camera import NEAR, Camera, unit
+from hood.media.drawing import SeenValues, address, library, packed
 from hood.media.raster import barycentric, rasterise
 from hood.media.shading import Light, Surface, backdrop
 
@@ -59,6 +61,11 @@ def render_frame(
     behind = backdrop(camera, light, surface, floor_height, width, height)
     image = np.repeat(np.repeat(behind, _SUPERSAMPLING, axis=0), _SUPERSAMPLING, axis=1)
     _draw_surface(image, camera, light, surface)
+    lib = library()
+    if lib is not None:
+        picture = np.empty((height, width, 3), dtype=np.uint8)
+        lib.picture_resolve(address(image), width, height, address(picture))
+        return picture
     steps = range(_SUPERSAMPLING)
     samples = [image[i::_SUPERSAMPLING, j::_SUPERSAMPLING] for i in steps for j in steps]
     image = np.sum(samples, axis=0) / len(samples)
@@ -135,6 +142,9 @@ def _draw_surface(image: Array, camera: Camera, light: Light, surface: Surface) 
     offset = focal * seen[:, :2] / depth[:, None]
     screen = np.stack([0.5 * width + offset[:, 0], 0.5 * height - offset[:, 1]], axis=1)
     visible = rasterise(screen, 1.0 / depth, faces, width, height).face
+    if library() is not None:
+        _shade_compiled(image, camera, light, replace(surface, faces=faces), (screen, depth, visible))
+        return
     row, column = np.nonzero(visible >= 0)
     if len(row) == 0:
         return
@@ -152,6 +162,21 @@ def _draw_surface(image: Array, camera: Camera, light: Light, surface: Surface) 
     normal[inside] *= -1.0
     color = np.where(inside[:, None], 0.72 * color, color)
     image[row, column] = light.shade(pos, normal, view, color)
+
+
+def _shade_compiled(
+    image: Array, camera: Camera, light: Light, surface: Surface, view: tuple[Array, Array, NDArray[np.integer]]
+) -> None:
+    """The rest of :func:`_draw_surface` in C++, from the pixels, depths and faces of a ``view``."""
+    lib = library()
+    assert lib is not None
+    assert image.flags.c_contiguous
+    screen, depth, visible = view
+    arrays = [packed(value) for value in (surface.pos, surface.color, surface.normal, screen, depth)]
+    arrays += [packed(surface.faces, np.int64), packed(visible, np.int32), image]
+    eye = tuple(float(value) for value in camera.position)
+    seen = SeenValues(*(address(value) for value in arrays), image.shape[1], image.shape[0], eye)
+    lib.picture_shade(ctypes.byref(light.values()), ctypes.byref(seen))
 
 
 def _vertex_normals(pos: Array, faces: NDArray[np.int64]) -> Array:

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+import ctypes
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hood.media.camera import Camera, unit, view_axes
+from hood.media.drawing import FloorValues, LightValues, address, library, packed
 from hood.media.raster import rasterise
 
 Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
 
+_DARK_SIZE, _CELL = 128, 0.03  # cells of the map of shade on the floor along a side, and the side of one [m]
 _SHADOW_SIZE = 640  # pixels of the shadow map
 # Where the shadow map is probed around a point, in texels: two rings, turned against each other.
 _PROBES = (
     (0.0, 0.0), (1.7, 0.6), (-0.6, 1.7), (-1.7, -0.6), (0.6, -1.7), (3.0, -2.4), (2.4, 3.0), (-3.0, 2.4),
     (-2.4, -3.0),
 )  # fmt: skip
+_PROBE_TEXELS = packed(_PROBES)
 _GROUND = np.array([0.80, 0.81, 0.82])
 _HORIZON = np.array([0.93, 0.935, 0.94])
 _ZENITH = np.array([0.80, 0.82, 0.85])
@@ -46,7 +50,7 @@ class Light:
         flat_forward = unit(np.array([forward[0], 0.0, forward[2]]) + 1e-9)
         self.key = unit(-0.55 * right + 1.0 * np.array([0.0, 1.0, 0.0]) - 0.75 * flat_forward)
         self.fill = unit(0.9 * right + 0.25 * np.array([0.0, 1.0, 0.0]) - 0.6 * flat_forward)
-        self._axes = view_axes(-self.key)
+        self._axes = packed(view_axes(-self.key))
         seen = pos @ self._axes.T
         self._low = seen[:, :2].min(axis=0)
         extent = float((seen[:, :2].max(axis=0) - self._low).max()) + 1e-6
@@ -55,8 +59,20 @@ class Light:
         self._map = rasterise(screen, -seen[:, 2], faces, _SHADOW_SIZE, _SHADOW_SIZE).nearness
         self._texel = 1.0 / self._scale
 
+    def values(self) -> LightValues:
+        """For the compiled drawing; valid as long as this light is."""
+        size, low, count = _SHADOW_SIZE, (float(self._low[0]), float(self._low[1])), len(_PROBES)
+        colors = (tuple(value) for value in (self.key, self.fill, _KEY, _FILL, _SKY, _BOUNCE))
+        at = (address(value) for value in (self._map, _PROBE_TEXELS, self._axes))
+        return LightValues(*at, size, count, low, self._scale, self._texel, *colors)
+
     def lit(self, pos: Array, spread: float = 1.0) -> Array:
         """Share of the key light that reaches `pos` (P, 3): percentage-closer filtering of the shadow map."""
+        lib = library()
+        if lib is not None:
+            points, out = packed(pos), np.empty(len(pos))
+            lib.picture_lit(ctypes.byref(self.values()), address(points), len(points), spread, address(out))
+            return out
         seen = pos @ self._axes.T
         at = (seen[:, :2] - self._low) * self._scale + 4.0
         bias = 0.004 + 1.5 * spread * self._texel
@@ -89,6 +105,15 @@ def backdrop(camera: Camera, light: Light, surface: Surface, floor: float, width
     """Linear colours (height, width, 3) of the floor, which fades into a plain background."""
     right, up, forward = camera.axes()
     tan_y = np.tan(np.radians(camera.fov) / 2)
+    lib = library()
+    if lib is not None:
+        image, dark = np.empty((height, width, 3)), _dark_map(surface, floor)
+        where = (tuple(value) for value in (camera.position, right, up, forward, _middle(surface)))
+        colors = (tuple(value) for value in (_GROUND**2.2, _HORIZON, _ZENITH))
+        sizes = width, height, len(dark)
+        values = FloorValues(address(dark), address(image), *sizes, *where, tan_y, floor, _CELL, *colors)
+        lib.picture_backdrop(ctypes.byref(light.values()), ctypes.byref(values))
+        return image
     x = (np.arange(width) + 0.5 - 0.5 * width) / (0.5 * height) * tan_y
     y = (0.5 * height - np.arange(height) - 0.5) / (0.5 * height) * tan_y
     rays = forward + x[None, :, None] * right + y[:, None, None] * up
@@ -103,7 +128,7 @@ def backdrop(camera: Camera, light: Light, surface: Surface, floor: float, width
     reach = drop / -rays[row, column, 1]
     pos = eye + reach[:, None] * rays[row, column]
     pixel = reach * 2.0 * tan_y / height
-    center = 0.5 * (surface.pos.min(axis=0) + surface.pos.max(axis=0))
+    center = _middle(surface)
     away = np.hypot(pos[:, 0] - center[0], pos[:, 2] - center[2])
     fade = np.exp(-((away / 3.2) ** 2))
     ground = _GROUND**2.2 * (1.0 - 0.16 * _grid_lines(pos, pixel, reach / drop) * fade)[:, None]
@@ -126,21 +151,31 @@ def _grid_lines(pos: Array, pixel: Array, stretch: Array) -> Array:
 
 def _floor_shadow(light: Light, surface: Surface, pos: Array, floor: float, away: Array) -> Array:
     """What is left of the light on the floor: the cast shadow, and a soft dark patch under low parts."""
-    size, cell = 128, 0.03
-    center = 0.5 * (surface.pos.min(axis=0) + surface.pos.max(axis=0))
-    a, b, c = (surface.pos[surface.faces[:, k]] for k in range(3))
-    middle = (a + b + c) / 3.0
-    area = 0.25 * np.abs(np.cross(b - a, c - a)[:, 1])
-    weight = area / cell**2 * np.exp(-np.maximum(middle[:, 1] - floor, 0.0) / 0.12)
-    at = np.clip((middle[:, [2, 0]] - center[[2, 0]]) / cell + size / 2, 0, size - 1).astype(np.int64)
-    flat = np.bincount(at[:, 0] * size + at[:, 1], weights=weight, minlength=size * size)
-    low = flat.astype(np.float64).reshape(size, size)
-    dark = 0.55 * _blur(low, 1.4) + 0.6 * _blur(low, 4.0)
-    contact = np.clip(_sample(dark, (pos[:, [2, 0]] - center[[2, 0]]) / cell + size / 2 - 0.5), 0.0, 0.6)
-    left = 1.0 - contact
+    dark, center = _dark_map(surface, floor), _middle(surface)
+    at = (pos[:, [2, 0]] - center[[2, 0]]) / _CELL + _DARK_SIZE / 2 - 0.5
+    left = 1.0 - np.clip(_sample(dark, at), 0.0, 0.6)
     near = away < 3.0
     left[near] *= 0.80 + 0.20 * light.lit(pos[near], spread=2.5)
     return left
+
+
+def _dark_map(surface: Surface, floor: float) -> Array:
+    """Shade under low parts, (_DARK_SIZE, _DARK_SIZE) cells of _CELL along z and x about the surface's middle."""
+    center = _middle(surface)
+    a, b, c = (surface.pos[surface.faces[:, k]] for k in range(3))
+    middle = (a + b + c) / 3.0
+    area = 0.25 * np.abs(np.cross(b - a, c - a)[:, 1])
+    weight = area / _CELL**2 * np.exp(-np.maximum(middle[:, 1] - floor, 0.0) / 0.12)
+    at = np.clip((middle[:, [2, 0]] - center[[2, 0]]) / _CELL + _DARK_SIZE / 2, 0, _DARK_SIZE - 1).astype(np.int64)
+    flat = np.bincount(at[:, 0] * _DARK_SIZE + at[:, 1], weights=weight, minlength=_DARK_SIZE * _DARK_SIZE)
+    low = flat.astype(np.float64).reshape(_DARK_SIZE, _DARK_SIZE)
+    return packed(0.55 * _blur(low, 1.4) + 0.6 * _blur(low, 4.0))
+
+
+def _middle(surface: Surface) -> Array:
+    """Of the box that holds the surface, (3,)."""
+    middle: Array = 0.5 * (surface.pos.min(axis=0) + surface.pos.max(axis=0))
+    return middle
 
 
 def _blur(image: Array, sigma: float) -> Array:

@@ -72,11 +72,12 @@ def test_what_cannot_be_compiled_is_left_out_and_named(source, tmp_path, monkeyp
 
 
 def test_the_list_names_what_the_modules_ask_for():
+    from hood.media import drawing
     from hood.mesh import surface_tree
     from hood.solver import engine
 
     listed = {path for path, _ in libraries.LIBRARIES}
-    assert {engine.SOURCE, surface_tree.SOURCE} <= listed
+    assert {engine.SOURCE, surface_tree.SOURCE, drawing.SOURCE} <= listed
     assert all(path.exists() for path in listed)
 
 

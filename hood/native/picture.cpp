@@ -1,0 +1,257 @@
+// Pictures: the nearest face of every pixel, and the light on it. The rules are those of hood/media, which stays the reference.
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+
+namespace {
+
+struct Three {
+    double x, y, z;
+};
+
+inline Three operator+(Three a, Three b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+inline Three operator-(Three a, Three b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+inline Three operator*(double s, Three a) { return {s * a.x, s * a.y, s * a.z}; }
+inline double dot(Three a, Three b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+inline Three read(const double* p) { return {p[0], p[1], p[2]}; }
+inline double clip(double v, double low, double high) { return std::min(std::max(v, low), high); }
+inline Three unit(Three a) { return (1.0 / std::max(std::sqrt(dot(a, a)), 1e-12)) * a; }
+
+}  // namespace
+
+extern "C" {
+
+// As `LightValues` of hood/media/drawing.py.
+struct Light {
+    const double* map;     // (size, size) nearness of what the key light sees
+    const double* probes;  // (num_probes, 2) texels
+    const double* axes;    // (3, 3) of the key light's view
+    int64_t size, num_probes;
+    double low[2];         // m, corner of the map
+    double scale, texel;   // texels per m, m
+    double key[3], fill[3];
+    double key_color[3], fill_color[3], sky_color[3], bounce_color[3];
+};
+
+// As `SeenValues` of hood/media/drawing.py: what is drawn, and from where.
+struct Seen {
+    const double *pos, *color, *normal, *screen, *depth;  // of vertices: (V, 3) three times, (V, 2) pixels, (V,) m
+    const int64_t* faces;                                 // (F, 3)
+    const int32_t* face;                                  // (height, width) of each pixel, -1 where nothing is drawn
+    double* image;                                        // (height, width, 3) linear colours
+    int64_t width, height;
+    double eye[3];
+};
+
+// As `FloorValues` of hood/media/drawing.py: what lies behind the surface.
+struct Floor {
+    const double* dark;  // (cells, cells) shade under low parts
+    double* image;       // (height, width, 3) linear colours
+    int64_t width, height, cells;
+    double eye[3], right[3], up[3], forward[3], center[3];
+    double tan_y, floor, cell;
+    double ground[3], horizon[3], zenith[3];  // ground linear, the others as shown
+};
+
+// best (H, W) starts at -inf, owner (H, W) at -1; of equally near faces the last is drawn.
+void picture_rasterise(const double* screen, const double* nearness, const int64_t* faces, int64_t num_faces, int64_t width,
+                       int64_t height, double tolerance, double least_area, double* best, int32_t* owner) {
+    for (int64_t f = 0; f < num_faces; ++f) {
+        double x[3], y[3], near[3];
+        for (int k = 0; k < 3; ++k) {
+            const int64_t v = faces[3 * f + k];
+            x[k] = screen[2 * v];
+            y[k] = screen[2 * v + 1];
+            near[k] = nearness[v];
+        }
+        const double area = (x[1] - x[0]) * (y[2] - y[0]) - (y[1] - y[0]) * (x[2] - x[0]);
+        const double top = std::max(std::ceil(std::min({y[0], y[1], y[2]}) - 0.5), 0.0);
+        const double bottom = std::min(std::floor(std::max({y[0], y[1], y[2]}) - 0.5), height - 1.0);
+        const bool outside = std::max({x[0], x[1], x[2]}) <= 0 || std::min({x[0], x[1], x[2]}) >= width;
+        if (!(std::fabs(area) > least_area) || outside || !(bottom >= top)) continue;
+        double slope_x[3], slope_y[3], constant[3], along = 0.0;
+        for (int k = 0; k < 3; ++k) {
+            const int n = (k + 1) % 3, p = (k + 2) % 3;
+            slope_x[k] = (y[n] - y[p]) / area;
+            slope_y[k] = (x[p] - x[n]) / area;
+            constant[k] = (x[n] * y[p] - x[p] * y[n]) / area;
+            along += slope_x[k] * near[k];
+        }
+        for (int64_t row = (int64_t)top; row <= (int64_t)bottom; ++row) {
+            double lower = -INFINITY, upper = INFINITY, here = 0.0;
+            for (int k = 0; k < 3; ++k) {
+                const double at_row = slope_y[k] * (row + 0.5) + constant[k];
+                const double safe = std::fabs(slope_x[k]) < 1e-12 ? 1e-12 : slope_x[k];
+                const double root = -at_row / safe;
+                if (safe > 0) lower = std::max(lower, root);
+                if (safe < 0) upper = std::min(upper, root);
+                here += at_row * near[k];
+            }
+            const double first = std::max(std::ceil(lower - 0.5 - tolerance), 0.0);
+            const double last = std::min(std::floor(upper - 0.5 + tolerance), width - 1.0);
+            for (int64_t column = (int64_t)first; column <= last; ++column) {
+                const double value = here + along * (column + 0.5);
+                double& nearest = best[row * width + column];
+                if (value >= nearest) {
+                    nearest = value;
+                    owner[row * width + column] = (int32_t)f;
+                }
+            }
+        }
+    }
+}
+
+}  // extern "C"
+
+namespace {
+
+double lit_at(const Light& light, Three p, double spread) {
+    double seen[3];
+    for (int k = 0; k < 3; ++k) seen[k] = dot(read(light.axes + 3 * k), p);
+    const double across = (seen[0] - light.low[0]) * light.scale + 4.0, down = (seen[1] - light.low[1]) * light.scale + 4.0;
+    const double bound = 0.004 + 1.5 * spread * light.texel - seen[2], most = light.size - 1.0;
+    int64_t covered = 0;
+    for (int64_t i = 0; i < light.num_probes; ++i) {
+        const int64_t column = (int64_t)clip(across + spread * light.probes[2 * i], 0.0, most);
+        const int64_t row = (int64_t)clip(down + spread * light.probes[2 * i + 1], 0.0, most);
+        covered += light.map[row * light.size + column] > bound;
+    }
+    return 1.0 - (double)covered / light.num_probes;
+}
+
+double power_24(double v) {
+    const double square = v * v, eighth = square * square * square * square;
+    return eighth * eighth * eighth;
+}
+
+void shade(const Light& light, Three pos, Three normal, Three view, Three color, double* out) {
+    const Three key = read(light.key);
+    const double diffuse = clip((dot(normal, key) + 0.25) / 1.25, 0.0, 1.0);
+    const double shadow = 0.25 + 0.75 * lit_at(light, pos + 0.006 * normal, 0.9);
+    const double fill = clip(dot(normal, read(light.fill)), 0.0, 1.0);
+    const double up = 0.5 + 0.5 * normal.y, facing = clip(dot(normal, view), 0.0, 1.0);
+    const double gloss = 0.06 * power_24(clip(dot(normal, unit(view + key)), 0.0, 1.0)) * shadow;
+    const double away = 1.0 - facing, shine = gloss + 0.10 * away * away * away * up, dim = 0.72 + 0.28 * facing;
+    const double own[3] = {color.x, color.y, color.z};
+    for (int k = 0; k < 3; ++k) {
+        const double received = diffuse * shadow * light.key_color[k] + fill * light.fill_color[k] + up * light.sky_color[k] +
+                                (1.0 - up) * light.bounce_color[k];
+        out[k] = own[k] * received * dim + shine;
+    }
+}
+
+}  // namespace
+
+extern "C" {
+
+// Share of the key light at points (P, 3) that is not in shadow.
+void picture_lit(const Light* light, const double* points, int64_t count, double spread, double* out) {
+    for (int64_t i = 0; i < count; ++i) out[i] = lit_at(*light, read(points + 3 * i), spread);
+}
+
+// Colours of all pixels that see a face; a face seen from inside is darker.
+void picture_shade(const Light* light, const Seen* seen) {
+    const Three eye = read(seen->eye);
+    for (int64_t row = 0; row < seen->height; ++row)
+        for (int64_t column = 0; column < seen->width; ++column) {
+            const int64_t pixel = row * seen->width + column, face = seen->face[pixel];
+            if (face < 0) continue;
+            const int64_t* corner = seen->faces + 3 * face;
+            const double *a = seen->screen + 2 * corner[0], *b = seen->screen + 2 * corner[1], *c = seen->screen + 2 * corner[2];
+            const double px = column + 0.5 - a[0], py = row + 0.5 - a[1];
+            const double turned = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]);
+            const double second = (px * (c[1] - a[1]) - py * (c[0] - a[0])) / turned;
+            const double third = ((b[0] - a[0]) * py - (b[1] - a[1]) * px) / turned;
+            double weight[3] = {1.0 - second - third, second, third}, sum = 0.0;
+            for (int k = 0; k < 3; ++k) sum += weight[k] /= seen->depth[corner[k]];
+            Three pos{0, 0, 0}, color{0, 0, 0}, normal{0, 0, 0};
+            for (int k = 0; k < 3; ++k) {
+                const double share = clip(weight[k] / sum, 0.0, 1.0);
+                pos = pos + share * read(seen->pos + 3 * corner[k]);
+                color = color + share * read(seen->color + 3 * corner[k]);
+                normal = normal + share * read(seen->normal + 3 * corner[k]);
+            }
+            normal = unit(normal);
+            if (turned > 0) {
+                normal = -1.0 * normal;
+                color = 0.72 * color;
+            }
+            shade(*light, pos, normal, unit(eye - pos), color, seen->image + 3 * pixel);
+        }
+}
+
+// Average of 2 x 2 samples, as shown: (height, width, 3) of 0 to 255 from linear colours of twice the size.
+void picture_resolve(const double* samples, int64_t width, int64_t height, uint8_t* out) {
+    for (int64_t row = 0; row < height; ++row)
+        for (int64_t i = 0; i < 3 * width; ++i) {
+            const int64_t left = 2 * row * 6 * width + 6 * (i / 3) + i % 3;
+            const double* low = samples + left + 6 * width;
+            const double mean = (((samples[left] + samples[left + 3]) + low[0]) + low[3]) / 4.0;
+            out[row * 3 * width + i] = (uint8_t)(255.0 * std::pow(clip(mean, 0.0, 1.0), 1 / 2.2) + 0.5);
+        }
+}
+
+}  // extern "C"
+
+namespace {
+
+// Bilinear; the border is repeated.
+double sample(const Floor& f, double row, double column) {
+    const double most = f.cells - 1.001;
+    row = clip(row, 0.0, most);
+    column = clip(column, 0.0, most);
+    const int64_t r = (int64_t)row, c = (int64_t)column;
+    const double down = row - r, across = column - c;
+    const double* at = f.dark + r * f.cells + c;
+    const double upper = at[0] * (1 - across) + at[1] * across;
+    const double lower = at[f.cells] * (1 - across) + at[f.cells + 1] * across;
+    return upper * (1 - down) + lower * down;
+}
+
+double positive_remainder(double v) { return v - std::floor(v); }
+
+// Coverage of 1 cm lines every half metre, smoothed over the pixel's footprint.
+double grid_lines(Three pos, double pixel, double stretch) {
+    const double foot = std::max(pixel, 1e-4) * std::sqrt(std::max(stretch, 1.0));
+    double lines = 0.0;
+    for (double along : {pos.x, pos.z}) {
+        const double offset = std::fabs(positive_remainder(along / 0.5 + 0.5) - 0.5) * 0.5;
+        lines = std::max(lines, clip((0.005 - offset) / foot + 0.5, 0.0, 1.0) * std::min(1.0, 0.01 / foot));
+    }
+    return lines;
+}
+
+void floor_color(const Light& light, const Floor& f, Three ray, double drop, double* out) {
+    const double reach = drop / -ray.y;
+    const Three pos = read(f.eye) + reach * ray;
+    const double from_x = pos.x - f.center[0], from_z = pos.z - f.center[2], away = std::hypot(from_x, from_z);
+    const double fade = std::exp(-(away / 3.2) * (away / 3.2));
+    const double lines = grid_lines(pos, reach * 2.0 * f.tan_y / f.height, reach / drop);
+    const double half = f.cells / 2.0 - 0.5;
+    double left = 1.0 - clip(sample(f, from_z / f.cell + half, from_x / f.cell + half), 0.0, 0.6);
+    if (away < 3.0) left *= 0.80 + 0.20 * lit_at(light, pos, 2.5);
+    const double blend = clip(fade, 0.0, 1.0);
+    for (int k = 0; k < 3; ++k) out[k] = blend * (f.ground[k] * (1.0 - 0.16 * lines * fade) * left) + (1.0 - blend) * out[k];
+}
+
+}  // namespace
+
+extern "C" {
+
+// The floor, which fades into a plain background.
+void picture_backdrop(const Light* light, const Floor* floor) {
+    const Floor& f = *floor;
+    const double drop = f.eye[1] - f.floor;
+    for (int64_t row = 0; row < f.height; ++row)
+        for (int64_t column = 0; column < f.width; ++column) {
+            const double x = (column + 0.5 - 0.5 * f.width) / (0.5 * f.height) * f.tan_y;
+            const double y = (0.5 * f.height - row - 0.5) / (0.5 * f.height) * f.tan_y;
+            const Three ray = read(f.forward) + x * read(f.right) + y * read(f.up);
+            const double high = clip(1.6 * ray.y / std::sqrt(dot(ray, ray)), 0.0, 1.0);
+            double* out = f.image + 3 * (row * f.width + column);
+            for (int k = 0; k < 3; ++k) out[k] = std::pow(f.horizon[k] + (f.zenith[k] - f.horizon[k]) * high, 2.2);
+            if (ray.y < -1e-4 && drop >= 1e-3) floor_color(*light, f, ray, drop, out);
+        }
+}
+
+}  // extern "C"
