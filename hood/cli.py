@@ -62,9 +62,6 @@ def script(name: str) -> None:
 
 def _run(command: Callable[[Sequence[str]], int], overrides: Sequence[str]) -> int:
     from hood.commands.notices import heard
-    from hood.native import build
-
-    build.announce = lambda sentence: print(f"hood: {sentence}", file=sys.stderr)
     try:
         with heard():
             return command(overrides)
@@ -116,6 +113,9 @@ def entry(argv: Sequence[str] | None = None) -> None:
     if sys.platform.startswith("linux") and not os.environ.get("MALLOC_TOP_PAD_"):
         os.environ.update({key: os.environ.get(key, value) for key, value in ENVIRONMENT.items()})
         os.execv(sys.executable, [sys.executable, "-m", "hood.cli", *arguments])
+    from hood.native import build
+
+    build.announce = lambda sentence: print(f"hood: {sentence}", file=sys.stderr)
     sys.exit(main(arguments))
 
 
