@@ -62,6 +62,7 @@ def script(name: str) -> None:
 
 def _run(command: Callable[[Sequence[str]], int], overrides: Sequence[str]) -> int:
     from hood.commands.notices import heard
+
     try:
         with heard():
             return command(overrides)

@@ -19,6 +19,8 @@ from hood.solver.reasons import count_reasons, name_counts
 
 #: The ways to say how far a step is refined; a user gives one of them.
 DIALS = ("refine", "target_rg", "budget_ms", "max_strain")
+#: ``refine=auto``: as the garment's size needs (:mod:`hood.commands.automatic`).
+AUTO = "auto"
 COLOURS = ("none", "strain", "rg")
 _BEGIN_FROM_TABLE = ("budget_ms", "max_strain")
 #: What says more about a dial, and its value where nothing is said.
@@ -26,12 +28,12 @@ _DETAILS = {"refine_method": "newton", "refine_most": 50, "refine_table": None}
 
 
 def chosen(config: Mapping[Any, Any]) -> tuple[str, float] | None:
-    """Name and value of the dial that is set; None where steps are taken as they come.
+    """Name and value of the dial that is set; None where steps are taken as they come, and while it is left to ``auto``.
 
     Raises:
         ConfigError: two are set, or the value is no number.
     """
-    given = [name for name in DIALS if config.get(name) is not None and not (name == "refine" and config[name] == 0)]
+    given = [*(["refine"] if config.get("refine") not in (None, 0, AUTO) else []), *other_dials(config)]
     if len(given) > 1:
         text = " and ".join(f"{name}={config[name]}" for name in given)
         raise ConfigError(f"{text}: these say in {len(given)} ways how far a step is refined; give one of {', '.join(DIALS)}")
@@ -41,6 +43,11 @@ def chosen(config: Mapping[Any, Any]) -> tuple[str, float] | None:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise ConfigError(f"{given[0]}={value!r}: give a number")
     return given[0], float(value)
+
+
+def other_dials(config: Mapping[Any, Any]) -> list[str]:
+    """The dials but ``refine`` that are set."""
+    return [name for name in DIALS if name != "refine" and config.get(name) is not None]
 
 
 def check_dial(config: DictConfig) -> None:

@@ -7,6 +7,7 @@ import json
 import os
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from hood.assets.library import locate
+from hood.commands.automatic import advice, choose
 from hood.commands.batch import Job, find_jobs, share
 from hood.commands.cautions import scene_cautions, warn
 from hood.commands.common import (
@@ -29,14 +31,14 @@ from hood.commands.common import (
     together,
     use_arithmetic,
 )
-from hood.commands.dial import check_dial, chosen, exported, refined
+from hood.commands.dial import AUTO, check_dial, chosen, exported, refined
 from hood.commands.notices import heard
 from hood.commands.performance import make_motion
 from hood.commands.summary import describe, describe_all, summarise
 from hood.commands.verdict import exit_code
 from hood.commands.wardrobe import heed, read_outfit
 from hood.config import ConfigError, build, load_config, plain, require_choice, save_run_record
-from hood.dynamics.captured import MODES, CapturedSimulator
+from hood.dynamics.captured import MODES, CapturedSimulator, network_of
 from hood.dynamics.recorder import RolloutWriter, read_rollout
 from hood.dynamics.refine import GuessStepper
 from hood.dynamics.rollout import METRIC_CHOICES, metric_names, simulate
@@ -58,7 +60,7 @@ def run(overrides: Sequence[str]) -> int:
     require_choice(config, "video", ("mp4", "gif", "none"))
     require_choice(config, "metrics", METRIC_CHOICES)
     _check_numbers(config)
-    require_choice(config, "stepper", ("network", "newton", "refine"))
+    require_choice(config, "stepper", ("network", "newton", "refine", AUTO))
     check_dial(config)
     require_choice(config, "step", (PLAIN, *MODES))
     return together(lambda: _run(config))
@@ -84,15 +86,24 @@ def _run_one(config: DictConfig, stepper: Stepper, digest: str) -> tuple[dict[st
 
 def _run_heard(config: DictConfig, stepper: Stepper, digest: str, warned: list[str]) -> tuple[dict[str, Any], bool]:
     """The rollout of one motion; ``warned`` is what has been warned about when the summary is written."""
-    scene = make_scene(config)
+    asked, scene = config, make_scene(config)
+    choice = choose(asked, stepper, scene)
+    config = choice.settle(asked)
+    print("".join(f"{sentence}\n" for sentence in choice.why), end="")
+    if _solves_in_double(config) != _solves_in_double(asked):
+        scene = make_scene(config)
+    if choice.stepper == "newton" and network_of(stepper) is not None:
+        stepper, _ = make_stepper(config)
     stepper = refined(stepper, config, scene.cloth.num_vertices)
     warn(scene_cautions(stepper, scene, build(config.losses), str(config.checkpoint)))
     folder = prepare_folder(output_folder(config))
     (folder / "summary.json").unlink(missing_ok=True)  # its presence says that everything is there
     save_run_record(folder, config, int(config.seed))
-    interrupted = _simulate_to_disk(config, scene, stepper, digest, folder / "rollout.h5")
+    interrupted = _simulate_to_disk(config, scene, stepper, digest, folder / "rollout.h5", asked)
     summary = summarise(folder / "rollout.h5")
+    summary["choice"] = asdict(choice)
     print(describe(summary))
+    print("".join(f"{sentence}\n" for sentence in advice(config, scene, summary)), end="")
     try:
         if not interrupted:
             _draw(config, folder)
@@ -141,7 +152,7 @@ def _finished(config: DictConfig, digest: str, folder: Path) -> dict[str, Any] |
         summary: dict[str, Any] = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
         with h5py.File(folder / "rollout.h5", "r") as file:
             attributes = dict(file.attrs)
-        before = json.loads(attributes["config"])
+        before = json.loads(attributes["asked"])
     except (OSError, ValueError, KeyError):
         return None
     now = plain(config)
@@ -168,12 +179,12 @@ def make_scene(config: DictConfig) -> Scene:
 
 def _solves_in_double(config: DictConfig) -> bool:
     """Whether steps are judged in float64: then states are kept in it, rounded ones would not meet what is said of them."""
-    return bool(config.solver.double) and (str(config.stepper) != "network" or chosen(config) is not None)
+    return bool(config.solver.double) and (str(config.stepper) not in ("network", AUTO) or chosen(config) is not None)
 
 
 def make_stepper(config: DictConfig) -> tuple[Stepper, str]:
     """What takes the steps, before they are refined, and the SHA-256 of its weights (``none`` without a network)."""
-    if str(config.stepper) == "network":
+    if str(config.stepper) in ("network", AUTO):
         simulator, digest = make_simulator(config)
         use_arithmetic(simulator, config)
         stepper: Stepper = simulator if str(config.step) == PLAIN else CapturedSimulator(simulator, str(config.step))
@@ -207,8 +218,8 @@ def make_simulator(config: DictConfig) -> tuple[Simulator, str]:
     return simulator.eval().to(device), hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def _simulate_to_disk(config: DictConfig, scene: Scene, stepper: Stepper, digest: str, path: Path) -> bool:
-    """Stream the rollout into ``path``; True when the user interrupted it."""
+def _simulate_to_disk(config: DictConfig, scene: Scene, stepper: Stepper, digest: str, path: Path, asked: DictConfig) -> bool:
+    """Stream the rollout into ``path``; True when the user interrupted it. ``asked`` is the config with ``auto`` in it."""
     potential = build(config.losses)
     count = min(int(config.num_frames), scene.num_frames)
     if count < int(config.num_frames):
@@ -216,6 +227,7 @@ def _simulate_to_disk(config: DictConfig, scene: Scene, stepper: Stepper, digest
     attributes = {
         "material": plain(config.material),
         "config": plain(config),
+        "asked": plain(asked),
         "checkpoint": str(config.checkpoint),
         "checkpoint_sha256": digest,
         "model": stepper.config,

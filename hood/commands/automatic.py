@@ -1,0 +1,122 @@
+"""``stepper=auto`` and ``refine=auto``: what they become for a scene on this machine, and sentences that say why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from hood.commands.dial import AUTO, other_dials, refined
+from hood.config import build
+from hood.dynamics.captured import network_of
+from hood.dynamics.ranges import scene_conditions
+from hood.dynamics.rollout import simulate
+from hood.dynamics.stepper import NewtonStepper, Stepper
+from hood.losses.potential import Potential, default_potential
+from hood.scene.scene import Scene
+
+#: Iterations after a network on a garment larger than those it was trained on: γ about 0.01 from 1,000 to 12,000 vertices
+#: (docs/accuracy.md).
+ITERATIONS = 5
+#: A garment has more vertices than the weights know where it has this many times the most of their training.
+_LARGER = 1.1
+#: Frames that tell how long one takes, the start and a first one to warm up included; a shorter rollout gets no advice.
+_TIMED_FRAMES = 4
+_LEAST_FRAMES = 10
+
+
+@dataclass
+class Choice:
+    """What the keys became.
+
+    Args:
+        stepper, refine: their values; ``refine`` is None where another dial, or no network, says how far a step is taken.
+        ms: of a frame, as measured, by stepper.
+        why: sentences for the user.
+    """
+
+    stepper: str
+    refine: int | None = None
+    ms: dict[str, float] = field(default_factory=dict)
+    why: list[str] = field(default_factory=list)
+
+    def settle(self, config: DictConfig) -> DictConfig:
+        """The config with these values in the place of ``auto``."""
+        values = {"stepper": self.stepper} | ({} if self.refine is None else {"refine": self.refine})
+        settled = OmegaConf.merge(config, values)
+        assert isinstance(settled, DictConfig)
+        return settled
+
+
+def choose(config: DictConfig, stepper: Stepper, scene: Scene) -> Choice:
+    """What ``auto`` means for this scene, whose steps a network takes (``stepper``) unless the config names a solver."""
+    asked = str(config.stepper)
+    choice = Choice("network" if asked == AUTO else asked)
+    if config.refine == AUTO:
+        choice.refine = _iterations(config, stepper, scene, choice)
+    if asked == AUTO:
+        _compare(config, stepper, scene, choice)
+    return choice
+
+
+def advice(config: DictConfig, scene: Scene, summary: dict[str, Any]) -> list[str]:
+    """After a rollout with a network: a sentence where the solver alone is faster here, and goes further down the potential."""
+    total = summary["ms_per_frame"].get("total") or {}
+    reached, target = summary["relative_gradient_median"], float(config.solver.target_rg)
+    if str(config.stepper) != "network" or int(summary["num_frames"]) < _LEAST_FRAMES or not total.get("median"):
+        return []
+    alone = _ms(solver(config), scene, build(config.losses))
+    if alone is None or alone >= total["median"] or (reached is not None and reached <= target):
+        return []
+    here = "" if reached is None else f", {reached:.2g} with the network"
+    return [
+        f"the solver alone takes {alone:.0f} ms a frame here, the network {total['median']:.0f}, and leaves less unbalanced force "
+        f"(relative gradient {target:g}{here}): stepper=newton; stepper=auto measures and takes the faster one"
+    ]
+
+
+def solver(config: DictConfig) -> NewtonStepper:
+    """The stepper of ``stepper=newton``."""
+    stepper = NewtonStepper(build(config.losses), build(config.solver))
+    stepper.gravity = stepper.gravity.to(str(config.device))
+    return stepper
+
+
+def _iterations(config: DictConfig, stepper: Stepper, scene: Scene, choice: Choice) -> int:
+    """Refinement that the garment's size needs: none where the weights know it, or do not say what they know."""
+    network = network_of(stepper)
+    if network is None or network.trained_for is None or other_dials(config):
+        return 0
+    asked = scene_conditions(scene.garment, scene.cloth, scene.dt, default_potential())
+    (_, vertices), (_, known) = asked.spans["vertices"], network.trained_for.spans.get("vertices", (0.0, float("inf")))
+    if vertices <= _LARGER * known:
+        return 0
+    choice.why.append(
+        f"refine={ITERATIONS}: {scene.garment.name} has {vertices:,.0f} vertices, {config.checkpoint} was trained on "
+        f"{known:,.0f} at most (refine=0 leaves it to the network alone)"
+    )
+    return ITERATIONS
+
+
+def _compare(config: DictConfig, stepper: Stepper, scene: Scene, choice: Choice) -> None:
+    """The solver where a frame of it takes less time than one of the network; both are measured."""
+    potential, size = build(config.losses), scene.cloth.num_vertices
+    with_network = _ms(refined(stepper, choice.settle(config), size), scene, potential)
+    alone = _ms(solver(config), scene, potential)
+    if with_network is None or alone is None:
+        choice.why.append("stepper=network: the motion is too short to measure which is faster")
+        return
+    choice.ms = {"network": with_network, "newton": alone}
+    if alone < with_network:
+        choice.stepper, choice.refine = "newton", 0 if config.refine == AUTO else None
+        choice.why = []
+    times = f"a frame of the solver takes {alone:.0f} ms here, one of the network {with_network:.0f} ms"
+    choice.why.append(f"stepper={choice.stepper}: {times}")
+
+
+def _ms(stepper: Stepper, scene: Scene, potential: Potential) -> float | None:
+    """Milliseconds of a frame, the shortest of a few; None where the motion has too few."""
+    frames = simulate(stepper, scene, potential, _TIMED_FRAMES, metrics="none")
+    times = [frame.metrics["ms_total"] for frame in frames if frame.index > 1]
+    return min(times, default=None)
