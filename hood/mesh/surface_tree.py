@@ -18,6 +18,10 @@ from hood.native.build import NATIVE_FLAGS, BuildError, build
 
 SOURCE = Path(native.__file__).with_name("surface.cpp")
 _POINTER, _COUNT = ctypes.c_void_p, ctypes.c_int64
+#: Faces of a leaf, as in the source, and bytes of a line of the cache.
+_WIDE, _LINE = 8, 64
+#: Points that are searched for together, as in the source; fewer where that makes more visits to leaves than this possible.
+_MOST, _VISITS = 64, 1 << 18
 
 
 def _fields(text: str, kind: type) -> list[tuple[str, type]]:
@@ -28,10 +32,15 @@ class _Tree(ctypes.Structure):
     """``Tree`` of ``surface.cpp``."""
 
     _fields_ = [
-        *_fields("num_faces num_nodes num_leaves", _COUNT),
-        *_fields("faces order children leaves boxes corners pos", _POINTER),
-        *_fields("around first valence face_edges edge_faces", _POINTER),
-        ("edge_width", _COUNT),
+        *_fields("num_faces num_nodes num_leaves num_blocks edge_width", _COUNT),
+        *_fields("faces around first valence face_edges edge_faces", _POINTER),
+        *_fields("order place around_place children number corner_of block_first block_vertex block_number", _POINTER),
+        *_fields("pos corners boxes face_boxes block_pos cross vertex_normal stamp leaf_stamp", _POINTER),
+        ("call", _COUNT),
+        ("origin", ctypes.c_double * 3),
+        ("size_sq", ctypes.c_double),
+        ("batch", _COUNT),
+        *_fields("nodes leaves reach", _POINTER),
     ]
 
 
@@ -40,7 +49,7 @@ class _Query(ctypes.Structure):
 
     _fields_ = [
         ("count", _COUNT),
-        *_fields("points next_pos guess vertex face vertex_dist bary dist", _POINTER),
+        *_fields("points next_pos vertex face vertex_dist bary dist", _POINTER),
         *_fields("point normal next_point next_normal", _POINTER),
     ]
 
@@ -88,38 +97,65 @@ class SurfaceTree:
         lib = library()
         assert lib is not None
         self._lib = lib
-        size = len(members)
-        leaves = -(-size // 8)  # all are full but one
-        self._arrays = dict(zip(("around", "first", "valence", "face_edges", "edge_faces"), incidence, strict=True))
-        self._arrays |= {
-            "faces": np.ascontiguousarray(faces, np.int64),
-            "order": members.astype(np.int32),
-            "children": np.zeros((leaves, 8), np.int32),
-            "leaves": np.zeros((leaves, 2), np.int32),
-            "boxes": np.zeros((leaves, 6, 8)),
-            "corners": np.zeros((leaves, 9, 8)),
-            "pos": np.array(pos, np.float64, order="C"),
+        leaves, num_vertices = -(-len(members) // _WIDE), len(pos)  # all leaves are full but one
+        blocks = 3 * leaves  # at most: faces without a vertex in common
+        batch = max(min(_MOST, _VISITS // leaves), 1)
+        integers = {
+            "order": (leaves, _WIDE),
+            "place": (len(faces),),
+            "around_place": (3 * len(faces),),
+            "children": (leaves, _WIDE),
+            "corner_of": (leaves, 3, _WIDE),
+            "block_first": (leaves + 1,),
+            "block_vertex": (blocks, _WIDE),
+            "stamp": (num_vertices,),
+            "leaf_stamp": (leaves,),
+            "nodes": (batch * leaves + 1, 2),
+            "leaves": (batch * leaves + 1, 2),
         }
-        self._tree = _Tree(num_faces=size, edge_width=incidence[4].shape[1])
+        reals = {
+            "number": (leaves, _WIDE),
+            "block_number": (blocks, _WIDE),
+            "pos": (num_vertices, 3),
+            "corners": (leaves, 9, _WIDE),
+            "boxes": (leaves, 6, _WIDE),
+            "block_pos": (blocks, 3, _WIDE),
+            "cross": (leaves, _WIDE, 8),
+            "vertex_normal": (num_vertices, 6),
+            "reach": (batch * leaves + 1,),
+        }
+        self._arrays = dict(zip(("around", "first", "valence", "face_edges", "edge_faces"), incidence, strict=True))
+        self._arrays |= {name: _aligned(shape, np.int32) for name, shape in integers.items()}
+        self._arrays |= {name: _aligned(shape, np.float64) for name, shape in reals.items()}
+        self._arrays |= {"face_boxes": _aligned((leaves, 6, _WIDE), np.float32)}
+        self._arrays["faces"] = np.ascontiguousarray(faces, np.int64)
+        self._arrays["order"].reshape(-1)[: len(members)] = members
+        self._arrays["place"].fill(-1)
+        self._tree = _Tree(num_faces=len(members), edge_width=incidence[4].shape[1], batch=batch)
         _point(self._tree, self._arrays)
-        centre = np.ascontiguousarray(np.nan_to_num(self._arrays["pos"][faces].mean(axis=1)))
-        lib.surface_build(ctypes.byref(self._tree), centre.ctypes.data_as(_POINTER))
-        self._guess = np.zeros(0, np.int32)
+        centre = np.ascontiguousarray(np.nan_to_num(np.asarray(pos, np.float64)[faces].mean(axis=1)))
+        lib.surface_build(ctypes.byref(self._tree), centre.ctypes.data_as(_POINTER), _COUNT(num_vertices))
 
     def search(self, points: np.ndarray, pos: np.ndarray, next_pos: np.ndarray) -> dict[str, np.ndarray]:
         """Fields of :class:`Match` for ``points`` (N, 3) on the surface at ``pos`` (W, 3), all float64 and C-contiguous."""
         count = len(points)
         self._arrays["pos"][...] = pos
         self._lib.surface_refit(ctypes.byref(self._tree))
-        if len(self._guess) != count:
-            self._guess = np.full(count, -1, np.int32)
         found: dict[str, np.ndarray] = {name: np.empty(count, np.int64) for name in ("vertex", "face")}
         found |= {"vertex_dist": np.empty(count), "dist": np.empty(count)}
         found |= {name: np.empty((count, 3)) for name in ("bary", *_PLACES)}
         query = _Query(count=count)
-        _point(query, {"points": points, "next_pos": next_pos, "guess": self._guess, **found})
+        _point(query, {"points": points, "next_pos": next_pos, **found})
         self._lib.surface_search(ctypes.byref(self._tree), ctypes.byref(query))
         return found
+
+
+def _aligned(shape: tuple[int, ...], kind: type) -> np.ndarray:
+    """Zeros that begin with a line of the cache, as vectors are read fastest."""
+    size = int(np.prod(shape)) * np.dtype(kind).itemsize
+    memory = np.zeros(size + _LINE, np.uint8)
+    begin = -memory.ctypes.data % _LINE
+    return memory[begin : begin + size].view(kind).reshape(shape)
 
 
 def _point(structure: ctypes.Structure, arrays: dict[str, np.ndarray]) -> None:

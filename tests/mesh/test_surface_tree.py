@@ -70,6 +70,23 @@ def test_surfaces_of_any_size(count):
     torch.testing.assert_close(found(where, pos, part).dist.abs(), expected, rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("away", [1e-9, 1e2, 1e7, 1e200])
+def test_points_far_from_the_surface_and_on_it_find_the_closest_face(away):
+    pos, faces = surface()
+    part, directions = faces[::7], points(70)
+    where = directions * away if away > 1.0 else pos[part].mean(dim=1)[:70] + directions * away
+    expected = torch.stack([found(where, pos, part[[k]]).dist.abs() for k in range(len(part))]).min(dim=0).values
+    torch.testing.assert_close(found(where, pos, part).dist.abs(), expected, rtol=0, atol=0)
+
+
+def test_a_point_is_found_alike_alone_and_among_others():
+    pos, faces = surface()
+    where = points(130)
+    together, alone = found(where, pos, faces), [found(row[None], pos, faces) for row in where]
+    for name in together._fields:
+        assert torch.equal(getattr(together, name), torch.cat([getattr(one, name) for one in alone])), name
+
+
 def test_contact_of_a_moving_batch_is_that_of_the_torch_form(monkeypatch):
     pos, faces = surface()
     both = torch.cat([pos, pos + 5.0])
