@@ -7,8 +7,12 @@ from abc import ABC, abstractmethod
 import torch
 from torch import Tensor, nn
 
+from hood.features.compiled import planes_of
 from hood.features.normalizer import RunningNormalizer
 from hood.losses.problem import StepProblem, inertial_guess
+from hood.mesh.diffusion import neighbours_of
+from hood.native import features as native
+from hood.scene.contact import Contact
 
 _SMOOTHING_ROUNDS = 16
 #: A body this far away [m] has a quarter of the say over a vertex's base motion.
@@ -71,9 +75,11 @@ class VelocityBaseOutput(Output):
         state, contact, cloth = problem.state, problem.contact, problem.cloth
         if contact is None:
             return inertial_guess(state, problem.step, cloth.vertex_scene)
+        target = problem.step.pin_target
+        if native.applies(state.pos, contact.point, target):
+            return self._compiled_base(problem, contact)
         trust = 1.0 / (1.0 + 3.0 * (contact.dist.clamp_min(0.0) / _REACH) ** 2)
         motion = contact.next_point - contact.point
-        target = problem.step.pin_target
         if target is not None:
             pinned = cloth.pinned
             motion = torch.where(pinned.unsqueeze(1), target - state.pos, motion)
@@ -81,6 +87,16 @@ class VelocityBaseOutput(Output):
         base = state.pos + _smooth(motion, trust, cloth.edges)
         depth = (self.clearance - contact.next_dist(base)).clamp_min(0.0) * contact.valid
         return base + depth.unsqueeze(1) * contact.next_normal
+
+    def _compiled_base(self, problem: StepProblem, contact: Contact) -> Tensor:
+        cloth, target = problem.cloth, problem.step.pin_target
+        pos = problem.state.pos.contiguous()
+        neighbours = neighbours_of(cloth.edges, cloth.num_vertices)
+        pins = (cloth.pinned, None if target is None else target.contiguous())
+        base, memory = torch.empty_like(pos), pos.new_empty(3, len(pos), 4)
+        body, far = planes_of(contact), (_REACH, self.clearance)
+        native.call("base", neighbours.pointers(), body, pos, *pins, *far, _SMOOTHING_ROUNDS, base, memory)
+        return base
 
     def displacement(self, raw: Tensor) -> Tensor:
         return self.scale * raw
@@ -107,6 +123,22 @@ class LocalStepOutput(VelocityBaseOutput):
         step = step * (_LONGEST_STEP / step.norm(dim=1, keepdim=True).clamp_min(_LONGEST_STEP))
         moved = (self.scale if first else self.late_scale) * raw[:, :3] + (raw[:, 3:4] + (0.0 if first else self.gain)) * step
         return moved if before is None else moved + raw[:, 4:5] * before
+
+    def take(
+        self, problem: StepProblem, raw: Tensor, index: int, step: Tensor, before: Tensor | None, last: Tensor, fixed: Tensor
+    ) -> Tensor:
+        """Positions (V, 3) after pass ``index`` from where the one before left off: its :meth:`correction`, then
+        :meth:`outside`; vertices that are not free at ``fixed``."""
+        contact, free = problem.contact, problem.cloth.free
+        if not native.applies(raw, step, before, last, fixed, None if contact is None else contact.next_point):
+            there = self.outside(problem, last + self.correction(raw, index, step, before))
+            return torch.where(free.unsqueeze(1), there, fixed)
+        scale, gain = (self.scale, 0.0) if index == 0 else (self.late_scale, self.gain)
+        pos, body = torch.empty_like(last), planes_of(contact)
+        tables = (None if table is None else table.contiguous() for table in (raw, step, before, last))
+        limits = (scale, gain, _LONGEST_STEP, self.clearance - _DEEPEST)
+        native.call("take", body, *tables, free, fixed.contiguous(), len(pos), *limits, pos)
+        return pos
 
     def outside(self, problem: StepProblem, pos: Tensor) -> Tensor:
         """``pos`` (V, 3) taken out of the body at t + 1, up to the depth in the contact zone that cloth's forces reach."""

@@ -8,13 +8,15 @@ import torch
 from torch import Tensor
 
 from hood.dynamics.output import LocalStepOutput
+from hood.features import compiled
 from hood.features.inputs import Inputs
 from hood.features.local import WIDE_ROUNDS, look
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
-from hood.mesh.diffusion import Diffusion
+from hood.mesh.diffusion import Diffusion, neighbours_of
+from hood.native import features as native
 from hood.nn.model import MeshGraphNet
-from hood.solver.local import LocalTerms
+from hood.solver.local_engine import local_terms
 
 
 class Feedback:
@@ -22,27 +24,35 @@ class Feedback:
 
     def __init__(self, potential: Potential, problem: StepProblem) -> None:
         self.potential = potential
-        self._terms = LocalTerms(potential, problem)
-        self._diffusion = Diffusion(problem.cloth.edges, problem.cloth.num_vertices)
-        self._mass = problem.cloth.mass.clamp_min(1e-12).unsqueeze(1)
+        self._cloth = cloth = problem.cloth
+        self._mass = cloth.mass.clamp_min(1e-12).unsqueeze(1)
+        self._compiled = native.applies(problem.state.pos, self._mass)
+        self._terms = local_terms(potential, problem, self._compiled)
 
     @torch.no_grad()
     def __call__(self, inputs: Inputs, pos: Tensor) -> tuple[Inputs, Tensor]:
         """The inputs with the view from positions (V, 3), and the forces −∂Φ/∂x (V, 3) [N] there."""
         view = self._terms(pos)
-        # Forces and masses of a neighbourhood are added up; its residual is their ratio.
-        spread, wide, done = torch.cat([view.force, self._mass], dim=1), [], 0
-        for rounds in WIDE_ROUNDS:
-            spread, done = self._diffusion.spread(spread, rounds - done), rounds
-            wide.append(spread[:, :3] / spread[:, 3:])
-        seen = replace(
-            inputs,
-            base_pos=pos,
-            residual=view.force / self._mass,
-            local_step=view.step,
-            wide_residual=torch.cat(wide, dim=1),
-        )
+        residual, wide = (self._compiled_residuals if self._compiled else self._residuals)(view.force)
+        seen = replace(inputs, base_pos=pos, residual=residual, local_step=view.step, wide_residual=wide)
         return seen, view.force
+
+    def _residuals(self, force: Tensor) -> tuple[Tensor, Tensor]:
+        """Accelerations (V, 3) that forces ask for, and those of neighbourhoods (V, 6)."""
+        # Forces and masses of a neighbourhood are added up; its residual is their ratio.
+        diffusion = Diffusion(self._cloth.edges, self._cloth.num_vertices)
+        spread, wide, done = torch.cat([force, self._mass], dim=1), [], 0
+        for rounds in WIDE_ROUNDS:
+            spread, done = diffusion.spread(spread, rounds - done), rounds
+            wide.append(spread[:, :3] / spread[:, 3:])
+        return force / self._mass, torch.cat(wide, dim=1)
+
+    def _compiled_residuals(self, force: Tensor) -> tuple[Tensor, Tensor]:
+        neighbours, count = neighbours_of(self._cloth.edges, len(force)), len(WIDE_ROUNDS)
+        residual, wide = torch.empty_like(force), force.new_empty(len(force), 3 * count)
+        tables = (neighbours.pointers(), force, self._mass, torch.tensor(WIDE_ROUNDS))
+        native.call("residuals", *tables, count, residual, wide, force.new_empty(3, len(force), 4))
+        return residual, wide
 
 
 class Passes:
@@ -76,9 +86,8 @@ class Passes:
         """Positions (V, 3) [m] after the pass with this output."""
         step = self._inputs.local_step
         assert step is not None
-        correction = self._output.correction(raw, len(self.positions), step, self._before)
-        there = self._output.outside(self._problem, self._last + correction)
-        pos = torch.where(self._problem.cloth.free.unsqueeze(1), there, self._fixed)
+        index = len(self.positions)
+        pos = self._output.take(self._problem, raw, index, step, self._before, self._last, self._fixed)
         self.positions.append(pos)
         self._before, self._last = pos.detach() - self._last, pos.detach()
         return pos
@@ -89,4 +98,5 @@ class Passes:
         self._inputs, force = self._feedback(self._inputs, pos)
         self.forces.append(force)
         with torch.no_grad():
-            return look(self._inputs, self._network.pass_sets(index + 1))
+            see = compiled.look if compiled.applies(self._inputs) else look
+            return see(self._inputs, self._network.pass_sets(index + 1))

@@ -15,7 +15,7 @@ from hood.dynamics.output import OUTPUTS, AccelerationOutput, LocalStepOutput, O
 from hood.dynamics.passes import Feedback, Passes
 from hood.dynamics.ranges import Conditions
 from hood.dynamics.stopwatch import Stopwatch, timed
-from hood.features import groups, local, physical
+from hood.features import compiled, groups, local, physical
 from hood.features.inputs import Inputs
 from hood.graph.builder import StaticGraph, build_graph, build_static
 from hood.graph.cache import template_hierarchy
@@ -23,6 +23,7 @@ from hood.graph.hierarchy import Hierarchy, concatenate_hierarchies
 from hood.losses.potential import Potential, default_potential
 from hood.losses.problem import StepProblem
 from hood.mesh.nearest import Nearest
+from hood.native import features as native
 from hood.nn.model import MeshGraphNet
 from hood.nn.schedule import edge_set_names, parse_passes, parse_schedule, set_level
 from hood.scene.cloth import Cloth
@@ -166,7 +167,14 @@ class Simulator(nn.Module):
         return find_nearest(seen.cloth, seen.state.pos, obstacle, self.body_radius)
 
     def predict(self, problem: StepProblem, prepared: Prepared, watch: Stopwatch | None = None) -> Prediction:
-        """Positions at t + 1. Pinned vertices reach their targets exactly, massless ones stay where they are."""
+        """Positions at t + 1. Pinned vertices reach their targets exactly, massless ones stay where they are.
+
+        Without a gradient and on a CPU features and feedback are computed by the compiled library where there is a compiler.
+        """
+        with native.in_torch(torch.is_grad_enabled()):
+            return self._predict(problem, prepared, watch)
+
+    def _predict(self, problem: StepProblem, prepared: Prepared, watch: Stopwatch | None) -> Prediction:
         assert prepared.static is not None
         cloth, step = problem.cloth, problem.step
         with timed(watch, "search"):
@@ -183,7 +191,7 @@ class Simulator(nn.Module):
                 feedback = Feedback(self._potential, seen) if self._wants_feedback else None
                 if feedback is not None:
                     inputs, _ = feedback(inputs, base)
-            nodes, edges = self.features(inputs)
+            nodes, edges = self.features(inputs, compiled.COLUMNS if compiled.applies(inputs) else None)
         with timed(watch, "network"):
             if feedback is None:
                 return self.integrate(problem, base, self.network(graph, nodes, edges))

@@ -8,8 +8,8 @@ differences, so features do not depend on where the scene is.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -304,14 +304,16 @@ class FeatureSet(nn.Module):
         """Widths by edge set as the network takes them."""
         return {"mesh": _width(self.edge), "coarse": _width(self.edge), BODY: _width(self.body_edge)}
 
-    def forward(self, inputs: Inputs) -> tuple[Tensor, dict[str, Tensor]]:
-        """Node features (V + W_active, node_width) and edge features by set, rows as in the graph."""
-        nodes = self._assemble(self.node, self.node_normalizer, inputs)
-        rows = self._assemble(self.edge, self.edge_normalizer, inputs)
+    def forward(self, inputs: Inputs, columns: Columns | None = None) -> tuple[Tensor, dict[str, Tensor]]:
+        """Node features (V + W_active, node_width) and edge features by set, rows as in the graph; the columns by torch if not
+        said otherwise."""
+        columns = columns or IN_TORCH
+        nodes = _normalized(columns.nodes(self, inputs), self.node_normalizer)
+        rows = _normalized(columns.edges(self, inputs), self.edge_normalizer)
         counts = [inputs.graph.edge_sets[name].num_edges for name in inputs.cloth_sets]
         edges = dict(zip(inputs.cloth_sets, rows.split(counts), strict=True))
         if inputs.body_edges.num_edges:
-            edges[BODY] = self._assemble(self.body_edge, self.body_edge_normalizer, inputs)
+            edges[BODY] = _normalized(columns.body_edges(self, inputs), self.body_edge_normalizer)
         else:
             edges[BODY] = nodes.new_zeros(0, self.edge_widths[BODY])
             if self.body_edge_normalizer is not None:
@@ -319,12 +321,28 @@ class FeatureSet(nn.Module):
                 self.body_edge_normalizer(edges[BODY][:, : self.body_edge_normalizer.width])
         return nodes, edges
 
-    @staticmethod
-    def _assemble(groups: Iterable[Any], normalizer: RunningNormalizer | None, inputs: Inputs) -> Tensor:
-        values = torch.cat([part for group in groups for part in group.columns(inputs)], dim=1)
-        if normalizer is None:
-            return values
-        return normalizer.leading(values)
+
+class Columns(NamedTuple):
+    """Who computes the columns of a feature set, before they are normalised: of nodes, cloth edges and body edges."""
+
+    nodes: Callable[[FeatureSet, Inputs], Tensor]
+    edges: Callable[[FeatureSet, Inputs], Tensor]
+    body_edges: Callable[[FeatureSet, Inputs], Tensor]
+
+
+def _together(groups: Iterable[Any], inputs: Inputs) -> Tensor:
+    return torch.cat([part for group in groups for part in group.columns(inputs)], dim=1)
+
+
+IN_TORCH = Columns(
+    nodes=lambda features, inputs: _together(features.node, inputs),
+    edges=lambda features, inputs: _together(features.edge, inputs),
+    body_edges=lambda features, inputs: _together(features.body_edge, inputs),
+)
+
+
+def _normalized(values: Tensor, normalizer: RunningNormalizer | None) -> Tensor:
+    return values if normalizer is None else normalizer.leading(values)
 
 
 def _width(groups: Iterable[Any]) -> int:

@@ -160,6 +160,7 @@ class Inputs:
         cloth, sets = self.cloth, [self.graph.edge_sets[name] for name in self.cloth_sets]
         of_sets = [x for s in sets for x in (s.senders, s.receivers, s.source)]
         of_cloth = [cloth.rest_pos, cloth.vertex_scene, cloth.vertex_fabric, cloth.edge_fabric]
+        of_cloth += [cloth.mass, cloth.pinned, self.graph.node_level]
         if torch.is_inference_mode_enabled() or any(x.requires_grad for x in of_cloth):
             return self.make_edge_rows()  # of no use to a later step: inference tensors, or a graph already walked
         key = [(x, x._version) for x in of_sets + of_cloth]

@@ -17,7 +17,7 @@ from hood.features.physical import GRAVITY, ContactDistance, Residual, length, p
 #: Rounds of diffusion of the residuals of small and of large neighbourhoods.
 WIDE_ROUNDS = (4, 16)
 #: Local steps of stiff cloth are of this size [m]; displacements of a pass of that one; strains of a percent matter.
-_STEP, _MOVE, _GAIN = 1e-4, 1e-2, 100.0
+STEP, MOVE, GAIN = 1e-4, 1e-2, 100.0
 
 
 class _View(NodeGroup, ABC):
@@ -45,7 +45,7 @@ class LocalStep(_View):
 
     width = 3
 
-    def __init__(self, scale: float = _STEP) -> None:
+    def __init__(self, scale: float = STEP) -> None:
         super().__init__(scale)
 
     def value(self, inputs: Inputs) -> Tensor | None:
@@ -66,7 +66,7 @@ class WideResidual(_View):
 
 
 #: What :func:`look` reads; they have no parameters.
-_RESIDUAL, _LOCAL_STEP, _WIDE, _CONTACT = Residual(), LocalStep(), WideResidual(), ContactDistance()
+_RESIDUAL, _LOCAL_STEP, _WIDE, CONTACT = Residual(), LocalStep(), WideResidual(), ContactDistance()
 
 #: Columns of :func:`look` of nodes and of edges.
 LOOK_WIDTHS = (3 + 3 + 3 + 1 + 1 + WideResidual.width, 1)
@@ -80,8 +80,8 @@ def look(inputs: Inputs, sets: Sequence[str]) -> tuple[Tensor, dict[str, Tensor]
     nodes = [
         _RESIDUAL.cloth(inputs),
         _LOCAL_STEP.cloth(inputs),
-        torch.asinh(moved / _MOVE),
-        _CONTACT.cloth(inputs)[:, :1],
+        torch.asinh(moved / MOVE),
+        CONTACT.cloth(inputs)[:, :1],
         _LOCAL_STEP.scale(length(step)),
         _WIDE.cloth(inputs),
     ]
@@ -98,7 +98,7 @@ def _strain(inputs: Inputs, name: str) -> Tensor:
     rows = inputs.graph.edge_sets[name]
     now, rest = (length(pos[rows.senders] - pos[rows.receivers]) for pos in (inputs.base, inputs.cloth.rest_pos))
     proper = rest > 1e-6
-    return torch.asinh(_GAIN * torch.where(proper, now / torch.where(proper, rest, 1.0) - 1, 0.0))
+    return torch.asinh(GAIN * torch.where(proper, now / torch.where(proper, rest, 1.0) - 1, 0.0))
 
 
 def _demand(values: Tensor | None) -> Tensor:

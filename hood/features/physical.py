@@ -162,7 +162,7 @@ class ScaledShape(EdgeGroup):
     def forward(self, inputs: Inputs) -> Tensor:
         current, rest = cloth_difference(inputs.state.pos, inputs), cloth_difference(inputs.cloth.rest_pos, inputs)
         columns = torch.cat([current, length(current), rest, length(rest)], dim=1)
-        return columns / _mean_length(length(rest), inputs).clamp_min(1e-6)
+        return columns / mean_rest_length(inputs)
 
 
 class Strain(EdgeGroup):
@@ -175,7 +175,7 @@ class Strain(EdgeGroup):
         self.scale = FixedScale(1.0 / gain, asinh=True)
 
     def forward(self, inputs: Inputs) -> Tensor:
-        rest = length(cloth_difference(inputs.cloth.rest_pos, inputs))
+        rest = rest_length(inputs)
         lengths = torch.cat([length(cloth_difference(pos, inputs)) for pos in (inputs.state.pos, inputs.base)], dim=1)
         proper = rest > 1e-6
         return self.scale(torch.where(proper, lengths / torch.where(proper, rest, 1.0) - 1, 0.0))
@@ -209,12 +209,17 @@ def length(vector: Tensor) -> Tensor:
     return vector.norm(dim=1, keepdim=True)
 
 
-def _mean_length(rest_length: Tensor, inputs: Inputs) -> Tensor:
-    """Mean rest length of the edges in the same set and scene, per edge (N, 1)."""
-    edges = inputs.edges
-    total = rest_length.new_zeros(edges.num_segments).index_add_(0, edges.segment, rest_length.squeeze(1))
+def rest_length(inputs: Inputs) -> Tensor:
+    """Rest lengths of the cloth edges [m], (N, 1)."""
+    return length(cloth_difference(inputs.cloth.rest_pos, inputs))
+
+
+def mean_rest_length(inputs: Inputs) -> Tensor:
+    """Mean rest length [m] of the edges in the same set and scene, at least 1 µm, per edge (N, 1)."""
+    edges, rest = inputs.edges, rest_length(inputs)
+    total = rest.new_zeros(edges.num_segments).index_add_(0, edges.segment, rest.squeeze(1))
     count = torch.bincount(edges.segment, minlength=edges.num_segments).clamp_min(1)
-    return (total / count)[edges.segment].unsqueeze(1)
+    return (total / count)[edges.segment].unsqueeze(1).clamp_min(1e-6)
 
 
 def physical(num_levels: int = 3, more: Sequence[NodeGroup] = ()) -> FeatureSet:

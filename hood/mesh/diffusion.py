@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import weakref
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
+
+from hood.native import features
 
 
 class Diffusion:
@@ -28,3 +33,32 @@ class Diffusion:
 
     def _sum(self, values: Tensor) -> Tensor:
         return torch.zeros_like(values).index_add(0, self._receivers, values.index_select(0, self._senders))
+
+
+class Neighbours(NamedTuple):
+    """Neighbours of the vertices of a mesh, vertex by vertex."""
+
+    first: Tensor  # (V + 1,) where those of each vertex begin
+    other: Tensor  # (2E,)
+
+    def pointers(self) -> features.Neighbours:
+        """The tables as the compiled functions read them; valid as long as they live."""
+        return features.Neighbours(len(self.first) - 1, self.first.data_ptr(), self.other.data_ptr())
+
+
+_NEIGHBOURS: dict[int, tuple[weakref.ref[Tensor], int, Neighbours]] = {}
+
+
+def neighbours_of(edges: Tensor, num_vertices: int) -> Neighbours:
+    """Neighbours by undirected ``edges`` (E, 2), kept as long as that tensor lives."""
+    key = id(edges)
+    known = _NEIGHBOURS.get(key)
+    if known is not None and known[0]() is edges and known[1] == num_vertices:
+        return known[2]
+    start, end = edges.unbind(dim=1)
+    senders, receivers = torch.cat([start, end]), torch.cat([end, start])
+    degree = torch.bincount(receivers, minlength=num_vertices)
+    first = torch.cat([degree.new_zeros(1), degree.cumsum(0)])
+    found = Neighbours(first, senders[torch.argsort(receivers, stable=True)].contiguous())
+    _NEIGHBOURS[key] = (weakref.ref(edges, lambda _: _NEIGHBOURS.pop(key, None)), num_vertices, found)
+    return found

@@ -736,6 +736,29 @@ bool backtrack(Engine& e) {
     return false;
 }
 
+// x with A x = b for a symmetric positive A by its upper triangle, by cofactors, scaled to a diagonal of ones first.
+inline void solve_block(const float* upper, const double* b, double* x) {
+    constexpr int PAIR[3][3] = {{0, 1, 2}, {1, 3, 4}, {2, 4, 5}}, DIAGONAL[3] = {0, 3, 5};
+    double scale[3], a[3][3], c[3][3];
+    for (int i = 0; i < 3; ++i) {
+        const double own = upper[DIAGONAL[i]];
+        scale[i] = 1.0 / std::sqrt(own > 0.0 ? own : 2.2250738585072014e-308);
+    }
+    for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j) a[i][j] = (double)upper[PAIR[i][j]] * scale[i] * scale[j];
+    for (int i = 0; i < 3; ++i) {
+        const double *u = a[(i + 1) % 3], *v = a[(i + 2) % 3];
+        c[i][0] = u[1] * v[2] - u[2] * v[1], c[i][1] = u[2] * v[0] - u[0] * v[2], c[i][2] = u[0] * v[1] - u[1] * v[0];
+    }
+    double determinant = dot3(a[0], c[0]);
+    if (!(determinant > 1.1920928955078125e-07)) determinant = 1.1920928955078125e-07;
+    for (int i = 0; i < 3; ++i) {
+        x[i] = 0.0;
+        for (int j = 0; j < 3; ++j) x[i] += c[i][j] * scale[j] * b[j];
+        x[i] *= scale[i] / determinant;
+    }
+}
+
 }  // namespace
 
 // ---- what is called ------------------------------------------------------------------------------------------------------
@@ -790,4 +813,67 @@ void newton_state(const Engine* e, double* pos, double* acc) {
 int64_t newton_face_record(int64_t wide) { return wide ? sizeof(FaceRecord<double>) : sizeof(FaceRecord<float>); }
 int64_t newton_hinge_record(int64_t wide) { return wide ? sizeof(HingeRecord<double>) : sizeof(HingeRecord<float>); }
 int64_t newton_most_blocks() { return MOST_BLOCKS; }
+
+// ---- single vertices on their own -----------------------------------------------------------------------------------------
+
+// Forces (V, 3) on free vertices at positions (V, 3) in the original order, and the steps (V, 3) each would take with its
+// neighbours held: by its diagonal block of the positive matrix. Rows of other vertices are not touched, nor is the matrix.
+void newton_alone(Engine* e, const float* pos, float* force, float* step) {
+    constexpr int DIAGONAL[3] = {0, 3, 5};
+    for (int64_t i = 0; i < e->num_vertices; ++i) {
+        const int64_t v = e->vertex[i];
+        for (int k = 0; k < 3; ++k) {
+            e->pos[4 * i + k] = pos[3 * v + k];
+            if (i < e->num_rows) e->acc[4 * i + k] = (e->pos[4 * i + k] - e->base[3 * v + k]) / e->dt_sq;
+        }
+    }
+    if (e->membrane) face_models<float>(*e, e->pos);
+    if (e->bending) hinge_models<float>(*e, e->pos);
+    float* blocks = (float*)e->inverse;  // upper triangles in the first six of twelve numbers a row
+    for (int64_t row = 0; row < e->num_rows; ++row) {
+        double *gradient = e->gradient + 4 * row, upper[6], slack[6];
+        vertex_model(*e, row, gradient, upper, slack);
+        if (e->membrane)
+            for (int64_t i = e->face_starts[row]; i < e->face_starts[row + 1]; ++i) {
+                const int32_t* use = e->face_uses + 5 * i;
+                const FaceRecord<float>& face = ((const FaceRecord<float>*)e->face_model)[use[0]];
+                const int c = use[1];
+                for (int m = 0; m < 3; ++m) {
+                    const float* root = face.root + 9 * m + 3 * c;
+                    const double own[3] = {root[0], root[1], root[2]};
+                    add_outer(upper, 1.0, own);
+                }
+                for (int k = 0; k < 3; ++k) {
+                    gradient[k] += face.gradient[3 * c + k];
+                    upper[DIAGONAL[k]] += face.axial[DIAGONAL[c]];
+                }
+            }
+        if (e->bending)
+            for (int64_t i = e->hinge_starts[row]; i < e->hinge_starts[row + 1]; ++i) {
+                const int32_t* use = e->hinge_uses + 6 * i;
+                const HingeRecord<float>& hinge = ((const HingeRecord<float>*)e->hinge_model)[use[0]];
+                const float* of = hinge.row + 3 * use[1];
+                const double own[3] = {of[0], of[1], of[2]};
+                add_outer(upper, 1.0, own);
+                for (int k = 0; k < 3; ++k) gradient[k] += hinge.gradient[3 * use[1] + k];
+            }
+        for (int k = 0; k < 6; ++k) blocks[12 * row + k] = (float)upper[k];
+    }
+    for (int64_t s = 0; s < e->num_springs; ++s)
+        for (int end = 0; end < 2; ++end) {
+            const int64_t own = e->spring_ends[2 * s + end], other = e->spring_ends[2 * s + 1 - end];
+            if (own >= e->num_rows) continue;
+            for (int k = 0; k < 3; ++k) {
+                e->gradient[4 * own + k] += e->spring_stiffness[s] * (e->pos[4 * own + k] - e->pos[4 * other + k]);
+                blocks[12 * own + DIAGONAL[k]] += (float)e->spring_stiffness[s];
+            }
+        }
+    for (int64_t row = 0; row < e->num_rows; ++row) {
+        const int64_t v = e->vertex[row];
+        const double pull[3] = {-e->gradient[4 * row], -e->gradient[4 * row + 1], -e->gradient[4 * row + 2]};
+        double moved[3];
+        solve_block(blocks + 12 * row, pull, moved);
+        for (int k = 0; k < 3; ++k) force[3 * v + k] = (float)pull[k], step[3 * v + k] = (float)moved[k];
+    }
+}
 }

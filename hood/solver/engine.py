@@ -76,6 +76,7 @@ def library() -> ctypes.CDLL:
     lib = build(SOURCE, NATIVE_FLAGS)
     lib.newton_model.restype = _REAL
     lib.newton_move.argtypes = [_POINTER, _REAL, _COUNT]
+    lib.newton_alone.argtypes = [_POINTER] * 4
     for name in ("newton_move", "newton_face_record", "newton_hinge_record", "newton_most_blocks"):
         getattr(lib, name).restype = _COUNT
     return lib
@@ -266,6 +267,11 @@ class SceneEngine:
     def read(self, pos: np.ndarray, acc: np.ndarray) -> None:
         """Write positions and accelerations (V, 3) of this scene's vertices into arrays of the whole cloth."""
         self._lib.newton_state(self._address, pos.ctypes.data_as(_POINTER), acc.ctypes.data_as(_POINTER))
+
+    def alone(self, pos: int, force: int, step: int) -> None:
+        """Write force [N] and local step [m] of this scene's free vertices at positions: addresses of tables (V, 3) of the
+        whole cloth, in float32."""
+        self._lib.newton_alone(self._address, pos, force, step)
 
     def array(self, name: str) -> np.ndarray:
         """An array that the structure points to, by its name there."""

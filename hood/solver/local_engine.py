@@ -1,0 +1,81 @@
+"""The potential as every vertex sees it alone, by the compiled solver's energies (``hood/native/newton.cpp``)."""
+
+from __future__ import annotations
+
+import ctypes
+import weakref
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hood.losses.potential import Potential
+from hood.losses.problem import StepProblem
+from hood.native.build import BuildError
+from hood.scene.cloth import Cloth
+from hood.scene.state import Attachments
+from hood.solver import engine
+from hood.solver.engine import SceneEngine, engine_step
+from hood.solver.engine_tables import build_tables
+from hood.solver.local import LocalTerms, LocalView
+
+_POINTER = ctypes.c_void_p
+
+
+class EngineTerms:
+    """Views of one step's potential, as :class:`hood.solver.local.LocalTerms` gives them, for positions in float32.
+
+    Energies are float64 inside: views are nearer to the exact ones than those of the torch form in float32.
+    """
+
+    def __init__(self, potential: Potential, problem: StepProblem) -> None:
+        state, dt = problem.state, problem.vertex_dt.double()
+        base = (state.pos.double() + dt * state.vel.double()).numpy()
+        step = replace(engine_step(potential, problem), base=base)
+        self._engines = _engines_of(problem.cloth, problem.step.attachments)
+        for scene, own in enumerate(self._engines):
+            own.enter(step, scene)
+
+    def __call__(self, pos: Tensor) -> LocalView:
+        """The view at positions (V, 3)."""
+        pos = pos.contiguous()
+        force, step = torch.zeros_like(pos), torch.zeros_like(pos)
+        for own in self._engines:
+            own.alone(pos.data_ptr(), force.data_ptr(), step.data_ptr())
+        return LocalView(force, step)
+
+
+def local_terms(potential: Potential, problem: StepProblem, compiled: bool = True) -> LocalTerms | EngineTerms:
+    """Views of one step's potential: compiled if asked for and possible, else in torch."""
+    if compiled and applies(potential, problem):
+        try:
+            return EngineTerms(potential, problem)
+        except BuildError:
+            pass
+    return LocalTerms(potential, problem)
+
+
+def applies(potential: Potential, problem: StepProblem) -> bool:
+    """Whether the compiled views know the potential and the numbers of ``problem``."""
+    pos = problem.state.pos
+    return type(pos) is Tensor and pos.dtype == torch.float32 and engine.applies(potential, problem)
+
+
+_Known = tuple[weakref.ref[Tensor], tuple[Tensor, Tensor, Tensor | None], list[SceneEngine]]
+_ENGINES: dict[int, _Known] = {}
+
+
+def _engines_of(cloth: Cloth, attachments: Attachments | None) -> list[SceneEngine]:
+    """Engines of a cloth's scenes, apart from those that the solver moves; kept as long as the cloth's faces live."""
+    key, now = id(cloth.faces), (cloth.hinges, cloth.free, None if attachments is None else attachments.edges)
+    known = _ENGINES.get(key)
+    if known is not None and known[0]() is cloth.faces and all(_same(a, b) for a, b in zip(now, known[1], strict=True)):
+        return known[2]
+    made = [SceneEngine(cloth, build_tables(cloth, attachments, scene)) for scene in range(cloth.num_scenes)]
+    _ENGINES[key] = (weakref.ref(cloth.faces, lambda _: _ENGINES.pop(key, None)), now, made)
+    return made
+
+
+def _same(a: Tensor | None, b: Tensor | None) -> bool:
+    return a is b or (a is not None and b is not None and np.array_equal(a.numpy(), b.numpy()))
