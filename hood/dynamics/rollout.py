@@ -197,6 +197,7 @@ def prepare_stepper(stepper: Stepper, scene: Scene) -> Any:
     return stepper.prepare(scene.cloth, scene.garment.rest_pos)
 
 
+@torch.no_grad()
 def start_state(stepper: Stepper, scene: Scene, potential: Potential, relaxing_steps: int, frame: int = 0) -> State:
     """Settled, relaxed start: the relaxing step is kept only where it lowers the potential of its own problem and leaves no
     edge stretched by more than a tenth that was not before.

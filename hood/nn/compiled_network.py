@@ -104,23 +104,39 @@ def check_width(width: int) -> None:
         )
 
 
-def applies(network: MeshGraphNet, nodes: Tensor) -> bool:
-    """Whether outputs for node features ``nodes`` can be had this way, of a network that :func:`check_width` lets pass: float32
-    on a CPU, without a gradient."""
+def weights_for(network: MeshGraphNet, nodes: Tensor) -> Packed | None:
+    """The network's weights, packed, if outputs for node features ``nodes`` can be had this way: float32 on a CPU, without a
+    gradient. The network is one that :func:`check_width` lets pass."""
     if torch.is_grad_enabled() or torch.compiler.is_compiling():
-        return False
+        return None
     if type(nodes) is not Tensor or nodes.device.type != "cpu" or nodes.dtype != torch.float32:
-        return False
-    return all(p.dtype == torch.float32 and not p.is_inference() for p in network.parameters())
+        return None
+    known = _PACKED.get(network)
+    parameters = _parameters(network) if known is None else [table[name] for table, name in known.slots]
+    state = [(p.data_ptr(), p._version) for p in parameters if p.dtype == torch.float32 and not p.is_inference()]
+    if len(state) < len(parameters):
+        return None
+    if known is None or known.state != state:
+        known = _PACKED[network] = Packed(network, state)
+    return known
+
+
+def _parameters(network: nn.Module) -> list[Tensor]:
+    return [table[name] for table, name in _slots(network)]
+
+
+def _slots(network: nn.Module) -> list[tuple[dict[str, Any], str]]:
+    """Where the parameters are found, without walking through the modules again: that takes longer than a frame may."""
+    tables = [cast("dict[str, Any]", module._parameters) for module in network.modules()]
+    return [(table, name) for table in tables for name, value in table.items() if value is not None]
 
 
 class Packed:
     """A network's weights as the library reads them; valid as long as they do not change."""
 
-    def __init__(self, network: MeshGraphNet) -> None:
-        lib = library()
-        self._lib, self._kept = lib, list[Any]()
-        self.state = weights_state(network)
+    def __init__(self, network: MeshGraphNet, state: list[tuple[int, int]]) -> None:
+        self._lib, self._kept = library(), list[Any]()
+        self.state, self.slots = state, _slots(network)  # what changes with the weights, and where they are
         self.node_encoder = self.perceptron(network.node_encoder)
         self.edge_encoders = {name: self.perceptron(network.edge_encoder(name)) for name in (*network.edge_set_names, BODY)}
         self.decoders = [self.perceptron(cast("MLP", mlp)) for mlp in (network.decoder, *network.late_decoders)]
@@ -191,27 +207,16 @@ class Packed:
         step.mean = module.aggregation == "mean"
 
 
-def weights_state(network: MeshGraphNet) -> list[tuple[int, int]]:
-    """Changes with any weight."""
-    return [(p.data_ptr(), p._version) for p in network.parameters()]
-
-
 _PACKED: weakref.WeakKeyDictionary[nn.Module, Packed] = weakref.WeakKeyDictionary()
-
-
-def packed(network: MeshGraphNet) -> Packed:
-    """The weights as they are now, packed once."""
-    known = _PACKED.get(network)
-    if known is None or known.state != weights_state(network):
-        known = _PACKED[network] = Packed(network)
-    return known
 
 
 class Inference:
     """One evaluation of a network on a graph, pass by pass."""
 
-    def __init__(self, network: MeshGraphNet, graph: Graph, nodes: Tensor, edges: Mapping[str, Tensor]) -> None:
-        self._lib, self._weights, self._width = library(), packed(network), network.latent_dim
+    def __init__(
+        self, network: MeshGraphNet, weights: Packed, graph: Graph, nodes: Tensor, edges: Mapping[str, Tensor]
+    ) -> None:
+        self._lib, self._weights, self._width = library(), weights, network.latent_dim
         self._num_cloth, self._passes, self._taken = graph.num_cloth, network.passes, 0
         self._nodes = self._rows(self._weights.node_encoder, nodes)
         encoders = self._weights.edge_encoders
@@ -267,13 +272,14 @@ def _pointers(edges: EdgeSet, rows: Tensor | None) -> _Edges:
 
 def infer(
     network: MeshGraphNet,
+    weights: Packed,
     graph: Graph,
     nodes: Tensor,
     edges: Mapping[str, Tensor],
     look: Callable[[int, Tensor], tuple[Tensor, Mapping[str, Tensor]]] | None,
 ) -> Tensor:
-    """What :meth:`hood.nn.model.MeshGraphNet.forward` returns where :func:`applies`."""
-    inference = Inference(network, graph, nodes, edges)
+    """What :meth:`hood.nn.model.MeshGraphNet.forward` returns, by the weights of :func:`weights_for`."""
+    inference = Inference(network, weights, graph, nodes, edges)
     raw = inference.take()
     for index in range(1, len(network.passes)):
         assert look is not None, "several passes need someone who looks at what they lead to"

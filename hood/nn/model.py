@@ -142,8 +142,9 @@ class MeshGraphNet(nn.Module):
         """
         check_precision(self.precision, node_features.device)
         check_kernels(self.kernels, self.precision, self.latent_dim, node_features.device)
-        if self.kernels == "fused" and compiled_network.applies(self, node_features):
-            return compiled_network.infer(self, graph, node_features, edge_features, look)
+        weights = compiled_network.weights_for(self, node_features) if self.kernels == "fused" else None
+        if weights is not None:
+            return compiled_network.infer(self, weights, graph, node_features, edge_features, look)
         with products(self.precision):
             return self._forward(graph, node_features, edge_features, look)
 

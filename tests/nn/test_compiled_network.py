@@ -56,8 +56,9 @@ def evaluate(network: MeshGraphNet, case: Case, compiled: bool) -> Tensor:
     look = looker(case, network) if len(network.passes) > 1 else None
     with torch.no_grad():
         if compiled:
-            assert compiled_network.applies(network, case.nodes)
-            return compiled_network.infer(network, case.graph, case.nodes, case.edges, look)
+            weights = compiled_network.weights_for(network, case.nodes)
+            assert weights is not None
+            return compiled_network.infer(network, weights, case.graph, case.nodes, case.edges, look)
         return network(case.graph, case.nodes, case.edges, look)
 
 
@@ -120,6 +121,8 @@ def test_weights_that_change_are_read_again():
     assert difference(network, case) < 3e-6
     network.load_state_dict({name: 0.5 * value for name, value in network.state_dict().items()})
     assert difference(network, case) < 3e-6
+    network.steps[0].node_mlp.second.weight = torch.nn.Parameter(torch.randn(48, 48) / 7)
+    assert difference(network, case) < 3e-6
 
 
 @needs_compiler
@@ -132,11 +135,11 @@ def test_undefined_numbers_are_not_hidden():
 @needs_compiler
 def test_gradients_and_float64_go_to_torch():
     network, nodes = make(SHORT), torch.zeros(4, 5)
-    assert not compiled_network.applies(network, nodes)  # a gradient may be asked for
+    assert compiled_network.weights_for(network, nodes) is None  # a gradient may be asked for
     with torch.no_grad():
-        assert compiled_network.applies(network, nodes)
-        assert not compiled_network.applies(network, nodes.double())
-        assert not compiled_network.applies(copy.deepcopy(network).double(), nodes)
+        assert compiled_network.weights_for(network, nodes) is not None
+        assert compiled_network.weights_for(network, nodes.double()) is None
+        assert compiled_network.weights_for(copy.deepcopy(network).double(), nodes) is None
 
 
 @needs_compiler
