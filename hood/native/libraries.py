@@ -13,6 +13,8 @@ LIBRARIES: tuple[tuple[Path, tuple[str, ...]], ...] = (
     (_HERE / "newton.cpp", NATIVE_FLAGS),
     (_HERE / "surface.cpp", NATIVE_FLAGS),
     (_HERE / "picture.cpp", NATIVE_FLAGS),
+    (_HERE / "features.cpp", NATIVE_FLAGS),
+    (_HERE.parent / "nn" / "network.cpp", NATIVE_FLAGS),
 )
 
 
