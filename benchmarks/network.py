@@ -13,10 +13,10 @@ products the network itself computes, against a (1024, 128) × (128, 128) produc
 faster of the machine's two libraries.
 
 Progress goes to the standard error, rows to the standard output and, with ``--output``, to a CSV file as soon as they are
-known. ``--compiled`` adds the network by its compiled kernels. Where one turn of all forms lasts longer than ``--long``
-seconds three turns are taken instead of ``--rounds``; the column ``turns`` says so. A form that needs more memory than the
-machine has is left out with a sentence that says how much: memory grows linearly with the number of vertices, by the line
-through two small sizes.
+known. ``--compiled`` adds the network by its compiled kernels, in inference also the fused ones. Where one turn of all forms
+lasts longer than ``--long`` seconds three turns are taken instead of ``--rounds``; the column ``turns`` says so. A form that
+needs more memory than the machine has is left out with a sentence that says how much: memory grows linearly with the number of
+vertices, by the line through two small sizes.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ TOUCHED = 1500  # body vertices near the cloth
 WIDTHS = {"mesh": 12, "coarse": 12, "body": 9}
 LATENT = 128
 PROBES = (1089, 2209)  # sizes whose memory tells that of larger ones
-COMPILED = "compiled "  # before a precision: the form's name
+FUSED = "fused"  # these kernels are for inference alone
 FEW = 3  # turns where one lasts long
 COLUMNS = ("pass", "form", "turns", "ms", "vs naive", "MB", "vs naive", "GFLOP/s", "of the product's")
 
@@ -216,11 +216,11 @@ def forms(case: Case, with_pyg: bool = False, with_compiled: bool = False) -> di
         "fp32": (case.network, partial(case.network, case.graph, case.nodes, case.edges)),
         "bf16": (half, partial(half, case.graph, case.nodes, case.edges)),
     }
-    for name in PRECISIONS if with_compiled else ():
+    for kernels, precision in (*(("compiled", name) for name in PRECISIONS), (FUSED, "fp32")) if with_compiled else ():
         network = copy.deepcopy(case.network)
-        network.use_precision(name)
-        network.use_kernels("compiled")
-        result[f"{COMPILED}{name}"] = (network, partial(network, case.graph, case.nodes, case.edges))
+        network.use_precision(precision)
+        network.use_kernels(kernels)
+        result[f"{kernels} {precision}"] = (network, partial(network, case.graph, case.nodes, case.edges))
     if with_pyg:
         result["pyg"] = (case.network, pyg(case))
     return result
@@ -333,9 +333,9 @@ def fitting(size: int, model: str, names: Sequence[str], training: bool) -> list
 
 def measure_memory(size: int, model: str, name: str, training: bool) -> float:
     """The same in this process: growth of the resident set's high-water mark over one pass."""
-    small = forms(make_case(100, model), name == "pyg", name.startswith(COMPILED))[name]
+    small = forms(make_case(100, model), name == "pyg", " " in name)[name]
     train(*small) if training else quiet(small[1])  # pages of the libraries' code are not counted
-    owner, run = forms(make_case(size, model), name == "pyg", name.startswith(COMPILED))[name]
+    owner, run = forms(make_case(size, model), name == "pyg", " " in name)[name]
     ctypes.CDLL(None).malloc_trim(0)  # what building the case has freed would be used again without being seen
     before = resident("VmRSS")
     Path("/proc/self/clear_refs").write_text("5")  # the mark starts again from here
@@ -362,7 +362,7 @@ def table(size: int, model: str, args: argparse.Namespace) -> None:
     print(f"\n{model}, {case.graph.num_cloth:,} vertices, edges {counts}, {flops / 1e9:.1f} GFLOP; {error}")
     print(f"| {' | '.join(COLUMNS)} |\n" + "|---" * len(COLUMNS) + "|", flush=True)
     for training in (False, True) if not args.forward_only else (False,):
-        names = fitting(size, model, list(runs), training) if training else present
+        names = fitting(size, model, [name for name in runs if not name.startswith(FUSED)], training) if training else present
         rows(size, model, training, {name: runs[name] for name in names}, flops, args)
 
 
@@ -392,7 +392,7 @@ def rows(
         compared = f"{seconds['naive'] / value:.2f}" if "naive" in seconds else ""
         space = f"{memory[name]:.0f}" if memory else ""
         share = f"{memory[name] / memory['naive']:.2f}" if "naive" in memory else ""
-        precision = name.removeprefix(COMPILED)
+        precision = name.split()[-1]
         fraction = (f"{own / 1e9:.0f}", f"{own / rate[precision]:.0%}") if precision in rate else ("", "")
         cells = (label, name, str(len(times[name])), f"{1e3 * value:.1f}", compared, space, share, *fraction)
         print(f"| {' | '.join(cells)} |", flush=True)

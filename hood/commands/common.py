@@ -6,6 +6,7 @@ import importlib.util
 import os
 import sys
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from hood.config import ConfigError, plain, require_choice
 from hood.dynamics.checkpoint import load_simulator
 from hood.dynamics.reference import SUFFIXES, load_reference_checkpoint
 from hood.dynamics.simulator import Simulator
+from hood.nn.choice import AUTO, Choice, choose_kernels
 from hood.nn.compiled import check_kernels
 from hood.nn.precision import check_precision
 from hood.training import distributed
@@ -102,8 +104,10 @@ def read_model(path: Path, fps: float) -> Simulator:
     return simulator
 
 
-def use_arithmetic(simulator: Simulator, config: DictConfig) -> None:
-    """Let the simulator's network compute as ``config.precision`` and ``config.kernels`` say.
+def use_arithmetic(simulator: Simulator, config: DictConfig, traced: bool = False) -> None:
+    """Let the simulator's network compute as ``config.precision`` and ``config.kernels`` say; a choice is told in one line.
+
+    A step that is ``traced`` is torch's operations, which leaves no choice.
 
     Raises:
         ValueError: no such precision or kernels, or not on this device.
@@ -111,9 +115,22 @@ def use_arithmetic(simulator: Simulator, config: DictConfig) -> None:
     precision, kernels, device = str(config.precision), str(config.kernels), torch.device(str(config.device))
     network = simulator.network
     check_precision(precision, device)
+    if kernels == AUTO and traced:
+        kernels = "torch"
+    if kernels == AUTO:
+        choice = choose_kernels(precision, network.latent_dim, device)
+        tell_choice(choice)
+        kernels = choice.kernels
     check_kernels(kernels, precision, network.latent_dim, device)
     network.use_precision(precision)
     network.use_kernels(kernels)
+
+
+@cache
+def tell_choice(choice: Choice) -> None:
+    """Print what ``kernels=auto`` has chosen, once."""
+    if distributed.rank() == 0:
+        print(choice, flush=True)
 
 
 def require_same_config(config: DictConfig, folder: Path, free: Sequence[str], free_below: Sequence[str] = ()) -> None:

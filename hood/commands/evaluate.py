@@ -43,6 +43,7 @@ from hood.evaluation.gap import REFERENCE
 from hood.evaluation.spectrum import spectrum_rows
 from hood.evaluation.table import Candidate, GapSettings, Measured, candidate_rows, measure
 from hood.losses.potential import Potential
+from hood.nn.choice import AUTO
 from hood.nn.compiled import KERNELS
 from hood.nn.precision import check_precision
 from hood.scene.cloth import build_cloth
@@ -62,7 +63,7 @@ def run(overrides: Sequence[str]) -> int:
     _check_lists(config)
     _check_numbers(config)
     require_choice(config, "refine_method", METHODS)
-    require_choice(config, "kernels", KERNELS)
+    require_choice(config, "kernels", (AUTO, *KERNELS))
     check_precision(str(config.precision), torch.device(str(config.device)))
     require_choice(config, "spectrum", SPECTRA)
     if config.spectrum != "none" and int(config.gap_states) == 0:

@@ -44,6 +44,7 @@ from hood.dynamics.refine import GuessStepper
 from hood.dynamics.rollout import METRIC_CHOICES, metric_names, simulate
 from hood.dynamics.simulator import Simulator
 from hood.dynamics.stepper import NewtonStepper, Stepper
+from hood.nn.compiled import KERNELS
 from hood.scene.fitting import misplacement
 from hood.scene.scene import Scene, dress
 from hood.training import distributed
@@ -60,6 +61,7 @@ def run(overrides: Sequence[str]) -> int:
     require_choice(config, "video", ("mp4", "gif", "none"))
     require_choice(config, "metrics", METRIC_CHOICES)
     _check_numbers(config)
+    require_choice(config, "kernels", (AUTO, *KERNELS))
     require_choice(config, "stepper", ("network", "newton", "refine", AUTO))
     check_dial(config)
     require_choice(config, "step", (PLAIN, *MODES))
@@ -104,10 +106,12 @@ def _run_heard(config: DictConfig, stepper: Stepper, digest: str, warned: list[s
     summary["choice"] = asdict(choice)
     print(describe(summary))
     print("".join(f"{sentence}\n" for sentence in advice(config, scene, summary)), end="")
+    simulator = network_of(stepper)
     try:
         if not interrupted:
             _draw(config, folder)
     finally:
+        summary["kernels"] = None if simulator is None else simulator.network.kernels
         summary["warnings"] = list(warned)
         _write_json(folder / "summary.json", summary)
     print(f"files in {folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
@@ -186,7 +190,7 @@ def make_stepper(config: DictConfig) -> tuple[Stepper, str]:
     """What takes the steps, before they are refined, and the SHA-256 of its weights (``none`` without a network)."""
     if str(config.stepper) in ("network", AUTO):
         simulator, digest = make_simulator(config)
-        use_arithmetic(simulator, config)
+        use_arithmetic(simulator, config, traced=str(config.step) == "compiled")
         stepper: Stepper = simulator if str(config.step) == PLAIN else CapturedSimulator(simulator, str(config.step))
         return stepper, digest
     potential = build(config.losses)

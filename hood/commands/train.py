@@ -17,7 +17,7 @@ from hood.assets.garment import load_garment
 from hood.assets.library import motion_split
 from hood.assets.motions import MotionFiles, find_motions
 from hood.assets.sequence import load_sequence
-from hood.commands.common import output_folder, prepare_folder, require_device, require_same_config, together
+from hood.commands.common import output_folder, prepare_folder, require_device, require_same_config, tell_choice, together
 from hood.config import ConfigError, build, load_config, plain, require_choice, save_run_record
 from hood.dynamics.simulator import Simulator
 from hood.evaluation.validation import Validation
@@ -57,6 +57,8 @@ def _train(config: DictConfig) -> int:
     if distributed.on_main(lambda: _is_resumed(config, prepare_folder(folder), trainer.checkpoint_path)):
         trainer.resume(trainer.checkpoint_path)
     distributed.on_main(lambda: save_run_record(folder, config, int(config.seed)))
+    if trainer.choice is not None:
+        tell_choice(trainer.choice)
     if main:
         parameters = sum(p.numel() for p in trainer.simulator.parameters())
         print(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+from hood.nn.choice import AUTO
 from hood.nn.compiled import KERNELS
 from hood.nn.model import PRECISIONS
 from hood.training.curriculum import CollisionRamp, Horizon, StepDecay, WarmupCosine, scaled_count
@@ -19,7 +20,8 @@ class TrainerSettings:
     ``max_skipped``: updates without a finite loss and gradient in a row after which training goes back to the last good
     checkpoint, on other scenes; ``max_rollbacks``: how often it does so without getting any further.
     ``precision``: of the network's latents and products; ``"bf16"`` keeps weights, their gradients and energies in float32.
-    ``kernels``: of the network on a CPU, see :meth:`hood.nn.model.MeshGraphNet.use_kernels`.
+    ``kernels``: of the network on a CPU, see :meth:`hood.nn.model.MeshGraphNet.use_kernels`; ``auto``: those that train fastest
+    here, :mod:`hood.nn.choice`.
     ``time_scale``: factor on the whole schedule, see :meth:`compressed`. ``max_vertices``: batches of garments of similar size,
     :mod:`hood.training.buckets`. ``workers``: processes that make scenes ahead, None for one per idle core.
     ``activation_checkpointing``: keep the latents between processor steps only and compute the rest again when it is needed.
@@ -51,8 +53,8 @@ class TrainerSettings:
     def __post_init__(self) -> None:
         if self.precision not in PRECISIONS:
             raise ValueError(f"trainer.precision {self.precision!r}: give {' or '.join(map(repr, PRECISIONS))}")
-        if self.kernels not in KERNELS:
-            raise ValueError(f"trainer.kernels {self.kernels!r}: give {' or '.join(map(repr, KERNELS))}")
+        if self.kernels not in (AUTO, *KERNELS):
+            raise ValueError(f"trainer.kernels {self.kernels!r}: give {' or '.join(map(repr, (AUTO, *KERNELS)))}")
         if self.optimizer not in OPTIMIZERS:
             raise ValueError(f"trainer.optimizer {self.optimizer!r}: give {' or '.join(map(repr, OPTIMIZERS))}")
         if self.signal not in ("potential", "scaled"):

@@ -21,6 +21,7 @@ from hood.dynamics.simulator import Simulator
 from hood.features.normalizer import RunningNormalizer
 from hood.losses.potential import Potential, relative_gradient, scale
 from hood.losses.problem import StepProblem
+from hood.nn.choice import AUTO, Choice, choose_kernels
 from hood.scene.dataset import SceneSampler
 from hood.training import distributed
 from hood.training.checkpoint import (
@@ -67,7 +68,11 @@ class Trainer:
         self.simulator, self.potential, self.settings = simulator, potential, settings
         self.folder, self.seed, self.watch = folder, seed, watch
         simulator.network.use_precision(settings.precision)
-        simulator.network.use_kernels(settings.kernels)
+        self.choice: Choice | None = None  # of kernels, where that was left open
+        if settings.kernels == AUTO:
+            width = simulator.network.latent_dim
+            self.choice = choose_kernels(settings.precision, width, simulator.gravity.device, training=True)
+        simulator.network.use_kernels(settings.kernels if self.choice is None else self.choice.kernels)
         simulator.network.use_checkpointing(settings.activation_checkpointing)
         ranks, rank = distributed.world_size(), distributed.rank()
         if settings.batch_size % ranks:

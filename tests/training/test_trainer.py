@@ -21,7 +21,9 @@ from hood.dynamics.ranges import training_conditions
 from hood.dynamics.simulator import Simulator, build_simulator
 from hood.features.inputs import Inputs
 from hood.losses.potential import Potential, default_potential
+from hood.nn.choice import Choice
 from hood.scene.dataset import SceneSampler, Window
+from hood.training import trainer as trainer_module
 from hood.training.curriculum import CollisionRamp, Horizon, WarmupCosine
 from hood.training.settings import TrainerSettings
 from hood.training.trainer import Trainer
@@ -190,6 +192,21 @@ def test_averaged_weights(tmp_path: Path, sampler: SceneSampler) -> None:
     off = make(tmp_path, sampler, settings=replace(SETTINGS, ema_decay=0.0))
     off.update()
     assert_same(dict(off.simulator.state_dict()), dict(off.averaged().state_dict()))
+
+
+def test_kernels_are_those_that_train_fastest_here(
+    tmp_path: Path, sampler: SceneSampler, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert make(tmp_path, sampler).choice is None  # as named
+
+    def choose(precision: str, width: int, device: torch.device, training: bool) -> Choice:
+        assert (precision, width, device.type, training) == ("bf16", 8, "cpu", True)
+        return Choice("torch", "measured")
+
+    monkeypatch.setattr(trainer_module, "choose_kernels", choose)
+    trainer = make(tmp_path, sampler, settings=replace(SETTINGS, kernels="auto", precision="bf16"))
+    assert str(trainer.choice) == "kernels=auto: torch (measured)"
+    assert trainer.simulator.network.kernels == "torch"
 
 
 def test_the_learning_rate_follows_its_schedule(tmp_path: Path, sampler: SceneSampler) -> None:
