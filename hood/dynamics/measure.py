@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from hood.losses.elements import absolute_strain
 from hood.losses.problem import STANDARD_GRAVITY, StepProblem
 from hood.scene.cloth import Cloth
 from hood.scene.contact import Contact
@@ -25,11 +27,12 @@ def edge_strain(cloth: Cloth, pos: Tensor) -> Tensor:
 
 def strain_metrics(cloth: Cloth, pos: Tensor) -> dict[str, float]:
     """Median, 99th percentile and maximum of the absolute edge strain; NaN where ``pos`` (V, 3) is not finite."""
-    strain = edge_strain(cloth, pos).abs()
-    if not bool(torch.isfinite(strain).all()):
-        return {"strain_p50": float("nan"), "strain_p99": float("nan"), "strain_max": float("nan")}
-    quantiles = torch.quantile(strain.double(), torch.tensor([0.5, 0.99, 1.0], dtype=torch.float64, device=strain.device))
-    return dict(zip(("strain_p50", "strain_p99", "strain_max"), quantiles.tolist(), strict=True))
+    strain = absolute_strain(cloth, pos)
+    if strain is None:
+        strain = edge_strain(cloth, pos).abs().double().cpu().numpy()
+    if not np.isfinite(strain).all():
+        return dict.fromkeys(STRAIN_METRICS, float("nan"))
+    return dict(zip(STRAIN_METRICS, np.quantile(strain, (0.5, 0.99, 1.0)).tolist(), strict=True))
 
 
 def penetration_metrics(contact: Contact | None, num_vertices: int) -> dict[str, float]:

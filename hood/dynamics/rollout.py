@@ -25,6 +25,7 @@ from hood.dynamics.stepper import Stepper
 from hood.dynamics.stopwatch import Stopwatch
 from hood.dynamics.surface import SURFACE_METRICS, SURFACE_STRIDE, SurfaceMeter
 from hood.graph.given import given_hierarchy
+from hood.losses.elements import energies_and_gradient, total_energy
 from hood.losses.potential import Potential, relative_gradient, scale
 from hood.losses.problem import StepProblem, inertial_guess
 from hood.scene.contact import Contact, find_contact
@@ -159,7 +160,7 @@ def simulate(
         stepped = _times(stepper, watch.lap()) | prediction.metrics
         with watch.aside("metrics"):
             if wants_potential:
-                gradient, energies = potential.gradient(known, prediction.next_pos, prediction.acc)
+                gradient, energies = energies_and_gradient(potential, known, prediction.next_pos, prediction.acc)
                 known_fields = {name: vertex_residual(known, gradient).float().cpu() for name in fields}
             if metrics == "all":
                 stepped |= energy_metrics(potential, known, gradient, energies)
@@ -268,14 +269,15 @@ def energy_metrics(
     potential: Potential, problem: StepProblem, gradient: Tensor, energies: Mapping[str, Tensor]
 ) -> dict[str, float]:
     """Energies [J] of one scene's step, its gradient norm [N] (the paper's: mean over vertices of ‖∂Φ/∂x_v‖₂), rg, e0 [J],
-    and for comparison the potential of the inertial guess x_t + dt v_t; from what :meth:`Potential.gradient` says."""
+    and for comparison the potential of the inertial guess x_t + dt v_t; from what
+    :func:`hood.losses.elements.energies_and_gradient` says."""
     free = problem.cloth.free
     result = {f"energy_{name}": float(value.sum()) for name, value in energies.items()}
     result["energy_total"] = sum(result.values())
     guess = inertial_guess(problem.state, problem.step, problem.cloth.vertex_scene)
     if problem.step.pin_target is not None:
         guess = torch.where(problem.cloth.pinned.unsqueeze(1), problem.step.pin_target, guess)
-    result["energy_inertial_guess"] = float(potential.total(problem, guess).sum())
+    result["energy_inertial_guess"] = float(total_energy(potential, problem, guess).sum())
     result["gradient_norm"] = float(gradient[free].norm(dim=1).mean()) if bool(free.any()) else 0.0
     result["relative_gradient"] = float(relative_gradient(problem, gradient * free.unsqueeze(1)).mean())
     result["e0"] = float(scale(problem).sum())

@@ -12,6 +12,7 @@ _HERE = Path(__file__).parent
 LIBRARIES: tuple[tuple[Path, tuple[str, ...]], ...] = (
     (_HERE / "newton.cpp", NATIVE_FLAGS),
     (_HERE / "surface.cpp", NATIVE_FLAGS),
+    (_HERE / "elements.cpp", NATIVE_FLAGS),
     (_HERE / "picture.cpp", NATIVE_FLAGS),
     (_HERE / "features.cpp", NATIVE_FLAGS),
     (_HERE.parent / "nn" / "network.cpp", NATIVE_FLAGS),

@@ -1,0 +1,170 @@
+"""Membrane and bending of a step in one compiled pass (``hood/native/elements.cpp``): energies, gradient, edge strain.
+
+Float64 whatever the cloth is in. The reference is :class:`hood.losses.potential.Potential`, which computes all other terms, and
+these too where there is no compiler and on an accelerator.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import weakref
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hood import native
+from hood.losses.bending import Bending, CurrentLengthBending, bending_weight
+from hood.losses.potential import Potential, Term
+from hood.losses.problem import StepProblem
+from hood.losses.stretching import Stretching
+from hood.native.build import NATIVE_FLAGS, BuildError, build
+from hood.scene.cloth import Cloth
+
+SOURCE = Path(native.__file__).with_name("elements.cpp")
+#: Terms of the pass. A subclass may compute something else and does not count.
+ELEMENT_TERMS = (Stretching, Bending, CurrentLengthBending)
+
+_POINTER, _COUNT = ctypes.c_void_p, ctypes.c_int64
+
+
+class _Faces(ctypes.Structure):
+    _fields_ = [("count", _COUNT)] + [(name, _POINTER) for name in ("corners", "scene", "inverse", "weight", "mu", "lambda_")]
+
+
+class _Hinges(ctypes.Structure):
+    _fields_ = [("count", _COUNT), ("current_length", _COUNT)] + [
+        (name, _POINTER) for name in ("corners", "scene", "weight", "rest_angle")
+    ]
+
+
+class _Constants(NamedTuple):
+    """What the pass reads of a cloth; the arrays that the structures point to are kept with them."""
+
+    faces: _Faces
+    hinges: _Hinges
+    current_hinges: _Hinges
+    edges: np.ndarray  # (E, 2)
+    edge_length: np.ndarray  # (E,) m, at rest
+    kept: list[np.ndarray]
+
+
+@cache
+def library() -> ctypes.CDLL | None:
+    """The compiled pass; None without a compiler."""
+    try:
+        return build(SOURCE, NATIVE_FLAGS)
+    except BuildError:
+        return None
+
+
+def energies_and_gradient(
+    potential: Potential, problem: StepProblem, next_pos: Tensor, acc: Tensor | None = None
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """What :meth:`hood.losses.potential.Potential.gradient` computes, element terms by the compiled pass."""
+    if not _applies(next_pos):
+        return potential.gradient(problem, next_pos, acc)
+    others, _ = _split(potential)
+    rest, values = others.gradient(problem, next_pos, acc)
+    gradient = np.zeros(tuple(next_pos.shape))
+    values |= _element_energies(potential, problem, next_pos, gradient)
+    return rest.double() + torch.from_numpy(gradient), {name: values[name] for name in potential.terms if name in values}
+
+
+@torch.no_grad()
+def total_energy(potential: Potential, problem: StepProblem, next_pos: Tensor) -> Tensor:
+    """Potential Φ [J] per scene (B,), what :meth:`hood.losses.potential.Potential.total` computes."""
+    if not _applies(next_pos):
+        return potential.total(problem, next_pos)
+    others, _ = _split(potential)
+    values = _element_energies(potential, problem, next_pos, None).values()
+    return sum(values, start=others.total(problem, next_pos).double())
+
+
+def absolute_strain(cloth: Cloth, pos: Tensor) -> np.ndarray | None:
+    """Absolute relative length change of every edge (E,), float64; None where there is no compiled pass."""
+    lib = library() if _applies(pos) else None
+    if lib is None:
+        return None
+    constants, place = _constants_of(cloth), _double(pos)
+    strain = np.empty(len(constants.edges))
+    arrays = (constants.edges, constants.edge_length, place, strain)
+    lib.elements_strain(_COUNT(len(strain)), *(_POINTER(array.ctypes.data) for array in arrays))
+    return strain
+
+
+def _applies(pos: Tensor) -> bool:
+    return type(pos) is Tensor and pos.device.type == "cpu" and library() is not None
+
+
+def _split(potential: Potential) -> tuple[Potential, dict[str, Term]]:
+    """The terms that torch computes, and those of the pass."""
+    elements = {name: term for name, term in potential.terms.items() if type(term) in ELEMENT_TERMS}
+    return Potential({name: term for name, term in potential.terms.items() if name not in elements}), elements
+
+
+def _element_energies(
+    potential: Potential, problem: StepProblem, pos: Tensor, gradient: np.ndarray | None
+) -> dict[str, Tensor]:
+    """Energies (B,) of the element terms that the problem needs; their gradient is added to ``gradient`` (V, 3)."""
+    lib, constants, place = library(), _constants_of(problem.cloth), _double(pos)
+    assert lib is not None
+    energies = {}
+    for name, term in _split(potential)[1].items():
+        if not term.applies(problem):
+            continue
+        energy = np.zeros(problem.num_scenes)
+        work, table = lib.elements_hinges, ctypes.byref(constants.hinges)
+        if type(term) is Stretching:
+            work, table = lib.elements_faces, ctypes.byref(constants.faces)
+        elif type(term) is CurrentLengthBending:
+            table = ctypes.byref(constants.current_hinges)
+        into = None if gradient is None else _POINTER(gradient.ctypes.data)
+        work(table, _POINTER(place.ctypes.data), _POINTER(energy.ctypes.data), into)
+        energies[name] = torch.from_numpy(energy)
+    return energies
+
+
+#: Constants of cloths, as long as these live.
+_CONSTANTS: dict[int, tuple[weakref.ref[Cloth], _Constants]] = {}
+
+
+def _constants_of(cloth: Cloth) -> _Constants:
+    key = id(cloth)
+    known = _CONSTANTS.get(key)
+    if known is None or known[0]() is not cloth:
+        known = weakref.ref(cloth, lambda _: _CONSTANTS.pop(key, None)), _make_constants(cloth)
+        _CONSTANTS[key] = known
+    return known[1]
+
+
+def _make_constants(cloth: Cloth) -> _Constants:
+    stiffness, area = cloth.bending_stiffness.double(), cloth.hinge_area.double()
+    faces = (cloth.faces, cloth.face_scene, cloth.rest_inverse, cloth.rest_area.double() * cloth.thickness.double())
+    weights = (
+        bending_weight(stiffness, length_sq, area) for length_sq in (cloth.rest_length.double() ** 2, torch.ones_like(area))
+    )
+    tables = [[*faces, cloth.lame_mu, cloth.lame_lambda]]
+    tables += [[cloth.hinges, cloth.hinge_scene, weight, cloth.rest_angle] for weight in weights]
+    kept = [[_whole(tensor) for tensor in table] for table in tables]
+    ends = cloth.edges.unbind(dim=1)
+    rest = cloth.rest_pos.double()
+    return _Constants(
+        _Faces(len(cloth.faces), *(array.ctypes.data for array in kept[0])),
+        _Hinges(len(cloth.hinges), 0, *(array.ctypes.data for array in kept[1])),
+        _Hinges(len(cloth.hinges), 1, *(array.ctypes.data for array in kept[2])),
+        _whole(cloth.edges),
+        _whole((rest[ends[1]] - rest[ends[0]]).norm(dim=1)),
+        [array for table in kept for array in table],
+    )
+
+
+def _whole(values: Tensor) -> np.ndarray:
+    return np.ascontiguousarray(values.detach().numpy(), np.float64 if values.is_floating_point() else np.int64)
+
+
+def _double(pos: Tensor) -> np.ndarray:
+    return np.ascontiguousarray(pos.detach().numpy(), np.float64)
