@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -96,6 +96,7 @@ class BodyMotion:
     dtype: torch.dtype
     device: torch.device
     _cache: dict[int, Tensor]
+    _bones: dict[int, Tensor] = field(default_factory=dict)  # joint transforms by chunk, float64
 
     @property
     def name(self) -> str:
@@ -121,12 +122,20 @@ class BodyMotion:
         """(W, 3) m, relative to ``translation[frame]``, float64."""
         chunk = frame // _CHUNK
         if chunk not in self._cache:
-            # Two chunks cover the three frames around any step.
-            for old in [key for key in self._cache if abs(key - chunk) > 1]:
-                del self._cache[old]
-            window = self.sequence.window(chunk * _CHUNK, (chunk + 1) * _CHUNK)
-            self._cache[chunk] = self.body.surface(window, self.betas, torch.float64).to(self.device)
+            _forget(self._cache, chunk)
+            self._cache[chunk] = self.body.surface(self._window(chunk), self.betas, torch.float64).to(self.device)
         return self._cache[chunk][frame % _CHUNK]
+
+    def _window(self, chunk: int) -> PoseSequence:
+        return self.sequence.window(chunk * _CHUNK, (chunk + 1) * _CHUNK)
+
+    def _transforms(self, frame: int) -> Tensor:
+        """(1, J, 3, 4) rest-to-posed joint transforms at ``frame``, in ``dtype``."""
+        chunk = frame // _CHUNK
+        if chunk not in self._bones:
+            _forget(self._bones, chunk)
+            self._bones[chunk] = self.body.transforms(self._window(chunk), self.betas, torch.float64)
+        return self._bones[chunk][frame % _CHUNK].unsqueeze(0).to(self.dtype)
 
     @property
     def posed(self) -> dict[int, Tensor]:
@@ -156,7 +165,7 @@ class BodyMotion:
         now = self.surface(frame, origin)
         after = now if static else self.surface(frame + 1, origin)
         before = now if static or frame == 0 else self.surface(frame - 1, origin)
-        faces = _body_faces(self.body, self.device)
+        faces, omitted = _body_tensors(self.body, self.device)
         return Obstacle(
             pos=now,
             next_pos=after,
@@ -164,7 +173,7 @@ class BodyMotion:
             faces=faces,
             vertex_scene=faces.new_zeros(len(now)),
             face_scene=faces.new_zeros(len(faces)),
-            omitted=torch.as_tensor(self.body.omitted, device=self.device),
+            omitted=omitted,
         )
 
     def dressed(self, garment: Garment) -> Garment:
@@ -185,9 +194,8 @@ class BodyMotion:
         """(V, 3) m: the garment posed with the body at ``frame`` by its skinning weights, relative to ``origin``."""
         rest = torch.as_tensor(garment.tpose(self.betas)).to(self.dtype)
         weights = torch.as_tensor(garment.lbs_weights).to(self.dtype)
-        transforms = self.body.transforms(self.sequence.window(frame, frame + 1), self.betas, self.dtype)
         shift = torch.as_tensor(self.translation[frame] - origin).to(self.dtype)
-        return (linear_blend_skinning(rest, weights, transforms)[0] + shift).to(self.device)
+        return (linear_blend_skinning(rest, weights, self._transforms(frame))[0] + shift).to(self.device)
 
 
 def body_motion(
@@ -202,14 +210,20 @@ def body_motion(
     return BodyMotion(body, sequence, betas, body.translation(sequence, betas), dtype, torch.device(device), {})
 
 
-_FACES: dict[tuple[int, str], tuple[Body, Tensor]] = {}
+def _forget(chunks: dict[int, Tensor], chunk: int) -> None:
+    """Drop what lies apart from ``chunk``: two chunks cover the three frames around any step."""
+    for old in [key for key in chunks if abs(key - chunk) > 1]:
+        del chunks[old]
 
 
-def _body_faces(body: Body, device: torch.device) -> Tensor:
-    """One faces tensor per body object: the search keeps its incidence table with the tensor."""
+_TENSORS: dict[tuple[int, str], tuple[Body, Tensor, Tensor]] = {}
+
+
+def _body_tensors(body: Body, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Faces and omitted vertices, one tensor each per body object: the search keeps its incidence table with the faces."""
     key = (id(body), str(device))
-    entry = _FACES.get(key)
+    entry = _TENSORS.get(key)
     if entry is None or entry[0] is not body:
-        entry = (body, torch.as_tensor(body.faces, device=device))
-        _FACES[key] = entry
-    return entry[1]
+        entry = body, torch.as_tensor(body.faces, device=device), torch.as_tensor(body.omitted, device=device)
+        _TENSORS[key] = entry
+    return entry[1:]
