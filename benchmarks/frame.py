@@ -1,12 +1,16 @@
 """Where the time of a rollout's frame goes: body search, features, network, the rest; and what its metrics cost apart.
 
-    python benchmarks/frame.py --sizes 1000 5000 12000 --models fine15 ours --precision fp32 bf16
+    python benchmarks/frame.py --sizes 1000 4000 --models ours.safetensors quickstart.safetensors --forms torch fused
+    python benchmarks/frame.py --sizes 1000 5000 12000 --models fine15 ours --precision fp32 bf16 --forms torch
 
-The embedded dress, refined to the given number of vertices, on the embedded body of 6,890 vertices, walking; random
-weights. Every frame starts from the garment skinned to the body's pose, so that contact is that of a worn garment whatever
-the weights predict. Medians over the frames of the process's CPU time [ms]; --precision takes turns frame by frame. The
-share of the network is that of the total, which leaves out the metrics: contact with the body's triangles, strain,
-penetration and energies, what ``metrics=all`` adds to a frame (``hood rollout metrics=none`` spares them).
+The embedded dress, refined to the given number of vertices, on the embedded body of 6,890 vertices, walking. A model is an
+architecture with random weights, or the name of embedded weights. Every frame starts from the garment skinned to the body's
+pose, so that contact is that of a worn garment whatever the weights predict. Medians over the frames of the process's CPU
+time [ms]; forms and precisions take turns frame by frame. ``torch`` computes everything in torch but the search; the others
+compute features and feedback by the compiled library and the network by these kernels. Feedback is what a model of several
+passes sees between them. The share of the network is that of the total, which leaves out the metrics: contact with the body's
+triangles, strain, penetration and energies, what ``metrics=all`` adds to a frame (``hood rollout metrics=none`` spares them).
+The column ``apart`` is the largest distance [µm] of a step's positions from those of the first form.
 """
 
 from __future__ import annotations
@@ -19,13 +23,18 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from hood.assets.body import load_body
 from hood.assets.garment import Garment, load_garment
+from hood.assets.library import DATA_FOLDER
 from hood.assets.material import Material
 from hood.assets.sequence import load_sequence
 from hood.cli import ENVIRONMENT
+from hood.dynamics import simulator as simulator_module
+from hood.dynamics.checkpoint import load_simulator
 from hood.dynamics.measure import penetration_metrics, strain_metrics
+from hood.dynamics.passes import Passes
 from hood.dynamics.rollout import energy_metrics
 from hood.dynamics.simulator import Simulator, build_simulator
 from hood.dynamics.stopwatch import Stopwatch
@@ -33,10 +42,13 @@ from hood.losses.elements import energies_and_gradient
 from hood.losses.potential import default_potential
 from hood.losses.problem import StepProblem
 from hood.mesh.topology import unique_edges
+from hood.native import features as native
+from hood.nn.compiled import KERNELS
 from hood.scene.scene import Scene, build_scene, recentre
 from hood.scene.state import State
 
-PARTS = ("posing", "search", "features", "network", "rest", "total", "metrics")
+PARTS = ("posing", "search", "features", "feedback", "network", "rest", "total", "metrics")
+WEIGHTS = DATA_FOLDER / "weights"
 POTENTIAL = default_potential()
 
 
@@ -77,11 +89,23 @@ def make_scene(count: int) -> Scene:
     return build_scene(garment, load_body("default"), load_sequence("walk_proud", 30.0), Material())
 
 
+class Timed(Passes):
+    """Passes whose looks are timed."""
+
+    spent = 0.0  # ms of CPU time, of all of them
+
+    def look(self, index: int, raw: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        begin = time.process_time()
+        seen = super().look(index, raw)
+        Timed.spent += 1e3 * (time.process_time() - begin)
+        return seen
+
+
 @torch.no_grad()
-def time_frame(simulator: Simulator, scene: Scene, prepared: object, frame: int) -> dict[str, float]:
-    """One step from the skinned garment at ``frame``; milliseconds by part."""
+def time_frame(simulator: Simulator, scene: Scene, prepared: object, frame: int) -> tuple[dict[str, float], Tensor]:
+    """One step from the skinned garment at ``frame``: milliseconds by part, and where it leads."""
     state = recentre(scene.start(frame, relaxed=False), scene.cloth.vertex_scene)
-    watch = Stopwatch(time.process_time)
+    Timed.spent, watch = 0.0, Stopwatch(time.process_time)
     with watch.part("posing"):
         problem = StepProblem(scene.cloth, state, scene.step_input(frame, state), gravity=simulator.gravity)
     with watch.part("search"):
@@ -94,25 +118,41 @@ def time_frame(simulator: Simulator, scene: Scene, prepared: object, frame: int)
         strain_metrics(scene.cloth, state.pos)
         penetration_metrics(known.contact, scene.cloth.num_vertices)
         energy_metrics(POTENTIAL, known, *energies_and_gradient(POTENTIAL, known, prediction.next_pos, prediction.acc))
-    return {**times, "metrics": watch.spent_aside("metrics")}
+    times |= {"feedback": Timed.spent, "network": times["network"] - Timed.spent}
+    return {**times, "metrics": watch.spent_aside("metrics")}, prediction.next_pos
 
 
-def run(size: int, model: str, precisions: list[str], frames: int) -> None:
-    """Print one line per precision."""
+def make_simulator(model: str) -> Simulator:
+    """An architecture with random weights, or embedded weights by the name of their file."""
+    if model.endswith(".safetensors"):
+        return load_simulator(WEIGHTS / model)
+    return build_simulator(schedule=model).eval()
+
+
+def run(size: int, model: str, forms: list[tuple[str, str]], frames: int) -> None:
+    """Print one line per form and precision."""
     torch.manual_seed(0)
-    scene, simulator = make_scene(size), build_simulator(schedule=model).eval()
+    scene, simulator = make_scene(size), make_simulator(model)
     prepared = simulator.prepare(scene.cloth, scene.garment.rest_pos)
-    rows: dict[str, list[dict[str, float]]] = {name: [] for name in precisions}
+    rows: dict[tuple[str, str], list[dict[str, float]]] = {form: [] for form in forms}
+    apart = dict.fromkeys(forms, 0.0)
     for frame in range(10, 10 + frames + 3):
-        for name in precisions:
-            simulator.network.use_precision(name)
-            rows[name].append(time_frame(simulator, scene, prepared, frame))
-    for name, measured in rows.items():
+        reached = {}
+        for kernels, precision in forms:
+            simulator.network.use_precision(precision)
+            simulator.network.use_kernels(kernels)
+            with native.in_torch(kernels == "torch"):
+                row, reached[kernels, precision] = time_frame(simulator, scene, prepared, frame)
+            rows[kernels, precision].append(row)
+        for form, pos in reached.items():
+            apart[form] = max(apart[form], 1e6 * float((pos - reached[forms[0]]).abs().max()))
+    for form, measured in rows.items():
         # The first frames meet new numbers of body edges, for which kernels are made.
         median = {part: float(np.median([row[part] for row in measured[3:]])) for part in PARTS}
         cells = " | ".join(f"{median[part]:.1f}" for part in PARTS)
         share = median["network"] / median["total"]
-        print(f"| {scene.cloth.num_vertices:,} | {model} | {name} | {cells} | {share:.0%} |", flush=True)
+        name = " | ".join(form)
+        print(f"| {scene.cloth.num_vertices:,} | {model} | {name} | {cells} | {share:.0%} | {apart[form]:.2g} |", flush=True)
 
 
 def main() -> None:
@@ -120,16 +160,20 @@ def main() -> None:
     parser.add_argument("--sizes", type=int, nargs="+", default=[1000, 5000])
     parser.add_argument("--models", nargs="+", default=["fine15", "ours"])
     parser.add_argument("--precision", nargs="+", default=["fp32", "bf16"])
+    parser.add_argument("--forms", nargs="+", default=["torch"], choices=KERNELS)
     parser.add_argument("--frames", type=int, default=9)
     parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args()
     if any(os.environ.get(key) is None for key in ENVIRONMENT):  # read at process start only
         os.execve(sys.executable, [sys.executable, *sys.argv], {**ENVIRONMENT, **os.environ})
     torch.set_num_threads(args.threads)
-    print("| vertices | model | precision | " + " | ".join(PARTS) + " | network's share |\n" + "|---" * 11 + "|")
+    forms = [(form, precision) for precision in args.precision for form in args.forms if (form, precision) != ("fused", "bf16")]
+    simulator_module.Passes = Timed  # type: ignore[misc]
+    titles = ["vertices", "model", "form", "precision", *PARTS, "network's share", "apart"]
+    print("| " + " | ".join(titles) + " |\n" + "|---" * len(titles) + "|")
     for size in args.sizes:
         for model in args.models:
-            run(size, model, args.precision, args.frames)
+            run(size, model, forms, args.frames)
 
 
 if __name__ == "__main__":
