@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -21,6 +22,13 @@ _REACH = 0.03
 _DEEPEST = 3e-4
 #: Local steps are shortened to this [m]: far from a minimum they mean little.
 _LONGEST_STEP = 5e-3
+
+
+class Held(NamedTuple):
+    """What the network does not move."""
+
+    free: Tensor  # (V,) bool, what it does
+    fixed: Tensor  # (V, 3) m, where the others are
 
 
 class Output(ABC, nn.Module):
@@ -125,11 +133,11 @@ class LocalStepOutput(VelocityBaseOutput):
         return moved if before is None else moved + raw[:, 4:5] * before
 
     def take(
-        self, problem: StepProblem, raw: Tensor, index: int, step: Tensor, before: Tensor | None, last: Tensor, fixed: Tensor
+        self, problem: StepProblem, raw: Tensor, index: int, step: Tensor, before: Tensor | None, last: Tensor, held: Held
     ) -> Tensor:
         """Positions (V, 3) after pass ``index`` from where the one before left off: its :meth:`correction`, then
-        :meth:`outside`; vertices that are not free at ``fixed``."""
-        contact, free = problem.contact, problem.cloth.free
+        :meth:`outside`; vertices that are not free where they are held."""
+        contact, (free, fixed) = problem.contact, held
         if not native.applies(raw, step, before, last, fixed, None if contact is None else contact.next_point):
             there = self.outside(problem, last + self.correction(raw, index, step, before))
             return torch.where(free.unsqueeze(1), there, fixed)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from hood.dynamics.output import LocalStepOutput
+from hood.dynamics.output import Held, LocalStepOutput
 from hood.features import compiled
 from hood.features.inputs import Inputs
 from hood.features.local import WIDE_ROUNDS, look
@@ -17,6 +17,8 @@ from hood.mesh.diffusion import Diffusion, neighbours_of
 from hood.native import features as native
 from hood.nn.model import MeshGraphNet
 from hood.solver.local_engine import local_terms
+
+_ROUNDS = torch.tensor(WIDE_ROUNDS)
 
 
 class Feedback:
@@ -34,7 +36,9 @@ class Feedback:
         """The inputs with the view from positions (V, 3), and the forces −∂Φ/∂x (V, 3) [N] there."""
         view = self._terms(pos)
         residual, wide = (self._compiled_residuals if self._compiled else self._residuals)(view.force)
-        seen = replace(inputs, base_pos=pos, residual=residual, local_step=view.step, wide_residual=wide)
+        seen = replace(
+            inputs, edge_rows=inputs.edges, base_pos=pos, residual=residual, local_step=view.step, wide_residual=wide
+        )
         return seen, view.force
 
     def _residuals(self, force: Tensor) -> tuple[Tensor, Tensor]:
@@ -50,7 +54,7 @@ class Feedback:
     def _compiled_residuals(self, force: Tensor) -> tuple[Tensor, Tensor]:
         neighbours, count = neighbours_of(self._cloth.edges, len(force)), len(WIDE_ROUNDS)
         residual, wide = torch.empty_like(force), force.new_empty(len(force), 3 * count)
-        tables = (neighbours.pointers(), force, self._mass, torch.tensor(WIDE_ROUNDS))
+        tables = (neighbours.pointers(), force, self._mass, _ROUNDS)
         native.call("residuals", *tables, count, residual, wide, force.new_empty(3, len(force), 4))
         return residual, wide
 
@@ -77,7 +81,7 @@ class Passes:
         fixed: Tensor,
     ) -> None:
         self._network, self._output, self._problem, self._feedback = network, output, problem, feedback
-        self._inputs, self._last, self._fixed = inputs, base, fixed
+        self._inputs, self._last, self._held = inputs, base, Held(problem.cloth.free, fixed)
         self._before: Tensor | None = None
         self.positions: list[Tensor] = []  # (V, 3) m after every pass
         self.forces: list[Tensor] = []  # (V, 3) N there, but for the last
@@ -87,7 +91,7 @@ class Passes:
         step = self._inputs.local_step
         assert step is not None
         index = len(self.positions)
-        pos = self._output.take(self._problem, raw, index, step, self._before, self._last, self._fixed)
+        pos = self._output.take(self._problem, raw, index, step, self._before, self._last, self._held)
         self.positions.append(pos)
         self._before, self._last = pos.detach() - self._last, pos.detach()
         return pos

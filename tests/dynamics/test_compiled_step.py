@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from hood.dynamics.output import LocalStepOutput, VelocityBaseOutput
+from hood.dynamics.output import Held, LocalStepOutput, VelocityBaseOutput
 from hood.dynamics.passes import Feedback
 from hood.dynamics.simulator import Simulator, build_simulator
 from hood.features.inputs import Inputs
@@ -75,7 +75,7 @@ def test_a_correction_is_that_of_torch(name: str, index: int, request: pytest.Fi
     fixed = torch.randn_like(pos)
 
     def take() -> Tensor:
-        return output.take(problem, raw, index, step, before, pos - 3e-3 * torch.sin(9 * pos), fixed)
+        return output.take(problem, raw, index, step, before, pos - 3e-3 * torch.sin(9 * pos), Held(problem.cloth.free, fixed))
 
     found = take()
     with native.in_torch():
