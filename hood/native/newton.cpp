@@ -657,7 +657,7 @@ template <class T> void direct(Engine& e, double residual, int64_t most) {
         halved = true;
     }
     const double raised = 2.0 * sharpness;
-    e.raised = halved ? sharpness : raised < 0.25 ? 0.25 : raised > 1.0 ? 1.0 : raised;
+    e.raised = halved ? sharpness : raised < 0.1 ? 0.1 : raised > 1.0 ? 1.0 : raised;
 }
 
 // ---- the line search -----------------------------------------------------------------------------------------------------

@@ -10,6 +10,8 @@ from hood.solver.plan import QuadraticModel, SolverPlan
 
 #: Below this share of the slack the next try does without.
 _LEAST_SHARPNESS = 0.2
+#: The first share that is tried.
+_FIRST_SHARPNESS = 0.1
 
 
 class Directions:
@@ -17,9 +19,11 @@ class Directions:
 
     The positive matrix of :class:`hood.solver.plan.QuadraticModel` is larger than the Hessian under compression and along
     sliding contacts: with it alone the last digits come linearly, by a factor of about 2 an iteration. So a share of the
-    slack is added, the *sharpness*: all of it at first, half as much wherever the linear solver meets negative curvature,
-    none below 0.2; it doubles again with every system solved. The idea to convexify only where that turns out necessary
-    is that of Fernández-Fernández et al. ("Progressively Projected Newton's Method", 2025), who decide element by element.
+    slack is added, the *sharpness*: none at first, where the model is farthest from the energy, then a tenth, twice as much
+    with every system solved, half as much wherever the linear solver meets negative curvature, none below 0.2. Over 96 steps
+    of worn garments of 1,000 and 4,400 vertices this needs 4 and 4.5 iterations to γ = 0.01 in the median; to begin with all
+    of the slack took 5 and 6. The idea to convexify only where that turns out necessary is that of Fernández-Fernández et
+    al. ("Progressively Projected Newton's Method", 2025), who decide element by element.
     """
 
     def __init__(self, plan: SolverPlan, num_scenes: int, linear: str, cg_iterations: int) -> None:
@@ -36,7 +40,7 @@ class Directions:
             active: (B,) bool, scenes to move.
         """
         plan = self.plan
-        sharpness = torch.ones_like(residual) if self._sharpness is None else self._sharpness
+        sharpness = torch.zeros_like(residual) if self._sharpness is None else self._sharpness
         moving = active[plan.scene].unsqueeze(1)
         rhs = torch.where(moving, -model.gradient[plan.vertices], 0.0)
         inverse = linear.diagonal_inverse(plan.pattern, self._idle(model.triples, active))
@@ -51,7 +55,7 @@ class Directions:
             pending, halved = failed, halved | failed
             smaller = torch.where(sharpness > _LEAST_SHARPNESS, 0.5 * sharpness, 0.0)
             sharpness = torch.where(failed, smaller, sharpness)
-        raised = (2.0 * sharpness).clamp(0.25, 1.0)
+        raised = (2.0 * sharpness).clamp(_FIRST_SHARPNESS, 1.0)
         self._sharpness = torch.where(halved, sharpness, raised)
         direction = torch.zeros_like(model.gradient)
         direction[plan.vertices] = torch.where(moving, solution, 0.0)

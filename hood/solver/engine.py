@@ -248,7 +248,7 @@ class SceneEngine:
         values.num_walls, values.num_grips = len(walls), len(grips)
         values.bending, values.membrane = step.bending, step.membrane > 0
         values.dt_sq = float(step.dt[scene]) ** 2
-        values.raised, values.cg_used = 1.0, 0
+        values.raised, values.cg_used = 0.0, 0
         self.widen(False)
 
     def start(self, acc: np.ndarray) -> float:
