@@ -38,7 +38,7 @@ def make_candidate(name: str, config: DictConfig) -> Candidate:
 
 def _unrefined_candidate(name: str, config: DictConfig) -> Candidate:
     if name == GUESS:
-        guess = GuessStepper(build(config.losses))
+        guess = GuessStepper(build(config.losses), build(config.solver))
         guess.gravity = guess.gravity.to(str(config.device))
         return Candidate(GUESS, "none", guess)
     if name == NEWTON:

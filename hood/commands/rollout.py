@@ -194,7 +194,8 @@ def make_stepper(config: DictConfig) -> tuple[Stepper, str]:
         stepper: Stepper = simulator if str(config.step) == PLAIN else CapturedSimulator(simulator, str(config.step))
         return stepper, digest
     potential = build(config.losses)
-    stepper = GuessStepper(potential) if str(config.stepper) == "refine" else NewtonStepper(potential, build(config.solver))
+    kind = GuessStepper if str(config.stepper) == "refine" else NewtonStepper
+    stepper = kind(potential, build(config.solver))
     stepper.gravity = stepper.gravity.to(str(config.device))
     return stepper, "none"
 

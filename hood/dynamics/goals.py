@@ -40,6 +40,7 @@ class Goal(Protocol):
 
     most: int  # iterations of a frame at most
     accuracy: float  # relative gradient at which every frame is done
+    decides: bool  # whether it stops a frame for other reasons than ``most`` and ``accuracy``
     wants_residual: bool  # whether it reads ``Standing.residual`` before every iteration
     metrics: tuple[str, ...]  # names of what ``end`` returns
 
@@ -60,6 +61,7 @@ class Count:
     """``count`` iterations in every frame, fewer only where nothing is left to gain."""
 
     accuracy = CONVERGED
+    decides = False
     wants_residual = False
     metrics: tuple[str, ...] = ()
 
@@ -81,6 +83,7 @@ class Count:
 class TargetResidual:
     """Until the relative gradient is ``target`` or less; ``refine_met`` says whether it is."""
 
+    decides = True
     wants_residual = True
     metrics: tuple[str, ...] = ("refine_met",)
 
@@ -110,6 +113,7 @@ class MaxStrain:
     """
 
     accuracy = CONVERGED
+    decides = True
     wants_residual = False
     metrics: tuple[str, ...] = ("refine_met",)
     _COMFORT = 0.7
@@ -153,6 +157,7 @@ class Budget:
     """
 
     accuracy = CONVERGED
+    decides = True
     wants_residual = False
     metrics: tuple[str, ...] = ()
     _LATE = 0.03

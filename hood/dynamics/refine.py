@@ -21,8 +21,8 @@ from hood.scene.batch import to_device
 from hood.scene.cloth import Cloth
 from hood.scene.scene import RELAXING_DT
 from hood.solver.colouring import colours_of
-from hood.solver.iterate import Progress, Unknowns, first_iterate, in_double, in_single, rounded
-from hood.solver.newton import NewtonSettings, minimize
+from hood.solver.iterate import Progress, in_single, rounded
+from hood.solver.newton import NewtonSettings, first_guess, minimize
 from hood.solver.plan import plan_for
 from hood.solver.reasons import reason_number
 from hood.solver.sweeps import sweep
@@ -33,15 +33,16 @@ METHODS = ("newton", "sweeps")
 class GuessStepper:
     """The contact-projected inertial guess as a step: where the solver starts, and a refinement without a network.
 
-    Vertices fly on, with their weight or without it, whichever has the lower potential, and are moved out of the body.
+    Vertices fly on, with their weight or without it, whichever has the lower potential, and are moved out of the body. Of the
+    ``settings`` it has the form of the solver.
     """
 
     times: tuple[str, ...] = ("search", "guess", "rest", "total")
     metrics: tuple[str, ...] = ()
     relaxing = Relaxing.SETTLE
 
-    def __init__(self, potential: Potential) -> None:
-        self.potential = potential
+    def __init__(self, potential: Potential, settings: NewtonSettings | None = None) -> None:
+        self.potential, self.settings = potential, settings or NewtonSettings()
         self.gravity = torch.tensor([0.0, -9.81, 0.0])
         self.config: dict[str, Any] = {"stepper": "guess"}
 
@@ -58,8 +59,7 @@ class GuessStepper:
         with timed(watch, "search"):
             problem = self.search(problem)
         with timed(watch, "guess"):
-            guess = first_iterate(Unknowns(self.potential, in_double(problem)))
-            return Prediction(rounded(problem, guess.pos), guess.acc.to(problem.state.pos.dtype))
+            return Prediction(*first_guess(self.potential, problem, self.settings))
 
     def next_velocity(self, problem: StepProblem, prediction: Prediction) -> Tensor:
         """(V, 3) m/s at t + 1: (x_{t+1} − x_t) / dt."""
@@ -194,7 +194,8 @@ class RefinedStepper:
 
         start = prediction.next_pos
         if self.method == "newton":
-            pos, report = minimize(self.potential, problem, start, self.settings, proceed=proceed)
+            asked = proceed if self.goal.decides else None
+            pos, report = minimize(self.potential, problem, start, self.settings, proceed=asked)
             acc, history, reason = report.acc, report.history, reason_number(report.reason)
         else:
             wants = self.goal.wants_residual

@@ -3,7 +3,8 @@
 // Everything lives in arrays that the caller owns (hood/solver/engine.py), so nothing here allocates. Vertices are numbered anew:
 // the free ones first, in an order that keeps neighbours near each other, then the fixed ones. A table of triples is padded to four
 // numbers a row. Elements are taken eight at a time, one per lane, in float64; a row of 3 x 3 blocks is then gathered from the
-// elements at its vertex, in cache, and written once: no two writers, a fixed order, the same bits in every run.
+// elements at its vertex, in cache, and written once: no two writers, a fixed order, the same bits in every run. Of the symmetric
+// matrix a row keeps its diagonal block, which comes first, and those of later columns.
 #include <cmath>
 #include <cstdint>
 #include <cstring>
@@ -28,7 +29,6 @@ template <class V, class T> inline V load(const T* p) {
 }
 template <class T, class V> inline void store(T* p, V v) { std::memcpy(p, &v, sizeof(V)); }
 
-template <class V> inline double first_three(V a) { return (double)a[0] + (double)a[1] + (double)a[2]; }
 inline double dot3(const double* a, const double* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 
 inline V8 all(double x) { return V8{x, x, x, x, x, x, x, x}; }
@@ -85,14 +85,14 @@ struct Grip {
 
 struct Engine {
     // The cloth: constant as long as its plan.
-    int64_t num_vertices, num_rows, num_faces, num_hinges, num_blocks, num_springs;  // elements padded to a multiple of 8
+    int64_t num_vertices, num_rows, num_faces, num_hinges, num_blocks, num_springs, most_blocks;  // elements padded to a multiple of 8
     const int64_t* vertex;                        // (V) original number of each vertex
     const int32_t *face_corners, *hinge_corners;  // (3, F), (4, H)
     const int32_t *row_starts, *cols;             // (N + 1), (R) block rows and columns
-    const int32_t* diagonal;                      // (N) block of every row on the diagonal
-    const int32_t *face_starts, *face_uses;       // (N + 1), (., 5): face, corner, the places of its corners in the row
-    const int32_t *hinge_starts, *hinge_uses;     // (N + 1), (., 6)
-    const int32_t *spring_ends, *spring_blocks;   // (A, 2) vertices, (A, 4) blocks aa, bb, ab, ba; -1 where fixed
+    // Elements at a row's vertex, those with the most blocks in the row first: (C N + 1) starts for elements of C corners, with
+    // C, ..., 1 blocks; (., 2 + 2 C) element, corner, then corners and places in the row of its blocks, the diagonal first.
+    const int32_t *face_starts, *face_uses, *hinge_starts, *hinge_uses, *spring_starts, *spring_uses;
+    const int32_t* spring_ends;                   // (2, A)
     // The fabric: constant as long as the cloth's numbers.
     const double *shape, *area, *mu, *lambda, *bulk, *soft;  // (6, F) 1/m, (F) m^3, Pa, Pa and roots of moduli times area
     const double *rest_angle, *hinge_weight, *rest_length;   // (H)
@@ -111,9 +111,12 @@ struct Engine {
     double *trial_pos, *trial_acc;  // the same
     double *gradient, *direction;   // (N, 4)
     double *path;                   // (W, N, 8) stops of the line search: give, compliance, depth, of every wall
-    void *face_model, *hinge_model; // records of the elements, see below
-    void *matrix, *slack, *own_slack;  // (R, 9) + 1, (R), (N, 6), of float or double
-    void *inverse, *x, *r, *z, *p, *q; // (N, 12), (N, 4) five times, of float or double
+    double *face_force, *hinge_force;  // (F, 10), (H, 14) gradients by corner, then axis, and what loads of four read beyond
+    void *face_model, *hinge_model; // records of the elements, see below, of float or double like the rest
+    void *matrix, *slack;           // (R, 9) + 1, (R)
+    void *own, *own_slack;          // (N, 6) what acts on single vertices
+    void *row_sum;                  // (most_blocks, 16), aligned to 32 bytes
+    void *inverse, *x, *r, *z, *p, *q; // (N, 12), (N, 4) five times
     double sharpness, raised;       // of the matrix as it stands, and of the next one
     double phi, noise;
     int64_t wide;                   // matrix and linear solver in float64
@@ -126,12 +129,10 @@ namespace {
 // ---- elements ------------------------------------------------------------------------------------------------------------
 
 template <class T> struct FaceRecord {
-    double gradient[10];  // by corner, then axis; a spare one for loads of four
-    T root[28];           // three vectors over the corners whose outer products are the material part
-    T axial[6], slack[6]; // pairs of corners 00 01 02 11 12 22: what acts on the three axes alike
+    T root[28];   // three vectors over the corners whose outer products are the material part; a spare one for loads of four
+    T axial[14];  // pairs of corners 00 01 02 11 12 22: what acts on the three axes alike, and its slack
 };
 template <class T> struct HingeRecord {
-    double gradient[14];
     T row[14];
 };
 
@@ -203,9 +204,8 @@ template <class T> void face_models(const Engine& e, const double* pos) {
                 const V8 roots[3] = {bulk * (along + across), soft * (along - across),
                                      soft * (b0[c] * s.f[1][k] + b1[c] * s.f[0][k])};
                 for (int lane = 0; lane < LANES; ++lane) {
-                    FaceRecord<T>& record = records[i + lane];
-                    record.gradient[3 * c + k] = force[lane];
-                    for (int m = 0; m < 3; ++m) record.root[9 * m + 3 * c + k] = (T)roots[m][lane];
+                    e.face_force[10 * (i + lane) + 3 * c + k] = force[lane];
+                    for (int m = 0; m < 3; ++m) records[i + lane].root[9 * m + 3 * c + k] = (T)roots[m][lane];
                 }
             }
         }
@@ -214,15 +214,15 @@ template <class T> void face_models(const Engine& e, const double* pos) {
             for (int d = c; d < 3; ++d, ++place) {
                 const V8 axial = ten0[c] * b0[d] + ten1[c] * b1[d], slack = pull0[c] * b0[d] + pull1[c] * b1[d] - axial;
                 for (int lane = 0; lane < LANES; ++lane) {
-                    records[i + lane].axial[place] = (T)axial[lane];
-                    records[i + lane].slack[place] = (T)slack[lane];
+                    records[i + lane].axial[2 * place] = (T)axial[lane];
+                    records[i + lane].axial[2 * place + 1] = (T)slack[lane];
                 }
             }
     }
 }
 
 struct Hinge {
-    V8 unit, edge[3], a[3], b[3], n1[3], n2[3], edge_sq, n1_sq, n2_sq, angle;
+    V8 per_unit, edge[3], a[3], b[3], n1[3], n2[3], length, edge_sq, n1_sq, n2_sq, angle;  // lengths in units of the rest length
     I8 regular;
 };
 
@@ -234,12 +234,12 @@ inline I8 regular(V8 cross_sq, V8 product_sq) {
 inline void hinge_of(const Engine& e, const double* pos, int64_t i, Hinge& h, V8* span) {
     V8 x[4][3];
     for (int c = 0; c < 4; ++c) gather(pos, e.hinge_corners + c * e.num_hinges + i, x[c]);
-    h.unit = load<V8>(e.rest_length + i);
+    h.per_unit = 1.0 / load<V8>(e.rest_length + i);
     for (int k = 0; k < 3; ++k) {
         span[k] = x[1][k] - x[0][k];
-        h.edge[k] = span[k] / h.unit;
-        h.a[k] = (x[2][k] - x[0][k]) / h.unit;
-        h.b[k] = (x[3][k] - x[0][k]) / h.unit;
+        h.edge[k] = span[k] * h.per_unit;
+        h.a[k] = (x[2][k] - x[0][k]) * h.per_unit;
+        h.b[k] = (x[3][k] - x[0][k]) * h.per_unit;
     }
     cross(h.edge, h.a, h.n1);
     cross(h.b, h.edge, h.n2);
@@ -248,7 +248,8 @@ inline void hinge_of(const Engine& e, const double* pos, int64_t i, Hinge& h, V8
     h.edge_sq = h.regular ? edge_sq : one;
     h.n1_sq = h.regular ? n1_sq : one;
     h.n2_sq = h.regular ? n2_sq : one;
-    const V8 sine = h.regular ? -root(h.edge_sq) * dot(h.n1, h.b) : all(0.0);
+    h.length = root(h.edge_sq);
+    const V8 sine = h.regular ? -h.length * dot(h.n1, h.b) : all(0.0);
     h.angle = angle_of(sine, h.regular ? dot(h.n1, h.n2) : one);
 }
 
@@ -268,7 +269,7 @@ double hinge_energy(const Engine& e, const double* pos) {
         hinge_of(e, pos, i, h, span);
         const V8 weight = load<V8>(e.hinge_weight + i);
         if (e.bending == 2) {
-            const V8 bend = h.angle / h.unit;
+            const V8 bend = h.angle * h.per_unit;
             sum += total(0.5 * weight * bend * bend * dot(span, span));
         } else {
             const V8 bend = bend_of(h.angle, load<V8>(e.rest_angle + i));
@@ -285,7 +286,7 @@ template <class T> void hinge_models(const Engine& e, const double* pos) {
         Hinge h;
         V8 span[3], slope[4][3];
         hinge_of(e, pos, i, h, span);
-        const V8 scale = (h.regular ? -root(h.edge_sq) : zero) / h.unit;
+        const V8 scale = h.regular ? -h.length * h.per_unit : zero;
         const V8 share_a = dot(h.edge, h.a) / h.edge_sq, share_b = dot(h.edge, h.b) / h.edge_sq;
         const V8 by_a = scale / h.n1_sq, by_b = scale / h.n2_sq;
         for (int k = 0; k < 3; ++k) {
@@ -297,9 +298,9 @@ template <class T> void hinge_models(const Engine& e, const double* pos) {
         }
         V8 residual;
         if (e.bending == 2) {
-            const V8 length = root(dot(span, span)), ratio = length / h.unit;
+            const V8 length = root(dot(span, span)), ratio = length * h.per_unit;
             residual = h.angle * ratio;
-            const V8 along = h.angle / (h.unit * (length > zero ? length : one));
+            const V8 along = h.angle * h.per_unit / (length > zero ? length : one);
             for (int k = 0; k < 3; ++k) {
                 for (int c = 0; c < 4; ++c) slope[c][k] *= ratio;
                 slope[0][k] -= along * span[k];
@@ -313,7 +314,7 @@ template <class T> void hinge_models(const Engine& e, const double* pos) {
             for (int k = 0; k < 3; ++k) {
                 const V8 pull = force * slope[c][k], row = size * slope[c][k];
                 for (int lane = 0; lane < LANES; ++lane) {
-                    records[i + lane].gradient[3 * c + k] = pull[lane];
+                    e.hinge_force[14 * (i + lane) + 3 * c + k] = pull[lane];
                     records[i + lane].row[3 * c + k] = (T)row[lane];
                 }
             }
@@ -430,7 +431,7 @@ void energy(const Engine& e, const double* pos, const double* acc, double* phi, 
     double springs = 0.0;
     for (int64_t s = 0; s < e.num_springs; ++s) {
         double gap[3];
-        for (int k = 0; k < 3; ++k) gap[k] = pos[4 * e.spring_ends[2 * s] + k] - pos[4 * e.spring_ends[2 * s + 1] + k];
+        for (int k = 0; k < 3; ++k) gap[k] = pos[4 * e.spring_ends[s] + k] - pos[4 * e.spring_ends[e.num_springs + s] + k];
         springs += 0.5 * e.spring_stiffness[s] * dot3(gap, gap);
     }
     if (e.num_springs) add(springs);
@@ -440,91 +441,148 @@ void energy(const Engine& e, const double* pos, const double* acc, double* phi, 
 
 // ---- the matrix ----------------------------------------------------------------------------------------------------------
 
-constexpr int MOST_BLOCKS = 512;  // in a row; rows with more are refused when the plan is made
+constexpr int PAIR[3][3] = {{0, 1, 2}, {1, 3, 4}, {2, 4, 5}};
 
-// Rows of blocks, column by column of a block, and the gradient; the records of the elements have been made.
-template <class T> void gather_rows(const Engine& e) {
+template <int CORNERS> inline D4 pull_of(const double* forces, int size, const int32_t* starts, const int32_t* uses, int64_t row) {
+    D4 sum = D4{};
+    for (int64_t i = starts[CORNERS * row]; i < starts[CORNERS * (row + 1)]; ++i) {
+        const int32_t* use = uses + (2 + 2 * CORNERS) * i;
+        sum += load<D4>(forces + size * (int64_t)use[0] + 3 * use[1]);
+    }
+    return sum;
+}
+
+// The gradient, and the blocks of single vertices; the elements' forces have been made.
+template <class T> void gather_gradient(const Engine& e) {
+    T *own = (T*)e.own, *own_slack = (T*)e.own_slack;
+    for (int64_t row = 0; row < e.num_rows; ++row) {
+        double gradient[3], upper[6], slack[6];
+        vertex_model(e, row, gradient, upper, slack);
+        D4 force = D4{gradient[0], gradient[1], gradient[2], 0.0};
+        if (e.membrane) force += pull_of<3>(e.face_force, 10, e.face_starts, e.face_uses, row);
+        if (e.bending) force += pull_of<4>(e.hinge_force, 14, e.hinge_starts, e.hinge_uses, row);
+        for (int64_t i = e.spring_starts[2 * row]; i < e.spring_starts[2 * (row + 1)]; ++i) {
+            const int64_t spring = e.spring_uses[6 * i], corner = e.spring_uses[6 * i + 1];
+            const int64_t here = e.spring_ends[corner * e.num_springs + spring];
+            const int64_t there = e.spring_ends[(1 - corner) * e.num_springs + spring];
+            const D4 gap = load<D4>(e.pos + 4 * here) - load<D4>(e.pos + 4 * there);
+            force += e.spring_stiffness[spring] * gap;
+        }
+        store(e.gradient + 4 * row, D4{force[0], force[1], force[2], 0.0});
+        for (int k = 0; k < 6; ++k) own[6 * row + k] = (T)upper[k], own_slack[6 * row + k] = (T)slack[k];
+    }
+}
+
+template <class T> struct Row {
     typedef typename Four<T>::type V4;
-    const FaceRecord<T>* faces = (const FaceRecord<T>*)e.face_model;
-    const HingeRecord<T>* hinges = (const HingeRecord<T>*)e.hinge_model;
-    T *matrix = (T*)e.matrix, *slack = (T*)e.slack, *own_slack = (T*)e.own_slack;
-    V4 block[3 * MOST_BLOCKS];
-    T axial[MOST_BLOCKS], less[MOST_BLOCKS];
-    constexpr int PAIR[3][3] = {{0, 1, 2}, {1, 3, 4}, {2, 4, 5}};
+    V4 *axial, *block;  // of every block what is added to its diagonal and the slack of that, and its three rows
+};
+
+// Faces with as many BLOCKS in the row.
+template <class T, int BLOCKS> inline void add_faces(const Engine& e, int64_t from, int64_t to, Row<T>& row) {
+    typedef typename Four<T>::type V4;
+    for (int64_t i = from; i < to; ++i) {
+        const int32_t* use = e.face_uses + 8 * i;
+        const FaceRecord<T>& face = ((const FaceRecord<T>*)e.face_model)[use[0]];
+        const int c = use[1];
+        const T* own = face.root + 3 * c;
+        for (int b = 0; b < BLOCKS; ++b) {
+            const int d = use[2 + 2 * b];
+            const int64_t place = use[3 + 2 * b];
+            const T* other = face.root + 3 * d;
+            const V4 first = load<V4>(other), second = load<V4>(other + 9), third = load<V4>(other + 18);
+            V4* target = row.block + 3 * place;
+            for (int k = 0; k < 3; ++k) target[k] += own[k] * first + own[9 + k] * second + own[18 + k] * third;
+            row.axial[place] += load<V4>(face.axial + 2 * PAIR[c][d]);
+        }
+    }
+}
+
+template <class T, int BLOCKS> inline void add_hinges(const Engine& e, int64_t from, int64_t to, Row<T>& row) {
+    typedef typename Four<T>::type V4;
+    for (int64_t i = from; i < to; ++i) {
+        const int32_t* use = e.hinge_uses + 10 * i;
+        const HingeRecord<T>& hinge = ((const HingeRecord<T>*)e.hinge_model)[use[0]];
+        const T* own = hinge.row + 3 * use[1];
+        for (int b = 0; b < BLOCKS; ++b) {
+            const V4 other = load<V4>(hinge.row + 3 * use[2 + 2 * b]);
+            V4* target = row.block + 3 * (int64_t)use[3 + 2 * b];
+            for (int k = 0; k < 3; ++k) target[k] += own[k] * other;
+        }
+    }
+}
+
+// Inverse of a symmetric block by cofactors, scaled to a diagonal of ones first; rows of four numbers.
+template <class T, class V4> inline void invert(const V4* m, T* inverse) {
+    double scale[3], a[3][3], c[3][3];
+    for (int i = 0; i < 3; ++i) scale[i] = 1.0 / std::sqrt(m[i][i] > T(0) ? (double)m[i][i] : 2.2250738585072014e-308);
+    for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j) a[i][j] = (double)m[i][j] * scale[i] * scale[j];
+    for (int i = 0; i < 3; ++i) {
+        const double *u = a[(i + 1) % 3], *v = a[(i + 2) % 3];
+        c[i][0] = u[1] * v[2] - u[2] * v[1], c[i][1] = u[2] * v[0] - u[0] * v[2], c[i][2] = u[0] * v[1] - u[1] * v[0];
+    }
+    double determinant = dot3(a[0], c[0]);
+    if (!(determinant > 2.220446049250313e-16)) determinant = 2.220446049250313e-16;
+    const double share = 1.0 / determinant;
+    for (int i = 0; i < 3; ++i) {
+        const double by = share * scale[i];
+        store(inverse + 4 * i, V4{(T)(c[i][0] * by * scale[0]), (T)(c[i][1] * by * scale[1]), (T)(c[i][2] * by * scale[2]), T(0)});
+    }
+}
+
+// The upper rows of blocks, with a share of the slack, and the inverse diagonal blocks of the matrix without it.
+template <class T> void gather_matrix(const Engine& e) {
+    typedef typename Four<T>::type V4;
+    T *matrix = (T*)e.matrix, *slack = (T*)e.slack, *inverse = (T*)e.inverse;
+    const T sharpness = (T)e.sharpness;
     const V4 unit[3] = {V4{1, 0, 0, 0}, V4{0, 1, 0, 0}, V4{0, 0, 1, 0}};
+    V4* memory = (V4*)e.row_sum;
+    Row<T> sum = {memory, memory + e.most_blocks};
     for (int64_t row = 0; row < e.num_rows; ++row) {
         const int64_t start = e.row_starts[row], degree = e.row_starts[row + 1] - start;
-        // One place more than there are blocks: what belongs to fixed corners goes there.
-        for (int64_t i = 0; i < 3 * (degree + 1); ++i) block[i] = V4{};
-        for (int64_t i = 0; i <= degree; ++i) axial[i] = less[i] = T(0);
-        D4 force = D4{};
-        if (e.membrane)
-            for (int64_t i = e.face_starts[row]; i < e.face_starts[row + 1]; ++i) {
-                const int32_t* use = e.face_uses + 5 * i;
-                const FaceRecord<T>& face = faces[use[0]];
-                const int c = use[1];
-                force += load<D4>(face.gradient + 3 * c);
-                V4 own[3];
-                for (int m = 0; m < 3; ++m) own[m] = load<V4>(face.root + 9 * m + 3 * c);
-                for (int d = 0; d < 3; ++d) {
-                    V4* target = block + 3 * use[2 + d];
-                    for (int k = 0; k < 3; ++k)
-                        target[k] += own[0] * face.root[3 * d + k] + own[1] * face.root[9 + 3 * d + k] +
-                                     own[2] * face.root[18 + 3 * d + k];
-                    axial[use[2 + d]] += face.axial[PAIR[c][d]];
-                    less[use[2 + d]] += face.slack[PAIR[c][d]];
-                }
-            }
-        if (e.bending)
-            for (int64_t i = e.hinge_starts[row]; i < e.hinge_starts[row + 1]; ++i) {
-                const int32_t* use = e.hinge_uses + 6 * i;
-                const HingeRecord<T>& hinge = hinges[use[0]];
-                force += load<D4>(hinge.gradient + 3 * use[1]);
-                const V4 own = load<V4>(hinge.row + 3 * use[1]);
-                for (int d = 0; d < 4; ++d) {
-                    V4* target = block + 3 * use[2 + d];
-                    for (int k = 0; k < 3; ++k) target[k] += own * hinge.row[3 * d + k];
-                }
-            }
-        double gradient[3], upper[6], own[6];
-        vertex_model(e, row, gradient, upper, own);
-        const int64_t self = e.diagonal[row] - start;
-        for (int a = 0; a < 3; ++a) {
-            e.gradient[4 * row + a] = gradient[a] + force[a];
-            // Whole vectors: a load of four that follows a store of one waits for it.
-            block[3 * self + a] += V4{(T)upper[PAIR[a][0]], (T)upper[PAIR[a][1]], (T)upper[PAIR[a][2]], T(0)};
+        for (int64_t i = 0; i < 3 * degree; ++i) sum.block[i] = V4{};
+        for (int64_t i = 0; i < degree; ++i) sum.axial[i] = V4{};
+        const T *own = (const T*)e.own + 6 * row, *own_slack = (const T*)e.own_slack + 6 * row;
+        for (int k = 0; k < 3; ++k) sum.block[k] = V4{own[PAIR[k][0]], own[PAIR[k][1]], own[PAIR[k][2]], T(0)};
+        if (e.membrane) {
+            const int32_t* starts = e.face_starts + 3 * row;
+            add_faces<T, 3>(e, starts[0], starts[1], sum);
+            add_faces<T, 2>(e, starts[1], starts[2], sum);
+            add_faces<T, 1>(e, starts[2], starts[3], sum);
         }
-        for (int k = 0; k < 6; ++k) own_slack[6 * row + k] = (T)own[k];
+        if (e.bending) {
+            const int32_t* starts = e.hinge_starts + 4 * row;
+            add_hinges<T, 4>(e, starts[0], starts[1], sum);
+            add_hinges<T, 3>(e, starts[1], starts[2], sum);
+            add_hinges<T, 2>(e, starts[2], starts[3], sum);
+            add_hinges<T, 1>(e, starts[3], starts[4], sum);
+        }
+        for (int64_t i = e.spring_starts[2 * row]; i < e.spring_starts[2 * (row + 1)]; ++i) {
+            const int32_t* use = e.spring_uses + 6 * i;
+            const T stiffness = (T)e.spring_stiffness[use[0]];
+            sum.axial[0] += V4{stiffness, T(0), T(0), T(0)};
+            if (i < e.spring_starts[2 * row + 1]) sum.axial[use[5]] += V4{-stiffness, T(0), T(0), T(0)};
+        }
+        for (int k = 0; k < 3; ++k) sum.block[k] += sum.axial[0][0] * unit[k];
+        invert<T>(sum.block, inverse + 12 * row);
+        for (int k = 0; k < 3; ++k)
+            sum.block[k] += sharpness * V4{own_slack[PAIR[k][0]], own_slack[PAIR[k][1]], own_slack[PAIR[k][2]], T(0)};
+        sum.axial[0][0] = T(0);
         for (int64_t i = 0; i < degree; ++i) {
             T* target = matrix + 9 * (start + i);
+            const T axial = sum.axial[i][0] + sharpness * sum.axial[i][1];
             for (int k = 0; k < 3; ++k)  // the fourth number is overwritten by the next store
-                store(target + 3 * k, block[3 * i + k] + axial[i] * unit[k]);
-            slack[start + i] = less[i];
+                store(target + 3 * k, sum.block[3 * i + k] + axial * unit[k]);
+            slack[start + i] = sum.axial[i][1];
         }
     }
 }
 
-template <class T> void add_springs(const Engine& e) {
-    T* matrix = (T*)e.matrix;
-    for (int64_t s = 0; s < e.num_springs; ++s) {
-        const double stiffness = e.spring_stiffness[s];
-        const int32_t *ends = e.spring_ends + 2 * s, *blocks = e.spring_blocks + 4 * s;
-        for (int k = 0; k < 3; ++k) {
-            const double pull = stiffness * (e.pos[4 * ends[0] + k] - e.pos[4 * ends[1] + k]);
-            if (ends[0] < e.num_rows) e.gradient[4 * ends[0] + k] += pull;
-            if (ends[1] < e.num_rows) e.gradient[4 * ends[1] + k] -= pull;
-            for (int b = 0; b < 4; ++b)
-                if (blocks[b] >= 0) matrix[9 * (int64_t)blocks[b] + 4 * k] += (T)(b < 2 ? stiffness : -stiffness);
-        }
-    }
-}
-
-template <class T> void assemble(Engine& e) {
+template <class T> void differentiate(const Engine& e) {
     if (e.membrane) face_models<T>(e, e.pos);
     if (e.bending) hinge_models<T>(e, e.pos);
-    gather_rows<T>(e);
-    add_springs<T>(e);
-    e.sharpness = 0.0;
+    gather_gradient<T>(e);
 }
 
 // The share of the slack that is in the matrix, from what it was to what it shall be.
@@ -535,72 +593,47 @@ template <class T> void sharpen(Engine& e, double sharpness) {
     if (change == T(0)) return;
     for (int64_t i = 0; i < e.num_blocks; ++i)
         for (int k = 0; k < 3; ++k) matrix[9 * i + 4 * k] += change * slack[i];
-    constexpr int PAIR[3][3] = {{0, 1, 2}, {1, 3, 4}, {2, 4, 5}};
     if (e.num_grips)
         for (int64_t row = 0; row < e.num_rows; ++row)
             for (int a = 0; a < 3; ++a)
                 for (int b = 0; b < 3; ++b)
-                    matrix[9 * (int64_t)e.diagonal[row] + 3 * a + b] += change * own_slack[6 * row + PAIR[a][b]];
+                    matrix[9 * (int64_t)e.row_starts[row] + 3 * a + b] += change * own_slack[6 * row + PAIR[a][b]];
 }
 
 // ---- the linear system ---------------------------------------------------------------------------------------------------
 
-// Inverses of the diagonal blocks by cofactors, scaled to a diagonal of ones first; columns of four numbers.
-template <class T> void invert_diagonal(const Engine& e) {
-    const T* matrix = (const T*)e.matrix;
-    T* inverse = (T*)e.inverse;
-    for (int64_t row = 0; row < e.num_rows; ++row) {
-        const T* m = matrix + 9 * (int64_t)e.diagonal[row];
-        double scale[3], a[3][3], c[3][3];
-        for (int i = 0; i < 3; ++i) scale[i] = 1.0 / std::sqrt(m[4 * i] > T(0) ? (double)m[4 * i] : 2.2250738585072014e-308);
-        for (int i = 0; i < 3; ++i)
-            for (int j = 0; j < 3; ++j) a[i][j] = (double)m[3 * i + j] * scale[i] * scale[j];
-        for (int i = 0; i < 3; ++i) {
-            const double *u = a[(i + 1) % 3], *v = a[(i + 2) % 3];
-            c[i][0] = u[1] * v[2] - u[2] * v[1], c[i][1] = u[2] * v[0] - u[0] * v[2], c[i][2] = u[0] * v[1] - u[1] * v[0];
-        }
-        double determinant = dot3(a[0], c[0]);
-        if (!(determinant > 2.220446049250313e-16)) determinant = 2.220446049250313e-16;
-        for (int i = 0; i < 3; ++i) {
-            for (int j = 0; j < 3; ++j) inverse[12 * row + 4 * i + j] = (T)(c[i][j] / determinant * scale[i] * scale[j]);
-            inverse[12 * row + 4 * i + 3] = T(0);
-        }
-    }
-}
-
-// q = H p and p . q.
+// q = H p and p . q; a block serves its row and, transposed, its column.
 template <class T> double multiply(const Engine& e, const T* p, T* q) {
     typedef typename Four<T>::type V4;
-    const T* matrix = (const T*)e.matrix;
-    double sum = 0.0;
+    const T* m = (const T*)e.matrix;
+    const int32_t *cols = e.cols, *starts = e.row_starts;
+    D4 sum = D4{};
+    std::memset(q, 0, sizeof(T) * 4 * e.num_rows);
     for (int64_t row = 0; row < e.num_rows; ++row) {
-        V4 a = V4{}, b = V4{}, c = V4{};
-        for (int32_t i = e.row_starts[row]; i < e.row_starts[row + 1]; ++i) {
-            const T *m = matrix + 9 * (int64_t)i, *x = p + 4 * (int64_t)e.cols[i];
-            a += load<V4>(m) * x[0];
-            b += load<V4>(m + 3) * x[1];
-            c += load<V4>(m + 6) * x[2];
+        const V4 own = load<V4>(p + 4 * row);
+        const T x = own[0], y = own[1], z = own[2];
+        V4 a = load<V4>(m) * own, b = load<V4>(m + 3) * own, c = load<V4>(m + 6) * own;
+        m += 9;
+        for (int32_t i = starts[row] + 1; i < starts[row + 1]; ++i, m += 9) {
+            const V4 first = load<V4>(m), second = load<V4>(m + 3), third = load<V4>(m + 6);
+            const int64_t col = 4 * (int64_t)cols[i];
+            const V4 other = load<V4>(p + col);
+            a += first * other, b += second * other, c += third * other;
+            store(q + col, load<V4>(q + col) + first * x + second * y + third * z);
         }
-        const V4 y = a + b + c, own = load<V4>(p + 4 * row);
-        T* out = q + 4 * row;
-        out[0] = y[0], out[1] = y[1], out[2] = y[2], out[3] = T(0);
-        sum += first_three(y * own);
+        const V4 before = load<V4>(q + 4 * row);
+        const V4 product = {before[0] + (a[0] + a[1] + a[2]), before[1] + (b[0] + b[1] + b[2]), before[2] + (c[0] + c[1] + c[2]), T(0)};
+        store(q + 4 * row, product);
+        sum += __builtin_convertvector(product * own, D4);
     }
-    return sum;
+    return (sum[0] + sum[1]) + sum[2];
 }
 
-// z = P r and r . z.
-template <class T> double precondition(const Engine& e, const T* r, T* z) {
-    typedef typename Four<T>::type V4;
-    const T* inverse = (const T*)e.inverse;
-    double sum = 0.0;
-    for (int64_t row = 0; row < e.num_rows; ++row) {
-        const T *m = inverse + 12 * row, *x = r + 4 * row;
-        const V4 y = load<V4>(m) * x[0] + load<V4>(m + 4) * x[1] + load<V4>(m + 8) * x[2];
-        store(z + 4 * row, y);
-        sum += first_three(y * load<V4>(x));
-    }
-    return sum;
+// z = P r for one row; adds r . z.
+template <class T, class V4> inline void precondition(const T* m, V4 r, T* z, D4& sum) {
+    const V4 result = load<V4>(m) * r[0] + load<V4>(m + 4) * r[1] + load<V4>(m + 8) * r[2];
+    store(z, result);
+    sum += __builtin_convertvector(result * r, D4);
 }
 
 // Conjugate gradients for the direction; false where the matrix turned out not to be positive definite.
@@ -612,12 +645,15 @@ template <class T> bool solve(Engine& e, double tolerance, int64_t most) {
     for (int64_t row = 0; row < size; ++row) norm += dot3(e.gradient + 4 * row, e.gradient + 4 * row);
     norm = std::sqrt(norm);
     const double scale = norm > 0.0 ? 1.0 / norm : 0.0;
-    for (int64_t row = 0; row < size; ++row)
-        for (int k = 0; k < 4; ++k) {
-            x[4 * row + k] = T(0);
-            r[4 * row + k] = k < 3 ? (T)(-scale * e.gradient[4 * row + k]) : T(0);
-        }
-    double rz = precondition<T>(e, r, z);
+    const T* inverse = (const T*)e.inverse;
+    D4 sum = D4{};
+    for (int64_t row = 0; row < size; ++row) {
+        const V4 right = __builtin_convertvector(-scale * load<D4>(e.gradient + 4 * row), V4);
+        store(x + 4 * row, V4{});
+        store(r + 4 * row, right);
+        precondition<T>(inverse + 12 * row, right, z + 4 * row, sum);
+    }
+    double rz = (sum[0] + sum[1]) + sum[2];
     std::memcpy(p, z, sizeof(T) * 4 * size);
     const double limit = tolerance * tolerance * rz;
     bool definite = true;
@@ -628,12 +664,15 @@ template <class T> bool solve(Engine& e, double tolerance, int64_t most) {
             break;
         }
         const T length = (T)(rz / curvature);
+        sum = D4{};
         for (int64_t row = 0; row < size; ++row) {
+            const V4 left = load<V4>(r + 4 * row) - length * load<V4>(q + 4 * row);
             store(x + 4 * row, load<V4>(x + 4 * row) + length * load<V4>(p + 4 * row));
-            store(r + 4 * row, load<V4>(r + 4 * row) - length * load<V4>(q + 4 * row));
+            store(r + 4 * row, left);
+            precondition<T>(inverse + 12 * row, left, z + 4 * row, sum);
         }
         const double before = rz;
-        rz = precondition<T>(e, r, z);
+        rz = (sum[0] + sum[1]) + sum[2];
         const T share = (T)(rz / before);
         for (int64_t row = 0; row < size; ++row) store(p + 4 * row, load<V4>(z + 4 * row) + share * load<V4>(p + 4 * row));
         ++e.cg_used;
@@ -645,7 +684,8 @@ template <class T> bool solve(Engine& e, double tolerance, int64_t most) {
 
 // As much of the slack as the system bears, see hood.solver.direction.Directions.
 template <class T> void direct(Engine& e, double residual, int64_t most) {
-    invert_diagonal<T>(e);
+    e.sharpness = e.raised;
+    gather_matrix<T>(e);
     double tolerance = std::sqrt(residual);
     tolerance = tolerance < 1e-3 ? 1e-3 : tolerance > 0.1 ? 0.1 : tolerance;
     double sharpness = e.raised;
@@ -713,6 +753,12 @@ void walk(const Engine& e, double length) {
     place(e, e.trial_acc, e.trial_pos);
 }
 
+void take_trial(Engine& e, double phi, double noise) {
+    std::memcpy(e.pos, e.trial_pos, sizeof(double) * 4 * e.num_rows);
+    std::memcpy(e.acc, e.trial_acc, sizeof(double) * 4 * e.num_rows);
+    e.phi = phi, e.noise = noise;
+}
+
 bool backtrack(Engine& e) {
     double slope = 0.0, length = 1.0;
     for (int64_t row = 0; row < e.num_rows; ++row) slope += dot3(e.gradient + 4 * row, e.direction + 4 * row);
@@ -722,9 +768,7 @@ bool backtrack(Engine& e) {
         walk(e, length);
         energy(e, e.trial_pos, e.trial_acc, &phi, &noise);
         if (phi <= e.phi + 1e-4 * length * slope + e.noise) {
-            std::memcpy(e.pos, e.trial_pos, sizeof(double) * 4 * e.num_rows);
-            std::memcpy(e.acc, e.trial_acc, sizeof(double) * 4 * e.num_rows);
-            e.phi = phi, e.noise = noise;
+            take_trial(e, phi, noise);
             return true;
         }
         // The minimum of the parabola through what is known, between a tenth and a half of the last length.
@@ -737,15 +781,15 @@ bool backtrack(Engine& e) {
 }
 
 // x with A x = b for a symmetric positive A by its upper triangle, by cofactors, scaled to a diagonal of ones first.
-inline void solve_block(const float* upper, const double* b, double* x) {
-    constexpr int PAIR[3][3] = {{0, 1, 2}, {1, 3, 4}, {2, 4, 5}}, DIAGONAL[3] = {0, 3, 5};
+inline void solve_block(const double* upper, const double* b, double* x) {
+    constexpr int DIAGONAL[3] = {0, 3, 5};
     double scale[3], a[3][3], c[3][3];
     for (int i = 0; i < 3; ++i) {
         const double own = upper[DIAGONAL[i]];
         scale[i] = 1.0 / std::sqrt(own > 0.0 ? own : 2.2250738585072014e-308);
     }
     for (int i = 0; i < 3; ++i)
-        for (int j = 0; j < 3; ++j) a[i][j] = (double)upper[PAIR[i][j]] * scale[i] * scale[j];
+        for (int j = 0; j < 3; ++j) a[i][j] = upper[PAIR[i][j]] * scale[i] * scale[j];
     for (int i = 0; i < 3; ++i) {
         const double *u = a[(i + 1) % 3], *v = a[(i + 2) % 3];
         c[i][0] = u[1] * v[2] - u[2] * v[1], c[i][1] = u[2] * v[0] - u[0] * v[2], c[i][2] = u[0] * v[1] - u[1] * v[0];
@@ -759,6 +803,30 @@ inline void solve_block(const float* upper, const double* b, double* x) {
     }
 }
 
+// ---- where a step begins -------------------------------------------------------------------------------------------------
+
+void hold_fixed(const Engine& e) {
+    for (int64_t i = e.num_rows; i < e.num_vertices; ++i)
+        for (int k = 0; k < 3; ++k) e.pos[4 * i + k] = e.trial_pos[4 * i + k] = e.fixed[3 * e.vertex[i] + k];
+}
+
+// Free flight, falling or not, then out of the first wall, as far as it carries the weight.
+void guess(const Engine& e, const double* mass, const double* gravity, bool falls, double* acc) {
+    const bool walled = e.num_walls && e.walls[0].weight > 0.0;
+    const double size = std::sqrt(dot3(gravity, gravity));
+    for (int64_t row = 0; row < e.num_rows; ++row) {
+        const int64_t v = e.vertex[row];
+        double pos[3];
+        for (int k = 0; k < 3; ++k) pos[k] = e.base[3 * v + k] + (falls ? e.dt_sq * gravity[k] : 0.0);
+        if (walled) {
+            const double out = depth_of(e.walls[0], v, pos) - std::sqrt(mass[v] * size / (3.0 * e.walls[0].weight));
+            if (out > 0.0)
+                for (int k = 0; k < 3; ++k) pos[k] += out * e.walls[0].normal[3 * v + k];
+        }
+        for (int k = 0; k < 3; ++k) acc[4 * row + k] = (pos[k] - e.base[3 * v + k]) / e.dt_sq;
+    }
+}
+
 }  // namespace
 
 // ---- what is called ------------------------------------------------------------------------------------------------------
@@ -767,25 +835,40 @@ extern "C" {
 
 // Accelerations (V, 3) in the original order become the state; potential and rounding with them.
 void newton_start(Engine* e, const double* acc) {
-    for (int64_t i = 0; i < e->num_vertices; ++i) {
-        const int64_t v = e->vertex[i];
-        for (int k = 0; k < 3; ++k) {
-            if (i < e->num_rows) e->acc[4 * i + k] = acc[3 * v + k];
-            else e->pos[4 * i + k] = e->trial_pos[4 * i + k] = e->fixed[3 * v + k];
-        }
-        if (i < e->num_rows) e->acc[4 * i + 3] = 0.0;
-    }
+    hold_fixed(*e);
+    for (int64_t row = 0; row < e->num_rows; ++row)
+        for (int k = 0; k < 3; ++k) e->acc[4 * row + k] = acc[3 * e->vertex[row] + k];
     place(*e, e->acc, e->pos);
     energy(*e, e->pos, e->acc, &e->phi, &e->noise);
 }
 
-// Gradient, matrix and slack at the state; returns the norm of the gradient.
+// The better of two guesses becomes the state, see hood.solver.iterate.first_iterate; masses (V) kg, gravity (3) m/s^2.
+void newton_guess(Engine* e, const double* mass, const double* gravity) {
+    hold_fixed(*e);
+    double phi, noise;
+    guess(*e, mass, gravity, true, e->trial_acc);
+    place(*e, e->trial_acc, e->trial_pos);
+    energy(*e, e->trial_pos, e->trial_acc, &phi, &noise);
+    guess(*e, mass, gravity, false, e->acc);
+    place(*e, e->acc, e->pos);
+    energy(*e, e->pos, e->acc, &e->phi, &e->noise);
+    if (!(e->phi < phi)) take_trial(*e, phi, noise);
+}
+
+// Gradient at the state, and what the matrix is made of; returns the norm of the gradient.
 double newton_model(Engine* e) {
-    if (e->wide) assemble<double>(*e);
-    else assemble<float>(*e);
+    if (e->wide) differentiate<double>(*e);
+    else differentiate<float>(*e);
     double sum = 0.0;
     for (int64_t row = 0; row < e->num_rows; ++row) sum += dot3(e->gradient + 4 * row, e->gradient + 4 * row);
     return std::sqrt(sum);
+}
+
+// The matrix with a share of the slack, from the model.
+void newton_matrix(Engine* e, double sharpness) {
+    e->sharpness = sharpness;
+    if (e->wide) gather_matrix<double>(*e);
+    else gather_matrix<float>(*e);
 }
 
 // From the model to the next state; 1 where it moved.
@@ -812,7 +895,6 @@ void newton_state(const Engine* e, double* pos, double* acc) {
 
 int64_t newton_face_record(int64_t wide) { return wide ? sizeof(FaceRecord<double>) : sizeof(FaceRecord<float>); }
 int64_t newton_hinge_record(int64_t wide) { return wide ? sizeof(HingeRecord<double>) : sizeof(HingeRecord<float>); }
-int64_t newton_most_blocks() { return MOST_BLOCKS; }
 
 // ---- single vertices on their own -----------------------------------------------------------------------------------------
 
@@ -827,15 +909,14 @@ void newton_alone(Engine* e, const float* pos, float* force, float* step) {
             if (i < e->num_rows) e->acc[4 * i + k] = (e->pos[4 * i + k] - e->base[3 * v + k]) / e->dt_sq;
         }
     }
-    if (e->membrane) face_models<float>(*e, e->pos);
-    if (e->bending) hinge_models<float>(*e, e->pos);
-    float* blocks = (float*)e->inverse;  // upper triangles in the first six of twelve numbers a row
+    differentiate<float>(*e);
     for (int64_t row = 0; row < e->num_rows; ++row) {
-        double *gradient = e->gradient + 4 * row, upper[6], slack[6];
-        vertex_model(*e, row, gradient, upper, slack);
+        const float* blocks = (const float*)e->own + 6 * row;
+        double upper[6];
+        for (int k = 0; k < 6; ++k) upper[k] = blocks[k];
         if (e->membrane)
-            for (int64_t i = e->face_starts[row]; i < e->face_starts[row + 1]; ++i) {
-                const int32_t* use = e->face_uses + 5 * i;
+            for (int64_t i = e->face_starts[3 * row]; i < e->face_starts[3 * (row + 1)]; ++i) {
+                const int32_t* use = e->face_uses + 8 * i;
                 const FaceRecord<float>& face = ((const FaceRecord<float>*)e->face_model)[use[0]];
                 const int c = use[1];
                 for (int m = 0; m < 3; ++m) {
@@ -843,37 +924,23 @@ void newton_alone(Engine* e, const float* pos, float* force, float* step) {
                     const double own[3] = {root[0], root[1], root[2]};
                     add_outer(upper, 1.0, own);
                 }
-                for (int k = 0; k < 3; ++k) {
-                    gradient[k] += face.gradient[3 * c + k];
-                    upper[DIAGONAL[k]] += face.axial[DIAGONAL[c]];
-                }
+                for (int k = 0; k < 3; ++k) upper[DIAGONAL[k]] += face.axial[2 * DIAGONAL[c]];
             }
         if (e->bending)
-            for (int64_t i = e->hinge_starts[row]; i < e->hinge_starts[row + 1]; ++i) {
-                const int32_t* use = e->hinge_uses + 6 * i;
-                const HingeRecord<float>& hinge = ((const HingeRecord<float>*)e->hinge_model)[use[0]];
-                const float* of = hinge.row + 3 * use[1];
+            for (int64_t i = e->hinge_starts[4 * row]; i < e->hinge_starts[4 * (row + 1)]; ++i) {
+                const int32_t* use = e->hinge_uses + 10 * i;
+                const float* of = ((const HingeRecord<float>*)e->hinge_model)[use[0]].row + 3 * use[1];
                 const double own[3] = {of[0], of[1], of[2]};
                 add_outer(upper, 1.0, own);
-                for (int k = 0; k < 3; ++k) gradient[k] += hinge.gradient[3 * use[1] + k];
             }
-        for (int k = 0; k < 6; ++k) blocks[12 * row + k] = (float)upper[k];
-    }
-    for (int64_t s = 0; s < e->num_springs; ++s)
-        for (int end = 0; end < 2; ++end) {
-            const int64_t own = e->spring_ends[2 * s + end], other = e->spring_ends[2 * s + 1 - end];
-            if (own >= e->num_rows) continue;
-            for (int k = 0; k < 3; ++k) {
-                e->gradient[4 * own + k] += e->spring_stiffness[s] * (e->pos[4 * own + k] - e->pos[4 * other + k]);
-                blocks[12 * own + DIAGONAL[k]] += (float)e->spring_stiffness[s];
-            }
-        }
-    for (int64_t row = 0; row < e->num_rows; ++row) {
+        for (int64_t i = e->spring_starts[2 * row]; i < e->spring_starts[2 * (row + 1)]; ++i)
+            for (int k = 0; k < 3; ++k) upper[DIAGONAL[k]] += e->spring_stiffness[e->spring_uses[6 * i]];
         const int64_t v = e->vertex[row];
         const double pull[3] = {-e->gradient[4 * row], -e->gradient[4 * row + 1], -e->gradient[4 * row + 2]};
         double moved[3];
-        solve_block(blocks + 12 * row, pull, moved);
+        solve_block(upper, pull, moved);
         for (int k = 0; k < 3; ++k) force[3 * v + k] = (float)pull[k], step[3 * v + k] = (float)moved[k];
     }
 }
+
 }

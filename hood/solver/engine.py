@@ -7,7 +7,6 @@ gradients are float64; the matrix and the linear solver are float32, and float64
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -28,7 +27,7 @@ from hood.scene.cloth import Cloth
 from hood.solver.elements import BENDINGS, face_constants, hinge_constants
 from hood.solver.engine_tables import Tables, build_tables
 from hood.solver.forces import Grip, VertexForces, Walls, attachment_stiffness, other_terms, vertex_forces
-from hood.solver.iterate import fixed_positions, projected_guess
+from hood.solver.iterate import fixed_positions
 from hood.solver.plan import SolverPlan
 
 SOURCE = Path(native.__file__).with_name("newton.cpp")
@@ -52,15 +51,15 @@ class _Engine(ctypes.Structure):
     """``Engine`` of ``newton.cpp``."""
 
     _fields_ = [
-        *_fields("num_vertices num_rows num_faces num_hinges num_blocks num_springs", _COUNT),
-        *_fields("vertex face_corners hinge_corners row_starts cols diagonal", _POINTER),
-        *_fields("face_starts face_uses hinge_starts hinge_uses spring_ends spring_blocks", _POINTER),
+        *_fields("num_vertices num_rows num_faces num_hinges num_blocks num_springs most_blocks", _COUNT),
+        *_fields("vertex face_corners hinge_corners row_starts cols", _POINTER),
+        *_fields("face_starts face_uses hinge_starts hinge_uses spring_starts spring_uses spring_ends", _POINTER),
         *_fields("shape area mu lambda bulk soft rest_angle hinge_weight rest_length", _POINTER),
         *_fields("base fixed inertia weight spring_stiffness walls grips", _POINTER),
         *_fields("num_walls num_grips bending membrane", _COUNT),
         ("dt_sq", _REAL),
-        *_fields("pos acc trial_pos trial_acc gradient direction path face_model hinge_model", _POINTER),
-        *_fields("matrix slack own_slack inverse x r z p q", _POINTER),
+        *_fields("pos acc trial_pos trial_acc gradient direction path face_force hinge_force", _POINTER),
+        *_fields("face_model hinge_model matrix slack own own_slack row_sum inverse x r z p q", _POINTER),
         *_fields("sharpness raised phi noise", _REAL),
         *_fields("wide cg_used", _COUNT),
     ]
@@ -76,8 +75,9 @@ def library() -> ctypes.CDLL:
     lib = build(SOURCE, NATIVE_FLAGS)
     lib.newton_model.restype = _REAL
     lib.newton_move.argtypes = [_POINTER, _REAL, _COUNT]
+    lib.newton_matrix.argtypes = [_POINTER, _REAL]
     lib.newton_alone.argtypes = [_POINTER] * 4
-    for name in ("newton_move", "newton_face_record", "newton_hinge_record", "newton_most_blocks"):
+    for name in ("newton_move", "newton_face_record", "newton_hinge_record"):
         getattr(lib, name).restype = _COUNT
     return lib
 
@@ -187,7 +187,8 @@ class SceneEngine:
             num_faces=tables.faces.corners.shape[1],
             num_hinges=tables.hinges.corners.shape[1],
             num_blocks=len(tables.cols),
-            num_springs=len(tables.springs),
+            num_springs=len(tables.springs.order),
+            most_blocks=tables.most_blocks,
         )
         self._address = ctypes.byref(self.values)
         self._point(
@@ -196,17 +197,18 @@ class SceneEngine:
             hinge_corners=tables.hinges.corners,
             row_starts=tables.row_starts,
             cols=tables.cols,
-            diagonal=tables.diagonal,
             face_starts=tables.faces.starts,
             face_uses=tables.faces.uses,
             hinge_starts=tables.hinges.starts,
             hinge_uses=tables.hinges.uses,
-            spring_ends=tables.spring_ends,
-            spring_blocks=tables.spring_blocks,
+            spring_starts=tables.springs.starts,
+            spring_uses=tables.springs.uses,
+            spring_ends=tables.springs.corners,
         )
         size, rows = len(tables.vertex), tables.num_rows
         self._point(**{name: np.zeros((size, 4)) for name in ("pos", "trial_pos")})
         self._point(**{name: np.zeros((rows, 4)) for name in ("acc", "trial_acc", "gradient", "direction")})
+        self._point(face_force=np.zeros((self.values.num_faces, 10)), hinge_force=np.zeros((self.values.num_hinges, 14)))
         self._memory: dict[bool, dict[str, np.ndarray]] = {}
         self.widen(False)
 
@@ -220,9 +222,10 @@ class SceneEngine:
     def _working_memory(self, wide: bool) -> dict[str, np.ndarray]:
         values, kind = self.values, np.float64 if wide else np.float32
         rows, blocks = values.num_rows, values.num_blocks
-        sizes = {"matrix": 9 * blocks + 1, "slack": blocks, "own_slack": 6 * rows, "inverse": 12 * rows}
+        sizes = {"matrix": 9 * blocks + 1, "slack": blocks, "own": 6 * rows, "own_slack": 6 * rows, "inverse": 12 * rows}
         memory = {name: np.zeros(count, kind) for name, count in sizes.items()}
         memory |= {name: np.zeros(4 * rows, kind) for name in "xrzpq"}
+        memory["row_sum"] = _aligned(16 * values.most_blocks, kind)
         memory["face_model"] = np.zeros(values.num_faces * self._lib.newton_face_record(int(wide)), np.uint8)
         memory["hinge_model"] = np.zeros(values.num_hinges * self._lib.newton_hinge_record(int(wide)), np.uint8)
         return memory
@@ -232,7 +235,7 @@ class SceneEngine:
         values = self.values
         self._take_fabric(step)
         self._point(base=step.base, fixed=step.fixed, inertia=step.inertia, weight=step.weight)
-        self._point(spring_stiffness=step.spring_stiffness[self.tables.springs])
+        self._point(spring_stiffness=step.spring_stiffness[self.tables.springs.order])
         walls, grips = (_Wall * len(step.walls))(), (_Grip * len(step.grips))()
         for structure, wall in zip(walls, step.walls, strict=True):
             for name in ("point", "normal", "reach"):
@@ -251,14 +254,21 @@ class SceneEngine:
         values.raised, values.cg_used = 0.0, 0
         self.widen(False)
 
-    def start(self, acc: np.ndarray) -> float:
-        """Take up accelerations (V, 3) of all vertices of the cloth; the potential there."""
+    def start(self, acc: np.ndarray) -> None:
+        """Take up accelerations (V, 3) of all vertices of the cloth."""
         self._lib.newton_start(self._address, acc.ctypes.data_as(_POINTER))
-        return float(self.values.phi)
+
+    def guess(self, mass: np.ndarray, gravity: np.ndarray) -> None:
+        """Take up the better of the two first guesses; masses [kg] (V,) of the cloth, gravity (3,) m/s²."""
+        self._lib.newton_guess(self._address, mass.ctypes.data_as(_POINTER), gravity.ctypes.data_as(_POINTER))
 
     def model(self) -> float:
-        """Gradient and matrix at the state; the norm of the gradient [N]."""
+        """Gradient at the state; its norm [N]."""
         return float(self._lib.newton_model(self._address))
+
+    def matrix(self, sharpness: float = 0.0) -> None:
+        """The matrix of the model with a share of its slack; a move makes its own."""
+        self._lib.newton_matrix(self._address, sharpness)
 
     def move(self, residual: float, cg_iterations: int) -> bool:
         """Take a Newton step from a state whose model has been made; whether it led anywhere."""
@@ -294,6 +304,14 @@ class SceneEngine:
             setattr(self.values, name, array.ctypes.data)
 
 
+def _aligned(count: int, kind: type) -> np.ndarray:
+    """Zeros (``count``,) that begin at a multiple of 64 bytes."""
+    size = count * np.dtype(kind).itemsize
+    memory = np.zeros(size + 64, np.uint8)
+    begin = -memory.ctypes.data % 64
+    return memory[begin : begin + size].view(kind)
+
+
 def _identical(a: object, b: object) -> bool:
     return a is b or (isinstance(a, float) and a == b)
 
@@ -312,7 +330,7 @@ class EngineSystem:
     """The unknowns of a step in the compiled solver, scene by scene; see :class:`hood.solver.newton.System`."""
 
     def __init__(self, potential: Potential, problem: StepProblem, plan: SolverPlan, cg_iterations: int) -> None:
-        self.problem, self._potential, self._cg_iterations = problem, potential, cg_iterations
+        self.problem, self._cg_iterations = problem, cg_iterations
         self._engines = scene_engines(problem, plan)
         self._step = engine_step(potential, problem)
         for scene, engine in enumerate(self._engines):
@@ -324,39 +342,34 @@ class EngineSystem:
 
     def begin(self, start: Tensor | None) -> None:
         """Take up positions (V, 3), or the better of the two first guesses."""
-        if start is not None:
-            self._start(_array(start), range(len(self._engines)))
+        if start is None:
+            mass, gravity = _array(self.problem.cloth.mass), _array(self.problem.gravity)
+            for engine in self._engines:
+                engine.guess(mass, gravity)
             return
-        everywhere = range(len(self._engines))
-        falling, held = (_array(projected_guess(self._potential, self.problem, falls)) for falls in (True, False))
-        fallen = self._start(falling, everywhere)
-        better = [scene for scene, phi in enumerate(self._start(held, everywhere)) if not phi < fallen[scene]]
-        self._start(falling, better)
-
-    def _start(self, pos: np.ndarray, scenes: Iterable[int]) -> list[float]:
-        acc = (pos - self._step.base) / self._dt_sq
-        return [self._engines[scene].start(acc) for scene in scenes]
+        acc = (_array(start) - self._step.base) / self._dt_sq
+        for engine in self._engines:
+            engine.start(acc)
 
     @property
-    def phi(self) -> Tensor:
-        """(B,) J."""
-        return torch.tensor([engine.values.phi for engine in self._engines], dtype=torch.float64)
+    def phi(self) -> list[float]:
+        """(B) J."""
+        return [engine.values.phi for engine in self._engines]
 
     @property
     def used(self) -> int:
         """Conjugate gradient iterations so far."""
         return sum(engine.values.cg_used for engine in self._engines)
 
-    def model(self) -> Tensor:
-        """Make the models of the state; the relative gradients (B,)."""
+    def model(self) -> list[float]:
+        """Make the models of the state; the relative gradients (B)."""
         norms = [engine.model() for engine in self._engines]
-        shares = [norm / weight if weight > 0 else 0.0 for norm, weight in zip(norms, self._weight, strict=True)]
-        return torch.tensor(shares, dtype=torch.float64)
+        return [norm / weight if weight > 0 else 0.0 for norm, weight in zip(norms, self._weight, strict=True)]
 
-    def move(self, residual: Tensor, active: Tensor) -> Tensor:
-        """Take a Newton step in the scenes ``active`` (B,); which of them moved (B,)."""
-        moving = zip(self._engines, residual.tolist(), active.tolist(), strict=True)
-        return torch.tensor([wanted and self._move(engine, share) for engine, share, wanted in moving])
+    def move(self, residual: list[float], active: list[bool]) -> list[bool]:
+        """Take a Newton step in the scenes ``active`` (B); which of them moved (B)."""
+        moving = zip(self._engines, residual, active, strict=True)
+        return [wanted and self._move(engine, share) for engine, share, wanted in moving]
 
     def _move(self, engine: SceneEngine, residual: float) -> bool:
         if engine.move(residual, self._cg_iterations):

@@ -7,6 +7,7 @@ Elements are sorted by their first vertex and padded to a multiple of eight by e
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from scipy import sparse
@@ -25,8 +26,8 @@ class Elements:
 
     order: np.ndarray  # (N,) elements of the cloth, in the new order
     corners: np.ndarray  # (C, P) int32 vertices of the padded elements
-    starts: np.ndarray  # (R + 1,) int32, where the uses of a row begin
-    uses: np.ndarray  # (U, 2 + C) int32: element, corner, the places of its corners in the row
+    starts: np.ndarray  # (R C + 1,) int32, where the uses of a row with C, ..., 1 blocks there begin
+    uses: np.ndarray  # (U, 2 + 2 C) int32: element, corner, then corner and place in the row of every block, the diagonal first
 
     def padded(self, values: np.ndarray, padding: float = 0.0) -> np.ndarray:
         """Numbers (..., elements of the cloth) in the new order (..., P), float64."""
@@ -42,13 +43,10 @@ class Tables:
     vertex: np.ndarray  # (V,) int64 vertices of the cloth, the R free ones first
     num_rows: int
     row_starts: np.ndarray  # (R + 1,) int32
-    cols: np.ndarray  # (K,) int32
-    diagonal: np.ndarray  # (R,) int32
+    cols: np.ndarray  # (K,) int32, that of the diagonal first in every row, then later ones
     faces: Elements
     hinges: Elements
-    springs: np.ndarray  # (A,) attachments of the step that are in this scene
-    spring_ends: np.ndarray  # (A, 2) int32
-    spring_blocks: np.ndarray  # (A, 4) int32
+    springs: Elements  # attachments of the step
 
     @property
     def most_blocks(self) -> int:
@@ -72,19 +70,14 @@ def build_tables(cloth: Cloth, attachments: Attachments | None, scene: int) -> T
     keys = _block_keys(corners, size)
     rows, cols = keys // max(size, 1), keys % max(size, 1)
     starts = np.searchsorted(rows, np.arange(size + 1))
-    springs = corners[2]
-    ends = [(springs[:, a], springs[:, b]) for a, b in ((0, 0), (1, 1), (0, 1), (1, 0))]
     return Tables(
         vertex=vertex,
         num_rows=size,
         row_starts=starts.astype(np.int32),
         cols=cols.astype(np.int32),
-        diagonal=_blocks(keys, np.arange(size), np.arange(size), size).astype(np.int32),
         faces=_elements(chosen[0], corners[0], keys, starts),
         hinges=_elements(chosen[1], corners[1], keys, starts),
-        springs=chosen[2],
-        spring_ends=springs.astype(np.int32),
-        spring_blocks=np.stack([_blocks(keys, a, b, size) for a, b in ends], axis=1).astype(np.int32),
+        springs=_elements(chosen[2], corners[2], keys, starts, lanes=1),
     )
 
 
@@ -94,49 +87,49 @@ def _order(free: np.ndarray, tables: list[np.ndarray]) -> tuple[np.ndarray, np.n
     size = int(free.sum())
     keys = _block_keys([unknown[table] for table in tables], size)
     rows, cols = keys // max(size, 1), keys % max(size, 1)
-    graph = sparse.csr_matrix((np.ones(len(keys), np.int8), (rows, cols)), shape=(size, size))
+    upper = sparse.csr_matrix((np.ones(len(keys), np.int8), (rows, cols)), shape=(size, size))
+    graph = (upper + upper.T).tocsr()
     order = csgraph.reverse_cuthill_mckee(graph, symmetric_mode=True) if size else np.zeros(0, np.int64)
     return unknown, np.flatnonzero(free)[order]
 
 
 def _block_keys(tables: list[np.ndarray], size: int) -> np.ndarray:
-    """Sorted keys row × ``size`` + column of all blocks between the unknowns of elements (N, C), and of the diagonal."""
+    """Sorted keys row × ``size`` + column of the blocks of the upper triangle between the unknowns of elements (N, C)."""
     keys = [np.arange(size, dtype=np.int64) * (size + 1)]
     for table in tables:
-        for a in range(table.shape[1]):
-            for b in range(table.shape[1]):
-                row, col = table[:, a], table[:, b]
-                inside = (row >= 0) & (row < size) & (col >= 0) & (col < size)
-                keys.append(row[inside] * size + col[inside])
+        for a, b in combinations(range(table.shape[1]), 2):
+            row, col = np.minimum(table[:, a], table[:, b]), np.maximum(table[:, a], table[:, b])
+            inside = (row >= 0) & (col < size)
+            keys.append(row[inside] * size + col[inside])
     return np.unique(np.concatenate(keys))
 
 
-def _blocks(keys: np.ndarray, rows: np.ndarray, cols: np.ndarray, size: int) -> np.ndarray:
-    """Numbers of the blocks at ``rows``, ``cols``; -1 where either is fixed."""
-    inside = (rows < size) & (cols < size)
-    return np.where(inside, np.searchsorted(keys, np.where(inside, rows * size + cols, 0)), -1)
-
-
-def _elements(chosen: np.ndarray, corners: np.ndarray, keys: np.ndarray, starts: np.ndarray) -> Elements:
+def _elements(chosen: np.ndarray, corners: np.ndarray, keys: np.ndarray, starts: np.ndarray, lanes: int = LANES) -> Elements:
     size, width = len(starts) - 1, corners.shape[1]
     order = np.lexsort(corners.T[::-1]) if len(corners) else np.zeros(0, np.int64)
     corners = corners[order]
-    padding = -len(corners) % LANES
+    padding = -len(corners) % lanes
     padded = np.concatenate([corners, np.repeat(corners[-1:], padding, axis=0)]) if padding else corners
-    uses = []
-    for c in range(width):
-        element = np.flatnonzero(corners[:, c] < size)
-        row = corners[element, c]
-        places = [_blocks(keys, row, corners[element, d], size) for d in range(width)]
-        # Fixed corners have the place behind the row's last block.
-        inside = [np.where(place >= 0, place, starts[row + 1]) - starts[row] for place in places]
-        uses.append(np.stack([row, element, np.full(len(row), c), *inside], axis=1))
-    table = np.concatenate(uses)
-    table = table[np.argsort(table[:, 0], kind="stable")]
-    first = np.searchsorted(table[:, 0], np.arange(size + 1))
+    table = np.concatenate([_uses(corners, corner, keys, starts) for corner in range(width)])
+    table = table[np.lexsort((-table[:, 1], table[:, 0]))]
+    groups = table[:, 0] * width + width - table[:, 1]
     return Elements(
         order=chosen[order],
         corners=np.ascontiguousarray(padded.T, dtype=np.int32),
-        starts=first.astype(np.int32),
-        uses=np.ascontiguousarray(table[:, 1:], dtype=np.int32),
+        starts=np.searchsorted(groups, np.arange(size * width + 1)).astype(np.int32),
+        uses=np.ascontiguousarray(table[:, 2:], dtype=np.int32),
     )
+
+
+def _uses(corners: np.ndarray, corner: int, keys: np.ndarray, starts: np.ndarray) -> np.ndarray:
+    """Row, number of blocks and use (U, 2 + 2 + 2 C) of the elements whose ``corner`` is free, one for each."""
+    size, width = len(starts) - 1, corners.shape[1]
+    element = np.flatnonzero(corners[:, corner] < size)
+    row, cols = corners[element, corner], corners[element]
+    # Blocks of earlier columns are kept by their rows, fixed corners have none; they come last and are not read.
+    upper = (cols >= row[:, None]) & (cols < size)
+    others = np.argsort(np.where(upper, cols, size), axis=1, kind="stable")
+    cols = np.take_along_axis(np.where(upper, cols, row[:, None]), others, axis=1)
+    places = np.searchsorted(keys, row[:, None] * size + cols) - starts[row][:, None]
+    blocks = np.stack([others, places], axis=2).reshape(len(element), 2 * width)
+    return np.concatenate([np.stack([row, upper.sum(axis=1), element, np.full(len(row), corner)], axis=1), blocks], axis=1)

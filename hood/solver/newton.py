@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
 from dataclasses import dataclass, field, replace
@@ -108,8 +109,20 @@ def minimize(
         start = start.detach().to(work.state.pos.dtype)
     system = _system(potential, work, plan, settings)
     system.begin(start)
-    report = _run(system, settings, began, proceed)
+    report = _run(system, work.state.pos, settings, began, proceed)
     return rounded(problem, system.state()[0]), replace(report, acc=report.acc.to(problem.state.pos.dtype))
+
+
+@torch.no_grad()
+def first_guess(potential: Potential, problem: StepProblem, settings: NewtonSettings | None = None) -> tuple[Tensor, Tensor]:
+    """Where :func:`minimize` starts by default, positions (V, 3) m and the accelerations (V, 3) m/s² that lead there, in the
+    problem's type; see :func:`hood.solver.iterate.first_iterate`."""
+    problem = potential.prepare(problem)
+    work = in_double(problem)
+    system = _system(potential, work, plan_for(work), settings or NewtonSettings())
+    system.begin(None)
+    pos, acc = system.state()
+    return rounded(problem, pos), acc.to(problem.state.pos.dtype)
 
 
 class System(Protocol):
@@ -120,8 +133,8 @@ class System(Protocol):
         ...
 
     @property
-    def phi(self) -> Tensor:
-        """(B,) J."""
+    def phi(self) -> list[float]:
+        """(B) J."""
         ...
 
     @property
@@ -129,12 +142,12 @@ class System(Protocol):
         """Conjugate gradient iterations so far."""
         ...
 
-    def model(self) -> Tensor:
-        """Make the quadratic model of the state; the relative gradients (B,)."""
+    def model(self) -> list[float]:
+        """Make the quadratic model of the state; the relative gradients (B)."""
         ...
 
-    def move(self, residual: Tensor, active: Tensor) -> Tensor:
-        """Take a Newton step in the scenes ``active`` (B,); which of them moved (B,)."""
+    def move(self, residual: list[float], active: list[bool]) -> list[bool]:
+        """Take a Newton step in the scenes ``active`` (B); which of them moved (B)."""
         ...
 
     def state(self) -> tuple[Tensor, Tensor]:
@@ -155,24 +168,25 @@ class TorchSystem:
         self._now = first_iterate(self.unknowns) if start is None else self.unknowns.at(start)
 
     @property
-    def phi(self) -> Tensor:
-        return self._now.phi
+    def phi(self) -> list[float]:
+        return [float(value) for value in self._now.phi.tolist()]
 
     @property
     def used(self) -> int:
         return self.directions.used
 
-    def model(self) -> Tensor:
+    def model(self) -> list[float]:
         self._model = self._build(self._now.pos, self._now.acc)
-        return relative_gradient(self.problem, self._model.gradient)
+        return [float(value) for value in relative_gradient(self.problem, self._model.gradient).tolist()]
 
-    def move(self, residual: Tensor, active: Tensor) -> Tensor:
+    def move(self, residual: list[float], active: list[bool]) -> list[bool]:
         now, model = self._now, self._model
-        direction, inverse = self.directions(model, residual, active)
+        searching = torch.tensor(active, device=now.phi.device)
+        direction, inverse = self.directions(model, now.phi.new_tensor(residual), searching)
         slope = self.problem.sum_vertices((model.gradient * direction).sum(1))
         path = Path(self.unknowns, now, direction, inverse, self.plan.vertices)
-        self._now, moved = backtrack(self.unknowns, path, now, slope, active)
-        return moved
+        self._now, moved = backtrack(self.unknowns, path, now, slope, searching)
+        return [bool(value) for value in moved.tolist()]
 
     def state(self) -> tuple[Tensor, Tensor]:
         return self._now.pos, self._now.acc
@@ -195,33 +209,35 @@ def _say_once(sentence: str) -> None:
     warnings.warn(sentence, stacklevel=4)
 
 
-def _run(system: System, settings: NewtonSettings, began: float, proceed: Proceed | None) -> Report:
+def _run(system: System, like: Tensor, settings: NewtonSettings, began: float, proceed: Proceed | None) -> Report:
+    """The iterations of ``system``; what is reported has the precision and device of ``like``."""
     phi = system.phi
-    active = torch.isfinite(phi)
-    finite, stuck, late, why = active, ~active, False, MOST_ITERATIONS
+    finite, stuck, why = [math.isfinite(value) for value in phi], [False] * len(phi), MOST_ITERATIONS
     history: list[Progress] = []
     iteration = 0
     while True:
         residual = system.model()
-        finite = finite & torch.isfinite(residual)
-        active = finite & ~stuck & (residual > settings.target_rg)
-        history.append(Progress(time.perf_counter() - began, system.phi, residual))
+        finite = [sound and math.isfinite(value) for sound, value in zip(finite, residual, strict=True)]
+        wanted = [sound and value > settings.target_rg for sound, value in zip(finite, residual, strict=True)]
+        active = [scene and not halted for scene, halted in zip(wanted, stuck, strict=True)]
+        history.append(Progress(time.perf_counter() - began, like.new_tensor(system.phi), like.new_tensor(residual)))
         late = settings.budget_ms is not None and 1e3 * history[-1].seconds > settings.budget_ms
-        if late or iteration >= settings.max_iterations or not bool(active.any()):
+        if late or iteration >= settings.max_iterations or not any(active):
             why = LATE if late else why
             break
         if proceed is not None and not proceed(history[-1], system.state()[0]):
             why = STOPPED
             break
-        stuck = stuck | (active & ~system.move(residual, active))
+        moved = system.move(residual, active)
+        stuck = [halted or (scene and not went) for halted, scene, went in zip(stuck, active, moved, strict=True)]
         iteration += 1
-    converged = finite & (residual <= settings.target_rg)
-    reason = _reasons(converged, finite, stuck, why)
-    return Report(iteration, system.used, system.phi, residual, converged, reason, system.state()[1], history)
+    reason = tuple(_reason(*scene, otherwise=why) for scene in zip(finite, wanted, stuck, strict=True))
+    last = history[-1]
+    converged = torch.tensor([not left for left in reason], device=like.device)
+    return Report(iteration, system.used, last.phi, last.relative_gradient, converged, reason, system.state()[1], history)
 
 
-def _reasons(converged: Tensor, finite: Tensor, stuck: Tensor, otherwise: str) -> tuple[str, ...]:
-    reasons = []
-    for done, sound, halted in zip(converged.tolist(), finite.tolist(), stuck.tolist(), strict=True):
-        reasons.append(CONVERGED if done else NOT_FINITE if not sound else STUCK if halted else otherwise)
-    return tuple(reasons)
+def _reason(finite: bool, wanted: bool, stuck: bool, otherwise: str) -> str:
+    if not finite:
+        return NOT_FINITE
+    return CONVERGED if not wanted else STUCK if stuck else otherwise
