@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol, runtime_checkable
+from functools import cache
+from typing import Any, Protocol, cast, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -39,6 +40,12 @@ class PreparedTerm(Protocol):
         ...
 
 
+@cache
+def _prepares(kind: type) -> bool:
+    """Whether terms of a class are of :class:`PreparedTerm`; to ask every term of every step takes 0.3 ms of it."""
+    return issubclass(kind, PreparedTerm)
+
+
 class Potential:
     """Sum of energies whose minimum over the next positions is the implicit Euler step (HOOD paper, section
     3.3).
@@ -69,8 +76,8 @@ class Potential:
         The problem itself where no term asks for more than it holds; contact that is there already is not searched again.
         """
         for term in self.terms.values():
-            if isinstance(term, PreparedTerm):
-                problem = term.prepare(problem)
+            if _prepares(type(term)):
+                problem = cast(PreparedTerm, term).prepare(problem)
         return problem
 
     def energies(self, problem: StepProblem, next_pos: Tensor, acc: Tensor | None = None) -> dict[str, Tensor]:
