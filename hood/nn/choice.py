@@ -22,7 +22,7 @@ import torch
 from hood.graph.builder import BODY, MESH, Graph, StaticGraph, build_graph, edge_set
 from hood.native.build import BuildError, find_compiler, processor
 from hood.native.cache import cache_folder
-from hood.nn import compiled, compiled_network
+from hood.nn import compiled, compiled_network, dense
 from hood.nn.compiled import KERNELS, check_kernels
 from hood.nn.model import MeshGraphNet
 from hood.nn.precision import PRECISIONS
@@ -130,7 +130,8 @@ def _digest(precision: str, width: int, training: bool) -> str:
         compiler = find_compiler()
     except BuildError:
         compiler = "none"
-    sources = [source.read_text(encoding="utf-8") for source in (compiled.SOURCE, compiled_network.SOURCE)]
+    files = (compiled.SOURCE, compiled_network.SOURCE, Path(dense.__file__))
+    sources = [file.read_text(encoding="utf-8") for file in files]
     parts = [processor(), torch.__version__, compiler, torch.get_num_threads(), precision, width, training, *sources]
     return hashlib.sha256("\0".join(map(str, parts)).encode()).hexdigest()
 

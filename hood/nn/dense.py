@@ -2,17 +2,20 @@
 
 On a CPU torch's float32 product is MKL's, which uses half of the vector units of an AMD processor: 90 GFLOP/s where oneDNN,
 which torch carries as well, reaches 190 on one core. On an Intel Xeon (Sapphire Rapids) it is the other way round, 143 by MKL
-and 97 by oneDNN; there the gain is bfloat16, 311 by oneDNN with AMX. torch offers oneDNN for float32 only through the
-operators that its own compiler emits, so they are tried once and the plain product takes over wherever they are missing.
-oneDNN compiles a kernel per shape (2–8 ms); numbers of rows are therefore rounded up to few sizes, or the changing number of
-body edges would cost more than the network. Other factors of time in this module are of one core of an AMD server CPU.
+and 97 by oneDNN: processors of MKL's maker take float32 products from MKL, all others from oneDNN, and bfloat16 comes from
+oneDNN everywhere (311 there with AMX). torch offers oneDNN for float32 only through the operators that its own compiler emits,
+so they are tried once and the plain product takes over wherever they are missing. oneDNN compiles a kernel per shape (2–8 ms);
+numbers of rows are therefore rounded up to few sizes, or the changing number of body edges would cost more than the network.
+Other factors of time in this module are of one core of an AMD server CPU.
 """
 
 from __future__ import annotations
 
+import platform
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -167,9 +170,17 @@ def _packed(weight: Tensor) -> Tensor:
 
 
 @cache
+def _mkl_is_faster() -> bool:
+    """Whether torch's own float32 product is MKL's, on a processor of MKL's maker."""
+    info = Path("/proc/cpuinfo")
+    maker = info.read_text(encoding="utf-8", errors="replace") if info.exists() else platform.processor()
+    return bool(torch.backends.mkl.is_available()) and "GenuineIntel" in maker
+
+
+@cache
 def _kernel(device: str, dtype: torch.dtype) -> Any:
-    """oneDNN's linear operator where it exists, supports the precision and gives the right numbers; else None."""
-    known = device == "cpu" and dtype in (torch.float32, torch.bfloat16)
+    """oneDNN's linear operator where it exists, supports the precision, gives the right numbers and is faster; else None."""
+    known = device == "cpu" and (dtype == torch.bfloat16 or (dtype == torch.float32 and not _mkl_is_faster()))
     if not known or torch.backends.cpu.get_cpu_capability() != "AVX512" or not torch.backends.mkldnn.is_available():
         return None
     try:

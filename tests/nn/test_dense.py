@@ -15,6 +15,20 @@ def make(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(sum(shape)), dtype=torch.float64).to(dtype)
 
 
+@pytest.fixture(autouse=True, params=["MKL", "oneDNN"])
+def library(request, monkeypatch):
+    """Products in float32 as on processors where one or the other is faster."""
+    monkeypatch.setattr(dense, "_mkl_is_faster", lambda: request.param == "MKL")
+    dense._kernel.cache_clear()
+    yield request.param
+    dense._kernel.cache_clear()
+
+
+def test_a_processor_takes_one_library(library):
+    kernel = dense._kernel("cpu", torch.float32)
+    assert kernel is None or library == "oneDNN"
+
+
 @pytest.mark.parametrize("dtype", TOLERANCE)
 @pytest.mark.parametrize("count", COUNTS)
 def test_affine_is_linear(count, dtype):
