@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hood.assets.fit_size import Size, find_size
 from hood.assets.placement import UP_AXES, Placement, Surrounding, surrounds
 from hood.assets.skin_field import WIDTH, Field, Skin, misfit, settle, sleeve_misfit
 from hood.assets.units import possible, size_ratio, used
@@ -32,6 +33,11 @@ _UPPER_ARM, _LOWERED = (0.05, 0.22), 45.0
 _FEW, _MANY = 200, 600
 #: Peaks of one orientation and pose; candidates that are settled, of usual and of other size; those whose angle is searched.
 _PEAKS, _USUAL, _ODD, _REFINED = 2, 12, 3, 4
+#: A garment that is too small passes through the body where it belongs: it is looked for larger as well, in so many places.
+_LARGER, _LARGER_PLACES = 1.09, 2
+#: A garment that lies so close in its place, for the clearance of its cut, or is there of its own size as far as its shape
+#: tells, is looked for nowhere else.
+_SURE, _OWN_SIZE = 0.25, 0.03
 #: A coordinate of the offset smaller than this [m] is within the accuracy of the search: it stays 0.
 _ACCURACY = 0.01
 #: A file that is at most this much worse as it is, stays as it is; so does one that fits nowhere but lies around the body with
@@ -56,6 +62,14 @@ class Asked:
     offset: np.ndarray | None = None
 
 
+class Resized(NamedTuple):
+    """The placement of a garment in another size, which explains it clearly better than its own."""
+
+    factor: float  # times its own size
+    placement: Placement  # ``scale`` is unit times factor
+    gain: float  # of the misfit, both at the clearance that suits them best
+
+
 class Found(NamedTuple):
     """The answer of a search."""
 
@@ -63,6 +77,8 @@ class Found(NamedTuple):
     misfit: float  # 0 to 1, see hood.assets.skin_field
     margin: float  # by how much the best different placement is worse
     refusal: str | None = None  # why the placement is not to be trusted
+    sizes: tuple[float, float] | None = None  # factors that fit about alike; None: its shape says nothing, or scale was given
+    resized: Resized | None = None  # never taken unasked: a looser cut is no larger unit
 
 
 _NOWHERE = Placement(1.0, "y", 0.0, np.zeros(3))
@@ -87,8 +103,19 @@ class Wearer:
     @cached_property
     def upper_arms(self) -> np.ndarray:
         """(M,) bool: samples of the skin."""
-        moved = np.linalg.norm(self.skin(_LOWERED).points - self.skin(0.0).points, axis=1)
-        return np.asarray((_UPPER_ARM[0] < moved) & (moved < _UPPER_ARM[1]))
+        return np.asarray((_UPPER_ARM[0] < self._lowered) & (self._lowered < _UPPER_ARM[1]))
+
+    @cached_property
+    def arms(self) -> np.ndarray:
+        """(M,) bool: samples of the skin; none of a body in one pose."""
+        return np.asarray(self._lowered > _UPPER_ARM[0])
+
+    @cached_property
+    def _lowered(self) -> np.ndarray:
+        """(M,) m: how far each sample moves when the arms are lowered."""
+        if len(self.angles) == 1:
+            return np.zeros(len(self.skin(self.angles[0]).points))
+        return np.asarray(np.linalg.norm(self.skin(_LOWERED).points - self.skin(0.0).points, axis=1))
 
 
 def find_placement(pos: np.ndarray, faces: np.ndarray, wearer: Wearer, asked: Asked | None = None) -> Found:
@@ -105,7 +132,7 @@ def find_placement(pos: np.ndarray, faces: np.ndarray, wearer: Wearer, asked: As
     candidates = _distinct([search.settled(start) for start in search.starts()], search.many)
     candidates = [search.with_angle(candidate) for candidate in candidates[:_REFINED]]
     ranked = _distinct([search.polished(candidate) for candidate in candidates], search.many)
-    return search.decided(ranked, search.as_it_is())
+    return search.with_size(search.decided(ranked, search.as_it_is()), ranked)
 
 
 class _Candidate(NamedTuple):
@@ -216,6 +243,55 @@ class _Search:
         if refusal is not None and stay is not None and self._worn(stay):
             return Found(stay.placement, stay.misfit, 0.0)
         return found._replace(refusal=refusal)
+
+    def with_size(self, found: Found, ranked: list[_Candidate]) -> Found:
+        """``found`` with the sizes that fit, and the place in another size where that explains the garment clearly better."""
+        ambiguous = found.refusal is not None and found.margin < _MARGIN
+        if self.asked.scale is not None or ambiguous:
+            return found
+        here = best = self._judged(found.placement)
+        own = size = self._size(best)
+        sure = size.misfit <= _SURE or (size.alike is not None and abs(size.factor - 1.0) <= _OWN_SIZE)
+        others = [] if sure else [*ranked, *self._larger()]
+        for other in others:
+            if other.odd <= here.odd and not _same(other, here, self.many, _SAME):
+                other_size = self._size(other)
+                if other_size.alike is not None and other_size.misfit < size.misfit - _MARGIN:
+                    best, size = other, other_size
+        found = found._replace(sizes=size.alike)
+        if best is not here:
+            unit = min(self.scales, key=lambda scale: abs(np.log(scale / best.placement.scale)))
+            size = size.of(best.placement.scale / unit, own)
+            refusal = f"it fits more closely elsewhere, at {size.factor:.3g} times its size"
+            found = found._replace(refusal=refusal, sizes=size.alike, placement=replace(found.placement, scale=unit))
+        return found._replace(resized=self._resized(best.placement, found.placement.scale, size)) if size.clear else found
+
+    def _larger(self) -> list[_Candidate]:
+        """The best places of the garment if it is larger than its file has it."""
+        search = replace(self)
+        search.scales = [_LARGER * scale for scale in self.scales]
+        return _distinct([search.settled(start) for start in search.starts()], search.many)[:_LARGER_PLACES]
+
+    def _size(self, candidate: _Candidate) -> Size:
+        points, _ = self._trunk(candidate.placement)
+        return find_size(points, self.wearer.skin(candidate.placement.angle))
+
+    def _trunk(self, placement: Placement) -> tuple[np.ndarray, np.ndarray]:
+        """Samples (N, 3) [m] of the garment off the arms, whose sleeves are wider than trunks; and their middle (3,)."""
+        points, skin = placement.apply(self.many), self.wearer.skin(placement.angle)
+        trunk = points[~self.wearer.arms[skin.measure(points).sample]]
+        points = trunk if len(trunk) >= _FEW else points
+        return points, points.mean(axis=0)
+
+    def _resized(self, start: Placement, unit: float, size: Size) -> Resized | None:
+        """The place in the size that explains the garment clearly better; None where it does not surround the body there."""
+        scale = float(f"{unit * size.factor:.3g}")
+        if self.asked.offset is None:
+            factor, (_, middle) = scale / start.scale, self._trunk(start)
+            start = replace(start, offset=factor * start.offset + (1.0 - factor) * middle + size.offset)
+        search = _Search(self.pos, self.faces, self.wearer, replace(self.asked, scale=scale))
+        best = search.polished(search.with_angle(search._judged(replace(start, scale=scale))))
+        return None if search._doubt(best, None, False) else Resized(size.factor, best.placement, size.gain)
 
     def _doubt(self, best: _Candidate, rival: _Candidate | None, stays: bool) -> str | None:
         if self.asked.offset is not None:  # who names the place has decided

@@ -5,7 +5,7 @@ Symbols: N points of a garment, d signed distance to the skin [m], n the skin's 
 The misfit of a place is the mean of e² / (e² + σ²) (Geman and McClure), 0 to 1, with e = d − c. What hangs rests on skin that
 faces up and hangs off skin that faces down: the clearance wanted is c = c₀ (1 − k n_up). An e below zero counts ``_TIGHT``
 times. Loose parts are far beyond σ and say little; what lies close decides. c₀, k and σ are those that put the embedded
-garments back where they came from.
+garments back where they came from. Where the size of a garment is asked for, c₀ is free: a wider cut is no larger unit.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from scipy import fft
 from scipy.spatial import cKDTree
 
 _CLEARANCE, _HANG = 0.010, 0.5  # m, share
+_CUTS = (0.004, 0.03)  # m, least and greatest c₀ of tight and of wide cuts
 _TIGHT = 3.0
 _SLEEVE_CLEARANCE, _SLEEVE_WIDTH = 0.025, 0.045  # m
 #: Width σ [m] of the misfit; searches start wider.
@@ -63,9 +64,9 @@ class Skin:
         return Measured(np.where(near, along, sign * far), normal, index)
 
 
-def misfit(measured: Measured, width: float = WIDTH) -> float:
+def misfit(measured: Measured, width: float = WIDTH, clearance: float = _CLEARANCE) -> float:
     """Mean cost of the points, 0: all of them at the clearance of worn cloth, 1: none near it or all inside."""
-    return float(_cost(_error(measured), width).mean())
+    return float(_cost(_error(measured, clearance), width).mean())
 
 
 def sleeve_misfit(measured: Measured) -> float:
@@ -77,18 +78,43 @@ def settle(points: np.ndarray, skin: Skin, width: float, rounds: int) -> np.ndar
     """Translation (3,) [m] of ``points`` that lowers their misfit, by reweighted Gauss–Newton steps."""
     offset = np.zeros(3)
     for _ in range(rounds):
-        measured = skin.measure(points + offset)
-        error = _error(measured)
-        slope = np.where(error < 0, _TIGHT, 1.0)
-        weight = (width**2 / (error**2 + width**2)) ** 2 * slope**2
-        pull = measured.normal * weight[:, None]
-        matrix = pull.T @ measured.normal
-        step = -np.linalg.solve(matrix + 1e-3 * (np.trace(matrix) + 1e-9) * np.eye(3), pull.T @ (error / slope))
-        step *= min(1.0, 2 * width / max(float(np.linalg.norm(step)), 1e-12))
+        step = _step(skin.measure(points + offset), width, _CLEARANCE)[:3]
         offset += step
         if float(np.abs(step).max()) < 1e-4:
             break
     return offset
+
+
+class Cut(NamedTuple):
+    """Where points fit best for the clearance that suits them best."""
+
+    offset: np.ndarray  # (3,) m
+    clearance: float  # m, c₀
+    misfit: float
+
+
+def settle_cut(points: np.ndarray, skin: Skin, start: Cut | None, rounds: int) -> Cut:
+    """Translation of ``points`` and clearance, together, that lower their misfit at width ``WIDTH``, from ``start`` on."""
+    offset, clearance = (np.zeros(3), _CLEARANCE) if start is None else (start.offset, start.clearance)
+    for _ in range(rounds):
+        step = _step(skin.measure(points + offset), WIDTH, clearance, free_cut=True)
+        offset, clearance = offset + step[:3], float(np.clip(clearance + step[3], *_CUTS))
+        if float(np.abs(step).max()) < 1e-4:
+            break
+    return Cut(offset, clearance, misfit(skin.measure(points + offset), WIDTH, clearance))
+
+
+def _step(measured: Measured, width: float, clearance: float, free_cut: bool = False) -> np.ndarray:
+    """A reweighted Gauss–Newton step [m] of the translation (3,), or of translation and clearance (4,)."""
+    error = _error(measured, clearance)
+    slope = np.where(error < 0, _TIGHT, 1.0)
+    weight = (width**2 / (error**2 + width**2)) ** 2 * slope**2
+    rows = np.concatenate([measured.normal, -_hang(measured)[:, None]], axis=1) if free_cut else measured.normal
+    pull = rows * weight[:, None]
+    matrix = pull.T @ rows
+    damped = matrix + 1e-3 * (np.trace(matrix) + 1e-9) * np.eye(len(matrix))
+    step = -np.linalg.solve(damped, pull.T @ (error / slope))
+    return np.asarray(step * min(1.0, 2 * width / max(float(np.linalg.norm(step)), 1e-12)))
 
 
 class Field:
@@ -124,8 +150,13 @@ class Field:
         return found
 
 
-def _error(measured: Measured) -> np.ndarray:
-    return _tightened(measured.dist - _CLEARANCE * (1 - _HANG * measured.normal[:, 1]))
+def _error(measured: Measured, clearance: float = _CLEARANCE) -> np.ndarray:
+    return _tightened(measured.dist - clearance * _hang(measured))
+
+
+def _hang(measured: Measured) -> np.ndarray:
+    """(N,) shares of c₀ that are wanted: what hangs rests on skin that faces up, and hangs off skin that faces down."""
+    return np.asarray(1 - _HANG * measured.normal[:, 1])
 
 
 def _tightened(error: np.ndarray) -> np.ndarray:

@@ -19,13 +19,14 @@ from hood.assets.library import locate
 from hood.assets.mesh_file import MESH_SUFFIXES, read_mesh_file
 from hood.assets.motion_file import read_recording
 from hood.assets.pins import opening_names, read_indices
-from hood.assets.placement import Placement, surrounds
+from hood.assets.placement import surrounds
 from hood.assets.standing import arms_down
 from hood.assets.suspicions import suspect_kind
 from hood.assets.units import UNITS, size_ratio, used
 from hood.assets.unpickle import load_pickle
 from hood.commands.beside_mesh import place_beside_mesh
 from hood.commands.common import read_model
+from hood.commands.describe_place import describe_place
 from hood.commands.placing import find_place
 from hood.dynamics import ranges
 from hood.dynamics.recorder import read_rollout
@@ -104,7 +105,7 @@ def inspect_garment(name: str, body: Body | MeshMotion, wearer: Sequence[str], b
     if _is_suspect(finding, garment, body):
         return finding
     if isinstance(body, MeshMotion):
-        place_beside_mesh(finding, garment, body, UNITS)
+        place_beside_mesh(finding, garment, body)
     elif garment.bound:
         _name_openings(finding, garment.rest_pos if garment.skin_pos is None else garment.skin_pos, garment.faces, body)
     else:
@@ -169,21 +170,24 @@ def _describe_defects(finding: Finding, defects: Defects) -> None:
 def _place_beside(finding: Finding, garment: Garment, body: Body, betas: np.ndarray) -> None:
     """Units, up axis, facing, place and pose of an unbound garment: what ``hood prepare`` finds for itself."""
     found = find_place(garment, body, betas, Asked(), None)
-    placement = found.placement
+    placement = found.placement if found.resized is None else found.resized.placement
     finding.facts |= {
         "size in body heights": float(f"{size_ratio(used(garment.rest_pos, garment.faces), body.shaped(betas)[0]):.3g}"),
-        "units": UNITS.get(placement.scale, "unknown"),
+        "units": UNITS.get(found.placement.scale, "unknown"),
+        "times its size it fits about alike": "its shape does not say"
+        if found.sizes is None
+        else np.round(found.sizes, 2).tolist(),
         "up axis": placement.up,
         "turned by [degrees]": placement.turn,
         "arms below the T-pose [degrees]": placement.angle,
         "misfit on the body, 0 to 1": round(found.misfit, 3),
         "misfit of the next place, beyond": round(found.margin, 3),
     }
-    if found.refusal is not None:
+    if found.resized is None and found.refusal is not None:
         finding.problem(f"no place on {body.name!r} is sure: {found.refusal}", _UNPLACED)
         finding.refused = True
         return
-    _describe_place(finding, placement, body)
+    describe_place(finding, found, body.name)
     posed = posed_body(body, arms_down(placement.angle), 0, betas)
     around = surrounds(placement.apply(used(garment.rest_pos, garment.faces)), posed.surface, posed.faces)
     finding.facts["distance to the skin, median [m]"] = round(around.middle, 4)
@@ -192,24 +196,6 @@ def _place_beside(finding: Finding, garment: Garment, body: Body, betas: np.ndar
     if around.inside:
         what = f"{100 * around.inside:.1f}% of its vertices are inside the body, to {1e3 * around.depth:.1f} mm"
         finding.problem(what, "prepare lets them start outside", "")
-
-
-def _describe_place(finding: Finding, placement: Placement, body: Body) -> None:
-    """What keeps the garment from lying where it belongs, and the keys that put it there, all of them where one is needed."""
-    scale, up, turn, offset = placement.keys()
-    far = float(np.linalg.norm(placement.offset))
-    problems = (
-        (placement.scale != 1.0, f"it is in {UNITS.get(placement.scale, 'another unit')}", scale),
-        (placement.up != "y", f"it lies as if {placement.up} were up", up),
-        (placement.turn != 0, f"it faces {placement.turn:g} degrees away from {body.name!r}", turn),
-        (far > 0, f"it is {far:.2f} m away from where it fits {body.name!r}", offset),
-        (placement.angle != 0, f"its arms hang {placement.angle:g} degrees below the T-pose's", f"pose={placement.angle:g}"),
-    )
-    wrong = [(what, key) for is_so, what, key in problems if is_so]
-    for what, key in wrong:
-        finding.problem(what, f"{key}, or leave it to prepare")
-    if wrong:
-        finding.repairs += [key for _, _, key in problems]
 
 
 def inspect_body(name: str) -> Finding:

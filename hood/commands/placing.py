@@ -9,14 +9,17 @@ from omegaconf import DictConfig
 
 from hood.assets.binding import PosedBody, posed_body
 from hood.assets.body import Body
-from hood.assets.fit_search import Asked, Found, Wearer, find_placement
+from hood.assets.fit_search import Asked, Found, Resized, Wearer, find_placement
 from hood.assets.garment import Garment
 from hood.assets.placement import UP_AXES, Placement
 from hood.assets.standing import A_POSE_ANGLE, arms_down
 from hood.assets.units import find_scale, size_ratio, used
 from hood.config import ConfigError, plain, require_choice
+from hood.scene.mesh_motion import MeshMotion, wearable, worn_pos
 
 AUTO = "auto"
+#: Meshes larger than this [m] are rooms and vehicles: places on them are not searched for.
+_LARGEST_BODY = 4.0
 _TURNS = (0, 90, 180, 270)
 _ANGLES = {"tpose": 0.0, "apose": A_POSE_ANGLE}
 
@@ -66,11 +69,41 @@ def find_place(garment: Garment, body: Body, betas: np.ndarray, asked: Asked, po
     if posed is not None and all(value is not None for value in given):
         return Found(_as_asked(asked), 0.0, 1.0)
     if posed is not None:
-        surface = posed.surface
-        wearer = Wearer(lambda angle: surface, body.faces, angles=(0.0,))
+        wearer = _statue(posed.surface, body.faces)
     else:
         wearer = Wearer(lambda angle: posed_body(body, arms_down(angle), 0, betas).surface, body.faces)
     return find_placement(garment.rest_pos, garment.faces, wearer, asked)
+
+
+def find_place_on_mesh(garment: Garment, motion: MeshMotion, asked: Asked) -> Found | None:
+    """The placement of an unbound garment on a mesh as it stands in its first frame, or in its rest pose where that is closer.
+
+    None where nothing is searched and the garment stays where it is: a sheet has no place on a body, and a mesh larger than
+    a person is none.
+    """
+    surfaces = [motion.points(0)] + ([] if motion.sequence.rest is None else [motion.sequence.rest])
+    if garment.bound or not wearable(garment) or float(np.ptp(surfaces[0], axis=0).max()) > _LARGEST_BODY:
+        return None
+    best: Found | None = None
+    for surface in surfaces:
+        found = find_placement(worn_pos(garment), garment.faces, _statue(surface, motion.faces), asked)
+        known = best is not None and (found.refusal is not None, found.misfit) >= (best.refusal is not None, best.misfit)
+        best = best if known else found
+    return best
+
+
+def _statue(surface: np.ndarray, faces: np.ndarray) -> Wearer:
+    """A body in one pose."""
+    return Wearer(lambda angle: surface, faces, angles=(0.0,))
+
+
+def explain_size(resized: Resized) -> tuple[str, str]:
+    """What is said of a garment that another size explains clearly better, and what to do, in words that follow "it"."""
+    cut = "tight" if resized.factor > 1 else "loose"
+    return (
+        f"lies around the body more closely at {resized.factor:.3g} times its size (misfit less by {resized.gain:.2f})",
+        f"{resized.placement.keys()[0]} resizes it, rest lengths too; leave scale out if its cut is meant to be so {cut}",
+    )
 
 
 def keep_place(garment: Garment, surface: np.ndarray, asked: Asked) -> Placement:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -24,8 +25,9 @@ from hood.assets.pins import pin_mask, pin_numbers
 from hood.assets.sequence import PoseSequence, load_sequence
 from hood.assets.standing import POSE_SUFFIXES, arms_down, read_pose
 from hood.assets.suspicions import suspect_kind
+from hood.assets.units import UNITS
 from hood.commands.common import prepare_folder
-from hood.commands.placing import AUTO, arm_angle, asked_keys, find_place, keep_place
+from hood.commands.placing import AUTO, arm_angle, asked_keys, explain_size, find_place, keep_place
 from hood.commands.prepare_mesh import prepare_for_mesh
 from hood.commands.wardrobe import checked_pins, heed, names_of, shape_coefficients
 from hood.config import ConfigError, load_config, plain, require_choice
@@ -178,7 +180,11 @@ def _place(fitting: Fitting, config: DictConfig, body: Body, betas: np.ndarray) 
     posed = _given_pose(config, body, betas)
     found = find_place(garment, body, betas, asked, posed)
     if found.refusal is not None:
-        raise ValueError(f"{garment.name}: {found.refusal}")
+        other = "" if found.resized is None else "; it {}: {}".format(*explain_size(found.resized))
+        raise ValueError(f"{garment.name}: {found.refusal}{other}")
+    if found.resized is not None:
+        what, fix = explain_size(found.resized)
+        warnings.warn(f"garment {garment.name!r} {what}; written as it is: {fix}", stacklevel=2)
     alterations.place(fitting, found.placement)
     angle = found.placement.angle
     if posed is None and angle:
@@ -278,9 +284,11 @@ def _text(report: dict[str, Any]) -> str:
 def _length_lines(part: dict[str, Any]) -> list[str]:
     """What became of a garment's edges: at rest, and where it is worn."""
     rest, worn = part["rest_lengths"], part["worn"]
+    factors = [change["details"]["factor"] for change in part["changes"] if change["what"] == "scaled"]
+    resized = "".join(f"{factor:g} times " for factor in factors if factor not in UNITS)
     lines = [
-        f"  rest lengths: the file's to {100 * rest['change_max']:.2f}%; {100 * rest['changed_share']:.1f}% of the edges "
-        f"changed by more than {100 * _CHANGED:.0f}%"
+        f"  rest lengths: {resized}the file's to {100 * rest['change_max']:.2f}%; {100 * rest['changed_share']:.1f}% of the "
+        f"edges changed by more than {100 * _CHANGED:.0f}%"
     ]
     if worn is not None:
         lines.append(

@@ -7,6 +7,7 @@ same body take it. Its rest lengths are those of its file.
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -23,7 +24,7 @@ from hood.assets.outfit import join_garments
 from hood.assets.pins import pin_mask, pin_numbers
 from hood.assets.suspicions import suspect_kind, suspect_place, suspect_seams
 from hood.commands.common import prepare_folder
-from hood.commands.placing import AUTO, asked_keys, keep_place
+from hood.commands.placing import AUTO, asked_keys, explain_size, find_place_on_mesh, keep_place
 from hood.commands.wardrobe import checked_pins, heed
 from hood.config import ConfigError, plain
 from hood.mesh.quality import check_triangles
@@ -64,12 +65,21 @@ def prepare_for_mesh(config: DictConfig, names: list[str], target: Path, read: C
 
 
 def _fit(fitting: Fitting, name: str, config: DictConfig, motion: MeshMotion) -> Fitting:
-    """One garment on the mesh: in metres, y up, sewn, clean, outside the skin; auto leaves it where it is, for the unit."""
+    """One garment on the mesh: in metres, where it fits, sewn, clean, outside the skin; where it fits nowhere, auto leaves it
+    where it is, for the unit."""
     garment, surface, clearance = fitting.garment, motion.points(0), float(config.clearance)
     heed(garment.name, suspect_kind(garment.rest_pos, garment.faces, surface))
     if not clearance >= 0:
         raise ConfigError(f"clearance={config.clearance}: give a number ≥ 0")
-    alterations.place(fitting, keep_place(garment, surface, asked_keys(config)))
+    asked = asked_keys(config)
+    found = find_place_on_mesh(garment, motion, asked)
+    if found is not None and found.resized is not None:
+        what, fix = explain_size(found.resized)
+        warnings.warn(f"garment {garment.name!r} {what}; written as it is: {fix}", stacklevel=2)
+    if found is None or found.refusal is not None:
+        alterations.place(fitting, keep_place(garment, surface, asked))
+    else:
+        alterations.place(fitting, found.placement)
     if str(config.weld) == "none":
         heed(garment.name, suspect_seams(fitting.garment.rest_pos, fitting.garment.faces))
     else:

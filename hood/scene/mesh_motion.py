@@ -97,7 +97,7 @@ class MeshMotion:
             if rest.fits and sum(rest) <= sum(first):
                 return bind_garment(garment, _rest_body(self.sequence))
         # A sheet may well fall on a body from afar; what was made for another body, or is open at both ends, is misplaced.
-        if first.inside <= _INSIDE and garment.bound_to is None and (first.fits or not _wearable(garment)):
+        if first.inside <= _INSIDE and garment.bound_to is None and (first.fits or not wearable(garment)):
             if not first.fits:
                 warnings.warn(
                     f"garment {garment.name!r}: half of it is over {first.middle:.2g} m away from {self.name!r} at first",
@@ -228,7 +228,7 @@ def _misfit(pos: np.ndarray, points: np.ndarray, faces: np.ndarray) -> _Misfit:
     return _Misfit(float((dist < -_DEEP).mean()), float(np.median(np.abs(dist))))
 
 
-def _wearable(garment: Garment) -> bool:
+def wearable(garment: Garment) -> bool:
     """Whether a part of it has openings to put it on by: a sheet has its rim alone."""
     part = topology.connected_components(len(garment.rest_pos), topology.unique_edges(garment.faces))
     rims = [int(part[loop[0]]) for loop in topology.boundary_loops(garment.faces)]

@@ -16,10 +16,12 @@ from workshop import write_obj
 
 from hood.assets.binding import posed_body
 from hood.assets.body import Body, load_body
+from hood.assets.fit_search import Asked
 from hood.assets.garment import Garment, load_garment
 from hood.assets.placement import Placement
 from hood.assets.standing import arms_down
 from hood.cli import main
+from hood.commands.placing import find_place
 
 GARMENTS = ("tshirt", "trousers", "dress", "tank", "longsleeve", "skirt")
 SLEEVED = ("tshirt", "longsleeve")
@@ -32,7 +34,7 @@ UNITS = (1.0, 1.0, 0.1, 0.0254, 0.01, 0.001)
 #: Shape coefficients: by number and value.
 SHAPES = ((0, 0.0), (0, 0.0), (0, 2.0), (0, -2.0), (1, 2.0), (1, -2.0), (2, 2.0), (4, -2.0))
 #: What counts as brought back.
-NEAR, ANGLE = 0.01, 3.0
+NEAR, ANGLE, SIZE = 0.01, 3.0, 0.015
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,7 @@ class Case:
     turn: float = 0.0
     angle: float = 0.0
     shape: tuple[int, float] = (0, 0.0)
+    factor: float = 1.0  # times the size that it was made in
 
     @property
     def betas(self) -> np.ndarray:
@@ -69,6 +72,18 @@ def table() -> list[Case]:
     return cases + [Case(*row) for row in zip(*columns, strict=True)]
 
 
+def sizes_table() -> list[Case]:
+    """Garments too small and too large by 7 and 8%, in mixtures like those of :func:`table`."""
+    mixer, count, names = random.Random(23), 42, (*GARMENTS, "shorts")
+    columns: list[list[Any]] = []
+    angles = (0.0, 0.0, 30.0, 45.0, 70.0)
+    for values in (names, SHIFTS, UNITS, ("y", "z"), (0.0, 90.0, 180.0, 270.0), angles, SHAPES, (0.92, 1.08, 0.93, 1.07)):
+        column = [values[i % len(values)] for i in range(count)]
+        mixer.shuffle(column)
+        columns.append(column)
+    return [Case(*row) for row in zip(*columns, strict=True)]
+
+
 @cache
 def _default() -> Body:
     return load_body()
@@ -87,11 +102,14 @@ def truth(case: Case) -> tuple[Garment, np.ndarray, Placement]:
         offset = (pos.min(axis=0) + pos.max(axis=0)) / 2
     else:
         offset = np.array(case.shift)
-    return garment, pos, Placement(case.unit, case.up, case.turn, offset, case.angle)
+    return garment, pos, Placement(case.unit / case.factor, case.up, case.turn, offset, case.angle)
 
 
 def bring_back(case: Case, capsys: pytest.CaptureFixture[str]) -> tuple[str, str]:
-    """Write the file, run what inspect prints: ("right", "refused" or what is wrong; the command)."""
+    """Write the file, run what inspect prints: ("right", "refused", "told" or what is wrong; the command).
+
+    Told: the garment is taken in the size of its file, and its own is among those that inspect says fit about alike.
+    """
     garment, pos, placement = truth(case)
     write_obj(Path("g.obj"), (pos - placement.offset) @ placement.rotation / placement.scale, garment.faces)
     main(["inspect", "g.obj", *case.words, "--json"])
@@ -103,6 +121,12 @@ def bring_back(case: Case, capsys: pytest.CaptureFixture[str]) -> tuple[str, str
         return ("refused" if finding["command"] is None else f"the command fails: {error}"), command
     if finding["command"] is None and any("no place" in entry["problem"] for entry in finding["problems"]):
         return "inspect refuses, prepare does not", command
+    (scale,) = [float(word.removeprefix("scale=")) for word in shlex.split(command) if word.startswith("scale=")] or [1.0]
+    if abs(scale / placement.scale - 1.0) > SIZE:
+        sizes = finding["facts"]["times its size it fits about alike"]
+        alike = sizes == "its shape does not say" or sizes[0] <= 1.0 / case.factor <= sizes[1]
+        told = alike and abs(scale / case.unit - 1.0) < 1e-6
+        return ("told" if told else f"scale {scale}, not {placement.scale:.4g}"), command
     back = load_garment("g.npz").shaped(case.betas)
     far = float(np.linalg.norm(back - pos, axis=1).mean())
     angle = finding["facts"]["arms below the T-pose [degrees]"]
@@ -140,6 +164,59 @@ def test_prepare_alone_does_what_inspect_prints(capsys: pytest.CaptureFixture[st
     np.testing.assert_allclose(load_garment("alone.npz").rest_pos, printed, atol=1e-4)
 
 
+SIZES = {
+    "tank too large by 8%, in centimetres, 3 m away": Case("tank", (3.0, 0.0, 0.0), 0.01, factor=1.08),
+    "trousers too small by 8%, z up": Case("trousers", "floor", up="z", factor=0.92),
+    "shorts too small by 8%, back to front": Case("shorts", "centre", turn=180.0, factor=0.92),
+}
+
+
+@pytest.mark.parametrize("name", SIZES)
+def test_another_size_comes_back_too(capsys: pytest.CaptureFixture[str], name: str) -> None:
+    assert bring_back(SIZES[name], capsys)[0] == "right"
+
+
+def test_prepare_resizes_nothing_unasked(capsys: pytest.CaptureFixture[str]) -> None:
+    """It says that another size lies closer; a size that is asked for is kept, and what becomes of rest lengths is said."""
+    case = Case("tank", factor=1.08)
+    _, command = bring_back(case, capsys)
+    (scale,) = [word for word in shlex.split(command) if word.startswith("scale=")]
+    file = load_garment("g.obj").rest_pos
+    assert main(["prepare", "garment=g.obj", "output=alone.npz"]) == 0
+    assert "lies around the body more closely at 0.9" in capsys.readouterr().err
+    assert np.ptp(load_garment("alone.npz").rest_pos, axis=0) == pytest.approx(np.ptp(file, axis=0), rel=1e-3)
+    assert main([*shlex.split(command)[1:], "output=asked.npz"]) == 0
+    said = capsys.readouterr()
+    assert said.err == ""
+    assert f"rest lengths: {scale.removeprefix('scale=')} times the file's" in said.out
+    resized = np.ptp(load_garment("asked.npz").rest_pos, axis=0) / np.ptp(file, axis=0)
+    assert resized == pytest.approx(float(scale.removeprefix("scale=")), rel=1e-3)
+
+
+@pytest.mark.parametrize("name", [*GARMENTS, "shorts"])
+@pytest.mark.parametrize("factor", [0.96, 1.0, 1.05])
+def test_a_cut_that_is_a_little_wider_or_tighter_keeps_its_size(body: Body, name: str, factor: float) -> None:
+    garment, pos, _ = truth(Case(name))
+    middle = pos.mean(axis=0)
+    found = find_place(replace(garment, rest_pos=middle + factor * (pos - middle)), body, np.zeros(10), Asked(), None)
+    assert found.resized is None
+    assert found.placement.scale == 1.0
+
+
+@pytest.mark.slow
+def test_the_table_of_sizes(capsys: pytest.CaptureFixture[str]) -> None:
+    """Every size that is proposed is within 1.5% of the garment's own; the rest are refused, or kept and told."""
+    cases = sizes_table()
+    results = [bring_back(case, capsys)[0] for case in cases]
+    fine = ("right", "refused", "told")
+    wrong = {str(case): result for case, result in zip(cases, results, strict=True) if result not in fine}
+    with capsys.disabled():
+        counts = {word: results.count(word) for word in fine}
+        print(f"\n{len(cases)} garments of another size: {counts}, {wrong}")
+    assert wrong == {}
+    assert results.count("right") >= 0.55 * len(cases)
+
+
 @pytest.mark.slow
 def test_the_table_of_misplacements(capsys: pytest.CaptureFixture[str]) -> None:
     """At least 95% come back within 1 cm and 3 degrees; the rest are refused, by inspect and prepare alike."""
@@ -165,6 +242,28 @@ def test_what_fits_nowhere_or_twice_is_refused(capsys: pytest.CaptureFixture[str
         assert main(["prepare", f"garment={name}.obj", "output=bad.npz"]) == 2
         assert not Path("bad.npz").exists()
         capsys.readouterr()
+
+
+MESHES = {
+    "tank, 3 m away, in centimetres": Case("tank", (3.0, 0.0, 0.0), 0.01),
+    "trousers, z up, back to front": Case("trousers", "centre", up="z", turn=180.0),
+    "T-shirt of another floor, in inches": Case("tshirt", "floor", 0.0254),
+}
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_the_command_for_a_mesh_body(capsys: pytest.CaptureFixture[str], body: Body, name: str) -> None:
+    """The mesh stands where it likes: two metres aside, with its feet on y = 0."""
+    aside = np.array([2.0, -body.v_template[:, 1].min(), 0.5])
+    write_obj(Path("hero.obj"), body.v_template + aside, body.faces)
+    garment, pos, placement = truth(MESHES[name])
+    file = (pos - placement.offset) @ placement.rotation / placement.scale
+    write_obj(Path("g.obj"), file, garment.faces)
+    main(["inspect", "g.obj", "body=hero.obj", "--json"])
+    command = json.loads(capsys.readouterr().out)["files"][0]["command"]
+    assert "body=hero.obj" in command
+    assert main([*shlex.split(command)[1:], "output=g.npz"]) == 0
+    assert np.linalg.norm(load_garment("g.npz").rest_pos - pos - aside, axis=1).mean() < NEAR
 
 
 def test_the_command_names_the_body(capsys: pytest.CaptureFixture[str], body: Body) -> None:
