@@ -150,3 +150,16 @@ class GltfWriter:
         parts = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(chunk), 0x004E4942) + chunk
         path.write_bytes(head + parts)
         return path
+
+
+def write_seated(path: Path) -> Path:
+    """An AMASS file (SMPL-H, z up, 60 fps): sitting upright with hanging arms, the chest swaying a little."""
+    time = np.arange(40) / 60
+    poses = np.zeros((len(time), 52, 3))
+    poses[:, 0] = Rotation.from_euler("x", 90, degrees=True).as_rotvec()
+    poses[:, [1, 2], 0], poses[:, [4, 5], 0] = -np.pi / 2, np.pi / 2
+    poses[:, 16, 2], poses[:, 17, 2] = -np.pi / 2, np.pi / 2
+    poses[:, 9, 1] = 0.05 * np.sin(2 * np.pi * time)
+    trans = np.tile([0.0, 0.0, 0.5], (len(time), 1))
+    np.savez(path, poses=poses.reshape(len(time), 156), trans=trans, mocap_framerate=60.0, betas=np.zeros(16), gender="neutral")
+    return path

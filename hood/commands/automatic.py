@@ -71,8 +71,8 @@ def advice(config: DictConfig, scene: Scene, summary: dict[str, Any]) -> list[st
         return []
     here = "" if reached is None else f", {reached:.2g} with the network"
     return [
-        f"the solver alone takes {alone:.0f} ms a frame here, the network {total['median']:.0f}, and leaves less unbalanced force "
-        f"(relative gradient {target:g}{here}): stepper=newton; stepper=auto measures and takes the faster one"
+        f"the solver alone takes {alone:.0f} ms a frame here, the network {total['median']:.0f}, and leaves less unbalanced "
+        f"force (relative gradient {target:g}{here}): stepper=newton; stepper=auto measures and takes the faster one"
     ]
 
 

@@ -23,7 +23,7 @@ from hood.config import ConfigError, load_config, plain, require_choice
 from hood.scene.cast import NO_MOTION, MotionOptions, load_motion
 from hood.scene.fitting import fit_figures, misplacement
 from hood.scene.mesh_motion import MeshMotion
-from hood.scene.scene import dress
+from hood.scene.scene import LEAD_IN, NotWornError, Scene, dress
 
 _UNREADABLE = "unreadable"
 _BODIES = (kinds.BODY, kinds.MOVING_MESH)
@@ -153,7 +153,21 @@ def _fit(found: list[Finding], body: str, config: DictConfig) -> dict[str, Any] 
     surface = performed.surface(0, performed.translation[0])
     height = float(surface[:, 1].max() - surface[:, 1].min()) if len(surface) else 0.0
     fits = start.stretch_max <= _STRETCH_LIMIT and start.depth_max <= _DEPTH_LIMIT
-    return {**names, "fits": fits, "body_height": height, "skinned": asdict(skinned), "start": asdict(start)}
+    led_in = not fits and _is_led_in(scene)
+    figures = {"body_height": height, "skinned": asdict(skinned), "start": asdict(start)}
+    return {**names, "fits": fits or led_in, "led_in": led_in, **figures}
+
+
+def _is_led_in(scene: Scene) -> bool:
+    """Whether a rollout cannot put the garment on in this pose, and lets the body move into it from the T-pose instead."""
+    try:
+        scene.start(0, relaxed=False, thorough=True)
+    except NotWornError:
+        try:
+            return scene.lead_in(0) is not None
+        except NotWornError:
+            pass
+    return False
 
 
 def _as_dict(finding: Finding) -> dict[str, Any]:
@@ -190,7 +204,9 @@ def _fit_lines(fit: dict[str, Any]) -> list[str]:
         f"edges stretched by at most {100 * skinned['stretch_max']:.1f}%",
         f"  settled: {start['num_inside']} vertices inside to {1e3 * start['depth_max']:.1f} mm, "
         f"edges stretched by at most {100 * start['stretch_max']:.1f}%",
-        "  they fit"
+        f"  they fit: put on in the T-pose, from where a rollout moves the body into this pose in {LEAD_IN:g} s that it drops"
+        if fit["led_in"]
+        else "  they fit"
         if fit["fits"]
         else "  ! they do not fit: prepare the garment with the pose, scale and body it was made for",
     ]

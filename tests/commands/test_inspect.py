@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from imitations import write_seated
 from wild import write_wild_garment
 from workshop import write_obj
 
@@ -196,3 +197,15 @@ def test_no_warning_of_python_reaches_the_user(
         assert "encountered" not in said.err + said.out
         assert said.err.count("\n") == (0 if words[0] == "inspect" else 1)
         assert caught == []
+
+
+def test_inspect_knows_what_a_rollout_does_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("hood.scene.start._MOST_ITERATIONS", 60)
+    seated = str(write_seated(tmp_path / "seated.npz"))
+    assert main(["inspect", "tshirt", seated]) == 1
+    assert "they do not fit" in capsys.readouterr().out
+    monkeypatch.setattr("hood.scene.scene._TORN", 0.1)
+    assert main(["inspect", "tshirt", seated]) == 0
+    assert "they fit: put on in the T-pose, from where a rollout moves the body into this pose" in capsys.readouterr().out

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from imitations import write_seated
 
 from hood.assets.body import Body
 from hood.assets.garment import Garment, load_garment
@@ -29,19 +29,6 @@ POTENTIAL = default_potential()
 def stepper() -> RefinedStepper:
     """No network: three iterations a frame."""
     return RefinedStepper(GuessStepper(POTENTIAL), POTENTIAL, Count(3))
-
-
-def write_seated(path: Path) -> Path:
-    """An AMASS file (SMPL-H, z up, 60 fps): sitting upright with hanging arms, the chest swaying a little."""
-    time = np.arange(40) / 60
-    poses = np.zeros((len(time), 52, 3))
-    poses[:, 0] = Rotation.from_euler("x", 90, degrees=True).as_rotvec()
-    poses[:, [1, 2], 0], poses[:, [4, 5], 0] = -np.pi / 2, np.pi / 2
-    poses[:, 16, 2], poses[:, 17, 2] = -np.pi / 2, np.pi / 2
-    poses[:, 9, 1] = 0.05 * np.sin(2 * np.pi * time)
-    trans = np.tile([0.0, 0.0, 0.5], (len(time), 1))
-    np.savez(path, poses=poses.reshape(len(time), 156), trans=trans, mocap_framerate=60.0, betas=np.zeros(16), gender="neutral")
-    return path
 
 
 def test_the_way_from_the_t_pose_is_that_of_blend_in(tmp_path: Path, garments: dict[str, Garment], body: Body) -> None:
@@ -79,6 +66,17 @@ def test_the_garment_is_put_on_in_the_t_pose(
     *_, last = simulate(stepper(), lead, POTENTIAL, metrics="none")
     assert last.index == 12
     np.testing.assert_array_equal(frames[0].world_pos, last.world_pos)
+
+
+def test_a_start_with_long_edges_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, garments: dict[str, Garment], body: Body
+) -> None:
+    monkeypatch.setattr("hood.scene.scene._TORN", 10.0)
+    monkeypatch.setattr("hood.scene.start._MOST_ITERATIONS", 60)
+    scene = build_scene(garments["tshirt"], body, load_sequence(write_seated(tmp_path / "seated.npz")))
+    told = r"'tshirt' starts with edges stretched by up to \d+% in frame 0 of 'seated': .* standing pose \(blend_in=1\)"
+    with pytest.warns(UserWarning, match=told):
+        next(simulate(stepper(), scene, POTENTIAL, 2, metrics="none"))
 
 
 def test_what_the_t_pose_does_not_help_is_refused(
