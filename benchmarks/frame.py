@@ -10,7 +10,8 @@ time [ms]; forms and precisions take turns frame by frame. ``torch`` computes ev
 compute features and feedback by the compiled library and the network by these kernels. Feedback is what a model of several
 passes sees between them. The share of the network is that of the total, which leaves out the metrics: contact with the body's
 triangles, strain, penetration and energies, what ``metrics=all`` adds to a frame (``hood rollout metrics=none`` spares them).
-The column ``apart`` is the largest distance [µm] of a step's positions from those of the first form.
+The column ``apart`` is the largest distance [µm] of a step's positions from those of the first form. In single frames (folded
+cloth, a contact about to change) a rounding is amplified: the torch form in float32 is then as far from itself in float64.
 """
 
 from __future__ import annotations
