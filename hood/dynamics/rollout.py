@@ -32,6 +32,7 @@ from hood.scene.contact import Contact, find_contact
 from hood.scene.scene import LEAD_IN, RELAXING_DT, NotWornError, Scene, recentre
 from hood.scene.start import free_stretch, push_out
 from hood.scene.state import Attachments, State
+from hood.solver import forces
 
 #: A start with an edge lengthened by more than this share would snap back in the first frames.
 _STRETCH = 0.1
@@ -162,7 +163,9 @@ def simulate(
         stepped = _times(stepper, watch.lap()) | prediction.metrics
         with watch.aside("metrics"):
             if wants_potential:
-                gradient, energies = energies_and_gradient(potential, known, prediction.next_pos, prediction.acc)
+                gradient, energies = energies_and_gradient(
+                    potential, known, prediction.next_pos, prediction.acc, by=forces.energies_and_gradient
+                )
                 known_fields = {name: vertex_residual(known, gradient).float().cpu() for name in fields}
             if metrics == "all":
                 stepped |= energy_metrics(potential, known, gradient, energies)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import weakref
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -21,12 +22,16 @@ from hood.losses.bending import Bending, CurrentLengthBending, bending_weight
 from hood.losses.potential import Potential, Term
 from hood.losses.problem import StepProblem
 from hood.losses.stretching import Stretching
+from hood.mesh.kept import forget
 from hood.native.build import NATIVE_FLAGS, BuildError, build
 from hood.scene.cloth import Cloth
 
 SOURCE = Path(native.__file__).with_name("elements.cpp")
 #: Terms of the pass. A subclass may compute something else and does not count.
 ELEMENT_TERMS = (Stretching, Bending, CurrentLengthBending)
+
+#: Energies [J] (B,) by term, and their gradient [N] (V, 3) before them, of a potential.
+Evaluate = Callable[[Potential, StepProblem, Tensor, Tensor | None], tuple[Tensor, dict[str, Tensor]]]
 
 _POINTER, _COUNT = ctypes.c_void_p, ctypes.c_int64
 
@@ -62,13 +67,14 @@ def library() -> ctypes.CDLL | None:
 
 
 def energies_and_gradient(
-    potential: Potential, problem: StepProblem, next_pos: Tensor, acc: Tensor | None = None
+    potential: Potential, problem: StepProblem, next_pos: Tensor, acc: Tensor | None = None, by: Evaluate = Potential.gradient
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """What :meth:`hood.losses.potential.Potential.gradient` computes, element terms by the compiled pass."""
+    """What :meth:`hood.losses.potential.Potential.gradient` computes, element terms by the compiled pass and others ``by``
+    another function."""
     if not _applies(next_pos):
-        return potential.gradient(problem, next_pos, acc)
+        return by(potential, problem, next_pos, acc)
     others, _ = _split(potential)
-    rest, values = others.gradient(problem, next_pos, acc)
+    rest, values = by(others, problem, next_pos, acc)
     gradient = np.zeros(tuple(next_pos.shape))
     values |= _element_energies(potential, problem, next_pos, gradient)
     return rest.double() + torch.from_numpy(gradient), {name: values[name] for name in potential.terms if name in values}
@@ -136,7 +142,7 @@ def _constants_of(cloth: Cloth) -> _Constants:
     key = id(cloth)
     known = _CONSTANTS.get(key)
     if known is None or known[0]() is not cloth:
-        known = weakref.ref(cloth, lambda _: _CONSTANTS.pop(key, None)), _make_constants(cloth)
+        known = weakref.ref(cloth, forget(_CONSTANTS, key)), _make_constants(cloth)
         _CONSTANTS[key] = known
     return known[1]
 

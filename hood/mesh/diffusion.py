@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from hood.mesh.kept import forget
 from hood.native import features
 
 
@@ -60,5 +61,5 @@ def neighbours_of(edges: Tensor, num_vertices: int) -> Neighbours:
     degree = torch.bincount(receivers, minlength=num_vertices)
     first = torch.cat([degree.new_zeros(1), degree.cumsum(0)])
     found = Neighbours(first, senders[torch.argsort(receivers, stable=True)].contiguous())
-    _NEIGHBOURS[key] = (weakref.ref(edges, lambda _: _NEIGHBOURS.pop(key, None)), num_vertices, found)
+    _NEIGHBOURS[key] = (weakref.ref(edges, forget(_NEIGHBOURS, key)), num_vertices, found)
     return found

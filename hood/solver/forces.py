@@ -21,6 +21,8 @@ COLLISIONS = (Collision, CentroidCollision)
 FRICTIONS = (Friction, WeightFriction, CodedFriction)
 #: Terms whose derivatives are written out. A subclass may compute something else and does not count.
 CLOSED_FORM = (Stretching, *BENDINGS, Attachment, Inertia, Gravity, *COLLISIONS, *FRICTIONS)
+#: Those that act on single vertices.
+SINGLE = (Inertia, Gravity, *COLLISIONS, *FRICTIONS)
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,11 @@ class Walls:
     def depth(self, pos: Tensor) -> Tensor:
         """Depth ε - d (N,) [m] of ``pos`` (N, 3) in the contact zone, negative outside."""
         return self.reach - _rows(pos - self.point, self.normal)
+
+    def pressure(self, pos: Tensor) -> Tensor:
+        """Force (N,) [N] along the normals at ``pos`` (N, 3)."""
+        depth = self.depth(pos).clamp_min(0.0)
+        return 3.0 * self.weight * depth * depth
 
     def take(self, rows: Tensor) -> Walls:
         return Walls(self.weight, self.point[rows], self.normal[rows], self.reach[rows])
@@ -96,6 +103,16 @@ class VertexForces:
             parts.append(grip.force * mollified_norm(_rows(slip, slip), grip.limit))
         return parts
 
+    def gradient(self, pos: Tensor, acc: Tensor) -> Tensor:
+        """Gradient [N] (N, 3) at positions and accelerations (N, 3)."""
+        gradient = self.inertia * acc - self.weight
+        for wall in self.walls:
+            gradient = gradient - wall.pressure(pos)[:, None] * wall.normal
+        for grip in self.grips:
+            slip, _, slope = _slope(grip, pos)
+            gradient = gradient + slope[:, None] * slip
+        return gradient
+
     def model(self, pos: Tensor, acc: Tensor) -> VertexModel:
         """Derivatives at positions and accelerations (N, 3).
 
@@ -107,7 +124,7 @@ class VertexForces:
         slack = None
         for wall in self.walls:
             depth = wall.depth(pos).clamp_min(0.0)
-            gradient = gradient - (3.0 * wall.weight * depth * depth)[:, None] * wall.normal
+            gradient = gradient - wall.pressure(pos)[:, None] * wall.normal
             matrix += _outer((6.0 * wall.weight * depth)[:, None] * wall.normal, wall.normal)
         for grip in self.grips:
             force, block, less = _friction(grip, pos)
@@ -155,17 +172,44 @@ def _grip(term: LaggedFriction, problem: StepProblem) -> Grip:
     return Grip(force, torch.where(sliding, normal, 0.0), anchor, limit)
 
 
-def _friction(grip: Grip, pos: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Gradient, matrix and slack."""
-    normal, slip = grip.normal, grip.slip(pos)
+def _slope(grip: Grip, pos: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Slip (N, 3) [m], its size (N,) and the force along it in units of it (N,) [N/m]."""
+    slip = grip.slip(pos)
     size = _rows(slip, slip).sqrt()
     small = size < grip.limit
-    ratio = size / grip.limit
-    slope = grip.force * torch.where(small, (2.0 - ratio) / grip.limit, 1.0 / torch.where(small, 1.0, size))
-    along = grip.force * torch.where(small, 2.0 * (1.0 - ratio) / grip.limit, 0.0)
+    slope = grip.force * torch.where(small, (2.0 - size / grip.limit) / grip.limit, 1.0 / torch.where(small, 1.0, size))
+    return slip, size, slope
+
+
+def _friction(grip: Grip, pos: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Gradient, matrix and slack."""
+    normal, (slip, size, slope) = grip.normal, _slope(grip, pos)
+    along = grip.force * torch.where(size < grip.limit, 2.0 * (1.0 - size / grip.limit) / grip.limit, 0.0)
     heading = slip / torch.where(size > 0, size, 1.0)[:, None]
     matrix = torch.diag_embed(slope.unsqueeze(1).expand(-1, 3)) - _outer(slope[:, None] * normal, normal)
     return slope[:, None] * slip, matrix, _outer((along - slope)[:, None] * heading, heading)
+
+
+@torch.no_grad()
+def energies_and_gradient(
+    potential: Potential, problem: StepProblem, next_pos: Tensor, acc: Tensor | None = None
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """What :meth:`hood.losses.potential.Potential.gradient` computes; terms of single vertices in closed form."""
+    acc = problem.acceleration(next_pos) if acc is None else acc
+    gradient, energies = torch.zeros_like(next_pos), dict[str, Tensor]()
+    for name, term in potential.terms.items():
+        if not term.applies(problem):
+            continue
+        alone = Potential({name: term})
+        if type(term) not in SINGLE:
+            slope, energy = alone.gradient(problem, next_pos, acc)
+            energies |= energy
+        else:
+            forces = vertex_forces(alone, problem)
+            slope, parts = forces.gradient(next_pos, acc), forces.energies(next_pos, acc, problem.vertex_dt)
+            energies[name] = problem.sum_vertices(sum(parts, start=torch.zeros_like(parts[0])))
+        gradient = gradient + slope
+    return gradient, energies
 
 
 def attachment_stiffness(term: Term, problem: StepProblem) -> Tensor:

@@ -12,6 +12,7 @@ from torch import Tensor
 from hood.losses.collision import Collision
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem, inertial_guess
+from hood.mesh.kept import forget
 from hood.scene.batch import to_device
 from hood.scene.cloth import Cloth
 from hood.solver.terms import StepTerms
@@ -156,7 +157,7 @@ def _double_cloth(cloth: Cloth) -> Cloth:
     if key in _DOUBLES and _DOUBLES[key][0]() is cloth:
         return _DOUBLES[key][1]
     double = to_device(cloth, dtype=torch.float64)
-    _DOUBLES[key] = (weakref.ref(cloth, lambda _: _DOUBLES.pop(key, None)), double)
+    _DOUBLES[key] = (weakref.ref(cloth, forget(_DOUBLES, key)), double)
     return double
 
 

@@ -12,6 +12,7 @@ from torch.nn import functional
 from hood.losses.inertia import Inertia
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
+from hood.mesh.kept import forget
 from hood.scene.cloth import Cloth
 from hood.solver.forces import CLOSED_FORM
 from hood.solver.linear import invert_blocks
@@ -103,5 +104,5 @@ def _incidence_of(cloth: Cloth) -> tuple[Tensor, Tensor]:
     order = torch.argsort(vertex, stable=True)
     count = torch.bincount(vertex, minlength=cloth.num_vertices)
     value = (order, torch.cat([count.new_zeros(1), count.cumsum(0)]))
-    _INCIDENCES[key] = (weakref.ref(cloth.faces, lambda _: _INCIDENCES.pop(key, None)), value)
+    _INCIDENCES[key] = (weakref.ref(cloth.faces, forget(_INCIDENCES, key)), value)
     return value

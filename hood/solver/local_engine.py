@@ -12,6 +12,7 @@ from torch import Tensor
 
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
+from hood.mesh.kept import forget
 from hood.native.build import BuildError
 from hood.scene.cloth import Cloth
 from hood.scene.state import Attachments
@@ -73,7 +74,7 @@ def _engines_of(cloth: Cloth, attachments: Attachments | None) -> list[SceneEngi
     if known is not None and known[0]() is cloth.faces and all(_same(a, b) for a, b in zip(now, known[1], strict=True)):
         return known[2]
     made = [SceneEngine(cloth, build_tables(cloth, attachments, scene)) for scene in range(cloth.num_scenes)]
-    _ENGINES[key] = (weakref.ref(cloth.faces, lambda _: _ENGINES.pop(key, None)), now, made)
+    _ENGINES[key] = (weakref.ref(cloth.faces, forget(_ENGINES, key)), now, made)
     return made
 
 

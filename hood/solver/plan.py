@@ -11,6 +11,7 @@ from torch import Tensor
 
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
+from hood.mesh.kept import forget
 from hood.scene.cloth import Cloth
 from hood.scene.state import Attachments
 from hood.solver import elements
@@ -81,7 +82,7 @@ def plan_for(problem: StepProblem) -> SolverPlan:
         if reference() is cloth.faces and all(_same(a, b) for a, b in zip(now, then, strict=True)):
             return plan
     plan = build_plan(cloth, attachments)
-    _PLANS[key] = (weakref.ref(cloth.faces, lambda _: _PLANS.pop(key, None)), now, plan)
+    _PLANS[key] = (weakref.ref(cloth.faces, forget(_PLANS, key)), now, plan)
     return plan
 
 
