@@ -47,7 +47,7 @@ def test_a_search_does_not_depend_on_those_before_it():
 
 def test_of_faces_at_the_same_distance_the_first_is_taken():
     pos, faces = surface(box(4))
-    corners = pos[:: max(len(pos) // 40, 1)]
+    corners = pos[:: max(len(pos) // 6, 1)]
     hit = found(2.0 * corners, pos, faces)
     for row, point in enumerate(2.0 * corners):
         alone = [float(found(point[None], pos, faces[[k]]).dist.abs()) for k in range(len(faces))]

@@ -96,7 +96,7 @@ def test_time_scales_that_leave_no_training_are_refused(factor: float, words: st
 def test_the_configs_hold_the_papers_numbers() -> None:
     config = load_config("train", ["experiment=paper", "trainer.time_scale=0.02"])
     assert config.trainer.time_scale == 0.02
-    assert build(config.trainer).compressed() == replace(PAPER, time_scale=0.02, workers=None).compressed()
+    assert build(config.trainer).compressed() == replace(PAPER, time_scale=0.02, workers=None, kernels="auto").compressed()
     assert config.model.features == "paper"
     sampling = config.data.sampling
     assert (sampling.beta_range, list(sampling.size_range), sampling.piecewise_fraction) == (2.0, [0.9, 1.1], 0.0)
