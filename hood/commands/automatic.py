@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from hood.commands.dial import AUTO, other_dials, refined
@@ -14,7 +15,7 @@ from hood.dynamics.ranges import scene_conditions
 from hood.dynamics.rollout import simulate
 from hood.dynamics.stepper import NewtonStepper, Stepper
 from hood.losses.potential import Potential, default_potential
-from hood.scene.scene import Scene
+from hood.scene.scene import NotWornError, Scene
 
 #: Iterations after a network on a garment larger than those it was trained on: γ about 0.01 from 1,000 to 12,000 vertices
 #: (docs/accuracy.md).
@@ -60,13 +61,16 @@ def choose(config: DictConfig, stepper: Stepper, scene: Scene) -> Choice:
     return choice
 
 
-def advice(config: DictConfig, scene: Scene, summary: dict[str, Any]) -> list[str]:
-    """After a rollout with a network: a sentence where the solver alone is faster here, and goes further down the potential."""
+def advice(config: DictConfig, scene: Scene, summary: dict[str, Any], start: np.ndarray) -> list[str]:
+    """After a rollout with a network: a sentence where the solver alone is faster here, and goes further down the potential.
+
+    The solver is measured from the rollout's own ``start`` (V, 3) [m], world.
+    """
     total = summary["ms_per_frame"].get("total") or {}
     reached, target = summary["relative_gradient_median"], float(config.solver.target_rg)
     if str(config.stepper) != "network" or int(summary["num_frames"]) < _LEAST_FRAMES or not total.get("median"):
         return []
-    alone = _ms(solver(config), scene, build(config.losses))
+    alone = _ms(solver(config), replace(scene, start_pos=start), build(config.losses))
     if alone is None or alone >= total["median"] or (reached is not None and reached <= target):
         return []
     here = "" if reached is None else f", {reached:.2g} with the network"
@@ -101,7 +105,7 @@ def _iterations(config: DictConfig, stepper: Stepper, scene: Scene, choice: Choi
 
 def _compare(config: DictConfig, stepper: Stepper, scene: Scene, choice: Choice) -> None:
     """The solver where a frame of it takes less time than one of the network; both are measured."""
-    potential, size = build(config.losses), scene.cloth.num_vertices
+    potential, size, scene = build(config.losses), scene.cloth.num_vertices, _put_on(scene)
     with_network = _ms(refined(stepper, choice.settle(config), size), scene, potential)
     alone = _ms(solver(config), scene, potential)
     if with_network is None or alone is None:
@@ -113,6 +117,15 @@ def _compare(config: DictConfig, stepper: Stepper, scene: Scene, choice: Choice)
         choice.why = []
     times = f"a frame of the solver takes {alone:.0f} ms here, one of the network {with_network:.0f} ms"
     choice.why.append(f"stepper={choice.stepper}: {times}")
+
+
+def _put_on(scene: Scene) -> Scene:
+    """The scene with the garment settled in its first frame, once for all that is measured there; itself where it cannot be."""
+    try:
+        start = scene.start(0, relaxed=False, thorough=True)
+    except NotWornError:
+        return scene
+    return replace(scene, start_pos=(start.pos.double().cpu() + start.origin[0]).numpy())
 
 
 def _ms(stepper: Stepper, scene: Scene, potential: Potential) -> float | None:

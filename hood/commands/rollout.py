@@ -80,18 +80,32 @@ def _run(config: DictConfig) -> int:
     return 130 if interrupted else exit_code([summary], bool(config.allow_unsound))
 
 
-def _run_one(config: DictConfig, stepper: Stepper, digest: str) -> tuple[dict[str, Any], bool]:
-    """The rollout of one motion with all its files: the summary, and whether the user interrupted it."""
+def _run_one(config: DictConfig, stepper: Stepper, digest: str, advise: bool = True) -> tuple[dict[str, Any], bool]:
+    """The rollout of one motion with all its files: the summary, and whether the user interrupted it. Where many are run,
+    none is the place for advice on the stepper."""
     with heard() as warned:
-        return _run_heard(config, stepper, digest, warned)
+        return _run_heard(config, stepper, digest, warned, advise)
 
 
-def _run_heard(config: DictConfig, stepper: Stepper, digest: str, warned: list[str]) -> tuple[dict[str, Any], bool]:
+def _tell(sentences: Sequence[str]) -> None:
+    for sentence in sentences:
+        print(sentence)
+
+
+def _first_positions(path: Path) -> np.ndarray:
+    """Frame 0 of a rollout file, (V, 3) float64 [m], world."""
+    with h5py.File(path, "r") as file:
+        return np.asarray(file["cloth/pos"][0], dtype=np.float64)
+
+
+def _run_heard(
+    config: DictConfig, stepper: Stepper, digest: str, warned: list[str], advise: bool
+) -> tuple[dict[str, Any], bool]:
     """The rollout of one motion; ``warned`` is what has been warned about when the summary is written."""
     asked, scene = config, make_scene(config)
     choice = choose(asked, stepper, scene)
     config = choice.settle(asked)
-    print("".join(f"{sentence}\n" for sentence in choice.why), end="")
+    _tell(choice.why)
     if _solves_in_double(config) != _solves_in_double(asked):
         scene = make_scene(config)
     if choice.stepper == "newton" and network_of(stepper) is not None:
@@ -105,7 +119,8 @@ def _run_heard(config: DictConfig, stepper: Stepper, digest: str, warned: list[s
     summary = summarise(folder / "rollout.h5")
     summary["choice"] = asdict(choice)
     print(describe(summary))
-    print("".join(f"{sentence}\n" for sentence in advice(config, scene, summary)), end="")
+    if advise:
+        _tell(advice(config, scene, summary, _first_positions(folder / "rollout.h5")))
     simulator = network_of(stepper)
     try:
         if not interrupted:
@@ -131,7 +146,7 @@ def _run_all(config: DictConfig, jobs: list[Job], output: Path) -> int:
         one = OmegaConf.merge(config, {"sequence": job.sequence, "output": str(job.folder)})
         assert isinstance(one, DictConfig)
         done = _finished(one, digest, job.folder) if bool(config.resume) else None
-        return (done, False) if done is not None else _run_one(one, stepper, digest)
+        return (done, False) if done is not None else _run_one(one, stepper, digest, advise=False)
 
     outcome = share(jobs, work)
     if distributed.rank() == 0:

@@ -23,7 +23,8 @@ from hood.losses.potential import Potential, Term
 from hood.losses.problem import StepProblem
 from hood.losses.stretching import Stretching
 from hood.mesh.kept import forget
-from hood.native.build import NATIVE_FLAGS, BuildError, build
+from hood.native.build import optional
+from hood.native.structures import COUNT, POINTER
 from hood.scene.cloth import Cloth
 
 SOURCE = Path(native.__file__).with_name("elements.cpp")
@@ -33,16 +34,14 @@ ELEMENT_TERMS = (Stretching, Bending, CurrentLengthBending)
 #: Energies [J] (B,) by term, and their gradient [N] (V, 3) before them, of a potential.
 Evaluate = Callable[[Potential, StepProblem, Tensor, Tensor | None], tuple[Tensor, dict[str, Tensor]]]
 
-_POINTER, _COUNT = ctypes.c_void_p, ctypes.c_int64
-
 
 class _Faces(ctypes.Structure):
-    _fields_ = [("count", _COUNT)] + [(name, _POINTER) for name in ("corners", "scene", "inverse", "weight", "mu", "lambda_")]
+    _fields_ = [("count", COUNT)] + [(name, POINTER) for name in ("corners", "scene", "inverse", "weight", "mu", "lambda_")]
 
 
 class _Hinges(ctypes.Structure):
-    _fields_ = [("count", _COUNT), ("current_length", _COUNT)] + [
-        (name, _POINTER) for name in ("corners", "scene", "weight", "rest_angle")
+    _fields_ = [("count", COUNT), ("current_length", COUNT)] + [
+        (name, POINTER) for name in ("corners", "scene", "weight", "rest_angle")
     ]
 
 
@@ -60,10 +59,7 @@ class _Constants(NamedTuple):
 @cache
 def library() -> ctypes.CDLL | None:
     """The compiled pass; None without a compiler."""
-    try:
-        return build(SOURCE, NATIVE_FLAGS)
-    except BuildError:
-        return None
+    return optional(SOURCE)
 
 
 def energies_and_gradient(
@@ -98,7 +94,7 @@ def absolute_strain(cloth: Cloth, pos: Tensor) -> np.ndarray | None:
     constants, place = _constants_of(cloth), _double(pos)
     strain = np.empty(len(constants.edges))
     arrays = (constants.edges, constants.edge_length, place, strain)
-    lib.elements_strain(_COUNT(len(strain)), *(_POINTER(array.ctypes.data) for array in arrays))
+    lib.elements_strain(COUNT(len(strain)), *(POINTER(array.ctypes.data) for array in arrays))
     return strain
 
 
@@ -128,8 +124,8 @@ def _element_energies(
             work, table = lib.elements_faces, ctypes.byref(constants.faces)
         elif type(term) is CurrentLengthBending:
             table = ctypes.byref(constants.current_hinges)
-        into = None if gradient is None else _POINTER(gradient.ctypes.data)
-        work(table, _POINTER(place.ctypes.data), _POINTER(energy.ctypes.data), into)
+        into = None if gradient is None else POINTER(gradient.ctypes.data)
+        work(table, POINTER(place.ctypes.data), POINTER(energy.ctypes.data), into)
         energies[name] = torch.from_numpy(energy)
     return energies
 

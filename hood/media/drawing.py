@@ -11,28 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hood import native
-from hood.native.build import NATIVE_FLAGS, BuildError, build
+from hood.native.build import optional
+from hood.native.structures import COUNT, POINTER, REAL, fields
 
 SOURCE = Path(native.__file__).with_name("picture.cpp")
 
 Array = NDArray[np.float64]
-_POINTER, _COUNT, _REAL = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
-_TRIPLE = _REAL * 3
-
-
-def _fields(text: str, kind: type) -> list[tuple[str, type]]:
-    return [(name, kind) for name in text.split()]
+_TRIPLE = REAL * 3
 
 
 class LightValues(ctypes.Structure):
     """``Light`` of ``picture.cpp``."""
 
     _fields_ = [
-        *_fields("map probes axes", _POINTER),
-        *_fields("size num_probes", _COUNT),
-        ("low", _REAL * 2),
-        *_fields("scale texel", _REAL),
-        *_fields("key fill key_color fill_color sky_color bounce_color", _TRIPLE),
+        *fields("map probes axes", POINTER),
+        *fields("size num_probes", COUNT),
+        ("low", REAL * 2),
+        *fields("scale texel", REAL),
+        *fields("key fill key_color fill_color sky_color bounce_color", _TRIPLE),
     ]
 
 
@@ -40,8 +36,8 @@ class SeenValues(ctypes.Structure):
     """``Seen`` of ``picture.cpp``."""
 
     _fields_ = [
-        *_fields("pos color normal screen depth faces face image", _POINTER),
-        *_fields("width height", _COUNT),
+        *fields("pos color normal screen depth faces face image", POINTER),
+        *fields("width height", COUNT),
         ("eye", _TRIPLE),
     ]
 
@@ -50,26 +46,25 @@ class FloorValues(ctypes.Structure):
     """``Floor`` of ``picture.cpp``."""
 
     _fields_ = [
-        *_fields("dark image", _POINTER),
-        *_fields("width height cells", _COUNT),
-        *_fields("eye right up forward center", _TRIPLE),
-        *_fields("tan_y floor cell", _REAL),
-        *_fields("ground horizon zenith", _TRIPLE),
+        *fields("dark image", POINTER),
+        *fields("width height cells", COUNT),
+        *fields("eye right up forward center", _TRIPLE),
+        *fields("tan_y floor cell", REAL),
+        *fields("ground horizon zenith", _TRIPLE),
     ]
 
 
 @cache
 def library() -> ctypes.CDLL | None:
     """The compiled drawing; None without a compiler."""
-    try:
-        lib = build(SOURCE, NATIVE_FLAGS)
-    except BuildError:
+    lib = optional(SOURCE)
+    if lib is None:
         return None
-    lib.picture_rasterise.argtypes = [*[_POINTER] * 3, *[_COUNT] * 3, _REAL, _REAL, *[_POINTER] * 2]
-    lib.picture_lit.argtypes = [_POINTER, _POINTER, _COUNT, _REAL, _POINTER]
-    lib.picture_shade.argtypes = [_POINTER] * 2
-    lib.picture_backdrop.argtypes = [_POINTER] * 2
-    lib.picture_resolve.argtypes = [_POINTER, _COUNT, _COUNT, _POINTER]
+    lib.picture_rasterise.argtypes = [*[POINTER] * 3, *[COUNT] * 3, REAL, REAL, *[POINTER] * 2]
+    lib.picture_lit.argtypes = [POINTER, POINTER, COUNT, REAL, POINTER]
+    lib.picture_shade.argtypes = [POINTER] * 2
+    lib.picture_backdrop.argtypes = [POINTER] * 2
+    lib.picture_resolve.argtypes = [POINTER, COUNT, COUNT, POINTER]
     for name in ("picture_rasterise", "picture_lit", "picture_shade", "picture_backdrop", "picture_resolve"):
         getattr(lib, name).restype = None
     return lib

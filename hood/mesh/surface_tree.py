@@ -14,33 +14,29 @@ import torch
 from torch import Tensor
 
 from hood import native
-from hood.native.build import NATIVE_FLAGS, BuildError, build
+from hood.native.build import optional
+from hood.native.structures import COUNT, POINTER, fields
 
 SOURCE = Path(native.__file__).with_name("surface.cpp")
-_POINTER, _COUNT = ctypes.c_void_p, ctypes.c_int64
 #: Faces of a leaf, as in the source, and bytes of a line of the cache.
 _WIDE, _LINE = 8, 64
 #: Points that are searched for together, as in the source; fewer where that makes more visits to leaves than this possible.
 _MOST, _VISITS = 64, 1 << 18
 
 
-def _fields(text: str, kind: type) -> list[tuple[str, type]]:
-    return [(name, kind) for name in text.split()]
-
-
 class _Tree(ctypes.Structure):
     """``Tree`` of ``surface.cpp``."""
 
     _fields_ = [
-        *_fields("num_faces num_nodes num_leaves num_blocks edge_width", _COUNT),
-        *_fields("faces around first valence face_edges edge_faces", _POINTER),
-        *_fields("order place around_place children number corner_of block_first block_vertex block_number", _POINTER),
-        *_fields("pos corners boxes face_boxes block_pos cross vertex_normal stamp leaf_stamp", _POINTER),
-        ("call", _COUNT),
+        *fields("num_faces num_nodes num_leaves num_blocks edge_width", COUNT),
+        *fields("faces around first valence face_edges edge_faces", POINTER),
+        *fields("order place around_place children number corner_of block_first block_vertex block_number", POINTER),
+        *fields("pos corners boxes face_boxes block_pos cross vertex_normal stamp leaf_stamp", POINTER),
+        ("call", COUNT),
         ("origin", ctypes.c_double * 3),
         ("size_sq", ctypes.c_double),
-        ("batch", _COUNT),
-        *_fields("nodes leaves reach", _POINTER),
+        ("batch", COUNT),
+        *fields("nodes leaves reach", POINTER),
     ]
 
 
@@ -48,9 +44,9 @@ class _Query(ctypes.Structure):
     """``Query`` of ``surface.cpp``."""
 
     _fields_ = [
-        ("count", _COUNT),
-        *_fields("points next_pos vertex face vertex_dist bary dist", _POINTER),
-        *_fields("point normal next_point next_normal", _POINTER),
+        ("count", COUNT),
+        *fields("points next_pos vertex face vertex_dist bary dist", POINTER),
+        *fields("point normal next_point next_normal", POINTER),
     ]
 
 
@@ -76,9 +72,8 @@ class Match(NamedTuple):
 @cache
 def library() -> ctypes.CDLL | None:
     """The compiled search; None without a compiler."""
-    try:
-        lib = build(SOURCE, NATIVE_FLAGS)
-    except BuildError:
+    lib = optional(SOURCE)
+    if lib is None:
         return None
     return lib
 
@@ -134,7 +129,7 @@ class SurfaceTree:
         self._tree = _Tree(num_faces=len(members), edge_width=incidence[4].shape[1], batch=batch)
         _point(self._tree, self._arrays)
         centre = np.ascontiguousarray(np.nan_to_num(np.asarray(pos, np.float64)[faces].mean(axis=1)))
-        lib.surface_build(ctypes.byref(self._tree), centre.ctypes.data_as(_POINTER), _COUNT(num_vertices))
+        lib.surface_build(ctypes.byref(self._tree), centre.ctypes.data_as(POINTER), COUNT(num_vertices))
 
     def search(self, points: np.ndarray, pos: np.ndarray, next_pos: np.ndarray) -> dict[str, np.ndarray]:
         """Fields of :class:`Match` for ``points`` (N, 3) on the surface at ``pos`` (W, 3), all float64 and C-contiguous."""

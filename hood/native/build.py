@@ -14,7 +14,7 @@ from functools import cache
 from pathlib import Path
 
 from hood.native.cache import cache_folder
-from hood.native.prebuilt import FOLDER, prebuilt
+from hood.native.prebuilt import FOLDER, prebuilt, source_text
 
 #: For sources that use what the processor has; arithmetic as IEEE has it.
 NATIVE_FLAGS = ("-O3", "-std=c++17", "-shared", "-fPIC", "-fno-math-errno", "-Wno-psabi", "-march=native")
@@ -55,6 +55,14 @@ def build(source: Path, flags: Sequence[str]) -> ctypes.CDLL:
             return _compile(compiler, flags, source, Path(temporary) / "library.so")
     except OSError as error:
         raise BuildError(f"a compiled library cannot be loaded ({error}); name a folder for it in HOOD_CACHE") from error
+
+
+def optional(source: Path) -> ctypes.CDLL | None:
+    """The library of ``source`` with :data:`NATIVE_FLAGS`; None where it cannot be built."""
+    try:
+        return build(source, NATIVE_FLAGS)
+    except BuildError:
+        return None
 
 
 def find_compiler() -> str:
@@ -104,7 +112,7 @@ def _run(compiler: str, flags: Sequence[str], source: Path, made: Path) -> list[
 
 def _digest(compiler: str, source: Path, flags: Sequence[str]) -> str:
     version = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
-    parts = [compiler, version, processor(), *flags, source.read_text(encoding="utf-8")]
+    parts = [compiler, version, processor(), *flags, source_text(source)]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 

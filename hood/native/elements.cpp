@@ -5,22 +5,14 @@
 #include <cmath>
 #include <cstdint>
 
+#include "vector.h"
+
 namespace {
 
 constexpr double EPS = 2.220446049250313e-16, TINY = 2.2250738585072014e-308;
 constexpr double DEGENERATE = (8.0 * EPS) * (8.0 * EPS);  // square of a sine, as in hood.mesh.geometry
 constexpr double TURN = 6.283185307179586476925;
 
-struct Vec {
-    double x, y, z;
-};
-inline Vec operator-(Vec a) { return {-a.x, -a.y, -a.z}; }
-inline Vec operator-(Vec a, Vec b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
-inline Vec operator+(Vec a, Vec b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
-inline Vec operator*(double s, Vec a) { return {s * a.x, s * a.y, s * a.z}; }
-inline double dot(Vec a, Vec b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
-inline Vec cross(Vec a, Vec b) { return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x}; }
-inline Vec at(const double* p, int64_t i) { return {p[3 * i], p[3 * i + 1], p[3 * i + 2]}; }
 inline void add(double* p, int64_t i, Vec a) { p[3 * i] += a.x, p[3 * i + 1] += a.y, p[3 * i + 2] += a.z; }
 inline double largest(Vec a) { return std::max(std::fabs(a.x), std::max(std::fabs(a.y), std::fabs(a.z))); }
 

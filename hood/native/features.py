@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from hood.native.build import NATIVE_FLAGS, BuildError, build
+from hood.native.build import optional
 
 SOURCE = Path(__file__).with_name("features.cpp")
 _TYPES = {"p": ctypes.c_void_p, "i": ctypes.c_int64, "f": ctypes.c_float}
@@ -49,9 +49,8 @@ class Neighbours(ctypes.Structure):
 @cache
 def library() -> ctypes.CDLL | None:
     """The compiled functions; None without a compiler."""
-    try:
-        lib = build(SOURCE, NATIVE_FLAGS)
-    except BuildError:
+    lib = optional(SOURCE)
+    if lib is None:
         return None
     for name, kinds in _SIGNATURES.items():
         function = getattr(lib, f"features_{name}")

@@ -3,19 +3,12 @@
 #include <cmath>
 #include <cstdint>
 
+#include "vector.h"
+
 namespace {
 
-struct Three {
-    double x, y, z;
-};
-
-inline Three operator+(Three a, Three b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
-inline Three operator-(Three a, Three b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
-inline Three operator*(double s, Three a) { return {s * a.x, s * a.y, s * a.z}; }
-inline double dot(Three a, Three b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
-inline Three read(const double* p) { return {p[0], p[1], p[2]}; }
 inline double clip(double v, double low, double high) { return std::min(std::max(v, low), high); }
-inline Three unit(Three a) { return (1.0 / std::max(std::sqrt(dot(a, a)), 1e-12)) * a; }
+inline Vec unit(Vec a) { return (1.0 / std::max(std::sqrt(dot(a, a)), 1e-12)) * a; }
 
 }  // namespace
 
@@ -105,9 +98,9 @@ void picture_rasterise(const double* screen, const double* nearness, const int64
 
 namespace {
 
-double lit_at(const Light& light, Three p, double spread) {
+double lit_at(const Light& light, Vec p, double spread) {
     double seen[3];
-    for (int k = 0; k < 3; ++k) seen[k] = dot(read(light.axes + 3 * k), p);
+    for (int k = 0; k < 3; ++k) seen[k] = dot(at(light.axes, k), p);
     const double across = (seen[0] - light.low[0]) * light.scale + 4.0, down = (seen[1] - light.low[1]) * light.scale + 4.0;
     const double bound = 0.004 + 1.5 * spread * light.texel - seen[2], most = light.size - 1.0;
     int64_t covered = 0;
@@ -124,11 +117,11 @@ double power_24(double v) {
     return eighth * eighth * eighth;
 }
 
-void shade(const Light& light, Three pos, Three normal, Three view, Three color, double* out) {
-    const Three key = read(light.key);
+void shade(const Light& light, Vec pos, Vec normal, Vec view, Vec color, double* out) {
+    const Vec key = at(light.key, 0);
     const double diffuse = clip((dot(normal, key) + 0.25) / 1.25, 0.0, 1.0);
     const double shadow = 0.25 + 0.75 * lit_at(light, pos + 0.006 * normal, 0.9);
-    const double fill = clip(dot(normal, read(light.fill)), 0.0, 1.0);
+    const double fill = clip(dot(normal, at(light.fill, 0)), 0.0, 1.0);
     const double up = 0.5 + 0.5 * normal.y, facing = clip(dot(normal, view), 0.0, 1.0);
     const double gloss = 0.06 * power_24(clip(dot(normal, unit(view + key)), 0.0, 1.0)) * shadow;
     const double away = 1.0 - facing, shine = gloss + 0.10 * away * away * away * up, dim = 0.72 + 0.28 * facing;
@@ -146,12 +139,12 @@ extern "C" {
 
 // Share of the key light at points (P, 3) that is not in shadow.
 void picture_lit(const Light* light, const double* points, int64_t count, double spread, double* out) {
-    for (int64_t i = 0; i < count; ++i) out[i] = lit_at(*light, read(points + 3 * i), spread);
+    for (int64_t i = 0; i < count; ++i) out[i] = lit_at(*light, at(points, i), spread);
 }
 
 // Colours of all pixels that see a face; a face seen from inside is darker.
 void picture_shade(const Light* light, const Seen* seen) {
-    const Three eye = read(seen->eye);
+    const Vec eye = at(seen->eye, 0);
     for (int64_t row = 0; row < seen->height; ++row)
         for (int64_t column = 0; column < seen->width; ++column) {
             const int64_t pixel = row * seen->width + column, face = seen->face[pixel];
@@ -164,16 +157,16 @@ void picture_shade(const Light* light, const Seen* seen) {
             const double third = ((b[0] - a[0]) * py - (b[1] - a[1]) * px) / turned;
             double weight[3] = {1.0 - second - third, second, third}, sum = 0.0;
             for (int k = 0; k < 3; ++k) sum += weight[k] /= seen->depth[corner[k]];
-            Three pos{0, 0, 0}, color{0, 0, 0}, normal{0, 0, 0};
+            Vec pos{0, 0, 0}, color{0, 0, 0}, normal{0, 0, 0};
             for (int k = 0; k < 3; ++k) {
                 const double share = clip(weight[k] / sum, 0.0, 1.0);
-                pos = pos + share * read(seen->pos + 3 * corner[k]);
-                color = color + share * read(seen->color + 3 * corner[k]);
-                normal = normal + share * read(seen->normal + 3 * corner[k]);
+                pos = pos + share * at(seen->pos, corner[k]);
+                color = color + share * at(seen->color, corner[k]);
+                normal = normal + share * at(seen->normal, corner[k]);
             }
             normal = unit(normal);
             if (turned > 0) {
-                normal = -1.0 * normal;
+                normal = -normal;
                 color = 0.72 * color;
             }
             shade(*light, pos, normal, unit(eye - pos), color, seen->image + 3 * pixel);
@@ -211,7 +204,7 @@ double sample(const Floor& f, double row, double column) {
 double positive_remainder(double v) { return v - std::floor(v); }
 
 // Coverage of 1 cm lines every half metre, smoothed over the pixel's footprint.
-double grid_lines(Three pos, double pixel, double stretch) {
+double grid_lines(Vec pos, double pixel, double stretch) {
     const double foot = std::max(pixel, 1e-4) * std::sqrt(std::max(stretch, 1.0));
     double lines = 0.0;
     for (double along : {pos.x, pos.z}) {
@@ -221,9 +214,9 @@ double grid_lines(Three pos, double pixel, double stretch) {
     return lines;
 }
 
-void floor_color(const Light& light, const Floor& f, Three ray, double drop, double* out) {
+void floor_color(const Light& light, const Floor& f, Vec ray, double drop, double* out) {
     const double reach = drop / -ray.y;
-    const Three pos = read(f.eye) + reach * ray;
+    const Vec pos = at(f.eye, 0) + reach * ray;
     const double from_x = pos.x - f.center[0], from_z = pos.z - f.center[2], away = std::hypot(from_x, from_z);
     const double fade = std::exp(-(away / 3.2) * (away / 3.2));
     const double lines = grid_lines(pos, reach * 2.0 * f.tan_y / f.height, reach / drop);
@@ -246,7 +239,7 @@ void picture_backdrop(const Light* light, const Floor* floor) {
         for (int64_t column = 0; column < f.width; ++column) {
             const double x = (column + 0.5 - 0.5 * f.width) / (0.5 * f.height) * f.tan_y;
             const double y = (0.5 * f.height - row - 0.5) / (0.5 * f.height) * f.tan_y;
-            const Three ray = read(f.forward) + x * read(f.right) + y * read(f.up);
+            const Vec ray = at(f.forward, 0) + x * at(f.right, 0) + y * at(f.up, 0);
             const double high = clip(1.6 * ray.y / std::sqrt(dot(ray, ray)), 0.0, 1.0);
             double* out = f.image + 3 * (row * f.width + column);
             for (int k = 0; k < 3; ++k) out[k] = std::pow(f.horizon[k] + (f.zenith[k] - f.horizon[k]) * high, 2.2);

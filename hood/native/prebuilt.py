@@ -44,9 +44,14 @@ def levels() -> tuple[Level, ...]:
     return LEVELS.get(platform.machine(), ())
 
 
+def source_text(source: Path) -> str:
+    """Of the source and of the headers beside it, which it may include: what a library depends on."""
+    return "\0".join(path.read_text(encoding="utf-8") for path in (source, *sorted(source.parent.glob("*.h"))))
+
+
 def file_name(source: Path, flags: Sequence[str], level: Level) -> str:
     """Of the library: a source that changed, or other flags, have another name, so a stale library is never taken."""
-    parts = [*(flag for flag in flags if flag != "-march=native"), source.read_text(encoding="utf-8")]
+    parts = [*(flag for flag in flags if flag != "-march=native"), source_text(source)]
     digest = hashlib.sha256("\0".join(parts).encode()).hexdigest()
     return f"{source.stem}-{level.name}-{digest[:16]}.so"
 

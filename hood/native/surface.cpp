@@ -9,6 +9,8 @@
 #include <cstdint>
 #include <cstring>
 
+#include "vector.h"
+
 namespace {
 
 constexpr int WIDE = 8;  // children of a node, faces of a leaf, vertices of a block
@@ -40,15 +42,6 @@ inline double least_lane(V8 v) {
     return low[1] < low[0] ? low[1] : low[0];
 }
 
-struct Vec {
-    double x, y, z;
-};
-inline Vec operator-(Vec a, Vec b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
-inline Vec operator+(Vec a, Vec b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
-inline Vec operator*(double s, Vec a) { return {s * a.x, s * a.y, s * a.z}; }
-inline double dot(Vec a, Vec b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
-inline Vec cross(Vec a, Vec b) { return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x}; }
-inline Vec at(const double* p, int64_t i) { return {p[3 * i], p[3 * i + 1], p[3 * i + 2]}; }
 inline void put(double* p, Vec a) { p[0] = a.x, p[1] = a.y, p[2] = a.z; }
 inline double clamp(double v) { return v < 0.0 ? 0.0 : v > 1.0 ? 1.0 : v; }
 

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from hood.native.build import BuildError, build, processor
+from hood.native.structures import COUNT, POINTER
 from hood.nn import compiled_network
 
 #: ``torch``: torch's operations, everywhere; ``compiled``: the blocks of the network in C++; ``fused``: whole passes of an
@@ -30,12 +31,11 @@ _HALF_FLAGS = ("-mavx512bf16",)
 _TILE_FLAGS = ("-mamx-tile", "-mamx-bf16")
 #: Widths of latents are a multiple of this for AMX: the terms that one of its instructions adds up.
 TILE_LANES = 32
-_POINTER, _COUNT = ctypes.c_void_p, ctypes.c_int64
 
 
 def _fields(*groups: str | tuple[str, type]) -> list[tuple[str, type]]:
-    named = [(name, _POINTER) for group in groups if isinstance(group, str) for name in group.split()]
-    return [("count", _COUNT), *named, *(group for group in groups if isinstance(group, tuple))]
+    named = [(name, POINTER) for group in groups if isinstance(group, str) for name in group.split()]
+    return [("count", COUNT), *named, *(group for group in groups if isinstance(group, tuple))]
 
 
 class Block(ctypes.Structure):
@@ -43,7 +43,7 @@ class Block(ctypes.Structure):
 
     _fields_ = _fields(
         "x table receivers senders first second third bias_2 bias_3 scale shift residual out received one two hat rstd",
-        ("wide", _COUNT),
+        ("wide", COUNT),
         ("eps", ctypes.c_double),
     )
 
@@ -54,7 +54,7 @@ class Gradient(ctypes.Structure):
     _fields_ = _fields(
         "grad grad_sum receivers x one two hat rstd first second third scale grad_first grad_second grad_third "
         "grad_bias_2 grad_bias_3 grad_scale grad_shift grad_hidden grad_x",
-        ("wide", _COUNT),
+        ("wide", COUNT),
     )
 
 

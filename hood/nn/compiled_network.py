@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from hood.graph.builder import BODY, EdgeSet, Graph
 from hood.native.build import NATIVE_FLAGS, build
+from hood.native.structures import COUNT, POINTER, fields
 from hood.nn.schedule import finest_level
 
 if TYPE_CHECKING:
@@ -26,19 +27,14 @@ if TYPE_CHECKING:
     from hood.nn.model import MeshGraphNet
 
 SOURCE = Path(__file__).with_name("network.cpp")
-_POINTER, _COUNT = ctypes.c_void_p, ctypes.c_int64
-
-
-def _fields(text: str, kind: type) -> list[tuple[str, type]]:
-    return [(name, kind) for name in text.split()]
 
 
 class _Perceptron(ctypes.Structure):
     """``Perceptron`` of ``network.cpp``."""
 
     _fields_ = [
-        *_fields("first second third bias_1 bias_2 bias_3 scale shift", _POINTER),
-        *_fields("in_width width out", _COUNT),
+        *fields("first second third bias_1 bias_2 bias_3 scale shift", POINTER),
+        *fields("in_width width out", COUNT),
         ("eps", ctypes.c_double),
     ]
 
@@ -46,16 +42,16 @@ class _Perceptron(ctypes.Structure):
 class _Edges(ctypes.Structure):
     """``Edges`` of ``network.cpp``."""
 
-    _fields_ = [*_fields("num_edges num_nodes", _COUNT), *_fields("senders receivers nodes rows offsets", _POINTER)]
+    _fields_ = [*fields("num_edges num_nodes", COUNT), *fields("senders receivers nodes rows offsets", POINTER)]
 
 
 class _Part(ctypes.Structure):
     """``Part`` of ``network.cpp``."""
 
     _fields_ = [
-        *_fields("to_receiver to_sender to_edge to_node", _POINTER),
+        *fields("to_receiver to_sender to_edge to_node", POINTER),
         ("network", _Perceptron),
-        *_fields("edges latent", _COUNT),
+        *fields("edges latent", COUNT),
     ]
 
 
@@ -63,17 +59,17 @@ class _Step(ctypes.Structure):
     """``Step`` of ``network.cpp``."""
 
     _fields_ = [
-        ("parts", _POINTER),
-        ("own", _POINTER),
+        ("parts", POINTER),
+        ("own", POINTER),
         ("network", _Perceptron),
-        *_fields("num_parts mean", _COUNT),
+        *fields("num_parts mean", COUNT),
     ]
 
 
 class _Memory(ctypes.Structure):
     """``Memory`` of ``network.cpp``."""
 
-    _fields_ = _fields("receiver sender received hidden", _POINTER)
+    _fields_ = fields("receiver sender received hidden", POINTER)
 
 
 @cache
@@ -85,12 +81,12 @@ def library() -> ctypes.CDLL:
     """
     lib = build(SOURCE, NATIVE_FLAGS)
     for name in ("network_most", "network_padded", "network_lanes"):
-        getattr(lib, name).restype = _COUNT
-    lib.network_padded.argtypes = [_COUNT]
-    lib.network_pack.argtypes = [_POINTER, _COUNT, _COUNT, _COUNT, _COUNT, _POINTER]
-    lib.network_rows.argtypes = [_POINTER, _POINTER, _COUNT, _POINTER, _COUNT]
-    lib.network_lift.argtypes = [_POINTER, _COUNT, _COUNT, _POINTER, _POINTER, _POINTER]
-    lib.network_steps.argtypes = [_POINTER, _COUNT, _POINTER, _POINTER, _POINTER, _COUNT, _POINTER]
+        getattr(lib, name).restype = COUNT
+    lib.network_padded.argtypes = [COUNT]
+    lib.network_pack.argtypes = [POINTER, COUNT, COUNT, COUNT, COUNT, POINTER]
+    lib.network_rows.argtypes = [POINTER, POINTER, COUNT, POINTER, COUNT]
+    lib.network_lift.argtypes = [POINTER, COUNT, COUNT, POINTER, POINTER, POINTER]
+    lib.network_steps.argtypes = [POINTER, COUNT, POINTER, POINTER, POINTER, COUNT, POINTER]
     return lib
 
 

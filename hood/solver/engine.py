@@ -23,6 +23,7 @@ from hood.losses.potential import Potential
 from hood.losses.problem import STANDARD_GRAVITY, StepProblem, inertial_guess
 from hood.losses.stretching import Stretching
 from hood.native.build import NATIVE_FLAGS, build
+from hood.native.structures import COUNT, POINTER, REAL, fields
 from hood.scene.cloth import Cloth
 from hood.solver.elements import BENDINGS, face_constants, hinge_constants
 from hood.solver.engine_tables import Tables, build_tables
@@ -32,36 +33,30 @@ from hood.solver.plan import SolverPlan
 
 SOURCE = Path(native.__file__).with_name("newton.cpp")
 
-_POINTER, _COUNT, _REAL = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
-
 
 class _Wall(ctypes.Structure):
-    _fields_ = [("point", _POINTER), ("normal", _POINTER), ("reach", _POINTER), ("weight", _REAL)]
+    _fields_ = [("point", POINTER), ("normal", POINTER), ("reach", POINTER), ("weight", REAL)]
 
 
 class _Grip(ctypes.Structure):
-    _fields_ = [(name, _POINTER) for name in ("force", "normal", "anchor", "limit")]
-
-
-def _fields(text: str, kind: type) -> list[tuple[str, type]]:
-    return [(name, kind) for name in text.split()]
+    _fields_ = [(name, POINTER) for name in ("force", "normal", "anchor", "limit")]
 
 
 class _Engine(ctypes.Structure):
     """``Engine`` of ``newton.cpp``."""
 
     _fields_ = [
-        *_fields("num_vertices num_rows num_faces num_hinges num_blocks num_springs most_blocks", _COUNT),
-        *_fields("vertex face_corners hinge_corners row_starts cols", _POINTER),
-        *_fields("face_starts face_uses hinge_starts hinge_uses spring_starts spring_uses spring_ends", _POINTER),
-        *_fields("shape area mu lambda bulk soft rest_angle hinge_weight rest_length", _POINTER),
-        *_fields("base fixed inertia weight spring_stiffness walls grips", _POINTER),
-        *_fields("num_walls num_grips bending membrane", _COUNT),
-        ("dt_sq", _REAL),
-        *_fields("pos acc trial_pos trial_acc gradient direction path face_force hinge_force", _POINTER),
-        *_fields("face_model hinge_model matrix slack own own_slack row_sum inverse x r z p q", _POINTER),
-        *_fields("sharpness raised phi noise", _REAL),
-        *_fields("wide cg_used", _COUNT),
+        *fields("num_vertices num_rows num_faces num_hinges num_blocks num_springs most_blocks", COUNT),
+        *fields("vertex face_corners hinge_corners row_starts cols", POINTER),
+        *fields("face_starts face_uses hinge_starts hinge_uses spring_starts spring_uses spring_ends", POINTER),
+        *fields("shape area mu lambda bulk soft rest_angle hinge_weight rest_length", POINTER),
+        *fields("base fixed inertia weight spring_stiffness walls grips", POINTER),
+        *fields("num_walls num_grips bending membrane", COUNT),
+        ("dt_sq", REAL),
+        *fields("pos acc trial_pos trial_acc gradient direction path face_force hinge_force", POINTER),
+        *fields("face_model hinge_model matrix slack own own_slack row_sum inverse x r z p q", POINTER),
+        *fields("sharpness raised phi noise", REAL),
+        *fields("wide cg_used", COUNT),
     ]
 
 
@@ -73,12 +68,12 @@ def library() -> ctypes.CDLL:
         hood.native.build.BuildError: there is no compiler, or it fails.
     """
     lib = build(SOURCE, NATIVE_FLAGS)
-    lib.newton_model.restype = _REAL
-    lib.newton_move.argtypes = [_POINTER, _REAL, _COUNT]
-    lib.newton_matrix.argtypes = [_POINTER, _REAL]
-    lib.newton_alone.argtypes = [_POINTER] * 4
+    lib.newton_model.restype = REAL
+    lib.newton_move.argtypes = [POINTER, REAL, COUNT]
+    lib.newton_matrix.argtypes = [POINTER, REAL]
+    lib.newton_alone.argtypes = [POINTER] * 4
     for name in ("newton_move", "newton_face_record", "newton_hinge_record"):
-        getattr(lib, name).restype = _COUNT
+        getattr(lib, name).restype = COUNT
     return lib
 
 
@@ -256,11 +251,11 @@ class SceneEngine:
 
     def start(self, acc: np.ndarray) -> None:
         """Take up accelerations (V, 3) of all vertices of the cloth."""
-        self._lib.newton_start(self._address, acc.ctypes.data_as(_POINTER))
+        self._lib.newton_start(self._address, acc.ctypes.data_as(POINTER))
 
     def guess(self, mass: np.ndarray, gravity: np.ndarray) -> None:
         """Take up the better of the two first guesses; masses [kg] (V,) of the cloth, gravity (3,) m/s²."""
-        self._lib.newton_guess(self._address, mass.ctypes.data_as(_POINTER), gravity.ctypes.data_as(_POINTER))
+        self._lib.newton_guess(self._address, mass.ctypes.data_as(POINTER), gravity.ctypes.data_as(POINTER))
 
     def model(self) -> float:
         """Gradient at the state; its norm [N]."""
@@ -276,7 +271,7 @@ class SceneEngine:
 
     def read(self, pos: np.ndarray, acc: np.ndarray) -> None:
         """Write positions and accelerations (V, 3) of this scene's vertices into arrays of the whole cloth."""
-        self._lib.newton_state(self._address, pos.ctypes.data_as(_POINTER), acc.ctypes.data_as(_POINTER))
+        self._lib.newton_state(self._address, pos.ctypes.data_as(POINTER), acc.ctypes.data_as(POINTER))
 
     def alone(self, pos: int, force: int, step: int) -> None:
         """Write force [N] and local step [m] of this scene's free vertices at positions: addresses of tables (V, 3) of the
