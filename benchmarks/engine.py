@@ -3,6 +3,7 @@
     python benchmarks/engine.py                                           # dress, dress_4k, dress_12k
     python benchmarks/engine.py tshirt trousers dress skirt --motions walk_proud dance_mixed plie
     python benchmarks/engine.py --frame tshirt dress_4k dress_12k --iterations 4
+    python benchmarks/engine.py --converged tshirt trousers dress skirt --motions walk_proud dance_mixed plie --frames 60
 
 Steps of rollouts (embedded body, default fabric), each solved by both forms from the same state; the compiled one goes on. A
 line per garment: median CPU milliseconds of the contact search and of the solver, the greatest difference of the potential that
@@ -10,13 +11,16 @@ both reach, in units of e0 (what their γ differ by), and the share of the steps
 
 ``--frame`` times whole frames of ``stepper=newton`` with the compiled solver: posing, search, solver, integration, no metrics
 and no files. Beside the median milliseconds stand median and 95th percentile of γ over every fourth state.
+
+``--converged`` lets both forms go on until they converge, by their default settings, each along its own rollout. A line per
+garment, motion and form: the steps that missed their accuracy, the Newton iterations of a step and its relative gradient.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from statistics import median
 from typing import Any, TypeVar
 
@@ -30,6 +34,7 @@ from hood.commands.circumstances import machine_name
 from hood.dynamics.rollout import simulate
 from hood.dynamics.simulator import Prediction
 from hood.dynamics.stepper import NewtonStepper
+from hood.dynamics.stopwatch import Stopwatch
 from hood.evaluation.gap import gap
 from hood.losses.potential import default_potential, scale
 from hood.losses.problem import StepProblem
@@ -37,7 +42,7 @@ from hood.mesh import surface_tree
 from hood.scene.contact import find_contact
 from hood.scene.scene import Scene, build_scene
 from hood.scene.state import State
-from hood.solver.newton import NewtonSettings, minimize
+from hood.solver.newton import NewtonSettings, Report, minimize
 
 #: Steps whose potentials differ by so much [e0] count as the same.
 SAME = 1e-3
@@ -116,6 +121,44 @@ def time_frames(garment: str, motions: list[str], frames: int, iterations: int) 
     return f"{garment:12s} {len(scene.cloth.rest_pos):6d} {ms:10.1f} {middle:10.2g} {high:10.2g} {len(gaps):6d}"
 
 
+class Reporting(NewtonStepper):
+    """Keeps what the solver reports of the last step."""
+
+    def predict(self, problem: StepProblem, prepared: None, watch: Stopwatch | None = None) -> Prediction:
+        pos, self.report = minimize(self.potential, problem, settings=self.settings)
+        return Prediction(pos, self.report.acc, {})
+
+
+def solved_rollout(garment: str, motion: str, frames: int, form: str) -> list[tuple[Report, float]]:
+    """Reports and CPU milliseconds of the steps of a rollout that one form solves."""
+    potential, reports, times = default_potential(), [], []
+    stepper = Reporting(potential, NewtonSettings(engine=form))
+    rollout = simulate(
+        stepper,
+        make_scene(garment, motion),
+        potential,
+        frames + 1,
+        observe=lambda *_: reports.append(stepper.report),
+        metrics="none",
+    )
+    next(rollout)
+    for _ in range(frames):
+        timed(times, next, rollout)
+    return list(zip(reports, times, strict=True))
+
+
+def converge(garment: str, motions: list[str], frames: int) -> Iterator[str]:
+    """Lines of the table of both forms until they converge."""
+    for motion in motions:
+        for form in ("compiled", "torch"):
+            steps = solved_rollout(garment, motion, frames, form)
+            missed = sum(not bool(report.converged.all()) for report, _ in steps)
+            middle, high, most = np.percentile([report.iterations for report, _ in steps], [50, 95, 100])
+            worst = max(float(report.relative_gradient.max()) for report, _ in steps)
+            counts = f"{len(steps):6d} {missed:7d} {middle:8.0f} {high:5.0f} {most:5.0f}"
+            yield f"{garment:12s} {motion:15s} {form:9s} {counts} {worst:9.1e} {median(ms for _, ms in steps):9.1f}"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("garments", nargs="*", default=["dress", "dress_4k", "dress_12k"])
@@ -123,8 +166,16 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=16)
     parser.add_argument("--iterations", type=int, default=5)
     parser.add_argument("--frame", action="store_true", help="time whole frames")
+    parser.add_argument("--converged", action="store_true", help="count the steps that miss their accuracy")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
+    if arguments.converged:
+        print(f"{machine_name('cpu')}; iterations until the default accuracy")
+        print("garment      motion          form       steps  missed its median   p95   max  worst rg  frame ms")
+        for garment in arguments.garments:
+            for line in converge(garment, arguments.motions, arguments.frames):
+                print(line, flush=True)
+        return
     print(f"{machine_name('cpu')}; {arguments.iterations} iterations at most")
     if arguments.frame:
         print("garment    vertices   frame ms   γ median      γ p95 states")

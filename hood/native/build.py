@@ -17,7 +17,7 @@ from hood.native.cache import cache_folder
 from hood.native.prebuilt import FOLDER, prebuilt, source_text
 
 #: For sources that use what the processor has; arithmetic as IEEE has it.
-NATIVE_FLAGS = ("-O3", "-std=c++17", "-shared", "-fPIC", "-fno-math-errno", "-Wno-psabi", "-march=native")
+NATIVE_FLAGS = ("-O3", "-std=c++17", "-shared", "-fPIC", "-pthread", "-fno-math-errno", "-Wno-psabi", "-march=native")
 #: What ``-march=native`` asks of a compiler that does not know the processor it runs on, or not the option.
 _UNKNOWN_PROCESSOR = ("unknown architecture", "unknown value", "unsupported argument", "unsupported option", "bad value")
 

@@ -4,10 +4,13 @@
 // the free ones first, in an order that keeps neighbours near each other, then the fixed ones. A table of triples is padded to four
 // numbers a row. Elements are taken eight at a time, one per lane, in float64; a row of 3 x 3 blocks is then gathered from the
 // elements at its vertex, in cache, and written once: no two writers, a fixed order, the same bits in every run. Of the symmetric
-// matrix a row keeps its diagonal block, which comes first, and those of later columns.
+// matrix a row keeps its diagonal block, which comes first, and those of later columns. Loops over elements and rows are shared by
+// threads where the cloth is large enough: in parts, each with its own sums, which are then added in their order.
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+
+#include "threads.h"
 
 namespace {
 
@@ -115,16 +118,39 @@ struct Engine {
     void *face_model, *hinge_model; // records of the elements, see below, of float or double like the rest
     void *matrix, *slack;           // (R, 9) + 1, (R)
     void *own, *own_slack;          // (N, 6) what acts on single vertices
-    void *row_sum;                  // (most_blocks, 16), aligned to 32 bytes
+    void *row_sum;                  // (parts, most_blocks, 16), aligned to 32 bytes
     void *inverse, *x, *r, *z, *p, *q; // (N, 12), (N, 4) five times
     double sharpness, raised;       // of the matrix as it stands, and of the next one
     double phi, noise;
     int64_t wide;                   // matrix and linear solver in float64
     int64_t cg_used;
+    // Threads.
+    int64_t parts, cg_parts;        // in how many parts loops are done, and those of conjugate gradients
+    int64_t reach;                  // how far a column is behind its row at most
+    void* spill;                    // (cg_parts - 1, reach, 4) what a part's rows give to the rows behind the part
 };
 }
 
 namespace {
+
+inline Range rows_of(const Engine& e, int64_t part) { return range_of(e.num_rows, part, e.parts); }
+inline Range system_of(const Engine& e, int64_t part) { return range_of(e.num_rows, part, e.cg_parts); }
+inline Range faces_of(const Engine& e, int64_t part) { return range_of(e.num_faces, part, e.parts, LANES); }
+inline Range hinges_of(const Engine& e, int64_t part) { return range_of(e.num_hinges, part, e.parts, LANES); }
+
+// A number of every part, a line of the cache each; added in their order.
+template <class V> struct Sums {
+    struct alignas(64) Line {
+        V value;
+    } line[MOST_PARTS];
+
+    V& operator[](int64_t part) { return line[part].value; }
+    V total(int64_t parts) const {
+        V sum = line[0].value;
+        for (int64_t part = 1; part < parts; ++part) sum += line[part].value;
+        return sum;
+    }
+};
 
 // ---- elements ------------------------------------------------------------------------------------------------------------
 
@@ -161,9 +187,9 @@ inline void strain_of(const Engine& e, const double* pos, int64_t i, Strain& s) 
     s.g11 = 0.5 * (dot(s.f[1], s.f[1]) - 1.0);
 }
 
-double face_energy(const Engine& e, const double* pos) {
+double face_energy(const Engine& e, const double* pos, Range range) {
     double sum = 0.0;
-    for (int64_t i = 0; i < e.num_faces; i += LANES) {
+    for (int64_t i = range.begin; i < range.end; i += LANES) {
         Strain s;
         strain_of(e, pos, i, s);
         const V8 trace = s.g00 + s.g11, square = s.g00 * s.g00 + s.g11 * s.g11 + 2.0 * s.g01 * s.g01;
@@ -173,10 +199,10 @@ double face_energy(const Engine& e, const double* pos) {
     return sum;
 }
 
-template <class T> void face_models(const Engine& e, const double* pos) {
+template <class T> void face_models(const Engine& e, const double* pos, Range range) {
     FaceRecord<T>* records = (FaceRecord<T>*)e.face_model;
     const V8 zero = all(0.0), one = all(1.0);
-    for (int64_t i = 0; i < e.num_faces; i += LANES) {
+    for (int64_t i = range.begin; i < range.end; i += LANES) {
         Strain s;
         strain_of(e, pos, i, s);
         const V8 mu = load<V8>(e.mu + i), area = load<V8>(e.area + i);
@@ -261,9 +287,9 @@ inline V8 bend_of(V8 angle, V8 rest_angle) {
     return bend - off;
 }
 
-double hinge_energy(const Engine& e, const double* pos) {
+double hinge_energy(const Engine& e, const double* pos, Range range) {
     double sum = 0.0;
-    for (int64_t i = 0; i < e.num_hinges; i += LANES) {
+    for (int64_t i = range.begin; i < range.end; i += LANES) {
         Hinge h;
         V8 span[3];
         hinge_of(e, pos, i, h, span);
@@ -279,10 +305,10 @@ double hinge_energy(const Engine& e, const double* pos) {
     return sum;
 }
 
-template <class T> void hinge_models(const Engine& e, const double* pos) {
+template <class T> void hinge_models(const Engine& e, const double* pos, Range range) {
     HingeRecord<T>* records = (HingeRecord<T>*)e.hinge_model;
     const V8 zero = all(0.0), one = all(1.0);
-    for (int64_t i = 0; i < e.num_hinges; i += LANES) {
+    for (int64_t i = range.begin; i < range.end; i += LANES) {
         Hinge h;
         V8 span[3], slope[4][3];
         hinge_of(e, pos, i, h, span);
@@ -426,8 +452,13 @@ void energy(const Engine& e, const double* pos, const double* acc, double* phi, 
         }
         add(part);
     }
-    if (e.membrane) add(face_energy(e, pos));
-    if (e.bending) add(hinge_energy(e, pos));
+    Sums<double> faces, hinges;
+    for_parts(e.parts, [&](int64_t part) {
+        if (e.membrane) faces[part] = face_energy(e, pos, faces_of(e, part));
+        if (e.bending) hinges[part] = hinge_energy(e, pos, hinges_of(e, part));
+    });
+    if (e.membrane) add(faces.total(e.parts));
+    if (e.bending) add(hinges.total(e.parts));
     double springs = 0.0;
     for (int64_t s = 0; s < e.num_springs; ++s) {
         double gap[3];
@@ -453,9 +484,9 @@ template <int CORNERS> inline D4 pull_of(const double* forces, int size, const i
 }
 
 // The gradient, and the blocks of single vertices; the elements' forces have been made.
-template <class T> void gather_gradient(const Engine& e) {
+template <class T> void gather_gradient(const Engine& e, Range range) {
     T *own = (T*)e.own, *own_slack = (T*)e.own_slack;
-    for (int64_t row = 0; row < e.num_rows; ++row) {
+    for (int64_t row = range.begin; row < range.end; ++row) {
         double gradient[3], upper[6], slack[6];
         vertex_model(e, row, gradient, upper, slack);
         D4 force = D4{gradient[0], gradient[1], gradient[2], 0.0};
@@ -532,14 +563,16 @@ template <class T, class V4> inline void invert(const V4* m, T* inverse) {
 }
 
 // The upper rows of blocks, with a share of the slack, and the inverse diagonal blocks of the matrix without it.
-template <class T> void gather_matrix(const Engine& e) {
+template <class T> void gather_matrix(const Engine& e, int64_t part) {
     typedef typename Four<T>::type V4;
     T *matrix = (T*)e.matrix, *slack = (T*)e.slack, *inverse = (T*)e.inverse;
     const T sharpness = (T)e.sharpness;
     const V4 unit[3] = {V4{1, 0, 0, 0}, V4{0, 1, 0, 0}, V4{0, 0, 1, 0}};
-    V4* memory = (V4*)e.row_sum;
+    V4* memory = (V4*)e.row_sum + 4 * e.most_blocks * part;
     Row<T> sum = {memory, memory + e.most_blocks};
-    for (int64_t row = 0; row < e.num_rows; ++row) {
+    const Range range = rows_of(e, part);
+    const int64_t end = e.row_starts[range.end];
+    for (int64_t row = range.begin; row < range.end; ++row) {
         const int64_t start = e.row_starts[row], degree = e.row_starts[row + 1] - start;
         for (int64_t i = 0; i < 3 * degree; ++i) sum.block[i] = V4{};
         for (int64_t i = 0; i < degree; ++i) sum.axial[i] = V4{};
@@ -572,17 +605,25 @@ template <class T> void gather_matrix(const Engine& e) {
         for (int64_t i = 0; i < degree; ++i) {
             T* target = matrix + 9 * (start + i);
             const T axial = sum.axial[i][0] + sharpness * sum.axial[i][1];
-            for (int k = 0; k < 3; ++k)  // the fourth number is overwritten by the next store
-                store(target + 3 * k, sum.block[3 * i + k] + axial * unit[k]);
+            for (int k = 0; k < 2; ++k) store(target + 3 * k, sum.block[3 * i + k] + axial * unit[k]);
+            const V4 third = sum.block[3 * i + 2] + axial * unit[2];
+            if (start + i + 1 < end) store(target + 6, third);  // the fourth number is overwritten by the next store
+            else std::memcpy(target + 6, &third, 3 * sizeof(T));  // it would be another part's
             slack[start + i] = sum.axial[i][1];
         }
     }
 }
 
+template <class T> void gather_matrix(const Engine& e) {
+    for_parts(e.parts, [&](int64_t part) { gather_matrix<T>(e, part); });
+}
+
 template <class T> void differentiate(const Engine& e) {
-    if (e.membrane) face_models<T>(e, e.pos);
-    if (e.bending) hinge_models<T>(e, e.pos);
-    gather_gradient<T>(e);
+    for_parts(e.parts, [&](int64_t part) {
+        if (e.membrane) face_models<T>(e, e.pos, faces_of(e, part));
+        if (e.bending) hinge_models<T>(e, e.pos, hinges_of(e, part));
+    });
+    for_parts(e.parts, [&](int64_t part) { gather_gradient<T>(e, rows_of(e, part)); });
 }
 
 // The share of the slack that is in the matrix, from what it was to what it shall be.
@@ -591,25 +632,29 @@ template <class T> void sharpen(Engine& e, double sharpness) {
     const T change = (T)(sharpness - e.sharpness);
     e.sharpness = sharpness;
     if (change == T(0)) return;
-    for (int64_t i = 0; i < e.num_blocks; ++i)
-        for (int k = 0; k < 3; ++k) matrix[9 * i + 4 * k] += change * slack[i];
-    if (e.num_grips)
-        for (int64_t row = 0; row < e.num_rows; ++row)
-            for (int a = 0; a < 3; ++a)
-                for (int b = 0; b < 3; ++b)
-                    matrix[9 * (int64_t)e.row_starts[row] + 3 * a + b] += change * own_slack[6 * row + PAIR[a][b]];
+    for_parts(e.parts, [&](int64_t part) {
+        const Range range = rows_of(e, part);
+        for (int64_t i = e.row_starts[range.begin]; i < e.row_starts[range.end]; ++i)
+            for (int k = 0; k < 3; ++k) matrix[9 * i + 4 * k] += change * slack[i];
+        if (e.num_grips)
+            for (int64_t row = range.begin; row < range.end; ++row)
+                for (int a = 0; a < 3; ++a)
+                    for (int b = 0; b < 3; ++b)
+                        matrix[9 * (int64_t)e.row_starts[row] + 3 * a + b] += change * own_slack[6 * row + PAIR[a][b]];
+    });
 }
 
 // ---- the linear system ---------------------------------------------------------------------------------------------------
 
-// q = H p and p . q; a block serves its row and, transposed, its column.
-template <class T> double multiply(const Engine& e, const T* p, T* q) {
+// Of q = H p some rows of a part that ends at a row, and their p . q; a block serves its row and, transposed, its column. What
+// columns behind the part get is put aside: ``spill`` has ``reach`` rows of them.
+template <class T, bool INSIDE> inline D4 multiply_rows(const Engine& e, Range range, int64_t end, T* spill) {
     typedef typename Four<T>::type V4;
-    const T* m = (const T*)e.matrix;
+    const T *p = (const T*)e.p, *m = (const T*)e.matrix + 9 * (int64_t)e.row_starts[range.begin];
+    T* q = (T*)e.q;
     const int32_t *cols = e.cols, *starts = e.row_starts;
     D4 sum = D4{};
-    std::memset(q, 0, sizeof(T) * 4 * e.num_rows);
-    for (int64_t row = 0; row < e.num_rows; ++row) {
+    for (int64_t row = range.begin; row < range.end; ++row) {
         const V4 own = load<V4>(p + 4 * row);
         const T x = own[0], y = own[1], z = own[2];
         V4 a = load<V4>(m) * own, b = load<V4>(m + 3) * own, c = load<V4>(m + 6) * own;
@@ -619,14 +664,47 @@ template <class T> double multiply(const Engine& e, const T* p, T* q) {
             const int64_t col = 4 * (int64_t)cols[i];
             const V4 other = load<V4>(p + col);
             a += first * other, b += second * other, c += third * other;
-            store(q + col, load<V4>(q + col) + first * x + second * y + third * z);
+            T* target = INSIDE || cols[i] < end ? q + col : spill + (col - 4 * end);
+            store(target, load<V4>(target) + first * x + second * y + third * z);
         }
         const V4 before = load<V4>(q + 4 * row);
         const V4 product = {before[0] + (a[0] + a[1] + a[2]), before[1] + (b[0] + b[1] + b[2]), before[2] + (c[0] + c[1] + c[2]), T(0)};
         store(q + 4 * row, product);
         sum += __builtin_convertvector(product * own, D4);
     }
-    return (sum[0] + sum[1]) + sum[2];
+    return sum;
+}
+
+inline Range behind(const Engine& e, Range range) { return {range.end, std::min(range.end + e.reach, e.num_rows)}; }
+
+template <class T> inline T* spill_of(const Engine& e, int64_t part) { return (T*)e.spill + 4 * e.reach * part; }
+
+template <class T> D4 multiply(const Engine& e, int64_t part) {
+    typedef typename Four<T>::type V4;
+    const Range range = system_of(e, part), rest = behind(e, range);
+    std::memset((T*)e.q + 4 * range.begin, 0, sizeof(T) * 4 * (range.end - range.begin));
+    if (rest.begin == rest.end) return multiply_rows<T, true>(e, range, range.end, nullptr);
+    T* spill = spill_of<T>(e, part);
+    std::memset(spill, 0, sizeof(T) * 4 * (rest.end - rest.begin));
+    const int64_t inside = std::max(range.begin, range.end - e.reach);
+    D4 sum = multiply_rows<T, true>(e, {range.begin, inside}, range.end, spill);
+    sum += multiply_rows<T, false>(e, {inside, range.end}, range.end, spill);
+    const T* p = (const T*)e.p;
+    for (int64_t row = rest.begin; row < rest.end; ++row)
+        sum += __builtin_convertvector(load<V4>(p + 4 * row) * load<V4>(spill + 4 * (row - rest.begin)), D4);
+    return sum;
+}
+
+// Adds to the rows of a part what earlier parts have put aside for them.
+template <class T> void take_spill(const Engine& e, int64_t part, T* q) {
+    typedef typename Four<T>::type V4;
+    const Range own = system_of(e, part);
+    for (int64_t other = 0; other < part; ++other) {
+        const Range rest = behind(e, system_of(e, other));
+        const T* spill = spill_of<T>(e, other) - 4 * rest.begin;
+        for (int64_t row = std::max(own.begin, rest.begin); row < std::min(own.end, rest.end); ++row)
+            store(q + 4 * row, load<V4>(q + 4 * row) + load<V4>(spill + 4 * row));
+    }
 }
 
 // z = P r for one row; adds r . z.
@@ -636,47 +714,80 @@ template <class T, class V4> inline void precondition(const T* m, V4 r, T* z, D4
     sum += __builtin_convertvector(result * r, D4);
 }
 
-// Conjugate gradients for the direction; false where the matrix turned out not to be positive definite.
-template <class T> bool solve(Engine& e, double tolerance, int64_t most) {
+// The vectors of conjugate gradients where they begin, with x = 0; r . z of the rows of a part.
+template <class T> D4 begin_rows(const Engine& e, int64_t part, double scale) {
     typedef typename Four<T>::type V4;
-    T *x = (T*)e.x, *r = (T*)e.r, *z = (T*)e.z, *p = (T*)e.p, *q = (T*)e.q;
-    const int64_t size = e.num_rows;
-    double norm = 0.0;  // the right-hand side is scaled to 1: nothing overflows in float32
-    for (int64_t row = 0; row < size; ++row) norm += dot3(e.gradient + 4 * row, e.gradient + 4 * row);
-    norm = std::sqrt(norm);
-    const double scale = norm > 0.0 ? 1.0 / norm : 0.0;
+    T *x = (T*)e.x, *r = (T*)e.r, *z = (T*)e.z, *p = (T*)e.p;
     const T* inverse = (const T*)e.inverse;
+    const Range range = system_of(e, part);
     D4 sum = D4{};
-    for (int64_t row = 0; row < size; ++row) {
+    for (int64_t row = range.begin; row < range.end; ++row) {
         const V4 right = __builtin_convertvector(-scale * load<D4>(e.gradient + 4 * row), V4);
         store(x + 4 * row, V4{});
         store(r + 4 * row, right);
         precondition<T>(inverse + 12 * row, right, z + 4 * row, sum);
     }
-    double rz = (sum[0] + sum[1]) + sum[2];
-    std::memcpy(p, z, sizeof(T) * 4 * size);
+    std::memcpy(p + 4 * range.begin, z + 4 * range.begin, sizeof(T) * 4 * (range.end - range.begin));
+    return sum;
+}
+
+// A step along p; r . z of the rows of a part.
+template <class T> D4 step_rows(const Engine& e, int64_t part, T length) {
+    typedef typename Four<T>::type V4;
+    T *x = (T*)e.x, *r = (T*)e.r, *z = (T*)e.z;
+    const T *p = (const T*)e.p, *q = (const T*)e.q, *inverse = (const T*)e.inverse;
+    const Range range = system_of(e, part);
+    take_spill<T>(e, part, (T*)e.q);
+    D4 sum = D4{};
+    for (int64_t row = range.begin; row < range.end; ++row) {
+        const V4 left = load<V4>(r + 4 * row) - length * load<V4>(q + 4 * row);
+        store(x + 4 * row, load<V4>(x + 4 * row) + length * load<V4>(p + 4 * row));
+        store(r + 4 * row, left);
+        precondition<T>(inverse + 12 * row, left, z + 4 * row, sum);
+    }
+    return sum;
+}
+
+template <class T> void turn_rows(const Engine& e, int64_t part, T share) {
+    typedef typename Four<T>::type V4;
+    const T* z = (const T*)e.z;
+    T* p = (T*)e.p;
+    const Range range = system_of(e, part);
+    for (int64_t row = range.begin; row < range.end; ++row) store(p + 4 * row, load<V4>(z + 4 * row) + share * load<V4>(p + 4 * row));
+}
+
+// The sum over the parts, and then over the axes.
+template <class Compute> inline double sum_parts(const Engine& e, const Compute& compute) {
+    Sums<D4> sums;
+    for_parts(e.cg_parts, [&](int64_t part) { sums[part] = compute(part); });
+    const D4 sum = sums.total(e.cg_parts);
+    return (sum[0] + sum[1]) + sum[2];
+}
+
+// Conjugate gradients for the direction; false where the matrix turned out not to be positive definite.
+template <class T> bool solve(Engine& e, double tolerance, int64_t most) {
+    const int64_t size = e.num_rows;
+    double norm = 0.0;  // the right-hand side is scaled to 1: nothing overflows in float32
+    for (int64_t row = 0; row < size; ++row) norm += dot3(e.gradient + 4 * row, e.gradient + 4 * row);
+    norm = std::sqrt(norm);
+    const double scale = norm > 0.0 ? 1.0 / norm : 0.0;
+    double rz = sum_parts(e, [&](int64_t part) { return begin_rows<T>(e, part, scale); });
     const double limit = tolerance * tolerance * rz;
     bool definite = true;
     for (int64_t iteration = 0; iteration < most && rz > limit; ++iteration) {
-        const double curvature = multiply<T>(e, p, q);
+        const double curvature = sum_parts(e, [&](int64_t part) { return multiply<T>(e, part); });
         if (!(curvature > 0.0)) {
             definite = false;
             break;
         }
         const T length = (T)(rz / curvature);
-        sum = D4{};
-        for (int64_t row = 0; row < size; ++row) {
-            const V4 left = load<V4>(r + 4 * row) - length * load<V4>(q + 4 * row);
-            store(x + 4 * row, load<V4>(x + 4 * row) + length * load<V4>(p + 4 * row));
-            store(r + 4 * row, left);
-            precondition<T>(inverse + 12 * row, left, z + 4 * row, sum);
-        }
         const double before = rz;
-        rz = (sum[0] + sum[1]) + sum[2];
+        rz = sum_parts(e, [&](int64_t part) { return step_rows<T>(e, part, length); });
         const T share = (T)(rz / before);
-        for (int64_t row = 0; row < size; ++row) store(p + 4 * row, load<V4>(z + 4 * row) + share * load<V4>(p + 4 * row));
+        for_parts(e.cg_parts, [&](int64_t part) { turn_rows<T>(e, part, share); });
         ++e.cg_used;
     }
+    const T* x = (const T*)e.x;
     for (int64_t row = 0; row < size; ++row)
         for (int k = 0; k < 3; ++k) e.direction[4 * row + k] = norm * (double)x[4 * row + k];
     return definite;

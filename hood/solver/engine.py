@@ -24,12 +24,16 @@ from hood.losses.problem import STANDARD_GRAVITY, StepProblem, inertial_guess
 from hood.losses.stretching import Stretching
 from hood.native.build import NATIVE_FLAGS, build
 from hood.native.structures import COUNT, POINTER, REAL, fields
+from hood.native.threads import num_parts
 from hood.scene.cloth import Cloth
 from hood.solver.elements import BENDINGS, face_constants, hinge_constants
 from hood.solver.engine_tables import Tables, build_tables
 from hood.solver.forces import Grip, VertexForces, Walls, attachment_stiffness, other_terms, vertex_forces
 from hood.solver.iterate import fixed_positions
 from hood.solver.plan import SolverPlan
+
+#: Vertices of a part that is worth a thread: in loops over elements, and in those of conjugate gradients, which are short.
+_ROWS, _CG_ROWS = 250, 1000
 
 SOURCE = Path(native.__file__).with_name("newton.cpp")
 
@@ -56,7 +60,8 @@ class _Engine(ctypes.Structure):
         *fields("pos acc trial_pos trial_acc gradient direction path face_force hinge_force", POINTER),
         *fields("face_model hinge_model matrix slack own own_slack row_sum inverse x r z p q", POINTER),
         *fields("sharpness raised phi noise", REAL),
-        *fields("wide cg_used", COUNT),
+        *fields("wide cg_used parts cg_parts reach", COUNT),
+        ("spill", POINTER),
     ]
 
 
@@ -184,6 +189,7 @@ class SceneEngine:
             num_blocks=len(tables.cols),
             num_springs=len(tables.springs.order),
             most_blocks=tables.most_blocks,
+            reach=tables.reach,
         )
         self._address = ctypes.byref(self.values)
         self._point(
@@ -205,6 +211,13 @@ class SceneEngine:
         self._point(**{name: np.zeros((rows, 4)) for name in ("acc", "trial_acc", "gradient", "direction")})
         self._point(face_force=np.zeros((self.values.num_faces, 10)), hinge_force=np.zeros((self.values.num_hinges, 14)))
         self._memory: dict[bool, dict[str, np.ndarray]] = {}
+        self.share(1, 1)
+
+    def share(self, parts: int, cg_parts: int) -> None:
+        """Do loops in as many parts, by threads of their own; results depend on the numbers, but not on the machine."""
+        if (parts, cg_parts) != (self.values.parts, self.values.cg_parts):
+            self.values.parts, self.values.cg_parts = parts, cg_parts
+            self._memory.clear()
         self.widen(False)
 
     def widen(self, wide: bool) -> None:
@@ -220,7 +233,8 @@ class SceneEngine:
         sizes = {"matrix": 9 * blocks + 1, "slack": blocks, "own": 6 * rows, "own_slack": 6 * rows, "inverse": 12 * rows}
         memory = {name: np.zeros(count, kind) for name, count in sizes.items()}
         memory |= {name: np.zeros(4 * rows, kind) for name in "xrzpq"}
-        memory["row_sum"] = _aligned(16 * values.most_blocks, kind)
+        memory["row_sum"] = _aligned(16 * values.most_blocks * values.parts, kind)
+        memory["spill"] = _aligned(4 * values.reach * (values.cg_parts - 1), kind)
         memory["face_model"] = np.zeros(values.num_faces * self._lib.newton_face_record(int(wide)), np.uint8)
         memory["hinge_model"] = np.zeros(values.num_hinges * self._lib.newton_hinge_record(int(wide)), np.uint8)
         return memory
@@ -247,7 +261,7 @@ class SceneEngine:
         values.bending, values.membrane = step.bending, step.membrane > 0
         values.dt_sq = float(step.dt[scene]) ** 2
         values.raised, values.cg_used = 0.0, 0
-        self.widen(False)
+        self.share(num_parts(values.num_rows, _ROWS), num_parts(values.num_rows, _CG_ROWS))
 
     def start(self, acc: np.ndarray) -> None:
         """Take up accelerations (V, 3) of all vertices of the cloth."""

@@ -53,6 +53,11 @@ class Tables:
         """Blocks of the longest row."""
         return int(np.diff(self.row_starts).max(initial=0))
 
+    @property
+    def reach(self) -> int:
+        """How far a column is behind its row at most."""
+        return int((self.cols - np.repeat(np.arange(self.num_rows), np.diff(self.row_starts))).max(initial=0))
+
 
 def build_tables(cloth: Cloth, attachments: Attachments | None, scene: int) -> Tables:
     """Tables of one ``scene`` of a cloth and the attachments of its steps."""

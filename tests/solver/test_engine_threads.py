@@ -1,0 +1,118 @@
+"""The compiled solver in parts: the same solver, and the same bits in every run, whoever computes a part."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from test_engine import COMPILED, compiler, dense, model_at
+from test_newton import batch, falling, hanging, pieces
+from test_plan import states, touching_sheet
+
+from hood.losses.potential import default_potential
+from hood.solver import engine
+from hood.solver.newton import minimize
+
+__all__ = ["compiler"]
+pytestmark = pytest.mark.usefixtures("compiler")
+#: Of loops over elements, and of conjugate gradients.
+PARTS = [(2, 1), (1, 2), (3, 3), (5, 7)]
+
+
+@pytest.fixture
+def share(monkeypatch):
+    """Sets the parts that every following step is solved in."""
+
+    def set_parts(parts: int, cg_parts: int) -> None:
+        counts = {engine._ROWS: parts, engine._CG_ROWS: cg_parts}
+        monkeypatch.setattr(engine, "num_parts", lambda count, least: min(counts[least], count))
+
+    return set_parts
+
+
+@pytest.mark.parametrize("wide", [False, True])
+@pytest.mark.parametrize("parts", PARTS)
+def test_the_model_has_the_same_bits_in_any_number_of_parts(share, parts, wide):
+    problem = touching_sheet()
+    pos = states(problem)["folded"]
+    share(1, 1)
+    whole = model_at(problem, default_potential(), pos, wide)
+    expected = {name: whole.array(name).copy() for name in ("gradient", "inverse", "own")} | {"matrix": dense(whole, "matrix")}
+    phi = whole.values.phi
+    share(*parts)
+    shared = model_at(problem, default_potential(), pos, wide)
+    assert shared.values.parts == parts[0]
+    found = {name: shared.array(name) for name in ("gradient", "inverse", "own")} | {"matrix": dense(shared, "matrix")}
+    for name, values in expected.items():
+        assert np.array_equal(found[name], values), name
+    assert shared.values.phi == pytest.approx(phi, rel=1e-14)
+
+
+@pytest.mark.parametrize("parts", PARTS)
+@pytest.mark.parametrize("make", [hanging, falling, touching_sheet, lambda: batch(pieces())])
+def test_iterations_are_those_of_one_part_and_runs_are_bit_identical(share, parts, make):
+    problem = make()
+    for count in (1, 2, 4):
+        settings = replace(COMPILED, max_iterations=count)
+        share(1, 1)
+        there, expected = minimize(default_potential(), problem, settings=settings)
+        share(*parts)
+        here, report = minimize(default_potential(), problem, settings=settings)
+        assert report.iterations == expected.iterations
+        assert float((here - there).norm()) <= 1e-4 * float((there - problem.state.pos).norm())
+        torch.testing.assert_close(report.phi, expected.phi, rtol=1e-5, atol=1e-9)
+        again, repeated = minimize(default_potential(), problem, settings=settings)
+        assert torch.equal(again, here)
+        assert torch.equal(repeated.phi, report.phi)
+
+
+def test_the_linear_solver_in_float64_does_not_depend_on_the_parts(share):
+    """What columns behind a part are given arrives: a lost block would show in the first digit."""
+    problem, found = touching_sheet(), []
+    for parts in ((1, 1), (1, 2), (2, 9)):
+        share(*parts)
+        scene = model_at(problem, default_potential(), states(problem)["near"], wide=True)
+        assert scene.move(1e-3, 30)
+        found.append(scene.array("direction").copy())
+    for direction in found[1:]:
+        assert np.abs(direction - found[0]).max() <= 1e-10 * np.abs(found[0]).max()
+
+
+def test_calls_from_several_threads_of_python_do_not_disturb_each_other(share):
+    share(3, 3)
+    problems = pieces()
+    alone = [minimize(default_potential(), problem, settings=COMPILED)[0] for problem in problems]
+    found: dict[int, list[torch.Tensor]] = {}
+
+    def work(index: int) -> None:
+        found[index] = [minimize(default_potential(), problems[index], settings=COMPILED)[0] for _ in range(5)]
+
+    workers = [threading.Thread(target=work, args=(index,)) for index in range(len(problems))]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    for index, expected in enumerate(alone):
+        assert all(torch.equal(pos, expected) for pos in found[index])
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="a system without fork")
+def test_a_forked_process_has_threads_of_its_own(share):
+    share(3, 3)
+    problem = touching_sheet()
+    scene = model_at(problem, default_potential(), states(problem)["near"], wide=False)
+    expected = scene.model()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # the child calls nothing but the library
+        child = os.fork()
+    if child == 0:
+        signal.alarm(60)
+        os._exit(0 if scene.model() == expected else 1)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    assert scene.model() == expected
