@@ -36,7 +36,8 @@ from hood.assets.material import Material
 from hood.assets.sequence import load_sequence
 from hood.cli import ENVIRONMENT
 from hood.dynamics.captured import CapturedSimulator
-from hood.dynamics.fixed_step import FixedStep, step_inputs
+from hood.dynamics.fixed_problem import step_inputs
+from hood.dynamics.fixed_step import FixedStep
 from hood.dynamics.simulator import Prepared, Simulator, build_simulator
 from hood.dynamics.stepper import Stepper
 from hood.dynamics.trace import count_operations, trace

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from hood.dynamics.fixed_step import FixedStep, StepResult, check_model, step_inputs, step_shape
+from hood.dynamics.cuda_graph import CudaGraph, InputMemory, Run
+from hood.dynamics.fixed_problem import Constants, settled_potential, step_inputs, step_shape
+from hood.dynamics.fixed_step import FixedStep, StepResult, check_model
 from hood.dynamics.frames import Relaxing
 from hood.dynamics.refine import unrefined
 from hood.dynamics.simulator import Prediction, Prepared, Simulator
@@ -17,21 +18,17 @@ from hood.dynamics.stepper import Stepper
 from hood.dynamics.stopwatch import Stopwatch, timed
 from hood.dynamics.trace import trace
 from hood.graph.fixed import Capacity, Layout, capacity_for, lay_out
+from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
 from hood.nn import triton_edge
 from hood.nn.precision import check_precision, products
 from hood.scene.cloth import Cloth
 from hood.scene.contact import find_nearest
-from hood.scene.state import Attachments
 
 #: How a step of fixed shapes is taken.
 MODES = ("fixed", "captured", "compiled")
 #: Steps of different shapes (cloths, with and without pins) that are kept ready.
 _MAX_PLANS = 4
-#: Runs before a capture, in which libraries choose their kernels and take their memory.
-_WARM_UP = 3
-
-Run = Callable[..., tuple[Tensor, ...]]
 
 
 @dataclass(frozen=True)
@@ -45,18 +42,17 @@ class CapturedSimulator:
     """Takes the steps of ``simulator`` with fixed shapes; its positions are the simulator's own up to rounding.
 
     Body edges get the places that the first step needs and a quarter more. A step that finds no room is repeated with
-    more of them: their number is read at the end of the step, with the result, never inside. Weights and cloth are read
-    when the step of a cloth is first taken; make a new one after changing them.
+    more of them: their number is read at the end of the step, with the result, never inside. Weights, cloth and gravity are
+    read when the step of a cloth is first taken; make a new one after changing them.
 
     Args:
-        simulator: in evaluation mode, of paper features.
+        simulator: in evaluation mode.
         mode: ``fixed``: one operation after the other; ``captured``: a CUDA graph of them, replayed at once; ``compiled``:
             through torch.compile, and on CUDA captured as well.
         capacity: places to begin with.
 
     Raises:
-        ValueError: an unknown mode, ``captured`` without CUDA, ``compiled`` of compiled kernels, or a model whose step has no
-            form of fixed shapes.
+        ValueError: an unknown mode, ``captured`` without CUDA, or ``compiled`` of compiled kernels.
     """
 
     times: tuple[str, ...] = ("step", "rest", "total")
@@ -110,18 +106,21 @@ class CapturedSimulator:
         return self.simulator.next_velocity(problem, prediction)
 
     def _plan(self, problem: StepProblem, prepared: Prepared) -> _Plan:
-        plan = self._plans.get(_key(problem))
-        if plan is None or plan.is_stale(problem, prepared, self.simulator.network.precision):
+        plan = self._plans.get(self._key(problem))
+        if plan is None or plan.is_stale(problem, prepared):
             plan = self._make_plan(problem, prepared, self._capacity or self._first_capacity(problem))
         return plan
 
     def _make_plan(self, problem: StepProblem, prepared: Prepared, capacity: Capacity) -> _Plan:
-        self._plans.pop(_key(problem), None)
+        self._plans.pop(self._key(problem), None)
         while len(self._plans) >= _MAX_PLANS:
             del self._plans[next(iter(self._plans))]
         plan = _Plan(self.simulator, problem, prepared, capacity, self.mode)
-        self._plans[_key(problem)] = plan
+        self._plans[self._key(problem)] = plan
         return plan
+
+    def _key(self, problem: StepProblem) -> tuple[Any, ...]:
+        return (id(problem.cloth), *step_shape(problem, self.simulator.needs_contact))
 
     def _first_capacity(self, problem: StepProblem) -> Capacity:
         obstacle = problem.step.obstacle
@@ -130,7 +129,7 @@ class CapturedSimulator:
         seen = self.simulator.rules.enter(problem)
         nearest = find_nearest(seen.cloth, seen.state.pos, obstacle, self.simulator.body_radius)
         near = torch.isfinite(nearest.dist)
-        return capacity_for((int(near.sum()), len(nearest.vertex[near].unique())), _limits(problem))
+        return capacity_for((int(near.sum()), len(nearest.vertex[near].unique()), 0), _limits(problem))
 
 
 def network_of(stepper: Stepper) -> Simulator | None:
@@ -146,61 +145,39 @@ class _Plan:
 
     def __init__(self, simulator: Simulator, problem: StepProblem, prepared: Prepared, capacity: Capacity, mode: str) -> None:
         assert prepared.static is not None
-        self._prepared, self._cloth, self._precision = prepared, problem.cloth, simulator.network.precision
-        attachments = problem.step.attachments
-        self._attachments = None if attachments is None else (attachments.edges.clone(), attachments.active.clone())
-        self.layout: Layout = lay_out(prepared.static, capacity, attachments)
-        self._inputs = [value.clone() for value in step_inputs(problem)]
-        self._given: list[tuple[Tensor, float]] = [(value, torch.nan) for value in self._inputs]
-        on_cuda = self._inputs[0].device.type == "cuda"
-        self._step = FixedStep(simulator, self.layout, problem, dense=mode == "compiled")
-        run: Run = self._step
-        if mode == "compiled" or (mode == "captured" and not _has_fused_edges(simulator, self._inputs[0])):
-            run = trace(run, self._inputs)
+        self._simulator, self._prepared, self._precision = simulator, prepared, simulator.network.precision
+        potential = self._potential()
+        self._constants = Constants(problem, potential)
+        self.layout: Layout = lay_out(prepared.static, capacity, problem.step.attachments)
+        self._inputs = InputMemory(self._read(problem))
+        memory = self._inputs.tensors
+        settled = None if potential is None else settled_potential(potential, problem)
+        run: Run = FixedStep(simulator, self.layout, problem, dense=mode == "compiled", potential=settled)
+        if mode == "compiled" or (mode == "captured" and not _has_fused_edges(simulator, memory[0])):
+            run = trace(run, memory)
         if mode == "compiled":
             run = torch.compile(run, fullgraph=True, dynamic=False)
-        if mode != "fixed" and on_cuda:
+        if mode != "fixed" and memory[0].device.type == "cuda":
             with products(self._precision):
-                run = _CudaGraph(run, self._inputs)
+                run = CudaGraph(run, memory)
         self._run = run
 
-    def is_stale(self, problem: StepProblem, prepared: Prepared, precision: str) -> bool:
+    def is_stale(self, problem: StepProblem, prepared: Prepared) -> bool:
         """Whether a problem of the same shape needs another plan after all."""
-        same = problem.cloth is self._cloth and prepared is self._prepared and precision == self._precision
-        return not same or not _same_attachments(self._attachments, problem.step.attachments)
+        same = prepared is self._prepared and self._simulator.network.precision == self._precision
+        return not same or not self._constants.hold(problem, self._potential())
 
     def take(self, problem: StepProblem) -> StepResult:
         """The step's result, in memory that the next call writes to."""
-        values = step_inputs(problem)
-        for memory, value, (given, version) in zip(self._inputs, values, self._given, strict=True):
-            if value is not given or _version(value) != version:
-                memory.copy_(value)
-        self._given = [(value, _version(value)) for value in values]
+        memory = self._inputs.load(self._read(problem))
         with products(self._precision):
-            return StepResult(*self._run(*self._inputs))
+            return StepResult(*self._run(*memory))
 
+    def _potential(self) -> Potential | None:
+        return self._simulator.potential if self._simulator.looks_at_potential else None
 
-class _CudaGraph:
-    """A function of tensors that stay in place, recorded once: a call starts all of its kernels at once."""
-
-    def __init__(self, function: Run, inputs: Sequence[Tensor]) -> None:
-        # Kept for the memory it holds, which the graph reads without knowing of.
-        self._function, self._inputs = function, list(inputs)
-        stream = torch.cuda.Stream()
-        stream.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(stream):
-            for _ in range(_WARM_UP):
-                function(*self._inputs)
-        torch.cuda.current_stream().wait_stream(stream)
-        self._graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(self._graph):
-            self._outputs = function(*self._inputs)
-
-    def __call__(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        same = all(a is b for a, b in zip(inputs, self._inputs, strict=True))
-        assert same, "a CUDA graph reads the memory it was recorded with"
-        self._graph.replay()
-        return self._outputs
+    def _read(self, problem: StepProblem) -> list[Tensor]:
+        return step_inputs(problem, self._simulator.needs_contact)
 
 
 def _has_fused_edges(simulator: Simulator, like: Tensor) -> bool:
@@ -209,27 +186,13 @@ def _has_fused_edges(simulator: Simulator, like: Tensor) -> bool:
     return triton_edge.applies(like.new_empty(1, simulator.config["latent_dim"], dtype=precision))
 
 
-def _version(value: Tensor) -> float:
-    """Changes with what the tensor holds; of tensors that keep no count, unequal to itself."""
-    return torch.nan if value.is_inference() else value._version
-
-
-def _key(problem: StepProblem) -> tuple[Any, ...]:
-    return (id(problem.cloth), *step_shape(problem))
-
-
-def _same_attachments(known: tuple[Tensor, Tensor] | None, now: Attachments | None) -> bool:
-    if known is None or now is None:
-        return known is None and now is None
-    return torch.equal(known[0], now.edges) and torch.equal(known[1], now.active)
-
-
-def _limits(problem: StepProblem) -> tuple[int, int]:
+def _limits(problem: StepProblem) -> tuple[int, int, int]:
     num_cloth = problem.cloth.num_vertices
     obstacle = problem.step.obstacle
-    return num_cloth, min(num_cloth, 0 if obstacle is None else len(obstacle.pos))
+    num_body, num_faces = (0, 0) if obstacle is None else (len(obstacle.pos), len(obstacle.faces))
+    return num_cloth, min(num_cloth, num_body), num_faces
 
 
-def _read(counts: Tensor) -> tuple[int, int]:
-    edges, vertices = counts.tolist()
-    return edges, vertices
+def _read(counts: Tensor) -> tuple[int, int, int]:
+    edges, vertices, faces = counts.tolist()
+    return edges, vertices, faces

@@ -30,6 +30,7 @@ class Feedback:
         self._mass = cloth.mass.clamp_min(1e-12).unsqueeze(1)
         self._compiled = native.applies(problem.state.pos, self._mass)
         self._terms = local_terms(potential, problem, self._compiled)
+        self._diffusion = None if self._compiled else Diffusion(cloth.edges, cloth.num_vertices)
 
     @torch.no_grad()
     def __call__(self, inputs: Inputs, pos: Tensor) -> tuple[Inputs, Tensor]:
@@ -44,7 +45,8 @@ class Feedback:
     def _residuals(self, force: Tensor) -> tuple[Tensor, Tensor]:
         """Accelerations (V, 3) that forces ask for, and those of neighbourhoods (V, 6)."""
         # Forces and masses of a neighbourhood are added up; its residual is their ratio.
-        diffusion = Diffusion(self._cloth.edges, self._cloth.num_vertices)
+        diffusion = self._diffusion
+        assert diffusion is not None
         spread, wide, done = torch.cat([force, self._mass], dim=1), [], 0
         for rounds in WIDE_ROUNDS:
             spread, done = diffusion.spread(spread, rounds - done), rounds

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -16,8 +16,8 @@ from hood.dynamics.passes import Feedback, Passes
 from hood.dynamics.ranges import Conditions
 from hood.dynamics.stopwatch import Stopwatch, timed
 from hood.features import compiled, groups, local, physical
-from hood.features.inputs import Inputs
-from hood.graph.builder import StaticGraph, build_graph, build_static
+from hood.features.inputs import EdgeRows, Inputs
+from hood.graph.builder import Graph, StaticGraph, build_graph, build_static
 from hood.graph.cache import template_hierarchy
 from hood.graph.hierarchy import Hierarchy, concatenate_hierarchies
 from hood.losses.potential import Potential, default_potential
@@ -49,6 +49,14 @@ class Prediction:
     metrics: dict[str, float] = field(default_factory=dict)  # what the stepper itself has to report
     #: Of models in several passes: (V, 3) m after every pass but the last, and the forces (V, 3) N there.
     early: tuple[tuple[Tensor, Tensor], ...] = ()
+
+
+class Sight(NamedTuple):
+    """What a network is shown of a step."""
+
+    inputs: Inputs
+    base: Tensor  # (V, 3) m, what its output is relative to
+    feedback: Feedback | None  # what it is told between its passes
 
 
 class Simulator(nn.Module):
@@ -83,6 +91,11 @@ class Simulator(nn.Module):
         self._wants_feedback = isinstance(output, LocalStepOutput)
         self._wants_residual = not self._wants_feedback and any(isinstance(group, physical.Residual) for group in features.node)
         self._wants_base = any(isinstance(group, physical.RelativeVelocity) for group in features.node)
+
+    @property
+    def potential(self) -> Potential:
+        """What the network is told of, where :attr:`looks_at_potential`."""
+        return self._potential
 
     @property
     def looks_at_potential(self) -> bool:
@@ -176,30 +189,58 @@ class Simulator(nn.Module):
 
     def _predict(self, problem: StepProblem, prepared: Prepared, watch: Stopwatch | None) -> Prediction:
         assert prepared.static is not None
-        cloth, step = problem.cloth, problem.step
         with timed(watch, "search"):
             problem = self.search(problem)
             seen = self.rules.enter(problem)
             nearest = self.nearest(problem, seen)
         with timed(watch, "features"):
-            with torch.no_grad():
-                base = self.output.base(seen)
-                residual = self._residual_acceleration(seen, base) if self._wants_residual else None
-                graph = build_graph(prepared.static, seen.step, nearest, self.body_radius)
-                guess = base if self._wants_base else None
-                inputs = Inputs(cloth, seen.state, seen.step, seen.contact, graph, guess, residual, timestep=step.dt)
-                feedback = Feedback(self._potential, seen) if self._wants_feedback else None
-                if feedback is not None:
-                    inputs, _ = feedback(inputs, base)
-            nodes, edges = self.features(inputs, compiled.COLUMNS if compiled.applies(inputs) else None)
+            graph = build_graph(prepared.static, seen.step, nearest, self.body_radius)
+            sight = self.look(problem, seen, graph)
+            features = self.features(sight.inputs, compiled.COLUMNS if compiled.applies(sight.inputs) else None)
         with timed(watch, "network"):
-            if feedback is None:
-                return self.integrate(problem, base, self.network(graph, nodes, edges))
-            assert isinstance(self.output, LocalStepOutput)
-            passes = Passes(self.network, self.output, seen, feedback, inputs, base, self._fixed(problem))
-            pos = passes.take(self.network(graph, nodes, edges, passes.look))
-            early = tuple(zip(passes.positions[:-1], passes.forces, strict=True))
-            return Prediction(pos, problem.acceleration(pos), early=early)
+            return self.advance(problem, seen, sight, *features)
+
+    @torch.no_grad()
+    def look(
+        self,
+        problem: StepProblem,
+        seen: StepProblem,
+        graph: Graph,
+        potential: Potential | None = None,
+        edge_rows: EdgeRows | None = None,
+    ) -> Sight:
+        """What the features are computed from.
+
+        Args:
+            seen: the problem as the network sees it, with its contact where :attr:`needs_contact`.
+            graph: of ``seen``.
+            potential: what the network is told of, instead of the one that it was given.
+            edge_rows: see :class:`hood.features.inputs.Inputs`.
+        """
+        potential = potential or self._potential
+        base = self.output.base(seen)
+        residual = self._residual_acceleration(potential, seen, base) if self._wants_residual else None
+        guess, dt = base if self._wants_base else None, problem.step.dt
+        inputs = Inputs(
+            seen.cloth, seen.state, seen.step, seen.contact, graph, guess, residual, timestep=dt, edge_rows=edge_rows
+        )
+        if not self._wants_feedback:
+            return Sight(inputs, base, None)
+        feedback = Feedback(potential, seen)
+        return Sight(feedback(inputs, base)[0], base, feedback)
+
+    def advance(
+        self, problem: StepProblem, seen: StepProblem, sight: Sight, nodes: Tensor, edges: dict[str, Tensor]
+    ) -> Prediction:
+        """Positions at t + 1 from the features of what was looked at."""
+        graph, base = sight.inputs.graph, sight.base
+        if sight.feedback is None:
+            return self.integrate(problem, base, self.network(graph, nodes, edges))
+        assert isinstance(self.output, LocalStepOutput)
+        passes = Passes(self.network, self.output, seen, sight.feedback, sight.inputs, base, self._fixed(problem))
+        pos = passes.take(self.network(graph, nodes, edges, passes.look))
+        early = tuple(zip(passes.positions[:-1], passes.forces, strict=True))
+        return Prediction(pos, problem.acceleration(pos), early=early)
 
     def integrate(self, problem: StepProblem, base: Tensor, raw: Tensor) -> Prediction:
         """Positions at t + 1 from the network's output ``raw`` (V, 3), which is relative to ``base`` (V, 3) [m]."""
@@ -247,8 +288,8 @@ class Simulator(nn.Module):
         copy.trained_for = self.trained_for
         return copy.to(self.gravity.device)
 
-    def _residual_acceleration(self, problem: StepProblem, base: Tensor) -> Tensor:
-        gradient, _ = self._potential.gradient(problem, base)
+    def _residual_acceleration(self, potential: Potential, problem: StepProblem, base: Tensor) -> Tensor:
+        gradient, _ = potential.gradient(problem, base)
         return -gradient / problem.cloth.mass.clamp_min(1e-12).unsqueeze(1) * problem.cloth.free.unsqueeze(1)
 
 

@@ -142,12 +142,17 @@ class FixedScale(nn.Module):
         self.register_buffer("scale", torch.as_tensor(scale, dtype=torch.float64), persistent=False)
         if not bool((self.scale > 0).all()):
             raise ValueError(f"fixed scale is {scale}; every entry must be > 0")
+        # A number is part of a kernel's call; a tensor would have to be copied to an accelerator in every call.
+        self._number = float(scale) if isinstance(scale, (int, float)) else None
 
     def forward(self, x: Tensor, mask: Tensor | None = None) -> Tensor:
         """x / scale, or its asinh; ``mask`` plays no role."""
-        y = x / self.scale.to(x)
+        y = x / self._divisor(x)
         return torch.asinh(y) if self.asinh else y
 
     def inverse(self, y: Tensor) -> Tensor:
         """Undo :meth:`forward`."""
-        return (torch.sinh(y) if self.asinh else y) * self.scale.to(y)
+        return (torch.sinh(y) if self.asinh else y) * self._divisor(y)
+
+    def _divisor(self, like: Tensor) -> Tensor | float:
+        return self.scale.to(like) if self._number is None else self._number

@@ -70,7 +70,7 @@ class TypeOneHot(NodeGroup):
         return functional.one_hot(inputs.cloth.pinned.long(), 3).to(inputs.state.pos)
 
     def body(self, inputs: Inputs) -> Tensor:
-        return inputs.state.pos.new_tensor([0.0, 0.0, 1.0]).expand(inputs.num_body, 3)
+        return functional.one_hot(inputs.graph.body_vertex.new_full((inputs.num_body,), 2), 3).to(inputs.state.pos)
 
 
 class LevelOneHot(NodeGroup):
@@ -162,7 +162,7 @@ class ScaledShape(EdgeGroup):
     def forward(self, inputs: Inputs) -> Tensor:
         current, rest = cloth_difference(inputs.state.pos, inputs), cloth_difference(inputs.cloth.rest_pos, inputs)
         columns = torch.cat([current, length(current), rest, length(rest)], dim=1)
-        return columns / mean_rest_length(inputs)
+        return columns / inputs.edges.once("mean length", lambda: mean_rest_length(inputs))
 
 
 class Strain(EdgeGroup):
@@ -217,9 +217,9 @@ def rest_length(inputs: Inputs) -> Tensor:
 def mean_rest_length(inputs: Inputs) -> Tensor:
     """Mean rest length [m] of the edges in the same set and scene, at least 1 µm, per edge (N, 1)."""
     edges, rest = inputs.edges, rest_length(inputs)
-    total = rest.new_zeros(edges.num_segments).index_add_(0, edges.segment, rest.squeeze(1))
-    count = torch.bincount(edges.segment, minlength=edges.num_segments).clamp_min(1)
-    return (total / count)[edges.segment].unsqueeze(1).clamp_min(1e-6)
+    ends = torch.cat([rest, torch.ones_like(rest)], dim=1)
+    total = rest.new_zeros(edges.num_segments, 2).index_add_(0, edges.segment, ends)
+    return (total[:, :1] / total[:, 1:].clamp_min(1.0)).index_select(0, edges.segment).clamp_min(1e-6)
 
 
 def physical(num_levels: int = 3, more: Sequence[NodeGroup] = ()) -> FeatureSet:

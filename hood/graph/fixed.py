@@ -17,6 +17,7 @@ from torch.nn import functional
 
 from hood.graph.builder import BODY, MESH, EdgeSet, Graph, StaticGraph, Subset, mesh_set, set_level
 from hood.mesh.nearest import Nearest
+from hood.mesh.places import gather_true
 from hood.scene.state import Attachments, Obstacle
 
 #: Capacities are multiples of this.
@@ -30,30 +31,34 @@ class Capacity:
     Args:
         edges: places for (undirected) body edges.
         vertices: places for body vertices that carry one.
+        faces: places for body faces that every cloth vertex is tested against, where there are any; none of them spare.
     """
 
     edges: int
     vertices: int
+    faces: int = 0
 
     def __post_init__(self) -> None:
-        if self.edges < 1 or self.vertices < 1:
+        if self.edges < 1 or self.vertices < 1 or self.faces < 0:
             raise ValueError(
-                f"capacity is {self.edges} edges and {self.vertices} vertices; each needs at least the spare one, 1"
+                f"capacity is {self.edges} edges, {self.vertices} vertices and {self.faces} faces; the first two need at least "
+                "the spare one, 1, the last is at least 0"
             )
 
-    def holds(self, counts: tuple[int, int]) -> bool:
-        """Whether ``counts`` edges and vertices fit beside the spare places."""
-        return counts[0] < self.edges and counts[1] < self.vertices
+    def holds(self, counts: tuple[int, int, int]) -> bool:
+        """Whether ``counts`` edges and vertices fit beside the spare places, and the faces into theirs."""
+        return counts[0] < self.edges and counts[1] < self.vertices and counts[2] <= self.faces
 
 
-def capacity_for(counts: tuple[int, int], limits: tuple[int, int], headroom: float = 0.25) -> Capacity:
-    """Room for ``counts`` body edges and vertices and ``headroom`` times as many more.
+def capacity_for(counts: tuple[int, int, int], limits: tuple[int, int, int], headroom: float = 0.25) -> Capacity:
+    """Room for ``counts`` body edges, vertices and faces and ``headroom`` times as many more.
 
     Args:
-        limits: most there can ever be: cloth vertices, and the smaller of cloth and body vertices.
+        limits: most there can ever be: cloth vertices, the smaller of cloth and body vertices, and body faces.
     """
-    edges, vertices = (min(_round_up((1 + headroom) * count + 1), most + 1) for count, most in zip(counts, limits, strict=True))
-    return Capacity(edges, vertices)
+    room = [min(_round_up((1 + headroom) * count + 1), most + 1) for count, most in zip(counts, limits, strict=True)]
+    # Few bodies have such faces, and all of them are tested at once: no place more than needed.
+    return Capacity(room[0], room[1], min(counts[2], limits[2]))
 
 
 @dataclass(frozen=True)
@@ -118,7 +123,7 @@ def build_fixed_graph(layout: Layout, obstacle: Obstacle | None, nearest: Neares
     if obstacle.omitted is not None:
         near = near & ~obstacle.omitted.index_select(0, nearest.vertex)
     used, body_node = _active_vertices(near, nearest.vertex, len(obstacle.pos), capacity.vertices)
-    cloth_node = _gather_true(near, size)
+    cloth_node = gather_true(near, size)
     body = functional.pad(body_node, (0, 1), value=capacity.vertices - 1).index_select(0, cloth_node)
     key, order = body.sort(stable=True)
     spare = num_cloth + capacity.vertices - 1
@@ -129,7 +134,7 @@ def build_fixed_graph(layout: Layout, obstacle: Obstacle | None, nearest: Neares
         subsets[least] = _deeper(places, level >= least, min(size, count + 1), num_cloth, capacity.vertices)
     return FixedGraph(
         num_cloth=num_cloth,
-        body_vertex=_gather_true(used, capacity.vertices).clamp_max(len(obstacle.pos) - 1),
+        body_vertex=gather_true(used, capacity.vertices).clamp_max(len(obstacle.pos) - 1),
         edge_sets={**layout.edge_sets, BODY: subsets[0].edges},
         body_subsets=subsets,
         node_level=static.node_level,
@@ -162,16 +167,6 @@ def _active_vertices(near: Tensor, vertex: Tensor, num_vertices: int, size: int)
     return count > 0, torch.where(near, rank, size - 1).clamp_max(size - 1)
 
 
-def _gather_true(mask: Tensor, size: int) -> Tensor:
-    """Indices of the first ``size`` − 1 true entries of ``mask`` (N,) in places 0 …, N in the others: (size,)."""
-    count = mask.shape[0]
-    place = torch.where(mask, mask.cumsum(0) - 1, size - 1).clamp_max(size - 1)
-    index = torch.arange(count, device=mask.device)
-    found = torch.full((size,), count, dtype=torch.int64, device=mask.device).scatter(0, place, index)
-    # Whatever had no place of its own went to the last one.
-    return functional.pad(found[: size - 1], (0, 1), value=count)
-
-
 def _edges_of(places: _Places, num_cloth: int, num_body: int) -> EdgeSet:
     """Both directions: rows 0 … K − 1 lead to the cloth nodes, one each, rows K … 2K − 1 to the body nodes."""
     size, device = places.cloth.shape[0], places.cloth.device
@@ -194,9 +189,9 @@ def _edges_of(places: _Places, num_cloth: int, num_body: int) -> EdgeSet:
 def _deeper(places: _Places, keep: Tensor, size: int, num_cloth: int, num_body: int) -> Subset:
     """The places ``keep`` (K,) in ``size`` places of their own; the spare one stays spare."""
     last = places.cloth.shape[0] - 1
-    chosen = _gather_true(keep, size).clamp_max(last)
+    chosen = gather_true(keep, size).clamp_max(last)
     # Their order among the body nodes is that of the whole set: no second sort.
-    in_order = _gather_true(keep.index_select(0, places.order), size).clamp_max(last)
+    in_order = gather_true(keep.index_select(0, places.order), size).clamp_max(last)
     renumbered = torch.where(keep, keep.cumsum(0) - 1, size - 1)
     part = _Places(
         cloth=places.cloth.index_select(0, chosen),

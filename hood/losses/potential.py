@@ -80,6 +80,19 @@ class Potential:
                 problem = cast(PreparedTerm, term).prepare(problem)
         return problem
 
+    def active(self, problem: StepProblem) -> dict[str, Term]:
+        """The terms that can be anything but a constant zero for a prepared ``problem``."""
+        return {name: term for name, term in self.terms.items() if term.applies(problem)}
+
+    def settled(self, problem: StepProblem) -> Potential:
+        """The terms that play a role in a prepared ``problem`` as a potential that does not ask again: to ask may wait for the
+        device, which a captured graph must not."""
+        return _Settled(self.active(problem))
+
+    def only(self, terms: Mapping[str, Term]) -> Potential:
+        """Some of the terms, by name, as a potential of the same kind."""
+        return type(self)(terms)
+
     def energies(self, problem: StepProblem, next_pos: Tensor, acc: Tensor | None = None) -> dict[str, Tensor]:
         """Energies [J] (B,) by term; terms that the scene does not need are left out.
 
@@ -93,7 +106,7 @@ class Potential:
         if next_pos.dtype in (torch.float16, torch.bfloat16):
             raise ValueError(f"energies cannot be computed in {next_pos.dtype}; give positions in float32 or float64")
         acc = problem.acceleration(next_pos) if acc is None else acc
-        return {name: term(problem, next_pos, acc) for name, term in self.terms.items() if term.applies(problem)}
+        return {name: term(problem, next_pos, acc) for name, term in self.active(problem).items()}
 
     def total(self, problem: StepProblem, next_pos: Tensor, acc: Tensor | None = None) -> Tensor:
         """Potential Φ [J] per scene (B,)."""
@@ -114,6 +127,13 @@ class Potential:
             total = sum(energies.values(), start=pos.sum() * 0.0)
             (gradient,) = torch.autograd.grad(total.sum(), pos)
         return gradient, {name: energy.detach() for name, energy in energies.items()}
+
+
+class _Settled(Potential):
+    """A potential all of whose terms play a role in every problem that it is asked about."""
+
+    def active(self, problem: StepProblem) -> dict[str, Term]:
+        return self.terms
 
 
 def default_potential(

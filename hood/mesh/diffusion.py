@@ -22,8 +22,8 @@ class Diffusion:
     def __init__(self, edges: Tensor, num_vertices: int) -> None:
         start, end = edges.unbind(dim=1)
         self._senders, self._receivers = torch.cat([start, end]), torch.cat([end, start])
-        degree = torch.bincount(self._receivers, minlength=num_vertices).clamp_min(1)
-        self._half = (0.5 / degree).unsqueeze(1)
+        degree = self._receivers.new_zeros(num_vertices).index_add(0, self._receivers, torch.ones_like(self._receivers))
+        self._half = (0.5 / degree.clamp_min(1)).unsqueeze(1)
 
     def spread(self, values: Tensor, rounds: int) -> Tensor:
         """``rounds`` rounds of the adjoint: the sums of the columns of values (V, C) stay what they are."""

@@ -19,13 +19,13 @@ from torch import Tensor
 
 from hood.mesh import surface_tree, topology
 
-_NUM_NEAREST = 3
+NUM_NEAREST = 3
 #: Scenes up to this many faces, and faces with an edge longer than this many mean edges, are tested
 # exhaustively.
-_SMALL_SURFACE = 64
-_LARGE_EDGE_RATIO = 4.0
+SMALL_SURFACE = 64
+LARGE_EDGE_RATIO = 4.0
 #: Pairs evaluated at once in the exhaustive test and in the search on an accelerator: bounds the memory.
-_CHUNK_PAIRS = 4_000_000
+CHUNK_PAIRS = 4_000_000
 _BLOCK_PAIRS = 8_000
 
 
@@ -60,7 +60,7 @@ class Incidence(NamedTuple):
         return self.around, self.first, self.valence, self.face_edges, self.edge_faces
 
 
-class _Span(NamedTuple):
+class Span(NamedTuple):
     """Triangles as the two edges from their first corner, by components, and products of these."""
 
     u: Sequence[Tensor]  # x, y, z
@@ -71,17 +71,17 @@ class _Span(NamedTuple):
     det: Tensor  # uu * vv - uv², at least 0
 
 
-class _Fans(NamedTuple):
+class Fans(NamedTuple):
     """The faces around every vertex."""
 
     edges: Tensor  # (W, 6, K) u (to ``following``) and v (to ``preceding``), three components each
     uu: Tensor  # (W, K) squared length of u
 
-    def select(self, index: Tensor) -> _Span:
+    def select(self, index: Tensor) -> Span:
         """The faces around the vertices ``index`` (N,), all arrays (N, K)."""
         # One gather of whole rows and a copy; recomputing the products is faster than gathering them too.
         edges = self.edges.index_select(0, index).transpose(0, 1).contiguous().unbind()
-        return _span(edges[:3], edges[3:])
+        return span(edges[:3], edges[3:])
 
 
 #: Of a tensor of faces: itself and its version, what it held, the number of vertices, and what was found.
@@ -113,22 +113,22 @@ def search_surface(
         face_scene: (G,).
     """
     if len(faces) == 0 or len(points) == 0:
-        return _no_hit(points)
+        return no_hit(points)
     incidence = build_incidence(faces, len(vertices))
     found = surface_tree.search(points, point_scene, vertices, faces, face_scene, incidence.adjacency, vertices)
     if found is not None:
         return SurfaceHit(found.vertex, found.vertex_dist, found.face, found.bary, found.dist)
-    fans = _build_fans(vertices, incidence)
+    fans = build_fans(vertices, incidence)
     nearest, nearest_dist = _nearest_vertices(points, point_scene, vertices, vertex_scene, incidence.valence > 0)
-    face = _closest_of_fans(points, vertices, nearest, incidence, fans)
-    bary, offset = _weights_and_offset(points, vertices, faces, face)
+    face = closest_of_fans(points, vertices, nearest, incidence, fans)
+    bary, offset = weights_and_offset(points, vertices, faces, face)
     for rows, candidates in _exhaustive(point_scene, vertex_scene, face_scene, incidence, fans):
         other = _closest_of_all(points[rows], vertices, faces, candidates)
-        other_bary, other_offset = _weights_and_offset(points[rows], vertices, faces, other)
+        other_bary, other_offset = weights_and_offset(points[rows], vertices, faces, other)
         better = (other_offset**2).sum(dim=1) < (offset[rows] ** 2).sum(dim=1)
         chosen = rows[better]
         face[chosen], bary[chosen], offset[chosen] = other[better], other_bary[better], other_offset[better]
-    side = (offset * _pseudonormals(vertices, faces, face, bary, incidence, fans)).sum(dim=1)
+    side = (offset * pseudonormals(vertices, faces, face, bary, incidence, fans)).sum(dim=1)
     dist = torch.where(side < 0, -1.0, 1.0) * offset.norm(dim=1)
     missing = torch.isinf(nearest_dist[:, 0])
     return SurfaceHit(nearest[:, 0], nearest_dist[:, 0], face, bary, dist.masked_fill(missing, torch.inf))
@@ -200,7 +200,7 @@ def _edge_tables(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return edge.reshape(-1, 3), edge_faces
 
 
-def _build_fans(vertices: Tensor, incidence: Incidence) -> _Fans:
+def build_fans(vertices: Tensor, incidence: Incidence) -> Fans:
     rows, slots = incidence.face.shape
     axes = vertices.t().contiguous()
     edges = vertices.new_empty(rows, 6, slots)
@@ -208,12 +208,12 @@ def _build_fans(vertices: Tensor, incidence: Incidence) -> _Fans:
         for k, axis in enumerate(axes):
             torch.sub(axis.index_select(0, corner).view(rows, slots), axis.unsqueeze(1), out=edges[:, 3 * i + k])
     u = edges[:, :3].unbind(dim=1)
-    return _Fans(edges, _sum_products(u, u))
+    return Fans(edges, _sum_products(u, u))
 
 
-def _span(u: Sequence[Tensor], v: Sequence[Tensor]) -> _Span:
+def span(u: Sequence[Tensor], v: Sequence[Tensor]) -> Span:
     uu, vv, uv = _sum_products(u, u), _sum_products(v, v), _sum_products(u, v)
-    return _Span(u, v, uu, vv, uv, (uu * vv - uv * uv).clamp_min_(0))
+    return Span(u, v, uu, vv, uv, (uu * vv - uv * uv).clamp_min_(0))
 
 
 def _nearest_vertices(
@@ -224,8 +224,8 @@ def _nearest_vertices(
     single = bool((vertex_scene == point_scene[0]).all()) and bool((point_scene == point_scene[0]).all())
     if single and bool(usable.all()):
         return _search_tree(query, vertices)
-    index = torch.zeros(len(points), _NUM_NEAREST, dtype=torch.int64, device=points.device)
-    dist = points.new_full((len(points), _NUM_NEAREST), torch.inf)
+    index = torch.zeros(len(points), NUM_NEAREST, dtype=torch.int64, device=points.device)
+    dist = points.new_full((len(points), NUM_NEAREST), torch.inf)
     for scene in point_scene.unique().tolist():
         rows = (point_scene == scene).nonzero().squeeze(1)
         targets = ((vertex_scene == scene) & usable).nonzero().squeeze(1)
@@ -237,20 +237,20 @@ def _nearest_vertices(
 
 def _search_tree(points: Tensor, vertices: Tensor) -> tuple[Tensor, Tensor]:
     """Nearest vertices (N, 3), ascending, and distances; of fewer than three the last one is repeated."""
-    if points.device.type != "cpu" or len(vertices) < _NUM_NEAREST:
+    if points.device.type != "cpu" or len(vertices) < NUM_NEAREST:
         return _search_dense(points, vertices)
     # Few points a query: large leaves and the median's approximation are faster to build and no slower to search.
     tree = cKDTree(vertices.detach().numpy(), leafsize=32, balanced_tree=False, compact_nodes=False)
-    dist, index = tree.query(points.detach().numpy(), k=_NUM_NEAREST, workers=1)
+    dist, index = tree.query(points.detach().numpy(), k=NUM_NEAREST, workers=1)
     return torch.from_numpy(index.astype(np.int64, copy=False)), torch.from_numpy(dist).to(points.dtype)
 
 
 def _search_dense(points: Tensor, vertices: Tensor) -> tuple[Tensor, Tensor]:
     """The same by all pairwise distances, in chunks; what an accelerator is fast at."""
     index, dist = [], []
-    count = min(_NUM_NEAREST, len(vertices))
-    places = [min(place, count - 1) for place in range(_NUM_NEAREST)]
-    for chunk in points.split(max(1, _CHUNK_PAIRS // len(vertices))):
+    count = min(NUM_NEAREST, len(vertices))
+    places = [min(place, count - 1) for place in range(NUM_NEAREST)]
+    for chunk in points.split(max(1, CHUNK_PAIRS // len(vertices))):
         # The matrix-product form loses half the digits for points close to the surface.
         pairs = torch.cdist(chunk, vertices, compute_mode="donot_use_mm_for_euclid_dist")
         nearest = pairs.topk(count, dim=1, largest=False, sorted=True)
@@ -259,7 +259,7 @@ def _search_dense(points: Tensor, vertices: Tensor) -> tuple[Tensor, Tensor]:
     return torch.cat(index), torch.cat(dist)
 
 
-def _closest_of_fans(points: Tensor, vertices: Tensor, nearest: Tensor, incidence: Incidence, fans: _Fans) -> Tensor:
+def closest_of_fans(points: Tensor, vertices: Tensor, nearest: Tensor, incidence: Incidence, fans: Fans) -> Tensor:
     """The face (N,) with the smallest distance among those around the vertices ``nearest`` (N, 3)."""
     num_slots = incidence.face.shape[1]
     # On a CPU, blocks whose temporaries stay in the cache: 1.2× as fast in all (AMD).
@@ -267,14 +267,14 @@ def _closest_of_fans(points: Tensor, vertices: Tensor, nearest: Tensor, incidenc
     best = []
     for rows, around in zip(points.split(block), nearest.split(block), strict=True):
         flat = around.reshape(-1)
-        p = (rows.repeat_interleave(_NUM_NEAREST, dim=0) - vertices.index_select(0, flat)).t().contiguous().unsqueeze(2)
-        best.append(_gain(p.unbind(), fans.select(flat)).view(len(rows), -1).argmax(dim=1))
+        p = (rows.repeat_interleave(NUM_NEAREST, dim=0) - vertices.index_select(0, flat)).t().contiguous().unsqueeze(2)
+        best.append(gain(p.unbind(), fans.select(flat)).view(len(rows), -1).argmax(dim=1))
     slot = torch.cat(best)
     vertex = nearest.gather(1, (slot // num_slots).unsqueeze(1)).squeeze(1)
     return incidence.face[vertex, slot % num_slots]
 
 
-def _gain(p: Sequence[Tensor], fan: _Span) -> Tensor:
+def gain(p: Sequence[Tensor], fan: Span) -> Tensor:
     """Minus half the squared distance from p to the triangles spanned by u and v, all broadcast together.
 
     With p relative to the triangle's first corner, the squared distance from p to the point su + tv is
@@ -294,9 +294,9 @@ def _gain(p: Sequence[Tensor], fan: _Span) -> Tensor:
     free = s.mul_(pu).add_(t.mul_(pv)).mul_(0.5).masked_fill_(outside, -torch.inf)
     ww = (uu + vv).sub_(uv, alpha=2)
     pw = (pv - pu).add_(uu).sub_(uv)
-    gain = torch.maximum(_edge_gain(pu, uu), _edge_gain(pv, vv))
-    gain = torch.maximum(gain, _edge_gain(pw, ww).add_(pu).sub_(uu, alpha=0.5))
-    return torch.maximum(gain, free).sub_(_sum_products(p, p), alpha=0.5)
+    best = torch.maximum(_edge_gain(pu, uu), _edge_gain(pv, vv))
+    best = torch.maximum(best, _edge_gain(pw, ww).add_(pu).sub_(uu, alpha=0.5))
+    return torch.maximum(best, free).sub_(_sum_products(p, p), alpha=0.5)
 
 
 def _edge_gain(along: Tensor, length_sq: Tensor) -> Tensor:
@@ -306,7 +306,7 @@ def _edge_gain(along: Tensor, length_sq: Tensor) -> Tensor:
 
 
 def _exhaustive(
-    point_scene: Tensor, vertex_scene: Tensor, face_scene: Tensor, incidence: Incidence, fans: _Fans
+    point_scene: Tensor, vertex_scene: Tensor, face_scene: Tensor, incidence: Incidence, fans: Fans
 ) -> list[tuple[Tensor, Tensor]]:
     """Per scene the points and faces to test pair by pair: all of a small scene, else oversized ones."""
     num_scenes = int(max(vertex_scene.max(), point_scene.max())) + 1
@@ -314,9 +314,9 @@ def _exhaustive(
     length = fans.uu.sqrt().mean(dim=1)
     mean = length.new_zeros(num_scenes).index_add_(0, vertex_scene, length)
     mean /= torch.bincount(vertex_scene, minlength=num_scenes).clamp_min(1)
-    limit_sq = (_LARGE_EDGE_RATIO * mean[vertex_scene]) ** 2
+    limit_sq = (LARGE_EDGE_RATIO * mean[vertex_scene]) ** 2
     oversized = (fans.uu.amax(dim=1) > limit_sq) & (incidence.valence > 0)
-    small = (counts > 0) & (counts <= _SMALL_SURFACE)
+    small = (counts > 0) & (counts <= SMALL_SURFACE)
     if not bool(oversized.any()) and not bool(small.any()):
         return []
     large_faces = incidence.face[oversized].unique()
@@ -334,39 +334,34 @@ def _exhaustive(
 def _closest_of_all(points: Tensor, vertices: Tensor, faces: Tensor, candidates: Tensor) -> Tensor:
     """The closest of the faces ``candidates`` to every point, by testing all pairs."""
     a, b, c = (list(vertices[faces[candidates, corner]].t()) for corner in range(3))
-    fan = _span([y - x for x, y in zip(a, b, strict=True)], [y - x for x, y in zip(a, c, strict=True)])
+    fan = span([y - x for x, y in zip(a, b, strict=True)], [y - x for x, y in zip(a, c, strict=True)])
     closest = []
-    for chunk in points.split(max(1, _CHUNK_PAIRS // (8 * len(candidates)))):
+    for chunk in points.split(max(1, CHUNK_PAIRS // (8 * len(candidates)))):
         p = [chunk[:, i : i + 1] - a[i] for i in range(3)]
-        closest.append(candidates[_gain(p, fan).argmax(dim=1)])
+        closest.append(candidates[gain(p, fan).argmax(dim=1)])
     return torch.cat(closest)
 
 
-def _weights_and_offset(points: Tensor, vertices: Tensor, faces: Tensor, face: Tensor) -> tuple[Tensor, Tensor]:
+def weights_and_offset(points: Tensor, vertices: Tensor, faces: Tensor, face: Tensor) -> tuple[Tensor, Tensor]:
     """Weights (N, 3) of the closest point on ``face`` (N,), and the vector (N, 3) from there to the point."""
     corners = vertices.index_select(0, faces.index_select(0, face).view(-1)).view(-1, 3, 3)
     bary = closest_point_on_triangles(points, corners)
     return bary, _sum_products(bary.unsqueeze(2).unbind(dim=1), (points.unsqueeze(1) - corners).unbind(dim=1))
 
 
-def _pseudonormals(vertices: Tensor, faces: Tensor, face: Tensor, bary: Tensor, incidence: Incidence, fans: _Fans) -> Tensor:
+def pseudonormals(vertices: Tensor, faces: Tensor, face: Tensor, bary: Tensor, incidence: Incidence, fans: Fans) -> Tensor:
     """Angle-weighted pseudonormals (N, 3), not normalised, at the points ``bary`` of ``face``."""
-    normal = _unit_face_normals(vertices, faces[face])
-    num_zero = (bary == 0).sum(dim=1)
-    at_edge = (num_zero == 1).nonzero().squeeze(1)
-    if len(at_edge):
-        corner = bary[at_edge].argmin(dim=1)
-        around = incidence.edge_faces[incidence.face_edges[face[at_edge], corner]]
-        normals = _unit_face_normals(vertices, faces[around.clamp_min(0)].reshape(-1, 3)).view(*around.shape, 3)
-        normal[at_edge] = (normals * (around >= 0).unsqueeze(-1)).sum(dim=1)
-    at_vertex = (num_zero == 2).nonzero().squeeze(1)
-    if len(at_vertex):
-        vertex = faces[face[at_vertex], bary[at_vertex].argmax(dim=1)]
-        normal[at_vertex] = _vertex_pseudonormals(vertex, incidence, fans)
-    return normal
+    num_zero = (bary == 0).sum(dim=1, keepdim=True)
+    around = incidence.edge_faces[incidence.face_edges[face, bary.argmin(dim=1)]]
+    beside = _unit_face_normals(vertices, faces[around.clamp_min(0)].reshape(-1, 3)).view(*around.shape, 3)
+    at_edge = (beside * (around >= 0).unsqueeze(-1)).sum(dim=1)
+    at_vertex = _vertex_pseudonormals(faces[face, bary.argmax(dim=1)], incidence, fans)
+    # All three for every point: which points need which is not known without waiting for an accelerator.
+    normal = torch.where(num_zero == 1, at_edge, _unit_face_normals(vertices, faces[face]))
+    return torch.where(num_zero == 2, at_vertex, normal)
 
 
-def _vertex_pseudonormals(vertex: Tensor, incidence: Incidence, fans: _Fans) -> Tensor:
+def _vertex_pseudonormals(vertex: Tensor, incidence: Incidence, fans: Fans) -> Tensor:
     fan = fans.select(vertex)
     u, v = torch.stack(tuple(fan.u), dim=-1), torch.stack(tuple(fan.v), dim=-1)
     area = fan.det.sqrt()
@@ -382,7 +377,7 @@ def _unit_face_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     return cross / cross.norm(dim=1, keepdim=True).clamp_min(torch.finfo(cross.dtype).tiny)
 
 
-def _no_hit(points: Tensor) -> SurfaceHit:
+def no_hit(points: Tensor) -> SurfaceHit:
     index = torch.zeros(len(points), dtype=torch.int64, device=points.device)
     far = points.new_full((len(points),), torch.inf)
     return SurfaceHit(index, far, index, points.new_zeros(len(points), 3), far)

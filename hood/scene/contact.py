@@ -13,8 +13,9 @@ from torch import Tensor
 
 from hood.mesh import geometry, surface_tree
 from hood.mesh.centroids import nearest_centroids
+from hood.mesh.fixed_surface import search_surface_fixed
 from hood.mesh.nearest import Nearest, nearest_dense, nearest_vertices
-from hood.mesh.proximity import build_incidence, search_surface
+from hood.mesh.proximity import Incidence, SurfaceHit, build_incidence, search_surface
 from hood.mesh.surface_tree import Match
 from hood.scene.cloth import Cloth
 from hood.scene.state import Obstacle
@@ -79,9 +80,33 @@ def match_surface(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle) -> Matc
         if found is not None:
             return found
     hit = search_surface(pos, vertex_scene, obstacle.pos, obstacle.faces, obstacle.vertex_scene, obstacle.face_scene)
+    return _match_of(hit, obstacle, incidence or build_incidence(obstacle.faces, len(obstacle.pos)))
+
+
+def find_fixed_contact(
+    pos: Tensor,
+    vertex_scene: Tensor,
+    obstacle: Obstacle,
+    incidence: Incidence,
+    num_scenes: int,
+    places: int,
+    cap: float = 0.1,
+) -> tuple[Contact, Tensor]:
+    """The same as :func:`find_contact` without waiting for the device, and the number (1,) of faces that need a place; see
+    :func:`hood.mesh.fixed_surface.search_surface_fixed`."""
+    surface = obstacle.pos, obstacle.faces, obstacle.vertex_scene, obstacle.face_scene
+    hit, needed = search_surface_fixed(pos, vertex_scene, *surface, incidence, num_scenes, places)
+    match = _match_of(hit, obstacle, incidence)
+    return Contact(**match._asdict(), valid=match.dist.abs() <= cap), needed
+
+
+def _match_of(hit: SurfaceHit, obstacle: Obstacle, incidence: Incidence) -> Match:
+    """Where the surface points of a search are at t and at t + 1."""
     corners = obstacle.faces[hit.face]
     points = (_weigh(hit.bary, at[corners]) for at in (obstacle.pos, obstacle.next_pos))
-    normals = (_interpolated_normal(at, obstacle.faces, corners, hit.bary) for at in (obstacle.pos, obstacle.next_pos))
+    normals = (
+        _interpolated_normal(at, obstacle.faces, corners, hit.bary, incidence) for at in (obstacle.pos, obstacle.next_pos)
+    )
     (point, next_point), (normal, next_normal) = points, normals
     return Match(*hit, point=point, normal=normal, next_point=next_point, next_normal=next_normal)
 
@@ -158,9 +183,8 @@ def _weigh(bary: Tensor, corner_values: Tensor) -> Tensor:
     return (bary.unsqueeze(-1) * corner_values).sum(dim=1)
 
 
-def _interpolated_normal(pos: Tensor, faces: Tensor, corners: Tensor, bary: Tensor) -> Tensor:
+def _interpolated_normal(pos: Tensor, faces: Tensor, corners: Tensor, bary: Tensor, incidence: Incidence) -> Tensor:
     """Normals vary continuously over the surface, so a sliding vertex sees no jump between facets."""
-    incidence = build_incidence(faces, len(pos))
     at_vertices = geometry.normals_of_fans(pos, faces, incidence.around, incidence.first)
     normal = _weigh(bary, at_vertices.index_select(0, corners.reshape(-1)).view(-1, 3, 3))
     return normal / normal.norm(dim=1, keepdim=True).clamp_min(torch.finfo(pos.dtype).tiny)

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from hood.losses.bending import Bending, CurrentLengthBending, bending_weight
 from hood.losses.potential import Term
+from hood.nn.dense import is_whole
 from hood.scene.cloth import Cloth
 
 BENDINGS = (Bending, CurrentLengthBending)
@@ -34,7 +35,7 @@ class Corners:
 
     def __call__(self, pos: Tensor) -> Tensor:
         """(C, 3, N) of ``pos`` (V, 3)."""
-        if pos.device.type == "cpu":  # numpy gathers several times faster than torch
+        if pos.device.type == "cpu" and not is_whole():  # numpy gathers several times faster than torch
             flat = torch.from_numpy(np.take(pos.t().contiguous().numpy(), self._index.numpy(), axis=1))
         else:
             flat = pos.t()[:, self._index]

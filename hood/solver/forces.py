@@ -139,9 +139,7 @@ def vertex_forces(potential: Potential, problem: StepProblem) -> VertexForces:
     inertia, weight = torch.zeros_like(mass), torch.zeros_like(pos)
     walls: list[Walls] = []
     grips: list[Grip] = []
-    for term in potential.terms.values():
-        if not term.applies(problem):
-            continue
+    for term in potential.active(problem).values():
         if type(term) is Inertia:
             inertia = inertia + mass
         elif type(term) is Gravity:
@@ -222,8 +220,8 @@ def attachment_stiffness(term: Term, problem: StepProblem) -> Tensor:
 
 def other_terms(potential: Potential, problem: StepProblem) -> Potential | None:
     """The terms that have no closed form here and play a role in the problem; None without any."""
-    others = {name: term for name, term in potential.terms.items() if type(term) not in CLOSED_FORM}
-    return Potential(others) if any(term.applies(problem) for term in others.values()) else None
+    others = {name: term for name, term in potential.active(problem).items() if type(term) not in CLOSED_FORM}
+    return potential.only(others) if others else None
 
 
 def _rows(a: Tensor, b: Tensor) -> Tensor:

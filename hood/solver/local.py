@@ -36,7 +36,7 @@ class LocalTerms:
     def __init__(self, potential: Potential, problem: StepProblem) -> None:
         self.problem = problem
         self.terms = StepTerms(potential, problem)
-        self._incidence = _incidence_of(problem.cloth)
+        self._incidence = incidence_of(problem.cloth)
 
     @torch.no_grad()
     def __call__(self, pos: Tensor) -> LocalView:
@@ -56,13 +56,16 @@ class LocalTerms:
             table = torch.cat(parts, dim=1).t().contiguous()
             sums = functional.embedding_bag(order, table, offsets, mode="sum", include_last_offset=True)
             gradient = gradient + sums[:, :3]
-            matrix = matrix + sums[:, [3, 4, 5, 4, 6, 7, 5, 7, 8]].view(-1, 3, 3)
+            a, b, c, d, e, f = sums[:, 3:].unbind(dim=1)
+            matrix = matrix + torch.stack([a, b, c, b, d, e, c, e, f], dim=1).view(-1, 3, 3)
         springs = terms.attachments(pos)
         if springs is not None:
             ends = self.problem.step.attachments.edges.t().reshape(-1)  # type: ignore[union-attr]
             gradient = gradient.index_add(0, ends, springs[0].permute(0, 2, 1).reshape(-1, 3))
             stiffness = terms.spring_stiffness().repeat(2)
-            matrix = matrix.index_add(0, ends, stiffness[:, None, None] * torch.eye(3).to(matrix))
+            matrix = matrix.index_add(
+                0, ends, stiffness[:, None, None] * torch.eye(3, dtype=matrix.dtype, device=matrix.device)
+            )
         other = terms.other_gradient(pos, acc)
         gradient = gradient if other is None else gradient + other
         force = torch.where(cloth.free.unsqueeze(1), -gradient, 0.0)
@@ -95,14 +98,14 @@ def _place(row: int, col: int, size: int = 9) -> int:
 _INCIDENCES: dict[int, tuple[weakref.ref[Tensor], tuple[Tensor, Tensor]]] = {}
 
 
-def _incidence_of(cloth: Cloth) -> tuple[Tensor, Tensor]:
+def incidence_of(cloth: Cloth) -> tuple[Tensor, Tensor]:
     """Corners of faces and hinges by the vertex they are at, kept as long as the cloth's faces live."""
     key = id(cloth.faces)
     if key in _INCIDENCES and _INCIDENCES[key][0]() is cloth.faces:
         return _INCIDENCES[key][1]
     vertex = torch.cat([cloth.faces.t().reshape(-1), cloth.hinges.t().reshape(-1)])
     order = torch.argsort(vertex, stable=True)
-    count = torch.bincount(vertex, minlength=cloth.num_vertices)
+    count = vertex.new_zeros(cloth.num_vertices).index_add(0, vertex, torch.ones_like(vertex))
     value = (order, torch.cat([count.new_zeros(1), count.cumsum(0)]))
     _INCIDENCES[key] = (weakref.ref(cloth.faces, forget(_INCIDENCES, key)), value)
     return value

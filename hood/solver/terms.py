@@ -23,7 +23,7 @@ class StepTerms:
 
     def __init__(self, potential: Potential, problem: StepProblem) -> None:
         self.problem = problem
-        cloth, terms = problem.cloth, [term for term in potential.terms.values() if term.applies(problem)]
+        cloth, terms = problem.cloth, list(potential.active(problem).values())
         self.vertices = vertex_forces(potential, problem)
         self.bendings = [term for term in terms if type(term) in BENDINGS]
         self.springs = [term for term in terms if type(term) is Attachment]

@@ -17,7 +17,8 @@ from hood.assets.garment import Garment
 from hood.assets.material import Material
 from hood.assets.sequence import PoseSequence
 from hood.dynamics.captured import CapturedSimulator, StepPrediction
-from hood.dynamics.fixed_step import FixedStep, step_inputs
+from hood.dynamics.fixed_problem import step_inputs
+from hood.dynamics.fixed_step import FixedStep
 from hood.dynamics.rollout import simulate
 from hood.dynamics.simulator import Prepared, Simulator, build_simulator
 from hood.dynamics.trace import count_operations, trace
@@ -228,13 +229,14 @@ def test_a_step_that_finds_no_room_is_taken_again(skirt_scene: Scene) -> None:
     with torch.no_grad():
         plain = simulator.predict(problem, prepared)
         *_, found = FixedStep(simulator, lay_out(prepared.static, Capacity(400, 400)), problem)(*step_inputs(problem))
-        edges, vertices = found.tolist()
+        edges, vertices, faces = found.tolist()
+        assert faces == 0
         for room in (Capacity(edges, vertices + 1), Capacity(edges + 1, vertices - 4), Capacity(edges + 1, vertices + 1)):
             step = FixedStep(simulator, lay_out(prepared.static, room), problem)
             _, acc, _, found = step(*step_inputs(problem))
             assert bool(torch.isfinite(acc).all())
-            assert found.tolist() == [edges, vertices]
-            assert (difference(acc, plain.acc) <= 1e-5) == room.holds((edges, vertices))
+            assert found.tolist() == [edges, vertices, 0]
+            assert (difference(acc, plain.acc) <= 1e-5) == room.holds((edges, vertices, 0))
     compare(simulator, CapturedSimulator(simulator, "fixed", Capacity(edges, 7)), problem, prepared, 1e-5)
 
 
@@ -300,8 +302,6 @@ def test_steps_that_do_not_exist_are_refused() -> None:
         CapturedSimulator(make(), "quick")
     with pytest.raises(ValueError, match="step=captured needs device=cuda.*use step=fixed or step=plain"):
         CapturedSimulator(make(), "captured")
-    with pytest.raises(ValueError, match="contact with the body's surface: use step=plain"):
-        CapturedSimulator(make(features="physical", output="velocity_base"), "fixed")
     with pytest.raises(ValueError, match=r"for inference: call simulator.eval\(\)"):
         CapturedSimulator(make().train(), "fixed")
 

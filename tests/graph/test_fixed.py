@@ -141,13 +141,16 @@ def test_closed_attachments_are_part_of_the_layout(static: StaticGraph) -> None:
 
 
 def test_capacities() -> None:
-    assert Capacity(11, 6).holds((10, 5))
-    assert not Capacity(11, 6).holds((11, 5))
-    assert not Capacity(11, 6).holds((10, 6))
-    for counts in ((0, 0), (63, 10), (500, 499), (1000, 700)):
-        room = capacity_for(counts, (1000, 700))
+    assert Capacity(11, 6).holds((10, 5, 0))
+    assert not Capacity(11, 6).holds((11, 5, 0))
+    assert not Capacity(11, 6).holds((10, 6, 0))
+    assert Capacity(11, 6, 2).holds((10, 5, 2))
+    assert not Capacity(11, 6, 2).holds((10, 5, 3))
+    for counts in ((0, 0, 0), (63, 10, 2), (500, 499, 70), (1000, 700, 900)):
+        room = capacity_for(counts, (1000, 700, 900))
         assert room.holds(counts)
         assert room.edges <= 1001
         assert room.vertices <= 701
+        assert room.faces == counts[2]
     with pytest.raises(ValueError, match="capacity is 0 edges"):
         Capacity(0, 5)

@@ -113,7 +113,7 @@ def test_pseudonormal_of_a_corner_does_not_depend_on_the_diagonals():
     vertices, faces = (torch.as_tensor(x) for x in box(3))
     incidence = proximity.build_incidence(faces, len(vertices))
     corners = (vertices.abs() > 0.49).all(dim=1).nonzero().squeeze(1)
-    fans = proximity._build_fans(vertices * torch.tensor([1.0, 2.0, 1.0], dtype=vertices.dtype), incidence)
+    fans = proximity.build_fans(vertices * torch.tensor([1.0, 2.0, 1.0], dtype=vertices.dtype), incidence)
     normals = proximity._vertex_pseudonormals(corners, incidence, fans)
     expected = np.pi / 2 * vertices[corners].sign()
     assert len(corners) == 8
