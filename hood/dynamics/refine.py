@@ -22,7 +22,7 @@ from hood.scene.cloth import Cloth
 from hood.scene.scene import RELAXING_DT
 from hood.solver.colouring import colours_of
 from hood.solver.iterate import Progress, in_single, rounded
-from hood.solver.newton import NewtonSettings, first_guess, minimize
+from hood.solver.newton import NewtonSettings, first_guess, minimize, plan_ahead
 from hood.solver.plan import plan_for
 from hood.solver.reasons import reason_number
 from hood.solver.sweeps import sweep
@@ -147,9 +147,11 @@ class RefinedStepper:
             # Such models turn the way that they went into a velocity: a refined one would be a blow.
             return prediction
         with timed(watch, "refine"):
-            plan = plan_for(problem)  # made once per cloth, so here: no part of what an iteration costs
+            # Made once per cloth, so here: no part of what an iteration costs.
             if self.method == "sweeps":
-                colours_of(plan, problem.cloth, problem.step.attachments)
+                colours_of(plan_for(problem), problem.cloth, problem.step.attachments)
+            else:
+                plan_ahead(self.potential, problem, self.settings)
             # A relaxing step is no frame and keeps no time: the refinement alone counts for its goal.
             return self._refine(problem, prediction, (Stopwatch() if watch is None else watch).elapsed)
 

@@ -125,6 +125,15 @@ def first_guess(potential: Potential, problem: StepProblem, settings: NewtonSett
     return rounded(problem, pos), acc.to(problem.state.pos.dtype)
 
 
+@torch.no_grad()
+def plan_ahead(potential: Potential, problem: StepProblem, settings: NewtonSettings | None = None) -> None:
+    """Make what :func:`minimize` needs once per cloth, so that it is no part of a step's time."""
+    plan = plan_for(problem)
+    if "ahead" not in plan.cache:
+        plan.cache["ahead"] = True
+        _system(potential, in_double(potential.prepare(problem)), plan, settings or NewtonSettings())
+
+
 class System(Protocol):
     """The unknowns of a step: where they are, the model there, and the way on. :func:`minimize` decides when to stop."""
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import weakref
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -19,22 +20,56 @@ from hood.solver.pattern import BlockPattern, Scatter, axial_targets, matrix_tar
 from hood.solver.terms import StepTerms
 
 
-@dataclass(frozen=True)
 class SolverPlan:
     """Unknowns, sparsity and scatter maps of a cloth; valid for every step with the same attachments' edges.
 
-    Unknowns are the N free vertices, in the order of their indices.
+    Unknowns are the N free vertices, in the order of their indices. What takes time and memory is made when it is first asked
+    for: the compiled solver has tables of its own.
+
+    Args:
+        attachments: of the steps, when they have any: their edges enter the sparsity.
     """
 
-    vertices: Tensor  # (N,) indices of the free vertices
-    scene: Tensor  # (N,) their scenes
-    pattern: BlockPattern
-    matrix: Scatter  # matrices of all vertices, faces, hinges and attachments, one after the other, onto the pattern
-    slack: Scatter  # slack of vertices and faces
-    face_vertices: Scatter  # gradients onto all V vertices
-    hinge_vertices: Scatter
-    attachment_vertices: Scatter | None
-    cache: dict[str, object] = field(default_factory=dict)  # what linear solvers and sweeps derive from the above
+    def __init__(self, cloth: Cloth, attachments: Attachments | None = None) -> None:
+        free = cloth.free.cpu().numpy()
+        self._unknown = np.where(free, np.cumsum(free) - 1, -1)
+        tables = [cloth.faces, cloth.hinges] + ([] if attachments is None else [attachments.edges])
+        self._corners = [table.cpu().numpy().copy() for table in tables]  # the cloth is not kept alive
+        self.vertices = torch.as_tensor(np.flatnonzero(free), device=cloth.faces.device)  # (N,) indices of the free vertices
+        self.scene = cloth.vertex_scene[self.vertices]  # (N,)
+        self.cache: dict[str, object] = {}  # what solvers and sweeps derive from the plan
+
+    @cached_property
+    def pattern(self) -> BlockPattern:
+        couples = np.concatenate([_pairs(table) for table in self._unknowns])
+        return BlockPattern(len(self.vertices), couples[(couples >= 0).all(axis=1)])
+
+    @cached_property
+    def matrix(self) -> Scatter:
+        """Matrices of all vertices, faces, hinges and attachments, one after the other, onto the pattern."""
+        return _matrix_sum(self.pattern, self._unknown, self._unknowns)
+
+    @cached_property
+    def slack(self) -> Scatter:
+        """Slack of vertices and faces onto the pattern."""
+        return _slack_sum(self.pattern, self._unknown, self._unknowns[0])
+
+    @cached_property
+    def face_vertices(self) -> Scatter:
+        """Gradients of faces onto all V vertices."""
+        return to_vertices(self._corners[0], len(self._unknown))
+
+    @cached_property
+    def hinge_vertices(self) -> Scatter:
+        return to_vertices(self._corners[1], len(self._unknown))
+
+    @cached_property
+    def attachment_vertices(self) -> Scatter:
+        return to_vertices(self._corners[2], len(self._unknown))
+
+    @property
+    def _unknowns(self) -> list[np.ndarray]:
+        return [self._unknown[table] for table in self._corners]
 
 
 @dataclass(frozen=True)
@@ -44,29 +79,6 @@ class QuadraticModel:
     gradient: Tensor  # (V, 3) N, pinned and massless vertices included
     triples: Tensor  # (R, 3) N/m, positive definite matrix of the free vertices in the pattern's layout
     slack: Tensor  # (R, 3) N/m, what is missing to the Hessian; negative semi-definite
-
-
-def build_plan(cloth: Cloth, attachments: Attachments | None = None) -> SolverPlan:
-    """Plan for steps of ``cloth``; ``attachments`` when the steps have any (their edges enter the sparsity)."""
-    free = cloth.free.cpu().numpy()
-    unknown = np.where(free, np.cumsum(free) - 1, -1)
-    tables = [cloth.faces, cloth.hinges] + ([] if attachments is None else [attachments.edges])
-    corners = [table.cpu().numpy() for table in tables]
-    unknowns = [unknown[table] for table in corners]
-    couples = np.concatenate([_pairs(table) for table in unknowns])
-    pattern = BlockPattern(int(free.sum()), couples[(couples >= 0).all(axis=1)])
-    vertices = torch.as_tensor(np.flatnonzero(free), device=cloth.faces.device)
-    sums = [to_vertices(table, cloth.num_vertices) for table in corners]
-    return SolverPlan(
-        vertices=vertices,
-        scene=cloth.vertex_scene[vertices],
-        pattern=pattern,
-        matrix=_matrix_sum(pattern, unknown, unknowns),
-        slack=_slack_sum(pattern, unknown, unknowns[0]),
-        face_vertices=sums[0],
-        hinge_vertices=sums[1],
-        attachment_vertices=sums[2] if len(sums) > 2 else None,
-    )
 
 
 _PLANS: dict[int, tuple[weakref.ref[Tensor], tuple[Tensor, Tensor, Tensor | None], SolverPlan]] = {}
@@ -81,7 +93,7 @@ def plan_for(problem: StepProblem) -> SolverPlan:
         reference, then, plan = _PLANS[key]
         if reference() is cloth.faces and all(_same(a, b) for a, b in zip(now, then, strict=True)):
             return plan
-    plan = build_plan(cloth, attachments)
+    plan = SolverPlan(cloth, attachments)
     _PLANS[key] = (weakref.ref(cloth.faces, forget(_PLANS, key)), now, plan)
     return plan
 
@@ -116,7 +128,6 @@ class ModelBuilder:
             elements.outer_upper(row.flatten(0, 1), self._hinges.view(78, -1), add=index > 0)
         springs = terms.attachments(pos)
         if springs is not None:
-            assert plan.attachment_vertices is not None
             gradient = gradient + plan.attachment_vertices(springs[0]).view(-1, 3)
             self._springs.copy_(springs[1].view(-1))
         other = terms.other_gradient(pos, acc)

@@ -10,10 +10,12 @@ import torch
 
 from hood.assets.material import Material
 from hood.losses.potential import default_potential
+from hood.native.build import BuildError
 from hood.scene.cloth import build_cloth
 from hood.scene.state import Attachments
 from hood.solver import linear
-from hood.solver.plan import build_plan, plan_for, quadratic_model
+from hood.solver.newton import NewtonSettings, minimize
+from hood.solver.plan import SolverPlan, plan_for, quadratic_model
 from hood.testing import fold, grid, make_problem, plane_contact
 
 F64 = torch.float64
@@ -133,8 +135,21 @@ def test_plan_is_kept_until_something_changes():
     assert plan_for(loose).pattern.size == 20
 
 
+def test_the_compiled_solver_does_without_the_pattern_of_the_torch_form():
+    """It takes seconds and gigabytes at 50,000 vertices."""
+    problem = touching_sheet()
+    plan = SolverPlan(problem.cloth, problem.step.attachments)
+    try:
+        minimize(default_potential(), problem, settings=NewtonSettings(engine="compiled"), plan=plan)
+    except BuildError as error:
+        pytest.skip(str(error))
+    assert not {"pattern", "matrix", "slack", "face_vertices", "hinge_vertices"} & vars(plan).keys()
+    minimize(default_potential(), problem, settings=NewtonSettings(engine="torch"), plan=plan)
+    assert {"pattern", "matrix", "slack"} <= vars(plan).keys()
+
+
 def test_fixed_vertices_are_no_unknowns():
     problem = touching_sheet()
-    plan = build_plan(problem.cloth)
+    plan = SolverPlan(problem.cloth)
     assert plan.vertices.tolist() == list(range(4, 20))
     assert plan.pattern.size == 16

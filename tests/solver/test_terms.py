@@ -15,7 +15,7 @@ from hood.losses.stretching import Stretching
 from hood.scene.cloth import build_cloth, concatenate_cloths
 from hood.scene.contact import find_contact
 from hood.scene.state import Attachments, Obstacle, StepInput
-from hood.solver.plan import build_plan, plan_for, quadratic_model
+from hood.solver.plan import SolverPlan, plan_for, quadratic_model
 from hood.solver.terms import StepTerms
 from hood.testing import cylinder, grid, make_problem, sphere
 
@@ -91,7 +91,7 @@ def test_gradient_is_that_of_the_potential(make):
 def test_a_term_given_twice_counts_twice():
     problem = crumpled()
     once, twice = Potential({"a": Stretching()}), Potential({"a": Stretching(), "b": Stretching()})
-    plan, pos = build_plan(problem.cloth, problem.step.attachments), problem.state.pos
+    plan, pos = SolverPlan(problem.cloth, problem.step.attachments), problem.state.pos
     models = [quadratic_model(potential, problem, plan, pos, 0 * pos) for potential in (once, twice)]
     for name in ("gradient", "triples", "slack"):
         torch.testing.assert_close(getattr(models[1], name), 2 * getattr(models[0], name))
