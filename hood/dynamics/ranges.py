@@ -28,6 +28,12 @@ _ROUNDING = 1e-4
 #: Names in sentences, of quantities that are no keys of a command.
 _TITLES = {"vertices": "garment vertices", "edge_length": "garment mean edge", "size": "garment size"}
 
+#: Settings of terms that files from before them do not name, and what these files were trained with.
+_LATER = {
+    f"hood.losses.{name}": {"contact": "vertices"}
+    for name in ("collision.Collision", "collision.CentroidCollision", "friction.Friction")
+}
+
 Span = tuple[float, float]
 
 
@@ -57,7 +63,8 @@ class Conditions:
         try:
             content = json.loads(text)
             spans = {str(name): (float(low), float(high)) for name, (low, high) in content["spans"].items()}
-            potential = {str(name): dict(term) for name, term in content["potential"].items()}
+            terms = {str(name): dict(term) for name, term in content["potential"].items()}
+            potential = {name: _LATER.get(str(term.get("term")), {}) | term for name, term in terms.items()}
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise ValueError(f"training ranges cannot be read ({type(error).__name__}: {error})") from error
         wrong = next((name for name, span in spans.items() if not (np.isfinite(span).all() and span[0] <= span[1])), None)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from hood.losses.collision import lagged_contact, with_lagged_centroids
-from hood.losses.problem import StepProblem
+from hood.losses.collision import checked_place, lagged_contact, with_lagged_centroids
+from hood.losses.problem import StepProblem, sum_per_scene
 from hood.scene.contact import Contact, LaggedContact
+from hood.scene.contact_points import PointContact
 
 
 class LaggedFriction:
@@ -53,27 +54,54 @@ class LaggedFriction:
             return next_pos.new_zeros(problem.num_scenes)
         force = self.normal_force(problem, contact)
         carried, normal = self.carrier(contact)
-        slip = torch.where(force.unsqueeze(1) > 0, next_pos - problem.state.pos - carried, 0.0)
-        slip = slip - (slip * normal).sum(dim=1, keepdim=True) * normal
-        limit = self.slip_speed * problem.vertex_dt.squeeze(1)
-        return problem.sum_vertices(self.coefficient * force * mollified_norm((slip * slip).sum(dim=1), limit))
+        moved, limit = next_pos - problem.state.pos - carried, self.slip_speed * problem.vertex_dt.squeeze(1)
+        return problem.sum_vertices(_slipping(self.coefficient * force, moved, normal, limit))
 
 
 class Friction(LaggedFriction):
     """Friction by the contact's own force: N = 3 w max(ε - d_t, 0)², that of the collision term at t.
 
+    At points inside edges and faces N has the factor of the collision there, the area share.
+
     Args:
-        weight, epsilon: w [J/m³] and ε [m] of the collision term.
+        weight, epsilon, contact: w [J/m³], ε [m] and places of the collision term.
     """
 
-    def __init__(self, coefficient: float = 0.5, slip_speed: float = 5e-3, weight: float = 5e5, epsilon: float = 2e-3) -> None:
+    def __init__(
+        self,
+        coefficient: float = 0.5,
+        slip_speed: float = 5e-3,
+        weight: float = 5e5,
+        epsilon: float = 2e-3,
+        contact: str = "vertices",
+    ) -> None:
         super().__init__(coefficient, slip_speed)
         self.weight = weight
         self.epsilon = epsilon
+        self.contact = checked_place("friction", contact)
 
     def with_weight(self, weight: float) -> Friction:
         """The same term with another collision weight, for a ramp during training."""
-        return Friction(self.coefficient, self.slip_speed, weight, self.epsilon)
+        return Friction(self.coefficient, self.slip_speed, weight, self.epsilon, self.contact)
+
+    def prepare(self, problem: StepProblem) -> StepProblem:
+        """The problem with its contact searched for, once per step, if there is friction."""
+        return problem.with_points(self.contact) if self.coefficient > 0 else problem
+
+    def __call__(self, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> Tensor:
+        """Energy [J] (B,) at ``next_pos`` (V, 3)."""
+        energy = super().__call__(problem, next_pos, acc)
+        points = problem.points_at(self.contact)
+        if points is None:
+            return energy
+        moved = points.at(next_pos - problem.state.pos) - (points.next_point - points.point)
+        limit = self.slip_speed * problem.step.dt[points.scene]
+        slipping = _slipping(self.coefficient * self.point_force(points), moved, points.next_normal, limit)
+        return energy + sum_per_scene(slipping, points.scene, problem.num_scenes)
+
+    def point_force(self, points: PointContact) -> Tensor:
+        """Lagged normal forces [N] (N,) at the points."""
+        return 3.0 * self.weight * points.share * (self.epsilon - points.dist).clamp_min(0.0) ** 2
 
     def normal_force(self, problem: StepProblem, contact: Contact) -> Tensor:
         touching = contact.valid & (problem.cloth.mass > 0)
@@ -155,6 +183,13 @@ class CodedFriction(LaggedFriction):
         """The way of the matched centroids from t-1 to t and the normals at t."""
         assert isinstance(contact, LaggedContact)
         return contact.lagged_motion, contact.lagged_normal
+
+
+def _slipping(force: Tensor, moved: Tensor, normal: Tensor, limit: Tensor) -> Tensor:
+    """F f(‖u_T‖) [J] (N,) with F = ``force`` (N,), u_T the tangential part of ``moved`` (N, 3) and e = ``limit`` (N,)."""
+    slip = torch.where(force.unsqueeze(1) > 0, moved, 0.0)
+    slip = slip - (slip * normal).sum(dim=1, keepdim=True) * normal
+    return force * mollified_norm((slip * slip).sum(dim=1), limit)
 
 
 def mollified_norm(norm_sq: Tensor, limit: Tensor) -> Tensor:

@@ -142,6 +142,7 @@ def default_potential(
     friction_coefficient: float = 0.5,
     friction_slip_speed: float = 5e-3,
     attachment_stiffness: float = 1e3,
+    contact: str = "vertices",
 ) -> Potential:
     """The paper's potential in safe forms: contact with triangles, friction by normal force, rest angles."""
     return Potential(
@@ -150,8 +151,8 @@ def default_potential(
             "bending": Bending(),
             "inertia": Inertia(),
             "gravity": Gravity(),
-            "collision": Collision(collision_weight, collision_epsilon),
-            "friction": Friction(friction_coefficient, friction_slip_speed, collision_weight, collision_epsilon),
+            "collision": Collision(collision_weight, collision_epsilon, contact),
+            "friction": Friction(friction_coefficient, friction_slip_speed, collision_weight, collision_epsilon, contact),
             "attachment": Attachment(attachment_stiffness),
         }
     )

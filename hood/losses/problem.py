@@ -9,6 +9,7 @@ from torch import Tensor
 
 from hood.scene.cloth import Cloth
 from hood.scene.contact import Contact, find_contact
+from hood.scene.contact_points import PointContact, find_point_contact
 from hood.scene.state import State, StepInput
 
 #: Standard gravity [m/s²], y up.
@@ -23,7 +24,8 @@ def _standard_gravity() -> Tensor:
 class StepProblem:
     """One implicit step t → t+1 of B scenes; everything in it is constant while the next positions vary.
 
-    ``contact`` is None without a body, and until somebody who needs it asks for :meth:`with_contact`.
+    ``contact`` is None without a body, and until somebody who needs it asks for :meth:`with_contact`; ``point_contacts`` holds
+    what terms asked for by :meth:`with_points`.
     """
 
     cloth: Cloth
@@ -31,6 +33,7 @@ class StepProblem:
     step: StepInput
     contact: Contact | None = None
     gravity: Tensor = field(default_factory=_standard_gravity)  # (3,) m/s²
+    point_contacts: tuple[PointContact, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.step.dt) != self.cloth.num_scenes:
@@ -48,6 +51,29 @@ class StepProblem:
         if self.contact is not None or obstacle is None:
             return self
         return replace(self, contact=find_contact(self.state.pos, self.cloth.vertex_scene, obstacle))
+
+    def with_points(self, place: str) -> StepProblem:
+        """The problem with its contact, also at points inside edges and faces (a ``place`` of
+        :data:`hood.scene.contact_points.PLACES`); itself where that has been done or there is no body."""
+        problem, obstacle = self.with_contact(), self.step.obstacle
+        known = place == "vertices" or any(points.place == place for points in self.point_contacts)
+        if known or obstacle is None or problem.contact is None:
+            return problem
+        points = find_point_contact(place, self.cloth, self.state.pos, obstacle, problem.contact)
+        return replace(problem, point_contacts=(*self.point_contacts, points))
+
+    def points_at(self, place: str) -> PointContact | None:
+        """Contact at the points of a place; None at ``vertices`` and without a body.
+
+        Raises:
+            ValueError: nobody searched for it.
+        """
+        found = next((points for points in self.point_contacts if points.place == place), None)
+        if found is None and place != "vertices" and self.step.obstacle is not None:
+            raise ValueError(
+                f"step problem: contact={place} not searched for yet; pass the problem through Potential.prepare once"
+            )
+        return found
 
     @property
     def searched_contact(self) -> Contact | None:

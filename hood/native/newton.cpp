@@ -81,9 +81,23 @@ extern "C" {
 struct Wall {
     const double *point, *normal, *reach;  // (V, 3), (V, 3), (V)
     double weight;
+    const double* share;  // (V) factors of the weight; none for vertices
 };
 struct Grip {
     const double *force, *normal, *anchor, *limit;  // (V), (V, 3), (V, 3), (V)
+};
+// The same at points inside edges and faces, weighted sums of up to three vertices; rows of points where those are of vertices.
+struct Points {
+    int64_t count, num_walls, num_grips;
+    const int32_t* corners;  // (N, 3), in the new numbering; what is not needed repeats one
+    const double* weights;   // (N, 3), 0 for those
+    // Points at a row's vertex: (R + 1) starts; (., 5) point, corner, then places in the row of the blocks with the point's
+    // corners, 0 where there is none or another row keeps it.
+    const int32_t *starts, *uses;
+    const Wall* walls;
+    const Grip* grips;
+    double* model;  // (N, 16) gradient, matrix and slack by the point, and 1 where there are any
+    double* path;   // (W, N, 14) of the line search: give of the corners, compliance, depth, 1 where it acts, push
 };
 
 struct Engine {
@@ -105,7 +119,8 @@ struct Engine {
     const double* spring_stiffness;  // (A) N/m
     const Wall* walls;
     const Grip* grips;
-    int64_t num_walls, num_grips;
+    const Points* points;
+    int64_t num_walls, num_grips, num_points;
     int64_t bending;  // 0 none, 1 about the rest shape, 2 with the current length about flat
     int64_t membrane;
     double dt_sq;
@@ -371,24 +386,25 @@ inline void add_outer(double* upper, double factor, const double* n) {
         for (int b = a; b < 3; ++b) upper[place++] += factor * n[a] * n[b];
 }
 
-inline void vertex_model(const Engine& e, int64_t row, double* gradient, double* upper, double* slack) {
-    const int64_t v = e.vertex[row];
-    const double *pos = e.pos + 4 * row, *acc = e.acc + 4 * row, *weight = e.weight + 3 * v;
-    for (int k = 0; k < 3; ++k) gradient[k] = e.inertia[v] * acc[k] - weight[k];
-    for (int k = 0; k < 6; ++k) upper[k] = slack[k] = 0.0;
-    upper[0] = upper[3] = upper[5] = e.inertia[v] / e.dt_sq;
-    for (int64_t w = 0; w < e.num_walls; ++w) {
-        const Wall& wall = e.walls[w];
+inline double weight_of(const Wall& wall, int64_t v) { return wall.share ? wall.weight * wall.share[v] : wall.weight; }
+
+// Adds contact and friction at the position of a row of walls and grips; whether there is any. Set has the fields of Points.
+template <class Set> inline bool add_contact(const Set& set, int64_t v, const double* pos, double* gradient, double* upper, double* slack) {
+    bool any = false;
+    for (int64_t w = 0; w < set.num_walls; ++w) {
+        const Wall& wall = set.walls[w];
         const double depth = depth_of(wall, v, pos);
         if (!(depth > 0.0)) continue;
-        const double* normal = wall.normal + 3 * v;
-        for (int k = 0; k < 3; ++k) gradient[k] -= 3.0 * wall.weight * depth * depth * normal[k];
-        add_outer(upper, 6.0 * wall.weight * depth, normal);
+        const double weight = weight_of(wall, v), *normal = wall.normal + 3 * v;
+        for (int k = 0; k < 3; ++k) gradient[k] -= 3.0 * weight * depth * depth * normal[k];
+        add_outer(upper, 6.0 * weight * depth, normal);
+        any = true;
     }
-    for (int64_t w = 0; w < e.num_grips; ++w) {
-        const Grip& grip = e.grips[w];
+    for (int64_t w = 0; w < set.num_grips; ++w) {
+        const Grip& grip = set.grips[w];
         const double force = grip.force[v];
         if (!(force > 0.0)) continue;
+        any = true;
         double slip[3];
         const double *normal = grip.normal + 3 * v, limit = grip.limit[v], size = slip_of(grip, v, pos, slip);
         const double ratio = size / limit;
@@ -402,6 +418,62 @@ inline void vertex_model(const Engine& e, int64_t row, double* gradient, double*
             add_outer(slack, along - slope, heading);
         }
     }
+    return any;
+}
+
+inline void vertex_model(const Engine& e, int64_t row, double* gradient, double* upper, double* slack) {
+    const int64_t v = e.vertex[row];
+    const double *pos = e.pos + 4 * row, *acc = e.acc + 4 * row, *weight = e.weight + 3 * v;
+    for (int k = 0; k < 3; ++k) gradient[k] = e.inertia[v] * acc[k] - weight[k];
+    for (int k = 0; k < 6; ++k) upper[k] = slack[k] = 0.0;
+    upper[0] = upper[3] = upper[5] = e.inertia[v] / e.dt_sq;
+    add_contact(e, v, pos, gradient, upper, slack);
+}
+
+// ---- points inside edges and faces ---------------------------------------------------------------------------------------
+
+inline void point_at(const Points& set, int64_t i, const double* pos, double* x) {
+    for (int k = 0; k < 3; ++k) x[k] = 0.0;
+    for (int c = 0; c < 3; ++c)
+        for (int k = 0; k < 3; ++k) x[k] += set.weights[3 * i + c] * pos[4 * (int64_t)set.corners[3 * i + c] + k];
+}
+
+void point_models(const Points& set, const double* pos, Range range) {
+    for (int64_t i = range.begin; i < range.end; ++i) {
+        double x[3], *model = set.model + 16 * i;
+        for (int k = 0; k < 16; ++k) model[k] = 0.0;
+        point_at(set, i, pos, x);
+        model[15] = add_contact(set, i, x, model, model + 3, model + 9);
+    }
+}
+
+// Adds the gradient and the diagonal block that points bring to a row.
+inline void add_points(const Engine& e, int64_t row, double* gradient, double* upper, double* slack) {
+    for (int64_t s = 0; s < e.num_points; ++s) {
+        const Points& set = e.points[s];
+        for (int32_t i = set.starts[row]; i < set.starts[row + 1]; ++i) {
+            const int32_t* use = set.uses + 5 * (int64_t)i;
+            const double* model = set.model + 16 * (int64_t)use[0];
+            if (model[15] == 0.0) continue;
+            const double weight = set.weights[3 * (int64_t)use[0] + use[1]], square = weight * weight;
+            for (int k = 0; k < 3; ++k) gradient[k] += weight * model[k];
+            for (int k = 0; k < 6; ++k) upper[k] += square * model[3 + k], slack[k] += square * model[9 + k];
+        }
+    }
+}
+
+// What points bring to the blocks of a row beside its diagonal: add(place, factor, matrix, slack), upper triangles.
+template <class Add> inline void couple_points(const Engine& e, int64_t row, const Add& add) {
+    for (int64_t s = 0; s < e.num_points; ++s) {
+        const Points& set = e.points[s];
+        for (int32_t i = set.starts[row]; i < set.starts[row + 1]; ++i) {
+            const int32_t* use = set.uses + 5 * (int64_t)i;
+            const double *model = set.model + 16 * (int64_t)use[0], *weights = set.weights + 3 * (int64_t)use[0];
+            if (model[15] == 0.0) continue;
+            for (int c = 0; c < 3; ++c)
+                if (use[2 + c] > 0) add(use[2 + c], weights[use[1]] * weights[c], model + 3, model + 9);
+        }
+    }
 }
 
 // ---- the potential -------------------------------------------------------------------------------------------------------
@@ -411,6 +483,19 @@ void place(const Engine& e, const double* acc, double* pos) {
         const double* base = e.base + 3 * e.vertex[row];
         for (int k = 0; k < 3; ++k) pos[4 * row + k] = base[k] + e.dt_sq * acc[4 * row + k];
     }
+}
+
+inline double wall_energy(const Wall& wall, int64_t v, const double* pos) {
+    const double depth = depth_of(wall, v, pos);
+    // Not-a-number is no depth to leave out.
+    return depth <= 0.0 ? 0.0 : weight_of(wall, v) * depth * depth * depth;
+}
+
+inline double grip_energy(const Grip& grip, int64_t v, const double* pos) {
+    if (!(grip.force[v] > 0.0)) return 0.0;
+    double slip[3];
+    const double limit = grip.limit[v], y = slip_of(grip, v, pos, slip);
+    return grip.force[v] * (y < limit ? y * y / limit * (1.0 - y / (3.0 * limit)) + limit / 3.0 : y);
 }
 
 // Potential at a placed state, and the rounding it is known to.
@@ -433,24 +518,25 @@ void energy(const Engine& e, const double* pos, const double* acc, double* phi, 
     add(gravity);
     for (int64_t w = 0; w < e.num_walls; ++w) {
         double part = 0.0;
-        for (int64_t row = 0; row < e.num_vertices; ++row) {
-            const double depth = depth_of(e.walls[w], e.vertex[row], pos + 4 * row);
-            // Not-a-number is no depth to leave out.
-            if (!(depth <= 0.0)) part += e.walls[w].weight * depth * depth * depth;
-        }
+        for (int64_t row = 0; row < e.num_vertices; ++row) part += wall_energy(e.walls[w], e.vertex[row], pos + 4 * row);
         add(part);
     }
     for (int64_t w = 0; w < e.num_grips; ++w) {
-        const Grip& grip = e.grips[w];
         double part = 0.0;
-        for (int64_t row = 0; row < e.num_vertices; ++row) {
-            const int64_t v = e.vertex[row];
-            if (!(grip.force[v] > 0.0)) continue;
-            double slip[3];
-            const double limit = grip.limit[v], y = slip_of(grip, v, pos + 4 * row, slip);
-            part += grip.force[v] * (y < limit ? y * y / limit * (1.0 - y / (3.0 * limit)) + limit / 3.0 : y);
-        }
+        for (int64_t row = 0; row < e.num_vertices; ++row) part += grip_energy(e.grips[w], e.vertex[row], pos + 4 * row);
         add(part);
+    }
+    for (int64_t s = 0; s < e.num_points; ++s) {
+        const Points& set = e.points[s];
+        double x[3];
+        for (int64_t w = 0; w < set.num_walls + set.num_grips; ++w) {
+            double part = 0.0;
+            for (int64_t i = 0; i < set.count; ++i) {
+                point_at(set, i, pos, x);
+                part += w < set.num_walls ? wall_energy(set.walls[w], i, x) : grip_energy(set.grips[w - set.num_walls], i, x);
+            }
+            add(part);
+        }
     }
     Sums<double> faces, hinges;
     for_parts(e.parts, [&](int64_t part) {
@@ -489,6 +575,7 @@ template <class T> void gather_gradient(const Engine& e, Range range) {
     for (int64_t row = range.begin; row < range.end; ++row) {
         double gradient[3], upper[6], slack[6];
         vertex_model(e, row, gradient, upper, slack);
+        add_points(e, row, gradient, upper, slack);
         D4 force = D4{gradient[0], gradient[1], gradient[2], 0.0};
         if (e.membrane) force += pull_of<3>(e.face_force, 10, e.face_starts, e.face_uses, row);
         if (e.bending) force += pull_of<4>(e.hinge_force, 14, e.hinge_starts, e.hinge_uses, row);
@@ -597,6 +684,11 @@ template <class T> void gather_matrix(const Engine& e, int64_t part) {
             sum.axial[0] += V4{stiffness, T(0), T(0), T(0)};
             if (i < e.spring_starts[2 * row + 1]) sum.axial[use[5]] += V4{-stiffness, T(0), T(0), T(0)};
         }
+        couple_points(e, row, [&](int32_t place, double factor, const double* m, const double* less) {
+            for (int k = 0; k < 3; ++k)
+                for (int j = 0; j < 3; ++j)
+                    sum.block[3 * place + k][j] += (T)(factor * (m[PAIR[k][j]] + e.sharpness * less[PAIR[k][j]]));
+        });
         for (int k = 0; k < 3; ++k) sum.block[k] += sum.axial[0][0] * unit[k];
         invert<T>(sum.block, inverse + 12 * row);
         for (int k = 0; k < 3; ++k)
@@ -622,6 +714,7 @@ template <class T> void differentiate(const Engine& e) {
     for_parts(e.parts, [&](int64_t part) {
         if (e.membrane) face_models<T>(e, e.pos, faces_of(e, part));
         if (e.bending) hinge_models<T>(e, e.pos, hinges_of(e, part));
+        for (int64_t s = 0; s < e.num_points; ++s) point_models(e.points[s], e.pos, range_of(e.points[s].count, part, e.parts));
     });
     for_parts(e.parts, [&](int64_t part) { gather_gradient<T>(e, rows_of(e, part)); });
 }
@@ -636,11 +729,17 @@ template <class T> void sharpen(Engine& e, double sharpness) {
         const Range range = rows_of(e, part);
         for (int64_t i = e.row_starts[range.begin]; i < e.row_starts[range.end]; ++i)
             for (int k = 0; k < 3; ++k) matrix[9 * i + 4 * k] += change * slack[i];
-        if (e.num_grips)
+        if (e.num_grips || e.num_points)
             for (int64_t row = range.begin; row < range.end; ++row)
                 for (int a = 0; a < 3; ++a)
                     for (int b = 0; b < 3; ++b)
                         matrix[9 * (int64_t)e.row_starts[row] + 3 * a + b] += change * own_slack[6 * row + PAIR[a][b]];
+        for (int64_t row = range.begin; row < range.end && e.num_points; ++row)
+            couple_points(e, row, [&](int32_t place, double factor, const double*, const double* less) {
+                T* block = matrix + 9 * ((int64_t)e.row_starts[row] + place);
+                for (int a = 0; a < 3; ++a)
+                    for (int b = 0; b < 3; ++b) block[3 * a + b] += change * (T)(factor * less[PAIR[a][b]]);
+            });
     });
 }
 
@@ -813,6 +912,31 @@ template <class T> void direct(Engine& e, double residual, int64_t most) {
 
 // ---- the line search -----------------------------------------------------------------------------------------------------
 
+// The same as below for points: how their vertices give, each along its own block.
+template <class T> void prepare_points(const Engine& e, const Points& set) {
+    for (int64_t w = 0; w < set.num_walls; ++w)
+        for (int64_t i = 0; i < set.count; ++i) {
+            const double *normal = set.walls[w].normal + 3 * i, *weights = set.weights + 3 * i;
+            double here[3], step[3] = {0.0, 0.0, 0.0}, *stop = set.path + 14 * (w * set.count + i);
+            point_at(set, i, e.pos, here);
+            for (int k = 0; k < 14; ++k) stop[k] = 0.0;
+            for (int c = 0; c < 3; ++c) {
+                const int64_t row = set.corners[3 * i + c];
+                if (row >= e.num_rows) continue;
+                const T* m = (const T*)e.inverse + 12 * row;
+                for (int k = 0; k < 3; ++k) {
+                    step[k] += weights[c] * e.direction[4 * row + k];
+                    stop[3 * c + k] = weights[c] * ((double)m[k] * normal[0] + (double)m[4 + k] * normal[1] + (double)m[8 + k] * normal[2]);
+                }
+                stop[9] += weights[c] * dot3(stop + 3 * c, normal);
+            }
+            const double start = depth_of(set.walls[w], i, here);
+            for (int k = 0; k < 3; ++k) here[k] += step[k];
+            stop[10] = start > 0.0 ? start : 0.0;
+            stop[11] = stop[9] > 0.0 && (start > 0.0 || depth_of(set.walls[w], i, here) > 0.0);
+        }
+}
+
 // What stops vertices at walls on the way of a step: give (3), compliance, depth at the start, 1 where it acts.
 template <class T> void prepare_path(const Engine& e) {
     const T* inverse = (const T*)e.inverse;
@@ -832,6 +956,48 @@ template <class T> void prepare_path(const Engine& e) {
             stop[3] = dot3(stop, normal);
             stop[4] = here > 0.0 ? here : 0.0;
         }
+    for (int64_t s = 0; s < e.num_points; ++s) prepare_points<T>(e, e.points[s]);
+}
+
+// Force that takes contact from the depth where the Newton model leads to the one where the whole penalty balances that model.
+inline double push_of(double cubic, double start, double end, double compliance) {
+    // The model's own force at the end, and the stiffness of everything else.
+    const double force = cubic * start * (2.0 * end - start);
+    double rest = 1.0 / compliance - 2.0 * cubic * start;
+    if (rest < 0.1 / compliance) rest = 0.1 / compliance;
+    double load = force + rest * end;
+    if (load < 0.0) load = 0.0;
+    // cubic q^2 + rest (q - end) = force for the depth q >= 0.
+    const double balance = 2.0 * load / (rest + std::sqrt(rest * rest + 4.0 * cubic * load));
+    return end > balance ? (end - balance) / compliance : 0.0;
+}
+
+// Points ask their vertices to give way; a vertex takes the mean of what those that push ask, see hood.solver.search.
+void walk_points(const Engine& e, const Points& set) {
+    for (int64_t w = 0; w < set.num_walls; ++w) {
+        const Wall& wall = set.walls[w];
+        double* path = set.path + 14 * w * set.count;
+        place(e, e.trial_acc, e.trial_pos);
+        for (int64_t i = 0; i < set.count; ++i) {
+            double *stop = path + 14 * i, x[3];
+            stop[12] = 0.0;
+            if (stop[11] == 0.0) continue;
+            point_at(set, i, e.trial_pos, x);
+            stop[12] = push_of(3.0 * weight_of(wall, i), stop[10], depth_of(wall, i, x), stop[9]);
+        }
+        for (int64_t row = 0; row < e.num_rows; ++row) {
+            double moved[3] = {0.0, 0.0, 0.0}, count = 0.0;
+            for (int32_t i = set.starts[row]; i < set.starts[row + 1]; ++i) {
+                const int32_t* use = set.uses + 5 * (int64_t)i;
+                const double* stop = path + 14 * (int64_t)use[0];
+                if (!(stop[12] > 0.0)) continue;
+                for (int k = 0; k < 3; ++k) moved[k] += stop[12] * stop[3 * use[1] + k];
+                count += 1.0;
+            }
+            if (count > 0.0)
+                for (int k = 0; k < 3; ++k) e.trial_acc[4 * row + k] += moved[k] / count / e.dt_sq;
+        }
+    }
 }
 
 void walk(const Engine& e, double length) {
@@ -847,20 +1013,12 @@ void walk(const Engine& e, double length) {
             const int64_t v = e.vertex[row];
             double *acc = e.trial_acc + 4 * row, pos[3];
             for (int k = 0; k < 3; ++k) pos[k] = e.base[3 * v + k] + e.dt_sq * acc[k];
-            const double compliance = stop[3], start = stop[4], end = depth_of(wall, v, pos);
-            // The model's own force at the end, and the stiffness of everything else.
-            const double force = cubic * start * (2.0 * end - start);
-            double rest = 1.0 / compliance - 2.0 * cubic * start;
-            if (rest < 0.1 / compliance) rest = 0.1 / compliance;
-            double load = force + rest * end;
-            if (load < 0.0) load = 0.0;
-            // cubic q^2 + rest (q - end) = force for the depth q >= 0.
-            const double balance = 2.0 * load / (rest + std::sqrt(rest * rest + 4.0 * cubic * load));
-            if (!(end > balance)) continue;
-            const double push = (end - balance) / compliance / e.dt_sq;
+            const double push = push_of(cubic, stop[4], depth_of(wall, v, pos), stop[3]) / e.dt_sq;
+            if (!(push > 0.0)) continue;
             for (int k = 0; k < 3; ++k) acc[k] += push * stop[k];
         }
     }
+    for (int64_t s = 0; s < e.num_points; ++s) walk_points(e, e.points[s]);
     place(e, e.trial_acc, e.trial_pos);
 }
 

@@ -27,10 +27,11 @@ from hood.native.structures import COUNT, POINTER, REAL, fields
 from hood.native.threads import num_parts
 from hood.scene.cloth import Cloth
 from hood.solver.elements import BENDINGS, face_constants, hinge_constants
-from hood.solver.engine_tables import Tables, build_tables
+from hood.solver.engine_tables import Tables, build_tables, point_uses
 from hood.solver.forces import Grip, VertexForces, Walls, attachment_stiffness, other_terms, vertex_forces
 from hood.solver.iterate import fixed_positions
 from hood.solver.plan import SolverPlan
+from hood.solver.points import PointForces, point_forces
 
 #: Vertices of a part that is worth a thread: in loops over elements, and in those of conjugate gradients, which are short.
 _ROWS, _CG_ROWS = 250, 1000
@@ -39,11 +40,18 @@ SOURCE = Path(native.__file__).with_name("newton.cpp")
 
 
 class _Wall(ctypes.Structure):
-    _fields_ = [("point", POINTER), ("normal", POINTER), ("reach", POINTER), ("weight", REAL)]
+    _fields_ = [("point", POINTER), ("normal", POINTER), ("reach", POINTER), ("weight", REAL), ("share", POINTER)]
 
 
 class _Grip(ctypes.Structure):
     _fields_ = [(name, POINTER) for name in ("force", "normal", "anchor", "limit")]
+
+
+class _Points(ctypes.Structure):
+    _fields_ = [
+        *fields("count num_walls num_grips", COUNT),
+        *fields("corners weights starts uses walls grips model path", POINTER),
+    ]
 
 
 class _Engine(ctypes.Structure):
@@ -54,8 +62,8 @@ class _Engine(ctypes.Structure):
         *fields("vertex face_corners hinge_corners row_starts cols", POINTER),
         *fields("face_starts face_uses hinge_starts hinge_uses spring_starts spring_uses spring_ends", POINTER),
         *fields("shape area mu lambda bulk soft rest_angle hinge_weight rest_length", POINTER),
-        *fields("base fixed inertia weight spring_stiffness walls grips", POINTER),
-        *fields("num_walls num_grips bending membrane", COUNT),
+        *fields("base fixed inertia weight spring_stiffness walls grips points", POINTER),
+        *fields("num_walls num_grips num_points bending membrane", COUNT),
         ("dt_sq", REAL),
         *fields("pos acc trial_pos trial_acc gradient direction path face_force hinge_force", POINTER),
         *fields("face_model hinge_model matrix slack own own_slack row_sum inverse x r z p q", POINTER),
@@ -134,6 +142,7 @@ class EngineStep:
     spring_stiffness: np.ndarray  # (A,) N/m
     walls: tuple[Walls, ...]
     grips: tuple[Grip, ...]
+    points: tuple[PointForces, ...]
     bending: int  # 0 none, 1 about the rest shape, 2 with the current length
     membrane: int  # how many such terms
 
@@ -156,6 +165,7 @@ def engine_step(potential: Potential, problem: StepProblem) -> EngineStep:
         spring_stiffness=_array(stiffness),
         walls=tuple(Walls(w.weight, *(_whole(t) for t in (w.point, w.normal, w.reach))) for w in forces.walls),
         grips=tuple(Grip(*(_whole(t) for t in (g.force, g.normal, g.anchor, g.limit))) for g in forces.grips),
+        points=point_forces(potential, problem),
         bending=0 if bending is None else 2 if type(bending) is CurrentLengthBending else 1,
         membrane=sum(type(term) is Stretching for term in terms),
     )
@@ -245,19 +255,15 @@ class SceneEngine:
         self._take_fabric(step)
         self._point(base=step.base, fixed=step.fixed, inertia=step.inertia, weight=step.weight)
         self._point(spring_stiffness=step.spring_stiffness[self.tables.springs.order])
-        walls, grips = (_Wall * len(step.walls))(), (_Grip * len(step.grips))()
-        for structure, wall in zip(walls, step.walls, strict=True):
-            for name in ("point", "normal", "reach"):
-                setattr(structure, name, getattr(wall, name).data_ptr())
-            structure.weight = wall.weight
-        for structure, grip in zip(grips, step.grips, strict=True):
-            for name in ("force", "normal", "anchor", "limit"):
-                setattr(structure, name, getattr(grip, name).data_ptr())
-        self._kept |= {"walls": walls, "grips": grips, "step": step}
-        values.walls, values.grips = ctypes.addressof(walls), ctypes.addressof(grips)
-        if values.num_walls != len(walls) or "path" not in self._kept:
-            self._point(path=np.zeros((len(walls), values.num_rows, 8)))
-        values.num_walls, values.num_grips = len(walls), len(grips)
+        walls, grips = _wall_structures(step.walls), _grip_structures(step.grips)
+        own = [_ScenePoints(points, self.tables, step.cloth.num_vertices) for points in step.points] if step.points else []
+        points = (_Points * len(own))(*(one.values for one in own))
+        self._kept |= {"walls": walls, "grips": grips, "points": (points, own), "step": step}
+        values.walls, values.grips = ctypes.addressof(walls[0]), ctypes.addressof(grips[0])
+        values.points = ctypes.addressof(points)
+        if values.num_walls != len(step.walls) or "path" not in self._kept:
+            self._point(path=np.zeros((len(step.walls), values.num_rows, 8)))
+        values.num_walls, values.num_grips, values.num_points = len(step.walls), len(step.grips), len(own)
         values.bending, values.membrane = step.bending, step.membrane > 0
         values.dt_sq = float(step.dt[scene]) ** 2
         values.raised, values.cg_used = 0.0, 0
@@ -311,6 +317,61 @@ class SceneEngine:
             assert array.flags.c_contiguous, f"{name} has gaps"
             self._kept[name] = array
             setattr(self.values, name, array.ctypes.data)
+
+
+class _ScenePoints:
+    """Points of one scene as the compiled solver reads them; what :attr:`values` points to lives as long."""
+
+    def __init__(self, points: PointForces, tables: Tables, num_vertices: int) -> None:
+        number = np.full(num_vertices, -1, np.int64)
+        number[tables.vertex] = np.arange(len(tables.vertex))
+        corners = number[points.vertices.numpy()]
+        rows = torch.from_numpy(np.flatnonzero(corners[:, 0] >= 0))
+        points, corners = points.take(rows), corners[rows.numpy()]
+        weights = _array(points.weights)
+        starts, uses = point_uses(tables, corners, weights)
+        walls, grips = points.forces.walls, points.forces.grips
+        arrays = {
+            "corners": np.ascontiguousarray(corners, np.int32),
+            "weights": weights,
+            "starts": starts,
+            "uses": uses,
+            "model": np.zeros((len(corners), 16)),
+            "path": np.zeros((len(walls), len(corners), 14)),
+        }
+        structures = _wall_structures(walls), _grip_structures(grips)
+        self._kept = arrays, structures
+        self.values = _Points(count=len(corners), num_walls=len(walls), num_grips=len(grips))
+        for name, array in arrays.items():
+            setattr(self.values, name, array.ctypes.data)
+        self.values.walls, self.values.grips = (ctypes.addressof(one) for one, _ in structures)
+
+
+def _wall_structures(walls: tuple[Walls, ...]) -> tuple[ctypes.Array[_Wall], list[Tensor]]:
+    """Walls as C++ reads them, and what they point to."""
+    structures, kept = (_Wall * len(walls))(), []
+    for structure, wall in zip(structures, walls, strict=True):
+        kept += _pointed(structure, wall, ("point", "normal", "reach"))
+        structure.weight = 1.0 if isinstance(wall.weight, Tensor) else wall.weight
+        if isinstance(wall.weight, Tensor):
+            kept.append(_whole(wall.weight))
+            structure.share = kept[-1].data_ptr()
+    return structures, kept
+
+
+def _grip_structures(grips: tuple[Grip, ...]) -> tuple[ctypes.Array[_Grip], list[Tensor]]:
+    """The same for grips."""
+    structures, kept = (_Grip * len(grips))(), []
+    for structure, grip in zip(structures, grips, strict=True):
+        kept += _pointed(structure, grip, ("force", "normal", "anchor", "limit"))
+    return structures, kept
+
+
+def _pointed(structure: ctypes.Structure, item: Walls | Grip, names: tuple[str, ...]) -> list[Tensor]:
+    tensors = [_whole(getattr(item, name)) for name in names]
+    for name, tensor in zip(names, tensors, strict=True):
+        setattr(structure, name, tensor.data_ptr())
+    return tensors
 
 
 def _aligned(count: int, kind: type) -> np.ndarray:

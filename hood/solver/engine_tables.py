@@ -86,6 +86,29 @@ def build_tables(cloth: Cloth, attachments: Attachments | None, scene: int) -> T
     )
 
 
+def point_uses(tables: Tables, corners: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where the points at the vertex of a row begin, (R + 1,), and what is known of each, (U, 5); both int32.
+
+    Known are the point, the corner that is the row's vertex, and the places in the row of the blocks with the point's three
+    corners, 0 where another row keeps the block or there is none.
+
+    Args:
+        corners: (N, 3) vertices of the points in the new numbering.
+        weights: (N, 3), 0 where there is no corner.
+    """
+    size = tables.num_rows
+    point, corner = np.nonzero((corners < size) & (weights > 0))
+    row = corners[point, corner]
+    order = np.argsort(row, kind="stable")
+    point, corner, row = point[order], corner[order], row[order]
+    cols = corners[point]
+    keys = np.repeat(np.arange(size), np.diff(tables.row_starts)) * size + tables.cols
+    places = np.searchsorted(keys, row[:, None] * size + cols) - tables.row_starts[row][:, None]
+    places = np.where((cols > row[:, None]) & (cols < size) & (weights[point] > 0), places, 0)
+    uses = np.concatenate([point[:, None], corner[:, None], places], axis=1)
+    return np.searchsorted(row, np.arange(size + 1)).astype(np.int32), np.ascontiguousarray(uses, np.int32)
+
+
 def _order(free: np.ndarray, tables: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Numbers (V,) of free vertices in their own order, and the free vertices in an order of small bandwidth."""
     unknown = np.where(free, np.cumsum(free) - 1, -1)

@@ -29,7 +29,7 @@ SINGLE = (Inertia, Gravity, *COLLISIONS, *FRICTIONS)
 class Walls:
     """A collision term as N planes; rows without one are zero and feel nothing."""
 
-    weight: float  # J/m³
+    weight: float | Tensor  # J/m³, one for all or (N,)
     point: Tensor  # (N, 3) m
     normal: Tensor  # (N, 3)
     reach: Tensor  # (N,) m, distance at which the penalty sets in
@@ -44,7 +44,8 @@ class Walls:
         return 3.0 * self.weight * depth * depth
 
     def take(self, rows: Tensor) -> Walls:
-        return Walls(self.weight, self.point[rows], self.normal[rows], self.reach[rows])
+        weight = self.weight[rows] if isinstance(self.weight, Tensor) else self.weight
+        return Walls(weight, self.point[rows], self.normal[rows], self.reach[rows])
 
 
 @dataclass(frozen=True)
@@ -96,8 +97,11 @@ class VertexForces:
     def energies(self, pos: Tensor, acc: Tensor, dt: Tensor) -> list[Tensor]:
         """Energies [J] (N,) of the terms at positions and accelerations (N, 3); time step ``dt`` (N, 1)."""
         moved = dt**2 * acc
-        parts = [0.5 * self.stiffness * _rows(moved, moved), -_rows(self.weight, pos)]
-        parts += [wall.weight * wall.depth(pos).clamp_min(0.0) ** 3 for wall in self.walls]
+        return [0.5 * self.stiffness * _rows(moved, moved), -_rows(self.weight, pos), *self.contact_energies(pos)]
+
+    def contact_energies(self, pos: Tensor) -> list[Tensor]:
+        """Those of contact and friction alone."""
+        parts = [wall.weight * wall.depth(pos).clamp_min(0.0) ** 3 for wall in self.walls]
         for grip in self.grips:
             slip = grip.slip(pos)
             parts.append(grip.force * mollified_norm(_rows(slip, slip), grip.limit))
@@ -192,14 +196,17 @@ def _friction(grip: Grip, pos: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 def energies_and_gradient(
     potential: Potential, problem: StepProblem, next_pos: Tensor, acc: Tensor | None = None
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """What :meth:`hood.losses.potential.Potential.gradient` computes; terms of single vertices in closed form."""
+    """What :meth:`hood.losses.potential.Potential.gradient` computes; terms of single vertices in closed form.
+
+    Contact that also acts inside edges and faces is left to autograd.
+    """
     acc = problem.acceleration(next_pos) if acc is None else acc
     gradient, energies = torch.zeros_like(next_pos), dict[str, Tensor]()
     for name, term in potential.terms.items():
         if not term.applies(problem):
             continue
         alone = Potential({name: term})
-        if type(term) not in SINGLE:
+        if type(term) not in SINGLE or getattr(term, "contact", "vertices") != "vertices":
             slope, energy = alone.gradient(problem, next_pos, acc)
             energies |= energy
         else:

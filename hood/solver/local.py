@@ -66,6 +66,10 @@ class LocalTerms:
             matrix = matrix.index_add(
                 0, ends, stiffness[:, None, None] * torch.eye(3, dtype=matrix.dtype, device=matrix.device)
             )
+        for points in terms.points:
+            model = points.model(pos)
+            gradient = gradient + points.spread(model.gradient, gradient)
+            matrix = matrix + points.spread_blocks(model.matrix, len(gradient))
         other = terms.other_gradient(pos, acc)
         gradient = gradient if other is None else gradient + other
         force = torch.where(cloth.free.unsqueeze(1), -gradient, 0.0)

@@ -17,6 +17,7 @@ from hood.scene.cloth import Cloth
 from hood.scene.state import Attachments
 from hood.solver import elements
 from hood.solver.pattern import BlockPattern, Scatter, axial_targets, matrix_targets, to_vertices, upper_pairs
+from hood.solver.points import PointBlocks
 from hood.solver.terms import StepTerms
 
 
@@ -32,7 +33,7 @@ class SolverPlan:
 
     def __init__(self, cloth: Cloth, attachments: Attachments | None = None) -> None:
         free = cloth.free.cpu().numpy()
-        self._unknown = np.where(free, np.cumsum(free) - 1, -1)
+        self.unknown = np.where(free, np.cumsum(free) - 1, -1)  # (V,) numbers of the free vertices, -1 for the others
         tables = [cloth.faces, cloth.hinges] + ([] if attachments is None else [attachments.edges])
         self._corners = [table.cpu().numpy().copy() for table in tables]  # the cloth is not kept alive
         self.vertices = torch.as_tensor(np.flatnonzero(free), device=cloth.faces.device)  # (N,) indices of the free vertices
@@ -47,29 +48,29 @@ class SolverPlan:
     @cached_property
     def matrix(self) -> Scatter:
         """Matrices of all vertices, faces, hinges and attachments, one after the other, onto the pattern."""
-        return _matrix_sum(self.pattern, self._unknown, self._unknowns)
+        return _matrix_sum(self.pattern, self.unknown, self._unknowns)
 
     @cached_property
     def slack(self) -> Scatter:
         """Slack of vertices and faces onto the pattern."""
-        return _slack_sum(self.pattern, self._unknown, self._unknowns[0])
+        return _slack_sum(self.pattern, self.unknown, self._unknowns[0])
 
     @cached_property
     def face_vertices(self) -> Scatter:
         """Gradients of faces onto all V vertices."""
-        return to_vertices(self._corners[0], len(self._unknown))
+        return to_vertices(self._corners[0], len(self.unknown))
 
     @cached_property
     def hinge_vertices(self) -> Scatter:
-        return to_vertices(self._corners[1], len(self._unknown))
+        return to_vertices(self._corners[1], len(self.unknown))
 
     @cached_property
     def attachment_vertices(self) -> Scatter:
-        return to_vertices(self._corners[2], len(self._unknown))
+        return to_vertices(self._corners[2], len(self.unknown))
 
     @property
     def _unknowns(self) -> list[np.ndarray]:
-        return [self._unknown[table] for table in self._corners]
+        return [self.unknown[table] for table in self._corners]
 
 
 @dataclass(frozen=True)
@@ -110,6 +111,7 @@ class ModelBuilder:
         parts = self._values.split([*sizes, len(self._values) - sum(sizes)])
         self._vertices, self._faces, self._hinges, self._springs = parts
         self._vertex_slack, self._face_slack = self._slack.split([sizes[0], len(self._slack) - sizes[0]])
+        self._blocks = [PointBlocks(plan.pattern, points, plan.unknown) for points in terms.points]
 
     def __call__(self, pos: Tensor, acc: Tensor) -> QuadraticModel:
         """The model at ``pos`` (V, 3) reached with ``acc`` (V, 3)."""
@@ -132,7 +134,13 @@ class ModelBuilder:
             self._springs.copy_(springs[1].view(-1))
         other = terms.other_gradient(pos, acc)
         gradient = gradient if other is None else gradient + other
-        return QuadraticModel(gradient, plan.matrix(self._values).view(-1, 3), plan.slack(self._slack).view(-1, 3))
+        triples, slack = plan.matrix(self._values).view(-1, 3), plan.slack(self._slack).view(-1, 3)
+        for points, blocks in zip(terms.points, self._blocks, strict=True):
+            model = points.model(pos)
+            gradient = gradient + points.spread(model.gradient, gradient)
+            triples = blocks.add(triples, model.matrix)
+            slack = slack if model.slack is None else blocks.add(slack, model.slack)
+        return QuadraticModel(gradient, triples, slack)
 
 
 def quadratic_model(potential: Potential, problem: StepProblem, plan: SolverPlan, pos: Tensor, acc: Tensor) -> QuadraticModel:

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from hood.solver.forces import Walls
 from hood.solver.iterate import Iterate, Unknowns
+from hood.solver.points import PointForces
 
 _ARMIJO = 1e-4
 _BACKTRACKS = 40
@@ -37,6 +38,11 @@ class Path:
             rows = (deepest > 0).nonzero().squeeze(1)
             if len(rows):
                 self._stops.append(_Stop(wall, now.pos, inverse[rows], vertices[rows]))
+        every = now.pos.new_zeros(len(now.pos), 3, 3).index_copy(0, vertices, inverse) if unknowns.terms.points else inverse
+        ends = now.pos, now.pos + direction
+        self._point_stops = [
+            _PointStop(points, wall, ends, every) for points in unknowns.terms.points for wall in points.forces.walls
+        ]
 
     def at(self, length: Tensor) -> Iterate:
         """The iterate at step lengths (B,)."""
@@ -45,6 +51,8 @@ class Path:
         for stop in self._stops:
             rows = stop.vertices
             acc[rows] += stop.correction(unknowns.place_free(rows, acc[rows])) / unknowns.dt_sq[rows]
+        for point_stop in self._point_stops:
+            acc += point_stop.correction(unknowns.place(acc)) / unknowns.dt_sq
         return unknowns.evaluate(acc)
 
 
@@ -60,15 +68,51 @@ class _Stop:
 
     def correction(self, pos: Tensor) -> Tensor:
         """Displacement (n, 3) of vertices that the Newton model has put at ``pos`` (n, 3)."""
-        cubic, start, end = 3.0 * self._wall.weight, self._depth, self._wall.depth(pos)
-        # The model's own force at the end, and the stiffness of everything else.
-        force = cubic * start * (2.0 * end - start)
-        rest = torch.maximum(1.0 / self._compliance - 2.0 * cubic * start, 0.1 / self._compliance)
-        # cubic q² + rest (q - end) = force for the depth q >= 0.
-        load = (force + rest * end).clamp_min(0.0)
-        balance = 2.0 * load / (rest + (rest * rest + 4.0 * cubic * load).sqrt())
-        push = torch.where(end > balance, end - balance, 0.0)
-        return (push / self._compliance)[:, None] * self._give
+        push = _push(self._wall, self._depth, self._wall.depth(pos), self._compliance)
+        return push[:, None] * self._give
+
+
+class _PointStop:
+    """Contact of points inside edges and faces with a wall during a step.
+
+    A point gives as its vertices do together, each along its own block. A vertex with several points that push takes the
+    mean of what they ask of it: all of it would throw cloth that meets the body as a whole far out.
+
+    Args:
+        ends: positions (V, 3) at the start and at the end of the straight line.
+        inverse: (V, 3, 3), 0 for vertices that do not move.
+    """
+
+    def __init__(self, points: PointForces, wall: Walls, ends: tuple[Tensor, Tensor], inverse: Tensor) -> None:
+        start, end = (wall.depth(points.at(pos)) for pos in ends)
+        give = torch.einsum("nk,nkab,nb->nka", points.weights, inverse[points.vertices], wall.normal)
+        compliance = torch.einsum("nk,nka,na->n", points.weights, give, wall.normal)
+        rows = ((torch.maximum(start, end) > 0) & (compliance > 0)).nonzero().squeeze(1)
+        self._points, self._wall, self._depth = points.take(rows), wall.take(rows), start[rows].clamp_min(0.0)
+        self._give, self._compliance = give[rows], compliance[rows]
+
+    def correction(self, pos: Tensor) -> Tensor:
+        """Displacement (V, 3) of vertices that the Newton model has put at ``pos`` (V, 3)."""
+        points = self._points
+        push = _push(self._wall, self._depth, self._wall.depth(points.at(pos)), self._compliance)
+        target = points.vertices.reshape(-1)
+        total = torch.zeros_like(pos).index_add(0, target, (push[:, None, None] * self._give).reshape(-1, 3))
+        asked = ((push > 0)[:, None] & (points.weights > 0)).to(pos.dtype).reshape(-1)
+        count = pos.new_zeros(len(pos)).index_add(0, target, asked)
+        return total / count.clamp_min(1.0)[:, None]
+
+
+def _push(wall: Walls, start: Tensor, end: Tensor, compliance: Tensor) -> Tensor:
+    """Force (n,) [N] that takes contact from the depth ``end`` where the Newton model leads to the one where the whole
+    penalty balances that model; ``start`` is the depth at the state, at least 0."""
+    cubic = 3.0 * wall.weight
+    # The model's own force at the end, and the stiffness of everything else.
+    force = cubic * start * (2.0 * end - start)
+    rest = torch.maximum(1.0 / compliance - 2.0 * cubic * start, 0.1 / compliance)
+    # cubic q² + rest (q - end) = force for the depth q >= 0.
+    load = (force + rest * end).clamp_min(0.0)
+    balance = 2.0 * load / (rest + (rest * rest + 4.0 * cubic * load).sqrt())
+    return torch.where(end > balance, end - balance, 0.0) / compliance
 
 
 def backtrack(unknowns: Unknowns, path: Path, now: Iterate, slope: Tensor, searching: Tensor) -> tuple[Iterate, Tensor]:

@@ -18,6 +18,7 @@ from hood.solver.forces import VertexForces, Walls
 from hood.solver.iterate import Iterate, Proceed, Progress, Unknowns, first_iterate, in_double, rounded
 from hood.solver.linear import invert_blocks
 from hood.solver.plan import plan_for
+from hood.solver.points import PointForces
 from hood.solver.reasons import MOST_ITERATIONS, NO_PROGRESS, NOT_FINITE, STOPPED
 from hood.solver.terms import StepTerms
 
@@ -120,6 +121,7 @@ class Neighbourhood:
     face_constants: FaceConstants
     hinge_corners: Corners
     hinge_constants: HingeConstants
+    points: tuple[PointForces, ...]  # those that have a vertex of the colour
     springs: tuple[Tensor, Tensor] | None  # stiffness (M,) and ends (M, 2), own one first
 
 
@@ -143,6 +145,7 @@ def neighbourhoods(terms: StepTerms) -> list[Neighbourhood]:
                 terms.face_constants.take(faces.element, faces.own),
                 Corners(cloth.hinges[hinges.element]),
                 terms.hinge_constants.take(hinges.element),
+                tuple(points.take(torch.isin(points.vertices, colour.vertices).any(dim=1)) for points in terms.points),
                 springs,
             )
         )
@@ -195,6 +198,10 @@ def vertex_systems(
     other = terms.other_gradient(pos, acc)
     if other is not None:
         gradient = gradient + other[rows]
+    for points in group.points:
+        inside = points.model(pos)
+        gradient = gradient + points.spread(inside.gradient, pos)[rows]
+        matrix = matrix + points.spread_blocks(inside.matrix, len(pos))[rows]
     for around, force, block in _around(terms, group, pos):
         gradient = gradient + around.gradient_sum(force).view(-1, 3)
         matrix = matrix + around.matrix_sum(block).view(-1, 3, 3)

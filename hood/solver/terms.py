@@ -16,6 +16,7 @@ from hood.losses.stretching import Stretching
 from hood.solver import elements
 from hood.solver.elements import BENDINGS, Corners
 from hood.solver.forces import attachment_stiffness, other_terms, vertex_forces
+from hood.solver.points import point_forces
 
 
 class StepTerms:
@@ -25,6 +26,7 @@ class StepTerms:
         self.problem = problem
         cloth, terms = problem.cloth, list(potential.active(problem).values())
         self.vertices = vertex_forces(potential, problem)
+        self.points = point_forces(potential, problem)
         self.bendings = [term for term in terms if type(term) in BENDINGS]
         self.springs = [term for term in terms if type(term) is Attachment]
         self.others = other_terms(potential, problem)
@@ -38,6 +40,7 @@ class StepTerms:
         """Energies [J] (B,), term by term or several together, at ``pos`` (V, 3) reached with ``acc`` (V, 3)."""
         problem, cloth = self.problem, self.problem.cloth
         parts = [(energy, cloth.vertex_scene) for energy in self.vertices.energies(pos, acc, problem.vertex_dt)]
+        parts += [(energy, points.scene) for points in self.points for energy in points.energies(pos)]
         if self.has_membrane:
             parts.append((elements.face_energy(self._face_corners(pos), self.face_constants), cloth.face_scene))
         if self.bendings:

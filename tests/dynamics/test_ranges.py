@@ -63,6 +63,16 @@ def test_a_scene_that_has_no_such_value_is_not_outside() -> None:
     assert outside(TRAINED, replace(scene, spans=spans)) == []
 
 
+def test_files_from_before_a_setting_were_trained_with_what_it_is_by_default() -> None:
+    text = Conditions({}, default_potential().settings).to_json()
+    older = Conditions.from_json(text.replace(', "contact": "vertices"', ""))
+    assert older == Conditions.from_json(text)
+    assert different(older.potential, default_potential(contact="edges").settings) == [
+        "losses.terms.collision.contact=edges (trained on vertices)",
+        "losses.terms.friction.contact=edges (trained on vertices)",
+    ]
+
+
 def test_settings_of_the_potential_are_compared_one_by_one() -> None:
     known = default_potential().settings
     assert different(known, default_potential(friction_coefficient=10.0).settings) == [

@@ -125,7 +125,12 @@ def test_settings_tell_potentials_apart() -> None:
     default = default_potential().settings
     assert default == default_potential().settings
     assert default["friction"] | {"coefficient": 10.0, "epsilon": 1e-2} == ROUGH.settings["friction"]
-    assert default["collision"] == {"term": "hood.losses.collision.Collision", "weight": 5e5, "epsilon": 2e-3}
+    assert default["collision"] == {
+        "term": "hood.losses.collision.Collision",
+        "weight": 5e5,
+        "epsilon": 2e-3,
+        "contact": "vertices",
+    }
     assert reference_potential().settings["collision"]["term"] != default["collision"]["term"]
 
 
