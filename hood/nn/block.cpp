@@ -8,6 +8,8 @@
 #include <cstring>
 #include <initializer_list>
 
+#include "ahead.h"
+
 #if HALF && defined(__AMX_BF16__) && WIDTH % 32 == 0
 #define TILES 1
 #include <sys/syscall.h>
@@ -32,6 +34,7 @@ inline __m512 load(const T* p) {
     return _mm512_castsi512_ps(_mm512_slli_epi32(_mm512_cvtepu16_epi32(_mm256_loadu_si256((const __m256i*)p)), 16));
 }
 inline void store(T* p, __m512 v) { _mm256_storeu_si256((__m256i*)p, (__m256i)_mm512_cvtneps_pbh(v)); }
+inline void stream(T* p, __m512 v) { _mm256_stream_si256((__m256i*)p, (__m256i)_mm512_cvtneps_pbh(v)); }
 inline __m512 multiply(__m512 sum, uint32_t a, __m512i b) {
     return _mm512_dpbf16_ps(sum, (__m512bh)_mm512_set1_epi32((int)a), (__m512bh)b);
 }
@@ -39,6 +42,7 @@ inline __m512 multiply(__m512 sum, uint32_t a, __m512i b) {
 using T = float;
 inline __m512 load(const T* p) { return _mm512_loadu_ps(p); }
 inline void store(T* p, __m512 v) { _mm512_storeu_ps(p, v); }
+inline void stream(T* p, __m512 v) { _mm512_stream_ps(p, v); }
 inline __m512 multiply(__m512 sum, uint32_t a, __m512i b) {
     return _mm512_fmadd_ps(_mm512_castsi512_ps(_mm512_set1_epi32((int)a)), _mm512_castsi512_ps(b), sum);
 }
@@ -49,30 +53,81 @@ using Word = uint32_t __attribute__((may_alias));
 
 inline __m512 relu(__m512 v) { return _mm512_max_ps(_mm512_setzero_ps(), v); }  // keeps a NaN
 
+// ---- memory --------------------------------------------------------------------------------------------------------------
+
+// What is written to memory past the caches, line by line between the products: it is read again in another pass, and a line
+// that goes through the caches is first read.
+class Behind {
+    static constexpr int MOST = 4;  // arrays of a tile
+    struct Span {
+        const char* from;
+        char *to, *end;
+    };
+    Span spans[MOST];
+    int count = 0, next = 0;
+
+  public:
+    void add(const void* from, void* to, int64_t bytes) { spans[count++] = {(const char*)from, (char*)to, (char*)to + bytes}; }
+    inline void turn(int lines) {
+        for (; lines > 0 && next < count; --lines) {
+            Span& span = spans[next];
+            _mm256_stream_si256((__m256i*)span.to, _mm256_loadu_si256((const __m256i*)span.from));
+            if (span.to + 32 < span.end) _mm256_stream_si256((__m256i*)(span.to + 32), _mm256_loadu_si256((const __m256i*)(span.from + 32)));
+            span.from += 64;
+            if ((span.to += 64) >= span.end) ++next;
+        }
+    }
+    void finish() {
+        while (next < count) turn(1 << 20);
+        count = next = 0;
+    }
+};
+
+struct Traffic {
+    Ahead ahead;
+    Behind behind;
+    inline void turn(int lines = 1) {
+        ahead.turn(lines);
+        behind.turn(lines);
+    }
+};
+
 // ---- products ------------------------------------------------------------------------------------------------------------
+
+template <int R>
+inline void accumulate_step(__m512 (&sum)[R][V], const Word* a, int64_t a_row, const Word* b) {
+    __m512i column[V];
+#pragma GCC unroll 4
+    for (int j = 0; j < V; ++j) column[j] = _mm512_loadu_si512(b + 16 * j);
+#pragma GCC unroll 24
+    for (int r = 0; r < R; ++r)
+#pragma GCC unroll 4
+        for (int j = 0; j < V; ++j) sum[r][j] = multiply(sum[r][j], a[r * a_row], column[j]);
+}
 
 // sums over k of a[r * a_row + k * a_step] * b[k * b_step + …] for R rows and a panel of columns
 template <int R>
-inline void accumulate(__m512 (&sum)[R][V], const Word* a, int64_t a_row, int64_t a_step, const Word* b, int64_t b_step, int steps) {
-    for (int k = 0; k < steps; ++k) {
-        __m512i column[V];
-#pragma GCC unroll 4
-        for (int j = 0; j < V; ++j) column[j] = _mm512_loadu_si512(b + k * b_step + 16 * j);
-#pragma GCC unroll 24
-        for (int r = 0; r < R; ++r)
-#pragma GCC unroll 4
-            for (int j = 0; j < V; ++j) sum[r][j] = multiply(sum[r][j], a[r * a_row + k * a_step], column[j]);
+inline void accumulate(__m512 (&sum)[R][V], const Word* a, int64_t a_row, int64_t a_step, const Word* b, int64_t b_step, int steps,
+                       Traffic& traffic) {
+    constexpr int STEPS = 96 / (R * V);
+    int k = 0;
+    for (; k + STEPS <= steps; k += STEPS) {
+        traffic.turn();
+#pragma GCC unroll 1
+        for (int i = k; i < k + STEPS; ++i) accumulate_step<R>(sum, a + i * a_step, a_row, b + i * b_step);
     }
+    for (; k < steps; ++k) accumulate_step<R>(sum, a + k * a_step, a_row, b + k * b_step);
 }
 
 template <int R, class Emit>
-inline void rows_product(const T* x, const T* weight, int row, int column, const Emit& emit) {
+inline void rows_product(const T* x, const T* weight, int row, int column, Traffic& traffic, const Emit& emit) {
     __m512 sum[R][V];
 #pragma GCC unroll 24
     for (int r = 0; r < R; ++r)
 #pragma GCC unroll 4
         for (int j = 0; j < V; ++j) sum[r][j] = _mm512_setzero_ps();
-    accumulate<R>(sum, (const Word*)(x + (int64_t)row * D), WORDS, 1, (const Word*)weight + (int64_t)column * WORDS, PANEL, WORDS);
+    accumulate<R>(sum, (const Word*)(x + (int64_t)row * D), WORDS, 1, (const Word*)weight + (int64_t)column * WORDS, PANEL, WORDS,
+                  traffic);
 #pragma GCC unroll 24
     for (int r = 0; r < R; ++r)
 #pragma GCC unroll 4
@@ -101,10 +156,13 @@ struct Tiles {  // for the length of a call: other libraries give tiles their ow
     ~Tiles() { _tile_release(); }
 };
 
+constexpr int LINES = 6;  // asked for at a time
+
 // tiles 0 to 3 += (32, D) (D, 32) for D terms; strides in bytes from row to row, of the right factor from pair to pair of rows
-inline void accumulate_tiles(const T* left, int64_t left_row, const Word* right, int64_t right_pair, int terms) {
+inline void accumulate_tiles(const T* left, int64_t left_row, const Word* right, int64_t right_pair, int terms, Traffic& traffic) {
     settle();
     for (int k = 0; k < terms; k += 32) {
+        traffic.turn(LINES);
         _tile_loadd(4, left + k, left_row);
         _tile_loadd(6, (const char*)right + k / 2 * right_pair, right_pair);
         _tile_loadd(7, (const char*)right + k / 2 * right_pair + 64, right_pair);
@@ -117,7 +175,7 @@ inline void accumulate_tiles(const T* left, int64_t left_row, const Word* right,
 }
 
 template <class Emit>
-void product(const T* x, int rows, const T* weight, const Emit& emit) {
+void product(const T* x, int rows, const T* weight, Traffic& traffic, const Emit& emit) {
     alignas(64) static thread_local T last[32 * D];
     alignas(64) float sum[32][32];
     for (int row = 0; row < rows; row += 32) {
@@ -134,7 +192,7 @@ void product(const T* x, int rows, const T* weight, const Emit& emit) {
             _tile_zero(1);
             _tile_zero(2);
             _tile_zero(3);
-            accumulate_tiles(left, D * sizeof(T), panel, PANEL * sizeof(Word), D);
+            accumulate_tiles(left, D * sizeof(T), panel, PANEL * sizeof(Word), D, traffic);
             _tile_stored(0, sum[0], sizeof sum[0]);
             _tile_stored(1, sum[0] + 16, sizeof sum[0]);
             _tile_stored(2, sum[16], sizeof sum[0]);
@@ -154,11 +212,11 @@ struct Tiles {};
 
 // emit(row, column, 16 values) of x W for all rows of a tile; the weight lies in panels of columns
 template <class Emit>
-void product(const T* x, int rows, const T* weight, const Emit& emit) {
+void product(const T* x, int rows, const T* weight, Traffic& traffic, const Emit& emit) {
     for (int column = 0; column < D; column += PANEL) {
         int row = 0;
-        for (; row + GROUP <= rows; row += GROUP) rows_product<GROUP>(x, weight, row, column, emit);
-        for (; row < rows; ++row) rows_product<1>(x, weight, row, column, emit);
+        for (; row + GROUP <= rows; row += GROUP) rows_product<GROUP>(x, weight, row, column, traffic, emit);
+        for (; row < rows; ++row) rows_product<1>(x, weight, row, column, traffic, emit);
     }
 }
 
@@ -208,7 +266,7 @@ inline void transpose(const Word* x, Word* out, int64_t out_row) {
 }
 
 // total += leftᵀ right over the rows of a tile
-void gram(const T* left, const T* right, int rows, float* total) {
+void gram(const T* left, const T* right, int rows, float* total, Traffic& traffic) {
     constexpr int PAIRS = TILE / 2;
     alignas(64) static thread_local Word pairs[PAIRS * D], turned[D * PAIRS], other[PAIRS * D];
     const int terms = (rows + 31) / 32 * 32;
@@ -225,7 +283,8 @@ void gram(const T* left, const T* right, int rows, float* total) {
             _tile_loadd(1, at + 16, total_row);
             _tile_loadd(2, below, total_row);
             _tile_loadd(3, below + 16, total_row);
-            accumulate_tiles((const T*)(turned + row * PAIRS), PAIRS * sizeof(Word), other + column, D * sizeof(Word), terms);
+            accumulate_tiles((const T*)(turned + row * PAIRS), PAIRS * sizeof(Word), other + column, D * sizeof(Word), terms,
+                             traffic);
             _tile_stored(0, at, total_row);
             _tile_stored(1, at + 16, total_row);
             _tile_stored(2, below, total_row);
@@ -236,7 +295,7 @@ void gram(const T* left, const T* right, int rows, float* total) {
 #else
 
 // total += leftᵀ right over the rows of a tile
-void gram(const T* left, const T* right, int rows, float* total) {
+void gram(const T* left, const T* right, int rows, float* total, Traffic& traffic) {
     alignas(64) static thread_local T a[TILE * D], b[TILE * D];
     if (HALF) {
         interleave(left, rows, a);
@@ -252,7 +311,7 @@ void gram(const T* left, const T* right, int rows, float* total) {
             for (int r = 0; r < GRAM_ROWS; ++r)
 #pragma GCC unroll 4
                 for (int j = 0; j < V; ++j) sum[r][j] = _mm512_loadu_ps(at + r * D + 16 * j);
-            accumulate<GRAM_ROWS>(sum, (const Word*)left + row, 1, D, (const Word*)right + column, D, steps);
+            accumulate<GRAM_ROWS>(sum, (const Word*)left + row, 1, D, (const Word*)right + column, D, steps, traffic);
 #pragma GCC unroll 16
             for (int r = 0; r < GRAM_ROWS; ++r)
 #pragma GCC unroll 4
@@ -326,61 +385,106 @@ struct Block {
     double eps;
 };
 
+namespace {
+
+inline int rows_from(int64_t count, int64_t start) {
+    const int64_t left = count - start;
+    return left < 0 ? 0 : left < TILE ? (int)left : TILE;
+}
+
+// rows of an array with D columns, from a row on
+inline void fetch_rows(Ahead& ahead, const void* x, int64_t row, int rows, int64_t bytes = sizeof(T)) {
+    if (x) ahead.add((const char*)x + row * D * bytes, rows * D * bytes);
+}
+
+// what the tile that begins at a row reads
+void fetch(Ahead& ahead, const Block* b, int64_t start) {
+    const int rows = rows_from(b->count, start);
+    ahead.clear();
+    fetch_rows(ahead, b->x, start, rows);
+    if (b->residual != b->x) fetch_rows(ahead, b->residual, start, rows, b->wide ? sizeof(float) : sizeof(T));
+    for (int r = 0; b->table && r < rows; ++r) {
+        const int64_t receiver = b->receivers[start + r], sender = b->senders[start + r];
+        ahead.add(b->table + sender * 2 * D + D, D * sizeof(T));
+        if (r == 0 || receiver != b->receivers[start + r - 1]) ahead.add(b->table + receiver * 2 * D, D * sizeof(T));
+    }
+}
+
+// layer norm of a row: its normalised numbers, and 1 / their deviation before
+inline float normalise(const float* row, float eps, __m512 (&hat)[D / 16]) {
+    __m512 total = _mm512_setzero_ps(), square = _mm512_setzero_ps();
+#pragma GCC unroll 16
+    for (int j = 0; j < D / 16; ++j) total = _mm512_add_ps(total, hat[j] = _mm512_loadu_ps(row + 16 * j));
+    const __m512 mean = _mm512_set1_ps(_mm512_reduce_add_ps(total) / D);
+#pragma GCC unroll 16
+    for (int j = 0; j < D / 16; ++j) {
+        hat[j] = _mm512_sub_ps(hat[j], mean);
+        square = _mm512_fmadd_ps(hat[j], hat[j], square);
+    }
+    const float rstd = 1.0f / __builtin_sqrtf(_mm512_reduce_add_ps(square) / D + eps);
+    const __m512 factor = _mm512_set1_ps(rstd);
+#pragma GCC unroll 16
+    for (int j = 0; j < D / 16; ++j) hat[j] = _mm512_mul_ps(hat[j], factor);
+    return rstd;
+}
+
+}  // namespace
+
 extern "C" void forward(const Block* b) {
-    alignas(64) static thread_local T one_tile[TILE * D], two_tile[TILE * D];
-    alignas(64) static thread_local float raw[TILE * D];
+    alignas(64) static thread_local T one[TILE * D], two[TILE * D], hats[TILE * D];
+    alignas(64) static thread_local float raw[TILE * D], outs[TILE * D];
     [[maybe_unused]] const Tiles tiles;
+    const bool keep = b->hat != nullptr;
+    const int64_t out_bytes = b->wide ? sizeof(float) : sizeof(T);
     Sums sums(b->received);
+    Traffic traffic;
     for (int64_t start = 0; start < b->count; start += TILE) {
-        const int rows = b->count - start < TILE ? (int)(b->count - start) : TILE;
+        const int rows = rows_from(b->count, start);
         const T* x = b->x + start * D;
-        T* one = b->one ? b->one + start * D : one_tile;
-        T* two = b->two ? b->two + start * D : two_tile;
+        fetch(traffic.ahead, b, start + TILE);
+        const auto write = [&](const void* tile, void* kept, int64_t bytes) {
+            if (keep) traffic.behind.add(tile, (char*)kept + start * D * bytes, rows * D * bytes);
+        };
         if (b->table) {
             const int64_t *receivers = b->receivers + start, *senders = b->senders + start;
-            product(x, rows, b->first, [&](int r, int c, __m512 v) {
+            product(x, rows, b->first, traffic, [&](int r, int c, __m512 v) {
                 const __m512 ends = _mm512_add_ps(load(b->table + receivers[r] * 2 * D + c), load(b->table + senders[r] * 2 * D + D + c));
-                store(one + (int64_t)r * D + c, relu(_mm512_add_ps(v, ends)));
+                store(one + r * D + c, relu(_mm512_add_ps(v, ends)));
             });
         } else {
             for (int i = 0; i < rows * D; i += 16) store(one + i, relu(load(x + i)));
         }
-        product(one, rows, b->second, [&](int r, int c, __m512 v) {
-            store(two + (int64_t)r * D + c, relu(_mm512_add_ps(v, _mm512_loadu_ps(b->bias_2 + c))));
-        });
-        product(two, rows, b->third, [&](int r, int c, __m512 v) {
-            _mm512_storeu_ps(raw + (int64_t)r * D + c, _mm512_add_ps(v, _mm512_loadu_ps(b->bias_3 + c)));
-        });
+        write(one, b->one, sizeof(T));
+        product(one, rows, b->second, traffic,
+                [&](int r, int c, __m512 v) { store(two + r * D + c, relu(_mm512_add_ps(v, _mm512_loadu_ps(b->bias_2 + c)))); });
+        write(two, b->two, sizeof(T));
+        product(two, rows, b->third, traffic,
+                [&](int r, int c, __m512 v) { _mm512_storeu_ps(raw + r * D + c, _mm512_add_ps(v, _mm512_loadu_ps(b->bias_3 + c))); });
+        traffic.behind.finish();
+        void* result = keep ? (void*)outs : (char*)b->out + start * D * out_bytes;
         for (int r = 0; r < rows; ++r) {
-            const int64_t at = (start + r) * D;
-            __m512 v[D / 16], total = _mm512_setzero_ps(), square = _mm512_setzero_ps();
-#pragma GCC unroll 16
-            for (int j = 0; j < D / 16; ++j) total = _mm512_add_ps(total, v[j] = _mm512_loadu_ps(raw + r * D + 16 * j));
-            const __m512 mean = _mm512_set1_ps(_mm512_reduce_add_ps(total) / D);
-#pragma GCC unroll 16
-            for (int j = 0; j < D / 16; ++j) {
-                v[j] = _mm512_sub_ps(v[j], mean);
-                square = _mm512_fmadd_ps(v[j], v[j], square);
-            }
-            const float rstd = 1.0f / __builtin_sqrtf(_mm512_reduce_add_ps(square) / D + (float)b->eps);
-            const __m512 factor = _mm512_set1_ps(rstd);
-            if (b->rstd) b->rstd[start + r] = rstd;
+            __m512 hat[D / 16];
+            const float rstd = normalise(raw + r * D, (float)b->eps, hat);
+            if (keep) b->rstd[start + r] = rstd;
             if (b->received) sums.move(b->receivers[start + r]);
 #pragma GCC unroll 16
             for (int j = 0; j < D / 16; ++j) {
-                const int c = 16 * j;
-                const __m512 hat = _mm512_mul_ps(v[j], factor);
-                if (b->hat) store(b->hat + at + c, hat);
-                __m512 out = _mm512_fmadd_ps(hat, _mm512_loadu_ps(b->scale + c), _mm512_loadu_ps(b->shift + c));
+                const int c = 16 * j, i = r * D + c;
+                if (keep) store(hats + i, hat[j]);
+                __m512 out = _mm512_fmadd_ps(hat[j], _mm512_loadu_ps(b->scale + c), _mm512_loadu_ps(b->shift + c));
                 if (b->received) add_to(sums.sum + c, out);
-                if (b->residual) out = _mm512_add_ps(out, load_any(b->residual, at + c, b->wide));
+                if (b->residual) out = _mm512_add_ps(out, load_any(b->residual, start * D + i, b->wide));
                 if (b->wide)
-                    _mm512_storeu_ps((float*)b->out + at + c, out);
+                    _mm512_storeu_ps((float*)result + i, out);
                 else
-                    store((T*)b->out + at + c, out);
+                    store((T*)result + i, out);
             }
         }
+        write(hats, b->hat, sizeof(T));
+        write(outs, b->out, out_bytes);
     }
+    traffic.behind.finish();
+    _mm_sfence();
     if (b->received) sums.flush();
 }
 
@@ -388,67 +492,106 @@ struct Gradient {
     int64_t count;
     const void* grad;   // at the output
     const T* grad_sum;  // of edges: at the sums
-    const int64_t* receivers;
+    const int64_t *receivers, *senders;
     const T *x, *one, *two, *hat;
     const float* rstd;
     const T *first, *second, *third;  // transposed weights in panels
     const float* scale;
     float *grad_first, *grad_second, *grad_third, *grad_bias_2, *grad_bias_3, *grad_scale, *grad_shift;  // are added to
-    T *grad_hidden, *grad_x;
-    int64_t wide;  // whether grad is float32
+    T* grad_x;
+    float* grad_table;  // of edges: is added to
+    int64_t wide;       // whether grad is float32
 };
 
-extern "C" void backward(const Gradient* b) {
-    alignas(64) static thread_local T third[TILE * D], second[TILE * D];
-    [[maybe_unused]] const Tiles tiles;
-    for (int64_t start = 0; start < b->count; start += TILE) {
-        const int rows = b->count - start < TILE ? (int)(b->count - start) : TILE;
-        const T *one = b->one + start * D, *two = b->two + start * D, *hat = b->hat + start * D;
-        T* hidden = b->grad_hidden + start * D;
-        for (int r = 0; r < rows; ++r) {
-            const int64_t at = (start + r) * D;
-            __m512 g[D / 16], mean = _mm512_setzero_ps(), along = _mm512_setzero_ps();
-            const T* sum = b->grad_sum ? b->grad_sum + b->receivers[start + r] * D : nullptr;
+namespace {
+
+// what the tile that begins at a row reads, after what this one reads at its end
+void fetch(Ahead& ahead, const Gradient* b, int64_t start) {
+    const int64_t next = start + TILE;
+    const int rows = rows_from(b->count, next);
+    ahead.clear();
+    fetch_rows(ahead, b->grad, next, rows, b->wide ? sizeof(float) : sizeof(T));
+    for (const T* kept : {b->hat, b->two, b->one}) fetch_rows(ahead, kept, next, rows);
+    if (!b->first) return;
+    for (int64_t r = start; r < start + rows_from(b->count, start); ++r)
+        ahead.add(b->grad_table + b->senders[r] * 2 * D + D, D * sizeof(float));
+    fetch_rows(ahead, b->x, next, rows);
+}
+
+// gradients at the layer norm's inputs of a tile, from those behind it
+void through_norm(const Gradient* b, int64_t start, int rows, T* out) {
+    for (int r = 0; r < rows; ++r) {
+        const int64_t at = (start + r) * D;
+        __m512 g[D / 16], mean = _mm512_setzero_ps(), along = _mm512_setzero_ps();
+        const T* sum = b->grad_sum ? b->grad_sum + b->receivers[start + r] * D : nullptr;
 #pragma GCC unroll 16
-            for (int j = 0; j < D / 16; ++j) {
-                const int c = 16 * j;
-                const __m512 h = load(hat + (int64_t)r * D + c);
-                g[j] = load_any(b->grad, at + c, b->wide);
-                if (sum) g[j] = _mm512_add_ps(g[j], load(sum + c));
-                add_to(b->grad_shift + c, g[j]);
-                add_to(b->grad_scale + c, _mm512_mul_ps(g[j], h));
-                g[j] = _mm512_mul_ps(g[j], _mm512_loadu_ps(b->scale + c));
-                mean = _mm512_add_ps(mean, g[j]);
-                along = _mm512_fmadd_ps(g[j], h, along);
-            }
-            const __m512 m = _mm512_set1_ps(_mm512_reduce_add_ps(mean) / D), a = _mm512_set1_ps(_mm512_reduce_add_ps(along) / D);
-            const __m512 factor = _mm512_set1_ps(b->rstd[start + r]);
-#pragma GCC unroll 16
-            for (int j = 0; j < D / 16; ++j) {
-                const int c = 16 * j;
-                const __m512 h = load(hat + (int64_t)r * D + c);
-                const __m512 v = _mm512_mul_ps(_mm512_sub_ps(g[j], _mm512_fmadd_ps(a, h, m)), factor);
-                store(third + (int64_t)r * D + c, v);
-            }
+        for (int j = 0; j < D / 16; ++j) {
+            const int c = 16 * j;
+            const __m512 h = load(b->hat + at + c);
+            g[j] = b->grad ? load_any(b->grad, at + c, b->wide) : _mm512_setzero_ps();
+            if (sum) g[j] = _mm512_add_ps(g[j], load(sum + c));
+            add_to(b->grad_shift + c, g[j]);
+            add_to(b->grad_scale + c, _mm512_mul_ps(g[j], h));
+            g[j] = _mm512_mul_ps(g[j], _mm512_loadu_ps(b->scale + c));
+            mean = _mm512_add_ps(mean, g[j]);
+            along = _mm512_fmadd_ps(g[j], h, along);
         }
-        add_rows(third, rows, b->grad_bias_3);
-        gram(third, two, rows, b->grad_third);
-        product(third, rows, b->third, [&](int r, int c, __m512 v) {
-            const int64_t i = (int64_t)r * D + c;
-            v = _mm512_maskz_mov_ps(_mm512_cmp_ps_mask(load(two + i), _mm512_setzero_ps(), _CMP_GT_OQ), v);
-            store(second + i, v);
-        });
-        add_rows(second, rows, b->grad_bias_2);
-        gram(second, one, rows, b->grad_second);
-        product(second, rows, b->second, [&](int r, int c, __m512 v) {
-            const int64_t i = (int64_t)r * D + c;
-            store(hidden + i, _mm512_maskz_mov_ps(_mm512_cmp_ps_mask(load(one + i), _mm512_setzero_ps(), _CMP_GT_OQ), v));
-        });
-        if (!b->first) continue;
-        gram(hidden, b->x + start * D, rows, b->grad_first);
-        product(hidden, rows, b->first, [&](int r, int c, __m512 v) {
-            const int64_t i = (start + r) * D + c;
-            store(b->grad_x + i, _mm512_add_ps(v, load((const T*)b->grad + i)));
-        });
+        const __m512 m = _mm512_set1_ps(_mm512_reduce_add_ps(mean) / D), a = _mm512_set1_ps(_mm512_reduce_add_ps(along) / D);
+        const __m512 factor = _mm512_set1_ps(b->rstd[start + r]);
+#pragma GCC unroll 16
+        for (int j = 0; j < D / 16; ++j) {
+            const __m512 h = load(b->hat + at + 16 * j);
+            store(out + r * D + 16 * j, _mm512_mul_ps(_mm512_sub_ps(g[j], _mm512_fmadd_ps(a, h, m)), factor));
+        }
     }
+}
+
+// a tile's gradients at the first layer's outputs, added up at both ends of its edges
+void add_to_ends(const Gradient* b, int64_t start, int rows, const T* hidden) {
+    for (int r = 0; r < rows; ++r) {
+        float* receiver = b->grad_table + b->receivers[start + r] * 2 * D;
+        float* sender = b->grad_table + b->senders[start + r] * 2 * D + D;
+        for (int c = 0; c < D; c += 16) {
+            const __m512 v = load(hidden + r * D + c);
+            add_to(receiver + c, v);
+            add_to(sender + c, v);
+        }
+    }
+}
+
+}  // namespace
+
+extern "C" void backward(const Gradient* b) {
+    alignas(64) static thread_local T third[TILE * D], second[TILE * D], hidden[TILE * D];
+    [[maybe_unused]] const Tiles tiles;
+    Traffic traffic;
+    for (int64_t start = 0; start < b->count; start += TILE) {
+        const int rows = rows_from(b->count, start);
+        const T *one = b->one + start * D, *two = b->two + start * D;
+        const auto through_relu = [](const T* output, __m512 v) {
+            return _mm512_maskz_mov_ps(_mm512_cmp_ps_mask(load(output), _mm512_setzero_ps(), _CMP_GT_OQ), v);
+        };
+        fetch(traffic.ahead, b, start);
+        through_norm(b, start, rows, third);
+        add_rows(third, rows, b->grad_bias_3);
+        gram(third, two, rows, b->grad_third, traffic);
+        product(third, rows, b->third, traffic,
+                [&](int r, int c, __m512 v) { store(second + r * D + c, through_relu(two + r * D + c, v)); });
+        add_rows(second, rows, b->grad_bias_2);
+        gram(second, one, rows, b->grad_second, traffic);
+        if (!b->first) {
+            product(second, rows, b->second, traffic,
+                    [&](int r, int c, __m512 v) { stream(b->grad_x + (start + r) * D + c, through_relu(one + r * D + c, v)); });
+            continue;
+        }
+        product(second, rows, b->second, traffic,
+                [&](int r, int c, __m512 v) { store(hidden + r * D + c, through_relu(one + r * D + c, v)); });
+        gram(hidden, b->x + start * D, rows, b->grad_first, traffic);
+        product(hidden, rows, b->first, traffic, [&](int r, int c, __m512 v) {
+            const int64_t i = (start + r) * D + c;
+            stream(b->grad_x + i, b->grad ? _mm512_add_ps(v, load((const T*)b->grad + i)) : v);
+        });
+        add_to_ends(b, start, rows, hidden);
+    }
+    _mm_sfence();
 }

@@ -52,8 +52,8 @@ class Gradient(ctypes.Structure):
     """``Gradient`` of ``block.cpp``."""
 
     _fields_ = _fields(
-        "grad grad_sum receivers x one two hat rstd first second third scale grad_first grad_second grad_third "
-        "grad_bias_2 grad_bias_3 grad_scale grad_shift grad_hidden grad_x",
+        "grad grad_sum receivers senders x one two hat rstd first second third scale grad_first grad_second grad_third "
+        "grad_bias_2 grad_bias_3 grad_scale grad_shift grad_x grad_table",
         ("wide", COUNT),
     )
 

@@ -15,7 +15,7 @@ from torch.autograd.function import once_differentiable
 
 from hood.graph.builder import EdgeSet
 from hood.nn.compiled import LANES, Block, Gradient, call, panel, point
-from hood.nn.dense import is_whole, sum_rows
+from hood.nn.dense import is_whole
 
 
 def applies(x: Tensor, parameters: tuple[Tensor, ...]) -> bool:
@@ -79,35 +79,35 @@ class _Compiled(torch.autograd.Function):
         call("forward", values, x.shape[1], x.dtype == torch.bfloat16)
         if setting.keep:
             ctx.save_for_backward(given, first, *parameters, *kept)
-            ctx.edges = setting.edges
+            ctx.edges, ctx.rows = setting.edges, 0 if table is None else len(table)
+            ctx.set_materialize_grads(False)  # of the last step's edges there are none
         return out if received is None else (out, received)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor, grad_sum: Tensor | None = None) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, grad: Tensor | None, grad_sum: Tensor | None = None) -> tuple[Tensor | None, ...]:
         tensors = ctx.saved_tensors  # once: under activation checkpointing a second look would compute them again
         x, first, parameters, kept = tensors[0].contiguous(), tensors[1], tensors[2:8], tensors[8:]
         edges: EdgeSet | None = ctx.edges
-        grad = grad.contiguous()
+        grad = None if grad is None else grad.contiguous()
         grads = [torch.zeros_like(p, memory_format=torch.contiguous_format) for p in parameters]
         grad_first = None if first is None else torch.zeros_like(first, memory_format=torch.contiguous_format)
-        grad_hidden = torch.empty_like(x)
-        grad_x = None if edges is None else torch.empty_like(x)
-        values = Gradient(count=len(x), wide=int(grad.dtype == torch.float32))
+        grad_x = torch.empty_like(x)
+        values = Gradient(count=len(x), wide=int(grad is not None and grad.dtype == torch.float32))
         weights = [None if w is None else panels(w.t(), x.dtype) for w in (first, parameters[0], parameters[2])]
         scale = parameters[4].contiguous()
-        point(values, x=x, grad=grad, grad_hidden=grad_hidden, grad_x=grad_x, **dict(zip(KEPT, kept, strict=True)))
+        point(values, x=x, grad=grad, grad_x=grad_x, **dict(zip(KEPT, kept, strict=True)))
         point(values, first=weights[0], second=weights[1], third=weights[2], scale=scale, grad_first=grad_first)
         point(values, **dict(zip(PARAMETERS, grads, strict=True)))
+        grad_table = None
         if edges is not None:
-            assert grad_sum is not None, "an edge update has two results"
-            grad_sum = grad_sum.contiguous()
-            point(values, grad_sum=grad_sum, receivers=edges.local_receivers)
+            grad_sum = None if grad_sum is None else grad_sum.contiguous()
+            grad_table = x.new_zeros(ctx.rows, 2 * x.shape[1], dtype=torch.float32)
+            point(values, grad_sum=grad_sum, grad_table=grad_table)
+            point(values, receivers=edges.local_receivers, senders=edges.local_senders)
         call("backward", values, x.shape[1], x.dtype == torch.bfloat16)
-        if edges is None:
-            return grad_hidden, None, None, grad if ctx.needs_input_grad[3] else None, None, *grads
-        assert grad_sum is not None
-        return grad_x, sums_at_ends(grad_hidden, edges, len(grad_sum)), grad_first, None, None, *grads
+        residual = grad if ctx.needs_input_grad[3] else None
+        return grad_x, None if grad_table is None else grad_table.to(x.dtype), grad_first, residual, None, *grads
 
 
 #: Fields of the kept tensors, and of the gradients of the parameters in the order of :meth:`MLP.tail_parameters`.
@@ -123,11 +123,3 @@ def panels(weight: Tensor, dtype: torch.dtype) -> Tensor:
     columns = panel(outputs)
     terms = weight.t().to(dtype).reshape(inputs // pair, pair, outputs // columns, columns)
     return terms.permute(2, 0, 3, 1).contiguous()
-
-
-def sums_at_ends(grad_hidden: Tensor, edges: EdgeSet, count: int) -> Tensor:
-    """Gradient (count, 2d) of the table of node parts from the one of the first layer's output (N, d)."""
-    result = grad_hidden.new_zeros(count, 2, grad_hidden.shape[1])
-    result[: len(edges.nodes), 0] = sum_rows(grad_hidden, edges.rows, edges.offsets)
-    result[: len(edges.nodes), 1] = sum_rows(grad_hidden, edges.reverse, edges.offsets)
-    return result.flatten(1)
