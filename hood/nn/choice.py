@@ -22,6 +22,7 @@ import torch
 from hood.graph.builder import BODY, MESH, Graph, StaticGraph, build_graph, edge_set
 from hood.native.build import BuildError, find_compiler, processor
 from hood.native.cache import cache_folder
+from hood.native.prebuilt import source_text
 from hood.nn import compiled, compiled_network, dense
 from hood.nn.compiled import KERNELS, check_kernels
 from hood.nn.model import MeshGraphNet
@@ -130,8 +131,7 @@ def _digest(precision: str, width: int, training: bool) -> str:
         compiler = find_compiler()
     except BuildError:
         compiler = "none"
-    files = (compiled.SOURCE, compiled_network.SOURCE, Path(dense.__file__))
-    sources = [file.read_text(encoding="utf-8") for file in files]
+    sources = [source_text(file) for file in (compiled.SOURCE, compiled_network.SOURCE, Path(dense.__file__))]
     parts = [processor(), torch.__version__, compiler, torch.get_num_threads(), precision, width, training, *sources]
     return hashlib.sha256("\0".join(map(str, parts)).encode()).hexdigest()
 

@@ -5,6 +5,12 @@
 #include <cstdint>
 #include <cstring>
 
+#include "ahead.h"
+
+#if defined(__AVX512F__)
+#include <immintrin.h>
+#endif
+
 namespace {
 
 #if defined(__AVX512F__)
@@ -18,6 +24,7 @@ constexpr int LANES = 4, SUMS = 12;
 #endif
 constexpr int TILE = 96;       // rows: a multiple of every group of rows below
 constexpr int MOST = 512;      // columns of a latent
+constexpr int STEPS = 4;       // terms of a sum between two lines that are asked for
 
 typedef float V __attribute__((vector_size(4 * LANES)));
 typedef decltype(V{} > V{}) Mask;
@@ -31,11 +38,15 @@ inline void store(float* p, V v) { std::memcpy(p, &v, sizeof v); }
 inline V all(float x) { return V{} + x; }
 inline V relu(V v) { return v < 0.0f ? V{} : v; }  // keeps a NaN
 inline float total(V v) {
+#if defined(__AVX512F__)
+    return _mm512_reduce_add_ps((__m512)v);  // in the order of below
+#else
     float half[LANES];
     store(half, v);
     for (int width = LANES / 2; width > 0; width /= 2)
         for (int i = 0; i < width; ++i) half[i] += half[i + width];
     return half[0];
+#endif
 }
 
 constexpr int padded(int64_t count) { return (int)((count + LANES - 1) / LANES * LANES); }
@@ -50,7 +61,8 @@ constexpr int panel_of(int64_t columns) {
 
 // emit(row, column, a vector of x W) for R rows and the panel of P vectors that begins at a column.
 template <int R, int P, class Emit>
-inline void rows_product(const float* x, int64_t stride, int terms, const float* panel, int row, int column, const Emit& emit) {
+inline void rows_product(const float* x, int64_t stride, int terms, const float* panel, int row, int column, Ahead& ahead,
+                         const Emit& emit) {
     V sum[R][P];
 #pragma GCC unroll 24
     for (int r = 0; r < R; ++r)
@@ -58,6 +70,7 @@ inline void rows_product(const float* x, int64_t stride, int terms, const float*
         for (int j = 0; j < P; ++j) sum[r][j] = V{};
     const float* from = x + row * stride;
     for (int k = 0; k < terms; ++k) {
+        if (k % STEPS == 0) ahead.turn();
         V weight[P];
 #pragma GCC unroll 4
         for (int j = 0; j < P; ++j) weight[j] = load(panel + (k * P + j) * LANES);
@@ -73,24 +86,26 @@ inline void rows_product(const float* x, int64_t stride, int terms, const float*
 }
 
 template <int P, class Emit>
-inline void panels_product(const float* x, int64_t stride, int rows, int terms, const float* weight, int columns, const Emit& emit) {
+inline void panels_product(const float* x, int64_t stride, int rows, int terms, const float* weight, int columns, Ahead& ahead,
+                           const Emit& emit) {
     constexpr int GROUP = SUMS / P;
     for (int column = 0; column < columns; column += P * LANES, weight += (int64_t)terms * P * LANES) {
         int row = 0;
-        for (; row + GROUP <= rows; row += GROUP) rows_product<GROUP, P>(x, stride, terms, weight, row, column, emit);
-        for (; row < rows; ++row) rows_product<1, P>(x, stride, terms, weight, row, column, emit);
+        for (; row + GROUP <= rows; row += GROUP) rows_product<GROUP, P>(x, stride, terms, weight, row, column, ahead, emit);
+        for (; row < rows; ++row) rows_product<1, P>(x, stride, terms, weight, row, column, ahead, emit);
     }
 }
 
 // All rows of a tile by all columns of a packed weight.
 template <class Emit>
-inline void product(const float* x, int64_t stride, int rows, int64_t terms, const float* weight, int64_t columns, const Emit& emit) {
+inline void product(const float* x, int64_t stride, int rows, int64_t terms, const float* weight, int64_t columns, Ahead& ahead,
+                    const Emit& emit) {
     const int wide = padded(columns);
     switch (panel_of(columns)) {
-        case 4: return panels_product<4>(x, stride, rows, (int)terms, weight, wide, emit);
-        case 3: return panels_product<3>(x, stride, rows, (int)terms, weight, wide, emit);
-        case 2: return panels_product<2>(x, stride, rows, (int)terms, weight, wide, emit);
-        default: return panels_product<1>(x, stride, rows, (int)terms, weight, wide, emit);
+        case 4: return panels_product<4>(x, stride, rows, (int)terms, weight, wide, ahead, emit);
+        case 3: return panels_product<3>(x, stride, rows, (int)terms, weight, wide, ahead, emit);
+        case 2: return panels_product<2>(x, stride, rows, (int)terms, weight, wide, ahead, emit);
+        default: return panels_product<1>(x, stride, rows, (int)terms, weight, wide, ahead, emit);
     }
 }
 
@@ -137,29 +152,41 @@ struct Memory {
 
 namespace {
 
+// The layer norm of a row, in place. N: its vectors where that is known beforehand, 0: any number.
+template <int N> inline void normalise(const Perceptron& p, float* row) {
+    const int d = N ? N * LANES : (int)p.width;
+    V sum = V{}, square = V{};
+#pragma GCC unroll 8
+    for (int c = 0; c < d; c += LANES) sum += load(row + c);
+    const V mean = all(total(sum) / (float)d);
+#pragma GCC unroll 8
+    for (int c = 0; c < d; c += LANES) {
+        const V centred = load(row + c) - mean;
+        square += centred * centred;
+    }
+    const V factor = all(1.0f / std::sqrt(total(square) / (float)d + (float)p.eps));
+#pragma GCC unroll 8
+    for (int c = 0; c < d; c += LANES) store(row + c, (load(row + c) - mean) * factor * load(p.scale + c) + load(p.shift + c));
+}
+
+void normalise_rows(const Perceptron& p, float* rows, int count) {
+    const int d = (int)p.width;
+    for (int r = 0; r < count; ++r) switch (d / LANES) {
+            case 3: normalise<3>(p, rows + r * d); break;
+            case 8: normalise<8>(p, rows + r * d); break;
+            default: normalise<0>(p, rows + r * d);
+        }
+}
+
 // The layers behind the first, from its output before the ReLU (in `one`, which is overwritten); finish(row, result of a row).
-template <class Finish> void tail(const Perceptron& p, float* one, int rows, const Finish& finish) {
+template <class Finish> void tail(const Perceptron& p, float* one, int rows, Ahead& ahead, const Finish& finish) {
     alignas(64) static thread_local float two[TILE * MOST], raw[TILE * MOST];
     const int d = (int)p.width, out = padded(p.out);
     for (int i = 0; i < rows * d; i += LANES) store(one + i, relu(load(one + i)));
-    product(one, d, rows, d, p.second, d, [&](int r, int c, V v) { store(two + r * d + c, relu(v + load(p.bias_2 + c))); });
-    product(two, d, rows, d, p.third, p.out, [&](int r, int c, V v) { store(raw + r * out + c, v + load(p.bias_3 + c)); });
-    for (int r = 0; r < rows; ++r) {
-        float* row = raw + r * out;
-        if (p.scale) {
-            V sum = V{}, square = V{};
-            for (int c = 0; c < d; c += LANES) sum += load(row + c);
-            const V mean = all(total(sum) / (float)d);
-            for (int c = 0; c < d; c += LANES) {
-                const V centred = load(row + c) - mean;
-                store(row + c, centred);
-                square += centred * centred;
-            }
-            const V factor = all(1.0f / std::sqrt(total(square) / (float)d + (float)p.eps));
-            for (int c = 0; c < d; c += LANES) store(row + c, load(row + c) * factor * load(p.scale + c) + load(p.shift + c));
-        }
-        finish(r, row);
-    }
+    product(one, d, rows, d, p.second, d, ahead, [&](int r, int c, V v) { store(two + r * d + c, relu(v + load(p.bias_2 + c))); });
+    product(two, d, rows, d, p.third, p.out, ahead, [&](int r, int c, V v) { store(raw + r * out + c, v + load(p.bias_3 + c)); });
+    if (p.scale) normalise_rows(p, raw, rows);
+    for (int r = 0; r < rows; ++r) finish(r, raw + r * out);
 }
 
 inline void gather(const float* x, const int64_t* rows, int count, int d, float* out) {
@@ -167,6 +194,15 @@ inline void gather(const float* x, const int64_t* rows, int count, int d, float*
 }
 
 inline int tile_of(int64_t count, int64_t start) { return count - start < TILE ? (int)(count - start) : TILE; }
+
+// Of the tile that begins at a row: its rows of x, and those at places.
+void fetch_rows(Ahead& ahead, const float* x, int64_t count, int64_t start, int d) {
+    if (start < count) ahead.add(x + start * d, sizeof(float) * tile_of(count, start) * d);
+}
+void fetch_places(Ahead& ahead, const float* x, const int64_t* places, int64_t count, int64_t start, int d) {
+    for (int64_t i = start; i < count && i < start + TILE; ++i)
+        if (i == start || places[i] != places[i - 1]) ahead.add(x + places[i] * d, sizeof(float) * d);
+}
 
 // Sums of consecutive rows of one receiver.
 struct Sums {
@@ -193,13 +229,16 @@ struct Sums {
 void node_parts(const Part& part, const Edges& edges, const float* nodes, const Memory& memory) {
     alignas(64) static thread_local float tile[TILE * MOST];
     const int d = (int)part.network.width;
+    Ahead ahead;
     for (int64_t start = 0; start < edges.num_nodes; start += TILE) {
         const int rows = tile_of(edges.num_nodes, start);
         gather(nodes, edges.nodes + start, rows, d, tile);
+        ahead.clear();
+        fetch_places(ahead, nodes, edges.nodes, edges.num_nodes, start + TILE, d);
         float *receiver = memory.receiver + start * d, *sender = memory.sender + start * d;
-        product(tile, d, rows, d, part.to_receiver, d,
+        product(tile, d, rows, d, part.to_receiver, d, ahead,
                 [&](int r, int c, V v) { store(receiver + r * d + c, v + load(part.network.bias_1 + c)); });
-        product(tile, d, rows, d, part.to_sender, d, [&](int r, int c, V v) { store(sender + r * d + c, v); });
+        product(tile, d, rows, d, part.to_sender, d, ahead, [&](int r, int c, V v) { store(sender + r * d + c, v); });
     }
 }
 
@@ -208,6 +247,7 @@ void update_edges(const Part& part, const Edges& edges, float* latent, const Mem
     alignas(64) static thread_local float tile[TILE * MOST], one[TILE * MOST];
     const int d = (int)part.network.width;
     Sums sums(memory.received, d);
+    Ahead ahead;
     for (int64_t start = 0; start < edges.num_edges; start += TILE) {
         const int rows = tile_of(edges.num_edges, start);
         const int64_t *receivers = edges.receivers + start, *senders = edges.senders + start;
@@ -217,10 +257,16 @@ void update_edges(const Part& part, const Edges& edges, float* latent, const Mem
             gather(latent, places, rows, d, tile);
             x = tile;
         }
-        product(x, d, rows, d, part.to_edge, d, [&](int r, int c, V v) {
+        ahead.clear();
+        if (places)
+            fetch_places(ahead, latent, edges.rows, edges.num_edges, start + TILE, d);
+        else
+            fetch_rows(ahead, latent, edges.num_edges, start + TILE, d);
+        fetch_places(ahead, memory.sender, edges.senders, edges.num_edges, start + TILE, d);
+        product(x, d, rows, d, part.to_edge, d, ahead, [&](int r, int c, V v) {
             store(one + r * d + c, v + load(memory.receiver + receivers[r] * d + c) + load(memory.sender + senders[r] * d + c));
         });
-        tail(part.network, one, rows, [&](int r, const float* message) {
+        tail(part.network, one, rows, ahead, [&](int r, const float* message) {
             float* at = latent + (places ? places[r] : start + r) * d;
             for (int c = 0; c < d; c += LANES) store(at + c, load(at + c) + load(message + c));
             sums.add(receivers[r], message);
@@ -232,14 +278,18 @@ void update_edges(const Part& part, const Edges& edges, float* latent, const Mem
 // The sums' part of the node network's first layer.
 void add_received(const Part& part, const Edges& edges, bool mean, const Memory& memory) {
     const int d = (int)part.network.width;
+    Ahead ahead;
     for (int64_t start = 0; start < edges.num_nodes; start += TILE) {
         const int rows = tile_of(edges.num_nodes, start);
+        ahead.clear();
+        fetch_places(ahead, memory.hidden, edges.nodes, edges.num_nodes, start, d);
+        fetch_rows(ahead, memory.received, edges.num_nodes, start + TILE, d);
         float* received = memory.received + start * d;
         for (int r = 0; mean && r < rows; ++r) {
             const int64_t degree = edges.offsets[start + r + 1] - edges.offsets[start + r];
             for (int c = 0; c < d; c += LANES) store(received + r * d + c, load(received + r * d + c) / (float)(degree > 1 ? degree : 1));
         }
-        product(received, d, rows, d, part.to_node, d, [&](int r, int c, V v) {
+        product(received, d, rows, d, part.to_node, d, ahead, [&](int r, int c, V v) {
             float* at = memory.hidden + edges.nodes[start + r] * d + c;
             store(at, load(at) + v);
         });
@@ -249,9 +299,13 @@ void add_received(const Part& part, const Edges& edges, bool mean, const Memory&
 void take_step(const Step& step, const Edges* edges, float* const* latents, float* nodes, int64_t num_nodes, const Memory& memory) {
     alignas(64) static thread_local float tile[TILE * MOST];
     const int d = (int)step.network.width;
-    for (int64_t start = 0; start < num_nodes; start += TILE)
-        product(nodes + start * d, d, tile_of(num_nodes, start), d, step.own, d,
+    Ahead ahead;
+    for (int64_t start = 0; start < num_nodes; start += TILE) {
+        ahead.clear();
+        fetch_rows(ahead, nodes, num_nodes, start + TILE, d);
+        product(nodes + start * d, d, tile_of(num_nodes, start), d, step.own, d, ahead,
                 [&](int r, int c, V v) { store(memory.hidden + (start + r) * d + c, v + load(step.network.bias_1 + c)); });
+    }
     for (int64_t i = 0; i < step.num_parts; ++i) {
         const Part& part = step.parts[i];
         const Edges& set = edges[part.edges];
@@ -263,7 +317,10 @@ void take_step(const Step& step, const Edges* edges, float* const* latents, floa
     for (int64_t start = 0; start < num_nodes; start += TILE) {
         const int rows = tile_of(num_nodes, start);
         std::memcpy(tile, memory.hidden + start * d, sizeof(float) * rows * d);
-        tail(step.network, tile, rows, [&](int r, const float* change) {
+        ahead.clear();
+        fetch_rows(ahead, nodes, num_nodes, start, d);
+        fetch_rows(ahead, memory.hidden, num_nodes, start + TILE, d);
+        tail(step.network, tile, rows, ahead, [&](int r, const float* change) {
             float* at = nodes + (start + r) * d;
             for (int c = 0; c < d; c += LANES) store(at + c, load(at + c) + load(change + c));
         });
@@ -293,11 +350,14 @@ void network_pack(const float* weight, int64_t columns, int64_t stride, int64_t 
 void network_rows(const Perceptron* p, const float* x, int64_t count, float* out, int64_t add) {
     alignas(64) static thread_local float one[TILE * MOST];
     const int d = (int)p->width;
+    Ahead ahead;
     for (int64_t start = 0; start < count; start += TILE) {
         const int rows = tile_of(count, start);
-        product(x + start * p->in, p->in, rows, p->in, p->first, d,
+        ahead.clear();
+        fetch_rows(ahead, x, count, start + TILE, (int)p->in);
+        product(x + start * p->in, p->in, rows, p->in, p->first, d, ahead,
                 [&](int r, int c, V v) { store(one + r * d + c, v + load(p->bias_1 + c)); });
-        tail(*p, one, rows, [&](int r, const float* row) {
+        tail(*p, one, rows, ahead, [&](int r, const float* row) {
             float* at = out + (start + r) * p->out;
             for (int64_t c = 0; c < p->out; ++c) at[c] = add ? at[c] + row[c] : row[c];
         });

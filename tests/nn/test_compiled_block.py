@@ -92,6 +92,21 @@ def test_an_edge_update_and_its_gradients_are_the_formulas(dtype, bound, bound_g
 
 
 @needs_compiler
+@pytest.mark.parametrize("used", [0, 1])
+def test_a_result_that_nobody_uses_has_no_gradient(used):
+    """The latents of a network's last step lead nowhere; its sums alone do."""
+    mlp, edges = perceptron(3 * WIDTH), hub_and_gaps()
+    leaves = [torch.randn(len(edges.nodes), WIDTH).requires_grad_(), torch.randn(edges.num_edges, WIDTH).requires_grad_()]
+    found = []
+    for compiled_form in (False, True):
+        mlp.compiled = compiled_form
+        result = update_edges(mlp, *leaves, edges)[used]
+        found.append(torch.autograd.grad(result.square().sum(), [*leaves, *mlp.parameters()]))
+    for value, reference in zip(*found, strict=True):
+        assert relative(value, reference) < 1e-5
+
+
+@needs_compiler
 @pytest.mark.parametrize("rows", [1, 95, 96, 205])
 @pytest.mark.parametrize("residual", [None, torch.float32])
 @pytest.mark.parametrize("dtype, bound, bound_gradient", BOUNDS)
