@@ -3,6 +3,8 @@
     python benchmarks/engine.py                                           # dress, dress_4k, dress_12k
     python benchmarks/engine.py tshirt trousers dress skirt --motions walk_proud dance_mixed plie
     python benchmarks/engine.py --frame tshirt dress_4k dress_12k --iterations 4
+    python benchmarks/engine.py --frame --threads 1 2                     # in turns, on the clock too
+    python benchmarks/engine.py --frame dress --refine-to 50000 --frames 4
     python benchmarks/engine.py --converged tshirt trousers dress skirt --motions walk_proud dance_mixed plie --frames 60
 
 Steps of rollouts (embedded body, default fabric), each solved by both forms from the same state; the compiled one goes on. A
@@ -10,7 +12,9 @@ line per garment: median CPU milliseconds of the contact search and of the solve
 both reach, in units of e0 (what their γ differ by), and the share of the steps in which it is 1e-3 at most.
 
 ``--frame`` times whole frames of ``stepper=newton`` with the compiled solver: posing, search, solver, integration, no metrics
-and no files. Beside the median milliseconds stand median and 95th percentile of γ over every fourth state.
+and no files: median CPU milliseconds, median and least milliseconds on the clock, CPU microseconds of a vertex, median and 95th
+percentile of γ over every fourth state, and the most memory that the process has had so far. ``--refine-to`` halves the longest
+edges of a garment until it has so many vertices.
 
 ``--converged`` lets both forms go on until they converge, by their default settings, each along its own rollout. A line per
 garment, motion and form: the steps that missed their accuracy, the Newton iterations of a step and its relative gradient.
@@ -19,17 +23,23 @@ garment, motion and form: the steps that missed their accuracy, the Newton itera
 from __future__ import annotations
 
 import argparse
+import os
+import resource
+import sys
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from statistics import median
 from typing import Any, TypeVar
 
 import numpy as np
 import torch
+from frame import refined
 
 from hood.assets.body import load_body
 from hood.assets.garment import load_garment
 from hood.assets.sequence import load_sequence
+from hood.cli import ENVIRONMENT
 from hood.commands.circumstances import machine_name
 from hood.dynamics.rollout import simulate
 from hood.dynamics.simulator import Prediction
@@ -50,6 +60,8 @@ SAME = 1e-3
 STRIDE = 4
 
 Result = TypeVar("Result")
+#: A step and where it leads.
+Seen = tuple[StepProblem, torch.Tensor]
 
 
 def timed(into: list[float], work: Callable[..., Result], *arguments: Any) -> Result:
@@ -61,7 +73,15 @@ def timed(into: list[float], work: Callable[..., Result], *arguments: Any) -> Re
 
 
 def make_scene(garment: str, motion: str) -> Scene:
-    return build_scene(load_garment(garment), load_body(), load_sequence(motion, 30.0), dtype=torch.float64)
+    """The scene of a garment; ``dress:50000`` is refined to so many vertices."""
+    name, _, count = garment.partition(":")
+    whole = load_garment(name)
+    chosen = refined(whole, int(count)) if count else whole
+    return build_scene(chosen, load_body(), load_sequence(motion, 30.0), dtype=torch.float64)
+
+
+def _keep(steps: list[Seen], index: int, problem: StepProblem, prediction: Prediction) -> None:
+    steps.append((problem, prediction.next_pos))
 
 
 def solve_both(scene: Scene, frames: int, iterations: int, times: dict[str, list[float]]) -> list[float]:
@@ -86,8 +106,8 @@ def solve_both(scene: Scene, frames: int, iterations: int, times: dict[str, list
     return differences
 
 
-def compare(garment: str, motions: list[str], frames: int, iterations: int) -> str:
-    """A line of the table of both forms."""
+def compare(garment: str, motions: list[str], frames: int, iterations: int) -> Iterator[str]:
+    """The line of the table of both forms."""
     times: dict[str, list[float]] = {name: [] for name in ("search torch", "search compiled", "torch", "compiled")}
     differences = []
     for motion in motions:
@@ -99,26 +119,41 @@ def compare(garment: str, motions: list[str], frames: int, iterations: int) -> s
         plain, fast = shown[f"{part}torch"], shown[f"{part}compiled"]
         columns.append(f"{plain:16.1f} {fast:9.1f} {plain / fast:6.1f}")
     same = sum(difference <= SAME for difference in differences)
-    return " ".join([*columns, f"{max(differences):12.1e}   {same} of {len(differences)}"])
+    yield " ".join([*columns, f"{max(differences):12.1e}   {same} of {len(differences)}"])
 
 
-def time_frames(garment: str, motions: list[str], frames: int, iterations: int) -> str:
-    """A line of the table of whole frames."""
-    potential, times, gaps = default_potential(), [], []
+def time_frames(garment: str, motions: list[str], frames: int, iterations: int, threads: list[int]) -> Iterator[str]:
+    """Lines of the table of whole frames, one for each number of threads; rollouts take turns frame by frame."""
+    potential = default_potential()
+    settings = NewtonSettings(max_iterations=iterations)
+    spent: dict[int, list[float]] = {number: [] for number in threads}
+    clock: dict[int, list[float]] = {number: [] for number in threads}
+    seen: dict[int, list[Seen]] = {number: [] for number in threads}
     for motion in motions:
-        scene, seen = make_scene(garment, motion), []
-
-        def keep(index: int, problem: StepProblem, prediction: Prediction, seen: list[Any] = seen) -> None:
-            seen.append((problem, prediction.next_pos))
-
-        stepper = NewtonStepper(potential, NewtonSettings(max_iterations=iterations))
-        rollout = simulate(stepper, scene, potential, frames + 1, observe=keep, metrics="none")
-        next(rollout)
+        scene = make_scene(garment, motion)
+        rollouts = {}
+        for number in threads:
+            torch.set_num_threads(number)
+            steps: list[Seen] = []
+            keep = partial(_keep, steps)
+            rollouts[number] = simulate(
+                NewtonStepper(potential, settings), scene, potential, frames + 1, observe=keep, metrics="none"
+            )
+            next(rollouts[number])
+            seen[number].append(steps)
         for _ in range(frames):
-            timed(times, next, rollout)
-        gaps += [float(gap(potential, problem, pos).gamma) for problem, pos in seen[::STRIDE]]
-    ms, (middle, high) = median(times), np.percentile(gaps, [50, 95])
-    return f"{garment:12s} {len(scene.cloth.rest_pos):6d} {ms:10.1f} {middle:10.2g} {high:10.2g} {len(gaps):6d}"
+            for number, rollout in rollouts.items():
+                torch.set_num_threads(number)
+                began = time.perf_counter()
+                timed(spent[number], next, rollout)
+                clock[number].append(1e3 * (time.perf_counter() - began))
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << 20 if sys.platform == "darwin" else 1 << 10)
+    size = len(scene.cloth.rest_pos)
+    for number in threads:
+        gaps = [float(gap(potential, problem, pos).gamma) for steps in seen[number] for problem, pos in steps[::STRIDE]]
+        cpu, (middle, high) = median(spent[number]), np.percentile(gaps, [50, 95])
+        times = f"{cpu:10.1f} {median(clock[number]):9.1f} {min(clock[number]):7.1f} {1e3 * cpu / size:9.1f}"
+        yield f"{garment:12s} {size:6d} {number:7d} {times} {middle:10.2g} {high:8.2g} {len(gaps):6d} {memory:8.0f}"
 
 
 class Reporting(NewtonStepper):
@@ -167,24 +202,29 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=5)
     parser.add_argument("--frame", action="store_true", help="time whole frames")
     parser.add_argument("--converged", action="store_true", help="count the steps that miss their accuracy")
+    parser.add_argument("--threads", type=int, nargs="+", default=[1], help="of --frame")
+    parser.add_argument("--refine-to", type=int, default=0, metavar="VERTICES", help="of every garment")
     arguments = parser.parse_args()
+    if any(os.environ.get(key) is None for key in ENVIRONMENT):  # read at process start only
+        os.execve(sys.executable, [sys.executable, *sys.argv], {**ENVIRONMENT, **os.environ})
     torch.set_num_threads(1)
+    common = (arguments.motions, arguments.frames)
+    limit = f"{arguments.iterations} iterations at most"
+    work: Callable[[str], Iterator[str]]
     if arguments.converged:
-        print(f"{machine_name('cpu')}; iterations until the default accuracy")
-        print("garment      motion          form       steps  missed its median   p95   max  worst rg  frame ms")
-        for garment in arguments.garments:
-            for line in converge(garment, arguments.motions, arguments.frames):
-                print(line, flush=True)
-        return
-    print(f"{machine_name('cpu')}; {arguments.iterations} iterations at most")
-    if arguments.frame:
-        print("garment    vertices   frame ms   γ median      γ p95 states")
+        limit, work = "iterations until the default accuracy", lambda garment: converge(garment, *common)
+        head = "garment      motion          form       steps  missed its median   p95   max  worst rg  frame ms"
+    elif arguments.frame:
+        work = lambda garment: time_frames(garment, *common, arguments.iterations, arguments.threads)  # noqa: E731
+        head = "garment    vertices threads   frame ms  on clock   least us/vertex   γ median    γ p95 states       MB"
     else:
+        work = lambda garment: compare(garment, *common, arguments.iterations)  # noqa: E731
         head = "garment    vertices  search ms: torch  compiled ratio  solver ms: torch compiled  ratio"
-        print(f"{head}  max |ΔΦ|/e0   within {SAME:g}")
-    work = time_frames if arguments.frame else compare
+        head += f"  max |ΔΦ|/e0   within {SAME:g}"
+    print(f"{machine_name('cpu')}; {limit}\n{head}", flush=True)
     for garment in arguments.garments:
-        print(work(garment, arguments.motions, arguments.frames, arguments.iterations), flush=True)
+        for line in work(f"{garment}:{arguments.refine_to}" if arguments.refine_to else garment):
+            print(line, flush=True)
 
 
 if __name__ == "__main__":

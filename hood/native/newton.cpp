@@ -140,16 +140,14 @@ struct Engine {
     int64_t wide;                   // matrix and linear solver in float64
     int64_t cg_used;
     // Threads.
-    int64_t parts, cg_parts;        // in how many parts loops are done, and those of conjugate gradients
-    int64_t reach;                  // how far a column is behind its row at most
-    void* spill;                    // (cg_parts - 1, reach, 4) what a part's rows give to the rows behind the part
+    int64_t parts, reach;           // in how many parts loops are done; how far a column is behind its row at most
+    void* spill;                    // (parts - 1, reach, 4) what a part's rows give to the rows behind the part
 };
 }
 
 namespace {
 
 inline Range rows_of(const Engine& e, int64_t part) { return range_of(e.num_rows, part, e.parts); }
-inline Range system_of(const Engine& e, int64_t part) { return range_of(e.num_rows, part, e.cg_parts); }
 inline Range faces_of(const Engine& e, int64_t part) { return range_of(e.num_faces, part, e.parts, LANES); }
 inline Range hinges_of(const Engine& e, int64_t part) { return range_of(e.num_hinges, part, e.parts, LANES); }
 
@@ -780,7 +778,7 @@ template <class T> inline T* spill_of(const Engine& e, int64_t part) { return (T
 
 template <class T> D4 multiply(const Engine& e, int64_t part) {
     typedef typename Four<T>::type V4;
-    const Range range = system_of(e, part), rest = behind(e, range);
+    const Range range = rows_of(e, part), rest = behind(e, range);
     std::memset((T*)e.q + 4 * range.begin, 0, sizeof(T) * 4 * (range.end - range.begin));
     if (rest.begin == rest.end) return multiply_rows<T, true>(e, range, range.end, nullptr);
     T* spill = spill_of<T>(e, part);
@@ -797,9 +795,9 @@ template <class T> D4 multiply(const Engine& e, int64_t part) {
 // Adds to the rows of a part what earlier parts have put aside for them.
 template <class T> void take_spill(const Engine& e, int64_t part, T* q) {
     typedef typename Four<T>::type V4;
-    const Range own = system_of(e, part);
+    const Range own = rows_of(e, part);
     for (int64_t other = 0; other < part; ++other) {
-        const Range rest = behind(e, system_of(e, other));
+        const Range rest = behind(e, rows_of(e, other));
         const T* spill = spill_of<T>(e, other) - 4 * rest.begin;
         for (int64_t row = std::max(own.begin, rest.begin); row < std::min(own.end, rest.end); ++row)
             store(q + 4 * row, load<V4>(q + 4 * row) + load<V4>(spill + 4 * row));
@@ -818,7 +816,7 @@ template <class T> D4 begin_rows(const Engine& e, int64_t part, double scale) {
     typedef typename Four<T>::type V4;
     T *x = (T*)e.x, *r = (T*)e.r, *z = (T*)e.z, *p = (T*)e.p;
     const T* inverse = (const T*)e.inverse;
-    const Range range = system_of(e, part);
+    const Range range = rows_of(e, part);
     D4 sum = D4{};
     for (int64_t row = range.begin; row < range.end; ++row) {
         const V4 right = __builtin_convertvector(-scale * load<D4>(e.gradient + 4 * row), V4);
@@ -835,7 +833,7 @@ template <class T> D4 step_rows(const Engine& e, int64_t part, T length) {
     typedef typename Four<T>::type V4;
     T *x = (T*)e.x, *r = (T*)e.r, *z = (T*)e.z;
     const T *p = (const T*)e.p, *q = (const T*)e.q, *inverse = (const T*)e.inverse;
-    const Range range = system_of(e, part);
+    const Range range = rows_of(e, part);
     take_spill<T>(e, part, (T*)e.q);
     D4 sum = D4{};
     for (int64_t row = range.begin; row < range.end; ++row) {
@@ -851,15 +849,15 @@ template <class T> void turn_rows(const Engine& e, int64_t part, T share) {
     typedef typename Four<T>::type V4;
     const T* z = (const T*)e.z;
     T* p = (T*)e.p;
-    const Range range = system_of(e, part);
+    const Range range = rows_of(e, part);
     for (int64_t row = range.begin; row < range.end; ++row) store(p + 4 * row, load<V4>(z + 4 * row) + share * load<V4>(p + 4 * row));
 }
 
 // The sum over the parts, and then over the axes.
 template <class Compute> inline double sum_parts(const Engine& e, const Compute& compute) {
     Sums<D4> sums;
-    for_parts(e.cg_parts, [&](int64_t part) { sums[part] = compute(part); });
-    const D4 sum = sums.total(e.cg_parts);
+    for_parts(e.parts, [&](int64_t part) { sums[part] = compute(part); });
+    const D4 sum = sums.total(e.parts);
     return (sum[0] + sum[1]) + sum[2];
 }
 
@@ -883,7 +881,7 @@ template <class T> bool solve(Engine& e, double tolerance, int64_t most) {
         const double before = rz;
         rz = sum_parts(e, [&](int64_t part) { return step_rows<T>(e, part, length); });
         const T share = (T)(rz / before);
-        for_parts(e.cg_parts, [&](int64_t part) { turn_rows<T>(e, part, share); });
+        for_parts(e.parts, [&](int64_t part) { turn_rows<T>(e, part, share); });
         ++e.cg_used;
     }
     const T* x = (const T*)e.x;

@@ -70,7 +70,7 @@ class Pool {
         return happened();
     }
 
-    static constexpr std::chrono::microseconds PATIENCE{100};
+    static constexpr std::chrono::microseconds PATIENCE{300};
 
     static int64_t cores() {
         static const int64_t count = std::max<int64_t>(std::thread::hardware_concurrency(), 1);

@@ -33,8 +33,8 @@ from hood.solver.iterate import fixed_positions
 from hood.solver.plan import SolverPlan
 from hood.solver.points import PointForces, point_forces
 
-#: Vertices of a part that is worth a thread: in loops over elements, and in those of conjugate gradients, which are short.
-_ROWS, _CG_ROWS = 250, 1000
+#: Vertices of a part that is worth a thread: an iteration of conjugate gradients takes 20 us at 1,000 vertices.
+_ROWS = 400
 
 SOURCE = Path(native.__file__).with_name("newton.cpp")
 
@@ -68,7 +68,7 @@ class _Engine(ctypes.Structure):
         *fields("pos acc trial_pos trial_acc gradient direction path face_force hinge_force", POINTER),
         *fields("face_model hinge_model matrix slack own own_slack row_sum inverse x r z p q", POINTER),
         *fields("sharpness raised phi noise", REAL),
-        *fields("wide cg_used parts cg_parts reach", COUNT),
+        *fields("wide cg_used parts reach", COUNT),
         ("spill", POINTER),
     ]
 
@@ -220,21 +220,20 @@ class SceneEngine:
         self._point(**{name: np.zeros((size, 4)) for name in ("pos", "trial_pos")})
         self._point(**{name: np.zeros((rows, 4)) for name in ("acc", "trial_acc", "gradient", "direction")})
         self._point(face_force=np.zeros((self.values.num_faces, 10)), hinge_force=np.zeros((self.values.num_hinges, 14)))
-        self._memory: dict[bool, dict[str, np.ndarray]] = {}
-        self.share(1, 1)
+        self._memory: dict[tuple[bool, int], dict[str, np.ndarray]] = {}
+        self.share(1)
 
-    def share(self, parts: int, cg_parts: int) -> None:
-        """Do loops in as many parts, by threads of their own; results depend on the numbers, but not on the machine."""
-        if (parts, cg_parts) != (self.values.parts, self.values.cg_parts):
-            self.values.parts, self.values.cg_parts = parts, cg_parts
-            self._memory.clear()
+    def share(self, parts: int) -> None:
+        """Do loops in as many parts, by threads of their own; results depend on the number, but not on who computes a part."""
+        self.values.parts = parts
         self.widen(False)
 
     def widen(self, wide: bool) -> None:
         """Matrix and linear solver in float64, or in float32."""
-        if wide not in self._memory:
-            self._memory[wide] = self._working_memory(wide)
-        self._point(**self._memory[wide])
+        key = (wide, self.values.parts)
+        if key not in self._memory:
+            self._memory[key] = self._working_memory(wide)
+        self._point(**self._memory[key])
         self.values.wide = wide
 
     def _working_memory(self, wide: bool) -> dict[str, np.ndarray]:
@@ -244,7 +243,7 @@ class SceneEngine:
         memory = {name: np.zeros(count, kind) for name, count in sizes.items()}
         memory |= {name: np.zeros(4 * rows, kind) for name in "xrzpq"}
         memory["row_sum"] = _aligned(16 * values.most_blocks * values.parts, kind)
-        memory["spill"] = _aligned(4 * values.reach * (values.cg_parts - 1), kind)
+        memory["spill"] = _aligned(4 * values.reach * (values.parts - 1), kind)
         memory["face_model"] = np.zeros(values.num_faces * self._lib.newton_face_record(int(wide)), np.uint8)
         memory["hinge_model"] = np.zeros(values.num_hinges * self._lib.newton_hinge_record(int(wide)), np.uint8)
         return memory
@@ -267,7 +266,7 @@ class SceneEngine:
         values.bending, values.membrane = step.bending, step.membrane > 0
         values.dt_sq = float(step.dt[scene]) ** 2
         values.raised, values.cg_used = 0.0, 0
-        self.share(num_parts(values.num_rows, _ROWS), num_parts(values.num_rows, _CG_ROWS))
+        self.share(num_parts(values.num_rows, _ROWS))
 
     def start(self, acc: np.ndarray) -> None:
         """Take up accelerations (V, 3) of all vertices of the cloth."""

@@ -21,17 +21,15 @@ from hood.solver.newton import minimize
 
 __all__ = ["compiler"]
 pytestmark = pytest.mark.usefixtures("compiler")
-#: Of loops over elements, and of conjugate gradients.
-PARTS = [(2, 1), (1, 2), (3, 3), (5, 7)]
+PARTS = [2, 3, 7]
 
 
 @pytest.fixture
 def share(monkeypatch):
     """Sets the parts that every following step is solved in."""
 
-    def set_parts(parts: int, cg_parts: int) -> None:
-        counts = {engine._ROWS: parts, engine._CG_ROWS: cg_parts}
-        monkeypatch.setattr(engine, "num_parts", lambda count, least: min(counts[least], count))
+    def set_parts(parts: int) -> None:
+        monkeypatch.setattr(engine, "num_parts", lambda count, least: min(parts, count))
 
     return set_parts
 
@@ -41,13 +39,13 @@ def share(monkeypatch):
 def test_the_model_has_the_same_bits_in_any_number_of_parts(share, parts, wide):
     problem = touching_sheet()
     pos = states(problem)["folded"]
-    share(1, 1)
+    share(1)
     whole = model_at(problem, default_potential(), pos, wide)
     expected = {name: whole.array(name).copy() for name in ("gradient", "inverse", "own")} | {"matrix": dense(whole, "matrix")}
     phi = whole.values.phi
-    share(*parts)
+    share(parts)
     shared = model_at(problem, default_potential(), pos, wide)
-    assert shared.values.parts == parts[0]
+    assert shared.values.parts == parts
     found = {name: shared.array(name) for name in ("gradient", "inverse", "own")} | {"matrix": dense(shared, "matrix")}
     for name, values in expected.items():
         assert np.array_equal(found[name], values), name
@@ -60,9 +58,9 @@ def test_iterations_are_those_of_one_part_and_runs_are_bit_identical(share, part
     problem = make()
     for count in (1, 2, 4):
         settings = replace(COMPILED, max_iterations=count)
-        share(1, 1)
+        share(1)
         there, expected = minimize(default_potential(), problem, settings=settings)
-        share(*parts)
+        share(parts)
         here, report = minimize(default_potential(), problem, settings=settings)
         assert report.iterations == expected.iterations
         assert float((here - there).norm()) <= 1e-4 * float((there - problem.state.pos).norm())
@@ -75,8 +73,8 @@ def test_iterations_are_those_of_one_part_and_runs_are_bit_identical(share, part
 def test_the_linear_solver_in_float64_does_not_depend_on_the_parts(share):
     """What columns behind a part are given arrives: a lost block would show in the first digit."""
     problem, found = touching_sheet(), []
-    for parts in ((1, 1), (1, 2), (2, 9)):
-        share(*parts)
+    for parts in (1, 2, 9):
+        share(parts)
         scene = model_at(problem, default_potential(), states(problem)["near"], wide=True)
         assert scene.move(1e-3, 30)
         found.append(scene.array("direction").copy())
@@ -85,7 +83,7 @@ def test_the_linear_solver_in_float64_does_not_depend_on_the_parts(share):
 
 
 def test_calls_from_several_threads_of_python_do_not_disturb_each_other(share):
-    share(3, 3)
+    share(3)
     problems = pieces()
     alone = [minimize(default_potential(), problem, settings=COMPILED)[0] for problem in problems]
     found: dict[int, list[torch.Tensor]] = {}
@@ -104,7 +102,7 @@ def test_calls_from_several_threads_of_python_do_not_disturb_each_other(share):
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="a system without fork")
 def test_a_forked_process_has_threads_of_its_own(share):
-    share(3, 3)
+    share(3)
     problem = touching_sheet()
     scene = model_at(problem, default_potential(), states(problem)["near"], wide=False)
     expected = scene.model()
