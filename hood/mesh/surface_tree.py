@@ -16,12 +16,15 @@ from torch import Tensor
 from hood import native
 from hood.native.build import optional
 from hood.native.structures import COUNT, POINTER, fields
+from hood.native.threads import num_parts
 
 SOURCE = Path(native.__file__).with_name("surface.cpp")
 #: Faces of a leaf, as in the source, and bytes of a line of the cache.
 _WIDE, _LINE = 8, 64
 #: Points that are searched for together, as in the source; fewer where that makes more visits to leaves than this possible.
 _MOST, _VISITS = 64, 1 << 18
+#: Points of a part that is worth a thread: threads need the normals of all vertices made before they begin.
+_POINTS = 1000
 
 
 class _Tree(ctypes.Structure):
@@ -35,7 +38,7 @@ class _Tree(ctypes.Structure):
         ("call", COUNT),
         ("origin", ctypes.c_double * 3),
         ("size_sq", ctypes.c_double),
-        ("batch", COUNT),
+        *fields("batch parts", COUNT),
         *fields("nodes leaves reach", POINTER),
     ]
 
@@ -105,8 +108,6 @@ class SurfaceTree:
             "block_vertex": (blocks, _WIDE),
             "stamp": (num_vertices,),
             "leaf_stamp": (leaves,),
-            "nodes": (batch * leaves + 1, 2),
-            "leaves": (batch * leaves + 1, 2),
         }
         reals = {
             "number": (leaves, _WIDE),
@@ -117,7 +118,6 @@ class SurfaceTree:
             "block_pos": (blocks, 3, _WIDE),
             "cross": (leaves, _WIDE, 8),
             "vertex_normal": (num_vertices, 6),
-            "reach": (batch * leaves + 1,),
         }
         self._arrays = dict(zip(("around", "first", "valence", "face_edges", "edge_faces"), incidence, strict=True))
         self._arrays |= {name: _aligned(shape, np.int32) for name, shape in integers.items()}
@@ -128,13 +128,25 @@ class SurfaceTree:
         self._arrays["place"].fill(-1)
         self._tree = _Tree(num_faces=len(members), edge_width=incidence[4].shape[1], batch=batch)
         _point(self._tree, self._arrays)
+        self._visits = batch * leaves + 1
+        self._share(1)
         centre = np.ascontiguousarray(np.nan_to_num(np.asarray(pos, np.float64)[faces].mean(axis=1)))
         lib.surface_build(ctypes.byref(self._tree), centre.ctypes.data_as(POINTER), COUNT(num_vertices))
+
+    def _share(self, parts: int) -> None:
+        """Search for points in as many parts, by threads of their own; what is found does not depend on it."""
+        if parts > self._tree.parts:
+            visits = {name: _aligned((parts, self._visits, 2), np.int32) for name in ("nodes", "leaves")}
+            visits["reach"] = _aligned((parts, self._visits), np.float64)
+            self._arrays |= visits
+            _point(self._tree, visits)
+        self._tree.parts = parts
 
     def search(self, points: np.ndarray, pos: np.ndarray, next_pos: np.ndarray) -> dict[str, np.ndarray]:
         """Fields of :class:`Match` for ``points`` (N, 3) on the surface at ``pos`` (W, 3), all float64 and C-contiguous."""
         count = len(points)
         self._arrays["pos"][...] = pos
+        self._share(num_parts(count, _POINTS))
         self._lib.surface_refit(ctypes.byref(self._tree))
         found: dict[str, np.ndarray] = {name: np.empty(count, np.int64) for name in ("vertex", "face")}
         found |= {"vertex_dist": np.empty(count), "dist": np.empty(count)}

@@ -9,6 +9,7 @@
 #include <cstdint>
 #include <cstring>
 
+#include "threads.h"
 #include "vector.h"
 
 namespace {
@@ -89,8 +90,9 @@ struct Tree {
     int64_t call;
     double origin[3], size_sq;        // m, m^2: middle of everything, and how far that reaches
     int64_t batch;                    // points that are searched for together, at most 64
-    Visit *nodes, *leaves;            // (batch * M + 1), (batch * L + 1) what they are to visit
-    double* reach;                    // (batch * L + 1) m^2, to the boxes of these leaves
+    int64_t parts;                    // in which the points of a call are searched for, by threads
+    Visit *nodes, *leaves;            // (parts, batch * L + 1) each, what points of a batch are to visit
+    double* reach;                    // (parts, batch * L + 1) m^2, to the boxes of these leaves
 };
 
 struct Query {
@@ -403,6 +405,18 @@ const double* vertex_normals(const Tree& tree, const double* next_pos, int64_t v
     return normal;
 }
 
+// Normals of all vertices in the tree, and what they are made of: threads must not make them while others read.
+void make_all_normals(const Tree& tree, const double* next_pos) {
+    for_parts(tree.parts, [&](int64_t part) {
+        const Range leaves = range_of(tree.num_leaves, part, tree.parts);
+        for (int64_t leaf = leaves.begin; leaf < leaves.end; ++leaf) crosses(tree, next_pos, WIDE * leaf);
+    });
+    for_parts(tree.parts, [&](int64_t part) {
+        const Range blocks = range_of(tree.num_blocks, part, tree.parts);
+        for (int64_t i = WIDE * blocks.begin; i < WIDE * blocks.end; ++i) vertex_normals(tree, next_pos, tree.block_vertex[i]);
+    });
+}
+
 // Where a point of a face is, now and next, and the normals there.
 void interpolate(const Tree& tree, const Query& query, int64_t face, const double* bary, int64_t i) {
     Vec where{0.0, 0.0, 0.0}, next_where = where, up = where, next_up = where;
@@ -597,6 +611,13 @@ void surface_refit(Tree* tree) {
 }
 
 void surface_search(const Tree* tree, const Query* query) {
-    for (int64_t i = 0; i < query->count; i += tree->batch) search(*tree, *query, i, std::min(i + tree->batch, query->count));
+    if (tree->parts > 1) make_all_normals(*tree, query->next_pos);
+    for_parts(tree->parts, [&](int64_t part) {
+        Tree own = *tree;
+        const int64_t visits = own.batch * own.num_leaves + 1;
+        own.nodes += visits * part, own.leaves += visits * part, own.reach += visits * part;
+        const Range range = range_of(query->count, part, own.parts, own.batch);
+        for (int64_t i = range.begin; i < range.end; i += own.batch) search(own, *query, i, std::min(i + own.batch, range.end));
+    });
 }
 }

@@ -45,6 +45,20 @@ def test_a_search_does_not_depend_on_those_before_it():
         assert torch.equal(getattr(again, name), getattr(fresh, name)), name
 
 
+def test_what_is_found_does_not_depend_on_the_threads(monkeypatch):
+    pos, faces = surface()
+    for seed, count in ((0, 500), (1, 3), (2, 130)):
+        where = points(count, seed)
+        where[: count // 2] *= 0.7  # inside and outside, beside vertices and edges
+        where[-1] = pos[5]
+        fresh = found(where, pos * (1 + seed), faces)
+        for parts in (2, 7):
+            monkeypatch.setattr(surface_tree, "num_parts", lambda count, least, parts=parts: parts)
+            again = found(where, pos * (1 + seed), faces)
+            assert all(torch.equal(a, b) for a, b in zip(again, fresh, strict=True))
+        monkeypatch.undo()
+
+
 def test_of_faces_at_the_same_distance_the_first_is_taken():
     pos, faces = surface(box(4))
     corners = pos[:: max(len(pos) // 6, 1)]

@@ -14,6 +14,7 @@ import torch
 from test_engine import COMPILED, compiler, dense, model_at
 from test_newton import batch, falling, hanging, pieces
 from test_plan import states, touching_sheet
+from test_points import PLACES, pressed
 
 from hood.losses.potential import default_potential
 from hood.solver import engine
@@ -68,6 +69,19 @@ def test_iterations_are_those_of_one_part_and_runs_are_bit_identical(share, part
         again, repeated = minimize(default_potential(), problem, settings=settings)
         assert torch.equal(again, here)
         assert torch.equal(repeated.phi, report.phi)
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_contact_at_points_has_the_same_bits_in_any_number_of_parts(share, place):
+    potential, problem, pos = pressed(place)
+    found = []
+    for parts in (1, *PARTS):
+        share(parts)
+        scene = model_at(problem, potential, pos, wide=False)
+        found.append((scene.array("gradient").copy(), dense(scene, "matrix")))
+    for gradient, matrix in found[1:]:
+        assert np.array_equal(gradient, found[0][0])
+        assert np.array_equal(matrix, found[0][1])
 
 
 def test_the_linear_solver_in_float64_does_not_depend_on_the_parts(share):
