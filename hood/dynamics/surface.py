@@ -10,9 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from hood.assets.garment import Garment
-from hood.mesh import topology
 from hood.mesh.crossing import crossings, self_crossings
-from hood.mesh.skin import skin_depth
+from hood.mesh.skin import Sheet, skin_depth
 
 SURFACE_METRICS = ("cut_face_share", "cut_edge_share", "skin_depth", "self_crossings", "garment_crossings")
 #: Frames from one measurement to the next: at 1,000 vertices it then takes less than a tenth of a frame.
@@ -31,7 +30,8 @@ class SurfaceMeter:
 
     def __init__(self, garment: Garment, body_faces: np.ndarray) -> None:
         self._faces, self._body_faces = np.asarray(garment.faces), np.asarray(body_faces).reshape(-1, 3)
-        self._edges = topology.unique_edges(self._faces)
+        self._sheet = Sheet.of(self._faces)
+        self._edges = self._sheet.edges
         self._lengths = _lengths(np.asarray(garment.rest_pos), self._edges)
         piece = np.zeros(len(garment.rest_pos), dtype=np.int64) if garment.piece is None else garment.piece
         self._piece = piece[self._faces[:, 0]]
@@ -59,7 +59,7 @@ class SurfaceMeter:
         values = (
             len(np.unique(cut.pairs[:, 0])) / max(len(self._faces), 1),
             len(np.unique(cut.first_edges[:, :2], axis=0)) / max(len(self._edges), 1),
-            skin_depth(pos, self._faces, body_pos, self._body_faces, cut),
+            skin_depth(pos, self._faces, body_pos, self._body_faces, cut, self._sheet),
             float(same.sum()),
             float((~same).sum()),
         )

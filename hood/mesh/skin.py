@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from scipy.spatial import cKDTree
 
-from hood.mesh import topology
+from hood.mesh import compiled_crossing, topology
 from hood.mesh.boxes import overlapping_boxes
 from hood.mesh.crossing import Crossings
 
@@ -13,9 +15,35 @@ from hood.mesh.crossing import Crossings
 REACH = 0.1
 _BEHIND = 0.5  # cosine of 60 degrees
 _NEAREST = 0.8
+#: Pairs of points and triangles that are all looked at by the compiled form; more are sorted first.
+_MOST_PAIRS = 1 << 25
 
 
-def skin_depth(pos: np.ndarray, faces: np.ndarray, skin_pos: np.ndarray, skin_faces: np.ndarray, cut: Crossings) -> float:
+class Sheet(NamedTuple):
+    """What of a cloth with faces (F, 3) depends on these alone."""
+
+    edges: np.ndarray  # (E, 2) as of hood.mesh.topology.unique_edges
+    open_edge: np.ndarray  # (F, 3) bool: the edge from this corner to the next belongs to this face alone
+    on_rim: np.ndarray  # (V,) bool, ends of such edges
+
+    @classmethod
+    def of(cls, faces: np.ndarray) -> Sheet:
+        """That of faces (F, 3)."""
+        edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        unique, row, count = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
+        on_rim = np.zeros(int(faces.max(initial=-1)) + 1, dtype=bool)
+        on_rim[unique[count == 1]] = True
+        return cls(unique, (count[row.reshape(-1)] == 1).reshape(-1, 3), on_rim)
+
+
+def skin_depth(
+    pos: np.ndarray,
+    faces: np.ndarray,
+    skin_pos: np.ndarray,
+    skin_faces: np.ndarray,
+    cut: Crossings,
+    sheet: Sheet | None = None,
+) -> float:
     """Largest height [m] of a vertex of the skin above the cloth; 0 where none is above it.
 
     A vertex of the skin (W, 3) is **above** the cloth (V, 3) if the cloth's point nearest to it
@@ -32,31 +60,30 @@ def skin_depth(pos: np.ndarray, faces: np.ndarray, skin_pos: np.ndarray, skin_fa
     Args:
         skin_faces: wound so that normals point outwards; the winding of the cloth plays no role.
         cut: the crossings of the cloth with the skin, all positions finite.
+        sheet: of ``faces``, where it is known.
     """
     suspect = np.zeros(len(faces), dtype=bool)
     suspect[cut.pairs[:, 0]] = True
     if not suspect.any():
         return 0.0
-    suspect |= sunken(pos, faces, skin_pos, skin_faces, cut)[faces].all(axis=1)
+    sheet = Sheet.of(faces) if sheet is None else sheet
+    suspect |= sunken(pos, sheet.edges, skin_pos, skin_faces, cut)[faces].all(axis=1)
     corners = pos[faces]
     reached = corners[suspect].reshape(-1, 3)
     low, high = reached.min(axis=0) - REACH, reached.max(axis=0) + REACH
     close = np.flatnonzero(((skin_pos >= low) & (skin_pos <= high)).all(axis=1))
-    # Some vertex of the cloth is this near; so is its nearest point.
-    known, _ = cKDTree(pos[np.unique(faces)]).query(skin_pos[close], distance_upper_bound=REACH)
-    nearest = _nearest(skin_pos[close], np.minimum(known, REACH), corners, np.flatnonzero(suspect))
+    nearest = _nearest(skin_pos[close], np.full(len(close), REACH), corners, np.flatnonzero(suspect))
     if nearest is None:
         return 0.0
     which, face, weights, point, dist = nearest
     vertex = close[which]
-    normal = _normals(skin_pos, skin_faces)[vertex]
+    normal = _normals(skin_pos, skin_faces, vertex)
     inwards = -np.einsum("ni,ni->n", point - skin_pos[vertex], normal)
     behind = inwards > _BEHIND * dist * np.linalg.norm(normal, axis=1)
-    kept = np.flatnonzero(behind & ~_on_rim(faces, face, weights))
+    kept = np.flatnonzero(behind & ~_on_rim(sheet, faces[face], face, weights))
     if len(kept) == 0:
         return 0.0
-    around, _ = cKDTree(skin_pos).query(point[kept])
-    kept = kept[around >= _NEAREST * dist[kept]]
+    kept = kept[_clearance(point[kept], skin_pos) >= _NEAREST * dist[kept]]
     # Where another face is nearer still, the vertex is under cloth that is not cut.
     other = _nearest(skin_pos[vertex[kept]], dist[kept], corners, np.flatnonzero(~suspect))
     if other is not None:
@@ -65,14 +92,13 @@ def skin_depth(pos: np.ndarray, faces: np.ndarray, skin_pos: np.ndarray, skin_fa
     return float(dist[kept].max(initial=0.0))
 
 
-def sunken(pos: np.ndarray, faces: np.ndarray, skin_pos: np.ndarray, skin_faces: np.ndarray, cut: Crossings) -> np.ndarray:
-    """Which vertices of the cloth are under the skin, (V,) bool.
+def sunken(pos: np.ndarray, edges: np.ndarray, skin_pos: np.ndarray, skin_faces: np.ndarray, cut: Crossings) -> np.ndarray:
+    """Which vertices of the cloth, with unique ``edges`` (E, 2), are under the skin, (V,) bool.
 
     An edge that the skin cuts says on which side its ends are, by the plane of the skin's face nearest to each; one that it
     does not cut has both ends on the same side. So the parts of the cloth between cut edges are on one side each; where skin
     passes through itself the majority of the ends decides. Parts without a cut edge count as outside.
     """
-    edges = topology.unique_edges(faces)
     start, end, through = cut.first_edges.T
     whole = np.ones(len(edges), dtype=bool)
     whole[topology.edge_index(edges, cut.first_edges[:, :2])] = False
@@ -129,11 +155,29 @@ def _interior_weights(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     return np.where(flat[:, None], -1.0, np.column_stack([1.0 - b - c, b, c]))
 
 
+def _clearance(points: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Distances (N,) from points (N, 3) to the nearest of others (M, 3)."""
+    if len(points) * len(others) <= _MOST_PAIRS:
+        found = compiled_crossing.clearance(points, others)
+        if found is not None:
+            return found
+    return np.asarray(cKDTree(others).query(points)[0])
+
+
 def _nearest(
     points: np.ndarray, reach: np.ndarray, corners: np.ndarray, chosen: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
     """Of points (N, 3) with one of the ``chosen`` triangles within their ``reach`` (N,): their numbers, the nearest triangle,
     weights, nearest point and distance; None where there is none."""
+    if len(points) * len(chosen) <= _MOST_PAIRS:
+        found = compiled_crossing.nearest(points, reach * (1 + 1e-9), corners[chosen])
+        if found is not None:
+            row = np.flatnonzero(found[0] >= 0)
+            face, weights, dist = chosen[found[0][row]], found[1][row], found[2][row]
+            return (row, face, weights, np.einsum("ni,nij->nj", weights, corners[face]), dist) if len(row) else None
+    # Some corner is this near; so is the nearest point.
+    known, _ = cKDTree(corners[chosen].reshape(-1, 3)).query(points)
+    reach = np.minimum(known, reach)
     triangles = corners[chosen]
     around = reach[:, None] * (1 + 1e-9)
     parts = []
@@ -151,21 +195,20 @@ def _nearest(
     return row[order], face[order], weights[order], point[order], dist[order]
 
 
-def _on_rim(faces: np.ndarray, face: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Which points, given by face and weights, lie on an edge that belongs to one face alone, (N,) bool."""
-    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    unique, row, count = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
-    open_edge = (count[row.reshape(-1)] == 1).reshape(-1, 3)
-    at_corner = np.zeros(int(faces.max()) + 1, dtype=bool)
-    at_corner[unique[count == 1]] = True
+def _on_rim(sheet: Sheet, corners: np.ndarray, face: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Which points, given by the numbers of a face's ``corners`` (N, 3), the face (N,) and weights, lie on an edge that belongs
+    to one face alone, (N,) bool."""
     away = weights == 0.0
-    on_edge = (away[:, [2, 0, 1]] & open_edge[face]).any(axis=1)
-    return on_edge | ((away.sum(axis=1) == 2) & (~away & at_corner[faces[face]]).any(axis=1))
+    on_edge = (away[:, [2, 0, 1]] & sheet.open_edge[face]).any(axis=1)
+    return on_edge | ((away.sum(axis=1) == 2) & (~away & sheet.on_rim[corners]).any(axis=1))
 
 
-def _normals(pos: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Area-weighted normals (W, 3), not of unit length."""
+def _normals(pos: np.ndarray, faces: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+    """Area-weighted normals (N, 3) at some vertices, not of unit length."""
+    wanted = np.zeros(len(pos), dtype=bool)
+    wanted[vertices] = True
+    faces = faces[wanted[faces].any(axis=1)]
     a, b, c = (pos[faces[:, corner]] for corner in range(3))
     normal = np.cross(b - a, c - a)
     columns = [np.bincount(faces.reshape(-1), np.repeat(normal[:, axis], 3), minlength=len(pos)) for axis in range(3)]
-    return np.stack(columns, axis=1)
+    return np.stack(columns, axis=1)[vertices]

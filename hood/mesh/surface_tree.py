@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import weakref
 from collections import deque
 from collections.abc import Sequence
 from functools import cache
@@ -14,6 +15,7 @@ import torch
 from torch import Tensor
 
 from hood import native
+from hood.mesh.kept import forget
 from hood.native.build import optional
 from hood.native.structures import COUNT, POINTER, fields
 from hood.native.threads import num_parts
@@ -190,8 +192,8 @@ def search(
     if type(points) is not Tensor or points.device.type != "cpu" or library() is None:
         return None
     given, pos, later = _double(points), _double(vertices), _double(next_vertices)
-    single = bool((face_scene == face_scene[0]).all()) and bool((point_scene == face_scene[0]).all())
-    if single:
+    scene = _only_scene(face_scene)
+    if scene is not None and scene == _only_scene(point_scene):
         return _found(points, _tree_of(faces, None, face_scene, incidence, pos).search(given, pos, later))
     result = _nothing(len(points))
     for scene in point_scene.unique().tolist():
@@ -201,6 +203,19 @@ def search(
             for name, values in part.items():
                 result[name][rows] = values
     return _found(points, result)
+
+
+_ONLY: dict[int, tuple[weakref.ref[Tensor], int, int | None]] = {}
+
+
+def _only_scene(scenes: Tensor) -> int | None:
+    """The scene that all of ``scenes`` (N,) name, if they do; kept as long as the tensor is what it was."""
+    key = id(scenes)
+    known = _ONLY.get(key)
+    if known is None or known[0]() is not scenes or known[1] != scenes._version:
+        only = int(scenes[0]) if bool((scenes == scenes[0]).all()) else None
+        known = _ONLY[key] = weakref.ref(scenes, forget(_ONLY, key)), scenes._version, only
+    return known[2]
 
 
 def _double(values: Tensor) -> np.ndarray:
@@ -216,7 +231,9 @@ def _nothing(count: int) -> dict[str, np.ndarray]:
 def _found(points: Tensor, arrays: dict[str, np.ndarray]) -> Match:
     """The arrays as tensors, numbers in the type of ``points``."""
     tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
-    return Match(**{name: value.to(points.dtype) if value.is_floating_point() else value for name, value in tensors.items()})
+    if points.dtype is not torch.float64:
+        tensors |= {name: value.to(points.dtype) for name, value in tensors.items() if value.is_floating_point()}
+    return Match(**tensors)
 
 
 #: Incidence, scene and tree of the last topologies.

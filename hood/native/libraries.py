@@ -8,10 +8,13 @@ from hood.native.build import NATIVE_FLAGS, BuildError, compile_library, find_co
 from hood.native.prebuilt import file_name, flags_for, levels
 
 _HERE = Path(__file__).parent
+#: Faces that share an edge must compute the same signs for it, to the last bit: no product is contracted with a sum.
+CROSSING_FLAGS = (*NATIVE_FLAGS, "-ffp-contract=off")
 #: Source and flags of each library, as the modules ask :func:`hood.native.build.build` for them.
 LIBRARIES: tuple[tuple[Path, tuple[str, ...]], ...] = (
     (_HERE / "newton.cpp", NATIVE_FLAGS),
     (_HERE / "surface.cpp", NATIVE_FLAGS),
+    (_HERE / "crossing.cpp", CROSSING_FLAGS),
     (_HERE / "elements.cpp", NATIVE_FLAGS),
     (_HERE / "picture.cpp", NATIVE_FLAGS),
     (_HERE / "features.cpp", NATIVE_FLAGS),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -59,7 +60,7 @@ class Cloth:
     def num_vertices(self) -> int:
         return self.rest_pos.shape[0]
 
-    @property
+    @cached_property
     def free(self) -> Tensor:
         """Vertices that the simulation moves, (V,) bool: neither pinned nor isolated (massless)."""
         return ~self.pinned & (self.mass > 0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -97,6 +97,7 @@ class BodyMotion:
     device: torch.device
     _cache: dict[int, Tensor]
     _bones: dict[int, Tensor] = field(default_factory=dict)  # joint transforms by chunk, float64
+    _placed: dict[int, tuple[bytes, Tensor]] = field(default_factory=dict)  # the last surfaces by frame, with their origins
 
     @property
     def name(self) -> str:
@@ -122,7 +123,7 @@ class BodyMotion:
         """(W, 3) m, relative to ``translation[frame]``, float64."""
         chunk = frame // _CHUNK
         if chunk not in self._cache:
-            _forget(self._cache, chunk)
+            _forget(self._cache, chunk, 1)
             self._cache[chunk] = self.body.surface(self._window(chunk), self.betas, torch.float64).to(self.device)
         return self._cache[chunk][frame % _CHUNK]
 
@@ -133,7 +134,7 @@ class BodyMotion:
         """(1, J, 3, 4) rest-to-posed joint transforms at ``frame``, in ``dtype``."""
         chunk = frame // _CHUNK
         if chunk not in self._bones:
-            _forget(self._bones, chunk)
+            _forget(self._bones, chunk, 1)
             self._bones[chunk] = self.body.transforms(self._window(chunk), self.betas, torch.float64)
         return self._bones[chunk][frame % _CHUNK].unsqueeze(0).to(self.dtype)
 
@@ -152,27 +153,34 @@ class BodyMotion:
 
     def with_surfaces(self, chunks: Mapping[int, Tensor], device: torch.device | str) -> BodyMotion:
         """The same motion on ``device`` with surfaces posed before; none is posed again as long as all are given."""
-        return replace(self, device=torch.device(device), _cache={key: chunk.to(device) for key, chunk in chunks.items()})
+        kept = {key: chunk.to(device) for key, chunk in chunks.items()}
+        return replace(self, device=torch.device(device), _cache=kept, _placed={})
 
     def surface(self, frame: int, origin: np.ndarray) -> Tensor:
         """(W, 3) m, relative to ``origin`` (3,) float64."""
+        known, key = self._placed.get(frame), origin.tobytes()
+        if known is not None and known[0] == key:
+            return known[1]
+        _forget(self._placed, frame, 2)
         shift = torch.as_tensor(self.translation[frame] - origin).to(self.device)
         # Rounded once, at the end: a mesh that moves as this body does gives the same numbers.
-        return (self.local_surface(frame) + shift).to(self.dtype)
+        surface = (self.local_surface(frame) + shift).to(self.dtype)
+        self._placed[frame] = key, surface
+        return surface
 
     def obstacle(self, frame: int, origin: np.ndarray, static: bool = False) -> Obstacle:
         """The body around the step ``frame`` → ``frame + 1``; ``static`` freezes it at ``frame`` (relaxing step)."""
         now = self.surface(frame, origin)
         after = now if static else self.surface(frame + 1, origin)
         before = now if static or frame == 0 else self.surface(frame - 1, origin)
-        faces, omitted = _body_tensors(self.body, self.device)
+        faces, omitted, vertex_scene, face_scene = _body_tensors(self.body, self.device)
         return Obstacle(
             pos=now,
             next_pos=after,
             prev_pos=before,
             faces=faces,
-            vertex_scene=faces.new_zeros(len(now)),
-            face_scene=faces.new_zeros(len(faces)),
+            vertex_scene=vertex_scene,
+            face_scene=face_scene,
             omitted=omitted,
         )
 
@@ -210,20 +218,22 @@ def body_motion(
     return BodyMotion(body, sequence, betas, body.translation(sequence, betas), dtype, torch.device(device), {})
 
 
-def _forget(chunks: dict[int, Tensor], chunk: int) -> None:
-    """Drop what lies apart from ``chunk``: two chunks cover the three frames around any step."""
-    for old in [key for key in chunks if abs(key - chunk) > 1]:
-        del chunks[old]
+def _forget(kept: dict[int, Any], place: int, reach: int) -> None:
+    """Drop what lies apart from ``place``: two chunks cover the three frames around any step."""
+    for old in [key for key in kept if abs(key - place) > reach]:
+        del kept[old]
 
 
-_TENSORS: dict[tuple[int, str], tuple[Body, Tensor, Tensor]] = {}
+_TENSORS: dict[tuple[int, str], tuple[Body, tuple[Tensor, ...]]] = {}
 
 
-def _body_tensors(body: Body, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Faces and omitted vertices, one tensor each per body object: the search keeps its incidence table with the faces."""
+def _body_tensors(body: Body, device: torch.device) -> tuple[Tensor, ...]:
+    """Faces, omitted vertices, and the scene of vertices and faces, one tensor each per body object: the search keeps what it
+    knows of a surface with them."""
     key = (id(body), str(device))
     entry = _TENSORS.get(key)
     if entry is None or entry[0] is not body:
-        entry = body, torch.as_tensor(body.faces, device=device), torch.as_tensor(body.omitted, device=device)
-        _TENSORS[key] = entry
-    return entry[1:]
+        faces = torch.as_tensor(body.faces, device=device)
+        scenes = faces.new_zeros(len(body.v_template)), faces.new_zeros(len(faces))
+        entry = _TENSORS[key] = body, (faces, torch.as_tensor(body.omitted, device=device), *scenes)
+    return entry[1]

@@ -52,9 +52,9 @@ class StepInput:
     attachments: Attachments | None = None
 
     def __post_init__(self) -> None:
-        sound = torch.isfinite(self.dt) & (self.dt > 0)
-        if self.dt.ndim != 1 or not bool(sound.all()):
-            scene = int(sound.reshape(-1).long().argmin())
+        sound = [0.0 < dt < float("inf") for dt in self.dt.reshape(-1).tolist()]
+        if self.dt.ndim != 1 or not all(sound):
+            scene = sound.index(False) if False in sound else 0
             raise ValueError(
                 f"time step: dt of scene {scene} is {self.dt.reshape(-1)[scene]} in shape {tuple(self.dt.shape)}; give one "
                 "finite number of seconds > 0 per scene, shape (num_scenes,)"

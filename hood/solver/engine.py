@@ -176,7 +176,8 @@ def _num_attachments(problem: StepProblem) -> int:
 
 
 def _whole(values: Tensor) -> Tensor:
-    return values.detach().double().contiguous()
+    sound = values.dtype is torch.float64 and values.is_contiguous() and not values.requires_grad
+    return values if sound else values.detach().double().contiguous()
 
 
 def _array(values: Tensor) -> np.ndarray:

@@ -109,8 +109,8 @@ def minimize(
         start = start.detach().to(work.state.pos.dtype)
     system = _system(potential, work, plan, settings)
     system.begin(start)
-    report = _run(system, work.state.pos, settings, began, proceed)
-    return rounded(problem, system.state()[0]), replace(report, acc=report.acc.to(problem.state.pos.dtype))
+    pos, report = _run(system, work.state.pos, settings, began, proceed)
+    return rounded(problem, pos), replace(report, acc=report.acc.to(problem.state.pos.dtype))
 
 
 @torch.no_grad()
@@ -218,8 +218,10 @@ def _say_once(sentence: str) -> None:
     warnings.warn(sentence, stacklevel=4)
 
 
-def _run(system: System, like: Tensor, settings: NewtonSettings, began: float, proceed: Proceed | None) -> Report:
-    """The iterations of ``system``; what is reported has the precision and device of ``like``."""
+def _run(
+    system: System, like: Tensor, settings: NewtonSettings, began: float, proceed: Proceed | None
+) -> tuple[Tensor, Report]:
+    """The iterations of ``system``: positions (V, 3) and a report in the precision and on the device of ``like``."""
     phi = system.phi
     finite, stuck, why = [math.isfinite(value) for value in phi], [False] * len(phi), MOST_ITERATIONS
     history: list[Progress] = []
@@ -229,7 +231,7 @@ def _run(system: System, like: Tensor, settings: NewtonSettings, began: float, p
         finite = [sound and math.isfinite(value) for sound, value in zip(finite, residual, strict=True)]
         wanted = [sound and value > settings.target_rg for sound, value in zip(finite, residual, strict=True)]
         active = [scene and not halted for scene, halted in zip(wanted, stuck, strict=True)]
-        history.append(Progress(time.perf_counter() - began, like.new_tensor(system.phi), like.new_tensor(residual)))
+        history.append(Progress(time.perf_counter() - began, _tensor(like, system.phi), _tensor(like, residual)))
         late = settings.budget_ms is not None and 1e3 * history[-1].seconds > settings.budget_ms
         if late or iteration >= settings.max_iterations or not any(active):
             why = LATE if late else why
@@ -243,7 +245,13 @@ def _run(system: System, like: Tensor, settings: NewtonSettings, began: float, p
     reason = tuple(_reason(*scene, otherwise=why) for scene in zip(finite, wanted, stuck, strict=True))
     last = history[-1]
     converged = torch.tensor([not left for left in reason], device=like.device)
-    return Report(iteration, system.used, last.phi, last.relative_gradient, converged, reason, system.state()[1], history)
+    pos, acc = system.state()
+    return pos, Report(iteration, system.used, last.phi, last.relative_gradient, converged, reason, acc, history)
+
+
+def _tensor(like: Tensor, values: list[float]) -> Tensor:
+    # One number is filled in at half the price of a list.
+    return like.new_full((1,), values[0]) if len(values) == 1 else like.new_tensor(values)
 
 
 def _reason(finite: bool, wanted: bool, stuck: bool, otherwise: str) -> str:
