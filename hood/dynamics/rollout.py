@@ -289,8 +289,9 @@ def energy_metrics(
     guess = inertial_guess(problem.state, problem.step, problem.cloth.vertex_scene)
     if problem.step.pin_target is not None:
         guess = torch.where(problem.cloth.pinned.unsqueeze(1), problem.step.pin_target, guess)
-    result["energy_inertial_guess"] = float(total_energy(potential, problem, guess).sum())
-    result["gradient_norm"] = float(gradient[free].norm(dim=1).mean()) if bool(free.any()) else 0.0
+    result["energy_inertial_guess"] = float(total_energy(potential, problem, guess, by=forces.total_energy).sum())
+    count = int(free.sum())
+    result["gradient_norm"] = float(gradient.norm(dim=1)[free].sum()) / count if count else 0.0
     result["relative_gradient"] = float(relative_gradient(problem, gradient * free.unsqueeze(1)).mean())
     result["e0"] = float(scale(problem).sum())
     return result

@@ -24,25 +24,27 @@ from hood.losses.problem import StepProblem
 from hood.losses.stretching import Stretching
 from hood.mesh.kept import forget
 from hood.native.build import optional
-from hood.native.structures import COUNT, POINTER
+from hood.native.structures import COUNT, POINTER, fields
 from hood.scene.cloth import Cloth
 
 SOURCE = Path(native.__file__).with_name("elements.cpp")
+_LANES = 8
 #: Terms of the pass. A subclass may compute something else and does not count.
 ELEMENT_TERMS = (Stretching, Bending, CurrentLengthBending)
 
 #: Energies [J] (B,) by term, and their gradient [N] (V, 3) before them, of a potential.
 Evaluate = Callable[[Potential, StepProblem, Tensor, Tensor | None], tuple[Tensor, dict[str, Tensor]]]
 
+#: Potential [J] (B,) of a step at positions (V, 3).
+Sum = Callable[[Potential, StepProblem, Tensor], Tensor]
+
 
 class _Faces(ctypes.Structure):
-    _fields_ = [("count", COUNT)] + [(name, POINTER) for name in ("corners", "scene", "inverse", "weight", "mu", "lambda_")]
+    _fields_ = [*fields("count padded", COUNT), *fields("corners scene inverse weight mu lambda_", POINTER)]
 
 
 class _Hinges(ctypes.Structure):
-    _fields_ = [("count", COUNT), ("current_length", COUNT)] + [
-        (name, POINTER) for name in ("corners", "scene", "weight", "rest_angle")
-    ]
+    _fields_ = [*fields("count padded current_length", COUNT), *fields("corners scene weight rest_angle", POINTER)]
 
 
 class _Constants(NamedTuple):
@@ -77,13 +79,14 @@ def energies_and_gradient(
 
 
 @torch.no_grad()
-def total_energy(potential: Potential, problem: StepProblem, next_pos: Tensor) -> Tensor:
-    """Potential Φ [J] per scene (B,), what :meth:`hood.losses.potential.Potential.total` computes."""
+def total_energy(potential: Potential, problem: StepProblem, next_pos: Tensor, by: Sum = Potential.total) -> Tensor:
+    """Potential Φ [J] per scene (B,), what :meth:`hood.losses.potential.Potential.total` computes, element terms by the
+    compiled pass and others ``by`` another function."""
     if not _applies(next_pos):
-        return potential.total(problem, next_pos)
+        return by(potential, problem, next_pos)
     others, _ = _split(potential)
     values = _element_energies(potential, problem, next_pos, None).values()
-    return sum(values, start=others.total(problem, next_pos).double())
+    return sum(values, start=by(others, problem, next_pos).double())
 
 
 def absolute_strain(cloth: Cloth, pos: Tensor) -> np.ndarray | None:
@@ -145,23 +148,33 @@ def _constants_of(cloth: Cloth) -> _Constants:
 
 def _make_constants(cloth: Cloth) -> _Constants:
     stiffness, area = cloth.bending_stiffness.double(), cloth.hinge_area.double()
-    faces = (cloth.faces, cloth.face_scene, cloth.rest_inverse, cloth.rest_area.double() * cloth.thickness.double())
+    faces = (cloth.faces, cloth.face_scene, cloth.rest_inverse.flatten(1), cloth.rest_area.double() * cloth.thickness.double())
     weights = (
         bending_weight(stiffness, length_sq, area) for length_sq in (cloth.rest_length.double() ** 2, torch.ones_like(area))
     )
     tables = [[*faces, cloth.lame_mu, cloth.lame_lambda]]
     tables += [[cloth.hinges, cloth.hinge_scene, weight, cloth.rest_angle] for weight in weights]
-    kept = [[_whole(tensor) for tensor in table] for table in tables]
+    kept = [[_padded(tensor) for tensor in table] for table in tables]
+    sizes = [(len(elements), table[1].shape[-1]) for elements, table in zip((cloth.faces, cloth.hinges), kept, strict=False)]
     ends = cloth.edges.unbind(dim=1)
     rest = cloth.rest_pos.double()
     return _Constants(
-        _Faces(len(cloth.faces), *(array.ctypes.data for array in kept[0])),
-        _Hinges(len(cloth.hinges), 0, *(array.ctypes.data for array in kept[1])),
-        _Hinges(len(cloth.hinges), 1, *(array.ctypes.data for array in kept[2])),
+        _Faces(*sizes[0], *(array.ctypes.data for array in kept[0])),
+        _Hinges(*sizes[1], 0, *(array.ctypes.data for array in kept[1])),
+        _Hinges(*sizes[1], 1, *(array.ctypes.data for array in kept[2])),
         _whole(cloth.edges),
         _whole((rest[ends[1]] - rest[ends[0]]).norm(dim=1)),
         [array for table in kept for array in table],
     )
+
+
+def _padded(values: Tensor) -> np.ndarray:
+    """Columns (N,) or (C, N) of elements (N,) or (N, C), N filled up to a multiple of eight: with what weighs nothing."""
+    array = values.detach().numpy().T
+    kind = np.float64 if values.is_floating_point() else np.int32
+    whole = np.zeros((*array.shape[:-1], -(-array.shape[-1] // _LANES) * _LANES), kind)
+    whole[..., : array.shape[-1]] = array
+    return whole
 
 
 def _whole(values: Tensor) -> np.ndarray:

@@ -1,10 +1,12 @@
 // Energies of membrane and bending with their gradients, and edge strain: one pass over the elements of a cloth, in float64.
 //
-// Elements are taken in their order and added up in it, so that a result is the same in every run.
+// Elements are taken eight at a time, one per lane; what they give is added up in their order, so that a result is the same in
+// every run. Tables of elements are padded to a multiple of eight.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
 
+#include "lanes.h"
 #include "vector.h"
 
 namespace {
@@ -13,76 +15,118 @@ constexpr double EPS = 2.220446049250313e-16, TINY = 2.2250738585072014e-308;
 constexpr double DEGENERATE = (8.0 * EPS) * (8.0 * EPS);  // square of a sine, as in hood.mesh.geometry
 constexpr double TURN = 6.283185307179586476925;
 
-inline void add(double* p, int64_t i, Vec a) { p[3 * i] += a.x, p[3 * i + 1] += a.y, p[3 * i + 2] += a.z; }
-inline double largest(Vec a) { return std::max(std::fabs(a.x), std::max(std::fabs(a.y), std::fabs(a.z))); }
+inline V8 larger(V8 a, V8 b) { return a > b ? a : b; }
+inline V8 largest(const V8* a) { return larger(magnitude(a[0]), larger(magnitude(a[1]), magnitude(a[2]))); }
+inline I8 regular(V8 cross_sq, V8 product_sq) { return (cross_sq > DEGENERATE * product_sq) & (cross_sq > all(TINY / EPS)); }
 
-inline bool regular(double cross_sq, double product_sq) { return cross_sq > DEGENERATE * product_sq && cross_sq > TINY / EPS; }
+// One corner of eight elements.
+inline void gather(const double* pos, const int32_t* corner, V8* x) {
+    alignas(64) double axes[3][LANES];
+    for (int lane = 0; lane < LANES; ++lane)
+        for (int k = 0; k < 3; ++k) axes[k][lane] = pos[3 * (int64_t)corner[lane] + k];
+    for (int k = 0; k < 3; ++k) x[k] = load<V8>(axes[k]);
+}
+
+// Adds the energies of ``count`` lanes to their scenes.
+inline void add_energy(V8 value, const int32_t* scene, int count, double* energy) {
+    for (int lane = 0; lane < count; ++lane) energy[scene[lane]] += value[lane];
+}
+
+// Adds forces on CORNERS corners of ``count`` elements, of a table of ``padded`` ones, to the gradient.
+template <int CORNERS> inline void scatter(const V8 (*force)[3], const int32_t* corners, int64_t padded, int count, double* gradient) {
+    alignas(64) double table[CORNERS][3][LANES];
+    for (int c = 0; c < CORNERS; ++c)
+        for (int k = 0; k < 3; ++k) store(table[c][k], force[c][k]);
+    for (int lane = 0; lane < count; ++lane)
+        for (int c = 0; c < CORNERS; ++c)
+            for (int k = 0; k < 3; ++k) gradient[3 * (int64_t)corners[c * padded + lane] + k] += table[c][k][lane];
+}
 
 }  // namespace
 
 extern "C" {
 
 struct Faces {
-    int64_t count;
-    const int64_t *corners, *scene;             // (F, 3), (F)
-    const double *inverse, *weight, *mu, *lambda;  // (F, 4) 1/m, (F) m^3, Pa, Pa
+    int64_t count, padded;
+    const int32_t *corners, *scene;                // (3, F), (F)
+    const double *inverse, *weight, *mu, *lambda;  // (4, F) 1/m, (F) m^3, Pa, Pa
 };
 
 struct Hinges {
-    int64_t count, current_length;     // 1: the code's form, with the edge's length now and about flat
-    const int64_t *corners, *scene;    // (H, 4), (H)
-    const double *weight, *rest_angle; // (H) J, or J/m^2 with the current length; rad
+    int64_t count, padded, current_length;  // 1: the code's form, with the edge's length now and about flat
+    const int32_t *corners, *scene;         // (4, H), (H)
+    const double *weight, *rest_angle;      // (H) J, or J/m^2 with the current length; rad
 };
 
 // Adds the membrane's energies [J] to those of the scenes, and its gradient (V, 3) [N] if there is room for it.
 void elements_faces(const Faces* faces, const double* pos, double* energy, double* gradient) {
-    for (int64_t i = 0; i < faces->count; ++i) {
-        const int64_t* c = faces->corners + 3 * i;
-        const Vec x = at(pos, c[0]), d1 = at(pos, c[1]) - x, d2 = at(pos, c[2]) - x;
-        const double* m = faces->inverse + 4 * i;
-        const Vec f0 = m[0] * d1 + m[2] * d2, f1 = m[1] * d1 + m[3] * d2;
-        const double g00 = 0.5 * (dot(f0, f0) - 1.0), g01 = 0.5 * dot(f0, f1), g11 = 0.5 * (dot(f1, f1) - 1.0);
-        const double trace = g00 + g11, square = g00 * g00 + g11 * g11 + 2.0 * g01 * g01;
-        const double weight = faces->weight[i], mu = faces->mu[i], lambda = faces->lambda[i];
-        energy[faces->scene[i]] += weight * (mu * square + 0.5 * lambda * trace * trace);
+    const int64_t padded = faces->padded;
+    for (int64_t i = 0; i < faces->count; i += LANES) {
+        const int count = (int)std::min<int64_t>(LANES, faces->count - i);
+        const int32_t* corners = faces->corners + i;
+        V8 x[3][3], f0[3], f1[3], m[4];
+        for (int c = 0; c < 3; ++c) gather(pos, corners + c * padded, x[c]);
+        for (int c = 0; c < 4; ++c) m[c] = load<V8>(faces->inverse + c * padded + i);
+        for (int k = 0; k < 3; ++k) {
+            const V8 d1 = x[1][k] - x[0][k], d2 = x[2][k] - x[0][k];
+            f0[k] = m[0] * d1 + m[2] * d2, f1[k] = m[1] * d1 + m[3] * d2;
+        }
+        const V8 g00 = 0.5 * (dot(f0, f0) - 1.0), g01 = 0.5 * dot(f0, f1), g11 = 0.5 * (dot(f1, f1) - 1.0);
+        const V8 trace = g00 + g11, square = g00 * g00 + g11 * g11 + 2.0 * g01 * g01;
+        const V8 weight = load<V8>(faces->weight + i), mu = load<V8>(faces->mu + i), lambda = load<V8>(faces->lambda + i);
+        add_energy(weight * (mu * square + 0.5 * lambda * trace * trace), faces->scene + i, count, energy);
         if (!gradient) continue;
         // First Piola-Kirchhoff stress F S, S = 2 mu G + lambda tr G, pulled back to the two edges.
-        const double s00 = 2.0 * mu * g00 + lambda * trace, s01 = 2.0 * mu * g01, s11 = 2.0 * mu * g11 + lambda * trace;
-        const Vec p0 = weight * (s00 * f0 + s01 * f1), p1 = weight * (s01 * f0 + s11 * f1);
-        const Vec by1 = m[0] * p0 + m[1] * p1, by2 = m[2] * p0 + m[3] * p1;
-        add(gradient, c[1], by1), add(gradient, c[2], by2), add(gradient, c[0], -(by1 + by2));
+        const V8 s00 = weight * (2.0 * mu * g00 + lambda * trace), s01 = weight * 2.0 * mu * g01;
+        const V8 s11 = weight * (2.0 * mu * g11 + lambda * trace);
+        V8 force[3][3];
+        for (int k = 0; k < 3; ++k) {
+            const V8 p0 = s00 * f0[k] + s01 * f1[k], p1 = s01 * f0[k] + s11 * f1[k];
+            force[1][k] = m[0] * p0 + m[1] * p1, force[2][k] = m[2] * p0 + m[3] * p1;
+            force[0][k] = -(force[1][k] + force[2][k]);
+        }
+        scatter<3>(force, corners, padded, count, gradient);
     }
 }
 
 // The same for bending; hinges with a degenerate face have the angle 0 and no force.
 void elements_hinges(const Hinges* hinges, const double* pos, double* energy, double* gradient) {
-    for (int64_t i = 0; i < hinges->count; ++i) {
-        const int64_t* c = hinges->corners + 4 * i;
-        const Vec x = at(pos, c[0]), e = at(pos, c[1]) - x, a = at(pos, c[2]) - x, b = at(pos, c[3]) - x;
-        const double size = std::max(std::max(largest(e), std::max(largest(a), largest(b))), TINY), scale = 1.0 / size;
-        const Vec edge = scale * e, arm_a = scale * a, arm_b = scale * b, n1 = cross(edge, arm_a), n2 = cross(arm_b, edge);
-        const double edge_sq = dot(edge, edge), n1_sq = dot(n1, n1), n2_sq = dot(n2, n2);
-        const bool sound = regular(n1_sq, edge_sq * dot(arm_a, arm_a)) && regular(n2_sq, edge_sq * dot(arm_b, arm_b));
-        const double length = std::sqrt(edge_sq), angle = sound ? std::atan2(-length * dot(n1, arm_b), dot(n1, n2)) : 0.0;
-        const double factor = hinges->weight[i] * (hinges->current_length ? dot(e, e) : 1.0);
-        double bend = angle;
+    const int64_t padded = hinges->padded;
+    const V8 zero = all(0.0), one = all(1.0);
+    for (int64_t i = 0; i < hinges->count; i += LANES) {
+        const int count = (int)std::min<int64_t>(LANES, hinges->count - i);
+        const int32_t* corners = hinges->corners + i;
+        V8 x[4][3], e[3], edge[3], arm_a[3], arm_b[3], n1[3], n2[3];
+        for (int c = 0; c < 4; ++c) gather(pos, corners + c * padded, x[c]);
+        for (int k = 0; k < 3; ++k) e[k] = x[1][k] - x[0][k], arm_a[k] = x[2][k] - x[0][k], arm_b[k] = x[3][k] - x[0][k];
+        const V8 size = larger(larger(largest(e), larger(largest(arm_a), largest(arm_b))), all(TINY)), scale = 1.0 / size;
+        for (int k = 0; k < 3; ++k) edge[k] = scale * e[k], arm_a[k] *= scale, arm_b[k] *= scale;
+        cross(edge, arm_a, n1), cross(arm_b, edge, n2);
+        const V8 edge_sq = dot(edge, edge), n1_sq = dot(n1, n1), n2_sq = dot(n2, n2);
+        const I8 sound = regular(n1_sq, edge_sq * dot(arm_a, arm_a)) & regular(n2_sq, edge_sq * dot(arm_b, arm_b));
+        const V8 length = root(edge_sq), along = dot(n1, arm_b), level = dot(n1, n2);
+        const V8 angle = angle_of(sound ? -length * along : zero, sound ? level : one);
+        const V8 weight = load<V8>(hinges->weight + i), factor = hinges->current_length ? weight * dot(e, e) : weight;
+        V8 bend = angle;
         if (!hinges->current_length) {
-            bend -= hinges->rest_angle[i];
-            bend -= TURN * std::nearbyint(bend / TURN);
+            bend -= load<V8>(hinges->rest_angle + i);
+            // Both angles are within a half turn, so at most one turn is off.
+            bend -= bend > 0.5 * TURN ? all(TURN) : bend < -0.5 * TURN ? all(-TURN) : zero;
         }
-        energy[hinges->scene[i]] += 0.5 * factor * bend * bend;
+        add_energy(0.5 * factor * bend * bend, hinges->scene + i, count, energy);
         if (!gradient) continue;
-        if (hinges->current_length) {
-            const Vec along = (hinges->weight[i] * bend * bend) * e;
-            add(gradient, c[1], along), add(gradient, c[0], -along);
-        }
-        if (!sound) continue;
         // The angle's slopes at the opposite vertices; those at the edge's ends follow from no net force and torque.
-        const double pull = -factor * bend * length * scale;
-        const Vec at_a = (pull / n1_sq) * n1, at_b = (pull / n2_sq) * n2;
-        const Vec at_end = -((dot(edge, arm_a) / edge_sq) * at_a + (dot(edge, arm_b) / edge_sq) * at_b);
-        add(gradient, c[2], at_a), add(gradient, c[3], at_b), add(gradient, c[1], at_end);
-        add(gradient, c[0], -(at_a + at_b + at_end));
+        const V8 pull = sound ? -factor * bend * length * scale : zero, safe = sound ? edge_sq : one;
+        const V8 by_a = pull / (sound ? n1_sq : one), by_b = pull / (sound ? n2_sq : one);
+        const V8 share_a = dot(edge, arm_a) / safe, share_b = dot(edge, arm_b) / safe, stretch = weight * bend * bend;
+        V8 force[4][3];
+        for (int k = 0; k < 3; ++k) {
+            const V8 at_a = by_a * n1[k], at_b = by_b * n2[k], at_end = -(share_a * at_a + share_b * at_b);
+            const V8 pulled = hinges->current_length ? stretch * e[k] : zero;
+            force[2][k] = at_a, force[3][k] = at_b, force[1][k] = at_end + pulled;
+            force[0][k] = -(at_a + at_b + at_end) - pulled;
+        }
+        scatter<4>(force, corners, padded, count, gradient);
     }
 }
 

@@ -28,7 +28,7 @@ from hood.native.threads import num_parts
 from hood.scene.cloth import Cloth
 from hood.solver.elements import BENDINGS, face_constants, hinge_constants
 from hood.solver.engine_tables import Tables, build_tables, point_uses
-from hood.solver.forces import Grip, VertexForces, Walls, attachment_stiffness, other_terms, vertex_forces
+from hood.solver.forces import Grip, VertexForces, Walls, attachment_stiffness, known_forces, other_terms
 from hood.solver.iterate import fixed_positions
 from hood.solver.plan import SolverPlan
 from hood.solver.points import PointForces, point_forces
@@ -150,7 +150,7 @@ class EngineStep:
 def engine_step(potential: Potential, problem: StepProblem) -> EngineStep:
     """The step ``problem``, in float64 and prepared, with the terms of ``potential``."""
     terms = [term for term in potential.terms.values() if term.applies(problem)]
-    forces: VertexForces = vertex_forces(potential, problem)
+    forces: VertexForces = known_forces(potential, problem)
     bending = next((term for term in terms if type(term) in BENDINGS), None)
     springs = [attachment_stiffness(term, problem) for term in terms if type(term) is Attachment]
     stiffness = torch.stack(springs).sum(0) if springs else problem.state.pos.new_zeros(_num_attachments(problem))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from dataclasses import dataclass
 
 import torch
@@ -15,6 +16,7 @@ from hood.losses.inertia import Inertia
 from hood.losses.potential import Potential, Term
 from hood.losses.problem import StepProblem
 from hood.losses.stretching import Stretching
+from hood.mesh.kept import forget
 from hood.solver.elements import BENDINGS
 
 COLLISIONS = (Collision, CentroidCollision)
@@ -192,6 +194,21 @@ def _friction(grip: Grip, pos: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return slope[:, None] * slip, matrix, _outer((along - slope)[:, None] * heading, heading)
 
 
+#: Forces of the last steps that were asked about, as long as these live: by the solver, and by those who measure.
+_FORCES: dict[int, tuple[weakref.ref[StepProblem], list[Term], VertexForces]] = {}
+
+
+@torch.no_grad()
+def known_forces(potential: Potential, problem: StepProblem) -> VertexForces:
+    """What :func:`vertex_forces` gathers, once for a step and the same terms."""
+    key, terms = id(problem), [term for term in potential.terms.values() if type(term) in SINGLE]
+    known = _FORCES.get(key)
+    if known is None or known[0]() is not problem or [id(term) for term in known[1]] != [id(term) for term in terms]:
+        reference = weakref.ref(problem, forget(_FORCES, key))
+        known = _FORCES[key] = reference, terms, vertex_forces(potential, problem)
+    return known[2]
+
+
 @torch.no_grad()
 def energies_and_gradient(
     potential: Potential, problem: StepProblem, next_pos: Tensor, acc: Tensor | None = None
@@ -201,20 +218,47 @@ def energies_and_gradient(
     Contact that also acts inside edges and faces is left to autograd.
     """
     acc = problem.acceleration(next_pos) if acc is None else acc
-    gradient, energies = torch.zeros_like(next_pos), dict[str, Tensor]()
-    for name, term in potential.terms.items():
-        if not term.applies(problem):
-            continue
-        alone = Potential({name: term})
-        if type(term) not in SINGLE or getattr(term, "contact", "vertices") != "vertices":
-            slope, energy = alone.gradient(problem, next_pos, acc)
-            energies |= energy
-        else:
-            forces = vertex_forces(alone, problem)
-            slope, parts = forces.gradient(next_pos, acc), forces.energies(next_pos, acc, problem.vertex_dt)
-            energies[name] = problem.sum_vertices(sum(parts, start=torch.zeros_like(parts[0])))
-        gradient = gradient + slope
-    return gradient, energies
+    single, rest = _split(potential)
+    energies = _single_energies(single, problem, next_pos, acc)
+    gradient = known_forces(single, problem).gradient(next_pos, acc)
+    if rest.active(problem):
+        slope, found = rest.gradient(problem, next_pos, acc)
+        gradient, energies = gradient + slope, energies | found
+    return gradient, {name: energies[name] for name in potential.terms if name in energies}
+
+
+@torch.no_grad()
+def total_energy(potential: Potential, problem: StepProblem, next_pos: Tensor) -> Tensor:
+    """What :meth:`hood.losses.potential.Potential.total` computes, (B,) J; terms of single vertices in closed form."""
+    single, rest = _split(potential)
+    energies = list(_single_energies(single, problem, next_pos, problem.acceleration(next_pos)).values())
+    if rest.active(problem):
+        energies.append(rest.total(problem, next_pos))
+    return sum(energies, start=next_pos.new_zeros(problem.num_scenes))
+
+
+def _split(potential: Potential) -> tuple[Potential, Potential]:
+    """The terms that act on single vertices alone, and the others."""
+    single = {
+        name: term
+        for name, term in potential.terms.items()
+        if type(term) in SINGLE and getattr(term, "contact", "vertices") == "vertices"
+    }
+    return potential.only(single), potential.only({n: term for n, term in potential.terms.items() if n not in single})
+
+
+def _single_energies(potential: Potential, problem: StepProblem, pos: Tensor, acc: Tensor) -> dict[str, Tensor]:
+    """Energies [J] (B,) by term of those that act on single vertices."""
+    named = potential.active(problem)
+    # In the order of VertexForces.energies; of two terms that it adds up into one each is asked alone.
+    kinds = (Inertia, Gravity, COLLISIONS, FRICTIONS)
+    names = [[name for name, term in named.items() if isinstance(term, kind)] for kind in kinds]
+    if len(names[0]) > 1 or len(names[1]) > 1:
+        alone = (potential.only({name: term}) for name, term in named.items())
+        return {name: value for part in alone for name, value in _single_energies(part, problem, pos, acc).items()}
+    parts = known_forces(potential, problem).energies(pos, acc, problem.vertex_dt)
+    order = [(names[0] or [""])[0], (names[1] or [""])[0], *names[2], *names[3]]
+    return {name: problem.sum_vertices(part) for name, part in zip(order, parts, strict=True) if name}
 
 
 def attachment_stiffness(term: Term, problem: StepProblem) -> Tensor:
