@@ -14,7 +14,7 @@ from hood.scene.cloth import Cloth, build_cloth, concatenate_cloths
 from hood.scene.contact import find_contact
 from hood.scene.contact_points import PointContact, find_point_contact
 from hood.scene.state import Obstacle, concatenate_obstacles
-from hood.testing import cylinder, grid, sphere
+from hood.testing import box, cylinder, grid, sphere
 
 F64 = torch.float64
 
@@ -90,8 +90,21 @@ def test_bare_skin_beyond_a_hem_is_not_under_cloth() -> None:
     skin = points.weights[:, 2] > 0
     reach = (points.point[:, axis] - arm[:, axis].mean()).abs()
     assert 50 < int(skin.sum())
-    assert float(reach.max()) < 0.12  # the sleeve ends at 0.1
+    assert float(reach.max()) < 0.105  # the sleeve ends at 0.1, the next ring of the arm is at 0.117
     assert float(points.dist.min()) > -0.002
+
+
+def test_skin_that_looks_away_is_not_under_cloth() -> None:
+    """Cloth on a slab of 10 mm is below the tangent planes of its lower side, 12 mm away."""
+    slab, slab_faces = box(6, 0.3)
+    low, high = slab.min(axis=0), slab.max(axis=0)
+    slab = slab * [1.0, 0.01 / (high - low)[1], 1.0]
+    pos, faces = grid(8, 8, 0.2)
+    cloth = build_cloth(pos - pos.mean(axis=0) + slab.mean(axis=0) + [0.0, 0.007, 0.0], faces, Material(), dtype=F64)
+    points = found("strict", cloth, cloth.rest_pos, body(slab, slab_faces))
+    skin = points.weights[:, 2] > 0
+    assert int(skin.sum()) >= 9
+    assert float((points.dist - 0.002).abs().max()) < 1e-6
 
 
 def test_rims_alone_have_midpoints_in_the_strict_form() -> None:
