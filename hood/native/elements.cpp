@@ -1,4 +1,5 @@
-// Energies of membrane and bending with their gradients, and edge strain: one pass over the elements of a cloth, in float64.
+// Energies of membrane and bending, and of what acts on single vertices, with their gradients, and edge strain: one pass over the
+// elements of a cloth, in float64.
 //
 // Elements are taken eight at a time, one per lane; what they give is added up in their order, so that a result is the same in
 // every run. Tables of elements are padded to a multiple of eight.
@@ -8,6 +9,7 @@
 
 #include "lanes.h"
 #include "vector.h"
+#include "vertex_terms.h"
 
 namespace {
 
@@ -127,6 +129,47 @@ void elements_hinges(const Hinges* hinges, const double* pos, double* energy, do
             force[0][k] = -(at_a + at_b + at_end) - pulled;
         }
         scatter<4>(force, corners, padded, count, gradient);
+    }
+}
+
+// What acts on single vertices: inertia, gravity, collision and friction terms.
+struct Vertices {
+    int64_t count, num_scenes, num_walls, num_grips;
+    const int64_t* scene;                          // (V)
+    const double *inertia, *stiffness, *weight;    // (V) kg, (V) N/m, (V, 3) N
+    const double* dt;                              // (B) s
+    const Wall* walls;
+    const Grip* grips;
+};
+
+// Adds the energies [J] (2 + W + G, B) of inertia, gravity, walls and grips at positions and accelerations (V, 3), and their
+// gradient (V, 3) [N] if there is room for it.
+void elements_vertices(const Vertices* all, const double* pos, const double* acc, double* energy, double* gradient) {
+    const int64_t scenes = all->num_scenes;
+    for (int64_t v = 0; v < all->count; ++v) {
+        const int64_t scene = all->scene[v];
+        const double *x = pos + 3 * v, *a = acc + 3 * v, *weight = all->weight + 3 * v, dt_sq = all->dt[scene] * all->dt[scene];
+        energy[scene] += 0.5 * all->stiffness[v] * dt_sq * dt_sq * dot3(a, a);
+        energy[scenes + scene] -= dot3(weight, x);
+        double force[3];
+        for (int k = 0; k < 3; ++k) force[k] = all->inertia[v] * a[k] - weight[k];
+        for (int64_t w = 0; w < all->num_walls; ++w) {
+            const Wall& wall = all->walls[w];
+            energy[(2 + w) * scenes + scene] += wall_energy(wall, v, x);
+            const double depth = depth_of(wall, v, x);
+            if (depth <= 0.0) continue;
+            for (int k = 0; k < 3; ++k) force[k] -= 3.0 * weight_of(wall, v) * depth * depth * wall.normal[3 * v + k];
+        }
+        for (int64_t w = 0; w < all->num_grips; ++w) {
+            const Grip& grip = all->grips[w];
+            if (!(grip.force[v] > 0.0)) continue;
+            energy[(2 + all->num_walls + w) * scenes + scene] += grip_energy(grip, v, x);
+            double slip[3];
+            const double slope = slope_of(grip, v, slip_of(grip, v, x, slip));
+            for (int k = 0; k < 3; ++k) force[k] += slope * slip[k];
+        }
+        if (gradient)
+            for (int k = 0; k < 3; ++k) gradient[3 * v + k] += force[k];
     }
 }
 

@@ -10,14 +10,12 @@
 #include <cstdint>
 #include <cstring>
 
+#include "lanes.h"
 #include "threads.h"
+#include "vertex_terms.h"
 
 namespace {
 
-constexpr int LANES = 8;
-
-typedef double V8 __attribute__((vector_size(64)));
-typedef decltype(V8{} < V8{}) I8;
 typedef double D4 __attribute__((vector_size(32)));
 typedef float F4 __attribute__((vector_size(16)));
 
@@ -25,68 +23,11 @@ template <class T> struct Four;
 template <> struct Four<float> { typedef F4 type; };
 template <> struct Four<double> { typedef D4 type; };
 
-template <class V, class T> inline V load(const T* p) {
-    V v;
-    std::memcpy(&v, p, sizeof(V));
-    return v;
-}
-template <class T, class V> inline void store(T* p, V v) { std::memcpy(p, &v, sizeof(V)); }
-
-inline double dot3(const double* a, const double* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
-
-inline V8 all(double x) { return V8{x, x, x, x, x, x, x, x}; }
-inline double total(V8 v) { return ((v[0] + v[4]) + (v[1] + v[5])) + ((v[2] + v[6]) + (v[3] + v[7])); }
-inline V8 root(V8 v) {
-    alignas(64) double lanes[LANES];
-    store(lanes, v);
-    for (int i = 0; i < LANES; ++i) lanes[i] = std::sqrt(lanes[i]);
-    return load<V8>(lanes);
-}
-inline V8 magnitude(V8 v) { return v < 0.0 ? -v : v; }
-inline V8 dot(const V8* a, const V8* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
-inline void cross(const V8* a, const V8* b, V8* c) {
-    c[0] = a[1] * b[2] - a[2] * b[1];
-    c[1] = a[2] * b[0] - a[0] * b[2];
-    c[2] = a[0] * b[1] - a[1] * b[0];
-}
-
-// Coefficients of (atan(t) / t - 1) / t^2 in t^2 up to tan(pi / 8), a Chebyshev fit with an error of 5e-18.
-constexpr double ATAN[] = {
-    -0.333333333333333302,  0.199999999999955207,   -0.142857142846665429,  0.111111110152563617,
-    -0.0909090457812390186, 0.0769218319082608591,  -0.0666451144738193878, 0.0585814891280212981,
-    -0.0508544973793984085, 0.0392316582955750863,  -0.0191768871190474343};
-
-V8 angle_of(V8 y, V8 x) {
-    const double quarter = 0.78539816339744830962, pi = 3.14159265358979323846;
-    const V8 a = magnitude(y), b = magnitude(x), zero = all(0.0), one = all(1.0);
-    const I8 steep = a > b;
-    const V8 low = steep ? b : a, high = steep ? a : b;
-    const I8 wide = low > 0.41421356237309504880 * high;
-    const V8 top = wide ? low - high : low, bottom = wide ? low + high : high;
-    const V8 t = top / (bottom > zero ? bottom : one), z = t * t;
-    V8 sum = all(ATAN[10]);
-    for (int i = 9; i >= 0; --i) sum = sum * z + ATAN[i];
-    V8 angle = t + t * z * sum;
-    angle = wide ? angle + quarter : angle;
-    angle = steep ? 0.5 * pi - angle : angle;
-    angle = x < 0.0 ? pi - angle : angle;
-    return y < 0.0 ? -angle : angle;
-}
-
 }  // namespace
 
 extern "C" {
 
-// A collision term as planes, or a friction term; rows of original vertices, zero where nothing acts.
-struct Wall {
-    const double *point, *normal, *reach;  // (V, 3), (V, 3), (V)
-    double weight;
-    const double* share;  // (V) factors of the weight; none for vertices
-};
-struct Grip {
-    const double *force, *normal, *anchor, *limit;  // (V), (V, 3), (V, 3), (V)
-};
-// The same at points inside edges and faces, weighted sums of up to three vertices; rows of points where those are of vertices.
+// Walls and grips at points inside edges and faces, weighted sums of up to three vertices; rows of points where those are of vertices.
 struct Points {
     int64_t count, num_walls, num_grips;
     const int32_t* corners;  // (N, 3), in the new numbering; what is not needed repeats one
@@ -362,29 +303,12 @@ template <class T> void hinge_models(const Engine& e, const double* pos, Range r
 
 // ---- single vertices -----------------------------------------------------------------------------------------------------
 
-inline double depth_of(const Wall& wall, int64_t v, const double* pos) {
-    const double *point = wall.point + 3 * v, *normal = wall.normal + 3 * v;
-    const double gap[3] = {pos[0] - point[0], pos[1] - point[1], pos[2] - point[2]};
-    return wall.reach[v] - dot3(gap, normal);
-}
-
-// Tangential slip; returns its length.
-inline double slip_of(const Grip& grip, int64_t v, const double* pos, double* slip) {
-    const double *anchor = grip.anchor + 3 * v, *normal = grip.normal + 3 * v;
-    for (int k = 0; k < 3; ++k) slip[k] = pos[k] - anchor[k];
-    const double along = dot3(slip, normal);
-    for (int k = 0; k < 3; ++k) slip[k] -= along * normal[k];
-    return std::sqrt(dot3(slip, slip));
-}
-
 // Upper triangles 00 01 02 11 12 22.
 inline void add_outer(double* upper, double factor, const double* n) {
     int place = 0;
     for (int a = 0; a < 3; ++a)
         for (int b = a; b < 3; ++b) upper[place++] += factor * n[a] * n[b];
 }
-
-inline double weight_of(const Wall& wall, int64_t v) { return wall.share ? wall.weight * wall.share[v] : wall.weight; }
 
 // Adds contact and friction at the position of a row of walls and grips; whether there is any. Set has the fields of Points.
 template <class Set> inline bool add_contact(const Set& set, int64_t v, const double* pos, double* gradient, double* upper, double* slack) {
@@ -405,8 +329,7 @@ template <class Set> inline bool add_contact(const Set& set, int64_t v, const do
         any = true;
         double slip[3];
         const double *normal = grip.normal + 3 * v, limit = grip.limit[v], size = slip_of(grip, v, pos, slip);
-        const double ratio = size / limit;
-        const double slope = force * (size < limit ? (2.0 - ratio) / limit : 1.0 / size);
+        const double ratio = size / limit, slope = slope_of(grip, v, size);
         const double along = size < limit ? force * 2.0 * (1.0 - ratio) / limit : 0.0;
         for (int k = 0; k < 3; ++k) gradient[k] += slope * slip[k];
         upper[0] += slope, upper[3] += slope, upper[5] += slope;
@@ -481,19 +404,6 @@ void place(const Engine& e, const double* acc, double* pos) {
         const double* base = e.base + 3 * e.vertex[row];
         for (int k = 0; k < 3; ++k) pos[4 * row + k] = base[k] + e.dt_sq * acc[4 * row + k];
     }
-}
-
-inline double wall_energy(const Wall& wall, int64_t v, const double* pos) {
-    const double depth = depth_of(wall, v, pos);
-    // Not-a-number is no depth to leave out.
-    return depth <= 0.0 ? 0.0 : weight_of(wall, v) * depth * depth * depth;
-}
-
-inline double grip_energy(const Grip& grip, int64_t v, const double* pos) {
-    if (!(grip.force[v] > 0.0)) return 0.0;
-    double slip[3];
-    const double limit = grip.limit[v], y = slip_of(grip, v, pos, slip);
-    return grip.force[v] * (y < limit ? y * y / limit * (1.0 - y / (3.0 * limit)) + limit / 3.0 : y);
 }
 
 // Potential at a placed state, and the rounding it is known to.

@@ -32,19 +32,12 @@ from hood.solver.forces import Grip, VertexForces, Walls, attachment_stiffness, 
 from hood.solver.iterate import fixed_positions
 from hood.solver.plan import SolverPlan
 from hood.solver.points import PointForces, point_forces
+from hood.solver.vertex_pass import grip_structures, wall_structures, whole
 
 #: Vertices of a part that is worth a thread: an iteration of conjugate gradients takes 20 us at 1,000 vertices.
 _ROWS = 400
 
 SOURCE = Path(native.__file__).with_name("newton.cpp")
-
-
-class _Wall(ctypes.Structure):
-    _fields_ = [("point", POINTER), ("normal", POINTER), ("reach", POINTER), ("weight", REAL), ("share", POINTER)]
-
-
-class _Grip(ctypes.Structure):
-    _fields_ = [(name, POINTER) for name in ("force", "normal", "anchor", "limit")]
 
 
 class _Points(ctypes.Structure):
@@ -163,8 +156,8 @@ def engine_step(potential: Potential, problem: StepProblem) -> EngineStep:
         inertia=_array(forces.inertia.squeeze(1)),
         weight=_array(forces.weight),
         spring_stiffness=_array(stiffness),
-        walls=tuple(Walls(w.weight, *(_whole(t) for t in (w.point, w.normal, w.reach))) for w in forces.walls),
-        grips=tuple(Grip(*(_whole(t) for t in (g.force, g.normal, g.anchor, g.limit))) for g in forces.grips),
+        walls=tuple(Walls(w.weight, *(whole(t) for t in (w.point, w.normal, w.reach))) for w in forces.walls),
+        grips=tuple(Grip(*(whole(t) for t in (g.force, g.normal, g.anchor, g.limit))) for g in forces.grips),
         points=point_forces(potential, problem),
         bending=0 if bending is None else 2 if type(bending) is CurrentLengthBending else 1,
         membrane=sum(type(term) is Stretching for term in terms),
@@ -175,13 +168,8 @@ def _num_attachments(problem: StepProblem) -> int:
     return 0 if problem.step.attachments is None else len(problem.step.attachments.edges)
 
 
-def _whole(values: Tensor) -> Tensor:
-    sound = values.dtype is torch.float64 and values.is_contiguous() and not values.requires_grad
-    return values if sound else values.detach().double().contiguous()
-
-
 def _array(values: Tensor) -> np.ndarray:
-    return _whole(values).numpy()
+    return whole(values).numpy()
 
 
 class SceneEngine:
@@ -255,7 +243,7 @@ class SceneEngine:
         self._take_fabric(step)
         self._point(base=step.base, fixed=step.fixed, inertia=step.inertia, weight=step.weight)
         self._point(spring_stiffness=step.spring_stiffness[self.tables.springs.order])
-        walls, grips = _wall_structures(step.walls), _grip_structures(step.grips)
+        walls, grips = wall_structures(step.walls), grip_structures(step.grips)
         own = [_ScenePoints(points, self.tables, step.cloth.num_vertices) for points in step.points] if step.points else []
         points = (_Points * len(own))(*(one.values for one in own))
         self._kept |= {"walls": walls, "grips": grips, "points": (points, own), "step": step}
@@ -339,39 +327,12 @@ class _ScenePoints:
             "model": np.zeros((len(corners), 16)),
             "path": np.zeros((len(walls), len(corners), 14)),
         }
-        structures = _wall_structures(walls), _grip_structures(grips)
+        structures = wall_structures(walls), grip_structures(grips)
         self._kept = arrays, structures
         self.values = _Points(count=len(corners), num_walls=len(walls), num_grips=len(grips))
         for name, array in arrays.items():
             setattr(self.values, name, array.ctypes.data)
         self.values.walls, self.values.grips = (ctypes.addressof(one) for one, _ in structures)
-
-
-def _wall_structures(walls: tuple[Walls, ...]) -> tuple[ctypes.Array[_Wall], list[Tensor]]:
-    """Walls as C++ reads them, and what they point to."""
-    structures, kept = (_Wall * len(walls))(), []
-    for structure, wall in zip(structures, walls, strict=True):
-        kept += _pointed(structure, wall, ("point", "normal", "reach"))
-        structure.weight = 1.0 if isinstance(wall.weight, Tensor) else wall.weight
-        if isinstance(wall.weight, Tensor):
-            kept.append(_whole(wall.weight))
-            structure.share = kept[-1].data_ptr()
-    return structures, kept
-
-
-def _grip_structures(grips: tuple[Grip, ...]) -> tuple[ctypes.Array[_Grip], list[Tensor]]:
-    """The same for grips."""
-    structures, kept = (_Grip * len(grips))(), []
-    for structure, grip in zip(structures, grips, strict=True):
-        kept += _pointed(structure, grip, ("force", "normal", "anchor", "limit"))
-    return structures, kept
-
-
-def _pointed(structure: ctypes.Structure, item: Walls | Grip, names: tuple[str, ...]) -> list[Tensor]:
-    tensors = [_whole(getattr(item, name)) for name in names]
-    for name, tensor in zip(names, tensors, strict=True):
-        setattr(structure, name, tensor.data_ptr())
-    return tensors
 
 
 def _aligned(count: int, kind: type) -> np.ndarray:

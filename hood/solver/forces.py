@@ -17,6 +17,7 @@ from hood.losses.potential import Potential, Term
 from hood.losses.problem import StepProblem
 from hood.losses.stretching import Stretching
 from hood.mesh.kept import forget
+from hood.solver import vertex_pass
 from hood.solver.elements import BENDINGS
 
 COLLISIONS = (Collision, CentroidCollision)
@@ -219,8 +220,8 @@ def energies_and_gradient(
     """
     acc = problem.acceleration(next_pos) if acc is None else acc
     single, rest = _split(potential)
-    energies = _single_energies(single, problem, next_pos, acc)
-    gradient = known_forces(single, problem).gradient(next_pos, acc)
+    energies, gradient = _single(single, problem, next_pos, acc, slope=True)
+    assert gradient is not None
     if rest.active(problem):
         slope, found = rest.gradient(problem, next_pos, acc)
         gradient, energies = gradient + slope, energies | found
@@ -231,7 +232,7 @@ def energies_and_gradient(
 def total_energy(potential: Potential, problem: StepProblem, next_pos: Tensor) -> Tensor:
     """What :meth:`hood.losses.potential.Potential.total` computes, (B,) J; terms of single vertices in closed form."""
     single, rest = _split(potential)
-    energies = list(_single_energies(single, problem, next_pos, problem.acceleration(next_pos)).values())
+    energies = list(_single(single, problem, next_pos, problem.acceleration(next_pos), slope=False)[0].values())
     if rest.active(problem):
         energies.append(rest.total(problem, next_pos))
     return sum(energies, start=next_pos.new_zeros(problem.num_scenes))
@@ -247,18 +248,27 @@ def _split(potential: Potential) -> tuple[Potential, Potential]:
     return potential.only(single), potential.only({n: term for n, term in potential.terms.items() if n not in single})
 
 
-def _single_energies(potential: Potential, problem: StepProblem, pos: Tensor, acc: Tensor) -> dict[str, Tensor]:
-    """Energies [J] (B,) by term of those that act on single vertices."""
+def _single(
+    potential: Potential, problem: StepProblem, pos: Tensor, acc: Tensor, slope: bool
+) -> tuple[dict[str, Tensor], Tensor | None]:
+    """Energies [J] (B,) by term of those that act on single vertices, and their gradient [N] (V, 3) where asked for."""
     named = potential.active(problem)
     # In the order of VertexForces.energies; of two terms that it adds up into one each is asked alone.
     kinds = (Inertia, Gravity, COLLISIONS, FRICTIONS)
     names = [[name for name, term in named.items() if isinstance(term, kind)] for kind in kinds]
+    forces = known_forces(potential, problem)
     if len(names[0]) > 1 or len(names[1]) > 1:
         alone = (potential.only({name: term}) for name, term in named.items())
-        return {name: value for part in alone for name, value in _single_energies(part, problem, pos, acc).items()}
-    parts = known_forces(potential, problem).energies(pos, acc, problem.vertex_dt)
+        energies = {name: value for part in alone for name, value in _single(part, problem, pos, acc, slope=False)[0].items()}
+        return energies, forces.gradient(pos, acc) if slope else None
     order = [(names[0] or [""])[0], (names[1] or [""])[0], *names[2], *names[3]]
-    return {name: problem.sum_vertices(part) for name, part in zip(order, parts, strict=True) if name}
+    found = vertex_pass.evaluate(forces, pos, acc, problem.cloth.vertex_scene, problem.step.dt, slope)
+    if found is None:
+        sums = [problem.sum_vertices(part) for part in forces.energies(pos, acc, problem.vertex_dt)]
+        gradient = forces.gradient(pos, acc) if slope else None
+    else:
+        sums, gradient = list(found[0].to(pos.dtype)), None if found[1] is None else found[1].to(pos.dtype)
+    return {name: part for name, part in zip(order, sums, strict=True) if name}, gradient
 
 
 def attachment_stiffness(term: Term, problem: StepProblem) -> Tensor:

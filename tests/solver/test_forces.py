@@ -7,10 +7,15 @@ import pytest
 import torch
 
 from hood.assets.material import Material
+from hood.losses.collision import Collision
+from hood.losses.gravity import Gravity
+from hood.losses.inertia import Inertia
 from hood.losses.potential import Potential, default_potential
 from hood.losses.problem import StepProblem
+from hood.losses.stretching import Stretching
 from hood.scene.cloth import build_cloth
-from hood.solver.forces import energies_and_gradient
+from hood.solver import vertex_pass
+from hood.solver.forces import energies_and_gradient, known_forces, total_energy
 from hood.testing import grid, make_problem, plane_contact
 
 F64 = torch.float64
@@ -30,7 +35,12 @@ def touching(size: float) -> tuple[StepProblem, torch.Tensor]:
     "potential", [default_potential(), default_potential(friction_coefficient=10.0)], ids=["default", "rough"]
 )
 @pytest.mark.parametrize("size", [0.0, 1e-5, 1e-3, 0.1])
-def test_they_are_those_of_the_potential(potential: Potential, size: float) -> None:
+@pytest.mark.parametrize("form", ["compiled", "torch"])
+def test_they_are_those_of_the_potential(potential: Potential, size: float, form: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    if form == "torch":
+        monkeypatch.setattr(vertex_pass, "library", lambda: None)
+    elif vertex_pass.library() is None:
+        pytest.skip("no C++ compiler")
     problem, pos = touching(size)
     problem = potential.prepare(problem)
     for acc in (None, problem.acceleration(pos)):
@@ -40,6 +50,31 @@ def test_they_are_those_of_the_potential(potential: Potential, size: float) -> N
         for name, value in energies.items():
             torch.testing.assert_close(found[name], value, rtol=1e-12, atol=1e-20)
         torch.testing.assert_close(gradient, expected, rtol=1e-10, atol=1e-12 * float(expected.abs().max()))
+        total = total_energy(potential, problem, pos)
+        torch.testing.assert_close(total, potential.total(problem, pos), rtol=1e-12, atol=1e-20)
+
+
+def test_terms_of_one_kind_have_energies_of_their_own() -> None:
+    problem, pos = touching(1e-3)
+    potential = default_potential().with_terms(
+        more_gravity=Gravity(), more_inertia=Inertia(), more_collision=Collision(1e5, 3e-3)
+    )
+    problem = potential.prepare(problem)
+    expected, energies = potential.gradient(problem, pos)
+    gradient, found = energies_and_gradient(potential, problem, pos)
+    assert list(found) == list(energies)
+    for name, value in energies.items():
+        torch.testing.assert_close(found[name], value, rtol=1e-12, atol=1e-20)
+    torch.testing.assert_close(gradient, expected, rtol=1e-10, atol=1e-12 * float(expected.abs().max()))
+
+
+def test_forces_are_gathered_once_a_step() -> None:
+    problem, _ = touching(1e-3)
+    potential = default_potential()
+    problem = potential.prepare(problem)
+    first = known_forces(potential, problem)
+    assert known_forces(potential.with_terms(stretching=Stretching()), problem) is first
+    assert known_forces(potential.with_terms(gravity=Gravity()), problem) is not first
 
 
 def test_contact_and_friction_are_felt() -> None:
