@@ -1,76 +1,230 @@
-"""A whole frame (search, features, network, integration) on a GPU: milliseconds and kernel launches by way of taking it.
+"""All that is to be known about frames on one GPU, in one call of ten minutes: networks and solver at 1k to 50k vertices.
 
-    python benchmarks/gpu.py --sizes 5000 12000 50000 --models fine15 ours --precision fp32 tf32 bf16
+    python benchmarks/gpu.py --minutes 9 --csv gpu.csv
+    python benchmarks/gpu.py --device-specs h100            # without a GPU: computed, from that one's data sheet
 
-The embedded dress, refined to the given number of vertices, on the embedded body of 6,890 vertices, walking; random weights;
-every frame starts from the garment skinned to the body's pose. Medians over the frames of wall-clock time between two waits
-for the device, ways taking turns frame by frame. ``launches`` counts the calls of the CUDA runtime that start something
-(kernels, copies, graphs), ``kernels`` what ran on the device. Rows ``fused`` are ``captured`` with the edge step in Triton,
-all others without it; they are left out where Triton is not installed.
+The embedded dress, refined to the given number of vertices, on the embedded body of 6,890 vertices, walking. States are those
+of a rollout of the solver. Rows come in the order of their importance, each printed and written to the CSV file at once, until
+the minutes are over; what was left out is said at the end. Columns:
 
-Without a GPU nothing of that is measured. What can be is printed instead: CPU time of the plain step and of the one of fixed
-shapes, how many places its body edges leave empty, and the operations of the traced step, before and after those that
-depend on no input have been folded: about the kernels that a GPU would be given.
+``way``       of a network: ``plain``; ``captured``: fixed shapes, one CUDA graph; ``fused``: the same with the edge update in
+              Triton. Of the solver, with so many Newton iterations: ``plain``; ``captured``: a graph for each of its pieces.
+``ms``        of a frame, search included, metrics not: median of wall-clock time between two waits for the device, ways taking
+              turns state by state.
+``floor ms``  what the frame's kernels take at least, one after the other: for each the longest of the gap between two kernels,
+              its bytes over the bandwidth, its operations over their rate (:mod:`hood.dynamics.work`). On a GPU all of these
+              constants are measured first, in this very run; else they are those of ``--device-specs``.
+``share``     floor / ms: how near the frame is to the roofline.
+``kernels``   of the traced frame, views not counted; of fused rows those before fusion.
+``launches``  calls of the CUDA runtime that start something.
+``gamma``     median gap of the step's positions to the minimum of the potential, see :mod:`hood.evaluation.gap`.
+
+Without a GPU everything but kernels, bytes, operations and gamma is computed, and marked so: ``ms`` is the floor then.
 """
 
 from __future__ import annotations
 
 import argparse
 import copy
+import csv
 import os
 import statistics
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from importlib.util import find_spec
+from pathlib import Path
 
 import torch
 from frame import refined
+from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from hood.assets.body import load_body
 from hood.assets.garment import load_garment
+from hood.assets.library import locate
 from hood.assets.material import Material
 from hood.assets.sequence import load_sequence
 from hood.cli import ENVIRONMENT
 from hood.dynamics.captured import CapturedSimulator
-from hood.dynamics.fixed_problem import step_inputs
+from hood.dynamics.captured_newton import CapturedNewton
+from hood.dynamics.checkpoint import load_simulator
+from hood.dynamics.fixed_problem import settled_potential, step_inputs
 from hood.dynamics.fixed_step import FixedStep
-from hood.dynamics.simulator import Prepared, Simulator, build_simulator
-from hood.dynamics.stepper import Stepper
-from hood.dynamics.trace import count_operations, trace
-from hood.graph.fixed import Capacity, Layout, lay_out
+from hood.dynamics.simulator import Prepared, Simulator
+from hood.dynamics.stepper import NewtonStepper, Stepper
+from hood.dynamics.trace import trace
+from hood.dynamics.work import DATA_SHEETS, Device, Work, WorkCounter
+from hood.graph.fixed import lay_out
+from hood.losses.potential import default_potential, scale
 from hood.losses.problem import StepProblem
+from hood.mesh.proximity import Incidence, build_incidence
+from hood.nn.dense import whole_arrays
+from hood.scene.contact import find_fixed_contact
 from hood.scene.scene import Scene, build_scene, recentre
+from hood.scene.state import State
+from hood.solver.iterate import in_double
+from hood.solver.newton import NewtonSettings, minimize
 from hood.testing import without_values
 
 SWITCH = "HOOD_TRITON"
-WAYS = ("plain", "fixed", "captured", "compiled", "fused")
-FIRST_FRAME = 10
-_KERNELS = ("cudaLaunchKernel", "cuLaunchKernel", "cudaLaunchKernelExC", "cuLaunchKernelEx")
-_LAUNCHES = (*_KERNELS, "cudaMemcpyAsync", "cudaMemsetAsync", "cudaGraphLaunch")
+WAYS = ("plain", "captured", "fused")
+FIRST_FRAME, LEAD = 10, 3
+ITERATIONS = (1, 2, 5, 10)
+_LAUNCHES = ("cudaLaunchKernel", "cuLaunchKernel", "cudaLaunchKernelExC", "cuLaunchKernelEx",
+             "cudaMemcpyAsync", "cudaMemsetAsync", "cudaGraphLaunch")  # fmt: skip
+SOLVER = "newton"
 
 
-def make_scene(count: int, device: str) -> Scene:
-    """The dress of ``count`` vertices on the walking body."""
-    garment = refined(load_garment("dress"), count)
-    return build_scene(garment, load_body("default"), load_sequence("walk_proud", 30.0), Material(), device=device)
+@dataclass(frozen=True)
+class Row:
+    """A line of the table; None where it is not known."""
+
+    vertices: int
+    method: str
+    precision: str
+    way: str
+    source: str  # ``measured`` or ``computed``: the time
+    ms: float
+    floor_ms: float
+    kernels: int
+    launches: int | None
+    gigabytes: float
+    gflop: float
+    gamma: float
+
+    def cells(self) -> list[str]:
+        share, rate = self.floor_ms / self.ms, f"{1e3 * self.gigabytes / self.ms:,.0f}"
+        launches = "–" if self.launches is None else f"{self.launches:,}"
+        return [f"{self.vertices:,}", self.method, self.precision, self.way, self.source, f"{self.ms:.2f}",
+                f"{self.floor_ms:.2f}", f"{share:.2f}", f"{self.kernels:,}", launches, f"{self.gigabytes:.2f}",
+                f"{self.gflop:.1f}", rate, f"{1e3 * self.gflop / self.ms:,.0f}", f"{self.gamma:.2g}"]  # fmt: skip
 
 
-def problems(scene: Scene, count: int) -> list[StepProblem]:
-    """The steps of frames from the tenth on, each from the skinned garment."""
-    made = []
-    for frame in range(FIRST_FRAME, FIRST_FRAME + count):
-        state = recentre(scene.start(frame, relaxed=False), scene.cloth.vertex_scene)
-        made.append(StepProblem(scene.cloth, state, scene.step_input(frame, state)))
-    return made
+COLUMNS = ("vertices", "method", "precision", "way", "time is", "ms", "floor ms", "share", "kernels", "launches", "GB", "GFLOP",
+           "GB/s", "GFLOP/s", "gamma")  # fmt: skip
 
 
-def take(stepper: Stepper, problem: StepProblem, prepared: Prepared) -> None:
-    prediction = stepper.predict(stepper.search(problem), prepared)
-    stepper.next_velocity(problem, prediction)
+class Table:
+    """Rows as they come: on the screen, and in a file that is whole at any moment."""
+
+    def __init__(self, path: Path | None) -> None:
+        self.path, self.rows = path, list[Row]()
+        print(f"| {' | '.join(COLUMNS)} |\n" + "|---" * len(COLUMNS) + "|", flush=True)
+
+    def add(self, row: Row) -> None:
+        self.rows.append(row)
+        print(f"| {' | '.join(row.cells())} |", flush=True)
+        if self.path is not None:
+            temporary = self.path.with_name(self.path.name + ".partial")
+            with temporary.open("w", newline="", encoding="utf-8") as file:
+                writer = csv.DictWriter(file, list(asdict(row)))
+                writer.writeheader()
+                writer.writerows(map(asdict, self.rows))
+            os.replace(temporary, self.path)
+
+
+class Bench:
+    """The dress at one size: states of a rollout of the solver, on the CPU and on the device, and their minima."""
+
+    def __init__(self, size: int, device: str, count: int) -> None:
+        garment, sequence = refined(load_garment("dress"), size), load_sequence("walk_proud", 30.0)
+        make = partial(build_scene, garment, load_body("default"), sequence, Material())
+        self.scene: Scene = make()
+        self.there: Scene = self.scene if device == "cpu" else make(device=device)
+        self.potential = default_potential()
+        self.problems, self.frames = self._roll(count), range(FIRST_FRAME + LEAD, FIRST_FRAME + LEAD + count)
+        self._lowest = [self._minimum(problem) for problem in self.problems]
+        self._work: dict[tuple[str, bool], Work] = {}
+
+    def _roll(self, count: int) -> list[StepProblem]:
+        scene, settings = self.scene, NewtonSettings(max_iterations=10)
+        state, problems = recentre(scene.start(FIRST_FRAME, relaxed=False), scene.cloth.vertex_scene), []
+        for frame in range(FIRST_FRAME, FIRST_FRAME + LEAD + count):
+            problem = self.potential.prepare(StepProblem(scene.cloth, state, scene.step_input(frame, state)))
+            problems.append(problem)
+            pos, report = minimize(self.potential, problem, settings=settings)
+            vel = state.vel + problem.vertex_dt * report.acc
+            state = recentre(State(pos, vel, state.origin), scene.cloth.vertex_scene)
+        return problems[LEAD:]
+
+    def _minimum(self, problem: StepProblem) -> float:
+        return float(minimize(self.potential, problem, settings=NewtonSettings(target_rg=1e-3, max_iterations=60))[1].phi)
+
+    def work_of(self, model: str, simulator: Simulator, precision: str) -> Work:
+        """Of a frame of a model on a CPU; the same in fp32 and tf32."""
+        key = model, precision == "bf16"
+        if key not in self._work:
+            self._work[key] = network_work(simulator, self)
+        return self._work[key]
+
+    def gamma(self, positions: list[Tensor]) -> float:
+        """Median over the states of the gap of positions (V, 3) that steps led to."""
+        gaps = []
+        for problem, lowest, pos in zip(self.problems, self._lowest, positions, strict=True):
+            work = in_double(problem)
+            phi = float(self.potential.total(work, pos.detach().cpu().double()))
+            gaps.append((phi - min(lowest, phi)) / float(scale(work)))
+        return statistics.median(gaps)
+
+    def on_device(self) -> list[StepProblem]:
+        """The same problems, contact not searched for."""
+        made = []
+        for frame, problem in zip(self.frames, self.problems, strict=True):
+            device = self.there.cloth.rest_pos.device
+            state = State(*(value.to(device) for value in (problem.state.pos, problem.state.vel, problem.state.origin)))
+            made.append(StepProblem(self.there.cloth, state, self.there.step_input(frame, state)))
+        return made
+
+
+# ---- work ------------------------------------------------------------------------------------------------------------
+
+
+@torch.no_grad()
+def network_work(simulator: Simulator, bench: Bench) -> Work:
+    """Of a step of fixed shapes as a GPU is given it, what depends on no input computed before; without computing it."""
+    problem, simulator = bench.problems[0], copy.deepcopy(simulator)
+    simulator.network.use_precision("bf16" if simulator.network.precision == "bf16" else "fp32")
+    static = simulator.prepare(problem.cloth, bench.scene.garment.rest_pos).static
+    assert static is not None
+    capacity = CapturedSimulator(simulator, "fixed")._first_capacity(problem)
+    potential = settled_potential(simulator.potential, problem) if simulator.looks_at_potential else None
+    inputs, layout = step_inputs(problem, simulator.needs_contact), lay_out(static, capacity)
+    with FakeTensorMode():
+        step = FixedStep(without_values(simulator), without_values(layout), without_values(problem), potential=potential)
+        empty = [without_values(value) for value in inputs]
+        module = trace(step, empty)
+        with WorkCounter() as counter:
+            module(*empty)
+    return counter.work
+
+
+def solver_work(bench: Bench, stepper: Stepper) -> Work:
+    """Of a step on one of the states, computed as a GPU does (everything at once), and of the search of all pairs."""
+    problem = bench.problems[0]
+    obstacle = problem.step.obstacle
+    assert obstacle is not None
+    stepper.predict(problem, None)  # what is made once per cloth is no part of a frame
+    with whole_arrays(), WorkCounter() as counter:
+        stepper.predict(problem, None)
+    incidence = build_incidence(obstacle.faces, len(obstacle.pos))
+    with FakeTensorMode():
+        given = problem.state.pos, problem.cloth.vertex_scene
+        empty = [without_values(value) for value in (*given, obstacle)]
+        tables = Incidence(*(without_values(value) for value in incidence))
+        with WorkCounter() as search:
+            find_fixed_contact(*empty, tables, 1, 0)
+    return Work(search.work.kernels + counter.work.kernels)
+
+
+def solver_settings(iterations: int) -> NewtonSettings:
+    return NewtonSettings(target_rg=1e-6, max_iterations=iterations, engine="torch")
+
+
+# ---- time ------------------------------------------------------------------------------------------------------------
 
 
 @contextmanager
@@ -84,114 +238,208 @@ def edges_fused(on: bool) -> Iterator[None]:
         os.environ.pop(SWITCH) if before is None else os.environ.update({SWITCH: before})
 
 
-def ways_of(names: list[str], simulator: Simulator) -> dict[str, Stepper]:
-    steppers: dict[str, Stepper] = {}
-    for name in names:
-        mode = "captured" if name == "fused" else name
-        steppers[name] = simulator if name == "plain" else CapturedSimulator(simulator, mode)
-    return steppers
+@contextmanager
+def in_way(name: str) -> Iterator[None]:
+    with edges_fused(name == "fused"):
+        yield
 
 
-def count_launches(call: Callable[[], None]) -> tuple[int, int]:
-    """Calls that start something on the device, and kernels that ran there."""
+def count_launches(call: Callable[[], object]) -> int:
+    """Calls that start something on the device."""
     activities = [torch.profiler.ProfilerActivity.CPU, torch.profiler.ProfilerActivity.CUDA]
     with torch.profiler.profile(activities=activities) as profile:
         call()
         torch.cuda.synchronize()
-    events = profile.events()
-    launches = sum(event.name in _LAUNCHES for event in events)
-    return launches, sum(event.device_type == torch.autograd.DeviceType.CUDA for event in events)
+    return sum(event.name in _LAUNCHES for event in profile.events())
 
 
-@torch.no_grad()
-def on_gpu(size: int, model: str, precisions: list[str], names: list[str], frames: int) -> None:
-    """Print a line per precision and way."""
-    scene = make_scene(size, "cuda")
-    torch.manual_seed(0)
-    simulator = build_simulator(schedule=model).eval().cuda()
-    steps = problems(scene, frames + 3)
-    prepared = simulator.prepare(steps[0].cloth, scene.garment.rest_pos)
-    for precision in precisions:
-        simulator.network.use_precision(precision)
-        steppers, times = ways_of(names, simulator), {name: [] for name in names}  # type: ignore[var-annotated]
-        for problem in steps:
-            for name, stepper in steppers.items():
-                with edges_fused(name == "fused"):
+def measured_device(size: int = 8192) -> Device:
+    """The GPU at hand: bandwidth by a copy, operations by matrix products of ``size``, gaps between small kernels."""
+    source = torch.empty(2**28, device="cuda")
+    target = torch.empty_like(source)
+    bandwidth = 2 * 4 * source.numel() / _seconds(lambda: target.copy_(source), 20)
+    before, rates = torch.backends.cuda.matmul.fp32_precision, {}
+    for name in ("fp32", "tf32", "bf16"):
+        torch.backends.cuda.matmul.fp32_precision = "tf32" if name == "tf32" else "ieee"
+        square = torch.randn(size, size, device="cuda", dtype=torch.bfloat16 if name == "bf16" else torch.float32)
+        rates[name] = 2 * size**3 / _seconds(partial(torch.mm, square, square), 10)
+    torch.backends.cuda.matmul.fp32_precision = before
+    small, graph = torch.zeros(1024, device="cuda"), torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        for _ in range(200):
+            small.add_(1.0)
+    launch, replay = _seconds(lambda: small.add_(1.0), 2000), _seconds(graph.replay, 20) / 200
+    return Device(torch.cuda.get_device_name(), bandwidth, rates, rates["fp32"], launch, replay)
+
+
+def _seconds(call: Callable[[], object], count: int) -> float:
+    """Of one call among many on the device."""
+    for _ in range(3):
+        call()
+    start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+    start.record()
+    for _ in range(count):
+        call()
+    end.record()
+    torch.cuda.synchronize()
+    return 1e-3 * start.elapsed_time(end) / count
+
+
+def time_ways(calls: dict[str, Callable[[StepProblem], Tensor]], problems: list[StepProblem]) -> dict[str, list[float]]:
+    """Milliseconds of every way on every state, three times over; the first round counts for nothing."""
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for round_number in range(4):
+        for problem in problems:
+            for name, call in calls.items():
+                with in_way(name):
                     torch.cuda.synchronize()
                     began = time.perf_counter()
-                    take(stepper, problem, prepared)
+                    call(problem)
                     torch.cuda.synchronize()
-                    times[name].append(1e3 * (time.perf_counter() - began))
-        for name, stepper in steppers.items():
-            with edges_fused(name == "fused"):
-                launches, kernels = count_launches(partial(take, stepper, steps[-1], prepared))
-            cells = f"{name} | {statistics.median(times[name][3:]):.2f} | {launches} | {kernels}"
-            print(f"| {scene.cloth.num_vertices:,} | {model} | {precision} | {cells} |", flush=True)
+                    if round_number:
+                        times[name].append(1e3 * (time.perf_counter() - began))
+    return times
+
+
+# ---- rows ------------------------------------------------------------------------------------------------------------
 
 
 @torch.no_grad()
-def count_for_gpu(simulator: Simulator, layout: Layout, problem: StepProblem) -> list[int]:
-    """Operations of the step as a device other than a CPU is given it, before and after folding."""
-    simulator = copy.deepcopy(simulator)
-    with FakeTensorMode():
-        problem = without_values(problem)
-        step = FixedStep(without_values(simulator), without_values(layout), problem)
-        return [count_operations(trace(step, step_inputs(problem), fold)) for fold in (False, True)]
+def network_rows(table: Table, bench: Bench, model: str, precision: str, device: Device, on_gpu: bool) -> None:
+    simulator = load_simulator(locate("weights", model)).eval()
+    simulator.network.use_precision("fp32" if not on_gpu and precision == "tf32" else precision)
+    work, problems = bench.work_of(model, simulator, precision), bench.on_device()
+    if on_gpu:
+        simulator = simulator.cuda()
+    prepared: Prepared = simulator.prepare(bench.there.cloth, bench.scene.garment.rest_pos)
+    ways = [way for way in WAYS if way != "fused" or (on_gpu and find_spec("triton") is not None)]
+    steppers: dict[str, Stepper] = {
+        way: simulator if way == "plain" else CapturedSimulator(simulator, "captured" if on_gpu else "fixed") for way in ways
+    }
+    calls = {way: partial(_step, stepper, prepared) for way, stepper in steppers.items()}
+    times = time_ways(calls, problems) if on_gpu else {}
+    for way, call in calls.items():
+        with in_way(way):
+            launches = count_launches(partial(call, problems[0])) if on_gpu else None
+            gamma = bench.gamma([call(problem) for problem in problems])
+        floor = 1e3 * device.seconds(work, precision, captured=way != "plain")
+        table.add(_row(bench, model, precision, way, work, floor, times.get(way), launches, gamma))
 
 
-@torch.no_grad()
-def on_cpu(size: int, model: str, precisions: list[str], frames: int) -> None:
-    """Print a line per precision: what fixed shapes cost where they gain nothing."""
-    scene = make_scene(size, "cpu")
-    torch.manual_seed(0)
-    simulator = build_simulator(schedule=model).eval()
-    steps = problems(scene, frames + 2)
-    prepared = simulator.prepare(scene.cloth, scene.garment.rest_pos)
-    assert prepared.static is not None
-    for precision in precisions:
-        simulator.network.use_precision(precision)
-        fixed = CapturedSimulator(simulator, "fixed")
-        times: dict[str, list[float]] = {"plain": [], "fixed": []}
-        for problem in steps:
-            for name, stepper in (("plain", simulator), ("fixed", fixed)):
-                began = time.process_time()
-                take(stepper, problem, prepared)
-                times[name].append(1e3 * (time.process_time() - began))
-        plain, padded = (statistics.median(times[name][2:]) for name in ("plain", "fixed"))
-        capacity: Capacity = next(iter(fixed._plans.values())).layout.capacity
-        step = FixedStep(simulator, lay_out(prepared.static, capacity), steps[-1], dense=True)
-        found = int(step(*step_inputs(steps[-1]))[3][0])
-        counts = count_for_gpu(simulator, lay_out(prepared.static, capacity), steps[-1])
-        filled = f"{found:,} of {capacity.edges:,}"
-        cells = f"{plain:.0f} | {padded:.0f} | {padded / plain:.2f} | {filled} | {counts[0]} | {counts[1]}"
-        print(f"| {scene.cloth.num_vertices:,} | {model} | {precision} | {cells} |", flush=True)
+def _step(stepper: Stepper, prepared: Prepared | None, problem: StepProblem) -> Tensor:
+    prediction = stepper.predict(stepper.search(problem), prepared)
+    stepper.next_velocity(problem, prediction)
+    return prediction.next_pos
+
+
+def solver_rows(table: Table, bench: Bench, iterations: int, device: Device, on_gpu: bool) -> None:
+    settings, problems = solver_settings(iterations), bench.on_device()
+    plain = NewtonStepper(bench.potential, settings)
+    works = {"plain": solver_work(bench, plain), "captured": solver_work(bench, CapturedNewton(plain, "fixed"))}
+    there = NewtonStepper(bench.potential, settings)
+    there.gravity = there.gravity.to(bench.there.cloth.rest_pos.device)
+    steppers: dict[str, Stepper] = {"plain": there, "captured": CapturedNewton(there, "captured" if on_gpu else "fixed")}
+    calls = {way: partial(_step, stepper, None) for way, stepper in steppers.items()}
+    times = time_ways(calls, problems) if on_gpu else {}
+    # The compiled form takes the same iterations on the CPU.
+    fast = replace(settings, engine="auto")
+    gamma = bench.gamma([minimize(bench.potential, problem, settings=fast)[0] for problem in bench.problems])
+    for way, call in calls.items():
+        launches = count_launches(partial(call, problems[0])) if on_gpu else None
+        floor = 1e3 * device.seconds(works[way], captured=way == "captured")
+        table.add(_row(bench, f"{SOLVER} {iterations}", "fp64", way, works[way], floor, times.get(way), launches, gamma))
+
+
+def _row(
+    bench: Bench,
+    method: str,
+    precision: str,
+    way: str,
+    work: Work,
+    floor: float,
+    times: list[float] | None,
+    launches: int | None,
+    gamma: float,
+) -> Row:
+    source, ms = ("computed", floor) if times is None else ("measured", statistics.median(times))
+    size, kernels = bench.scene.cloth.num_vertices, len(work.kernels)
+    return Row(
+        size, method, precision, way, source, ms, floor, kernels, launches, 1e-9 * work.bytes_moved, 1e-9 * work.flops, gamma
+    )
+
+
+def crossover(rows: list[Row]) -> list[str]:
+    """At every size, the fastest network against the solver with no larger gap."""
+    sentences = []
+    for size in sorted({row.vertices for row in rows}):
+        own = [row for row in rows if row.vertices == size]
+        networks = [row for row in own if not row.method.startswith(SOLVER)]
+        if not networks:
+            continue
+        best = min(networks, key=lambda row: row.ms)
+        as_good = [row for row in own if row.method.startswith(SOLVER) and row.gamma <= best.gamma]
+        said = f"{size:,} vertices: {best.method} ({best.precision}, {best.way}) {best.ms:.2f} ms at gamma {best.gamma:.2g}"
+        if as_good:
+            rival = min(as_good, key=lambda row: row.ms)
+            said += f"; {rival.method} {rival.ms:.2f} ms at gamma {rival.gamma:.2g}"
+            said += ": the solver wins" if rival.ms < best.ms else ": the network wins"
+        elif any(row.method.startswith(SOLVER) for row in own):
+            said += "; no row of the solver is as near to the minimum"
+        else:
+            said += "; no row of the solver"
+        sentences.append(said)
+    return sentences
+
+
+def jobs(sizes: list[int], models: list[str]) -> list[tuple[int, str, str | int]]:
+    """Size, kind (model or solver), precision or iterations; what matters most comes first."""
+    first: list[tuple[int, str, str | int]] = []
+    for size in sizes:
+        first += [(size, models[0], "fp32"), (size, SOLVER, 5)]
+    rest: list[tuple[int, str, str | int]] = []
+    for size in sizes:
+        rest += [(size, model, "fp32") for model in models[1:]]
+        rest += [(size, SOLVER, count) for count in ITERATIONS if count != 5]
+    last = [(size, model, precision) for size in sizes for model in models for precision in ("bf16", "tf32")]
+    return first + rest + last
+
+
+def run(args: argparse.Namespace, on_gpu: bool) -> None:
+    began = time.perf_counter()
+    device = measured_device() if on_gpu else DATA_SHEETS[args.device_specs]
+    rates = ", ".join(f"{name} {1e-12 * rate:.0f} TFLOP/s" for name, rate in device.matmul.items())
+    origin = "measured" if on_gpu else "data sheet and assumptions; all times below are computed"
+    gaps = f"{1e6 * device.launch:.1f} µs from kernel to kernel, {1e6 * device.replay:.1f} µs within a graph"
+    print(f"{device.name} ({origin}): {1e-12 * device.bandwidth:.2f} TB/s, {rates}, {gaps}; torch {torch.__version__}\n")
+    table, benches, left = Table(args.csv), dict[int, Bench](), []
+    for size, kind, choice in jobs(args.sizes, args.models):
+        if time.perf_counter() - began > 60 * args.minutes:
+            left.append(f"{kind} {choice} at {size:,}")
+            continue
+        if size not in benches:
+            benches[size] = Bench(size, "cuda" if on_gpu else "cpu", 1 if size > 20000 else 3)
+        if kind == SOLVER:
+            solver_rows(table, benches[size], int(choice), device, on_gpu)
+        else:
+            network_rows(table, benches[size], kind, str(choice), device, on_gpu)
+    print("\n" + "\n".join(crossover(table.rows)))
+    if left:
+        print(f"\nleft out after {args.minutes:g} minutes: {', '.join(left)}")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--sizes", type=int, nargs="+", default=[5000, 12000, 50000])
-    parser.add_argument("--models", nargs="+", default=["fine15", "ours"])
-    parser.add_argument("--precision", nargs="+", default=["fp32", "tf32", "bf16"])
-    parser.add_argument("--ways", nargs="+", default=list(WAYS), choices=WAYS)
-    parser.add_argument("--frames", type=int, default=21)
+    parser.add_argument("--minutes", type=float, default=9.0)
+    parser.add_argument("--sizes", type=int, nargs="+", default=[4400, 1000, 12000, 50000])
+    parser.add_argument("--models", nargs="+", default=["quickstart", "ours", "fine15"], help="names of embedded weights")
+    parser.add_argument("--device-specs", choices=sorted(DATA_SHEETS), default="h100", help="computed for it without a GPU")
+    parser.add_argument("--csv", type=Path, default=None)
     args = parser.parse_args()
     if any(os.environ.get(key) is None for key in ENVIRONMENT):  # read at process start only
         os.execve(sys.executable, [sys.executable, *sys.argv], {**ENVIRONMENT, **os.environ})
-    if torch.cuda.is_available():
-        ways = [name for name in args.ways if name != "fused" or find_spec("triton") is not None]
-        print(f"{torch.cuda.get_device_name()}, torch {torch.__version__}\n")
-        print("| vertices | model | precision | way | ms a frame | launches | kernels |\n" + "|---" * 7 + "|")
-        for size in args.sizes:
-            for model in args.models:
-                on_gpu(size, model, args.precision, ways, args.frames)
-        return
-    torch.set_num_threads(1)
-    print("no GPU: milliseconds and launches there are not measured; one thread of the CPU instead\n")
-    columns = ("vertices", "model", "precision", "plain ms", "fixed ms", "ratio", "places filled", "operations", "folded")
-    print(f"| {' | '.join(columns)} |\n" + "|---" * len(columns) + "|")
-    for size in args.sizes:
-        for model in args.models:
-            on_cpu(size, model, [name for name in args.precision if name != "tf32"], args.frames)
+    if not torch.cuda.is_available():
+        torch.set_num_threads(1)
+    run(args, torch.cuda.is_available())
 
 
 if __name__ == "__main__":

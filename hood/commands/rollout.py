@@ -39,6 +39,7 @@ from hood.commands.verdict import exit_code
 from hood.commands.wardrobe import heed, read_outfit
 from hood.config import ConfigError, build, load_config, plain, require_choice, save_run_record
 from hood.dynamics.captured import MODES, CapturedSimulator, network_of
+from hood.dynamics.captured_newton import CapturedNewton
 from hood.dynamics.recorder import RolloutWriter, read_rollout
 from hood.dynamics.refine import GuessStepper
 from hood.dynamics.rollout import METRIC_CHOICES, metric_names, simulate
@@ -210,9 +211,13 @@ def make_stepper(config: DictConfig) -> tuple[Stepper, str]:
         return stepper, digest
     potential = build(config.losses)
     kind = GuessStepper if str(config.stepper) == "refine" else NewtonStepper
-    stepper = kind(potential, build(config.solver))
-    stepper.gravity = stepper.gravity.to(str(config.device))
-    return stepper, "none"
+    solver = kind(potential, build(config.solver))
+    solver.gravity = solver.gravity.to(str(config.device))
+    if str(config.step) == PLAIN:
+        return solver, "none"
+    if not isinstance(solver, NewtonStepper):
+        raise ConfigError(f"step={config.step}: steps of stepper={config.stepper} are plain; drop step=… from the command")
+    return CapturedNewton(solver, str(config.step)), "none"
 
 
 def make_simulator(config: DictConfig) -> tuple[Simulator, str]:

@@ -18,7 +18,7 @@ from hood.nn.dense import whole_arrays
 
 Function = Callable[..., Any]
 #: Operations that give another view of their argument and start nothing on the device.
-_VIEWS = ("view", "_unsafe_view", "t", "transpose", "permute", "expand", "slice", "select", "split", "split_with_sizes",
+VIEWS = ("view", "_unsafe_view", "t", "transpose", "permute", "expand", "slice", "select", "split", "split_with_sizes",
           "unsqueeze", "squeeze", "unbind", "alias", "detach", "as_strided")  # fmt: skip
 
 
@@ -49,7 +49,7 @@ def trace(function: Function, inputs: Sequence[Tensor], fold: bool = True) -> fx
 def count_operations(module: fx.GraphModule) -> int:
     """Operations of a traced function that work on the device, views not counted: about one kernel each."""
     calls = [node.target for node in module.graph.nodes if node.op == "call_function"]
-    return sum(isinstance(target, torch._ops.OpOverload) and target._opname not in _VIEWS for target in calls)
+    return sum(isinstance(target, torch._ops.OpOverload) and target._opname not in VIEWS for target in calls)
 
 
 @torch.no_grad()

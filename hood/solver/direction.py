@@ -9,9 +9,9 @@ from hood.solver import linear
 from hood.solver.plan import QuadraticModel, SolverPlan
 
 #: Below this share of the slack the next try does without.
-_LEAST_SHARPNESS = 0.2
+LEAST_SHARPNESS = 0.2
 #: The first share that is tried.
-_FIRST_SHARPNESS = 0.1
+FIRST_SHARPNESS = 0.1
 
 
 class Directions:
@@ -53,9 +53,9 @@ class Directions:
             if not bool(failed.any()):
                 break
             pending, halved = failed, halved | failed
-            smaller = torch.where(sharpness > _LEAST_SHARPNESS, 0.5 * sharpness, 0.0)
+            smaller = torch.where(sharpness > LEAST_SHARPNESS, 0.5 * sharpness, 0.0)
             sharpness = torch.where(failed, smaller, sharpness)
-        raised = (2.0 * sharpness).clamp(_FIRST_SHARPNESS, 1.0)
+        raised = (2.0 * sharpness).clamp(FIRST_SHARPNESS, 1.0)
         self._sharpness = torch.where(halved, sharpness, raised)
         direction = torch.zeros_like(model.gradient)
         direction[plan.vertices] = torch.where(moving, solution, 0.0)

@@ -11,6 +11,7 @@ from scipy import linalg
 from torch import Tensor
 
 from hood.losses.problem import sum_per_scene
+from hood.nn.dense import is_whole
 from hood.solver.pattern import BlockPattern, row_product
 from hood.solver.plan import SolverPlan
 
@@ -27,7 +28,7 @@ class BandLayout:
 
 def product(pattern: BlockPattern, triples: Tensor) -> Callable[[Tensor], Tensor]:
     """x (N, 3) → H x (N, 3)."""
-    if triples.device.type != "cpu":
+    if triples.device.type != "cpu" or is_whole():
         return block_product(pattern, triples)
     apply = row_product(triples.reshape(-1), pattern.indices, pattern.indptr, 3 * pattern.size)
     return lambda x: apply(x.reshape(-1)).view(-1, 3)

@@ -109,7 +109,7 @@ def minimize(
         start = start.detach().to(work.state.pos.dtype)
     system = _system(potential, work, plan, settings)
     system.begin(start)
-    pos, report = _run(system, work.state.pos, settings, began, proceed)
+    pos, report = run(system, work.state.pos, settings, began, proceed)
     return rounded(problem, pos), replace(report, acc=report.acc.to(problem.state.pos.dtype))
 
 
@@ -218,9 +218,7 @@ def _say_once(sentence: str) -> None:
     warnings.warn(sentence, stacklevel=4)
 
 
-def _run(
-    system: System, like: Tensor, settings: NewtonSettings, began: float, proceed: Proceed | None
-) -> tuple[Tensor, Report]:
+def run(system: System, like: Tensor, settings: NewtonSettings, began: float, proceed: Proceed | None) -> tuple[Tensor, Report]:
     """The iterations of ``system``: positions (V, 3) and a report in the precision and on the device of ``like``."""
     phi = system.phi
     finite, stuck, why = [math.isfinite(value) for value in phi], [False] * len(phi), MOST_ITERATIONS

@@ -11,6 +11,8 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from torch import Tensor
 
+from hood.nn.dense import is_whole
+
 
 def row_product(data: Tensor, cols: np.ndarray, starts: np.ndarray, width: int) -> Callable[[Tensor], Tensor]:
     """x (``width``,) → A x on the CPU, A given row by row: numbers, their columns, where rows start (both int32)."""
@@ -48,7 +50,7 @@ class Scatter:
 
     def __call__(self, values: Tensor) -> Tensor:
         """(M,) sums of ``values``, any shape with N entries."""
-        if values.device.type != "cpu":
+        if values.device.type != "cpu" or is_whole():
             return self.by_index(values)
         if values.dtype not in self._products:
             ones = torch.ones(len(self._source), dtype=values.dtype)

@@ -9,8 +9,8 @@ from hood.solver.forces import Walls
 from hood.solver.iterate import Iterate, Unknowns
 from hood.solver.points import PointForces
 
-_ARMIJO = 1e-4
-_BACKTRACKS = 40
+ARMIJO = 1e-4
+BACKTRACKS = 40
 
 
 class Path:
@@ -37,7 +37,7 @@ class Path:
             deepest = torch.maximum(wall.depth(now.pos), wall.depth(now.pos + direction))[vertices]
             rows = (deepest > 0).nonzero().squeeze(1)
             if len(rows):
-                self._stops.append(_Stop(wall, now.pos, inverse[rows], vertices[rows]))
+                self._stops.append(Stop(wall, now.pos, inverse[rows], vertices[rows]))
         every = now.pos.new_zeros(len(now.pos), 3, 3).index_copy(0, vertices, inverse) if unknowns.terms.points else inverse
         ends = now.pos, now.pos + direction
         self._point_stops = [
@@ -56,7 +56,7 @@ class Path:
         return unknowns.evaluate(acc)
 
 
-class _Stop:
+class Stop:
     """Contact of n vertices with a wall during a step."""
 
     def __init__(self, wall: Walls, pos: Tensor, inverse: Tensor, vertices: Tensor) -> None:
@@ -123,20 +123,20 @@ def backtrack(unknowns: Unknowns, path: Path, now: Iterate, slope: Tensor, searc
     """
     length = torch.ones_like(slope)
     searching, moved, result = searching & (slope < 0), torch.zeros_like(searching), now
-    for _ in range(_BACKTRACKS):
+    for _ in range(BACKTRACKS):
         if not bool(searching.any()):
             break
         trial = path.at(length * searching)
-        accepted = searching & (trial.phi <= now.phi + _ARMIJO * length * slope + now.noise)
+        accepted = searching & (trial.phi <= now.phi + ARMIJO * length * slope + now.noise)
         if bool(accepted.all()):
             return trial, accepted
         result = unknowns.select(accepted, trial, result)
         moved, searching = moved | accepted, searching & ~accepted
-        length = torch.where(searching, _shorter(length, slope, trial.phi - now.phi), length)
+        length = torch.where(searching, shorter(length, slope, trial.phi - now.phi), length)
     return result, moved
 
 
-def _shorter(length: Tensor, slope: Tensor, rise: Tensor) -> Tensor:
+def shorter(length: Tensor, slope: Tensor, rise: Tensor) -> Tensor:
     """Step length (B,) at the minimum of the parabola through what is known, between a tenth and a half of the last."""
     excess = rise - length * slope
     usable = torch.isfinite(excess) & (excess > 0)
