@@ -127,6 +127,11 @@ def padded_count(count: int) -> int:
     return -(-count // unit) * unit
 
 
+def wants_padding(x: Tensor) -> bool:
+    """Whether products of ``x`` want numbers of rows rounded up: all but those of MKL, which takes any."""
+    return x.device.type != "cpu" or _whole or _kernel(x.device.type, x.dtype) is not None
+
+
 def pad_rows(x: Tensor) -> Tensor:
     """``x`` (N, …) with zeros below, up to :func:`padded_count`."""
     extra = padded_count(x.shape[0]) - x.shape[0]
@@ -153,6 +158,8 @@ class _Linear(torch.autograd.Function):
 
 
 def _in_blocks(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+    if not wants_padding(x):
+        return affine(x, weight, bias)
     parts = list(blocks(x))
     if len(parts) <= 1 or padded_count(x.shape[0]) == x.shape[0]:
         out = affine(x, weight, bias)

@@ -8,7 +8,7 @@ from typing import cast
 from torch import Tensor, nn
 
 from hood.graph.builder import Subset
-from hood.nn.dense import linear, pad_rows
+from hood.nn.dense import linear, pad_rows, wants_padding
 from hood.nn.edge_update import update_edges
 from hood.nn.mlp import MLP
 
@@ -52,20 +52,22 @@ class ProcessorStep(nn.Module):
             if subset.edges.num_edges == 0:
                 continue
             updated[name], received = self._update_set(name, low, edges[name], subset, overwrite)
-            received = linear(received, weight)[: subset.edges.nodes.shape[0]]
-            hidden.index_add_(0, subset.edges.nodes, received)
+            received, rows = linear(received, weight), subset.edges.nodes.shape[0]
+            hidden.index_add_(0, subset.edges.nodes, received if len(received) == rows else received[:rows])
         return self.node_mlp.tail(hidden, nodes), updated
 
     def _update_set(self, name: str, nodes: Tensor, latent: Tensor, subset: Subset, overwrite: bool) -> tuple[Tensor, Tensor]:
         """New latents of a set, and the aggregate at the nodes that have an edge in it (and in rows of no meaning)."""
         mlp, edges, rows = cast(MLP, self.edge_mlps[name]), subset.edges, subset.rows
-        present = nodes.index_select(0, pad_rows(edges.nodes))
+        padded = wants_padding(nodes)
+        present = nodes.index_select(0, pad_rows(edges.nodes) if padded else edges.nodes)
         if rows is None:
             latent, received = update_edges(mlp, present, latent, edges, overwrite)
         else:
             part, received = update_edges(mlp, present, latent.index_select(0, rows), edges, overwrite=True)
             latent = latent.index_copy_(0, rows, part) if overwrite else latent.index_copy(0, rows, part)
         if self.aggregation == "mean":
-            degree = pad_rows(edges.offsets.diff()).clamp_min(1)
+            degree = edges.offsets.diff()
+            degree = (pad_rows(degree) if padded else degree).clamp_min(1)
             received = received / degree.unsqueeze(1).to(received.dtype)
         return latent, received
