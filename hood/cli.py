@@ -31,6 +31,9 @@ COMMANDS = {
     "convert": "write published HOOD weights (.pth) as a model file",
 }
 
+#: Commands that take steps: libraries for these are compiled while torch is loaded, where that has not been done before.
+_SIMULATE = ("train", "rollout", "evaluate", "tradeoff")
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code, see :mod:`hood.commands.exit_codes`."""
@@ -119,6 +122,10 @@ def entry(argv: Sequence[str] | None = None) -> None:
     from hood.native import build
 
     build.announce = lambda sentence: print(f"hood: {sentence}", file=sys.stderr)
+    if arguments and arguments[0] in _SIMULATE and not any(word in ("-h", "--help") for word in arguments):
+        from hood.native import ahead
+
+        ahead.start()
     sys.exit(main(arguments))
 
 

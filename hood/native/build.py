@@ -9,6 +9,8 @@ import platform
 import shutil
 import subprocess
 import tempfile
+import threading
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
@@ -20,6 +22,11 @@ from hood.native.prebuilt import FOLDER, prebuilt, source_text
 NATIVE_FLAGS = ("-O3", "-std=c++17", "-shared", "-fPIC", "-pthread", "-fno-math-errno", "-Wno-psabi", "-march=native")
 #: What ``-march=native`` asks of a compiler that does not know the processor it runs on, or not the option.
 _UNKNOWN_PROCESSOR = ("unknown architecture", "unknown value", "unsupported argument", "unsupported option", "bad value")
+
+#: Threads of a program do not make the same library twice.
+_LOCKS: defaultdict[Path, threading.Lock] = defaultdict(threading.Lock)
+#: Compilers that are at work, and the threads that wait for them.
+_RUNS: dict[subprocess.Popen[str], threading.Thread] = {}
 
 #: Called with one sentence when a compiler starts, which takes some seconds; commands print it.
 announce: Callable[[str], None] = lambda sentence: None  # noqa: E731
@@ -44,10 +51,11 @@ def build(source: Path, flags: Sequence[str]) -> ctypes.CDLL:
     compiler = find_compiler()
     folder = cache_folder()
     if folder is not None:
-        path = folder / "kernels" / f"{_digest(compiler, source, flags)}.so"
+        path = _place(folder, compiler, source, flags)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            return _kept(path) or _compile(compiler, flags, source, path)
+            with _LOCKS[path]:
+                return _kept(path) or _compile(compiler, flags, source, path)
         except OSError:  # a folder that cannot be written to, or whose files may not be run: done without
             pass
     try:
@@ -55,6 +63,32 @@ def build(source: Path, flags: Sequence[str]) -> ctypes.CDLL:
             return _compile(compiler, flags, source, Path(temporary) / "library.so")
     except OSError as error:
         raise BuildError(f"a compiled library cannot be loaded ({error}); name a folder for it in HOOD_CACHE") from error
+
+
+def keep(source: Path, flags: Sequence[str]) -> None:
+    """Make what :func:`build` would load, unless it is carried or kept already, and keep it; it is not loaded. Nothing where
+    nothing is kept.
+
+    Raises:
+        BuildError: there is no compiler, or it fails.
+        OSError: the folder cannot be written to.
+    """
+    folder = cache_folder()
+    if folder is None or prebuilt(FOLDER, source, flags) is not None:
+        return
+    compiler = find_compiler()
+    path = _place(folder, compiler, source, flags)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with _LOCKS[path]:
+        if not path.exists():
+            _make(compiler, flags, source, path)
+
+
+def stop_compilers(thread: threading.Thread) -> None:
+    """End the compilers that ``thread`` waits for; their output is not kept."""
+    for run, owner in list(_RUNS.items()):
+        if owner is thread:
+            run.terminate()
 
 
 def optional(source: Path) -> ctypes.CDLL | None:
@@ -106,8 +140,18 @@ def compile_library(compiler: str, flags: Sequence[str], source: Path, path: Pat
 
 def _run(compiler: str, flags: Sequence[str], source: Path, made: Path) -> list[str]:
     """What the compiler complains about; nothing where it succeeds."""
-    run = subprocess.run([compiler, *flags, str(source), "-o", str(made)], capture_output=True, text=True, check=False)
-    return (run.stderr.strip().splitlines() or [f"exit code {run.returncode}"]) if run.returncode else []
+    command = [compiler, *flags, str(source), "-o", str(made)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as run:
+        _RUNS[run] = threading.current_thread()
+        try:
+            _, said = run.communicate()
+        finally:
+            del _RUNS[run]
+    return (said.strip().splitlines() or [f"exit code {run.returncode}"]) if run.returncode else []
+
+
+def _place(folder: Path, compiler: str, source: Path, flags: Sequence[str]) -> Path:
+    return folder / "kernels" / f"{_digest(compiler, source, flags)}.so"
 
 
 def _digest(compiler: str, source: Path, flags: Sequence[str]) -> str:
@@ -126,6 +170,10 @@ def _kept(path: Path) -> ctypes.CDLL | None:
 
 def _compile(compiler: str, flags: Sequence[str], source: Path, path: Path) -> ctypes.CDLL:
     """Compile and load."""
+    _make(compiler, flags, source, path)
+    return ctypes.CDLL(str(path))
+
+
+def _make(compiler: str, flags: Sequence[str], source: Path, path: Path) -> None:
     announce(f"compiling {source.name} for this processor; this happens once and takes some seconds")
     compile_library(compiler, flags, source, path)
-    return ctypes.CDLL(str(path))

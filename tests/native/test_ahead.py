@@ -1,0 +1,78 @@
+"""Libraries made in the background: once, waited for, and left without a trace when the program ends before."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from hood.native import ahead, libraries
+from hood.native import build as native_build
+from hood.native.build import BuildError, build, find_compiler, keep
+
+FLAGS = ("-O0", "-shared", "-fPIC")
+SOURCE = 'extern "C" int answer() { return 42; }\n'
+
+
+@pytest.fixture
+def source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A small source, with an empty folder for what is made of it."""
+    try:
+        find_compiler()
+    except BuildError as error:
+        pytest.skip(str(error))
+    monkeypatch.setenv("HOOD_CACHE", str(tmp_path / "kept"))
+    path = tmp_path / "answer.cpp"
+    path.write_text(SOURCE)
+    return path
+
+
+def kept(source: Path) -> list[Path]:
+    return [path for path in (source.parent / "kept").rglob("*") if path.is_file()]
+
+
+def test_who_needs_what_is_being_made_waits_for_it(source, monkeypatch):
+    said: list[str] = []
+    monkeypatch.setattr(native_build, "announce", said.append)
+    threads = [threading.Thread(target=keep, args=(source, FLAGS)) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    assert build(source, FLAGS).answer() == 42
+    for thread in threads:
+        thread.join()
+    assert len(said) == len(kept(source)) == 1
+
+
+def test_nothing_is_made_where_nothing_is_kept(source, monkeypatch):
+    monkeypatch.setenv("HOOD_CACHE", "off")
+    keep(source, FLAGS)
+    assert not kept(source)
+
+
+def test_all_that_a_wheel_would_carry_is_made(source, monkeypatch):
+    other = source.with_name("other.cpp")
+    other.write_text(SOURCE.replace("42", "43"))
+    monkeypatch.setattr(ahead, "LIBRARIES", ((source, FLAGS), (other, FLAGS)))
+    ahead._make(threading.Event())
+    assert len(kept(source)) == 2
+    assert build(other, FLAGS).answer() == 43
+    assert ahead.LIBRARIES is not libraries.LIBRARIES
+
+
+def test_a_program_that_ends_first_stops_the_compiler_and_leaves_nothing(source):
+    script = source.parent / "slow-compiler"
+    script.write_text('#!/bin/sh\n[ "$1" = --version ] && exit 0\ntouch "$(dirname "$0")/begun"\nexec sleep 60\n')
+    script.chmod(0o755)
+    code = (
+        "import time; from pathlib import Path; from hood.native import ahead\n"
+        f"ahead.LIBRARIES = ((Path({str(source)!r}), {FLAGS!r}),); ahead.start()\n"
+        f"while not Path({str(source.parent / 'begun')!r}).exists(): time.sleep(0.01)\n"
+    )
+    environment = {**os.environ, "CXX": str(script)}
+    subprocess.run([sys.executable, "-c", code], env=environment, check=True, timeout=30)
+    assert not kept(source)
+    assert not any((source.parent / "kept" / "kernels").iterdir())
