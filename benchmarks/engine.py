@@ -23,6 +23,7 @@ garment, motion and form: the steps that missed their accuracy, the Newton itera
 from __future__ import annotations
 
 import argparse
+import gc
 import os
 import resource
 import sys
@@ -122,8 +123,15 @@ def compare(garment: str, motions: list[str], frames: int, iterations: int) -> I
     yield " ".join([*columns, f"{max(differences):12.1e}   {same} of {len(differences)}"])
 
 
-def time_frames(garment: str, motions: list[str], frames: int, iterations: int, threads: list[int]) -> Iterator[str]:
-    """Lines of the table of whole frames, one for each number of threads; rollouts take turns frame by frame."""
+#: Milliseconds and γ of the frames of all garments, by threads.
+Pool = dict[int, tuple[list[float], list[float]]]
+
+
+def time_frames(
+    garment: str, motions: list[str], frames: int, iterations: int, threads: list[int], pool: Pool
+) -> Iterator[str]:
+    """Lines of the table of whole frames, one for each number of threads; rollouts take turns frame by frame. What was found is
+    added to ``pool``."""
     potential = default_potential()
     settings = NewtonSettings(max_iterations=iterations)
     spent: dict[int, list[float]] = {number: [] for number in threads}
@@ -151,6 +159,8 @@ def time_frames(garment: str, motions: list[str], frames: int, iterations: int, 
     size = len(scene.cloth.rest_pos)
     for number in threads:
         gaps = [float(gap(potential, problem, pos).gamma) for steps in seen[number] for problem, pos in steps[::STRIDE]]
+        pool.setdefault(number, ([], []))[0].extend(spent[number])
+        pool[number][1].extend(gaps)
         cpu, (middle, high) = median(spent[number]), np.percentile(gaps, [50, 95])
         times = f"{cpu:10.1f} {median(clock[number]):9.1f} {min(clock[number]):7.1f} {1e3 * cpu / size:9.1f}"
         yield f"{garment:12s} {size:6d} {number:7d} {times} {middle:10.2g} {high:8.2g} {len(gaps):6d} {memory:8.0f}"
@@ -208,14 +218,16 @@ def main() -> None:
     if any(os.environ.get(key) is None for key in ENVIRONMENT):  # read at process start only
         os.execve(sys.executable, [sys.executable, *sys.argv], {**ENVIRONMENT, **os.environ})
     torch.set_num_threads(1)
+    gc.freeze()  # as the commands do
     common = (arguments.motions, arguments.frames)
     limit = f"{arguments.iterations} iterations at most"
     work: Callable[[str], Iterator[str]]
+    pool: Pool = {}
     if arguments.converged:
         limit, work = "iterations until the default accuracy", lambda garment: converge(garment, *common)
         head = "garment      motion          form       steps  missed its median   p95   max  worst rg  frame ms"
     elif arguments.frame:
-        work = lambda garment: time_frames(garment, *common, arguments.iterations, arguments.threads)  # noqa: E731
+        work = lambda garment: time_frames(garment, *common, arguments.iterations, arguments.threads, pool)  # noqa: E731
         head = "garment    vertices threads   frame ms  on clock   least us/vertex   γ median    γ p95 states       MB"
     else:
         work = lambda garment: compare(garment, *common, arguments.iterations)  # noqa: E731
@@ -225,6 +237,9 @@ def main() -> None:
     for garment in arguments.garments:
         for line in work(f"{garment}:{arguments.refine_to}" if arguments.refine_to else garment):
             print(line, flush=True)
+    for number, (times, gaps) in pool.items():
+        middle, high = np.percentile(gaps, [50, 95])
+        print(f"{'all':12s} {number:14d} {median(times):10.1f} {middle:37.2g} {high:8.2g} {len(gaps):6d}")
 
 
 if __name__ == "__main__":
