@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import torch
 
@@ -68,7 +66,8 @@ def test_a_body_vertex_is_matched_with_the_nearest_cloth() -> None:
     torch.testing.assert_close(points.weights.sum(dim=1), torch.ones(len(points.dist), dtype=F64))
     assert bool((points.weights >= 0).all())
     gap = points.at(pos) - points.point
-    nearest = find_contact(obstacle.pos, obstacle.vertex_scene, replace(obstacle, pos=pos, next_pos=pos, faces=cloth.faces))
+    surface = Obstacle(pos, pos, pos, cloth.faces, cloth.vertex_scene, cloth.face_scene)
+    nearest = find_contact(obstacle.pos, obstacle.vertex_scene, surface)
     torch.testing.assert_close(gap.norm(dim=1), nearest.dist.abs())
     # On a ball the vertices' normals are radial to a degree.
     torch.testing.assert_close(points.dist, (gap * points.point).sum(dim=1) / 0.1, rtol=0, atol=1e-5)
