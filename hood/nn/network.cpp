@@ -178,15 +178,22 @@ void normalise_rows(const Perceptron& p, float* rows, int count) {
         }
 }
 
-// The layers behind the first, from its output before the ReLU (in `one`, which is overwritten); finish(row, result of a row).
-template <class Finish> void tail(const Perceptron& p, float* one, int rows, Ahead& ahead, const Finish& finish) {
-    alignas(64) static thread_local float two[TILE * MOST], raw[TILE * MOST];
+// The layers behind the first, from its output before the ReLU (in `one`, which is overwritten); rows of padded(p.out) in `raw`.
+// No template: the products are long to compile.
+void layers_behind(const Perceptron& p, float* one, int rows, Ahead& ahead, float* raw) {
+    alignas(64) static thread_local float two[TILE * MOST];
     const int d = (int)p.width, out = padded(p.out);
     for (int i = 0; i < rows * d; i += LANES) store(one + i, relu(load(one + i)));
     product(one, d, rows, d, p.second, d, ahead, [&](int r, int c, V v) { store(two + r * d + c, relu(v + load(p.bias_2 + c))); });
     product(two, d, rows, d, p.third, p.out, ahead, [&](int r, int c, V v) { store(raw + r * out + c, v + load(p.bias_3 + c)); });
     if (p.scale) normalise_rows(p, raw, rows);
-    for (int r = 0; r < rows; ++r) finish(r, raw + r * out);
+}
+
+// The same, and finish(row, result of a row).
+template <class Finish> void tail(const Perceptron& p, float* one, int rows, Ahead& ahead, const Finish& finish) {
+    alignas(64) static thread_local float raw[TILE * MOST];
+    layers_behind(p, one, rows, ahead, raw);
+    for (int r = 0; r < rows; ++r) finish(r, raw + r * padded(p.out));
 }
 
 inline void gather(const float* x, const int64_t* rows, int count, int d, float* out) {
