@@ -7,29 +7,21 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
-#include <cstring>
 
+#include "halving.h"
+#include "lanes.h"
 #include "threads.h"
 #include "vector.h"
 
 namespace {
 
-constexpr int WIDE = 8;  // children of a node, faces of a leaf, vertices of a block
+constexpr int WIDE = LANES;  // children of a node, faces of a leaf, vertices of a block
 constexpr int MOST = 64;  // points of a batch
 constexpr double EPS = 2.220446049250313e-16, TINY = 2.2250738585072014e-308;
 constexpr double NONE = 1e300;  // the number of no face and of no vertex
 
-typedef double V8 __attribute__((vector_size(64)));
-typedef decltype(V8{} < V8{}) I8;
 typedef float F8 __attribute__((vector_size(32)));
 
-template <class V, class T> inline V load(const T* p) {
-    V v;
-    std::memcpy(&v, p, sizeof(V));
-    return v;
-}
-template <class T, class V> inline void store(T* p, V v) { std::memcpy(p, &v, sizeof(V)); }
-inline V8 all(double x) { return V8{x, x, x, x, x, x, x, x}; }
 // The second where one is not a number.
 template <class V> inline V least(V a, V b) { return a < b ? a : b; }
 template <class V> inline V greatest(V a, V b) { return a > b ? a : b; }
@@ -464,24 +456,11 @@ void search(const Tree& tree, const Query& query, int64_t begin, int64_t end) {
     }
 }
 
-// Halves the faces ``begin`` to ``end`` of the order along the longest side of their centres, into whole leaves as far as they go;
-// returns the middle.
-int32_t halve(Tree& tree, int32_t begin, int32_t end, const double* centre) {
+// Halves the faces ``begin`` to ``end`` of the order, into whole leaves as far as they go; returns the middle.
+int32_t halve_leaves(Tree& tree, int32_t begin, int32_t end, const double* centre) {
     if (end - begin <= WIDE) return end;
-    double low[3] = {INFINITY, INFINITY, INFINITY}, high[3] = {-INFINITY, -INFINITY, -INFINITY};
-    for (int32_t i = begin; i < end; ++i)
-        for (int k = 0; k < 3; ++k) {
-            const double value = centre[3 * (int64_t)tree.order[i] + k];
-            low[k] = std::min(low[k], value), high[k] = std::max(high[k], value);
-        }
-    int axis = 0;
-    for (int k = 1; k < 3; ++k)
-        if (high[k] - low[k] > high[axis] - low[axis]) axis = k;
     const int32_t middle = begin + WIDE * (((end - begin) / 2 + WIDE - 1) / WIDE);
-    std::nth_element(tree.order + begin, tree.order + middle, tree.order + end, [&](int32_t a, int32_t b) {
-        const double x = centre[3 * (int64_t)a + axis], y = centre[3 * (int64_t)b + axis];
-        return x < y || (x == y && a < b);
-    });
+    halve(tree.order, begin, middle, end, centre);
     return middle;
 }
 
@@ -495,7 +474,7 @@ int32_t grow(Tree& tree, int32_t begin, int32_t end, const double* centre) {
     int32_t cut[WIDE + 1];
     cut[0] = begin, cut[WIDE] = end;
     for (int step = WIDE; step > 1; step /= 2)
-        for (int i = 0; i < WIDE; i += step) cut[i + step / 2] = halve(tree, cut[i], cut[i + step], centre);
+        for (int i = 0; i < WIDE; i += step) cut[i + step / 2] = halve_leaves(tree, cut[i], cut[i + step], centre);
     for (int i = 0; i < WIDE; ++i) {
         const int32_t child = cut[i] < cut[i + 1] ? grow(tree, cut[i], cut[i + 1], centre) : node;
         tree.children[WIDE * (int64_t)node + i] = child;
