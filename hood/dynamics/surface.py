@@ -10,11 +10,12 @@ from __future__ import annotations
 import numpy as np
 
 from hood.assets.garment import Garment
+from hood.mesh.compiled_crossing import Eights, eights
 from hood.mesh.crossing import crossings, self_crossings
 from hood.mesh.skin import Sheet, skin_depth
 
 SURFACE_METRICS = ("cut_face_share", "cut_edge_share", "skin_depth", "self_crossings", "garment_crossings")
-#: Frames from one measurement to the next: 4 ms a frame at 1,000 vertices, 7 ms at 12,000.
+#: Frames from one measurement to the next: less than 1 ms a frame at 1,000 vertices, 1 ms at 12,000.
 SURFACE_STRIDE = 5
 #: Cloth with a median edge of more than so many times that at rest is no garment any more.
 TATTERS = 3.0
@@ -32,7 +33,10 @@ class SurfaceMeter:
         self._faces, self._body_faces = np.asarray(garment.faces), np.asarray(body_faces).reshape(-1, 3)
         self._sheet = Sheet.of(self._faces)
         self._edges = self._sheet.edges
-        self._lengths = _lengths(np.asarray(garment.rest_pos), self._edges)
+        lengths = _lengths(np.asarray(garment.rest_pos), self._edges)
+        self._longest = TATTERS * float(np.median(lengths)) if len(lengths) else np.inf
+        self._cloth = eights(self._faces, garment.rest_pos)
+        self._body: Eights | None = None
         piece = np.zeros(len(garment.rest_pos), dtype=np.int64) if garment.piece is None else garment.piece
         self._piece = piece[self._faces[:, 0]]
 
@@ -51,19 +55,32 @@ class SurfaceMeter:
         pos, body_pos = np.asarray(pos, dtype=np.float64), np.asarray(body_pos, dtype=np.float64)
         if not (np.isfinite(pos).all() and np.isfinite(body_pos).all()):
             return dict.fromkeys(SURFACE_METRICS, float("nan"))
-        if len(self._edges) and np.median(_lengths(pos, self._edges)) > TATTERS * np.median(self._lengths):
+        if self._in_tatters(pos):
             return dict.fromkeys(SURFACE_METRICS, float("nan"))
-        cut = crossings(pos, self._faces, body_pos, self._body_faces)
-        pairs = self_crossings(pos, self._faces)
+        cloth, self._body = self._cloth, self._body or eights(self._body_faces, body_pos)
+        both = None if cloth is None or self._body is None else (cloth, self._body)
+        cut = crossings(pos, self._faces, body_pos, self._body_faces, both)
+        pairs = self_crossings(pos, self._faces, cloth)
         same = self._piece[pairs[:, 0]] == self._piece[pairs[:, 1]]
         values = (
-            len(np.unique(cut.pairs[:, 0])) / max(len(self._faces), 1),
-            len(np.unique(cut.first_edges[:, :2], axis=0)) / max(len(self._edges), 1),
-            skin_depth(pos, self._faces, body_pos, self._body_faces, cut, self._sheet),
+            _num_groups(cut.pairs[:, :1]) / max(len(self._faces), 1),
+            _num_groups(cut.first_edges[:, :2]) / max(len(self._edges), 1),
+            skin_depth(pos, self._faces, body_pos, self._body_faces, cut, self._sheet, both),
             float(same.sum()),
             float((~same).sum()),
         )
         return dict(zip(SURFACE_METRICS, values, strict=True))
+
+    def _in_tatters(self, pos: np.ndarray) -> bool:
+        lengths = _lengths(pos, self._edges)
+        longer = 2 * int(np.count_nonzero(lengths > self._longest))
+        # The median lies between two lengths where these are half of them.
+        return longer > len(lengths) or (longer == len(lengths) > 0 and bool(np.median(lengths) > self._longest))
+
+
+def _num_groups(rows: np.ndarray) -> int:
+    """Different ones among sorted rows."""
+    return int((rows[1:] != rows[:-1]).any(axis=1).sum()) + 1 if len(rows) else 0
 
 
 def _lengths(pos: np.ndarray, edges: np.ndarray) -> np.ndarray:

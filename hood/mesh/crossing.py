@@ -12,7 +12,7 @@ computed from the four vertices in the order of their numbers: faces that share 
 nothing slips through between them. The winding of the faces plays no role.
 
 Positions are taken to float64 around the middle of the scene. Triangles with a corner that is not finite cross nothing. Where
-there is a compiler :mod:`hood.mesh.compiled_crossing` does the same in a hundredth of the time.
+there is a compiler :mod:`hood.mesh.compiled_crossing` does the same in less than a hundredth of the time.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hood.mesh import compiled_crossing
 from hood.mesh.boxes import overlapping_boxes
+from hood.mesh.compiled_crossing import Eights, eights, find
 
 #: Distance from a plane, in units of the size of the scene, up to which a corner lies in it.
 TOUCH = 1e-10
@@ -43,25 +43,37 @@ class Crossings(NamedTuple):
     second_edges: np.ndarray
 
 
-def crossings(pos: np.ndarray, faces: np.ndarray, other_pos: np.ndarray, other_faces: np.ndarray) -> Crossings:
-    """Crossings of two meshes with positions (V, 3), (W, 3) and faces (F, 3), (G, 3)."""
+def crossings(
+    pos: np.ndarray,
+    faces: np.ndarray,
+    other_pos: np.ndarray,
+    other_faces: np.ndarray,
+    both: tuple[Eights, Eights] | None = None,
+) -> Crossings:
+    """Crossings of two meshes with positions (V, 3), (W, 3) and faces (F, 3), (G, 3).
+
+    ``both``: :func:`hood.mesh.compiled_crossing.eights` of the faces, where they are known.
+    """
     pos, faces, other_pos, other_faces = _arrays(pos, faces) + _arrays(other_pos, other_faces)
+    own, other = both or (eights(faces, pos), eights(other_faces, other_pos))
+    if own is not None and other is not None:
+        return Crossings(*find(own, pos, other, other_pos, TOUCH))
     frame = _Frame.around(pos, other_pos)
-    found = compiled_crossing.find(pos, faces, other_pos, other_faces, frame.origin, frame.touch)
-    if found is not None:
-        return Crossings(*(_unique_rows(table) for table in found))
     first = _triangles(pos, faces, frame)
     second = _triangles(other_pos, other_faces, frame, within=first)
     return _collect(_crossing(first, second, pairs, frame.touch) for pairs in _near(first, second))
 
 
-def self_crossings(pos: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Pairs (N, 2) of faces of one mesh that cross, the smaller number first; those that share a vertex are left out."""
+def self_crossings(pos: np.ndarray, faces: np.ndarray, own: Eights | None = None) -> np.ndarray:
+    """Pairs (N, 2) of faces of one mesh that cross, the smaller number first; those that share a vertex are left out.
+
+    ``own``: :func:`hood.mesh.compiled_crossing.eights` of the faces, where they are known.
+    """
     pos, faces = _arrays(pos, faces)
+    own = own or eights(faces, pos)
+    if own is not None:
+        return find(own, pos, own, pos, TOUCH)[0]
     frame = _Frame.around(pos)
-    found = compiled_crossing.find(pos, faces, pos, faces, frame.origin, frame.touch)
-    if found is not None:
-        return _unique_rows(found[0])
     mesh = _triangles(pos, faces, frame)
     return _collect(_crossing(mesh, mesh, _apart(mesh, pairs), frame.touch) for pairs in _near(mesh, mesh)).pairs
 

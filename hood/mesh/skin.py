@@ -7,16 +7,15 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from hood.mesh import compiled_crossing, topology
+from hood.mesh import topology
 from hood.mesh.boxes import overlapping_boxes
+from hood.mesh.compiled_crossing import Eights, depth, eights
 from hood.mesh.crossing import Crossings
 
 #: Skin farther than this [m] from all cloth is bare.
 REACH = 0.1
 _BEHIND = 0.5  # cosine of 60 degrees
 _NEAREST = 0.8
-#: Pairs of points and triangles that are all looked at by the compiled form; more are sorted first.
-_MOST_PAIRS = 1 << 25
 
 
 class Sheet(NamedTuple):
@@ -43,6 +42,7 @@ def skin_depth(
     skin_faces: np.ndarray,
     cut: Crossings,
     sheet: Sheet | None = None,
+    both: tuple[Eights, Eights] | None = None,
 ) -> float:
     """Largest height [m] of a vertex of the skin above the cloth; 0 where none is above it.
 
@@ -61,12 +61,16 @@ def skin_depth(
         skin_faces: wound so that normals point outwards; the winding of the cloth plays no role.
         cut: the crossings of the cloth with the skin, all positions finite.
         sheet: of ``faces``, where it is known.
+        both: :func:`hood.mesh.compiled_crossing.eights` of ``faces`` and ``skin_faces``, where they are known.
     """
-    suspect = np.zeros(len(faces), dtype=bool)
-    suspect[cut.pairs[:, 0]] = True
-    if not suspect.any():
+    if not len(cut.pairs):
         return 0.0
     sheet = Sheet.of(faces) if sheet is None else sheet
+    cloth, skin = both or (eights(faces, pos), eights(skin_faces, skin_pos))
+    if cloth is not None and skin is not None:
+        return depth(cloth, pos, skin, skin_pos, sheet, cut[:2], (REACH, _BEHIND, _NEAREST))
+    suspect = np.zeros(len(faces), dtype=bool)
+    suspect[cut.pairs[:, 0]] = True
     suspect |= sunken(pos, sheet.edges, skin_pos, skin_faces, cut)[faces].all(axis=1)
     corners = pos[faces]
     reached = corners[suspect].reshape(-1, 3)
@@ -157,10 +161,6 @@ def _interior_weights(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 def _clearance(points: np.ndarray, others: np.ndarray) -> np.ndarray:
     """Distances (N,) from points (N, 3) to the nearest of others (M, 3)."""
-    if len(points) * len(others) <= _MOST_PAIRS:
-        found = compiled_crossing.clearance(points, others)
-        if found is not None:
-            return found
     return np.asarray(cKDTree(others).query(points)[0])
 
 
@@ -169,12 +169,6 @@ def _nearest(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
     """Of points (N, 3) with one of the ``chosen`` triangles within their ``reach`` (N,): their numbers, the nearest triangle,
     weights, nearest point and distance; None where there is none."""
-    if len(points) * len(chosen) <= _MOST_PAIRS:
-        found = compiled_crossing.nearest(points, reach * (1 + 1e-9), corners[chosen])
-        if found is not None:
-            row = np.flatnonzero(found[0] >= 0)
-            face, weights, dist = chosen[found[0][row]], found[1][row], found[2][row]
-            return (row, face, weights, np.einsum("ni,nij->nj", weights, corners[face]), dist) if len(row) else None
     # Some corner is this near; so is the nearest point.
     known, _ = cKDTree(corners[chosen].reshape(-1, 3)).query(points)
     reach = np.minimum(known, reach)

@@ -1,71 +1,50 @@
-// Where triangles pass through each other, and triangles nearest to points: see hood/mesh/crossing.py and hood/mesh/skin.py.
+// Where triangles pass through each other, and how far skin sticks out: see hood/mesh/crossing.py and hood/mesh/skin.py.
 //
 // To be compiled without contracted products: faces that share an edge must compute the same signs for it, to the last bit.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <numeric>
 #include <vector>
 
+#include "eights.h"
+#include "halving.h"
+#include "lanes.h"
 #include "vector.h"
 
 namespace {
 
-constexpr double EPS = 2.220446049250313e-16, TINY = 2.2250738585072014e-308;
-constexpr double CELL = 1.5;             // edge of a cell in units of the typical box
-constexpr int64_t MANY_CELLS = 512;      // a box over more cells than this is compared with every other box
 constexpr int EDGE[3][2] = {{0, 1}, {1, 2}, {0, 2}};  // of a triangle whose corners ascend
 
 inline double axis(Vec v, int k) { return k == 0 ? v.x : k == 1 ? v.y : v.z; }
 inline double norm(Vec v) { return std::sqrt(dot(v, v)); }
-inline bool finite(Vec v) { return std::isfinite(v.x) && std::isfinite(v.y) && std::isfinite(v.z); }
 inline int sign(double v) { return (v > 0.0) - (v < 0.0); }
-
-struct Box {
-    double low[3], high[3];
-};
-
-inline Box box_of(Vec a, Vec b, Vec c) {
-    Box box;
-    for (int k = 0; k < 3; ++k) {
-        const double x = axis(a, k), y = axis(b, k), z = axis(c, k);
-        box.low[k] = std::min(std::min(x, y), z), box.high[k] = std::max(std::max(x, y), z);
-    }
-    return box;
-}
-
-inline bool overlap(const Box& a, const Box& b) {
-    bool apart = false;
-    for (int k = 0; k < 3; ++k) apart |= a.low[k] > b.high[k] || a.high[k] < b.low[k];
-    return !apart;
-}
 
 // A triangle with its corners in the order of their numbers, and its unit normal: zero without an area.
 struct Triangle {
-    int64_t vertex[3];
+    int64_t number, vertex[3];
     Vec corner[3], normal;
 };
 
-Triangle triangle(const double* pos, const int64_t* face, const double* origin) {
+inline Vec lane_of(const double* table, int i) { return {table[i], table[LANES + i], table[2 * LANES + i]}; }
+
+Triangle triangle(const Eights& e, int64_t leaf, int i) {
     Triangle t;
-    std::copy(face, face + 3, t.vertex);
-    std::sort(t.vertex, t.vertex + 3);
-    for (int c = 0; c < 3; ++c) t.corner[c] = at(pos, t.vertex[c]) - at(origin, 0);
-    const Vec first = t.corner[1] - t.corner[0], second = t.corner[2] - t.corner[0], normal = cross(first, second);
-    const double length = norm(normal);
-    // Below this the direction is rounding alone.
-    t.normal = length <= 16.0 * EPS * norm(first) * norm(second) ? Vec{0.0, 0.0, 0.0} : (1.0 / length) * normal;
+    t.number = e.order[LANES * leaf + i];
+    for (int c = 0; c < 3; ++c) {
+        t.vertex[c] = e.vertex[LANES * (3 * leaf + c) + i];
+        t.corner[c] = lane_of(e.corner + LANES * (9 * leaf + 3 * c), i);
+    }
+    t.normal = lane_of(normals(e, leaf), i);
     return t;
 }
 
-// Sides of a plane on which the corners lie; false where they are not on both.
-inline bool sides(const Triangle& t, const Triangle& plane, double touch, int* side) {
-    int least = 1, most = -1;
+// Sides of a plane on which the corners lie.
+inline void sides(const Triangle& t, const Triangle& plane, double touch, int* side) {
     for (int c = 0; c < 3; ++c) {
         const double height = dot(t.corner[c] - plane.corner[0], plane.normal);
         side[c] = std::fabs(height) > touch ? sign(height) : 0;
-        least = std::min(least, side[c]), most = std::max(most, side[c]);
     }
-    return least < 0 && most > 0;
 }
 
 // Whether a line passes the edges of a triangle on one side all the way round.
@@ -74,144 +53,52 @@ inline bool inside(int a, int b, int c) {
     return (a >= 0 && b >= 0 && c >= 0) || (a <= 0 && b <= 0 && c <= 0);
 }
 
-// The finite triangles of a mesh: boxes about the origin, and their numbers.
-struct Boxes {
-    std::vector<Box> box;
-    std::vector<int64_t> number;
-};
-
-Boxes boxes_of(const double* pos, const int64_t* faces, int64_t num_faces, const double* origin) {
-    Boxes result;
-    result.box.reserve(num_faces), result.number.reserve(num_faces);
-    for (int64_t f = 0; f < num_faces; ++f) {
-        Vec corner[3];
-        for (int c = 0; c < 3; ++c) corner[c] = at(pos, faces[3 * f + c]) - at(origin, 0);
-        if (!(finite(corner[0]) && finite(corner[1]) && finite(corner[2]))) continue;
-        result.box.push_back(box_of(corner[0], corner[1], corner[2]));
-        result.number.push_back(f);
-    }
-    return result;
+// Triangles of a leaf that share no vertex with one of another leaf.
+inline I8 strangers(const Eights& e, int64_t leaf, int i, int64_t other) {
+    N8 same = N8{};
+    for (int c = 0; c < 3; ++c)
+        for (int d = 0; d < 3; ++d)
+            same |= load<N8>(e.vertex + LANES * (3 * other + d)) == e.vertex[LANES * (3 * leaf + c) + i];
+    return __builtin_convertvector(~same, I8);
 }
 
-// Cubic cells around some boxes, and which boxes reach into each; boxes over many cells are kept apart.
-struct Grid {
-    double low[3], high[3], per_cell;
-    int32_t shape[3];
-    std::vector<int32_t> start, item, large;
+// Triangles of a leaf of b with corners on both sides of the plane of a triangle of a, which has corners on both sides of theirs.
+inline I8 straddling(const Eights& a, int64_t leaf, int i, const Eights& b, int64_t other, double touch) {
+    const double *corner = a.corner + 9 * LANES * leaf + i, *normal = normals(a, leaf) + i;
+    const double* corners = b.corner + 9 * LANES * other;
+    const auto theirs = [&](int c, int k) { return load<V8>(corners + LANES * (3 * c + k)); };
+    const auto own = [&](int c, int k) { return all(corner[LANES * (3 * c + k)]); };
+    const I8 first = on_both_sides(theirs, [&](int k) { return corner[LANES * k]; }, [&](int k) { return normal[LANES * k]; }, touch);
+    if (!lanes_of(first)) return first;
+    const double* up = normals(b, other);
+    return first & on_both_sides(own, [&](int k) { return theirs(0, k); }, [&](int k) { return load<V8>(up + LANES * k); }, touch);
+}
 
-    struct Range {
-        int32_t first[3], last[3];
-        int64_t count() const { return (int64_t)(last[0] - first[0] + 1) * (last[1] - first[1] + 1) * (last[2] - first[2] + 1); }
+// Middle of the finite ones of some points, and the extent of the box around them.
+void locate(const Eights& first, const Eights& second, double* origin, double* extent) {
+    double low[3] = {INFINITY, INFINITY, INFINITY}, high[3] = {-INFINITY, -INFINITY, -INFINITY};
+    for (const Eights* e : {&first, &second})
+        for (int64_t i = 0; i < e->num_vertices; ++i) {
+            const double *p = e->pos + 3 * i, sum = (p[0] - p[0]) + (p[1] - p[1]) + (p[2] - p[2]);
+            if (!(sum == 0.0)) continue;
+            for (int k = 0; k < 3; ++k) low[k] = std::min(low[k], p[k]), high[k] = std::max(high[k], p[k]);
+        }
+    *extent = 0.0;
+    for (int k = 0; k < 3; ++k) {
+        origin[k] = low[k] <= high[k] ? 0.5 * low[k] + 0.5 * high[k] : 0.0;
+        *extent = low[k] <= high[k] ? std::max(*extent, high[k] - low[k]) : *extent;
+    }
+}
+
+template <int WIDTH> void sort_rows(int64_t* table, int64_t* count) {
+    struct Row {
+        int64_t value[WIDTH];
+        bool operator<(const Row& other) const { return std::lexicographical_compare(value, value + WIDTH, other.value, other.value + WIDTH); }
+        bool operator==(const Row& other) const { return std::equal(value, value + WIDTH, other.value); }
     };
-    std::vector<Range> ranges;  // of the boxes
-
-    int32_t place(double x, int k) const {
-        const double share = (x - low[k]) * per_cell;
-        return share <= 0.0 ? 0 : share >= (double)shape[k] ? shape[k] - 1 : (int32_t)share;
-    }
-    Range range(const Box& box) const {
-        Range r;
-        for (int k = 0; k < 3; ++k) r.first[k] = place(box.low[k], k), r.last[k] = place(box.high[k], k);
-        return r;
-    }
-    template <class Visit> void cells(const Range& r, Visit visit) const {
-        for (int32_t z = r.first[2]; z <= r.last[2]; ++z)
-            for (int32_t y = r.first[1]; y <= r.last[1]; ++y)
-                for (int32_t x = r.first[0]; x <= r.last[0]; ++x) visit((z * shape[1] + y) * shape[0] + x);
-    }
-
-    Grid(const std::vector<Box>& boxes, double typical) {
-        for (int k = 0; k < 3; ++k) low[k] = INFINITY, high[k] = -INFINITY;
-        for (const Box& box : boxes)
-            for (int k = 0; k < 3; ++k) low[k] = std::min(low[k], box.low[k]), high[k] = std::max(high[k], box.high[k]);
-        const double extent = std::max(std::max(high[0] - low[0], high[1] - low[1]), high[2] - low[2]);
-        double cell = std::max(std::max(CELL * typical, 1e-5 * extent), TINY);
-        // No more cells than a few times the boxes.
-        const double most = 64.0 + 8.0 * (double)boxes.size();
-        while (true) {
-            double count = 1.0;
-            for (int k = 0; k < 3; ++k) count *= std::floor((high[k] - low[k]) / cell) + 1.0;
-            if (count <= most) break;
-            cell *= 1.25;
-        }
-        per_cell = 1.0 / cell;
-        int32_t count = 1;
-        for (int k = 0; k < 3; ++k) count *= shape[k] = (int32_t)((high[k] - low[k]) / cell) + 1;
-        start.assign(count + 1, 0);
-        ranges.reserve(boxes.size());
-        for (size_t i = 0; i < boxes.size(); ++i) {
-            ranges.push_back(range(boxes[i]));
-            if (ranges[i].count() > MANY_CELLS) large.push_back((int32_t)i);
-            else cells(ranges[i], [&](int32_t c) { ++start[c + 1]; });
-        }
-        for (int32_t c = 0; c < count; ++c) start[c + 1] += start[c];
-        item.resize(start[count]);
-        std::vector<int32_t> next(start.begin(), start.end() - 1);
-        for (size_t i = 0; i < boxes.size(); ++i)
-            if (ranges[i].count() <= MANY_CELLS) cells(ranges[i], [&](int32_t c) { item[next[c]++] = (int32_t)i; });
-    }
-
-    // Those of ``boxes``, which the grid was made of, that overlap another one, below a number.
-    template <class Visit> void overlapping(const std::vector<Box>& boxes, const Box& other, int32_t end, Visit visit) const {
-        for (int k = 0; k < 3; ++k)
-            if (other.low[k] > high[k] || other.high[k] < low[k]) return;
-        for (int32_t i : large)
-            if (i < end && overlap(boxes[i], other)) visit(i);
-        const Range r = range(other);
-        if (r.count() > MANY_CELLS) {
-            for (int32_t i = 0; i < end; ++i)
-                if (ranges[i].count() <= MANY_CELLS && overlap(boxes[i], other)) visit(i);
-            return;
-        }
-        for (int32_t z = r.first[2]; z <= r.last[2]; ++z)
-            for (int32_t y = r.first[1]; y <= r.last[1]; ++y)
-                for (int32_t x = r.first[0]; x <= r.last[0]; ++x) {
-                    const int32_t c = (z * shape[1] + y) * shape[0] + x;
-                    for (int32_t at = start[c]; at < start[c + 1] && item[at] < end; ++at) {
-                        // Of the cells that both reach into, in the first one.
-                        const int32_t i = item[at], *first = ranges[i].first;
-                        const bool here = (first[0] == x || r.first[0] == x) & (first[1] == y || r.first[1] == y) &
-                                          (first[2] == z || r.first[2] == z);
-                        if (here && overlap(boxes[i], other)) visit(i);
-                    }
-                }
-    }
-};
-
-double typical_size(const std::vector<Box>& boxes) {
-    if (boxes.empty()) return 0.0;
-    std::vector<double> size(boxes.size());
-    for (size_t i = 0; i < boxes.size(); ++i) {
-        const Box& box = boxes[i];
-        size[i] = std::max(std::max(box.high[0] - box.low[0], box.high[1] - box.low[1]), box.high[2] - box.low[2]);
-    }
-    std::nth_element(size.begin(), size.begin() + size.size() / 2, size.end());
-    return size[size.size() / 2];
-}
-
-// Triangles of a mesh, made when they are first needed.
-struct Lazy {
-    const double *pos, *origin;
-    const int64_t* faces;
-    std::vector<Triangle> made;
-    std::vector<int32_t> where;
-
-    Lazy(const double* pos, const int64_t* faces, int64_t count, const double* origin)
-        : pos(pos), origin(origin), faces(faces), where(count, -1) {}
-    const Triangle& get(int64_t face) {
-        if (where[face] < 0) {
-            where[face] = (int32_t)made.size();
-            made.push_back(triangle(pos, faces + 3 * face, origin));
-        }
-        return made[where[face]];
-    }
-};
-
-inline bool share_vertex(const int64_t* a, const int64_t* b) {
-    bool same = false;
-    for (int i = 0; i < 3; ++i)
-        for (int j = 0; j < 3; ++j) same |= a[i] == b[j];
-    return same;
+    Row *begin = (Row*)table, *end = begin + *count;
+    std::sort(begin, end);
+    *count = std::unique(begin, end) - begin;
 }
 
 // Squared distance from p to a triangle and the weights of its nearest point: exactly 0 for corners that have no part in it.
@@ -241,44 +128,136 @@ double closest(Vec p, Vec a, Vec b, Vec c, double* weights) {
     return dot(gap, gap);
 }
 
+// Some of the cloth's faces in eights, for the one nearest to a point.
+struct Pile {
+    const double* pos;
+    const int64_t* faces;
+    std::vector<int64_t> face;
+    std::vector<double> boxes, groups;
+    mutable std::vector<double> away;
+
+    Pile(const double* pos, const int64_t* faces, std::vector<int64_t> chosen) : pos(pos), faces(faces), face(std::move(chosen)) {
+        const int64_t count = (int64_t)face.size(), leaves = (count + LANES - 1) / LANES, wide = (leaves + LANES - 1) / LANES;
+        boxes.resize(6 * LANES * leaves), groups.resize(6 * LANES * wide), away.resize(LANES * wide);
+        for (std::vector<double>* sides : {&boxes, &groups})
+            for (size_t i = 0; i < sides->size(); ++i) (*sides)[i] = i / (3 * LANES) % 2 ? -INFINITY : INFINITY;
+        for (int64_t i = 0; i < count; ++i)
+            for (int k = 0; k < 3; ++k) {
+                double* side = boxes.data() + LANES * (6 * (i / LANES) + k) + i % LANES;
+                for (int c = 0; c < 3; ++c) {
+                    const double x = pos[3 * faces[3 * face[i] + c] + k];
+                    side[0] = std::min(side[0], x), side[3 * LANES] = std::max(side[3 * LANES], x);
+                }
+            }
+        for (int64_t i = 0; i < leaves; ++i) surround(boxes.data() + 6 * LANES * i, groups.data() + 6 * LANES * (i / LANES), i % LANES);
+    }
+
+    // Squared distances to eight boxes; infinite where there is none.
+    static V8 box_dist_sq(const double* sides, Vec p) {
+        V8 sum = all(0.0);
+        for (int k = 0; k < 3; ++k) {
+            const V8 gap = higher(load<V8>(sides + LANES * k) - axis(p, k), axis(p, k) - load<V8>(sides + LANES * (3 + k)));
+            const V8 out = higher(gap, all(0.0));
+            sum += out * out;
+        }
+        return sum;
+    }
+
+    // The nearest face within a squared distance, the first one of several, or -1; the squared distance and weights of its point.
+    int64_t nearest(Vec p, double& best, double* weights) const {
+        double least = INFINITY;
+        int64_t likely = -1, number = -1;
+        for (size_t i = 0; i < away.size(); i += LANES) store(away.data() + i, box_dist_sq(groups.data() + 6 * i, p));
+        for (size_t i = 0; i < away.size(); ++i)
+            if (away[i] < least) least = away[i], likely = (int64_t)i;
+        if (!(least <= best * (1.0 + 1e-9))) return -1;
+        const auto look_into = [&](int64_t leaf) {
+            const V8 gap = box_dist_sq(boxes.data() + 6 * LANES * leaf, p);
+            each_lane(lanes_of(gap <= best * (1.0 + 1e-9)), [&](int lane) {
+                if (!(gap[lane] <= best * (1.0 + 1e-9))) return;
+                const int64_t f = face[LANES * leaf + lane], *corner = faces + 3 * f;
+                double at_point[3];
+                const double dist_sq = closest(p, at(pos, corner[0]), at(pos, corner[1]), at(pos, corner[2]), at_point);
+                if (!(dist_sq < best || (dist_sq == best && (number < 0 || f < number)))) return;
+                best = dist_sq, number = f;
+                std::copy(at_point, at_point + 3, weights);
+            });
+        };
+        // The leaf whose box is nearest first: it leaves few others to look at.
+        look_into(likely);
+        for (size_t i = 0; i < away.size(); ++i)
+            if (away[i] <= best * (1.0 + 1e-9) && (int64_t)i != likely) look_into((int64_t)i);
+        return number;
+    }
+};
+
+// Parts of a mesh that hang together.
+struct Parts {
+    std::vector<int32_t> above;
+
+    explicit Parts(int64_t count) : above(count) { std::iota(above.begin(), above.end(), 0); }
+    int32_t root(int64_t i) {
+        while (above[i] != i) above[i] = above[above[i]], i = above[i];
+        return (int32_t)i;
+    }
+    void join(int64_t a, int64_t b) { above[root(a)] = root(b); }
+};
+
 }  // namespace
 
 extern "C" {
 
-struct Mesh {
-    int64_t num_faces;
-    const double* pos;     // (V, 3) m
-    const int64_t* faces;  // (F, 3)
-};
-
-// Rows that were found; where there are more than there is room for, they are counted alone.
+// Rows that were found, unique and sorted; where there are more than there is room for, they are counted alone.
 struct Rows {
     int64_t room[3], found[3];
     int64_t *pairs, *first_edges, *second_edges;  // (., 2), (., 3), (., 3)
 };
 
+// Everything about a mesh that depends on the topology, from centres (F, 3) of the faces; ``order`` holds their numbers.
+void crossing_order(Eights* e, const double* centre) {
+    struct {
+        int32_t begin, end;
+    } left[64];
+    int count = 0;
+    left[count++] = {0, (int32_t)e->num_faces};
+    while (count) {
+        const auto now = left[--count];
+        const int32_t leaves = (now.end - now.begin + LANES - 1) / LANES;
+        if (leaves <= 1) continue;
+        // The first part is full on all levels: groups are eights of leaves from the first one on.
+        int32_t part = 1;
+        while (2 * part < leaves) part *= 2;
+        const int32_t middle = now.begin + LANES * part;
+        halve(e->order, now.begin, middle, now.end, centre);
+        left[count++] = {now.begin, middle}, left[count++] = {middle, now.end};
+    }
+    for (int64_t i = 0; i < LANES * e->num_leaves; ++i) {
+        int64_t vertex[3] = {0, 0, 0};
+        if (i < e->num_faces) std::copy(e->faces + 3 * (int64_t)e->order[i], e->faces + 3 * (int64_t)e->order[i] + 3, vertex);
+        else e->order[i] = -1;
+        std::sort(vertex, vertex + 3);
+        for (int c = 0; c < 3; ++c) e->vertex[LANES * (3 * (i / LANES) + c) + i % LANES] = (int32_t)vertex[c];
+    }
+}
+
 // Crossings of two meshes, or of pairs of one mesh's faces without a common vertex, the smaller number first (``same``).
-void crossing_find(const Mesh* first, const Mesh* second, int64_t same, const double* origin, double touch, Rows* rows) {
+void crossing_find(const Eights* first, const Eights* second, int64_t same, double touch_share, Rows* rows) {
     for (int k = 0; k < 3; ++k) rows->found[k] = 0;
-    const Boxes own = boxes_of(first->pos, first->faces, first->num_faces, origin);
-    const Boxes other = same ? Boxes{} : boxes_of(second->pos, second->faces, second->num_faces, origin);
-    const Boxes& others = same ? own : other;
-    if (own.box.empty() || others.box.empty()) return;
-    const Grid grid(own.box, std::max(typical_size(own.box), typical_size(others.box)));
-    Lazy lazy(first->pos, first->faces, first->num_faces, origin);
-    Lazy lazy_other(second->pos, second->faces, same ? 0 : second->num_faces, origin);
+    if (!first->num_leaves || !second->num_leaves) return;
+    double origin[3], touch;
+    locate(*first, *second, origin, &touch);
+    touch *= touch_share;
+    place(*first, origin);
+    if (!same) place(*second, origin);
     const auto put = [&](int which, int64_t* table, int width, int64_t x, int64_t y, int64_t z) {
         int64_t* row = table + width * rows->found[which];
         if (rows->found[which]++ >= rows->room[which]) return;
         row[0] = x, row[1] = y;
         if (width == 3) row[2] = z;
     };
-    const auto examine = [&](int64_t f, int64_t g) {
-        lazy.get(f);
-        (same ? lazy : lazy_other).get(g);
-        const Triangle &a = lazy.get(f), &b = (same ? lazy : lazy_other).get(g);
+    const auto examine = [&](const Triangle& a, const Triangle& b) {
         int side[3], other_side[3], turn[3][3];
-        if (!sides(a, b, touch, side) || !sides(b, a, touch, other_side)) return;
+        sides(a, b, touch, side), sides(b, a, touch, other_side);
         for (int i = 0; i < 3; ++i) {
             const Vec start = a.corner[EDGE[i][0]], along = a.corner[EDGE[i][1]] - start;
             const Vec moved[3] = {b.corner[0] - start, b.corner[1] - start, b.corner[2] - start};
@@ -289,72 +268,192 @@ void crossing_find(const Mesh* first, const Mesh* second, int64_t same, const do
             const int *ends = EDGE[i], here = side[ends[0]] * side[ends[1]], there = other_side[ends[0]] * other_side[ends[1]];
             if (here < 0 && inside(turn[i][0], turn[i][1], turn[i][2])) {
                 crossed = true;
-                put(1, rows->first_edges, 3, a.vertex[ends[0]], a.vertex[ends[1]], g);
+                put(1, rows->first_edges, 3, a.vertex[ends[0]], a.vertex[ends[1]], b.number);
             }
             if (there < 0 && inside(turn[0][i], turn[1][i], turn[2][i])) {
                 crossed = true;
-                put(2, rows->second_edges, 3, b.vertex[ends[0]], b.vertex[ends[1]], f);
+                put(2, rows->second_edges, 3, b.vertex[ends[0]], b.vertex[ends[1]], a.number);
             }
         }
-        if (crossed) put(0, rows->pairs, 2, f, g, 0);
+        if (crossed) put(0, rows->pairs, 2, a.number, b.number, 0);
     };
-    for (size_t i = 0; i < others.box.size(); ++i) {
-        const int64_t g = others.number[i];
-        const int32_t end = same ? (int32_t)i : (int32_t)own.box.size();  // of two of one mesh the smaller number is the first
-        grid.overlapping(own.box, others.box[i], end, [&](int32_t at) {
-            const int64_t f = own.number[at];
-            if (!same || !share_vertex(first->faces + 3 * f, first->faces + 3 * g)) examine(f, g);
+    const Levels levels(second->num_leaves);
+    const auto compare = [&](int64_t leaf, int64_t other) {
+        const double* boxes = second->boxes + 6 * LANES * other;
+        const uint64_t close = overlapped(first->boxes + 6 * LANES * leaf, box_in(second->groups + 6 * LANES * (other / LANES), other % LANES));
+        each_lane(close, [&](int i) {
+            uint64_t met = overlapped(boxes, box_in(first->boxes + 6 * LANES * leaf, i));
+            // Of two triangles of one leaf once.
+            if (same && leaf == other) met &= ((uint64_t)1 << 8 * i) - 1;
+            if (met && same) met &= lanes_of(strangers(*first, leaf, i, other));
+            if (met) met &= lanes_of(straddling(*first, leaf, i, *second, other, touch));
+            each_lane(met, [&](int j) {
+                const Triangle a = triangle(*first, leaf, i), b = triangle(*second, other, j);
+                if (same && b.number < a.number) examine(b, a);
+                else examine(a, b);
+            });
         });
+    };
+    for (int64_t leaf = 0; leaf < first->num_leaves; ++leaf) {
+        const Box around = box_in(first->groups + 6 * LANES * (leaf / LANES), leaf % LANES);
+        visit_leaves(second->groups, levels, same ? leaf + 1 : second->num_leaves,
+                     [&](const double* boxes) { return overlapped(boxes, around); }, [&](int64_t other) { compare(leaf, other); });
     }
+    for (int k = 0; k < 3; ++k)
+        if (rows->found[k] > rows->room[k]) return;
+    sort_rows<2>(rows->pairs, rows->found), sort_rows<3>(rows->first_edges, rows->found + 1), sort_rows<3>(rows->second_edges, rows->found + 2);
 }
 
-// Of points (N, 3) the nearest of triangles (T, 3, 3) within a distance (N), the first one of several; its number or -1, weights
-// (N, 3) of the nearest point and the distance (N).
-void crossing_nearest(int64_t num_points, const double* points, const double* reach, int64_t num_triangles, const double* corners,
-                      int64_t* number, double* weights, double* dist) {
-    std::vector<double> side(6 * num_triangles), away(num_triangles);
-    for (int64_t t = 0; t < num_triangles; ++t) {
-        const Box box = box_of(at(corners, 3 * t), at(corners, 3 * t + 1), at(corners, 3 * t + 2));
-        for (int k = 0; k < 3; ++k) side[k * num_triangles + t] = box.low[k], side[(3 + k) * num_triangles + t] = box.high[k];
+// What is known of cloth, of skin and of how they cut, and the rules of hood/mesh/skin.py.
+struct Depth {
+    int64_t num_vertices, num_faces, num_edges, num_skin, num_pairs, num_cuts;
+    const double* pos;                // (V, 3) m
+    const int64_t *faces, *edges;     // (F, 3), (E, 2) unique and sorted
+    const uint8_t *open_edge, *on_rim;  // (F, 3), (V)
+    const int32_t* order;             // (F) faces in an order in which neighbours lie together
+    const double* skin_pos;           // (W, 3) m
+    const int64_t *skin_faces, *first, *around;  // (G, 3), (W + 1), (3G) faces around each vertex, ascending
+    const int64_t *pairs, *cuts;      // (., 2), (., 3) crossing faces; edges of the cloth and faces of the skin; unique and sorted
+    double reach, behind, nearest;
+};
+}
+
+namespace {
+
+// Which vertices of the cloth are under the skin: see hood.mesh.skin.sunken.
+std::vector<uint8_t> sunken(const Depth& d) {
+    Parts parts(d.num_vertices);
+    for (int64_t e = 0, at_cut = 0; e < d.num_edges; ++e) {
+        const int64_t *edge = d.edges + 2 * e, *cut = d.cuts + 3 * at_cut;
+        if (at_cut < d.num_cuts && cut[0] == edge[0] && cut[1] == edge[1])
+            while (at_cut < d.num_cuts && d.cuts[3 * at_cut] == edge[0] && d.cuts[3 * at_cut + 1] == edge[1]) ++at_cut;
+        else parts.join(edge[0], edge[1]);
     }
-    for (int64_t i = 0; i < num_points; ++i) {
-        const Vec p = at(points, i);
-        std::fill(away.begin(), away.end(), 0.0);
+    std::vector<int32_t> votes(d.num_vertices, 0);
+    for (int64_t begin = 0, end; begin < d.num_cuts; begin = end) {
+        const int64_t* edge = d.cuts + 3 * begin;
+        double least = 0.0, most = 0.0;
+        int side[2] = {0, 0};
+        for (end = begin; end < d.num_cuts && d.cuts[3 * end] == edge[0] && d.cuts[3 * end + 1] == edge[1]; ++end) {
+            const int64_t* corner = d.skin_faces + 3 * d.cuts[3 * end + 2];
+            const Vec a = at(d.skin_pos, corner[0]), normal = cross(at(d.skin_pos, corner[1]) - a, at(d.skin_pos, corner[2]) - a);
+            const double height = dot(at(d.pos, edge[0]) - a, normal), other = dot(at(d.pos, edge[1]) - a, normal);
+            const double along = height / (height - other);  // the ends are on two sides of the plane
+            if (end == begin || along < least) least = along, side[0] = sign(height);
+            if (end == begin || along > most) most = along, side[1] = sign(other);
+        }
+        for (int k = 0; k < 2; ++k) votes[parts.root(edge[k])] += side[k];
+    }
+    std::vector<uint8_t> under(d.num_vertices);
+    for (int64_t v = 0; v < d.num_vertices; ++v) under[v] = votes[parts.root(v)] < 0;
+    return under;
+}
+
+// Area-weighted normal at a vertex of the skin, not of unit length.
+Vec normal_at(const Depth& d, int64_t vertex) {
+    Vec sum{0.0, 0.0, 0.0};
+    for (int64_t i = d.first[vertex]; i < d.first[vertex + 1]; ++i) {
+        const int64_t* corner = d.skin_faces + 3 * d.around[i];
+        const Vec a = at(d.skin_pos, corner[0]);
+        sum = sum + cross(at(d.skin_pos, corner[1]) - a, at(d.skin_pos, corner[2]) - a);
+    }
+    return sum;
+}
+
+bool is_on_rim(const Depth& d, int64_t face, const double* weights) {
+    bool away[3], rim = false, on_edge = false;
+    for (int c = 0; c < 3; ++c) away[c] = weights[c] == 0.0;
+    for (int c = 0; c < 3; ++c) {
+        on_edge |= away[(c + 2) % 3] && d.open_edge[3 * face + c];
+        rim |= !away[c] && d.on_rim[d.faces[3 * face + c]];
+    }
+    return on_edge || (away[0] + away[1] + away[2] == 2 && rim);
+}
+
+// A vertex of the skin that may be above the cloth, and the cloth's point nearest to it.
+struct Above {
+    double dist;
+    int64_t vertex;
+    Vec point;
+};
+
+// Coordinates in rows, in eights, to be compared with a point together.
+struct Cloud {
+    std::vector<double> row[3];
+
+    Cloud(const double* pos, int64_t count) {
         for (int k = 0; k < 3; ++k) {
-            const double x = axis(p, k), *low = side.data() + k * num_triangles, *high = low + 3 * num_triangles;
-            for (int64_t t = 0; t < num_triangles; ++t) {
-                const double below = low[t] - x, above = x - high[t], gap = below > above ? below : above;
-                away[t] += gap > 0.0 ? gap * gap : 0.0;
-            }
+            row[k].assign((count + LANES - 1) / LANES * LANES, INFINITY);
+            for (int64_t i = 0; i < count; ++i) row[k][i] = pos[3 * i + k];
         }
-        double best = reach[i] * reach[i];
-        number[i] = -1;
-        const auto examine = [&](int64_t t) {
-            double at_point[3];
-            const double dist_sq = closest(p, at(corners, 3 * t), at(corners, 3 * t + 1), at(corners, 3 * t + 2), at_point);
-            if (dist_sq < best || (dist_sq == best && (number[i] < 0 || t < number[i]))) {
-                best = dist_sq, number[i] = t;
-                std::copy(at_point, at_point + 3, weights + 3 * i);
-            }
-        };
-        // The one whose box is nearest first: it leaves few others to look at.
-        const int64_t likely = std::min_element(away.begin(), away.end()) - away.begin();
-        if (likely < num_triangles) examine(likely);
-        for (int64_t t = 0; t < num_triangles; ++t)
-            if (away[t] <= best * (1.0 + 1e-9) && t != likely) examine(t);
-        dist[i] = std::sqrt(best);
     }
+    // Whether any of them is nearer to p than a distance.
+    bool any_within(Vec p, double dist) const {
+        constexpr size_t STEP = 64 * LANES;
+        for (size_t begin = 0; begin < row[0].size(); begin += STEP) {
+            V8 least = all(INFINITY);
+            for (size_t i = begin; i < std::min(begin + STEP, row[0].size()); i += LANES) {
+                const V8 x = load<V8>(&row[0][i]) - p.x, y = load<V8>(&row[1][i]) - p.y, z = load<V8>(&row[2][i]) - p.z;
+                least = lower(x * x + y * y + z * z, least);
+            }
+            double dist_sq = least[0];
+            for (int i = 1; i < LANES; ++i) dist_sq = std::min(dist_sq, least[i]);
+            if (std::sqrt(dist_sq) < dist) return true;
+        }
+        return false;
+    }
+};
+
+std::vector<Above> candidates(const Depth& d, const Pile& suspects) {
+    Box all_around{{INFINITY, INFINITY, INFINITY}, {-INFINITY, -INFINITY, -INFINITY}};
+    for (size_t i = 0; i < suspects.groups.size(); ++i) {
+        const size_t k = i / LANES % 6;
+        if (k < 3) all_around.low[k] = std::min(all_around.low[k], suspects.groups[i]);
+        else all_around.high[k - 3] = std::max(all_around.high[k - 3], suspects.groups[i]);
+    }
+    std::vector<Above> found;
+    for (int64_t v = 0; v < d.num_skin; ++v) {
+        const Vec p = at(d.skin_pos, v);
+        bool close = true;
+        for (int k = 0; k < 3; ++k) close &= axis(p, k) >= all_around.low[k] - d.reach && axis(p, k) <= all_around.high[k] + d.reach;
+        if (!close) continue;
+        const double reach = d.reach * (1.0 + 1e-9);
+        double best = reach * reach, weights[3];
+        const int64_t face = suspects.nearest(p, best, weights), *corner = d.faces + 3 * face;
+        if (face < 0 || is_on_rim(d, face, weights)) continue;
+        const Vec point = weights[0] * at(d.pos, corner[0]) + weights[1] * at(d.pos, corner[1]) + weights[2] * at(d.pos, corner[2]);
+        const Vec normal = normal_at(d, v);
+        const double dist = std::sqrt(best);
+        if (-dot(point - p, normal) > d.behind * dist * norm(normal)) found.push_back({dist, v, point});
+    }
+    return found;
+}
 }
 
-// Distances (N) from points (N, 3) to the nearest of others (M, 3).
-void crossing_clearance(int64_t num_points, const double* points, int64_t num_others, const double* others, double* dist) {
-    for (int64_t i = 0; i < num_points; ++i) {
-        double best = INFINITY;
-        for (int64_t j = 0; j < num_others; ++j) {
-            const double x = others[3 * j] - points[3 * i], y = others[3 * j + 1] - points[3 * i + 1], z = others[3 * j + 2] - points[3 * i + 2];
-            best = std::min(best, x * x + y * y + z * z);
-        }
-        dist[i] = std::sqrt(best);
+extern "C" {
+
+// Largest height of a vertex of the skin above the cloth: see hood.mesh.skin.skin_depth.
+double crossing_depth(const Depth* depth) {
+    const Depth& d = *depth;
+    std::vector<uint8_t> suspect(d.num_faces, 0);
+    for (int64_t i = 0; i < d.num_pairs; ++i) suspect[d.pairs[2 * i]] = 1;
+    const std::vector<uint8_t> under = sunken(d);
+    for (int64_t f = 0; f < d.num_faces; ++f) suspect[f] |= under[d.faces[3 * f]] & under[d.faces[3 * f + 1]] & under[d.faces[3 * f + 2]];
+    std::vector<int64_t> chosen[2];
+    for (int64_t i = 0; i < d.num_faces; ++i) chosen[suspect[d.order[i]]].push_back(d.order[i]);
+    std::vector<Above> found = candidates(d, Pile(d.pos, d.faces, std::move(chosen[1])));
+    if (found.empty()) return 0.0;
+    // From the highest one down: the first that is above the cloth is the answer.
+    std::sort(found.begin(), found.end(), [](const Above& a, const Above& b) { return a.dist > b.dist || (a.dist == b.dist && a.vertex < b.vertex); });
+    const Cloud skin(d.skin_pos, d.num_skin);
+    const Pile others(d.pos, d.faces, std::move(chosen[0]));
+    for (const Above& above : found) {
+        if (skin.any_within(above.point, d.nearest * above.dist)) continue;
+        // Where another face is nearer still, the vertex is under cloth that is not cut.
+        double best = above.dist * above.dist, weights[3];
+        const int64_t other = others.nearest(at(d.skin_pos, above.vertex), best, weights);
+        if (other < 0 || !(std::sqrt(best) < above.dist * (1.0 - 1e-9))) return above.dist;
     }
+    return 0.0;
 }
 }

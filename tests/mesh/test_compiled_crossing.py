@@ -7,7 +7,7 @@ import pytest
 
 from hood.mesh import compiled_crossing
 from hood.mesh.crossing import crossings, self_crossings
-from hood.mesh.skin import Sheet, closest_on_triangles, skin_depth
+from hood.mesh.skin import Sheet, skin_depth
 from hood.testing import grid, random_rotation, sphere
 
 pytestmark = pytest.mark.skipif(compiled_crossing.library() is None, reason="no C++ compiler")
@@ -57,20 +57,34 @@ def test_boxes_of_very_different_size_meet_once() -> None:
     np.testing.assert_array_equal(pairs[:, ::-1], crossings(large + 0.05, np.array([[0, 1, 2]]), *both).pairs)
 
 
-def test_the_nearest_of_all_triangles_is_found() -> None:
-    pos, faces = crumpled(15, 2)
-    points = np.random.default_rng(0).uniform(-0.6, 0.6, (200, 3))
-    row = np.arange(len(points))
-    every, corners = np.meshgrid(row, np.arange(len(faces)), indexing="ij"), pos[faces]
-    at, weights = closest_on_triangles(points[every[0].ravel()], corners[every[1].ravel()])
-    dist = np.linalg.norm(points[every[0].ravel()] - at, axis=1).reshape(len(points), -1)
-    found = compiled_crossing.nearest(points, np.full(len(points), 0.2), corners)
-    assert found is not None
-    reached = dist.min(axis=1) <= 0.2
-    assert 20 < reached.sum() < 180
-    np.testing.assert_array_equal(found[0] >= 0, reached)
-    np.testing.assert_allclose(found[2][reached], dist.min(axis=1)[reached], rtol=1e-12)
-    chosen = weights.reshape(len(points), -1, 3)[row[reached], found[0][reached]]
-    np.testing.assert_allclose(found[1][reached], chosen, atol=1e-9)
-    clear = compiled_crossing.clearance(points, pos)
-    np.testing.assert_allclose(clear, np.linalg.norm(points[:, None] - pos, axis=2).min(axis=1), rtol=1e-12)
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("size", [0.1, 0.4])
+def test_depth_is_that_of_numpy(seed: int, size: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On crumpled cloth over a ball, finer and coarser than it, with a vertex of the skin without a face."""
+    pos, faces = crumpled(12 + 6 * seed, seed)
+    ball, ball_faces = sphere(3 + seed % 2, size)
+    ball = np.concatenate([ball + pos[len(pos) // 2] + 0.03, pos[:1]])
+    cut = crossings(pos, faces, ball, ball_faces)
+    assert len(cut.pairs) > 10
+    depth = skin_depth(pos, faces, ball, ball_faces, cut)
+    monkeypatch.setattr(compiled_crossing, "library", lambda: None)
+    assert depth == pytest.approx(skin_depth(pos, faces, ball, ball_faces, cut), abs=1e-12)
+
+
+def test_what_is_kept_of_the_faces_and_its_order_do_not_matter() -> None:
+    """Passes over other positions in between, and an order by another shape, change nothing."""
+    pos, faces = crumpled(25, 3)
+    ball, ball_faces = sphere(4, 0.4)
+    cut, own = crossings(pos, faces, ball, ball_faces), self_crossings(pos, faces)
+    depth = skin_depth(pos, faces, ball, ball_faces, cut)
+    for shape in (pos, crumpled(25, 4)[0], np.zeros_like(pos)):
+        cloth, skin = compiled_crossing.eights(faces, shape), compiled_crossing.eights(ball_faces, ball[::-1])
+        assert cloth is not None
+        assert skin is not None
+        for moved in (0.5 * pos, pos):
+            found, pairs = crossings(moved, faces, ball, ball_faces, (cloth, skin)), self_crossings(moved, faces, cloth)
+            height = skin_depth(moved, faces, ball, ball_faces, found, both=(cloth, skin))
+        for table, other in zip(found, cut, strict=True):
+            np.testing.assert_array_equal(table, other)
+        np.testing.assert_array_equal(pairs, own)
+        assert height == depth

@@ -5,18 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hood.mesh import compiled_crossing
 from hood.mesh.crossing import crossings, self_crossings
 from hood.testing import cylinder, grid, random_rotation, sphere
 
-
-@pytest.fixture(autouse=True, params=["compiled", "numpy"])
-def form(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    if request.param == "numpy":
-        monkeypatch.setattr(compiled_crossing, "library", lambda: None)
-    elif compiled_crossing.library() is None:
-        pytest.skip("no C++ compiler")
-
+pytestmark = pytest.mark.usefixtures("form")
 
 FLAT = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
 FACE = np.array([[0, 1, 2]])

@@ -5,20 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hood.mesh import compiled_crossing
 from hood.mesh.crossing import crossings
 from hood.mesh.skin import REACH, closest_on_triangles, skin_depth, sunken
 from hood.mesh.topology import unique_edges
 from hood.testing import grid, random_rotation, sphere
 
-
-@pytest.fixture(autouse=True, params=["compiled", "numpy"])
-def form(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    if request.param == "numpy":
-        monkeypatch.setattr(compiled_crossing, "library", lambda: None)
-    elif compiled_crossing.library() is None:
-        pytest.skip("no C++ compiler")
-
+pytestmark = pytest.mark.usefixtures("form")
 
 RADIUS = 0.1
 

@@ -1,0 +1,182 @@
+// Triangles of a mesh in eights that lie together, in a tree of boxes: the order belongs to the topology, the rest to a call.
+#pragma once
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+
+#include "lanes.h"
+#include "vector.h"
+
+extern "C" {
+
+struct Eights {
+    int64_t num_vertices, num_faces, num_leaves;
+    const double* pos;      // (V, 3) m
+    const int64_t* faces;   // (F, 3)
+    int32_t* order;         // (L, 8) the faces, -1 behind the last one
+    int32_t* vertex;        // (L, 3, 8) their corners in ascending order
+    double* corner;         // (L, 9, 8) m, where these are about the origin of a call
+    double* normal;         // (L, 3, 8) unit normals, zero without an area; of leaves that this call needed
+    double* boxes;          // (L, 6, 8) m, least and greatest corners
+    double* groups;         // (G, 6, 8) m, those of eight leaves, then of eight of these, level after level
+    uint8_t* has_normals;   // (L)
+};
+}
+
+namespace {
+
+constexpr int MOST_LEVELS = 12;
+constexpr double EPS = 2.220446049250313e-16;
+
+typedef int8_t B8 __attribute__((vector_size(8)));
+typedef int32_t N8 __attribute__((vector_size(32)));
+
+// A byte of 1 for every lane that holds, the first one lowest.
+template <class M> inline uint64_t lanes_of(M mask) {
+    const B8 bytes = __builtin_convertvector(mask, B8);
+    uint64_t bits;
+    std::memcpy(&bits, &bytes, sizeof(bits));
+    return bits & 0x0101010101010101u;
+}
+template <class Visit> inline void each_lane(uint64_t lanes, Visit visit) {
+    for (; lanes; lanes &= lanes - 1) visit(__builtin_ctzll(lanes) / 8);
+}
+
+inline V8 lower(V8 a, V8 b) { return a < b ? a : b; }
+inline V8 higher(V8 a, V8 b) { return a > b ? a : b; }
+
+struct Box {
+    double low[3], high[3];
+};
+
+inline Box box_in(const double* sides, int lane) {
+    Box box;
+    for (int k = 0; k < 3; ++k) box.low[k] = sides[LANES * k + lane], box.high[k] = sides[LANES * (3 + k) + lane];
+    return box;
+}
+
+// Which of eight boxes a box overlaps or touches.
+inline uint64_t overlapped(const double* sides, const Box& box) {
+    I8 apart = I8{};
+    for (int k = 0; k < 3; ++k)
+        apart |= (load<V8>(sides + LANES * k) > box.high[k]) | (load<V8>(sides + LANES * (3 + k)) < box.low[k]);
+    return lanes_of(~apart);
+}
+
+// What is around eight boxes goes to a lane of others.
+inline void surround(const double* sides, double* into, int lane) {
+    for (int k = 0; k < 3; ++k) {
+        double low = INFINITY, high = -INFINITY;
+        for (int i = 0; i < LANES; ++i) low = std::min(low, sides[LANES * k + i]), high = std::max(high, sides[LANES * (3 + k) + i]);
+        into[LANES * k + lane] = low, into[LANES * (3 + k) + lane] = high;
+    }
+}
+
+// Where the levels of groups begin, and how many there are; the last one is a single group.
+struct Levels {
+    int64_t first[MOST_LEVELS + 1];
+    int count = 0;
+
+    explicit Levels(int64_t leaves) {
+        first[0] = 0;
+        for (int64_t size = leaves; size > 1 || count == 0; ++count) {
+            size = (size + LANES - 1) / LANES;
+            first[count + 1] = first[count] + size;
+        }
+    }
+};
+
+// Boxes of groups, from those of the leaves up; a box without anything in it overlaps nothing.
+inline void fit_groups(const double* boxes, int64_t num_leaves, double* groups) {
+    const Levels levels(num_leaves);
+    const double* from = boxes;
+    int64_t size = num_leaves;
+    for (int level = 0; level < levels.count; ++level) {
+        const int64_t next = levels.first[level + 1] - levels.first[level];
+        double* into = groups + 6 * LANES * levels.first[level];
+        for (int64_t i = 0; i < 3 * next; ++i) {
+            const int64_t at = 6 * LANES * (i / 3) + LANES * (i % 3);
+            store(into + at, all(INFINITY)), store(into + at + 3 * LANES, all(-INFINITY));
+        }
+        for (int64_t i = 0; i < size; ++i) surround(from + 6 * LANES * i, into + 6 * LANES * (i / LANES), i % LANES);
+        from = into, size = next;
+    }
+}
+
+// Visits the leaves, below a number, whose boxes ``near`` picks from eight.
+template <class Near, class Visit>
+inline void visit_leaves(const double* groups, const Levels& levels, int64_t end, Near near, Visit visit) {
+    struct {
+        int level;
+        int64_t group;
+    } left[MOST_LEVELS * LANES];
+    int count = 0;
+    left[count++] = {levels.count - 1, 0};
+    while (count) {
+        const auto now = left[--count];
+        each_lane(near(groups + 6 * LANES * (levels.first[now.level] + now.group)), [&](int lane) {
+            const int64_t item = LANES * now.group + lane;
+            if (now.level) left[count++] = {now.level - 1, item};
+            else if (item < end) visit(item);
+        });
+    }
+}
+
+// Takes up where the corners are now, about an origin. Triangles that are not finite get a box that overlaps nothing.
+inline void place(const Eights& e, const double* origin) {
+    for (int64_t leaf = 0; leaf < e.num_leaves; ++leaf) {
+        double* corner = e.corner + 9 * LANES * leaf;
+        const int32_t* vertex = e.vertex + 3 * LANES * leaf;
+        for (int c = 0; c < 3; ++c)
+            for (int i = 0; i < LANES; ++i)
+                for (int k = 0; k < 3; ++k)
+                    corner[LANES * (3 * c + k) + i] = e.pos[3 * (int64_t)vertex[LANES * c + i] + k];
+        I8 usable = __builtin_convertvector(load<N8>(e.order + LANES * leaf) >= 0, I8);
+        for (int j = 0; j < 9; ++j) {
+            const V8 value = load<V8>(corner + LANES * j) - origin[j % 3];
+            store(corner + LANES * j, value);
+            usable &= value - value == 0.0;
+        }
+        for (int k = 0; k < 3; ++k) {
+            const V8 a = load<V8>(corner + LANES * k), b = load<V8>(corner + LANES * (3 + k)), c = load<V8>(corner + LANES * (6 + k));
+            store(e.boxes + LANES * (6 * leaf + k), usable ? lower(lower(a, b), c) : all(INFINITY));
+            store(e.boxes + LANES * (6 * leaf + 3 + k), usable ? higher(higher(a, b), c) : all(-INFINITY));
+        }
+        e.has_normals[leaf] = 0;
+    }
+    fit_groups(e.boxes, e.num_leaves, e.groups);
+}
+
+// Unit normals of the triangles of a leaf.
+inline const double* normals(const Eights& e, int64_t leaf) {
+    double* normal = e.normal + 3 * LANES * leaf;
+    if (e.has_normals[leaf]) return normal;
+    e.has_normals[leaf] = 1;
+    const double* corner = e.corner + 9 * LANES * leaf;
+    V8 first[3], second[3], product[3];
+    for (int k = 0; k < 3; ++k) {
+        const V8 a = load<V8>(corner + LANES * k);
+        first[k] = load<V8>(corner + LANES * (3 + k)) - a, second[k] = load<V8>(corner + LANES * (6 + k)) - a;
+    }
+    cross(first, second, product);
+    const V8 length = root(dot(product, product)), limit = 16.0 * EPS * root(dot(first, first)) * root(dot(second, second));
+    // Below this the direction is rounding alone.
+    const I8 flat = length <= limit;
+    for (int k = 0; k < 3; ++k) store(normal + LANES * k, flat ? all(0.0) : 1.0 / length * product[k]);
+    return normal;
+}
+
+// Lanes whose corners lie on both sides of planes; planes by a point and a normal, each in eight or one for all.
+template <class Corner, class Point, class Normal>
+inline I8 on_both_sides(Corner corner, Point point, Normal normal, double touch) {
+    I8 below = I8{}, above = I8{};
+    for (int c = 0; c < 3; ++c) {
+        V8 away[3], up[3];
+        for (int k = 0; k < 3; ++k) away[k] = corner(c, k) - point(k), up[k] = all(0.0) + normal(k);
+        const V8 height = dot(away, up);
+        below |= height < -touch, above |= height > touch;
+    }
+    return below & above;
+}
+
+}  // namespace
