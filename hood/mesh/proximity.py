@@ -128,7 +128,8 @@ def search_surface(
         better = (other_offset**2).sum(dim=1) < (offset[rows] ** 2).sum(dim=1)
         chosen = rows[better]
         face[chosen], bary[chosen], offset[chosen] = other[better], other_bary[better], other_offset[better]
-    side = (offset * pseudonormals(vertices, faces, face, bary, incidence, fans)).sum(dim=1)
+    normals_at = _chosen_pseudonormals if points.device.type == "cpu" else pseudonormals
+    side = (offset * normals_at(vertices, faces, face, bary, incidence, fans)).sum(dim=1)
     dist = torch.where(side < 0, -1.0, 1.0) * offset.norm(dim=1)
     missing = torch.isinf(nearest_dist[:, 0])
     return SurfaceHit(nearest[:, 0], nearest_dist[:, 0], face, bary, dist.masked_fill(missing, torch.inf))
@@ -351,14 +352,30 @@ def weights_and_offset(points: Tensor, vertices: Tensor, faces: Tensor, face: Te
 
 def pseudonormals(vertices: Tensor, faces: Tensor, face: Tensor, bary: Tensor, incidence: Incidence, fans: Fans) -> Tensor:
     """Angle-weighted pseudonormals (N, 3), not normalised, at the points ``bary`` of ``face``."""
-    num_zero = (bary == 0).sum(dim=1, keepdim=True)
-    around = incidence.edge_faces[incidence.face_edges[face, bary.argmin(dim=1)]]
-    beside = _unit_face_normals(vertices, faces[around.clamp_min(0)].reshape(-1, 3)).view(*around.shape, 3)
-    at_edge = (beside * (around >= 0).unsqueeze(-1)).sum(dim=1)
-    at_vertex = _vertex_pseudonormals(faces[face, bary.argmax(dim=1)], incidence, fans)
     # All three for every point: which points need which is not known without waiting for an accelerator.
+    num_zero = (bary == 0).sum(dim=1, keepdim=True)
+    at_vertex = _vertex_pseudonormals(faces[face, bary.argmax(dim=1)], incidence, fans)
+    at_edge = _edge_pseudonormals(vertices, faces, face, bary, incidence)
     normal = torch.where(num_zero == 1, at_edge, _unit_face_normals(vertices, faces[face]))
     return torch.where(num_zero == 2, at_vertex, normal)
+
+
+def _chosen_pseudonormals(
+    vertices: Tensor, faces: Tensor, face: Tensor, bary: Tensor, incidence: Incidence, fans: Fans
+) -> Tensor:
+    """The same with each kind only where it is needed: on a CPU the whole search takes 0.7 to 0.9 times as long."""
+    normal = _unit_face_normals(vertices, faces[face])
+    num_zero = (bary == 0).sum(dim=1)
+    edge, vertex = ((num_zero == count).nonzero().squeeze(1) for count in (1, 2))
+    normal[edge] = _edge_pseudonormals(vertices, faces, face[edge], bary[edge], incidence)
+    normal[vertex] = _vertex_pseudonormals(faces[face[vertex], bary[vertex].argmax(dim=1)], incidence, fans)
+    return normal
+
+
+def _edge_pseudonormals(vertices: Tensor, faces: Tensor, face: Tensor, bary: Tensor, incidence: Incidence) -> Tensor:
+    around = incidence.edge_faces[incidence.face_edges[face, bary.argmin(dim=1)]]
+    beside = _unit_face_normals(vertices, faces[around.clamp_min(0)].reshape(-1, 3)).view(*around.shape, 3)
+    return (beside * (around >= 0).unsqueeze(-1)).sum(dim=1)
 
 
 def _vertex_pseudonormals(vertex: Tensor, incidence: Incidence, fans: Fans) -> Tensor:
