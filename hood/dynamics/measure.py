@@ -26,13 +26,23 @@ def edge_strain(cloth: Cloth, pos: Tensor) -> Tensor:
 
 
 def strain_metrics(cloth: Cloth, pos: Tensor) -> dict[str, float]:
-    """Median, 99th percentile and maximum of the absolute edge strain; NaN where ``pos`` (V, 3) is not finite."""
+    """Median, 99th percentile and maximum of the absolute edge strain; NaN where ``pos`` (V, 3) is not finite, and
+    without edges."""
     strain = absolute_strain(cloth, pos)
     if strain is None:
         strain = edge_strain(cloth, pos).abs().double().cpu().numpy()
-    if not np.isfinite(strain).all():
+    if len(strain) == 0 or not np.isfinite(strain).all():
         return dict.fromkeys(STRAIN_METRICS, float("nan"))
-    return dict(zip(STRAIN_METRICS, np.quantile(strain, (0.5, 0.99, 1.0)).tolist(), strict=True))
+    strain.sort()
+    return dict(zip(STRAIN_METRICS, (_quantile(strain, share) for share in (0.5, 0.99, 1.0)), strict=True))
+
+
+def _quantile(ascending: np.ndarray, share: float) -> float:
+    """What numpy's function says, of values (N,) in ascending order, for a quarter of its time."""
+    place = share * (len(ascending) - 1)
+    below = int(place)
+    low, high = float(ascending[below]), float(ascending[min(below + 1, len(ascending) - 1)])
+    return low + (place - below) * (high - low)
 
 
 def penetration_metrics(contact: Contact | None, num_vertices: int) -> dict[str, float]:

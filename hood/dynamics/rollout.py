@@ -284,7 +284,7 @@ def energy_metrics(
     and for comparison the potential of the inertial guess x_t + dt v_t; from what
     :func:`hood.losses.elements.energies_and_gradient` says."""
     free = problem.cloth.free
-    result = {f"energy_{name}": float(value.sum()) for name, value in energies.items()}
+    result = {f"energy_{name}": sum(value.tolist()) for name, value in energies.items()}
     result["energy_total"] = sum(result.values())
     guess = inertial_guess(problem.state, problem.step, problem.cloth.vertex_scene)
     if problem.step.pin_target is not None:

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from hood.assets.material import Material
-from hood.dynamics.measure import PENETRATION_METRICS, edge_strain, penetration_metrics, strain_metrics
+from hood.dynamics.measure import PENETRATION_METRICS, _quantile, edge_strain, penetration_metrics, strain_metrics
 from hood.scene.cloth import build_cloth
 from hood.testing import grid, plane_contact
 
@@ -63,3 +63,11 @@ def test_vertices_without_any_surface_do_not_count() -> None:
 
 def test_depth_is_zero_outside() -> None:
     assert penetration_metrics(plane_contact(CLOTH.rest_pos + 0.1), 36)["penetration_depth"] == 0.0
+
+
+def test_quantiles_are_those_of_numpy():
+    rng = np.random.default_rng(3)
+    for count in (1, 2, 3, 101, 3000):
+        values = np.sort(rng.random(count))
+        for share in (0.5, 0.99, 1.0):
+            assert _quantile(values, share) == pytest.approx(np.quantile(values, share), rel=1e-14)
