@@ -42,7 +42,7 @@ from hood.dynamics.captured import MODES, CapturedSimulator, network_of
 from hood.dynamics.captured_newton import CapturedNewton
 from hood.dynamics.recorder import RolloutWriter, read_rollout
 from hood.dynamics.refine import GuessStepper
-from hood.dynamics.rollout import METRIC_CHOICES, metric_names, simulate
+from hood.dynamics.rollout import METRIC_CHOICES, SETTLE_CHOICES, metric_names, simulate, takes_equilibrium
 from hood.dynamics.simulator import Simulator
 from hood.dynamics.stepper import NewtonStepper, Stepper
 from hood.nn.compiled import KERNELS
@@ -61,6 +61,7 @@ def run(overrides: Sequence[str]) -> int:
     require_device(config)
     require_choice(config, "video", ("mp4", "gif", "none"))
     require_choice(config, "metrics", METRIC_CHOICES)
+    require_choice(config, "settle", SETTLE_CHOICES)
     _check_numbers(config)
     require_choice(config, "kernels", (AUTO, *KERNELS))
     require_choice(config, "stepper", ("network", "newton", "refine", AUTO))
@@ -112,6 +113,7 @@ def _run_heard(
     if choice.stepper == "newton" and network_of(stepper) is not None:
         stepper, _ = make_stepper(config)
     stepper = refined(stepper, config, scene.cloth.num_vertices)
+    _check_start(config, stepper, scene)
     warn(scene_cautions(stepper, scene, build(config.losses), str(config.checkpoint)))
     folder = prepare_folder(output_folder(config))
     (folder / "summary.json").unlink(missing_ok=True)  # its presence says that everything is there
@@ -268,7 +270,7 @@ def _simulate_to_disk(config: DictConfig, scene: Scene, stepper: Stepper, digest
         scene.garment.faces,
         scene.motion.faces,
         scene.motion.num_vertices,
-        metric_names(potential, stepper, str(config.metrics)),
+        metric_names(potential, stepper, str(config.metrics), str(config.settle)),
         scene.dt,
         attributes,
         farthest=float(np.abs(scene.motion.translation).max()),
@@ -284,6 +286,7 @@ def _simulate_to_disk(config: DictConfig, scene: Scene, stepper: Stepper, digest
         metrics=str(config.metrics),
         fields=exported(config),
         surface_stride=int(config.surface_stride),
+        settle=str(config.settle),
     )
     try:
         with writer:
@@ -295,6 +298,18 @@ def _simulate_to_disk(config: DictConfig, scene: Scene, stepper: Stepper, digest
             raise
         return True
     return False
+
+
+def _check_start(config: DictConfig, stepper: Stepper, scene: Scene) -> None:
+    """A line where weights have a start of their own; ConfigError where the number of relaxing steps would play no role."""
+    if str(config.settle) != "equilibrium":
+        return
+    if not takes_equilibrium(stepper, scene):
+        print(f"settle=paper: {config.checkpoint} goes on from its relaxing step, as it was trained to")
+    elif int(config.relaxing_steps) != 1:
+        raise ConfigError(
+            f"relaxing_steps={config.relaxing_steps}: belongs to settle=paper, settle=equilibrium has none; add settle=paper"
+        )
 
 
 def _draw(config: DictConfig, folder: Path) -> None:

@@ -38,6 +38,7 @@ def summarise(path: Path) -> dict[str, Any]:
         "first_frame": {
             key: _at(metrics[key], 0) for key in ("strain_p50", "strain_p99", "penetration_count", "penetration_depth")
         },
+        "settled": _settled(metrics),
         "strain_p50": _median(metrics["strain_p50"]),
         "strain_p99": _median(metrics["strain_p99"]),
         "strain_max": _largest(metrics["strain_max"]),
@@ -67,6 +68,7 @@ def describe(summary: dict[str, Any]) -> str:
             + ("all finite" if first is None else f"first non-finite frame {first}"),
             f"strain p50 {_percent(summary['strain_p50'])} p99 {_worst_strain(summary)}, {_penetration(summary)}",
             "ms per frame (median): " + ", ".join(f"{name} {value or 0.0:.1f}" for name, value in times.items()),
+            *_describe_start(summary.get("settled")),
             *describe_refinement(summary),
             *describe_surface(summary["surface"]),
             *_missed(summary),
@@ -94,6 +96,30 @@ def describe_all(rows: Mapping[str, Mapping[str, Any]], total: int) -> str:
     parts = [f"{len(rows) - failed} of {total} motions simulated"]
     parts += [f"{count} {what}" for count, what in ((failed, "failed"), (unsound, "unsound")) if count]
     return "\n".join([*lines, ", ".join(parts)])
+
+
+def _settled(metrics: Mapping[str, np.ndarray]) -> dict[str, Any] | None:
+    """How the start was brought to rest; None where it was not."""
+    seconds = _at(metrics["settle_seconds"], 0)
+    if seconds is None:
+        return None
+    return {
+        "seconds": seconds,
+        "steps": int(metrics["settle_steps"][0]),
+        "speed_m_per_s": _at(metrics["settle_speed"], 0),
+        "reached": bool(metrics["settle_reached"][0]),
+    }
+
+
+def _describe_start(settled: Mapping[str, Any] | None) -> list[str]:
+    if settled is None:
+        return []
+    speed = settled["speed_m_per_s"]
+    moves = "n/a" if speed is None else f"{1e3 * speed:.1f} mm a second"
+    state = "at rest" if settled["reached"] else "not at rest"
+    return [
+        f"frame 0: settled in {settled['seconds']:.1f} s by {settled['steps']} steps, {state} (the cloth still moves by {moves})"
+    ]
 
 
 def _missed(summary: Mapping[str, Any]) -> list[str]:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from hood.dynamics.captured import network_of
+from hood.dynamics.equilibrium import Rest, find_equilibrium, without_hold
 from hood.dynamics.frames import Relaxing
 from hood.dynamics.measure import (
     PENETRATION_METRICS,
@@ -61,10 +62,13 @@ class Frame:
 METRIC_CHOICES = ("all", "strain", "none")
 #: What can be had of every vertex: the relative gradient, see :func:`hood.dynamics.measure.vertex_residual`.
 FIELD_CHOICES = ("rg",)
+#: How frame 0 is made, see :func:`simulate`, and what frame 0 says of an equilibrium.
+SETTLE_CHOICES = ("equilibrium", "paper")
+SETTLE_METRICS = ("settle_steps", "settle_seconds", "settle_speed", "settle_reached")
 
 
-def metric_names(potential: Potential, stepper: Stepper, metrics: str = "all") -> tuple[str, ...]:
-    """Every metric a frame of a rollout can have, for one of :data:`METRIC_CHOICES`."""
+def metric_names(potential: Potential, stepper: Stepper, metrics: str = "all", settle: str = "paper") -> tuple[str, ...]:
+    """Every metric a frame of a rollout can have, for one of :data:`METRIC_CHOICES` and of :data:`SETTLE_CHOICES`."""
     energies = (
         *(f"energy_{name}" for name in potential.terms),
         "energy_total",
@@ -78,7 +82,8 @@ def metric_names(potential: Potential, stepper: Stepper, metrics: str = "all") -
         "strain": STRAIN_METRICS,
         "none": (),
     }
-    return (*measured[metrics], *stepper.metrics, *(f"ms_{part}" for part in stepper.times), "ms_metrics")
+    settled = SETTLE_METRICS if settle == "equilibrium" else ()
+    return (*measured[metrics], *stepper.metrics, *settled, *(f"ms_{part}" for part in stepper.times), "ms_metrics")
 
 
 @torch.no_grad()
@@ -94,14 +99,21 @@ def simulate(
     metrics: str = "all",
     fields: Sequence[str] = (),
     surface_stride: int = SURFACE_STRIDE,
+    settle: str = "paper",
 ) -> Iterator[Frame]:
     """Frames 0, 1, … of the garment on the moving body.
 
-    Frame 0 is the settled start after ``relaxing_steps`` relaxing steps (paper, section 3.4), vertices pushed out of the
-    body. Where the stepper restarts from the relaxing step (:class:`hood.dynamics.frames.Relaxing`), the last one leads from
-    frame 0 to frame 1 instead. The cloth of a frame always belongs to the body of the same frame. A frame's energies belong
-    to the step that led to it, as do its times. The simulation goes on over non-finite frames, so that their number and
-    place are seen. ``observe`` sees every step from frame to frame, outside its time.
+    ``settle`` is one of :data:`SETTLE_CHOICES`. With ``paper`` frame 0 is the settled start after ``relaxing_steps`` relaxing
+    steps (paper, section 3.4), vertices pushed out of the body. Where the stepper restarts from the relaxing step
+    (:class:`hood.dynamics.frames.Relaxing`), the last one leads from frame 0 to frame 1 instead. With ``equilibrium`` there
+    are no relaxing steps: the solver settles the cloth on the still body (:func:`hood.dynamics.equilibrium.find_equilibrium`),
+    the same way for every stepper, and frame 0 has :data:`SETTLE_METRICS` (number, s, m/s, 0 or 1). A start that is given with
+    the scene, and a stepper with a rule of its own for the relaxing step, keep ``paper``. Either way frame 0 has the velocity
+    of the skinned garment.
+
+    The cloth of a frame always belongs to the body of the same frame. A frame's energies belong to the step that led to it,
+    as do its times. The simulation goes on over non-finite frames, so that their number and place are seen. ``observe`` sees
+    every step from frame to frame, outside its time.
 
     ``metrics`` is one of :data:`METRIC_CHOICES`. What only they need to know, contact included, is no part of the step and
     changes nothing about it; its time is ``ms_metrics``, which ``ms_total`` leaves out as it does the caller's work. The same
@@ -111,9 +123,11 @@ def simulate(
     A network that looks at a potential looks at ``potential``; a solver keeps its own.
 
     Raises:
-        ValueError: ``metrics`` or a field is none of the choices, ``surface_stride`` is less than 1, or the network cannot look
-            at this potential.
+        ValueError: ``metrics``, ``settle`` or a field is none of the choices, ``surface_stride`` is less than 1, or the network
+            cannot look at this potential.
     """
+    if settle not in SETTLE_CHOICES:
+        raise ValueError(f"settle is {settle!r}; choose {', '.join(SETTLE_CHOICES)}")
     if metrics not in METRIC_CHOICES:
         raise ValueError(f"metrics is {metrics!r}; choose {', '.join(METRIC_CHOICES)}")
     strange = [name for name in fields if name not in FIELD_CHOICES]
@@ -126,9 +140,13 @@ def simulate(
     if network is not None:
         network.use_potential(potential)
     prepared = prepare_stepper(stepper, scene)
-    state = start_state(stepper, scene, potential, relaxing_steps, start_frame)
+    rest = None
+    if settle == "equilibrium" and takes_equilibrium(stepper, scene, start_frame):
+        state, rest = rest_state(stepper, scene, potential, relaxing_steps, start_frame, attachments)
+    else:
+        state = start_state(stepper, scene, potential, relaxing_steps, start_frame)
     relaxing = relaxing_steps > 0 and stepper.relaxing is Relaxing.RESTART
-    stepped: dict[str, float] = {}
+    stepped = {} if rest is None else _settled(rest)
     known_fields = {name: torch.full((scene.cloth.num_vertices,), torch.nan) for name in fields}
     wants_potential = metrics == "all" or bool(fields)
     meter = SurfaceMeter(scene.garment, scene.motion.faces) if metrics == "all" else None
@@ -247,6 +265,39 @@ def start_state(stepper: Stepper, scene: Scene, potential: Potential, relaxing_s
         if lower and bool(torch.isfinite(pos).all()) and _longest(scene, pos) <= max(_STRETCH, _longest(scene, state.pos)):
             state = State(pos, state.vel, state.origin)
     return State(state.pos, velocity, state.origin)
+
+
+def takes_equilibrium(stepper: Stepper, scene: Scene, frame: int = 0) -> bool:
+    """Whether ``settle="equilibrium"`` says where ``frame`` starts: not where the scene gives the start, nor of weights that
+    were trained to go on from their relaxing step."""
+    given = scene.start_pos is not None and frame == 0
+    return stepper.relaxing is Relaxing.SETTLE and not given
+
+
+@torch.no_grad()
+def rest_state(
+    stepper: Stepper,
+    scene: Scene,
+    potential: Potential,
+    relaxing_steps: int,
+    frame: int = 0,
+    attachments: AttachmentSchedule | None = None,
+) -> tuple[State, Rest | None]:
+    """Start at rest on the still body of ``frame``, moving with the skinned garment, and how it was found; that of
+    :func:`start_state`, None and a warning where nothing holds the garment."""
+    falls = without_hold(scene)
+    if falls is not None:
+        warnings.warn(f"garment {scene.garment.name!r} is not settled, it falls from its start: {falls}", stacklevel=2)
+        return start_state(stepper, scene, potential, relaxing_steps, frame), None
+    start = start_state(stepper, scene, potential, 0, frame)
+    closed = None if attachments is None else attachments(0)
+    rest = find_equilibrium(scene, potential, start, frame, stepper.gravity, closed)
+    return State(rest.pos, scene.start_velocity(frame), start.origin), rest
+
+
+def _settled(rest: Rest) -> dict[str, float]:
+    values = (float(rest.steps), rest.seconds, rest.speed, float(rest.reached))
+    return dict(zip(SETTLE_METRICS, values, strict=True))
 
 
 def _led_in(
