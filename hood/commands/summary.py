@@ -117,9 +117,8 @@ def _describe_start(settled: Mapping[str, Any] | None) -> list[str]:
     speed = settled["speed_m_per_s"]
     moves = "n/a" if speed is None else f"{1e3 * speed:.1f} mm a second"
     state = "at rest" if settled["reached"] else "not at rest"
-    return [
-        f"frame 0: settled in {settled['seconds']:.1f} s by {settled['steps']} steps, {state} (the cloth still moves by {moves})"
-    ]
+    took = f"{settled['seconds']:.1f} s ({settled['steps']} steps)"
+    return [f"frame 0: settled in {took}, {state}: the cloth still moves by {moves}"]
 
 
 def _missed(summary: Mapping[str, Any]) -> list[str]:

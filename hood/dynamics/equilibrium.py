@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
 from collections.abc import Iterator
@@ -14,10 +15,12 @@ from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
 from hood.mesh.topology import connected_components
 from hood.scene.batch import to_device
+from hood.scene.cloth import Cloth
 from hood.scene.mesh_motion import wearable
 from hood.scene.scene import Scene
 from hood.scene.state import Attachments, State, StepInput
 from hood.solver.newton import NewtonSettings, minimize
+from hood.solver.reasons import NOT_FINITE
 
 #: Steps begin with the first and grow to the second [s]; they last longer while no vertex moves much farther than the third
 #: [m] in one: contact is searched once a step, and finds the body within a decimetre.
@@ -26,7 +29,7 @@ _SHORTEST, _LONGEST, _STRIDE = 1.0 / 30.0, 1.0, 0.04
 _REST = 1e-3
 #: Steps at most.
 _MOST_STEPS = 40
-#: A garment that has moved so far [m] on average is not worn any more.
+#: A part of a garment that has no pins and has moved so far [m] on average is not worn any more.
 _LOST = 0.3
 #: Accuracy of the steps on the way, and of the longest: the way leads to the same place, whatever is left over on it.
 _ROUGH, _FINE = NewtonSettings(target_rg=0.1, max_iterations=15), NewtonSettings(target_rg=1e-2)
@@ -56,12 +59,12 @@ class Rest:
 
 
 def without_hold(scene: Scene) -> str | None:
-    """Why nothing keeps the garment from falling, neither pins nor a body that wears it; None where something does."""
-    if bool(scene.cloth.pinned.any()):
-        return None
+    """Why nothing keeps the garment, or a part of it, from falling, neither pins nor a body that wears it; None where something
+    does."""
     if scene.motion.num_vertices == 0:
-        return "there is no body, and nothing is pinned"
-    return None if wearable(scene.garment) else "it is a sheet, and nothing is pinned"
+        return "there is no body, and a part of it has no pins" if bool(_Parts(scene.cloth).loose.any()) else None
+    held = bool(scene.cloth.pinned.any()) or wearable(scene.garment)
+    return None if held else "it is a sheet without pins"
 
 
 @torch.no_grad()
@@ -89,68 +92,74 @@ def find_equilibrium(
         attachments: closed in ``frame``.
     """
     began = time.perf_counter()
-    cloth, start = (to_device(item, "cpu") for item in (scene.cloth, state))
+    cloth, start = to_device(scene.cloth, "cpu"), to_device(state, "cpu")
     step = _on_cpu(scene.step_input(frame, state, relaxing=True, attachments=attachments))
     problem = StepProblem(cloth, replace(start, vel=torch.zeros_like(start.vel)), step, gravity=gravity.to(start.pos))
-    parts = _parts(problem)
+    parts = _Parts(cloth)
     *_, (count, pos, speed) = _steps(potential, problem, parts)
-    lost = bool((_means((pos - start.pos).norm(dim=1), parts) > _LOST).any())
+    lost = parts.lost(pos - start.pos)
     rest = Rest((start.pos if lost else pos).to(state.pos), count, time.perf_counter() - began, speed, lost)
     if not rest.reached:
         _warn(scene, rest)
     return rest
 
 
-def _steps(potential: Potential, problem: StepProblem, parts: Tensor) -> Iterator[tuple[int, Tensor, float]]:
+def _steps(potential: Potential, problem: StepProblem, parts: _Parts) -> Iterator[tuple[int, Tensor, float]]:
     """Number, positions (V, 3) and speed [m/s] after each step, until the cloth is at rest, lost, or out of steps."""
     start, dt = problem.state.pos, _SHORTEST
     for count in range(1, _MOST_STEPS + 1):
         here = problem.state
         longest = dt >= _LONGEST
         problem = replace(problem, step=replace(problem.step, dt=torch.full_like(problem.step.dt, dt)))
-        pos, _ = minimize(potential, problem, here.pos, _FINE if longest else _ROUGH)
-        moved = (pos - here.pos).norm(dim=1)
-        if not bool(moved.isfinite().all()):
-            yield count, here.pos, float("inf")
+        pos, report = minimize(potential, problem, here.pos, _FINE if longest else _ROUGH)
+        if NOT_FINITE in report.reason:
+            yield count, here.pos, math.inf
             return
-        speed = float(_means(moved, parts).max()) / dt
+        moved = (pos - here.pos).norm(dim=1)
+        speed = float(parts.means(moved).max()) / dt
         yield count, pos, speed
-        if (longest and speed <= _REST / _LONGEST) or bool((_means((pos - start).norm(dim=1), parts) > _LOST).any()):
+        if (longest and speed <= _REST / _LONGEST) or parts.lost(pos - start):
             return
         growth = _STRIDE / max(float(moved.max()), 1e-9)
         dt = min(max(dt * min(max(growth, 0.5), 2.0), _SHORTEST), _LONGEST)
         problem = replace(problem, state=replace(here, pos=pos))
 
 
-def _parts(problem: StepProblem) -> Tensor:
-    """Connected part (V,) of each vertex that moves, counted from 1; 0 for the others."""
-    cloth = problem.cloth
-    parts = connected_components(cloth.num_vertices, cloth.edges.numpy())
-    return torch.where(cloth.free, torch.as_tensor(parts) + 1, 0)
+class _Parts:
+    """The connected parts of a cloth: the garments of an outfit, and what else hangs together."""
 
+    def __init__(self, cloth: Cloth) -> None:
+        self._free = cloth.free.cpu()
+        self._part = torch.as_tensor(connected_components(cloth.num_vertices, cloth.edges.cpu().numpy()))
+        self._free_part = self._part[self._free]
+        count = int(self._part.max()) + 1 if len(self._part) else 0
+        self._size = torch.bincount(self._free_part, minlength=count)
+        pinned = torch.bincount(self._part[cloth.pinned.cpu()], minlength=count)
+        self.loose = (pinned == 0) & (self._size > 0)  # (P,) bool: they move, and no pin holds them
 
-def _means(values: Tensor, parts: Tensor) -> Tensor:
-    """Mean of ``values`` (V,) over the vertices of every part; part 0 and parts without a vertex have 0."""
-    count = torch.bincount(parts)
-    total = values.new_zeros(len(count)).index_add(0, parts, values)
-    total[0] = 0.0
-    return total / count.clamp_min(1)
+    def means(self, values: Tensor) -> Tensor:
+        """Means (P,) of ``values`` (V,) over the free vertices of every part; 0 where there are none."""
+        total = values.new_zeros(len(self._size)).index_add(0, self._free_part, values[self._free])
+        return total / self._size.clamp_min(1)
+
+    def lost(self, moved: Tensor) -> bool:
+        """Whether a part that no pin holds has come off, by the way (V, 3) [m] of the vertices."""
+        return bool((self.means(moved.norm(dim=1))[self.loose] > _LOST).any())
 
 
 def _on_cpu(step: StepInput) -> StepInput:
-    moved = {name: getattr(step, name) for name in ("obstacle", "attachments")}
-    return replace(
-        to_device(step, "cpu"), **{name: None if item is None else to_device(item, "cpu") for name, item in moved.items()}
-    )
+    obstacle = None if step.obstacle is None else to_device(step.obstacle, "cpu")
+    attachments = None if step.attachments is None else to_device(step.attachments, "cpu")
+    return replace(to_device(step, "cpu"), obstacle=obstacle, attachments=attachments)
 
 
 def _warn(scene: Scene, rest: Rest) -> None:
-    name = scene.garment.name
+    name = f"garment {scene.garment.name!r}"
     if rest.lost:
-        text = f"garment {name!r} comes off the body when it settles: it starts as it is put on, and will fall"
+        text = f"{name} comes off the body when it settles: it starts as it is put on, and will fall"
+    elif not math.isfinite(rest.speed):
+        text = f"{name} is not at rest in frame 0: the potential has no finite value in step {rest.steps} of settling"
     else:
-        text = (
-            f"garment {name!r} is not at rest in frame 0: after {rest.steps} steps of settling it still moves by "
-            f"{1e3 * rest.speed:.1f} mm a second"
-        )
+        moves = f"{1e3 * rest.speed:.1f} mm a second"
+        text = f"{name} is not at rest in frame 0: after {rest.steps} steps of settling it still moves by {moves}"
     warnings.warn(f"{text} (pins=… hold it, settle=paper does not settle it)", stacklevel=4)
