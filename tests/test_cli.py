@@ -204,7 +204,7 @@ def test_an_interrupt_has_its_own_exit_code(
 
     def interrupted(*arguments: object) -> object:
         calls.append(1)
-        if len(calls) == 3:
+        if len(calls) == 2:
             raise KeyboardInterrupt
         return step(*arguments)
 
@@ -261,12 +261,13 @@ def test_rollout_file_has_the_documented_content(run_folder: Path) -> None:
     assert attributes["surface_stride"] == 5
 
 
-def test_a_rollout_without_metrics_holds_times_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_rollout_without_metrics_holds_times_and_its_start_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["garment=tank", "num_frames=3", "video=none", "sheet=false", f"output={tmp_path / 'run'}"]
     assert main(["rollout", *UNTRAINED, *arguments, "metrics=none"]) == 0
     assert "strain p50 n/a p99 n/a, vertices inside the body n/a\n" in capsys.readouterr().out
     names = set(read_rollout(tmp_path / "run" / "rollout.h5").metrics)
-    assert names == {f"ms_{part}" for part in ("search", "features", "network", "rest", "total", "metrics")}
+    times = {f"ms_{part}" for part in ("search", "features", "network", "rest", "total", "metrics")}
+    assert names == times | {"settle_steps", "settle_seconds", "settle_speed", "settle_reached"}
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["strain_p50"] is summary["potential_mean_J"] is summary["first_frame"]["strain_p99"] is None
     assert summary["ms_per_frame"]["network"]["median"] > 0
