@@ -104,7 +104,8 @@ def start_figures(folder: Path) -> tuple[float, float]:
 
 
 def check_valid(case: Case, workshop: Workshop, folder: Path, *options: str) -> None:
-    assert main(["rollout", *words_of(case, workshop, folder), *QUIET, *options]) == 0
+    # The garment as it is put on is judged: its own weight stretches a shoulder further, by up to a seventh.
+    assert main(["rollout", *words_of(case, workshop, folder), *QUIET, "settle=paper", *options]) == 0
     stretch, depth = start_figures(folder)
     assert stretch <= STRETCH
     assert depth <= DEPTH
