@@ -42,7 +42,7 @@ from hood.dynamics.captured import MODES, CapturedSimulator, network_of
 from hood.dynamics.captured_newton import CapturedNewton
 from hood.dynamics.recorder import RolloutWriter, read_rollout
 from hood.dynamics.refine import GuessStepper
-from hood.dynamics.rollout import METRIC_CHOICES, SETTLE_CHOICES, metric_names, simulate, takes_equilibrium
+from hood.dynamics.rollout import METRIC_CHOICES, SETTLE_CHOICES, metric_names, own_start, simulate
 from hood.dynamics.simulator import Simulator
 from hood.dynamics.stepper import NewtonStepper, Stepper
 from hood.nn.compiled import KERNELS
@@ -301,11 +301,12 @@ def _simulate_to_disk(config: DictConfig, scene: Scene, stepper: Stepper, digest
 
 
 def _check_start(config: DictConfig, stepper: Stepper, scene: Scene) -> None:
-    """A line where weights have a start of their own; ConfigError where the number of relaxing steps would play no role."""
+    """A line where a rollout has a start of its own; ConfigError where the number of relaxing steps would play no role."""
     if str(config.settle) != "equilibrium":
         return
-    if not takes_equilibrium(stepper, scene):
-        print(f"settle=paper: {config.checkpoint} goes on from its relaxing step, as it was trained to")
+    reason = own_start(stepper, scene)
+    if reason is not None:
+        print(f"settle=paper: {reason}")
     elif int(config.relaxing_steps) != 1:
         raise ConfigError(
             f"relaxing_steps={config.relaxing_steps}: belongs to settle=paper, settle=equilibrium has none; add settle=paper"

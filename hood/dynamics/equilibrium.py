@@ -16,7 +16,6 @@ from hood.losses.problem import StepProblem
 from hood.mesh.topology import connected_components
 from hood.scene.batch import to_device
 from hood.scene.cloth import Cloth
-from hood.scene.mesh_motion import wearable
 from hood.scene.scene import Scene
 from hood.scene.state import Attachments, State, StepInput
 from hood.solver.newton import NewtonSettings, minimize
@@ -59,12 +58,9 @@ class Rest:
 
 
 def without_hold(scene: Scene) -> str | None:
-    """Why nothing keeps the garment, or a part of it, from falling, neither pins nor a body that wears it; None where something
-    does."""
-    if scene.motion.num_vertices == 0:
-        return "there is no body, and a part of it has no pins" if bool(_Parts(scene.cloth).loose.any()) else None
-    held = bool(scene.cloth.pinned.any()) or wearable(scene.garment)
-    return None if held else "it is a sheet without pins"
+    """Why nothing keeps a part of a worn garment from falling, neither pins nor a body; None where something does."""
+    loose = scene.motion.num_vertices == 0 and bool(_Parts(scene.cloth).loose.any())
+    return "there is no body, and a part of it has no pins" if loose else None
 
 
 @torch.no_grad()

@@ -30,6 +30,7 @@ from hood.losses.elements import energies_and_gradient, total_energy
 from hood.losses.potential import Potential, relative_gradient, scale
 from hood.losses.problem import StepProblem, inertial_guess
 from hood.scene.contact import Contact, find_contact
+from hood.scene.mesh_motion import wearable
 from hood.scene.scene import LEAD_IN, RELAXING_DT, NotWornError, Scene, recentre
 from hood.scene.start import free_stretch, push_out
 from hood.scene.state import Attachments, State
@@ -107,8 +108,8 @@ def simulate(
     steps (paper, section 3.4), vertices pushed out of the body. Where the stepper restarts from the relaxing step
     (:class:`hood.dynamics.frames.Relaxing`), the last one leads from frame 0 to frame 1 instead. With ``equilibrium`` there
     are no relaxing steps: the solver settles the cloth on the still body (:func:`hood.dynamics.equilibrium.find_equilibrium`),
-    the same way for every stepper, and frame 0 has :data:`SETTLE_METRICS` (number, s, m/s, 0 or 1). A start that is given with
-    the scene, and a stepper with a rule of its own for the relaxing step, keep ``paper``. Either way frame 0 has the velocity
+    the same way for every stepper, and frame 0 has :data:`SETTLE_METRICS` (number, s, m/s, 0 or 1). What has a start of its
+    own (:func:`own_start`) keeps ``paper``. Either way frame 0 has the velocity
     of the skinned garment.
 
     The cloth of a frame always belongs to the body of the same frame. A frame's energies belong to the step that led to it,
@@ -141,7 +142,7 @@ def simulate(
         network.use_potential(potential)
     prepared = prepare_stepper(stepper, scene)
     rest = None
-    if settle == "equilibrium" and takes_equilibrium(stepper, scene, start_frame):
+    if settle == "equilibrium" and own_start(stepper, scene, start_frame) is None:
         state, rest = rest_state(stepper, scene, potential, relaxing_steps, start_frame, attachments)
     else:
         state = start_state(stepper, scene, potential, relaxing_steps, start_frame)
@@ -267,11 +268,13 @@ def start_state(stepper: Stepper, scene: Scene, potential: Potential, relaxing_s
     return State(state.pos, velocity, state.origin)
 
 
-def takes_equilibrium(stepper: Stepper, scene: Scene, frame: int = 0) -> bool:
-    """Whether ``settle="equilibrium"`` says where ``frame`` starts: not where the scene gives the start, nor of weights that
-    were trained to go on from their relaxing step."""
-    given = scene.start_pos is not None and frame == 0
-    return stepper.relaxing is Relaxing.SETTLE and not given
+def own_start(stepper: Stepper, scene: Scene, frame: int = 0) -> str | None:
+    """Why ``settle="equilibrium"`` does not say where ``frame`` starts; None where it does."""
+    if stepper.relaxing is not Relaxing.SETTLE:
+        return "these weights go on from their relaxing step, as they were trained to"
+    if scene.start_pos is not None and frame == 0:
+        return "the scene gives the start"
+    return None if wearable(scene.garment) else "a sheet starts as it is given"
 
 
 @torch.no_grad()

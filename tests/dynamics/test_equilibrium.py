@@ -20,7 +20,7 @@ from hood.dynamics import equilibrium
 from hood.dynamics.equilibrium import Rest, find_equilibrium, without_hold
 from hood.dynamics.reference import import_reference_weights
 from hood.dynamics.refine import GuessStepper
-from hood.dynamics.rollout import SETTLE_CHOICES, SETTLE_METRICS, Frame, metric_names, simulate
+from hood.dynamics.rollout import SETTLE_CHOICES, SETTLE_METRICS, Frame, metric_names, own_start, simulate
 from hood.dynamics.simulator import build_simulator
 from hood.dynamics.stepper import NewtonStepper, Stepper
 from hood.losses.potential import Potential, default_potential
@@ -114,15 +114,26 @@ def test_without_a_body_a_sheet_hangs_from_its_pins() -> None:
     assert float(height[scene.cloth.pinned].min()) == pytest.approx(1.5)
 
 
-@pytest.mark.parametrize("with_body", [True, False])
-def test_what_nothing_holds_is_left_as_it_is(with_body: bool, body: Body, walk: PoseSequence) -> None:
-    """A sheet in the air falls from there; so does a part without pins where there is no body."""
+def test_what_nothing_holds_is_left_as_it_is() -> None:
+    """A part without pins, where there is no body, falls from its start."""
     tube = cylinder(8, 3, 0.1, 0.1)
     loose = join_garments([sheet(held=True), Garment("tube", *tube, np.zeros(len(tube[0]), dtype=bool))])
-    scene = sheet_above(body, walk) if with_body else dress(loose, NoBody(3, 30.0))
+    scene = dress(loose, NoBody(3, 30.0))
     assert without_hold(scene) is not None
     with pytest.warns(UserWarning, match="is not settled, it falls from its start: "):
         frame = first_frame(NewtonStepper(POTENTIAL), scene)
+    assert_as_in_the_paper(frame, scene)
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_a_sheet_starts_as_it_is_given(held: bool, body: Body, walk: PoseSequence) -> None:
+    """It is to fall, or to swing down from its pins."""
+    scene = dress(sheet(held=True), NoBody(3, 30.0)) if held else sheet_above(body, walk)
+    assert own_start(NewtonStepper(POTENTIAL), scene) == "a sheet starts as it is given"
+    assert_as_in_the_paper(first_frame(NewtonStepper(POTENTIAL), scene), scene)
+
+
+def assert_as_in_the_paper(frame: Frame, scene: Scene) -> None:
     paper = first_frame(NewtonStepper(POTENTIAL), scene, "paper")
     assert torch.equal(frame.world_pos, paper.world_pos)
     assert frame.metrics.keys() == paper.metrics.keys()
