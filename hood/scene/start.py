@@ -64,7 +64,7 @@ def _project(cloth: Cloth, pos: Tensor, obstacle: Obstacle | None, clearance: fl
             if iteration % _SEARCH_EVERY == 0:
                 contact = find_contact(pos, cloth.vertex_scene, obstacle)
             assert contact is not None
-            pos = _leave(pos, contact, clearance, cloth.free)
+            pos = leave(pos, contact, clearance, cloth.free)
         if iteration == iterations - 1:
             break
         span = pos[end] - pos[start]
@@ -95,8 +95,8 @@ def _unstretch(cloth: Cloth, pos: Tensor, obstacle: Obstacle | None, clearance: 
         if least <= _STRETCH_LIMIT:
             break
         contact = search(ahead)
-        now = _descend(cloth, ahead, weight, rest_length)
-        now = now if contact is None else _leave(now, contact, clearance, cloth.free)
+        now = descend(cloth, ahead, weight, rest_length)
+        now = now if contact is None else leave(now, contact, clearance, cloth.free)
         if float(((ahead - now) * (now - pos)).sum()) > 0.0:
             pace = 1.0
         next_pace = (1.0 + (1.0 + 4.0 * pace**2) ** 0.5) / 2.0
@@ -110,7 +110,7 @@ def _unstretch(cloth: Cloth, pos: Tensor, obstacle: Obstacle | None, clearance: 
     return best
 
 
-def _descend(cloth: Cloth, pos: Tensor, weight: Tensor, rest_length: Tensor) -> Tensor:
+def descend(cloth: Cloth, pos: Tensor, weight: Tensor, rest_length: Tensor) -> Tensor:
     """Free vertices moved by the weighted average of what would bring each of their edges within the limits."""
     start, end = cloth.edges.unbind(dim=1)
     span = pos[end] - pos[start]
@@ -143,7 +143,7 @@ class _LazySearch:
         return self._contact
 
 
-def _leave(pos: Tensor, contact: Contact, clearance: float, free: Tensor) -> Tensor:
+def leave(pos: Tensor, contact: Contact, clearance: float, free: Tensor) -> Tensor:
     """Free vertices nearer than ``clearance`` to their tangent planes moved there."""
     depth = (clearance - ((pos - contact.point) * contact.normal).sum(1)).clamp_min(0.0)
     return pos + (depth * contact.valid * free).unsqueeze(1) * contact.normal

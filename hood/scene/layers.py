@@ -1,0 +1,242 @@
+"""Layers of an outfit: which garment lies over which, and a start in which none passes through another.
+
+Garments are drafted one by one on the bare body, so that an outfit starts with hundreds of triangles through each other.
+Forces between layers keep what has been crossed, so the layers are sorted out before the first step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations, permutations, product
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hood.mesh.crossing import self_crossings
+from hood.mesh.topology import boundary_loops
+from hood.scene.cloth import Cloth
+from hood.scene.contact import find_contact
+from hood.scene.start import descend, free_stretch, leave, push_out
+from hood.scene.state import Obstacle
+
+#: Distance [m] that layers are taken apart to; where triangles still cross, by so much more a round, up to the last.
+_GAP, _MORE, _WIDEST = 3e-3, 1e-3, 1.5e-2
+#: Rounds at most, and steps of each; crossings are counted after a round.
+_ROUNDS, _STEPS = 24, 20
+#: Rounds after which a way is given up that has not become better.
+_PATIENCE = 8
+#: Garments that do not cross go on being smoothed for so many rounds while an edge is stretched by more than the second.
+_SMOOTHING, _STRETCHED = 6, 0.1
+#: A vertex belongs to the other side of a layer if it is nearer than this [m].
+_NEAR = 0.04
+#: Orders of the layers that are tried where the likeliest does not come out well.
+_TRIED = 3
+#: What the inner layer takes of a push: half, which opens narrow places, or nothing, which opens folds of an outer layer.
+_SHARES = (0.5, 0.0)
+
+
+class TangledError(ValueError):
+    """Garments of an outfit that cannot be taken apart."""
+
+
+@dataclass(frozen=True)
+class Separation:
+    """Garments of an outfit taken apart."""
+
+    pos: Tensor  # (V, 3) m
+    order: tuple[int, ...]  # garments from the body outwards
+    before: int  # pairs of triangles of two garments that passed through each other
+    after: int
+    stretch: float  # largest relative lengthening of an edge
+
+
+class Outfit(NamedTuple):
+    """Garments that are one mesh."""
+
+    cloth: Cloth
+    faces: np.ndarray  # (F, 3)
+    piece: np.ndarray  # (V,) garment of a vertex, from 0
+    names: tuple[str, ...]
+
+
+def crossing_pairs(outfit: Outfit, pos: Tensor) -> np.ndarray:
+    """Pairs (N, 2) of faces of different garments that pass through each other."""
+    pairs = self_crossings(pos.double().cpu().numpy(), outfit.faces)
+    garment = outfit.piece[outfit.faces[:, 0]]
+    return pairs[garment[pairs[:, 0]] != garment[pairs[:, 1]]]
+
+
+def separate(
+    outfit: Outfit, pos: Tensor, obstacle: Obstacle | None, clearance: float, order: Sequence[int] | None = None
+) -> Separation:
+    """The garments at ``pos`` (V, 3) [m] taken apart, at least ``clearance`` [m] outside the body.
+
+    Steps alternate edge-length projections with pushes: out of the body, and of the vertices of one layer to their side of
+    the nearest triangle of another, which gives way as much, or alone where the vertex is held. What still crosses after a
+    round is pushed farther. Matches on the rim of a layer that lie more than 45 degrees beside it are none: cloth beyond a hem
+    has no side.
+
+    Args:
+        order: garments from the body outwards; None: the likeliest of :func:`likely_orders` that comes out well.
+
+    Raises:
+        TangledError: triangles of two garments still cross.
+    """
+    before = len(crossing_pairs(outfit, pos))
+    if before == 0:
+        chosen = tuple(order) if order is not None else likely_orders(outfit, pos, obstacle)[0]
+        return Separation(pos, chosen, 0, 0, _longest(outfit, pos))
+    orders = [tuple(order)] if order is not None else likely_orders(outfit, pos, obstacle)[:_TRIED]
+    best: Separation | None = None
+    for tried, inner_share in product(orders, _SHARES):
+        now = _take_apart(outfit, pos, obstacle, clearance, tried, inner_share, before)
+        if best is None or (now.after, now.stretch) < (best.after, best.stretch):
+            best = now
+        if best.after == 0 and best.stretch <= _STRETCHED:
+            break
+    assert best is not None
+    if best.after:
+        raise TangledError(_refusal(outfit, best))
+    return best
+
+
+def likely_orders(outfit: Outfit, pos: Tensor, obstacle: Obstacle | None) -> list[tuple[int, ...]]:
+    """All orders of the garments, from the body outwards, the likeliest first: by how many vertices lie on the side that the
+    order gives them."""
+    sheets = _sheets(outfit, pos, obstacle)
+    count = len(outfit.names)
+    outside = np.zeros((count, count))
+    for a, b in combinations(range(count), 2):
+        for over, under in ((a, b), (b, a)):
+            match = sheets[under].match(pos, sheets[over].vertices)
+            outside[over, under] += float((match.height[match.valid] > 0).sum() - (match.height[match.valid] < 0).sum())
+    return sorted(
+        permutations(range(count)),
+        key=lambda order: -sum(outside[over, under] - outside[under, over] for under, over in combinations(order, 2)),
+    )
+
+
+class _Match(NamedTuple):
+    corners: Tensor  # (N, 3) vertices
+    bary: Tensor  # (N, 3)
+    height: Tensor  # (N,) m, over the surface
+    normal: Tensor  # (N, 3)
+    valid: Tensor  # (N,) bool
+
+
+class _Sheet:
+    """The surface of one garment, its outside away from the body."""
+
+    def __init__(self, outfit: Outfit, garment: int) -> None:
+        faces = outfit.faces[outfit.piece[outfit.faces[:, 0]] == garment]
+        self.vertices = torch.as_tensor(np.flatnonzero(outfit.piece == garment))
+        self._faces = torch.as_tensor(faces)
+        self._rim = torch.zeros(len(outfit.piece), dtype=torch.bool)
+        for loop in boundary_loops(faces):
+            self._rim[torch.as_tensor(loop)] = True
+
+    def turn(self) -> None:
+        """Make the other side the outside."""
+        self._faces = self._faces.flip(1)
+
+    def obstacle(self, pos: Tensor) -> Obstacle:
+        none = torch.zeros(len(pos), dtype=torch.long)
+        return Obstacle(pos, pos, pos, self._faces, none, torch.zeros(len(self._faces), dtype=torch.long), none.bool())
+
+    def match(self, pos: Tensor, rows: Tensor) -> _Match:
+        """Where the vertices ``rows`` (N,) are over this surface, both at ``pos`` (V, 3)."""
+        contact = find_contact(pos[rows], torch.zeros(len(rows), dtype=torch.long), self.obstacle(pos), cap=_NEAR)
+        corners, offset = self._faces[contact.face], pos[rows] - contact.point
+        height = (offset * contact.normal).sum(dim=1)
+        beside = (offset - height[:, None] * contact.normal).norm(dim=1)
+        inside = contact.bary > 1e-6
+        on_rim = (self._rim[corners] | ~inside).all(dim=1) & ~inside.all(dim=1)
+        return _Match(corners, contact.bary, height, contact.normal, contact.valid & ~(on_rim & (beside > height.abs())))
+
+
+def _sheets(outfit: Outfit, pos: Tensor, obstacle: Obstacle | None) -> list[_Sheet]:
+    sheets = [_Sheet(outfit, garment) for garment in range(len(outfit.names))]
+    if obstacle is None:
+        return sheets
+    body = find_contact(pos, torch.zeros(len(pos), dtype=torch.long), obstacle)
+    for sheet in sheets:
+        own = find_contact(pos[sheet.vertices], torch.zeros(len(sheet.vertices), dtype=torch.long), sheet.obstacle(pos))
+        if float((own.normal * body.normal[sheet.vertices]).sum()) < 0:
+            sheet.turn()
+    return sheets
+
+
+def _take_apart(
+    outfit: Outfit,
+    pos: Tensor,
+    obstacle: Obstacle | None,
+    clearance: float,
+    order: tuple[int, ...],
+    inner_share: float,
+    before: int,
+) -> Separation:
+    """The garments apart in one order; the best of the rounds."""
+    cloth, sheets = outfit.cloth, _sheets(outfit, pos, obstacle)
+    rest_length = (cloth.rest_pos[cloth.edges[:, 1]] - cloth.rest_pos[cloth.edges[:, 0]]).norm(dim=1)
+    gap, weight = torch.full_like(pos[:, 0], _GAP), torch.ones_like(rest_length)
+    best, found, clean = Separation(pos, order, before, before, _longest(outfit, pos)), 0, 0
+    for number in range(_ROUNDS):
+        for _ in range(_STEPS):
+            pos = descend(cloth, pos, weight, rest_length) if number else pos
+            if obstacle is not None:
+                pos = leave(pos, find_contact(pos, cloth.vertex_scene, obstacle), clearance, cloth.free)
+            for inner, outer in combinations(order, 2):
+                pos = _apart(cloth, pos, sheets[outer].vertices, sheets[inner], gap, 1.0, 1.0 - inner_share)
+                pos = _apart(cloth, pos, sheets[inner].vertices, sheets[outer], gap, -1.0, inner_share)
+        ended = push_out(cloth, pos, obstacle, clearance)
+        pairs = crossing_pairs(outfit, ended)
+        now = Separation(ended, order, before, len(pairs), _longest(outfit, ended))
+        if (now.after, now.stretch) < (best.after, best.stretch):
+            best, found = now, number
+        clean += now.after == 0
+        done = now.after == 0 and (now.stretch <= _STRETCHED or clean > _SMOOTHING)
+        if done or number - found >= _PATIENCE:
+            break
+        crossed = torch.as_tensor(np.unique(outfit.faces[pairs.reshape(-1)]))
+        gap[crossed] = (gap[crossed] + _MORE).clamp_max(_WIDEST)
+    return best
+
+
+def _apart(cloth: Cloth, pos: Tensor, rows: Tensor, sheet: _Sheet, gap: Tensor, side: float, share: float) -> Tensor:
+    """``pos`` (V, 3) with the vertices ``rows`` (N,) on a side of a sheet, +1 its outside, by their ``gap`` (V,) [m];
+    ``share`` of the way is theirs, the rest the sheet's. What several ask of a vertex is averaged."""
+    match = sheet.match(pos, rows)
+    lacking = (gap[rows] - side * match.height).clamp_min(0.0) * match.valid
+    touched = lacking > 0
+    match, rows, lacking = _Match(*(values[touched] for values in match)), rows[touched], lacking[touched]
+    free = cloth.free.to(pos.dtype)
+    point, surface = free[rows], (match.bary * free[match.corners]).sum(dim=1)
+    both = point * share + surface * (1.0 - share)
+    own = torch.where(both > 0, point * share / both.clamp_min(1e-9), point)
+    move = side * lacking[:, None] * match.normal
+    load = match.bary * free[match.corners]
+    target = torch.cat([rows, match.corners.reshape(-1)])
+    asked = torch.cat([point, load.reshape(-1)])
+    corner_moves = -((1.0 - own)[:, None] * move).repeat_interleave(3, dim=0)
+    moves = asked[:, None] * torch.cat([own[:, None] * move, corner_moves])
+    total = torch.zeros_like(pos).index_add(0, target, moves)
+    count = torch.zeros_like(pos[:, 0]).index_add(0, target, asked)
+    return pos + total / count.clamp_min(1e-9)[:, None]
+
+
+def _longest(outfit: Outfit, pos: Tensor) -> float:
+    return float(free_stretch(outfit.cloth, pos).max()) if len(outfit.cloth.edges) else 0.0
+
+
+def _refusal(outfit: Outfit, best: Separation) -> str:
+    garments = outfit.piece[outfit.faces[:, 0]][crossing_pairs(outfit, best.pos)]
+    named = sorted({tuple(sorted((outfit.names[a], outfit.names[b]))) for a, b in garments.tolist()})
+    through = ", ".join(f"{a!r} and {b!r}" for a, b in named)
+    return (
+        f"outfit: {best.after} pairs of triangles of {through} pass through each other at the start and could not be taken "
+        "apart; give the layers from the body outwards (layers=[inner,outer]), free their pins (pins=none), start from another "
+        "frame or a standing pose (start=…, blend_in=3), or simulate without contact between layers (cloth_contact=off)"
+    )

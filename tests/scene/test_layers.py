@@ -1,0 +1,124 @@
+"""Garments of an outfit are taken apart before the first step."""
+
+import numpy as np
+import pytest
+import torch
+
+from hood.assets.body import load_body
+from hood.assets.garment import load_garment
+from hood.assets.material import Material
+from hood.assets.outfit import join_garments
+from hood.assets.sequence import load_sequence
+from hood.mesh.crossing import self_crossings
+from hood.scene.cloth import build_cloth
+from hood.scene.contact import find_contact
+from hood.scene.layers import Outfit, TangledError, crossing_pairs, likely_orders, separate
+from hood.scene.scene import build_scene
+from hood.scene.state import Obstacle
+from hood.testing import cylinder
+
+CLEARANCE = 2e-3
+
+
+def tubes(*radii, pinned=(), wave=0.0):
+    """Tubes around one axis, the second turned; ``wave`` [m] is how far they swing about their radii."""
+    meshes = [cylinder(around=24, rows=10, radius=radius, height=0.4) for radius in radii]
+    pos = [points @ _turned(0.1 * number) for number, (points, _) in enumerate(meshes)]
+    swung = [
+        p * (1.0 + wave / radii[0] * np.sin(9 * np.arctan2(p[:, 2], p[:, 0]) + n)[:, None] * [1, 0, 1])
+        for n, p in enumerate(pos)
+    ]
+    starts = np.cumsum([0, *(len(p) for p in pos[:-1])])
+    faces = np.concatenate([rows + start for (_, rows), start in zip(meshes, starts, strict=True)])
+    piece = np.repeat(np.arange(len(pos)), [len(p) for p in pos])
+    held = np.isin(piece, pinned)
+    cloth = build_cloth(np.concatenate(pos), faces, Material(), held, dtype=torch.float64)
+    return Outfit(cloth, faces, piece, tuple("abcd"[: len(pos)])), torch.as_tensor(np.concatenate(swung))
+
+
+def _turned(angle):
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+
+
+def trunk(radius):
+    points, faces = cylinder(around=48, rows=12, radius=radius, height=0.6)
+    pos, none = torch.as_tensor(points), torch.zeros(len(points), dtype=torch.long)
+    return Obstacle(pos, pos, pos, torch.as_tensor(faces), none, torch.zeros(len(faces), dtype=torch.long), none.bool())
+
+
+def heights(outfit, pos, over, under):
+    """Mean distance from the axis of a garment less that of another [m]."""
+    away = np.linalg.norm(pos.numpy()[:, [0, 2]], axis=1)
+    return away[outfit.piece == over].mean() - away[outfit.piece == under].mean()
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_crossed_tubes_come_apart_in_either_order(order):
+    outfit, pos = tubes(0.2, 0.201, wave=6e-3)
+    found = separate(outfit, pos, trunk(0.19), CLEARANCE, order)
+    assert found.before == len(crossing_pairs(outfit, pos)) > 100
+    assert (found.after, found.order) == (0, order)
+    assert len(crossing_pairs(outfit, found.pos)) == 0
+    assert heights(outfit, found.pos, order[1], order[0]) > 2e-3
+    assert found.stretch < 0.1
+
+
+def test_the_likely_order_is_the_one_most_vertices_have():
+    outfit, pos = tubes(0.2, 0.206, 0.212, wave=4e-3)
+    orders = likely_orders(outfit, pos, trunk(0.19))
+    assert orders[0] == (0, 1, 2)
+    assert len(orders) == 6
+    found = separate(outfit, pos, trunk(0.19), CLEARANCE)
+    assert (found.after, found.order) == (0, (0, 1, 2))
+
+
+def test_a_garment_that_is_inside_out_has_its_outside_away_from_the_body():
+    outfit, pos = tubes(0.2, 0.206, wave=4e-3)
+    turned = outfit._replace(faces=np.where(outfit.piece[outfit.faces[:, :1]] == 0, outfit.faces[:, ::-1], outfit.faces))
+    assert likely_orders(turned, pos, trunk(0.19))[0] == (0, 1)
+    assert separate(turned, pos, trunk(0.19), CLEARANCE, (0, 1)).after == 0
+
+
+def test_held_garments_stay_and_the_others_give_way():
+    outfit, pos = tubes(0.2, 0.203, pinned=(1,), wave=4e-3)
+    found = separate(outfit, pos, trunk(0.18), CLEARANCE, (0, 1))
+    assert found.after == 0
+    assert torch.equal(found.pos[outfit.piece == 1], pos[outfit.piece == 1])
+
+
+def test_garments_apart_stay_as_they_are():
+    outfit, pos = tubes(0.2, 0.23)
+    found = separate(outfit, pos, trunk(0.19), CLEARANCE)
+    assert (found.before, found.after, found.order) == (0, 0, (0, 1))
+    assert found.pos is pos
+
+
+def test_without_a_body_the_winding_says_what_is_outside():
+    outfit, pos = tubes(0.2, 0.203, wave=4e-3)
+    found = separate(outfit, pos, None, CLEARANCE)
+    assert (found.after, found.order) == (0, (0, 1))
+
+
+def test_held_garments_that_cross_are_refused_by_name():
+    outfit, pos = tubes(0.2, 0.201, pinned=(0, 1), wave=6e-3)
+    with pytest.raises(TangledError, match=r"pairs of triangles of 'a' and 'b' pass .*layers=\[inner,outer\]"):
+        separate(outfit, pos, trunk(0.18), CLEARANCE, (0, 1))
+
+
+@pytest.mark.parametrize(
+    ("names", "order"), [(("tank", "skirt"), (0, 1)), (("tshirt", "trousers"), (1, 0)), (("tank_4k", "skirt_4k"), (0, 1))]
+)
+def test_embedded_outfits_come_apart(names, order):
+    garment = join_garments([load_garment(name) for name in names])
+    scene = build_scene(garment, load_body(), load_sequence("plie", 30.0))
+    start = scene.start(0, relaxed=False, thorough=True)
+    obstacle = scene.motion.obstacle(0, start.origin[0].numpy(), static=True)
+    found = separate(Outfit(scene.cloth, garment.faces, garment.piece, names), start.pos, obstacle, CLEARANCE)
+    assert found.before > 20
+    assert found.order == order
+    pairs = self_crossings(found.pos.double().numpy(), garment.faces)
+    assert not (garment.piece[garment.faces[pairs[:, 0], 0]] != garment.piece[garment.faces[pairs[:, 1], 0]]).any()
+    assert found.stretch < 0.15
+    dist = find_contact(found.pos, scene.cloth.vertex_scene, obstacle).dist
+    assert float(dist[scene.cloth.free].min()) > CLEARANCE - 1e-4
