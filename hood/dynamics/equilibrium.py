@@ -26,8 +26,8 @@ from hood.solver.reasons import NOT_FINITE
 _SHORTEST, _LONGEST, _STRIDE = 1.0 / 30.0, 1.0, 0.04
 #: At rest: in the longest step every part of the cloth moves by less than this [m] on average.
 _REST = 1e-3
-#: Steps at most.
-_MOST_STEPS = 40
+#: Steps at most: the default garments need half of them, and what creeps goes on creeping.
+_MOST_STEPS = 30
 #: A part of a garment that has no pins and has moved so far [m] on average is not worn any more.
 _LOST = 0.3
 #: Accuracy of the steps on the way, and of the longest: the way leads to the same place, whatever is left over on it.
