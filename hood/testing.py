@@ -116,6 +116,7 @@ def plane_contact(pos: Tensor, normal: Tensor | None = None, height: float = 0.0
         normal=normals,
         next_point=point if motion is None else point + motion.to(pos),
         next_normal=normals,
+        curvature=torch.zeros_like(dist),
     )
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from hood.losses.problem import StepProblem, sum_per_scene
 from hood.scene.contact import CentroidContact, LaggedContact, find_centroid_contact, find_lagged_contact
 from hood.scene.contact_points import PLACES
+from hood.scene.reach import checked_reach, vertex_reach
 
 
 def checked_place(term: str, contact: str) -> str:
@@ -40,27 +41,35 @@ class Collision:
     smooth function of the positions. A vertex at depth p = ε - d feels the force 3 w p² along the normal.
     Vertices without a match within the search's cap, and isolated ones, feel nothing.
 
+    At vertices ε is ``epsilon`` and by ``reach=curvature`` the depth as well to which the skin would bulge through the flat
+    triangles between them (:func:`hood.scene.reach.sag`). Like the correspondence it is found at t and constant in the step.
+
     With ``contact`` at more places than the vertices the same energy acts at points x_p = Σ w_i x_i of edges and faces, with w
     times the area share of the point (:class:`hood.scene.contact_points.PointContact`). Per area of cloth all points together
     press as hard as all vertices do: whatever the meshes, contact gets twice as stiff where both touch, and where an edge sags
-    between vertices that do not, it is as stiff as theirs would be.
+    between vertices that do not, it is as stiff as theirs would be. Points lie where the skin bulges most: their ε is ``epsilon``
+    in any case.
 
     Args:
         weight: w [J/m³].
-        epsilon: ε [m], distance at which the penalty sets in.
+        epsilon: least distance [m] at which the penalty sets in.
         contact: ``vertices``, ``edges`` or ``strict``, see :data:`hood.scene.contact_points.PLACES`.
+        reach: ``curvature`` or ``constant``, see :data:`hood.scene.reach.REACHES`.
     """
 
-    def __init__(self, weight: float = 5e5, epsilon: float = 2e-3, contact: str = "vertices") -> None:
+    def __init__(
+        self, weight: float = 5e5, epsilon: float = 2e-3, contact: str = "vertices", reach: str = "curvature"
+    ) -> None:
         if weight < 0 or epsilon <= 0:
             raise ValueError(f"collision: weight is {weight}, epsilon {epsilon}; give weight >= 0 and epsilon > 0")
         self.weight = weight
         self.epsilon = epsilon
         self.contact = checked_place("collision", contact)
+        self.reach = checked_reach("collision", reach)
 
     def with_weight(self, weight: float) -> Collision:
         """The same term with another weight, for a ramp during training."""
-        return type(self)(weight, self.epsilon, self.contact)
+        return type(self)(weight, self.epsilon, self.contact, self.reach)
 
     def prepare(self, problem: StepProblem) -> StepProblem:
         """The problem with its contact searched for, once per step."""
@@ -75,11 +84,16 @@ class Collision:
         assert contact is not None
         return _planes(problem, contact.valid, contact.next_point, contact.next_normal)
 
+    def reaches(self, problem: StepProblem) -> Tensor:
+        """Distances ε [m] (V,) from the planes at which the penalty sets in; the problem must have a contact."""
+        assert problem.contact is not None
+        return vertex_reach(self.reach, self.epsilon, problem.cloth, problem.contact)
+
     def depth(self, problem: StepProblem, next_pos: Tensor) -> tuple[Tensor, Tensor]:
         """Depth ε - d [m] (V,), negative outside, and normals (V, 3); both 0 without a match."""
         planes = self.planes(problem)
         dist = ((next_pos - planes.point) * planes.normal).sum(dim=1)
-        return torch.where(planes.touching, self.epsilon - dist, 0.0), planes.normal
+        return torch.where(planes.touching, self.reaches(problem) - dist, 0.0), planes.normal
 
     def __call__(self, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> Tensor:
         """Energy [J] (B,) at ``next_pos`` (V, 3)."""
@@ -109,7 +123,7 @@ class CentroidCollision(Collision):
     """
 
     def __init__(self, weight: float = 5e5, epsilon: float = 2e-3, lagged: bool = False) -> None:
-        super().__init__(weight, epsilon)
+        super().__init__(weight, epsilon, reach="constant")
         self.lagged = lagged
 
     def with_weight(self, weight: float) -> CentroidCollision:

@@ -9,6 +9,7 @@ from hood.losses.collision import checked_place, lagged_contact, with_lagged_cen
 from hood.losses.problem import StepProblem, sum_per_scene
 from hood.scene.contact import Contact, LaggedContact
 from hood.scene.contact_points import PointContact
+from hood.scene.reach import checked_reach, vertex_reach
 
 
 class LaggedFriction:
@@ -64,7 +65,7 @@ class Friction(LaggedFriction):
     At points inside edges and faces N has the factor of the collision there, the area share.
 
     Args:
-        weight, epsilon, contact: w [J/m³], ε [m] and places of the collision term.
+        weight, epsilon, contact, reach: those of the collision term, which make w [J/m³] and ε [m].
     """
 
     def __init__(
@@ -74,15 +75,17 @@ class Friction(LaggedFriction):
         weight: float = 5e5,
         epsilon: float = 2e-3,
         contact: str = "vertices",
+        reach: str = "curvature",
     ) -> None:
         super().__init__(coefficient, slip_speed)
         self.weight = weight
         self.epsilon = epsilon
         self.contact = checked_place("friction", contact)
+        self.reach = checked_reach("friction", reach)
 
     def with_weight(self, weight: float) -> Friction:
         """The same term with another collision weight, for a ramp during training."""
-        return Friction(self.coefficient, self.slip_speed, weight, self.epsilon, self.contact)
+        return Friction(self.coefficient, self.slip_speed, weight, self.epsilon, self.contact, self.reach)
 
     def prepare(self, problem: StepProblem) -> StepProblem:
         """The problem with its contact searched for, once per step, if there is friction."""
@@ -105,8 +108,9 @@ class Friction(LaggedFriction):
 
     def normal_force(self, problem: StepProblem, contact: Contact) -> Tensor:
         touching = contact.valid & (problem.cloth.mass > 0)
-        dist = torch.where(touching, contact.dist, self.epsilon)
-        return 3.0 * self.weight * (self.epsilon - dist).clamp_min(0.0) ** 2
+        reach = vertex_reach(self.reach, self.epsilon, problem.cloth, contact)
+        depth = torch.where(touching, reach - contact.dist, 0.0).clamp_min(0.0)
+        return 3.0 * self.weight * depth**2
 
 
 class WeightFriction(LaggedFriction):

@@ -143,6 +143,7 @@ def default_potential(
     friction_slip_speed: float = 5e-3,
     attachment_stiffness: float = 1e3,
     contact: str = "vertices",
+    reach: str = "curvature",
 ) -> Potential:
     """The paper's potential in safe forms: contact with triangles, friction by normal force, rest angles."""
     return Potential(
@@ -151,8 +152,8 @@ def default_potential(
             "bending": Bending(),
             "inertia": Inertia(),
             "gravity": Gravity(),
-            "collision": Collision(collision_weight, collision_epsilon, contact),
-            "friction": Friction(friction_coefficient, friction_slip_speed, collision_weight, collision_epsilon, contact),
+            "collision": Collision(collision_weight, collision_epsilon, contact, reach),
+            "friction": Friction(friction_coefficient, friction_slip_speed, collision_weight, collision_epsilon, contact, reach),
             "attachment": Attachment(attachment_stiffness),
         }
     )

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from hood import native
+from hood.mesh import topology
 from hood.mesh.kept import forget
 from hood.native.build import optional
 from hood.native.structures import COUNT, POINTER, fields
@@ -171,6 +172,43 @@ def _point(structure: ctypes.Structure, arrays: dict[str, np.ndarray]) -> None:
     for name, array in arrays.items():
         assert array.flags.c_contiguous, f"{name} has gaps"
         setattr(structure, name, array.ctypes.data)
+
+
+@torch.no_grad()
+def curvature(pos: Tensor, faces: Tensor, incidence: Sequence[Tensor], most: float, rounds: int) -> Tensor | None:
+    """What :func:`hood.mesh.curvature.convex_curvature` computes, (W,); None where there is no compiled form, or not for these
+    tensors.
+
+    Args:
+        incidence: as for :class:`SurfaceTree`.
+        most: bound [1/m].
+        rounds: of averaging.
+    """
+    lib = library() if type(pos) is Tensor and pos.device.type == "cpu" else None
+    if lib is None:
+        return None
+    corners = np.ascontiguousarray(faces.numpy(), np.int64)
+    edges = _edges_of(incidence[0], corners)
+    around, first, valence = (np.ascontiguousarray(part.numpy(), np.int64) for part in incidence[:3])
+    place, found = _double(pos), np.empty(len(pos))
+    arrays = (corners, edges, around, first, valence, place, np.empty((len(place), 3)), np.empty(len(corners)), found)
+    counts = (COUNT(len(array)) for array in (corners, edges, place))
+    addresses = (POINTER(array.ctypes.data) for array in arrays)
+    lib.surface_curvature(*counts, *addresses, ctypes.c_double(most), COUNT(rounds))
+    return torch.from_numpy(found).to(pos.dtype)
+
+
+_EDGES: dict[int, tuple[weakref.ref[Tensor], np.ndarray]] = {}
+
+
+def _edges_of(around: Tensor, faces: np.ndarray) -> np.ndarray:
+    """The edges (E, 2) of ``faces`` (G, 3), kept as long as ``around`` of their incidence lives."""
+    key = id(around)
+    known = _EDGES.get(key)
+    if known is None or known[0]() is not around:
+        edges = np.ascontiguousarray(topology.unique_edges(faces), np.int64)
+        known = _EDGES[key] = weakref.ref(around, forget(_EDGES, key)), edges
+    return known[1]
 
 
 @torch.no_grad()

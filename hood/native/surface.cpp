@@ -589,6 +589,43 @@ void surface_refit(Tree* tree) {
     fit_boxes(*tree);
 }
 
+// Curvatures of vertices, see hood/mesh/curvature.py; ``memory`` is (vertices, 3), ``of_face`` (faces).
+void surface_curvature(int64_t num_faces, int64_t num_edges, int64_t num_vertices, const int64_t* faces, const int64_t* edges,
+                       const int64_t* around, const int64_t* first, const int64_t* valence, const double* pos, double* memory,
+                       double* of_face, double* curvature, double most, int64_t rounds) {
+    std::fill(memory, memory + 3 * num_vertices, 0.0);
+    std::fill(curvature, curvature + num_vertices, 0.0);
+    for (int64_t face = 0; face < num_faces; ++face) {
+        const int64_t* c = faces + 3 * face;
+        const Vec here = at(pos, c[0]), normal = cross(at(pos, c[1]) - here, at(pos, c[2]) - here);
+        for (int k = 0; k < 3; ++k) put(memory + 3 * c[k], at(memory, c[k]) + normal);
+    }
+    for (int64_t i = 0; i < num_vertices; ++i) {
+        const Vec sum = at(memory, i);
+        const double length = std::sqrt(dot(sum, sum));
+        put(memory + 3 * i, length > TINY ? (1.0 / length) * sum : Vec{0.0, 0.0, 0.0});
+    }
+    for (int64_t edge = 0; edge < num_edges; ++edge) {
+        const int64_t i = edges[2 * edge], j = edges[2 * edge + 1];
+        const Vec along = at(pos, j) - at(pos, i);
+        const double bend = std::min(dot(at(memory, j) - at(memory, i), along) / std::max(dot(along, along), TINY), most);
+        // Not-a-number is no curvature.
+        if (bend > curvature[i]) curvature[i] = bend;
+        if (bend > curvature[j]) curvature[j] = bend;
+    }
+    for (int64_t round = 0; round < rounds; ++round) {
+        for (int64_t face = 0; face < num_faces; ++face) {
+            const int64_t* c = faces + 3 * face;
+            of_face[face] = (curvature[c[0]] + curvature[c[1]] + curvature[c[2]]) / 3.0;
+        }
+        for (int64_t i = 0; i < num_vertices; ++i) {
+            double sum = 0.0;
+            for (int64_t k = first[i]; k < first[i] + valence[i]; ++k) sum += of_face[around[k]];
+            curvature[i] = sum / (double)std::max(valence[i], (int64_t)1);
+        }
+    }
+}
+
 void surface_search(const Tree* tree, const Query* query) {
     if (tree->parts > 1) make_all_normals(*tree, query->next_pos);
     for_parts(tree->parts, [&](int64_t part) {

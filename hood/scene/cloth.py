@@ -65,6 +65,15 @@ class Cloth:
         """Vertices that the simulation moves, (V,) bool: neither pinned nor isolated (massless)."""
         return ~self.pinned & (self.mass > 0)
 
+    @cached_property
+    def edge_length_sq(self) -> Tensor:
+        """Mean square [m²] (V,) of the rest lengths of the edges at every vertex; 0 at isolated ones."""
+        start, end = self.edges.unbind(dim=1)
+        square = (self.rest_pos[end] - self.rest_pos[start]).square().sum(dim=1)
+        ends = torch.stack([square, torch.ones_like(square)], dim=1)
+        total = ends.new_zeros(self.num_vertices, 2).index_add(0, start, ends).index_add(0, end, ends)
+        return total[:, 0] / total[:, 1].clamp_min(1.0)
+
 
 def build_cloth(
     rest_pos: np.ndarray,

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from hood.mesh import geometry, surface_tree
 from hood.mesh.centroids import nearest_centroids
+from hood.mesh.curvature import convex_curvature
 from hood.mesh.fixed_surface import search_surface_fixed
 from hood.mesh.nearest import Nearest, nearest_dense, nearest_vertices
 from hood.mesh.proximity import Incidence, SurfaceHit, build_incidence, search_surface
@@ -51,6 +52,7 @@ class Contact:
     normal: Tensor  # (V, 3) outward unit normal there at t
     next_point: Tensor  # (V, 3) m, the same material point at t + 1
     next_normal: Tensor  # (V, 3) outward unit normal there at t + 1
+    curvature: Tensor  # (V,) 1/m, of the body there at t, see hood.mesh.curvature
 
     @property
     def nearest(self) -> Nearest:
@@ -68,7 +70,17 @@ def find_contact(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, cap: flo
     Matches farther than ``cap`` [m] are kept but marked invalid.
     """
     match = match_surface(pos, vertex_scene, obstacle)
-    return Contact(**match._asdict(), valid=match.dist.abs() <= cap)
+    incidence = build_incidence(obstacle.faces, len(obstacle.pos))
+    return _contact_of(match, obstacle, incidence, cap)
+
+
+def _contact_of(match: Match, obstacle: Obstacle, incidence: Incidence, cap: float) -> Contact:
+    if len(obstacle.faces) == 0:
+        curvature = torch.zeros_like(match.dist)
+    else:
+        at_vertices = convex_curvature(obstacle.pos, obstacle.faces, incidence).to(match.bary)
+        curvature = (match.bary * at_vertices[obstacle.faces[match.face]]).sum(dim=1)
+    return Contact(**match._asdict(), valid=match.dist.abs() <= cap, curvature=curvature)
 
 
 def match_surface(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle) -> Match:
@@ -96,8 +108,7 @@ def find_fixed_contact(
     :func:`hood.mesh.fixed_surface.search_surface_fixed`."""
     surface = obstacle.pos, obstacle.faces, obstacle.vertex_scene, obstacle.face_scene
     hit, needed = search_surface_fixed(pos, vertex_scene, *surface, incidence, num_scenes, places)
-    match = _match_of(hit, obstacle, incidence)
-    return Contact(**match._asdict(), valid=match.dist.abs() <= cap), needed
+    return _contact_of(_match_of(hit, obstacle, incidence), obstacle, incidence, cap), needed
 
 
 def _match_of(hit: SurfaceHit, obstacle: Obstacle, incidence: Incidence) -> Match:

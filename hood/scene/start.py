@@ -7,6 +7,7 @@ from torch import Tensor
 
 from hood.scene.cloth import Cloth
 from hood.scene.contact import Contact, find_contact
+from hood.scene.reach import sag
 from hood.scene.state import Obstacle
 
 #: Edges may start this much longer or shorter than at rest; beyond it they are projected back.
@@ -30,7 +31,8 @@ def settle(
     iterations: int = 60,
     thorough: bool = False,
 ) -> Tensor:
-    """Positions (V, 3) [m] near ``pos`` with bounded edge strain, at least ``clearance`` [m] outside the body.
+    """Positions (V, 3) [m] near ``pos`` with bounded edge strain, at least ``clearance`` [m] outside the body, and
+    where it bulges under long edges so far that these are outside as well (:func:`hood.scene.reach.sag`).
 
     Skinning stretches loose cloth between the limbs and pushes cuffs into the skin; the first frame would then start with
     forces far beyond the weight. Alternates averaged edge-length projections (position based dynamics, Müller et al. 2007)
@@ -64,7 +66,7 @@ def _project(cloth: Cloth, pos: Tensor, obstacle: Obstacle | None, clearance: fl
             if iteration % _SEARCH_EVERY == 0:
                 contact = find_contact(pos, cloth.vertex_scene, obstacle)
             assert contact is not None
-            pos = leave(pos, contact, clearance, cloth.free)
+            pos = leave(cloth, pos, contact, clearance)
         if iteration == iterations - 1:
             break
         span = pos[end] - pos[start]
@@ -96,7 +98,7 @@ def _unstretch(cloth: Cloth, pos: Tensor, obstacle: Obstacle | None, clearance: 
             break
         contact = search(ahead)
         now = descend(cloth, ahead, weight, rest_length)
-        now = now if contact is None else leave(now, contact, clearance, cloth.free)
+        now = now if contact is None else leave(cloth, now, contact, clearance)
         if float(((ahead - now) * (now - pos)).sum()) > 0.0:
             pace = 1.0
         next_pace = (1.0 + (1.0 + 4.0 * pace**2) ** 0.5) / 2.0
@@ -143,22 +145,22 @@ class _LazySearch:
         return self._contact
 
 
-def leave(pos: Tensor, contact: Contact, clearance: float, free: Tensor) -> Tensor:
-    """Free vertices nearer than ``clearance`` to their tangent planes moved there."""
-    depth = (clearance - ((pos - contact.point) * contact.normal).sum(1)).clamp_min(0.0)
-    return pos + (depth * contact.valid * free).unsqueeze(1) * contact.normal
+def leave(cloth: Cloth, pos: Tensor, contact: Contact, clearance: float) -> Tensor:
+    """Free vertices nearer than ``clearance`` and the :func:`sag` to their tangent planes moved there."""
+    depth = (clearance + sag(cloth, contact) - ((pos - contact.point) * contact.normal).sum(1)).clamp_min(0.0)
+    return pos + (depth * contact.valid * cloth.free).unsqueeze(1) * contact.normal
 
 
 def push_out(cloth: Cloth, pos: Tensor, obstacle: Obstacle | None, clearance: float, rounds: int = 4) -> Tensor:
-    """``pos`` (V, 3) with every free vertex at least ``clearance`` [m] outside the body at t (up to ``rounds`` searches:
-    leaving one limb may enter another)."""
+    """``pos`` (V, 3) with every free vertex at least ``clearance`` [m] and the :func:`sag` outside the body at t (up to
+    ``rounds`` searches: leaving one limb may enter another)."""
     if obstacle is None:
         return pos
     free = cloth.free
     for _ in range(rounds):
         contact = find_contact(pos, cloth.vertex_scene, obstacle)
         # The margin covers the difference between the tangent plane and the true distance.
-        depth = (clearance - contact.dist) * (contact.valid & free)
+        depth = (clearance + sag(cloth, contact) - contact.dist) * (contact.valid & free)
         if not bool((depth > 0).any()):
             break
         pos = pos + (depth.clamp_min(0.0) + 2e-4 * (depth > 0)).unsqueeze(1) * contact.normal

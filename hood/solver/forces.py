@@ -161,7 +161,7 @@ def vertex_forces(potential: Potential, problem: StepProblem) -> VertexForces:
 def walls_of(term: Collision, problem: StepProblem) -> Walls:
     """The planes of a collision term; the problem must have a contact."""
     planes = term.planes(problem)
-    reach = term.epsilon * planes.touching.to(planes.point.dtype)
+    reach = torch.where(planes.touching, term.reaches(problem), 0.0)
     return Walls(term.weight, planes.point, planes.normal, reach)
 
 

@@ -38,7 +38,7 @@ def make_inputs(base: bool = True, shift: float = 0.0, dt: float = DT) -> Inputs
     point = pos + shift - dist.unsqueeze(1) * up
     contact = Contact(
         vertex=torch.tensor([1, 0, 0, 0]), vertex_dist=dist, face=zero, bary=up, dist=dist, valid=dist < 0.1,
-        point=point, normal=up, next_point=point + 0.01, next_normal=up,
+        point=point, normal=up, next_point=point + 0.01, next_normal=up, curvature=torch.zeros(4, dtype=torch.float64),
     )  # fmt: skip
     step = StepInput(torch.tensor([dt], dtype=torch.float64), obstacle)
     state = State(pos + shift, vel, torch.zeros(1, 3, dtype=torch.float64))
