@@ -2,17 +2,20 @@
 
     python benchmarks/surface.py                                             # seven garments of 1,000 vertices
     python benchmarks/surface.py tshirt_4k trousers_4k dress_4k dress_12k --motions walk_proud --frames 30
+    python benchmarks/surface.py --steppers newton quickstart+5 --reach constant         # the network refined; contact as it was
 
 Rollouts as of ``hood rollout``: embedded body, default fabric, the motions of the validation list. A line per rollout as soon
 as it is done, then a table over the motions: mean and worst share of the cloth's triangles that the body's true surface cuts,
 the greatest height of skin above the cloth, mean and worst number of pairs of the cloth's triangles that pass through each
-other, over every --stride-th frame, the first and the last.
+other, over every --stride-th frame, the first and the last; of all frames the median distance of the vertices that touch from
+the skin, the iterations (median and 95th percentile), the steps that missed the solver's accuracy, and the time.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -22,74 +25,123 @@ from hood.assets.garment import load_garment
 from hood.assets.library import locate, motion_split
 from hood.assets.sequence import load_sequence
 from hood.dynamics.checkpoint import load_simulator
+from hood.dynamics.goals import Count
+from hood.dynamics.refine import RefinedStepper
 from hood.dynamics.rollout import simulate
 from hood.dynamics.stepper import NewtonStepper, Stepper
 from hood.dynamics.surface import SURFACE_METRICS, SURFACE_STRIDE, SurfaceMeter
-from hood.losses.potential import default_potential
+from hood.losses.potential import Potential, default_potential
+from hood.mesh.proximity import search_surface
 from hood.nn.compiled import KERNELS, check_kernels
+from hood.scene.contact_points import PLACES
+from hood.scene.reach import REACHES
 from hood.scene.scene import Scene, build_scene
 from hood.solver.newton import NewtonSettings
 
 GARMENTS = ("tshirt", "longsleeve", "tank", "dress", "skirt", "trousers", "shorts")
-HEADER = f"{'':38}{'cut, mean':>11}{'worst':>8}{'frame':>7}{'skin, mm':>10}{'crossings':>11}{'worst':>7}"
+HEADER = (
+    f"{'':38}{'cut, mean':>11}{'worst':>8}{'frame':>7}{'skin, mm':>10}{'crossings':>11}{'worst':>7}"
+    f"{'off, mm':>9}{'iterations':>12}{'p95':>5}{'missed':>8}{'ms':>8}"
+)
+#: Vertices as near to the skin as this [m] count as in touch.
+TOUCH = 0.02
 
 
-def make_stepper(name: str, kernels: str) -> Stepper:
-    """``newton`` with the command's accuracy, or the weights of that name."""
+class Measured(NamedTuple):
+    """A rollout."""
+
+    rows: np.ndarray  # (N, 1 + 5 + 1) number, SURFACE_METRICS and median distance [m] from the skin of the measured frames
+    steps: np.ndarray  # (T, 4) solver's iterations, whether converged, ms, refining iterations of all frames but the first
+
+
+def make_stepper(name: str, kernels: str, potential: Potential) -> Stepper:
+    """``newton`` with the command's accuracy, or the weights of that name; ``NAME+K`` refines them by K iterations."""
     if name == "newton":
-        return NewtonStepper(default_potential(), NewtonSettings(target_rg=1e-2))
-    simulator = load_simulator(locate("weights", name)).eval()
+        return NewtonStepper(potential, NewtonSettings(target_rg=1e-2))
+    weights, _, refine = name.partition("+")
+    simulator = load_simulator(locate("weights", weights)).eval()
     check_kernels(kernels, "fp32", simulator.network.latent_dim, torch.device("cpu"))
     simulator.network.use_kernels(kernels)
-    return simulator
+    simulator.use_potential(potential)
+    return RefinedStepper(simulator, potential, Count(int(refine))) if refine else simulator
 
 
-def measure(stepper: Stepper, scene: Scene, num_frames: int, stride: int) -> np.ndarray:
-    """(N, 1 + 5): number of the frame and :data:`SURFACE_METRICS` of the measured frames."""
-    meter, rows = SurfaceMeter(scene.garment, scene.motion.faces), []
+def measure(stepper: Stepper, scene: Scene, potential: Potential, num_frames: int, stride: int) -> Measured:
+    """One rollout."""
+    meter, rows, steps = SurfaceMeter(scene.garment, scene.motion.faces), [], []
     count = min(num_frames, scene.num_frames)
-    for frame in simulate(stepper, scene, default_potential(), count, metrics="none"):
+    faces = torch.as_tensor(scene.motion.faces, dtype=torch.int64)
+    scenes = [
+        torch.zeros(size, dtype=torch.int64) for size in (scene.cloth.num_vertices, scene.motion.num_vertices, len(faces))
+    ]
+    for frame in simulate(stepper, scene, potential, count, metrics="none"):
+        taken = [frame.metrics.get(key, np.nan) for key in ("solver_iterations", "solver_converged", "ms_total")]
+        steps.append([*taken, frame.metrics.get("refine_iterations", np.nan)])
         if frame.index % stride == 0 or frame.index + 1 == count:
             found = meter(frame.world_pos.numpy(), frame.body_pos.numpy())
-            rows.append([frame.index, *(found[key] for key in SURFACE_METRICS)])
-    return np.array(rows)
+            dist = search_surface(frame.world_pos.double(), scenes[0], frame.body_pos.double(), faces, *scenes[1:]).dist
+            off = float(dist[(dist < TOUCH) & scene.cloth.free].median())
+            rows.append([frame.index, *(found[key] for key in SURFACE_METRICS), off])
+    return Measured(np.array(rows), np.array(steps[1:]))
 
 
-def line(title: str, rows: np.ndarray) -> str:
+def line(title: str, measured: Measured) -> str:
     """Figures of measured frames; those that are not finite count as a whole surface cut."""
-    frame, share, _, depth, own, _ = rows.T
+    frame, share, _, depth, own, _, off = measured.rows.T
     share = np.where(np.isfinite(share), share, 1.0)
     own, depth = np.nan_to_num(own), np.nan_to_num(depth)
     worst = int(share.argmax())
     return (
         f"{title:38}{share.mean():>11.2%}{share[worst]:>8.2%}{frame[worst]:>7.0f}{1e3 * depth.max():>10.1f}"
-        f"{own.mean():>11.1f}{own.max():>7.0f}"
+        f"{own.mean():>11.1f}{own.max():>7.0f}{1e3 * np.median(off):>9.2f}{_effort(measured.steps)}"
     )
+
+
+def _effort(steps: np.ndarray) -> str:
+    solved, converged, time, refined = steps.T
+    used = refined if np.isnan(solved).all() else solved
+    iterations = f"{np.median(used):>12.0f}{np.quantile(used, 0.95):>5.0f}" if len(used) else f"{'':17}"
+    missed = f"{int((converged == 0).sum()):>8}" if np.isfinite(converged).any() else f"{'':8}"
+    return f"{iterations}{missed}{np.median(time):>8.1f}"
+
+
+def joined(parts: Sequence[Measured]) -> Measured:
+    """Several rollouts as one."""
+    return Measured(np.concatenate([part.rows for part in parts]), np.concatenate([part.steps for part in parts]))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("garments", nargs="*", default=GARMENTS)
-    parser.add_argument("--steppers", nargs="+", default=["quickstart", "newton"], help="newton, or weights")
+    parser.add_argument(
+        "--steppers", nargs="+", default=["quickstart", "newton"], help="newton, weights, or weights+iterations"
+    )
+    parser.add_argument("--reach", default="curvature", choices=REACHES, help="of contact")
+    parser.add_argument("--contact", default="vertices", choices=PLACES, help="where the cloth meets the body")
     parser.add_argument("--motions", nargs="+", default=motion_split()["validation"])
     parser.add_argument("--frames", type=int, default=60)
     parser.add_argument("--stride", type=int, default=SURFACE_STRIDE)
     parser.add_argument("--kernels", default="torch", choices=KERNELS, help="of the network; compiled ones round differently")
     chosen = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    body, steppers = load_body("default"), {name: make_stepper(name, chosen.kernels) for name in chosen.steppers}
-    table: dict[str, list[np.ndarray]] = {}
+    body, potential = load_body("default"), default_potential(contact=chosen.contact, reach=chosen.reach)
+    steppers = {name: make_stepper(name, chosen.kernels, potential) for name in chosen.steppers}
+    table: dict[str, list[Measured]] = {}
     print(HEADER)
     for motion in chosen.motions:
         for garment in chosen.garments:
             scene = build_scene(load_garment(garment), body, load_sequence(motion, 30.0))
             for name, stepper in steppers.items():
-                rows = measure(stepper, scene, chosen.frames, chosen.stride)
-                table.setdefault(f"{garment} {name}", []).append(rows)
-                print(line(f"{garment} {name} {motion}", rows), flush=True)
+                measured = measure(stepper, scene, potential, chosen.frames, chosen.stride)
+                table.setdefault(f"{garment} {name}", []).append(measured)
+                print(line(f"{garment} {name} {motion}", measured), flush=True)
     print(f"\n{HEADER}")
     for title in sorted(table):
-        print(line(title, np.concatenate(table[title])))
+        print(line(title, joined(table[title])))
+    for name in steppers:
+        print(
+            line(f"all {name}", joined([part for title, parts in table.items() if title.split()[1] == name for part in parts]))
+        )
 
 
 if __name__ == "__main__":

@@ -102,6 +102,7 @@ class _Plan:
         self._constants, self._shape = Constants(problem, stepper.potential), step_shape(problem, surface=True)
         self._inputs = InputMemory(step_inputs(problem, surface=True))
         potential, known = settled_potential(stepper.potential, problem), problem.with_contact()
+        self._potential = potential
         others = other_terms(potential, known)
         if others is not None:
             raise ValueError(
@@ -134,7 +135,7 @@ class _Plan:
     def _read(self) -> StepProblem:
         problem, incidence = problem_from(self._like, self._inputs.tensors)
         contact, self._faces = fixed_contact(problem, incidence, self.places)
-        return altered(problem, contact=contact)
+        return self._potential.with_pull(altered(problem, contact=contact), compiled=False)
 
 
 def _recorded(piece: Piece) -> Piece:

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from hood.losses.potential import Potential
+from hood.losses.potential import Potential, PreparedTerm
 from hood.losses.problem import StepProblem
 from hood.mesh.proximity import Incidence, build_incidence
 from hood.scene.contact import Contact, find_contact, find_fixed_contact
@@ -46,7 +46,7 @@ def settled_potential(potential: Potential, problem: StepProblem) -> Potential:
     """
     with_contact = problem.with_contact()
     for name, term in potential.terms.items():
-        if Potential({name: term}).prepare(with_contact) is not with_contact:
+        if isinstance(term, PreparedTerm) and term.prepare(with_contact) is not with_contact:
             raise ValueError(
                 f"losses.terms.{name} is a {type(term).__name__}, which searches for more than contact with the body's "
                 "surface; steps of fixed shapes have no form of that: use step=plain"
@@ -78,7 +78,7 @@ def problem_from(like: StepProblem, inputs: Sequence[Tensor]) -> tuple[StepProbl
         obstacle = altered(obstacle, **present)
     tables = list(values)
     step = altered(like.step, dt=dt, pin_target=pins, obstacle=obstacle)
-    problem = altered(like, state=State(pos, vel, like.state.origin), step=step, contact=None)
+    problem = altered(like, state=State(pos, vel, like.state.origin), step=step, contact=None, pull=None)
     return problem, Incidence(*tables) if tables else None
 
 

@@ -80,6 +80,8 @@ class FixedStep:
         simulator = self.simulator
         contact, num_faces = fixed_contact(problem, incidence, self.layout.capacity.faces, self.dense)
         problem = altered(problem, contact=contact)
+        if self._potential is not None:
+            problem = self._potential.with_pull(problem, compiled=False)
         seen = simulator.rules.stand(self._in_frames(problem))
         obstacle, nearest = seen.step.obstacle, None
         if obstacle is not None:

@@ -57,9 +57,7 @@ class Collision:
         reach: ``curvature`` or ``constant``, see :data:`hood.scene.reach.REACHES`.
     """
 
-    def __init__(
-        self, weight: float = 5e5, epsilon: float = 2e-3, contact: str = "vertices", reach: str = "curvature"
-    ) -> None:
+    def __init__(self, weight: float = 5e5, epsilon: float = 2e-3, contact: str = "vertices", reach: str = "curvature") -> None:
         if weight < 0 or epsilon <= 0:
             raise ValueError(f"collision: weight is {weight}, epsilon {epsilon}; give weight >= 0 and epsilon > 0")
         self.weight = weight

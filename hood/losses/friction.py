@@ -60,9 +60,20 @@ class LaggedFriction:
 
 
 class Friction(LaggedFriction):
-    """Friction by the contact's own force: N = 3 w max(ε - d_t, 0)², that of the collision term at t.
+    """Friction by the contact's own force: N = 3 w max(ε - d_t, 0)², that of the collision term at t, but no more than what
+    presses the vertex onto the skin during the step.
 
-    At points inside edges and faces N has the factor of the collision there, the area share.
+    The penalty has no bound: a vertex 6 mm deep, where a limb has passed it or the nearest skin has changed, would be held with
+    thousands of times its weight, although a few weights take it out. What presses it is
+
+        P = m/dt² max(ε - d̂, 0) + max(-f·n, 0),
+
+    the force that stops its own mass at the edge of the zone, with d̂ the distance at t+1 of where it would fly under its weight,
+    and what the forces f of the cloth around it (:attr:`hood.losses.problem.StepProblem.pull`) add along the normal n. Cloth that
+    lies still, or is stretched over the skin, is pressed with exactly N.
+
+    At points inside edges and faces N has the factor of the collision there, the area share, and so has P, of the weighted
+    vertices.
 
     Args:
         weight, epsilon, contact, reach: those of the collision term, which make w [J/m³] and ε [m].
@@ -99,18 +110,33 @@ class Friction(LaggedFriction):
             return energy
         moved = points.at(next_pos - problem.state.pos) - (points.next_point - points.point)
         limit = self.slip_speed * problem.step.dt[points.scene]
-        slipping = _slipping(self.coefficient * self.point_force(points), moved, points.next_normal, limit)
+        slipping = _slipping(self.coefficient * self.point_force(problem, points), moved, points.next_normal, limit)
         return energy + sum_per_scene(slipping, points.scene, problem.num_scenes)
 
-    def point_force(self, points: PointContact) -> Tensor:
+    def point_force(self, problem: StepProblem, points: PointContact) -> Tensor:
         """Lagged normal forces [N] (N,) at the points."""
-        return 3.0 * self.weight * points.share * (self.epsilon - points.dist).clamp_min(0.0) ** 2
+        force = 3.0 * self.weight * (self.epsilon - points.dist).clamp_min(0.0) ** 2
+        pull = problem.searched_pull
+        if pull is not None:
+            carried = problem.cloth.mass[points.vertices].mul(points.weights).sum(dim=1)
+            dt = problem.step.dt[points.scene]
+            depth = self.epsilon - _along(points.at(_flown(problem)) - points.next_point, points.next_normal)
+            force = torch.minimum(force, _pressing(carried / dt**2, depth, points.at(pull), points.next_normal))
+        return points.share * force
 
     def normal_force(self, problem: StepProblem, contact: Contact) -> Tensor:
         touching = contact.valid & (problem.cloth.mass > 0)
         reach = vertex_reach(self.reach, self.epsilon, problem.cloth, contact)
         depth = torch.where(touching, reach - contact.dist, 0.0).clamp_min(0.0)
-        return 3.0 * self.weight * depth**2
+        force = 3.0 * self.weight * depth**2
+        pull = problem.searched_pull
+        if pull is None:
+            return force
+        # where() before the arithmetic: rows without a match may hold infinite or undefined numbers.
+        point, normal = (torch.where(touching[:, None], given, 0.0) for given in (contact.next_point, contact.next_normal))
+        flown = reach - _along(_flown(problem) - point, normal)
+        inertia = problem.cloth.mass / problem.vertex_dt.squeeze(1) ** 2
+        return torch.minimum(force, _pressing(inertia, flown, pull, normal))
 
 
 class WeightFriction(LaggedFriction):
@@ -187,6 +213,21 @@ class CodedFriction(LaggedFriction):
         """The way of the matched centroids from t-1 to t and the normals at t."""
         assert isinstance(contact, LaggedContact)
         return contact.lagged_motion, contact.lagged_normal
+
+
+def _flown(problem: StepProblem) -> Tensor:
+    """Where (V, 3) [m] vertices would be at t + 1 with nothing but their weight."""
+    dt = problem.vertex_dt
+    return problem.state.pos + dt * (problem.state.vel + dt * problem.gravity.to(dt))
+
+
+def _pressing(inertia: Tensor, depth: Tensor, pull: Tensor, normal: Tensor) -> Tensor:
+    """P [N] (N,) of masses over dt² ``inertia`` [N/m] that would fly ``depth`` [m] deep, and of the ``pull`` (N, 3) [N]."""
+    return inertia * depth.clamp_min(0.0) - _along(pull, normal).clamp_max(0.0)
+
+
+def _along(vectors: Tensor, normal: Tensor) -> Tensor:
+    return (vectors * normal).sum(dim=1)
 
 
 def _slipping(force: Tensor, moved: Tensor, normal: Tensor, limit: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cache
 from typing import Any, Protocol, cast, runtime_checkable
 
@@ -12,7 +13,7 @@ from torch import Tensor
 from hood.losses.attachment import Attachment
 from hood.losses.bending import Bending, CurrentLengthBending
 from hood.losses.collision import CentroidCollision, Collision
-from hood.losses.friction import CodedFriction, Friction, WeightFriction
+from hood.losses.friction import CodedFriction, Friction, LaggedFriction, WeightFriction
 from hood.losses.gravity import Gravity
 from hood.losses.inertia import Inertia
 from hood.losses.problem import STANDARD_GRAVITY, StepProblem, sum_per_scene
@@ -44,6 +45,10 @@ class PreparedTerm(Protocol):
 def _prepares(kind: type) -> bool:
     """Whether terms of a class are of :class:`PreparedTerm`; to ask every term of every step takes 0.3 ms of it."""
     return issubclass(kind, PreparedTerm)
+
+
+#: What a pull leaves out, see :meth:`Potential.with_pull`.
+_NOT_PULLING = (Inertia, Gravity, Collision, LaggedFriction)
 
 
 class Potential:
@@ -78,7 +83,25 @@ class Potential:
         for term in self.terms.values():
             if _prepares(type(term)):
                 problem = cast(PreparedTerm, term).prepare(problem)
-        return problem
+        return self.with_pull(problem)
+
+    @torch.no_grad()
+    def with_pull(self, problem: StepProblem, compiled: bool = True) -> StepProblem:
+        """The problem with the forces at x_t of all terms but inertia, gravity, contact and friction, if a friction by the
+        contact's own force asks for them; itself where that is done, there is no contact or nobody asks.
+
+        Args:
+            compiled: may leave torch; False where a graph is recorded or traced.
+        """
+        asked = any(isinstance(term, Friction) and term.coefficient > 0 for term in self.terms.values())
+        if problem.pull is not None or problem.contact is None or not asked:
+            return problem
+        from hood.losses.elements import energies_and_gradient  # knows of potentials itself
+
+        pulling = Potential({name: term for name, term in self.terms.items() if not isinstance(term, _NOT_PULLING)})
+        pos = problem.state.pos
+        by = energies_and_gradient if compiled else Potential.gradient
+        return replace(problem, pull=-by(pulling, problem, pos)[0].to(pos.dtype))
 
     def active(self, problem: StepProblem) -> dict[str, Term]:
         """The terms that can be anything but a constant zero for a prepared ``problem``."""
@@ -153,7 +176,9 @@ def default_potential(
             "inertia": Inertia(),
             "gravity": Gravity(),
             "collision": Collision(collision_weight, collision_epsilon, contact, reach),
-            "friction": Friction(friction_coefficient, friction_slip_speed, collision_weight, collision_epsilon, contact, reach),
+            "friction": Friction(
+                friction_coefficient, friction_slip_speed, collision_weight, collision_epsilon, contact, reach
+            ),
             "attachment": Attachment(attachment_stiffness),
         }
     )

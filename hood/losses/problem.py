@@ -25,7 +25,9 @@ class StepProblem:
     """One implicit step t → t+1 of B scenes; everything in it is constant while the next positions vary.
 
     ``contact`` is None without a body, and until somebody who needs it asks for :meth:`with_contact`; ``point_contacts`` holds
-    what terms asked for by :meth:`with_points`.
+    what terms asked for by :meth:`with_points`. ``pull`` are the forces at x_t of everything but inertia, weight and the body, by
+    which the cloth around a vertex presses it onto the skin; None where :meth:`hood.losses.potential.Potential.with_pull` has not
+    been asked.
     """
 
     cloth: Cloth
@@ -34,6 +36,7 @@ class StepProblem:
     contact: Contact | None = None
     gravity: Tensor = field(default_factory=_standard_gravity)  # (3,) m/s²
     point_contacts: tuple[PointContact, ...] = ()
+    pull: Tensor | None = None  # (V, 3) N
 
     def __post_init__(self) -> None:
         if len(self.step.dt) != self.cloth.num_scenes:
@@ -85,6 +88,17 @@ class StepProblem:
         if self.contact is None and self.step.obstacle is not None:
             raise ValueError("step problem: contact not searched for yet; pass the problem through Potential.prepare once")
         return self.contact
+
+    @property
+    def searched_pull(self) -> Tensor | None:
+        """``pull``, demanded: None in a problem that was given its contact without a body only.
+
+        Raises:
+            ValueError: there is a body, but nobody asked for the pull.
+        """
+        if self.pull is None and self.step.obstacle is not None:
+            raise ValueError("step problem: pull not known yet; pass the problem through Potential.prepare once")
+        return self.pull
 
     @property
     def vertex_dt(self) -> Tensor:

@@ -32,8 +32,6 @@ def convex_curvature(pos: Tensor, faces: Tensor, incidence: Incidence) -> Tensor
     compiled = surface_tree.curvature(pos, faces, incidence.adjacency, MOST_CURVATURE, _ROUNDS)
     if compiled is not None:
         return compiled
-    if len(faces) == 0:
-        return pos.new_zeros(len(pos))
     normals = normals_of_fans(pos, faces, incidence.around, incidence.first)
     start, end = faces.reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
     along = pos.index_select(0, end) - pos.index_select(0, start)

@@ -75,11 +75,8 @@ def find_contact(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, cap: flo
 
 
 def _contact_of(match: Match, obstacle: Obstacle, incidence: Incidence, cap: float) -> Contact:
-    if len(obstacle.faces) == 0:
-        curvature = torch.zeros_like(match.dist)
-    else:
-        at_vertices = convex_curvature(obstacle.pos, obstacle.faces, incidence).to(match.bary)
-        curvature = (match.bary * at_vertices[obstacle.faces[match.face]]).sum(dim=1)
+    at_vertices = convex_curvature(obstacle.pos, obstacle.faces, incidence).to(match.bary)
+    curvature = (match.bary * at_vertices[obstacle.faces[match.face]]).sum(dim=1)
     return Contact(**match._asdict(), valid=match.dist.abs() <= cap, curvature=curvature)
 
 

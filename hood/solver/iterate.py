@@ -146,6 +146,7 @@ def _in_precision(problem: StepProblem, cloth: Cloth) -> StepProblem:
         None if problem.contact is None else to_device(problem.contact, dtype=real),
         problem.gravity.to(real),
         tuple(to_device(points, dtype=real) for points in problem.point_contacts),
+        None if problem.pull is None else problem.pull.to(real),
     )
 
 

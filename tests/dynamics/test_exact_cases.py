@@ -225,9 +225,9 @@ def swinging() -> tuple[Mesh, Mesh]:
 
 @pytest.fixture(scope="module")
 def reference() -> torch.Tensor:
-    """What :func:`swinging` comes to; the sheet has met the body."""
+    """What :func:`swinging` comes to; the sheet has met the body, which holds edges of 50 mm 5 mm off a ball of 150 mm."""
     pos = collided(*swinging())
-    assert float((pos.norm(dim=1) < 0.153).sum()) > 5
+    assert float((pos.norm(dim=1) < 0.156).sum()) > 5
     return pos
 
 

@@ -105,7 +105,9 @@ def test_one_search_per_step_and_none_for_the_default(monkeypatch):
     search = collision_module.find_centroid_contact
     monkeypatch.setattr(collision_module, "find_centroid_contact", lambda *a: calls.append(1) or search(*a))
     problem = problem_on(slope_body(0.1), 1e-3)
-    assert default_potential().prepare(problem) is problem
+    plain = default_potential().prepare(problem)
+    assert plain.contact is problem.contact
+    assert default_potential().prepare(plain) is plain
     potential = reference_potential()
     prepared = potential.prepare(problem)
     assert potential.prepare(prepared) is prepared

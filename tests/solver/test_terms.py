@@ -68,8 +68,8 @@ def test_energies_are_those_of_the_potential(make, scenes):
 
 def test_float32_keeps_the_forms_that_are_exact_there():
     """Contact far from the origin and inertia of tiny accelerations, to the rounding of their inputs."""
-    problem = crumpled(torch.float32)
     potential = default_potential()
+    problem = potential.prepare(crumpled(torch.float32))
     acc = torch.full_like(problem.state.pos, 1e-4)
     terms = StepTerms(potential, problem)
     inertia = terms.vertices.energies(problem.state.pos, acc, problem.vertex_dt)[0]
@@ -101,7 +101,8 @@ def test_a_term_given_twice_counts_twice():
 
 
 def test_a_state_of_one_scene_does_not_reach_another():
-    problem, potential = crumpled(), default_potential()
+    potential = default_potential()
+    problem = potential.prepare(crumpled())
     moved = problem.state.pos.clone()
     moved[35] += 0.01
     before, after = (

@@ -1,0 +1,98 @@
+"""Curvature of a surface at its vertices: known bodies, both forms, shapes that have none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from hood.mesh import surface_tree
+from hood.mesh.curvature import MOST_CURVATURE, convex_curvature
+from hood.mesh.proximity import build_incidence
+from hood.testing import Mesh, cylinder, grid, sphere
+
+F64 = torch.float64
+
+
+def curvature(mesh: Mesh, dtype: torch.dtype = F64) -> torch.Tensor:
+    pos, faces = torch.as_tensor(mesh[0]).to(dtype), torch.as_tensor(mesh[1])
+    return convex_curvature(pos, faces, build_incidence(faces, len(pos)))
+
+
+@pytest.fixture(params=["compiled", "torch"])
+def form(request, monkeypatch) -> str:
+    """Both forms, where there is a compiler."""
+    if request.param == "torch":
+        monkeypatch.setattr(surface_tree, "library", lambda: None)
+    elif surface_tree.library() is None:
+        pytest.skip("no C++ compiler")
+    return request.param
+
+
+def bumpy(seed: int = 0) -> Mesh:
+    """An uneven surface, open and closed parts, one face without area, one vertex without faces."""
+    rng = np.random.default_rng(seed)
+    pos, faces = sphere(2, 0.08)
+    sheet, others = grid(6, 5, 0.2)
+    points = np.concatenate([pos, sheet + 0.4]) + rng.normal(size=(len(pos) + len(sheet), 3)) * 4e-3
+    points = np.concatenate([points, points[-1:], [[9.0, 9.0, 9.0]]])
+    last = len(points) - 2
+    return points, np.concatenate([faces, others + len(pos), [[last, last - 1, last - 2]]])
+
+
+@pytest.mark.usefixtures("form")
+@pytest.mark.parametrize("radius", [0.03, 0.06, 0.5])
+def test_a_sphere_has_one_over_its_radius(radius: float) -> None:
+    found = curvature(sphere(3, radius))
+    torch.testing.assert_close(found, torch.full_like(found, 1 / radius), rtol=0.1, atol=0)
+
+
+@pytest.mark.usefixtures("form")
+def test_a_tube_has_that_of_its_cross_section_and_inside_out_none() -> None:
+    pos, faces = cylinder(32, 12, 0.05, 0.3)
+    found = curvature((pos, faces)).view(-1)
+    outward = float(found.max()) > 1.0
+    other = curvature((pos, faces[:, ::-1].copy()))
+    bulging, hollow = (found, other) if outward else (other, found)
+    assert float(bulging.median()) == pytest.approx(20.0, rel=0.05)
+    # Diagonals of the hollow side are bent the other way as well.
+    assert float(hollow.max()) < 0.05
+
+
+@pytest.mark.usefixtures("form")
+def test_flat_and_tiny_surfaces_are_bounded() -> None:
+    assert float(curvature(grid(7, 7, 1.0)).abs().max()) == 0.0
+    assert float(curvature(sphere(2, 1e-3)).min()) == pytest.approx(MOST_CURVATURE)
+
+
+def test_both_forms_agree(monkeypatch) -> None:
+    if surface_tree.library() is None:
+        pytest.skip("no C++ compiler")
+    for mesh in (bumpy(), bumpy(1), sphere(3, 0.06)):
+        found = [curvature(mesh), curvature(mesh, torch.float32)]
+        with monkeypatch.context() as patched:
+            patched.setattr(surface_tree, "library", lambda: None)
+            torch.testing.assert_close(found[0], curvature(mesh), rtol=1e-12, atol=1e-12)
+            torch.testing.assert_close(found[1], curvature(mesh, torch.float32), rtol=1e-3, atol=1e-3)
+    assert float(curvature(bumpy())[-1]) == 0.0
+
+
+@pytest.mark.usefixtures("form")
+def test_places_that_are_no_numbers_have_none_and_spoil_no_others() -> None:
+    pos, faces = sphere(3, 0.06)
+    sound = curvature((pos, faces))
+    pos = pos.copy()
+    pos[0] = np.nan
+    found = curvature((pos, faces))
+    assert torch.isfinite(found).all()
+    far = torch.as_tensor(np.linalg.norm(sphere(3, 0.06)[0] - sphere(3, 0.06)[0][0], axis=1) > 0.06)
+    torch.testing.assert_close(found[far], sound[far])
+
+
+@pytest.mark.usefixtures("form")
+def test_order_and_place_play_no_role() -> None:
+    pos, faces = bumpy()
+    rng = np.random.default_rng(3)
+    order, rows = rng.permutation(len(pos)), rng.permutation(len(faces))
+    shuffled = np.argsort(order)[faces][rows][:, [1, 2, 0]]
+    torch.testing.assert_close(curvature((pos[order] + 0.5, shuffled)), curvature((pos, faces))[order], rtol=1e-6, atol=1e-6)
