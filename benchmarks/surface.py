@@ -2,7 +2,7 @@
 
     python benchmarks/surface.py                                             # seven garments of 1,000 vertices
     python benchmarks/surface.py tshirt_4k trousers_4k dress_4k dress_12k --motions walk_proud --frames 30
-    python benchmarks/surface.py --steppers newton quickstart+5 --reach constant         # the network refined; contact as it was
+    python benchmarks/surface.py --steppers newton quickstart+5 --reach constant   # contact as it was; a network refined
 
 Rollouts as of ``hood rollout``: embedded body, default fabric, the motions of the validation list. A line per rollout as soon
 as it is done, then a table over the motions: mean and worst share of the cloth's triangles that the body's true surface cuts,

@@ -47,8 +47,8 @@ class Collision:
     With ``contact`` at more places than the vertices the same energy acts at points x_p = Σ w_i x_i of edges and faces, with w
     times the area share of the point (:class:`hood.scene.contact_points.PointContact`). Per area of cloth all points together
     press as hard as all vertices do: whatever the meshes, contact gets twice as stiff where both touch, and where an edge sags
-    between vertices that do not, it is as stiff as theirs would be. Points lie where the skin bulges most: their ε is ``epsilon``
-    in any case.
+    between vertices that do not, it is as stiff as theirs would be. Points lie where the skin bulges most: their ε is
+    ``epsilon`` in any case.
 
     Args:
         weight: w [J/m³].

@@ -68,9 +68,9 @@ class Friction(LaggedFriction):
 
         P = m/dt² max(ε - d̂, 0) + max(-f·n, 0),
 
-    the force that stops its own mass at the edge of the zone, with d̂ the distance at t+1 of where it would fly under its weight,
-    and what the forces f of the cloth around it (:attr:`hood.losses.problem.StepProblem.pull`) add along the normal n. Cloth that
-    lies still, or is stretched over the skin, is pressed with exactly N.
+    the force that stops its own mass at the edge of the zone, with d̂ the distance at t+1 of where it would fly under its
+    weight, and what the forces f of the cloth around it (:attr:`hood.losses.problem.StepProblem.pull`) add along the normal n.
+    Cloth that lies still, or is stretched over the skin, is pressed with exactly N.
 
     At points inside edges and faces N has the factor of the collision there, the area share, and so has P, of the weighted
     vertices.

@@ -169,16 +169,15 @@ def default_potential(
     reach: str = "curvature",
 ) -> Potential:
     """The paper's potential in safe forms: contact with triangles, friction by normal force, rest angles."""
+    collision = collision_weight, collision_epsilon, contact, reach
     return Potential(
         {
             "stretching": Stretching(),
             "bending": Bending(),
             "inertia": Inertia(),
             "gravity": Gravity(),
-            "collision": Collision(collision_weight, collision_epsilon, contact, reach),
-            "friction": Friction(
-                friction_coefficient, friction_slip_speed, collision_weight, collision_epsilon, contact, reach
-            ),
+            "collision": Collision(*collision),
+            "friction": Friction(friction_coefficient, friction_slip_speed, *collision),
             "attachment": Attachment(attachment_stiffness),
         }
     )

@@ -25,9 +25,9 @@ class StepProblem:
     """One implicit step t → t+1 of B scenes; everything in it is constant while the next positions vary.
 
     ``contact`` is None without a body, and until somebody who needs it asks for :meth:`with_contact`; ``point_contacts`` holds
-    what terms asked for by :meth:`with_points`. ``pull`` are the forces at x_t of everything but inertia, weight and the body, by
-    which the cloth around a vertex presses it onto the skin; None where :meth:`hood.losses.potential.Potential.with_pull` has not
-    been asked.
+    what terms asked for by :meth:`with_points`. ``pull`` are the forces at x_t of everything but inertia, weight and the body,
+    by which the cloth around a vertex presses it onto the skin; None where nobody has asked
+    :meth:`hood.losses.potential.Potential.with_pull`.
     """
 
     cloth: Cloth

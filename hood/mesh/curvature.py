@@ -21,8 +21,8 @@ def convex_curvature(pos: Tensor, faces: Tensor, incidence: Incidence) -> Tensor
     """Curvature [1/m] (W,) of the surface at its vertices, between 0 (flat, hollow) and :data:`MOST_CURVATURE`.
 
     The largest normal curvature over the edges at a vertex, (n_j − n_i)·(x_j − x_i)/‖x_j − x_i‖² with area-weighted vertex
-    normals n: 1/r along and across a sphere, and around a cylinder, of radius r. Bounded, then averaged twice over the corners of
-    the faces around. Edges without length, and vertices without faces or of no finite place, have none.
+    normals n: 1/r on a sphere, and around a cylinder, of radius r. Bounded, then averaged twice over the corners of the faces
+    around. Edges without length, and vertices without faces or of no finite place, have none.
 
     Args:
         pos: (W, 3) m.
