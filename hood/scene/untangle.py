@@ -187,7 +187,7 @@ def _take_apart(
         for _ in range(_STEPS):
             pos = descend(cloth, pos, weight, rest_length) if number else pos
             if obstacle is not None:
-                pos = leave(pos, find_contact(pos, cloth.vertex_scene, obstacle), clearance, cloth.free)
+                pos = leave(cloth, pos, find_contact(pos, cloth.vertex_scene, obstacle), clearance)
             for inner, outer in combinations(order, 2):
                 pos = _apart(cloth, pos, sheets[outer].vertices, sheets[inner], gap, 1.0, 1.0 - inner_share)
                 pos = _apart(cloth, pos, sheets[inner].vertices, sheets[outer], gap, -1.0, inner_share)
