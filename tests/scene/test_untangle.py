@@ -12,9 +12,9 @@ from hood.assets.sequence import load_sequence
 from hood.mesh.crossing import self_crossings
 from hood.scene.cloth import build_cloth
 from hood.scene.contact import find_contact
-from hood.scene.untangle import Outfit, TangledError, crossing_pairs, likely_orders, separate
 from hood.scene.scene import build_scene
 from hood.scene.state import Obstacle
+from hood.scene.untangle import Outfit, TangledError, crossing_pairs, likely_orders, separate
 from hood.testing import cylinder
 
 CLEARANCE = 2e-3
