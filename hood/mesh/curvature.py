@@ -17,7 +17,7 @@ _ROUNDS = 2
 
 
 @torch.no_grad()
-def convex_curvature(pos: Tensor, faces: Tensor, incidence: Incidence) -> Tensor:
+def convex_curvature(pos: Tensor, faces: Tensor, incidence: Incidence, by_compiled: bool = True) -> Tensor:
     """Curvature [1/m] (W,) of the surface at its vertices, between 0 (flat, hollow) and :data:`MOST_CURVATURE`.
 
     The largest normal curvature over the edges at a vertex, (n_j − n_i)·(x_j − x_i)/‖x_j − x_i‖² with area-weighted vertex
@@ -28,10 +28,11 @@ def convex_curvature(pos: Tensor, faces: Tensor, incidence: Incidence) -> Tensor
         pos: (W, 3) m.
         faces: (G, 3), outward winding; open, closed or in several pieces.
         incidence: of ``faces``.
+        by_compiled: may leave torch; False where a graph is recorded or traced.
     """
-    compiled = surface_tree.curvature(pos, faces, incidence.adjacency, MOST_CURVATURE, _ROUNDS)
-    if compiled is not None:
-        return compiled
+    found = surface_tree.curvature(pos, faces, incidence.adjacency, MOST_CURVATURE, _ROUNDS) if by_compiled else None
+    if found is not None:
+        return found
     normals = normals_of_fans(pos, faces, incidence.around, incidence.first)
     start, end = faces.reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
     along = pos.index_select(0, end) - pos.index_select(0, start)

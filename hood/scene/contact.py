@@ -74,8 +74,8 @@ def find_contact(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, cap: flo
     return _contact_of(match, obstacle, incidence, cap)
 
 
-def _contact_of(match: Match, obstacle: Obstacle, incidence: Incidence, cap: float) -> Contact:
-    at_vertices = convex_curvature(obstacle.pos, obstacle.faces, incidence).to(match.bary)
+def _contact_of(match: Match, obstacle: Obstacle, incidence: Incidence, cap: float, by_compiled: bool = True) -> Contact:
+    at_vertices = convex_curvature(obstacle.pos, obstacle.faces, incidence, by_compiled).to(match.bary)
     curvature = (match.bary * at_vertices[obstacle.faces[match.face]]).sum(dim=1)
     return Contact(**match._asdict(), valid=match.dist.abs() <= cap, curvature=curvature)
 
@@ -105,7 +105,8 @@ def find_fixed_contact(
     :func:`hood.mesh.fixed_surface.search_surface_fixed`."""
     surface = obstacle.pos, obstacle.faces, obstacle.vertex_scene, obstacle.face_scene
     hit, needed = search_surface_fixed(pos, vertex_scene, *surface, incidence, num_scenes, places)
-    return _contact_of(_match_of(hit, obstacle, incidence), obstacle, incidence, cap), needed
+    match = _match_of(hit, obstacle, incidence)
+    return _contact_of(match, obstacle, incidence, cap, by_compiled=False), needed
 
 
 def _match_of(hit: SurfaceHit, obstacle: Obstacle, incidence: Incidence) -> Match:
