@@ -34,7 +34,7 @@ def convex_curvature(pos: Tensor, faces: Tensor, incidence: Incidence, by_compil
     if found is not None:
         return found
     normals = normals_of_fans(pos, faces, incidence.around, incidence.first)
-    start, end = faces.reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
+    start, end = faces.reshape(-1), faces.roll(-1, dims=1).reshape(-1)
     along = pos.index_select(0, end) - pos.index_select(0, start)
     turn = normals.index_select(0, end) - normals.index_select(0, start)
     length_sq = (along * along).sum(dim=1)
