@@ -30,7 +30,8 @@ SETTINGS = TrainerSettings(
 
 
 class Fault:
-    """An energy that is 0 but at the calls ``when`` says: a loss or a gradient without a number there."""
+    """An energy that is 0 but at the calls ``when`` says: a loss or a gradient without a number there. What friction asks of all
+    energies before the step is no call."""
 
     def __init__(self, when: Callable[[int], bool], loss: float = 0.0, slope: float = 0.0) -> None:
         self.when, self.loss, self.slope = when, loss, slope
@@ -40,8 +41,9 @@ class Fault:
         return True
 
     def __call__(self, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> Tensor:
-        self.calls += 1
-        bad = self.when(self.calls)
+        before_the_step = problem.contact is not None and problem.pull is None
+        self.calls += not before_the_step
+        bad = not before_the_step and self.when(self.calls)
         slope = self.slope if bad else 0.0
         varying = slope * (next_pos - next_pos.detach()).sum()
         return (varying + (self.loss if bad else 0.0)).expand(problem.num_scenes)
