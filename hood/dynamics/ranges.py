@@ -30,9 +30,11 @@ _TITLES = {"vertices": "garment vertices", "edge_length": "garment mean edge", "
 
 #: Settings of terms that files from before them do not name, and what these files were trained with.
 _LATER = {
-    f"hood.losses.{name}": {"contact": "vertices"}
+    f"hood.losses.{name}": {"contact": "vertices", "reach": "constant"}
     for name in ("collision.Collision", "collision.CentroidCollision", "friction.Friction")
 }
+#: A setting that weights take as it is, whatever they were trained with: figures in docs/contact.md.
+_TAKEN = "reach"
 
 Span = tuple[float, float]
 
@@ -111,7 +113,11 @@ def outside(trained: Conditions, asked: Conditions) -> list[str]:
             value = most if too_high else least
             title = _TITLES.get(name, name)
             sentences.append(f"{title}={_range(name, (value, value))} (trained on {_range(name, (low, high))})")
-    return sentences + different(trained.potential, asked.potential)
+    known = {
+        name: {key: asked.potential.get(name, {}).get(key, value) if key == _TAKEN else value for key, value in term.items()}
+        for name, term in trained.potential.items()
+    }
+    return sentences + different(known, asked.potential)
 
 
 def different(

@@ -28,6 +28,9 @@ LOOKING = {
 #: Contact from 1 cm on: cloth that starts at 2 mm is in contact, and friction acts.
 SLIPPERY, ROUGH = (default_potential(collision_epsilon=1e-2, friction_coefficient=mu) for mu in (0.0, 10.0))
 
+#: The same with contact of two stiffnesses: a base that sticks to the skin feels that, and no friction.
+SOFT, HARD = (default_potential(collision_epsilon=1e-2, collision_weight=weight) for weight in (5e4, 5e5))
+
 
 def simulator_of(kind: str) -> Simulator:
     return make("physical", **LOOKING[kind]) if kind in LOOKING else make(kind)
@@ -46,9 +49,9 @@ class Breeze(Gravity):
 def test_a_rollout_moves_by_the_potential_it_is_measured_with(kind: str, tank_scene: Scene) -> None:
     simulator = simulator_of(kind)
     assert simulator.looks_at_potential
-    slippery, rough = (last_pos(simulator, tank_scene, potential) for potential in (SLIPPERY, ROUGH))
-    assert float((slippery - rough).norm(dim=1).max()) > 1e-6
-    assert torch.equal(last_pos(simulator, tank_scene, SLIPPERY), slippery)  # nothing of the other one is left
+    soft, hard = (last_pos(simulator, tank_scene, potential) for potential in (SOFT, HARD))
+    assert float((soft - hard).norm(dim=1).max()) > 1e-6
+    assert torch.equal(last_pos(simulator, tank_scene, SOFT), soft)  # nothing of the other one is left
 
 
 def test_the_shipped_networks_feel_friction(tank_scene: Scene) -> None:
@@ -130,6 +133,7 @@ def test_settings_tell_potentials_apart() -> None:
         "weight": 5e5,
         "epsilon": 2e-3,
         "contact": "vertices",
+        "reach": "curvature",
     }
     assert reference_potential().settings["collision"]["term"] != default["collision"]["term"]
 
