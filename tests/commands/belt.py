@@ -13,9 +13,9 @@ from hood.testing import cylinder
 
 
 def write_belt(path: Path) -> None:
-    """A ring of cloth round the default body's waist."""
+    """A ring of cloth round the default body's waist, tight enough to stay there."""
     waist = load_body().shaped(np.zeros(10))[1][3]
-    pos, faces = cylinder(around=20, rows=5, radius=0.19, height=0.16)
+    pos, faces = cylinder(around=20, rows=5, radius=0.14, height=0.16)
     rows = [f"v {x} {y} {z}" for x, y, z in pos - pos.mean(axis=0) + waist] + [f"f {a} {b} {c}" for a, b, c in faces + 1]
     path.write_text("\n".join(rows) + "\n")
 

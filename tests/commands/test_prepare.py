@@ -89,7 +89,7 @@ def lengths(pos: np.ndarray, edges: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.norm(pos[edges[:, 0]] - pos[edges[:, 1]], axis=1))
 
 
-@pytest.mark.parametrize(("name", "angle", "factor"), [("tank", 0.0, 0.95), ("shorts", 0.0, 0.95), ("longsleeve", 45.0, 0.97)])
+@pytest.mark.parametrize(("name", "angle", "factor"), [("tank", 0.0, 0.95), ("shorts", 0.0, 0.95), ("longsleeve", 45.0, 0.95)])
 def test_the_rest_shape_is_that_of_the_file(
     capsys: pytest.CaptureFixture[str], garments: dict[str, Garment], body: Body, name: str, angle: float, factor: float
 ) -> None:

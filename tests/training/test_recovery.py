@@ -30,8 +30,8 @@ SETTINGS = TrainerSettings(
 
 
 class Fault:
-    """An energy that is 0 but at the calls ``when`` says: a loss or a gradient without a number there. What friction asks of all
-    energies before the step is no call."""
+    """An energy that is 0 but at the calls ``when`` says: a loss or a gradient without a number there. What friction asks of
+    all energies before the step is no call."""
 
     def __init__(self, when: Callable[[int], bool], loss: float = 0.0, slope: float = 0.0) -> None:
         self.when, self.loss, self.slope = when, loss, slope
