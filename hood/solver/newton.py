@@ -17,7 +17,7 @@ from hood.losses.problem import StepProblem
 from hood.native.build import BuildError
 from hood.solver import engine
 from hood.solver.direction import Directions
-from hood.solver.iterate import Proceed, Progress, Unknowns, first_iterate, in_double, rounded
+from hood.solver.iterate import Proceed, Progress, Unknowns, in_double, rounded
 from hood.solver.plan import ModelBuilder, SolverPlan, plan_for
 from hood.solver.reasons import CONVERGED, LATE, MOST_ITERATIONS, NOT_FINITE, STOPPED, STUCK
 from hood.solver.search import Path, backtrack
@@ -171,10 +171,10 @@ class TorchSystem:
         self.problem, self.plan = problem, plan
         self.unknowns = Unknowns(potential, problem)
         self.directions = Directions(plan, problem.num_scenes, settings.linear, settings.cg_iterations)
-        self._build = ModelBuilder(self.unknowns.terms, plan)
+        self._build = ModelBuilder(self.unknowns.terms, plan, self.unknowns.layers)
 
     def begin(self, start: Tensor | None) -> None:
-        self._now = first_iterate(self.unknowns) if start is None else self.unknowns.at(start)
+        self._now = self.unknowns.begin(start)
 
     @property
     def phi(self) -> list[float]:
