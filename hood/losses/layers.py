@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
 from hood.scene.layers import SceneLayers
 
@@ -70,3 +71,15 @@ class LayerBarrier:
         edges = torch.as_tensor(found.edges, device=device)
         ratio = torch.where(edges, (normal * normal).sum(dim=1) / torch.where(edges, parallel, 1.0), 1.0).clamp_max(1.0)
         return (energy * ratio * (2.0 - ratio)).sum()
+
+
+def has_layers(potential: Potential) -> bool:
+    """Whether the potential keeps layers of cloth apart."""
+    return any(type(term) is LayerBarrier for term in potential.terms.values())
+
+
+def without_layers(potential: Potential) -> Potential:
+    """The potential without what keeps layers of cloth apart; itself where there is nothing of the kind."""
+    if not has_layers(potential):
+        return potential
+    return potential.only({name: term for name, term in potential.terms.items() if type(term) is not LayerBarrier})

@@ -11,6 +11,7 @@ import weakref
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -51,7 +52,7 @@ def library() -> ctypes.CDLL:
         getattr(lib, name).restype = COUNT
     for name in ("layers_limit", "layers_energy"):
         getattr(lib, name).restype = REAL
-    for name, count in (("energy", 2), ("model", 2), ("contacts", 5), ("forces", 3), ("rows", 2), ("counts", 2), ("number", 2)):
+    for name, count in (("energy", 2), ("model", 2), ("contacts", 5), ("forces", 3), ("rows", 2), ("counts", 3), ("number", 2)):
         getattr(lib, f"layers_{name}").argtypes = [POINTER] * count
     return lib
 
@@ -129,6 +130,16 @@ class Contacts:
     parallel: np.ndarray  # (N,) m⁴, square of the edges' cross product below which their barrier fades; 0 for others
 
 
+class Work(NamedTuple):
+    """What the search of one step has come to."""
+
+    listed: int  # pairs in the list
+    left_out: int  # pairs of features that are not
+    searches: int
+    overflowed: bool  # no list: nearly everything is near everything, in torn cloth, or a position is not finite
+    seconds: float  # searching, measuring distances and limiting moves
+
+
 class Layers:
     """Cloth near cloth during one step, from positions ``pos`` (V, 3) [m] on.
 
@@ -195,11 +206,11 @@ class Layers:
         self._lib.layers_number(self.handle, numbers.ctypes.data)
 
     @property
-    def counts(self) -> tuple[int, int, int]:
-        """Pairs in the list, pairs left out, searches so far."""
-        counts = np.empty(3, np.int64)
-        self._lib.layers_counts(self.handle, counts.ctypes.data)
-        return int(counts[0]), int(counts[1]), int(counts[2])
+    def work(self) -> Work:
+        """What has been done so far."""
+        counts, seconds = np.empty(4, np.int64), np.empty(1)
+        self._lib.layers_counts(self.handle, counts.ctypes.data, seconds.ctypes.data)
+        return Work(int(counts[0]), int(counts[1]), int(counts[2]), bool(counts[3]), float(seconds[0]))
 
 
 def _positions(pos: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ void layers_free(void* layers) { delete (Layers*)layers; }
 // Pairs of faces that pass through each other here are left out; returns how many.
 int64_t layers_begin(void* handle, const double* pos, double margin) {
     Layers* layers = (Layers*)handle;
+    const LayerTimer timer{layers->seconds};
     const int64_t crossed = layers->release_crossed(pos);
     layers->enclose(pos, margin);
     return crossed;
@@ -24,6 +25,7 @@ int64_t layers_begin(void* handle, const double* pos, double margin) {
 // Targets that can be reached from positions become ``to``; returns how many pairs are left out for it.
 int64_t layers_approach(void* handle, const double* from, double* to, double left, double margin) {
     Layers* layers = (Layers*)handle;
+    const LayerTimer timer{layers->seconds};
     const int64_t released = layers->approach(from, to, left);
     layers->enclose(to, margin);
     return released;
@@ -65,9 +67,10 @@ void layers_forces(const void* handle, double* gradient, double* own) {
 // Rows (N, 12) whose outer products are the curvature of the last model.
 void layers_rows(const void* handle, double* normals) { std::copy(((const Layers*)handle)->normals.begin(), ((const Layers*)handle)->normals.end(), normals); }
 
-// Pairs of features in the list, pairs that are left out, and searches so far.
-void layers_counts(const void* handle, int64_t* counts) {
+// Pairs of features in the list, pairs that are left out, searches so far, whether there were too many pairs for a list; seconds.
+void layers_counts(const void* handle, int64_t* counts, double* seconds) {
     const Layers* layers = (const Layers*)handle;
     counts[0] = (int64_t)layers->pairs.size(), counts[1] = (int64_t)layers->released.size(), counts[2] = layers->searches;
+    counts[3] = layers->overflowed, *seconds = layers->seconds;
 }
 }

@@ -6,6 +6,7 @@
 // meet that are not in it. Where a vertex leaves its box the box grows and the list is made anew. The numbering is the cloth's own.
 #pragma once
 #include <algorithm>
+#include <chrono>
 #include <cmath>
 #include <cstdint>
 #include <cstring>
@@ -154,6 +155,13 @@ inline double safe_share(int32_t edges, const Vec* x0, const Vec* p0, double lef
     return time;
 }
 
+// Adds the time it lives.
+struct LayerTimer {
+    double& seconds;
+    std::chrono::steady_clock::time_point began = std::chrono::steady_clock::now();
+    ~LayerTimer() { seconds += std::chrono::duration<double>(std::chrono::steady_clock::now() - began).count(); }
+};
+
 struct Layers {
     LayerMesh mesh;
     double pressure = 0.0;  // Pa
@@ -166,6 +174,8 @@ struct Layers {
     std::vector<LayerContact> contacts;     // of the last model
     std::vector<LayerBox> tree;
     int64_t searches = 0;
+    double seconds = 0.0;  // of everything but what the solver does with the rows
+    bool overflowed = false;  // cloth so crumpled, or torn, that nearly everything is near everything: no list
     // For the solver.
     std::vector<double> here, there, gradient, own;  // (3 V) twice, (3 V), (6 V)
     std::vector<int32_t> row, rows;                  // (V) number of a vertex in the solver, (N, 4)
@@ -200,6 +210,7 @@ struct Layers {
 
     static constexpr int64_t LEAF = 4;
     static constexpr double MOST_MARGIN = 0.016;  // m
+    static constexpr int64_t MOST_PAIRS = 4000000;
 
     template <class Box> void refit(int64_t node, int64_t begin, int64_t end, const Box& box_at) {
         if ((int64_t)tree.size() <= node) tree.resize(node + 1);
@@ -290,7 +301,10 @@ struct Layers {
     void search() {
         pairs.clear(), keys.clear(), contacts.clear();
         ++searches;
+        overflowed = overflowed || !finite();
+        if (overflowed) return;
         face_pairs([&](int64_t f, int64_t g) {
+            if ((int64_t)pairs.size() > MOST_PAIRS) return;
             for (int c = 0; c < 3; ++c) {
                 if (mesh.face_vertex[3 * f + c] >= 0) add_vertex(mesh.face_vertex[3 * f + c], g);
                 if (mesh.face_vertex[3 * g + c] >= 0) add_vertex(mesh.face_vertex[3 * g + c], f);
@@ -298,6 +312,14 @@ struct Layers {
                     if (mesh.face_edge[3 * f + c] >= 0 && mesh.face_edge[3 * g + d] >= 0) add_edges(mesh.face_edge[3 * f + c], mesh.face_edge[3 * g + d]);
             }
         });
+        overflowed = (int64_t)pairs.size() > MOST_PAIRS;
+        if (overflowed) pairs.clear(), keys.clear();
+    }
+
+    bool finite() const {
+        double sum = 0.0;
+        for (int64_t i = 0; i < 3 * mesh.num_vertices; ++i) sum += 0.0 * low[i] + 0.0 * high[i];
+        return sum == 0.0;
     }
 
     // Boxes of positions (V, 3) alone, by ``more`` in every direction.
@@ -318,6 +340,7 @@ struct Layers {
     // boxes are made anew around them, with twice the margin for those that have left.
     void cover(const double* pos) { cover(pos, pos); }
     void cover(const double* pos, const double* there) {
+        if (overflowed) return;
         bool left = false;
         for (int64_t v = 0; v < mesh.num_vertices; ++v) {
             if (inside(pos, v) && inside(there, v)) continue;
@@ -348,6 +371,7 @@ struct Layers {
         released.clear();
         low.assign(pos, pos + 3 * mesh.num_vertices), high = low;
         int64_t count = 0;
+        if (!finite()) return 0;
         face_pairs([&](int64_t f, int64_t g) {
             const int32_t *a = mesh.faces + 3 * f, *b = mesh.faces + 3 * g;
             for (int i = 0; i < 3; ++i)
@@ -509,6 +533,7 @@ struct Layers {
     }
 
     double energy(const double* pos) {
+        const LayerTimer timer{seconds};
         cover(pos);
         double sum = 0.0, slope;
         for (const LayerPair& pair : pairs) {
@@ -527,6 +552,7 @@ struct Layers {
 
     // Forces by vertex, and rows n (12) such that the sum of their outer products is a positive curvature; how many rows.
     int64_t model(const double* pos) {
+        const LayerTimer timer{seconds};
         cover(pos);
         contacts.clear(), rows.clear(), normals.clear();
         std::fill(gradient.begin(), gradient.end(), 0.0), std::fill(own.begin(), own.end(), 0.0);

@@ -998,6 +998,7 @@ double limit_trial(const Engine& e) {
     if (!e.layers) return 1.0;
     Layers& layers = layers_of(e);
     const double *here = own_order(e, e.pos, layers.here), *there = own_order(e, e.trial_pos, layers.there);
+    const LayerTimer timer{layers.seconds};
     const double share = layers.limit(here, there, e.kept);
     if (share >= 1.0) return 1.0;
     for (int64_t row = 0; row < e.num_rows; ++row)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from hood.losses.collision import Collision
-from hood.losses.layers import LayerBarrier
+from hood.losses.layers import without_layers
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem, inertial_guess
 from hood.mesh.kept import forget
@@ -67,8 +67,7 @@ class Unknowns:
 
     def _guess_apart(self) -> Tensor:
         """The guess that would be best if layers did not touch."""
-        alone = self.potential.only({n: term for n, term in self.potential.terms.items() if type(term) is not LayerBarrier})
-        return first_iterate(Unknowns(alone, self.problem)).pos
+        return first_iterate(Unknowns(without_layers(self.potential), self.problem)).pos
 
     def safe(self, now: Iterate, acc: Tensor) -> tuple[Tensor, Tensor | None]:
         """Accelerations (V, 3) on the straight way from ``now`` to ``acc`` (V, 3), as far as no cloth meets cloth; the shares

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hood.losses.layers import LayerBarrier
+from hood.losses.layers import has_layers
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
 from hood.scene.layers import SceneLayers
@@ -20,7 +20,7 @@ from hood.scene.layers import SceneLayers
 
 def layers_of(potential: Potential, problem: StepProblem) -> tuple[SceneLayers, ...]:
     """The layers that the potential's barrier acts between; none without such a term."""
-    return problem.layers if any(type(term) is LayerBarrier for term in potential.terms.values()) else ()
+    return problem.layers if has_layers(potential) else ()
 
 
 @dataclass(frozen=True)
