@@ -33,7 +33,7 @@ def layer_metrics(problem: StepProblem, next_pos: Tensor) -> dict[str, float]:
     values = (
         near,
         sum(scene.layers.crossed for scene in problem.layers),
-        sum(scene.layers.released for scene in problem.layers),
+        sum(scene.layers.forced for scene in problem.layers),
         any(one.overflowed for one in work),
         1e3 * sum(one.seconds for one in work),
     )

@@ -23,8 +23,8 @@ from hood.native.structures import COUNT, POINTER, REAL, fields
 SOURCE = Path(native.__file__).with_name("layers.cpp")
 #: Of the distance of two features at least this share is left by one move.
 LEFT = 0.1
-#: How far [m] vertices may move before the list of pairs is made anew, at first.
-MARGIN = 2e-3
+#: How far vertices may move at most before the list of pairs is made anew, at first [m].
+MARGIN = 5e-3
 
 
 class _Mesh(ctypes.Structure):
@@ -43,12 +43,12 @@ def library() -> ctypes.CDLL:
     """
     lib = build(SOURCE, NATIVE_FLAGS)
     lib.layers_make.restype = POINTER
-    lib.layers_make.argtypes = [POINTER, POINTER, REAL, COUNT]
+    lib.layers_make.argtypes = [*[POINTER] * 4, REAL, COUNT]
     lib.layers_free.argtypes = [POINTER]
-    lib.layers_begin.argtypes = [POINTER, POINTER, REAL]
-    lib.layers_approach.argtypes = [POINTER, POINTER, POINTER, REAL, REAL]
+    lib.layers_crossed.argtypes = [POINTER]
+    lib.layers_approach.argtypes = [POINTER, POINTER, REAL]
     lib.layers_limit.argtypes = [POINTER, POINTER, POINTER, REAL]
-    for name in ("layers_begin", "layers_approach", "layers_model"):
+    for name in ("layers_crossed", "layers_approach", "layers_model"):
         getattr(lib, name).restype = COUNT
     for name in ("layers_limit", "layers_energy"):
         getattr(lib, name).restype = REAL
@@ -75,9 +75,9 @@ class LayerMesh:
         normal = np.cross(rest[faces[:, 1]] - rest[faces[:, 0]], rest[faces[:, 2]] - rest[faces[:, 0]])
         area = 0.5 * np.linalg.norm(normal, axis=1)
         height = 2.0 * area / length[sides].max(axis=1, initial=0.0)
-        near = np.full(len(rest), reach)
-        np.minimum.at(near, faces.reshape(-1), np.repeat(0.5 * height, 3))
         thirds = np.repeat(area / 3.0, 3)
+        self.room = np.full(len(rest), np.inf)  # half of the smallest height around
+        np.minimum.at(self.room, faces.reshape(-1), np.repeat(0.5 * height, 3))
         self._arrays = {
             "faces": np.ascontiguousarray(faces, np.int32),
             "edges": np.ascontiguousarray(edges, np.int32),
@@ -85,7 +85,7 @@ class LayerMesh:
             "face_edge": _answered(sides, len(edges)),
             "order": _order(rest[faces].mean(axis=1)),
             "piece": topology.connected_components(len(rest), edges).astype(np.int32),
-            "reach": near,
+            "reach": np.minimum(self.room, reach),
             "vertex_area": np.bincount(faces.reshape(-1), thirds, minlength=len(rest)),
             "edge_area": np.bincount(sides.reshape(-1), thirds, minlength=len(edges)),
             "edge_length_sq": length**2,
@@ -154,21 +154,26 @@ class Layers:
 
     def __init__(self, mesh: LayerMesh, pos: np.ndarray, fixed: np.ndarray, pressure: float, between: bool = False) -> None:
         self.mesh, self._lib = mesh, library()
-        held = np.ascontiguousarray(fixed, np.uint8)
-        self.handle = self._lib.layers_make(ctypes.byref(mesh.structure), held.ctypes.data, pressure, int(between))
+        start, held = _positions(pos), np.ascontiguousarray(fixed, np.uint8)
+        margin = np.minimum(mesh.room, MARGIN)
+        given = (start.ctypes.data, held.ctypes.data, margin.ctypes.data)
+        self.handle = self._lib.layers_make(ctypes.byref(mesh.structure), *given, pressure, int(between))
         weakref.finalize(self, self._lib.layers_free, self.handle)
-        self.start = _positions(pos)
-        self.crossed = int(self._lib.layers_begin(self.handle, self.start.ctypes.data, MARGIN))
-        self.released = 0  # pairs of features that held vertices drive through each other
+        self.forced = 0  # pairs of features that held vertices drive through each other
+
+    @property
+    def crossed(self) -> int:
+        """Pairs of faces that pass through each other where the step begins."""
+        return int(self._lib.layers_crossed(self.handle))
 
     def approach(self, target: np.ndarray) -> np.ndarray:
         """Positions (V, 3) near ``target`` (V, 3) that straight ways from the start lead to on which no two features meet.
 
         Vertices of pairs that would meet go on together. ``fixed`` ones are at their targets; pairs that cannot make room for
-        them are left out and counted in ``released``.
+        them are left out and counted in ``forced``.
         """
         there = _positions(target).copy()
-        self.released += int(self._lib.layers_approach(self.handle, self.start.ctypes.data, there.ctypes.data, LEFT, MARGIN))
+        self.forced += int(self._lib.layers_approach(self.handle, there.ctypes.data, LEFT))
         return there
 
     def limit(self, now: np.ndarray, there: np.ndarray) -> float:

@@ -3,32 +3,32 @@
 
 extern "C" {
 
-void* layers_make(const void* mesh, const uint8_t* fixed, double pressure, int64_t between) {
+// Layers of a step from positions on; ``margins`` (V) [m] is how far vertices may go at first.
+void* layers_make(const void* mesh, const double* pos, const uint8_t* fixed, const double* margins, double pressure, int64_t between) {
     Layers* layers = new Layers;
     layers->mesh = *(const LayerMesh*)mesh;
     layers->fixed.assign(fixed, fixed + layers->mesh.num_vertices);
+    layers->start.assign(pos, pos + 3 * layers->mesh.num_vertices);
+    layers->margin.assign(margins, margins + layers->mesh.num_vertices);
     layers->pressure = pressure, layers->between = between != 0;
     return layers;
 }
 
 void layers_free(void* layers) { delete (Layers*)layers; }
 
-// Pairs of faces that pass through each other here are left out; returns how many.
-int64_t layers_begin(void* handle, const double* pos, double margin) {
+// Pairs of faces that pass through each other where the step begins.
+int64_t layers_crossed(void* handle) {
     Layers* layers = (Layers*)handle;
     const LayerTimer timer{layers->seconds};
-    const int64_t crossed = layers->release_crossed(pos);
-    layers->enclose(pos, margin);
-    return crossed;
+    layers->begin();
+    return layers->crossed;
 }
 
-// Targets that can be reached from positions become ``to``; returns how many pairs are left out for it.
-int64_t layers_approach(void* handle, const double* from, double* to, double left, double margin) {
+// Targets that can be reached become ``to``; returns how many pairs are left out for it.
+int64_t layers_approach(void* handle, double* to, double left) {
     Layers* layers = (Layers*)handle;
     const LayerTimer timer{layers->seconds};
-    const int64_t released = layers->approach(from, to, left);
-    layers->enclose(to, margin);
-    return released;
+    return layers->approach(to, left);
 }
 
 double layers_limit(void* handle, const double* from, const double* to, double left) { return ((Layers*)handle)->limit(from, to, left); }

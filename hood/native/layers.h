@@ -173,7 +173,9 @@ struct Layers {
     std::vector<uint64_t> keys;
     std::vector<LayerContact> contacts;     // of the last model
     std::vector<LayerBox> tree;
-    int64_t searches = 0;
+    std::vector<double> start;  // (3 V) where the step begins
+    bool begun = false;
+    int64_t searches = 0, crossed = 0;  // pairs of faces that are crossed where it begins
     double seconds = 0.0;  // of everything but what the solver does with the rows
     bool overflowed = false;  // cloth so crumpled, or torn, that nearly everything is near everything: no list
     // For the solver.
@@ -298,13 +300,14 @@ struct Layers {
         add(1, corner, a, b, 0.5 * (mesh.edge_area[a] + mesh.edge_area[b]), 1e-3 * mesh.edge_length_sq[a] * mesh.edge_length_sq[b]);
     }
 
-    void search() {
+    void search(const double* crossing_at = nullptr) {
         pairs.clear(), keys.clear(), contacts.clear();
         ++searches;
         overflowed = overflowed || !finite();
         if (overflowed) return;
         face_pairs([&](int64_t f, int64_t g) {
             if ((int64_t)pairs.size() > MOST_PAIRS) return;
+            if (crossing_at && crossed_faces(f, g, crossing_at)) ++crossed, release_faces(f, g);
             for (int c = 0; c < 3; ++c) {
                 if (mesh.face_vertex[3 * f + c] >= 0) add_vertex(mesh.face_vertex[3 * f + c], g);
                 if (mesh.face_vertex[3 * g + c] >= 0) add_vertex(mesh.face_vertex[3 * g + c], f);
@@ -314,6 +317,7 @@ struct Layers {
         });
         overflowed = (int64_t)pairs.size() > MOST_PAIRS;
         if (overflowed) pairs.clear(), keys.clear();
+        if (crossed) forget_released();
     }
 
     bool finite() const {
@@ -322,11 +326,31 @@ struct Layers {
         return sum == 0.0;
     }
 
-    // Boxes of positions (V, 3) alone, by ``more`` in every direction.
-    void enclose(const double* pos, double more) {
-        low.assign(pos, pos + 3 * mesh.num_vertices), high = low;
-        margin.assign(mesh.num_vertices, more);
-        for (int64_t i = 0; i < 3 * mesh.num_vertices; ++i) low[i] -= more, high[i] += more;
+    // Takes pairs out of the list that are to be left out.
+    void forget_released() {
+        std::sort(released.begin(), released.end());
+        size_t kept = 0;
+        for (size_t i = 0; i < pairs.size(); ++i)
+            if (!is_released(keys[i])) pairs[kept] = pairs[i], keys[kept++] = keys[i];
+        pairs.resize(kept), keys.resize(kept);
+    }
+
+    // The first list of a step from positions (V, 3): what is crossed there is left out.
+    void begin() { begin(start.data()); }
+    void begin(const double* target) {
+        if (begun) return;
+        begun = true;
+        low.resize(3 * mesh.num_vertices), high.resize(3 * mesh.num_vertices);
+        for (int64_t i = 0; i < 3 * mesh.num_vertices; ++i) {
+            low[i] = std::min(start[i], target[i]) - margin[i / 3];
+            high[i] = std::max(start[i], target[i]) + margin[i / 3];
+        }
+        search(start.data());
+    }
+
+    // Boxes around positions (V, 3) alone.
+    void enclose(const double* pos) {
+        for (int64_t i = 0; i < 3 * mesh.num_vertices; ++i) low[i] = pos[i] - margin[i / 3], high[i] = pos[i] + margin[i / 3];
         search();
     }
 
@@ -340,6 +364,7 @@ struct Layers {
     // boxes are made anew around them, with twice the margin for those that have left.
     void cover(const double* pos) { cover(pos, pos); }
     void cover(const double* pos, const double* there) {
+        begin(there);
         if (overflowed) return;
         bool left = false;
         for (int64_t v = 0; v < mesh.num_vertices; ++v) {
@@ -366,28 +391,18 @@ struct Layers {
         return (x >= 0.0 && y >= 0.0 && z >= 0.0) || (x <= 0.0 && y <= 0.0 && z <= 0.0);
     }
 
-    // Leaves out all pairs between faces that pass through each other at positions (V, 3); how many such pairs of faces.
-    int64_t release_crossed(const double* pos) {
-        released.clear();
-        low.assign(pos, pos + 3 * mesh.num_vertices), high = low;
-        int64_t count = 0;
-        if (!finite()) return 0;
-        face_pairs([&](int64_t f, int64_t g) {
-            const int32_t *a = mesh.faces + 3 * f, *b = mesh.faces + 3 * g;
-            for (int i = 0; i < 3; ++i)
-                for (int j = 0; j < 3; ++j)
-                    if (a[i] == b[j]) return;
-            if (between && mesh.piece[a[0]] == mesh.piece[b[0]]) return;
-            Vec x[3], y[3];
-            for (int c = 0; c < 3; ++c) x[c] = at(pos, a[c]), y[c] = at(pos, b[c]);
-            bool crossed = false;
-            for (int c = 0; c < 3; ++c) crossed |= pierces(x[c], x[(c + 1) % 3], y) || pierces(y[c], y[(c + 1) % 3], x);
-            if (!crossed) return;
-            ++count;
-            release_faces(f, g);
-        });
-        std::sort(released.begin(), released.end());
-        return count;
+    // Whether two faces without a common vertex pass through each other at positions (V, 3).
+    bool crossed_faces(int64_t f, int64_t g, const double* pos) const {
+        const int32_t *a = mesh.faces + 3 * f, *b = mesh.faces + 3 * g;
+        for (int i = 0; i < 3; ++i)
+            for (int j = 0; j < 3; ++j)
+                if (a[i] == b[j]) return false;
+        if (between && mesh.piece[a[0]] == mesh.piece[b[0]]) return false;
+        Vec x[3], y[3];
+        for (int c = 0; c < 3; ++c) x[c] = at(pos, a[c]), y[c] = at(pos, b[c]);
+        bool crossed = false;
+        for (int c = 0; c < 3; ++c) crossed |= pierces(x[c], x[(c + 1) % 3], y) || pierces(y[c], y[(c + 1) % 3], x);
+        return crossed;
     }
 
     int64_t edge_number(int32_t a, int32_t b) const {
@@ -453,19 +468,25 @@ struct Layers {
     // Moves targets (V, 3) of free vertices so that the straight ways there from positions (V, 3) are free, as little as it can:
     // first the corners of pairs that meet go on together, then all vertices. Pairs that held vertices drive through each other
     // are left out from then on. Returns how many.
-    int64_t approach(const double* from, double* to, double left) {
+    int64_t approach(double* to, double left) {
+        const double* from = start.data();
         std::vector<double> shift(3 * mesh.num_vertices), count(mesh.num_vertices);
-        enclose(from, 1e-3);
+        int64_t forced = 0;
         for (int round = 0; round < 30; ++round) {
             std::vector<int32_t> meeting;
             std::vector<double> shares;
-            if (limit(from, to, left, &meeting, &shares) >= 1.0) return 0;
+            if (limit(from, to, left, &meeting, &shares) >= 1.0) break;
+            if (round == 29) {
+                forced = approach_as_one(from, to, left);
+                break;
+            }
             std::fill(shift.begin(), shift.end(), 0.0), std::fill(count.begin(), count.end(), 0.0);
             for (size_t i = 0; i < meeting.size(); ++i) bring_together(pairs[meeting[i]], 0.8 * shares[i], from, to, shift.data(), count.data());
             for (int64_t v = 0; v < mesh.num_vertices; ++v)
                 for (int k = 0; k < 3 && count[v] > 0.0; ++k) to[3 * v + k] += shift[3 * v + k] / count[v];
         }
-        return approach_as_one(from, to, left);
+        enclose(to);
+        return forced;
     }
 
     void bring_together(const LayerPair& pair, double share, const double* from, const double* to, double* shift, double* count) const {
