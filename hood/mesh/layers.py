@@ -96,11 +96,11 @@ class LayerMesh:
 
 
 def _answered(corners: np.ndarray, count: int) -> np.ndarray:
-    """``corners`` (F, 3) where a face is the first to have them, -1 elsewhere."""
+    """Of ``corners`` (F, 3) those that a face is the first to have, then -1."""
     first = np.zeros(corners.size, bool)
     first[np.unique(corners.reshape(-1), return_index=True)[1]] = True
     assert corners.size == 0 or corners.max() < count
-    return np.where(first.reshape(corners.shape), corners, -1).astype(np.int32)
+    return -np.sort(-np.where(first.reshape(corners.shape), corners, -1), axis=1).astype(np.int32)
 
 
 def _order(centre: np.ndarray) -> np.ndarray:

@@ -21,7 +21,7 @@ namespace {
 struct LayerMesh {
     int64_t num_vertices, num_faces, num_edges;
     const int32_t *faces, *edges;                 // (F, 3), (E, 2)
-    const int32_t *face_vertex, *face_edge;       // (F, 3) vertices and edges that a face answers for, -1 for none
+    const int32_t *face_vertex, *face_edge;       // (F, 3) vertices and edges that a face answers for, then -1
     const int32_t *order, *piece;                 // (F) faces along the tree's leaves, (V) garment of a vertex
     const double *reach;                          // (V) m, distance at which a vertex is near others
     const double *vertex_area, *edge_area;        // (V), (E) m^2 at rest
@@ -172,7 +172,7 @@ struct Layers {
     std::vector<LayerPair> pairs;
     std::vector<uint64_t> keys;
     std::vector<LayerContact> contacts;     // of the last model
-    std::vector<LayerBox> tree;
+    std::vector<LayerBox> tree, vertex_box, edge_box, face_box;
     std::vector<double> start;  // (3 V) where the step begins
     bool begun = false;
     int64_t searches = 0, crossed = 0;  // pairs of faces that are crossed where it begins
@@ -190,12 +190,9 @@ struct Layers {
 
     // ---- boxes and the list --------------------------------------------------------------------------------------------
 
-    void box_of(int32_t v, LayerBox& box, bool first) const {
+    void box_of(int64_t v, LayerBox& box) const {
         const double wide = 0.5 * mesh.reach[v];
-        for (int k = 0; k < 3; ++k) {
-            const double l = low[3 * v + k] - wide, h = high[3 * v + k] + wide;
-            box.low[k] = first ? l : std::min(box.low[k], l), box.high[k] = first ? h : std::max(box.high[k], h);
-        }
+        for (int k = 0; k < 3; ++k) box.low[k] = low[3 * v + k] - wide, box.high[k] = high[3 * v + k] + wide;
     }
 
     static bool overlap(const LayerBox& a, const LayerBox& b) {
@@ -204,15 +201,9 @@ struct Layers {
         return !apart;
     }
 
-    LayerBox box_of_corners(const int32_t* corners, int count) const {
-        LayerBox box;
-        for (int c = 0; c < count; ++c) box_of(corners[c], box, c == 0);
-        return box;
-    }
-
     static constexpr int64_t LEAF = 4;
     static constexpr double MOST_MARGIN = 0.016;  // m
-    static constexpr int64_t MOST_PAIRS = 4000000;
+    static constexpr int64_t MOST_PAIRS = 4000000, LONG_LIST = 4;
 
     template <class Box> void refit(int64_t node, int64_t begin, int64_t end, const Box& box_at) {
         if ((int64_t)tree.size() <= node) tree.resize(node + 1);
@@ -259,10 +250,24 @@ struct Layers {
         }
     }
 
+    void box_features() {
+        vertex_box.resize(mesh.num_vertices), edge_box.resize(mesh.num_edges), face_box.resize(mesh.num_faces);
+        for (int64_t v = 0; v < mesh.num_vertices; ++v) box_of(v, vertex_box[v]);
+        for (int64_t e = 0; e < mesh.num_edges; ++e) edge_box[e] = joined(mesh.edges + 2 * e, 2);
+        for (int64_t f = 0; f < mesh.num_faces; ++f) face_box[f] = joined(mesh.faces + 3 * f, 3);
+    }
+
+    LayerBox joined(const int32_t* corners, int count) const {
+        LayerBox box = vertex_box[corners[0]];
+        for (int c = 1; c < count; ++c) join(box, vertex_box[corners[c]]);
+        return box;
+    }
+
     template <class Visit> void face_pairs(const Visit& visit) {
         if (mesh.num_faces < 2) return;
+        box_features();
         std::vector<LayerBox> box(mesh.num_faces);
-        for (int64_t i = 0; i < mesh.num_faces; ++i) box[i] = box_of_corners(mesh.faces + 3 * (int64_t)mesh.order[i], 3);
+        for (int64_t i = 0; i < mesh.num_faces; ++i) box[i] = face_box[mesh.order[i]];
         refit(0, 0, mesh.num_faces, [&](int64_t i) { return box[i]; });
         overlapping(0, 0, mesh.num_faces, 0, 0, mesh.num_faces, box,
                     [&](int64_t i, int64_t j) { visit(mesh.order[i], mesh.order[j]); });
@@ -270,34 +275,48 @@ struct Layers {
 
     bool is_released(uint64_t k) const { return !released.empty() && std::binary_search(released.begin(), released.end(), k); }
 
-    void add(int32_t edges, const int32_t* corner, int64_t first, int64_t second, double area, double parallel) {
+    void add(int32_t edges, const LayerBox& one, const LayerBox& other, const int32_t* corner, int64_t first, int64_t second, double area, double parallel) {
+        if (!overlap(one, other)) return;
         for (int i = 0; i < (edges ? 2 : 1); ++i)
             for (int j = edges ? 2 : 1; j < 4; ++j)
                 if (corner[i] == corner[j]) return;
         if (fixed[corner[0]] && fixed[corner[1]] && fixed[corner[2]] && fixed[corner[3]]) return;
         if (between && mesh.piece[corner[0]] == mesh.piece[corner[3]]) return;
-        const int count = edges ? 2 : 1;
-        if (!overlap(box_of_corners(corner, count), box_of_corners(corner + count, 4 - count))) return;
-        const uint64_t k = key(edges, first, second);
-        if (is_released(k)) return;
         LayerPair pair;
         std::copy(corner, corner + 4, pair.corner);
         pair.edges = edges, pair.area = area, pair.parallel = parallel;
         pair.reach = std::min(std::min(mesh.reach[corner[0]], mesh.reach[corner[1]]), std::min(mesh.reach[corner[2]], mesh.reach[corner[3]]));
+        if (out_of_reach(pair)) return;
+        const uint64_t k = key(edges, first, second);
+        if (is_released(k)) return;
         pairs.push_back(pair);
         keys.push_back(k);
+    }
+
+    // Whether features are apart wherever in their boxes the corners are: by their distance at the middle, less the way from there.
+    bool out_of_reach(const LayerPair& pair) const {
+        const int split = pair.edges ? 2 : 1;
+        double way[2] = {0.0, 0.0}, weight[4];
+        Vec x[4];
+        for (int c = 0; c < 4; ++c) {
+            const Vec l = at(low.data(), pair.corner[c]), h = at(high.data(), pair.corner[c]), half = 0.5 * (h - l);
+            x[c] = 0.5 * (l + h);
+            way[c >= split] = std::max(way[c >= split], dot(half, half));
+        }
+        const double far = pair.reach + std::sqrt(way[0]) + std::sqrt(way[1]);
+        return pair_distance_sq(pair.edges, x, weight) > far * far * (1.0 + 1e-9);
     }
 
     void add_vertex(int32_t v, int64_t f) {
         const int32_t* face = mesh.faces + 3 * f;
         const int32_t corner[4] = {v, face[0], face[1], face[2]};
-        add(0, corner, v, f, mesh.vertex_area[v], 0.0);
+        add(0, vertex_box[v], face_box[f], corner, v, f, mesh.vertex_area[v], 0.0);
     }
 
     void add_edges(int64_t a, int64_t b) {
         if (a > b) std::swap(a, b);
         const int32_t corner[4] = {mesh.edges[2 * a], mesh.edges[2 * a + 1], mesh.edges[2 * b], mesh.edges[2 * b + 1]};
-        add(1, corner, a, b, 0.5 * (mesh.edge_area[a] + mesh.edge_area[b]), 1e-3 * mesh.edge_length_sq[a] * mesh.edge_length_sq[b]);
+        add(1, edge_box[a], edge_box[b], corner, a, b, 0.5 * (mesh.edge_area[a] + mesh.edge_area[b]), 1e-3 * mesh.edge_length_sq[a] * mesh.edge_length_sq[b]);
     }
 
     void search(const double* crossing_at = nullptr) {
@@ -308,12 +327,11 @@ struct Layers {
         face_pairs([&](int64_t f, int64_t g) {
             if ((int64_t)pairs.size() > MOST_PAIRS) return;
             if (crossing_at && crossed_faces(f, g, crossing_at)) ++crossed, release_faces(f, g);
-            for (int c = 0; c < 3; ++c) {
-                if (mesh.face_vertex[3 * f + c] >= 0) add_vertex(mesh.face_vertex[3 * f + c], g);
-                if (mesh.face_vertex[3 * g + c] >= 0) add_vertex(mesh.face_vertex[3 * g + c], f);
-                for (int d = 0; d < 3; ++d)
-                    if (mesh.face_edge[3 * f + c] >= 0 && mesh.face_edge[3 * g + d] >= 0) add_edges(mesh.face_edge[3 * f + c], mesh.face_edge[3 * g + d]);
-            }
+            const int32_t *of_f = mesh.face_edge + 3 * f, *of_g = mesh.face_edge + 3 * g;
+            for (int c = 0; c < 3 && mesh.face_vertex[3 * f + c] >= 0; ++c) add_vertex(mesh.face_vertex[3 * f + c], g);
+            for (int c = 0; c < 3 && mesh.face_vertex[3 * g + c] >= 0; ++c) add_vertex(mesh.face_vertex[3 * g + c], f);
+            for (int c = 0; c < 3 && of_f[c] >= 0; ++c)
+                for (int d = 0; d < 3 && of_g[d] >= 0; ++d) add_edges(of_f[c], of_g[d]);
         });
         overflowed = (int64_t)pairs.size() > MOST_PAIRS;
         if (overflowed) pairs.clear(), keys.clear();
@@ -485,7 +503,8 @@ struct Layers {
             for (int64_t v = 0; v < mesh.num_vertices; ++v)
                 for (int k = 0; k < 3 && count[v] > 0.0; ++k) to[3 * v + k] += shift[3 * v + k] / count[v];
         }
-        enclose(to);
+        // A list of the whole way is long where cloth moves far.
+        if (forced || (int64_t)pairs.size() > LONG_LIST * mesh.num_vertices) enclose(to);
         return forced;
     }
 

@@ -71,3 +71,15 @@ def approached(layers: tuple[SceneLayers, ...], target: Tensor) -> Tensor:
 def limits(layers: tuple[SceneLayers, ...], now: Tensor, there: Tensor) -> Tensor:
     """Shares (B,) of the straight ways from ``now`` to ``there`` (V, 3) on which no cloth meets cloth."""
     return now.new_tensor([scene.layers.limit(scene.of(now), scene.of(there)) for scene in layers])
+
+
+def touching(layers: tuple[SceneLayers, ...], pos: Tensor) -> bool:
+    """Whether any cloth is near or through cloth at ``pos`` (V, 3), where the step begins."""
+    return any(scene.layers.crossed > 0 or len(scene.layers.contacts(scene.of(pos)).corners) > 0 for scene in layers)
+
+
+def free_way(layers: tuple[SceneLayers, ...], now: Tensor, there: Tensor) -> bool:
+    """Whether no cloth meets cloth on the straight ways from ``now`` to ``there`` (V, 3), nor is near any there."""
+    if bool((limits(layers, now, there) < 1.0).any()):
+        return False
+    return all(len(scene.layers.contacts(scene.of(there)).corners) == 0 for scene in layers)
