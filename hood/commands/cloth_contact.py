@@ -116,8 +116,8 @@ def describe_cloth_contact(summary: Mapping[str, Any]) -> list[str]:
     if crossed:
         lines.append(
             f"{len(crossed)} steps (the first to frame {crossed[0]}) began with cloth through cloth, up to "
-            f"{found['crossed_pairs_max']} pairs of triangles; these are left out until they come apart: start from cloth that is "
-            "not crossed"
+            f"{found['crossed_pairs_max']} pairs of triangles; these are left out until they come apart: "
+            "start from cloth that is not crossed"
         )
     if forced:
         lines.append(

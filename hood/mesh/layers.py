@@ -78,7 +78,7 @@ class LayerMesh:
         thirds = np.repeat(area / 3.0, 3)
         self.room = np.full(len(rest), np.inf)  # half of the smallest height around
         np.minimum.at(self.room, faces.reshape(-1), np.repeat(0.5 * height, 3))
-        self._arrays = {
+        self._arrays = {  # in the order of the structure
             "faces": np.ascontiguousarray(faces, np.int32),
             "edges": np.ascontiguousarray(edges, np.int32),
             "face_vertex": _answered(faces, len(rest)),
@@ -90,9 +90,9 @@ class LayerMesh:
             "edge_area": np.bincount(sides.reshape(-1), thirds, minlength=len(edges)),
             "edge_length_sq": length**2,
         }
-        self.num_vertices, self.num_pieces = len(rest), len(np.unique(self._arrays["piece"][faces.reshape(-1)]))
+        self.num_vertices = len(rest)
         counts = len(rest), len(faces), len(edges)
-        self.structure = _Mesh(*counts, *(self._arrays[name].ctypes.data for name, _ in _Mesh._fields_[3:]))
+        self.structure = _Mesh(*counts, *(self._arrays[name].ctypes.data for name in self._arrays))
 
 
 def _answered(corners: np.ndarray, count: int) -> np.ndarray:

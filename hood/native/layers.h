@@ -174,7 +174,7 @@ struct Layers {
     std::vector<LayerContact> contacts;     // of the last model
     std::vector<LayerBox> tree, vertex_box, edge_box, face_box;
     std::vector<double> start;  // (3 V) where the step begins
-    bool begun = false;
+    bool begun = false, swept = false;  // the list is one of a way
     int64_t searches = 0, crossed = 0;  // pairs of faces that are crossed where it begins
     double seconds = 0.0;  // of everything but what the solver does with the rows
     bool overflowed = false;  // cloth so crumpled, or torn, that nearly everything is near everything: no list
@@ -202,8 +202,7 @@ struct Layers {
     }
 
     static constexpr int64_t LEAF = 4;
-    static constexpr double MOST_MARGIN = 0.016;  // m
-    static constexpr int64_t MOST_PAIRS = 4000000, LONG_LIST = 4;
+    static constexpr int64_t MOST_PAIRS = 4000000;
 
     template <class Box> void refit(int64_t node, int64_t begin, int64_t end, const Box& box_at) {
         if ((int64_t)tree.size() <= node) tree.resize(node + 1);
@@ -369,7 +368,13 @@ struct Layers {
     // Boxes around positions (V, 3) alone.
     void enclose(const double* pos) {
         for (int64_t i = 0; i < 3 * mesh.num_vertices; ++i) low[i] = pos[i] - margin[i / 3], high[i] = pos[i] + margin[i / 3];
+        swept = false;
         search();
+    }
+
+    // The list of a way is long where cloth moves far: it is made anew for the place that it led to.
+    void settle(const double* pos) {
+        if (swept && (int64_t)pairs.size() > mesh.num_vertices) enclose(pos);
     }
 
     bool inside(const double* pos, int64_t v) const {
@@ -379,18 +384,17 @@ struct Layers {
     }
 
     // Makes sure that the list holds at positions (V, 3), and on straight ways between two. Where a vertex has left its box all
-    // boxes are made anew around them, with twice the margin for those that have left.
+    // boxes are made anew around them.
     void cover(const double* pos) { cover(pos, pos); }
     void cover(const double* pos, const double* there) {
         begin(there);
         if (overflowed) return;
         bool left = false;
         for (int64_t v = 0; v < mesh.num_vertices; ++v) {
-            if (inside(pos, v) && inside(there, v)) continue;
-            left = true;
-            margin[v] = std::min(2.0 * margin[v], MOST_MARGIN);
+            left = left || !inside(pos, v) || !inside(there, v);
         }
         if (!left) return;
+        swept = true;
         for (int64_t i = 0; i < 3 * mesh.num_vertices; ++i) {
             low[i] = std::min(pos[i], there[i]) - margin[i / 3];
             high[i] = std::max(pos[i], there[i]) + margin[i / 3];
@@ -503,8 +507,9 @@ struct Layers {
             for (int64_t v = 0; v < mesh.num_vertices; ++v)
                 for (int k = 0; k < 3 && count[v] > 0.0; ++k) to[3 * v + k] += shift[3 * v + k] / count[v];
         }
-        // A list of the whole way is long where cloth moves far.
-        if (forced || (int64_t)pairs.size() > LONG_LIST * mesh.num_vertices) enclose(to);
+        swept = true;
+        if (forced) enclose(to);
+        else settle(to);
         return forced;
     }
 
@@ -594,6 +599,7 @@ struct Layers {
     int64_t model(const double* pos) {
         const LayerTimer timer{seconds};
         cover(pos);
+        settle(pos);
         contacts.clear(), rows.clear(), normals.clear();
         std::fill(gradient.begin(), gradient.end(), 0.0), std::fill(own.begin(), own.end(), 0.0);
         gradient.resize(3 * mesh.num_vertices, 0.0), own.resize(6 * mesh.num_vertices, 0.0);

@@ -394,7 +394,7 @@ class EngineSystem:
         self._weight = problem.sum_vertices(weight**2).sqrt().tolist()
 
     def begin(self, start: Tensor | None) -> None:
-        """Take up positions (V, 3), or the better of the two first guesses; near them where cloth would cross cloth on the way."""
+        """Take up positions (V, 3), or the better of the two first guesses; near them where cloth would meet cloth."""
         if start is None:
             mass, gravity = _array(self.problem.cloth.mass), _array(self.problem.gravity)
             for engine in self._engines:

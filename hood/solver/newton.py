@@ -18,8 +18,8 @@ from hood.losses.problem import StepProblem
 from hood.native.build import BuildError
 from hood.solver import engine
 from hood.solver.direction import Directions
-from hood.solver.layers import free_way, layers_of, touching
 from hood.solver.iterate import Proceed, Progress, Unknowns, in_double, rounded
+from hood.solver.layers import free_way, layers_of, touching
 from hood.solver.plan import ModelBuilder, SolverPlan, plan_for
 from hood.solver.reasons import CONVERGED, LATE, MOST_ITERATIONS, NOT_FINITE, STOPPED, STUCK
 from hood.solver.search import Path, backtrack
