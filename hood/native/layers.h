@@ -532,7 +532,7 @@ struct Layers {
     }
 
     int64_t approach_as_one(const double* from, double* to, double left) {
-        const double share = limit(from, to, left);
+        const double share = 0.9 * limit(from, to, left);  // less, so that rounding does not make pairs meet after all
         double mean[3] = {0.0, 0.0, 0.0}, sum = 0.0;
         bool held = false;
         for (int64_t v = 0; v < mesh.num_vertices; ++v) held |= fixed[v] != 0;
