@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
+from hood.commands.cloth_contact import potential_of
 from hood.commands.dial import AUTO, other_dials, refined
 from hood.config import build
 from hood.dynamics.captured import network_of
@@ -82,7 +83,9 @@ def advice(config: DictConfig, scene: Scene, summary: dict[str, Any], start: np.
 
 def solver(config: DictConfig) -> NewtonStepper:
     """The stepper of ``stepper=newton``."""
-    stepper = NewtonStepper(build(config.losses), build(config.solver))
+    alone = OmegaConf.merge(config, {"stepper": "newton"})
+    assert isinstance(alone, DictConfig)
+    stepper = NewtonStepper(potential_of(alone), build(config.solver))
     stepper.gravity = stepper.gravity.to(str(config.device))
     return stepper
 

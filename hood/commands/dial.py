@@ -15,6 +15,7 @@ from hood.dynamics.refine import METHODS, RefinedStepper
 from hood.dynamics.refine_table import costs_from_table, floor_from_table
 from hood.dynamics.rollout import FIELD_CHOICES
 from hood.dynamics.stepper import Stepper
+from hood.losses.potential import Potential
 from hood.solver.reasons import count_reasons, name_counts
 
 #: The ways to say how far a step is refined; a user gives one of them.
@@ -116,12 +117,14 @@ def make_goal(config: DictConfig, num_vertices: int) -> Goal | None:
     )
 
 
-def refined(stepper: Stepper, config: DictConfig, num_vertices: int) -> Stepper:
-    """The stepper with its steps refined as the config says: itself where it says nothing."""
+def refined(stepper: Stepper, config: DictConfig, num_vertices: int, potential: Potential | None = None) -> Stepper:
+    """The stepper with its steps refined as the config says, down ``potential`` (default: its losses): itself where it says
+    nothing."""
     goal = make_goal(config, num_vertices)
     if goal is None:
         return stepper
-    return RefinedStepper(stepper, build(config.losses), goal, str(config.refine_method), build(config.solver))
+    potential = build(config.losses) if potential is None else potential
+    return RefinedStepper(stepper, potential, goal, str(config.refine_method), build(config.solver))
 
 
 def summarise_refinement(config: Mapping[str, Any], metrics: Mapping[str, np.ndarray]) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from hood.assets.library import locate
 from hood.commands.automatic import advice, choose
 from hood.commands.batch import Job, find_jobs, share
 from hood.commands.cautions import scene_cautions, warn
+from hood.commands.cloth_contact import check_cloth_contact, potential_of
 from hood.commands.common import (
     UNTRAINED,
     output_folder,
@@ -66,6 +67,7 @@ def run(overrides: Sequence[str]) -> int:
     require_choice(config, "kernels", (AUTO, *KERNELS))
     require_choice(config, "stepper", ("network", "newton", "refine", AUTO))
     check_dial(config)
+    check_cloth_contact(config)
     require_choice(config, "step", (PLAIN, *MODES))
     return together(lambda: _run(config))
 
@@ -112,7 +114,7 @@ def _run_heard(
         scene = make_scene(config)
     if choice.stepper == "newton" and network_of(stepper) is not None:
         stepper, _ = make_stepper(config)
-    stepper = refined(stepper, config, scene.cloth.num_vertices)
+    stepper = refined(stepper, config, scene.cloth.num_vertices, potential_of(config))
     _check_start(config, stepper, scene)
     warn(scene_cautions(stepper, scene, build(config.losses), str(config.checkpoint)))
     folder = prepare_folder(output_folder(config))
@@ -211,7 +213,7 @@ def make_stepper(config: DictConfig) -> tuple[Stepper, str]:
         use_arithmetic(simulator, config, traced=str(config.step) == "compiled")
         stepper: Stepper = simulator if str(config.step) == PLAIN else CapturedSimulator(simulator, str(config.step))
         return stepper, digest
-    potential = build(config.losses)
+    potential = potential_of(config)
     kind = GuessStepper if str(config.stepper) == "refine" else NewtonStepper
     solver = kind(potential, build(config.solver))
     solver.gravity = solver.gravity.to(str(config.device))
@@ -247,7 +249,7 @@ def make_simulator(config: DictConfig) -> tuple[Simulator, str]:
 
 def _simulate_to_disk(config: DictConfig, scene: Scene, stepper: Stepper, digest: str, path: Path, asked: DictConfig) -> bool:
     """Stream the rollout into ``path``; True when the user interrupted it. ``asked`` is the config with ``auto`` in it."""
-    potential = build(config.losses)
+    potential = potential_of(config)
     count = min(int(config.num_frames), scene.num_frames)
     if count < int(config.num_frames):
         print(f"{scene.motion.name} has {count} frames at {1 / scene.dt:g} fps; the rollout ends there")

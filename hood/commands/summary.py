@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from hood.commands.cloth_contact import describe_cloth_contact, summarise_cloth_contact
 from hood.commands.dial import describe_refinement, summarise_refinement
 from hood.commands.surface_report import cut_at_worst, describe_surface, summarise_surface
 from hood.commands.verdict import describe_verdict, describe_worst, summarise_verdict
@@ -52,6 +53,7 @@ def summarise(path: Path) -> dict[str, Any]:
         "relative_gradient_median": _median(metrics["relative_gradient"]),
         "ms_per_frame": times,
         **solver,
+        **summarise_cloth_contact(json.loads(data.attributes["config"]), data.metrics),
         **summarise_refinement(json.loads(data.attributes["config"]), data.metrics),
         **summarise_verdict(data),
     }
@@ -71,6 +73,7 @@ def describe(summary: dict[str, Any]) -> str:
             *_describe_start(summary.get("settled")),
             *describe_refinement(summary),
             *describe_surface(summary["surface"]),
+            *describe_cloth_contact(summary),
             *_missed(summary),
             *describe_verdict(summary),
         ]

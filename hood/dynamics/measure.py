@@ -18,6 +18,28 @@ STRAIN_METRICS = ("strain_p50", "strain_p99", "strain_max")
 PENETRATION_METRICS = ("penetration_count", "penetration_share", "penetration_depth")
 
 
+#: Of a step in which layers of cloth are kept apart: pairs of features within their reach at its end, pairs of faces that were
+#: crossed at its start, pairs of features that held vertices drove through each other, 1 where nearly everything is near
+#: everything and nothing is kept apart, and what it took.
+LAYER_METRICS = ("layer_contacts", "layer_crossed", "layer_forced", "layer_overflow", "ms_layers")
+
+
+def layer_metrics(problem: StepProblem, next_pos: Tensor) -> dict[str, float]:
+    """:data:`LAYER_METRICS` of the step to ``next_pos`` (V, 3); nothing where layers play no role."""
+    if not problem.layers:
+        return {}
+    work = [scene.layers.work for scene in problem.layers]
+    near = sum(len(scene.layers.contacts(scene.of(next_pos)).corners) for scene in problem.layers)
+    values = (
+        near,
+        sum(scene.layers.crossed for scene in problem.layers),
+        sum(scene.layers.forced for scene in problem.layers),
+        any(one.overflowed for one in work),
+        1e3 * sum(one.seconds for one in work),
+    )
+    return dict(zip(LAYER_METRICS, map(float, values), strict=True))
+
+
 def edge_strain(cloth: Cloth, pos: Tensor) -> Tensor:
     """Relative length change of every edge, (E,), signed."""
     start, end = cloth.edges.unbind(dim=1)

@@ -22,6 +22,7 @@ from hood.scene.cloth import Cloth
 from hood.scene.scene import RELAXING_DT
 from hood.solver.colouring import colours_of
 from hood.solver.iterate import Progress, in_single, rounded
+from hood.solver.layers import approached, layers_of
 from hood.solver.newton import NewtonSettings, first_guess, minimize, plan_ahead
 from hood.solver.plan import plan_for
 from hood.solver.reasons import reason_number
@@ -163,8 +164,20 @@ class RefinedStepper:
         pos = rounded(problem, prediction.next_pos)
         return Prediction(pos, problem.acceleration(pos), prediction.metrics)
 
+    def _apart(self, problem: StepProblem, prediction: Prediction) -> Prediction:
+        """The prediction, as far as cloth does not cross cloth on the way there."""
+        layers = layers_of(self.potential, problem)
+        if not layers:
+            return prediction
+        there = approached(layers, prediction.next_pos.double())
+        if bool((there == prediction.next_pos.double()).all()):
+            return prediction
+        pos = rounded(problem, there)
+        return Prediction(pos, problem.acceleration(pos), prediction.metrics)
+
     def _refine(self, problem: StepProblem, prediction: Prediction, elapsed: Callable[[], float]) -> Prediction:
         goal, nan = self.goal, float("nan")
+        prediction = self._apart(problem, prediction)
         standing = Standing(problem, prediction.next_pos, 0, nan, elapsed())
         before = after = reason = nan
         if goal.begin(standing):

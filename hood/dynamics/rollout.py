@@ -14,8 +14,10 @@ from hood.dynamics.captured import network_of
 from hood.dynamics.equilibrium import Rest, find_equilibrium, without_hold
 from hood.dynamics.frames import Relaxing
 from hood.dynamics.measure import (
+    LAYER_METRICS,
     PENETRATION_METRICS,
     STRAIN_METRICS,
+    layer_metrics,
     penetration_metrics,
     strain_metrics,
     vertex_residual,
@@ -27,6 +29,7 @@ from hood.dynamics.stopwatch import Stopwatch
 from hood.dynamics.surface import SURFACE_METRICS, SURFACE_STRIDE, SurfaceMeter
 from hood.graph.given import given_hierarchy
 from hood.losses.elements import energies_and_gradient, total_energy
+from hood.losses.layers import has_layers, without_layers
 from hood.losses.potential import Potential, relative_gradient, scale
 from hood.losses.problem import StepProblem, inertial_guess
 from hood.scene.contact import Contact, find_contact
@@ -83,8 +86,10 @@ def metric_names(potential: Potential, stepper: Stepper, metrics: str = "all", s
         "strain": STRAIN_METRICS,
         "none": (),
     }
+    layers = LAYER_METRICS if has_layers(potential) else ()
     settled = SETTLE_METRICS if settle == "equilibrium" else ()
-    return (*measured[metrics], *stepper.metrics, *settled, *(f"ms_{part}" for part in stepper.times), "ms_metrics")
+    own = (*layers, *stepper.metrics, *settled)
+    return (*measured[metrics], *own, *(f"ms_{part}" for part in stepper.times), "ms_metrics")
 
 
 @torch.no_grad()
@@ -139,7 +144,7 @@ def simulate(
     count = scene.num_frames - start_frame if num_frames is None else min(num_frames, scene.num_frames - start_frame)
     network = network_of(stepper)
     if network is not None:
-        network.use_potential(potential)
+        network.use_potential(without_layers(potential))  # networks know none
     prepared = prepare_stepper(stepper, scene)
     rest = None
     if settle == "equilibrium" and own_start(stepper, scene, start_frame) is None:
@@ -180,6 +185,8 @@ def simulate(
         prediction = stepper.predict(problem, prepared, watch)
         state = State(prediction.next_pos, stepper.next_velocity(problem, prediction), state.origin)
         stepped = _times(stepper, watch.lap()) | prediction.metrics
+        if has_layers(potential):
+            stepped |= layer_metrics(known, prediction.next_pos)
         with watch.aside("metrics"):
             if wants_potential:
                 gradient, energies = energies_and_gradient(

@@ -10,6 +10,7 @@ from torch import Tensor
 from hood.scene.cloth import Cloth
 from hood.scene.contact import Contact, find_contact
 from hood.scene.contact_points import PointContact, find_point_contact
+from hood.scene.layers import SceneLayers, find_layers
 from hood.scene.state import State, StepInput
 
 #: Standard gravity [m/s²], y up.
@@ -25,9 +26,9 @@ class StepProblem:
     """One implicit step t → t+1 of B scenes; everything in it is constant while the next positions vary.
 
     ``contact`` is None without a body, and until somebody who needs it asks for :meth:`with_contact`; ``point_contacts`` holds
-    what terms asked for by :meth:`with_points`. ``pull`` are the forces at x_t of everything but inertia, weight and the body,
-    by which the cloth around a vertex presses it onto the skin; None where nobody has asked
-    :meth:`hood.losses.potential.Potential.with_pull`.
+    what terms asked for by :meth:`with_points`, ``layers`` the cloth near cloth where :meth:`with_layers` was asked for. ``pull``
+    are the forces at x_t of everything but inertia, weight and the body, by which the cloth around a vertex presses it onto the
+    skin; None where nobody has asked :meth:`hood.losses.potential.Potential.with_pull`.
     """
 
     cloth: Cloth
@@ -37,6 +38,7 @@ class StepProblem:
     gravity: Tensor = field(default_factory=_standard_gravity)  # (3,) m/s²
     point_contacts: tuple[PointContact, ...] = ()
     pull: Tensor | None = None  # (V, 3) N
+    layers: tuple[SceneLayers, ...] = ()  # one per scene, or none
 
     def __post_init__(self) -> None:
         if len(self.step.dt) != self.cloth.num_scenes:
@@ -64,6 +66,12 @@ class StepProblem:
             return problem
         points = find_point_contact(place, self.cloth, self.state.pos, obstacle, problem.contact)
         return replace(problem, point_contacts=(*self.point_contacts, points))
+
+    def with_layers(self, reach: float, pressure: float, between: bool) -> StepProblem:
+        """The problem with its cloth near cloth, see :func:`hood.scene.layers.find_layers`; itself where that has been done."""
+        if self.layers:
+            return self
+        return replace(self, layers=find_layers(self.cloth, self.state.pos, reach, pressure, between))
 
     def points_at(self, place: str) -> PointContact | None:
         """Contact at the points of a place; None at ``vertices`` and without a body.

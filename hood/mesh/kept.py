@@ -6,7 +6,7 @@ from collections.abc import Callable, MutableMapping
 from typing import Any
 
 
-def forget(kept: MutableMapping[int, Any], key: int) -> Callable[[Any], None]:
+def forget(kept: MutableMapping[Any, Any], key: Any) -> Callable[[Any], None]:
     """For :class:`weakref.ref`: takes ``key`` out of ``kept`` when the object is gone; works while Python shuts down, too, when
     the names of modules are gone as well."""
 

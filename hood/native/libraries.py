@@ -18,6 +18,7 @@ LIBRARIES: tuple[tuple[Path, tuple[str, ...]], ...] = (
     (_HERE / "elements.cpp", NATIVE_FLAGS),
     (_HERE / "picture.cpp", NATIVE_FLAGS),
     (_HERE / "features.cpp", NATIVE_FLAGS),
+    (_HERE / "layers.cpp", NATIVE_FLAGS),
     (_HERE.parent / "nn" / "network.cpp", NATIVE_FLAGS),
 )
 

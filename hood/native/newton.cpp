@@ -11,6 +11,7 @@
 #include <cstring>
 
 #include "lanes.h"
+#include "layers.h"
 #include "threads.h"
 #include "vertex_terms.h"
 
@@ -83,6 +84,10 @@ struct Engine {
     // Threads.
     int64_t parts, reach;           // in how many parts loops are done; how far a column is behind its row at most
     void* spill;                    // (parts - 1, reach, 4) what a part's rows give to the rows behind the part
+    // Cloth near cloth, a Layers; none where there is no such term.
+    void* layers;
+    const int64_t* vertex_of_scene;  // (V) number of each vertex in them
+    double kept;                     // share of a distance that a move leaves
 };
 }
 
@@ -397,6 +402,60 @@ template <class Add> inline void couple_points(const Engine& e, int64_t row, con
     }
 }
 
+// ---- cloth near cloth ----------------------------------------------------------------------------------------------------
+
+inline Layers& layers_of(const Engine& e) { return *(Layers*)e.layers; }
+
+// Positions in the cloth's own numbering.
+inline const double* own_order(const Engine& e, const double* pos, std::vector<double>& out) {
+    out.resize(3 * e.num_vertices);
+    for (int64_t i = 0; i < e.num_vertices; ++i)
+        for (int k = 0; k < 3; ++k) out[3 * e.vertex_of_scene[i] + k] = pos[4 * i + k];
+    return out.data();
+}
+
+// Whether anything is near anything at the state; then its forces, curvature and rows are those of the layers.
+inline bool model_layers(const Engine& e) {
+    if (!e.layers) return false;
+    Layers& layers = layers_of(e);
+    return layers.model(own_order(e, e.pos, layers.here)) > 0;
+}
+
+inline bool near_layers(const Engine& e) { return e.layers && !layers_of(e).contacts.empty(); }
+
+inline void add_layers(const Engine& e, int64_t row, double* gradient, double* upper) {
+    const Layers& layers = layers_of(e);
+    const int64_t v = e.vertex_of_scene[row];
+    for (int k = 0; k < 3; ++k) gradient[k] += layers.gradient[3 * v + k];
+    for (int k = 0; k < 6; ++k) upper[k] += layers.own[6 * v + k];
+}
+
+// Adds the blocks beside the diagonal to q = H p; returns their p . q.
+template <class T> double couple_layers(const Engine& e) {
+    const Layers& layers = layers_of(e);
+    const T* p = (const T*)e.p;
+    T* q = (T*)e.q;
+    double sum = 0.0;
+    for (size_t i = 0; i < layers.contacts.size(); ++i) {
+        const int32_t* row = layers.rows.data() + 4 * i;
+        const double* n = layers.normals.data() + 12 * i;
+        double along[4], total = 0.0;
+        for (int c = 0; c < 4; ++c) {
+            along[c] = 0.0;
+            if (row[c] >= e.num_rows) continue;
+            for (int k = 0; k < 3; ++k) along[c] += n[3 * c + k] * (double)p[4 * row[c] + k];
+            total += along[c];
+        }
+        for (int c = 0; c < 4; ++c) {
+            if (row[c] >= e.num_rows) continue;
+            const double others = total - along[c];
+            for (int k = 0; k < 3; ++k) q[4 * row[c] + k] += (T)(others * n[3 * c + k]);
+            sum += along[c] * others;
+        }
+    }
+    return sum;
+}
+
 // ---- the potential -------------------------------------------------------------------------------------------------------
 
 void place(const Engine& e, const double* acc, double* pos) {
@@ -460,6 +519,7 @@ void energy(const Engine& e, const double* pos, const double* acc, double* phi, 
         springs += 0.5 * e.spring_stiffness[s] * dot3(gap, gap);
     }
     if (e.num_springs) add(springs);
+    if (e.layers) add(layers_of(e).energy(own_order(e, pos, layers_of(e).there)));
     *phi = sum;
     *noise = 8.0 * 2.220446049250313e-16 * size;
 }
@@ -478,12 +538,13 @@ template <int CORNERS> inline D4 pull_of(const double* forces, int size, const i
 }
 
 // The gradient, and the blocks of single vertices; the elements' forces have been made.
-template <class T> void gather_gradient(const Engine& e, Range range) {
+template <class T> void gather_gradient(const Engine& e, Range range, bool near) {
     T *own = (T*)e.own, *own_slack = (T*)e.own_slack;
     for (int64_t row = range.begin; row < range.end; ++row) {
         double gradient[3], upper[6], slack[6];
         vertex_model(e, row, gradient, upper, slack);
         add_points(e, row, gradient, upper, slack);
+        if (near) add_layers(e, row, gradient, upper);
         D4 force = D4{gradient[0], gradient[1], gradient[2], 0.0};
         if (e.membrane) force += pull_of<3>(e.face_force, 10, e.face_starts, e.face_uses, row);
         if (e.bending) force += pull_of<4>(e.hinge_force, 14, e.hinge_starts, e.hinge_uses, row);
@@ -624,7 +685,8 @@ template <class T> void differentiate(const Engine& e) {
         if (e.bending) hinge_models<T>(e, e.pos, hinges_of(e, part));
         for (int64_t s = 0; s < e.num_points; ++s) point_models(e.points[s], e.pos, range_of(e.points[s].count, part, e.parts));
     });
-    for_parts(e.parts, [&](int64_t part) { gather_gradient<T>(e, rows_of(e, part)); });
+    const bool near = model_layers(e);
+    for_parts(e.parts, [&](int64_t part) { gather_gradient<T>(e, rows_of(e, part), near); });
 }
 
 // The share of the slack that is in the matrix, from what it was to what it shall be.
@@ -782,7 +844,8 @@ template <class T> bool solve(Engine& e, double tolerance, int64_t most) {
     const double limit = tolerance * tolerance * rz;
     bool definite = true;
     for (int64_t iteration = 0; iteration < most && rz > limit; ++iteration) {
-        const double curvature = sum_parts(e, [&](int64_t part) { return multiply<T>(e, part); });
+        double curvature = sum_parts(e, [&](int64_t part) { return multiply<T>(e, part); });
+        if (near_layers(e)) curvature += couple_layers<T>(e);
         if (!(curvature > 0.0)) {
             definite = false;
             break;
@@ -930,6 +993,20 @@ void walk(const Engine& e, double length) {
     place(e, e.trial_acc, e.trial_pos);
 }
 
+// Shortens the way from the state to the trial to where no cloth meets cloth; the share that is left.
+double limit_trial(const Engine& e) {
+    if (!e.layers) return 1.0;
+    Layers& layers = layers_of(e);
+    const double *here = own_order(e, e.pos, layers.here), *there = own_order(e, e.trial_pos, layers.there);
+    const LayerTimer timer{layers.seconds};
+    const double share = layers.limit(here, there, e.kept);
+    if (share >= 1.0) return 1.0;
+    for (int64_t row = 0; row < e.num_rows; ++row)
+        for (int k = 0; k < 3; ++k) e.trial_acc[4 * row + k] = e.acc[4 * row + k] + share * (e.trial_acc[4 * row + k] - e.acc[4 * row + k]);
+    place(e, e.trial_acc, e.trial_pos);
+    return share;
+}
+
 void take_trial(Engine& e, double phi, double noise) {
     std::memcpy(e.pos, e.trial_pos, sizeof(double) * 4 * e.num_rows);
     std::memcpy(e.acc, e.trial_acc, sizeof(double) * 4 * e.num_rows);
@@ -943,6 +1020,7 @@ bool backtrack(Engine& e) {
     for (int attempt = 0; attempt < 40; ++attempt) {
         double phi, noise;
         walk(e, length);
+        length *= limit_trial(e);
         energy(e, e.trial_pos, e.trial_acc, &phi, &noise);
         if (phi <= e.phi + 1e-4 * length * slope + e.noise) {
             take_trial(e, phi, noise);
@@ -1021,6 +1099,8 @@ void newton_start(Engine* e, const double* acc) {
 
 // The better of two guesses becomes the state, see hood.solver.iterate.first_iterate; masses (V) kg, gravity (3) m/s^2.
 void newton_guess(Engine* e, const double* mass, const double* gravity) {
+    void* const layers = e->layers;  // the guess is the one that would be best without
+    e->layers = nullptr;
     hold_fixed(*e);
     double phi, noise;
     guess(*e, mass, gravity, true, e->trial_acc);
@@ -1030,6 +1110,7 @@ void newton_guess(Engine* e, const double* mass, const double* gravity) {
     place(*e, e->acc, e->pos);
     energy(*e, e->pos, e->acc, &e->phi, &e->noise);
     if (!(e->phi < phi)) take_trial(*e, phi, noise);
+    e->layers = layers;
 }
 
 // Gradient at the state, and what the matrix is made of; returns the norm of the gradient.

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
 from hood.solver import linear
+from hood.solver.layers import LayerRows
 from hood.solver.plan import QuadraticModel, SolverPlan
 
 #: Below this share of the slack the next try does without.
@@ -47,7 +50,8 @@ class Directions:
         solution, pending, halved = torch.zeros_like(rhs), active, torch.zeros_like(active)
         while True:
             triples = self._idle(self._sharpened(model, sharpness), pending)
-            found, failed = self._solve(triples, inverse, torch.where(pending[plan.scene].unsqueeze(1), rhs, 0.0), residual)
+            right = torch.where(pending[plan.scene].unsqueeze(1), rhs, 0.0)
+            found, failed = self._solve(triples, inverse, right, residual, model.layers)
             failed = failed & pending & (sharpness > 0)
             solution = torch.where((pending & ~failed)[plan.scene].unsqueeze(1), found, solution)
             if not bool(failed.any()):
@@ -61,12 +65,14 @@ class Directions:
         direction[plan.vertices] = torch.where(moving, solution, 0.0)
         return direction, inverse
 
-    def _solve(self, triples: Tensor, inverse: Tensor, rhs: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
+    def _solve(
+        self, triples: Tensor, inverse: Tensor, rhs: Tensor, residual: Tensor, layers: LayerRows | None
+    ) -> tuple[Tensor, Tensor]:
         """Solution (N, 3), and the scenes (B,) bool in which the matrix is not positive definite as far as was seen."""
-        if self.linear == "direct":
+        if self.linear == "direct" and layers is None:  # a factorisation knows the pattern alone
             return self._solve_direct(triples, inverse, rhs)
         solution, used, failed = linear.conjugate_gradients(
-            linear.product(self.plan.pattern, triples),
+            _beside(linear.product(self.plan.pattern, triples), layers),
             linear.by_blocks(inverse),
             rhs,
             self.plan.scene,
@@ -107,3 +113,8 @@ class Directions:
         diagonal = plan.pattern.diagonal.to(triples.device)[idle]
         kept[diagonal.reshape(-1)] = torch.eye(3, dtype=kept.dtype, device=kept.device).repeat(int(idle.sum()), 1)
         return kept
+
+
+def _beside(apply: Callable[[Tensor], Tensor], layers: LayerRows | None) -> Callable[[Tensor], Tensor]:
+    """``apply`` with what layers add beside the pattern."""
+    return apply if layers is None else lambda x: apply(x) + layers.couple(x)

@@ -19,17 +19,21 @@ from torch import Tensor
 from hood import native
 from hood.losses.attachment import Attachment
 from hood.losses.bending import CurrentLengthBending
+from hood.losses.layers import LayerBarrier
 from hood.losses.potential import Potential
 from hood.losses.problem import STANDARD_GRAVITY, StepProblem, inertial_guess
 from hood.losses.stretching import Stretching
+from hood.mesh.layers import LEFT
 from hood.native.build import NATIVE_FLAGS, build
 from hood.native.structures import COUNT, POINTER, REAL, fields
 from hood.native.threads import num_parts
 from hood.scene.cloth import Cloth
+from hood.scene.layers import SceneLayers
 from hood.solver.elements import BENDINGS, face_constants, hinge_constants
 from hood.solver.engine_tables import Tables, build_tables, point_uses
 from hood.solver.forces import Grip, VertexForces, Walls, attachment_stiffness, known_forces, other_terms
 from hood.solver.iterate import fixed_positions
+from hood.solver.layers import approached, layers_of
 from hood.solver.plan import SolverPlan
 from hood.solver.points import PointForces, point_forces
 from hood.solver.vertex_pass import grip_structures, wall_structures, whole
@@ -62,7 +66,8 @@ class _Engine(ctypes.Structure):
         *fields("face_model hinge_model matrix slack own own_slack row_sum inverse x r z p q", POINTER),
         *fields("sharpness raised phi noise", REAL),
         *fields("wide cg_used parts reach", COUNT),
-        ("spill", POINTER),
+        *fields("spill layers vertex_of_scene", POINTER),
+        ("kept", REAL),
     ]
 
 
@@ -86,7 +91,9 @@ def library() -> ctypes.CDLL:
 def applies(potential: Potential, problem: StepProblem) -> bool:
     """Whether the compiled solver knows every term of the potential that plays a role in ``problem``, on a CPU."""
     bendings = [term for term in potential.terms.values() if type(term) in BENDINGS and term.applies(problem)]
-    return problem.state.pos.device.type == "cpu" and len(bendings) <= 1 and other_terms(potential, problem) is None
+    others = other_terms(potential, problem)
+    known = others is None or all(type(term) is LayerBarrier for term in others.terms.values())
+    return problem.state.pos.device.type == "cpu" and len(bendings) <= 1 and known
 
 
 @dataclass(frozen=True)
@@ -138,6 +145,7 @@ class EngineStep:
     points: tuple[PointForces, ...]
     bending: int  # 0 none, 1 about the rest shape, 2 with the current length
     membrane: int  # how many such terms
+    layers: tuple[SceneLayers, ...]  # one per scene, or none
 
 
 def engine_step(potential: Potential, problem: StepProblem) -> EngineStep:
@@ -161,6 +169,7 @@ def engine_step(potential: Potential, problem: StepProblem) -> EngineStep:
         points=point_forces(potential, problem),
         bending=0 if bending is None else 2 if type(bending) is CurrentLengthBending else 1,
         membrane=sum(type(term) is Stretching for term in terms),
+        layers=layers_of(potential, problem),
     )
 
 
@@ -255,7 +264,20 @@ class SceneEngine:
         values.bending, values.membrane = step.bending, step.membrane > 0
         values.dt_sq = float(step.dt[scene]) ** 2
         values.raised, values.cg_used = 0.0, 0
+        self._take_layers(step.layers[scene] if step.layers else None)
         self.share(num_parts(values.num_rows, _ROWS))
+
+    def _take_layers(self, scene: SceneLayers | None) -> None:
+        self.layers = scene
+        if scene is None:
+            self.values.layers = None
+            return
+        vertex = self.tables.vertex - scene.first
+        row = np.empty_like(vertex)
+        row[vertex] = np.arange(len(vertex))
+        scene.layers.number(row)
+        self._point(vertex_of_scene=vertex)
+        self.values.layers, self.values.kept = scene.layers.handle, LEFT
 
     def start(self, acc: np.ndarray) -> None:
         """Take up accelerations (V, 3) of all vertices of the cloth."""
@@ -372,13 +394,22 @@ class EngineSystem:
         self._weight = problem.sum_vertices(weight**2).sqrt().tolist()
 
     def begin(self, start: Tensor | None) -> None:
-        """Take up positions (V, 3), or the better of the two first guesses."""
+        """Take up positions (V, 3), or the better of the two first guesses; near them where cloth would meet cloth."""
         if start is None:
             mass, gravity = _array(self.problem.cloth.mass), _array(self.problem.gravity)
             for engine in self._engines:
                 engine.guess(mass, gravity)
-            return
-        acc = (_array(start) - self._step.base) / self._dt_sq
+            if self._step.layers:
+                self._start(self._apart(self.state()[0]))
+        else:
+            self._start(self._apart(start) if self._step.layers else start)
+
+    def _apart(self, target: Tensor) -> Tensor:
+        free = self.problem.cloth.free.unsqueeze(1)
+        return approached(self._step.layers, torch.where(free, target, torch.from_numpy(self._step.fixed)))
+
+    def _start(self, pos: Tensor) -> None:
+        acc = (_array(pos) - self._step.base) / self._dt_sq
         for engine in self._engines:
             engine.start(acc)
 

@@ -10,11 +10,13 @@ import torch
 from torch import Tensor
 
 from hood.losses.collision import Collision
+from hood.losses.layers import without_layers
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem, inertial_guess
 from hood.mesh.kept import forget
 from hood.scene.batch import to_device
 from hood.scene.cloth import Cloth
+from hood.solver.layers import approached, layers_of, limits
 from hood.solver.terms import StepTerms
 
 
@@ -52,6 +54,30 @@ class Unknowns:
         self._base = inertial_guess(problem.state, problem.step, self.scene)
         self._fixed = fixed_positions(problem)
         self._fixed_acc = (self._fixed - self._base) / self.dt_sq
+        self.layers = layers_of(potential, problem)
+
+    def begin(self, start: Tensor | None) -> Iterate:
+        """The iterate at positions (V, 3), or at the default of :func:`first_iterate`; near it, where cloth would cross cloth
+        on the way there."""
+        if not self.layers:
+            return first_iterate(self) if start is None else self.at(start)
+        target = self._guess_apart() if start is None else self.place((start - self._base) / self.dt_sq)
+        there = approached(self.layers, target)
+        return self.at(there)
+
+    def _guess_apart(self) -> Tensor:
+        """The guess that would be best if layers did not touch."""
+        return first_iterate(Unknowns(without_layers(self.potential), self.problem)).pos
+
+    def safe(self, now: Iterate, acc: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Accelerations (V, 3) on the straight way from ``now`` to ``acc`` (V, 3), as far as no cloth meets cloth; the shares
+        (B,) of the way, None for all of it."""
+        if not self.layers:
+            return acc, None
+        share = limits(self.layers, now.pos, self.place(acc))
+        if bool((share >= 1.0).all()):
+            return acc, None
+        return now.acc + share[self.scene].unsqueeze(1) * (acc - now.acc), share
 
     def at(self, pos: Tensor) -> Iterate:
         """The iterate at positions (V, 3), of which free vertices are read."""
@@ -147,6 +173,7 @@ def _in_precision(problem: StepProblem, cloth: Cloth) -> StepProblem:
         problem.gravity.to(real),
         tuple(to_device(points, dtype=real) for points in problem.point_contacts),
         None if problem.pull is None else problem.pull.to(real),
+        problem.layers,
     )
 
 

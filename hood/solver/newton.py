@@ -12,12 +12,14 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from hood.losses.layers import without_layers
 from hood.losses.potential import Potential, relative_gradient
 from hood.losses.problem import StepProblem
 from hood.native.build import BuildError
 from hood.solver import engine
 from hood.solver.direction import Directions
-from hood.solver.iterate import Proceed, Progress, Unknowns, first_iterate, in_double, rounded
+from hood.solver.iterate import Proceed, Progress, Unknowns, in_double, rounded
+from hood.solver.layers import free_way, layers_of, touching
 from hood.solver.plan import ModelBuilder, SolverPlan, plan_for
 from hood.solver.reasons import CONVERGED, LATE, MOST_ITERATIONS, NOT_FINITE, STOPPED, STUCK
 from hood.solver.search import Path, backtrack
@@ -107,6 +109,14 @@ def minimize(
     plan = plan or plan_for(work)
     if start is not None:
         start = start.detach().to(work.state.pos.dtype)
+    layers = layers_of(potential, work)
+    if layers and proceed is None and not touching(layers, work.state.pos):
+        # Most cloth meets none: the step is taken without, and that is the step where it turns out to have met none.
+        system = _system(without_layers(potential), work, plan, settings)
+        system.begin(start)
+        pos, report = run(system, work.state.pos, settings, began, proceed)
+        if free_way(layers, work.state.pos, pos):
+            return rounded(problem, pos), replace(report, acc=report.acc.to(problem.state.pos.dtype))
     system = _system(potential, work, plan, settings)
     system.begin(start)
     pos, report = run(system, work.state.pos, settings, began, proceed)
@@ -171,10 +181,10 @@ class TorchSystem:
         self.problem, self.plan = problem, plan
         self.unknowns = Unknowns(potential, problem)
         self.directions = Directions(plan, problem.num_scenes, settings.linear, settings.cg_iterations)
-        self._build = ModelBuilder(self.unknowns.terms, plan)
+        self._build = ModelBuilder(self.unknowns.terms, plan, self.unknowns.layers)
 
     def begin(self, start: Tensor | None) -> None:
-        self._now = first_iterate(self.unknowns) if start is None else self.unknowns.at(start)
+        self._now = self.unknowns.begin(start)
 
     @property
     def phi(self) -> list[float]:

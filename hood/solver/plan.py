@@ -14,8 +14,10 @@ from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
 from hood.mesh.kept import forget
 from hood.scene.cloth import Cloth
+from hood.scene.layers import SceneLayers
 from hood.scene.state import Attachments
 from hood.solver import elements
+from hood.solver.layers import LayerRows, layer_rows
 from hood.solver.pattern import BlockPattern, Scatter, axial_targets, matrix_targets, to_vertices, upper_pairs
 from hood.solver.points import PointBlocks
 from hood.solver.terms import StepTerms
@@ -80,6 +82,7 @@ class QuadraticModel:
     gradient: Tensor  # (V, 3) N, pinned and massless vertices included
     triples: Tensor  # (R, 3) N/m, positive definite matrix of the free vertices in the pattern's layout
     slack: Tensor  # (R, 3) N/m, what is missing to the Hessian; negative semi-definite
+    layers: LayerRows | None = None  # what cloth near cloth adds; None where there is none
 
 
 _PLANS: dict[int, tuple[weakref.ref[Tensor], tuple[Tensor, Tensor, Tensor | None], SolverPlan]] = {}
@@ -102,8 +105,8 @@ def plan_for(problem: StepProblem) -> SolverPlan:
 class ModelBuilder:
     """Assembles the quadratic models of one step; keeps the memory that every model needs."""
 
-    def __init__(self, terms: StepTerms, plan: SolverPlan) -> None:
-        self.terms, self.plan = terms, plan
+    def __init__(self, terms: StepTerms, plan: SolverPlan, layers: tuple[SceneLayers, ...] = ()) -> None:
+        self.terms, self.plan, self._layers = terms, plan, layers
         cloth, like = terms.problem.cloth, terms.problem.state.pos
         sizes = [9 * len(like), 45 * len(cloth.faces), 78 * len(cloth.hinges)]
         # Zero where nothing is ever written: no such term.
@@ -140,7 +143,10 @@ class ModelBuilder:
             gradient = gradient + points.spread(model.gradient, gradient)
             triples = blocks.add(triples, model.matrix)
             slack = slack if model.slack is None else blocks.add(slack, model.slack)
-        return QuadraticModel(gradient, triples, slack)
+        near = layer_rows(self._layers, pos, plan.unknown) if self._layers else None
+        if near is not None:
+            triples = triples.index_add(0, plan.pattern.diagonal.to(triples.device).reshape(-1), near.own.reshape(-1, 3))
+        return QuadraticModel(gradient, triples, slack, near)
 
 
 def quadratic_model(potential: Potential, problem: StepProblem, plan: SolverPlan, pos: Tensor, acc: Tensor) -> QuadraticModel:

@@ -46,6 +46,10 @@ class Path:
 
     def at(self, length: Tensor) -> Iterate:
         """The iterate at step lengths (B,)."""
+        return self.reached(length)[0]
+
+    def reached(self, length: Tensor) -> tuple[Iterate, Tensor]:
+        """The iterate at step lengths (B,), and what is left of them where cloth would meet cloth."""
         unknowns = self._unknowns
         acc = self._now.acc + length[unknowns.scene].unsqueeze(1) * self._step
         for stop in self._stops:
@@ -53,7 +57,8 @@ class Path:
             acc[rows] += stop.correction(unknowns.place_free(rows, acc[rows])) / unknowns.dt_sq[rows]
         for point_stop in self._point_stops:
             acc += point_stop.correction(unknowns.place(acc)) / unknowns.dt_sq
-        return unknowns.evaluate(acc)
+        acc, share = unknowns.safe(self._now, acc)
+        return unknowns.evaluate(acc), length if share is None else length * share
 
 
 class Stop:
@@ -126,7 +131,8 @@ def backtrack(unknowns: Unknowns, path: Path, now: Iterate, slope: Tensor, searc
     for _ in range(BACKTRACKS):
         if not bool(searching.any()):
             break
-        trial = path.at(length * searching)
+        trial, taken = path.reached(length * searching)
+        length = torch.where(searching, taken, length)
         accepted = searching & (trial.phi <= now.phi + ARMIJO * length * slope + now.noise)
         if bool(accepted.all()):
             return trial, accepted

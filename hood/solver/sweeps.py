@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from hood.losses.layers import has_layers
 from hood.losses.potential import Potential, relative_gradient
 from hood.losses.problem import StepProblem
 from hood.solver import elements
@@ -61,11 +62,13 @@ def sweep(
         residuals: compute the relative gradient before every sweep; otherwise ``history`` has it at the end alone.
 
     Raises:
-        ValueError: ``count`` is negative.
+        ValueError: ``count`` is negative, or the potential keeps layers of cloth apart.
     """
     began = time.perf_counter()
     if count < 0:
         raise ValueError(f"sweep: count is {count}; give 0 or more sweeps")
+    if has_layers(potential):
+        raise ValueError("sweep: vertices that move one by one may cross cloth; leave out the term of layers, or use minimize")
     problem = potential.prepare(problem)
     work = in_double(problem) if double else problem
     unknowns = Unknowns(potential, work)

@@ -1,0 +1,127 @@
+"""``cloth_contact=``: whether layers of cloth are kept apart, what that comes to in a rollout, and sentences on it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig
+
+from hood.commands.dial import chosen
+from hood.config import ConfigError, build, require_choice
+from hood.dynamics.measure import LAYER_METRICS
+from hood.losses.collision import Collision
+from hood.losses.layers import LayerBarrier
+from hood.losses.potential import Potential
+from hood.mesh import layers
+from hood.native.build import BuildError
+
+CHOICES = ("auto", "on", "off", "layers")
+
+
+def check_cloth_contact(config: DictConfig) -> None:
+    """Raise ConfigError where the key asks for what the other keys rule out."""
+    require_choice(config, "cloth_contact", CHOICES)
+    if str(config.cloth_contact) in ("on", "layers"):
+        reason = _hindrance(config)
+        if reason and not (config.refine == "auto" or str(config.stepper) == "auto"):
+            raise ConfigError(f"cloth_contact={config.cloth_contact}: {reason}")
+
+
+def potential_of(config: DictConfig) -> Potential:
+    """The potential of the config's losses, with a barrier between layers of cloth where ``cloth_contact`` and the rest of the
+    settled config ask for one."""
+    potential: Potential = build(config.losses)
+    if not acts(config):
+        return potential
+    return potential.with_terms(layers=LayerBarrier(between=str(config.cloth_contact) == "layers"))
+
+
+def acts(config: DictConfig) -> bool:
+    """Whether layers of cloth are kept apart.
+
+    Raises:
+        ConfigError: the key asks for it, but the settled config's steps cannot do it.
+    """
+    asked = str(config.cloth_contact)
+    if asked == "off":
+        return False
+    reason = _hindrance(config)
+    if reason and asked != "auto":
+        raise ConfigError(f"cloth_contact={asked}: {reason}")
+    return not reason
+
+
+def _hindrance(config: DictConfig) -> str:
+    """Why layers cannot be kept apart in this rollout, with the way out; empty where they can."""
+    if str(config.stepper) not in ("newton", "refine") and chosen(config) is None:
+        return "a network alone does not keep layers of cloth apart; add refine=5, or use stepper=newton"
+    if str(config.refine_method) != "newton":
+        return f"refine_method={config.refine_method} moves vertices through cloth; use refine_method=newton"
+    if str(config.step) != "plain":
+        return f"step={config.step} has fixed shapes, which contact of cloth with cloth has not; use step=plain"
+    if str(config.cloth_contact) == "auto" and str(config.device) != "cpu":
+        return "its search is done on the CPU, between steps on another device; cloth_contact=on does so"
+    collision = [term for term in build(config.losses).terms.values() if isinstance(term, Collision)]
+    if str(config.cloth_contact) == "auto" and not any(type(term) is Collision for term in collision):
+        return "losses=… are those of published code, which has none; cloth_contact=on adds it"
+    try:
+        layers.library()
+    except BuildError as error:
+        return str(error)
+    return ""
+
+
+def summarise_cloth_contact(config: Mapping[str, Any], metrics: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """What ``summary.json`` says of it; nothing of files from before."""
+    if "cloth_contact" not in config:
+        return {}
+    asked = config["cloth_contact"]
+    if "layer_contacts" not in metrics:
+        return {"cloth_contact": {"asked": asked, "used": "off"}}
+    near, crossed, released, overflow, ms = (np.nan_to_num(np.asarray(metrics[name])) for name in LAYER_METRICS)
+    frames = np.flatnonzero(near > 0)
+    return {
+        "cloth_contact": {
+            "asked": asked,
+            "used": "layers" if asked == "layers" else "on",
+            "frames_with_contact": len(frames),
+            "first_frame": int(frames[0]) if len(frames) else None,
+            "last_frame": int(frames[-1]) if len(frames) else None,
+            "contacts_max": int(near.max(initial=0.0)),
+            "frames_with_crossed_cloth": [int(frame) for frame in np.flatnonzero((crossed > 0) | (overflow > 0))],
+            "crossed_pairs_max": int(crossed.max(initial=0.0)),
+            "frames_with_forced_pairs": [int(frame) for frame in np.flatnonzero(released > 0)],
+            "ms_median": float(np.median(ms[1:])) if len(ms) > 1 else None,
+        }
+    }
+
+
+def describe_cloth_contact(summary: Mapping[str, Any]) -> list[str]:
+    """Lines on it: when layers touched and what that cost, and where they could not be kept apart."""
+    found = summary.get("cloth_contact")
+    if found is None or found["used"] == "off":
+        return []
+    touched = (
+        "no frame"
+        if not found["frames_with_contact"]
+        else (
+            f"{found['frames_with_contact']} frames ({found['first_frame']} to {found['last_frame']}), "
+            f"up to {found['contacts_max']} pairs of features"
+        )
+    )
+    lines = [f"cloth against cloth: {touched}; {found['ms_median'] or 0.0:.1f} ms a frame (median)"]
+    crossed, forced = found["frames_with_crossed_cloth"], found["frames_with_forced_pairs"]
+    if crossed:
+        lines.append(
+            f"{len(crossed)} steps (the first to frame {crossed[0]}) began with cloth through cloth, up to "
+            f"{found['crossed_pairs_max']} pairs of triangles; these are left out until they come apart: "
+            "start from cloth that is not crossed"
+        )
+    if forced:
+        lines.append(
+            f"in {len(forced)} steps (the first to frame {forced[0]}) held vertices drive cloth through cloth; these pairs are "
+            "left out: let pins move more slowly, or hold fewer vertices (pins=…)"
+        )
+    return lines

@@ -1,0 +1,222 @@
+"""Cloth near cloth: pairs of features that may come near each other, and how far vertices may move before two of them meet.
+
+A pair is a vertex and a face, or two edges, of one mesh, without a common vertex. The work is done in ``hood/native/layers.h``;
+nothing of it is shared with :mod:`hood.mesh.crossing`, which counts what passes through what.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import weakref
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from hood import native
+from hood.mesh import topology
+from hood.native.build import NATIVE_FLAGS, build
+from hood.native.structures import COUNT, POINTER, REAL, fields
+
+SOURCE = Path(native.__file__).with_name("layers.cpp")
+#: Of the distance of two features at least this share is left by one move.
+LEFT = 0.1
+#: How far vertices may move at most before the list of pairs is made anew, at first [m].
+MARGIN = 5e-3
+
+
+class _Mesh(ctypes.Structure):
+    _fields_ = [
+        *fields("num_vertices num_faces num_edges", COUNT),
+        *fields("faces edges face_vertex face_edge order piece reach vertex_area edge_area edge_length_sq", POINTER),
+    ]
+
+
+@cache
+def library() -> ctypes.CDLL:
+    """The compiled search.
+
+    Raises:
+        hood.native.build.BuildError: there is no compiler, or it fails.
+    """
+    lib = build(SOURCE, NATIVE_FLAGS)
+    lib.layers_make.restype = POINTER
+    lib.layers_make.argtypes = [*[POINTER] * 4, REAL, COUNT]
+    lib.layers_free.argtypes = [POINTER]
+    lib.layers_crossed.argtypes = [POINTER]
+    lib.layers_approach.argtypes = [POINTER, POINTER, REAL]
+    lib.layers_limit.argtypes = [POINTER, POINTER, POINTER, REAL]
+    for name in ("layers_crossed", "layers_approach", "layers_model"):
+        getattr(lib, name).restype = COUNT
+    for name in ("layers_limit", "layers_energy"):
+        getattr(lib, name).restype = REAL
+    for name, count in (("energy", 2), ("model", 2), ("contacts", 5), ("forces", 3), ("rows", 2), ("counts", 3), ("number", 2)):
+        getattr(lib, f"layers_{name}").argtypes = [POINTER] * count
+    return lib
+
+
+class LayerMesh:
+    """What is constant as long as a cloth: which face answers for which vertex and edge, areas, and reaches.
+
+    Args:
+        rest_pos: (V, 3) m.
+        faces: (F, 3).
+        reach: m, distance at which features are near each other. Where faces are small it is half of the smallest height of
+            the faces around: at rest nothing is near anything.
+    """
+
+    def __init__(self, rest_pos: np.ndarray, faces: np.ndarray, reach: float) -> None:
+        rest, faces = np.asarray(rest_pos, np.float64), np.asarray(faces, np.int64)
+        edges = topology.unique_edges(faces)
+        sides = topology.edge_index(edges, faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)).reshape(-1, 3)
+        length = np.linalg.norm(rest[edges[:, 1]] - rest[edges[:, 0]], axis=1)
+        normal = np.cross(rest[faces[:, 1]] - rest[faces[:, 0]], rest[faces[:, 2]] - rest[faces[:, 0]])
+        area = 0.5 * np.linalg.norm(normal, axis=1)
+        height = 2.0 * area / length[sides].max(axis=1, initial=0.0)
+        thirds = np.repeat(area / 3.0, 3)
+        self.room = np.full(len(rest), np.inf)  # half of the smallest height around
+        np.minimum.at(self.room, faces.reshape(-1), np.repeat(0.5 * height, 3))
+        self._arrays = {  # in the order of the structure
+            "faces": np.ascontiguousarray(faces, np.int32),
+            "edges": np.ascontiguousarray(edges, np.int32),
+            "face_vertex": _answered(faces, len(rest)),
+            "face_edge": _answered(sides, len(edges)),
+            "order": _order(rest[faces].mean(axis=1)),
+            "piece": topology.connected_components(len(rest), edges).astype(np.int32),
+            "reach": np.minimum(self.room, reach),
+            "vertex_area": np.bincount(faces.reshape(-1), thirds, minlength=len(rest)),
+            "edge_area": np.bincount(sides.reshape(-1), thirds, minlength=len(edges)),
+            "edge_length_sq": length**2,
+        }
+        self.num_vertices = len(rest)
+        counts = len(rest), len(faces), len(edges)
+        self.structure = _Mesh(*counts, *(self._arrays[name].ctypes.data for name in self._arrays))
+
+
+def _answered(corners: np.ndarray, count: int) -> np.ndarray:
+    """Of ``corners`` (F, 3) those that a face is the first to have, then -1."""
+    first = np.zeros(corners.size, bool)
+    first[np.unique(corners.reshape(-1), return_index=True)[1]] = True
+    assert corners.size == 0 or corners.max() < count
+    return -np.sort(-np.where(first.reshape(corners.shape), corners, -1), axis=1).astype(np.int32)
+
+
+def _order(centre: np.ndarray) -> np.ndarray:
+    """Faces (F,) in an order whose neighbours are near each other: halves along the longest axis, again and again."""
+    order = np.arange(len(centre))
+    stack = [(0, len(centre))]
+    while stack:
+        begin, end = stack.pop()
+        if end - begin <= 4:
+            continue
+        part, middle = order[begin:end], (begin + end) // 2
+        axis = int(np.ptp(centre[part], axis=0).argmax())
+        order[begin:end] = part[np.argsort(centre[part, axis], kind="stable")]
+        stack += [(begin, middle), (middle, end)]
+    return order.astype(np.int32)
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """N pairs of features within their reach; the gap between them is Σ w_c x_c over four vertices."""
+
+    corners: np.ndarray  # (N, 4): a vertex and a face, or two edges
+    edges: np.ndarray  # (N,) bool, two edges
+    weights: np.ndarray  # (N, 4)
+    reach: np.ndarray  # (N,) m
+    area: np.ndarray  # (N,) m² at rest that the pair stands for
+    parallel: np.ndarray  # (N,) m⁴, square of the edges' cross product below which their barrier fades; 0 for others
+
+
+class Work(NamedTuple):
+    """What the search of one step has come to."""
+
+    listed: int  # pairs in the list
+    left_out: int  # pairs of features that are not
+    searches: int
+    overflowed: bool  # no list: nearly everything is near everything, in torn cloth, or a position is not finite
+    seconds: float  # searching, measuring distances and limiting moves
+
+
+class Layers:
+    """Cloth near cloth during one step, from positions ``pos`` (V, 3) [m] on.
+
+    Faces that pass through each other at ``pos`` would be held there: pairs of their features are left out until they have
+    come apart, and ``crossed`` is how many such pairs of faces there are.
+
+    Args:
+        fixed: (V,) bool, vertices that go where they must.
+        pressure: Pa, what the barrier (:class:`hood.losses.layers.LayerBarrier`) scales with.
+        between: pairs of two pieces (connected parts) of the mesh alone.
+    """
+
+    def __init__(self, mesh: LayerMesh, pos: np.ndarray, fixed: np.ndarray, pressure: float, between: bool = False) -> None:
+        self.mesh, self._lib = mesh, library()
+        start, held = _positions(pos), np.ascontiguousarray(fixed, np.uint8)
+        margin = np.minimum(mesh.room, MARGIN)
+        given = (start.ctypes.data, held.ctypes.data, margin.ctypes.data)
+        self.handle = self._lib.layers_make(ctypes.byref(mesh.structure), *given, pressure, int(between))
+        weakref.finalize(self, self._lib.layers_free, self.handle)
+        self.forced = 0  # pairs of features that held vertices drive through each other
+
+    @property
+    def crossed(self) -> int:
+        """Pairs of faces that pass through each other where the step begins."""
+        return int(self._lib.layers_crossed(self.handle))
+
+    def approach(self, target: np.ndarray) -> np.ndarray:
+        """Positions (V, 3) near ``target`` (V, 3) that straight ways from the start lead to on which no two features meet.
+
+        Vertices of pairs that would meet go on together. ``fixed`` ones are at their targets; pairs that cannot make room for
+        them are left out and counted in ``forced``.
+        """
+        there = _positions(target).copy()
+        self.forced += int(self._lib.layers_approach(self.handle, there.ctypes.data, LEFT))
+        return there
+
+    def limit(self, now: np.ndarray, there: np.ndarray) -> float:
+        """Share of the straight ways from ``now`` to ``there`` (V, 3) on which no two features meet: 1 for all of it."""
+        now, there = _positions(now), _positions(there)
+        return float(self._lib.layers_limit(self.handle, now.ctypes.data, there.ctypes.data, LEFT))
+
+    def energy(self, pos: np.ndarray) -> float:
+        """Energy [J] of the barrier at ``pos`` (V, 3)."""
+        here = _positions(pos)
+        return float(self._lib.layers_energy(self.handle, here.ctypes.data))
+
+    def contacts(self, pos: np.ndarray) -> Contacts:
+        """All pairs within their reach at ``pos`` (V, 3)."""
+        here = _positions(pos)
+        count = int(self._lib.layers_model(self.handle, here.ctypes.data))
+        corners, edges = np.empty((count, 4), np.int64), np.empty(count, np.int64)
+        weights, constants = np.empty((count, 4)), np.empty((count, 3))
+        self._lib.layers_contacts(self.handle, *(array.ctypes.data for array in (corners, edges, weights, constants)))
+        return Contacts(corners, edges != 0, weights, *np.ascontiguousarray(constants.T))
+
+    def model(self, pos: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Gradient (V, 3) [N] at ``pos`` (V, 3), and its curvature: the sum of n nᵀ over rows n (N, 4, 3) of the vertices
+        (N, 4), diagonal blocks of which are (V, 6) upper triangles."""
+        found = self.contacts(pos)
+        gradient, own = np.empty((self.mesh.num_vertices, 3)), np.empty((self.mesh.num_vertices, 6))
+        rows = np.empty((len(found.corners), 4, 3))
+        self._lib.layers_forces(self.handle, gradient.ctypes.data, own.ctypes.data)
+        self._lib.layers_rows(self.handle, rows.ctypes.data)
+        return gradient, rows, found.corners, own
+
+    def number(self, row: np.ndarray) -> None:
+        """Let the compiled solver name vertices by ``row`` (V,)."""
+        numbers = np.ascontiguousarray(row, np.int32)
+        self._lib.layers_number(self.handle, numbers.ctypes.data)
+
+    @property
+    def work(self) -> Work:
+        """What has been done so far."""
+        counts, seconds = np.empty(4, np.int64), np.empty(1)
+        self._lib.layers_counts(self.handle, counts.ctypes.data, seconds.ctypes.data)
+        return Work(int(counts[0]), int(counts[1]), int(counts[2]), bool(counts[3]), float(seconds[0]))
+
+
+def _positions(pos: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(pos, np.float64)

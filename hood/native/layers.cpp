@@ -1,0 +1,76 @@
+// Cloth near cloth, as Python asks for it; see layers.h and hood/mesh/layers.py. Positions are (V, 3) float64 [m].
+#include "layers.h"
+
+extern "C" {
+
+// Layers of a step from positions on; ``margins`` (V) [m] is how far vertices may go at first.
+void* layers_make(const void* mesh, const double* pos, const uint8_t* fixed, const double* margins, double pressure, int64_t between) {
+    Layers* layers = new Layers;
+    layers->mesh = *(const LayerMesh*)mesh;
+    layers->fixed.assign(fixed, fixed + layers->mesh.num_vertices);
+    layers->start.assign(pos, pos + 3 * layers->mesh.num_vertices);
+    layers->margin.assign(margins, margins + layers->mesh.num_vertices);
+    layers->pressure = pressure, layers->between = between != 0;
+    return layers;
+}
+
+void layers_free(void* layers) { delete (Layers*)layers; }
+
+// Pairs of faces that pass through each other where the step begins.
+int64_t layers_crossed(void* handle) {
+    Layers* layers = (Layers*)handle;
+    const LayerTimer timer{layers->seconds};
+    layers->begin();
+    return layers->crossed;
+}
+
+// Targets that can be reached become ``to``; returns how many pairs are left out for it.
+int64_t layers_approach(void* handle, double* to, double left) {
+    Layers* layers = (Layers*)handle;
+    const LayerTimer timer{layers->seconds};
+    return layers->approach(to, left);
+}
+
+double layers_limit(void* handle, const double* from, const double* to, double left) { return ((Layers*)handle)->limit(from, to, left); }
+
+double layers_energy(void* handle, const double* pos) { return ((Layers*)handle)->energy(pos); }
+
+// Contacts at positions; returns how many.
+int64_t layers_model(void* handle, const double* pos) { return ((Layers*)handle)->model(pos); }
+
+// Those of the last model: corners (N, 4), two edges or not (N), weights of the corners in the gap (N, 4), then reach [m],
+// area [m^2] and bound of parallel edges [m^4], (N, 3).
+void layers_contacts(const void* handle, int64_t* corners, int64_t* edges, double* weights, double* constants) {
+    const Layers* layers = (const Layers*)handle;
+    for (size_t i = 0; i < layers->contacts.size(); ++i) {
+        const LayerContact& contact = layers->contacts[i];
+        const LayerPair& pair = layers->pairs[contact.pair];
+        for (int c = 0; c < 4; ++c) corners[4 * i + c] = pair.corner[c], weights[4 * i + c] = contact.weight[c];
+        edges[i] = pair.edges;
+        constants[3 * i] = pair.reach, constants[3 * i + 1] = pair.area, constants[3 * i + 2] = pair.parallel;
+    }
+}
+
+// Numbers (V) by which rows name vertices from now on.
+void layers_number(void* handle, const int32_t* row) {
+    Layers* layers = (Layers*)handle;
+    layers->row.assign(row, row + layers->mesh.num_vertices);
+}
+
+// Gradient (V, 3) [N] and the upper triangles (V, 6) of the diagonal blocks of the last model's curvature.
+void layers_forces(const void* handle, double* gradient, double* own) {
+    const Layers* layers = (const Layers*)handle;
+    std::copy(layers->gradient.begin(), layers->gradient.end(), gradient);
+    std::copy(layers->own.begin(), layers->own.end(), own);
+}
+
+// Rows (N, 12) whose outer products are the curvature of the last model.
+void layers_rows(const void* handle, double* normals) { std::copy(((const Layers*)handle)->normals.begin(), ((const Layers*)handle)->normals.end(), normals); }
+
+// Pairs of features in the list, pairs that are left out, searches so far, whether there were too many pairs for a list; seconds.
+void layers_counts(const void* handle, int64_t* counts, double* seconds) {
+    const Layers* layers = (const Layers*)handle;
+    counts[0] = (int64_t)layers->pairs.size(), counts[1] = (int64_t)layers->released.size(), counts[2] = layers->searches;
+    counts[3] = layers->overflowed, *seconds = layers->seconds;
+}
+}

@@ -1,0 +1,55 @@
+"""Cloth near cloth in a batch of scenes: what is found out about a cloth once, and about each of its steps."""
+
+from __future__ import annotations
+
+import weakref
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hood.mesh.kept import forget
+from hood.mesh.layers import LayerMesh, Layers
+from hood.scene.cloth import Cloth
+
+
+@dataclass(frozen=True)
+class SceneLayers:
+    """The layers of one scene, and where its vertices are in the batch."""
+
+    layers: Layers
+    first: int
+    last: int
+
+    def of(self, values: Tensor) -> np.ndarray:
+        """This scene's rows of ``values`` (V, 3), float64."""
+        return values[self.first : self.last].detach().cpu().double().numpy()
+
+
+def find_layers(cloth: Cloth, pos: Tensor, reach: float, pressure: float, between: bool) -> tuple[SceneLayers, ...]:
+    """The layers of every scene at ``pos`` (V, 3); see :class:`hood.mesh.layers.Layers`."""
+    found = []
+    for mesh, first, last in _meshes(cloth, reach):
+        fixed = ~cloth.free[first:last].cpu().numpy()
+        here = pos[first:last].detach().cpu().double().numpy()
+        found.append(SceneLayers(Layers(mesh, here, fixed, pressure, between), first, last))
+    return tuple(found)
+
+
+_MESHES: dict[tuple[int, float], tuple[weakref.ref[Tensor], list[tuple[LayerMesh, int, int]]]] = {}
+
+
+def _meshes(cloth: Cloth, reach: float) -> list[tuple[LayerMesh, int, int]]:
+    """Mesh and range of vertices of every scene, kept as long as the cloth's faces live."""
+    key = id(cloth.faces), reach
+    known = _MESHES.get(key)
+    if known is not None and known[0]() is cloth.faces:
+        return known[1]
+    rest, faces = cloth.rest_pos.cpu().double().numpy(), cloth.faces.cpu().numpy()
+    bounds = torch.searchsorted(cloth.vertex_scene.cpu(), torch.arange(cloth.num_scenes + 1)).tolist()
+    scene, made = cloth.face_scene.cpu().numpy(), []
+    for index, (first, last) in enumerate(zip(bounds, bounds[1:], strict=False)):
+        made.append((LayerMesh(rest[first:last], faces[scene == index] - first, reach), first, last))
+    _MESHES[key] = weakref.ref(cloth.faces, forget(_MESHES, key)), made
+    return made

@@ -1,0 +1,85 @@
+"""Cloth near cloth in the torch form of the solver: the barrier's curvature beside the pattern, and moves that cross nothing.
+
+Energy and gradient come from the term itself (:class:`hood.losses.layers.LayerBarrier`). Its pairs change with the positions,
+so that their curvature cannot lie in the fixed pattern of the Hessian: it is a sum of outer products of rows of four vertices.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hood.losses.layers import has_layers
+from hood.losses.potential import Potential
+from hood.losses.problem import StepProblem
+from hood.scene.layers import SceneLayers
+
+
+def layers_of(potential: Potential, problem: StepProblem) -> tuple[SceneLayers, ...]:
+    """The layers that the potential's barrier acts between; none without such a term."""
+    return problem.layers if has_layers(potential) else ()
+
+
+@dataclass(frozen=True)
+class LayerRows:
+    """Curvature Σ n nᵀ of the barrier on M free vertices, in the solver's numbering."""
+
+    vertices: Tensor  # (N, 4); M for vertices that do not move
+    normals: Tensor  # (N, 4, 3)
+    own: Tensor  # (M, 3, 3), the diagonal blocks
+
+    def couple(self, x: Tensor) -> Tensor:
+        """Product (M, 3) of all blocks but the diagonal ones with ``x`` (M, 3)."""
+        padded = torch.cat([x, x.new_zeros(1, 3)])
+        along = (self.normals * padded[self.vertices]).sum(dim=2)
+        others = along.sum(dim=1, keepdim=True) - along
+        parts = (others.unsqueeze(2) * self.normals).reshape(-1, 3)
+        return torch.zeros_like(padded).index_add(0, self.vertices.reshape(-1), parts)[:-1]
+
+
+def layer_rows(layers: tuple[SceneLayers, ...], pos: Tensor, unknown: np.ndarray) -> LayerRows | None:
+    """The curvature at ``pos`` (V, 3); None where nothing is near anything.
+
+    Args:
+        unknown: (V,) numbers of the free vertices, -1 for others.
+    """
+    num_free = int(unknown.max(initial=-1)) + 1
+    vertices, normals = [], []
+    for scene in layers:
+        _, rows, corners, _ = scene.layers.model(scene.of(pos))
+        vertices.append(unknown[corners + scene.first])
+        normals.append(rows)
+    number, row = np.concatenate(vertices), np.concatenate(normals)
+    if len(number) == 0:
+        return None
+    number = np.where(number < 0, num_free, number)
+    index, n = torch.as_tensor(number, device=pos.device), torch.as_tensor(row).to(pos)
+    blocks = (n.unsqueeze(3) * n.unsqueeze(2)).reshape(-1, 3, 3)
+    own = pos.new_zeros(num_free + 1, 3, 3).index_add(0, index.reshape(-1), blocks)[:-1]
+    return LayerRows(index, n, own)
+
+
+def approached(layers: tuple[SceneLayers, ...], target: Tensor) -> Tensor:
+    """Positions (V, 3) near ``target`` (V, 3) that can be reached from the start of the step without crossing cloth."""
+    reached = [torch.as_tensor(scene.layers.approach(scene.of(target))) for scene in layers]
+    return torch.cat(reached).to(target)
+
+
+def limits(layers: tuple[SceneLayers, ...], now: Tensor, there: Tensor) -> Tensor:
+    """Shares (B,) of the straight ways from ``now`` to ``there`` (V, 3) on which no cloth meets cloth."""
+    return now.new_tensor([scene.layers.limit(scene.of(now), scene.of(there)) for scene in layers])
+
+
+def touching(layers: tuple[SceneLayers, ...], pos: Tensor) -> bool:
+    """Whether any cloth is near or through cloth at ``pos`` (V, 3), where the step begins."""
+    return any(scene.layers.crossed > 0 or len(scene.layers.contacts(scene.of(pos)).corners) > 0 for scene in layers)
+
+
+def free_way(layers: tuple[SceneLayers, ...], now: Tensor, there: Tensor) -> bool:
+    """Whether no cloth meets cloth on the straight ways from ``now`` to ``there`` (V, 3), nor is near any there."""
+    if bool((limits(layers, now, there) < 1.0).any()):
+        return False
+    return all(len(scene.layers.contacts(scene.of(there)).corners) == 0 for scene in layers)

@@ -1,0 +1,77 @@
+"""``cloth_contact=``: what it asks for, what the summary says, and where it cannot be had."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from belt import write_belt, write_walk
+
+from hood.cli import main
+from hood.commands.cloth_contact import describe_cloth_contact, summarise_cloth_contact
+from hood.dynamics.measure import LAYER_METRICS
+
+COMMAND = ["rollout", "stepper=newton", "sequence=walk.npz", "num_frames=4", "video=none", "sheet=false"]
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_walk(Path("walk.npz"), 6)
+
+
+def _run(*more: str) -> tuple[dict[str, Any], np.ndarray]:
+    assert main([*COMMAND, *more, "output=out"]) in (0, 3)
+    with h5py.File("out/rollout.h5", "r") as file:
+        pos = file["cloth/pos"][:]
+    return json.loads(Path("out/summary.json").read_text()), pos
+
+
+def test_cloth_that_meets_none_moves_to_the_bit_as_without(capsys: pytest.CaptureFixture[str]) -> None:
+    write_belt(Path("belt.obj"))
+    auto, with_contact = _run("garment=belt.obj", "metrics=strain")
+    said = capsys.readouterr().out
+    off, without = _run("garment=belt.obj", "metrics=strain", "cloth_contact=off")
+    assert auto["cloth_contact"]["used"] == "on"
+    assert auto["cloth_contact"]["frames_with_contact"] == 0
+    assert "cloth against cloth: no frame" in said
+    assert off["cloth_contact"] == {"asked": "off", "used": "off"}
+    assert "cloth against cloth" not in capsys.readouterr().out
+    np.testing.assert_array_equal(with_contact, without)
+
+
+def test_a_sleeve_that_meets_itself_is_kept_apart() -> None:
+    found, _ = _run("garment=longsleeve", "surface_stride=1")
+    assert found["cloth_contact"]["frames_with_contact"] > 0
+    assert found["cloth_contact"]["frames_with_crossed_cloth"] == []
+    assert found["surface"]["self_crossings"]["worst"] == 0
+
+
+@pytest.mark.parametrize(
+    ("more", "sentence"),
+    [
+        (["stepper=network", "refine=0", "cloth_contact=on"], "a network alone does not keep layers of cloth apart"),
+        (["stepper=refine", "refine=2", "refine_method=sweeps", "cloth_contact=on"], "use refine_method=newton"),
+        (["step=fixed", "cloth_contact=layers"], "use step=plain"),
+        (["cloth_contact=maybe"], "cloth_contact"),
+    ],
+)
+def test_what_cannot_be_had_is_refused(more: list[str], sentence: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*COMMAND, "garment=longsleeve", *more]) == 2
+    assert sentence in capsys.readouterr().err
+
+
+def test_sentences_name_crossed_starts_and_forced_pins() -> None:
+    columns = {name: np.zeros(5) for name in LAYER_METRICS}
+    columns["layer_contacts"][2:] = 7
+    columns["layer_crossed"][3] = 12
+    columns["layer_forced"][4] = 2
+    found = summarise_cloth_contact({"cloth_contact": "auto"}, columns)
+    text = "\n".join(describe_cloth_contact(found))
+    assert "3 frames (2 to 4), up to 7 pairs" in text
+    assert "1 steps (the first to frame 3) began with cloth through cloth, up to 12 pairs of triangles" in text
+    assert "in 1 steps (the first to frame 4) held vertices drive cloth through cloth" in text

@@ -1,0 +1,80 @@
+"""Steps in which cloth meets cloth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from layer_scenes import folding_strip, sheet_over_bar, sheets_on_sphere, stack
+
+from hood.dynamics.march import march
+from hood.losses.layers import LayerBarrier
+from hood.losses.potential import default_potential
+from hood.mesh.crossing import self_crossings
+from hood.solver.newton import NewtonSettings, minimize
+from hood.solver.sweeps import sweep
+
+POTENTIAL = default_potential().with_terms(layers=LayerBarrier())
+SMALL = {
+    "folding_strip": lambda dt: folding_strip(dt, n=10),
+    "sheet_over_bar": lambda dt: sheet_over_bar(dt, n=9),
+    "sheets_on_sphere": lambda dt: sheets_on_sphere(dt, n=9),
+    "stack": lambda dt: stack(dt, n=4, count=5),
+}
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_clean_cloth_stays_clean(name: str) -> None:
+    problem = SMALL[name](1 / 30)
+    faces = problem.cloth.faces.numpy()
+    touched = 0
+    for now in march(POTENTIAL, problem, 12):
+        pos = now.state.pos.numpy()
+        layers = now.problem.layers[0].layers
+        touched += len(layers.contacts(pos).corners)
+        assert layers.crossed == layers.forced == 0
+        assert len(self_crossings(pos, faces)) == 0
+    assert touched > 0 or name == "sheet_over_bar"
+
+
+def test_without_layers_the_same_sheets_cross() -> None:
+    problem = SMALL["sheets_on_sphere"](1 / 30)
+    *_, last = march(default_potential(), problem, 12)
+    assert len(self_crossings(last.state.pos.numpy(), problem.cloth.faces.numpy())) > 0
+
+
+def test_compiled_and_torch_reach_the_same_minimum() -> None:
+    *_, before = march(POTENTIAL, SMALL["stack"](1 / 30), 4)
+    problem = replace(before.problem, state=before.state, contact=None, layers=())
+    ends = []
+    for engine in ("compiled", "torch"):
+        settings = NewtonSettings(target_rg=1e-6, engine=engine)
+        pos, report = minimize(POTENTIAL, problem, settings=settings)
+        assert bool(report.converged.all())
+        ends.append((pos, float(report.phi)))
+    assert ends[0][1] == pytest.approx(ends[1][1], rel=1e-9, abs=1e-12)
+    torch.testing.assert_close(ends[0][0], ends[1][0], rtol=0.0, atol=1e-7)
+
+
+@pytest.mark.parametrize("engine", ["compiled", "torch"])
+def test_cloth_that_meets_none_moves_to_the_bit_as_without(engine: str) -> None:
+    problem = stack(1 / 30, n=5, count=1)
+    settings = NewtonSettings(engine=engine)
+    for one, other in zip(
+        march(POTENTIAL, problem, 3, settings), march(default_potential(), problem, 3, settings), strict=True
+    ):
+        assert torch.equal(one.state.pos, other.state.pos)
+
+
+def test_report_is_that_of_the_potential() -> None:
+    *_, before = march(POTENTIAL, SMALL["stack"](1 / 30), 4)
+    problem = POTENTIAL.prepare(replace(before.problem, state=before.state, contact=None, layers=()))
+    pos, report = minimize(POTENTIAL, problem)
+    assert float(report.phi) == pytest.approx(float(POTENTIAL.total(problem, pos)), rel=1e-9)
+    assert float(POTENTIAL.energies(problem, pos)["layers"]) > 0
+
+
+def test_sweeps_refuse_layers() -> None:
+    with pytest.raises(ValueError, match="cross cloth"):
+        sweep(POTENTIAL, SMALL["stack"](1 / 30), None, 1)
