@@ -7,7 +7,7 @@ import json
 import os
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +37,7 @@ from hood.commands.notices import heard
 from hood.commands.performance import make_motion
 from hood.commands.summary import describe, describe_all, summarise
 from hood.commands.verdict import exit_code
-from hood.commands.wardrobe import heed, read_outfit
+from hood.commands.wardrobe import heed, layer_order, names_of, read_outfit
 from hood.config import ConfigError, build, load_config, plain, require_choice, save_run_record
 from hood.dynamics.captured import MODES, CapturedSimulator, network_of
 from hood.dynamics.captured_newton import CapturedNewton
@@ -189,8 +189,9 @@ def _finished(config: DictConfig, digest: str, folder: Path) -> dict[str, Any] |
 def make_scene(config: DictConfig) -> Scene:
     """Assets named in the config, put together."""
     motion = make_motion(config, torch.float64 if _solves_in_double(config) else torch.float32)
+    order = layer_order(config.layers, names_of(config.garment))
     garment = read_outfit(config.garment, motion, bool(config.triangulate), config.pins)
-    scene = dress(garment, motion, build(config.material))
+    scene = replace(dress(garment, motion, build(config.material)), layers=order)
     found = misplacement(scene)
     if found is not None and found.grave:
         raise ValueError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -60,6 +61,28 @@ def read_outfit(given: Any, motion: Motion, triangulate: bool = False, pins: Any
         return outfit
     body = motion.body if isinstance(motion, BodyMotion) else None
     return replace(outfit, pinned=pin_mask(checked_pins(pins), outfit, body))
+
+
+def layer_order(given: Any, names: Sequence[str]) -> tuple[int, ...] | None:
+    """Garments from the body outwards, by their places among ``names`` (of files the stem is enough); None for ``auto``.
+
+    Raises:
+        ConfigError: ``given`` is not ``auto``, nor all of the names in some order.
+    """
+    if plain(given) == "auto":
+        return None
+    wanted, left, order = names_of(given, "layers"), list(enumerate(names)), []
+    for name in wanted:
+        place = next((item for item in left if name in (item[1], Path(item[1]).stem)), None)
+        if place is None:
+            break
+        left.remove(place)
+        order.append(place[0])
+    if left or len(order) != len(wanted):
+        raise ConfigError(
+            f"layers={','.join(wanted)}: give all garments from the body outwards, layers=[{','.join(names)}] or another order"
+        )
+    return tuple(order)
 
 
 def heed(name: str, suspicions: Sequence[Suspicion]) -> None:

@@ -238,16 +238,21 @@ def start_state(stepper: Stepper, scene: Scene, potential: Potential, relaxing_s
     velocity of their own rule. Those that restart take the last of the relaxing steps on the way to the next frame: it is not
     taken here, and the start is at rest.
 
+    Garments of an outfit are taken apart where the potential keeps layers apart (:func:`hood.scene.untangle.separate`).
+
     Where the garment cannot be put on in the pose of ``frame``, the body moves into it from the T-pose first: that second is
     simulated and dropped, and a warning says so. What it leads to is the start, velocity included.
 
     Raises:
         NotWornError: nor can it be put on in the T-pose, or the way from there ends in numbers that are not finite.
+        TangledError: garments of an outfit cannot be taken apart.
     """
     try:
         state = scene.start(frame, relaxed=False, thorough=True)
     except NotWornError as refusal:
         return _led_in(stepper, scene, potential, relaxing_steps, frame, refusal)
+    if has_layers(potential):
+        state = _taken_apart(scene, state, frame)
     stretched = _longest(scene, state.pos)
     if stretched > _TORN:
         warnings.warn(
@@ -273,6 +278,21 @@ def start_state(stepper: Stepper, scene: Scene, potential: Potential, relaxing_s
         if lower and bool(torch.isfinite(pos).all()) and _longest(scene, pos) <= max(_STRETCH, _longest(scene, state.pos)):
             state = State(pos, state.vel, state.origin)
     return State(state.pos, velocity, state.origin)
+
+
+def _taken_apart(scene: Scene, state: State, frame: int) -> State:
+    """The start with its garments apart; a warning says in which order they are worn where that was guessed."""
+    state, found = scene.taken_apart(state, frame)
+    if found is not None and found.before:
+        assert scene.outfit is not None
+        order = ",".join(scene.outfit.names[garment] for garment in found.order)
+        guessed = "" if scene.layers is not None else f" (as they mostly lie; layers=[{order}] or another order settles it)"
+        warnings.warn(
+            f"outfit: {found.before} pairs of triangles passed through each other at the start and were taken apart; from the body "
+            f"outwards: {order.replace(',', ', ')}{guessed}",
+            stacklevel=3,
+        )
+    return state
 
 
 def own_start(stepper: Stepper, scene: Scene, frame: int = 0) -> str | None:

@@ -18,6 +18,7 @@ from hood.scene.cloth import Cloth, build_cloth
 from hood.scene.motion import BodyMotion, Motion, body_motion
 from hood.scene.start import free_stretch, settle
 from hood.scene.state import Attachments, State, StepInput, concatenate_obstacles
+from hood.scene.untangle import Outfit, Separation, separate
 
 #: Time step [s] of the relaxing first step: inertia shrinks by 100, the paper's α (section 3.4).
 RELAXING_DT = 1.0 / 3.0
@@ -45,6 +46,7 @@ class Scene:
     clearance: float = 2e-3
     start_pos: np.ndarray | None = None  # (V, 3) m, world, float64: frame 0 starts there, and is not settled
     start_vel: np.ndarray | None = None  # (V, 3) m/s, likewise
+    layers: tuple[int, ...] | None = None  # garments of an outfit from the body outwards; None: as they lie at the start
 
     @property
     def num_frames(self) -> int:
@@ -73,6 +75,31 @@ class Scene:
         if thorough:
             self._require_worn(frame, skinned, pos)
         return State(pos=pos, vel=vel, origin=torch.as_tensor(origin).unsqueeze(0))
+
+    @property
+    def outfit(self) -> Outfit | None:
+        """The garments, where they are several."""
+        piece = self.garment.piece
+        if piece is None or not piece.any():
+            return None
+        count = int(piece.max()) + 1
+        names = tuple(self.garment.name.split("+"))
+        return Outfit(
+            self.cloth, self.garment.faces, piece, names if len(names) == count else tuple(map(str, range(1, count + 1)))
+        )
+
+    def taken_apart(self, state: State, frame: int = 0) -> tuple[State, Separation | None]:
+        """``state`` at ``frame`` with its garments taken apart, and how; itself and None of a single garment.
+
+        Raises:
+            TangledError: triangles of two garments still pass through each other.
+        """
+        outfit = self.outfit
+        if outfit is None:
+            return state, None
+        obstacle = self.motion.obstacle(frame, state.origin[0].numpy(), static=True)
+        found = separate(outfit, state.pos, obstacle, self.clearance, self.layers)
+        return State(found.pos, state.vel, state.origin), found
 
     def _require_worn(self, frame: int, skinned: Tensor, settled: Tensor) -> None:
         """Settling shortens the edges of a garment that is worn, and lengthens those of one that a limb passes through."""
