@@ -23,7 +23,7 @@ _PACKAGE = Path(__file__).resolve().parent
 #: Installed packages carry the configs inside; a clone has them beside the package.
 CONFIG_FOLDER = _PACKAGE / "configs" if (_PACKAGE / "configs").is_dir() else _PACKAGE.parent / "configs"
 #: Keys that take one word or a list.
-_ONE_OR_MORE = ("garment", "offset")
+_ONE_OR_MORE = ("garment", "offset", "layers")
 _TARGETS = ("hood.", "torch.optim.")
 
 

@@ -288,8 +288,8 @@ def _taken_apart(scene: Scene, state: State, frame: int) -> State:
         order = ",".join(scene.outfit.names[garment] for garment in found.order)
         guessed = "" if scene.layers is not None else f" (as they mostly lie; layers=[{order}] or another order settles it)"
         warnings.warn(
-            f"outfit: {found.before} pairs of triangles passed through each other at the start and were taken apart; from the body "
-            f"outwards: {order.replace(',', ', ')}{guessed}",
+            f"outfit: {found.before} pairs of triangles passed through each other at the start and were taken apart; from the "
+            f"body outwards: {order.replace(',', ', ')}{guessed}",
             stacklevel=3,
         )
     return state
