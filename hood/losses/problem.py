@@ -26,9 +26,9 @@ class StepProblem:
     """One implicit step t → t+1 of B scenes; everything in it is constant while the next positions vary.
 
     ``contact`` is None without a body, and until somebody who needs it asks for :meth:`with_contact`; ``point_contacts`` holds
-    what terms asked for by :meth:`with_points`, ``layers`` the cloth near cloth where :meth:`with_layers` was asked for. ``pull``
-    are the forces at x_t of everything but inertia, weight and the body, by which the cloth around a vertex presses it onto the
-    skin; None where nobody has asked :meth:`hood.losses.potential.Potential.with_pull`.
+    what terms asked for by :meth:`with_points`, ``layers`` the cloth near cloth where :meth:`with_layers` was asked for.
+    ``pull`` are the forces at x_t of everything but inertia, weight and the body, by which the cloth around a vertex presses it
+    onto the skin; None where nobody has asked :meth:`hood.losses.potential.Potential.with_pull`.
     """
 
     cloth: Cloth
