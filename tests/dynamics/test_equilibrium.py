@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from conftest import GARMENT_NAMES
 from reference_oracle import make_state
 from torch import Tensor
 
@@ -62,7 +61,7 @@ def test_cloth_at_rest_does_not_fall(garments: dict[str, Garment], body: Body, w
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", GARMENT_NAMES)
+@pytest.mark.parametrize("name", ["tshirt", "tank", "longsleeve", "shorts", "trousers", "dress", "skirt"])
 def test_no_default_garment_falls(name: str, garments: dict[str, Garment], body: Body, walk: PoseSequence) -> None:
     assert abs(drop(build_scene(garments[name], body, still(walk, 16), dtype=torch.float64), "equilibrium")) < 3e-3
 
