@@ -17,8 +17,8 @@ from hood.scene.batch import to_device
 from hood.scene.cloth import Cloth, build_cloth
 from hood.scene.motion import BodyMotion, Motion, body_motion
 from hood.scene.start import free_stretch, settle
-from hood.scene.state import Attachments, State, StepInput, concatenate_obstacles
-from hood.scene.untangle import Outfit, Separation, separate
+from hood.scene.state import Attachments, Obstacle, State, StepInput, concatenate_obstacles
+from hood.scene.untangle import Outfit, Separation, separate, smooth_out
 
 #: Time step [s] of the relaxing first step: inertia shrinks by 100, the paper's α (section 3.4).
 RELAXING_DT = 1.0 / 3.0
@@ -89,17 +89,29 @@ class Scene:
         )
 
     def taken_apart(self, state: State, frame: int = 0) -> tuple[State, Separation | None]:
-        """``state`` at ``frame`` with its garments taken apart, and how; itself and None of a single garment.
+        """``state`` at ``frame`` with no cloth through cloth, as far as that can be had: places smoothed where a garment passes
+        through itself (:func:`hood.scene.untangle.smooth_out`), and the garments of an outfit taken apart; how that was, None
+        of a single garment.
 
         Raises:
             TangledError: triangles of two garments still pass through each other.
         """
-        outfit = self.outfit
-        if outfit is None:
-            return state, None
         obstacle = self.motion.obstacle(frame, state.origin[0].numpy(), static=True)
-        found = separate(outfit, state.pos, obstacle, self.clearance, self.layers)
-        return State(found.pos, state.vel, state.origin), found
+        outfit, found, pos = self.outfit, None, state.pos
+        if outfit is None:
+            pos = smooth_out(self.cloth, self.garment.faces, pos, obstacle, self.clearance)
+        else:
+            pos = self._each_smoothed(outfit, pos, obstacle)
+            found = separate(outfit, pos, obstacle, self.clearance, self.layers)
+            pos = found.pos
+        return (state if pos is state.pos else State(pos, state.vel, state.origin)), found
+
+    def _each_smoothed(self, outfit: Outfit, pos: Tensor, obstacle: Obstacle | None) -> Tensor:
+        """Garment by garment: where one passes through another nothing is smoothed."""
+        garment = outfit.piece[outfit.faces[:, 0]]
+        for number in range(len(outfit.names)):
+            pos = smooth_out(self.cloth, outfit.faces[garment == number], pos, obstacle, self.clearance)
+        return pos
 
     def _require_worn(self, frame: int, skinned: Tensor, settled: Tensor) -> None:
         """Settling shortens the edges of a garment that is worn, and lengthens those of one that a limb passes through."""

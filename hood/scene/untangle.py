@@ -30,6 +30,8 @@ _ROUNDS, _STEPS = 24, 20
 _PATIENCE = 8
 #: Garments that do not cross go on being smoothed for so many rounds while an edge is stretched by more than the second.
 _SMOOTHING, _STRETCHED = 6, 0.1
+#: Times that places are smoothed at most where a garment passes through itself.
+_SMOOTHED = 40
 #: A vertex belongs to the other side of a layer if it is nearer than this [m].
 _NEAR = 0.04
 #: Orders of the layers that are tried where the likeliest does not come out well.
@@ -67,6 +69,30 @@ def crossing_pairs(outfit: Outfit, pos: Tensor) -> np.ndarray:
     pairs = self_crossings(pos.double().cpu().numpy(), outfit.faces)
     garment = outfit.piece[outfit.faces[:, 0]]
     return pairs[garment[pairs[:, 0]] != garment[pairs[:, 1]]]
+
+
+def smooth_out(cloth: Cloth, faces: np.ndarray, pos: Tensor, obstacle: Obstacle | None, clearance: float) -> Tensor:
+    """``pos`` (V, 3) [m] with the places smoothed where triangles of a single garment pass through each other, as an armpit
+    may when it is put on; the best that was found, itself where nothing crosses.
+
+    A vertex of such a triangle, or beside one, goes half the way to the mean of its neighbours, and out of the body again.
+    """
+    best, least = pos, None
+    start, end = cloth.edges.unbind(dim=1)
+    both, other = torch.cat([start, end]), torch.cat([end, start])
+    count = torch.zeros_like(pos[:, 0]).index_add(0, both, torch.ones_like(pos[:, 0])[both]).clamp_min(1.0)[:, None]
+    for _ in range(_SMOOTHED):
+        pairs = self_crossings(pos.double().cpu().numpy(), faces)
+        if least is None or len(pairs) < least:
+            best, least = pos, len(pairs)
+        if len(pairs) == 0:
+            break
+        near = torch.zeros_like(cloth.free)
+        near[torch.as_tensor(np.unique(faces[pairs.reshape(-1)]))] = True
+        near = near.index_put((both[near[other]],), torch.tensor(True)) & cloth.free
+        mean = torch.zeros_like(pos).index_add(0, both, pos[other]) / count
+        pos = push_out(cloth, torch.where(near[:, None], 0.5 * (pos + mean), pos), obstacle, clearance)
+    return best
 
 
 def separate(

@@ -14,7 +14,7 @@ from hood.scene.cloth import build_cloth
 from hood.scene.contact import find_contact
 from hood.scene.scene import build_scene
 from hood.scene.state import Obstacle
-from hood.scene.untangle import Outfit, TangledError, crossing_pairs, likely_orders, separate
+from hood.scene.untangle import Outfit, TangledError, crossing_pairs, likely_orders, separate, smooth_out
 from hood.testing import cylinder
 
 CLEARANCE = 2e-3
@@ -122,3 +122,24 @@ def test_embedded_outfits_come_apart(names, order):
     assert found.stretch < 0.15
     dist = find_contact(found.pos, scene.cloth.vertex_scene, obstacle).dist
     assert float(dist[scene.cloth.free].min()) > CLEARANCE - 1e-4
+
+
+def test_a_place_where_a_garment_passes_through_itself_is_smoothed():
+    outfit, pos = tubes(0.2)
+    pricked = pos.clone()
+    pricked[24 * 4 + 3] *= torch.tensor([-1.05, 1.0, -1.05])  # through the other side
+    assert len(self_crossings(pricked.numpy(), outfit.faces)) > 3
+    body = trunk(0.05)
+    smooth = smooth_out(outfit.cloth, outfit.faces, pricked, body, CLEARANCE)
+    assert len(self_crossings(smooth.numpy(), outfit.faces)) == 0
+    moved = (smooth - pricked).norm(dim=1) > 0
+    assert moved[24 * 4 + 3]
+    assert moved.sum() < 60
+    assert smooth_out(outfit.cloth, outfit.faces, pos, body, CLEARANCE) is pos
+
+
+def test_held_vertices_are_not_smoothed():
+    outfit, pos = tubes(0.2, pinned=(0,))
+    pricked = pos.clone()
+    pricked[24 * 4 + 3] *= torch.tensor([-1.05, 1.0, -1.05])
+    assert smooth_out(outfit.cloth, outfit.faces, pricked, trunk(0.05), CLEARANCE) is pricked
