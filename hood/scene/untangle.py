@@ -30,10 +30,14 @@ _ROUNDS, _STEPS = 24, 20
 _PATIENCE = 8
 #: Garments that do not cross go on being smoothed for so many rounds while an edge is stretched by more than the second.
 _SMOOTHING, _STRETCHED = 6, 0.1
+#: Garments in their likeliest order may be stretched by so much before another order is tried, half before the other share.
+_ACCEPTED = 0.5
 #: Times that places are smoothed at most where a garment passes through itself.
 _SMOOTHED = 40
 #: A vertex belongs to the other side of a layer if it is nearer than this [m].
 _NEAR = 0.04
+#: Share of the vertices that may lie on the other side of a garment that is held, which is still taken for the inner one.
+_HELD = 0.2
 #: Orders of the layers that are tried where the likeliest does not come out well.
 _TRIED = 3
 #: What the inner layer takes of a push: half, which opens narrow places, or nothing, which opens folds of an outer layer.
@@ -121,7 +125,9 @@ def separate(
         now = _take_apart(outfit, pos, obstacle, clearance, tried, inner_share, before)
         if best is None or (now.after, now.stretch) < (best.after, best.stretch):
             best = now
-        if best.after == 0 and best.stretch <= _STRETCHED:
+        # Settling relaxes what is stretched; a less likely order is worn for the whole rollout.
+        bound = _ACCEPTED if inner_share == _SHARES[-1] else 0.5 * _ACCEPTED
+        if best.after == 0 and best.stretch <= bound:
             break
     assert best is not None
     if best.after:
@@ -131,14 +137,17 @@ def separate(
 
 def likely_orders(outfit: Outfit, pos: Tensor, obstacle: Obstacle | None) -> list[tuple[int, ...]]:
     """All orders of the garments, from the body outwards, the likeliest first: by how many vertices lie on the side that the
-    order gives them."""
+    order gives them. Where that leaves it open a garment with held vertices lies under one without: what it holds to the body
+    has no room beneath."""
     sheets = _sheets(outfit, pos, obstacle)
     count = len(outfit.names)
     outside = np.zeros((count, count))
     for a, b in combinations(range(count), 2):
         for over, under in ((a, b), (b, a)):
-            match = sheets[under].match(pos, sheets[over].vertices)
-            outside[over, under] += float((match.height[match.valid] > 0).sum() - (match.height[match.valid] < 0).sum())
+            height = sheets[under].match(pos, sheets[over].vertices).over
+            outside[over, under] += float((height > 0).sum() - (height < 0).sum())
+            held = [bool(outfit.cloth.pinned[sheets[garment].vertices].any()) for garment in (under, over)]
+            outside[over, under] += _HELD * len(height) * (held[0] - held[1])
     return sorted(
         permutations(range(count)),
         key=lambda order: -sum(outside[over, under] - outside[under, over] for under, over in combinations(order, 2)),
@@ -151,6 +160,11 @@ class _Match(NamedTuple):
     height: Tensor  # (N,) m, over the surface
     normal: Tensor  # (N, 3)
     valid: Tensor  # (N,) bool
+
+    @property
+    def over(self) -> Tensor:
+        """Heights of the valid ones."""
+        return self.height[self.valid]
 
 
 class _Sheet:
