@@ -203,6 +203,7 @@ struct Layers {
 
     static constexpr int64_t LEAF = 4;
     static constexpr int64_t MOST_PAIRS = 4000000;
+    static constexpr int64_t MOST_LOOKS = 300;  // at pairs of faces, for each face: beyond it the cloth is torn
 
     template <class Box> void refit(int64_t node, int64_t begin, int64_t end, const Box& box_at) {
         if ((int64_t)tree.size() <= node) tree.resize(node + 1);
@@ -323,8 +324,11 @@ struct Layers {
         ++searches;
         overflowed = overflowed || !finite();
         if (overflowed) return;
+        int64_t looked_at = 0;
+        const auto too_many = [&] { return looked_at > MOST_LOOKS * mesh.num_faces || (int64_t)pairs.size() > MOST_PAIRS; };
         face_pairs([&](int64_t f, int64_t g) {
-            if ((int64_t)pairs.size() > MOST_PAIRS) return;
+            if (too_many()) return;
+            ++looked_at;
             if (crossing_at && crossed_faces(f, g, crossing_at)) ++crossed, release_faces(f, g);
             const int32_t *of_f = mesh.face_edge + 3 * f, *of_g = mesh.face_edge + 3 * g;
             for (int c = 0; c < 3 && mesh.face_vertex[3 * f + c] >= 0; ++c) add_vertex(mesh.face_vertex[3 * f + c], g);
@@ -332,7 +336,7 @@ struct Layers {
             for (int c = 0; c < 3 && of_f[c] >= 0; ++c)
                 for (int d = 0; d < 3 && of_g[d] >= 0; ++d) add_edges(of_f[c], of_g[d]);
         });
-        overflowed = (int64_t)pairs.size() > MOST_PAIRS;
+        overflowed = too_many();
         if (overflowed) pairs.clear(), keys.clear();
         if (crossed) forget_released();
     }
