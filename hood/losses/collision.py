@@ -11,18 +11,20 @@ from torch import Tensor
 from hood.losses.problem import StepProblem, sum_per_scene
 from hood.scene.contact import CentroidContact, LaggedContact, find_centroid_contact, find_lagged_contact
 from hood.scene.contact_points import PLACES
-from hood.scene.reach import checked_reach, vertex_reach
+from hood.scene.reach import REACHES, vertex_reach
 
 
-def checked_place(term: str, contact: str) -> str:
-    """``contact``, one of :data:`hood.scene.contact_points.PLACES`.
+def checked_contact(term: str, contact: str, reach: str) -> tuple[str, str]:
+    """``contact`` and ``reach`` of a term: one of :data:`hood.scene.contact_points.PLACES` and of
+    :data:`hood.scene.reach.REACHES`.
 
     Raises:
-        ValueError: it is not.
+        ValueError: they are not.
     """
-    if contact not in PLACES:
-        raise ValueError(f"{term}: contact is {contact!r}; choose {', '.join(PLACES)}")
-    return contact
+    for key, value, choices in (("contact", contact, PLACES), ("reach", reach, REACHES)):
+        if value not in choices:
+            raise ValueError(f"{term}: {key} is {value!r}; choose {', '.join(choices)}")
+    return contact, reach
 
 
 class Planes(NamedTuple):
@@ -62,8 +64,7 @@ class Collision:
             raise ValueError(f"collision: weight is {weight}, epsilon {epsilon}; give weight >= 0 and epsilon > 0")
         self.weight = weight
         self.epsilon = epsilon
-        self.contact = checked_place("collision", contact)
-        self.reach = checked_reach("collision", reach)
+        self.contact, self.reach = checked_contact("collision", contact, reach)
 
     def with_weight(self, weight: float) -> Collision:
         """The same term with another weight, for a ramp during training."""

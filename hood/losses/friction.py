@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from hood.losses.collision import checked_place, lagged_contact, with_lagged_centroids
+from hood.losses.collision import checked_contact, lagged_contact, with_lagged_centroids
 from hood.losses.problem import StepProblem, sum_per_scene
 from hood.scene.contact import Contact, LaggedContact
 from hood.scene.contact_points import PointContact
-from hood.scene.reach import checked_reach, vertex_reach
+from hood.scene.reach import vertex_reach
 
 
 class LaggedFriction:
@@ -91,8 +91,7 @@ class Friction(LaggedFriction):
         super().__init__(coefficient, slip_speed)
         self.weight = weight
         self.epsilon = epsilon
-        self.contact = checked_place("friction", contact)
-        self.reach = checked_reach("friction", reach)
+        self.contact, self.reach = checked_contact("friction", contact, reach)
 
     def with_weight(self, weight: float) -> Friction:
         """The same term with another collision weight, for a ramp during training."""

@@ -6,6 +6,7 @@ a step that needs body edges alone is spared the triangles.
 
 from __future__ import annotations
 
+import weakref
 from dataclasses import dataclass
 
 import torch
@@ -15,6 +16,7 @@ from hood.mesh import geometry, surface_tree
 from hood.mesh.centroids import nearest_centroids
 from hood.mesh.curvature import convex_curvature
 from hood.mesh.fixed_surface import search_surface_fixed
+from hood.mesh.kept import forget
 from hood.mesh.nearest import Nearest, nearest_dense, nearest_vertices
 from hood.mesh.proximity import Incidence, SurfaceHit, build_incidence, search_surface
 from hood.mesh.surface_tree import Match
@@ -71,13 +73,30 @@ def find_contact(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, cap: flo
     """
     match = match_surface(pos, vertex_scene, obstacle)
     incidence = build_incidence(obstacle.faces, len(obstacle.pos))
-    return _contact_of(match, obstacle, incidence, cap)
+    return _contact_of(match, obstacle, _curvature_of(obstacle, incidence), cap)
 
 
-def _contact_of(match: Match, obstacle: Obstacle, incidence: Incidence, cap: float, by_compiled: bool = True) -> Contact:
-    at_vertices = convex_curvature(obstacle.pos, obstacle.faces, incidence, by_compiled).to(match.bary)
-    curvature = (match.bary * at_vertices[obstacle.faces[match.face]]).sum(dim=1)
-    return Contact(**match._asdict(), valid=match.dist.abs() <= cap, curvature=curvature)
+#: Curvatures of the last bodies that contact was searched on, as long as their positions live: settling asks for one often.
+_CURVATURES: dict[int, tuple[weakref.ref[Tensor], int, Tensor]] = {}
+
+
+def _curvature_of(obstacle: Obstacle, incidence: Incidence) -> Tensor:
+    """Curvature [1/m] (W,) of the body at t, once for the same positions."""
+    pos, key = obstacle.pos, id(obstacle.pos)
+    if pos.is_inference():  # written over unseen
+        return convex_curvature(pos, obstacle.faces, incidence)
+    known = _CURVATURES.get(key)
+    if known is None or known[0]() is not pos or known[1] != pos._version:
+        found = convex_curvature(pos, obstacle.faces, incidence)
+        known = _CURVATURES[key] = weakref.ref(pos, forget(_CURVATURES, key)), pos._version, found
+    return known[2]
+
+
+def _contact_of(match: Match, obstacle: Obstacle, curvature: Tensor, cap: float) -> Contact:
+    """``curvature`` (W,) is that of the body's vertices."""
+    at_vertices = curvature.to(match.bary)
+    matched = (match.bary * at_vertices[obstacle.faces[match.face]]).sum(dim=1)
+    return Contact(**match._asdict(), valid=match.dist.abs() <= cap, curvature=matched)
 
 
 def match_surface(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle) -> Match:
@@ -106,7 +125,8 @@ def find_fixed_contact(
     surface = obstacle.pos, obstacle.faces, obstacle.vertex_scene, obstacle.face_scene
     hit, needed = search_surface_fixed(pos, vertex_scene, *surface, incidence, num_scenes, places)
     match = _match_of(hit, obstacle, incidence)
-    return _contact_of(match, obstacle, incidence, cap, by_compiled=False), needed
+    curvature = convex_curvature(obstacle.pos, obstacle.faces, incidence, by_compiled=False)
+    return _contact_of(match, obstacle, curvature, cap), needed
 
 
 def _match_of(hit: SurfaceHit, obstacle: Obstacle, incidence: Incidence) -> Match:

@@ -29,14 +29,3 @@ def sag(cloth: Cloth, contact: Contact) -> Tensor:
 def vertex_reach(form: str, least: float, cloth: Cloth, contact: Contact) -> Tensor:
     """Distance from the skin [m] (V,) at which contact sets in: ``least`` [m], and by ``curvature`` the :func:`sag` as well."""
     return least + (sag(cloth, contact) if form == "curvature" else torch.zeros_like(contact.dist))
-
-
-def checked_reach(term: str, reach: str) -> str:
-    """``reach``, one of :data:`REACHES`.
-
-    Raises:
-        ValueError: it is not.
-    """
-    if reach not in REACHES:
-        raise ValueError(f"{term}: reach is {reach!r}; choose {', '.join(REACHES)}")
-    return reach

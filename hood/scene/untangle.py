@@ -18,7 +18,7 @@ from torch import Tensor
 from hood.mesh.crossing import self_crossings
 from hood.mesh.topology import boundary_loops
 from hood.scene.cloth import Cloth
-from hood.scene.contact import find_contact
+from hood.scene.contact import find_contact, match_surface
 from hood.scene.start import descend, free_stretch, leave, push_out
 from hood.scene.state import Obstacle
 
@@ -188,22 +188,23 @@ class _Sheet:
 
     def match(self, pos: Tensor, rows: Tensor) -> _Match:
         """Where the vertices ``rows`` (N,) are over this surface, both at ``pos`` (V, 3)."""
-        contact = find_contact(pos[rows], torch.zeros(len(rows), dtype=torch.long), self.obstacle(pos), cap=_NEAR)
-        corners, offset = self._faces[contact.face], pos[rows] - contact.point
-        height = (offset * contact.normal).sum(dim=1)
-        beside = (offset - height[:, None] * contact.normal).norm(dim=1)
-        inside = contact.bary > 1e-6
+        found = match_surface(pos[rows], torch.zeros(len(rows), dtype=torch.long), self.obstacle(pos))
+        corners, offset = self._faces[found.face], pos[rows] - found.point
+        height = (offset * found.normal).sum(dim=1)
+        beside = (offset - height[:, None] * found.normal).norm(dim=1)
+        inside = found.bary > 1e-6
         on_rim = (self._rim[corners] | ~inside).all(dim=1) & ~inside.all(dim=1)
-        return _Match(corners, contact.bary, height, contact.normal, contact.valid & ~(on_rim & (beside > height.abs())))
+        near = found.dist.abs() <= _NEAR
+        return _Match(corners, found.bary, height, found.normal, near & ~(on_rim & (beside > height.abs())))
 
 
 def _sheets(outfit: Outfit, pos: Tensor, obstacle: Obstacle | None) -> list[_Sheet]:
     sheets = [_Sheet(outfit, garment) for garment in range(len(outfit.names))]
     if obstacle is None:
         return sheets
-    body = find_contact(pos, torch.zeros(len(pos), dtype=torch.long), obstacle)
+    body = match_surface(pos, torch.zeros(len(pos), dtype=torch.long), obstacle)
     for sheet in sheets:
-        own = find_contact(pos[sheet.vertices], torch.zeros(len(sheet.vertices), dtype=torch.long), sheet.obstacle(pos))
+        own = match_surface(pos[sheet.vertices], torch.zeros(len(sheet.vertices), dtype=torch.long), sheet.obstacle(pos))
         if float((own.normal * body.normal[sheet.vertices]).sum()) < 0:
             sheet.turn()
     return sheets

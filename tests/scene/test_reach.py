@@ -149,3 +149,18 @@ def test_a_ball_is_held_off_by_its_own_curvature() -> None:
     contact = find_contact(cloth.rest_pos, cloth.vertex_scene, ball)
     expected = 1.5 / 8.0 * cloth.edge_length_sq / 0.1
     torch.testing.assert_close(sag(cloth, contact), expected, rtol=0.1, atol=0)
+
+
+def test_a_body_that_has_moved_has_another_curvature() -> None:
+    """Also where its positions are written over."""
+    pos, faces = sphere(3, 0.1)
+    none = torch.zeros(len(pos), dtype=torch.long)
+    place = torch.as_tensor(pos).clone()
+    own = torch.zeros(len(faces), dtype=torch.long)
+    obstacle = Obstacle(place, place, place, torch.as_tensor(faces), none, own, none.bool())
+    above = torch.tensor([[0.0, 0.0, 0.25]], dtype=place.dtype)
+    scene = torch.zeros(1, dtype=torch.long)
+    small = float(find_contact(above, scene, obstacle, cap=1.0).curvature)
+    assert float(find_contact(above, scene, obstacle, cap=1.0).curvature) == small
+    place.mul_(2.0)
+    assert float(find_contact(above, scene, obstacle, cap=1.0).curvature) == pytest.approx(0.5 * small, rel=0.02)
