@@ -11,6 +11,7 @@ import numpy as np
 from hood.assets.binding import PosedBody, bind_posed, push_out, signed_distances
 from hood.assets.garment import Garment
 from hood.assets.placement import Placement
+from hood.assets.suspicions import suspect_sides
 from hood.mesh import repair, topology
 
 #: A garment whose middle vertex is farther from the skin than this [m] was made for another place or body.
@@ -105,6 +106,16 @@ def clean(fitting: Fitting) -> None:
         ("removed_unused_vertices", alone, "removed {} vertices of no face"),
     ):
         fitting.note(what, int(mask.sum()), text.format(int(mask.sum())))
+
+
+def face_out(fitting: Fitting, surface: np.ndarray, body_faces: np.ndarray) -> None:
+    """Turn all faces over where the garment is inside out on the body (W, 3) [m], ``body_faces`` (G, 3)."""
+    garment = fitting.garment
+    pos = garment.rest_pos if garment.skin_pos is None else garment.skin_pos
+    if suspect_sides(pos, garment.faces, surface, body_faces):
+        count = len(garment.faces)
+        fitting.garment = _turn_faces(garment, np.ones(count, dtype=bool))
+        fitting.note("turned_inside_out", count, f"turned all {count} faces over: the garment was inside out")
 
 
 def leave_body(fitting: Fitting, posed: PosedBody, clearance: float) -> np.ndarray:

@@ -18,6 +18,9 @@ _MOST_INSIDE = 0.25
 #: ... and at least this much cloth on the sides opposite to its main side: a cape on the back alone has 0.36.
 _LEAST_ROUND = 0.3
 
+#: Faces that are looked at to see where a garment's normals point, spread over its list of faces.
+_LOOKED_AT = 4000
+
 #: Rotations (3, 3) that turn the up axis of a file to y.
 UP_AXES = {"y": np.eye(3), "z": Z_UP_TO_Y_UP, "x": np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])}
 
@@ -82,3 +85,16 @@ def surrounds(points: np.ndarray, surface: np.ndarray, faces: np.ndarray) -> Sur
         middle=float(np.median(np.abs(dist))),
         roundness=1.0 - float(np.linalg.norm(away.mean(axis=0))),
     )
+
+
+def inward_share(pos: np.ndarray, faces: np.ndarray, surface: np.ndarray, body_faces: np.ndarray) -> float:
+    """Share of the area of the garment ``pos`` (V, 3) [m], ``faces`` (F, 3) whose normals point to the closed ``surface``
+    (W, 3) [m] with ``body_faces`` (G, 3): about 0 for one worn as it was made, about 1 for one that is inside out."""
+    some = faces[:: -(-len(faces) // _LOOKED_AT)] if len(faces) else faces
+    corners = pos[some]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    centre = corners.mean(axis=1)
+    dist, closest = closest_points(centre, surface, body_faces)
+    inward = ((centre - closest) * np.sign(dist)[:, None] * normal).sum(axis=1) < 0
+    area = np.linalg.norm(normal, axis=1)
+    return float(area[inward].sum() / max(float(area.sum()), 1e-30))

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from hood.assets.openings import find_openings
-from hood.assets.placement import surrounds
+from hood.assets.placement import inward_share, surrounds
 from hood.mesh import repair, topology
 
 #: A part is flat where its least extent is below this share of its greatest.
@@ -27,6 +27,9 @@ _ON_SKIN, _ALL_SKIN = 0.006, 0.95
 _UNITS = (1.0, 0.01, 0.001)
 #: A sheet farther from the skin than this [m] in the middle does not lie on the body at first.
 _FAR = 0.35
+#: A garment is inside out where the normals of more than this share of its area point to the body; those that are not have
+#: 0 to 0.04 of it, clothes with two sides a half.
+_INSIDE_OUT = 0.75
 
 
 @dataclass(frozen=True)
@@ -98,6 +101,21 @@ def suspect_place(pos: np.ndarray, faces: np.ndarray, surface: np.ndarray, body_
         )
         return [Suspicion(what, fix, 2 * openings.num_empty >= openings.num)]
     return []
+
+
+def suspect_sides(pos: np.ndarray, faces: np.ndarray, surface: np.ndarray, body_faces: np.ndarray) -> list[Suspicion]:
+    """Whether a garment (V, 3) [m] is inside out on the body (W, 3) [m]; a sheet has no inside.
+
+    The solver asks for no side; networks that look at normals, pictures and exports do.
+    """
+    share = inward_share(pos, faces, surface, body_faces)
+    if share <= _INSIDE_OUT or find_openings(pos, faces, surface, body_faces).num == 0:
+        return []
+    what = (
+        f"is inside out: the normals of {share:.0%} of its area point to the body, which networks take for the other side and "
+        "pictures show"
+    )
+    return [Suspicion(what, "hood prepare garment=… turns it", False)]
 
 
 def _flat_parts(pos: np.ndarray, faces: np.ndarray) -> tuple[int, int]:

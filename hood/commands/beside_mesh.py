@@ -9,7 +9,7 @@ import numpy as np
 from hood.assets.binding import signed_distances
 from hood.assets.fit_search import Asked
 from hood.assets.garment import Garment
-from hood.assets.suspicions import suspect_place
+from hood.assets.suspicions import suspect_place, suspect_sides
 from hood.assets.units import UNITS, find_scale, size_ratio, used
 from hood.commands.describe_place import describe_place
 from hood.commands.placing import find_place_on_mesh
@@ -55,6 +55,8 @@ def place_beside_mesh(finding: Finding, garment: Garment, motion: MeshMotion) ->
         centred = f"offset={gap.tolist()}".replace(" ", "")
         finding.problem(f"it {suspicion.what}", f"move it to where it is worn; {centred} puts it into the body's middle")
     finding.refused = any(suspicion.grave for suspicion in misplaced)
+    for suspicion in [] if misplaced else suspect_sides(pos, garment.faces, surface, motion.faces):
+        finding.problem(f"it {suspicion.what}", "prepare turns it", "")
     if inside and not misplaced:
         depth = -1e3 * float(dist.min())
         what = f"{inside} vertices ({100 * inside / len(dist):.1f}%) are inside the body, to {depth:.1f} mm"

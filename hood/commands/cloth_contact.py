@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -44,18 +45,35 @@ def acts(config: DictConfig) -> bool:
     Raises:
         ConfigError: the key asks for it, but the settled config's steps cannot do it.
     """
+    return str(config.cloth_contact) != "off" and not why_not(config)
+
+
+def why_not(config: DictConfig) -> str:
+    """Why layers are not kept apart in the settled config, with the way out; empty where they are, or nobody asks.
+
+    Raises:
+        ConfigError: the key asks for it, but the config's steps cannot do it.
+    """
     asked = str(config.cloth_contact)
-    if asked == "off":
-        return False
-    reason = _hindrance(config)
+    reason = "" if asked == "off" else _hindrance(config)
     if reason and asked != "auto":
         raise ConfigError(f"cloth_contact={asked}: {reason}")
-    return not reason
+    return reason
+
+
+def tell_if_off(config: DictConfig, garments: int) -> None:
+    """A line where contact that may be expected does not act: where the solver takes or refines the steps, and a warning where
+    several garments start as they are, one through the other."""
+    reason = why_not(config)
+    if reason and garments > 1:
+        warnings.warn(f"outfit: nothing keeps the {garments} garments apart, at the start neither: {reason}", stacklevel=2)
+    elif reason and not _network_alone(config):
+        print(f"cloth_contact=auto: off; {reason}")
 
 
 def _hindrance(config: DictConfig) -> str:
     """Why layers cannot be kept apart in this rollout, with the way out; empty where they can."""
-    if str(config.stepper) not in ("newton", "refine") and chosen(config) is None:
+    if _network_alone(config):
         return "a network alone does not keep layers of cloth apart; add refine=5, or use stepper=newton"
     if str(config.refine_method) != "newton":
         return f"refine_method={config.refine_method} moves vertices through cloth; use refine_method=newton"
@@ -73,13 +91,17 @@ def _hindrance(config: DictConfig) -> str:
     return ""
 
 
-def summarise_cloth_contact(config: Mapping[str, Any], metrics: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """What ``summary.json`` says of it; nothing of files from before."""
+def _network_alone(config: DictConfig) -> bool:
+    return str(config.stepper) not in ("newton", "refine") and chosen(config) is None
+
+
+def summarise_cloth_contact(config: Mapping[str, Any], metrics: Mapping[str, np.ndarray], reason: str = "") -> dict[str, Any]:
+    """What ``summary.json`` says of it; nothing of files from before. ``reason`` is that of :func:`why_not`."""
     if "cloth_contact" not in config:
         return {}
     asked = config["cloth_contact"]
     if "layer_contacts" not in metrics:
-        return {"cloth_contact": {"asked": asked, "used": "off"}}
+        return {"cloth_contact": {"asked": asked, "used": "off"} | ({"reason": reason} if reason else {})}
     near, crossed, released, overflow, ms = (np.nan_to_num(np.asarray(metrics[name])) for name in LAYER_METRICS)
     frames = np.flatnonzero(near > 0)
     return {
@@ -99,10 +121,14 @@ def summarise_cloth_contact(config: Mapping[str, Any], metrics: Mapping[str, np.
 
 
 def describe_cloth_contact(summary: Mapping[str, Any]) -> list[str]:
-    """Lines on it: when layers touched and what that cost, and where they could not be kept apart."""
+    """Lines on it: when layers touched and what that cost, and where they could not be kept apart; where cloth went through
+    cloth, why nothing kept it apart."""
     found = summary.get("cloth_contact")
-    if found is None or found["used"] == "off":
+    if found is None:
         return []
+    if found["used"] == "off":
+        crossed = _has_crossings(summary.get("surface"))
+        return [f"cloth against cloth: off; {found['reason']}"] if crossed and "reason" in found else []
     touched = (
         "no frame"
         if not found["frames_with_contact"]
@@ -125,3 +151,7 @@ def describe_cloth_contact(summary: Mapping[str, Any]) -> list[str]:
             "left out: let pins move more slowly, or hold fewer vertices (pins=…)"
         )
     return lines
+
+
+def _has_crossings(surface: Mapping[str, Any] | None) -> bool:
+    return surface is not None and any(surface[key]["worst"] > 0 for key in ("self_crossings", "garment_crossings"))

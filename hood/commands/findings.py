@@ -21,7 +21,7 @@ from hood.assets.motion_file import read_recording
 from hood.assets.pins import opening_names, read_indices
 from hood.assets.placement import surrounds
 from hood.assets.standing import arms_down
-from hood.assets.suspicions import suspect_kind
+from hood.assets.suspicions import suspect_kind, suspect_sides
 from hood.assets.units import UNITS, size_ratio, used
 from hood.assets.unpickle import load_pickle
 from hood.commands.beside_mesh import place_beside_mesh
@@ -193,6 +193,8 @@ def _place_beside(finding: Finding, garment: Garment, body: Body, betas: np.ndar
     finding.facts["distance to the skin, median [m]"] = round(around.middle, 4)
     finding.facts["vertices inside the body"] = f"{100 * around.inside:.1f}%"
     _name_openings(finding, placement.apply(garment.rest_pos), garment.faces, body)
+    for suspicion in suspect_sides(placement.apply(garment.rest_pos), garment.faces, posed.surface, posed.faces):
+        finding.problem(f"it {suspicion.what}", "prepare turns it", "")
     if around.inside:
         what = f"{100 * around.inside:.1f}% of its vertices are inside the body, to {1e3 * around.depth:.1f} mm"
         finding.problem(what, "prepare lets them start outside", "")

@@ -113,6 +113,7 @@ def _fit(name: str, config: DictConfig, body: Body, betas: np.ndarray) -> _Fitte
         alterations.sew(fitting, tolerance)
     alterations.clean(fitting)
     check_triangles(fitting.garment.rest_pos, fitting.garment.faces, name)
+    alterations.face_out(fitting, body.v_template if posed is None else posed.surface, body.faces)
     clearance = _number(config, "clearance", "")
     assert clearance is not None
     worn = None

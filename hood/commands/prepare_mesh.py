@@ -95,14 +95,16 @@ def _fit(fitting: Fitting, name: str, config: DictConfig, motion: MeshMotion) ->
 
 
 def _leave_mesh(fitting: Fitting, motion: MeshMotion, clearance: float) -> None:
-    """Where the garment is worn, outside the mesh in its first frame, or in its rest pose where that is nearer."""
-    garment, rest = fitting.garment, motion.sequence.rest
-    pos = worn_pos(garment)
+    """Where the garment is worn, outside the mesh in its first frame, or in its rest pose where that is nearer; its outside
+    away from it."""
+    rest, pos = motion.sequence.rest, worn_pos(fitting.garment)
     surfaces = [motion.points(0)] if rest is None else [motion.points(0), rest]
     dist, surface = min(
         ((signed_distances(pos, surface, motion.faces), surface) for surface in surfaces),
         key=lambda pair: float(np.median(np.abs(pair[0]))),
     )
+    alterations.face_out(fitting, surface, motion.faces)
+    garment = fitting.garment
     heed(garment.name, suspect_place(pos, garment.faces, surface, motion.faces))
     pushed = push_out(pos, surface, motion.faces, clearance)
     fitting.garment = replace(garment, skin_pos=np.where((dist < 0)[:, None], pushed.pos, pos))

@@ -21,7 +21,7 @@ from hood.assets.library import locate
 from hood.commands.automatic import advice, choose
 from hood.commands.batch import Job, find_jobs, share
 from hood.commands.cautions import scene_cautions, warn
-from hood.commands.cloth_contact import check_cloth_contact, potential_of
+from hood.commands.cloth_contact import check_cloth_contact, potential_of, tell_if_off, why_not
 from hood.commands.common import (
     UNTRAINED,
     output_folder,
@@ -47,7 +47,7 @@ from hood.dynamics.rollout import METRIC_CHOICES, SETTLE_CHOICES, metric_names, 
 from hood.dynamics.simulator import Simulator
 from hood.dynamics.stepper import NewtonStepper, Stepper
 from hood.nn.compiled import KERNELS
-from hood.scene.fitting import misplacement
+from hood.scene.fitting import doubts, misplacement
 from hood.scene.scene import Scene, dress
 from hood.training import distributed
 
@@ -116,6 +116,7 @@ def _run_heard(
         stepper, _ = make_stepper(config)
     stepper = refined(stepper, config, scene.cloth.num_vertices, potential_of(config))
     _check_start(config, stepper, scene)
+    tell_if_off(config, 1 if scene.outfit is None else len(scene.outfit.names))
     warn(scene_cautions(stepper, scene, build(config.losses), str(config.checkpoint)))
     folder = prepare_folder(output_folder(config))
     (folder / "summary.json").unlink(missing_ok=True)  # its presence says that everything is there
@@ -199,6 +200,8 @@ def make_scene(config: DictConfig) -> Scene:
             f"there, {found.fix}"
         )
     heed(garment.name, [found] if found is not None else [])
+    for name, doubt in doubts(scene):
+        heed(name, [doubt])
     return scene
 
 
@@ -265,6 +268,7 @@ def _simulate_to_disk(config: DictConfig, scene: Scene, stepper: Stepper, digest
         "garment": scene.garment.name,
         "sequence": scene.motion.name,
         "surface_stride": int(config.surface_stride),
+        "cloth_contact_off": why_not(config),
     }
     writer = RolloutWriter(
         path,

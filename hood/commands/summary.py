@@ -53,7 +53,9 @@ def summarise(path: Path) -> dict[str, Any]:
         "relative_gradient_median": _median(metrics["relative_gradient"]),
         "ms_per_frame": times,
         **solver,
-        **summarise_cloth_contact(json.loads(data.attributes["config"]), data.metrics),
+        **summarise_cloth_contact(
+            json.loads(data.attributes["config"]), data.metrics, str(data.attributes.get("cloth_contact_off", ""))
+        ),
         **summarise_refinement(json.loads(data.attributes["config"]), data.metrics),
         **summarise_verdict(data),
     }

@@ -283,13 +283,19 @@ def start_state(stepper: Stepper, scene: Scene, potential: Potential, relaxing_s
 def _taken_apart(scene: Scene, state: State, frame: int) -> State:
     """The start with its garments apart; a warning says in which order they are worn where that was guessed."""
     state, found = scene.taken_apart(state, frame)
-    if found is not None and found.before:
+    if found is not None and (found.before or found.turned):
         assert scene.outfit is not None
+        names = scene.outfit.names
         order = ",".join(scene.outfit.names[garment] for garment in found.order)
         guessed = "" if scene.layers is not None else f" (as they mostly lie; layers=[{order}] or another order settles it)"
+        turned = "".join(
+            f"; {names[over]!r} lay under {names[under]!r} and was taken over it, with edges stretched by up to "
+            f"{found.stretch:.0%}, as layers=… asks"
+            for over, under in found.turned
+        )
         warnings.warn(
             f"outfit: {found.before} pairs of triangles passed through each other at the start and were taken apart; from the "
-            f"body outwards: {order.replace(',', ', ')}{guessed}",
+            f"body outwards: {order.replace(',', ', ')}{guessed}{turned}",
             stacklevel=3,
         )
     return state

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from hood.assets.suspicions import Suspicion, suspect_place
+from hood.assets.suspicions import Suspicion, suspect_place, suspect_sides
 from hood.scene.contact import find_contact
 from hood.scene.motion import BodyMotion
 from hood.scene.scene import Scene
@@ -59,6 +60,45 @@ def misplacement(scene: Scene, frame: int = 0) -> Suspicion | None:
     return next((one for one in found if one.grave or isinstance(scene.motion, BodyMotion)), None)
 
 
+def doubts(scene: Scene, frame: int = 0) -> list[tuple[str, Suspicion]]:
+    """What is strange about garments that are worn, by the name of each, where ``frame`` puts them, not yet settled: one that
+    is inside out, held vertices inside the body. A rollout goes on with it."""
+    origin, garment = scene.motion.translation[frame], scene.garment
+    surface = scene.motion.surface(frame, origin).double().cpu().numpy()
+    if not len(surface):
+        return []
+    pos, outfit = scene.motion.skinned(garment, frame, origin), scene.outfit
+    piece = np.zeros(len(pos), dtype=np.int64) if outfit is None else outfit.piece
+    places = pos.double().cpu().numpy()
+    inside = _held_inside(scene, pos, frame)
+    found: list[tuple[str, Suspicion]] = []
+    for number, name in enumerate((garment.name,) if outfit is None else outfit.names):
+        faces = garment.faces[piece[garment.faces[:, 0]] == number]
+        found += [(name, one) for one in suspect_sides(places, faces, surface, scene.motion.faces)]
+        deep = np.where(piece == number, inside, 0.0)
+        if (deep > _INSIDE).any():
+            held = int((garment.pinned & (piece == number)).sum())
+            what = (
+                f"has {int((deep > _INSIDE).sum())} of its {held} held vertices inside the body in frame {frame}, to "
+                f"{1e3 * deep.max():.1f} mm (vertex {int(deep.argmax())}), where they stay and hold the cloth under the skin"
+            )
+            fix = "hold others (pins=…), none (pins=none), or prepare the garment for this body"
+            found.append((name, Suspicion(what, fix, False)))
+    return found
+
+
+def _held_inside(scene: Scene, pos: Tensor, frame: int) -> np.ndarray:
+    """Depth [m] (V,) of held vertices inside the body, 0 of others."""
+    held = scene.cloth.pinned
+    obstacle = scene.motion.obstacle(frame, scene.motion.translation[frame], static=True)
+    if obstacle is None or not bool(held.any()):
+        return np.zeros(len(pos))
+    dist = find_contact(pos, scene.cloth.vertex_scene, obstacle).dist
+    return torch.where(held & torch.isfinite(dist), -dist, 0.0).double().clamp_min(0.0).cpu().numpy()
+
+
+#: Held vertices deeper than this [m] inside the body are told; cloth is kept as far off it.
+_INSIDE = 2e-3
 #: torch.quantile refuses longer inputs.
 _QUANTILE_LIMIT = 1 << 24
 

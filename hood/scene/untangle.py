@@ -38,6 +38,8 @@ _SMOOTHED = 40
 _NEAR = 0.04
 #: Share of the vertices that may lie on the other side of a garment that is held, which is still taken for the inner one.
 _HELD = 0.2
+#: Garments lie against an order where more than this share of the vertices that are near the other one does.
+_WRONG = 0.75
 #: Orders of the layers that are tried where the likeliest does not come out well.
 _TRIED = 3
 #: What the inner layer takes of a push: half, which opens narrow places, or nothing, which opens folds of an outer layer.
@@ -57,6 +59,7 @@ class Separation:
     before: int  # pairs of triangles of two garments that passed through each other
     after: int
     stretch: float  # largest relative lengthening of an edge
+    turned: tuple[tuple[int, int], ...] = ()  # garments over others, which lay under them against the order that was given
 
 
 class Outfit(NamedTuple):
@@ -110,19 +113,21 @@ def separate(
     has no side.
 
     Args:
-        order: garments from the body outwards; None: the likeliest of :func:`likely_orders` that comes out well.
+        order: garments from the body outwards, also of those that lie the other way without touching; None: the likeliest of
+            :func:`likely_orders` that comes out well.
 
     Raises:
-        TangledError: triangles of two garments still cross.
+        TangledError: triangles of two garments still cross, or a garment is not over another one that ``order`` has it over.
     """
     before = len(crossing_pairs(outfit, pos))
-    if before == 0:
+    turned = () if order is None else _against(outfit, pos, obstacle, tuple(order))
+    if before == 0 and not turned:
         chosen = tuple(order) if order is not None else likely_orders(outfit, pos, obstacle)[0]
         return Separation(pos, chosen, 0, 0, _longest(outfit, pos))
     orders = [tuple(order)] if order is not None else likely_orders(outfit, pos, obstacle)[:_TRIED]
     best: Separation | None = None
     for tried, inner_share in product(orders, _SHARES):
-        now = _take_apart(outfit, pos, obstacle, clearance, tried, inner_share, before)
+        now = _take_apart(outfit, pos, obstacle, clearance, tried, inner_share, before, turned)
         if best is None or (now.after, now.stretch) < (best.after, best.stretch):
             best = now
         # Settling relaxes what is stretched; a less likely order is worn for the whole rollout.
@@ -131,8 +136,20 @@ def separate(
             break
     assert best is not None
     if best.after:
-        raise TangledError(_refusal(outfit, best))
+        raise TangledError(_refusal(outfit, best, obstacle))
     return best
+
+
+def _against(outfit: Outfit, pos: Tensor, obstacle: Obstacle | None, order: tuple[int, ...]) -> tuple[tuple[int, int], ...]:
+    """Pairs (over, under) of an order whose vertices, where they are near each other, lie the other way round."""
+    sheets, found = _sheets(outfit, pos, obstacle), []
+    for under, over in combinations(order, 2):
+        right = sheets[under].match(pos, sheets[over].vertices).over
+        other = -sheets[over].match(pos, sheets[under].vertices).over
+        height = torch.cat([right, other])
+        if int((height < 0).sum()) > _WRONG * len(height):
+            found.append((over, under))
+    return tuple(found)
 
 
 def likely_orders(outfit: Outfit, pos: Tensor, obstacle: Obstacle | None) -> list[tuple[int, ...]]:
@@ -218,12 +235,13 @@ def _take_apart(
     order: tuple[int, ...],
     inner_share: float,
     before: int,
+    turned: tuple[tuple[int, int], ...],
 ) -> Separation:
-    """The garments apart in one order; the best of the rounds."""
+    """The garments apart in one order; the best of the rounds. What is not yet as the order has it counts as one crossing."""
     cloth, sheets = outfit.cloth, _sheets(outfit, pos, obstacle)
     rest_length = (cloth.rest_pos[cloth.edges[:, 1]] - cloth.rest_pos[cloth.edges[:, 0]]).norm(dim=1)
     gap, weight = torch.full_like(pos[:, 0], _GAP), torch.ones_like(rest_length)
-    best, found, clean = Separation(pos, order, before, before, _longest(outfit, pos)), 0, 0
+    best, found, clean = Separation(pos, order, before, before + len(turned), _longest(outfit, pos), turned), 0, 0
     for number in range(_ROUNDS):
         for _ in range(_STEPS):
             pos = descend(cloth, pos, weight, rest_length) if number else pos
@@ -234,7 +252,8 @@ def _take_apart(
                 pos = _apart(cloth, pos, sheets[inner].vertices, sheets[outer], gap, -1.0, inner_share)
         ended = push_out(cloth, pos, obstacle, clearance)
         pairs = crossing_pairs(outfit, ended)
-        now = Separation(ended, order, before, len(pairs), _longest(outfit, ended))
+        left = len(pairs) + (len(_against(outfit, ended, obstacle, order)) if turned else 0)
+        now = Separation(ended, order, before, left, _longest(outfit, ended), turned)
         if (now.after, now.stretch) < (best.after, best.stretch):
             best, found = now, number
         clean += now.after == 0
@@ -272,12 +291,18 @@ def _longest(outfit: Outfit, pos: Tensor) -> float:
     return float(free_stretch(outfit.cloth, pos).max()) if len(outfit.cloth.edges) else 0.0
 
 
-def _refusal(outfit: Outfit, best: Separation) -> str:
+def _refusal(outfit: Outfit, best: Separation, obstacle: Obstacle | None) -> str:
     garments = outfit.piece[outfit.faces[:, 0]][crossing_pairs(outfit, best.pos)]
+    if not len(garments):
+        over, under = (outfit.names[garment] for garment in _against(outfit, best.pos, obstacle, best.order)[0])
+        return (
+            f"outfit: {over!r} lies under {under!r} at the start, not over it as the layers have it, and could not be brought "
+            "there; give them from the body outwards as they lie, or layers=auto"
+        )
     named = sorted({tuple(sorted((outfit.names[a], outfit.names[b]))) for a, b in garments.tolist()})
     through = ", ".join(f"{a!r} and {b!r}" for a, b in named)
     return (
-        f"outfit: {best.after} pairs of triangles of {through} pass through each other at the start and could not be taken "
+        f"outfit: {len(garments)} pairs of triangles of {through} pass through each other at the start and could not be taken "
         "apart; give the layers from the body outwards (layers=[inner,outer]), free their pins (pins=none), start from another "
         "frame or a standing pose (start=…, blend_in=3), or simulate without contact between layers (cloth_contact=off)"
     )

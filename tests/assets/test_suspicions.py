@@ -10,8 +10,8 @@ from hood.assets.body import Body
 from hood.assets.garment import Garment
 from hood.assets.openings import find_openings
 from hood.assets.sequence import load_sequence
-from hood.assets.suspicions import suspect_kind, suspect_place, suspect_seams
-from hood.scene.fitting import misplacement
+from hood.assets.suspicions import suspect_kind, suspect_place, suspect_seams, suspect_sides
+from hood.scene.fitting import doubts, misplacement
 from hood.scene.scene import build_scene
 from hood.testing import grid
 
@@ -26,7 +26,25 @@ def test_nothing_is_said_of_the_default_garments(garments: dict[str, Garment], b
     assert suspect_seams(garment.rest_pos, garment.faces) == []
     assert suspect_kind(garment.rest_pos, garment.faces, body.v_template) == []
     for motion in ("walk_proud", "stand_sway"):
-        assert misplacement(build_scene(garment, body, load_sequence(motion).window(0, 2))) is None
+        scene = build_scene(garment, body, load_sequence(motion).window(0, 2))
+        assert misplacement(scene) is None
+        assert doubts(scene) == []
+
+
+@pytest.mark.parametrize("name", OPENINGS)
+def test_default_garments_turned_over_are_inside_out(garments: dict[str, Garment], body: Body, name: str) -> None:
+    garment = garments[name]
+    (found,) = suspect_sides(garment.rest_pos, garment.faces[:, ::-1], body.v_template, body.faces)
+    assert "is inside out" in found.what
+    assert not found.grave
+
+
+def test_a_sheet_and_a_garment_with_two_sides_have_no_inside(garments: dict[str, Garment], body: Body) -> None:
+    pos, faces = grid(9, 9, 0.5)
+    assert suspect_sides(pos + [-0.25, 1.0, -0.25], faces[:, ::-1], body.v_template, body.faces) == []
+    shirt = garments["tshirt"]
+    both = np.concatenate([shirt.faces, shirt.faces[:, ::-1] + len(shirt.rest_pos)])
+    assert suspect_sides(np.tile(shirt.rest_pos, (2, 1)), both, body.v_template, body.faces) == []
 
 
 def test_the_unit_and_the_place_of_a_body_do_not_hide_it(body: Body) -> None:

@@ -65,6 +65,35 @@ def test_what_cannot_be_had_is_refused(more: list[str], sentence: str, capsys: p
     assert sentence in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("more", "reason", "said"),
+    [
+        (["step=fixed"], "step=fixed has fixed shapes", "cloth_contact=auto: off; step=fixed has fixed shapes"),
+        (["stepper=refine", "refine=1", "refine_method=sweeps"], "use refine_method=newton", "refine_method=sweeps moves"),
+        (["losses=reference"], "cloth_contact=on adds it", "are those of published code"),
+        (["stepper=network", "refine=0", "checkpoint=untrained", "model=small"], "add refine=5", ""),
+    ],
+)
+def test_auto_that_cannot_act_says_why(more: list[str], reason: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    write_belt(Path("belt.obj"))
+    found, _ = _run("garment=belt.obj", "metrics=strain", *more)
+    assert found["cloth_contact"]["used"] == "off"
+    assert reason in found["cloth_contact"]["reason"]
+    out = capsys.readouterr().out
+    assert said in out
+    assert ("cloth_contact" in out) == bool(said)  # a network alone is not expected to
+
+
+def test_garments_that_nothing_keeps_apart_are_warned_about(capsys: pytest.CaptureFixture[str]) -> None:
+    write_belt(Path("belt.obj"))
+    write_belt(Path("band.obj"))
+    found, _ = _run("garment=[belt.obj,band.obj]", "checkpoint=untrained", "model=small", "stepper=network", "refine=0")
+    said = capsys.readouterr()
+    assert "nothing keeps the 2 garments apart, at the start neither: a network alone does not" in said.err
+    assert any("nothing keeps the 2 garments apart" in sentence for sentence in found["warnings"])
+    assert "cloth against cloth: off; a network alone does not keep layers of cloth apart; add refine=5" in said.out
+
+
 def test_sentences_name_crossed_starts_and_forced_pins() -> None:
     columns = {name: np.zeros(5) for name in LAYER_METRICS}
     columns["layer_contacts"][2:] = 7

@@ -102,6 +102,21 @@ def test_garments_apart_stay_as_they_are():
     assert found.pos is pos
 
 
+@pytest.mark.parametrize("outer", [0.206, 0.23])
+def test_a_garment_wholly_under_another_is_taken_over_it(outer):
+    outfit, pos = tubes(0.2, outer)
+    found = separate(outfit, pos, trunk(0.19), CLEARANCE, (1, 0))
+    assert (found.before, found.after, found.turned) == (0, 0, ((0, 1),))
+    assert heights(outfit, found.pos, 0, 1) > 2e-3
+    assert len(crossing_pairs(outfit, found.pos)) == 0
+
+
+def test_held_garments_that_lie_the_other_way_are_refused_by_name():
+    outfit, pos = tubes(0.2, 0.206, pinned=(0, 1))
+    with pytest.raises(TangledError, match=r"'a' lies under 'b' at the start, not over it .*layers=auto"):
+        separate(outfit, pos, trunk(0.19), CLEARANCE, (1, 0))
+
+
 def test_without_a_body_the_winding_says_what_is_outside():
     outfit, pos = tubes(0.2, 0.203, wave=4e-3)
     found = separate(outfit, pos, None, CLEARANCE)
