@@ -21,6 +21,7 @@ from hood.commands.common import output_folder, prepare_folder, require_device, 
 from hood.config import ConfigError, build, load_config, plain, require_choice, save_run_record
 from hood.dynamics.simulator import Simulator
 from hood.evaluation.validation import Validation
+from hood.losses.layers import for_networks
 from hood.losses.potential import Potential
 from hood.scene.dataset import SceneSampler
 from hood.training import distributed
@@ -125,7 +126,7 @@ def _make_watch(config: DictConfig, sampler: SceneSampler, potential: Potential,
         sampler.body,
         sampler.garments,
         motions,
-        potential,
+        for_networks(potential),
         num_frames=int(config.data.validation_frames),
         states=int(config.validation_states),
         device=str(config.device),

@@ -29,7 +29,7 @@ from hood.dynamics.stopwatch import Stopwatch
 from hood.dynamics.surface import SURFACE_METRICS, SURFACE_STRIDE, SurfaceMeter
 from hood.graph.given import given_hierarchy
 from hood.losses.elements import energies_and_gradient, total_energy
-from hood.losses.layers import has_layers, without_layers
+from hood.losses.layers import for_networks, has_layers
 from hood.losses.potential import Potential, relative_gradient, scale
 from hood.losses.problem import StepProblem, inertial_guess
 from hood.scene.contact import Contact, find_contact
@@ -144,7 +144,7 @@ def simulate(
     count = scene.num_frames - start_frame if num_frames is None else min(num_frames, scene.num_frames - start_frame)
     network = network_of(stepper)
     if network is not None:
-        network.use_potential(without_layers(potential))  # networks know none
+        network.use_potential(for_networks(potential))
     prepared = prepare_stepper(stepper, scene)
     rest = None
     if settle == "equilibrium" and own_start(stepper, scene, start_frame) is None:

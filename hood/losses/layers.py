@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from hood.losses.layer_sides import LayerSides
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
 from hood.scene.layers import SceneLayers
@@ -83,3 +84,10 @@ def without_layers(potential: Potential) -> Potential:
     if not has_layers(potential):
         return potential
     return potential.only({name: term for name, term in potential.terms.items() if type(term) is not LayerBarrier})
+
+
+def for_networks(potential: Potential) -> Potential:
+    """What a network is shown of the potential, and known to have been trained with: no feature tells of layers of cloth."""
+    return potential.only(
+        {name: term for name, term in potential.terms.items() if type(term) not in (LayerBarrier, LayerSides)}
+    )

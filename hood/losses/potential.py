@@ -56,11 +56,11 @@ class Potential:
     3.3).
 
     ``next_pos`` and ``acc`` are two views of the same unknown, next_pos = x_t + dt v_t + dt² acc; terms use
-    the one that is exact for them.
+    the one that is exact for them. A term that is None is left out: a config's way to have none.
     """
 
-    def __init__(self, terms: Mapping[str, Term]) -> None:
-        self.terms = dict(terms)
+    def __init__(self, terms: Mapping[str, Term | None]) -> None:
+        self.terms: dict[str, Term] = {name: term for name, term in terms.items() if term is not None}
 
     def with_terms(self, **terms: Term) -> Potential:
         """The same potential with some terms replaced or added."""

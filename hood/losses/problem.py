@@ -10,6 +10,7 @@ from torch import Tensor
 from hood.scene.cloth import Cloth
 from hood.scene.contact import Contact, find_contact
 from hood.scene.contact_points import PointContact, find_point_contact
+from hood.scene.layer_sides import LayerPairs, find_sides
 from hood.scene.layers import SceneLayers, find_layers
 from hood.scene.state import State, StepInput
 
@@ -26,7 +27,8 @@ class StepProblem:
     """One implicit step t → t+1 of B scenes; everything in it is constant while the next positions vary.
 
     ``contact`` is None without a body, and until somebody who needs it asks for :meth:`with_contact`; ``point_contacts`` holds
-    what terms asked for by :meth:`with_points`, ``layers`` the cloth near cloth where :meth:`with_layers` was asked for.
+    what terms asked for by :meth:`with_points`, ``layers`` the cloth near cloth where :meth:`with_layers` was asked for,
+    ``sides`` its sides where :meth:`with_sides` was.
     ``pull`` are the forces at x_t of everything but inertia, weight and the body, by which the cloth around a vertex presses it
     onto the skin; None where nobody has asked :meth:`hood.losses.potential.Potential.with_pull`.
     """
@@ -39,6 +41,7 @@ class StepProblem:
     point_contacts: tuple[PointContact, ...] = ()
     pull: Tensor | None = None  # (V, 3) N
     layers: tuple[SceneLayers, ...] = ()  # one per scene, or none
+    sides: LayerPairs | None = None
 
     def __post_init__(self) -> None:
         if len(self.step.dt) != self.cloth.num_scenes:
@@ -72,6 +75,13 @@ class StepProblem:
         if self.layers:
             return self
         return replace(self, layers=find_layers(self.cloth, self.state.pos, reach, pressure, between))
+
+    def with_sides(self, reach: float) -> StepProblem:
+        """The problem with the sides of cloth near cloth, see :func:`hood.scene.layer_sides.find_sides`; itself where that has
+        been done."""
+        if self.sides is not None:
+            return self
+        return replace(self, sides=find_sides(self.cloth, self.state.pos, reach))
 
     def points_at(self, place: str) -> PointContact | None:
         """Contact at the points of a place; None at ``vertices`` and without a body.

@@ -74,10 +74,8 @@ class LayerMesh:
         length = np.linalg.norm(rest[edges[:, 1]] - rest[edges[:, 0]], axis=1)
         normal = np.cross(rest[faces[:, 1]] - rest[faces[:, 0]], rest[faces[:, 2]] - rest[faces[:, 0]])
         area = 0.5 * np.linalg.norm(normal, axis=1)
-        height = 2.0 * area / length[sides].max(axis=1, initial=0.0)
         thirds = np.repeat(area / 3.0, 3)
-        self.room = np.full(len(rest), np.inf)  # half of the smallest height around
-        np.minimum.at(self.room, faces.reshape(-1), np.repeat(0.5 * height, 3))
+        self.room = vertex_room(rest, faces)
         self._arrays = {  # in the order of the structure
             "faces": np.ascontiguousarray(faces, np.int32),
             "edges": np.ascontiguousarray(edges, np.int32),
@@ -93,6 +91,16 @@ class LayerMesh:
         self.num_vertices = len(rest)
         counts = len(rest), len(faces), len(edges)
         self.structure = _Mesh(*counts, *(self._arrays[name].ctypes.data for name in self._arrays))
+
+
+def vertex_room(rest: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Half of the smallest height [m] (V,) of the faces (F, 3) around every vertex of ``rest`` (V, 3); infinite without any."""
+    corners = rest[faces]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1, initial=0.0)
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    room = np.full(len(rest), np.inf)
+    np.minimum.at(room, faces.reshape(-1), np.repeat(area / longest, 3))
+    return room
 
 
 def _answered(corners: np.ndarray, count: int) -> np.ndarray:

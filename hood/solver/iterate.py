@@ -174,6 +174,7 @@ def _in_precision(problem: StepProblem, cloth: Cloth) -> StepProblem:
         tuple(to_device(points, dtype=real) for points in problem.point_contacts),
         None if problem.pull is None else problem.pull.to(real),
         problem.layers,
+        None if problem.sides is None else to_device(problem.sides, dtype=real),
     )
 
 

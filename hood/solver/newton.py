@@ -12,6 +12,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from hood.losses.layer_sides import LayerSides
 from hood.losses.layers import without_layers
 from hood.losses.potential import Potential, relative_gradient
 from hood.losses.problem import StepProblem
@@ -212,7 +213,17 @@ class TorchSystem:
 
 
 def _system(potential: Potential, problem: StepProblem, plan: SolverPlan, settings: NewtonSettings) -> System:
-    """The fastest form of the solver that does what ``settings`` ask for."""
+    """The fastest form of the solver that does what ``settings`` ask for.
+
+    Raises:
+        ValueError: a term is for training alone.
+    """
+    for name, term in potential.terms.items():
+        if type(term) is LayerSides:
+            raise ValueError(
+                f"losses.terms.{name} is for training: where it sets in the solver does not converge; layers of cloth are kept "
+                "apart by cloth_contact=on"
+            )
     if settings.engine != "torch" and settings.double and settings.linear == "cg" and engine.applies(potential, problem):
         try:
             return engine.EngineSystem(potential, problem, plan, settings.cg_iterations)

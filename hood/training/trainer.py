@@ -19,6 +19,7 @@ from hood.dynamics.output import AccelerationOutput
 from hood.dynamics.ranges import training_conditions
 from hood.dynamics.simulator import Simulator
 from hood.features.normalizer import RunningNormalizer
+from hood.losses.layers import for_networks
 from hood.losses.potential import Potential, relative_gradient, scale
 from hood.losses.problem import StepProblem
 from hood.nn.choice import AUTO, Choice, choose_kernels
@@ -63,8 +64,9 @@ class Trainer:
         watch: Watch | None = None,
     ) -> None:
         settings = settings.compressed()
-        simulator.use_potential(potential)
-        simulator.trained_for = training_conditions(sampler, settings.collision.apply(potential, settings.iterations))
+        shown = for_networks(potential)
+        simulator.use_potential(shown)
+        simulator.trained_for = training_conditions(sampler, settings.collision.apply(shown, settings.iterations))
         self.simulator, self.potential, self.settings = simulator, potential, settings
         self.folder, self.seed, self.watch = folder, seed, watch
         simulator.network.use_precision(settings.precision)
@@ -150,7 +152,7 @@ class Trainer:
         horizon = settings.horizon(self.iteration)
         cloth, prepared, state, step = self.slots.batch(horizon)
         potential = settings.collision.apply(self.potential, self.iteration)
-        simulator.use_potential(potential)
+        simulator.use_potential(for_networks(potential))
         problem = potential.prepare(StepProblem(cloth, state, step, gravity=simulator.gravity))
         collecting = self.iteration < settings.statistics_iterations and simulator.uses_statistics
         if collecting and isinstance(simulator.output, AccelerationOutput):

@@ -13,13 +13,14 @@ from torch import Tensor
 
 from hood.assets.body import Body
 from hood.assets.garment import Garment
-from hood.assets.sequence import PoseSequence
+from hood.assets.sequence import PoseSequence, load_sequence
 from hood.dynamics.checkpoint import load_simulator
 from hood.dynamics.output import AccelerationOutput
 from hood.dynamics.passes import Feedback
 from hood.dynamics.ranges import training_conditions
 from hood.dynamics.simulator import Simulator, build_simulator
 from hood.features.inputs import Inputs
+from hood.losses.layer_sides import LayerSides
 from hood.losses.potential import Potential, default_potential
 from hood.nn.choice import Choice
 from hood.scene.dataset import SceneSampler, Window
@@ -75,6 +76,22 @@ def test_the_signal_goes_down_on_a_fixed_scene(
     assert (np.diff(totals) < 1e-6).all()
     assert totals[-1] < totals[0] - 1e-3
     assert all(p.dtype == torch.float32 for p in trainer.averaged().parameters())
+
+
+def test_a_network_learns_to_leave_layers_on_their_sides(tmp_path: Path, body: Body, garments: dict[str, Garment]) -> None:
+    constant = {"schedule": WarmupCosine(1, floor=1.0), "horizon": Horizon(every=100, maximum=1)}
+    scenes = OneScene(body, [garments["longsleeve"]], [load_sequence("dance_mixed", 30.0).window(30, 90)])
+    felt = {}
+    for weight in (1e-3, 5e6):
+        potential = default_potential().with_terms(layer_sides=LayerSides(weight, epsilon=5e-3))
+        settings = replace(SETTINGS, batch_size=1, learning_rate=1e-2, **constant)
+        trainer = make(tmp_path / str(weight), scenes, PHYSICAL | {"output_init": 1.0}, settings, potential=potential)
+        assert "layer_sides" not in trainer.simulator.potential.terms
+        assert trainer.simulator.trained_for is not None
+        assert "layer_sides" not in trainer.simulator.trained_for.potential
+        felt[weight] = [trainer.update()["layer_sides"] / weight for _ in range(12)][1::2]  # every other step is a relaxing one
+    assert felt[5e6][-1] < 0.7 * felt[5e6][0]
+    assert felt[5e6][-1] < 0.7 * felt[1e-3][-1]
 
 
 def test_features_look_at_the_potential_that_is_trained(
