@@ -53,7 +53,7 @@ class FixedStep:
             :func:`hood.dynamics.fixed_problem.settled_potential`; needed where ``simulator.looks_at_potential``.
 
     Raises:
-        ValueError: the simulator counts statistics.
+        ValueError: the simulator counts statistics, or its graph has edges between layers of cloth.
     """
 
     def __init__(
@@ -120,3 +120,8 @@ def check_model(simulator: Simulator) -> None:
     """Raise ValueError if the simulator's step has no form of fixed shapes."""
     if simulator.training:
         raise ValueError("fixed-shape steps are for inference: call simulator.eval() first")
+    if simulator.layer_radius is not None:
+        raise ValueError(
+            f"the model has edges between layers of cloth (model.layer_radius={simulator.layer_radius:g}), as many as a step "
+            "finds: use step=plain"
+        )

@@ -28,6 +28,7 @@ from hood.nn.model import MeshGraphNet
 from hood.nn.schedule import edge_set_names, parse_passes, parse_schedule, set_level
 from hood.scene.cloth import Cloth
 from hood.scene.contact import find_nearest
+from hood.scene.near_cloth import find_near_cloth
 from hood.scene.state import State, StepInput
 from hood.solver.local import check_local
 
@@ -78,10 +79,11 @@ class Simulator(nn.Module):
         config: dict[str, Any],
         rules: FrameRules | None = None,
         embedded_levels: int = 1,
+        layer_radius: float | None = None,
     ) -> None:
         super().__init__()
         self.features, self.network, self.output = features, network, output
-        self.body_radius = body_radius
+        self.body_radius, self.layer_radius = body_radius, layer_radius
         self.rules = rules or FrameRules()
         self._embedded_levels = embedded_levels
         self.config = config
@@ -179,6 +181,10 @@ class Simulator(nn.Module):
             return seen.contact.nearest
         return find_nearest(seen.cloth, seen.state.pos, obstacle, self.body_radius)
 
+    def near_cloth(self, seen: StepProblem) -> Tensor | None:
+        """Cloth near cloth (E, 2) at the positions that the network sees; None for models that know no such edges."""
+        return None if self.layer_radius is None else find_near_cloth(seen.cloth, seen.state.pos, self.layer_radius)
+
     def predict(self, problem: StepProblem, prepared: Prepared, watch: Stopwatch | None = None) -> Prediction:
         """Positions at t + 1. Pinned vertices reach their targets exactly, massless ones stay where they are.
 
@@ -192,9 +198,9 @@ class Simulator(nn.Module):
         with timed(watch, "search"):
             problem = self.search(problem)
             seen = self.rules.enter(problem)
-            nearest = self.nearest(problem, seen)
+            nearest, layers = self.nearest(problem, seen), self.near_cloth(seen)
         with timed(watch, "features"):
-            graph = build_graph(prepared.static, seen.step, nearest, self.body_radius)
+            graph = build_graph(prepared.static, seen.step, nearest, self.body_radius, layers=layers)
             sight = self.look(problem, seen, graph)
             features = self.features(sight.inputs, compiled.COLUMNS if compiled.applies(sight.inputs) else None)
         with timed(watch, "network"):
@@ -311,6 +317,7 @@ def build_simulator(
     pins_ahead: bool = False,
     velocity: str = "displacement",
     late_scale: float = 1e-3,
+    layer_radius: float | None = None,
 ) -> Simulator:
     """A simulator from plain arguments.
 
@@ -337,9 +344,11 @@ def build_simulator(
         divisor_floor: least divisor of the statistics, see :class:`hood.features.normalizer.RunningNormalizer`.
         frame_dt, pins_ahead, velocity: see :class:`hood.dynamics.frames.FrameRules`.
         late_scale: as ``output_scale``, in the later passes of ``local_steps``.
+        layer_radius: reach [m] of edges between layers of cloth, which have networks of their own
+            (:func:`hood.scene.near_cloth.find_near_cloth`); None: the model has none.
     """
     config = {name: value for name, value in locals().items() if name not in _CONVENTIONS or value != _CONVENTIONS[name]}
-    for name in ("latent_dim", "body_radius", "output_scale", "late_scale"):
+    for name in ("latent_dim", "body_radius", "output_scale", "late_scale", "layer_radius"):
         if name in config and not config[name] > 0:
             raise ValueError(f"model.{name} is {config[name]!r}; it must be > 0")
     for name, value, known in (("features", features, ("paper", "physical", "local")), ("output", output, tuple(OUTPUTS))):
@@ -357,9 +366,10 @@ def build_simulator(
     rules = FrameRules(frame_dt, pins_ahead, velocity)
     num_levels = 1 + num_coarse_levels(parse_schedule(schedule)) if embedded_levels is None else embedded_levels
     if features == "paper":
-        feature_set = groups.paper(num_levels, body_velocity, normalizer_decay, divisor_floor)
+        feature_set = groups.paper(num_levels, body_velocity, normalizer_decay, divisor_floor, layer_radius is not None)
     else:
-        feature_set = local.local(num_levels) if features == "local" else physical.physical(num_levels)
+        kind = local.local if features == "local" else physical.physical
+        feature_set = kind(num_levels, layers=layer_radius is not None)
     head: Output
     if output == "acceleration":
         head = AccelerationOutput(normalizer_decay, divisor_floor)
@@ -371,7 +381,7 @@ def build_simulator(
     network = MeshGraphNet(
         *widths, latent_dim, schedule, head.width, aggregation, output_init, coarse_encoders, local.LOOK_WIDTHS
     )
-    return Simulator(feature_set, network, head, body_radius, config, rules, num_levels)
+    return Simulator(feature_set, network, head, body_radius, config, rules, num_levels, layer_radius)
 
 
 #: Arguments of :func:`build_simulator` that are written down only where they differ from its defaults: files of models that
@@ -389,6 +399,7 @@ _CONVENTIONS: dict[str, Any] = {
         "pins_ahead",
         "velocity",
         "late_scale",
+        "layer_radius",
     )
 }
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from hood.assets.material import Material
 from hood.dynamics.simulator import Simulator
-from hood.graph.builder import BODY, Graph, build_graph, build_static
+from hood.graph.builder import LAYERS, Graph, build_graph, build_static
 from hood.graph.hierarchy import build_hierarchy
 from hood.nn.model import MeshGraphNet
 from hood.scene.cloth import Cloth, build_cloth
@@ -39,7 +39,8 @@ def measured_radius(simulator: Simulator, seed: int = 0) -> int:
     edges = cloth.edges.numpy()
     hierarchy = build_hierarchy(cloth.num_vertices, edges, cloth.rest_pos.numpy(), simulator.num_coarse)
     static = build_static(cloth, hierarchy, network.edge_set_names)
-    graph = build_graph(static, StepInput(dt=torch.full((1,), 1.0 / 30.0, dtype=torch.float64)))
+    apart = static.mesh_edges[:0] if LAYERS in network.world_sets else None
+    graph = build_graph(static, StepInput(dt=torch.full((1,), 1.0 / 30.0, dtype=torch.float64)), layers=apart)
     hops = _hops(cloth.num_vertices, edges)
     generator = torch.Generator().manual_seed(seed)
     targets = _targets(hierarchy.node_level)
@@ -97,6 +98,6 @@ def _random_features(network: MeshGraphNet, graph: Graph, generator: torch.Gener
         return torch.randn(rows, width, generator=generator, dtype=torch.float64)
 
     features = {"nodes": draw(graph.num_nodes, network.node_encoder)}
-    for name in (*network.edge_set_names, BODY):
+    for name in (*network.edge_set_names, *network.world_sets):
         features[name] = draw(graph.edge_sets[name].num_edges, network.edge_encoder(name))
     return features

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from hood.assets.material import RANGES
 from hood.features.inputs import Inputs
 from hood.features.normalizer import RunningNormalizer
-from hood.graph.builder import BODY
+from hood.graph.builder import BODY, LAYERS
 
 # Types of the reference implementation. Omitted body vertices (2) never carry an edge and so never become nodes.
 CLOTH_TYPE, BODY_TYPE, PINNED_TYPE = 0, 1, 3
@@ -47,7 +47,8 @@ class NodeGroup(nn.Module):
 
 
 class EdgeGroup(nn.Module):
-    """Columns of the cloth edge features (rows: ``inputs.edges``) or the body edge features (``inputs.body_edges``)."""
+    """Columns of the features of cloth edges (rows: ``inputs.edges``), of body edges (``inputs.body_edges``) or of those
+    between layers of cloth (``inputs.layer_edges``)."""
 
     width: int
     normalized = True
@@ -258,6 +259,33 @@ class BodyTimestep(EdgeGroup):
         return inputs.edge_timestep(inputs.body_edges.receivers)
 
 
+class LayerRelative(EdgeGroup):
+    """Relative position and norm [m] between layers of cloth at t, or where they go on to with ``moved``: at x + dt v."""
+
+    width = 4
+
+    def __init__(self, moved: bool = False) -> None:
+        super().__init__()
+        self.moved = moved
+
+    def forward(self, inputs: Inputs) -> Tensor:
+        pos = inputs.state.pos
+        return with_norm(layer_difference(pos + inputs.vertex_dt * inputs.state.vel if self.moved else pos, inputs))
+
+
+class LayerTimestep(EdgeGroup):
+    """Timestep feature [s]."""
+
+    width = 1
+
+    def forward(self, inputs: Inputs) -> Tensor:
+        return inputs.edge_timestep(inputs.layer_edges.receivers)
+
+
+def layer_difference(pos: Tensor, inputs: Inputs) -> Tensor:
+    return pos.index_select(0, inputs.layer_edges.senders).sub_(pos.index_select(0, inputs.layer_edges.receivers))
+
+
 def cloth_difference(pos: Tensor, inputs: Inputs) -> Tensor:
     return pos.index_select(0, inputs.edges.senders).sub_(pos.index_select(0, inputs.edges.receivers))
 
@@ -275,10 +303,11 @@ def with_norm(vector: Tensor) -> Tensor:
 
 
 class FeatureSet(nn.Module):
-    """Node, cloth edge and body edge features of a step, normalised.
+    """Node, cloth edge and body edge features of a step, normalised, and those of edges between layers of cloth where there
+    are groups for them.
 
-    One normaliser for nodes, one shared by mesh and coarse edges, one for body edges, each over the groups that ask
-    for it; ``decay`` None normalises nothing (groups that bring their own scales).
+    One normaliser for nodes, one shared by mesh and coarse edges, one for body edges, one for those between layers, each over
+    the groups that ask for it; ``decay`` None normalises nothing (groups that bring their own scales).
     """
 
     def __init__(
@@ -288,12 +317,15 @@ class FeatureSet(nn.Module):
         body_edge: Sequence[EdgeGroup],
         decay: float | None = 0.999,
         divisor_floor: float | None = None,
+        layer_edge: Sequence[EdgeGroup] = (),
     ) -> None:
         super().__init__()
         self.node, self.edge, self.body_edge = nn.ModuleList(node), nn.ModuleList(edge), nn.ModuleList(body_edge)
+        self.layer_edge = nn.ModuleList(layer_edge)
         self.node_normalizer = _normalizer("node", node, decay, divisor_floor)
         self.edge_normalizer = _normalizer("edge", edge, decay, divisor_floor)
         self.body_edge_normalizer = _normalizer("body edge", body_edge, decay, divisor_floor)
+        self.layer_edge_normalizer = _normalizer("layer edge", layer_edge, decay, divisor_floor) if layer_edge else None
 
     @property
     def node_width(self) -> int:
@@ -302,7 +334,8 @@ class FeatureSet(nn.Module):
     @property
     def edge_widths(self) -> dict[str, int]:
         """Widths by edge set as the network takes them."""
-        return {"mesh": _width(self.edge), "coarse": _width(self.edge), BODY: _width(self.body_edge)}
+        widths = {"mesh": _width(self.edge), "coarse": _width(self.edge), BODY: _width(self.body_edge)}
+        return widths | {LAYERS: _width(self.layer_edge)} if len(self.layer_edge) else widths
 
     def forward(self, inputs: Inputs, columns: Columns | None = None) -> tuple[Tensor, dict[str, Tensor]]:
         """Node features (V + W_active, node_width) and edge features by set, rows as in the graph; the columns by torch if not
@@ -312,13 +345,11 @@ class FeatureSet(nn.Module):
         rows = _normalized(columns.edges(self, inputs), self.edge_normalizer)
         counts = [inputs.graph.edge_sets[name].num_edges for name in inputs.cloth_sets]
         edges = dict(zip(inputs.cloth_sets, rows.split(counts), strict=True))
-        if inputs.body_edges.num_edges:
-            edges[BODY] = _normalized(columns.body_edges(self, inputs), self.body_edge_normalizer)
-        else:
-            edges[BODY] = nodes.new_zeros(0, self.edge_widths[BODY])
-            if self.body_edge_normalizer is not None:
-                # No rows count as nothing, but processes that share a batch all have to be heard.
-                self.body_edge_normalizer(edges[BODY][:, : self.body_edge_normalizer.width])
+        found = columns.body_edges(self, inputs) if inputs.body_edges.num_edges else None
+        edges[BODY] = _changing(found, nodes, self.edge_widths[BODY], self.body_edge_normalizer)
+        if len(self.layer_edge):
+            found = _together(self.layer_edge, inputs) if inputs.layer_edges.num_edges else None
+            edges[LAYERS] = _changing(found, nodes, self.edge_widths[LAYERS], self.layer_edge_normalizer)
         return nodes, edges
 
 
@@ -345,6 +376,17 @@ def _normalized(values: Tensor, normalizer: RunningNormalizer | None) -> Tensor:
     return values if normalizer is None else normalizer.leading(values)
 
 
+def _changing(found: Tensor | None, like: Tensor, width: int, normalizer: RunningNormalizer | None) -> Tensor:
+    """Columns of edges that a step may have none of, normalised."""
+    if found is not None:
+        return _normalized(found, normalizer)
+    none = like.new_zeros(0, width)
+    if normalizer is not None:
+        # No rows count as nothing, but processes that share a batch all have to be heard.
+        normalizer(none[:, : normalizer.width])
+    return none
+
+
 def _width(groups: Iterable[Any]) -> int:
     return sum(int(group.width) for group in groups)
 
@@ -361,9 +403,14 @@ def _normalizer(
 
 
 def paper(
-    num_levels: int = 3, body_velocity: str = "previous", decay: float = 0.999, divisor_floor: float | None = None
+    num_levels: int = 3,
+    body_velocity: str = "previous",
+    decay: float = 0.999,
+    divisor_floor: float | None = None,
+    layers: bool = False,
 ) -> FeatureSet:
-    """The paper's features: node 24 (20 with ``num_levels`` 1, which has no level embedding), edge 12, body edge 9.
+    """The paper's features: node 24 (20 with ``num_levels`` 1, which has no level embedding), edge 12, body edge 9; with
+    ``layers`` edges between layers of cloth as well, 9.
 
     ``divisor_floor`` is that of :class:`hood.features.normalizer.RunningNormalizer`.
     """
@@ -374,4 +421,5 @@ def paper(
         body_edge=[BodyRelative("current"), BodyRelative("next"), BodyTimestep()],
         decay=decay,
         divisor_floor=divisor_floor,
+        layer_edge=[LayerRelative(), LayerRelative(moved=True), LayerTimestep()] if layers else [],
     )

@@ -10,7 +10,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from hood.graph.builder import BODY, MESH, EdgeSet, Graph
+from hood.graph.builder import BODY, LAYERS, MESH, EdgeSet, Graph
 from hood.graph.fixed import FixedGraph
 from hood.mesh import geometry
 from hood.mesh.proximity import build_incidence
@@ -148,9 +148,14 @@ class Inputs:
     def body_edges(self) -> EdgeSet:
         return self.graph.edge_sets[BODY]
 
+    @property
+    def layer_edges(self) -> EdgeSet:
+        return self.graph.edge_sets[LAYERS]
+
     @cached_property
     def cloth_sets(self) -> tuple[str, ...]:
-        return tuple(name for name in self.graph.edge_sets if name != BODY)
+        """The static ones."""
+        return tuple(name for name in self.graph.edge_sets if name not in (BODY, LAYERS))
 
     @cached_property
     def edges(self) -> EdgeRows:

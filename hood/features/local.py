@@ -88,9 +88,9 @@ def look(inputs: Inputs, sets: Sequence[str]) -> tuple[Tensor, dict[str, Tensor]
     return torch.cat(nodes, dim=1), {name: _strain(inputs, name) for name in sets}
 
 
-def local(num_levels: int = 3) -> FeatureSet:
+def local(num_levels: int = 3, layers: bool = False) -> FeatureSet:
     """The physical features with local steps and wide residuals."""
-    return physical(num_levels, [LocalStep(), WideResidual()])
+    return physical(num_levels, [LocalStep(), WideResidual()], layers)
 
 
 def _strain(inputs: Inputs, name: str) -> Tensor:

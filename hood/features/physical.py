@@ -16,6 +16,7 @@ from hood.features.groups import (
     Normal,
     body_difference,
     cloth_difference,
+    layer_difference,
     unit_fabric,
 )
 from hood.features.inputs import Inputs
@@ -204,6 +205,20 @@ class BaseBodyRelative(EdgeGroup):
         return self.scale(torch.cat([vector, length(vector)], dim=1))
 
 
+class BaseLayerRelative(EdgeGroup):
+    """Relative position and norm between layers of cloth at t and at the base guess, over ``scale`` [m]."""
+
+    width = 8
+
+    def __init__(self, scale: float = 0.01) -> None:
+        super().__init__()
+        self.scale = FixedScale(scale)
+
+    def forward(self, inputs: Inputs) -> Tensor:
+        vectors = [layer_difference(pos, inputs) for pos in (inputs.state.pos, inputs.base)]
+        return self.scale(torch.cat([part for vector in vectors for part in (vector, length(vector))], dim=1))
+
+
 def length(vector: Tensor) -> Tensor:
     """Norms (N, 1) of the rows of ``vector`` (N, 3)."""
     return vector.norm(dim=1, keepdim=True)
@@ -222,9 +237,9 @@ def mean_rest_length(inputs: Inputs) -> Tensor:
     return (total[:, :1] / total[:, 1:].clamp_min(1.0)).index_select(0, edges.segment).clamp_min(1e-6)
 
 
-def physical(num_levels: int = 3, more: Sequence[NodeGroup] = ()) -> FeatureSet:
+def physical(num_levels: int = 3, more: Sequence[NodeGroup] = (), layers: bool = False) -> FeatureSet:
     """Scaled features for training without a warm-up of statistics, with ``more`` beside the residual; they need
-    ``Inputs.base_pos``."""
+    ``Inputs.base_pos``. With ``layers`` there are edges between layers of cloth."""
     level = [LevelOneHot(num_levels)] if num_levels > 1 else []
     return FeatureSet(
         node=[
@@ -242,4 +257,5 @@ def physical(num_levels: int = 3, more: Sequence[NodeGroup] = ()) -> FeatureSet:
         edge=[ScaledShape(), Strain(), EdgeLogMaterial()],
         body_edge=[BaseBodyRelative()],
         decay=None,
+        layer_edge=[BaseLayerRelative()] if layers else [],
     )

@@ -1,9 +1,10 @@
-"""The graph of one step: static mesh and coarse edges, and the body edges and attachments that change every step."""
+"""The graph of one step: static mesh and coarse edges, and the edges that change every step: to the body, between layers of
+cloth that are near each other, and attachments."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import torch
@@ -16,6 +17,7 @@ from hood.scene.state import Attachments, Obstacle, StepInput
 
 MESH = "mesh"
 BODY = "body"
+LAYERS = "layers"
 
 
 def coarse_name(level: int) -> str:
@@ -108,15 +110,23 @@ class Graph:
     ``body_vertex`` (indices into the obstacle's vertices).
 
     ``body_subsets[l]`` holds the body edges of cloth nodes on level l or deeper: a processor step that works on
-    levels ≥ l only (paper, section 4.2) uses these.
+    levels ≥ l only (paper, section 4.2) uses these. ``layer_subsets[l]`` holds the edges between layers of cloth both of
+    whose nodes are: there are none in graphs of models that know no such edges.
     """
 
     num_cloth: int
     body_vertex: Tensor  # (W_active,)
-    edge_sets: dict[str, EdgeSet]  # mesh, coarse0, …, body (always present, possibly without edges)
+    edge_sets: dict[str, EdgeSet]  # mesh, coarse0, …, body (always present, possibly without edges), layers
     body_subsets: dict[int, Subset]
     node_level: Tensor  # (V,)
     num_mesh_edges: int  # undirected mesh edges; mesh rows with a larger ``source`` are attachments
+    layer_subsets: dict[int, Subset] = field(default_factory=dict, kw_only=True)
+
+    def subset(self, name: str, level: int) -> Subset:
+        """The edges of a set that a processor step on levels ≥ ``level`` works on; all of a static one."""
+        if name == BODY:
+            return self.body_subsets[level]
+        return self.layer_subsets[level] if name == LAYERS else Subset(self.edge_sets[name], None)
 
     @property
     def num_nodes(self) -> int:
@@ -176,6 +186,7 @@ def build_graph(
     nearest: Nearest | None = None,
     radius: float = 0.03,
     active_edges: Tensor | None = None,
+    layers: Tensor | None = None,
 ) -> Graph:
     """Graph of one step.
 
@@ -185,6 +196,8 @@ def build_graph(
         nearest: nearest body vertices of the cloth's; None without a body.
         radius: body edges are kept where the nearest body vertex is closer than this [m] (paper: 3 cm).
         active_edges: (E,) bool, mesh edges that exist in this step; None for all of them.
+        layers: (L, 2) cloth nodes near each other (:func:`hood.scene.near_cloth.find_near_cloth`); None for models that know no
+            such edges.
     """
     sets = dict(static.edge_sets)
     if MESH in sets:
@@ -196,8 +209,22 @@ def build_graph(
     sets[BODY] = body
     row_level = static.node_level[cloth_node][body.source]
     depth = max((set_level(name) for name in static.edge_sets), default=0)
-    subsets = {0: Subset(body, None)} | {level: _subset(body, row_level >= level) for level in range(1, depth + 1)}
-    return Graph(static.num_cloth, body_vertex, sets, subsets, static.node_level, static.mesh_edges.shape[0])
+    graph = Graph(
+        static.num_cloth, body_vertex, sets, _by_level(body, row_level, depth), static.node_level, static.mesh_edges.shape[0]
+    )
+    return graph if layers is None else _with_layers(graph, layers, depth)
+
+
+def _with_layers(graph: Graph, pairs: Tensor, depth: int) -> Graph:
+    edges = edge_set(pairs)
+    level = torch.minimum(graph.node_level[edges.senders], graph.node_level[edges.receivers])
+    sets = {**graph.edge_sets, LAYERS: edges}
+    return replace(graph, edge_sets=sets, layer_subsets=_by_level(edges, level, depth))
+
+
+def _by_level(edges: EdgeSet, row_level: Tensor, depth: int) -> dict[int, Subset]:
+    """The rows on every level or deeper, by level."""
+    return {0: Subset(edges, None)} | {level: _subset(edges, row_level >= level) for level in range(1, depth + 1)}
 
 
 def mesh_set(static: StaticGraph, attachments: Attachments | None, active_edges: Tensor | None) -> EdgeSet:

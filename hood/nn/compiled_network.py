@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, cast
 import torch
 from torch import Tensor, nn
 
-from hood.graph.builder import BODY, EdgeSet, Graph
+from hood.graph.builder import EdgeSet, Graph
 from hood.native.build import NATIVE_FLAGS, build
 from hood.native.structures import COUNT, POINTER, fields
 from hood.nn.schedule import finest_level
@@ -134,16 +134,17 @@ class Packed:
         self._lib, self._kept = library(), list[Any]()
         self.state, self.slots = state, _slots(network)  # what changes with the weights, and where they are
         self.node_encoder = self.perceptron(network.node_encoder)
-        self.edge_encoders = {name: self.perceptron(network.edge_encoder(name)) for name in (*network.edge_set_names, BODY)}
+        names = (*network.edge_set_names, *network.world_sets)
+        self.edge_encoders = {name: self.perceptron(network.edge_encoder(name)) for name in names}
         self.decoders = [self.perceptron(cast("MLP", mlp)) for mlp in (network.decoder, *network.late_decoders)]
         self.node_looks = [self.perceptron(cast("MLP", mlp)) for mlp in network.node_looks]
         self.edge_looks = [self._linear_layers(cast(nn.ModuleDict, layers)) for layers in network.edge_looks]
-        #: Places of edge latents in a list, and of subsets of edges: of a cloth set all, of the body's those of a level.
-        self.latents = {name: place for place, name in enumerate((*network.edge_set_names, BODY))}
+        #: Places of edge latents in a list, and of subsets of edges: of a static set all, of the others those of a level.
+        self.latents = {name: place for place, name in enumerate(names)}
         self.subsets: dict[tuple[str, int], int] = {}
         self.steps = (_Step * len(network.steps))()
         for step, sets, module in zip(self.steps, network.schedule, network.steps, strict=True):
-            self._fill_step(step, sets, cast("ProcessorStep", module))
+            self._fill_step(step, sets, network.world_sets, cast("ProcessorStep", module))
 
     def perceptron(self, mlp: MLP, first: bool = True) -> _Perceptron:
         """A perceptron's layers; without the first one where that is evaluated in parts."""
@@ -186,11 +187,11 @@ class Packed:
         named = {name: cast(nn.Linear, layer) for name, layer in layers.items()}
         return {name: (self.vector(layer.weight[:, 0]), self.vector(layer.bias)) for name, layer in named.items()}
 
-    def _fill_step(self, step: _Step, sets: Sequence[str], module: ProcessorStep) -> None:
+    def _fill_step(self, step: _Step, sets: Sequence[str], world: Sequence[str], module: ProcessorStep) -> None:
         parts = (_Part * len(module.sets))()
         for index, (part, name) in enumerate(zip(parts, module.sets, strict=True)):
             mlp = cast("MLP", module.edge_mlps[name])
-            subset = (name, finest_level(tuple(sets)) if name == BODY else 0)
+            subset = (name, finest_level(tuple(sets)) if name in world else 0)
             part.edges = self.subsets.setdefault(subset, len(self.subsets))
             part.latent = self.latents[name]
             part.to_receiver, part.to_sender, part.to_edge = (self.pack(mlp.first.weight, block) for block in range(3))
@@ -218,10 +219,8 @@ class Inference:
         encoders = self._weights.edge_encoders
         self._edges = {name: self._rows(encoders[name], edges[name]) for name in self._weights.latents}
         self._latents = (ctypes.c_void_p * len(self._edges))(*(self._edges[name].data_ptr() for name in self._weights.latents))
-        chosen = [graph.body_subsets[level] if name == BODY else None for name, level in self._weights.subsets]
-        names = [name for name, _ in self._weights.subsets]
-        sets = [graph.edge_sets[name] if part is None else part.edges for name, part in zip(names, chosen, strict=True)]
-        rows = [None if part is None else part.rows for part in chosen]
+        chosen = [graph.subset(name, level) for name, level in self._weights.subsets]
+        sets, rows = [part.edges for part in chosen], [part.rows for part in chosen]
         self._subsets = (_Edges * len(sets))(*(_pointers(*pair) for pair in zip(sets, rows, strict=True)))
         self._kept: list[Any] = [*sets, *rows]
         memory = torch.empty(4, len(self._nodes), self._width)

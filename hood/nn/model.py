@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from hood.graph.builder import BODY, MESH, Graph, Subset, coarse_name, set_level
+from hood.graph.builder import BODY, LAYERS, MESH, Graph, coarse_name, set_level
 from hood.nn import compiled_network
 from hood.nn.compiled import check_kernels
 from hood.nn.dense import pad_rows
@@ -29,8 +29,9 @@ class MeshGraphNet(nn.Module):
     """Raw decoder output per cloth node from node and edge features.
 
     One encoder for all nodes and one per edge set; processor steps as the schedule says, each with its own networks;
-    body edges take part in every step, restricted to cloth nodes on the step's levels. Cloth and body nodes share the
-    node networks; body nodes receive nothing from cloth edges.
+    body edges take part in every step, restricted to cloth nodes on the step's levels, and so do edges between layers of cloth
+    where the model has them. Cloth and body nodes share the node networks; body nodes receive nothing from cloth edges. A step
+    without edges between layers is, to the bit, that of a model which has none and otherwise the same weights.
 
     A schedule of several passes decodes an output at the end of each; what it leads to is looked at, and what is seen is
     added to the latents before the next pass.
@@ -38,7 +39,8 @@ class MeshGraphNet(nn.Module):
     Args:
         node_width: width of the node features.
         edge_widths: width of the edge features: ``{"mesh": 12, "coarse": 12, "body": 9}``. A coarse set is looked up by
-            its own name first and by ``coarse`` then; a missing ``coarse`` means the mesh's width.
+            its own name first and by ``coarse`` then; a missing ``coarse`` means the mesh's width. With ``layers`` the model
+            has edges between layers of cloth.
         latent_dim: width of all latents (paper: 128).
         schedule: name or text for :func:`hood.nn.schedule.parse_schedule`.
         out_width: width of the output.
@@ -73,10 +75,12 @@ class MeshGraphNet(nn.Module):
         self.passes = parse_passes(schedule)
         self.edge_set_names = edge_set_names(self.schedule)
         encoded = self.edge_set_names if coarse_encoders is None else (MESH, *map(coarse_name, range(coarse_encoders)))
-        widths = {name: _edge_width(name, edge_widths) for name in (*encoded, BODY)}
+        #: Sets of edges that change every step, in the order of the node networks' input.
+        self.world_sets = (BODY, LAYERS) if LAYERS in edge_widths else (BODY,)
+        widths = {name: _edge_width(name, edge_widths) for name in (*encoded, *self.world_sets)}
         self.node_encoder = MLP(node_width, latent_dim, latent_dim)
         self.edge_encoders = nn.ModuleDict({n: MLP(w, latent_dim, latent_dim) for n, w in widths.items()})
-        self.steps = nn.ModuleList(ProcessorStep((*sets, BODY), latent_dim, aggregation) for sets in self.schedule)
+        self.steps = nn.ModuleList(ProcessorStep((*sets, *self.world_sets), latent_dim, aggregation) for sets in self.schedule)
         self.decoder = MLP(latent_dim, latent_dim, out_width, norm=False)
         later = range(1, len(self.passes))
         self.late_decoders = nn.ModuleList(MLP(latent_dim, latent_dim, out_width, norm=False) for _ in later)
@@ -125,7 +129,7 @@ class MeshGraphNet(nn.Module):
         self.checkpointing = on
 
     def pass_sets(self, index: int) -> tuple[str, ...]:
-        """Cloth edge sets that pass ``index`` works on."""
+        """Static edge sets that pass ``index`` works on."""
         first = sum(self.passes[:index])
         return edge_set_names(self.schedule[first : first + self.passes[index]])
 
@@ -135,7 +139,7 @@ class MeshGraphNet(nn.Module):
         """(V, out_width) for the cloth nodes, of the last pass.
 
         Args:
-            graph: needs every set of :attr:`edge_set_names`.
+            graph: needs every set of :attr:`edge_set_names` and :attr:`world_sets`.
             node_features: (V + W_active, node_width), cloth rows first.
             edge_features: by set, rows as in ``graph.edge_sets``.
             look: called between two passes; schedules of one pass need none.
@@ -152,7 +156,8 @@ class MeshGraphNet(nn.Module):
         dtype = torch.bfloat16 if self.precision == "bf16" else None
         # Rows of padding are nodes without edges. A node's latent, a sum over all steps, stays in float32.
         nodes = self.node_encoder(pad_rows(node_features), dtype).to(node_features.dtype)
-        edges = {name: self.edge_encoder(name)(edge_features[name], dtype) for name in (*self.edge_set_names, BODY)}
+        names = (*self.edge_set_names, *self.world_sets)
+        edges = {name: self.edge_encoder(name)(edge_features[name], dtype) for name in names}
         steps = iter(zip(self.schedule, self.steps, strict=True))
         raw = nodes.new_empty(0)
         for index, length in enumerate(self.passes):
@@ -170,8 +175,7 @@ class MeshGraphNet(nn.Module):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Latents after one processor step on the edge sets ``sets``."""
         overwrite = not torch.is_grad_enabled()
-        subsets = {name: Subset(graph.edge_sets[name], None) for name in sets}
-        subsets[BODY] = graph.body_subsets[finest_level(sets)]
+        subsets = {name: graph.subset(name, finest_level(sets)) for name in (*sets, *self.world_sets)}
         if self.checkpointing and not overwrite:
             taken: tuple[Tensor, dict[str, Tensor]] = checkpoint(
                 step, nodes, edges, subsets, use_reentrant=False, preserve_rng_state=False
@@ -204,6 +208,6 @@ class MeshGraphNet(nn.Module):
 
 def _edge_width(name: str, widths: Mapping[str, int]) -> int:
     for key in (name, "coarse" if name.startswith("coarse") else name, "mesh"):
-        if key in widths and (key != "mesh" or name != BODY):
+        if key in widths and (key != "mesh" or name not in (BODY, LAYERS)):
             return widths[key]
     raise ValueError(f"edge_widths has no entry for {name!r} (given: {', '.join(widths)})")

@@ -7,20 +7,18 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy import sparse
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from hood.mesh.kept import forget
 from hood.mesh.layers import vertex_room
 from hood.mesh.proximity import closest_point_on_triangles
+from hood.mesh.rings import Rings
 from hood.mesh.topology import unique_edges
 from hood.scene.cloth import Cloth
 
 #: Beside a face by more than this [m] a vertex is paired with it only where it is the nearest one.
 _BESIDE = 3e-3
-#: Vertices nearer along the mesh than so many edges from a face are its neighbours.
-_RINGS = 2
 
 
 @dataclass(frozen=True)
@@ -55,20 +53,11 @@ class _Patch:
     def __init__(self, rest: np.ndarray, faces: np.ndarray, first: int) -> None:
         self.faces, self.first, self.last = faces, first, first + len(rest)
         self.room = vertex_room(rest, faces)
-        edges, count = unique_edges(faces), len(rest)
-        ones = np.ones(len(edges), dtype=np.int8)
-        beside = sparse.coo_matrix((ones, edges.T), shape=(count, count)).tocsr()
-        ring = reached = ((beside + beside.T + sparse.identity(count, dtype=np.int8)) > 0).astype(np.int8).tocsr()
-        for _ in range(_RINGS - 1):
-            reached = ((reached @ ring) > 0).astype(np.int8).tocsr()
-        table = reached.tocoo()
-        self._near = np.sort(table.row.astype(np.int64) * count + table.col)
+        self._rings = Rings(len(rest), unique_edges(faces))
 
     def are_neighbours(self, vertex: np.ndarray, corners: np.ndarray) -> np.ndarray:
         """(N,) bool: a corner (N, 3) is at most two edges away from the vertex (N,)."""
-        key = vertex[:, None] * (self.last - self.first) + corners
-        place = np.searchsorted(self._near, key).clip(max=len(self._near) - 1)
-        return np.asarray((self._near[place] == key).any(axis=1))
+        return np.asarray(self._rings.hold(vertex[:, None], corners).any(axis=1))
 
 
 def _find(patch: _Patch, pos: np.ndarray, reach: float) -> tuple[np.ndarray, ...]:

@@ -89,9 +89,29 @@ def test_a_network_learns_to_leave_layers_on_their_sides(tmp_path: Path, body: B
         assert "layer_sides" not in trainer.simulator.potential.terms
         assert trainer.simulator.trained_for is not None
         assert "layer_sides" not in trainer.simulator.trained_for.potential
-        felt[weight] = [trainer.update()["layer_sides"] / weight for _ in range(12)][1::2]  # every other step is a relaxing one
-    assert felt[5e6][-1] < 0.7 * felt[5e6][0]
-    assert felt[5e6][-1] < 0.7 * felt[1e-3][-1]
+        felt[weight] = [trainer.update()["layer_sides"] / weight for _ in range(8)][1::2]  # every other step is a relaxing one
+    assert felt[5e6][-1] < 0.8 * felt[5e6][0]
+    assert felt[5e6][-1] < 0.8 * felt[1e-3][-1]
+
+
+@pytest.mark.parametrize("options", [PAPER, PHYSICAL, PASSES], ids=["paper", "physical", "passes"])
+def test_models_with_edges_between_layers_train(
+    options: dict, tmp_path: Path, body: Body, garments: dict[str, Garment]
+) -> None:
+    scenes = OneScene(body, [garments["longsleeve"], garments["tank"]], [load_sequence("dance_mixed", 30.0).window(30, 90)])
+    trainer = make(tmp_path, scenes, options | {"layer_radius": 0.03}, replace(SETTINGS, statistics_iterations=2))
+    network = trainer.simulator.network
+    weight = network.edge_encoders["layers"].first.weight
+    before = weight.detach().clone()
+    reports = [trainer.update() for _ in range(5)]
+    assert all(np.isfinite(list(report.values())).all() for report in reports)
+    assert not torch.equal(weight, before)
+    trainer.save()
+    again = load_simulator(tmp_path / "model.safetensors")
+    assert again.layer_radius == 0.03
+    torch.testing.assert_close(
+        again.network.edge_encoders["layers"].first.weight, trainer.averaged().network.edge_encoders["layers"].first.weight
+    )
 
 
 def test_features_look_at_the_potential_that_is_trained(
