@@ -71,9 +71,10 @@ class RefinedStepper:
     """Takes the steps of another stepper further: iterations down ``potential`` from where that one led.
 
     The potential of a step never rises: what an iteration leads to is kept where it is lower, and a step for which there is no
-    such place stays, to the bit, what the inner stepper made of it. Pinned vertices stay on their targets. Of every frame
-    the metrics hold ``refine_iterations`` (those that were kept), ``refine_rg`` (the relative gradient reached),
-    ``refine_phi_before`` and ``refine_phi_after`` [J], ``refine_reason`` (the number of what ended it,
+    such place stays, to the bit, what the inner stepper made of it. Where the potential keeps layers of cloth apart, a step
+    starts as near to what the inner stepper made of it as cloth does not cross cloth on the way. Pinned vertices stay on their
+    targets. Of every frame the metrics hold ``refine_iterations`` (those that were kept), ``refine_rg`` (the relative gradient
+    reached), ``refine_phi_before`` and ``refine_phi_after`` [J], ``refine_reason`` (the number of what ended it,
     :mod:`hood.solver.reasons`) and what the goal reports; its time is ``ms_refine``. Where a goal wants no refinement of a
     frame, nothing is computed and the last four are NaN.
 
@@ -146,7 +147,7 @@ class RefinedStepper:
         prediction = self._inner_step(problem, prepared, watch)
         if self.relaxing is Relaxing.CARRY and bool(((problem.step.dt - RELAXING_DT).abs() < 1e-6).all()):
             # Such models turn the way that they went into a velocity: a refined one would be a blow.
-            return prediction
+            return self._apart(problem, prediction)
         with timed(watch, "refine"):
             # Made once per cloth, so here: no part of what an iteration costs.
             if self.method == "sweeps":
