@@ -267,7 +267,11 @@ def inspect_checkpoint(name: str) -> Finding:
     finding.facts = {
         "parameters": sum(parameter.numel() for parameter in simulator.parameters()),
         "message-passing steps": len(simulator.schedule),
-        **{key: simulator.config[key] for key in ("features", "output", "latent_dim")},
+        **{
+            key: simulator.config[key]
+            for key in ("features", "output", "latent_dim", "layer_radius")
+            if key in simulator.config
+        },
         **ranges.describe(simulator.trained_for),
     }
     return finding
