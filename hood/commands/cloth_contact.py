@@ -10,7 +10,7 @@ import numpy as np
 from omegaconf import DictConfig
 
 from hood.commands.dial import chosen
-from hood.config import ConfigError, build, require_choice
+from hood.config import ConfigError, build, plain, require_choice
 from hood.dynamics.measure import LAYER_METRICS
 from hood.losses.collision import Collision
 from hood.losses.layers import LayerBarrier
@@ -65,8 +65,12 @@ def tell_if_off(config: DictConfig, garments: int) -> None:
     """A line where contact that may be expected does not act: where the solver takes or refines the steps, and a warning where
     several garments start as they are, one through the other."""
     reason = why_not(config)
+    if garments > 1 and plain(config.layers) != "auto" and not acts(config):
+        warnings.warn("outfit: layers=… has no effect where cloth_contact is off", stacklevel=2)
     if reason and garments > 1:
-        warnings.warn(f"outfit: nothing keeps the {garments} garments apart, at the start neither: {reason}", stacklevel=2)
+        warnings.warn(
+            f"outfit: the {garments} garments are not kept apart, and not taken apart at the start: {reason}", stacklevel=2
+        )
     elif reason and not _network_alone(config):
         print(f"cloth_contact=auto: off; {reason}")
 

@@ -89,9 +89,18 @@ def test_garments_that_nothing_keeps_apart_are_warned_about(capsys: pytest.Captu
     write_belt(Path("band.obj"))
     found, _ = _run("garment=[belt.obj,band.obj]", "checkpoint=untrained", "model=small", "stepper=network", "refine=0")
     said = capsys.readouterr()
-    assert "nothing keeps the 2 garments apart, at the start neither: a network alone does not" in said.err
-    assert any("nothing keeps the 2 garments apart" in sentence for sentence in found["warnings"])
+    assert "the 2 garments are not kept apart, and not taken apart at the start: a network alone does not" in said.err
+    assert any("the 2 garments are not kept apart" in sentence for sentence in found["warnings"])
+    assert "layers=" not in said.err
     assert "cloth against cloth: off; a network alone does not keep layers of cloth apart; add refine=5" in said.out
+
+
+def test_an_order_without_contact_has_no_effect_and_that_is_told() -> None:
+    write_belt(Path("belt.obj"))
+    write_belt(Path("band.obj"))
+    garments = ("garment=[belt.obj,band.obj]", "layers=[band,belt]", "metrics=none", "settle=paper")
+    found, _ = _run(*garments, "cloth_contact=off")
+    assert "outfit: layers=… has no effect where cloth_contact is off" in found["warnings"]
 
 
 def test_sentences_name_crossed_starts_and_forced_pins() -> None:
