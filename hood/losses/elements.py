@@ -72,10 +72,13 @@ def energies_and_gradient(
     if not _applies(next_pos):
         return by(potential, problem, next_pos, acc)
     others, _ = _split(potential)
-    rest, values = by(others, problem, next_pos, acc)
     gradient = np.zeros(tuple(next_pos.shape))
-    values |= _element_energies(potential, problem, next_pos, gradient)
-    return rest.double() + torch.from_numpy(gradient), {name: values[name] for name in potential.terms if name in values}
+    values = _element_energies(potential, problem, next_pos, gradient)
+    total = torch.from_numpy(gradient)
+    if others.active(problem):  # a gradient of nothing takes as long as the pass
+        rest, found = by(others, problem, next_pos, acc)
+        total, values = rest.double() + total, values | found
+    return total, {name: values[name] for name in potential.terms if name in values}
 
 
 @torch.no_grad()

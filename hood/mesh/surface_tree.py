@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 
 from hood import native
-from hood.mesh import topology
+from hood.mesh.curvature import MOST_CURVATURE, ROUNDS
 from hood.mesh.kept import forget
 from hood.native.build import optional
-from hood.native.structures import COUNT, POINTER, fields
+from hood.native.structures import COUNT, POINTER, REAL, fields
 from hood.native.threads import num_parts
 
 SOURCE = Path(native.__file__).with_name("surface.cpp")
@@ -34,10 +34,11 @@ class _Tree(ctypes.Structure):
     """``Tree`` of ``surface.cpp``."""
 
     _fields_ = [
-        *fields("num_faces num_nodes num_leaves num_blocks edge_width", COUNT),
+        *fields("num_faces num_vertices num_nodes num_leaves num_blocks edge_width", COUNT),
         *fields("faces around first valence face_edges edge_faces", POINTER),
-        *fields("order place around_place children number corner_of block_first block_vertex block_number", POINTER),
-        *fields("pos corners boxes face_boxes block_pos cross vertex_normal stamp leaf_stamp", POINTER),
+        *fields("order place children number corner_of block_first block_vertex block_number", POINTER),
+        *fields("fan_first fan fan_share", POINTER),
+        *fields("pos corners boxes face_boxes block_pos vertex_normal bulge needed stamp", POINTER),
         ("call", COUNT),
         ("origin", ctypes.c_double * 3),
         ("size_sq", ctypes.c_double),
@@ -52,7 +53,9 @@ class _Query(ctypes.Structure):
     _fields_ = [
         ("count", COUNT),
         *fields("points next_pos vertex face vertex_dist bary dist", POINTER),
-        *fields("point normal next_point next_normal", POINTER),
+        *fields("point normal next_point next_normal curvature", POINTER),
+        ("most_curvature", REAL),
+        ("rounds", COUNT),
     ]
 
 
@@ -73,6 +76,7 @@ class Match(NamedTuple):
     normal: Tensor  # (N, 3) outward unit normals there, interpolated over the face
     next_point: Tensor  # (N, 3) m
     next_normal: Tensor  # (N, 3)
+    curvature: Tensor | None = None  # (N,) 1/m, of the surface there (hood.mesh.curvature); None where nobody asked for it
 
 
 @cache
@@ -104,23 +108,25 @@ class SurfaceTree:
         integers = {
             "order": (leaves, _WIDE),
             "place": (len(faces),),
-            "around_place": (3 * len(faces),),
             "children": (leaves, _WIDE),
             "corner_of": (leaves, 3, _WIDE),
             "block_first": (leaves + 1,),
             "block_vertex": (blocks, _WIDE),
+            "fan_first": (num_vertices + 1,),
+            "fan": (9 * len(faces),),
+            "needed": (num_vertices + 1,),
             "stamp": (num_vertices,),
-            "leaf_stamp": (leaves,),
         }
         reals = {
             "number": (leaves, _WIDE),
             "block_number": (blocks, _WIDE),
+            "fan_share": (9 * len(faces),),
             "pos": (num_vertices, 3),
             "corners": (leaves, 9, _WIDE),
             "boxes": (leaves, 6, _WIDE),
             "block_pos": (blocks, 3, _WIDE),
-            "cross": (leaves, _WIDE, 8),
             "vertex_normal": (num_vertices, 6),
+            "bulge": (2, num_vertices),
         }
         self._arrays = dict(zip(("around", "first", "valence", "face_edges", "edge_faces"), incidence, strict=True))
         self._arrays |= {name: _aligned(shape, np.int32) for name, shape in integers.items()}
@@ -129,12 +135,13 @@ class SurfaceTree:
         self._arrays["faces"] = np.ascontiguousarray(faces, np.int64)
         self._arrays["order"].reshape(-1)[: len(members)] = members
         self._arrays["place"].fill(-1)
-        self._tree = _Tree(num_faces=len(members), edge_width=incidence[4].shape[1], batch=batch)
+        counts = {"num_faces": len(members), "num_vertices": num_vertices, "edge_width": incidence[4].shape[1]}
+        self._tree = _Tree(**counts, batch=batch)
         _point(self._tree, self._arrays)
         self._visits = batch * leaves + 1
         self._share(1)
         centre = np.ascontiguousarray(np.nan_to_num(np.asarray(pos, np.float64)[faces].mean(axis=1)))
-        lib.surface_build(ctypes.byref(self._tree), centre.ctypes.data_as(POINTER), COUNT(num_vertices))
+        lib.surface_build(ctypes.byref(self._tree), centre.ctypes.data_as(POINTER))
 
     def _share(self, parts: int) -> None:
         """Search for points in as many parts, by threads of their own; what is found does not depend on it."""
@@ -145,8 +152,9 @@ class SurfaceTree:
             _point(self._tree, visits)
         self._tree.parts = parts
 
-    def search(self, points: np.ndarray, pos: np.ndarray, next_pos: np.ndarray) -> dict[str, np.ndarray]:
-        """Fields of :class:`Match` for ``points`` (N, 3) on the surface at ``pos`` (W, 3), all float64 and C-contiguous."""
+    def search(self, points: np.ndarray, pos: np.ndarray, next_pos: np.ndarray, curved: bool) -> dict[str, np.ndarray]:
+        """Fields of :class:`Match` for ``points`` (N, 3) on the surface at ``pos`` (W, 3), all float64 and C-contiguous;
+        the curvature only if it is to be ``curved``."""
         count = len(points)
         self._arrays["pos"][...] = pos
         self._share(num_parts(count, _POINTS))
@@ -154,7 +162,8 @@ class SurfaceTree:
         found: dict[str, np.ndarray] = {name: np.empty(count, np.int64) for name in ("vertex", "face")}
         found |= {"vertex_dist": np.empty(count), "dist": np.empty(count)}
         found |= {name: np.empty((count, 3)) for name in ("bary", *_PLACES)}
-        query = _Query(count=count)
+        found |= {"curvature": np.empty(count)} if curved else {}
+        query = _Query(count=count, most_curvature=MOST_CURVATURE, rounds=ROUNDS)
         _point(query, {"points": points, "next_pos": next_pos, **found})
         self._lib.surface_search(ctypes.byref(self._tree), ctypes.byref(query))
         return found
@@ -175,43 +184,6 @@ def _point(structure: ctypes.Structure, arrays: dict[str, np.ndarray]) -> None:
 
 
 @torch.no_grad()
-def curvature(pos: Tensor, faces: Tensor, incidence: Sequence[Tensor], most: float, rounds: int) -> Tensor | None:
-    """What :func:`hood.mesh.curvature.convex_curvature` computes, (W,); None where there is no compiled form, or not for these
-    tensors.
-
-    Args:
-        incidence: as for :class:`SurfaceTree`.
-        most: bound [1/m].
-        rounds: of averaging.
-    """
-    lib = library() if type(pos) is Tensor and pos.device.type == "cpu" else None
-    if lib is None:
-        return None
-    corners = np.ascontiguousarray(faces.numpy(), np.int64)
-    edges = _edges_of(incidence[0], corners)
-    around, first, valence = (np.ascontiguousarray(part.numpy(), np.int64) for part in incidence[:3])
-    place, found = _double(pos), np.empty(len(pos))
-    arrays = (corners, edges, around, first, valence, place, np.empty((len(place), 3)), np.empty(len(corners)), found)
-    counts = (COUNT(len(array)) for array in (corners, edges, place))
-    addresses = (POINTER(array.ctypes.data) for array in arrays)
-    lib.surface_curvature(*counts, *addresses, ctypes.c_double(most), COUNT(rounds))
-    return torch.from_numpy(found).to(pos.dtype)
-
-
-_EDGES: dict[int, tuple[weakref.ref[Tensor], np.ndarray]] = {}
-
-
-def _edges_of(around: Tensor, faces: np.ndarray) -> np.ndarray:
-    """The edges (E, 2) of ``faces`` (G, 3), kept as long as ``around`` of their incidence lives."""
-    key = id(around)
-    known = _EDGES.get(key)
-    if known is None or known[0]() is not around:
-        edges = np.ascontiguousarray(topology.unique_edges(faces), np.int64)
-        known = _EDGES[key] = weakref.ref(around, forget(_EDGES, key)), edges
-    return known[1]
-
-
-@torch.no_grad()
 def search(
     points: Tensor,
     point_scene: Tensor,
@@ -220,24 +192,26 @@ def search(
     face_scene: Tensor,
     incidence: Sequence[Tensor],
     next_vertices: Tensor,
+    curved: bool = False,
 ) -> Match | None:
     """Closest points, scene by scene; None where there is no compiled search, or not for these tensors.
 
     Args:
         incidence: as for :class:`SurfaceTree`.
         next_vertices: (W, 3) m, where the surface goes.
+        curved: with the curvature of the surface.
     """
     if type(points) is not Tensor or points.device.type != "cpu" or library() is None:
         return None
     given, pos, later = _double(points), _double(vertices), _double(next_vertices)
     scene = _only_scene(face_scene)
     if scene is not None and scene == _only_scene(point_scene):
-        return _found(points, _tree_of(faces, None, face_scene, incidence, pos).search(given, pos, later))
-    result = _nothing(len(points))
+        return _found(points, _tree_of(faces, None, face_scene, incidence, pos).search(given, pos, later, curved))
+    result = _nothing(len(points), curved)
     for scene in point_scene.unique().tolist():
         rows = (point_scene == scene).numpy().nonzero()[0]
         if bool((face_scene == scene).any()):
-            part = _tree_of(faces, scene, face_scene, incidence, pos).search(given[rows], pos, later)
+            part = _tree_of(faces, scene, face_scene, incidence, pos).search(given[rows], pos, later, curved)
             for name, values in part.items():
                 result[name][rows] = values
     return _found(points, result)
@@ -260,8 +234,9 @@ def _double(values: Tensor) -> np.ndarray:
     return np.ascontiguousarray(values.detach().numpy(), np.float64)
 
 
-def _nothing(count: int) -> dict[str, np.ndarray]:
+def _nothing(count: int, curved: bool) -> dict[str, np.ndarray]:
     result: dict[str, np.ndarray] = {name: np.zeros(count, np.int64) for name in ("vertex", "face")}
+    result |= {"curvature": np.zeros(count)} if curved else {}
     result |= {name: np.full(count, np.inf) for name in ("vertex_dist", "dist")}
     return result | {name: np.zeros((count, 3)) for name in ("bary", *_PLACES)}
 

@@ -23,10 +23,7 @@ inline I8 regular(V8 cross_sq, V8 product_sq) { return (cross_sq > DEGENERATE * 
 
 // One corner of eight elements.
 inline void gather(const double* pos, const int32_t* corner, V8* x) {
-    alignas(64) double axes[3][LANES];
-    for (int lane = 0; lane < LANES; ++lane)
-        for (int k = 0; k < 3; ++k) axes[k][lane] = pos[3 * (int64_t)corner[lane] + k];
-    for (int k = 0; k < 3; ++k) x[k] = load<V8>(axes[k]);
+    for (int k = 0; k < 3; ++k) x[k] = lanes([&](int lane) { return pos[3 * (int64_t)corner[lane] + k]; });
 }
 
 // Adds the energies of ``count`` lanes to their scenes.
@@ -170,6 +167,67 @@ void elements_vertices(const Vertices* all, const double* pos, const double* acc
         }
         if (gradient)
             for (int k = 0; k < 3; ++k) gradient[3 * v + k] += force[k];
+    }
+}
+
+// The contact of a step as it was searched for, see hood.scene.contact.Contact, and what tells how hard vertices are pressed on it.
+struct Contact {
+    int64_t count;
+    const uint8_t* valid;                                           // (V)
+    const int64_t* scene;                                           // (V)
+    const double *mass, *length_sq, *pos, *vel;                     // (V) kg, (V) m^2, (V, 3) m, (V, 3) m/s
+    const double *dist, *curvature;                                 // (V) m, (V) 1/m
+    const double *point, *next_point, *next_normal;                 // (V, 3) m, (V, 3) m, (V, 3)
+    const double *pull, *dt, *gravity;                              // (V, 3) N or none, (B) s, (3) m/s^2
+};
+
+// How far off the skin contact sets in, see hood.scene.reach: ``least`` [m], and ``share`` of L^2 times the curvature up to ``most`` [m].
+struct Reach {
+    double least, share, most;
+};
+
+inline bool touches(const Contact& contact, int64_t v) { return contact.valid[v] && contact.mass[v] > 0.0; }
+
+inline double reach_of(const Contact& contact, const Reach& reach, int64_t v) {
+    return reach.least + std::min(reach.share * contact.length_sq[v] * contact.curvature[v], reach.most);
+}
+
+// A collision term's planes and their reach, see hood.losses.collision; rows that touch nothing are zero.
+void elements_wall(const Contact* all, const Reach* reach, double* point, double* normal, double* reaches) {
+    for (int64_t v = 0; v < all->count; ++v) {
+        const bool touching = touches(*all, v);
+        for (int64_t i = 3 * v; i < 3 * v + 3; ++i) {
+            point[i] = touching ? all->next_point[i] : 0.0;
+            normal[i] = touching ? all->next_normal[i] : 0.0;
+        }
+        reaches[v] = touching ? reach_of(*all, *reach, v) : 0.0;
+    }
+}
+
+// A friction term's lagged force, see hood.losses.friction.Friction, and what the slip is measured against; rows without force are
+// zero but for the last two.
+void elements_grip(const Contact* all, const Reach* reach, double weight, double coefficient, double slip_speed, double* normal,
+                   double* anchor, double* force, double* limit) {
+    for (int64_t v = 0; v < all->count; ++v) {
+        const double dt = all->dt[all->scene[v]];
+        const double *pos = all->pos + 3 * v, *up = all->next_normal + 3 * v, *goal = all->next_point + 3 * v;
+        double pressed = 0.0;
+        if (touches(*all, v)) {
+            const double apart = reach_of(*all, *reach, v), depth = std::max(apart - all->dist[v], 0.0);
+            pressed = 3.0 * weight * depth * depth;
+            if (all->pull && pressed > 0.0) {
+                double gap[3];
+                for (int k = 0; k < 3; ++k) gap[k] = pos[k] + dt * (all->vel[3 * v + k] + dt * all->gravity[k]) - goal[k];
+                const double flown = apart - dot3(gap, up), pull = dot3(all->pull + 3 * v, up);
+                const double most = all->mass[v] / (dt * dt) * (flown < 0.0 ? 0.0 : flown) - (pull > 0.0 ? 0.0 : pull);
+                pressed = most > pressed ? pressed : most;  // not-a-number stays
+            }
+        }
+        force[v] = coefficient * pressed, limit[v] = slip_speed * dt;
+        for (int k = 0; k < 3; ++k) {
+            normal[3 * v + k] = force[v] > 0.0 ? up[k] : 0.0;
+            anchor[3 * v + k] = pos[k] + (force[v] > 0.0 ? goal[k] - all->point[3 * v + k] : 0.0);
+        }
     }
 }
 

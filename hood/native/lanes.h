@@ -18,6 +18,10 @@ template <class V, class T> inline V load(const T* p) {
 }
 template <class T, class V> inline void store(T* p, V v) { std::memcpy(p, &v, sizeof(V)); }
 
+// The number of every lane. Put together in memory it would be waited for, ten times as long, before it could be loaded as one.
+template <class Number> inline V8 lanes(const Number& number) {
+    return V8{number(0), number(1), number(2), number(3), number(4), number(5), number(6), number(7)};
+}
 inline V8 all(double x) { return V8{x, x, x, x, x, x, x, x}; }
 inline double total(V8 v) { return ((v[0] + v[4]) + (v[1] + v[5])) + ((v[2] + v[6]) + (v[3] + v[7])); }
 inline V8 root(V8 v) {

@@ -122,12 +122,7 @@ template <class T> struct HingeRecord {
 };
 
 inline void gather(const double* pos, const int32_t* index, V8* x) {
-    alignas(64) double axes[3][LANES];
-    for (int lane = 0; lane < LANES; ++lane) {
-        const double* p = pos + 4 * (int64_t)index[lane];
-        for (int k = 0; k < 3; ++k) axes[k][lane] = p[k];
-    }
-    for (int k = 0; k < 3; ++k) x[k] = load<V8>(axes[k]);
+    for (int k = 0; k < 3; ++k) x[k] = lanes([&](int lane) { return pos[4 * (int64_t)index[lane] + k]; });
 }
 
 struct Strain {

@@ -5,8 +5,11 @@
 // boxes look nearest, which bounds its distance, and lists the other leaves within that bound before it looks into any of them:
 // lists that grow without a branch are several times as fast as a branch at every box.
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <cstdint>
+#include <utility>
+#include <vector>
 
 #include "halving.h"
 #include "lanes.h"
@@ -56,29 +59,31 @@ struct Visit {
 };
 
 struct Tree {
-    int64_t num_faces, num_nodes, num_leaves, num_blocks, edge_width;
+    int64_t num_faces, num_vertices, num_nodes, num_leaves, num_blocks, edge_width;
     // The topology. Places are those of faces in the order: leaf times eight and lane.
     const int64_t* faces;                     // (G, 3)
     const int64_t *around, *first, *valence;  // (3G), (W), (W), see hood.mesh.proximity.Incidence
     const int64_t *face_edges, *edge_faces;   // (G, 3), (E, M) with -1
     int32_t* order;         // (L, 8) the faces in the tree, leaf after leaf; the last one is repeated
     int32_t* place;         // (G) where they are in it, -1 for others
-    int32_t* around_place;  // (3G) of the faces around vertices
     int32_t* children;      // (M, 8) nodes, or -1 - leaf; the node itself where there is none
     double* number;         // (L, 8) the order again
     int32_t* corner_of;     // (L, 3, 8) corners of the faces of a leaf
     int32_t* block_first;   // (L + 1) blocks of a leaf: vertices of its faces, each in one leaf; the last one of a leaf is repeated
     int32_t* block_vertex;  // (B, 8)
     double* block_number;   // (B, 8) the same
+    int32_t *fan_first, *fan;  // (W + 1), (9G) corners of the faces around a vertex: two that follow each other belong to a face
+    double* fan_share;         // (9G) what a corner counts in the average over the corners of these faces
     // The positions of this call.
     double* pos;                      // (W, 3) m
     double* corners;                  // (L, 9, 8) m, corners of the faces of a leaf
     double* boxes;                    // (M, 6, 8) m, least and greatest corners of the children
     float* face_boxes;                // (L, 6, 8) m, those of the faces of a leaf, about the origin
     double* block_pos;                // (B, 3, 8) m
-    double* cross;                    // (L, 8, 8) m^2, products of the faces' edges by place: now and next, each in four
     double* vertex_normal;            // (W, 6) unit normals, now and next, of the vertices that this call needed
-    int32_t *stamp, *leaf_stamp;      // (W), (L) the call in which vertex normals, and a leaf's products, were made
+    double* bulge;                    // (2, W) 1/m, their curvatures before an average and after it
+    int32_t* needed;                  // (W + 1) these vertices
+    int32_t* stamp;                   // (W) the call in which they were last needed
     int64_t call;
     double origin[3], size_sq;        // m, m^2: middle of everything, and how far that reaches
     int64_t batch;                    // points that are searched for together, at most 64
@@ -94,6 +99,9 @@ struct Query {
     int64_t *vertex, *face;  // (N)
     double *vertex_dist, *bary, *dist;                  // (N), (N, 3), (N)
     double *point, *normal, *next_point, *next_normal;  // (N, 3) each
+    double* curvature;       // (N) 1/m, none where nobody asks
+    double most_curvature;   // 1/m
+    int64_t rounds;          // of averaging
 };
 }
 
@@ -325,45 +333,27 @@ inline void gather(const Tree& tree, int64_t leaf, const double* pos, double* ta
             for (int k = 0; k < 3; ++k) table[WIDE * (3 * c + k) + i] = pos[3 * (int64_t)tree.corner_of[WIDE * (3 * leaf + c) + i] + k];
 }
 
-inline void multiply(const double* table, double* rows) {
-    const Axes a = load_axes(table), u = load_axes(table + 3 * WIDE) - a, v = load_axes(table + 6 * WIDE) - a;
-    alignas(64) double product[3][WIDE];
-    store(product[0], u.y * v.z - u.z * v.y);
-    store(product[1], u.z * v.x - u.x * v.z);
-    store(product[2], u.x * v.y - u.y * v.x);
-    for (int i = 0; i < WIDE; ++i)
-        for (int k = 0; k < 3; ++k) rows[WIDE * i + k] = product[k][i];
-}
-
-// Cross products of the edges of the face at a place, now and, four numbers on, next; made when a face of its leaf is first needed.
-const double* crosses(const Tree& tree, const double* next_pos, int64_t place) {
-    const int64_t leaf = place / WIDE;
-    if (tree.leaf_stamp[leaf] != (int32_t)tree.call) {
-        tree.leaf_stamp[leaf] = (int32_t)tree.call;
-        double* rows = tree.cross + WIDE * WIDE * leaf;
-        multiply(tree.corners + 9 * WIDE * leaf, rows);
-        alignas(64) double table[9 * WIDE];
-        gather(tree, leaf, next_pos, table);
-        multiply(table, rows + 4);
-    }
-    return tree.cross + WIDE * place;
-}
-
 inline Vec unit(Vec a) {
     const double length = std::sqrt(dot(a, a));
     return (1.0 / std::max(length, TINY)) * a;
 }
 
+inline Vec face_cross(const Tree& tree, int64_t face) {
+    const int64_t* c = tree.faces + 3 * face;
+    const Vec here = at(tree.pos, c[0]);
+    return cross(at(tree.pos, c[1]) - here, at(tree.pos, c[2]) - here);
+}
+
 // Angle-weighted pseudonormal, not normalised, at a point of a face.
-Vec pseudonormal(const Tree& tree, const double* next_pos, int64_t face, const double* bary) {
+Vec pseudonormal(const Tree& tree, int64_t face, const double* bary) {
     const int zeros = (bary[0] == 0.0) + (bary[1] == 0.0) + (bary[2] == 0.0);
     Vec sum{0.0, 0.0, 0.0};
-    if (zeros == 0) return at(crosses(tree, next_pos, tree.place[face]), 0);
+    if (zeros == 0) return face_cross(tree, face);
     if (zeros == 1) {
         const int corner = bary[0] == 0.0 ? 0 : bary[1] == 0.0 ? 1 : 2;
         const int64_t* faces = tree.edge_faces + tree.edge_width * tree.face_edges[3 * face + corner];
         for (int64_t i = 0; i < tree.edge_width; ++i)
-            if (faces[i] >= 0) sum = sum + unit(at(crosses(tree, next_pos, tree.place[faces[i]]), 0));
+            if (faces[i] >= 0) sum = sum + unit(face_cross(tree, faces[i]));
         return sum;
     }
     const int64_t* corners = tree.faces + 3 * face;
@@ -379,50 +369,172 @@ Vec pseudonormal(const Tree& tree, const double* next_pos, int64_t face, const d
     return sum;
 }
 
-// Area-weighted unit normals at a vertex, now and next; zero where there is none.
-const double* vertex_normals(const Tree& tree, const double* next_pos, int64_t vertex) {
-    double* normal = tree.vertex_normal + 6 * vertex;
-    if (tree.stamp[vertex] == (int32_t)tree.call) return normal;
+// Eight vertices and the faces around them.
+struct Fans {
+    int32_t vertex[WIDE], first[WIDE], size[WIDE], turns = 0;
+
+    // The needed vertices from the i-th on; the last one is repeated.
+    Fans(const Tree& tree, int64_t i, int64_t count) {
+        for (int lane = 0; lane < WIDE; ++lane) {
+            const int32_t v = vertex[lane] = tree.needed[std::min(i + lane, count - 1)];
+            first[lane] = tree.fan_first[v], size[lane] = tree.fan_first[v + 1] - first[lane];
+            turns = std::max(turns, size[lane]);
+        }
+    }
+
+    // The corners whose turn it is, and what they count; vertices themselves, and nothing, where there are no more.
+    void turn(const Tree& tree, int32_t k, int32_t* corner) const {
+        for (int lane = 0; lane < WIDE; ++lane) corner[lane] = k < size[lane] ? tree.fan[first[lane] + k] : vertex[lane];
+    }
+    V8 share(const Tree& tree, int32_t k) const {
+        return lanes([&](int lane) { return k < size[lane] ? tree.fan_share[first[lane] + k] : 0.0; });
+    }
+};
+
+// Rows of a table, which are so far apart.
+inline Axes pick(const double* table, int64_t stride, const int32_t* row) {
+    const double* at[WIDE];
+    for (int lane = 0; lane < WIDE; ++lane) at[lane] = table + stride * row[lane];
+    return {lanes([&](int lane) { return at[lane][0]; }), lanes([&](int lane) { return at[lane][1]; }),
+            lanes([&](int lane) { return at[lane][2]; })};
+}
+
+inline void put(double* table, int64_t stride, const int32_t* row, Axes a) {
+    alignas(64) double axes[3][WIDE];
+    store(axes[0], a.x), store(axes[1], a.y), store(axes[2], a.z);
+    for (int lane = 0; lane < WIDE; ++lane)
+        for (int k = 0; k < 3; ++k) table[stride * row[lane] + k] = axes[k][lane];
+}
+
+inline void add_cross(Axes a, Axes b, Axes& sum) {
+    sum.x += a.y * b.z - a.z * b.y, sum.y += a.z * b.x - a.x * b.z, sum.z += a.x * b.y - a.y * b.x;
+}
+
+inline Axes unit(Axes a) {
+    const V8 length = root(dot(a, a)), zero = all(0.0);
+    const I8 some = length > TINY;
+    const V8 scale = 1.0 / (some ? length : all(1.0));
+    return {some ? scale * a.x : zero, some ? scale * a.y : zero, some ? scale * a.z : zero};
+}
+
+// Area-weighted unit normals now and, of as many places, next; zero where there is none.
+void make_normals(const Tree& tree, const Fans& fans, const double* const* pos, int places) {
+    const Axes nothing{all(0.0), all(0.0), all(0.0)};
+    Axes here[2] = {nothing, nothing}, before[2] = {nothing, nothing}, sum[2] = {nothing, nothing};
+    for (int p = 0; p < places; ++p) here[p] = pick(pos[p], 3, fans.vertex);
+    for (int32_t k = 0; k < fans.turns; ++k) {
+        int32_t corner[WIDE];
+        fans.turn(tree, k, corner);
+        for (int p = 0; p < places; ++p) {
+            const Axes edge = pick(pos[p], 3, corner) - here[p];
+            add_cross(before[p], edge, sum[p]);
+            before[p] = edge;
+        }
+    }
+    for (int p = 0; p < places; ++p) put(tree.vertex_normal + 3 * p, 6, fans.vertex, unit(sum[p]));
+}
+
+// Largest normal curvatures over the edges at vertices, see hood/mesh/curvature.py.
+V8 bend(const Tree& tree, const Query& query, const Fans& fans) {
+    const Axes here = pick(tree.pos, 3, fans.vertex), normal = pick(tree.vertex_normal, 6, fans.vertex);
+    V8 most = all(0.0);
+    for (int32_t k = 0; k < fans.turns; ++k) {
+        int32_t corner[WIDE];
+        fans.turn(tree, k, corner);
+        const Axes edge = pick(tree.pos, 3, corner) - here, turn = pick(tree.vertex_normal, 6, corner) - normal;
+        most = greatest(dot(turn, edge) / greatest(dot(edge, edge), all(TINY)), most);
+    }
+    return least(most, all(query.most_curvature));
+}
+
+// The average over the corners of the faces around vertices, each face with the vertex itself.
+V8 average(const Tree& tree, const double* values, const Fans& fans) {
+    V8 sum = lanes([&](int lane) { return values[fans.vertex[lane]]; }) / 3.0;
+    for (int32_t k = 0; k < fans.turns; ++k) {
+        int32_t corner[WIDE];
+        fans.turn(tree, k, corner);
+        sum += fans.share(tree, k) * lanes([&](int lane) { return values[corner[lane]]; });
+    }
+    return sum;
+}
+
+// Work on the needed vertices ``begin`` to ``end``, eight at a time, by threads.
+template <class Work> void for_needed(const Tree& tree, int64_t begin, int64_t end, const Work& work) {
+    for_parts(tree.parts, [&](int64_t part) {
+        const Range range = range_of(end - begin, part, tree.parts, WIDE);
+        for (int64_t i = begin + range.begin; i < begin + range.end; i += WIDE) work(Fans(tree, i, end));
+    });
+}
+
+inline void need(const Tree& tree, int64_t vertex, int64_t& count) {
+    // Without a branch: whether a vertex is new is hard to foresee.
+    tree.needed[count] = (int32_t)vertex;
+    count += tree.stamp[vertex] != (int32_t)tree.call;
     tree.stamp[vertex] = (int32_t)tree.call;
-    Vec sum[2] = {{0.0, 0.0, 0.0}, {0.0, 0.0, 0.0}};
-    const int32_t* around = tree.around_place + tree.first[vertex];
-    for (int64_t i = 0; i < tree.valence[vertex]; ++i) {
-        const double* row = crosses(tree, next_pos, around[i]);
-        sum[0] = sum[0] + at(row, 0), sum[1] = sum[1] + at(row + 4, 0);
-    }
-    for (int k = 0; k < 2; ++k) {
-        const double length = std::sqrt(dot(sum[k], sum[k]));
-        put(normal + 3 * k, length > TINY ? (1.0 / length) * sum[k] : Vec{0.0, 0.0, 0.0});
-    }
-    return normal;
 }
 
-// Normals of all vertices in the tree, and what they are made of: threads must not make them while others read.
-void make_all_normals(const Tree& tree, const double* next_pos) {
-    for_parts(tree.parts, [&](int64_t part) {
-        const Range leaves = range_of(tree.num_leaves, part, tree.parts);
-        for (int64_t leaf = leaves.begin; leaf < leaves.end; ++leaf) crosses(tree, next_pos, WIDE * leaf);
-    });
-    for_parts(tree.parts, [&](int64_t part) {
-        const Range blocks = range_of(tree.num_blocks, part, tree.parts);
-        for (int64_t i = WIDE * blocks.begin; i < WIDE * blocks.end; ++i) vertex_normals(tree, next_pos, tree.block_vertex[i]);
-    });
+// Lists the vertices that the points were found at, then those around them, ring by ring; how many there are up to each.
+std::vector<int64_t> list_needed(const Tree& tree, const Query& query, int64_t rings) {
+    int64_t count = 0, begin = 0;
+    for (int64_t i = 0; i < query.count; ++i)
+        for (int c = 0; c < 3; ++c)
+            if (query.bary[3 * i + c] != 0.0) need(tree, tree.faces[3 * query.face[i] + c], count);
+    std::vector<int64_t> until{count};
+    for (int64_t ring = 0; ring < rings; ++ring) {
+        for (const int64_t end = count; begin < end; ++begin)
+            for (int32_t i = tree.fan_first[tree.needed[begin]]; i < tree.fan_first[tree.needed[begin] + 1]; ++i)
+                need(tree, tree.fan[i], count);
+        until.push_back(count);
+    }
+    return until;
 }
 
-// Where a point of a face is, now and next, and the normals there.
-void interpolate(const Tree& tree, const Query& query, int64_t face, const double* bary, int64_t i) {
+// Curvatures at the vertices that the points were found at, of those around them alone: every average takes a ring less.
+const double* make_curvatures(const Tree& tree, const Query& query, const std::vector<int64_t>& until) {
+    double *now = tree.bulge, *other = now + tree.num_vertices;
+    const auto fill = [&](int64_t ring, double* values, const auto& values_at) {
+        for_needed(tree, 0, until[ring], [&](const Fans& fans) {
+            alignas(64) double value[WIDE];
+            store(value, values_at(fans));
+            for (int lane = 0; lane < WIDE; ++lane) values[fans.vertex[lane]] = value[lane];
+        });
+    };
+    fill(query.rounds, now, [&](const Fans& fans) { return bend(tree, query, fans); });
+    for (int64_t ring = query.rounds - 1; ring >= 0; --ring, std::swap(now, other))
+        fill(ring, other, [&](const Fans& fans) { return average(tree, now, fans); });
+    return now;
+}
+
+// Where the i-th point of a face is, now and next, and the normals there.
+void interpolate(const Tree& tree, const Query& query, const double* curvature, int64_t i) {
     Vec where{0.0, 0.0, 0.0}, next_where = where, up = where, next_up = where;
+    double bulge = 0.0;
     for (int c = 0; c < 3; ++c) {
-        const int64_t vertex = tree.faces[3 * face + c];
-        where = where + bary[c] * at(tree.pos, vertex);
-        next_where = next_where + bary[c] * at(query.next_pos, vertex);
-        if (bary[c] == 0.0) continue;
-        const double* normals = vertex_normals(tree, query.next_pos, vertex);
-        up = up + bary[c] * at(normals, 0);
-        next_up = next_up + bary[c] * at(normals, 1);
+        const int64_t vertex = tree.faces[3 * query.face[i] + c];
+        const double share = query.bary[3 * i + c], *normals = tree.vertex_normal + 6 * vertex;
+        where = where + share * at(tree.pos, vertex);
+        next_where = next_where + share * at(query.next_pos, vertex);
+        if (share == 0.0) continue;
+        up = up + share * at(normals, 0);
+        next_up = next_up + share * at(normals, 1);
+        if (curvature) bulge += share * curvature[vertex];
     }
     put(query.point + 3 * i, where), put(query.normal + 3 * i, unit(up));
     put(query.next_point + 3 * i, next_where), put(query.next_normal + 3 * i, unit(next_up));
+    if (curvature) query.curvature[i] = bulge;
+}
+
+// What is known of the points that were found.
+void describe(const Tree& tree, const Query& query) {
+    const std::vector<int64_t> until = list_needed(tree, query, query.curvature ? query.rounds + 1 : 0);
+    const double* const pos[2] = {tree.pos, query.next_pos};
+    for_needed(tree, 0, until.front(), [&](const Fans& fans) { make_normals(tree, fans, pos, 2); });
+    for_needed(tree, until.front(), until.back(), [&](const Fans& fans) { make_normals(tree, fans, pos, 1); });
+    const double* curvature = query.curvature ? make_curvatures(tree, query, until) : nullptr;
+    for_parts(tree.parts, [&](int64_t part) {
+        const Range range = range_of(query.count, part, tree.parts);
+        for (int64_t i = range.begin; i < range.end; ++i) interpolate(tree, query, curvature, i);
+    });
 }
 
 void finish(const Tree& tree, const Query& query, int64_t i, const Walk& walk) {
@@ -436,9 +548,8 @@ void finish(const Tree& tree, const Query& query, int64_t i, const Walk& walk) {
     double* bary = query.bary + 3 * i;
     Vec offset;
     closest_on_triangle(walk.p, at(tree.pos, corner[0]), at(tree.pos, corner[1]), at(tree.pos, corner[2]), bary, &offset);
-    const double side = dot(offset, pseudonormal(tree, query.next_pos, face, bary));
+    const double side = dot(offset, pseudonormal(tree, face, bary));
     query.dist[i] = (side < 0.0 ? -1.0 : 1.0) * std::sqrt(closest.dist_sq);
-    interpolate(tree, query, face, bary, i);
 }
 
 void search(const Tree& tree, const Query& query, int64_t begin, int64_t end) {
@@ -483,10 +594,10 @@ int32_t grow(Tree& tree, int32_t begin, int32_t end, const double* centre) {
 }
 
 // Gives every vertex to one of the leaves around it, to that which has the fewest, and lists those of each leaf.
-void share_vertices(Tree& tree, int64_t num_vertices) {
+void share_vertices(Tree& tree) {
     int32_t* count = tree.block_first + 1;
     std::fill(count, count + tree.num_leaves, 0);
-    for (int64_t vertex = 0; vertex < num_vertices; ++vertex) {
+    for (int64_t vertex = 0; vertex < tree.num_vertices; ++vertex) {
         int64_t owner = -1;
         for (int64_t i = 0; i < tree.valence[vertex]; ++i) {
             const int64_t place = tree.place[tree.around[tree.first[vertex] + i]], leaf = place / WIDE;
@@ -499,7 +610,7 @@ void share_vertices(Tree& tree, int64_t num_vertices) {
     for (int64_t leaf = 0; leaf < tree.num_leaves; ++leaf) count[leaf] = tree.block_first[leaf] + (count[leaf] + WIDE - 1) / WIDE;
     tree.num_blocks = tree.block_first[tree.num_leaves];
     std::fill(tree.block_vertex, tree.block_vertex + WIDE * tree.num_blocks, -1);
-    for (int64_t vertex = 0; vertex < num_vertices; ++vertex) {
+    for (int64_t vertex = 0; vertex < tree.num_vertices; ++vertex) {
         if (tree.stamp[vertex] < 0) continue;
         int32_t* slot = tree.block_vertex + WIDE * (int64_t)tree.block_first[tree.stamp[vertex]];
         while (*slot >= 0) ++slot;
@@ -507,6 +618,43 @@ void share_vertices(Tree& tree, int64_t num_vertices) {
     }
     for (int64_t i = 0; i < WIDE * tree.num_blocks; ++i)
         if (tree.block_vertex[i] < 0) tree.block_vertex[i] = tree.block_vertex[i - 1];
+}
+
+// Lists the corners of the faces around a vertex in turn, from one rim to the other or once around. Where fans meet in a vertex
+// alone it stands itself between them.
+void list_fan(Tree& tree, int64_t vertex, std::vector<std::array<int32_t, 2>>& left) {
+    left.clear();
+    for (int64_t i = tree.first[vertex]; i < tree.first[vertex] + tree.valence[vertex]; ++i) {
+        const int64_t* c = tree.faces + 3 * tree.around[i];
+        const int own = c[0] == vertex ? 0 : c[1] == vertex ? 1 : 2;
+        left.push_back({(int32_t)c[(own + 1) % 3], (int32_t)c[(own + 2) % 3]});
+    }
+    const double share = 1.0 / (3.0 * (double)tree.valence[vertex]);
+    const int32_t begin = tree.fan_first[vertex];
+    int32_t end = begin;
+    const auto append = [&](int32_t corner, double count) { tree.fan[end] = corner, tree.fan_share[end++] = count; };
+    const auto follows = [&](size_t i, int32_t corner) { return left[i][0] == corner; };
+    while (!left.empty()) {
+        size_t next = 0;
+        for (size_t i = 0; i < left.size(); ++i) {
+            bool begins = true;
+            for (const auto& face : left) begins = begins && face[1] != left[i][0];
+            if (begins) {
+                next = i;
+                break;
+            }
+        }
+        if (end > begin) append((int32_t)vertex, 0.0);
+        append(left[next][0], 0.0);
+        while (next < left.size()) {
+            const int32_t corner = left[next][1];
+            tree.fan_share[end - 1] += share;
+            append(corner, share);
+            left.erase(left.begin() + next);
+            for (next = 0; next < left.size() && !follows(next, corner);) ++next;
+        }
+    }
+    tree.fan_first[vertex + 1] = end;
 }
 
 // Widens the box from low to high, lane by lane; passes over what is not a number.
@@ -560,7 +708,7 @@ void fit_boxes(Tree& tree) {
 extern "C" {
 
 // Everything that depends on the topology alone, from centres (G, 3) of the faces; ``order`` holds those in the tree.
-void surface_build(Tree* tree, const double* centre, int64_t num_vertices) {
+void surface_build(Tree* tree, const double* centre) {
     tree->num_nodes = tree->num_leaves = tree->num_blocks = 0;
     grow(*tree, 0, (int32_t)tree->num_faces, centre);
     for (int64_t i = tree->num_faces; i < WIDE * tree->num_leaves; ++i) tree->order[i] = tree->order[tree->num_faces - 1];
@@ -570,11 +718,10 @@ void surface_build(Tree* tree, const double* centre, int64_t num_vertices) {
             tree->corner_of[WIDE * (3 * (i / WIDE) + c) + i % WIDE] = (int32_t)tree->faces[3 * (int64_t)tree->order[i] + c];
     }
     for (int64_t i = 0; i < tree->num_faces; ++i) tree->place[tree->order[i]] = (int32_t)i;
-    for (int64_t vertex = 0; vertex < num_vertices; ++vertex)
-        for (int64_t i = tree->first[vertex]; i < tree->first[vertex] + tree->valence[vertex]; ++i)
-            tree->around_place[i] = tree->place[tree->around[i]];
-    share_vertices(*tree, num_vertices);
-    std::fill(tree->stamp, tree->stamp + num_vertices, 0);
+    share_vertices(*tree);
+    std::fill(tree->stamp, tree->stamp + tree->num_vertices, 0);
+    std::vector<std::array<int32_t, 2>> left;
+    for (int64_t vertex = 0; vertex < tree->num_vertices; ++vertex) list_fan(*tree, vertex, left);
     for (int64_t i = 0; i < WIDE * tree->num_blocks; ++i) tree->block_number[i] = tree->block_vertex[i];
 }
 
@@ -627,7 +774,6 @@ void surface_curvature(int64_t num_faces, int64_t num_edges, int64_t num_vertice
 }
 
 void surface_search(const Tree* tree, const Query* query) {
-    if (tree->parts > 1) make_all_normals(*tree, query->next_pos);
     for_parts(tree->parts, [&](int64_t part) {
         Tree own = *tree;
         const int64_t visits = own.batch * own.num_leaves + 1;
@@ -635,5 +781,6 @@ void surface_search(const Tree* tree, const Query* query) {
         const Range range = range_of(query->count, part, own.parts, own.batch);
         for (int64_t i = range.begin; i < range.end; i += own.batch) search(own, *query, i, std::min(i + own.batch, range.end));
     });
+    describe(*tree, *query);
 }
 }

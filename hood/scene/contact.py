@@ -6,7 +6,6 @@ a step that needs body edges alone is spared the triangles.
 
 from __future__ import annotations
 
-import weakref
 from dataclasses import dataclass
 
 import torch
@@ -16,7 +15,6 @@ from hood.mesh import geometry, surface_tree
 from hood.mesh.centroids import nearest_centroids
 from hood.mesh.curvature import convex_curvature
 from hood.mesh.fixed_surface import search_surface_fixed
-from hood.mesh.kept import forget
 from hood.mesh.nearest import Nearest, nearest_dense, nearest_vertices
 from hood.mesh.proximity import Incidence, SurfaceHit, build_incidence, search_surface
 from hood.mesh.surface_tree import Match
@@ -71,44 +69,25 @@ def find_contact(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, cap: flo
 
     Matches farther than ``cap`` [m] are kept but marked invalid.
     """
-    match = match_surface(pos, vertex_scene, obstacle)
-    incidence = build_incidence(obstacle.faces, len(obstacle.pos))
-    return _contact_of(match, obstacle, _curvature_of(obstacle, incidence), cap)
+    match = match_surface(pos, vertex_scene, obstacle, curved=True)
+    return Contact(**match._asdict(), valid=match.dist.abs() <= cap)
 
 
-#: Curvatures of the last bodies that contact was searched on, as long as their positions live: settling asks for one often.
-_CURVATURES: dict[int, tuple[weakref.ref[Tensor], int, Tensor]] = {}
+def match_surface(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, curved: bool = False) -> Match:
+    """The closest body points at t of positions (V, 3), and where they go: by the compiled search where there is one.
 
-
-def _curvature_of(obstacle: Obstacle, incidence: Incidence) -> Tensor:
-    """Curvature [1/m] (W,) of the body at t, once for the same positions."""
-    pos, key = obstacle.pos, id(obstacle.pos)
-    if pos.is_inference():  # written over unseen
-        return convex_curvature(pos, obstacle.faces, incidence)
-    known = _CURVATURES.get(key)
-    if known is None or known[0]() is not pos or known[1] != pos._version:
-        found = convex_curvature(pos, obstacle.faces, incidence)
-        known = _CURVATURES[key] = weakref.ref(pos, forget(_CURVATURES, key)), pos._version, found
-    return known[2]
-
-
-def _contact_of(match: Match, obstacle: Obstacle, curvature: Tensor, cap: float) -> Contact:
-    """``curvature`` (W,) is that of the body's vertices."""
-    at_vertices = curvature.to(match.bary)
-    matched = (match.bary * at_vertices[obstacle.faces[match.face]]).sum(dim=1)
-    return Contact(**match._asdict(), valid=match.dist.abs() <= cap, curvature=matched)
-
-
-def match_surface(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle) -> Match:
-    """The closest body points at t of positions (V, 3), and where they go: by the compiled search where there is one."""
+    With the body's curvature at t there if it is to be ``curved``.
+    """
     incidence = build_incidence(obstacle.faces, len(obstacle.pos)) if len(obstacle.faces) and len(pos) else None
     if incidence is not None:
         surface = obstacle.pos, obstacle.faces, obstacle.face_scene, incidence.adjacency, obstacle.next_pos
-        found = surface_tree.search(pos, vertex_scene, *surface)
+        found = surface_tree.search(pos, vertex_scene, *surface, curved)
         if found is not None:
             return found
     hit = search_surface(pos, vertex_scene, obstacle.pos, obstacle.faces, obstacle.vertex_scene, obstacle.face_scene)
-    return _match_of(hit, obstacle, incidence or build_incidence(obstacle.faces, len(obstacle.pos)))
+    incidence = incidence or build_incidence(obstacle.faces, len(obstacle.pos))
+    match = _match_of(hit, obstacle, incidence)
+    return match._replace(curvature=_matched_curvature(match, obstacle, incidence)) if curved else match
 
 
 def find_fixed_contact(
@@ -125,8 +104,8 @@ def find_fixed_contact(
     surface = obstacle.pos, obstacle.faces, obstacle.vertex_scene, obstacle.face_scene
     hit, needed = search_surface_fixed(pos, vertex_scene, *surface, incidence, num_scenes, places)
     match = _match_of(hit, obstacle, incidence)
-    curvature = convex_curvature(obstacle.pos, obstacle.faces, incidence, by_compiled=False)
-    return _contact_of(match, obstacle, curvature, cap), needed
+    match = match._replace(curvature=_matched_curvature(match, obstacle, incidence))
+    return Contact(**match._asdict(), valid=match.dist.abs() <= cap), needed
 
 
 def _match_of(hit: SurfaceHit, obstacle: Obstacle, incidence: Incidence) -> Match:
@@ -138,6 +117,12 @@ def _match_of(hit: SurfaceHit, obstacle: Obstacle, incidence: Incidence) -> Matc
     )
     (point, next_point), (normal, next_normal) = points, normals
     return Match(*hit, point=point, normal=normal, next_point=next_point, next_normal=next_normal)
+
+
+def _matched_curvature(match: Match, obstacle: Obstacle, incidence: Incidence) -> Tensor:
+    """Curvature [1/m] (N,) of the body at t where it was matched."""
+    at_vertices = convex_curvature(obstacle.pos, obstacle.faces, incidence).to(match.bary)
+    return (match.bary * at_vertices[obstacle.faces[match.face]]).sum(dim=1)
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,10 @@ from hood.scene.contact import Contact
 
 #: ``curvature``: farther where the body bulges under long edges; ``constant``: the same everywhere.
 REACHES = ("curvature", "constant")
-#: Triangles sag more than the edges, and their corners differ.
-_MARGIN = 1.5
-#: Vertices are held off by no more [m] than this beside the constant part.
-_MOST = 8e-3
+#: How much of L² κ vertices are held off: an eighth for the edges; triangles sag more, and their corners differ.
+SAG_SHARE = 1.5 / 8.0
+#: They are held off by no more [m] than this beside the constant part.
+MOST_SAG = 8e-3
 
 
 def sag(cloth: Cloth, contact: Contact) -> Tensor:
@@ -23,7 +23,7 @@ def sag(cloth: Cloth, contact: Contact) -> Tensor:
     lengths of the edges at the vertex, κ the body's curvature where the vertex was matched (:mod:`hood.mesh.curvature`).
     Fades with the square of the edges: 3.8 mm for 35 mm on a limb 120 mm thick, 0.9 mm for 17 mm.
     """
-    return (_MARGIN / 8.0 * cloth.edge_length_sq * contact.curvature).clamp_max(_MOST)
+    return (SAG_SHARE * cloth.edge_length_sq * contact.curvature).clamp_max(MOST_SAG)
 
 
 def vertex_reach(form: str, least: float, cloth: Cloth, contact: Contact) -> Tensor:

@@ -18,6 +18,7 @@ from hood.losses.problem import StepProblem
 from hood.losses.stretching import Stretching
 from hood.mesh.kept import forget
 from hood.solver import vertex_pass
+from hood.solver.contact_pass import ContactPass, contact_pass
 from hood.solver.elements import BENDINGS
 
 COLLISIONS = (Collision, CentroidCollision)
@@ -140,32 +141,38 @@ class VertexForces:
         return VertexModel(gradient, matrix, slack)
 
 
-def vertex_forces(potential: Potential, problem: StepProblem) -> VertexForces:
-    """The potential's terms of :data:`CLOSED_FORM` that act on single vertices."""
+def vertex_forces(potential: Potential, problem: StepProblem, compiled: bool = False) -> VertexForces:
+    """The potential's terms of :data:`CLOSED_FORM` that act on single vertices; ``compiled`` may leave torch."""
     mass, pos = problem.cloth.mass, problem.state.pos
     inertia, weight = torch.zeros_like(mass), torch.zeros_like(pos)
     walls: list[Walls] = []
     grips: list[Grip] = []
+    contact = contact_pass(problem) if compiled else None
     for term in potential.active(problem).values():
         if type(term) is Inertia:
             inertia = inertia + mass
         elif type(term) is Gravity:
             weight = weight + mass[:, None] * problem.gravity.to(pos)
         elif isinstance(term, Collision) and type(term) in COLLISIONS:
-            walls.append(walls_of(term, problem))
+            walls.append(walls_of(term, problem, contact))
         elif isinstance(term, LaggedFriction) and type(term) in FRICTIONS:
-            grips.append(_grip(term, problem))
+            grips.append(_grip(term, problem, contact))
     return VertexForces(inertia[:, None], inertia / problem.vertex_dt.squeeze(1) ** 2, weight, tuple(walls), tuple(grips))
 
 
-def walls_of(term: Collision, problem: StepProblem) -> Walls:
-    """The planes of a collision term; the problem must have a contact."""
+def walls_of(term: Collision, problem: StepProblem, compiled: ContactPass | None = None) -> Walls:
+    """The planes of a collision term; the problem must have a contact. By the ``compiled`` pass where there is one."""
+    if compiled is not None and type(term) is Collision:
+        return Walls(term.weight, *compiled.planes(term))
     planes = term.planes(problem)
     reach = torch.where(planes.touching, term.reaches(problem), 0.0)
     return Walls(term.weight, planes.point, planes.normal, reach)
 
 
-def _grip(term: LaggedFriction, problem: StepProblem) -> Grip:
+def _grip(term: LaggedFriction, problem: StepProblem, compiled: ContactPass | None) -> Grip:
+    if compiled is not None and type(term) is Friction:
+        normal, anchor, force, limit = compiled.grips(term)
+        return Grip(force, normal, anchor, limit)
     contact = problem.contact
     assert contact is not None
     force = term.coefficient * term.normal_force(problem, contact)
@@ -206,7 +213,7 @@ def known_forces(potential: Potential, problem: StepProblem) -> VertexForces:
     known = _FORCES.get(key)
     if known is None or known[0]() is not problem or [id(term) for term in known[1]] != [id(term) for term in terms]:
         reference = weakref.ref(problem, forget(_FORCES, key))
-        known = _FORCES[key] = reference, terms, vertex_forces(potential, problem)
+        known = _FORCES[key] = reference, terms, vertex_forces(potential, problem, compiled=True)
     return known[2]
 
 

@@ -141,9 +141,9 @@ def surface_searches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     calls: list[int] = []
     search = contact.match_surface
 
-    def counted(points: Tensor, *rest: object) -> object:
+    def counted(points: Tensor, *rest: object, **named: object) -> object:
         calls.append(len(points))
-        return search(points, *rest)
+        return search(points, *rest, **named)
 
     monkeypatch.setattr(contact, "match_surface", counted)
     return calls

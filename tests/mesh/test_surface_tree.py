@@ -19,7 +19,7 @@ def zeros(count):
 
 def found(points, pos, faces):
     return surface_tree.search(
-        points, zeros(len(points)), pos, faces, zeros(len(faces)), build_incidence(faces, len(pos)).adjacency, pos
+        points, zeros(len(points)), pos, faces, zeros(len(faces)), build_incidence(faces, len(pos)).adjacency, pos, True
     )
 
 
@@ -41,7 +41,7 @@ def test_a_search_does_not_depend_on_those_before_it():
         found(where, 0.1 * pos.flip(1), faces)
         found(points(7, seed), pos, faces)
     again = found(where, pos, faces)
-    for name in ("vertex", "face", "dist", "bary", "vertex_dist"):
+    for name in ("vertex", "face", "dist", "bary", "vertex_dist", "normal", "curvature"):
         assert torch.equal(getattr(again, name), getattr(fresh, name)), name
 
 
@@ -112,7 +112,7 @@ def test_contact_of_a_moving_batch_is_that_of_the_torch_form(monkeypatch):
     compiled = find_contact(where, owner, obstacle)
     monkeypatch.setattr(surface_tree, "library", lambda: None)
     plain = find_contact(where, owner, obstacle)
-    for name in ("dist", "point", "normal", "next_point", "next_normal", "vertex_dist"):
+    for name in ("dist", "point", "normal", "next_point", "next_normal", "vertex_dist", "curvature"):
         torch.testing.assert_close(getattr(compiled, name), getattr(plain, name), rtol=0, atol=1e-11)
     assert torch.equal(compiled.valid, plain.valid)
     assert compiled.dist.dtype == where.dtype
