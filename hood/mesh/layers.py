@@ -52,8 +52,10 @@ def library() -> ctypes.CDLL:
         getattr(lib, name).restype = COUNT
     for name in ("layers_limit", "layers_energy"):
         getattr(lib, name).restype = REAL
-    for name, count in (("energy", 2), ("model", 2), ("contacts", 5), ("forces", 3), ("rows", 2), ("counts", 3), ("number", 2)):
+    for name, count in (("energy", 2), ("model", 2), ("contacts", 5), ("forces", 3), ("rows", 2), ("counts", 3)):
         getattr(lib, f"layers_{name}").argtypes = [POINTER] * count
+    lib.layers_number.restype = POINTER
+    lib.layers_number.argtypes = [POINTER, POINTER, COUNT]
     return lib
 
 
@@ -145,7 +147,16 @@ class Work(NamedTuple):
     left_out: int  # pairs of features that are not
     searches: int
     overflowed: bool  # no list: nearly everything is near everything, in torn cloth, or a position is not finite
-    seconds: float  # searching, measuring distances and limiting moves
+    # Processor time [s].
+    searching: float
+    limiting: float  # moves
+    energies: float
+    models: float
+
+    @property
+    def seconds(self) -> float:
+        """All of it."""
+        return self.searching + self.limiting + self.energies + self.models
 
 
 class Layers:
@@ -213,17 +224,18 @@ class Layers:
         self._lib.layers_rows(self.handle, rows.ctypes.data)
         return gradient, rows, found.corners, own
 
-    def number(self, row: np.ndarray) -> None:
-        """Let the compiled solver name vertices by ``row`` (V,)."""
+    def number(self, row: np.ndarray, num_rows: int) -> int:
+        """Name vertices by ``row`` (V,), of which those from ``num_rows`` on do not move; address of what the compiled solver
+        reads (``hood/native/layer_view.h``), as long as this lives."""
         numbers = np.ascontiguousarray(row, np.int32)
-        self._lib.layers_number(self.handle, numbers.ctypes.data)
+        return int(self._lib.layers_number(self.handle, numbers.ctypes.data, num_rows))
 
     @property
     def work(self) -> Work:
         """What has been done so far."""
-        counts, seconds = np.empty(4, np.int64), np.empty(1)
+        counts, seconds = np.empty(4, np.int64), np.empty(4)
         self._lib.layers_counts(self.handle, counts.ctypes.data, seconds.ctypes.data)
-        return Work(int(counts[0]), int(counts[1]), int(counts[2]), bool(counts[3]), float(seconds[0]))
+        return Work(int(counts[0]), int(counts[1]), int(counts[2]), bool(counts[3]), *seconds.tolist())
 
 
 def _positions(pos: np.ndarray) -> np.ndarray:

@@ -19,16 +19,13 @@ void layers_free(void* layers) { delete (Layers*)layers; }
 // Pairs of faces that pass through each other where the step begins.
 int64_t layers_crossed(void* handle) {
     Layers* layers = (Layers*)handle;
-    const LayerTimer timer{layers->seconds};
     layers->begin();
     return layers->crossed;
 }
 
 // Targets that can be reached become ``to``; returns how many pairs are left out for it.
 int64_t layers_approach(void* handle, double* to, double left) {
-    Layers* layers = (Layers*)handle;
-    const LayerTimer timer{layers->seconds};
-    return layers->approach(to, left);
+    return ((Layers*)handle)->approach(to, left);
 }
 
 double layers_limit(void* handle, const double* from, const double* to, double left) { return ((Layers*)handle)->limit(from, to, left); }
@@ -51,10 +48,14 @@ void layers_contacts(const void* handle, int64_t* corners, int64_t* edges, doubl
     }
 }
 
-// Numbers (V) by which rows name vertices from now on.
-void layers_number(void* handle, const int32_t* row) {
+// Numbers (V) by which rows name vertices from now on; those from ``num_rows`` on do not move. Returns what solvers read.
+const void* layers_number(void* handle, const int32_t* row, int64_t num_rows) {
     Layers* layers = (Layers*)handle;
     layers->row.assign(row, row + layers->mesh.num_vertices);
+    layers->num_rows = (int32_t)num_rows;
+    layers->show();
+    layers->view.limit = layers_limit, layers->view.energy = layers_energy, layers->view.model = layers_model;
+    return &layers->view;
 }
 
 // Gradient (V, 3) [N] and the upper triangles (V, 6) of the diagonal blocks of the last model's curvature.
@@ -65,12 +66,17 @@ void layers_forces(const void* handle, double* gradient, double* own) {
 }
 
 // Rows (N, 12) whose outer products are the curvature of the last model.
-void layers_rows(const void* handle, double* normals) { std::copy(((const Layers*)handle)->normals.begin(), ((const Layers*)handle)->normals.end(), normals); }
+void layers_rows(const void* handle, double* normals) {
+    const std::vector<double>& own = ((const Layers*)handle)->normals;
+    for (size_t i = 0; i < own.size() / 4; ++i) std::copy(&own[4 * i], &own[4 * i] + 3, normals + 3 * i);
+}
 
-// Pairs of features in the list, pairs that are left out, searches so far, whether there were too many pairs for a list; seconds.
+// Pairs of features in the list, pairs that are left out, searches so far, whether there were too many pairs for a list; seconds
+// (4) of processor time: of searching, of limiting moves, of energies and of models.
 void layers_counts(const void* handle, int64_t* counts, double* seconds) {
     const Layers* layers = (const Layers*)handle;
     counts[0] = (int64_t)layers->pairs.size(), counts[1] = (int64_t)layers->released.size(), counts[2] = layers->searches;
-    counts[3] = layers->overflowed, *seconds = layers->seconds;
+    counts[3] = layers->overflowed;
+    for (int part = LayerClock::SEARCH; part < LayerClock::PARTS; ++part) seconds[part - 1] = layers->clock.seconds[part];
 }
 }

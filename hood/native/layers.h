@@ -1,18 +1,22 @@
 // Cloth near cloth: a list of pairs of features that may come near each other, a barrier on their distance, and how far vertices
 // may move along straight lines before two features meet. See hood/mesh/layers.py and hood/losses/layers.py.
 //
-// A pair is a vertex and a face, or two edges, without a common vertex. Every vertex has a box; all pairs that can be within their
-// reach while every vertex is in its box are in the list, so that sums over it are sums over all pairs, and no two features can
-// meet that are not in it. Where a vertex leaves its box the box grows and the list is made anew. The numbering is the cloth's own.
+// A pair is a vertex and a face, or two edges, without a common vertex. The list is made for straight ways: all pairs that can be
+// within their reach while every vertex is within its margin of its place on the way, all of them equally far along, are in the list.
+// So sums over it are sums over all pairs, and no two features can meet that are not in it. Where a vertex leaves its margin the
+// list is made anew. A pair keeps a lower bound of its distance, which falls by what the cloth moves; only where it comes within
+// reach the distance is measured again. The numbering is the cloth's own.
 #pragma once
 #include <algorithm>
-#include <chrono>
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <ctime>
 #include <limits>
 #include <vector>
 
+#include "layer_search.h"
+#include "layer_view.h"
 #include "vector.h"
 
 namespace {
@@ -32,10 +36,6 @@ struct LayerPair {
     int32_t corner[4];  // a vertex and a face, or two edges
     int32_t edges;      // 1 for two edges
     double reach, area, parallel;  // m; m^2; m^4: square of the edges' cross product below which the barrier fades
-};
-
-struct LayerBox {
-    double low[3], high[3];
 };
 
 // A pair within its reach.
@@ -131,20 +131,24 @@ inline double fading(double square, double parallel, double* slope) {
     return ratio * (2.0 - ratio);
 }
 
-// Along straight lines from x by p, the share of the way that is safe: 1, or where at least ``left`` of the first distance is kept.
-// By additive conservative advancement: no two points of the features come nearer than by the largest relative motion.
-inline double safe_share(int32_t edges, const Vec* x0, const Vec* p0, double left) {
-    Vec x[4], p[4];
-    const Vec mean = 0.25 * (p0[0] + p0[1] + p0[2] + p0[3]);
+// Takes the mean off the ways of the corners; how far points of the features then move towards each other at most.
+inline double relative_way(int32_t edges, Vec* p) {
+    const Vec mean = 0.25 * (p[0] + p[1] + p[2] + p[3]);
     double size[4];
-    for (int i = 0; i < 4; ++i) x[i] = x0[i], p[i] = p0[i] - mean, size[i] = dot(p[i], p[i]);
-    const double way = edges ? std::sqrt(std::max(size[0], size[1])) + std::sqrt(std::max(size[2], size[3]))
-                             : std::sqrt(size[0]) + std::sqrt(std::max(size[1], std::max(size[2], size[3])));
-    if (!(way > 0.0)) return 1.0;
-    double weight[4], dist = std::sqrt(pair_distance_sq(edges, x, weight));
+    for (int i = 0; i < 4; ++i) p[i] = p[i] - mean, size[i] = dot(p[i], p[i]);
+    return edges ? std::sqrt(std::max(size[0], size[1])) + std::sqrt(std::max(size[2], size[3]))
+                 : std::sqrt(size[0]) + std::sqrt(std::max(size[1], std::max(size[2], size[3])));
+}
+
+// Along straight lines from x by p, of which ``way`` is the relative one, the share that is safe: 1, or where at least ``left`` of
+// the first distance is kept. By additive conservative advancement: no two points of the features come nearer than by their ways.
+inline double safe_share(int32_t edges, const Vec* x0, const Vec* p, double way, double left, double* first) {
+    double weight[4], dist = std::sqrt(pair_distance_sq(edges, x0, weight));
+    *first = dist;
     const double kept = left * dist;
-    if (dist - kept >= way) return 1.0;
+    if (!(way > 0.0) || dist - kept >= way) return 1.0;
     double time = 0.0;
+    Vec x[4];
     while (dist - kept > 0.01 * dist) {
         const double step = 0.9 * (dist - kept) / way;
         if (time + step >= 1.0) return 1.0;
@@ -155,11 +159,34 @@ inline double safe_share(int32_t edges, const Vec* x0, const Vec* p0, double lef
     return time;
 }
 
-// Adds the time it lives.
+// Processor time of this thread [s].
+inline double thread_seconds() {
+    timespec now;
+    clock_gettime(CLOCK_THREAD_CPUTIME_ID, &now);
+    return (double)now.tv_sec + 1e-9 * (double)now.tv_nsec;
+}
+
+// What the time is spent on; a part within another is not counted for the other.
+struct LayerClock {
+    enum Part { OTHER, SEARCH, LIMIT, ENERGY, MODEL, PARTS };
+    double seconds[PARTS] = {};
+    Part part = OTHER;
+    double since = 0.0;
+
+    Part turn(Part next) {
+        const double now = thread_seconds();
+        if (part != OTHER) seconds[part] += now - since;
+        const Part before = part;
+        part = next, since = now;
+        return before;
+    }
+};
+
 struct LayerTimer {
-    double& seconds;
-    std::chrono::steady_clock::time_point began = std::chrono::steady_clock::now();
-    ~LayerTimer() { seconds += std::chrono::duration<double>(std::chrono::steady_clock::now() - began).count(); }
+    LayerClock& clock;
+    LayerClock::Part before;
+    LayerTimer(LayerClock& its, LayerClock::Part part) : clock(its), before(its.turn(part)) {}
+    ~LayerTimer() { clock.turn(before); }
 };
 
 struct Layers {
@@ -167,183 +194,177 @@ struct Layers {
     double pressure = 0.0;  // Pa
     bool between = false;   // pairs of two garments alone
     std::vector<uint8_t> fixed;
-    std::vector<double> low, high, margin;  // (3 V), (3 V), (V) boxes and how far beyond a vertex they go
-    std::vector<uint64_t> released;         // sorted keys of pairs that are left out
+    std::vector<double> margin;      // (V) m, how far vertices may be off their ways
+    std::vector<uint64_t> released;  // sorted keys of pairs that are left out
     std::vector<LayerPair> pairs;
     std::vector<uint64_t> keys;
-    std::vector<LayerContact> contacts;     // of the last model
-    std::vector<LayerBox> tree, vertex_box, edge_box, face_box;
+    std::vector<double> bounds;  // of the distances of the pairs, and what the cloth had moved when they were found [m]
+    std::vector<LayerContact> contacts;  // of the last model
+    LayerTree tree;
     std::vector<double> start;  // (3 V) where the step begins
-    bool begun = false, swept = false;  // the list is one of a way
+    // The ways that the list is for, the margins then, and how far the cloth has moved since.
+    std::vector<double> from, to, room, last;
+    bool moving = false, known = false;  // whether the ways lead anywhere; whether bounds count from ``last``, not from the ways
+    double moved = 0.0, most_reach = 0.0;
+    bool begun = false;
     int64_t searches = 0, crossed = 0;  // pairs of faces that are crossed where it begins
-    double seconds = 0.0;  // of everything but what the solver does with the rows
+    LayerClock clock;  // what solvers do with the rows is no part of it
     bool overflowed = false;  // cloth so crumpled, or torn, that nearly everything is near everything: no list
+    struct Candidate {
+        int32_t first, second;  // a vertex and a face, or two edges
+    };
+    std::vector<Candidate> candidates[2];
     // For the solver.
+    LayerView view = {};
     std::vector<double> here, there, gradient, own;  // (3 V) twice, (3 V), (6 V)
     std::vector<int32_t> row, rows;                  // (V) number of a vertex in the solver, (N, 4)
-    std::vector<double> normals;                     // (N, 12)
+    int32_t num_rows = 0;                            // those from this number on do not move
+    std::vector<double> normals;                     // (N, 16)
     std::vector<float> normals_single;
 
     uint64_t key(int32_t edges, int64_t first, int64_t second) const {
         return edges ? ((uint64_t)1 << 63) | ((uint64_t)first * mesh.num_edges + second) : (uint64_t)first * mesh.num_faces + second;
     }
 
-    // ---- boxes and the list --------------------------------------------------------------------------------------------
+    // ---- the list --------------------------------------------------------------------------------------------------------
 
-    void box_of(int64_t v, LayerBox& box) const {
-        const double wide = 0.5 * mesh.reach[v];
-        for (int k = 0; k < 3; ++k) box.low[k] = low[3 * v + k] - wide, box.high[k] = high[3 * v + k] + wide;
-    }
-
-    static bool overlap(const LayerBox& a, const LayerBox& b) {
-        bool apart = false;
-        for (int k = 0; k < 3; ++k) apart |= a.low[k] > b.high[k] || a.high[k] < b.low[k];
-        return !apart;
-    }
-
-    static constexpr int64_t LEAF = 4;
     static constexpr int64_t MOST_PAIRS = 4000000;
     static constexpr int64_t MOST_LOOKS = 300;  // at pairs of faces, for each face: beyond it the cloth is torn
+    static constexpr double SLACK = 1e-9;       // m, more than rounding makes of a distance
 
-    template <class Box> void refit(int64_t node, int64_t begin, int64_t end, const Box& box_at) {
-        if ((int64_t)tree.size() <= node) tree.resize(node + 1);
-        if (end - begin <= LEAF) {
-            LayerBox box = box_at(begin);
-            for (int64_t i = begin + 1; i < end; ++i) join(box, box_at(i));
-            tree[node] = box;
-            return;
+    // The list of straight ways between positions (V, 3), for vertices within ``share`` of their margins of them.
+    void search(const double* begin, const double* end, double share) {
+        const LayerTimer timer(clock, LayerClock::SEARCH);
+        const bool first = !begun;
+        begun = true;
+        const int64_t size = 3 * mesh.num_vertices;
+        pairs.clear(), keys.clear(), bounds.clear(), contacts.clear();
+        for (std::vector<Candidate>& some : candidates) some.clear();
+        ++searches;
+        from.assign(begin, begin + size), to.assign(end, end + size), room.resize(mesh.num_vertices);
+        moving = std::memcmp(begin, end, sizeof(double) * size) != 0, known = false, moved = 0.0;
+        overflowed = overflowed || !finite();
+        if (overflowed) return;
+        std::vector<double> wide(mesh.num_vertices);
+        for (int64_t v = 0; v < mesh.num_vertices; ++v) {
+            room[v] = share * margin[v], wide[v] = room[v] + 0.5 * mesh.reach[v] + SLACK;
+            most_reach = std::max(most_reach, mesh.reach[v]);
         }
-        const int64_t middle = (begin + end) / 2;
-        refit(2 * node + 1, begin, middle, box_at);
-        refit(2 * node + 2, middle, end, box_at);
-        LayerBox box = tree[2 * node + 1];
-        join(box, tree[2 * node + 2]);
-        tree[node] = box;
+        if (mesh.num_faces > 1) look(wide, first);
+        if (overflowed) pairs.clear(), keys.clear(), bounds.clear();
     }
 
-    static void join(LayerBox& box, const LayerBox& other) {
-        for (int k = 0; k < 3; ++k) box.low[k] = std::min(box.low[k], other.low[k]), box.high[k] = std::max(box.high[k], other.high[k]);
+    void look(const std::vector<double>& wide, bool first) {
+        int64_t looked_at = 0;
+        const auto too_many = [&] {
+            return looked_at > MOST_LOOKS * mesh.num_faces || (int64_t)(candidates[0].size() + candidates[1].size()) > MOST_PAIRS;
+        };
+        tree.enclose(from.data(), to.data(), wide);
+        tree.build(mesh.faces, mesh.num_faces, mesh.edges, mesh.num_edges, mesh.order);
+        tree.pairs([&](int32_t f, int32_t g) {
+            if (too_many()) return;
+            ++looked_at;
+            if (first && crossed_faces(f, g, from.data())) ++crossed, release_faces(f, g);
+            const int32_t *of_f = mesh.face_edge + 3 * (int64_t)f, *of_g = mesh.face_edge + 3 * (int64_t)g;
+            const int32_t *in_f = mesh.face_vertex + 3 * (int64_t)f, *in_g = mesh.face_vertex + 3 * (int64_t)g;
+            for (int c = 0; c < 3 && in_f[c] >= 0; ++c) consider_vertex(in_f[c], g);
+            for (int c = 0; c < 3 && in_g[c] >= 0; ++c) consider_vertex(in_g[c], f);
+            for (int c = 0; c < 3 && of_f[c] >= 0; ++c)
+                for (int d = 0; d < 3 && of_g[d] >= 0; ++d) consider_edges(of_f[c], of_g[d]);
+        });
+        overflowed = too_many();
+        if (overflowed) return;
+        std::sort(released.begin(), released.end());
+        for (int edges = 0; edges < 2; ++edges)
+            for (size_t i = 0; i < candidates[edges].size(); i += LANES) measure(edges, i);
     }
 
-    // Pairs of places in the order whose boxes overlap; a place and itself is none.
-    template <class Visit>
-    void overlapping(int64_t a, int64_t a0, int64_t a1, int64_t b, int64_t b0, int64_t b1, const std::vector<LayerBox>& box, const Visit& visit) const {
-        if (a != b && !overlap(tree[a], tree[b])) return;
-        const bool leaf_a = a1 - a0 <= LEAF, leaf_b = b1 - b0 <= LEAF;
-        if (leaf_a && leaf_b) {
-            for (int64_t i = a0; i < a1; ++i)
-                for (int64_t j = a == b ? i + 1 : b0; j < b1; ++j)
-                    if (overlap(box[i], box[j])) visit(i, j);
-            return;
+    void consider_vertex(int32_t v, int32_t f) {
+        const int32_t* face = mesh.faces + 3 * (int64_t)f;
+        if (v == face[0] || v == face[1] || v == face[2]) return;
+        if (between && mesh.piece[v] == mesh.piece[face[0]]) return;
+        MovingBox box = tree.vertex[face[0]];
+        join(box, tree.vertex[face[1]]), join(box, tree.vertex[face[2]]);
+        if (!overlap(tree.vertex[v], box)) return;
+        if (fixed[v] && fixed[face[0]] && fixed[face[1]] && fixed[face[2]]) return;
+        candidates[0].push_back({v, f});
+    }
+
+    void consider_edges(int32_t a, int32_t b) {
+        if (!overlap(tree.edge[a], tree.edge[b])) return;
+        const int32_t *one = mesh.edges + 2 * (int64_t)a, *two = mesh.edges + 2 * (int64_t)b;
+        if (one[0] == two[0] || one[0] == two[1] || one[1] == two[0] || one[1] == two[1]) return;
+        if (between && mesh.piece[one[0]] == mesh.piece[two[0]]) return;
+        if (fixed[one[0]] && fixed[one[1]] && fixed[two[0]] && fixed[two[1]]) return;
+        candidates[1].push_back(a < b ? Candidate{a, b} : Candidate{b, a});
+    }
+
+    void corners_of(int edges, Candidate pair, int32_t* corner) const {
+        const int32_t* second = edges ? mesh.edges + 2 * (int64_t)pair.second : mesh.faces + 3 * (int64_t)pair.second;
+        if (edges) std::copy(mesh.edges + 2 * (int64_t)pair.first, mesh.edges + 2 * (int64_t)pair.first + 2, corner);
+        else corner[0] = pair.first;
+        std::copy(second, second + (edges ? 2 : 3), corner + (edges ? 2 : 1));
+    }
+
+    // Adds those of the next candidates to the list that can come within their reach: by the distance halfway, less what the
+    // features move towards each other from there and what they may be off their ways.
+    void measure(int edges, size_t begin) {
+        const std::vector<Candidate>& list = candidates[edges];
+        const int count = (int)std::min<size_t>(LANES, list.size() - begin), split = edges ? 2 : 1;
+        int32_t corner[LANES][4];
+        alignas(64) double middle[4][3][LANES], half[4][3][LANES];
+        for (int lane = 0; lane < LANES; ++lane) {
+            corners_of(edges, list[begin + std::min(lane, count - 1)], corner[lane]);
+            for (int c = 0; c < 4; ++c) {
+                const double *a = from.data() + 3 * (int64_t)corner[lane][c], *b = to.data() + 3 * (int64_t)corner[lane][c];
+                for (int k = 0; k < 3; ++k) middle[c][k][lane] = 0.5 * (a[k] + b[k]), half[c][k][lane] = 0.5 * (b[k] - a[k]);
+            }
         }
-        const int64_t am = (a0 + a1) / 2, bm = (b0 + b1) / 2;
-        if (a == b) {
-            overlapping(2 * a + 1, a0, am, 2 * a + 1, a0, am, box, visit);
-            overlapping(2 * a + 2, am, a1, 2 * a + 2, am, a1, box, visit);
-            overlapping(2 * a + 1, a0, am, 2 * a + 2, am, a1, box, visit);
-        } else if (leaf_b || (!leaf_a && a1 - a0 >= b1 - b0)) {
-            overlapping(2 * a + 1, a0, am, b, b0, b1, box, visit);
-            overlapping(2 * a + 2, am, a1, b, b0, b1, box, visit);
-        } else {
-            overlapping(a, a0, a1, 2 * b + 1, b0, bm, box, visit);
-            overlapping(a, a0, a1, 2 * b + 2, bm, b1, box, visit);
+        Lanes3 x[4], p[4];
+        for (int c = 0; c < 4; ++c) {
+            x[c] = {load<V8>(middle[c][0]), load<V8>(middle[c][1]), load<V8>(middle[c][2])};
+            p[c] = {load<V8>(half[c][0]), load<V8>(half[c][1]), load<V8>(half[c][2])};
+        }
+        const V8 square = edges ? segment_segment_sq(x) : point_triangle_sq(x);
+        V8 way[2] = {all(0.0), all(0.0)};
+        if (moving) {
+            const Lanes3 mean = {0.25 * (p[0].x + p[1].x + p[2].x + p[3].x), 0.25 * (p[0].y + p[1].y + p[2].y + p[3].y),
+                                 0.25 * (p[0].z + p[1].z + p[2].z + p[3].z)};
+            for (int c = 0; c < 4; ++c) {
+                const Lanes3 own = p[c] - mean;
+                way[c >= split] = more(way[c >= split], dot(own, own));
+            }
+        }
+        for (int lane = 0; lane < count; ++lane) {
+            double off[2] = {0.0, 0.0}, reach = mesh.reach[corner[lane][0]];
+            for (int c = 0; c < 4; ++c) {
+                off[c >= split] = std::max(off[c >= split], room[corner[lane][c]]);
+                reach = std::min(reach, mesh.reach[corner[lane][c]]);
+            }
+            const double bound = std::sqrt(square[lane]) - (moving ? std::sqrt(way[0][lane]) + std::sqrt(way[1][lane]) : 0.0) - SLACK;
+            if (bound <= reach + off[0] + off[1]) add(edges, list[begin + lane], corner[lane], reach, bound);
         }
     }
 
-    void box_features() {
-        vertex_box.resize(mesh.num_vertices), edge_box.resize(mesh.num_edges), face_box.resize(mesh.num_faces);
-        for (int64_t v = 0; v < mesh.num_vertices; ++v) box_of(v, vertex_box[v]);
-        for (int64_t e = 0; e < mesh.num_edges; ++e) edge_box[e] = joined(mesh.edges + 2 * e, 2);
-        for (int64_t f = 0; f < mesh.num_faces; ++f) face_box[f] = joined(mesh.faces + 3 * f, 3);
-    }
-
-    LayerBox joined(const int32_t* corners, int count) const {
-        LayerBox box = vertex_box[corners[0]];
-        for (int c = 1; c < count; ++c) join(box, vertex_box[corners[c]]);
-        return box;
-    }
-
-    template <class Visit> void face_pairs(const Visit& visit) {
-        if (mesh.num_faces < 2) return;
-        box_features();
-        std::vector<LayerBox> box(mesh.num_faces);
-        for (int64_t i = 0; i < mesh.num_faces; ++i) box[i] = face_box[mesh.order[i]];
-        refit(0, 0, mesh.num_faces, [&](int64_t i) { return box[i]; });
-        overlapping(0, 0, mesh.num_faces, 0, 0, mesh.num_faces, box,
-                    [&](int64_t i, int64_t j) { visit(mesh.order[i], mesh.order[j]); });
+    void add(int edges, Candidate found, const int32_t* corner, double reach, double bound) {
+        const uint64_t k = key(edges, found.first, found.second);
+        if (is_released(k)) return;
+        LayerPair pair;
+        std::copy(corner, corner + 4, pair.corner);
+        pair.edges = edges, pair.reach = reach, pair.area = mesh.vertex_area[found.first], pair.parallel = 0.0;
+        if (edges) {
+            const int64_t a = found.first, b = found.second;
+            pair.area = 0.5 * (mesh.edge_area[a] + mesh.edge_area[b]);
+            pair.parallel = 1e-3 * mesh.edge_length_sq[a] * mesh.edge_length_sq[b];
+        }
+        pairs.push_back(pair), keys.push_back(k), bounds.push_back(bound);
     }
 
     bool is_released(uint64_t k) const { return !released.empty() && std::binary_search(released.begin(), released.end(), k); }
 
-    void add(int32_t edges, const LayerBox& one, const LayerBox& other, const int32_t* corner, int64_t first, int64_t second, double area, double parallel) {
-        if (!overlap(one, other)) return;
-        for (int i = 0; i < (edges ? 2 : 1); ++i)
-            for (int j = edges ? 2 : 1; j < 4; ++j)
-                if (corner[i] == corner[j]) return;
-        if (fixed[corner[0]] && fixed[corner[1]] && fixed[corner[2]] && fixed[corner[3]]) return;
-        if (between && mesh.piece[corner[0]] == mesh.piece[corner[3]]) return;
-        LayerPair pair;
-        std::copy(corner, corner + 4, pair.corner);
-        pair.edges = edges, pair.area = area, pair.parallel = parallel;
-        pair.reach = std::min(std::min(mesh.reach[corner[0]], mesh.reach[corner[1]]), std::min(mesh.reach[corner[2]], mesh.reach[corner[3]]));
-        if (out_of_reach(pair)) return;
-        const uint64_t k = key(edges, first, second);
-        if (is_released(k)) return;
-        pairs.push_back(pair);
-        keys.push_back(k);
-    }
-
-    // Whether features are apart wherever in their boxes the corners are: by their distance at the middle, less the way from there.
-    bool out_of_reach(const LayerPair& pair) const {
-        const int split = pair.edges ? 2 : 1;
-        double way[2] = {0.0, 0.0}, weight[4];
-        Vec x[4];
-        for (int c = 0; c < 4; ++c) {
-            const Vec l = at(low.data(), pair.corner[c]), h = at(high.data(), pair.corner[c]), half = 0.5 * (h - l);
-            x[c] = 0.5 * (l + h);
-            way[c >= split] = std::max(way[c >= split], dot(half, half));
-        }
-        const double far = pair.reach + std::sqrt(way[0]) + std::sqrt(way[1]);
-        return pair_distance_sq(pair.edges, x, weight) > far * far * (1.0 + 1e-9);
-    }
-
-    void add_vertex(int32_t v, int64_t f) {
-        const int32_t* face = mesh.faces + 3 * f;
-        const int32_t corner[4] = {v, face[0], face[1], face[2]};
-        add(0, vertex_box[v], face_box[f], corner, v, f, mesh.vertex_area[v], 0.0);
-    }
-
-    void add_edges(int64_t a, int64_t b) {
-        if (a > b) std::swap(a, b);
-        const int32_t corner[4] = {mesh.edges[2 * a], mesh.edges[2 * a + 1], mesh.edges[2 * b], mesh.edges[2 * b + 1]};
-        add(1, edge_box[a], edge_box[b], corner, a, b, 0.5 * (mesh.edge_area[a] + mesh.edge_area[b]), 1e-3 * mesh.edge_length_sq[a] * mesh.edge_length_sq[b]);
-    }
-
-    void search(const double* crossing_at = nullptr) {
-        pairs.clear(), keys.clear(), contacts.clear();
-        ++searches;
-        overflowed = overflowed || !finite();
-        if (overflowed) return;
-        int64_t looked_at = 0;
-        const auto too_many = [&] { return looked_at > MOST_LOOKS * mesh.num_faces || (int64_t)pairs.size() > MOST_PAIRS; };
-        face_pairs([&](int64_t f, int64_t g) {
-            if (too_many()) return;
-            ++looked_at;
-            if (crossing_at && crossed_faces(f, g, crossing_at)) ++crossed, release_faces(f, g);
-            const int32_t *of_f = mesh.face_edge + 3 * f, *of_g = mesh.face_edge + 3 * g;
-            for (int c = 0; c < 3 && mesh.face_vertex[3 * f + c] >= 0; ++c) add_vertex(mesh.face_vertex[3 * f + c], g);
-            for (int c = 0; c < 3 && mesh.face_vertex[3 * g + c] >= 0; ++c) add_vertex(mesh.face_vertex[3 * g + c], f);
-            for (int c = 0; c < 3 && of_f[c] >= 0; ++c)
-                for (int d = 0; d < 3 && of_g[d] >= 0; ++d) add_edges(of_f[c], of_g[d]);
-        });
-        overflowed = too_many();
-        if (overflowed) pairs.clear(), keys.clear();
-        if (crossed) forget_released();
-    }
-
     bool finite() const {
         double sum = 0.0;
-        for (int64_t i = 0; i < 3 * mesh.num_vertices; ++i) sum += 0.0 * low[i] + 0.0 * high[i];
+        for (int64_t i = 0; i < 3 * mesh.num_vertices; ++i) sum += 0.0 * from[i] + 0.0 * to[i];
         return sum == 0.0;
     }
 
@@ -352,59 +373,77 @@ struct Layers {
         std::sort(released.begin(), released.end());
         size_t kept = 0;
         for (size_t i = 0; i < pairs.size(); ++i)
-            if (!is_released(keys[i])) pairs[kept] = pairs[i], keys[kept++] = keys[i];
-        pairs.resize(kept), keys.resize(kept);
+            if (!is_released(keys[i])) pairs[kept] = pairs[i], bounds[kept] = bounds[i], keys[kept++] = keys[i];
+        pairs.resize(kept), bounds.resize(kept), keys.resize(kept);
     }
 
-    // The first list of a step from positions (V, 3): what is crossed there is left out.
-    void begin() { begin(start.data()); }
-    void begin(const double* target) {
-        if (begun) return;
-        begun = true;
-        low.resize(3 * mesh.num_vertices), high.resize(3 * mesh.num_vertices);
-        for (int64_t i = 0; i < 3 * mesh.num_vertices; ++i) {
-            low[i] = std::min(start[i], target[i]) - margin[i / 3];
-            high[i] = std::max(start[i], target[i]) + margin[i / 3];
-        }
-        search(start.data());
+    // The first list of a step, where it begins: what is crossed there is left out.
+    void begin() {
+        if (!begun) search(start.data(), start.data(), 0.0);
     }
 
-    // Boxes around positions (V, 3) alone.
-    void enclose(const double* pos) {
-        for (int64_t i = 0; i < 3 * mesh.num_vertices; ++i) low[i] = pos[i] - margin[i / 3], high[i] = pos[i] + margin[i / 3];
-        swept = false;
-        search();
-    }
-
-    // The list of a way is long where cloth moves far: it is made anew for the place that it led to.
-    void settle(const double* pos) {
-        if (swept && (int64_t)pairs.size() > mesh.num_vertices) enclose(pos);
-    }
-
-    bool inside(const double* pos, int64_t v) const {
-        bool out = false;
-        for (int k = 0; k < 3; ++k) out |= !(pos[3 * v + k] >= low[3 * v + k] && pos[3 * v + k] <= high[3 * v + k]);
-        return !out;
-    }
-
-    // Makes sure that the list holds at positions (V, 3), and on straight ways between two. Where a vertex has left its box all
-    // boxes are made anew around them.
-    void cover(const double* pos) { cover(pos, pos); }
-    void cover(const double* pos, const double* there) {
-        begin(there);
-        if (overflowed) return;
-        bool left = false;
+    // Farthest that positions (V, 3) are off the ways of the list, some share along; infinite where one is beyond its margin.
+    double off_ways(const double* pos, double share) const {
+        double farthest = 0.0;
+        bool beyond = false;
         for (int64_t v = 0; v < mesh.num_vertices; ++v) {
-            left = left || !inside(pos, v) || !inside(there, v);
+            const int64_t i = 3 * v;
+            const Vec gap = at(pos, v) - Vec{from[i] + share * (to[i] - from[i]), from[i + 1] + share * (to[i + 1] - from[i + 1]),
+                                             from[i + 2] + share * (to[i + 2] - from[i + 2])};
+            const double square = dot(gap, gap);
+            farthest = std::max(farthest, square), beyond |= !(square <= (room[v] + SLACK) * (room[v] + SLACK));
         }
-        if (!left) return;
-        swept = true;
-        for (int64_t i = 0; i < 3 * mesh.num_vertices; ++i) {
-            low[i] = std::min(pos[i], there[i]) - margin[i / 3];
-            high[i] = std::max(pos[i], there[i]) + margin[i / 3];
-        }
-        search();
+        return beyond ? std::numeric_limits<double>::infinity() : std::sqrt(farthest);
     }
+
+    double off_ways(const double* pos) const {
+        double off = off_ways(pos, 1.0);
+        if (!std::isfinite(off) && moving) off = off_ways(pos, 0.0);
+        if (!std::isfinite(off) && moving) off = off_ways(pos, share_of(pos));
+        return off;
+    }
+
+    // How far along the ways positions are.
+    double share_of(const double* pos) const {
+        double along = 0.0, size = 0.0;
+        for (int64_t i = 0; i < 3 * mesh.num_vertices; ++i) {
+            const double way = to[i] - from[i];
+            along += way * (pos[i] - from[i]), size += way * way;
+        }
+        return size > 0.0 ? layer_clamp(along / size) : 0.0;
+    }
+
+    // Farthest that a vertex moves from positions to others, seen from their mean: distances change by twice that at most.
+    double farthest(const double* a, const double* b) const {
+        Vec mean = {0.0, 0.0, 0.0};
+        for (int64_t v = 0; v < mesh.num_vertices; ++v) mean = mean + (at(b, v) - at(a, v));
+        mean = (1.0 / (double)std::max<int64_t>(mesh.num_vertices, 1)) * mean;
+        double square = 0.0;
+        for (int64_t v = 0; v < mesh.num_vertices; ++v) {
+            const Vec own = at(b, v) - at(a, v) - mean;
+            square = std::max(square, dot(own, own));
+        }
+        return std::sqrt(square);
+    }
+
+    // Makes sure that the list holds at positions (V, 3), and on straight ways from there; bounds hold there.
+    void cover(const double* pos) { cover(pos, pos); }
+    void cover(const double* pos, const double* end) {
+        begin();
+        if (overflowed) return;
+        double off = off_ways(pos);
+        if (!std::isfinite(off) || (end != pos && !std::isfinite(off_ways(end)))) {
+            search(pos, end, 1.0);
+            off = 0.0;
+        }
+        moved += 2.0 * (known ? farthest(last.data(), pos) : off);
+        last.assign(pos, pos + 3 * mesh.num_vertices);
+        known = true;
+    }
+
+    // Whether a pair cannot be nearer than a distance where the cloth is.
+    bool farther(size_t i, double dist) const { return bounds[i] - moved > dist; }
+    void measured(size_t i, double dist) { bounds[i] = dist + moved - SLACK; }
 
     // ---- crossings -----------------------------------------------------------------------------------------------------
 
@@ -426,9 +465,17 @@ struct Layers {
         if (between && mesh.piece[a[0]] == mesh.piece[b[0]]) return false;
         Vec x[3], y[3];
         for (int c = 0; c < 3; ++c) x[c] = at(pos, a[c]), y[c] = at(pos, b[c]);
+        if (one_side(x, y) || one_side(y, x)) return false;
         bool crossed = false;
         for (int c = 0; c < 3; ++c) crossed |= pierces(x[c], x[(c + 1) % 3], y) || pierces(y[c], y[(c + 1) % 3], x);
         return crossed;
+    }
+
+    // Whether a triangle is on one side of another one's plane, as ``pierces`` sees it.
+    static bool one_side(const Vec* x, const Vec* t) {
+        const Vec normal = cross(t[1] - t[0], t[2] - t[0]);
+        const bool above = dot(x[0] - t[0], normal) > 0.0;
+        return (dot(x[1] - t[0], normal) > 0.0) == above && (dot(x[2] - t[0], normal) > 0.0) == above;
     }
 
     int64_t edge_number(int32_t a, int32_t b) const {
@@ -458,15 +505,21 @@ struct Layers {
     // ---- the way -------------------------------------------------------------------------------------------------------
 
     // Share of the straight ways between positions (V, 3) that no two features meet on, and the pairs that would.
-    double limit(const double* from, const double* to, double left, std::vector<int32_t>* meeting = nullptr, std::vector<double>* shares = nullptr) {
-        cover(from, to);
+    double limit(const double* now, const double* end, double left, std::vector<int32_t>* meeting = nullptr, std::vector<double>* shares = nullptr) {
+        const LayerTimer timer(clock, LayerClock::LIMIT);
+        cover(now, end);
+        const double far = 2.0 * farthest(now, end) / (1.0 - left);
         double least = 1.0;
         for (size_t i = 0; i < pairs.size(); ++i) {
+            if (farther(i, far)) continue;
             const LayerPair& pair = pairs[i];
             Vec x[4], p[4];
-            for (int c = 0; c < 4; ++c) x[c] = at(from, pair.corner[c]), p[c] = at(to, pair.corner[c]) - x[c];
-            if (apart(pair, x, p)) continue;
-            const double share = safe_share(pair.edges, x, p, left);
+            for (int c = 0; c < 4; ++c) x[c] = at(now, pair.corner[c]), p[c] = at(end, pair.corner[c]) - x[c];
+            const double way = relative_way(pair.edges, p);
+            if (farther(i, way / (1.0 - left))) continue;
+            double dist;
+            const double share = safe_share(pair.edges, x, p, way, left, &dist);
+            measured(i, dist);
             if (share >= 1.0) continue;
             least = std::min(least, share);
             if (meeting) meeting->push_back((int32_t)i), shares->push_back(share);
@@ -474,27 +527,11 @@ struct Layers {
         return least;
     }
 
-    // Whether the boxes that the features sweep are apart, seen from the first corner.
-    static bool apart(const LayerPair& pair, const Vec* x, const Vec* p) {
-        const int split = pair.edges ? 2 : 1;
-        const double o[3] = {p[0].x, p[0].y, p[0].z};
-        bool gap = false;
-        for (int k = 0; k < 3; ++k) {
-            double l[2] = {1e300, 1e300}, h[2] = {-1e300, -1e300};
-            for (int c = 0; c < 4; ++c) {
-                const double a = k == 0 ? x[c].x : k == 1 ? x[c].y : x[c].z, q = k == 0 ? p[c].x : k == 1 ? p[c].y : p[c].z, b = a + q - o[k];
-                const int side = c >= split;
-                l[side] = std::min(l[side], std::min(a, b)), h[side] = std::max(h[side], std::max(a, b));
-            }
-            gap |= l[0] > h[1] || l[1] > h[0];
-        }
-        return gap;
-    }
-
     // Moves targets (V, 3) of free vertices so that the straight ways there from positions (V, 3) are free, as little as it can:
     // first the corners of pairs that meet go on together, then all vertices. Pairs that held vertices drive through each other
     // are left out from then on. Returns how many.
     int64_t approach(double* to, double left) {
+        const LayerTimer timer(clock, LayerClock::LIMIT);
         const double* from = start.data();
         std::vector<double> shift(3 * mesh.num_vertices), count(mesh.num_vertices);
         int64_t forced = 0;
@@ -511,9 +548,7 @@ struct Layers {
             for (int64_t v = 0; v < mesh.num_vertices; ++v)
                 for (int k = 0; k < 3 && count[v] > 0.0; ++k) to[3 * v + k] += shift[3 * v + k] / count[v];
         }
-        swept = true;
-        if (forced) enclose(to);
-        else settle(to);
+        if (forced) forget_released();
         return forced;
     }
 
@@ -554,27 +589,21 @@ struct Layers {
         std::vector<double> shares;
         limit(from, to, left, &meeting, &shares);
         for (int32_t i : meeting) released.push_back(keys[i]);
-        std::sort(released.begin(), released.end());
         return (int64_t)meeting.size();
     }
 
     // ---- the barrier ---------------------------------------------------------------------------------------------------
 
-    bool contact(const LayerPair& pair, const double* pos, LayerContact& found, Vec* x) const {
-        const int split = pair.edges ? 2 : 1;
+    // Whether a pair is within its reach at positions that are covered.
+    bool contact(size_t i, const double* pos, LayerContact& found, Vec* x) {
+        if (farther(i, most_reach)) return false;
+        const LayerPair& pair = pairs[i];
         for (int c = 0; c < 4; ++c) x[c] = at(pos, pair.corner[c]);
-        Vec l[2] = {x[0], x[split]}, h[2] = {x[0], x[split]};
-        for (int c = 1; c < 4; ++c) {
-            const int side = c >= split;
-            l[side] = {std::min(l[side].x, x[c].x), std::min(l[side].y, x[c].y), std::min(l[side].z, x[c].z)};
-            h[side] = {std::max(h[side].x, x[c].x), std::max(h[side].y, x[c].y), std::max(h[side].z, x[c].z)};
-        }
-        const Vec a = l[0] - h[1], b = l[1] - h[0];
-        if (std::max(std::max(std::max(a.x, a.y), std::max(a.z, b.x)), std::max(b.y, b.z)) >= pair.reach) return false;
-        const double square = pair_distance_sq(pair.edges, x, found.weight);
-        if (!(square < pair.reach * pair.reach)) return false;
+        const double dist = std::sqrt(pair_distance_sq(pair.edges, x, found.weight));
+        measured(i, dist);
+        if (!(dist < pair.reach)) return false;
         // Features that touch are told from those that nearly do no more: the barrier stays finite.
-        found.dist = std::max(std::sqrt(square), 1e-12);
+        found.pair = (int32_t)i, found.dist = std::max(dist, 1e-12);
         Vec gap = {0.0, 0.0, 0.0};
         for (int c = 0; c < 4; ++c) gap = gap + found.weight[c] * x[c];
         found.gap[0] = gap.x, found.gap[1] = gap.y, found.gap[2] = gap.z;
@@ -582,13 +611,14 @@ struct Layers {
     }
 
     double energy(const double* pos) {
-        const LayerTimer timer{seconds};
+        const LayerTimer timer(clock, LayerClock::ENERGY);
         cover(pos);
         double sum = 0.0, slope;
-        for (const LayerPair& pair : pairs) {
+        for (size_t i = 0; i < pairs.size(); ++i) {
             LayerContact found;
             Vec x[4];
-            if (!contact(pair, pos, found, x)) continue;
+            if (!contact(i, pos, found, x)) continue;
+            const LayerPair& pair = pairs[i];
             double part = pressure * pair.reach * pair.area * barrier(found.dist / pair.reach);
             if (pair.edges) {
                 const Vec normal = cross(x[1] - x[0], x[3] - x[2]);
@@ -601,22 +631,27 @@ struct Layers {
 
     // Forces by vertex, and rows n (12) such that the sum of their outer products is a positive curvature; how many rows.
     int64_t model(const double* pos) {
-        const LayerTimer timer{seconds};
+        const LayerTimer timer(clock, LayerClock::MODEL);
         cover(pos);
-        settle(pos);
-        contacts.clear(), rows.clear(), normals.clear();
-        std::fill(gradient.begin(), gradient.end(), 0.0), std::fill(own.begin(), own.end(), 0.0);
-        gradient.resize(3 * mesh.num_vertices, 0.0), own.resize(6 * mesh.num_vertices, 0.0);
+        contacts.clear(), rows.clear(), normals.clear(), normals_single.clear();
+        gradient.assign(3 * mesh.num_vertices, 0.0), own.assign(6 * mesh.num_vertices, 0.0);
         for (size_t i = 0; i < pairs.size(); ++i) {
-            const LayerPair& pair = pairs[i];
             LayerContact found;
             Vec x[4];
-            if (!contact(pair, pos, found, x)) continue;
-            found.pair = (int32_t)i;
+            if (!contact(i, pos, found, x)) continue;
             contacts.push_back(found);
-            add_model(pair, found, x);
+            add_model(pairs[i], found, x);
         }
+        show();
         return (int64_t)contacts.size();
+    }
+
+    void show() {
+        here.resize(3 * mesh.num_vertices), there.resize(3 * mesh.num_vertices);
+        view.layers = this, view.here = here.data(), view.there = there.data();
+        view.num_contacts = (int64_t)contacts.size(), view.rows = rows.data();
+        view.normals = normals.data(), view.normals_single = normals_single.data();
+        view.gradient = gradient.data(), view.own = own.data();
     }
 
     void add_model(const LayerPair& pair, const LayerContact& found, const Vec* x) {
@@ -635,11 +670,10 @@ struct Layers {
         const double stiff = std::sqrt(share * scale / pair.reach * barrier_curvature(s)) / found.dist;
         for (int c = 0; c < 4; ++c) {
             const int64_t v = pair.corner[c];
-            double n[3];
+            double n[4] = {};
             for (int k = 0; k < 3; ++k) {
                 gradient[3 * v + k] += push * found.weight[c] * found.gap[k];
                 n[k] = stiff * found.weight[c] * found.gap[k];
-                normals.push_back(n[k]);
             }
             double* upper = own.data() + 6 * v;
             upper[0] += n[0] * n[0], upper[1] += n[0] * n[1], upper[2] += n[0] * n[2];
@@ -649,7 +683,16 @@ struct Layers {
                 const double sign = c % 2 ? 1.0 : -1.0;
                 gradient[3 * v] += sign * turn.x, gradient[3 * v + 1] += sign * turn.y, gradient[3 * v + 2] += sign * turn.z;
             }
-            rows.push_back(row.empty() ? (int32_t)v : row[v]);
+            add_row(v, n);
+        }
+    }
+
+    void add_row(int64_t v, const double* n) {
+        const bool moves = row.empty() || row[v] < num_rows;
+        rows.push_back(row.empty() ? (int32_t)v : moves ? row[v] : 0);
+        for (int k = 0; k < 4; ++k) {
+            const double value = moves ? n[k] : 0.0;
+            normals.push_back(value), normals_single.push_back((float)value);
         }
     }
 };

@@ -11,7 +11,7 @@
 #include <cstring>
 
 #include "lanes.h"
-#include "layers.h"
+#include "layer_view.h"
 #include "threads.h"
 #include "vertex_terms.h"
 
@@ -84,8 +84,8 @@ struct Engine {
     // Threads.
     int64_t parts, reach;           // in how many parts loops are done; how far a column is behind its row at most
     void* spill;                    // (parts - 1, reach, 4) what a part's rows give to the rows behind the part
-    // Cloth near cloth, a Layers; none where there is no such term.
-    void* layers;
+    // Cloth near cloth; none where there is no such term.
+    LayerView* layers;
     const int64_t* vertex_of_scene;  // (V) number of each vertex in them
     double kept;                     // share of a distance that a move leaves
 };
@@ -399,53 +399,53 @@ template <class Add> inline void couple_points(const Engine& e, int64_t row, con
 
 // ---- cloth near cloth ----------------------------------------------------------------------------------------------------
 
-inline Layers& layers_of(const Engine& e) { return *(Layers*)e.layers; }
-
 // Positions in the cloth's own numbering.
-inline const double* own_order(const Engine& e, const double* pos, std::vector<double>& out) {
-    out.resize(3 * e.num_vertices);
+inline const double* own_order(const Engine& e, const double* pos, double* out) {
     for (int64_t i = 0; i < e.num_vertices; ++i)
         for (int k = 0; k < 3; ++k) out[3 * e.vertex_of_scene[i] + k] = pos[4 * i + k];
-    return out.data();
+    return out;
 }
 
 // Whether anything is near anything at the state; then its forces, curvature and rows are those of the layers.
 inline bool model_layers(const Engine& e) {
-    if (!e.layers) return false;
-    Layers& layers = layers_of(e);
-    return layers.model(own_order(e, e.pos, layers.here)) > 0;
+    return e.layers && e.layers->model(e.layers->layers, own_order(e, e.pos, e.layers->here)) > 0;
 }
 
-inline bool near_layers(const Engine& e) { return e.layers && !layers_of(e).contacts.empty(); }
+inline double energy_of_layers(const Engine& e, const double* pos) {
+    return e.layers->energy(e.layers->layers, own_order(e, pos, e.layers->there));
+}
+
+inline bool near_layers(const Engine& e) { return e.layers && e.layers->num_contacts > 0; }
 
 inline void add_layers(const Engine& e, int64_t row, double* gradient, double* upper) {
-    const Layers& layers = layers_of(e);
     const int64_t v = e.vertex_of_scene[row];
-    for (int k = 0; k < 3; ++k) gradient[k] += layers.gradient[3 * v + k];
-    for (int k = 0; k < 6; ++k) upper[k] += layers.own[6 * v + k];
+    for (int k = 0; k < 3; ++k) gradient[k] += e.layers->gradient[3 * v + k];
+    for (int k = 0; k < 6; ++k) upper[k] += e.layers->own[6 * v + k];
 }
+
+inline const float* rows_of_layers(const LayerView& layers, float) { return layers.normals_single; }
+inline const double* rows_of_layers(const LayerView& layers, double) { return layers.normals; }
 
 // Adds the blocks beside the diagonal to q = H p; returns their p . q.
 template <class T> double couple_layers(const Engine& e) {
-    const Layers& layers = layers_of(e);
-    const T* p = (const T*)e.p;
+    typedef typename Four<T>::type V4;
+    const T *p = (const T*)e.p, *normals = rows_of_layers(*e.layers, T());
     T* q = (T*)e.q;
     double sum = 0.0;
-    for (size_t i = 0; i < layers.contacts.size(); ++i) {
-        const int32_t* row = layers.rows.data() + 4 * i;
-        const double* n = layers.normals.data() + 12 * i;
-        double along[4], total = 0.0;
+    for (int64_t i = 0; i < e.layers->num_contacts; ++i) {
+        const int32_t* row = e.layers->rows + 4 * i;
+        V4 n[4];
+        T along[4];
         for (int c = 0; c < 4; ++c) {
-            along[c] = 0.0;
-            if (row[c] >= e.num_rows) continue;
-            for (int k = 0; k < 3; ++k) along[c] += n[3 * c + k] * (double)p[4 * row[c] + k];
-            total += along[c];
+            n[c] = load<V4>(normals + 16 * i + 4 * c);
+            const V4 product = n[c] * load<V4>(p + 4 * (int64_t)row[c]);
+            along[c] = (product[0] + product[1]) + product[2];
         }
+        const T total = (along[0] + along[1]) + (along[2] + along[3]);
         for (int c = 0; c < 4; ++c) {
-            if (row[c] >= e.num_rows) continue;
-            const double others = total - along[c];
-            for (int k = 0; k < 3; ++k) q[4 * row[c] + k] += (T)(others * n[3 * c + k]);
-            sum += along[c] * others;
+            T* to = q + 4 * (int64_t)row[c];
+            store(to, load<V4>(to) + (total - along[c]) * n[c]);
+            sum += (double)along[c] * (double)(total - along[c]);
         }
     }
     return sum;
@@ -514,7 +514,7 @@ void energy(const Engine& e, const double* pos, const double* acc, double* phi, 
         springs += 0.5 * e.spring_stiffness[s] * dot3(gap, gap);
     }
     if (e.num_springs) add(springs);
-    if (e.layers) add(layers_of(e).energy(own_order(e, pos, layers_of(e).there)));
+    if (e.layers) add(energy_of_layers(e, pos));
     *phi = sum;
     *noise = 8.0 * 2.220446049250313e-16 * size;
 }
@@ -991,10 +991,9 @@ void walk(const Engine& e, double length) {
 // Shortens the way from the state to the trial to where no cloth meets cloth; the share that is left.
 double limit_trial(const Engine& e) {
     if (!e.layers) return 1.0;
-    Layers& layers = layers_of(e);
+    LayerView& layers = *e.layers;
     const double *here = own_order(e, e.pos, layers.here), *there = own_order(e, e.trial_pos, layers.there);
-    const LayerTimer timer{layers.seconds};
-    const double share = layers.limit(here, there, e.kept);
+    const double share = layers.limit(layers.layers, here, there, e.kept);
     if (share >= 1.0) return 1.0;
     for (int64_t row = 0; row < e.num_rows; ++row)
         for (int k = 0; k < 3; ++k) e.trial_acc[4 * row + k] = e.acc[4 * row + k] + share * (e.trial_acc[4 * row + k] - e.acc[4 * row + k]);
@@ -1094,7 +1093,7 @@ void newton_start(Engine* e, const double* acc) {
 
 // The better of two guesses becomes the state, see hood.solver.iterate.first_iterate; masses (V) kg, gravity (3) m/s^2.
 void newton_guess(Engine* e, const double* mass, const double* gravity) {
-    void* const layers = e->layers;  // the guess is the one that would be best without
+    LayerView* const layers = e->layers;  // the guess is the one that would be best without
     e->layers = nullptr;
     hold_fixed(*e);
     double phi, noise;

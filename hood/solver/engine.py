@@ -275,9 +275,8 @@ class SceneEngine:
         vertex = self.tables.vertex - scene.first
         row = np.empty_like(vertex)
         row[vertex] = np.arange(len(vertex))
-        scene.layers.number(row)
         self._point(vertex_of_scene=vertex)
-        self.values.layers, self.values.kept = scene.layers.handle, LEFT
+        self.values.layers, self.values.kept = scene.layers.number(row, self.values.num_rows), LEFT
 
     def start(self, acc: np.ndarray) -> None:
         """Take up accelerations (V, 3) of all vertices of the cloth."""
