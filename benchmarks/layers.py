@@ -7,8 +7,8 @@
 A case is garments joined by ``+`` and a motion. Embedded body, default fabric and accuracy of ``hood rollout``; frames are whole
 ones without metrics and files, CPU milliseconds. Two lines per case. The first: medians of both, their ratio and that of the sums,
 Newton iterations of a step (mean, both), frames that missed the accuracy, and the share of frames that are the same to the bit.
-The second: what the layers were about, per frame: pairs of features in reach at the end, pairs in the list, searches, and CPU
-milliseconds of the search, of limiting moves, of energies and of models.
+The second: what the layers were about, per frame: pairs of features in reach at the end, pairs in the list, searches (of all, of
+some vertices), and CPU milliseconds of the search, of limiting moves, of energies and of models.
 """
 
 from __future__ import annotations
@@ -118,9 +118,9 @@ def run(case: str, first: int, frames: int) -> Iterator[str]:
     )
     works = on.layers[FIRST:]
     near, listed = mean(near for _, near in works), mean(work.listed for work, _ in works)
-    searches = mean(work.searches for work, _ in works)
+    searches, refreshes = (mean(getattr(work, name) for work, _ in works) for name in ("searches", "refreshes"))
     parts = [1e3 * mean(getattr(work, name) for work, _ in works) for name in ("searching", "limiting", "energies", "models")]
-    yield f"{'':34s} near {near:.0f}, listed {listed:.0f}, searches {searches:.1f}; ms " + " ".join(
+    yield f"{'':34s} near {near:.0f}, listed {listed:.0f}, searches {searches:.1f} + {refreshes:.1f}; ms " + " ".join(
         f"{name} {value:.1f}" for name, value in zip(("search", "limit", "energy", "model"), parts, strict=True)
     )
 

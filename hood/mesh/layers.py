@@ -146,6 +146,7 @@ class Work(NamedTuple):
     listed: int  # pairs in the list
     left_out: int  # pairs of features that are not
     searches: int
+    refreshes: int  # searches for some vertices alone
     overflowed: bool  # no list: nearly everything is near everything, in torn cloth, or a position is not finite
     # Processor time [s].
     searching: float
@@ -233,9 +234,9 @@ class Layers:
     @property
     def work(self) -> Work:
         """What has been done so far."""
-        counts, seconds = np.empty(4, np.int64), np.empty(4)
+        counts, seconds = np.empty(5, np.int64), np.empty(4)
         self._lib.layers_counts(self.handle, counts.ctypes.data, seconds.ctypes.data)
-        return Work(int(counts[0]), int(counts[1]), int(counts[2]), bool(counts[3]), *seconds.tolist())
+        return Work(*counts[:4].tolist(), bool(counts[4]), *seconds.tolist())
 
 
 def _positions(pos: np.ndarray) -> np.ndarray:

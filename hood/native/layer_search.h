@@ -78,7 +78,7 @@ struct LayerTree {
         int64_t size = 1;  // halves differ by a face at most, so that the levels above the last are full
         for (int64_t most = faces_count; most > LEAF; most = (most + 1) / 2) size = 2 * size + 1;
         node.resize(size);
-        refit(0, 0, faces_count);
+        if (faces_count) refit(0, 0, faces_count);
     }
 
     void refit(int64_t at, int64_t begin, int64_t end) {
@@ -111,6 +111,19 @@ struct LayerTree {
         within(2 * at + 1, begin, middle, visit);
         within(2 * at + 2, middle, end, visit);
         between(2 * at + 1, begin, middle, 2 * at + 2, middle, end, visit);
+    }
+
+    // visit(g) for faces whose boxes overlap a box.
+    template <class Visit> void around(const MovingBox& box, int64_t at, int64_t begin, int64_t end, const Visit& visit) const {
+        if (!overlap(box, node[at])) return;
+        if (end - begin <= LEAF) {
+            for (int64_t j = begin; j < end; ++j)
+                if (overlap(box, face[j])) visit(order[j]);
+            return;
+        }
+        const int64_t middle = (begin + end) / 2;
+        around(box, 2 * at + 1, begin, middle, visit);
+        around(box, 2 * at + 2, middle, end, visit);
     }
 
     template <class Visit>

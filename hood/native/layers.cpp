@@ -71,12 +71,12 @@ void layers_rows(const void* handle, double* normals) {
     for (size_t i = 0; i < own.size() / 4; ++i) std::copy(&own[4 * i], &own[4 * i] + 3, normals + 3 * i);
 }
 
-// Pairs of features in the list, pairs that are left out, searches so far, whether there were too many pairs for a list; seconds
-// (4) of processor time: of searching, of limiting moves, of energies and of models.
+// Pairs of features in the list, pairs that are left out, searches so far, those for some vertices alone, whether there were too
+// many pairs for a list; seconds (4) of processor time: of searching, of limiting moves, of energies and of models.
 void layers_counts(const void* handle, int64_t* counts, double* seconds) {
     const Layers* layers = (const Layers*)handle;
     counts[0] = (int64_t)layers->pairs.size(), counts[1] = (int64_t)layers->released.size(), counts[2] = layers->searches;
-    counts[3] = layers->overflowed;
+    counts[3] = layers->refreshes, counts[4] = layers->overflowed;
     for (int part = LayerClock::SEARCH; part < LayerClock::PARTS; ++part) seconds[part - 1] = layers->clock.seconds[part];
 }
 }

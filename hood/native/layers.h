@@ -206,14 +206,16 @@ struct Layers {
     std::vector<double> from, to, room, last;
     bool moving = false, known = false;  // whether the ways lead anywhere; whether bounds count from ``last``, not from the ways
     double moved = 0.0, most_reach = 0.0;
-    bool begun = false;
-    int64_t searches = 0, crossed = 0;  // pairs of faces that are crossed where it begins
+    bool begun = false, begun_ways = false;  // whether there is a list; whether it has margins
+    int64_t searches = 0, refreshes = 0, crossed = 0;  // pairs of faces that are crossed where it begins
     LayerClock clock;  // what solvers do with the rows is no part of it
     bool overflowed = false;  // cloth so crumpled, or torn, that nearly everything is near everything: no list
     struct Candidate {
         int32_t first, second;  // a vertex and a face, or two edges
     };
     std::vector<Candidate> candidates[2];
+    std::vector<double> wide;
+    std::vector<int32_t> strays;
     // For the solver.
     LayerView view = {};
     std::vector<double> here, there, gradient, own;  // (3 V) twice, (3 V), (6 V)
@@ -231,6 +233,7 @@ struct Layers {
     static constexpr int64_t MOST_PAIRS = 4000000;
     static constexpr int64_t MOST_LOOKS = 300;  // at pairs of faces, for each face: beyond it the cloth is torn
     static constexpr double SLACK = 1e-9;       // m, more than rounding makes of a distance
+    static constexpr size_t FEW = 16;           // at most one of so many vertices is looked for alone
 
     // The list of straight ways between positions (V, 3), for vertices within ``share`` of their margins of them.
     void search(const double* begin, const double* end, double share) {
@@ -239,29 +242,75 @@ struct Layers {
         begun = true;
         const int64_t size = 3 * mesh.num_vertices;
         pairs.clear(), keys.clear(), bounds.clear(), contacts.clear();
-        for (std::vector<Candidate>& some : candidates) some.clear();
         ++searches;
         from.assign(begin, begin + size), to.assign(end, end + size), room.resize(mesh.num_vertices);
         moving = std::memcmp(begin, end, sizeof(double) * size) != 0, known = false, moved = 0.0;
-        overflowed = overflowed || !finite();
-        if (overflowed) return;
-        std::vector<double> wide(mesh.num_vertices);
         for (int64_t v = 0; v < mesh.num_vertices; ++v) {
-            room[v] = share * margin[v], wide[v] = room[v] + 0.5 * mesh.reach[v] + SLACK;
+            room[v] = share * margin[v];
             most_reach = std::max(most_reach, mesh.reach[v]);
         }
-        if (mesh.num_faces > 1) look(wide, first);
+        overflowed = overflowed || !finite();
+        if (overflowed || mesh.num_faces < 2) return;
+        make_boxes();
+        fill([&](const auto& look) { tree.pairs(look); }, first, nullptr);
+    }
+
+    // The list where few vertices have left their margins, on straight ways between positions (V, 3): their pairs are looked for
+    // anew. Ends of the ways are what counts from now on, and for these vertices the middle of their present ways.
+    void search_again(const double* begin, const double* end, const std::vector<int32_t>& strays) {
+        const LayerTimer timer(clock, LayerClock::SEARCH);
+        ++refreshes;
+        from = to, moving = false;
+        std::vector<uint8_t> stray(mesh.num_vertices, 0);
+        for (int32_t v : strays) {
+            double way = 0.0;
+            for (int k = 0; k < 3; ++k) {
+                const int64_t i = 3 * (int64_t)v + k;
+                from[i] = to[i] = 0.5 * (begin[i] + end[i]);
+                way += (end[i] - begin[i]) * (end[i] - begin[i]);
+            }
+            stray[v] = 1, room[v] = std::sqrt(way) + margin[v];
+        }
+        overflowed = overflowed || !finite();
+        if (!overflowed) {
+            keep([&](size_t i) { return !any_of(pairs[i].corner, 4, stray); });
+            contacts.clear();
+            make_boxes();
+            const auto visit_strays = [&](const auto& look) {
+                for (int64_t i = 0; i < mesh.num_faces; ++i) {
+                    const int32_t f = mesh.order[i];
+                    if (!any_of(mesh.faces + 3 * (int64_t)f, 3, stray)) continue;
+                    tree.around(tree.face[i], 0, 0, mesh.num_faces, [&](int32_t g) {
+                        if (g != f && (g > f || !any_of(mesh.faces + 3 * (int64_t)g, 3, stray))) look(f, g);
+                    });
+                }
+            };
+            fill(visit_strays, false, &stray);
+        }
         if (overflowed) pairs.clear(), keys.clear(), bounds.clear();
     }
 
-    void look(const std::vector<double>& wide, bool first) {
+    static bool any_of(const int32_t* corner, int count, const std::vector<uint8_t>& marked) {
+        bool any = false;
+        for (int c = 0; c < count; ++c) any |= marked[corner[c]] != 0;
+        return any;
+    }
+
+    void make_boxes() {
+        wide.resize(mesh.num_vertices);
+        for (int64_t v = 0; v < mesh.num_vertices; ++v) wide[v] = room[v] + 0.5 * mesh.reach[v] + SLACK;
+        tree.enclose(from.data(), to.data(), wide);
+        tree.build(mesh.faces, mesh.num_faces, mesh.edges, mesh.num_edges, mesh.order);
+    }
+
+    // Adds pairs of features of the pairs of faces that are visited; where ``stray`` is given, only those with such a vertex.
+    template <class Faces> void fill(const Faces& visit, bool first, const std::vector<uint8_t>* stray) {
         int64_t looked_at = 0;
+        for (std::vector<Candidate>& some : candidates) some.clear();
         const auto too_many = [&] {
             return looked_at > MOST_LOOKS * mesh.num_faces || (int64_t)(candidates[0].size() + candidates[1].size()) > MOST_PAIRS;
         };
-        tree.enclose(from.data(), to.data(), wide);
-        tree.build(mesh.faces, mesh.num_faces, mesh.edges, mesh.num_edges, mesh.order);
-        tree.pairs([&](int32_t f, int32_t g) {
+        visit([&](int32_t f, int32_t g) {
             if (too_many()) return;
             ++looked_at;
             if (first && crossed_faces(f, g, from.data())) ++crossed, release_faces(f, g);
@@ -274,9 +323,9 @@ struct Layers {
         });
         overflowed = too_many();
         if (overflowed) return;
-        std::sort(released.begin(), released.end());
+        if (first) std::sort(released.begin(), released.end());
         for (int edges = 0; edges < 2; ++edges)
-            for (size_t i = 0; i < candidates[edges].size(); i += LANES) measure(edges, i);
+            for (size_t i = 0; i < candidates[edges].size(); i += LANES) measure(edges, i, stray);
     }
 
     void consider_vertex(int32_t v, int32_t f) {
@@ -308,7 +357,7 @@ struct Layers {
 
     // Adds those of the next candidates to the list that can come within their reach: by the distance halfway, less what the
     // features move towards each other from there and what they may be off their ways.
-    void measure(int edges, size_t begin) {
+    void measure(int edges, size_t begin, const std::vector<uint8_t>* stray) {
         const std::vector<Candidate>& list = candidates[edges];
         const int count = (int)std::min<size_t>(LANES, list.size() - begin), split = edges ? 2 : 1;
         int32_t corner[LANES][4];
@@ -336,13 +385,16 @@ struct Layers {
             }
         }
         for (int lane = 0; lane < count; ++lane) {
+            if (stray && !any_of(corner[lane], 4, *stray)) continue;
             double off[2] = {0.0, 0.0}, reach = mesh.reach[corner[lane][0]];
             for (int c = 0; c < 4; ++c) {
                 off[c >= split] = std::max(off[c >= split], room[corner[lane][c]]);
                 reach = std::min(reach, mesh.reach[corner[lane][c]]);
             }
             const double bound = std::sqrt(square[lane]) - (moving ? std::sqrt(way[0][lane]) + std::sqrt(way[1][lane]) : 0.0) - SLACK;
-            if (bound <= reach + off[0] + off[1]) add(edges, list[begin + lane], corner[lane], reach, bound);
+            if (bound > reach + off[0] + off[1]) continue;
+            // Vertices that were looked for alone are off the middle of their ways, at a time when the cloth has moved already.
+            add(edges, list[begin + lane], corner[lane], reach, stray ? bound - off[0] - off[1] + moved : bound);
         }
     }
 
@@ -368,12 +420,11 @@ struct Layers {
         return sum == 0.0;
     }
 
-    // Takes pairs out of the list that are to be left out.
-    void forget_released() {
-        std::sort(released.begin(), released.end());
+    // Takes all pairs out of the list but those that ``stays`` says.
+    template <class Stays> void keep(const Stays& stays) {
         size_t kept = 0;
         for (size_t i = 0; i < pairs.size(); ++i)
-            if (!is_released(keys[i])) pairs[kept] = pairs[i], bounds[kept] = bounds[i], keys[kept++] = keys[i];
+            if (stays(i)) pairs[kept] = pairs[i], bounds[kept] = bounds[i], keys[kept++] = keys[i];
         pairs.resize(kept), bounds.resize(kept), keys.resize(kept);
     }
 
@@ -433,12 +484,32 @@ struct Layers {
         if (overflowed) return;
         double off = off_ways(pos);
         if (!std::isfinite(off) || (end != pos && !std::isfinite(off_ways(end)))) {
+            find_strays(pos, end);
+            if (begun_ways && strays.size() * FEW <= (size_t)mesh.num_vertices) {
+                move_to(pos, 0.0);  // bounds count from there
+                search_again(pos, end, strays);
+                return;
+            }
             search(pos, end, 1.0);
-            off = 0.0;
+            begun_ways = true, off = 0.0;
         }
+        move_to(pos, off);
+    }
+
+    void move_to(const double* pos, double off) {
         moved += 2.0 * (known ? farthest(last.data(), pos) : off);
         last.assign(pos, pos + 3 * mesh.num_vertices);
         known = true;
+    }
+
+    // Vertices that are beyond their margins of the ends of the list's ways, at positions or others.
+    void find_strays(const double* pos, const double* end) {
+        strays.clear();
+        for (int64_t v = 0; v < mesh.num_vertices; ++v) {
+            const Vec there = at(to.data(), v), one = at(pos, v) - there, other = at(end, v) - there;
+            const double most = (room[v] + SLACK) * (room[v] + SLACK);
+            if (!(dot(one, one) <= most && dot(other, other) <= most)) strays.push_back((int32_t)v);
+        }
     }
 
     // Whether a pair cannot be nearer than a distance where the cloth is.
@@ -548,7 +619,8 @@ struct Layers {
             for (int64_t v = 0; v < mesh.num_vertices; ++v)
                 for (int k = 0; k < 3 && count[v] > 0.0; ++k) to[3 * v + k] += shift[3 * v + k] / count[v];
         }
-        if (forced) forget_released();
+        std::sort(released.begin(), released.end());
+        if (forced) keep([&](size_t i) { return !is_released(keys[i]); });
         return forced;
     }
 
