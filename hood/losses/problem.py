@@ -74,7 +74,10 @@ class StepProblem:
         """The problem with its cloth near cloth, see :func:`hood.scene.layers.find_layers`; itself where that has been done."""
         if self.layers:
             return self
-        return replace(self, layers=find_layers(self.cloth, self.state.pos, reach, pressure, between))
+        ahead, target = inertial_guess(self.state, self.step, self.cloth.vertex_scene), self.step.pin_target
+        if target is not None:
+            ahead = torch.where(self.cloth.pinned.unsqueeze(1), target.to(ahead), ahead)
+        return replace(self, layers=find_layers(self.cloth, self.state.pos, ahead, reach, pressure, between))
 
     def with_sides(self, reach: float) -> StepProblem:
         """The problem with the sides of cloth near cloth, see :func:`hood.scene.layer_sides.find_sides`; itself where that has

@@ -23,8 +23,9 @@ from hood.native.structures import COUNT, POINTER, REAL, fields
 SOURCE = Path(native.__file__).with_name("layers.cpp")
 #: Of the distance of two features at least this share is left by one move.
 LEFT = 0.1
-#: How far vertices may move at most before the list of pairs is made anew, at first [m].
-MARGIN = 5e-3
+#: How far vertices may be off the ways that the list of pairs was made for: a share of half of the smallest height of a face
+#: around, and at most so much [m].
+SHARE, MARGIN = 0.3, 5e-3
 
 
 class _Mesh(ctypes.Structure):
@@ -43,7 +44,7 @@ def library() -> ctypes.CDLL:
     """
     lib = build(SOURCE, NATIVE_FLAGS)
     lib.layers_make.restype = POINTER
-    lib.layers_make.argtypes = [*[POINTER] * 4, REAL, COUNT]
+    lib.layers_make.argtypes = [*[POINTER] * 5, REAL, COUNT]
     lib.layers_free.argtypes = [POINTER]
     lib.layers_crossed.argtypes = [POINTER]
     lib.layers_approach.argtypes = [POINTER, POINTER, REAL]
@@ -170,13 +171,23 @@ class Layers:
         fixed: (V,) bool, vertices that go where they must.
         pressure: Pa, what the barrier (:class:`hood.losses.layers.LayerBarrier`) scales with.
         between: pairs of two pieces (connected parts) of the mesh alone.
+        ahead: (V, 3) m, where the step may end; near it no search is needed but the first. Default ``pos``.
     """
 
-    def __init__(self, mesh: LayerMesh, pos: np.ndarray, fixed: np.ndarray, pressure: float, between: bool = False) -> None:
+    def __init__(
+        self,
+        mesh: LayerMesh,
+        pos: np.ndarray,
+        fixed: np.ndarray,
+        pressure: float,
+        between: bool = False,
+        ahead: np.ndarray | None = None,
+    ) -> None:
         self.mesh, self._lib = mesh, library()
         start, held = _positions(pos), np.ascontiguousarray(fixed, np.uint8)
-        margin = np.minimum(mesh.room, MARGIN)
-        given = (start.ctypes.data, held.ctypes.data, margin.ctypes.data)
+        end = start if ahead is None else _positions(ahead)
+        margin = np.minimum(SHARE * mesh.room, MARGIN)
+        given = (start.ctypes.data, end.ctypes.data, held.ctypes.data, margin.ctypes.data)
         self.handle = self._lib.layers_make(ctypes.byref(mesh.structure), *given, pressure, int(between))
         weakref.finalize(self, self._lib.layers_free, self.handle)
         self.forced = 0  # pairs of features that held vertices drive through each other

@@ -21,11 +21,18 @@ struct MovingBox {
     Axes low[2], high[2];
 };
 
-inline bool overlap(const MovingBox& a, const MovingBox& b) {
-    const AxesTest apart = ((a.low[0] > b.high[0]) & (a.low[1] > b.high[1])) | ((b.low[0] > a.high[0]) & (b.low[1] > a.high[1]));
+inline bool any(AxesTest test) {
+#if defined(__SSE__)
+    return __builtin_ia32_movmskps((Axes)test) != 0;
+#else
     int64_t half[2];
-    std::memcpy(half, &apart, sizeof(half));
-    return (half[0] | half[1]) == 0;
+    std::memcpy(half, &test, sizeof(half));
+    return (half[0] | half[1]) != 0;
+#endif
+}
+
+inline bool overlap(const MovingBox& a, const MovingBox& b) {
+    return !any(((a.low[0] > b.high[0]) & (a.low[1] > b.high[1])) | ((b.low[0] > a.high[0]) & (b.low[1] > a.high[1])));
 }
 
 inline void join(MovingBox& box, const MovingBox& other) {
@@ -35,10 +42,39 @@ inline void join(MovingBox& box, const MovingBox& other) {
     }
 }
 
+// What is constant as long as the cloth; arrays of the caller.
+struct LayerMesh {
+    int64_t num_vertices, num_faces, num_edges;
+    const int32_t *faces, *edges;                 // (F, 3), (E, 2)
+    const int32_t *face_vertex, *face_edge;       // (F, 3) vertices and edges that a face answers for, then -1
+    const int32_t *order, *piece;                 // (F) faces along the tree's leaves, (V) garment of a vertex
+    const double *reach;                          // (V) m, distance at which a vertex is near others
+    const double *vertex_area, *edge_area;        // (V), (E) m^2 at rest
+    const double *edge_length_sq;                 // (E) m^2 at rest
+};
+
+// Features that the faces answer for, in the order of the faces, with their boxes.
+struct OwnFeatures {
+    std::vector<int32_t> starts, number;  // (F + 1), and what feature it is
+    std::vector<MovingBox> box;
+
+    void list(const int32_t* owned, const int32_t* order, int64_t num_faces) {
+        starts.assign(1, 0), number.clear();
+        for (int64_t i = 0; i < num_faces; ++i) {
+            const int32_t* own = owned + 3 * (int64_t)order[i];
+            for (int c = 0; c < 3 && own[c] >= 0; ++c) number.push_back(own[c]);
+            starts.push_back((int32_t)number.size());
+        }
+        box.resize(number.size());
+    }
+};
+
+// All of a face's neighbours in the tree are told by its place in the order.
 struct LayerTree {
-    std::vector<MovingBox> vertex, edge, face, node;  // faces by their places in the order
-    const int32_t* order = nullptr;
+    std::vector<MovingBox> vertex, face, node;
+    OwnFeatures vertices, edges;
     int64_t num_faces = 0;
+    const int32_t* starts_of = nullptr;  // the order that features are listed in
 
     static constexpr int64_t LEAF = 4;
 
@@ -63,22 +99,28 @@ struct LayerTree {
         }
     }
 
-    void build(const int32_t* faces, int64_t faces_count, const int32_t* edges, int64_t edges_count, const int32_t* its_order) {
-        order = its_order, num_faces = faces_count;
-        edge.resize(edges_count), face.resize(faces_count);
-        for (int64_t e = 0; e < edges_count; ++e) {
-            edge[e] = vertex[edges[2 * e]];
-            join(edge[e], vertex[edges[2 * e + 1]]);
+    void build(const LayerMesh& mesh) {
+        num_faces = mesh.num_faces;
+        if (starts_of != mesh.order) {
+            vertices.list(mesh.face_vertex, mesh.order, num_faces), edges.list(mesh.face_edge, mesh.order, num_faces);
+            starts_of = mesh.order;
         }
-        for (int64_t i = 0; i < faces_count; ++i) {
-            const int32_t* corner = faces + 3 * (int64_t)order[i];
+        for (size_t i = 0; i < vertices.number.size(); ++i) vertices.box[i] = vertex[vertices.number[i]];
+        for (size_t i = 0; i < edges.number.size(); ++i) {
+            const int32_t* ends = mesh.edges + 2 * (int64_t)edges.number[i];
+            edges.box[i] = vertex[ends[0]];
+            join(edges.box[i], vertex[ends[1]]);
+        }
+        face.resize(num_faces);
+        for (int64_t i = 0; i < num_faces; ++i) {
+            const int32_t* corner = mesh.faces + 3 * (int64_t)mesh.order[i];
             face[i] = vertex[corner[0]];
             join(face[i], vertex[corner[1]]), join(face[i], vertex[corner[2]]);
         }
         int64_t size = 1;  // halves differ by a face at most, so that the levels above the last are full
-        for (int64_t most = faces_count; most > LEAF; most = (most + 1) / 2) size = 2 * size + 1;
+        for (int64_t most = num_faces; most > LEAF; most = (most + 1) / 2) size = 2 * size + 1;
         node.resize(size);
-        if (faces_count) refit(0, 0, faces_count);
+        if (num_faces) refit(0, 0, num_faces);
     }
 
     void refit(int64_t at, int64_t begin, int64_t end) {
@@ -95,7 +137,7 @@ struct LayerTree {
         join(node[at], node[2 * at + 2]);
     }
 
-    // visit(f, g) for pairs of faces whose boxes overlap.
+    // visit(i, j) for pairs of faces whose boxes overlap.
     template <class Visit> void pairs(const Visit& visit) const {
         if (num_faces > 1) within(0, 0, num_faces, visit);
     }
@@ -104,7 +146,7 @@ struct LayerTree {
         if (end - begin <= LEAF) {
             for (int64_t i = begin; i < end; ++i)
                 for (int64_t j = i + 1; j < end; ++j)
-                    if (overlap(face[i], face[j])) visit(order[i], order[j]);
+                    if (overlap(face[i], face[j])) visit(i, j);
             return;
         }
         const int64_t middle = (begin + end) / 2;
@@ -113,12 +155,12 @@ struct LayerTree {
         between(2 * at + 1, begin, middle, 2 * at + 2, middle, end, visit);
     }
 
-    // visit(g) for faces whose boxes overlap a box.
+    // visit(j) for faces whose boxes overlap a box.
     template <class Visit> void around(const MovingBox& box, int64_t at, int64_t begin, int64_t end, const Visit& visit) const {
         if (!overlap(box, node[at])) return;
         if (end - begin <= LEAF) {
             for (int64_t j = begin; j < end; ++j)
-                if (overlap(box, face[j])) visit(order[j]);
+                if (overlap(box, face[j])) visit(j);
             return;
         }
         const int64_t middle = (begin + end) / 2;
@@ -134,7 +176,7 @@ struct LayerTree {
             for (int64_t i = a0; i < a1; ++i) {
                 if (!overlap(face[i], node[b])) continue;
                 for (int64_t j = b0; j < b1; ++j)
-                    if (overlap(face[i], face[j])) visit(order[i], order[j]);
+                    if (overlap(face[i], face[j])) visit(i, j);
             }
         } else if (leaf_b || (!leaf_a && a1 - a0 >= b1 - b0)) {
             const int64_t middle = (a0 + a1) / 2;

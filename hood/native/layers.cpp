@@ -3,12 +3,13 @@
 
 extern "C" {
 
-// Layers of a step from positions on; ``margins`` (V) [m] is how far vertices may go at first.
-void* layers_make(const void* mesh, const double* pos, const uint8_t* fixed, const double* margins, double pressure, int64_t between) {
+// Layers of a step from positions on, which may end ``ahead``; ``margins`` (V) [m] is how far vertices may be off straight ways.
+void* layers_make(const void* mesh, const double* pos, const double* ahead, const uint8_t* fixed, const double* margins, double pressure, int64_t between) {
     Layers* layers = new Layers;
     layers->mesh = *(const LayerMesh*)mesh;
     layers->fixed.assign(fixed, fixed + layers->mesh.num_vertices);
     layers->start.assign(pos, pos + 3 * layers->mesh.num_vertices);
+    layers->ahead.assign(ahead, ahead + 3 * layers->mesh.num_vertices);
     layers->margin.assign(margins, margins + layers->mesh.num_vertices);
     layers->pressure = pressure, layers->between = between != 0;
     return layers;

@@ -21,17 +21,6 @@
 
 namespace {
 
-// What is constant as long as the cloth; arrays of the caller.
-struct LayerMesh {
-    int64_t num_vertices, num_faces, num_edges;
-    const int32_t *faces, *edges;                 // (F, 3), (E, 2)
-    const int32_t *face_vertex, *face_edge;       // (F, 3) vertices and edges that a face answers for, then -1
-    const int32_t *order, *piece;                 // (F) faces along the tree's leaves, (V) garment of a vertex
-    const double *reach;                          // (V) m, distance at which a vertex is near others
-    const double *vertex_area, *edge_area;        // (V), (E) m^2 at rest
-    const double *edge_length_sq;                 // (E) m^2 at rest
-};
-
 struct LayerPair {
     int32_t corner[4];  // a vertex and a face, or two edges
     int32_t edges;      // 1 for two edges
@@ -201,19 +190,31 @@ struct Layers {
     std::vector<double> bounds;  // of the distances of the pairs, and what the cloth had moved when they were found [m]
     std::vector<LayerContact> contacts;  // of the last model
     LayerTree tree;
-    std::vector<double> start;  // (3 V) where the step begins
-    // The ways that the list is for, the margins then, and how far the cloth has moved since.
+    std::vector<double> start, ahead;  // (3 V) where the step begins, and where it may end
+    // The ways that the list is for, the margins then, where the cloth was last and how far it has moved since.
     std::vector<double> from, to, room, last;
-    bool moving = false, known = false;  // whether the ways lead anywhere; whether bounds count from ``last``, not from the ways
+    bool moving = false;  // whether the ways lead anywhere
     double moved = 0.0, most_reach = 0.0;
-    bool begun = false, begun_ways = false;  // whether there is a list; whether it has margins
+    bool begun = false;   // whether there is a list
     int64_t searches = 0, refreshes = 0, crossed = 0;  // pairs of faces that are crossed where it begins
     LayerClock clock;  // what solvers do with the rows is no part of it
     bool overflowed = false;  // cloth so crumpled, or torn, that nearly everything is near everything: no list
     struct Candidate {
         int32_t first, second;  // a vertex and a face, or two edges
     };
-    std::vector<Candidate> candidates[2];
+    // Pairs whose boxes overlap; written without a branch, which would be guessed wrongly as often as not.
+    struct Candidates {
+        std::vector<Candidate> list;
+        size_t count = 0;
+
+        void offer(int32_t first, int32_t second, bool taken) {
+            list[count] = {first, second};
+            count += taken;
+        }
+        void make_room(size_t more) {
+            if (list.size() < count + more) list.resize(2 * (count + more));
+        }
+    } candidates[2];
     std::vector<double> wide;
     std::vector<int32_t> strays;
     // For the solver.
@@ -235,41 +236,35 @@ struct Layers {
     static constexpr double SLACK = 1e-9;       // m, more than rounding makes of a distance
     static constexpr size_t FEW = 16;           // at most one of so many vertices is looked for alone
 
-    // The list of straight ways between positions (V, 3), for vertices within ``share`` of their margins of them.
-    void search(const double* begin, const double* end, double share) {
+    // The list of straight ways between positions (V, 3).
+    void search(const double* begin, const double* end) {
         const LayerTimer timer(clock, LayerClock::SEARCH);
         const bool first = !begun;
         begun = true;
         const int64_t size = 3 * mesh.num_vertices;
         pairs.clear(), keys.clear(), bounds.clear(), contacts.clear();
         ++searches;
-        from.assign(begin, begin + size), to.assign(end, end + size), room.resize(mesh.num_vertices);
-        moving = std::memcmp(begin, end, sizeof(double) * size) != 0, known = false, moved = 0.0;
-        for (int64_t v = 0; v < mesh.num_vertices; ++v) {
-            room[v] = share * margin[v];
-            most_reach = std::max(most_reach, mesh.reach[v]);
-        }
+        from.assign(begin, begin + size), to.assign(end, end + size);
+        moving = std::memcmp(begin, end, sizeof(double) * size) != 0, moved = 0.0;
+        last = from, room = margin;
+        for (int64_t v = 0; v < mesh.num_vertices; ++v) most_reach = std::max(most_reach, mesh.reach[v]);
         overflowed = overflowed || !finite();
         if (overflowed || mesh.num_faces < 2) return;
         make_boxes();
         fill([&](const auto& look) { tree.pairs(look); }, first, nullptr);
     }
 
-    // The list where few vertices have left their margins, on straight ways between positions (V, 3): their pairs are looked for
-    // anew. Ends of the ways are what counts from now on, and for these vertices the middle of their present ways.
-    void search_again(const double* begin, const double* end, const std::vector<int32_t>& strays) {
+    // The list where few vertices have left their margins: their pairs alone are looked for anew, on straight ways between
+    // positions (V, 3) that are ``shifts`` off the ways of the list, or off their ends where those are what counts from now on.
+    void search_again(const double* begin, const double* end, const Vec* shifts, bool along) {
         const LayerTimer timer(clock, LayerClock::SEARCH);
         ++refreshes;
-        from = to, moving = false;
+        if (!along) from = to, moving = false;
         std::vector<uint8_t> stray(mesh.num_vertices, 0);
         for (int32_t v : strays) {
-            double way = 0.0;
-            for (int k = 0; k < 3; ++k) {
-                const int64_t i = 3 * (int64_t)v + k;
-                from[i] = to[i] = 0.5 * (begin[i] + end[i]);
-                way += (end[i] - begin[i]) * (end[i] - begin[i]);
-            }
-            stray[v] = 1, room[v] = std::sqrt(way) + margin[v];
+            const Vec one = at(begin, v) - shifts[0], other = at(end, v) - shifts[1], way = other - one, middle = 0.5 * (one + other);
+            put(from, v, along ? one : middle), put(to, v, along ? other : middle);
+            stray[v] = 1, room[v] = margin[v] + (along ? 0.0 : std::sqrt(dot(way, way)));
         }
         overflowed = overflowed || !finite();
         if (!overflowed) {
@@ -278,10 +273,9 @@ struct Layers {
             make_boxes();
             const auto visit_strays = [&](const auto& look) {
                 for (int64_t i = 0; i < mesh.num_faces; ++i) {
-                    const int32_t f = mesh.order[i];
-                    if (!any_of(mesh.faces + 3 * (int64_t)f, 3, stray)) continue;
-                    tree.around(tree.face[i], 0, 0, mesh.num_faces, [&](int32_t g) {
-                        if (g != f && (g > f || !any_of(mesh.faces + 3 * (int64_t)g, 3, stray))) look(f, g);
+                    if (!any_of(corners_at(i), 3, stray)) continue;
+                    tree.around(tree.face[i], 0, 0, mesh.num_faces, [&](int64_t j) {
+                        if (i != j && (i < j || !any_of(corners_at(j), 3, stray))) look(i, j);
                     });
                 }
             };
@@ -289,6 +283,8 @@ struct Layers {
         }
         if (overflowed) pairs.clear(), keys.clear(), bounds.clear();
     }
+
+    static void put(std::vector<double>& to, int64_t v, Vec x) { to[3 * v] = x.x, to[3 * v + 1] = x.y, to[3 * v + 2] = x.z; }
 
     static bool any_of(const int32_t* corner, int count, const std::vector<uint8_t>& marked) {
         bool any = false;
@@ -300,52 +296,48 @@ struct Layers {
         wide.resize(mesh.num_vertices);
         for (int64_t v = 0; v < mesh.num_vertices; ++v) wide[v] = room[v] + 0.5 * mesh.reach[v] + SLACK;
         tree.enclose(from.data(), to.data(), wide);
-        tree.build(mesh.faces, mesh.num_faces, mesh.edges, mesh.num_edges, mesh.order);
+        tree.build(mesh);
     }
 
     // Adds pairs of features of the pairs of faces that are visited; where ``stray`` is given, only those with such a vertex.
     template <class Faces> void fill(const Faces& visit, bool first, const std::vector<uint8_t>* stray) {
         int64_t looked_at = 0;
-        for (std::vector<Candidate>& some : candidates) some.clear();
+        for (Candidates& some : candidates) some.count = 0;
         const auto too_many = [&] {
-            return looked_at > MOST_LOOKS * mesh.num_faces || (int64_t)(candidates[0].size() + candidates[1].size()) > MOST_PAIRS;
+            return looked_at > MOST_LOOKS * mesh.num_faces || (int64_t)(candidates[0].count + candidates[1].count) > MOST_PAIRS;
         };
-        visit([&](int32_t f, int32_t g) {
+        const OwnFeatures &vertices = tree.vertices, &edges = tree.edges;
+        visit([&](int64_t i, int64_t j) {
             if (too_many()) return;
             ++looked_at;
-            if (first && crossed_faces(f, g, from.data())) ++crossed, release_faces(f, g);
-            const int32_t *of_f = mesh.face_edge + 3 * (int64_t)f, *of_g = mesh.face_edge + 3 * (int64_t)g;
-            const int32_t *in_f = mesh.face_vertex + 3 * (int64_t)f, *in_g = mesh.face_vertex + 3 * (int64_t)g;
-            for (int c = 0; c < 3 && in_f[c] >= 0; ++c) consider_vertex(in_f[c], g);
-            for (int c = 0; c < 3 && in_g[c] >= 0; ++c) consider_vertex(in_g[c], f);
-            for (int c = 0; c < 3 && of_f[c] >= 0; ++c)
-                for (int d = 0; d < 3 && of_g[d] >= 0; ++d) consider_edges(of_f[c], of_g[d]);
+            if (first && crossed_faces(mesh.order[i], mesh.order[j], from.data())) ++crossed, release_faces(mesh.order[i], mesh.order[j]);
+            candidates[0].make_room(6), candidates[1].make_room(9);
+            for (int32_t v = vertices.starts[i]; v < vertices.starts[i + 1]; ++v) consider_vertex(v, j);
+            for (int32_t v = vertices.starts[j]; v < vertices.starts[j + 1]; ++v) consider_vertex(v, i);
+            for (int32_t a = edges.starts[i]; a < edges.starts[i + 1]; ++a)
+                for (int32_t b = edges.starts[j]; b < edges.starts[j + 1]; ++b) consider_edges(a, b);
         });
         overflowed = too_many();
         if (overflowed) return;
         if (first) std::sort(released.begin(), released.end());
         for (int edges = 0; edges < 2; ++edges)
-            for (size_t i = 0; i < candidates[edges].size(); i += LANES) measure(edges, i, stray);
+            for (size_t i = 0; i < candidates[edges].count; i += LANES) measure(edges, i, stray);
     }
 
-    void consider_vertex(int32_t v, int32_t f) {
-        const int32_t* face = mesh.faces + 3 * (int64_t)f;
-        if (v == face[0] || v == face[1] || v == face[2]) return;
-        if (between && mesh.piece[v] == mesh.piece[face[0]]) return;
-        MovingBox box = tree.vertex[face[0]];
-        join(box, tree.vertex[face[1]]), join(box, tree.vertex[face[2]]);
-        if (!overlap(tree.vertex[v], box)) return;
-        if (fixed[v] && fixed[face[0]] && fixed[face[1]] && fixed[face[2]]) return;
-        candidates[0].push_back({v, f});
+    const int32_t* corners_at(int64_t place) const { return mesh.faces + 3 * (int64_t)mesh.order[place]; }
+
+    // Features by their places in the tree.
+    void consider_vertex(int32_t place, int64_t at_face) {
+        const int32_t v = tree.vertices.number[place], *face = corners_at(at_face);
+        const bool shared = (v == face[0]) | (v == face[1]) | (v == face[2]);
+        candidates[0].offer(v, mesh.order[at_face], overlap(tree.vertices.box[place], tree.face[at_face]) & !shared);
     }
 
-    void consider_edges(int32_t a, int32_t b) {
-        if (!overlap(tree.edge[a], tree.edge[b])) return;
+    void consider_edges(int32_t place, int32_t other) {
+        const int32_t a = tree.edges.number[place], b = tree.edges.number[other];
         const int32_t *one = mesh.edges + 2 * (int64_t)a, *two = mesh.edges + 2 * (int64_t)b;
-        if (one[0] == two[0] || one[0] == two[1] || one[1] == two[0] || one[1] == two[1]) return;
-        if (between && mesh.piece[one[0]] == mesh.piece[two[0]]) return;
-        if (fixed[one[0]] && fixed[one[1]] && fixed[two[0]] && fixed[two[1]]) return;
-        candidates[1].push_back(a < b ? Candidate{a, b} : Candidate{b, a});
+        const bool shared = (one[0] == two[0]) | (one[0] == two[1]) | (one[1] == two[0]) | (one[1] == two[1]);
+        candidates[1].offer(std::min(a, b), std::max(a, b), overlap(tree.edges.box[place], tree.edges.box[other]) & !shared);
     }
 
     void corners_of(int edges, Candidate pair, int32_t* corner) const {
@@ -358,8 +350,8 @@ struct Layers {
     // Adds those of the next candidates to the list that can come within their reach: by the distance halfway, less what the
     // features move towards each other from there and what they may be off their ways.
     void measure(int edges, size_t begin, const std::vector<uint8_t>* stray) {
-        const std::vector<Candidate>& list = candidates[edges];
-        const int count = (int)std::min<size_t>(LANES, list.size() - begin), split = edges ? 2 : 1;
+        const std::vector<Candidate>& list = candidates[edges].list;
+        const int count = (int)std::min<size_t>(LANES, candidates[edges].count - begin), split = edges ? 2 : 1;
         int32_t corner[LANES][4];
         alignas(64) double middle[4][3][LANES], half[4][3][LANES];
         for (int lane = 0; lane < LANES; ++lane) {
@@ -385,7 +377,8 @@ struct Layers {
             }
         }
         for (int lane = 0; lane < count; ++lane) {
-            if (stray && !any_of(corner[lane], 4, *stray)) continue;
+            if ((stray && !any_of(corner[lane], 4, *stray)) || (between && mesh.piece[corner[lane][0]] == mesh.piece[corner[lane][3]])) continue;
+            if (fixed[corner[lane][0]] && fixed[corner[lane][1]] && fixed[corner[lane][2]] && fixed[corner[lane][3]]) continue;
             double off[2] = {0.0, 0.0}, reach = mesh.reach[corner[lane][0]];
             for (int c = 0; c < 4; ++c) {
                 off[c >= split] = std::max(off[c >= split], room[corner[lane][c]]);
@@ -428,31 +421,40 @@ struct Layers {
         pairs.resize(kept), bounds.resize(kept), keys.resize(kept);
     }
 
-    // The first list of a step, where it begins: what is crossed there is left out.
+    // The first list of a step: what is crossed where it begins is left out.
     void begin() {
-        if (!begun) search(start.data(), start.data(), 0.0);
+        if (begun) return;
+        search(start.data(), ahead.data());
+        if (!overflowed) return;
+        overflowed = begun = false, crossed = 0, released.clear();
+        search(start.data(), start.data());
     }
 
-    // Farthest that positions (V, 3) are off the ways of the list, some share along; infinite where one is beyond its margin.
-    double off_ways(const double* pos, double share) const {
-        double farthest = 0.0;
-        bool beyond = false;
-        for (int64_t v = 0; v < mesh.num_vertices; ++v) {
-            const int64_t i = 3 * v;
-            const Vec gap = at(pos, v) - Vec{from[i] + share * (to[i] - from[i]), from[i + 1] + share * (to[i + 1] - from[i + 1]),
-                                             from[i + 2] + share * (to[i + 2] - from[i + 2])};
-            const double square = dot(gap, gap);
-            farthest = std::max(farthest, square), beyond |= !(square <= (room[v] + SLACK) * (room[v] + SLACK));
-        }
-        return beyond ? std::numeric_limits<double>::infinity() : std::sqrt(farthest);
+    // Distances do not change where all cloth is shifted: how far positions (V, 3) are off the ways on average, some share along.
+    Vec shift_of(const double* pos, double share) const {
+        Vec sum = {0.0, 0.0, 0.0};
+        for (int64_t v = 0; v < mesh.num_vertices; ++v) sum = sum + off_way(pos, v, share);
+        return (1.0 / (double)std::max<int64_t>(mesh.num_vertices, 1)) * sum;
     }
 
-    double off_ways(const double* pos) const {
-        double off = off_ways(pos, 1.0);
-        if (!std::isfinite(off) && moving) off = off_ways(pos, 0.0);
-        if (!std::isfinite(off) && moving) off = off_ways(pos, share_of(pos));
-        return off;
+    Vec off_way(const double* pos, int64_t v, double share) const {
+        const Vec begin = at(from.data(), v);
+        return at(pos, v) - (begin + share * (at(to.data(), v) - begin));
     }
+
+    bool astray(const double* pos, int64_t v, double share, Vec shift) const {
+        const Vec off = off_way(pos, v, share) - shift;
+        return !(dot(off, off) <= (room[v] + SLACK) * (room[v] + SLACK));
+    }
+
+    // Whether all vertices are within their margins, some share along.
+    bool on_ways(const double* pos, double share) const {
+        const Vec shift = shift_of(pos, share);
+        bool off = false;
+        for (int64_t v = 0; v < mesh.num_vertices; ++v) off |= astray(pos, v, share, shift);
+        return !off;
+    }
+    bool on_ways(const double* pos) const { return on_ways(pos, 1.0) || (moving && (on_ways(pos, 0.0) || on_ways(pos, share_of(pos)))); }
 
     // How far along the ways positions are.
     double share_of(const double* pos) const {
@@ -462,6 +464,30 @@ struct Layers {
             along += way * (pos[i] - from[i]), size += way * way;
         }
         return size > 0.0 ? layer_clamp(along / size) : 0.0;
+    }
+
+    // Makes sure that the list holds at positions (V, 3), and on straight ways from there; bounds hold there.
+    void cover(const double* pos) { cover(pos, pos); }
+    void cover(const double* pos, const double* end) {
+        begin();
+        if (overflowed) return;
+        moved += 2.0 * farthest(last.data(), pos);
+        last.assign(pos, pos + 3 * mesh.num_vertices);
+        if (on_ways(pos) && (end == pos || on_ways(end))) return;
+        const bool along = moving && end != pos;
+        if (!(along && retrace(pos, end, true)) && !retrace(pos, end, false)) search(pos, end);
+    }
+
+    // Whether few vertices are astray, from the beginnings of the ways to their ends or at the ends; then their pairs are found.
+    bool retrace(const double* pos, const double* end, bool along) {
+        const double share = along ? 0.0 : 1.0;
+        const Vec shifts[2] = {shift_of(pos, share), shift_of(end, 1.0)};
+        strays.clear();
+        for (int64_t v = 0; v < mesh.num_vertices; ++v)
+            if (astray(pos, v, share, shifts[0]) || astray(end, v, 1.0, shifts[1])) strays.push_back((int32_t)v);
+        if (strays.size() * FEW > (size_t)mesh.num_vertices) return false;
+        search_again(pos, end, shifts, along);
+        return true;
     }
 
     // Farthest that a vertex moves from positions to others, seen from their mean: distances change by twice that at most.
@@ -475,41 +501,6 @@ struct Layers {
             square = std::max(square, dot(own, own));
         }
         return std::sqrt(square);
-    }
-
-    // Makes sure that the list holds at positions (V, 3), and on straight ways from there; bounds hold there.
-    void cover(const double* pos) { cover(pos, pos); }
-    void cover(const double* pos, const double* end) {
-        begin();
-        if (overflowed) return;
-        double off = off_ways(pos);
-        if (!std::isfinite(off) || (end != pos && !std::isfinite(off_ways(end)))) {
-            find_strays(pos, end);
-            if (begun_ways && strays.size() * FEW <= (size_t)mesh.num_vertices) {
-                move_to(pos, 0.0);  // bounds count from there
-                search_again(pos, end, strays);
-                return;
-            }
-            search(pos, end, 1.0);
-            begun_ways = true, off = 0.0;
-        }
-        move_to(pos, off);
-    }
-
-    void move_to(const double* pos, double off) {
-        moved += 2.0 * (known ? farthest(last.data(), pos) : off);
-        last.assign(pos, pos + 3 * mesh.num_vertices);
-        known = true;
-    }
-
-    // Vertices that are beyond their margins of the ends of the list's ways, at positions or others.
-    void find_strays(const double* pos, const double* end) {
-        strays.clear();
-        for (int64_t v = 0; v < mesh.num_vertices; ++v) {
-            const Vec there = at(to.data(), v), one = at(pos, v) - there, other = at(end, v) - there;
-            const double most = (room[v] + SLACK) * (room[v] + SLACK);
-            if (!(dot(one, one) <= most && dot(other, other) <= most)) strays.push_back((int32_t)v);
-        }
     }
 
     // Whether a pair cannot be nearer than a distance where the cloth is.
@@ -530,9 +521,10 @@ struct Layers {
     // Whether two faces without a common vertex pass through each other at positions (V, 3).
     bool crossed_faces(int64_t f, int64_t g, const double* pos) const {
         const int32_t *a = mesh.faces + 3 * f, *b = mesh.faces + 3 * g;
+        bool shared = false;
         for (int i = 0; i < 3; ++i)
-            for (int j = 0; j < 3; ++j)
-                if (a[i] == b[j]) return false;
+            for (int j = 0; j < 3; ++j) shared |= a[i] == b[j];
+        if (shared) return false;
         if (between && mesh.piece[a[0]] == mesh.piece[b[0]]) return false;
         Vec x[3], y[3];
         for (int c = 0; c < 3; ++c) x[c] = at(pos, a[c]), y[c] = at(pos, b[c]);

@@ -27,13 +27,17 @@ class SceneLayers:
         return values[self.first : self.last].detach().cpu().double().numpy()
 
 
-def find_layers(cloth: Cloth, pos: Tensor, reach: float, pressure: float, between: bool) -> tuple[SceneLayers, ...]:
-    """The layers of every scene at ``pos`` (V, 3); see :class:`hood.mesh.layers.Layers`."""
+def find_layers(
+    cloth: Cloth, pos: Tensor, ahead: Tensor, reach: float, pressure: float, between: bool
+) -> tuple[SceneLayers, ...]:
+    """The layers of every scene at ``pos`` (V, 3), from where the step may lead to ``ahead`` (V, 3); see
+    :class:`hood.mesh.layers.Layers`."""
     found = []
     for mesh, first, last in _meshes(cloth, reach):
         fixed = ~cloth.free[first:last].cpu().numpy()
-        here = pos[first:last].detach().cpu().double().numpy()
-        found.append(SceneLayers(Layers(mesh, here, fixed, pressure, between), first, last))
+        here, there = (values[first:last].detach().cpu().double().numpy() for values in (pos, ahead))
+        there = np.where(np.isfinite(there), there, here)
+        found.append(SceneLayers(Layers(mesh, here, fixed, pressure, between, there), first, last))
     return tuple(found)
 
 
