@@ -91,7 +91,7 @@ class LayerMesh:
             "edge_area": np.bincount(sides.reshape(-1), thirds, minlength=len(edges)),
             "edge_length_sq": length**2,
         }
-        self.num_vertices = len(rest)
+        self.num_vertices, self.reach = len(rest), self._arrays["reach"]  # (V,) m
         counts = len(rest), len(faces), len(edges)
         self.structure = _Mesh(*counts, *(self._arrays[name].ctypes.data for name in self._arrays))
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
+from hood.mesh import topology
 from hood.mesh.crossing import self_crossings
 from hood.mesh.layers import LayerMesh, Layers
 from hood.testing import grid
@@ -61,6 +63,105 @@ def test_list_is_complete_wherever_vertices_went() -> None:
     for _ in range(6):
         here = here + 0.004 * rng.normal(size=pos.shape)
         assert _pairs(layers, here) == _pairs(_layers(mesh, pos), here)
+
+
+def _to_segments(p: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Distances of points to segments, all (N, 3)."""
+    along = b - a
+    share = np.clip(((p - a) * along).sum(1) / (along * along).sum(1), 0.0, 1.0)
+    return np.asarray(np.linalg.norm(p - a - share[:, None] * along, axis=1))
+
+
+def _all_pairs(mesh: LayerMesh, faces: np.ndarray, pos: np.ndarray) -> dict[tuple[int, ...], float]:
+    """Distances of all pairs of features without a common vertex by (whether edges, corners): no boxes, no bounds."""
+    vertex, face = (axis.reshape(-1) for axis in np.meshgrid(np.arange(len(pos)), np.arange(len(faces)), indexing="ij"))
+    corners = np.column_stack([vertex, faces[face]])
+    corners = corners[(corners[:, :1] != corners[:, 1:]).all(1)]
+    p, a, b, c = (pos[corners[:, k]] for k in range(4))
+    dist = np.minimum(np.minimum(_to_segments(p, a, b), _to_segments(p, b, c)), _to_segments(p, c, a))
+    normal = np.cross(b - a, c - a)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    height = ((p - a) * normal).sum(1)
+    foot = p - height[:, None] * normal
+    ways = [(np.cross(second - first, foot - first) * normal).sum(1) for first, second in ((a, b), (b, c), (c, a))]
+    dist = np.where((np.array(ways) >= 0.0).all(0), np.abs(height), dist)
+    found = {(0, *pair): far for pair, far in zip(corners.tolist(), dist.tolist(), strict=True)}
+    edges = topology.unique_edges(faces)
+    one, two = np.triu_indices(len(edges), 1)
+    corners = np.column_stack([edges[one], edges[two]])
+    corners = corners[(corners[:, :2, None] != corners[:, None, 2:]).all((1, 2))]
+    a, b, c, d = (pos[corners[:, k]] for k in range(4))
+    ends = ((a, c, d), (b, c, d), (c, a, b), (d, a, b))
+    dist = np.minimum.reduce([_to_segments(*end) for end in ends])
+    # Between the ends the distance of the lines, where its foot is on both.
+    u, v, w = b - a, d - c, a - c
+    uu, uv, vv, uw, vw = ((x * y).sum(1) for x, y in ((u, u), (u, v), (v, v), (u, w), (v, w)))
+    det = np.maximum(uu * vv - uv * uv, 1e-300)
+    s, t = (uv * vw - vv * uw) / det, (uu * vw - uv * uw) / det
+    between = (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1) & (det > 1e-12 * uu * vv)
+    dist = np.where(between, np.minimum(dist, np.linalg.norm(w + s[:, None] * u - t[:, None] * v, axis=1)), dist)
+    return found | {(1, *pair): far for pair, far in zip(corners.tolist(), dist.tolist(), strict=True)}
+
+
+def _require_all_pairs(layers: Layers, faces: np.ndarray, pos: np.ndarray) -> int:
+    """Check what is in reach against all pairs; how many are."""
+    reach = layers.mesh.reach
+    everything = _all_pairs(layers.mesh, faces, pos)
+    near = {pair for pair, dist in everything.items() if dist < reach[list(pair[1:])].min() - 1e-9}
+    nearly = {pair for pair, dist in everything.items() if dist < reach[list(pair[1:])].min() + 1e-9}
+    found = layers.contacts(pos)
+    listed = [(int(edges), *row) for edges, row in zip(found.edges, found.corners.tolist(), strict=True)]
+    assert len(listed) == len(set(listed))
+    assert near <= set(listed) <= nearly
+    gap = np.linalg.norm((found.weights[:, :, None] * pos[found.corners]).sum(1), axis=1)
+    np.testing.assert_allclose(gap, [everything[pair] for pair in listed], atol=1e-9)
+    return len(listed)
+
+
+def test_pairs_in_reach_are_those_of_all_pairs_at_random_and_crushed() -> None:
+    mesh, pos, faces = _sheets(6)
+    rng = np.random.default_rng(4)
+    counts = []
+    for squeeze in (1.0, 0.3, 0.05, 0.02):
+        here = pos * np.array([squeeze, 0.3, squeeze]) + 1e-3 * rng.normal(size=pos.shape)
+        counts.append(_require_all_pairs(_layers(mesh, pos), faces, here))
+    assert counts[0] < counts[-1]
+    assert counts[-1] > 1000
+
+
+def test_pairs_in_reach_are_those_of_all_pairs_whatever_was_asked_before() -> None:
+    """Ways ahead, moves of all cloth and of few vertices, limits and energies in between: the list is never short of a pair."""
+    mesh, pos, faces = _sheets(6)
+    rng = np.random.default_rng(5)
+    here = pos * np.array([0.5, 0.3, 0.5])
+    ahead = here + [0.03, 0.0, 0.0] + 2e-3 * rng.normal(size=pos.shape)
+    layers = Layers(mesh, here, np.zeros(len(pos), bool), 20.0, ahead=ahead)
+    fresh = 0
+    for turn in range(16):
+        there = here + 0.02 * rng.normal(size=3) + 4e-4 * rng.normal(size=pos.shape)
+        there[rng.integers(len(pos))] += 0.01 * rng.normal(size=3)
+        there = ahead + 1e-3 * rng.normal(size=pos.shape) if turn == 0 else there
+        share = layers.limit(here, there)
+        assert share == pytest.approx(_layers(mesh, here).limit(here, there), rel=1e-9)
+        fresh += _require_all_pairs(layers, faces, here + share * (there - here))
+        if turn % 3 == 0:
+            assert layers.energy(there) == pytest.approx(_layers(mesh, here).energy(there), rel=1e-9)
+        here = here + share * (there - here)
+    assert fresh > 0
+    assert layers.work.refreshes > 3
+    assert layers.work.searches < 10
+
+
+def test_common_motion_needs_no_search() -> None:
+    mesh, pos, _ = _sheets()
+    near = pos * np.array([1.0, 0.2, 1.0])
+    layers = _layers(mesh, near)
+    first = layers.energy(near)
+    assert first > 0.0
+    for step in range(1, 5):
+        assert layers.energy(near + 0.1 * step) == pytest.approx(first, rel=1e-9)
+    assert layers.work.searches == 1
+    assert layers.work.refreshes == 0
 
 
 def test_limited_moves_cross_nothing() -> None:
