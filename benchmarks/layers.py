@@ -136,7 +136,9 @@ def main() -> None:
     torch.set_num_threads(1)
     gc.freeze()  # as the commands do
     print(machine_name("cpu"))
-    print(f"{'case':34s} {'':6s} {'on, ms':>8s} {'off':>8s} {'ratio':>6s} {'total':>6s} {'its on':>5s} {'off':>4s}  missed   same")
+    print(
+        f"{'case':34s} {'':6s} {'on, ms':>8s} {'off':>8s} {'ratio':>6s} {'total':>6s} {'its on':>5s} {'off':>4s}  missed   same"
+    )
     for case in arguments.cases:
         for line in run(case, arguments.first, arguments.frames):
             print(line, flush=True)

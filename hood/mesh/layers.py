@@ -26,6 +26,8 @@ LEFT = 0.1
 #: How far vertices may be off the ways that the list of pairs was made for: a share of half of the smallest height of a face
 #: around, and at most so much [m].
 SHARE, MARGIN = 0.3, 5e-3
+#: Beyond its reach by so much [m] a pair is apart after any shift of all cloth, rounded as it may be.
+SPARE = 1e-6
 
 
 class _Mesh(ctypes.Structure):
@@ -44,12 +46,14 @@ def library() -> ctypes.CDLL:
     """
     lib = build(SOURCE, NATIVE_FLAGS)
     lib.layers_make.restype = POINTER
-    lib.layers_make.argtypes = [*[POINTER] * 5, REAL, COUNT]
+    lib.layers_make.argtypes = [*[POINTER] * 5, REAL, COUNT, COUNT]
     lib.layers_free.argtypes = [POINTER]
     lib.layers_crossed.argtypes = [POINTER]
     lib.layers_approach.argtypes = [POINTER, POINTER, REAL]
     lib.layers_limit.argtypes = [POINTER, POINTER, POINTER, REAL]
-    for name in ("layers_crossed", "layers_approach", "layers_model"):
+    lib.layers_restart.argtypes = [POINTER]
+    lib.layers_apart.argtypes = [POINTER, POINTER, REAL]
+    for name in ("layers_crossed", "layers_apart", "layers_approach", "layers_model"):
         getattr(lib, name).restype = COUNT
     for name in ("layers_limit", "layers_energy"):
         getattr(lib, name).restype = REAL
@@ -58,6 +62,14 @@ def library() -> ctypes.CDLL:
     lib.layers_number.restype = POINTER
     lib.layers_number.argtypes = [POINTER, POINTER, COUNT]
     return lib
+
+
+class Apart(NamedTuple):
+    """Positions where nothing is near or through anything, with :data:`SPARE` to spare."""
+
+    pos: np.ndarray  # (V, 3) m
+    held: np.ndarray  # (V,) vertices of pairs that do not count if it is all four
+    between: bool
 
 
 class LayerMesh:
@@ -91,9 +103,18 @@ class LayerMesh:
             "edge_area": np.bincount(sides.reshape(-1), thirds, minlength=len(edges)),
             "edge_length_sq": length**2,
         }
+        self.apart: Apart | None = None  # where a step has ended lately
         self.num_vertices, self.reach = len(rest), self._arrays["reach"]  # (V,) m
         counts = len(rest), len(faces), len(edges)
         self.structure = _Mesh(*counts, *(self._arrays[name].ctypes.data for name in self._arrays))
+
+    def known_apart(self, pos: np.ndarray, held: np.ndarray, between: bool) -> bool:
+        """Whether ``pos`` (V, 3) are the positions :attr:`apart`, moved as a whole."""
+        known = self.apart
+        if known is None or known.between != between or not np.isfinite(pos).all() or not np.array_equal(known.held, held):
+            return False
+        shift = pos - known.pos
+        return bool(np.abs(shift - shift.mean(axis=0)).max(initial=0.0) < 0.1 * SPARE)
 
 
 def vertex_room(rest: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -188,14 +209,26 @@ class Layers:
         end = start if ahead is None else _positions(ahead)
         margin = np.minimum(SHARE * mesh.room, MARGIN)
         given = (start.ctypes.data, end.ctypes.data, held.ctypes.data, margin.ctypes.data)
-        self.handle = self._lib.layers_make(ctypes.byref(mesh.structure), *given, pressure, int(between))
+        rules = pressure, int(between), int(mesh.known_apart(start, held, between))
+        self.handle = self._lib.layers_make(ctypes.byref(mesh.structure), *given, *rules)
         weakref.finalize(self, self._lib.layers_free, self.handle)
+        self._held, self._between = held, between
         self.forced = 0  # pairs of features that held vertices drive through each other
 
     @property
     def crossed(self) -> int:
         """Pairs of faces that pass through each other where the step begins."""
         return int(self._lib.layers_crossed(self.handle))
+
+    def restart(self) -> None:
+        """Forget what has been asked so far: what comes next does not depend on it, to the bit."""
+        self._lib.layers_restart(self.handle)
+
+    def remember_apart(self, pos: np.ndarray) -> None:
+        """Spare the next step from ``pos`` (V, 3) its search there, if nothing is near anything at ``pos``."""
+        here = _positions(pos)
+        if self._lib.layers_apart(self.handle, here.ctypes.data, SPARE):
+            self.mesh.apart = Apart(here.copy(), self._held, self._between)
 
     def approach(self, target: np.ndarray) -> np.ndarray:
         """Positions (V, 3) near ``target`` (V, 3) that straight ways from the start lead to on which no two features meet.
@@ -247,7 +280,8 @@ class Layers:
         """What has been done so far."""
         counts, seconds = np.empty(5, np.int64), np.empty(4)
         self._lib.layers_counts(self.handle, counts.ctypes.data, seconds.ctypes.data)
-        return Work(*counts[:4].tolist(), bool(counts[4]), *seconds.tolist())
+        listed, left_out, searches, refreshes, overflowed = counts.tolist()
+        return Work(listed, left_out, searches, refreshes, bool(overflowed), *seconds.tolist())
 
 
 def _positions(pos: np.ndarray) -> np.ndarray:

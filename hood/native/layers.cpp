@@ -3,15 +3,17 @@
 
 extern "C" {
 
-// Layers of a step from positions on, which may end ``ahead``; ``margins`` (V) [m] is how far vertices may be off straight ways.
-void* layers_make(const void* mesh, const double* pos, const double* ahead, const uint8_t* fixed, const double* margins, double pressure, int64_t between) {
+// Layers of a step from positions on, which may end ``ahead``; ``margins`` (V) [m] is how far vertices may be off straight ways;
+// ``apart`` says that nothing is near or through anything there.
+void* layers_make(const void* mesh, const double* pos, const double* ahead, const uint8_t* fixed, const double* margins, double pressure, int64_t between,
+                  int64_t apart) {
     Layers* layers = new Layers;
     layers->mesh = *(const LayerMesh*)mesh;
     layers->fixed.assign(fixed, fixed + layers->mesh.num_vertices);
     layers->start.assign(pos, pos + 3 * layers->mesh.num_vertices);
     layers->ahead.assign(ahead, ahead + 3 * layers->mesh.num_vertices);
     layers->margin.assign(margins, margins + layers->mesh.num_vertices);
-    layers->pressure = pressure, layers->between = between != 0;
+    layers->pressure = pressure, layers->between = between != 0, layers->known_apart = apart != 0;
     return layers;
 }
 
@@ -20,9 +22,15 @@ void layers_free(void* layers) { delete (Layers*)layers; }
 // Pairs of faces that pass through each other where the step begins.
 int64_t layers_crossed(void* handle) {
     Layers* layers = (Layers*)handle;
-    layers->begin();
+    if (!layers->known_apart) layers->begin();
     return layers->crossed;
 }
+
+// Forgets what has been asked so far.
+void layers_restart(void* handle) { ((Layers*)handle)->restart(); }
+
+// Whether nothing is within its reach and so much beyond it [m] at positions.
+int64_t layers_apart(void* handle, const double* pos, double spare) { return ((Layers*)handle)->apart_at(pos, spare); }
 
 // Targets that can be reached become ``to``; returns how many pairs are left out for it.
 int64_t layers_approach(void* handle, double* to, double left) {

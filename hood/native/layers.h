@@ -196,6 +196,7 @@ struct Layers {
     bool moving = false;  // whether the ways lead anywhere
     double moved = 0.0, most_reach = 0.0;
     bool begun = false;   // whether there is a list
+    bool known_apart = false;  // nothing is near or through anything where the step begins
     int64_t searches = 0, refreshes = 0, crossed = 0;  // pairs of faces that are crossed where it begins
     LayerClock clock;  // what solvers do with the rows is no part of it
     bool overflowed = false;  // cloth so crumpled, or torn, that nearly everything is near everything: no list
@@ -239,7 +240,7 @@ struct Layers {
     // The list of straight ways between positions (V, 3).
     void search(const double* begin, const double* end) {
         const LayerTimer timer(clock, LayerClock::SEARCH);
-        const bool first = !begun;
+        const bool first = !begun && !known_apart;
         begun = true;
         const int64_t size = 3 * mesh.num_vertices;
         pairs.clear(), keys.clear(), bounds.clear(), contacts.clear();
@@ -430,6 +431,34 @@ struct Layers {
         search(start.data(), start.data());
     }
 
+    // As if nothing had been asked yet.
+    void restart() {
+        begun = overflowed = known_apart = false, crossed = 0;
+        released.clear(), pairs.clear(), keys.clear(), bounds.clear(), contacts.clear();
+    }
+
+    // Whether positions (V, 3) are where the step begins, where nothing is near anything: no list is needed for them.
+    bool idle_at(const double* pos) const {
+        return known_apart && !begun && std::memcmp(pos, start.data(), sizeof(double) * start.size()) == 0;
+    }
+
+    // Whether nothing is within its reach, or so much beyond it, at positions (V, 3).
+    bool apart_at(const double* pos, double spare) {
+        const LayerTimer timer(clock, LayerClock::LIMIT);
+        cover(pos);
+        if (overflowed || crossed || !released.empty()) return false;
+        for (size_t i = 0; i < pairs.size(); ++i) {
+            if (farther(i, most_reach + spare)) continue;
+            Vec x[4];
+            double weight[4];
+            for (int c = 0; c < 4; ++c) x[c] = at(pos, pairs[i].corner[c]);
+            const double dist = std::sqrt(pair_distance_sq(pairs[i].edges, x, weight));
+            measured(i, dist);
+            if (!(dist > pairs[i].reach + spare)) return false;
+        }
+        return true;
+    }
+
     // Distances do not change where all cloth is shifted: how far positions (V, 3) are off the ways on average, some share along.
     Vec shift_of(const double* pos, double share) const {
         Vec sum = {0.0, 0.0, 0.0};
@@ -469,6 +498,7 @@ struct Layers {
     // Makes sure that the list holds at positions (V, 3), and on straight ways from there; bounds hold there.
     void cover(const double* pos) { cover(pos, pos); }
     void cover(const double* pos, const double* end) {
+        if (!begun && known_apart && end != pos) search(pos, end);
         begin();
         if (overflowed) return;
         moved += 2.0 * farthest(last.data(), pos);
@@ -696,10 +726,11 @@ struct Layers {
     // Forces by vertex, and rows n (12) such that the sum of their outer products is a positive curvature; how many rows.
     int64_t model(const double* pos) {
         const LayerTimer timer(clock, LayerClock::MODEL);
-        cover(pos);
+        const bool idle = idle_at(pos);
+        if (!idle) cover(pos);
         contacts.clear(), rows.clear(), normals.clear(), normals_single.clear();
         gradient.assign(3 * mesh.num_vertices, 0.0), own.assign(6 * mesh.num_vertices, 0.0);
-        for (size_t i = 0; i < pairs.size(); ++i) {
+        for (size_t i = 0; i < pairs.size() && !idle; ++i) {
             LayerContact found;
             Vec x[4];
             if (!contact(i, pos, found, x)) continue;

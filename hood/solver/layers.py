@@ -79,7 +79,13 @@ def touching(layers: tuple[SceneLayers, ...], pos: Tensor) -> bool:
 
 
 def free_way(layers: tuple[SceneLayers, ...], now: Tensor, there: Tensor) -> bool:
-    """Whether no cloth meets cloth on the straight ways from ``now`` to ``there`` (V, 3), nor is near any there."""
-    if bool((limits(layers, now, there) < 1.0).any()):
+    """Whether no cloth meets cloth on the straight ways from ``now`` to ``there`` (V, 3), nor is near any there. A step from
+    there needs no search to begin with; where cloth does, it is as if this had not been asked."""
+    met = bool((limits(layers, now, there) < 1.0).any())
+    if met or any(len(scene.layers.contacts(scene.of(there)).corners) for scene in layers):
+        for scene in layers:
+            scene.layers.restart()
         return False
-    return all(len(scene.layers.contacts(scene.of(there)).corners) == 0 for scene in layers)
+    for scene in layers:
+        scene.layers.remember_apart(scene.of(there))
+    return True

@@ -164,6 +164,28 @@ def test_common_motion_needs_no_search() -> None:
     assert layers.work.refreshes == 0
 
 
+def test_where_cloth_is_known_to_be_apart_no_search_is_made() -> None:
+    mesh, pos, _ = _sheets()
+    first = _layers(mesh, pos)
+    assert first.limit(pos, pos + 0.001) == 1.0
+    first.remember_apart(pos + 0.001)
+    again = _layers(mesh, pos + 0.2)
+    assert again.crossed == len(again.contacts(pos + 0.2).corners) == again.work.searches == 0
+    near = pos * np.array([1.0, 0.2, 1.0])
+    assert len(again.contacts(near).corners) > 0
+    again.remember_apart(near)
+    assert mesh.apart is not None
+    np.testing.assert_array_equal(mesh.apart.pos, pos + 0.001)
+    others = [
+        _layers(mesh, near),
+        _layers(mesh, pos, np.ones(len(pos), bool)),
+        Layers(mesh, pos, np.zeros(len(pos), bool), 1.0, True),
+    ]
+    for other in others:
+        other.contacts(pos)
+        assert other.work.searches == 1
+
+
 def test_limited_moves_cross_nothing() -> None:
     mesh, pos, faces = _sheets()
     rng = np.random.default_rng(2)

@@ -67,6 +67,21 @@ def test_cloth_that_meets_none_moves_to_the_bit_as_without(engine: str) -> None:
         assert torch.equal(one.state.pos, other.state.pos)
 
 
+def test_steps_do_not_depend_on_those_before() -> None:
+    """What is known of where the last step ended spares a search and changes nothing, to the bit."""
+    spared = touched = 0
+    for now in march(POTENTIAL, sheets_on_sphere(1 / 30, n=9, gap=0.05), 6):
+        layers = now.problem.layers[0].layers
+        spared += layers.mesh.apart is not None
+        touched += len(layers.contacts(now.state.pos.numpy()).corners) > 0
+        kept, layers.mesh.apart = layers.mesh.apart, None
+        alone, _ = minimize(POTENTIAL, replace(now.problem, layers=()))
+        assert torch.equal(alone, now.state.pos)
+        layers.mesh.apart = kept
+    assert spared > 1
+    assert touched > 1
+
+
 def test_report_is_that_of_the_potential() -> None:
     *_, before = march(POTENTIAL, SMALL["stack"](1 / 30), 4)
     problem = POTENTIAL.prepare(replace(before.problem, state=before.state, contact=None, layers=()))
