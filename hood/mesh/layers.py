@@ -17,7 +17,8 @@ import numpy as np
 
 from hood import native
 from hood.mesh import topology
-from hood.native.build import NATIVE_FLAGS, build
+from hood.native.build import build
+from hood.native.libraries import LAYER_FLAGS
 from hood.native.structures import COUNT, POINTER, REAL, fields
 
 SOURCE = Path(native.__file__).with_name("layers.cpp")
@@ -44,7 +45,7 @@ def library() -> ctypes.CDLL:
     Raises:
         hood.native.build.BuildError: there is no compiler, or it fails.
     """
-    lib = build(SOURCE, NATIVE_FLAGS)
+    lib = build(SOURCE, LAYER_FLAGS)
     lib.layers_make.restype = POINTER
     lib.layers_make.argtypes = [*[POINTER] * 5, REAL, COUNT, COUNT]
     lib.layers_free.argtypes = [POINTER]
