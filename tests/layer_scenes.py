@@ -74,3 +74,17 @@ SCENES = {
     "sheets_on_sphere": sheets_on_sphere,
     "stack": stack,
 }
+
+
+def sheet_on_slope(dt: float, degrees: float, gap: float = 1.2e-3) -> tuple[StepProblem, int, np.ndarray]:
+    """A small sheet at rest above a held one that is inclined; the first vertex of the small one, and the way down (3,)."""
+    under, sides = grid(9, 9, 0.4)
+    over, faces = grid(5, 5, 0.1)
+    rest = np.concatenate([under, over + np.array([0.1513, gap, 0.1497])])
+    turn = np.deg2rad(degrees)
+    down = np.array([np.cos(turn), -np.sin(turn), 0.0])
+    frame = np.stack([down, [np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]], axis=1)
+    pinned = np.arange(len(rest)) < len(under)
+    cloth = build_cloth(rest, np.concatenate([sides, faces + len(under)]), Material(), pinned=pinned, dtype=torch.float64)
+    problem = make_problem(cloth, rest @ frame.T, dt=dt)
+    return replace(problem, step=replace(problem.step, pin_target=problem.state.pos)), len(under), down

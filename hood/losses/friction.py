@@ -119,7 +119,7 @@ class Friction(LaggedFriction):
         if pull is not None:
             carried = problem.cloth.mass[points.vertices].mul(points.weights).sum(dim=1)
             dt = problem.step.dt[points.scene]
-            depth = self.epsilon - _along(points.at(_flown(problem)) - points.next_point, points.next_normal)
+            depth = self.epsilon - _along(points.at(flown(problem)) - points.next_point, points.next_normal)
             force = torch.minimum(force, _pressing(carried / dt**2, depth, points.at(pull), points.next_normal))
         return points.share * force
 
@@ -133,9 +133,9 @@ class Friction(LaggedFriction):
             return force
         # where() before the arithmetic: rows without a match may hold infinite or undefined numbers.
         point, normal = (torch.where(touching[:, None], given, 0.0) for given in (contact.next_point, contact.next_normal))
-        flown = reach - _along(_flown(problem) - point, normal)
+        depth = reach - _along(flown(problem) - point, normal)
         inertia = problem.cloth.mass / problem.vertex_dt.squeeze(1) ** 2
-        return torch.minimum(force, _pressing(inertia, flown, pull, normal))
+        return torch.minimum(force, _pressing(inertia, depth, pull, normal))
 
 
 class WeightFriction(LaggedFriction):
@@ -214,7 +214,7 @@ class CodedFriction(LaggedFriction):
         return contact.lagged_motion, contact.lagged_normal
 
 
-def _flown(problem: StepProblem) -> Tensor:
+def flown(problem: StepProblem) -> Tensor:
     """Where (V, 3) [m] vertices would be at t + 1 with nothing but their weight."""
     dt = problem.vertex_dt
     return problem.state.pos + dt * (problem.state.vel + dt * problem.gravity.to(dt))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from hood.losses.layer_friction import LayerFriction, fading
 from hood.losses.layer_sides import LayerSides
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
@@ -69,9 +70,12 @@ class LayerBarrier:
         share = torch.linalg.vector_norm(gap, dim=1).clamp_min(_LEAST) / reach
         energy = self.pressure * area * reach * (1.0 - share) ** 2 * -share.log()
         normal = torch.linalg.cross(x[:, 1] - x[:, 0], x[:, 3] - x[:, 2])
-        edges = torch.as_tensor(found.edges, device=device)
-        ratio = torch.where(edges, (normal * normal).sum(dim=1) / torch.where(edges, parallel, 1.0), 1.0).clamp_max(1.0)
-        return (energy * ratio * (2.0 - ratio)).sum()
+        # Pairs of a vertex and a face have 0 to fade below.
+        return (energy * fading((normal * normal).sum(dim=1), parallel)).sum()
+
+
+#: Terms that act between layers; of other classes the solvers know nothing.
+LAYER_TERMS = (LayerBarrier, LayerFriction)
 
 
 def has_layers(potential: Potential) -> bool:
@@ -80,14 +84,14 @@ def has_layers(potential: Potential) -> bool:
 
 
 def without_layers(potential: Potential) -> Potential:
-    """The potential without what keeps layers of cloth apart; itself where there is nothing of the kind."""
-    if not has_layers(potential):
+    """The potential without what acts between layers of cloth; itself where there is nothing of the kind."""
+    if not any(type(term) in LAYER_TERMS for term in potential.terms.values()):
         return potential
-    return potential.only({name: term for name, term in potential.terms.items() if type(term) is not LayerBarrier})
+    return potential.only({name: term for name, term in potential.terms.items() if type(term) not in LAYER_TERMS})
 
 
 def for_networks(potential: Potential) -> Potential:
     """What a network is shown of the potential, and known to have been trained with: no feature tells of layers of cloth."""
     return potential.only(
-        {name: term for name, term in potential.terms.items() if type(term) not in (LayerBarrier, LayerSides)}
+        {name: term for name, term in potential.terms.items() if type(term) not in (*LAYER_TERMS, LayerSides)}
     )

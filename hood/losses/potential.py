@@ -16,6 +16,7 @@ from hood.losses.collision import CentroidCollision, Collision
 from hood.losses.friction import CodedFriction, Friction, LaggedFriction, WeightFriction
 from hood.losses.gravity import Gravity
 from hood.losses.inertia import Inertia
+from hood.losses.layer_friction import LayerFriction
 from hood.losses.problem import STANDARD_GRAVITY, StepProblem, sum_per_scene
 from hood.losses.stretching import Stretching
 
@@ -48,7 +49,7 @@ def _prepares(kind: type) -> bool:
 
 
 #: What a pull leaves out, see :meth:`Potential.with_pull`.
-_NOT_PULLING = (Inertia, Gravity, Collision, LaggedFriction)
+_NOT_PULLING = (Inertia, Gravity, Collision, LaggedFriction, LayerFriction)
 
 
 class Potential:
@@ -93,8 +94,7 @@ class Potential:
         Args:
             compiled: may leave torch; False where a graph is recorded or traced.
         """
-        asked = any(isinstance(term, Friction) and term.coefficient > 0 for term in self.terms.values())
-        if problem.pull is not None or problem.contact is None or not asked:
+        if problem.pull is not None or not any(_asks_for_pull(term, problem) for term in self.terms.values()):
             return problem
         from hood.losses.elements import energies_and_gradient  # knows of potentials itself
 
@@ -157,6 +157,12 @@ class _Settled(Potential):
 
     def active(self, problem: StepProblem) -> dict[str, Term]:
         return self.terms
+
+
+def _asks_for_pull(term: Term, problem: StepProblem) -> bool:
+    if isinstance(term, Friction):
+        return term.coefficient > 0 and problem.contact is not None
+    return isinstance(term, LayerFriction) and term.applies(problem)
 
 
 def default_potential(

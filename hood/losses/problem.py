@@ -86,6 +86,14 @@ class StepProblem:
             return self
         return replace(self, sides=find_sides(self.cloth, self.state.pos, reach))
 
+    def with_layers_at_start(self) -> StepProblem:
+        """The problem with what is near what at x_t; itself where that is known. Its layers must have been searched for."""
+        if all(scene.at_start is not None for scene in self.layers):
+            return self
+        pos = self.state.pos
+        known = (replace(scene, at_start=scene.layers.contacts(scene.of(pos))) for scene in self.layers)
+        return replace(self, layers=tuple(known))
+
     def points_at(self, place: str) -> PointContact | None:
         """Contact at the points of a place; None at ``vertices`` and without a body.
 

@@ -29,6 +29,8 @@ LEFT = 0.1
 SHARE, MARGIN = 0.3, 5e-3
 #: Beyond its reach by so much [m] a pair is apart after any shift of all cloth, rounded as it may be.
 SPARE = 1e-6
+#: Share of a move that is left where features would meet, below which it is bent around them (:meth:`Layers.ease`).
+EASED = 0.5
 
 
 class _Mesh(ctypes.Structure):
@@ -51,7 +53,8 @@ def library() -> ctypes.CDLL:
     lib.layers_free.argtypes = [POINTER]
     lib.layers_crossed.argtypes = [POINTER]
     lib.layers_approach.argtypes = [POINTER, POINTER, REAL]
-    lib.layers_limit.argtypes = [POINTER, POINTER, POINTER, REAL]
+    for name in ("layers_limit", "layers_ease"):
+        getattr(lib, name).argtypes = [POINTER, POINTER, POINTER, REAL]
     lib.layers_restart.argtypes = [POINTER]
     lib.layers_apart.argtypes = [POINTER, POINTER, REAL]
     for name in ("layers_crossed", "layers_apart", "layers_approach", "layers_model"):
@@ -205,7 +208,7 @@ class Layers:
         between: bool = False,
         ahead: np.ndarray | None = None,
     ) -> None:
-        self.mesh, self._lib = mesh, library()
+        self.mesh, self.pressure, self._lib = mesh, pressure, library()
         start, held = _positions(pos), np.ascontiguousarray(fixed, np.uint8)
         end = start if ahead is None else _positions(ahead)
         margin = np.minimum(SHARE * mesh.room, MARGIN)
@@ -245,6 +248,16 @@ class Layers:
         """Share of the straight ways from ``now`` to ``there`` (V, 3) on which no two features meet: 1 for all of it."""
         now, there = _positions(now), _positions(there)
         return float(self._lib.layers_limit(self.handle, now.ctypes.data, there.ctypes.data, LEFT))
+
+    def ease(self, now: np.ndarray, there: np.ndarray) -> np.ndarray:
+        """Positions (V, 3) near ``there`` (V, 3) that straight ways from ``now`` (V, 3) lead to on which no two features meet.
+
+        Features that would meet go on together, and lose of their ways towards each other alone; as a last resort all ways are
+        shortened by the same share.
+        """
+        now, to = _positions(now), _positions(there).copy()
+        self._lib.layers_ease(self.handle, now.ctypes.data, to.ctypes.data, LEFT)
+        return to
 
     def energy(self, pos: np.ndarray) -> float:
         """Energy [J] of the barrier at ``pos`` (V, 3)."""

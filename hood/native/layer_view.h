@@ -7,6 +7,7 @@ namespace {
 struct LayerView {
     void* layers;
     double (*limit)(void* layers, const double* from, const double* to, double left);
+    void (*ease)(void* layers, const double* from, double* to, double left);
     double (*energy)(void* layers, const double* pos);
     int64_t (*model)(void* layers, const double* pos);
     double *here, *there;  // (3 V) positions in the cloth's own numbering: room for the solver

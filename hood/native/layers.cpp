@@ -39,6 +39,13 @@ int64_t layers_approach(void* handle, double* to, double left) {
 
 double layers_limit(void* handle, const double* from, const double* to, double left) { return ((Layers*)handle)->limit(from, to, left); }
 
+// Targets ``to`` become such that straight ways there are free: bent where features would meet, then shortened if they still would.
+void layers_ease(void* handle, const double* from, double* to, double left) {
+    Layers* layers = (Layers*)handle;
+    const double share = layers->ease(from, to, left);
+    for (int64_t i = 0; i < 3 * layers->mesh.num_vertices && share < 1.0; ++i) to[i] = from[i] + share * (to[i] - from[i]);
+}
+
 double layers_energy(void* handle, const double* pos) { return ((Layers*)handle)->energy(pos); }
 
 // Contacts at positions; returns how many.
@@ -63,7 +70,7 @@ const void* layers_number(void* handle, const int32_t* row, int64_t num_rows) {
     layers->row.assign(row, row + layers->mesh.num_vertices);
     layers->num_rows = (int32_t)num_rows;
     layers->show();
-    layers->view.limit = layers_limit, layers->view.energy = layers_energy, layers->view.model = layers_model;
+    layers->view.limit = layers_limit, layers->view.ease = layers_ease, layers->view.energy = layers_energy, layers->view.model = layers_model;
     return &layers->view;
 }
 

@@ -120,6 +120,9 @@ inline double fading(double square, double parallel, double* slope) {
     return ratio * (2.0 - ratio);
 }
 
+constexpr int MOST_ADVANCES = 60;
+constexpr double NARROW = 1e-2;  // of the reach
+
 // Takes the mean off the ways of the corners; how far points of the features then move towards each other at most.
 inline double relative_way(int32_t edges, Vec* p) {
     const Vec mean = 0.25 * (p[0] + p[1] + p[2] + p[3]);
@@ -131,14 +134,17 @@ inline double relative_way(int32_t edges, Vec* p) {
 
 // Along straight lines from x by p, of which ``way`` is the relative one, the share that is safe: 1, or where at least ``left`` of
 // the first distance is kept. By additive conservative advancement: no two points of the features come nearer than by their ways.
-inline double safe_share(int32_t edges, const Vec* x0, const Vec* p, double way, double left, double* first) {
+// Features nearer than ``near`` keep more, down to where nothing is left to lose: from a distance far below that of equal forces
+// a Newton step comes back by a factor of two only.
+inline double safe_share(int32_t edges, const Vec* x0, const Vec* p, double way, double left, double near, double* first) {
     double weight[4], dist = std::sqrt(pair_distance_sq(edges, x0, weight));
     *first = dist;
-    const double kept = left * dist;
+    const double kept = std::max(left, 1.0 - dist / near) * dist, lost = dist - kept;
     if (!(way > 0.0) || dist - kept >= way) return 1.0;
     double time = 0.0;
     Vec x[4];
-    while (dist - kept > 0.01 * dist) {
+    // Features that slide along each other very near would take steps without end: what has been gone by then is safe as well.
+    for (int tries = 0; tries < MOST_ADVANCES && dist - kept > 0.02 * lost; ++tries) {
         const double step = 0.9 * (dist - kept) / way;
         if (time + step >= 1.0) return 1.0;
         time += step;
@@ -611,7 +617,7 @@ struct Layers {
             const double way = relative_way(pair.edges, p);
             if (farther(i, way / (1.0 - left))) continue;
             double dist;
-            const double share = safe_share(pair.edges, x, p, way, left, &dist);
+            const double share = safe_share(pair.edges, x, p, way, left, NARROW * pair.reach, &dist);
             measured(i, dist);
             if (share >= 1.0) continue;
             least = std::min(least, share);
@@ -626,24 +632,76 @@ struct Layers {
     int64_t approach(double* to, double left) {
         const LayerTimer timer(clock, LayerClock::LIMIT);
         const double* from = start.data();
-        std::vector<double> shift(3 * mesh.num_vertices), count(mesh.num_vertices);
         int64_t forced = 0;
-        for (int round = 0; round < 30; ++round) {
-            std::vector<int32_t> meeting;
-            std::vector<double> shares;
-            if (limit(from, to, left, &meeting, &shares) >= 1.0) break;
-            if (round == 29) {
-                forced = approach_as_one(from, to, left);
-                break;
-            }
+        if (!go_together(from, to, left, 29)) forced = approach_as_one(from, to, left);
+        std::sort(released.begin(), released.end());
+        if (forced) keep([&](size_t i) { return !is_released(keys[i]); });
+        return forced;
+    }
+
+    // The same without a last resort, for a way that begins anywhere: what is left of it. Where pairs go on meeting, all that hangs
+    // together by them keeps its common motion, and loses the same share of the rest.
+    double ease(const double* from, double* to, double left) {
+        const LayerTimer timer(clock, LayerClock::LIMIT);
+        if (go_together(from, to, left, PAIR_ROUNDS)) return 1.0;
+        std::vector<int32_t> zone(mesh.num_vertices), meeting;
+        for (int64_t v = 0; v < mesh.num_vertices; ++v) zone[v] = (int32_t)v;
+        std::vector<double> shares;
+        for (int round = 0;; ++round) {
+            meeting.clear(), shares.clear();
+            const double share = limit(from, to, left, &meeting, &shares);
+            if (share >= 1.0 || round == ZONE_ROUNDS) return share;
+            slow_zones(meeting, shares, zone, from, to);
+        }
+    }
+
+    static constexpr int PAIR_ROUNDS = 8, ZONE_ROUNDS = 12;
+
+    // Rounds in which corners of pairs that would meet go on together; whether none meets in the end.
+    bool go_together(const double* from, double* to, double left, int rounds) {
+        std::vector<double> shift(3 * mesh.num_vertices), count(mesh.num_vertices), shares;
+        std::vector<int32_t> meeting;
+        for (int round = 0;; ++round) {
+            meeting.clear(), shares.clear();
+            if (limit(from, to, left, &meeting, &shares) >= 1.0) return true;
+            if (round == rounds) return false;
             std::fill(shift.begin(), shift.end(), 0.0), std::fill(count.begin(), count.end(), 0.0);
             for (size_t i = 0; i < meeting.size(); ++i) bring_together(pairs[meeting[i]], 0.8 * shares[i], from, to, shift.data(), count.data());
             for (int64_t v = 0; v < mesh.num_vertices; ++v)
                 for (int k = 0; k < 3 && count[v] > 0.0; ++k) to[3 * v + k] += shift[3 * v + k] / count[v];
         }
-        std::sort(released.begin(), released.end());
-        if (forced) keep([&](size_t i) { return !is_released(keys[i]); });
-        return forced;
+    }
+
+    static int32_t zone_of(std::vector<int32_t>& zone, int32_t v) {
+        while (zone[v] != v) v = zone[v] = zone[zone[v]];
+        return v;
+    }
+
+    void slow_zones(const std::vector<int32_t>& meeting, const std::vector<double>& shares, std::vector<int32_t>& zone, const double* from, double* to) const {
+        std::vector<double> least(mesh.num_vertices, 1.0), sum(5 * mesh.num_vertices, 0.0);
+        for (int32_t i : meeting)
+            for (int c = 1; c < 4; ++c) zone[zone_of(zone, pairs[i].corner[c])] = zone_of(zone, pairs[i].corner[0]);
+        for (size_t i = 0; i < meeting.size(); ++i) {
+            double& share = least[zone_of(zone, pairs[meeting[i]].corner[0])];
+            share = std::min(share, 0.9 * shares[i]);
+        }
+        for (int64_t v = 0; v < mesh.num_vertices; ++v) {  // the motion of a zone is that of what is held in it, if anything is
+            const int32_t z = zone_of(zone, (int32_t)v);
+            double* of = sum.data() + 5 * z;
+            if (least[z] >= 1.0 || (of[4] > 0.0 && !fixed[v])) continue;
+            if (fixed[v] && of[4] == 0.0) of[0] = of[1] = of[2] = of[3] = 0.0, of[4] = 1.0;
+            for (int k = 0; k < 3; ++k) of[k] += to[3 * v + k] - from[3 * v + k];
+            of[3] += 1.0;
+        }
+        for (int64_t v = 0; v < mesh.num_vertices; ++v) {
+            const int32_t z = zone_of(zone, (int32_t)v);
+            if (least[z] >= 1.0 || fixed[v]) continue;
+            const double* of = sum.data() + 5 * z;
+            for (int k = 0; k < 3; ++k) {
+                const double common = of[k] / of[3], own = to[3 * v + k] - from[3 * v + k];
+                to[3 * v + k] = from[3 * v + k] + common + least[z] * (own - common);
+            }
+        }
     }
 
     void bring_together(const LayerPair& pair, double share, const double* from, const double* to, double* shift, double* count) const {

@@ -11,6 +11,7 @@
 #include <cstring>
 
 #include "lanes.h"
+#include "layer_grips.h"
 #include "layer_view.h"
 #include "threads.h"
 #include "vertex_terms.h"
@@ -88,6 +89,8 @@ struct Engine {
     LayerView* layers;
     const int64_t* vertex_of_scene;  // (V) number of each vertex in them
     double kept;                     // share of a distance that a move leaves
+    double eased;                    // share of a move below which it is bent around cloth
+    const LayerGrips* layer_grips;   // friction between them; none where there is no such term
 };
 }
 
@@ -426,6 +429,12 @@ inline void add_layers(const Engine& e, int64_t row, double* gradient, double* u
 inline const float* rows_of_layers(const LayerView& layers, float) { return layers.normals_single; }
 inline const double* rows_of_layers(const LayerView& layers, double) { return layers.normals; }
 
+inline void add_layer_grips(const Engine& e, int64_t row, double* gradient, double* upper, double* slack) {
+    const LayerGrips& grips = *e.layer_grips;
+    for (int k = 0; k < 3; ++k) gradient[k] += grips.gradient[3 * row + k];
+    for (int k = 0; k < 6; ++k) upper[k] += grips.own[6 * row + k], slack[k] += grips.own_slack[6 * row + k];
+}
+
 // Adds the blocks beside the diagonal to q = H p; returns their p . q.
 template <class T> double couple_layers(const Engine& e) {
     typedef typename Four<T>::type V4;
@@ -515,6 +524,7 @@ void energy(const Engine& e, const double* pos, const double* acc, double* phi, 
     }
     if (e.num_springs) add(springs);
     if (e.layers) add(energy_of_layers(e, pos));
+    if (e.layer_grips) add(layer_grip_energy(*e.layer_grips, pos));
     *phi = sum;
     *noise = 8.0 * 2.220446049250313e-16 * size;
 }
@@ -540,6 +550,7 @@ template <class T> void gather_gradient(const Engine& e, Range range, bool near)
         vertex_model(e, row, gradient, upper, slack);
         add_points(e, row, gradient, upper, slack);
         if (near) add_layers(e, row, gradient, upper);
+        if (e.layer_grips) add_layer_grips(e, row, gradient, upper, slack);
         D4 force = D4{gradient[0], gradient[1], gradient[2], 0.0};
         if (e.membrane) force += pull_of<3>(e.face_force, 10, e.face_starts, e.face_uses, row);
         if (e.bending) force += pull_of<4>(e.hinge_force, 14, e.hinge_starts, e.hinge_uses, row);
@@ -681,6 +692,7 @@ template <class T> void differentiate(const Engine& e) {
         for (int64_t s = 0; s < e.num_points; ++s) point_models(e.points[s], e.pos, range_of(e.points[s].count, part, e.parts));
     });
     const bool near = model_layers(e);
+    if (e.layer_grips) model_layer_grips(*e.layer_grips, e.num_vertices, e.pos);
     for_parts(e.parts, [&](int64_t part) { gather_gradient<T>(e, rows_of(e, part), near); });
 }
 
@@ -694,7 +706,7 @@ template <class T> void sharpen(Engine& e, double sharpness) {
         const Range range = rows_of(e, part);
         for (int64_t i = e.row_starts[range.begin]; i < e.row_starts[range.end]; ++i)
             for (int k = 0; k < 3; ++k) matrix[9 * i + 4 * k] += change * slack[i];
-        if (e.num_grips || e.num_points)
+        if (e.num_grips || e.num_points || e.layer_grips)
             for (int64_t row = range.begin; row < range.end; ++row)
                 for (int a = 0; a < 3; ++a)
                     for (int b = 0; b < 3; ++b)
@@ -841,6 +853,7 @@ template <class T> bool solve(Engine& e, double tolerance, int64_t most) {
     for (int64_t iteration = 0; iteration < most && rz > limit; ++iteration) {
         double curvature = sum_parts(e, [&](int64_t part) { return multiply<T>(e, part); });
         if (near_layers(e)) curvature += couple_layers<T>(e);
+        if (e.layer_grips) curvature += couple_layer_grips<T>(*e.layer_grips, e.num_rows, e.sharpness, (const T*)e.p, (T*)e.q);
         if (!(curvature > 0.0)) {
             definite = false;
             break;
@@ -988,17 +1001,29 @@ void walk(const Engine& e, double length) {
     place(e, e.trial_acc, e.trial_pos);
 }
 
-// Shortens the way from the state to the trial to where no cloth meets cloth; the share that is left.
-double limit_trial(const Engine& e) {
-    if (!e.layers) return 1.0;
-    LayerView& layers = *e.layers;
-    const double *here = own_order(e, e.pos, layers.here), *there = own_order(e, e.trial_pos, layers.there);
-    const double share = layers.limit(layers.layers, here, there, e.kept);
-    if (share >= 1.0) return 1.0;
+// Shortens the way from the state to the trial to a share of it.
+void shorten_trial(const Engine& e, double share) {
     for (int64_t row = 0; row < e.num_rows; ++row)
         for (int k = 0; k < 3; ++k) e.trial_acc[4 * row + k] = e.acc[4 * row + k] + share * (e.trial_acc[4 * row + k] - e.acc[4 * row + k]);
     place(e, e.trial_acc, e.trial_pos);
-    return share;
+}
+
+// The share of the way from the state to the trial on which no cloth meets cloth.
+double free_share(const Engine& e) {
+    if (!e.layers) return 1.0;
+    LayerView& layers = *e.layers;
+    const double *here = own_order(e, e.pos, layers.here), *there = own_order(e, e.trial_pos, layers.there);
+    return layers.limit(layers.layers, here, there, e.kept);
+}
+
+// Bends the way to the trial, of which little is free, around cloth.
+void ease_trial(const Engine& e) {
+    e.layers->ease(e.layers->layers, e.layers->here, e.layers->there, e.kept);
+    for (int64_t row = 0; row < e.num_rows; ++row) {
+        const double* base = e.base + 3 * e.vertex[row];
+        for (int k = 0; k < 3; ++k) e.trial_acc[4 * row + k] = (e.layers->there[3 * e.vertex_of_scene[row] + k] - base[k]) / e.dt_sq;
+    }
+    place(e, e.trial_acc, e.trial_pos);
 }
 
 void take_trial(Engine& e, double phi, double noise) {
@@ -1014,7 +1039,18 @@ bool backtrack(Engine& e) {
     for (int attempt = 0; attempt < 40; ++attempt) {
         double phi, noise;
         walk(e, length);
-        length *= limit_trial(e);
+        const double share = free_share(e);
+        if (share < e.eased) {
+            ease_trial(e);
+            energy(e, e.trial_pos, e.trial_acc, &phi, &noise);
+            if (phi <= e.phi + 1e-4 * length * slope + e.noise) {
+                take_trial(e, phi, noise);
+                return true;
+            }
+            walk(e, length);
+        }
+        if (share < 1.0) shorten_trial(e, share);
+        length *= share;
         energy(e, e.trial_pos, e.trial_acc, &phi, &noise);
         if (phi <= e.phi + 1e-4 * length * slope + e.noise) {
             take_trial(e, phi, noise);
@@ -1094,7 +1130,8 @@ void newton_start(Engine* e, const double* acc) {
 // The better of two guesses becomes the state, see hood.solver.iterate.first_iterate; masses (V) kg, gravity (3) m/s^2.
 void newton_guess(Engine* e, const double* mass, const double* gravity) {
     LayerView* const layers = e->layers;  // the guess is the one that would be best without
-    e->layers = nullptr;
+    const LayerGrips* const layer_grips = e->layer_grips;
+    e->layers = nullptr, e->layer_grips = nullptr;
     hold_fixed(*e);
     double phi, noise;
     guess(*e, mass, gravity, true, e->trial_acc);
@@ -1104,7 +1141,7 @@ void newton_guess(Engine* e, const double* mass, const double* gravity) {
     place(*e, e->acc, e->pos);
     energy(*e, e->pos, e->acc, &e->phi, &e->noise);
     if (!(e->phi < phi)) take_trial(*e, phi, noise);
-    e->layers = layers;
+    e->layers = layers, e->layer_grips = layer_grips;
 }
 
 // Gradient at the state, and what the matrix is made of; returns the norm of the gradient.

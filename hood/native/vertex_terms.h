@@ -43,17 +43,19 @@ inline double slip_of(const Grip& grip, int64_t v, const double* pos, double* sl
     return std::sqrt(dot3(slip, slip));
 }
 
+// The law of slip by the length of the slip, and its slope over that length.
+inline double mollified(double y, double limit) { return y < limit ? y * y / limit * (1.0 - y / (3.0 * limit)) + limit / 3.0 : y; }
+inline double mollified_slope(double y, double limit) { return y < limit ? (2.0 - y / limit) / limit : 1.0 / y; }
+
 inline double grip_energy(const Grip& grip, int64_t v, const double* pos) {
     if (!(grip.force[v] > 0.0)) return 0.0;
     double slip[3];
-    const double limit = grip.limit[v], y = slip_of(grip, v, pos, slip);
-    return grip.force[v] * (y < limit ? y * y / limit * (1.0 - y / (3.0 * limit)) + limit / 3.0 : y);
+    return grip.force[v] * mollified(slip_of(grip, v, pos, slip), grip.limit[v]);
 }
 
 // Force along the slip, of length ``size``, in units of it.
 inline double slope_of(const Grip& grip, int64_t v, double size) {
-    const double limit = grip.limit[v];
-    return grip.force[v] * (size < limit ? (2.0 - size / limit) / limit : 1.0 / size);
+    return grip.force[v] * mollified_slope(size, grip.limit[v]);
 }
 
 }  // namespace

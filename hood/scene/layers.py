@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from hood.mesh.kept import forget
-from hood.mesh.layers import LayerMesh, Layers
+from hood.mesh.layers import Contacts, LayerMesh, Layers
 from hood.scene.cloth import Cloth
 
 
@@ -21,6 +21,7 @@ class SceneLayers:
     layers: Layers
     first: int
     last: int
+    at_start: Contacts | None = None  # what is within its reach where the step begins, if anybody asked
 
     def of(self, values: Tensor) -> np.ndarray:
         """This scene's rows of ``values`` (V, 3), float64."""

@@ -19,11 +19,12 @@ from torch import Tensor
 from hood import native
 from hood.losses.attachment import Attachment
 from hood.losses.bending import CurrentLengthBending
-from hood.losses.layers import LayerBarrier
+from hood.losses.layer_friction import LayerGrips
+from hood.losses.layers import LAYER_TERMS
 from hood.losses.potential import Potential
 from hood.losses.problem import STANDARD_GRAVITY, StepProblem, inertial_guess
 from hood.losses.stretching import Stretching
-from hood.mesh.layers import LEFT
+from hood.mesh.layers import EASED, LEFT
 from hood.native.build import NATIVE_FLAGS, build
 from hood.native.structures import COUNT, POINTER, REAL, fields
 from hood.native.threads import num_parts
@@ -33,7 +34,7 @@ from hood.solver.elements import BENDINGS, face_constants, hinge_constants
 from hood.solver.engine_tables import Tables, build_tables, point_uses
 from hood.solver.forces import Grip, VertexForces, Walls, attachment_stiffness, known_forces, other_terms
 from hood.solver.iterate import fixed_positions
-from hood.solver.layers import approached, layers_of
+from hood.solver.layers import approached, grips_of, layers_of
 from hood.solver.plan import SolverPlan
 from hood.solver.points import PointForces, point_forces
 from hood.solver.vertex_pass import grip_structures, wall_structures, whole
@@ -67,8 +68,15 @@ class _Engine(ctypes.Structure):
         *fields("sharpness raised phi noise", REAL),
         *fields("wide cg_used parts reach", COUNT),
         *fields("spill layers vertex_of_scene", POINTER),
-        ("kept", REAL),
+        *fields("kept eased", REAL),
+        ("layer_grips", POINTER),
     ]
+
+
+class _LayerGrips(ctypes.Structure):
+    """``LayerGrips`` of ``layer_grips.h``."""
+
+    _fields_ = [("count", COUNT), *fields("corners weights normal force limit model gradient own own_slack", POINTER)]
 
 
 @cache
@@ -92,7 +100,7 @@ def applies(potential: Potential, problem: StepProblem) -> bool:
     """Whether the compiled solver knows every term of the potential that plays a role in ``problem``, on a CPU."""
     bendings = [term for term in potential.terms.values() if type(term) in BENDINGS and term.applies(problem)]
     others = other_terms(potential, problem)
-    known = others is None or all(type(term) is LayerBarrier for term in others.terms.values())
+    known = others is None or all(type(term) in LAYER_TERMS for term in others.terms.values())
     return problem.state.pos.device.type == "cpu" and len(bendings) <= 1 and known
 
 
@@ -146,6 +154,7 @@ class EngineStep:
     bending: int  # 0 none, 1 about the rest shape, 2 with the current length
     membrane: int  # how many such terms
     layers: tuple[SceneLayers, ...]  # one per scene, or none
+    layer_grips: LayerGrips | None  # of the whole batch
 
 
 def engine_step(potential: Potential, problem: StepProblem) -> EngineStep:
@@ -170,6 +179,7 @@ def engine_step(potential: Potential, problem: StepProblem) -> EngineStep:
         bending=0 if bending is None else 2 if type(bending) is CurrentLengthBending else 1,
         membrane=sum(type(term) is Stretching for term in terms),
         layers=layers_of(potential, problem),
+        layer_grips=grips_of(potential, problem),
     )
 
 
@@ -265,6 +275,7 @@ class SceneEngine:
         values.dt_sq = float(step.dt[scene]) ** 2
         values.raised, values.cg_used = 0.0, 0
         self._take_layers(step.layers[scene] if step.layers else None)
+        self._take_layer_grips(step.layer_grips, scene, step.cloth.num_vertices)
         self.share(num_parts(values.num_rows, _ROWS))
 
     def _take_layers(self, scene: SceneLayers | None) -> None:
@@ -276,7 +287,25 @@ class SceneEngine:
         row = np.empty_like(vertex)
         row[vertex] = np.arange(len(vertex))
         self._point(vertex_of_scene=vertex)
-        self.values.layers, self.values.kept = scene.layers.number(row, self.values.num_rows), LEFT
+        self.values.layers = scene.layers.number(row, self.values.num_rows)
+        self.values.kept, self.values.eased = LEFT, EASED
+
+    def _take_layer_grips(self, grips: LayerGrips | None, scene: int, num_vertices: int) -> None:
+        self.values.layer_grips = None
+        rows = None if grips is None else (grips.scene == scene) & (grips.force > 0)
+        if grips is None or rows is None or not bool(rows.any()):
+            return
+        number = np.full(num_vertices, -1, np.int32)
+        number[self.tables.vertex] = np.arange(len(self.tables.vertex))
+        size, count = len(self.tables.vertex), int(rows.sum())
+        arrays = {name: _array(getattr(grips, name)[rows]) for name in ("weights", "normal", "force", "limit")}
+        arrays |= {"corners": number[grips.corners[rows].numpy()], "model": np.empty((count, 5))}
+        arrays |= {"gradient": np.empty((size, 3)), "own": np.empty((size, 6)), "own_slack": np.empty((size, 6))}
+        structure = _LayerGrips(count=count)
+        for name, array in arrays.items():
+            setattr(structure, name, array.ctypes.data)
+        self._kept["layer_grips"] = structure, arrays
+        self.values.layer_grips = ctypes.addressof(structure)
 
     def start(self, acc: np.ndarray) -> None:
         """Take up accelerations (V, 3) of all vertices of the cloth."""

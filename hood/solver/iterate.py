@@ -16,7 +16,8 @@ from hood.losses.problem import StepProblem, inertial_guess
 from hood.mesh.kept import forget
 from hood.scene.batch import to_device
 from hood.scene.cloth import Cloth
-from hood.solver.layers import approached, layers_of, limits
+from hood.mesh.layers import EASED
+from hood.solver.layers import approached, eased, layers_of, limits
 from hood.solver.terms import StepTerms
 
 
@@ -69,15 +70,20 @@ class Unknowns:
         """The guess that would be best if layers did not touch."""
         return first_iterate(Unknowns(without_layers(self.potential), self.problem)).pos
 
-    def safe(self, now: Iterate, acc: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Accelerations (V, 3) on the straight way from ``now`` to ``acc`` (V, 3), as far as no cloth meets cloth; the shares
-        (B,) of the way, None for all of it."""
+    def free_share(self, now: Iterate, acc: Tensor) -> Tensor | None:
+        """Shares (B,) of the straight ways from ``now`` to ``acc`` (V, 3) on which no cloth meets cloth; None for all of them."""
         if not self.layers:
-            return acc, None
+            return None
         share = limits(self.layers, now.pos, self.place(acc))
-        if bool((share >= 1.0).all()):
-            return acc, None
-        return now.acc + share[self.scene].unsqueeze(1) * (acc - now.acc), share
+        return None if bool((share >= 1.0).all()) else share
+
+    def around(self, now: Iterate, acc: Tensor, share: Tensor) -> tuple[Iterate, Tensor] | None:
+        """The iterate near accelerations (V, 3) by ways that are bent around cloth, and the scenes (B,) bool that need it, of
+        which only a small ``share`` (B,) of the straight ways is free; None without any."""
+        blocked = share < EASED
+        if not bool(blocked.any()):
+            return None
+        return self.at(eased(self.layers, now.pos, self.place(acc))), blocked
 
     def at(self, pos: Tensor) -> Iterate:
         """The iterate at positions (V, 3), of which free vertices are read."""

@@ -6,12 +6,13 @@ so that their curvature cannot lie in the fixed pattern of the Hessian: it is a 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from hood.losses.layer_friction import LayerFriction, LayerGrips
 from hood.losses.layers import has_layers
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
@@ -23,9 +24,19 @@ def layers_of(potential: Potential, problem: StepProblem) -> tuple[SceneLayers, 
     return problem.layers if has_layers(potential) else ()
 
 
+def grips_of(potential: Potential, problem: StepProblem) -> LayerGrips | None:
+    """What grips what by the potential's friction between layers; None where nothing does."""
+    terms = [term for term in potential.terms.values() if type(term) is LayerFriction and term.applies(problem)]
+    if not terms:
+        return None
+    parts = [term.grips(problem) for term in terms]
+    columns = ([getattr(part, field.name) for part in parts] for field in fields(LayerGrips))
+    return LayerGrips(*(torch.cat(column) for column in columns))
+
+
 @dataclass(frozen=True)
 class LayerRows:
-    """Curvature Σ n nᵀ of the barrier on M free vertices, in the solver's numbering."""
+    """Curvature Σ n nᵀ of barrier and friction on M free vertices, in the solver's numbering."""
 
     vertices: Tensor  # (N, 4); M for vertices that do not move
     normals: Tensor  # (N, 4, 3)
@@ -40,7 +51,9 @@ class LayerRows:
         return torch.zeros_like(padded).index_add(0, self.vertices.reshape(-1), parts)[:-1]
 
 
-def layer_rows(layers: tuple[SceneLayers, ...], pos: Tensor, unknown: np.ndarray) -> LayerRows | None:
+def layer_rows(
+    layers: tuple[SceneLayers, ...], grips: LayerGrips | None, pos: Tensor, unknown: np.ndarray
+) -> LayerRows | None:
     """The curvature at ``pos`` (V, 3); None where nothing is near anything.
 
     Args:
@@ -52,6 +65,9 @@ def layer_rows(layers: tuple[SceneLayers, ...], pos: Tensor, unknown: np.ndarray
         _, rows, corners, _ = scene.layers.model(scene.of(pos))
         vertices.append(unknown[corners + scene.first])
         normals.append(rows)
+    if grips is not None:
+        vertices += 2 * [unknown[grips.corners.cpu().numpy()]]
+        normals += [row.cpu().numpy() for row in _grip_rows(grips, pos)]
     number, row = np.concatenate(vertices), np.concatenate(normals)
     if len(number) == 0:
         return None
@@ -60,6 +76,19 @@ def layer_rows(layers: tuple[SceneLayers, ...], pos: Tensor, unknown: np.ndarray
     blocks = (n.unsqueeze(3) * n.unsqueeze(2)).reshape(-1, 3, 3)
     own = pos.new_zeros(num_free + 1, 3, 3).index_add(0, index.reshape(-1), blocks)[:-1]
     return LayerRows(index, n, own)
+
+
+def _grip_rows(grips: LayerGrips, pos: Tensor) -> list[Tensor]:
+    """Rows (N, 4, 3) along two directions across the normal; their outer products are the slope f'/y across and along the slip,
+    which majorises friction as at single vertices (:meth:`hood.solver.forces.VertexForces.model`)."""
+    slip = grips.slip(pos.to(grips.weights))
+    size = torch.linalg.vector_norm(slip, dim=1)
+    small = size < grips.limit
+    slope = grips.force * torch.where(small, (2.0 - size / grips.limit) / grips.limit, 1.0 / torch.where(small, 1.0, size))
+    axis = torch.eye(3).to(slip)[grips.normal.abs().argmin(dim=1)]
+    one = torch.nn.functional.normalize(torch.linalg.cross(grips.normal, axis), dim=1)
+    both = one, torch.linalg.cross(grips.normal, one)
+    return [slope.sqrt()[:, None, None] * grips.weights.unsqueeze(2) * across.unsqueeze(1) for across in both]
 
 
 def approached(layers: tuple[SceneLayers, ...], target: Tensor) -> Tensor:
@@ -71,6 +100,12 @@ def approached(layers: tuple[SceneLayers, ...], target: Tensor) -> Tensor:
 def limits(layers: tuple[SceneLayers, ...], now: Tensor, there: Tensor) -> Tensor:
     """Shares (B,) of the straight ways from ``now`` to ``there`` (V, 3) on which no cloth meets cloth."""
     return now.new_tensor([scene.layers.limit(scene.of(now), scene.of(there)) for scene in layers])
+
+
+def eased(layers: tuple[SceneLayers, ...], now: Tensor, there: Tensor) -> Tensor:
+    """Positions (V, 3) near ``there`` (V, 3), by ways from ``now`` that are bent where cloth would meet cloth."""
+    reached = [torch.as_tensor(scene.layers.ease(scene.of(now), scene.of(there))) for scene in layers]
+    return torch.cat(reached).to(there)
 
 
 def touching(layers: tuple[SceneLayers, ...], pos: Tensor) -> bool:

@@ -20,7 +20,7 @@ from hood.native.build import BuildError
 from hood.solver import engine
 from hood.solver.direction import Directions
 from hood.solver.iterate import Proceed, Progress, Unknowns, in_double, rounded
-from hood.solver.layers import free_way, layers_of, touching
+from hood.solver.layers import free_way, grips_of, layers_of, touching
 from hood.solver.plan import ModelBuilder, SolverPlan, plan_for
 from hood.solver.reasons import CONVERGED, LATE, MOST_ITERATIONS, NOT_FINITE, STOPPED, STUCK
 from hood.solver.search import Path, backtrack
@@ -182,7 +182,7 @@ class TorchSystem:
         self.problem, self.plan = problem, plan
         self.unknowns = Unknowns(potential, problem)
         self.directions = Directions(plan, problem.num_scenes, settings.linear, settings.cg_iterations)
-        self._build = ModelBuilder(self.unknowns.terms, plan, self.unknowns.layers)
+        self._build = ModelBuilder(self.unknowns.terms, plan, self.unknowns.layers, grips_of(potential, problem))
 
     def begin(self, start: Tensor | None) -> None:
         self._now = self.unknowns.begin(start)

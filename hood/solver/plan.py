@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hood.losses.layer_friction import LayerGrips
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
 from hood.mesh.kept import forget
@@ -105,8 +106,14 @@ def plan_for(problem: StepProblem) -> SolverPlan:
 class ModelBuilder:
     """Assembles the quadratic models of one step; keeps the memory that every model needs."""
 
-    def __init__(self, terms: StepTerms, plan: SolverPlan, layers: tuple[SceneLayers, ...] = ()) -> None:
-        self.terms, self.plan, self._layers = terms, plan, layers
+    def __init__(
+        self,
+        terms: StepTerms,
+        plan: SolverPlan,
+        layers: tuple[SceneLayers, ...] = (),
+        grips: LayerGrips | None = None,
+    ) -> None:
+        self.terms, self.plan, self._layers, self._grips = terms, plan, layers, grips
         cloth, like = terms.problem.cloth, terms.problem.state.pos
         sizes = [9 * len(like), 45 * len(cloth.faces), 78 * len(cloth.hinges)]
         # Zero where nothing is ever written: no such term.
@@ -143,7 +150,7 @@ class ModelBuilder:
             gradient = gradient + points.spread(model.gradient, gradient)
             triples = blocks.add(triples, model.matrix)
             slack = slack if model.slack is None else blocks.add(slack, model.slack)
-        near = layer_rows(self._layers, pos, plan.unknown) if self._layers else None
+        near = layer_rows(self._layers, self._grips, pos, plan.unknown) if self._layers else None
         if near is not None:
             triples = triples.index_add(0, plan.pattern.diagonal.to(triples.device).reshape(-1), near.own.reshape(-1, 3))
         return QuadraticModel(gradient, triples, slack, near)

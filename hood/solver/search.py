@@ -46,10 +46,9 @@ class Path:
 
     def at(self, length: Tensor) -> Iterate:
         """The iterate at step lengths (B,)."""
-        return self.reached(length)[0]
+        return self._unknowns.evaluate(self._straight(length))
 
-    def reached(self, length: Tensor) -> tuple[Iterate, Tensor]:
-        """The iterate at step lengths (B,), and what is left of them where cloth would meet cloth."""
+    def _straight(self, length: Tensor) -> Tensor:
         unknowns = self._unknowns
         acc = self._now.acc + length[unknowns.scene].unsqueeze(1) * self._step
         for stop in self._stops:
@@ -57,8 +56,24 @@ class Path:
             acc[rows] += stop.correction(unknowns.place_free(rows, acc[rows])) / unknowns.dt_sq[rows]
         for point_stop in self._point_stops:
             acc += point_stop.correction(unknowns.place(acc)) / unknowns.dt_sq
-        acc, share = unknowns.safe(self._now, acc)
-        return unknowns.evaluate(acc), length if share is None else length * share
+        return acc
+
+    def reached(self, length: Tensor, goal: Tensor) -> tuple[Iterate, Tensor]:
+        """The iterate at step lengths (B,), and what is left of them where cloth would meet cloth.
+
+        Where little is left the way is bent around cloth instead, if that leads to a potential of at most ``goal`` (B,) [J].
+        """
+        unknowns, now = self._unknowns, self._now
+        acc = self._straight(length)
+        share = unknowns.free_share(now, acc)
+        if share is None:
+            return unknowns.evaluate(acc), length
+        shortened = unknowns.evaluate(now.acc + share[unknowns.scene].unsqueeze(1) * (acc - now.acc))
+        bent = unknowns.around(now, acc, share)
+        if bent is None:
+            return shortened, length * share
+        around = bent[1] & (bent[0].phi <= goal)
+        return unknowns.select(around, bent[0], shortened), torch.where(around, length, length * share)
 
 
 class Stop:
@@ -131,7 +146,7 @@ def backtrack(unknowns: Unknowns, path: Path, now: Iterate, slope: Tensor, searc
     for _ in range(BACKTRACKS):
         if not bool(searching.any()):
             break
-        trial, taken = path.reached(length * searching)
+        trial, taken = path.reached(length * searching, now.phi + ARMIJO * length * slope + now.noise)
         length = torch.where(searching, taken, length)
         accepted = searching & (trial.phi <= now.phi + ARMIJO * length * slope + now.noise)
         if bool(accepted.all()):

@@ -1,0 +1,102 @@
+// Friction between layers of cloth, found at the start of a step: see hood/losses/layer_friction.py.
+#pragma once
+#include <cmath>
+#include <cstdint>
+
+#include "vertex_terms.h"
+
+extern "C" {
+
+// Pairs of features that grip each other; vertices are numbered as the solver does.
+struct LayerGrips {
+    int64_t count;
+    const int32_t* corners;                           // (N, 4)
+    const double *weights, *normal, *force, *limit;   // (N, 4), (N, 3), (N), (N)
+    double* model;                                    // (N, 5) heading of the slip, force by slip across it, and what is less along it
+    double *gradient, *own, *own_slack;               // (V, 3), (V, 6), (V, 6) of the last model, by vertex
+};
+}
+
+namespace {
+
+// Tangential motion of the nearest points relative to each other at positions (V, 4); returns its length.
+template <class T> inline double layer_slip(const LayerGrips& g, int64_t i, const T* pos, double* slip) {
+    for (int k = 0; k < 3; ++k) slip[k] = 0.0;
+    for (int c = 0; c < 4; ++c)
+        for (int k = 0; k < 3; ++k) slip[k] += g.weights[4 * i + c] * (double)pos[4 * (int64_t)g.corners[4 * i + c] + k];
+    const double* normal = g.normal + 3 * i;
+    const double along = dot3(slip, normal);
+    for (int k = 0; k < 3; ++k) slip[k] -= along * normal[k];
+    return std::sqrt(dot3(slip, slip));
+}
+
+double layer_grip_energy(const LayerGrips& g, const double* pos) {
+    double sum = 0.0, slip[3];
+    for (int64_t i = 0; i < g.count; ++i) sum += g.force[i] * mollified(layer_slip(g, i, pos, slip), g.limit[i]);
+    return sum;
+}
+
+inline void add_symmetric(double* upper, double factor, const double* n) {
+    int place = 0;
+    for (int a = 0; a < 3; ++a)
+        for (int b = a; b < 3; ++b) upper[place++] += factor * n[a] * n[b];
+}
+
+// Forces and curvature at positions (V, 4), by pair and by vertex.
+void model_layer_grips(const LayerGrips& g, int64_t num_vertices, const double* pos) {
+    std::memset(g.gradient, 0, sizeof(double) * 3 * num_vertices);
+    std::memset(g.own, 0, sizeof(double) * 6 * num_vertices);
+    std::memset(g.own_slack, 0, sizeof(double) * 6 * num_vertices);
+    for (int64_t i = 0; i < g.count; ++i) {
+        double slip[3], block[6] = {}, less[6] = {}, *model = g.model + 5 * i;
+        const double size = layer_slip(g, i, pos, slip), force = g.force[i], limit = g.limit[i];
+        const double slope = force * mollified_slope(size, limit);
+        const double along = size < limit ? force * 2.0 * (1.0 - size / limit) / limit : 0.0;
+        for (int k = 0; k < 3; ++k) model[k] = size > 0.0 ? slip[k] / size : 0.0;
+        model[3] = slope, model[4] = size > 0.0 ? along - slope : 0.0;
+        block[0] = block[3] = block[5] = slope;
+        add_symmetric(block, -slope, g.normal + 3 * i);
+        add_symmetric(less, model[4], model);
+        for (int c = 0; c < 4; ++c) {
+            const int64_t v = g.corners[4 * i + c];
+            const double weight = g.weights[4 * i + c], square = weight * weight;
+            for (int k = 0; k < 3; ++k) g.gradient[3 * v + k] += weight * slope * slip[k];
+            for (int k = 0; k < 6; ++k) g.own[6 * v + k] += square * block[k], g.own_slack[6 * v + k] += square * less[k];
+        }
+    }
+}
+
+// Adds what pairs bring beside the diagonal blocks, with a share of the slack, to q = H p; returns their p . q. Vertices from
+// num_rows on do not move.
+template <class T> double couple_layer_grips(const LayerGrips& g, int64_t num_rows, double sharpness, const T* p, T* q) {
+    double sum = 0.0;
+    for (int64_t i = 0; i < g.count; ++i) {
+        const double *model = g.model + 5 * i, *normal = g.normal + 3 * i, less = sharpness * model[4];
+        if (!(model[3] > 0.0)) continue;
+        // By the tangential matrix slope (1 - n n') + less h h'.
+        const auto apply = [&](const double* x, double* y) {
+            const double across = model[3] * dot3(x, normal), along = less * dot3(x, model);
+            for (int k = 0; k < 3; ++k) y[k] = model[3] * x[k] - across * normal[k] + along * model[k];
+        };
+        double all[3] = {0.0, 0.0, 0.0}, mine[4][3];
+        for (int c = 0; c < 4; ++c) {
+            const int64_t row = g.corners[4 * i + c];
+            for (int k = 0; k < 3; ++k) {
+                mine[c][k] = row < num_rows ? g.weights[4 * i + c] * (double)p[4 * row + k] : 0.0;
+                all[k] += mine[c][k];
+            }
+        }
+        for (int c = 0; c < 4; ++c) {
+            const int64_t row = g.corners[4 * i + c];
+            if (row >= num_rows) continue;
+            const double others[3] = {all[0] - mine[c][0], all[1] - mine[c][1], all[2] - mine[c][2]};
+            double push[3];
+            apply(others, push);
+            for (int k = 0; k < 3; ++k) q[4 * row + k] += (T)(g.weights[4 * i + c] * push[k]);
+            sum += dot3(mine[c], push);
+        }
+    }
+    return sum;
+}
+
+}  // namespace
