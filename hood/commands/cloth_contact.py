@@ -13,6 +13,7 @@ from hood.commands.dial import chosen
 from hood.config import ConfigError, build, plain, require_choice
 from hood.dynamics.measure import LAYER_METRICS
 from hood.losses.collision import Collision
+from hood.losses.layer_friction import LayerFriction
 from hood.losses.layers import LayerBarrier
 from hood.losses.potential import Potential
 from hood.mesh import layers
@@ -24,6 +25,8 @@ CHOICES = ("auto", "on", "off", "layers")
 def check_cloth_contact(config: DictConfig) -> None:
     """Raise ConfigError where the key asks for what the other keys rule out."""
     require_choice(config, "cloth_contact", CHOICES)
+    if not float(config.cloth_friction) >= 0.0:
+        raise ConfigError(f"cloth_friction={config.cloth_friction}: give a coefficient of at least 0; 0 for none")
     if str(config.cloth_contact) in ("on", "layers"):
         reason = _hindrance(config)
         if reason and not (config.refine == "auto" or str(config.stepper) == "auto"):
@@ -31,12 +34,14 @@ def check_cloth_contact(config: DictConfig) -> None:
 
 
 def potential_of(config: DictConfig) -> Potential:
-    """The potential of the config's losses, with a barrier between layers of cloth where ``cloth_contact`` and the rest of the
-    settled config ask for one."""
+    """The potential of the config's losses, with a barrier and friction between layers of cloth where ``cloth_contact`` and the
+    rest of the settled config ask for them."""
     potential: Potential = build(config.losses)
     if not acts(config):
         return potential
-    return potential.with_terms(layers=LayerBarrier(between=str(config.cloth_contact) == "layers"))
+    potential = potential.with_terms(layers=LayerBarrier(between=str(config.cloth_contact) == "layers"))
+    coefficient = float(config.cloth_friction)
+    return potential.with_terms(layer_friction=LayerFriction(coefficient)) if coefficient > 0 else potential
 
 
 def acts(config: DictConfig) -> bool:

@@ -121,7 +121,7 @@ inline double fading(double square, double parallel, double* slope) {
 }
 
 constexpr int MOST_ADVANCES = 60;
-constexpr double NARROW = 1e-2;  // of the reach
+constexpr double NARROW = 1e-3;  // of the reach
 
 // Takes the mean off the ways of the corners; how far points of the features then move towards each other at most.
 inline double relative_way(int32_t edges, Vec* p) {
@@ -666,7 +666,7 @@ struct Layers {
             if (limit(from, to, left, &meeting, &shares) >= 1.0) return true;
             if (round == rounds) return false;
             std::fill(shift.begin(), shift.end(), 0.0), std::fill(count.begin(), count.end(), 0.0);
-            for (size_t i = 0; i < meeting.size(); ++i) bring_together(pairs[meeting[i]], 0.8 * shares[i], from, to, shift.data(), count.data());
+            for (size_t i = 0; i < meeting.size(); ++i) bring_together(pairs[meeting[i]], 0.5 * shares[i], from, to, shift.data(), count.data());
             for (int64_t v = 0; v < mesh.num_vertices; ++v)
                 for (int k = 0; k < 3 && count[v] > 0.0; ++k) to[3 * v + k] += shift[3 * v + k] / count[v];
         }
@@ -683,7 +683,7 @@ struct Layers {
             for (int c = 1; c < 4; ++c) zone[zone_of(zone, pairs[i].corner[c])] = zone_of(zone, pairs[i].corner[0]);
         for (size_t i = 0; i < meeting.size(); ++i) {
             double& share = least[zone_of(zone, pairs[meeting[i]].corner[0])];
-            share = std::min(share, 0.9 * shares[i]);
+            share = std::min(share, 0.6 * shares[i]);
         }
         for (int64_t v = 0; v < mesh.num_vertices; ++v) {  // the motion of a zone is that of what is held in it, if anything is
             const int32_t z = zone_of(zone, (int32_t)v);

@@ -58,6 +58,7 @@ def test_a_sleeve_that_meets_itself_is_kept_apart() -> None:
         (["stepper=refine", "refine=2", "refine_method=sweeps", "cloth_contact=on"], "use refine_method=newton"),
         (["step=fixed", "cloth_contact=layers"], "use step=plain"),
         (["cloth_contact=maybe"], "cloth_contact"),
+        (["cloth_friction=-0.1"], "give a coefficient of at least 0"),
     ],
 )
 def test_what_cannot_be_had_is_refused(more: list[str], sentence: str, capsys: pytest.CaptureFixture[str]) -> None:
