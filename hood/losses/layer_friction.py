@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import ctypes
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from hood.losses.friction import flown, mollified_norm
 from hood.losses.problem import StepProblem, sum_per_scene
-from hood.mesh.layers import Contacts
+from hood.mesh.layers import Contacts, library
+from hood.native.structures import COUNT, POINTER, fields
 from hood.scene.layers import SceneLayers
 
 
@@ -95,7 +98,7 @@ class _Pairs:
 
     corners: Tensor  # (N, 4)
     weights: Tensor  # (N, 4)
-    first: Tensor  # (N, 4) bool, corners of the first side
+    edges: Tensor  # (N,) bool, two edges
     normal: Tensor  # (N, 3), from the second side to the first
     force: Tensor  # (N,) N, of the barrier
     reach: Tensor  # (N,) m
@@ -119,16 +122,15 @@ def _scene_pairs(scene: SceneLayers, pos: Tensor, index: int) -> tuple[Tensor, .
     device = pos.device
     corners = torch.as_tensor(found.corners + scene.first, device=device)
     weights = torch.as_tensor(found.weights, device=device)
-    edges = torch.as_tensor(found.edges, device=device).unsqueeze(1)
-    first = torch.tensor([True, False, False, False], device=device) | (edges & torch.tensor([False, True, False, False], device=device))
+    edges = torch.as_tensor(found.edges, device=device)
     x = pos[corners]
     gap = (weights.unsqueeze(2) * x).sum(dim=1)
     dist = torch.linalg.vector_norm(gap, dim=1).clamp_min(1e-12)
     reach, area, parallel = (torch.as_tensor(values, device=device) for values in (found.reach, found.area, found.parallel))
     force = scene.layers.pressure * area * barrier_force(dist / reach)
     cross = torch.linalg.cross(x[:, 1] - x[:, 0], x[:, 3] - x[:, 2])
-    force = torch.where(edges.squeeze(1), force * fading(_dot(cross, cross), parallel), force)
-    return corners, weights, first, gap / dist.unsqueeze(1), force, reach, torch.full_like(corners[:, 0], index)
+    force = torch.where(edges, force * fading(_dot(cross, cross), parallel), force)
+    return corners, weights, edges, gap / dist.unsqueeze(1), force, reach, torch.full_like(corners[:, 0], index)
 
 
 def barrier_force(share: Tensor) -> Tensor:
@@ -143,45 +145,31 @@ def fading(square: Tensor, parallel: Tensor) -> Tensor:
     return ratio * (2.0 - ratio)
 
 
+class _Pressing(ctypes.Structure):
+    """``LayerPressing`` of ``layer_pressing.h``."""
+
+    _fields_ = [
+        *fields("count num_vertices", COUNT),
+        *fields("corners edges weights normal force reach inertia there pull backed", POINTER),
+    ]
+
+
 def _pressing(problem: StepProblem, pairs: _Pairs) -> Tensor:
-    """P [N] (N,), of the side that can bring less."""
-    cloth, size = problem.cloth, len(problem.state.pos)
-    mass, dt = cloth.mass.double(), problem.vertex_dt.double()
-    there = torch.where(cloth.free.unsqueeze(1), flown(problem), _held(problem)).double()
-    missing = pairs.reach - _dot((pairs.weights.unsqueeze(2) * there[pairs.corners]).sum(dim=1), pairs.normal)
-    part = pairs.weights.abs() * pairs.force.unsqueeze(1)  # (N, 4) N, what a corner bears of a pair
-    loads = _Loads(size, pairs, part)
-    around = torch.zeros_like(loads.net) if problem.pull is None else problem.pull.double() - loads.net
-    inertia = (mass / dt.squeeze(1) ** 2)[pairs.corners] * missing.clamp_min(0.0).unsqueeze(1)
-    backed = ~cloth.free | _on_body(problem)
-    least = torch.full_like(pairs.force, float("inf"))
-    for side, sign in ((pairs.first, 1.0), (~pairs.first, -1.0)):
-        outward = sign * pairs.normal
-        ahead, behind = loads.along(pairs.corners, outward)
-        pressed = (behind - (around[pairs.corners] * outward.unsqueeze(1)).sum(dim=2)).clamp_min(0.0)
-        share = torch.where(part > 0, part / torch.where(part > 0, torch.maximum(ahead, part), 1.0), 0.0)
-        bears = side & (part > 0)
-        brought = torch.where(bears, share * (inertia + pressed), 0.0).sum(dim=1)
-        held = (bears & backed[pairs.corners]).any(dim=1)
-        least = torch.where(held, least, torch.minimum(least, brought))
-    return least
-
-
-class _Loads:
-    """Forces of all pairs at vertices: their sum, and how they are spread over directions."""
-
-    def __init__(self, size: int, pairs: _Pairs, part: Tensor) -> None:
-        index, normal = pairs.corners.reshape(-1), pairs.normal
-        force = pairs.force[:, None, None] * pairs.weights.unsqueeze(2) * normal.unsqueeze(1)
-        spread = part[:, :, None, None] * (normal.unsqueeze(2) * normal.unsqueeze(1)).unsqueeze(1)
-        self.net = force.new_zeros(size, 3).index_add(0, index, force.reshape(-1, 3))
-        self._spread = force.new_zeros(size, 3, 3).index_add(0, index, spread.reshape(-1, 3, 3))
-
-    def along(self, corners: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
-        """Loads [N] (N, 4) at corners along ``normal`` (N, 3) and against it, exact where all pairs push along it."""
-        both = torch.einsum("na,ncab,nb->nc", normal, self._spread[corners], normal)
-        net = (self.net[corners] * normal.unsqueeze(1)).sum(dim=2)
-        return (0.5 * (both + net)).clamp_min(0.0), (0.5 * (both - net)).clamp_min(0.0)
+    """P [N] (N,), of the side that can bring less; ``hood/native/layer_pressing.h``."""
+    cloth = problem.cloth
+    there = torch.where(cloth.free.unsqueeze(1), flown(problem), _held(problem))
+    inertia = cloth.mass.double() / problem.vertex_dt.squeeze(1).double() ** 2
+    vectors = (pairs.weights, pairs.normal, pairs.force, pairs.reach, inertia, there)
+    arrays = [np.ascontiguousarray(values.cpu().numpy(), np.int64) for values in (pairs.corners, pairs.edges)]
+    arrays += [np.ascontiguousarray(values.double().cpu().numpy()) for values in vectors]
+    pull = None if problem.pull is None else np.ascontiguousarray(problem.pull.double().cpu().numpy())
+    backed = np.ascontiguousarray((~cloth.free | _on_body(problem)).cpu().numpy(), np.uint8)
+    pointers = [array.ctypes.data for array in arrays] + [None if pull is None else pull.ctypes.data, backed.ctypes.data]
+    pressing = np.empty(len(pairs.force))
+    library().layers_pressing(
+        ctypes.byref(_Pressing(len(pressing), len(there), *pointers)), pressing.ctypes.data
+    )
+    return torch.from_numpy(pressing).to(pairs.force.device)
 
 
 def _held(problem: StepProblem) -> Tensor:

@@ -30,7 +30,7 @@ SHARE, MARGIN = 0.3, 5e-3
 #: Beyond its reach by so much [m] a pair is apart after any shift of all cloth, rounded as it may be.
 SPARE = 1e-6
 #: Share of a move that is left where features would meet, below which it is bent around them (:meth:`Layers.ease`).
-EASED = 0.5
+EASED = 0.1
 
 
 class _Mesh(ctypes.Structure):
@@ -52,6 +52,7 @@ def library() -> ctypes.CDLL:
     lib.layers_make.argtypes = [*[POINTER] * 5, REAL, COUNT, COUNT]
     lib.layers_free.argtypes = [POINTER]
     lib.layers_crossed.argtypes = [POINTER]
+    lib.layers_pressing.argtypes = [POINTER, POINTER]
     lib.layers_approach.argtypes = [POINTER, POINTER, REAL]
     for name in ("layers_limit", "layers_ease"):
         getattr(lib, name).argtypes = [POINTER, POINTER, POINTER, REAL]

@@ -1,5 +1,6 @@
 // Cloth near cloth, as Python asks for it; see layers.h and hood/mesh/layers.py. Positions are (V, 3) float64 [m].
 #include "layers.h"
+#include "layer_pressing.h"
 
 extern "C" {
 
@@ -47,6 +48,9 @@ void layers_ease(void* handle, const double* from, double* to, double left) {
 }
 
 double layers_energy(void* handle, const double* pos) { return ((Layers*)handle)->energy(pos); }
+
+// What presses pairs onto each other in a step [N] (N).
+void layers_pressing(const LayerPressing* step, double* pressing) { layer_pressing(*step, pressing); }
 
 // Contacts at positions; returns how many.
 int64_t layers_model(void* handle, const double* pos) { return ((Layers*)handle)->model(pos); }
