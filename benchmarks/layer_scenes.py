@@ -1,4 +1,4 @@
-"""Cloth that meets cloth in small scenes, at four time steps: a folding strip, a sheet over a bar, sheets on a ball, a stack of ten.
+"""Cloth that meets cloth in small scenes at four time steps: folding strip, sheet over a bar, sheets on a ball, stack of ten.
 
     python benchmarks/layer_scenes.py --seconds 1
     python benchmarks/layer_scenes.py --scenes stack --rates 30 --engine torch --friction 0
@@ -55,8 +55,8 @@ class Line:
     def __str__(self) -> str:
         most, p95 = max(self.iterations), np.percentile(self.iterations, 95)
         return (
-            f"pairs {self.pairs:3d}   least {1e3 * self.least:.2g} mm   iterations {np.mean(self.iterations):5.1f} / {p95:.0f} / "
-            f"{most}   missed {len(self.missed)} of {len(self.iterations)}   {np.mean(self.milliseconds):.0f} ms"
+            f"pairs {self.pairs:3d}   least {1e3 * self.least:.2g} mm   iterations {np.mean(self.iterations):5.1f} / {p95:.0f}"
+            f" / {most}   missed {len(self.missed)} of {len(self.iterations)}   {np.mean(self.milliseconds):.0f} ms"
         )
 
 

@@ -36,9 +36,9 @@ class LayerGrips:
 class LayerFriction:
     """Friction energy [J] between layers, the sum over pairs of features of μ N f(‖u_T‖).
 
-    The pairs are those within the reach of :class:`hood.losses.layers.LayerBarrier` at t, u_T is the tangential motion from t to
-    t+1 of their nearest points relative to each other, f the law of slip of :class:`hood.losses.friction.LaggedFriction`. N is
-    the barrier's force at t, but no more than either side can bring during the step,
+    The pairs are those within the reach of :class:`hood.losses.layers.LayerBarrier` at t, u_T is the tangential motion from t
+    to t+1 of their nearest points relative to each other, f the law of slip of :class:`hood.losses.friction.LaggedFriction`. N
+    is the barrier's force at t, but no more than either side can bring during the step,
 
         P = m/dt² max(r - d̂, 0) + L,
 
@@ -46,8 +46,8 @@ class LayerFriction:
     the side and the layers behind it press it on with at t. Vertices share m and L among their pairs by the load of these. A
     side that is held, or lies on the body, can bring anything. Layers that lie still are pressed with exactly N.
 
-    No net force: a pair pulls its sides by as much, in opposite directions. These act as far apart as the layers are, at most the
-    reach, which leaves that couple.
+    No net force: a pair pulls its sides by as much, in opposite directions. These act as far apart as the layers are, at most
+    the reach, which leaves that couple.
 
     Args:
         coefficient: μ.
@@ -57,7 +57,8 @@ class LayerFriction:
     def __init__(self, coefficient: float = 0.5, slip_speed: float = 5e-3) -> None:
         if coefficient < 0 or slip_speed <= 0:
             raise ValueError(
-                f"layer friction: coefficient is {coefficient}, slip_speed {slip_speed}; give coefficient >= 0 and slip_speed > 0"
+                f"layer friction: coefficient is {coefficient}, slip_speed {slip_speed}; "
+                "give coefficient >= 0 and slip_speed > 0"
             )
         self.coefficient, self.slip_speed = coefficient, slip_speed
 
@@ -166,9 +167,7 @@ def _pressing(problem: StepProblem, pairs: _Pairs) -> Tensor:
     backed = np.ascontiguousarray((~cloth.free | _on_body(problem)).cpu().numpy(), np.uint8)
     pointers = [array.ctypes.data for array in arrays] + [None if pull is None else pull.ctypes.data, backed.ctypes.data]
     pressing = np.empty(len(pairs.force))
-    library().layers_pressing(
-        ctypes.byref(_Pressing(len(pressing), len(there), *pointers)), pressing.ctypes.data
-    )
+    library().layers_pressing(ctypes.byref(_Pressing(len(pressing), len(there), *pointers)), pressing.ctypes.data)
     return torch.from_numpy(pressing).to(pairs.force.device)
 
 

@@ -14,9 +14,9 @@ from hood.losses.layers import without_layers
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem, inertial_guess
 from hood.mesh.kept import forget
+from hood.mesh.layers import EASED
 from hood.scene.batch import to_device
 from hood.scene.cloth import Cloth
-from hood.mesh.layers import EASED
 from hood.solver.layers import approached, eased, layers_of, limits
 from hood.solver.terms import StepTerms
 
@@ -71,7 +71,7 @@ class Unknowns:
         return first_iterate(Unknowns(without_layers(self.potential), self.problem)).pos
 
     def free_share(self, now: Iterate, acc: Tensor) -> Tensor | None:
-        """Shares (B,) of the straight ways from ``now`` to ``acc`` (V, 3) on which no cloth meets cloth; None for all of them."""
+        """Shares (B,) of the straight ways from ``now`` to ``acc`` (V, 3) on which no cloth meets cloth; None: all of them."""
         if not self.layers:
             return None
         share = limits(self.layers, now.pos, self.place(acc))

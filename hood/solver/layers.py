@@ -51,9 +51,7 @@ class LayerRows:
         return torch.zeros_like(padded).index_add(0, self.vertices.reshape(-1), parts)[:-1]
 
 
-def layer_rows(
-    layers: tuple[SceneLayers, ...], grips: LayerGrips | None, pos: Tensor, unknown: np.ndarray
-) -> LayerRows | None:
+def layer_rows(layers: tuple[SceneLayers, ...], grips: LayerGrips | None, pos: Tensor, unknown: np.ndarray) -> LayerRows | None:
     """The curvature at ``pos`` (V, 3); None where nothing is near anything.
 
     Args:
@@ -110,7 +108,12 @@ def eased(layers: tuple[SceneLayers, ...], now: Tensor, there: Tensor) -> Tensor
 
 def touching(layers: tuple[SceneLayers, ...], pos: Tensor) -> bool:
     """Whether any cloth is near or through cloth at ``pos`` (V, 3), where the step begins."""
-    return any(scene.layers.crossed > 0 or len(scene.layers.contacts(scene.of(pos)).corners) > 0 for scene in layers)
+    return any(scene.layers.crossed > 0 or _near_at_start(scene, pos) for scene in layers)
+
+
+def _near_at_start(scene: SceneLayers, pos: Tensor) -> bool:
+    found = scene.layers.contacts(scene.of(pos)) if scene.at_start is None else scene.at_start
+    return len(found.corners) > 0
 
 
 def free_way(layers: tuple[SceneLayers, ...], now: Tensor, there: Tensor) -> bool:
