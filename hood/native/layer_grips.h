@@ -2,6 +2,7 @@
 #pragma once
 #include <cmath>
 #include <cstdint>
+#include <cstring>
 
 #include "vertex_terms.h"
 
@@ -66,34 +67,33 @@ void model_layer_grips(const LayerGrips& g, int64_t num_vertices, const double* 
     }
 }
 
-// Adds what pairs bring beside the diagonal blocks, with a share of the slack, to q = H p; returns their p . q. Vertices from
-// num_rows on do not move.
+// Adds what pairs bring beside the diagonal blocks, with a share of the slack, to q = H p: all that they bring, less those blocks.
+// Returns their p . q. Vertices from num_rows on do not move.
 template <class T> double couple_layer_grips(const LayerGrips& g, int64_t num_rows, double sharpness, const T* p, T* q) {
     double sum = 0.0;
     for (int64_t i = 0; i < g.count; ++i) {
-        const double *model = g.model + 5 * i, *normal = g.normal + 3 * i, less = sharpness * model[4];
-        if (!(model[3] > 0.0)) continue;
-        // By the tangential matrix slope (1 - n n') + less h h'.
-        const auto apply = [&](const double* x, double* y) {
-            const double across = model[3] * dot3(x, normal), along = less * dot3(x, model);
-            for (int k = 0; k < 3; ++k) y[k] = model[3] * x[k] - across * normal[k] + along * model[k];
-        };
-        double all[3] = {0.0, 0.0, 0.0}, mine[4][3];
-        for (int c = 0; c < 4; ++c) {
-            const int64_t row = g.corners[4 * i + c];
-            for (int k = 0; k < 3; ++k) {
-                mine[c][k] = row < num_rows ? g.weights[4 * i + c] * (double)p[4 * row + k] : 0.0;
-                all[k] += mine[c][k];
-            }
-        }
-        for (int c = 0; c < 4; ++c) {
-            const int64_t row = g.corners[4 * i + c];
-            if (row >= num_rows) continue;
-            const double others[3] = {all[0] - mine[c][0], all[1] - mine[c][1], all[2] - mine[c][2]};
-            double push[3];
-            apply(others, push);
-            for (int k = 0; k < 3; ++k) q[4 * row + k] += (T)(g.weights[4 * i + c] * push[k]);
-            sum += dot3(mine[c], push);
+        const double *model = g.model + 5 * i, *normal = g.normal + 3 * i, *weights = g.weights + 4 * i;
+        const int32_t* corners = g.corners + 4 * i;
+        double slip[3] = {0.0, 0.0, 0.0};
+        for (int c = 0; c < 4; ++c)
+            for (int k = 0; k < 3 && corners[c] < num_rows; ++k) slip[k] += weights[c] * (double)p[4 * (int64_t)corners[c] + k];
+        const double across = model[3] * dot3(slip, normal), along = sharpness * model[4] * dot3(slip, model);
+        const double push[3] = {model[3] * slip[0] - across * normal[0] + along * model[0],
+                                model[3] * slip[1] - across * normal[1] + along * model[1],
+                                model[3] * slip[2] - across * normal[2] + along * model[2]};
+        for (int c = 0; c < 4; ++c)
+            for (int k = 0; k < 3 && corners[c] < num_rows; ++k) q[4 * (int64_t)corners[c] + k] += (T)(weights[c] * push[k]);
+        sum += dot3(slip, push);
+    }
+    constexpr int PLACE[3][3] = {{0, 1, 2}, {1, 3, 4}, {2, 4, 5}};
+    for (int64_t row = 0; row < num_rows; ++row) {
+        const double *own = g.own + 6 * row, *less = g.own_slack + 6 * row;
+        if (own[0] == 0.0 && own[3] == 0.0 && own[5] == 0.0) continue;
+        for (int a = 0; a < 3; ++a) {
+            double push = 0.0;
+            for (int b = 0; b < 3; ++b) push += (own[PLACE[a][b]] + sharpness * less[PLACE[a][b]]) * (double)p[4 * row + b];
+            q[4 * row + a] -= (T)push;
+            sum -= push * (double)p[4 * row + a];
         }
     }
     return sum;
