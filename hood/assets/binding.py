@@ -105,13 +105,9 @@ def bind_posed(garment: Garment, posed: PosedBody, worn_pos: np.ndarray | None =
     """
     worn_pos = garment.rest_pos if worn_pos is None else worn_pos
     weights, shapedirs = _spread_skin(worn_pos, garment.faces, posed.body, posed.surface)
-    blended = (weights @ posed.transforms.reshape(len(posed.transforms), 12)).reshape(-1, 3, 4)
-    left, stretch, right = np.linalg.svd(blended[:, :, :3])
-    inverse = right.transpose(0, 2, 1) / np.maximum(stretch, _LEAST_STRETCH)[:, None, :] @ left.transpose(0, 2, 1)
-    grown = np.einsum("vij,vj->vi", inverse, worn_pos - blended[:, :, 3])
+    grown, turn = undo_skinning(weights, posed.transforms, worn_pos)
     count = min(len(posed.betas), shapedirs.shape[2])
     offset = shapedirs[..., :count] @ posed.betas[:count]
-    turn = left @ right
     straight = np.allclose(turn, np.eye(3), atol=1e-9)
     as_given = straight and np.array_equal(worn_pos, garment.rest_pos)
     return replace(
@@ -123,6 +119,20 @@ def bind_posed(garment: Garment, posed: PosedBody, worn_pos: np.ndarray | None =
         shapedirs=shapedirs,
         bound_to=posed.body.name,
     )
+
+
+def undo_skinning(weights: np.ndarray, transforms: np.ndarray, pos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What linear blend skinning by ``weights`` (V, J) and ``transforms`` (J, 3, 4) takes to ``pos`` (V, 3), and its turns.
+
+    Where blended rotations all but cancel the inverse is limited.
+
+    Returns:
+        (V, 3) [m], in T-pose, and (V, 3, 3): the rotations from there to ``pos``.
+    """
+    blended = (weights @ transforms.reshape(len(transforms), 12)).reshape(-1, 3, 4)
+    left, stretch, right = np.linalg.svd(blended[:, :, :3])
+    inverse = right.transpose(0, 2, 1) / np.maximum(stretch, _LEAST_STRETCH)[:, None, :] @ left.transpose(0, 2, 1)
+    return np.einsum("vij,vj->vi", inverse, pos - blended[:, :, 3]), left @ right
 
 
 def signed_distances(points: np.ndarray, surface: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -21,6 +21,7 @@ _ROWS: dict[str, tuple[int | None, ...]] = {
     "rest_turn": (3, 3),
     "colours": (3,),
     "piece": (),
+    "region": (),
 }
 _CORNERS = ("uv_faces", "normal_faces")
 _LEVEL = "coarse_edges_"
@@ -47,8 +48,9 @@ def read_fields(path: Path) -> dict[str, Any]:
             fields[key] = _reals(path, key, arrays[key])
             check_rows(str(path), key, fields[key], num_vertices)
     fields["pinned"] = fields.get("pinned", np.zeros(num_vertices)).astype(bool)
-    if "piece" in fields:
-        fields["piece"] = fields["piece"].astype(np.int64)
+    for key in ("piece", "region"):
+        if key in fields:
+            fields[key] = fields[key].astype(np.int64)
     if "lbs_weights" in fields:
         fields["lbs_weights"] = normalised(str(path), fields["lbs_weights"])
     if "uv" in arrays and "uv_faces" in arrays:

@@ -15,9 +15,20 @@ from torch import Tensor
 
 from hood.assets.body import Body
 from hood.assets.garment import Garment
+from hood.assets.pins import MARKS
 from hood.assets.sequence import PoseSequence
 
 _SIDES = np.array([-1.0, 1.0, 1.0])
+
+
+def _other_side(name: str) -> str:
+    """The region that `name` becomes in a mirror: left and right change places."""
+    head, _, side = name.rpartition("_")
+    return f"{head}_{'right' if side == 'left' else 'left'}" if side in ("left", "right") else name
+
+
+#: Region (len(MARKS),) that each region becomes in a mirror.
+_OTHER_SIDE = np.array([MARKS.index(_other_side(name)) for name in MARKS])
 #: Corner tables of a garment: turned over with its faces.
 _CORNERS = ("faces", "uv_faces", "normal_faces")
 
@@ -74,6 +85,8 @@ def mirror_garment(garment: Garment) -> Garment:
         image["skin_pos"] = garment.skin_pos * _SIDES
     if garment.rest_turn is not None:
         image["rest_turn"] = _SIDES[:, None] * garment.rest_turn * _SIDES
+    if garment.region is not None:
+        image["region"] = _OTHER_SIDE[garment.region]
     if garment.bound_to is not None:
         image["bound_to"] = _image_name(garment.bound_to)
     return replace(garment, **image)

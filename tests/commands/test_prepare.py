@@ -246,7 +246,7 @@ REFUSED = {
     "region": (["garment=tank", "pins=waisband"], ("did you mean 'waistband'",)),
     "colours": (["garment=tank", "pins=painted"], ("no vertex colours",)),
     "frame": (["garment=far.obj", "pose=walk_proud", "frame=99999"], ("frame=99999",)),
-    "number": (["garment=tank", "pins=99999"], ("vertex 99999 of 1021",)),
+    "number": (["garment=tank", "pins=99999"], ("vertex 99999 of 1016",)),
     "empty": (["garment=[]"], ("garment=[]",)),
 }
 

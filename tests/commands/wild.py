@@ -31,7 +31,8 @@ class WildFile:
 def write_wild_garment(path: Path, garments: dict[str, Garment], body: Body, share: float = 0.05) -> WildFile:
     """An OBJ of a T-shirt, shorts and an armband with every fault at once."""
     garment = join_garments([garments["tshirt"], garments["shorts"], armband(body)])
-    pos = garment.rest_pos.copy()
+    assert garment.skin_pos is not None  # the T-shirt is drafted in another pose
+    pos = garment.skin_pos.copy()
     chosen = np.random.default_rng(3).choice(len(pos), round(share * len(pos)), replace=False)
     pos[chosen] = sink(pos[chosen], body, 5e-3)
     assert garment.uv is not None
@@ -77,12 +78,15 @@ def sink(points: np.ndarray, body: Body, depth: float) -> np.ndarray:
 def pair_up(faces: np.ndarray) -> tuple[list[list[int]], list[list[int]]]:
     """Quads of as many neighbouring triangles as a greedy walk finds, and the triangles left over."""
     hinges = topology.hinges(faces)
+    edges = set(map(tuple, topology.unique_edges(faces).tolist()))
     used = np.zeros(len(faces), dtype=bool)
     quads = []
     for (a, b, c, d), (first, second) in zip(hinges.vertices.tolist(), hinges.faces.tolist(), strict=True):
-        if used[first] or used[second]:
+        # Cut along its other diagonal, a quad around a vertex of three or four faces would double a face of another.
+        if used[first] or used[second] or (min(c, d), max(c, d)) in edges:
             continue
         used[[first, second]] = True
+        edges.add((min(c, d), max(c, d)))
         face = faces[first].tolist()
         forward = face[(face.index(a) + 1) % 3] == b
         quads.append([a, d, b, c] if forward else [b, d, a, c])

@@ -50,10 +50,10 @@ def test_the_garment_is_put_on_in_the_t_pose(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, garments: dict[str, Garment], body: Body
 ) -> None:
     """Frame 0 is the motion's first; the cloth starts as the way there, shortened here, leaves it."""
-    monkeypatch.setattr("hood.scene.scene._TORN", 0.1)  # in 60 iterations this T-shirt is stretched by more
+    monkeypatch.setattr("hood.scene.scene._TORN", 0.1)  # in 60 iterations this dress is stretched by more
     monkeypatch.setattr("hood.scene.start._MOST_ITERATIONS", 60)
     monkeypatch.setattr("hood.scene.scene.LEAD_IN", 0.4)
-    scene = build_scene(garments["tshirt"], body, load_sequence(write_seated(tmp_path / "seated.npz")))
+    scene = build_scene(garments["dress"], body, load_sequence(write_seated(tmp_path / "seated.npz")))
     with pytest.raises(NotWornError, match="passes through 'seated' in frame 0"):
         scene.start(0, relaxed=False, thorough=True)
     with pytest.warns(UserWarning, match="moves into it from the T-pose"):
@@ -96,7 +96,7 @@ def test_a_way_that_breaks_the_cloth_is_refused(
     monkeypatch.setattr("hood.scene.scene._TORN", 0.1)
     monkeypatch.setattr("hood.scene.start._MOST_ITERATIONS", 60)
     monkeypatch.setattr("hood.scene.scene.LEAD_IN", 0.1)
-    scene = build_scene(garments["tshirt"], body, load_sequence(write_seated(tmp_path / "seated.npz")))
+    scene = build_scene(garments["dress"], body, load_sequence(write_seated(tmp_path / "seated.npz")))
 
     class Broken(GuessStepper):
         def predict(self, *args: Any) -> Prediction:

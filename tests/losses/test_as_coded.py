@@ -19,7 +19,7 @@ from hood.losses.collision import CentroidCollision
 from hood.losses.friction import CodedFriction, WeightFriction
 from hood.losses.potential import coded_potential
 from hood.losses.problem import StepProblem
-from hood.scene.contact import LaggedContact
+from hood.scene.contact import LaggedContact, find_contact
 from hood.scene.scene import build_scene
 from hood.scene.state import State
 
@@ -40,7 +40,7 @@ class Case:
 
 
 STATES = {
-    "shirt, walking": ("tshirt", 60, 5, 2e-4, 1.0),
+    "shirt, walking": ("tshirt", 60, 5, 2e-3, 1.0),
     "skirt, walking, rumpled": ("skirt", 60, 3, 2e-3, 1.0),
     "tank, off the body and stretched": ("tank", 20, 8, 1e-3, 1.15),
 }
@@ -194,12 +194,17 @@ def test_the_two_frictions_and_the_two_collisions_differ(case: Case) -> None:
 
 
 def test_a_shirt_is_held_all_over(garments: dict[str, Garment], body: Body, walk: PoseSequence) -> None:
-    """The figure that is known of the published code: it acts on 1,011 of 1,014 vertices."""
+    """Known of the published code: it acts on nearly every vertex of a shirt, few of which touch the skin."""
     scene = build_scene(garments["tshirt"], body, walk.window(0, 3))
     state = scene.start(0)
-    problem = coded_potential().prepare(StepProblem(scene.cloth, state, scene.step_input(0, state)))
+    step = scene.step_input(0, state)
+    problem = coded_potential().prepare(StepProblem(scene.cloth, state, step))
     assert problem.contact is not None
-    assert int((CodedFriction().normal_force(problem, problem.contact) > 0).sum()) == 1011
+    held = CodedFriction().normal_force(problem, problem.contact) > 0
+    assert float(held.double().mean()) > 0.99
+    assert step.obstacle is not None
+    dist = find_contact(state.pos, scene.cloth.vertex_scene, step.obstacle).dist
+    assert float((dist < 3e-3).double().mean()) < 0.1
 
 
 @pytest.mark.parametrize("lagged", [False, True])
