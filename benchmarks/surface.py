@@ -3,8 +3,10 @@
     python benchmarks/surface.py                                             # seven garments of 1,000 vertices
     python benchmarks/surface.py tshirt_4k trousers_4k dress_4k dress_12k --motions walk_proud --frames 30
     python benchmarks/surface.py --steppers newton quickstart+5 --reach constant   # contact as it was; a network refined
+    python benchmarks/surface.py --cloth-contact off                         # layers of cloth go through each other
 
-Rollouts as of ``hood rollout``: embedded body, default fabric, the motions of the validation list. A line per rollout as soon
+Rollouts as of ``hood rollout``: embedded body, default fabric, the motions of the validation list, layers of cloth kept apart
+where the solver takes or refines the steps. A line per rollout as soon
 as it is done, then a table over the motions: mean and worst share of the cloth's triangles that the body's true surface cuts,
 the greatest height of skin above the cloth, mean and worst number of pairs of the cloth's triangles that pass through each
 other, over every --stride-th frame, the first and the last; of all frames the median distance of the vertices that touch from
@@ -30,6 +32,7 @@ from hood.dynamics.refine import RefinedStepper
 from hood.dynamics.rollout import simulate
 from hood.dynamics.stepper import NewtonStepper, Stepper
 from hood.dynamics.surface import SURFACE_METRICS, SURFACE_STRIDE, SurfaceMeter
+from hood.losses.layers import LayerBarrier, for_networks
 from hood.losses.potential import Potential, default_potential
 from hood.mesh.proximity import search_surface
 from hood.nn.compiled import KERNELS, check_kernels
@@ -54,6 +57,11 @@ class Measured(NamedTuple):
     steps: np.ndarray  # (T, 4) solver's iterations, whether converged, ms, refining iterations of all frames but the first
 
 
+def solves(name: str) -> bool:
+    """Whether the solver takes or refines the steps."""
+    return name == "newton" or "+" in name
+
+
 def make_stepper(name: str, kernels: str, potential: Potential) -> Stepper:
     """``newton`` with the command's accuracy, or the weights of that name; ``NAME+K`` refines them by K iterations."""
     if name == "newton":
@@ -62,7 +70,7 @@ def make_stepper(name: str, kernels: str, potential: Potential) -> Stepper:
     simulator = load_simulator(locate("weights", weights)).eval()
     check_kernels(kernels, "fp32", simulator.network.latent_dim, torch.device("cpu"))
     simulator.network.use_kernels(kernels)
-    simulator.use_potential(potential)
+    simulator.use_potential(for_networks(potential))
     return RefinedStepper(simulator, potential, Count(int(refine))) if refine else simulator
 
 
@@ -118,21 +126,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--reach", default="curvature", choices=REACHES, help="of contact")
     parser.add_argument("--contact", default="vertices", choices=PLACES, help="where the cloth meets the body")
+    parser.add_argument("--cloth-contact", default="auto", choices=["auto", "off"], help="of layers of cloth with each other")
     parser.add_argument("--motions", nargs="+", default=motion_split()["validation"])
     parser.add_argument("--frames", type=int, default=60)
     parser.add_argument("--stride", type=int, default=SURFACE_STRIDE)
     parser.add_argument("--kernels", default="torch", choices=KERNELS, help="of the network; compiled ones round differently")
     chosen = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    body, potential = load_body("default"), default_potential(contact=chosen.contact, reach=chosen.reach)
-    steppers = {name: make_stepper(name, chosen.kernels, potential) for name in chosen.steppers}
+    body, plain = load_body("default"), default_potential(contact=chosen.contact, reach=chosen.reach)
+    layered = plain.with_terms(layers=LayerBarrier()) if chosen.cloth_contact == "auto" else plain
+    potentials = {name: layered if solves(name) else plain for name in chosen.steppers}
+    steppers = {name: make_stepper(name, chosen.kernels, potentials[name]) for name in chosen.steppers}
     table: dict[str, list[Measured]] = {}
     print(HEADER)
     for motion in chosen.motions:
         for garment in chosen.garments:
-            scene = build_scene(load_garment(garment), body, load_sequence(motion, 30.0))
+            parts = load_garment(garment), body, load_sequence(motion, 30.0)
             for name, stepper in steppers.items():
-                measured = measure(stepper, scene, potential, chosen.frames, chosen.stride)
+                scene = build_scene(*parts, dtype=torch.float64 if solves(name) else torch.float32)
+                measured = measure(stepper, scene, potentials[name], chosen.frames, chosen.stride)
                 table.setdefault(f"{garment} {name}", []).append(measured)
                 print(line(f"{garment} {name} {motion}", measured), flush=True)
     print(f"\n{HEADER}")
