@@ -89,7 +89,7 @@ def test_a_network_learns_to_leave_layers_on_their_sides(tmp_path: Path, body: B
         assert "layer_sides" not in trainer.simulator.potential.terms
         assert trainer.simulator.trained_for is not None
         assert "layer_sides" not in trainer.simulator.trained_for.potential
-        felt[weight] = [trainer.update()["layer_sides"] / weight for _ in range(8)][1::2]  # every other step is a relaxing one
+        felt[weight] = [trainer.update()["layer_sides"] / weight for _ in range(14)][1::2]  # every other step is a relaxing one
     assert felt[5e6][-1] < 0.8 * felt[5e6][0]
     assert felt[5e6][-1] < 0.8 * felt[1e-3][-1]
 
