@@ -16,9 +16,9 @@ import numpy as np
 from scipy import fft
 from scipy.spatial import cKDTree
 
-_CLEARANCE, _HANG = 0.0092, 0.7  # m, share
+_CLEARANCE, _HANG = 0.0085, 0.7  # m, share
 _CUTS = (0.004, 0.03)  # m, least and greatest c₀ of tight and of wide cuts
-_TIGHT = 3.0
+_TIGHT = 5.0
 _SLEEVE_CLEARANCE, _SLEEVE_WIDTH = 0.015, 0.045  # m
 #: Width σ [m] of the misfit; searches start wider.
 WIDTH = 0.015

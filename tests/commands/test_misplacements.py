@@ -130,7 +130,7 @@ def bring_back(case: Case, capsys: pytest.CaptureFixture[str]) -> tuple[str, str
     back = load_garment("g.npz").shaped(case.betas)
     far = float(np.linalg.norm(back - pos, axis=1).mean())
     angle = finding["facts"]["arms below the T-pose [degrees]"]
-    if far > NEAR + 5e-5:  # offsets are printed to a tenth of a millimetre
+    if far > NEAR:
         return f"{100 * far:.1f} cm away", command
     if case.garment in SLEEVED and abs(angle - case.angle) > ANGLE:
         return f"arms at {angle:g} instead of {case.angle:g} degrees", command
