@@ -121,7 +121,7 @@ inline double fading(double square, double parallel, double* slope) {
 }
 
 constexpr int MOST_ADVANCES = 60;
-constexpr double NARROW = 1e-2;  // of the reach
+constexpr double NARROW = 1e-4;  // of the reach
 
 // Takes the mean off the ways of the corners; how far points of the features then move towards each other at most.
 inline double relative_way(int32_t edges, Vec* p) {
