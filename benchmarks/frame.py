@@ -36,10 +36,8 @@ from hood.dynamics import simulator as simulator_module
 from hood.dynamics.checkpoint import load_simulator
 from hood.dynamics.measure import penetration_metrics, strain_metrics
 from hood.dynamics.passes import Passes
-from hood.dynamics.rollout import energy_metrics
 from hood.dynamics.simulator import Simulator, build_simulator
 from hood.dynamics.stopwatch import Stopwatch
-from hood.losses.elements import energies_and_gradient
 from hood.losses.potential import default_potential
 from hood.losses.problem import StepProblem
 from hood.mesh.topology import unique_edges
@@ -47,7 +45,7 @@ from hood.native import features as native
 from hood.nn.compiled import KERNELS
 from hood.scene.scene import Scene, build_scene, recentre
 from hood.scene.state import State
-from hood.solver import forces
+from hood.solver.step_figures import StepFigures
 
 PARTS = ("posing", "search", "features", "feedback", "network", "rest", "total", "metrics")
 WEIGHTS = DATA_FOLDER / "weights"
@@ -119,8 +117,7 @@ def time_frame(simulator: Simulator, scene: Scene, prepared: object, frame: int)
         known = POTENTIAL.prepare(problem)
         strain_metrics(scene.cloth, state.pos)
         penetration_metrics(known.contact, scene.cloth.num_vertices)
-        found = energies_and_gradient(POTENTIAL, known, prediction.next_pos, prediction.acc, by=forces.energies_and_gradient)
-        energy_metrics(POTENTIAL, known, *found)
+        StepFigures(POTENTIAL, known, prediction.next_pos, prediction.acc).metrics()
     times |= {"feedback": Timed.spent, "network": times["network"] - Timed.spent}
     return {**times, "metrics": watch.spent_aside("metrics")}, prediction.next_pos
 

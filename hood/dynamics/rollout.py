@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -28,16 +28,15 @@ from hood.dynamics.stepper import Stepper
 from hood.dynamics.stopwatch import Stopwatch
 from hood.dynamics.surface import SURFACE_METRICS, SURFACE_STRIDE, SurfaceMeter
 from hood.graph.given import given_hierarchy
-from hood.losses.elements import energies_and_gradient, total_energy
 from hood.losses.layers import for_networks, has_layers
-from hood.losses.potential import Potential, relative_gradient, scale
-from hood.losses.problem import StepProblem, inertial_guess
+from hood.losses.potential import Potential
+from hood.losses.problem import StepProblem
 from hood.scene.contact import Contact, find_contact
 from hood.scene.mesh_motion import wearable
 from hood.scene.scene import LEAD_IN, RELAXING_DT, NotWornError, Scene, recentre
 from hood.scene.start import free_stretch, push_out
 from hood.scene.state import Attachments, State
-from hood.solver import forces
+from hood.solver.step_figures import StepFigures
 
 #: A start with an edge lengthened by more than this share would snap back in the first frames.
 _STRETCH = 0.1
@@ -189,12 +188,10 @@ def simulate(
             stepped |= layer_metrics(known, prediction.next_pos)
         with watch.aside("metrics"):
             if wants_potential:
-                gradient, energies = energies_and_gradient(
-                    potential, known, prediction.next_pos, prediction.acc, by=forces.energies_and_gradient
-                )
-                known_fields = {name: vertex_residual(known, gradient).float().cpu() for name in fields}
-            if metrics == "all":
-                stepped |= energy_metrics(potential, known, gradient, energies)
+                figures = StepFigures(potential, known, prediction.next_pos, prediction.acc)
+                known_fields = {name: vertex_residual(known, figures.gradient).float().cpu() for name in fields}
+                if metrics == "all":
+                    stepped |= figures.metrics()
         if observe is not None:
             with watch.aside("caller"):
                 observe(index + 1, known, prediction)
@@ -362,26 +359,6 @@ def _led_in(
 def _longest(scene: Scene, pos: Tensor) -> float:
     """Largest relative lengthening of an edge that is not held at both ends."""
     return float(free_stretch(scene.cloth, pos).max()) if len(scene.cloth.edges) else 0.0
-
-
-def energy_metrics(
-    potential: Potential, problem: StepProblem, gradient: Tensor, energies: Mapping[str, Tensor]
-) -> dict[str, float]:
-    """Energies [J] of one scene's step, its gradient norm [N] (the paper's: mean over vertices of ‖∂Φ/∂x_v‖₂), rg, e0 [J],
-    and for comparison the potential of the inertial guess x_t + dt v_t; from what
-    :func:`hood.losses.elements.energies_and_gradient` says."""
-    free = problem.cloth.free
-    result = {f"energy_{name}": sum(value.tolist()) for name, value in energies.items()}
-    result["energy_total"] = sum(result.values())
-    guess = inertial_guess(problem.state, problem.step, problem.cloth.vertex_scene)
-    if problem.step.pin_target is not None:
-        guess = torch.where(problem.cloth.pinned.unsqueeze(1), problem.step.pin_target, guess)
-    result["energy_inertial_guess"] = float(total_energy(potential, problem, guess, by=forces.total_energy).sum())
-    count, size = int(free.sum()), torch.mv(gradient * gradient, gradient.new_ones(3)).sqrt()
-    result["gradient_norm"] = float(torch.where(free, size, 0.0).sum()) / count if count else 0.0
-    result["relative_gradient"] = float(relative_gradient(problem, gradient * free.unsqueeze(1)).mean())
-    result["e0"] = float(scale(problem).sum())
-    return result
 
 
 def _surface_now(meter: SurfaceMeter, scene: Scene, state: State, frame: int) -> dict[str, float]:

@@ -69,11 +69,11 @@ def energies_and_gradient(
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """What :meth:`hood.losses.potential.Potential.gradient` computes, element terms by the compiled pass and others ``by``
     another function."""
-    if not _applies(next_pos):
+    if not applies(next_pos):
         return by(potential, problem, next_pos, acc)
-    others, _ = _split(potential)
+    others, _ = split(potential)
     gradient = np.zeros(tuple(next_pos.shape))
-    values = _element_energies(potential, problem, next_pos, gradient)
+    values = element_energies(potential, problem, _double(next_pos), gradient)
     total = torch.from_numpy(gradient)
     if others.active(problem):  # a gradient of nothing takes as long as the pass
         rest, found = by(others, problem, next_pos, acc)
@@ -85,16 +85,16 @@ def energies_and_gradient(
 def total_energy(potential: Potential, problem: StepProblem, next_pos: Tensor, by: Sum = Potential.total) -> Tensor:
     """Potential Φ [J] per scene (B,), what :meth:`hood.losses.potential.Potential.total` computes, element terms by the
     compiled pass and others ``by`` another function."""
-    if not _applies(next_pos):
+    if not applies(next_pos):
         return by(potential, problem, next_pos)
-    others, _ = _split(potential)
-    values = _element_energies(potential, problem, next_pos, None).values()
+    others, _ = split(potential)
+    values = element_energies(potential, problem, _double(next_pos), None).values()
     return sum(values, start=by(others, problem, next_pos).double())
 
 
 def absolute_strain(cloth: Cloth, pos: Tensor) -> np.ndarray | None:
     """Absolute relative length change of every edge (E,), float64; None where there is no compiled pass."""
-    lib = library() if _applies(pos) else None
+    lib = library() if applies(pos) else None
     if lib is None:
         return None
     constants, place = _constants_of(cloth), _double(pos)
@@ -104,24 +104,26 @@ def absolute_strain(cloth: Cloth, pos: Tensor) -> np.ndarray | None:
     return strain
 
 
-def _applies(pos: Tensor) -> bool:
+def applies(pos: Tensor) -> bool:
+    """Whether there is a compiled pass for these positions."""
     return type(pos) is Tensor and pos.device.type == "cpu" and library() is not None
 
 
-def _split(potential: Potential) -> tuple[Potential, dict[str, Term]]:
+def split(potential: Potential) -> tuple[Potential, dict[str, Term]]:
     """The terms that torch computes, and those of the pass."""
     elements = {name: term for name, term in potential.terms.items() if type(term) in ELEMENT_TERMS}
     return Potential({name: term for name, term in potential.terms.items() if name not in elements}), elements
 
 
-def _element_energies(
-    potential: Potential, problem: StepProblem, pos: Tensor, gradient: np.ndarray | None
+def element_energies(
+    potential: Potential, problem: StepProblem, pos: np.ndarray, gradient: np.ndarray | None
 ) -> dict[str, Tensor]:
-    """Energies (B,) of the element terms that the problem needs; their gradient is added to ``gradient`` (V, 3)."""
-    lib, constants, place = library(), _constants_of(problem.cloth), _double(pos)
+    """Energies [J] (B,) of the element terms that the problem needs, at ``pos`` (V, 3); their gradient is added to ``gradient``
+    (V, 3). Both float64 without gaps."""
+    lib, constants = library(), _constants_of(problem.cloth)
     assert lib is not None
     energies = {}
-    for name, term in _split(potential)[1].items():
+    for name, term in split(potential)[1].items():
         if not term.applies(problem):
             continue
         energy = np.zeros(problem.num_scenes)
@@ -131,7 +133,7 @@ def _element_energies(
         elif type(term) is CurrentLengthBending:
             table = ctypes.byref(constants.current_hinges)
         into = None if gradient is None else POINTER(gradient.ctypes.data)
-        work(table, POINTER(place.ctypes.data), POINTER(energy.ctypes.data), into)
+        work(table, POINTER(pos.ctypes.data), POINTER(energy.ctypes.data), into)
         energies[name] = torch.from_numpy(energy)
     return energies
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import weakref
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -20,6 +23,7 @@ from hood.mesh.kept import forget
 from hood.solver import vertex_pass
 from hood.solver.contact_pass import ContactPass, contact_pass
 from hood.solver.elements import BENDINGS
+from hood.solver.vertex_pass import VertexPass
 
 COLLISIONS = (Collision, CentroidCollision)
 FRICTIONS = (Friction, WeightFriction, CodedFriction)
@@ -88,6 +92,11 @@ class VertexForces:
     weight: Tensor  # (N, 3) N
     walls: tuple[Walls, ...]
     grips: tuple[Grip, ...]
+
+    @cached_property
+    def compiled(self) -> VertexPass:
+        """What the compiled pass reads of them, gathered once."""
+        return VertexPass(self)
 
     def take(self, rows: Tensor) -> VertexForces:
         """Those of some vertices."""
@@ -202,19 +211,44 @@ def _friction(grip: Grip, pos: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return slope[:, None] * slip, matrix, _outer((along - slope)[:, None] * heading, heading)
 
 
-#: Forces of the last steps that were asked about, as long as these live: by the solver, and by those who measure.
-_FORCES: dict[int, tuple[weakref.ref[StepProblem], list[Term], VertexForces]] = {}
+class KnownForces(NamedTuple):
+    """Forces of a step, the terms that they are of, and the names in the order of :meth:`VertexForces.energies`."""
+
+    problem: weakref.ref[StepProblem]
+    terms: dict[str, Term]
+    forces: VertexForces
+    names: list[str] | None  # None where several terms are added up into one
+
+
+#: Of the last steps that were asked about, as long as these live: by the solver, and by those who measure.
+_KNOWN: dict[int, KnownForces] = {}
+
+
+def known_forces(potential: Potential, problem: StepProblem) -> VertexForces:
+    """What :func:`vertex_forces` gathers, once for a step and the same terms."""
+    return known(potential, problem).forces
 
 
 @torch.no_grad()
-def known_forces(potential: Potential, problem: StepProblem) -> VertexForces:
-    """What :func:`vertex_forces` gathers, once for a step and the same terms."""
-    key, terms = id(problem), [term for term in potential.terms.values() if type(term) in SINGLE]
-    known = _FORCES.get(key)
-    if known is None or known[0]() is not problem or [id(term) for term in known[1]] != [id(term) for term in terms]:
-        reference = weakref.ref(problem, forget(_FORCES, key))
-        known = _FORCES[key] = reference, terms, vertex_forces(potential, problem, compiled=True)
-    return known[2]
+def known(potential: Potential, problem: StepProblem) -> KnownForces:
+    """The same, with the terms that they are of."""
+    key, terms = id(problem), {name: term for name, term in potential.terms.items() if type(term) in SINGLE}
+    last = _KNOWN.get(key)
+    if last is None or last.problem() is not problem or not _same(last.terms, terms):
+        found, names = vertex_forces(potential, problem, compiled=True), _names(potential.only(terms).active(problem))
+        last = _KNOWN[key] = KnownForces(weakref.ref(problem, forget(_KNOWN, key)), terms, found, names)
+    return last
+
+
+def _same(terms: Mapping[str, Term], others: Mapping[str, Term]) -> bool:
+    return list(terms) == list(others) and all(a is b for a, b in zip(terms.values(), others.values(), strict=True))
+
+
+def _names(terms: Mapping[str, Term]) -> list[str] | None:
+    """Names of terms in the order of :meth:`VertexForces.energies`, "" for none; None where two share a place."""
+    kinds = (Inertia, Gravity, COLLISIONS, FRICTIONS)
+    inertia, gravity, *others = [[name for name, term in terms.items() if isinstance(term, kind)] for kind in kinds]
+    return None if max(len(inertia), len(gravity)) > 1 else [(inertia or [""])[0], (gravity or [""])[0], *others[0], *others[1]]
 
 
 @torch.no_grad()
@@ -226,7 +260,7 @@ def energies_and_gradient(
     Contact that also acts inside edges and faces is left to autograd.
     """
     acc = problem.acceleration(next_pos) if acc is None else acc
-    single, rest = _split(potential)
+    single, rest = split(potential)
     energies, gradient = _single(single, problem, next_pos, acc, slope=True)
     assert gradient is not None
     if rest.active(problem):
@@ -238,14 +272,14 @@ def energies_and_gradient(
 @torch.no_grad()
 def total_energy(potential: Potential, problem: StepProblem, next_pos: Tensor) -> Tensor:
     """What :meth:`hood.losses.potential.Potential.total` computes, (B,) J; terms of single vertices in closed form."""
-    single, rest = _split(potential)
+    single, rest = split(potential)
     energies = list(_single(single, problem, next_pos, problem.acceleration(next_pos), slope=False)[0].values())
     if rest.active(problem):
         energies.append(rest.total(problem, next_pos))
     return sum(energies, start=next_pos.new_zeros(problem.num_scenes))
 
 
-def _split(potential: Potential) -> tuple[Potential, Potential]:
+def split(potential: Potential) -> tuple[Potential, Potential]:
     """The terms that act on single vertices alone, and the others."""
     single = {
         name: term
@@ -259,23 +293,20 @@ def _single(
     potential: Potential, problem: StepProblem, pos: Tensor, acc: Tensor, slope: bool
 ) -> tuple[dict[str, Tensor], Tensor | None]:
     """Energies [J] (B,) by term of those that act on single vertices, and their gradient [N] (V, 3) where asked for."""
-    named = potential.active(problem)
-    # In the order of VertexForces.energies; of two terms that it adds up into one each is asked alone.
-    kinds = (Inertia, Gravity, COLLISIONS, FRICTIONS)
-    names = [[name for name, term in named.items() if isinstance(term, kind)] for kind in kinds]
-    forces = known_forces(potential, problem)
-    if len(names[0]) > 1 or len(names[1]) > 1:
-        alone = (potential.only({name: term}) for name, term in named.items())
+    _, _, forces, names = known(potential, problem)
+    if names is None:
+        alone = (potential.only({name: term}) for name, term in potential.active(problem).items())
         energies = {name: value for part in alone for name, value in _single(part, problem, pos, acc, slope=False)[0].items()}
         return energies, forces.gradient(pos, acc) if slope else None
-    order = [(names[0] or [""])[0], (names[1] or [""])[0], *names[2], *names[3]]
-    found = vertex_pass.evaluate(forces, pos, acc, problem.cloth.vertex_scene, problem.step.dt, slope)
+    found = None
+    if vertex_pass.applies(pos):
+        found = forces.compiled.evaluate(pos, acc, problem.cloth.vertex_scene, problem.step.dt, slope)
     if found is None:
         sums = [problem.sum_vertices(part) for part in forces.energies(pos, acc, problem.vertex_dt)]
         gradient = forces.gradient(pos, acc) if slope else None
     else:
         sums, gradient = list(found[0].to(pos.dtype)), None if found[1] is None else found[1].to(pos.dtype)
-    return {name: part for name, part in zip(order, sums, strict=True) if name}, gradient
+    return {name: part for name, part in zip(names, sums, strict=True) if name}, gradient
 
 
 def attachment_stiffness(term: Term, problem: StepProblem) -> Tensor:

@@ -70,37 +70,52 @@ def whole(values: Tensor) -> Tensor:
     return values if sound else values.detach().double().contiguous()
 
 
-def evaluate(
-    forces: VertexForces, pos: Tensor, acc: Tensor, scene: Tensor, dt: Tensor, gradient: bool
-) -> tuple[Tensor, Tensor | None] | None:
-    """Energies [J] (2 + W + G, B) of inertia, gravity, walls and grips, and where asked for their gradient [N] (V, 3), float64.
+def applies(pos: Tensor) -> bool:
+    """Whether there is a compiled pass for these positions."""
+    return type(pos) is Tensor and pos.device.type == "cpu" and library() is not None
+
+
+class VertexPass:
+    """Forces of a step as C++ reads them, for as many evaluations as are asked for.
 
     Args:
-        pos, acc: (V, 3) m and m/s².
-        scene, dt: of every vertex (V,), and seconds of each (B,).
-
-    Returns:
-        None where there is no compiled pass, or not for these tensors.
+        forces: what acts on the vertices; it must stay as it is.
     """
-    lib = library() if type(pos) is Tensor and pos.device.type == "cpu" else None
-    if lib is None:
-        return None
-    walls, grips = wall_structures(forces.walls), grip_structures(forces.grips)
-    constants = [whole(forces.inertia), whole(forces.stiffness), whole(forces.weight), whole(dt)]
-    given = [whole(pos), whole(acc)]
-    vertices = _Vertices(
-        len(pos),
-        len(dt),
-        len(walls[0]),
-        len(grips[0]),
-        scene.data_ptr(),
-        *(values.data_ptr() for values in constants),
-        ctypes.addressof(walls[0]),
-        ctypes.addressof(grips[0]),
-    )
-    energies = np.zeros((2 + len(walls[0]) + len(grips[0]), len(dt)))
-    slope = np.zeros(tuple(pos.shape)) if gradient else None
-    into = None if slope is None else POINTER(slope.ctypes.data)
-    addresses = [POINTER(values.data_ptr()) for values in given]
-    lib.elements_vertices(ctypes.byref(vertices), *addresses, POINTER(energies.ctypes.data), into)
-    return torch.from_numpy(energies), None if slope is None else torch.from_numpy(slope)
+
+    def __init__(self, forces: VertexForces) -> None:
+        self._walls, self._grips = wall_structures(forces.walls), grip_structures(forces.grips)
+        self._constants = [whole(values) for values in (forces.inertia, forces.stiffness, forces.weight)]
+        self._num_parts = 2 + len(forces.walls) + len(forces.grips)
+        self._structure = _Vertices(
+            count=len(forces.stiffness),
+            num_walls=len(forces.walls),
+            num_grips=len(forces.grips),
+            inertia=self._constants[0].data_ptr(),
+            stiffness=self._constants[1].data_ptr(),
+            weight=self._constants[2].data_ptr(),
+            walls=ctypes.addressof(self._walls[0]),
+            grips=ctypes.addressof(self._grips[0]),
+        )
+
+    def evaluate(self, pos: Tensor, acc: Tensor, scene: Tensor, dt: Tensor, gradient: bool) -> tuple[Tensor, Tensor | None]:
+        """Energies [J] (2 + W + G, B) of inertia, gravity, walls and grips, and where asked for their gradient [N] (V, 3),
+        float64.
+
+        Args:
+            pos, acc: (V, 3) m and m/s².
+            scene, dt: of every vertex (V,), and seconds of each (B,).
+        """
+        slope = np.zeros(tuple(pos.shape)) if gradient else None
+        energies = self.add(whole(pos).numpy(), whole(acc).numpy(), scene, dt, slope)
+        return torch.from_numpy(energies), None if slope is None else torch.from_numpy(slope)
+
+    def add(self, pos: np.ndarray, acc: np.ndarray, scene: Tensor, dt: Tensor, gradient: np.ndarray | None) -> np.ndarray:
+        """The energies of :meth:`evaluate`; their gradient is added to ``gradient`` (V, 3). All float64 without gaps."""
+        lib = library()
+        assert lib is not None
+        structure, seconds = self._structure, whole(dt)
+        structure.num_scenes, structure.scene, structure.dt = len(dt), scene.data_ptr(), seconds.data_ptr()
+        energies = np.zeros((self._num_parts, len(dt)))
+        arrays = (pos, acc, energies, gradient)
+        lib.elements_vertices(ctypes.byref(structure), *(None if a is None else POINTER(a.ctypes.data) for a in arrays))
+        return energies
