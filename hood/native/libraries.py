@@ -12,6 +12,8 @@ _HERE = Path(__file__).parent
 CROSSING_FLAGS = (*NATIVE_FLAGS, "-ffp-contract=off")
 #: Compiled in two thirds of the time, and no slower: what counts is written in vectors.
 LAYER_FLAGS = (*NATIVE_FLAGS, "-O2")
+#: The solver with its matrix in float64.
+WIDE_FLAGS = (*NATIVE_FLAGS, "-DWIDE")
 #: Source and flags of each library, as the modules ask :func:`hood.native.build.build` for them.
 LIBRARIES: tuple[tuple[Path, tuple[str, ...]], ...] = (
     (_HERE / "newton.cpp", NATIVE_FLAGS),
@@ -25,6 +27,10 @@ LIBRARIES: tuple[tuple[Path, tuple[str, ...]], ...] = (
 )
 
 
+#: What few scenes need: compiled when one does.
+SELDOM: tuple[tuple[Path, tuple[str, ...]], ...] = ((_HERE / "newton.cpp", WIDE_FLAGS),)
+
+
 def make(folder: Path) -> tuple[list[Path], list[str]]:
     """Compile all of them into ``folder``, for each generation of processors of this architecture.
 
@@ -36,7 +42,7 @@ def make(folder: Path) -> tuple[list[Path], list[str]]:
     except BuildError as error:
         return [], [f"the wheel carries no compiled parts: {error}"]
     made, left_out = [], []
-    for source, flags in LIBRARIES:
+    for source, flags in (*LIBRARIES, *SELDOM):
         for level in levels():
             path = folder / file_name(source, flags, level)
             try:

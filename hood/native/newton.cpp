@@ -20,6 +20,11 @@ namespace {
 
 typedef double D4 __attribute__((vector_size(32)));
 typedef float F4 __attribute__((vector_size(16)));
+#ifdef WIDE  // a library of its own: few scenes need it
+typedef double Real;  // of the matrix and the linear solver
+#else
+typedef float Real;
+#endif
 
 template <class T> struct Four;
 template <> struct Four<float> { typedef F4 type; };
@@ -80,7 +85,6 @@ struct Engine {
     void *inverse, *x, *r, *z, *p, *q; // (N, 12), (N, 4) five times
     double sharpness, raised;       // of the matrix as it stands, and of the next one
     double phi, noise;
-    int64_t wide;                   // matrix and linear solver in float64
     int64_t cg_used;
     // Threads.
     int64_t parts, reach;           // in how many parts loops are done; how far a column is behind its row at most
@@ -1146,8 +1150,7 @@ void newton_guess(Engine* e, const double* mass, const double* gravity) {
 
 // Gradient at the state, and what the matrix is made of; returns the norm of the gradient.
 double newton_model(Engine* e) {
-    if (e->wide) differentiate<double>(*e);
-    else differentiate<float>(*e);
+    differentiate<Real>(*e);
     double sum = 0.0;
     for (int64_t row = 0; row < e->num_rows; ++row) sum += dot3(e->gradient + 4 * row, e->gradient + 4 * row);
     return std::sqrt(sum);
@@ -1156,19 +1159,13 @@ double newton_model(Engine* e) {
 // The matrix with a share of the slack, from the model.
 void newton_matrix(Engine* e, double sharpness) {
     e->sharpness = sharpness;
-    if (e->wide) gather_matrix<double>(*e);
-    else gather_matrix<float>(*e);
+    gather_matrix<Real>(*e);
 }
 
 // From the model to the next state; 1 where it moved.
 int64_t newton_move(Engine* e, double residual, int64_t cg_iterations) {
-    if (e->wide) {
-        direct<double>(*e, residual, cg_iterations);
-        prepare_path<double>(*e);
-    } else {
-        direct<float>(*e, residual, cg_iterations);
-        prepare_path<float>(*e);
-    }
+    direct<Real>(*e, residual, cg_iterations);
+    prepare_path<Real>(*e);
     return backtrack(*e);
 }
 
@@ -1182,8 +1179,8 @@ void newton_state(const Engine* e, double* pos, double* acc) {
         }
 }
 
-int64_t newton_face_record(int64_t wide) { return wide ? sizeof(FaceRecord<double>) : sizeof(FaceRecord<float>); }
-int64_t newton_hinge_record(int64_t wide) { return wide ? sizeof(HingeRecord<double>) : sizeof(HingeRecord<float>); }
+int64_t newton_face_record() { return sizeof(FaceRecord<Real>); }
+int64_t newton_hinge_record() { return sizeof(HingeRecord<Real>); }
 
 // ---- single vertices on their own -----------------------------------------------------------------------------------------
 
@@ -1198,18 +1195,18 @@ void newton_alone(Engine* e, const float* pos, float* force, float* step) {
             if (i < e->num_rows) e->acc[4 * i + k] = (e->pos[4 * i + k] - e->base[3 * v + k]) / e->dt_sq;
         }
     }
-    differentiate<float>(*e);
+    differentiate<Real>(*e);
     for (int64_t row = 0; row < e->num_rows; ++row) {
-        const float* blocks = (const float*)e->own + 6 * row;
+        const Real* blocks = (const Real*)e->own + 6 * row;
         double upper[6];
         for (int k = 0; k < 6; ++k) upper[k] = blocks[k];
         if (e->membrane)
             for (int64_t i = e->face_starts[3 * row]; i < e->face_starts[3 * (row + 1)]; ++i) {
                 const int32_t* use = e->face_uses + 8 * i;
-                const FaceRecord<float>& face = ((const FaceRecord<float>*)e->face_model)[use[0]];
+                const FaceRecord<Real>& face = ((const FaceRecord<Real>*)e->face_model)[use[0]];
                 const int c = use[1];
                 for (int m = 0; m < 3; ++m) {
-                    const float* root = face.root + 9 * m + 3 * c;
+                    const Real* root = face.root + 9 * m + 3 * c;
                     const double own[3] = {root[0], root[1], root[2]};
                     add_outer(upper, 1.0, own);
                 }
@@ -1218,7 +1215,7 @@ void newton_alone(Engine* e, const float* pos, float* force, float* step) {
         if (e->bending)
             for (int64_t i = e->hinge_starts[4 * row]; i < e->hinge_starts[4 * (row + 1)]; ++i) {
                 const int32_t* use = e->hinge_uses + 10 * i;
-                const float* of = ((const HingeRecord<float>*)e->hinge_model)[use[0]].row + 3 * use[1];
+                const Real* of = ((const HingeRecord<Real>*)e->hinge_model)[use[0]].row + 3 * use[1];
                 const double own[3] = {of[0], of[1], of[2]};
                 add_outer(upper, 1.0, own);
             }

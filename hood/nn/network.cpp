@@ -25,6 +25,7 @@ constexpr int LANES = 4, SUMS = 12;
 constexpr int TILE = 96;       // rows: a multiple of every group of rows below
 constexpr int MOST = 512;      // columns of a latent
 constexpr int STEPS = 4;       // terms of a sum between two lines that are asked for
+alignas(64) constexpr float NOTHING[MOST] = {};
 
 typedef float V __attribute__((vector_size(4 * LANES)));
 typedef decltype(V{} > V{}) Mask;
@@ -59,10 +60,26 @@ constexpr int panel_of(int64_t columns) {
 
 // ---- products ------------------------------------------------------------------------------------------------------------
 
-// emit(row, column, a vector of x W) for R rows and the panel of P vectors that begins at a column.
-template <int R, int P, class Emit>
+// Rows of a table: one after the other, or at places; with a stride of 0 all the same.
+template <class T> struct Rows {
+    T* from = nullptr;
+    int64_t stride = 0;
+    const int64_t* places = nullptr;
+    inline T* at(int r) const { return from + (places ? places[r] : r) * stride; }
+};
+
+// Where a product goes: its sums and rows of one or two tables, no less than a floor. Not a function for each use: the loops around
+// the sums would be compiled as many times.
+struct Goal {
+    Rows<float> out;
+    Rows<const float> add, more;
+    float floor = -__builtin_inff();
+};
+
+// R rows of x W, of the panel of P vectors that begins at a column.
+template <int R, int P>
 inline void rows_product(const float* x, int64_t stride, int terms, const float* panel, int row, int column, Ahead& ahead,
-                         const Emit& emit) {
+                         const Goal& goal) {
     V sum[R][P];
 #pragma GCC unroll 24
     for (int r = 0; r < R; ++r)
@@ -79,33 +96,40 @@ inline void rows_product(const float* x, int64_t stride, int terms, const float*
 #pragma GCC unroll 4
             for (int j = 0; j < P; ++j) sum[r][j] += from[r * stride + k] * weight[j];
     }
+    const V floor = all(goal.floor);
 #pragma GCC unroll 24
-    for (int r = 0; r < R; ++r)
+    for (int r = 0; r < R; ++r) {
+        const float *add = goal.add.at(row + r) + column, *more = goal.more.from ? goal.more.at(row + r) + column : nullptr;
+        float* out = goal.out.at(row + r) + column;
 #pragma GCC unroll 4
-        for (int j = 0; j < P; ++j) emit(row + r, column + j * LANES, sum[r][j]);
+        for (int j = 0; j < P; ++j) {
+            V v = sum[r][j] + load(add + j * LANES);
+            if (more) v += load(more + j * LANES);
+            store(out + j * LANES, v < floor ? floor : v);  // keeps a NaN
+        }
+    }
 }
 
-template <int P, class Emit>
+template <int P>
 inline void panels_product(const float* x, int64_t stride, int rows, int terms, const float* weight, int columns, Ahead& ahead,
-                           const Emit& emit) {
+                           const Goal& goal) {
     constexpr int GROUP = SUMS / P;
     for (int column = 0; column < columns; column += P * LANES, weight += (int64_t)terms * P * LANES) {
         int row = 0;
-        for (; row + GROUP <= rows; row += GROUP) rows_product<GROUP, P>(x, stride, terms, weight, row, column, ahead, emit);
-        for (; row < rows; ++row) rows_product<1, P>(x, stride, terms, weight, row, column, ahead, emit);
+        for (; row + GROUP <= rows; row += GROUP) rows_product<GROUP, P>(x, stride, terms, weight, row, column, ahead, goal);
+        for (; row < rows; ++row) rows_product<1, P>(x, stride, terms, weight, row, column, ahead, goal);
     }
 }
 
 // All rows of a tile by all columns of a packed weight.
-template <class Emit>
-inline void product(const float* x, int64_t stride, int rows, int64_t terms, const float* weight, int64_t columns, Ahead& ahead,
-                    const Emit& emit) {
+void product(const float* x, int64_t stride, int rows, int64_t terms, const float* weight, int64_t columns, Ahead& ahead,
+             const Goal& goal) {
     const int wide = padded(columns);
     switch (panel_of(columns)) {
-        case 4: return panels_product<4>(x, stride, rows, (int)terms, weight, wide, ahead, emit);
-        case 3: return panels_product<3>(x, stride, rows, (int)terms, weight, wide, ahead, emit);
-        case 2: return panels_product<2>(x, stride, rows, (int)terms, weight, wide, ahead, emit);
-        default: return panels_product<1>(x, stride, rows, (int)terms, weight, wide, ahead, emit);
+        case 4: return panels_product<4>(x, stride, rows, (int)terms, weight, wide, ahead, goal);
+        case 3: return panels_product<3>(x, stride, rows, (int)terms, weight, wide, ahead, goal);
+        case 2: return panels_product<2>(x, stride, rows, (int)terms, weight, wide, ahead, goal);
+        default: return panels_product<1>(x, stride, rows, (int)terms, weight, wide, ahead, goal);
     }
 }
 
@@ -179,13 +203,12 @@ void normalise_rows(const Perceptron& p, float* rows, int count) {
 }
 
 // The layers behind the first, from its output before the ReLU (in `one`, which is overwritten); rows of padded(p.out) in `raw`.
-// No template: the products are long to compile.
 void layers_behind(const Perceptron& p, float* one, int rows, Ahead& ahead, float* raw) {
     alignas(64) static thread_local float two[TILE * MOST];
     const int d = (int)p.width, out = padded(p.out);
     for (int i = 0; i < rows * d; i += LANES) store(one + i, relu(load(one + i)));
-    product(one, d, rows, d, p.second, d, ahead, [&](int r, int c, V v) { store(two + r * d + c, relu(v + load(p.bias_2 + c))); });
-    product(two, d, rows, d, p.third, p.out, ahead, [&](int r, int c, V v) { store(raw + r * out + c, v + load(p.bias_3 + c)); });
+    product(one, d, rows, d, p.second, d, ahead, {{two, d}, {p.bias_2}, {}, 0.0f});
+    product(two, d, rows, d, p.third, p.out, ahead, {{raw, out}, {p.bias_3}, {}});
     if (p.scale) normalise_rows(p, raw, rows);
 }
 
@@ -243,9 +266,8 @@ void node_parts(const Part& part, const Edges& edges, const float* nodes, const 
         ahead.clear();
         fetch_places(ahead, nodes, edges.nodes, edges.num_nodes, start + TILE, d);
         float *receiver = memory.receiver + start * d, *sender = memory.sender + start * d;
-        product(tile, d, rows, d, part.to_receiver, d, ahead,
-                [&](int r, int c, V v) { store(receiver + r * d + c, v + load(part.network.bias_1 + c)); });
-        product(tile, d, rows, d, part.to_sender, d, ahead, [&](int r, int c, V v) { store(sender + r * d + c, v); });
+        product(tile, d, rows, d, part.to_receiver, d, ahead, {{receiver, d}, {part.network.bias_1}, {}});
+        product(tile, d, rows, d, part.to_sender, d, ahead, {{sender, d}, {NOTHING}, {}});
     }
 }
 
@@ -270,9 +292,7 @@ void update_edges(const Part& part, const Edges& edges, float* latent, const Mem
         else
             fetch_rows(ahead, latent, edges.num_edges, start + TILE, d);
         fetch_places(ahead, memory.sender, edges.senders, edges.num_edges, start + TILE, d);
-        product(x, d, rows, d, part.to_edge, d, ahead, [&](int r, int c, V v) {
-            store(one + r * d + c, v + load(memory.receiver + receivers[r] * d + c) + load(memory.sender + senders[r] * d + c));
-        });
+        product(x, d, rows, d, part.to_edge, d, ahead, {{one, d}, {memory.receiver, d, receivers}, {memory.sender, d, senders}});
         tail(part.network, one, rows, ahead, [&](int r, const float* message) {
             float* at = latent + (places ? places[r] : start + r) * d;
             for (int c = 0; c < d; c += LANES) store(at + c, load(at + c) + load(message + c));
@@ -296,10 +316,8 @@ void add_received(const Part& part, const Edges& edges, bool mean, const Memory&
             const int64_t degree = edges.offsets[start + r + 1] - edges.offsets[start + r];
             for (int c = 0; c < d; c += LANES) store(received + r * d + c, load(received + r * d + c) / (float)(degree > 1 ? degree : 1));
         }
-        product(received, d, rows, d, part.to_node, d, ahead, [&](int r, int c, V v) {
-            float* at = memory.hidden + edges.nodes[start + r] * d + c;
-            store(at, load(at) + v);
-        });
+        const int64_t* nodes = edges.nodes + start;
+        product(received, d, rows, d, part.to_node, d, ahead, {{memory.hidden, d, nodes}, {memory.hidden, d, nodes}, {}});
     }
 }
 
@@ -311,7 +329,7 @@ void take_step(const Step& step, const Edges* edges, float* const* latents, floa
         ahead.clear();
         fetch_rows(ahead, nodes, num_nodes, start + TILE, d);
         product(nodes + start * d, d, tile_of(num_nodes, start), d, step.own, d, ahead,
-                [&](int r, int c, V v) { store(memory.hidden + (start + r) * d + c, v + load(step.network.bias_1 + c)); });
+                {{memory.hidden + start * d, d}, {step.network.bias_1}, {}});
     }
     for (int64_t i = 0; i < step.num_parts; ++i) {
         const Part& part = step.parts[i];
@@ -362,8 +380,7 @@ void network_rows(const Perceptron* p, const float* x, int64_t count, float* out
         const int rows = tile_of(count, start);
         ahead.clear();
         fetch_rows(ahead, x, count, start + TILE, (int)p->in);
-        product(x + start * p->in, p->in, rows, p->in, p->first, d, ahead,
-                [&](int r, int c, V v) { store(one + r * d + c, v + load(p->bias_1 + c)); });
+        product(x + start * p->in, p->in, rows, p->in, p->first, d, ahead, {{one, d}, {p->bias_1}, {}});
         tail(*p, one, rows, ahead, [&](int r, const float* row) {
             float* at = out + (start + r) * p->out;
             for (int64_t c = 0; c < p->out; ++c) at[c] = add ? at[c] + row[c] : row[c];

@@ -26,6 +26,7 @@ from hood.losses.problem import STANDARD_GRAVITY, StepProblem, inertial_guess
 from hood.losses.stretching import Stretching
 from hood.mesh.layers import EASED, LEFT
 from hood.native.build import NATIVE_FLAGS, build
+from hood.native.libraries import WIDE_FLAGS
 from hood.native.structures import COUNT, POINTER, REAL, fields
 from hood.native.threads import num_parts
 from hood.scene.cloth import Cloth
@@ -66,7 +67,7 @@ class _Engine(ctypes.Structure):
         *fields("pos acc trial_pos trial_acc gradient direction path face_force hinge_force", POINTER),
         *fields("face_model hinge_model matrix slack own own_slack row_sum inverse x r z p q", POINTER),
         *fields("sharpness raised phi noise", REAL),
-        *fields("wide cg_used parts reach", COUNT),
+        *fields("cg_used parts reach", COUNT),
         *fields("spill layers vertex_of_scene", POINTER),
         *fields("kept eased", REAL),
         ("layer_grips", POINTER),
@@ -80,13 +81,13 @@ class _LayerGrips(ctypes.Structure):
 
 
 @cache
-def library() -> ctypes.CDLL:
-    """The compiled solver.
+def library(wide: bool = False) -> ctypes.CDLL:
+    """The compiled solver, its matrix and linear solver in float32, or in float64 (``wide``).
 
     Raises:
         hood.native.build.BuildError: there is no compiler, or it fails.
     """
-    lib = build(SOURCE, NATIVE_FLAGS)
+    lib = build(SOURCE, WIDE_FLAGS if wide else NATIVE_FLAGS)
     lib.newton_model.restype = REAL
     lib.newton_move.argtypes = [POINTER, REAL, COUNT]
     lib.newton_matrix.argtypes = [POINTER, REAL]
@@ -196,7 +197,6 @@ class SceneEngine:
 
     def __init__(self, cloth: Cloth, tables: Tables) -> None:
         self.tables = tables
-        self._lib = library()
         self._kept: dict[str, Any] = {}  # what the structure points to
         self._fabric: tuple[tuple[Tensor | float, ...], Fabric] | None = None
         self.values = _Engine(
@@ -239,21 +239,21 @@ class SceneEngine:
     def widen(self, wide: bool) -> None:
         """Matrix and linear solver in float64, or in float32."""
         key = (wide, self.values.parts)
+        self.wide, self._lib = wide, library(wide)
         if key not in self._memory:
-            self._memory[key] = self._working_memory(wide)
+            self._memory[key] = self._working_memory()
         self._point(**self._memory[key])
-        self.values.wide = wide
 
-    def _working_memory(self, wide: bool) -> dict[str, np.ndarray]:
-        values, kind = self.values, np.float64 if wide else np.float32
+    def _working_memory(self) -> dict[str, np.ndarray]:
+        values, kind = self.values, np.float64 if self.wide else np.float32
         rows, blocks = values.num_rows, values.num_blocks
         sizes = {"matrix": 9 * blocks + 1, "slack": blocks, "own": 6 * rows, "own_slack": 6 * rows, "inverse": 12 * rows}
         memory = {name: np.zeros(count, kind) for name, count in sizes.items()}
         memory |= {name: np.zeros(4 * rows, kind) for name in "xrzpq"}
         memory["row_sum"] = _aligned(16 * values.most_blocks * values.parts, kind)
         memory["spill"] = _aligned(4 * values.reach * (values.parts - 1), kind)
-        memory["face_model"] = np.zeros(values.num_faces * self._lib.newton_face_record(int(wide)), np.uint8)
-        memory["hinge_model"] = np.zeros(values.num_hinges * self._lib.newton_hinge_record(int(wide)), np.uint8)
+        memory["face_model"] = np.zeros(values.num_faces * self._lib.newton_face_record(), np.uint8)
+        memory["hinge_model"] = np.zeros(values.num_hinges * self._lib.newton_hinge_record(), np.uint8)
         return memory
 
     def enter(self, step: EngineStep, scene: int) -> None:
@@ -464,7 +464,7 @@ class EngineSystem:
     def _move(self, engine: SceneEngine, residual: float) -> bool:
         if engine.move(residual, self._cg_iterations):
             return True
-        if engine.values.wide:
+        if engine.wide:
             return False
         engine.widen(True)
         engine.model()

@@ -1,7 +1,7 @@
 """What is measured of a step that was taken: energies, the force left over, and what they are compared with.
 
-On a CPU everything goes through compiled passes and numpy: between two frames a small call of torch costs 30 µs, and there would
-be a hundred of them. :class:`hood.losses.potential.Potential` is the reference, and computes the energies on an accelerator and
+On a CPU everything goes through compiled passes and numpy: between two frames a small call of torch costs 30 µs, and there are
+a hundred of them. :class:`hood.losses.potential.Potential` is the reference, and computes the energies on an accelerator and
 without a compiler.
 """
 

@@ -25,6 +25,7 @@ def source(compiler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
     for module in (prebuilt, libraries):
         monkeypatch.setattr(module, "levels", lambda: LEVELS)
     monkeypatch.setattr(libraries, "LIBRARIES", ((path, FLAGS),))
+    monkeypatch.setattr(libraries, "SELDOM", ())
     chosen = {"wide": "-DWIDE", "plain": "-DPLAIN"}
     monkeypatch.setattr(
         libraries,
@@ -72,6 +73,7 @@ def test_the_list_names_what_the_modules_ask_for():
     from hood.mesh import surface_tree
     from hood.solver import engine
 
+    assert (engine.SOURCE, libraries.WIDE_FLAGS) in libraries.SELDOM
     listed = {path for path, _ in libraries.LIBRARIES}
     assert {engine.SOURCE, surface_tree.SOURCE, drawing.SOURCE} <= listed
     assert all(path.exists() for path in listed)
