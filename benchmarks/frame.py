@@ -20,7 +20,6 @@ import argparse
 import os
 import sys
 import time
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -53,12 +52,11 @@ POTENTIAL = default_potential()
 
 
 def refined(garment: Garment, count: int) -> Garment:
-    """The garment with its longest edges halved until it has ``count`` vertices; unbound, nothing pinned."""
-    pos, faces = garment.rest_pos, garment.faces
+    """The garment's shape in T-pose with the longest edges halved until it has ``count`` vertices; unbound, nothing pinned."""
+    pos, faces = garment.rest_pos if garment.skin_pos is None else garment.skin_pos, garment.faces
     while len(pos) < count:
         pos, faces = _halve(pos, faces, count - len(pos))
-    bare = dict(lbs_weights=None, shapedirs=None, bound_to=None, uv=None, uv_faces=None)
-    return replace(garment, rest_pos=pos, faces=faces, pinned=np.zeros(len(pos), dtype=bool), **bare)
+    return Garment(garment.name, pos, faces, np.zeros(len(pos), dtype=bool))
 
 
 def _halve(pos: np.ndarray, faces: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
