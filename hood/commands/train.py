@@ -37,6 +37,7 @@ _BOOKKEEPING = (
     "workers",
     "activation_checkpointing",
     "checkpoint_every",
+    "keep_at",
     "log_every",
     "validate_every",
     "validation_frames",

@@ -61,6 +61,27 @@ class WarmupCosine:
 
 
 @dataclass(frozen=True)
+class InverseRoot:
+    """Learning-rate factor: linear over ``warmup`` iterations, 1 until iteration ``steady``, then √(steady / iteration).
+
+    It does not ask how long the run will be: the first n updates of a long run are the run of n updates.
+    """
+
+    warmup: int = 50
+    steady: int = 100
+
+    def __call__(self, iteration: int, num_iterations: int) -> float:
+        return min((iteration + 1) / max(self.warmup, 1), math.sqrt(max(self.steady, 1) / max(iteration, 1)), 1.0)
+
+    def scaled(self, factor: float) -> InverseRoot:
+        """The same with warm-up and steady part ``factor`` times as long."""
+        warmup, steady = (
+            scaled_count(f"trainer.schedule.{name}", getattr(self, name), factor) for name in ("warmup", "steady")
+        )
+        return replace(self, warmup=warmup, steady=steady)
+
+
+@dataclass(frozen=True)
 class CollisionRamp:
     """Collision weight [J/m³] rising linearly from ``start`` to ``end`` between two iterations."""
 

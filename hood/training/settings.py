@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 from hood.nn.choice import AUTO
 from hood.nn.compiled import KERNELS
 from hood.nn.model import PRECISIONS
-from hood.training.curriculum import CollisionRamp, Horizon, StepDecay, WarmupCosine, scaled_count
+from hood.training.curriculum import CollisionRamp, Horizon, InverseRoot, StepDecay, WarmupCosine, scaled_count
 from hood.training.optimiser import OPTIMIZERS
 
 
@@ -19,6 +20,7 @@ class TrainerSettings:
     1 + rg / 3, so that one broken scene does not drown the others.
     ``max_skipped``: updates without a finite loss and gradient in a row after which training goes back to the last good
     checkpoint, on other scenes; ``max_rollbacks``: how often it does so without getting any further.
+    ``keep_at``: iterations whose weights and checkpoint stay, in the folder ``kept`` of the run.
     ``precision``: of the network's latents and products; ``"bf16"`` keeps weights, their gradients and energies in float32.
     ``kernels``: of the network on a CPU, see :meth:`hood.nn.model.MeshGraphNet.use_kernels`; ``auto``: those that train fastest
     here, :mod:`hood.nn.choice`.
@@ -30,7 +32,7 @@ class TrainerSettings:
     iterations: int = 150_000
     batch_size: int = 1
     learning_rate: float = 5e-5
-    schedule: StepDecay | WarmupCosine = field(default_factory=StepDecay)
+    schedule: StepDecay | WarmupCosine | InverseRoot = field(default_factory=StepDecay)
     horizon: Horizon = field(default_factory=Horizon)
     collision: CollisionRamp = field(default_factory=lambda: CollisionRamp(5e3, 5e5, 50_000, 150_000))
     clip_norm: float = 1.0
@@ -41,6 +43,7 @@ class TrainerSettings:
     kernels: str = "torch"
     statistics_iterations: int = 100
     checkpoint_every: int = 500
+    keep_at: Sequence[int] = ()
     log_every: int = 20
     validate_every: int = 0
     max_skipped: int = 20
@@ -65,6 +68,9 @@ class TrainerSettings:
         for name in ("validate_every", "max_rollbacks"):
             if getattr(self, name) < 0:
                 raise ValueError(f"trainer.{name} is {getattr(self, name)}; it must be at least 0")
+        object.__setattr__(self, "keep_at", tuple(self.keep_at))  # a list in a config
+        if any(iteration < 1 for iteration in self.keep_at):
+            raise ValueError(f"trainer.keep_at is {list(self.keep_at)}; iterations are at least 1")
         if self.learning_rate <= 0 or self.clip_norm <= 0:
             raise ValueError("trainer.learning_rate and trainer.clip_norm must be > 0")
         if self.time_scale != 1.0:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
+from hood.assets.atomic import write_atomically
 from hood.dynamics.checkpoint import save_simulator
 from hood.dynamics.output import AccelerationOutput
 from hood.dynamics.ranges import training_conditions
@@ -49,8 +50,9 @@ class Trainer:
     """Owns the optimisation: slots of running rollouts, optimiser, averaged weights, checkpoints.
 
     Files in ``folder``: ``checkpoint.pt`` and ``checkpoint.previous.pt`` (resume), ``model.safetensors`` (use),
-    ``best.safetensors`` (use; the best validation so far), ``metrics.jsonl``, ``validation/``, TensorBoard events. Process 0
-    alone writes and reads them. A disk that refuses a file ends the training with the last checkpoint intact.
+    ``best.safetensors`` (use; the best validation so far), ``kept/`` (checkpoint and weights of the iterations ``keep_at``),
+    ``metrics.jsonl``, ``validation/``, TensorBoard events. Process 0 alone writes and reads them. A disk that refuses a file
+    ends the training with the last checkpoint intact.
     """
 
     def __init__(
@@ -124,7 +126,8 @@ class Trainer:
                 report = self.update()
                 last = self.iteration == settings.iterations
                 # In the middle of a streak of skipped updates the weights are not known to be good.
-                saving = last or (self.iteration % settings.checkpoint_every == 0 and not self._skipped_in_row)
+                keeping = self.iteration in settings.keep_at
+                saving = last or ((keeping or self.iteration % settings.checkpoint_every == 0) and not self._skipped_in_row)
                 if self._is_lost(saving):
                     self._roll_back()
                     clock = Clock(self.iteration)
@@ -141,6 +144,8 @@ class Trainer:
                         progress(self.iteration, None)
                 if saving:
                     self.save()
+                if saving and keeping:
+                    distributed.on_main(self._keep)
             if self.iteration != self._saved_at and not self._is_lost(True):
                 self.save()
         return self.iteration >= settings.iterations
@@ -262,6 +267,13 @@ class Trainer:
     def _write(self, state: dict[str, Any]) -> None:
         save_checkpoint(self.checkpoint_path, state)
         save_simulator(self.folder / "model.safetensors", self.averaged(), {"iteration": str(self.iteration)})
+
+    def _keep(self) -> None:
+        """Copies of what was just saved, under the iteration's number."""
+        folder = self.folder / "kept"
+        folder.mkdir(exist_ok=True)
+        for source in (self.checkpoint_path, self.folder / "model.safetensors"):
+            write_atomically(folder / f"{self.iteration:06d}{source.suffix}", source.read_bytes())
 
     def _restore(self, state: Mapping[str, Any]) -> None:
         """What is learned, as it was at the checkpoint."""

@@ -8,7 +8,7 @@ import pytest
 
 from hood.config import build, load_config
 from hood.losses.potential import default_potential
-from hood.training.curriculum import CollisionRamp, Horizon, StepDecay, WarmupCosine
+from hood.training.curriculum import CollisionRamp, Horizon, InverseRoot, StepDecay, WarmupCosine
 from hood.training.settings import TrainerSettings
 
 
@@ -30,6 +30,14 @@ def test_warm_up_is_linear_and_the_cosine_ends_at_the_floor() -> None:
     assert schedule(1000, 1000) == schedule(5000, 1000) == pytest.approx(0.01)
     rates = [schedule(i, 1000) for i in range(50, 1001)]
     assert all(later < earlier for earlier, later in zip(rates, rates[1:], strict=False))
+
+
+def test_the_inverse_root_does_not_ask_how_long_a_run_is() -> None:
+    schedule = InverseRoot(warmup=50, steady=100)
+    assert [schedule(i, 1000) for i in (0, 24, 49, 100)] == pytest.approx([0.02, 0.5, 1.0, 1.0])
+    assert [schedule(i, 1000) for i in (400, 2500, 10_000)] == pytest.approx([0.5, 0.2, 0.1])
+    assert all(schedule(i, 1000) == schedule(i, 150_000) for i in range(0, 1000, 7))
+    assert schedule.scaled(0.5) == InverseRoot(25, 50)
 
 
 def test_schedules_survive_runs_shorter_than_the_warm_up() -> None:

@@ -25,7 +25,7 @@ from hood.losses.potential import Potential, default_potential
 from hood.nn.choice import Choice
 from hood.scene.dataset import SceneSampler, Window
 from hood.training import trainer as trainer_module
-from hood.training.curriculum import CollisionRamp, Horizon, WarmupCosine
+from hood.training.curriculum import CollisionRamp, Horizon, InverseRoot, WarmupCosine
 from hood.training.settings import TrainerSettings
 from hood.training.trainer import Trainer
 
@@ -229,6 +229,27 @@ def test_averaged_weights(tmp_path: Path, sampler: SceneSampler) -> None:
     off = make(tmp_path, sampler, settings=replace(SETTINGS, ema_decay=0.0))
     off.update()
     assert_same(dict(off.simulator.state_dict()), dict(off.averaged().state_dict()))
+
+
+def test_marked_iterations_are_kept_and_are_whole_runs(tmp_path: Path, sampler: SceneSampler) -> None:
+    """What is kept of a long run is the run that ends there, and the long run can go on from it."""
+    endless = replace(SETTINGS, iterations=6, schedule=InverseRoot(2, 3), keep_at=[3, 5])
+    whole = make(tmp_path / "long", sampler, settings=endless)
+    assert whole.run()
+    kept = tmp_path / "long" / "kept"
+    names = [f"{number}.{kind}" for number in ("000003", "000005") for kind in ("pt", "safetensors")]
+    assert sorted(path.name for path in kept.iterdir()) == names
+    short = make(tmp_path / "short", sampler, settings=replace(endless, iterations=3))
+    assert short.run()
+    assert_same(dict(load_simulator(kept / "000003.safetensors").state_dict()), dict(short.averaged().state_dict()))
+
+    again = make(tmp_path / "again", sampler, settings=endless)
+    again.resume(kept / "000003.pt")
+    assert again.run()
+    assert_same(dict(again.averaged().state_dict()), dict(whole.averaged().state_dict()))
+    assert not (tmp_path / "again" / "kept" / "000003.pt").exists()
+    with pytest.raises(ValueError, match="keep_at"):
+        replace(SETTINGS, keep_at=[0])
 
 
 def test_kernels_are_those_that_train_fastest_here(
