@@ -6,6 +6,7 @@
     python benchmarks/recipes.py ablations                  # Fine15, Fine48 and Ours with equal updates and with equal time
     python benchmarks/recipes.py levels                     # the small model with one, two and three levels
     python benchmarks/recipes.py shipped                    # both again, told what the potential asks of single vertices
+    python benchmarks/recipes.py heads                      # one pass that predicts positions, or edges to solve positions from
 
 Every run is ``hood train`` in a process of its own with one thread, ``--jobs`` of them side by side; its time is the CPU time
 of that process, so that a busy machine changes nothing. Every finished run is evaluated by ``hood evaluate`` on motions it
@@ -76,6 +77,8 @@ LEVELS = {
     "small2": "2x(mesh+coarse0) 4x(coarse0+coarse1) 2x(mesh+coarse0)",
     "small3": "2x(mesh+coarse0) 1x(coarse0+coarse1) 2x(coarse1+coarse2) 1x(coarse0+coarse1) 2x(mesh+coarse0)",
 }
+#: The same network and features with edges as output.
+EDGES = ("model=edges",)
 EIGHT_PASSES = fast("8 passes, 11 steps", SHORT, "model=passes")
 
 SUITES: dict[str, list[Recipe]] = {
@@ -117,6 +120,11 @@ SUITES: dict[str, list[Recipe]] = {
     "shipped": [
         fast(f"{name}, one pass", SHIPPED_UPDATES, *ONE_PASS, f"model.schedule='{schedule}'")
         for name, schedule in ({name: name for name in ("fine15", "ours", "fine48")} | LEVELS).items()
+    ],
+    "heads": [
+        fast("positions", 2 * SHORT, *ONE_PASS),
+        fast("edges", 2 * SHORT, *EDGES),
+        fast("edges, physical features", 2 * SHORT, *EDGES, "model.features=physical"),
     ],
 }
 

@@ -70,6 +70,7 @@ class FixedStep:
         self._like, self._potential = like, potential
         self._rows = self._edge_rows()
         self._incidence = incidence_of(like.cloth)
+        assert like.cloth.scene_sizes  # known to the host before anything is captured
 
     def __call__(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """The fields of :class:`StepResult`."""

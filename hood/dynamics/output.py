@@ -35,7 +35,8 @@ class Output(ABC, nn.Module):
     """Turns raw network output into displacements [m] from a base position."""
 
     needs_contact = False  # of the problem that ``base`` is asked for
-    width = 3  # columns of the raw output
+    width = 3  # columns of the raw output of vertices
+    edge_width = 0  # and of mesh edges
 
     @abstractmethod
     def base(self, problem: StepProblem) -> Tensor:
@@ -109,6 +110,14 @@ class VelocityBaseOutput(Output):
     def displacement(self, raw: Tensor) -> Tensor:
         return self.scale * raw
 
+    def outside(self, problem: StepProblem, pos: Tensor) -> Tensor:
+        """``pos`` (V, 3) taken out of the body at t + 1, up to the depth in the contact zone that cloth's forces reach."""
+        contact = problem.contact
+        if contact is None:
+            return pos
+        depth = (self.clearance - _DEEPEST - contact.next_dist(pos)).clamp_min(0.0) * contact.valid
+        return pos + depth.unsqueeze(1) * contact.next_normal
+
 
 class LocalStepOutput(VelocityBaseOutput):
     """Corrections in several passes, each with a share of the vertices' own steps down the potential.
@@ -148,14 +157,6 @@ class LocalStepOutput(VelocityBaseOutput):
         native.call("take", body, *tables, free, fixed.contiguous(), len(pos), *limits, pos)
         return pos
 
-    def outside(self, problem: StepProblem, pos: Tensor) -> Tensor:
-        """``pos`` (V, 3) taken out of the body at t + 1, up to the depth in the contact zone that cloth's forces reach."""
-        contact = problem.contact
-        if contact is None:
-            return pos
-        depth = (self.clearance - _DEEPEST - contact.next_dist(pos)).clamp_min(0.0) * contact.valid
-        return pos + depth.unsqueeze(1) * contact.next_normal
-
 
 def _smooth(values: Tensor, trust: Tensor, edges: Tensor) -> Tensor:
     """Trust-weighted averages of ``values`` (V, 3) over growing neighbourhoods: untrusted vertices take their neighbours'
@@ -171,6 +172,3 @@ def _smooth(values: Tensor, trust: Tensor, edges: Tensor) -> Tensor:
         # A vertex keeps its own say in every round, in proportion to its trust.
         smooth = weight * total + (1.0 - 0.5 * weight) * spread
     return smooth[:, :3] / smooth[:, 3:].clamp_min(1e-12)
-
-
-OUTPUTS = {"acceleration": AccelerationOutput, "velocity_base": VelocityBaseOutput, "local_steps": LocalStepOutput}

@@ -10,8 +10,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from hood.dynamics.edge_output import EdgeOutput
 from hood.dynamics.frames import FrameRules, Relaxing
-from hood.dynamics.output import OUTPUTS, AccelerationOutput, LocalStepOutput, Output, VelocityBaseOutput
+from hood.dynamics.output import AccelerationOutput, Held, LocalStepOutput, Output, VelocityBaseOutput
 from hood.dynamics.passes import Feedback, Passes
 from hood.dynamics.ranges import Conditions
 from hood.dynamics.stopwatch import Stopwatch, timed
@@ -90,7 +91,7 @@ class Simulator(nn.Module):
         self.register_buffer("gravity", torch.tensor([0.0, -9.81, 0.0]), persistent=False)
         self.trained_for: Conditions | None = None  # None: unknown
         self._potential = default_potential()
-        self._wants_feedback = isinstance(output, LocalStepOutput)
+        self._wants_feedback = any(isinstance(group, local.LocalStep) for group in features.node)
         self._wants_residual = not self._wants_feedback and any(isinstance(group, physical.Residual) for group in features.node)
         self._wants_base = any(isinstance(group, physical.RelativeVelocity) for group in features.node)
 
@@ -240,6 +241,10 @@ class Simulator(nn.Module):
     ) -> Prediction:
         """Positions at t + 1 from the features of what was looked at."""
         graph, base = sight.inputs.graph, sight.base
+        if isinstance(self.output, EdgeOutput):
+            held = Held(problem.cloth.free, self._fixed(problem))
+            pos = self.output.positions(seen, graph, base, *self.network.with_edges(graph, nodes, edges), held)
+            return Prediction(pos, problem.acceleration(pos))
         if sight.feedback is None:
             return self.integrate(problem, base, self.network(graph, nodes, edges))
         assert isinstance(self.output, LocalStepOutput)
@@ -299,6 +304,10 @@ class Simulator(nn.Module):
         return -gradient / problem.cloth.mass.clamp_min(1e-12).unsqueeze(1) * problem.cloth.free.unsqueeze(1)
 
 
+#: What a model's output may be.
+OUTPUTS = ("acceleration", "velocity_base", "local_steps", "edges")
+
+
 def build_simulator(
     features: str = "paper",
     output: str = "acceleration",
@@ -327,14 +336,16 @@ def build_simulator(
     Args:
         features: ``paper`` (node 24, edge 12, body edge 9, running statistics), ``physical`` (fixed scales, residual) or
             ``local`` (the same with what every vertex and its neighbourhood would do about the residual).
-        output: ``acceleration`` (paper), ``velocity_base`` (corrections to a base that moves with the body) or
-            ``local_steps`` (several such corrections with shares of the vertices' own steps; features=local).
+        output: ``acceleration`` (paper), ``velocity_base`` (corrections to a base that moves with the body),
+            ``local_steps`` (several such corrections with shares of the vertices' own steps; features=local) or ``edges``
+            (corrections to the edges of the base, and a linear solve for the positions; features=physical or local).
         schedule: name (``ours``, ``fine15``, ``fine48``) or text such as ``3x(mesh+coarse0) 3x(coarse0)``; ``|`` between
             passes (``local_steps`` only).
         latent_dim: width of all latents.
         aggregation: ``sum`` or ``mean`` of the messages at a node.
         body_radius: reach of body edges [m].
-        output_scale: displacement [m] of one unit of raw output (``velocity_base``; ``local_steps`` in the first pass).
+        output_scale: displacement [m] of one unit of raw output (``velocity_base``; ``local_steps`` in the first pass; of the
+            anchors of ``edges``).
         output_init: factor on the decoder's last layer at the start.
         normalizer_decay: decay of the exponentially weighted statistics (``paper`` features).
         body_velocity: displacement of the body that its nodes see: from the ``previous`` frame or to the ``next``
@@ -351,12 +362,16 @@ def build_simulator(
     for name in ("latent_dim", "body_radius", "output_scale", "late_scale", "layer_radius"):
         if name in config and not config[name] > 0:
             raise ValueError(f"model.{name} is {config[name]!r}; it must be > 0")
-    for name, value, known in (("features", features, ("paper", "physical", "local")), ("output", output, tuple(OUTPUTS))):
+    for name, value, known in (("features", features, ("paper", "physical", "local")), ("output", output, OUTPUTS)):
         if value not in known:
             raise ValueError(f"model.{name} is {value!r}; choose {' or '.join(known)}")
-    if features == "physical" and output != "velocity_base":
-        raise ValueError("model.features=physical describes corrections to a base; it needs model.output=velocity_base")
-    if (features == "local") != (output == "local_steps"):
+    if output == "edges" and features == "paper":
+        raise ValueError("model.output=edges corrects a base; it needs model.features=physical or model.features=local")
+    if features == "physical" and output not in ("velocity_base", "edges"):
+        raise ValueError(
+            "model.features=physical describes corrections to a base; it needs model.output=velocity_base or model.output=edges"
+        )
+    if (features == "local") != (output == "local_steps") and output != "edges":
         raise ValueError(f"model.features={features} with model.output={output}: local and local_steps need each other")
     if len(parse_passes(schedule)) > 1 and output != "local_steps":
         raise ValueError(f"model.schedule has several passes (|); they need model.output=local_steps, not {output}")
@@ -375,11 +390,13 @@ def build_simulator(
         head = AccelerationOutput(normalizer_decay, divisor_floor)
     elif output == "velocity_base":
         head = VelocityBaseOutput(output_scale)
+    elif output == "edges":
+        head = EdgeOutput(output_scale)
     else:
         head = LocalStepOutput(output_scale, late_scale=late_scale)
     widths = (feature_set.node_width, feature_set.edge_widths)
     network = MeshGraphNet(
-        *widths, latent_dim, schedule, head.width, aggregation, output_init, coarse_encoders, local.LOOK_WIDTHS
+        *widths, latent_dim, schedule, head.width, aggregation, output_init, coarse_encoders, local.LOOK_WIDTHS, head.edge_width
     )
     return Simulator(feature_set, network, head, body_radius, config, rules, num_levels, layer_radius)
 

@@ -235,6 +235,60 @@ void features_residuals(const Neighbours* mesh, const float* force, const float*
     }
 }
 
+// u (V, 4) with (diag(weight) + k L) u = force (V, 3) where free, L the mesh's graph Laplacian, and u = 0 elsewhere: conjugate
+// gradients with the diagonal as preconditioner. The scenes do not touch each other and take as many steps as `steps` says of each;
+// a vertex is of scene[v], all of the first one if there is no such table. sums (3, scenes), memory (4, V, 4).
+void features_fit(const Neighbours* mesh, const float* weight, const float* force, const uint8_t* free, const int64_t* scene,
+                  int64_t scenes, const int64_t* steps, float k, float* u, double* sums, float* memory) {
+    const int64_t count = mesh->count;
+    float *r = memory, *p = memory + 4 * count, *q = memory + 8 * count, *inverse = memory + 12 * count;
+    double *rz = sums, *pq = sums + scenes, *after = sums + 2 * scenes;
+    int64_t most = 0;
+    for (int64_t s = 0; s < scenes; ++s) {
+        rz[s] = 0.0;
+        most = steps[s] > most ? steps[s] : most;
+    }
+    const auto of = [scene](int64_t v) { return scene ? scene[v] : 0; };
+    const auto add = [](double* sum, F4 a, F4 b) {
+        const F4 c = a * b;
+        *sum += (double)c[0] + (double)c[1] + (double)c[2];
+    };
+    for (int64_t v = 0; v < count; ++v) {
+        const float degree = (float)(mesh->first[v + 1] - mesh->first[v]), diagonal = weight[v] + k * degree;
+        inverse[4 * v] = free[v] ? 1.0f / diagonal : 0.0f;
+        inverse[4 * v + 1] = diagonal;
+        const F4 given = free[v] ? F4{force[3 * v], force[3 * v + 1], force[3 * v + 2], 0.0f} : F4{};
+        store(r + 4 * v, given);
+        store(p + 4 * v, inverse[4 * v] * given);
+        store(u + 4 * v, F4{});
+        add(rz + of(v), given, load(p + 4 * v));
+    }
+    for (int64_t step = 0; step < most; ++step) {
+        for (int64_t s = 0; s < scenes; ++s) pq[s] = after[s] = 0.0;
+        for (int64_t v = 0; v < count; ++v) {
+            F4 sum = F4{};
+            for (int64_t i = mesh->first[v]; i < mesh->first[v + 1]; ++i) sum += load(p + 4 * mesh->other[i]);
+            const F4 own = load(p + 4 * v), here = inverse[4 * v + 1] * own - k * sum;
+            store(q + 4 * v, here);
+            add(pq + of(v), own, here);
+        }
+        for (int64_t v = 0; v < count; ++v) {
+            const int64_t s = of(v);
+            const float length = step < steps[s] && pq[s] > 0.0 ? (float)(rz[s] / pq[s]) : 0.0f;
+            store(u + 4 * v, load(u + 4 * v) + length * load(p + 4 * v));
+            const F4 left = free[v] ? load(r + 4 * v) - length * load(q + 4 * v) : F4{};
+            store(r + 4 * v, left);
+            add(after + s, left, inverse[4 * v] * left);
+        }
+        for (int64_t v = 0; v < count; ++v) {
+            const int64_t s = of(v);
+            const float share = rz[s] > 0.0 ? (float)(after[s] / rz[s]) : 0.0f;
+            store(p + 4 * v, inverse[4 * v] * load(r + 4 * v) + share * load(p + 4 * v));
+        }
+        for (int64_t s = 0; s < scenes; ++s) rz[s] = after[s];
+    }
+}
+
 // Positions that have moved with the body: its matched points' way, averaged over growing neighbourhoods with the trust that a
 // vertex has in its own (1 where pinned, falling with the distance over `reach`), then out of the body. memory (3, V, 4).
 void features_base(const Neighbours* mesh, const Planes* planes, const float* pos, const uint8_t* pinned, const float* target,

@@ -215,25 +215,25 @@ class Inference:
     ) -> None:
         self._lib, self._weights, self._width = library(), weights, network.latent_dim
         self._num_cloth, self._passes, self._taken = graph.num_cloth, network.passes, 0
-        self._nodes = self._rows(self._weights.node_encoder, nodes)
+        self.nodes = self._rows(self._weights.node_encoder, nodes)
         encoders = self._weights.edge_encoders
-        self._edges = {name: self._rows(encoders[name], edges[name]) for name in self._weights.latents}
-        self._latents = (ctypes.c_void_p * len(self._edges))(*(self._edges[name].data_ptr() for name in self._weights.latents))
+        self.edges = {name: self._rows(encoders[name], edges[name]) for name in self._weights.latents}
+        self._latents = (ctypes.c_void_p * len(self.edges))(*(self.edges[name].data_ptr() for name in self._weights.latents))
         chosen = [graph.subset(name, level) for name, level in self._weights.subsets]
         sets, rows = [part.edges for part in chosen], [part.rows for part in chosen]
         self._subsets = (_Edges * len(sets))(*(_pointers(*pair) for pair in zip(sets, rows, strict=True)))
         self._kept: list[Any] = [*sets, *rows]
-        memory = torch.empty(4, len(self._nodes), self._width)
+        memory = torch.empty(4, len(self.nodes), self._width)
         self._memory = _Memory(*(part.data_ptr() for part in memory))
         self._kept.append(memory)
 
     def see(self, node_look: Tensor, edge_look: Mapping[str, Tensor]) -> None:
         """Add what is seen before the next pass, see :class:`hood.nn.model.MeshGraphNet`, to the latents."""
         index = self._taken - 1
-        self._rows(self._weights.node_looks[index], node_look, onto=self._nodes)
+        self._rows(self._weights.node_looks[index], node_look, onto=self.nodes)
         for name, (weight, bias) in self._weights.edge_looks[index].items():
             seen = edge_look[name].contiguous()
-            self._lib.network_lift(seen.data_ptr(), len(seen), self._width, weight, bias, self._edges[name].data_ptr())
+            self._lib.network_lift(seen.data_ptr(), len(seen), self._width, weight, bias, self.edges[name].data_ptr())
 
     def take(self) -> Tensor:
         """Raw output (V, out_width) at the end of the next pass."""
@@ -245,11 +245,11 @@ class Inference:
             self._passes[index],
             ctypes.addressof(self._subsets),
             ctypes.addressof(self._latents),
-            self._nodes.data_ptr(),
-            len(self._nodes),
+            self.nodes.data_ptr(),
+            len(self.nodes),
             ctypes.addressof(self._memory),
         )
-        return self._rows(weights.decoders[index], self._nodes[: self._num_cloth])
+        return self._rows(weights.decoders[index], self.nodes[: self._num_cloth])
 
     def _rows(self, perceptron: _Perceptron, x: Tensor, onto: Tensor | None = None) -> Tensor:
         x = x.contiguous()
@@ -272,12 +272,13 @@ def infer(
     nodes: Tensor,
     edges: Mapping[str, Tensor],
     look: Callable[[int, Tensor], tuple[Tensor, Mapping[str, Tensor]]] | None,
-) -> Tensor:
-    """What :meth:`hood.nn.model.MeshGraphNet.forward` returns, by the weights of :func:`weights_for`."""
+) -> tuple[Tensor, Tensor, Mapping[str, Tensor]]:
+    """What :meth:`hood.nn.model.MeshGraphNet.forward` returns, by the weights of :func:`weights_for`, and the latents of nodes
+    and edges at the end."""
     inference = Inference(network, weights, graph, nodes, edges)
     raw = inference.take()
     for index in range(1, len(network.passes)):
         assert look is not None, "several passes need someone who looks at what they lead to"
         inference.see(*look(index - 1, raw))
         raw = inference.take()
-    return raw
+    return raw, inference.nodes, inference.edges

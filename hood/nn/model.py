@@ -14,6 +14,7 @@ from hood.graph.builder import BODY, LAYERS, MESH, Graph, coarse_name, set_level
 from hood.nn import compiled_network
 from hood.nn.compiled import check_kernels
 from hood.nn.dense import pad_rows
+from hood.nn.edge_decoder import EdgeDecoder
 from hood.nn.message_passing import ProcessorStep
 from hood.nn.mlp import MLP
 from hood.nn.precision import PRECISIONS as PRECISIONS
@@ -49,6 +50,7 @@ class MeshGraphNet(nn.Module):
         coarse_encoders: number of encoders for coarse edges, ``coarse0`` first. Sets beyond them share the last one,
             encoders beyond the sets are never evaluated; None gives every set its own.
         look_widths: columns of nodes and of edges that are seen between passes; schedules of one pass need none.
+        edge_out_width: width of the output of mesh edges, see :meth:`with_edges`; 0: none.
 
     ``precision`` says how the network computes and is no part of what it is: weights, input and output keep their own
     precision. Set it by :meth:`use_precision`.
@@ -69,6 +71,7 @@ class MeshGraphNet(nn.Module):
         output_init: float = 1.0,
         coarse_encoders: int | None = None,
         look_widths: tuple[int, int] = (0, 0),
+        edge_out_width: int = 0,
     ) -> None:
         super().__init__()
         self.schedule = parse_schedule(schedule)
@@ -88,8 +91,13 @@ class MeshGraphNet(nn.Module):
         self.edge_looks = nn.ModuleList(
             nn.ModuleDict({name: nn.Linear(look_widths[1], latent_dim) for name in self.pass_sets(index)}) for index in later
         )
+        if edge_out_width and MESH not in self.edge_set_names:
+            raise ValueError("schedule has no step on the mesh, whose edges are to be predicted; add one, such as 1x(mesh)")
+        # Last and only where it is asked for: models without it start from the weights they always had.
+        self.edge_decoder = EdgeDecoder(latent_dim, edge_out_width) if edge_out_width else None
         with torch.no_grad():
-            for decoder in (self.decoder, *self.late_decoders):
+            decoders = [self.decoder, *self.late_decoders, *([self.edge_decoder.mlp] if self.edge_decoder else [])]
+            for decoder in cast("list[MLP]", decoders):
                 decoder.third.weight.mul_(output_init)
                 decoder.third.bias.mul_(output_init)
         self.latent_dim = latent_dim
@@ -144,6 +152,19 @@ class MeshGraphNet(nn.Module):
             edge_features: by set, rows as in ``graph.edge_sets``.
             look: called between two passes; schedules of one pass need none.
         """
+        return self._evaluate(graph, node_features, edge_features, look)[0]
+
+    def with_edges(self, graph: Graph, node_features: Tensor, edge_features: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """The same and the output of the mesh's edges, (N, edge_out_width), rows as in ``graph.edge_sets``."""
+        assert self.edge_decoder is not None, "the network was built without an output of edges"
+        raw, nodes, edges = self._evaluate(graph, node_features, edge_features, None)
+        dtype = node_features.dtype
+        return raw, self.edge_decoder(nodes[: graph.num_cloth].to(dtype), edges[MESH].to(dtype), graph.edge_sets[MESH])
+
+    def _evaluate(
+        self, graph: Graph, node_features: Tensor, edge_features: Mapping[str, Tensor], look: Look | None
+    ) -> tuple[Tensor, Tensor, Mapping[str, Tensor]]:
+        """Output of the last pass, and the latents of nodes and edges that it is decoded from."""
         check_precision(self.precision, node_features.device)
         check_kernels(self.kernels, self.precision, self.latent_dim, node_features.device)
         weights = compiled_network.weights_for(self, node_features) if self.kernels == "fused" else None
@@ -152,7 +173,9 @@ class MeshGraphNet(nn.Module):
         with products(self.precision):
             return self._forward(graph, node_features, edge_features, look)
 
-    def _forward(self, graph: Graph, node_features: Tensor, edge_features: Mapping[str, Tensor], look: Look | None) -> Tensor:
+    def _forward(
+        self, graph: Graph, node_features: Tensor, edge_features: Mapping[str, Tensor], look: Look | None
+    ) -> tuple[Tensor, Tensor, Mapping[str, Tensor]]:
         dtype = torch.bfloat16 if self.precision == "bf16" else None
         # Rows of padding are nodes without edges. A node's latent, a sum over all steps, stays in float32.
         nodes = self.node_encoder(pad_rows(node_features), dtype).to(node_features.dtype)
@@ -168,7 +191,7 @@ class MeshGraphNet(nn.Module):
                 nodes, edges = self._take(cast(ProcessorStep, step), sets, graph, nodes, edges)
             decoder = self.decoder if index == 0 else self.late_decoders[index - 1]
             raw = decoder(nodes[: graph.num_cloth].to(node_features.dtype))
-        return raw
+        return raw, nodes, edges
 
     def _take(
         self, step: ProcessorStep, sets: tuple[str, ...], graph: Graph, nodes: Tensor, edges: Mapping[str, Tensor]

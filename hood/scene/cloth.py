@@ -66,6 +66,13 @@ class Cloth:
         return ~self.pinned & (self.mass > 0)
 
     @cached_property
+    def scene_sizes(self) -> tuple[int, ...]:
+        """Vertices of every scene, known to the host; waits for the device once, and only where there are several scenes."""
+        if self.num_scenes == 1:
+            return (self.num_vertices,)
+        return tuple(torch.bincount(self.vertex_scene, minlength=self.num_scenes).tolist())
+
+    @cached_property
     def edge_length_sq(self) -> Tensor:
         """Mean square [m²] (V,) of the rest lengths of the edges at every vertex; 0 at isolated ones."""
         start, end = self.edges.unbind(dim=1)

@@ -13,6 +13,7 @@ KINDS = {
     "paper": {"features": "paper", "output": "acceleration"},
     "base": {"features": "paper", "output": "velocity_base"},
     "physical": {"features": "physical", "output": "velocity_base"},
+    "edges": {"features": "physical", "output": "edges"},
 }
 
 

@@ -37,8 +37,9 @@ def problem_of(scene: Scene, frame: int = 8) -> StepProblem:
         ("local", "local_steps", PASSES),
         ("physical", "velocity_base", "1x(mesh+coarse0)"),
         ("paper", "acceleration", "1x(mesh+coarse0)"),
+        ("local", "edges", "1x(mesh+coarse0)"),
     ],
-    ids=["local", "physical", "paper"],
+    ids=["local", "physical", "paper", "edges"],
 )
 @torch.no_grad()
 def test_a_step_is_that_of_torch(name: str, arguments: tuple[str, str, str], request: pytest.FixtureRequest) -> None:

@@ -41,6 +41,8 @@ KINDS = {
     "local": ("local", "local_steps", PASSES),
     "physical": ("physical", "velocity_base", "1x(mesh+coarse0)"),
     "base": ("paper", "velocity_base", "1x(mesh)"),
+    "edges": ("physical", "edges", "1x(mesh+coarse0)"),
+    "local edges": ("local", "edges", "1x(mesh)"),
 }
 
 

@@ -58,7 +58,7 @@ def evaluate(network: MeshGraphNet, case: Case, compiled: bool) -> Tensor:
         if compiled:
             weights = compiled_network.weights_for(network, case.nodes)
             assert weights is not None
-            return compiled_network.infer(network, weights, case.graph, case.nodes, case.edges, look)
+            return compiled_network.infer(network, weights, case.graph, case.nodes, case.edges, look)[0]
         return network(case.graph, case.nodes, case.edges, look)
 
 

@@ -175,6 +175,7 @@ VARIANTS = {
     "paper": (PAPER, {"signal": "potential"}),
     "passes": (PASSES, {"optimizer": "muon"}),
     "bf16": (PHYSICAL, {"precision": "bf16", "ema_decay": 0.0}),
+    "edges": (PHYSICAL | {"output": "edges"}, {}),
 }
 
 

@@ -1,0 +1,87 @@
+"""Edges predicted, positions solved for.
+
+To move a garment by a long wave without stretching it, positions have to be right to a thousandth of the move; the edges of the
+same move need not be. An error in the edges that differs from one to the next is averaged away by the solve, and its cost does
+not grow as meshes get finer.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from hood.dynamics.output import Held, VelocityBaseOutput
+from hood.graph.builder import MESH, Graph
+from hood.losses.problem import StepProblem
+from hood.nn.edge_solve import EdgeSystem, fit_edges
+from hood.scene.reach import sag
+
+#: Stiffness [N/m] of the edges in the solve, and of the anchors of vertices that touch the body where the network does not ask
+#: for another one.
+_STIFFNESS, _CONTACT = 40.0, 20.0
+#: Share of inertia, m / dt², in the anchors of all vertices: it decides where nothing else does.
+_INERTIA = 0.1
+#: Anchors are up to exp(±this) times as strong as they are by default.
+_RANGE = 4.0
+#: Within this distance [m] of where contact sets in vertices are anchored, the nearer the more.
+_NEAR = 5e-3
+#: One unit of output turns an edge by this share of its rest length, and stretches it by that one.
+_TURN, _STRETCH = 0.1, 0.01
+#: Shorter edges [m] have no direction.
+_SHORTEST = 1e-9
+
+
+class EdgeOutput(VelocityBaseOutput):
+    """Corrections to the edges of the base, and one linear solve for the positions (:mod:`hood.nn.edge_solve`).
+
+    The raw output of an edge (N, 5) turns its vector, takes a share of the way to its rest length, and stretches it by
+    hundredths. That of a vertex (V, 4) is a displacement of its anchor in units of ``scale``, and the logarithm of how much
+    more than by default it is held there if it is near the body. Zero output is the base. At last the cloth is taken out of
+    the body.
+
+    Everything turns with the world if the output does, and lengths are relative to the edges: the same at every resolution.
+    """
+
+    width = 4
+    edge_width = 5
+
+    def positions(self, problem: StepProblem, graph: Graph, base: Tensor, raw: Tensor, edge_raw: Tensor, held: Held) -> Tensor:
+        """Positions (V, 3) [m] at t + 1.
+
+        Args:
+            problem: with its contact, as the network saw it.
+            graph: its mesh edges, attachments included, are solved for.
+            base: (V, 3) m.
+            raw: (V, 4) of the vertices.
+            edge_raw: (N, 5) of the rows of the graph's mesh edges.
+        """
+        cloth, free = problem.cloth, held.free.unsqueeze(1)
+        system = EdgeSystem(graph.edge_sets[MESH], held.free, cloth.vertex_scene, cloth.scene_sizes, _STIFFNESS)
+        start = torch.where(free, base, held.fixed)
+        vector = self.vectors(problem, graph, system.vectors(start), edge_raw)
+        anchor, weight = start + self.scale * raw[:, :3], self.weights(problem, start, raw[:, 3])
+        pos = fit_edges(system, start, vector, anchor, weight)
+        return torch.where(free, self.outside(problem, pos), held.fixed)
+
+    def vectors(self, problem: StepProblem, graph: Graph, vector: Tensor, raw: Tensor) -> Tensor:
+        """What the edges (N, 3) [m] of the base become: the same in both directions, but for the sign."""
+        edges, rest_pos = graph.edge_sets[MESH], problem.cloth.rest_pos
+        rest = (rest_pos.index_select(0, edges.receivers) - rest_pos.index_select(0, edges.senders)).norm(dim=1, keepdim=True)
+        other = raw.index_select(0, edges.reverse)
+        turned = vector + 0.5 * _TURN * rest * (raw[:, :3] - other[:, :3])
+        share, stretch = (0.5 * (raw[:, 3:] + other[:, 3:])).split(1, dim=1)
+        now = vector.norm(dim=1, keepdim=True)
+        # Attachments have a length of their own only by chance, from how the pieces lie at rest.
+        goal = torch.where((edges.source < graph.num_mesh_edges).unsqueeze(1), rest, now)
+        length = (now + share * (goal - now) + _STRETCH * goal * stretch).clamp_min(0.0)
+        return turned * (length / turned.norm(dim=1, keepdim=True).clamp_min(_SHORTEST))
+
+    def weights(self, problem: StepProblem, start: Tensor, raw: Tensor) -> Tensor:
+        """How strongly vertices are held at their anchors, (V,) [N/m]."""
+        cloth, contact = problem.cloth, problem.contact
+        inertia = _INERTIA * cloth.mass / problem.vertex_dt.squeeze(1) ** 2
+        if contact is None:
+            return inertia
+        gap = contact.next_dist(start) - self.clearance - sag(cloth, contact)
+        near = (1.0 - gap / _NEAR).clamp(0.0, 1.0) * contact.valid
+        return inertia + _CONTACT * near * torch.exp(raw.clamp(-_RANGE, _RANGE))

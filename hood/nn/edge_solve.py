@@ -1,0 +1,174 @@
+"""Positions whose edges are as predicted, as nearly as they can be: one linear least-squares solve.
+
+    x = argmin Σ_i w_i/2 |x_i − a_i|² + Σ_ij k/2 |x_i − x_j − p_ij|²
+
+| symbol | variable | |
+|---|---|---|
+| a_i | ``anchor`` | m, where vertex i is drawn to, (V, 3) |
+| w_i | ``weight`` | N/m, how strongly, > 0, (V,) |
+| p_ij | ``vector`` | m, what the edge from j to i should be, (N, 3) |
+| k | ``stiffness`` | N/m, of every edge |
+
+The matrix is a Laplacian and a diagonal, the same for the three coordinates. It is solved by conjugate gradients with the
+diagonal as preconditioner, as many steps as the size of the mesh asks for: no shape and no branch depends on a value, so that a
+CUDA graph can hold it. The derivative is the same solve.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from hood.graph.builder import EdgeSet
+from hood.native import features as native
+from hood.nn.dense import sum_rows
+
+#: Steps of conjugate gradients per square root of the vertices of a scene: a square sheet that hangs from one side is left with
+#: a thousandth of the energy, at every resolution. Never fewer than the second number.
+_STEPS, _LEAST_STEPS = 2.0, 16
+
+
+@dataclass(frozen=True)
+class EdgeSystem:
+    """The edges of B scenes, which do not touch each other, and what moves."""
+
+    edges: EdgeSet  # its rows list every edge in both directions
+    free: Tensor  # (V,) bool; the others stay where they are
+    scene: Tensor  # (V,)
+    scene_sizes: tuple[int, ...]  # vertices of every scene
+    stiffness: float  # N/m
+
+    @cached_property
+    def degree(self) -> Tensor:
+        """Edges at every vertex, (V,)."""
+        return self._spread(self.edges.offsets.diff())
+
+    def neighbours(self, values: Tensor) -> Tensor:
+        """Σ_j of ``values`` (V, C) over the neighbours j of every vertex, (V, C)."""
+        return self._spread(sum_rows(values, self.edges.senders, self.edges.offsets))
+
+    def sums(self, rows: Tensor) -> Tensor:
+        """Sums of ``rows`` (N, C) at the vertices that receive them, (V, C)."""
+        return self._spread(sum_rows(rows, self.edges.rows, self.edges.offsets))
+
+    def vectors(self, pos: Tensor) -> Tensor:
+        """x_i − x_j of every row, (N, 3), at positions (V, 3)."""
+        return pos.index_select(0, self.edges.receivers) - pos.index_select(0, self.edges.senders)
+
+    def _spread(self, values: Tensor) -> Tensor:
+        """From the vertices that have an edge to all of them."""
+        count = len(self.free)
+        if len(values) == count:
+            return values
+        return values.new_zeros(count, *values.shape[1:]).index_copy(0, self.edges.nodes, values)
+
+
+def fit_edges(system: EdgeSystem, start: Tensor, vector: Tensor, anchor: Tensor, weight: Tensor) -> Tensor:
+    """The positions x (V, 3) [m] above, solved for from ``start`` (V, 3) [m].
+
+    Differentiable in ``vector``, ``anchor`` and ``weight``, as if the solve were exact. What is not free stays at ``start``.
+    Where edges and anchors are those of ``start``, that is the result, to the bit.
+    """
+    force = weight.unsqueeze(1) * (anchor - start) + system.stiffness * system.sums(vector - system.vectors(start))
+    moved: Tensor = _Solve.apply(force, weight, system)
+    return start + moved
+
+
+class _Solve(torch.autograd.Function):
+    """u with A u = ``force`` (V, 3) for A = diag(w) + k L."""
+
+    @staticmethod
+    def forward(ctx: Any, force: Tensor, weight: Tensor, system: EdgeSystem) -> Tensor:
+        ctx.solve = compiled_gradients if _is_compiled(system, weight, force) else conjugate_gradients
+        moved: Tensor = ctx.solve(system, weight, force)
+        ctx.save_for_backward(weight, moved)
+        ctx.system = system
+        return moved
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        weight, moved = ctx.saved_tensors
+        adjoint = ctx.solve(ctx.system, weight, grad)
+        # A symmetric, ∂A/∂w_i = 1 at (i, i): dw = −λ·u.
+        return adjoint, -(adjoint * moved).sum(dim=1), None
+
+
+def num_steps(num_vertices: int) -> int:
+    """Steps for a scene of that many vertices: their number grows with its width in edges."""
+    return max(math.ceil(_STEPS * math.sqrt(num_vertices)), _LEAST_STEPS)
+
+
+def conjugate_gradients(system: EdgeSystem, weight: Tensor, force: Tensor) -> Tensor:
+    """Approximate u (V, 3) with (diag(``weight``) + k L) u = ``force`` at free vertices and u = 0 at the others.
+
+    The scenes run side by side, each with its own step lengths and as many steps as alone.
+    """
+    free = system.free.unsqueeze(1)
+    diagonal = (weight + system.stiffness * system.degree.to(weight)).unsqueeze(1)
+    inverse = torch.where(free, 1.0 / torch.where(free, diagonal, 1.0), 0.0)
+    dot = _dot(system)
+    u, r = torch.zeros_like(force), torch.where(free, force, 0.0)
+    p = inverse * r
+    rz = dot(r, p)
+    limit = _limits(system)
+    for step in range(max(map(num_steps, system.scene_sizes))):
+        # Neighbours that are not free have p = 0; what they would receive is not asked for.
+        q = diagonal * p - system.stiffness * system.neighbours(p)
+        length = _ratio(rz, dot(p, q))
+        if limit is not None:
+            length = torch.where(step < limit, length, 0.0)
+        u = u + length * p
+        r = torch.where(free, r - length * q, 0.0)
+        z = inverse * r
+        before, rz = rz, dot(r, z)
+        p = z + _ratio(rz, before) * p
+    return u
+
+
+def compiled_gradients(system: EdgeSystem, weight: Tensor, force: Tensor) -> Tensor:
+    """The same by the compiled library, for numbers in float32 on a CPU; every vertex must have an edge."""
+    edges, scenes = system.edges, len(system.scene_sizes)
+    steps = torch.tensor([num_steps(size) for size in system.scene_sizes])
+    mesh = native.Neighbours(len(force), edges.offsets.data_ptr(), edges.senders.data_ptr())
+    u, memory = force.new_empty(len(force), 4), force.new_empty(4, len(force), 4)
+    given = weight.contiguous(), force.contiguous(), system.free, system.scene if scenes > 1 else None
+    sums = torch.empty(3, scenes, dtype=torch.float64)
+    native.call("fit", mesh, *given, scenes, steps, system.stiffness, u, sums, memory)
+    return u[:, :3]
+
+
+def _is_compiled(system: EdgeSystem, *values: Tensor) -> bool:
+    return len(system.edges.nodes) == len(system.free) and native.applies(*values)
+
+
+def _dot(system: EdgeSystem) -> Callable[[Tensor, Tensor], Tensor]:
+    """Products of two (V, 3) scene by scene, spread to the vertices: (V, 1), or (1, 1) where there is one scene."""
+    if len(system.scene_sizes) == 1:
+        return lambda a, b: (a * b).sum().view(1, 1)
+    scene, count = system.scene, len(system.scene_sizes)
+    return lambda a, b: a.new_zeros(count).index_add(0, scene, (a * b).sum(dim=1))[scene].unsqueeze(1)
+
+
+def _limits(system: EdgeSystem) -> Tensor | None:
+    """Steps of the scene of every vertex, (V, 1); None where there is one scene. Made on the device: a copy from the host could
+    not be captured."""
+    scene, count = system.scene, len(system.scene_sizes)
+    if count == 1:
+        return None
+    sizes = torch.zeros(count, dtype=torch.float64, device=scene.device)
+    sizes = sizes.index_add(0, scene, torch.ones_like(scene, dtype=torch.float64))
+    return (_STEPS * sizes.sqrt()).ceil().clamp_min(_LEAST_STEPS)[scene].unsqueeze(1)
+
+
+def _ratio(above: Tensor, below: Tensor) -> Tensor:
+    """above / below; 0 where nothing is left to do."""
+    some = below > 0
+    return torch.where(some, above / torch.where(some, below, 1.0), 0.0)

@@ -1,0 +1,140 @@
+"""Edges predicted, positions solved for: zero output is the base, everything turns with the world."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from small_simulators import make
+from test_output import ball_problem
+from torch import Tensor
+
+from hood.dynamics.checkpoint import load_simulator, save_simulator
+from hood.dynamics.edge_output import EdgeOutput
+from hood.dynamics.output import Held
+from hood.graph.builder import MESH, Graph, build_graph, build_static
+from hood.graph.hierarchy import build_hierarchy
+from hood.losses.problem import StepProblem
+from hood.scene.scene import Scene
+from hood.scene.state import Attachments
+
+STILL, TURN = np.eye(3), Rotation.from_rotvec([0.3, 1.2, -0.4]).as_matrix()
+
+
+def graph_of(problem: StepProblem) -> Graph:
+    cloth = problem.cloth
+    hierarchy = build_hierarchy(cloth.num_vertices, cloth.edges.numpy(), cloth.rest_pos.numpy(), 0)
+    return build_graph(build_static(cloth, hierarchy, [MESH]), replace(problem.step, obstacle=None))
+
+
+def positions(problem: StepProblem, raw: Tensor, edge_raw: Tensor) -> Tensor:
+    output, cloth = EdgeOutput(), problem.cloth
+    held = Held(cloth.free, problem.state.pos)
+    return output.positions(problem, graph_of(problem), output.base(problem), raw, edge_raw, held)
+
+
+def draw(problem: StepProblem, size: float = 1.0) -> tuple[Tensor, Tensor]:
+    num_rows = 2 * len(problem.cloth.edges)
+    return size * torch.randn(problem.cloth.num_vertices, 4).double(), size * torch.randn(num_rows, 5).double()
+
+
+def turned(problem: StepProblem) -> StepProblem:
+    """The same step in a world that is turned."""
+    contact, turn = problem.contact, torch.as_tensor(TURN)
+    assert contact is not None
+    fields = {name: getattr(contact, name) @ turn.T for name in ("point", "normal", "next_point", "next_normal")}
+    state = replace(problem.state, pos=problem.state.pos @ turn.T, vel=problem.state.vel @ turn.T)
+    return replace(problem, state=state, contact=replace(contact, **fields))
+
+
+def test_zero_output_is_the_base() -> None:
+    problem = ball_problem(TURN, np.array([0.01, 0.0, 0.0]))
+    raw, edge_raw = draw(problem, 0.0)
+    torch.testing.assert_close(positions(problem, raw, edge_raw), EdgeOutput().base(problem), rtol=0, atol=1e-12)
+
+
+def test_what_is_predicted_turns_with_the_world() -> None:
+    problem, turn = ball_problem(STILL, np.array([0.01, 0.0, 0.0])), torch.as_tensor(TURN)
+    raw, edge_raw = draw(problem)
+    there = positions(problem, raw, edge_raw)
+    raw, edge_raw = (torch.cat([part[:, :3] @ turn.T, part[:, 3:]], dim=1) for part in (raw, edge_raw))
+    assert float((there - problem.state.pos).norm(dim=1).max()) > 2e-3
+    torch.testing.assert_close(positions(turned(problem), raw, edge_raw), there @ turn.T, rtol=0, atol=1e-9)
+
+
+def vectors(problem: StepProblem, base: Tensor, edge_raw: Tensor) -> tuple[Tensor, Graph]:
+    graph = graph_of(problem)
+    edges = graph.edge_sets[MESH]
+    return EdgeOutput().vectors(problem, graph, base[edges.receivers] - base[edges.senders], edge_raw), graph
+
+
+def test_an_edge_is_the_same_from_both_ends() -> None:
+    problem = ball_problem(STILL, np.zeros(3))
+    found, graph = vectors(problem, problem.state.pos, draw(problem)[1])
+    torch.testing.assert_close(found, -found[graph.edge_sets[MESH].reverse], rtol=0, atol=1e-12)
+
+
+def test_lengths_are_shares_of_the_way_to_rest_and_do_not_ask_how_edges_turn() -> None:
+    problem = ball_problem(STILL, np.zeros(3))
+    edges = graph_of(problem).edge_sets[MESH]
+    rest = (problem.cloth.rest_pos[edges.receivers] - problem.cloth.rest_pos[edges.senders]).norm(dim=1)
+    raw = draw(problem, 3.0)[1]
+    for share, stretch, expected in ((0.0, 0.0, 1.2), (1.0, 0.0, 1.0), (0.5, 0.0, 1.1), (0.0, 2.0, 1.22)):
+        raw[:, 3], raw[:, 4] = share, stretch
+        found, _ = vectors(problem, 1.2 * problem.state.pos, raw)
+        torch.testing.assert_close(found.norm(dim=1), expected * rest, rtol=1e-9, atol=0)
+
+
+def test_buttons_keep_their_length_and_hold_their_ends_together() -> None:
+    """Where their two ends are at rest is a matter of how pieces were laid out."""
+    problem = ball_problem(STILL, np.zeros(3))
+    ends = torch.tensor([[0, 100]])
+    step = replace(problem.step, attachments=Attachments(ends, torch.tensor([True])))
+    problem = replace(problem, step=step)
+    graph, start = graph_of(problem), 1.1 * problem.state.pos
+    edges = graph.edge_sets[MESH]
+    raw = torch.zeros(edges.num_edges, 5).double()
+    raw[:, 3] = 1.0
+    now = start[edges.receivers] - start[edges.senders]
+    button = edges.source >= graph.num_mesh_edges
+    found = EdgeOutput().vectors(problem, graph, now, raw)
+    assert int(button.sum()) == 2
+    assert torch.equal(found[button], now[button])
+    assert bool((found[~button].norm(dim=1) < now[~button].norm(dim=1)).all())
+
+
+def test_vertices_near_the_body_are_anchored_and_others_follow_inertia() -> None:
+    output = EdgeOutput()
+    near, far = ball_problem(STILL, np.zeros(3), gap=2e-3), ball_problem(STILL, np.zeros(3), gap=0.05)
+    zero = torch.zeros(near.cloth.num_vertices).double()
+    inertia = 0.1 * near.cloth.mass * 30**2
+    torch.testing.assert_close(output.weights(far, far.state.pos, zero + 3.0), inertia * (far.cloth.mass / near.cloth.mass))
+    by_default = output.weights(near, near.state.pos, zero)
+    assert float(by_default.min()) > 5.0 > 10 * float(inertia.max())
+    torch.testing.assert_close(output.weights(near, near.state.pos, zero + 1.0) - inertia, np.e * (by_default - inertia))
+    assert float(output.weights(near, near.state.pos, zero - 100.0).min()) > 0
+
+
+def test_cloth_is_taken_out_of_the_body() -> None:
+    problem = ball_problem(STILL, np.zeros(3))
+    raw, edge_raw = draw(problem, 0.0)
+    contact = problem.contact
+    assert contact is not None
+    raw[:, :3] = -2.0 * contact.next_normal  # a centimetre into it
+    found = positions(problem, raw, edge_raw)
+    assert float(contact.next_dist(found).min()) > 1.69e-3
+
+
+def test_a_model_file_names_its_output(tmp_path: Path, tank_scene: Scene) -> None:
+    simulator = make("edges")
+    save_simulator(tmp_path / "model.safetensors", simulator)
+    again = load_simulator(tmp_path / "model.safetensors")
+    assert again.config["output"] == "edges"
+    assert isinstance(again.output, EdgeOutput)
+    problem = StepProblem(tank_scene.cloth, tank_scene.start(0), tank_scene.step_input(0, tank_scene.start(0)))
+    prepared = simulator.prepare(tank_scene.cloth, tank_scene.garment.rest_pos)
+    with torch.no_grad():
+        assert torch.equal(again.predict(problem, prepared).next_pos, simulator.predict(problem, prepared).next_pos)
