@@ -1,0 +1,226 @@
+"""What errors in predicted positions and in predicted edges cost, and what trained models make of either.
+
+    python benchmarks/heads.py errors                              # the exact answer with errors, on states of the solver
+    python benchmarks/heads.py errors --garments dress_4k skirt_4k --states 1
+    python benchmarks/heads.py models A.safetensors B.safetensors  # models on the states of their own rollouts
+
+An error of 30% is 0.3 times the change from the base at every vertex, or edge, in a direction of its own; ``shrunk`` is the
+change 30% too small everywhere. Positions follow from edges by the solve of ``output=edges`` with its default weights; anchors
+are exact, in error like the edges, or firm ones of the base. Controls without a network: the base, and its edges rescaled to
+their rest lengths (projective dynamics), after one solve and after ten.
+
+Models are told by γ, by the relative error of the change they predict (‖x − x*‖ over ‖base − x*‖, weighted by mass, and the
+same of edges, not weighted), and by the CPU time of a step, beside the same controls on the same states.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from hood.assets.body import load_body
+from hood.assets.garment import load_garment
+from hood.assets.library import locate
+from hood.assets.sequence import load_sequence
+from hood.dynamics.checkpoint import load_simulator
+from hood.dynamics.edge_output import EdgeOutput
+from hood.dynamics.output import Held
+from hood.dynamics.rollout import simulate
+from hood.dynamics.stepper import NewtonStepper, Stepper
+from hood.evaluation.gap import REFERENCE, starts
+from hood.evaluation.sample import StepSample
+from hood.graph.builder import MESH, Graph, StaticGraph, build_graph, edge_set
+from hood.losses.potential import default_potential, scale
+from hood.losses.problem import StepProblem
+from hood.scene.scene import Scene, build_scene
+from hood.scene.state import StepInput
+from hood.solver.iterate import in_double
+from hood.solver.newton import minimize
+
+POTENTIAL = default_potential()
+MOTIONS = {"dress": "walk_proud", "tshirt": "dance_mixed", "skirt": "twist_and_bend", "trousers": "plie"}
+ERRORS = (0.3, 0.1, 0.03)
+SOLVES = 10
+#: Logarithm of how much more than by default vertices near the body are held where nothing is predicted: 300 N/m, which is best
+#: for the controls.
+FIRM = math.log(15.0)
+
+
+@dataclass
+class Table:
+    """Figures by the name of a row, one per state."""
+
+    rows: dict[str, list[float]] = field(default_factory=dict)
+
+    def add(self, name: str, value: float) -> None:
+        self.rows.setdefault(name, []).append(value)
+
+    def print(self) -> None:
+        for name, values in self.rows.items():
+            known = [value for value in values if math.isfinite(value)]
+            middle = f"{statistics.median(known):9.4f}" if known else "        -"
+            print(f"{name:40}{middle}   {min(known, default=math.nan):.3g} to {max(known, default=math.nan):.3g}")
+
+
+class Case:
+    """A step in float64, its minimum, and the head's own solve."""
+
+    def __init__(self, problem: StepProblem, near: Tensor) -> None:
+        self.problem = problem = in_double(POTENTIAL.prepare(problem))
+        minima = [minimize(POTENTIAL, problem, start, REFERENCE) for start in starts(problem, near)]
+        self.exact, report = min(minima, key=lambda found: float(found[1].phi))
+        self.phi, self.e0 = float(report.phi), float(scale(problem))
+        cloth, step = problem.cloth, problem.step
+        target = problem.state.pos
+        if step.pin_target is not None:
+            target = torch.where(cloth.pinned.unsqueeze(1), step.pin_target, target)
+        self.held, self.head = Held(cloth.free, target), EdgeOutput()
+        self.base = torch.where(cloth.free.unsqueeze(1), self.head.base(problem), target)
+        static = StaticGraph(len(target), cloth.edges, {MESH: edge_set(cloth.edges)}, torch.zeros(len(target)).long())
+        self.graph: Graph = build_graph(static, StepInput(step.dt))
+        self.edges = self.graph.edge_sets[MESH]
+
+    def gamma(self, pos: Tensor) -> float:
+        return (float(POTENTIAL.total(self.problem, pos.double())) - self.phi) / self.e0
+
+    def vectors(self, pos: Tensor) -> Tensor:
+        return pos[self.edges.receivers] - pos[self.edges.senders]
+
+    def solve(self, vector: Tensor, anchor: Tensor, base: Tensor | None = None, hold: float = 0.0) -> Tensor:
+        """Positions from edges (N, 3) and anchors (V, 3) by the head, ``hold`` being its output for how firm these are."""
+        base = self.base if base is None else base
+        head = _Given(vector)
+        raw = torch.cat([(anchor - base) / head.scale, torch.full_like(anchor[:, :1], hold)], dim=1)
+        return head.positions(self.problem, self.graph, base, raw, vector, self.held)
+
+    def projective(self, solves: int) -> Tensor:
+        """The base with its edges rescaled to their rest lengths, ``solves`` times."""
+        pos, rest = self.base, self.vectors(self.problem.cloth.rest_pos).norm(dim=1, keepdim=True)
+        for _ in range(solves):
+            now = self.vectors(pos)
+            pos = self.solve(now * (rest / now.norm(dim=1, keepdim=True).clamp_min(1e-9)), pos, pos, FIRM)
+        return pos
+
+    def controls(self, table: Table) -> None:
+        table.add("base", self.gamma(self.base))
+        table.add("rest lengths, one solve", self.gamma(self.projective(1)))
+        table.add(f"rest lengths, {SOLVES} solves", self.gamma(self.projective(SOLVES)))
+
+
+class _Given(EdgeOutput):
+    """The head with edges that are known."""
+
+    def __init__(self, vector: Tensor) -> None:
+        super().__init__()
+        self._vector = vector
+
+    def vectors(self, problem: StepProblem, graph: Graph, vector: Tensor, raw: Tensor) -> Tensor:
+        return self._vector
+
+
+def make_scene(garment: str) -> Scene:
+    return build_scene(load_garment(garment), load_body(), load_sequence(MOTIONS[garment.partition("_")[0]], 30.0))
+
+
+def cases(stepper: Stepper, scene: Scene, states: int, frames: int) -> list[tuple[Case, StepProblem, Tensor]]:
+    """States of the stepper's own rollout, with its answer."""
+    sample = StepSample(range(3, frames), states)
+    for _ in simulate(stepper, scene, POTENTIAL, frames, observe=sample, metrics="none"):
+        pass
+    return [(Case(problem, step.next_pos), problem, step.next_pos) for problem, step in sample.steps]
+
+
+def errors(garments: list[str], states: int, frames: int) -> None:
+    """γ of the exact answer with errors."""
+    table, generator = Table(), torch.Generator().manual_seed(0)
+
+    def noise(change: Tensor, other: Tensor | None = None) -> Tensor:
+        """As large as ``change`` (N, 3) in every row, in a direction of its own; opposite in the row ``other``."""
+        drawn = torch.randn(change.shape, generator=generator, dtype=change.dtype)
+        drawn = drawn if other is None else (drawn - drawn[other]) / math.sqrt(2)
+        return drawn * change.norm(dim=1, keepdim=True) / math.sqrt(3)
+
+    for garment in garments:
+        for case, _, _ in cases(NewtonStepper(POTENTIAL), make_scene(garment), states, frames):
+            exact, change = case.exact, case.exact - case.base
+            edges, turn = case.vectors(exact), case.vectors(exact) - case.vectors(case.base)
+            case.controls(table)
+            for share in ERRORS:
+                pos, vector = exact + share * noise(change), edges + share * noise(turn, case.edges.reverse)
+                table.add(f"positions, error {share:.0%}", case.gamma(pos))
+                table.add(f"edges, error {share:.0%}", case.gamma(case.solve(vector, exact)))
+                table.add(f"edges and anchors, error {share:.0%}", case.gamma(case.solve(vector, pos)))
+            shrunk = exact - ERRORS[0] * change
+            table.add(f"positions, shrunk {ERRORS[0]:.0%}", case.gamma(shrunk))
+            table.add(f"edges and anchors, shrunk {ERRORS[0]:.0%}", case.gamma(case.solve(edges - ERRORS[0] * turn, shrunk)))
+            table.add("edges exact, anchors of the base", case.gamma(case.solve(edges, case.base, hold=FIRM)))
+            table.add("edges and anchors exact", case.gamma(case.solve(edges, exact)))
+    print(f"γ, median and range over {len(table.rows['base'])} states of the solver ({', '.join(garments)})")
+    table.print()
+
+
+def models(paths: list[str], garments: list[str], states: int, frames: int, kernels: str) -> None:
+    """Trained models on their own states."""
+    for path in paths:
+        simulator = load_simulator(Path(path) if Path(path).exists() else locate("weights", path)).eval()
+        simulator.network.use_kernels(kernels)
+        table = Table()
+        for garment in garments:
+            scene = make_scene(garment)
+            prepared = simulator.prepare(scene.cloth, scene.garment.rest_pos)
+            for case, problem, pos in cases(simulator, scene, states, frames):
+                table.add("γ", case.gamma(pos))
+                case.controls(table)
+                weight = case.problem.cloth.mass.unsqueeze(1)
+                table.add("error of the change, positions", relative(pos, case.base, case.exact, weight))
+                table.add("error of the change, edges", relative(*map(case.vectors, (pos.double(), case.base, case.exact))))
+                table.add("CPU ms of a step", 1e3 * cpu_time(partial(simulator.predict, problem, prepared)))
+        print(f"{path} ({simulator.config['features']}, {simulator.config['output']}), median and range over its own states")
+        table.print()
+
+
+def relative(found: Tensor, base: Tensor, exact: Tensor, weight: Tensor | float = 1.0) -> float:
+    """‖found − exact‖ / ‖base − exact‖."""
+    left, whole = ((value.double() - exact).square() * weight for value in (found, base))
+    return math.sqrt(float(left.sum() / whole.sum()))
+
+
+def cpu_time(call: Callable[[], object]) -> float:
+    """Least CPU seconds of five calls after a first one."""
+    best = math.inf
+    with torch.no_grad():
+        for turn in range(6):
+            begin = time.process_time()
+            call()
+            best = min(best, time.process_time() - begin) if turn else best
+    return best
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("errors", "models"))
+    parser.add_argument("models", nargs="*", help="model files or names of shipped ones")
+    parser.add_argument("--garments", nargs="+", default=["dress", "tshirt", "skirt"])
+    parser.add_argument("--states", type=int, default=2, help="of every rollout")
+    parser.add_argument("--frames", type=int, default=24)
+    parser.add_argument("--kernels", default="fused")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    common = arguments.garments, arguments.states, arguments.frames
+    if arguments.what == "errors":
+        errors(*common)
+    else:
+        models(arguments.models, *common, arguments.kernels)
+
+
+if __name__ == "__main__":
+    main()
