@@ -12,11 +12,11 @@
 #include <cstdint>
 #include <cstring>
 #include <ctime>
-#include <limits>
 #include <vector>
 
 #include "layer_search.h"
 #include "layer_view.h"
+#include "layer_way.h"
 #include "vector.h"
 
 namespace {
@@ -33,72 +33,6 @@ struct LayerContact {
     double weight[4], dist;  // the gap is the sum of weight times corner
     double gap[3];
 };
-
-inline double layer_clamp(double v) { return v < 0.0 ? 0.0 : v > 1.0 ? 1.0 : v; }
-
-inline double point_segment(Vec p, Vec a, Vec b, double* share) {
-    const Vec along = b - a, from = p - a;
-    const double size = dot(along, along);
-    *share = size > 0.0 ? layer_clamp(dot(from, along) / size) : 0.0;
-    const Vec gap = from - *share * along;
-    return dot(gap, gap);
-}
-
-// Square of the distance of a point to a triangle, and weights of all four such that the gap is their sum.
-inline double point_triangle(Vec p, Vec a, Vec b, Vec c, double* weight) {
-    const Vec corner[3] = {a, b, c}, first = b - a, second = c - a, offset = p - a, normal = cross(first, second);
-    const double area_sq = dot(normal, normal);
-    weight[0] = 1.0;
-    if (area_sq > 1e-24 * dot(first, first) * dot(second, second)) {
-        const double y = dot(cross(offset, second), normal) / area_sq, z = dot(cross(first, offset), normal) / area_sq, x = 1.0 - y - z;
-        if (x >= 0.0 && y >= 0.0 && z >= 0.0) {
-            const double height = dot(offset, normal);
-            weight[1] = -x, weight[2] = -y, weight[3] = -z;
-            return height * height / area_sq;
-        }
-    }
-    double best = std::numeric_limits<double>::infinity();
-    for (int i = 0; i < 3; ++i) {
-        const int j = (i + 1) % 3;
-        double share;
-        const double square = point_segment(p, corner[i], corner[j], &share);
-        if (!(square < best)) continue;
-        best = square;
-        weight[1 + i] = share - 1.0, weight[1 + j] = -share, weight[1 + (i + 2) % 3] = 0.0;
-    }
-    return best;
-}
-
-// The same for two segments.
-inline double segment_segment(Vec a, Vec b, Vec c, Vec d, double* weight) {
-    const Vec u = b - a, v = d - c, w = a - c;
-    const double uu = dot(u, u), uv = dot(u, v), vv = dot(v, v), uw = dot(u, w), vw = dot(v, w), det = uu * vv - uv * uv;
-    if (det > 1e-24 * uu * vv) {
-        const double s = (uv * vw - vv * uw) / det, t = (uu * vw - uv * uw) / det;
-        if (s >= 0.0 && s <= 1.0 && t >= 0.0 && t <= 1.0) {
-            const Vec gap = w + s * u - t * v;
-            weight[0] = 1.0 - s, weight[1] = s, weight[2] = t - 1.0, weight[3] = -t;
-            return dot(gap, gap);
-        }
-    }
-    double best = std::numeric_limits<double>::infinity(), share;
-    const Vec end[4] = {a, b, c, d};
-    for (int i = 0; i < 4; ++i) {
-        const double square = i < 2 ? point_segment(end[i], c, d, &share) : point_segment(end[i], a, b, &share);
-        if (!(square < best)) continue;
-        best = square;
-        const double sign = i < 2 ? 1.0 : -1.0;
-        for (int k = 0; k < 4; ++k) weight[k] = 0.0;
-        weight[i] = sign;
-        const int other = i < 2 ? 2 : 0;
-        weight[other] = -sign * (1.0 - share), weight[other + 1] = -sign * share;
-    }
-    return best;
-}
-
-inline double pair_distance_sq(int32_t edges, const Vec* x, double* weight) {
-    return edges ? segment_segment(x[0], x[1], x[2], x[3], weight) : point_triangle(x[0], x[1], x[2], x[3], weight);
-}
 
 // The barrier -(1 - s)^2 ln s of the distance in units of the reach, and its first two derivatives.
 inline double barrier(double s) { return -(1.0 - s) * (1.0 - s) * std::log(s); }
@@ -118,40 +52,6 @@ inline double fading(double square, double parallel, double* slope) {
     }
     *slope = 2.0 * (1.0 - ratio) / parallel;
     return ratio * (2.0 - ratio);
-}
-
-constexpr int MOST_ADVANCES = 60;
-constexpr double NARROW = 1e-4;  // of the reach
-
-// Takes the mean off the ways of the corners; how far points of the features then move towards each other at most.
-inline double relative_way(int32_t edges, Vec* p) {
-    const Vec mean = 0.25 * (p[0] + p[1] + p[2] + p[3]);
-    double size[4];
-    for (int i = 0; i < 4; ++i) p[i] = p[i] - mean, size[i] = dot(p[i], p[i]);
-    return edges ? std::sqrt(std::max(size[0], size[1])) + std::sqrt(std::max(size[2], size[3]))
-                 : std::sqrt(size[0]) + std::sqrt(std::max(size[1], std::max(size[2], size[3])));
-}
-
-// Along straight lines from x by p, of which ``way`` is the relative one, the share that is safe: 1, or where at least ``left`` of
-// the first distance is kept. By additive conservative advancement: no two points of the features come nearer than by their ways.
-// Features nearer than ``near`` keep more, down to where nothing is left to lose: from a distance far below that of equal forces
-// a Newton step comes back by a factor of two only.
-inline double safe_share(int32_t edges, const Vec* x0, const Vec* p, double way, double left, double near, double* first) {
-    double weight[4], dist = std::sqrt(pair_distance_sq(edges, x0, weight));
-    *first = dist;
-    const double kept = std::max(left, 1.0 - dist / near) * dist, lost = dist - kept;
-    if (!(way > 0.0) || dist - kept >= way) return 1.0;
-    double time = 0.0;
-    Vec x[4];
-    // Features that slide along each other very near would take steps without end: what has been gone by then is safe as well.
-    for (int tries = 0; tries < MOST_ADVANCES && dist - kept > 0.02 * lost; ++tries) {
-        const double step = 0.9 * (dist - kept) / way;
-        if (time + step >= 1.0) return 1.0;
-        time += step;
-        for (int i = 0; i < 4; ++i) x[i] = x0[i] + time * p[i];
-        dist = std::sqrt(pair_distance_sq(edges, x, weight));
-    }
-    return time;
 }
 
 // Processor time of this thread [s].
@@ -188,7 +88,8 @@ struct Layers {
     LayerMesh mesh;
     double pressure = 0.0;  // Pa
     bool between = false;   // pairs of two garments alone
-    std::vector<uint8_t> fixed;
+    bool whole = false;     // pairs of fixed vertices as well
+    std::vector<uint8_t> fixed, careful;  // (V), (V) or none: vertices that keep a distance on their way
     std::vector<double> margin;      // (V) m, how far vertices may be off their ways
     std::vector<uint64_t> released;  // sorted keys of pairs that are left out
     std::vector<LayerPair> pairs;
@@ -197,6 +98,7 @@ struct Layers {
     std::vector<LayerContact> contacts;  // of the last model
     LayerTree tree;
     std::vector<double> start, ahead;  // (3 V) where the step begins, and where it may end
+    std::vector<double> resort;        // (3 V) where ways lead that are known to be free; or none
     // The ways that the list is for, the margins then, where the cloth was last and how far it has moved since.
     std::vector<double> from, to, room, last;
     bool moving = false;  // whether the ways lead anywhere
@@ -243,10 +145,10 @@ struct Layers {
     static constexpr double SLACK = 1e-9;       // m, more than rounding makes of a distance
     static constexpr size_t FEW = 16;           // at most one of so many vertices is looked for alone
 
-    // The list of straight ways between positions (V, 3).
-    void search(const double* begin, const double* end) {
+    // The list of straight ways between positions (V, 3), or of the pairs of some vertices alone.
+    void search(const double* begin, const double* end, const std::vector<uint8_t>* some = nullptr) {
         const LayerTimer timer(clock, LayerClock::SEARCH);
-        const bool first = !begun && !known_apart;
+        const bool first = !begun && !known_apart && !some;
         begun = true;
         const int64_t size = 3 * mesh.num_vertices;
         pairs.clear(), keys.clear(), bounds.clear(), contacts.clear();
@@ -258,7 +160,21 @@ struct Layers {
         overflowed = overflowed || !finite();
         if (overflowed || mesh.num_faces < 2) return;
         make_boxes();
-        fill([&](const auto& look) { tree.pairs(look); }, first, nullptr);
+        if (some) fill_around(*some);
+        else fill([&](const auto& look) { tree.pairs(look); }, first, nullptr);
+    }
+
+    // Adds the pairs of some vertices.
+    void fill_around(const std::vector<uint8_t>& some) {
+        const auto visit = [&](const auto& look) {
+            for (int64_t i = 0; i < mesh.num_faces; ++i) {
+                if (!any_of(corners_at(i), 3, some)) continue;
+                tree.around(tree.face[i], 0, 0, mesh.num_faces, [&](int64_t j) {
+                    if (i != j && (i < j || !any_of(corners_at(j), 3, some))) look(i, j);
+                });
+            }
+        };
+        fill(visit, false, &some);
     }
 
     // The list where few vertices have left their margins: their pairs alone are looked for anew, on straight ways between
@@ -278,15 +194,7 @@ struct Layers {
             keep([&](size_t i) { return !any_of(pairs[i].corner, 4, stray); });
             contacts.clear();
             make_boxes();
-            const auto visit_strays = [&](const auto& look) {
-                for (int64_t i = 0; i < mesh.num_faces; ++i) {
-                    if (!any_of(corners_at(i), 3, stray)) continue;
-                    tree.around(tree.face[i], 0, 0, mesh.num_faces, [&](int64_t j) {
-                        if (i != j && (i < j || !any_of(corners_at(j), 3, stray))) look(i, j);
-                    });
-                }
-            };
-            fill(visit_strays, false, &stray);
+            fill_around(stray);
         }
         if (overflowed) pairs.clear(), keys.clear(), bounds.clear();
     }
@@ -385,7 +293,7 @@ struct Layers {
         }
         for (int lane = 0; lane < count; ++lane) {
             if ((stray && !any_of(corner[lane], 4, *stray)) || (between && mesh.piece[corner[lane][0]] == mesh.piece[corner[lane][3]])) continue;
-            if (fixed[corner[lane][0]] && fixed[corner[lane][1]] && fixed[corner[lane][2]] && fixed[corner[lane][3]]) continue;
+            if (!whole && fixed[corner[lane][0]] && fixed[corner[lane][1]] && fixed[corner[lane][2]] && fixed[corner[lane][3]]) continue;
             double off[2] = {0.0, 0.0}, reach = mesh.reach[corner[lane][0]];
             for (int c = 0; c < 4; ++c) {
                 off[c >= split] = std::max(off[c >= split], room[corner[lane][c]]);
@@ -617,7 +525,7 @@ struct Layers {
             const double way = relative_way(pair.edges, p);
             if (farther(i, way / (1.0 - left))) continue;
             double dist;
-            const double share = safe_share(pair.edges, x, p, way, left, NARROW * pair.reach, &dist);
+            const double share = safe_share(pair.edges, x, p, way, left, near_of(pair), &dist);
             measured(i, dist);
             if (share >= 1.0) continue;
             least = std::min(least, share);
@@ -626,17 +534,29 @@ struct Layers {
         return least;
     }
 
+    // Distance below which a pair may hardly come nearer.
+    double near_of(const LayerPair& pair) const { return (!careful.empty() && any_of(pair.corner, 4, careful) ? PINCHED : NARROW) * pair.reach; }
+
     // Moves targets (V, 3) of free vertices so that the straight ways there from positions (V, 3) are free, as little as it can:
-    // first the corners of pairs that meet go on together, then all vertices. Pairs that held vertices drive through each other
-    // are left out from then on. Returns how many.
+    // first the corners of pairs that meet go on together, then from the last resort, if there is one, else all vertices. Pairs that
+    // held vertices drive through each other are left out from then on. Returns how many.
     int64_t approach(double* to, double left) {
         const LayerTimer timer(clock, LayerClock::LIMIT);
         const double* from = start.data();
+        const std::vector<double> target(to, to + start.size());
         int64_t forced = 0;
-        if (!go_together(from, to, left, 29)) forced = approach_as_one(from, to, left);
+        if (!go_together(from, to, left, 29) && !approach_from_resort(target, to, left)) forced = approach_as_one(from, to, left);
         std::sort(released.begin(), released.end());
         if (forced) keep([&](size_t i) { return !is_released(keys[i]); });
         return forced;
+    }
+
+    bool approach_from_resort(const std::vector<double>& target, double* to, double left) {
+        if (resort.empty()) return false;
+        std::copy(target.begin(), target.end(), to);
+        const double share = ease(resort.data(), to, left);
+        for (size_t i = 0; i < target.size() && share < 1.0; ++i) to[i] = resort[i] + share * (to[i] - resort[i]);
+        return true;
     }
 
     // The same without a last resort, for a way that begins anywhere: what is left of it. Where pairs go on meeting, all that hangs
@@ -655,21 +575,45 @@ struct Layers {
         }
     }
 
+    // Whether fixed vertices that go from ``along`` to ``there`` (V, 3) meet nothing, ``along`` being where all begin, moved as one
+    // body. They go no farther than pairs that are not in the list are apart where the step begins.
+    bool fixed_are_free(const double* along, const double* there, double farthest, double left) {
+        const LayerTimer timer(clock, LayerClock::LIMIT);
+        begin();
+        if (overflowed) return true;
+        for (size_t i = 0; i < pairs.size(); ++i) {
+            const LayerPair& pair = pairs[i];
+            if (farther(i, 2.0 * farthest / (1.0 - left)) || !any_of(pair.corner, 4, fixed)) continue;
+            Vec x[4], p[4];
+            for (int c = 0; c < 4; ++c) x[c] = at(along, pair.corner[c]), p[c] = at(there, pair.corner[c]) - x[c];
+            double dist;
+            const double way = relative_way(pair.edges, p);
+            if (safe_share(pair.edges, x, p, way, left, near_of(pair), &dist) < 1.0) return false;
+        }
+        return true;
+    }
+
     static constexpr int PAIR_ROUNDS = 8, ZONE_ROUNDS = 12;
 
     // Rounds in which corners of pairs that would meet go on together; whether none meets in the end.
     bool go_together(const double* from, double* to, double left, int rounds) {
-        std::vector<double> shift(3 * mesh.num_vertices), count(mesh.num_vertices), shares;
+        std::vector<double> shift, count, shares;
         std::vector<int32_t> meeting;
         for (int round = 0;; ++round) {
             meeting.clear(), shares.clear();
             if (limit(from, to, left, &meeting, &shares) >= 1.0) return true;
             if (round == rounds) return false;
-            std::fill(shift.begin(), shift.end(), 0.0), std::fill(count.begin(), count.end(), 0.0);
-            for (size_t i = 0; i < meeting.size(); ++i) bring_together(pairs[meeting[i]], 0.5 * shares[i], from, to, shift.data(), count.data());
-            for (int64_t v = 0; v < mesh.num_vertices; ++v)
-                for (int k = 0; k < 3 && count[v] > 0.0; ++k) to[3 * v + k] += shift[3 * v + k] / count[v];
+            bring_together(meeting, shares, from, to, shift, count);
         }
+    }
+
+    // Targets of free corners of pairs that meet, by the means of what their pairs ask; the last two are room for that.
+    void bring_together(const std::vector<int32_t>& meeting, const std::vector<double>& shares, const double* from, double* to, std::vector<double>& shift,
+                        std::vector<double>& count) const {
+        shift.assign(3 * mesh.num_vertices, 0.0), count.assign(mesh.num_vertices, 0.0);
+        for (size_t i = 0; i < meeting.size(); ++i) bring_together(pairs[meeting[i]], 0.5 * shares[i], from, to, shift.data(), count.data());
+        for (int64_t v = 0; v < mesh.num_vertices; ++v)
+            for (int k = 0; k < 3 && count[v] > 0.0; ++k) to[3 * v + k] += shift[3 * v + k] / count[v];
     }
 
     static int32_t zone_of(std::vector<int32_t>& zone, int32_t v) {

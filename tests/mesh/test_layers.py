@@ -201,6 +201,23 @@ def test_limited_moves_cross_nothing() -> None:
     assert crossed > 0
 
 
+def test_features_that_slide_past_each_other_are_not_held_up() -> None:
+    """Two edges a ten-millionth of a millimetre apart that go past each other by a centimetre, and apart by as little; then
+    a little towards each other."""
+    pos = 0.01 * np.array([[-2, 0, 0], [2, 0, 0], [0, -2, -3], [0, 0, -2], [0, 0, 2], [3, 2, 0]])
+    mesh = LayerMesh(pos + 0.5 * np.eye(3)[1] * np.arange(2).repeat(3)[:, None], np.array([[0, 1, 2], [3, 4, 5]]), 3e-3)
+    pos[3:, 1] += 1e-10
+    past = pos.copy()
+    past[3:] += [0.009, 1e-10, 0.004]
+    assert _layers(mesh, pos).limit(pos, past) == 1.0
+    past[3:, 1] -= 1e-6
+    share = _layers(mesh, pos).limit(pos, past)
+    assert 0.0 < share < 1e-4
+    ways = [pos + part * share * (past - pos) for part in np.linspace(0.0, 1.0, 101)]
+    sides = {np.sign(np.linalg.det([x[1] - x[0], x[4] - x[3], x[3] - x[0]])) for x in ways}
+    assert len(sides) == 1
+
+
 def test_moving_together_is_free() -> None:
     mesh, pos, _ = _sheets()
     assert _layers(mesh, pos).limit(pos, pos + [0.5, -0.3, 0.2]) == 1.0
