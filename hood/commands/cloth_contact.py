@@ -111,7 +111,8 @@ def summarise_cloth_contact(config: Mapping[str, Any], metrics: Mapping[str, np.
     asked = config["cloth_contact"]
     if "layer_contacts" not in metrics:
         return {"cloth_contact": {"asked": asked, "used": "off"} | ({"reason": reason} if reason else {})}
-    near, crossed, released, overflow, ms = (np.nan_to_num(np.asarray(metrics[name])) for name in LAYER_METRICS)
+    known = [np.nan_to_num(np.asarray(metrics.get(name, 0.0 * metrics["layer_contacts"]))) for name in LAYER_METRICS]
+    near, crossed, released, overflow, ms, lag = known
     frames = np.flatnonzero(near > 0)
     return {
         "cloth_contact": {
@@ -124,6 +125,8 @@ def summarise_cloth_contact(config: Mapping[str, Any], metrics: Mapping[str, np.
             "frames_with_crossed_cloth": [int(frame) for frame in np.flatnonzero((crossed > 0) | (overflow > 0))],
             "crossed_pairs_max": int(crossed.max(initial=0.0)),
             "frames_with_forced_pairs": [int(frame) for frame in np.flatnonzero(released > 0)],
+            "frames_with_late_pins": [int(frame) for frame in np.flatnonzero(lag > 0)],
+            "pin_lag_max": float(lag.max(initial=0.0)),
             "ms_median": float(np.median(ms[1:])) if len(ms) > 1 else None,
         }
     }
@@ -153,6 +156,12 @@ def describe_cloth_contact(summary: Mapping[str, Any]) -> list[str]:
             f"{len(crossed)} steps (the first to frame {crossed[0]}) began with cloth through cloth, up to "
             f"{found['crossed_pairs_max']} pairs of triangles; these are left out until they come apart: "
             "start from cloth that is not crossed"
+        )
+    late = found.get("frames_with_late_pins")
+    if late:
+        lines.append(
+            f"in {len(late)} frames (the first {late[0]}) held vertices stop up to {1e3 * found['pin_lag_max']:.1f} mm short "
+            "of where they should be: cloth is in their way, and they go on when it makes room (pins=… holds fewer vertices)"
         )
     if forced:
         lines.append(

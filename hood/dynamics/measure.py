@@ -20,8 +20,9 @@ PENETRATION_METRICS = ("penetration_count", "penetration_share", "penetration_de
 
 #: Of a step in which layers of cloth are kept apart: pairs of features within their reach at its end, pairs of faces that were
 #: crossed at its start, pairs of features that held vertices drove through each other, 1 where nearly everything is near
-#: everything and nothing is kept apart, and what it took.
-LAYER_METRICS = ("layer_contacts", "layer_crossed", "layer_forced", "layer_overflow", "ms_layers")
+#: everything and nothing is kept apart, what it took, and how far held vertices stop short of their targets at most [m], which
+#: files from before do not have.
+LAYER_METRICS = ("layer_contacts", "layer_crossed", "layer_forced", "layer_overflow", "ms_layers", "pin_lag")
 
 
 def layer_metrics(problem: StepProblem, next_pos: Tensor) -> dict[str, float]:
@@ -29,13 +30,15 @@ def layer_metrics(problem: StepProblem, next_pos: Tensor) -> dict[str, float]:
     if not problem.layers:
         return {}
     work = [scene.layers.work for scene in problem.layers]
+    pins = [scene.pins for scene in problem.layers if scene.pins is not None]
     near = sum(len(scene.layers.contacts(scene.of(next_pos)).corners) for scene in problem.layers)
     values = (
         near,
         sum(scene.layers.crossed for scene in problem.layers),
         sum(scene.layers.forced for scene in problem.layers),
         any(one.overflowed for one in work),
-        1e3 * sum(one.seconds for one in work),
+        1e3 * (sum(one.seconds for one in work) + sum(one.seconds for one in pins)),
+        max((one.lag.max(initial=0.0) for one in pins), default=0.0),
     )
     return dict(zip(LAYER_METRICS, map(float, values), strict=True))
 

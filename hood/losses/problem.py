@@ -11,7 +11,7 @@ from hood.scene.cloth import Cloth
 from hood.scene.contact import Contact, find_contact
 from hood.scene.contact_points import PointContact, find_point_contact
 from hood.scene.layer_sides import LayerPairs, find_sides
-from hood.scene.layers import SceneLayers, find_layers
+from hood.scene.layers import SceneLayers, find_layers, late_targets
 from hood.scene.state import State, StepInput
 
 #: Standard gravity [m/s²], y up.
@@ -71,13 +71,19 @@ class StepProblem:
         return replace(problem, point_contacts=(*self.point_contacts, points))
 
     def with_layers(self, reach: float, pressure: float, between: bool) -> StepProblem:
-        """The problem with its cloth near cloth, see :func:`hood.scene.layers.find_layers`; itself where that has been done."""
+        """The problem with its cloth near cloth, see :func:`hood.scene.layers.find_layers`; itself where that has been done.
+
+        Held vertices that cloth is in the way of have the places that they come to as their targets from then on.
+        """
         if self.layers:
             return self
         ahead, target = inertial_guess(self.state, self.step, self.cloth.vertex_scene), self.step.pin_target
         if target is not None:
             ahead = torch.where(self.cloth.pinned.unsqueeze(1), target.to(ahead), ahead)
-        return replace(self, layers=find_layers(self.cloth, self.state.pos, ahead, reach, pressure, between))
+        layers = find_layers(self.cloth, self.state.pos, ahead, reach, pressure, between)
+        if target is None:
+            return replace(self, layers=layers)
+        return replace(self, layers=layers, step=replace(self.step, pin_target=late_targets(layers, target)))
 
     def with_sides(self, reach: float) -> StepProblem:
         """The problem with the sides of cloth near cloth, see :func:`hood.scene.layer_sides.find_sides`; itself where that has

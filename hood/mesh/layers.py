@@ -54,11 +54,14 @@ def library() -> ctypes.CDLL:
     lib.layers_crossed.argtypes = [POINTER]
     lib.layers_pressing.argtypes = [POINTER, POINTER]
     lib.layers_approach.argtypes = [POINTER, POINTER, REAL]
+    lib.layers_resort.argtypes = [POINTER, POINTER]
+    lib.layers_fixed_are_free.argtypes = [POINTER, POINTER, POINTER, REAL, REAL]
+    lib.layers_follow.argtypes = [POINTER, POINTER, REAL, POINTER]
     for name in ("layers_limit", "layers_ease"):
         getattr(lib, name).argtypes = [POINTER, POINTER, POINTER, REAL]
     lib.layers_restart.argtypes = [POINTER]
     lib.layers_apart.argtypes = [POINTER, POINTER, REAL]
-    for name in ("layers_crossed", "layers_apart", "layers_approach", "layers_model"):
+    for name in ("layers_crossed", "layers_apart", "layers_approach", "layers_follow", "layers_model", "layers_fixed_are_free"):
         getattr(lib, name).restype = COUNT
     for name in ("layers_limit", "layers_energy"):
         getattr(lib, name).restype = REAL
@@ -214,10 +217,11 @@ class Layers:
         end = start if ahead is None else _positions(ahead)
         margin = np.minimum(SHARE * mesh.room, MARGIN)
         given = (start.ctypes.data, end.ctypes.data, held.ctypes.data, margin.ctypes.data)
-        rules = pressure, int(between), int(mesh.known_apart(start, held, between))
+        self._apart = mesh.known_apart(start, held, between)
+        rules = pressure, int(between), int(self._apart)
         self.handle = self._lib.layers_make(ctypes.byref(mesh.structure), *given, *rules)
         weakref.finalize(self, self._lib.layers_free, self.handle)
-        self._held, self._between = held, between
+        self._held, self.between = held, between
         self.forced = 0  # pairs of features that held vertices drive through each other
 
     @property
@@ -233,17 +237,42 @@ class Layers:
         """Spare the next step from ``pos`` (V, 3) its search there, if nothing is near anything at ``pos``."""
         here = _positions(pos)
         if self._lib.layers_apart(self.handle, here.ctypes.data, SPARE):
-            self.mesh.apart = Apart(here.copy(), self._held, self._between)
+            self.mesh.apart = Apart(here.copy(), self._held, self.between)
 
     def approach(self, target: np.ndarray) -> np.ndarray:
         """Positions (V, 3) near ``target`` (V, 3) that straight ways from the start lead to on which no two features meet.
 
-        Vertices of pairs that would meet go on together. ``fixed`` ones are at their targets; pairs that cannot make room for
-        them are left out and counted in ``forced``.
+        Vertices of pairs that would meet go on together. ``fixed`` ones are at their targets; where that leads nowhere, the
+        others are taken as near as can be from where :meth:`resort_to` says. Pairs that cannot make room even so are left out
+        and counted in ``forced``.
         """
         there = _positions(target).copy()
         self.forced += int(self._lib.layers_approach(self.handle, there.ctypes.data, LEFT))
         return there
+
+    def fixed_are_free(self, along: np.ndarray, there: np.ndarray) -> bool:
+        """Whether ``fixed`` vertices surely meet nothing where others do not move, on straight ways from ``along`` to ``there``
+        (V, 3): the start moved as one body, and the same with them at their targets. Asked first of all."""
+        farthest = float(np.linalg.norm(there - along, axis=1).max(initial=0.0))
+        if not 2.0 * farthest < (1.0 - LEFT) * float(self.mesh.reach.min(initial=np.inf)):
+            return False  # they may come to what is in no list
+        if self._apart:
+            return True
+        ways = [_positions(pos) for pos in (along, there)]
+        return bool(self._lib.layers_fixed_are_free(self.handle, *(way.ctypes.data for way in ways), farthest, LEFT))
+
+    def resort_to(self, pos: np.ndarray) -> None:
+        """Say where (V, 3) ways from the start lead on which no features meet, with ``fixed`` vertices at their targets."""
+        self._lib.layers_resort(self.handle, _positions(pos).ctypes.data)
+
+    def follow(self, target: np.ndarray) -> tuple[np.ndarray, bool]:
+        """Positions (V, 3) that straight ways from the start lead to on which no two features meet, with ``fixed`` vertices as
+        near to ``target`` (V, 3) as they come, where others fly to, and whether all are there. Layers that are asked this are
+        good for nothing else; see :func:`hood.mesh.layer_pins.follow`.
+        """
+        there, reached = _positions(target), np.empty((self.mesh.num_vertices, 3))
+        arrived = self._lib.layers_follow(self.handle, there.ctypes.data, LEFT, reached.ctypes.data)
+        return reached, bool(arrived)
 
     def limit(self, now: np.ndarray, there: np.ndarray) -> float:
         """Share of the straight ways from ``now`` to ``there`` (V, 3) on which no two features meet: 1 for all of it."""

@@ -1,5 +1,6 @@
 // Cloth near cloth, as Python asks for it; see layers.h and hood/mesh/layers.py. Positions are (V, 3) float64 [m].
 #include "layers.h"
+#include "layer_pins.h"
 #include "layer_pressing.h"
 
 extern "C" {
@@ -36,6 +37,24 @@ int64_t layers_apart(void* handle, const double* pos, double spare) { return ((L
 // Targets that can be reached become ``to``; returns how many pairs are left out for it.
 int64_t layers_approach(void* handle, double* to, double left) {
     return ((Layers*)handle)->approach(to, left);
+}
+
+// Where ways lead that are known to be free: what is left where nearer targets cannot be reached.
+void layers_resort(void* handle, const double* pos) {
+    Layers* layers = (Layers*)handle;
+    layers->resort.assign(pos, pos + layers->start.size());
+}
+
+// Whether fixed vertices meet nothing on their ways, from where all vertices are moved as one body.
+int64_t layers_fixed_are_free(void* handle, const double* along, const double* there, double farthest, double left) {
+    return ((Layers*)handle)->fixed_are_free(along, there, farthest, left);
+}
+
+// Positions ``to`` that straight ways lead to; 1 where fixed vertices are at their targets there. Of layers for this alone.
+int64_t layers_follow(void* handle, const double* target, double left, double* to) {
+    Layers* layers = (Layers*)handle;
+    layers->whole = true, layers->known_apart = false;
+    return LayerPins{*layers, target}.follow(left, to);
 }
 
 double layers_limit(void* handle, const double* from, const double* to, double left) { return ((Layers*)handle)->limit(from, to, left); }

@@ -105,7 +105,7 @@ def test_an_order_without_contact_has_no_effect_and_that_is_told() -> None:
     assert "outfit: layers=… has no effect where cloth_contact is off" in found["warnings"]
 
 
-def test_sentences_name_crossed_starts_and_forced_pins() -> None:
+def test_sentences_name_crossed_starts_and_forced_and_late_pins() -> None:
     columns = {name: np.zeros(5) for name in LAYER_METRICS}
     columns["layer_contacts"][2:] = 7
     columns["layer_crossed"][3] = 12
@@ -115,3 +115,12 @@ def test_sentences_name_crossed_starts_and_forced_pins() -> None:
     assert "3 frames (2 to 4), up to 7 pairs" in text
     assert "1 steps (the first to frame 3) began with cloth through cloth, up to 12 pairs of triangles" in text
     assert "in 1 steps (the first to frame 4) held vertices drive cloth through cloth" in text
+    assert "short of" not in text
+    assert found["cloth_contact"]["pin_lag_max"] == 0.0
+    columns["pin_lag"][2:4] = 0.5e-3, 3.2e-3
+    late = summarise_cloth_contact({"cloth_contact": "auto"}, columns)
+    assert late["cloth_contact"]["frames_with_late_pins"] == [2, 3]
+    text = "\n".join(describe_cloth_contact(late))
+    assert "in 2 frames (the first 2) held vertices stop up to 3.2 mm short of where they should be" in text
+    del columns["pin_lag"]  # a file from before
+    assert summarise_cloth_contact({"cloth_contact": "auto"}, columns) == found

@@ -95,3 +95,25 @@ def test_a_relaxing_step_that_is_not_refined_ends_before_the_cloth_as_well() -> 
     prepared = stepper.prepare(problem.cloth, problem.cloth.rest_pos.numpy())
     assert crossings(problem, alone.predict(problem, prepared).next_pos) > 10
     assert crossings(problem, stepper.predict(problem, prepared).next_pos) == 0
+
+
+@pytest.mark.parametrize("iterations", [0, 5])
+def test_a_network_is_shown_held_vertices_where_they_can_come_to(iterations: int) -> None:
+    """The middles of both sheets are held, and the upper one's should go through the lower one's."""
+    problem = sheets()
+    middle = torch.tensor([30, 31, 32, 39, 40, 41, 48, 49, 50])
+    held, target = torch.zeros(162, dtype=torch.bool), problem.state.pos.clone()
+    held[middle], held[81 + middle] = True, True
+    target[81 + middle, 1] -= 0.03
+    cloth, step = replace(problem.cloth, pinned=held), replace(problem.step, pin_target=target)
+    problem = replace(problem, cloth=cloth, step=step)
+    stepper = RefinedStepper(wild(), POTENTIAL, Count(iterations))
+    prepared = stepper.prepare(problem.cloth, problem.cloth.rest_pos.numpy())
+    known = stepper.search(problem)
+    prediction = stepper.predict(known, prepared)
+    assert known.step.pin_target is not None
+    assert torch.equal(prediction.next_pos[held], known.step.pin_target[held])
+    assert float((prediction.next_pos - target)[held].norm(dim=1).min()) > 5e-3
+    assert crossings(problem, prediction.next_pos) == under(prediction.next_pos) == 0
+    # What has been prepared is not prepared again: the same step as from the bare problem.
+    assert torch.equal(stepper.predict(problem, prepared).next_pos, prediction.next_pos)

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
 import torch
 from layer_scenes import folding_strip, sheet_over_bar, sheets_on_sphere, stack
 
-from hood.dynamics.march import march
+from hood.dynamics.march import Marched, march
 from hood.losses.layer_friction import LayerFriction
 from hood.losses.layers import LayerBarrier
 from hood.losses.potential import default_potential
 from hood.losses.problem import StepProblem
 from hood.mesh.crossing import self_crossings
+from hood.scene.cloth import concatenate_cloths
+from hood.scene.scene import concatenate_step_inputs
+from hood.scene.state import concatenate_states
 from hood.solver.newton import NewtonSettings, minimize
 from hood.solver.sweeps import sweep
 
@@ -68,41 +72,80 @@ def test_a_long_strip_that_folds_at_full_speed_stays_clean() -> None:
 @pytest.mark.parametrize("engine", ["compiled", "torch"])
 def test_held_vertices_push_layers_before_them(engine: str) -> None:
     """A row of the upper sheet that is driven down by 12 mm a step takes the lower one along."""
-    forced, crossed = _drive(held=(0,), steps=4, engine=engine)
-    assert forced == [0] * 4
-    assert crossed == [0] * 4
+    for now, crossed, short in _drive(_ROW, held=(0,), steps=(1, 2, 3, 4), engine=engine):
+        assert crossed == short == now.problem.layers[0].layers.forced == 0
 
 
-def test_held_vertices_that_cannot_reach_their_targets_are_counted() -> None:
-    """The same with the lower sheet held below: the step says so, and all goes on."""
-    forced, crossed = _drive(held=(0, 1), steps=4, engine="compiled")
-    assert max(forced) > 0
-    assert all(count == 0 or any(forced[: index + 1]) for index, count in enumerate(crossed))
+@pytest.mark.parametrize("engine", ["compiled", "torch"])
+def test_held_vertices_that_meet_stop_short_and_go_on_when_there_is_room(engine: str) -> None:
+    """The middle of both sheets is held. The upper one's should go down through the lower one and come back: both give way."""
+    lags = []
+    for now, crossed, short in _drive(_MIDDLE, held=(0, 1), steps=(1, 2, 2, 2, 1, 0, 0), engine=engine):
+        pins, problem = now.problem.layers[0].pins, now.problem
+        assert crossed == problem.layers[0].layers.forced == 0
+        assert bool(now.report.converged.all())
+        assert pins is not None
+        assert short == pytest.approx(float(pins.lag.max()), abs=1e-12)
+        # The places that they come to are the step's boundary condition, for every energy and for the solver.
+        assert problem.step.pin_target is not None
+        assert torch.equal(now.state.pos[problem.cloth.pinned], problem.step.pin_target[problem.cloth.pinned])
+        lags.append(short)
+    assert lags[1] > 7e-3
+    assert abs(lags[3] - lags[2]) < 1e-3
+    assert lags[-2:] == [0.0, 0.0]
 
 
-def _drive(held: tuple[int, ...], steps: int, engine: str) -> tuple[list[int], list[int]]:
-    """Pairs that pins force, and pairs of faces that cross, in steps of two sheets, the upper (0) and the lower (1), of which
-    a row is held; the upper one's is driven down by 12 mm a step."""
+def test_late_pins_are_those_of_each_scene_of_a_batch() -> None:
+    held = _held_sheets(_MIDDLE, (0, 1))
+    ways = [torch.zeros_like(held.state.pos) for _ in range(2)]
+    for way, down in zip(ways, (-12e-3, -1e-3), strict=True):
+        way[25:, 1] = down
+    alone = [replace(held, step=replace(held.step, pin_target=held.state.pos + way)) for way in ways]
+    together = POTENTIAL.prepare(_batch(alone)).step.pin_target
+    singles = [POTENTIAL.prepare(problem).step.pin_target for problem in alone]
+    assert together is not None
+    for scene, (single, problem) in enumerate(zip(singles, alone, strict=True)):
+        assert single is not None
+        assert problem.step.pin_target is not None
+        assert torch.equal(single, problem.step.pin_target) == (scene == 1)
+        assert torch.equal(single, together[50 * scene : 50 * (scene + 1)])
+
+
+#: Vertices of a sheet of 5 by 5 that are held.
+_ROW, _MIDDLE = list(range(10, 15)), [6, 7, 8, 11, 12, 13, 16, 17, 18]
+
+
+def _held_sheets(places: list[int], held: tuple[int, ...]) -> StepProblem:
+    """Two sheets in the air, the upper (0) and the lower (1), with the same places held of some of them."""
     problem = stack(1 / 30, n=5, count=2)
-    size = len(problem.state.pos) // 2
-    rows = torch.zeros(2 * size, dtype=torch.bool)
+    pinned = torch.zeros(50, dtype=torch.bool)
     for sheet in held:
-        first = size if sheet == 0 else 0
-        rows[first + 10 : first + 15] = True
-    cloth, start = replace(problem.cloth, pinned=rows), problem.state.pos
+        pinned[torch.tensor(places) + (25 if sheet == 0 else 0)] = True
+    return replace(problem, cloth=replace(problem.cloth, pinned=pinned), step=replace(problem.step, obstacle=None))
+
+
+def _batch(problems: list[StepProblem]) -> StepProblem:
+    cloth = concatenate_cloths([problem.cloth for problem in problems])
+    state = concatenate_states([problem.state for problem in problems])
+    step = concatenate_step_inputs([problem.step for problem in problems], [len(problem.state.pos) for problem in problems])
+    return StepProblem(cloth, state, step, gravity=problems[0].gravity)
+
+
+def _drive(
+    places: list[int], held: tuple[int, ...], steps: tuple[int, ...], engine: str
+) -> Iterator[tuple[Marched, int, float]]:
+    """Steps, pairs of faces that cross after each, and how far held vertices are short of where they should be: held places of
+    the upper sheet as many times 12 mm down as ``steps`` say."""
+    problem = _held_sheets(places, held)
+    start, faces, rows = problem.state.pos, problem.cloth.faces.numpy(), problem.cloth.pinned
     down = torch.zeros_like(start)
-    down[size:, 1] = -12e-3
-    free = replace(problem.step, obstacle=None)
-    inputs = [replace(free, pin_target=start + (index + 1) * down) for index in range(steps)]
-    forced, crossed = [], []
-    marched = march(
-        POTENTIAL, replace(problem, cloth=cloth, step=free), steps, NewtonSettings(engine=engine), inputs.__getitem__
-    )
+    down[25:, 1] = -12e-3
+    inputs = [replace(problem.step, pin_target=start + count * down) for count in steps]
+    marched = march(POTENTIAL, problem, len(steps), NewtonSettings(engine=engine), inputs.__getitem__)
     for now, step in zip(marched, inputs, strict=True):
-        forced.append(now.problem.layers[0].layers.forced)
-        crossed.append(len(self_crossings(now.state.pos.numpy(), cloth.faces.numpy())))
-        assert torch.equal(now.state.pos[rows], step.pin_target[rows])
-    return forced, crossed
+        assert step.pin_target is not None
+        short = float((now.state.pos - step.pin_target)[rows].norm(dim=1).max())
+        yield now, len(self_crossings(now.state.pos.numpy(), faces)), short
 
 
 def test_without_layers_the_same_sheets_cross() -> None:
