@@ -82,29 +82,23 @@ def _unstretch(cloth: Cloth, pos: Tensor, obstacle: Obstacle | None, clearance: 
     """The least stretched of the positions on the way to no free edge stretched by more than 8%.
 
     A trouser leg on a bent hip has to slide along the whole thigh: plain projections carry a length from edge to edge only
-    and take thousands. Here they are the gradient of ½ Σ w (length − target)², descended with momentum that starts again
-    where it leads uphill (O'Donoghue and Candès 2015). A few edges in a crease stay behind the others in a sum of
-    squares; their weights w grow until they count.
+    and take thousands. Here they are the gradient of ½ Σ w (length − target)², descended with :class:`Momentum`. A few edges
+    in a crease stay behind the others in a sum of squares; their weights w grow until they count.
     """
     start, end = cloth.edges.unbind(dim=1)
     rest_length = (cloth.rest_pos[end] - cloth.rest_pos[start]).norm(dim=1)
     weight = torch.ones_like(rest_length)
     stretch = free_stretch(cloth, pos)
     best, least = pos, float(stretch.max()) if len(stretch) else 0.0
-    search = _LazySearch(cloth, obstacle)
-    ahead, pace = pos, 1.0
+    search, course = LazySearch(cloth, obstacle), Momentum(pos)
     for iteration in range(1, _MOST_ITERATIONS + 1):
         if least <= _STRETCH_LIMIT:
             break
-        contact = search(ahead)
-        now = descend(cloth, ahead, weight, rest_length)
-        now = now if contact is None else leave(cloth, now, contact, clearance)
-        if float(((ahead - now) * (now - pos)).sum()) > 0.0:
-            pace = 1.0
-        next_pace = (1.0 + (1.0 + 4.0 * pace**2) ** 0.5) / 2.0
-        ahead, pos, pace = now + (pace - 1.0) / next_pace * (now - pos), now, next_pace
+        contact = search(course.ahead)
+        now = descend(cloth, course.ahead, weight, rest_length)
+        course.go(now if contact is None else leave(cloth, now, contact, clearance))
         if iteration % _LOOK_EVERY == 0:
-            outside = push_out(cloth, pos, obstacle, clearance)
+            outside = push_out(cloth, course.pos, obstacle, clearance)
             stretch = free_stretch(cloth, outside)
             if float(stretch.max()) < least:
                 best, least = outside, float(stretch.max())
@@ -125,7 +119,28 @@ def descend(cloth: Cloth, pos: Tensor, weight: Tensor, rest_length: Tensor) -> T
     return pos + total / shares.unsqueeze(1) * cloth.free.unsqueeze(1)
 
 
-class _LazySearch:
+class Momentum:
+    """A descent whose steps are carried on, and begin again where that leads uphill (O'Donoghue and Candès 2015)."""
+
+    def __init__(self, pos: Tensor) -> None:
+        self.pos = self.ahead = pos  # (V, 3) m: where the descent is, and from where it takes its next step
+        self._pace = 1.0
+
+    def go(self, now: Tensor) -> None:
+        """Take note of where the step from ``ahead`` led to."""
+        if float(((self.ahead - now) * (now - self.pos)).sum()) > 0.0:
+            self._pace = 1.0
+        pace = (1.0 + (1.0 + 4.0 * self._pace**2) ** 0.5) / 2.0
+        self.ahead = now + (self._pace - 1.0) / pace * (now - self.pos)
+        self.pos, self._pace = now, pace
+
+    def stop(self, pos: Tensor) -> None:
+        """Go on from ``pos``, from rest."""
+        self.pos = self.ahead = pos
+        self._pace = 1.0
+
+
+class LazySearch:
     """Contact with a body that stands still, searched again only where the cloth has moved on."""
 
     def __init__(self, cloth: Cloth, obstacle: Obstacle | None) -> None:

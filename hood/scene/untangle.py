@@ -18,8 +18,8 @@ from torch import Tensor
 from hood.mesh.crossing import self_crossings
 from hood.mesh.topology import boundary_loops
 from hood.scene.cloth import Cloth
-from hood.scene.contact import find_contact, match_surface
-from hood.scene.start import descend, free_stretch, leave, push_out
+from hood.scene.contact import match_surface
+from hood.scene.start import LazySearch, Momentum, descend, free_stretch, leave, push_out
 from hood.scene.state import Obstacle
 
 #: Distance [m] that layers are taken apart to; where triangles still cross, by so much more a round, up to the last.
@@ -29,7 +29,7 @@ _ROUNDS, _STEPS = 24, 20
 #: Rounds after which a way is given up that has not become better.
 _PATIENCE = 8
 #: Garments that do not cross go on being smoothed for so many rounds while an edge is stretched by more than the second.
-_SMOOTHING, _STRETCHED = 6, 0.1
+_SMOOTHING, _STRETCHED = 10, 0.1
 #: Garments in their likeliest order may be stretched by so much before another order is tried, half before the other share.
 _ACCEPTED = 0.5
 #: Times that places are smoothed at most where a garment passes through itself.
@@ -42,8 +42,9 @@ _HELD = 0.2
 _WRONG = 0.75
 #: Orders of the layers that are tried where the likeliest does not come out well.
 _TRIED = 3
-#: What the inner layer takes of a push: half, which opens narrow places, or nothing, which opens folds of an outer layer.
-_SHARES = (0.5, 0.0)
+#: What the inner layer takes of a push: nothing, which opens folds of an outer layer, or half, which opens narrow places; and
+#: once nothing crosses.
+_SHARES, _RELAXED = (0.0, 0.5), 0.25
 
 
 class TangledError(ValueError):
@@ -203,6 +204,12 @@ class _Sheet:
         none = torch.zeros(len(pos), dtype=torch.long)
         return Obstacle(pos, pos, pos, self._faces, none, torch.zeros(len(self._faces), dtype=torch.long), none.bool())
 
+    def within_reach(self, pos: Tensor, rows: Tensor) -> Tensor:
+        """Those of the vertices ``rows`` (N,) that are in the box around this surface; to the others no match is valid."""
+        low, high = (edge(pos[self.vertices], dim=0) for edge in (torch.amin, torch.amax))
+        at = pos[rows]
+        return rows[((at >= low - _NEAR) & (at <= high + _NEAR)).all(dim=1)]
+
     def match(self, pos: Tensor, rows: Tensor) -> _Match:
         """Where the vertices ``rows`` (N,) are over this surface, both at ``pos`` (V, 3)."""
         found = match_surface(pos[rows], torch.zeros(len(rows), dtype=torch.long), self.obstacle(pos))
@@ -238,19 +245,12 @@ def _take_apart(
     turned: tuple[tuple[int, int], ...],
 ) -> Separation:
     """The garments apart in one order; the best of the rounds. What is not yet as the order has it counts as one crossing."""
-    cloth, sheets = outfit.cloth, _sheets(outfit, pos, obstacle)
-    rest_length = (cloth.rest_pos[cloth.edges[:, 1]] - cloth.rest_pos[cloth.edges[:, 0]]).norm(dim=1)
-    gap, weight = torch.full_like(pos[:, 0], _GAP), torch.ones_like(rest_length)
+    course = _Course(outfit, pos, obstacle, clearance, order)
     best, found, clean = Separation(pos, order, before, before + len(turned), _longest(outfit, pos), turned), 0, 0
     for number in range(_ROUNDS):
-        for _ in range(_STEPS):
-            pos = descend(cloth, pos, weight, rest_length) if number else pos
-            if obstacle is not None:
-                pos = leave(cloth, pos, find_contact(pos, cloth.vertex_scene, obstacle), clearance)
-            for inner, outer in combinations(order, 2):
-                pos = _apart(cloth, pos, sheets[outer].vertices, sheets[inner], gap, 1.0, 1.0 - inner_share)
-                pos = _apart(cloth, pos, sheets[inner].vertices, sheets[outer], gap, -1.0, inner_share)
-        ended = push_out(cloth, pos, obstacle, clearance)
+        # What is apart has no folds to open any more: both layers give way, and lengths travel with momentum.
+        course.round(_RELAXED if clean else inner_share, lengths=number > 0, carried=clean > 0)
+        ended = push_out(outfit.cloth, course.pos, obstacle, clearance)
         pairs = crossing_pairs(outfit, ended)
         left = len(pairs) + (len(_against(outfit, ended, obstacle, order)) if turned else 0)
         now = Separation(ended, order, before, left, _longest(outfit, ended), turned)
@@ -260,14 +260,62 @@ def _take_apart(
         done = now.after == 0 and (now.stretch <= _STRETCHED or clean > _SMOOTHING)
         if done or number - found >= _PATIENCE:
             break
-        crossed = torch.as_tensor(np.unique(outfit.faces[pairs.reshape(-1)]))
-        gap[crossed] = (gap[crossed] + _MORE).clamp_max(_WIDEST)
+        course.widen(pairs)
     return best
+
+
+class _Course:
+    """The way of an outfit's garments apart, in rounds of steps."""
+
+    def __init__(
+        self, outfit: Outfit, pos: Tensor, obstacle: Obstacle | None, clearance: float, order: tuple[int, ...]
+    ) -> None:
+        self._outfit, self._order, self._clearance = outfit, order, clearance
+        cloth, self._sheets = outfit.cloth, _sheets(outfit, pos, obstacle)
+        self._rest_length = (cloth.rest_pos[cloth.edges[:, 1]] - cloth.rest_pos[cloth.edges[:, 0]]).norm(dim=1)
+        self._weight = torch.ones_like(self._rest_length)
+        self._gap = torch.full_like(pos[:, 0], _GAP)
+        self._search, self._course = LazySearch(cloth, obstacle), Momentum(pos)
+
+    @property
+    def pos(self) -> Tensor:
+        """(V, 3) m, where the garments are."""
+        return self._course.pos
+
+    def round(self, inner_share: float, lengths: bool, carried: bool) -> None:
+        """Steps in which the inner of two layers takes ``inner_share`` of the push, edges get their ``lengths`` back or not,
+        and steps are ``carried`` on or not."""
+        if not carried:
+            self._course.stop(self.pos)
+        cloth = self._outfit.cloth
+        for _ in range(_STEPS):
+            pos = self._course.ahead
+            pos = descend(cloth, pos, self._weight, self._rest_length) if lengths else pos
+            contact = self._search(pos)
+            pos = self._layered(pos if contact is None else leave(cloth, pos, contact, self._clearance), inner_share)
+            if carried:
+                self._course.go(pos)
+            else:
+                self._course.stop(pos)
+
+    def _layered(self, pos: Tensor, inner_share: float) -> Tensor:
+        """``pos`` (V, 3) with every layer pushed to its side of every other one."""
+        for inner, outer in combinations(self._order, 2):
+            over, under = self._sheets[outer], self._sheets[inner]
+            pos = _apart(self._outfit.cloth, pos, over.vertices, under, self._gap, 1.0, 1.0 - inner_share)
+            pos = _apart(self._outfit.cloth, pos, under.vertices, over, self._gap, -1.0, inner_share)
+        return pos
+
+    def widen(self, pairs: np.ndarray) -> None:
+        """Take the faces of ``pairs`` (N, 2), which cross, farther apart in the next rounds."""
+        crossed = torch.as_tensor(np.unique(self._outfit.faces[pairs.reshape(-1)]))
+        self._gap[crossed] = (self._gap[crossed] + _MORE).clamp_max(_WIDEST)
 
 
 def _apart(cloth: Cloth, pos: Tensor, rows: Tensor, sheet: _Sheet, gap: Tensor, side: float, share: float) -> Tensor:
     """``pos`` (V, 3) with the vertices ``rows`` (N,) on a side of a sheet, +1 its outside, by their ``gap`` (V,) [m];
     ``share`` of the way is theirs, the rest the sheet's. What several ask of a vertex is averaged."""
+    rows = sheet.within_reach(pos, rows)
     match = sheet.match(pos, rows)
     lacking = (gap[rows] - side * match.height).clamp_min(0.0) * match.valid
     touched = lacking > 0
