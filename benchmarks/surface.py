@@ -8,9 +8,10 @@
 Rollouts as of ``hood rollout``: embedded body, default fabric, the motions of the validation list, layers of cloth kept apart
 where the solver takes or refines the steps. A line per rollout as soon
 as it is done, then a table over the motions: mean and worst share of the cloth's triangles that the body's true surface cuts,
-the greatest height of skin above the cloth, mean and worst number of pairs of the cloth's triangles that pass through each
-other, over every --stride-th frame, the first and the last; of all frames the median distance of the vertices that touch from
-the skin, the iterations (median and 95th percentile), the steps that missed the solver's accuracy, and the time.
+the same apart from those that are caught where the body passes through itself, the greatest height of skin above the cloth,
+mean and worst number of pairs of the cloth's triangles that pass through each other, over every --stride-th frame, the first
+and the last; of all frames the median distance of the vertices that touch from the skin, the iterations (median and 95th
+percentile), the steps that missed the solver's accuracy, and the time.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ from hood.solver.newton import NewtonSettings
 
 GARMENTS = ("tshirt", "longsleeve", "tank", "dress", "skirt", "trousers", "shorts")
 HEADER = (
-    f"{'':38}{'cut, mean':>11}{'worst':>8}{'frame':>7}{'skin, mm':>10}{'crossings':>11}{'worst':>7}"
+    f"{'':38}{'cut, mean':>11}{'worst':>8}{'frame':>7}{'apart':>8}{'worst':>8}{'skin, mm':>10}{'crossings':>11}{'worst':>7}"
     f"{'off, mm':>9}{'iterations':>12}{'p95':>5}{'missed':>8}{'ms':>8}"
 )
 #: Vertices as near to the skin as this [m] count as in touch.
@@ -53,7 +54,7 @@ TOUCH = 0.02
 class Measured(NamedTuple):
     """A rollout."""
 
-    rows: np.ndarray  # (N, 1 + 5 + 1) number, SURFACE_METRICS and median distance [m] from the skin of the measured frames
+    rows: np.ndarray  # (N, 1 + 6 + 1) number, SURFACE_METRICS and median distance [m] from the skin of the measured frames
     steps: np.ndarray  # (T, 4) solver's iterations, whether converged, ms, refining iterations of all frames but the first
 
 
@@ -95,12 +96,13 @@ def measure(stepper: Stepper, scene: Scene, potential: Potential, num_frames: in
 
 def line(title: str, measured: Measured) -> str:
     """Figures of measured frames; those that are not finite count as a whole surface cut."""
-    frame, share, _, depth, own, _, off = measured.rows.T
+    frame, share, _, depth, own, _, folds, off = measured.rows.T
     share = np.where(np.isfinite(share), share, 1.0)
-    own, depth = np.nan_to_num(own), np.nan_to_num(depth)
+    own, depth, folds = np.nan_to_num(own), np.nan_to_num(depth), np.nan_to_num(folds)
     worst = int(share.argmax())
     return (
-        f"{title:38}{share.mean():>11.2%}{share[worst]:>8.2%}{frame[worst]:>7.0f}{1e3 * depth.max():>10.1f}"
+        f"{title:38}{share.mean():>11.2%}{share[worst]:>8.2%}{frame[worst]:>7.0f}"
+        f"{(share - folds).mean():>8.2%}{(share - folds).max():>8.2%}{1e3 * depth.max():>10.1f}"
         f"{own.mean():>11.1f}{own.max():>7.0f}{1e3 * np.median(off):>9.2f}{_effort(measured.steps)}"
     )
 

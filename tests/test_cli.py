@@ -242,7 +242,7 @@ def test_rollout_file_has_the_documented_content(run_folder: Path) -> None:
         np.testing.assert_allclose(file["time"][:], np.arange(3) / 30)
         for name in ("strain_p50", "strain_p99", "strain_max", "penetration_count", "penetration_share", "penetration_depth"):
             assert np.isfinite(file[f"metrics/{name}"][:]).all()
-        for name in ("cut_face_share", "cut_edge_share", "skin_depth", "self_crossings", "garment_crossings"):
+        for name in ("cut_face_share", "cut_edge_share", "skin_depth", "self_crossings", "garment_crossings", "cut_in_folds"):
             assert np.isfinite(file[f"metrics/{name}"][:]).tolist() == [True, False, True]  # first and last
         for name in ("energy_stretching", "energy_total", "gradient_norm", "relative_gradient", "e0", "ms_total"):
             values = file[f"metrics/{name}"][:]

@@ -17,10 +17,13 @@ def summarise_surface(metrics: Mapping[str, np.ndarray], stride: int | None) -> 
     measured = int(np.isfinite(share).sum())
     if measured == 0:
         return None
+    folds = metrics.get("cut_in_folds")  # older files have none
+    apart = {} if folds is None else {"cut_apart_from_folds": _mean_and_worst(share - folds)}
     return {
         "stride": stride,
         "frames_measured": measured,
         "cut_face_share": _mean_and_worst(share),
+        **apart,
         "cut_edge_share": _mean_and_worst(metrics["cut_edge_share"]),
         "skin_depth_m": _mean_and_worst(metrics["skin_depth"]),
         "self_crossings": _mean_and_worst(metrics["self_crossings"]),
@@ -40,11 +43,20 @@ def describe_surface(surface: Mapping[str, Any] | None) -> list[str]:
         if surface[key]["worst"] > 0
     ]
     found = [
-        f"the body cuts {cut['mean']:.1%} of the cloth's triangles on average, {cut['worst']:.1%} in frame {cut['frame']}",
+        f"the body cuts {cut['mean']:.1%} of the cloth's triangles on average, {cut['worst']:.1%} in frame {cut['frame']}"
+        + _apart_from_folds(surface),
         f"skin at most {1e3 * depth['worst']:.1f} mm above the cloth",
         *crossed,
     ]
     return [f"surface{every}: {', '.join(found)}", *_warnings(surface)]
+
+
+def _apart_from_folds(surface: Mapping[str, Any]) -> str:
+    """What is left without the triangles that are caught where the body passes through itself; empty without such."""
+    rest = surface.get("cut_apart_from_folds")
+    if rest is None or rest["mean"] == surface["cut_face_share"]["mean"]:
+        return ""
+    return f" ({rest['mean']:.2%} and {rest['worst']:.2%} apart from where the body passes through itself)"
 
 
 def cut_at_worst(surface: Mapping[str, Any] | None) -> str:

@@ -14,7 +14,7 @@ from hood.mesh.compiled_crossing import Eights, eights
 from hood.mesh.crossing import crossings, self_crossings
 from hood.mesh.skin import Sheet, skin_depth
 
-SURFACE_METRICS = ("cut_face_share", "cut_edge_share", "skin_depth", "self_crossings", "garment_crossings")
+SURFACE_METRICS = ("cut_face_share", "cut_edge_share", "skin_depth", "self_crossings", "garment_crossings", "cut_in_folds")
 #: Frames from one measurement to the next: less than 1 ms a frame at 1,000 vertices, 1 ms at 12,000.
 SURFACE_STRIDE = 5
 #: Cloth with a median edge of more than so many times that at rest is no garment any more.
@@ -47,7 +47,8 @@ class SurfaceMeter:
         ``skin_depth`` [m] is how far the body sticks out through them (:func:`hood.mesh.skin.skin_depth`). ``self_crossings``
         is the number of pairs of faces of one garment that pass through each other and share no vertex,
         ``garment_crossings`` that of faces of two garments of an outfit. What crossing means:
-        :mod:`hood.mesh.crossing`.
+        :mod:`hood.mesh.crossing`. ``cut_in_folds`` is the part of ``cut_face_share`` whose faces are caught where the body
+        passes through itself, as in the bend of an elbow, see :func:`in_folds`.
 
         NaN where a position is not finite, and where the cloth is in tatters, its median edge more than :data:`TATTERS` times
         as long as at rest: nearly all of its triangles would have to be compared with each other, to say no more than that.
@@ -68,6 +69,8 @@ class SurfaceMeter:
             skin_depth(pos, self._faces, body_pos, self._body_faces, cut, self._sheet, both),
             float(same.sum()),
             float((~same).sum()),
+            _num_groups(cut.pairs[in_folds(cut.pairs[:, 1], body_pos, self._body_faces, self._body), :1])
+            / max(len(self._faces), 1),
         )
         return dict(zip(SURFACE_METRICS, values, strict=True))
 
@@ -76,6 +79,19 @@ class SurfaceMeter:
         longer = 2 * int(np.count_nonzero(lengths > self._longest))
         # The median lies between two lengths where these are half of them.
         return longer > len(lengths) or (longer == len(lengths) > 0 and bool(np.median(lengths) > self._longest))
+
+
+def in_folds(cutting: np.ndarray, body_pos: np.ndarray, body_faces: np.ndarray, body: Eights | None = None) -> np.ndarray:
+    """Which of the faces ``cutting`` (N,) of a body are in a fold, (N,) bool: they pass through another face of it, or share a
+    vertex with one that does. Cloth between two parts of a body that are in one place cannot be outside both.
+
+    ``body``: :func:`hood.mesh.compiled_crossing.eights` of the faces, where they are known.
+    """
+    if not len(cutting):
+        return np.zeros(0, dtype=bool)
+    through = np.zeros(len(body_pos), dtype=bool)
+    through[body_faces[np.unique(self_crossings(body_pos, body_faces, body))]] = True
+    return np.asarray(through[body_faces[cutting]].any(axis=1))
 
 
 def _num_groups(rows: np.ndarray) -> int:

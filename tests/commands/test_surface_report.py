@@ -41,6 +41,17 @@ def test_a_whole_surface_is_said_to_be_whole_without_a_warning() -> None:
     assert crossed[1:] == ["warning: 7 pairs of triangles of two garments pass through each other in frame 0"]
 
 
+def test_triangles_caught_in_folds_of_the_body_are_counted_and_told_apart() -> None:
+    measured = metrics([0.002, 0.006], [0, 0], [0, 0])
+    found = summarise_surface(measured | {"cut_in_folds": np.array([0.002, 0.005])}, 1)
+    assert found is not None
+    assert found["cut_face_share"]["worst"] == 0.006
+    assert found["cut_apart_from_folds"] == {"mean": pytest.approx(0.0005), "worst": pytest.approx(0.001), "frame": 1}
+    assert "0.6% in frame 1 (0.05% and 0.10% apart from where the body passes through itself)" in describe_surface(found)[0]
+    plain = summarise_surface(measured | {"cut_in_folds": np.zeros(2)}, 1)
+    assert describe_surface(plain) == describe_surface(summarise_surface(measured, 1))
+
+
 def test_what_was_not_measured_is_not_claimed() -> None:
     assert summarise_surface({}, None) is None
     assert summarise_surface(metrics([NAN], [NAN], [NAN]), 5) is None

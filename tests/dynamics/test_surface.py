@@ -36,6 +36,20 @@ def test_a_ball_that_fits_cuts_nothing_and_one_that_does_not_cuts_a_band() -> No
     assert cut["self_crossings"] == cut["garment_crossings"] == 0.0
 
 
+def test_cloth_caught_where_the_body_passes_through_itself_is_told_apart() -> None:
+    middle, big = TUBE.mean(axis=0), 1.5 * BALL
+    alone = SurfaceMeter(tube("tube"), BALL_FACES)(TUBE, big + middle)
+    assert alone["cut_in_folds"] == 0.0 < alone["cut_face_share"]
+    faces = np.concatenate([BALL_FACES, BALL_FACES + len(BALL)])
+    meter = SurfaceMeter(tube("tube"), faces)
+    up = np.array([0.0, 0.05, 0.0])
+    crossed = meter(TUBE, np.concatenate([big + middle - up, big + middle + up]))
+    assert 0.0 < crossed["cut_in_folds"] < crossed["cut_face_share"]
+    apart = meter(TUBE, np.concatenate([big + middle, big + middle + 10 * up]))
+    assert apart["cut_in_folds"] == 0.0
+    assert apart["cut_face_share"] == alone["cut_face_share"]
+
+
 def test_crossings_are_told_apart_by_garment() -> None:
     first, second = tube("a"), tube("b", (0.05, 0.003, 0.01))
     outfit = join_garments([first, second])
