@@ -181,7 +181,9 @@ def summary(garment: Garment) -> str:
     return f"{len(garment.rest_pos)} vertices, {len(garment.faces)} triangles, {parts} component(s), {openings} openings"
 
 
-_PER_VERTEX = ("rest_pos", "pinned", "lbs_weights", "shapedirs", "colours", "skin_pos", "rest_turn", "piece", "region")
+_PER_VERTEX = (
+    "rest_pos", "pinned", "lbs_weights", "shapedirs", "colours", "skin_pos", "rest_turn", "piece", "region", "stiffness",
+)  # fmt: skip
 _PER_FACE = ("faces", "uv_faces", "normal_faces")
 
 

@@ -40,6 +40,7 @@ class Garment:
     rest_turn: np.ndarray | None = None  # (V, 3, 3) from the T-pose into the pose of rest_pos; None: identity
     coarse_edges: tuple[np.ndarray, ...] | None = None  # each (E, 2), levels of a hierarchy that came with the garment
     region: np.ndarray | None = None  # (V,) int64, index into hood.assets.pins.MARKS; None: not marked
+    stiffness: np.ndarray | None = None  # (V,) how many times as stiff as its fabric the cloth is there; None: once
     piece: np.ndarray | None = None  # (V,) int64, garment of an outfit that a vertex belongs to, from 0; None: all one garment
 
     @property

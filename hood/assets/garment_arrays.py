@@ -22,6 +22,7 @@ _ROWS: dict[str, tuple[int | None, ...]] = {
     "colours": (3,),
     "piece": (),
     "region": (),
+    "stiffness": (),
 }
 _CORNERS = ("uv_faces", "normal_faces")
 _LEVEL = "coarse_edges_"
@@ -48,6 +49,7 @@ def read_fields(path: Path) -> dict[str, Any]:
             fields[key] = _reals(path, key, arrays[key])
             check_rows(str(path), key, fields[key], num_vertices)
     fields["pinned"] = fields.get("pinned", np.zeros(num_vertices)).astype(bool)
+    _check_stiffness(path, fields.get("stiffness"))
     for key in ("piece", "region"):
         if key in fields:
             fields[key] = fields[key].astype(np.int64)
@@ -90,6 +92,14 @@ def check_rows(where: str, key: str, value: np.ndarray, num_vertices: int) -> No
     finite = np.isfinite(value).reshape(num_vertices, -1).all(axis=1)
     if not finite.all():
         raise ValueError(f"{where}: {key} of vertex {int(np.argmin(finite))} is not finite; repair it")
+
+
+def _check_stiffness(path: Path, stiffness: np.ndarray | None) -> None:
+    if stiffness is not None and not (stiffness > 0).all():
+        vertex = int(np.argmin(stiffness > 0))
+        raise ValueError(
+            f"{path}: stiffness of vertex {vertex} is {stiffness[vertex]}; give a factor above 0, 1 for plain cloth"
+        )
 
 
 def normalised(where: str, weights: np.ndarray) -> np.ndarray:

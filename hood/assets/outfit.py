@@ -41,6 +41,7 @@ def join_garments(garments: Sequence[Garment]) -> Garment:
         rest_turn=_join_rows(garments, "rest_turn", lambda garment: np.tile(np.eye(3), (len(garment.rest_pos), 1, 1))),
         coarse_edges=_join_levels(garments, starts),
         piece=_join_pieces(garments),
+        stiffness=_join_rows(garments, "stiffness", lambda garment: np.ones(len(garment.rest_pos))),
         region=_join_rows(garments, "region", lambda garment: np.zeros(len(garment.rest_pos), dtype=np.int64)),
     )
 

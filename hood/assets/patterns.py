@@ -69,7 +69,7 @@ class Pattern:
     waist; those without `legs` share the thighs' motion. `weight_reach` [m] is the length over which
     skinning weights are smoothed. `parts` are negative on what is cut from panels of its own, a leg or a sleeve. `arms` is how
     far the arms hang down [degrees] in the pose it is drafted in: sleeves drafted for level arms crumple at the armpit of
-    lowered ones.
+    lowered ones. `firm` names what is sewn stiffer: ``rims`` (neckline and armholes) or ``crotch``.
     """
 
     field: Callable[[Fields], Array]
@@ -80,6 +80,7 @@ class Pattern:
     legs: bool = False
     parts: tuple[Callable[[Array], Array], ...] = ()
     arms: float = 0.0
+    firm: str | None = None
 
 
 def body_fields(posed: PosedBody) -> Fields:
@@ -286,6 +287,7 @@ PATTERNS = {
         weight_reach=0.035,
         legs=True,
         parts=(right_leg,),
+        firm="crotch",
     ),
     "trousers": Pattern(
         lambda f: leg_field(f, 0.016, 0.065),
@@ -294,6 +296,7 @@ PATTERNS = {
         weight_reach=0.035,
         legs=True,
         parts=(right_leg,),
+        firm="crotch",
     ),
     "dress": Pattern(
         lambda f: dress_field(f, 0.012, 0.27),
@@ -301,6 +304,7 @@ PATTERNS = {
         arms=45.0,
         weight_reach=0.05,
         flared=True,
+        firm="rims",
     ),
     "skirt": Pattern(
         lambda f: finish(f, skirt_field(f, 0.010, 0.22, 0.32), 0.014),

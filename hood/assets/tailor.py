@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from hood.assets.binding import PosedBody, posed_body, undo_skinning
 from hood.assets.body import Body, load_body
@@ -39,6 +40,9 @@ from hood.mesh import topology
 #: m. What the T-pose brings nearer to the skin than the first, of garments drafted in another pose, is moved to the second:
 #: contact holds edges of 35 mm as far off the crest of the shoulders (hood/scene/reach.py), and would stretch nearer cloth.
 _TPOSE_NEAR, _TPOSE_CLEARANCE = 0.004, 0.007
+#: How many times as stiff as plain cloth bindings and linings are; within the range of fabrics that networks are trained with
+#: (hood/assets/material.py). Bindings and linings reach so far [m] from a rim and from the crotch.
+_FIRMER, _BINDING, _LINING = 2.0, 0.025, 0.08
 _SHAPE_STEP = 2.0**-16  # m per unit of beta
 
 
@@ -88,9 +92,34 @@ def tailor(pattern: Pattern, model: Model, verts: Array, faces: Faces) -> dict[s
         "shapedirs": _steps(shapedirs).astype(np.float16),
         "lbs_weights": weights.astype(np.float16),
         "pinned": pinned_vertices(pattern, verts, faces),
-        "region": mark_regions(tpose, faces, panel, model.rest.body),
+        "region": (region := mark_regions(tpose, faces, panel, model.rest.body)),
+        "stiffness": firmness(pattern.firm, verts, faces, region),
         **worn,
     }
+
+
+def firmness(firm: str | None, verts: Array, faces: Faces, region: NDArray[np.uint8]) -> NDArray[np.float16] | None:
+    """Stiffness (V,) of a garment whose neckline and armholes are bound (``rims``), or which is lined around its ``crotch``;
+    None of one that is all plain cloth."""
+    if firm is None:
+        return None
+    places, width = (_rims(verts, region), _BINDING) if firm == "rims" else (_crotch(verts, faces), _LINING)
+    near = cKDTree(places).query(verts)[0] < width
+    return np.where(near, _FIRMER, 1.0).astype(np.float16)
+
+
+def _rims(verts: Array, region: NDArray[np.uint8]) -> Array:
+    """Vertices (N, 3) of the neckline and the armholes."""
+    return verts[np.isin(region, [MARKS.index(name) for name in ("neckline", "armhole_left", "armhole_right")])]
+
+
+def _crotch(verts: Array, faces: Faces) -> Array:
+    """Where the legs meet (1, 3): the lowest point at which an edge passes through the middle."""
+    start, end = verts[topology.unique_edges(faces)].transpose(1, 0, 2)
+    across = start[:, 0] * end[:, 0] < 0
+    start, end = start[across], end[across]
+    points = start + (end - start) * (start[:, :1] / (start[:, :1] - end[:, :1]))
+    return points[points[:, 1].argmin()][None]
 
 
 def mark_regions(tpose: Array, faces: Faces, panel: NDArray[np.int64], body: Body) -> NDArray[np.uint8]:

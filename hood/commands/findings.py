@@ -113,6 +113,15 @@ def inspect_garment(name: str, body: Body | MeshMotion, wearer: Sequence[str], b
     return finding
 
 
+def _stiffer(garment: Garment) -> str | None:
+    """Where the file has bindings or seams: how many vertices, and by which factors."""
+    if garment.stiffness is None or (garment.stiffness == 1.0).all():
+        return None
+    other = garment.stiffness[garment.stiffness != 1.0]
+    factors = f"{other.min():g}" if other.min() == other.max() else f"{other.min():g} to {other.max():g}"
+    return f"{len(other)} vertices, {factors} times"
+
+
 def _garment_facts(garment: Garment) -> dict[str, Any]:
     return {
         "vertices": len(garment.rest_pos),
@@ -120,6 +129,7 @@ def _garment_facts(garment: Garment) -> dict[str, Any]:
         "size": np.round(np.ptp(garment.rest_pos, axis=0), 4).tolist(),
         "bound to": (garment.bound_to or "any body of its skeleton") if garment.bound else None,
         "held vertices": int(garment.pinned.sum()),
+        "stiffer than the fabric": _stiffer(garment),
         "texture coordinates": 0 if garment.uv is None else len(garment.uv),
         "hard edges": garment.normal_faces is not None,
         "vertex colours": garment.colours is not None,

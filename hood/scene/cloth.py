@@ -88,6 +88,7 @@ def build_cloth(
     material: Material,
     pinned: np.ndarray | None = None,
     flat_rest: bool = False,
+    stiffness: np.ndarray | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> Cloth:
     """Cloth of one garment.
@@ -102,6 +103,7 @@ def build_cloth(
         faces: (F, 3) vertex indices.
         material: fabric; each property a number or a field on vertices, faces or edges.
         pinned: (V,) bool, vertices that follow prescribed positions.
+        stiffness: (V,) factors on both Lamé parameters, of bindings and seams; faces and edges have the mean of their corners.
         flat_rest: take 0 as rest angle of every hinge instead of the angle in ``rest_pos``.
 
     Raises:
@@ -117,7 +119,7 @@ def build_cloth(
     edges, hinges = torch.as_tensor(edge_table), torch.as_tensor(hinge_table.vertices)
     area = geometry.triangle_areas(pos, tri)
     _warn_about_slivers(pos, tri, area)
-    fabric = FabricMap(material, len(points), triangles, edge_table, area.numpy())
+    fabric = FabricMap(material, len(points), triangles, edge_table, area.numpy(), stiffness)
     density = torch.tensor(fabric.on_faces("density"))
     hinge_edges = topology.edge_index(edge_table, hinge_table.vertices[:, :2])
     angle = geometry.dihedral_angles(pos, hinges)

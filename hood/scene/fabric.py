@@ -30,12 +30,24 @@ class FabricMap:
         faces: (F, 3).
         edges: (E, 2), :func:`hood.mesh.topology.unique_edges` of the faces.
         area: (F,) m² at rest.
+        stiffness: (V,) factors on ``lame_mu`` and ``lame_lambda``, carried over like a property given on vertices; None: 1.
 
     Raises:
-        ValueError: a field has the wrong length, or μ + λ is not positive on a face.
+        ValueError: a field or ``stiffness`` has the wrong length, or μ + λ is not positive on a face.
     """
 
-    def __init__(self, material: Material, num_vertices: int, faces: np.ndarray, edges: np.ndarray, area: np.ndarray) -> None:
+    def __init__(
+        self,
+        material: Material,
+        num_vertices: int,
+        faces: np.ndarray,
+        edges: np.ndarray,
+        area: np.ndarray,
+        stiffness: np.ndarray | None = None,
+    ) -> None:
+        if stiffness is not None and stiffness.shape != (num_vertices,):
+            raise ValueError(f"stiffness has shape {stiffness.shape}; give one factor per vertex ({num_vertices},)")
+        self._stiffness = stiffness
         self.faces, self.edges, self.area = faces, edges, area
         self._counts = {"vertex": num_vertices, "face": len(faces), "edge": len(edges)}
         self._values = {name: values_of(getattr(material, name)) for name in Material.names()}
@@ -50,6 +62,9 @@ class FabricMap:
 
     def on_vertices(self, name: str) -> np.ndarray:
         """(V,) values of a property."""
+        return self._stiffened(name, self._on_vertices(name), None)
+
+    def _on_vertices(self, name: str) -> np.ndarray:
         values, place = self._values[name]
         if place == "face":
             return self._gather(self.faces, values, self.area)
@@ -59,6 +74,9 @@ class FabricMap:
 
     def on_faces(self, name: str) -> np.ndarray:
         """(F,) values of a property."""
+        return self._stiffened(name, self._on_faces(name), self.faces)
+
+    def _on_faces(self, name: str) -> np.ndarray:
         values, place = self._values[name]
         if place == "vertex":
             return values[self.faces].mean(axis=1)
@@ -68,6 +86,9 @@ class FabricMap:
 
     def on_edges(self, name: str) -> np.ndarray:
         """(E,) values of a property."""
+        return self._stiffened(name, self._on_edges(name), self.edges)
+
+    def _on_edges(self, name: str) -> np.ndarray:
         values, place = self._values[name]
         if place == "vertex":
             return values[self.edges].mean(axis=1)
@@ -76,6 +97,12 @@ class FabricMap:
             total = np.bincount(edge, np.repeat(values, 3), len(self.edges))
             return total / np.bincount(edge, minlength=len(self.edges))
         return self._broadcast(values, "edge")
+
+    def _stiffened(self, name: str, values: np.ndarray, elements: np.ndarray | None) -> np.ndarray:
+        """``values`` of a property on vertices, or on elements (N, C), with the factors that it has there."""
+        if self._stiffness is None or name not in _STIFFENED:
+            return values
+        return values * (self._stiffness if elements is None else self._stiffness[elements].mean(axis=1))
 
     @cached_property
     def _face_edges(self) -> np.ndarray:
@@ -95,4 +122,6 @@ class FabricMap:
         return np.broadcast_to(values, (self._counts[place],))
 
 
+#: What a garment's stiffness multiplies.
+_STIFFENED = ("lame_mu", "lame_lambda")
 _PLURAL = {"vertex": "vertices", "face": "faces", "edge": "edges"}

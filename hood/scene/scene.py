@@ -197,7 +197,8 @@ def dress(garment: Garment, motion: Motion, material: Material | None = None, si
     """
     garment = motion.dressed(garment)
     rest_pos = motion.rest_pos(garment) * size
-    cloth = build_cloth(rest_pos, garment.faces, material or Material(), garment.pinned, dtype=motion.dtype)
+    fabric = material or Material()
+    cloth = build_cloth(rest_pos, garment.faces, fabric, garment.pinned, stiffness=garment.stiffness, dtype=motion.dtype)
     return Scene(to_device(cloth, motion.device), garment, motion, 1.0 / motion.fps)
 
 

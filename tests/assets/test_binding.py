@@ -143,6 +143,9 @@ def test_an_outfit_is_its_parts(garments: dict[str, Garment], body: Body) -> Non
     np.testing.assert_array_equal(outfit.colours[:start], 1.0)
     np.testing.assert_array_equal(outfit.piece, np.repeat([0, 1, 2], [start, len(skirt.rest_pos), start]))
     np.testing.assert_array_equal(join_garments([plain, outfit]).piece[len(skirt.rest_pos) :], outfit.piece + 1)
+    dress = garments["dress"]
+    np.testing.assert_array_equal(join_garments([top, dress]).stiffness, np.r_[np.ones(start), dress.stiffness])
+    assert outfit.stiffness is None
     assert join_garments([top]) is top
     assert not join_garments([top, bare(skirt)]).bound
 

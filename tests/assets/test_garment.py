@@ -44,8 +44,10 @@ def test_shape_offsets_follow_the_body(garments: dict[str, Garment], body: Body)
 
 def test_npz_round_trip(tmp_path: Path, arrays: dict[str, np.ndarray]) -> None:
     piece = np.arange(len(arrays["rest_pos"])) % 2
-    np.savez(tmp_path / "rag.npz", **arrays, piece=piece)
+    stiffness = 1.0 + piece
+    np.savez(tmp_path / "rag.npz", **arrays, piece=piece, stiffness=stiffness)
     garment = load_garment(tmp_path / "rag.npz")
+    np.testing.assert_array_equal(garment.stiffness, stiffness)
     assert garment.name == "rag"
     np.testing.assert_array_equal(garment.piece, piece)
     assert not garment.bound
@@ -76,6 +78,7 @@ REFUSED = {
     "real faces": (lambda a: {"faces": a["faces"].astype(float)}, ("faces are float64",)),
     "repeated": (lambda a: {"faces": np.array([[0, 1, 3], [0, 0, 1]])}, ("face 1 repeats a vertex",)),
     "no faces": (lambda a: {"faces": np.zeros((0, 3), dtype=int)}, ("empty",)),
+    "stiffness": (lambda a: {"stiffness": with_row(-1.0, 5, (9,))}, ("stiffness of vertex 5 is -1.0", "above 0")),
     "pins": (lambda a: {"pinned": np.zeros(4, dtype=bool)}, ("pinned has 4 rows for 9 vertices",)),
     "weights": (lambda a: {"lbs_weights": with_row(0.0, 2, (9, 24))}, ("lbs_weights of vertex 2",)),
     "shape": (lambda a: {"shapedirs": with_row(np.nan, 3, (9, 3, 10))}, ("shapedirs of vertex 3",)),

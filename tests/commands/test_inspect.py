@@ -210,3 +210,11 @@ def test_inspect_knows_what_a_rollout_does_there(
     monkeypatch.setattr("hood.scene.scene._TORN", 0.1)  # in 60 iterations this dress is stretched by more
     assert main(["inspect", "dress", seated]) == 0
     assert "they fit: put on in the T-pose, from where a rollout moves the body into this pose" in capsys.readouterr().out
+
+
+def test_bindings_of_a_garment_are_told(capsys: pytest.CaptureFixture[str], garments: dict[str, Garment]) -> None:
+    code, report = inspect(capsys, "dress", "tank")
+    assert code == 0
+    dress, tank = (finding["facts"]["stiffer than the fabric"] for finding in report["files"])
+    assert dress == f"{int((garments['dress'].stiffness > 1).sum())} vertices, 2 times"
+    assert tank is None

@@ -82,6 +82,27 @@ def test_every_rule_by_hand() -> None:
 
 
 @pytest.mark.parametrize("place", PLACES)
+def test_a_garments_stiffness_multiplies_the_membrane_alone(place: str) -> None:
+    mesh = cylinder(9, 6)
+    material, factors = random_material(mesh, place), np.random.default_rng(2).uniform(0.5, 3.0, len(mesh[0]))
+    plain, firm, same = (
+        build_cloth(*mesh, material, stiffness=given, dtype=F64) for given in (None, factors, np.ones(len(factors)))
+    )
+    on = {key: torch.as_tensor(factors[getattr(plain, key).numpy()].mean(axis=1)) for key in ("faces", "edges")}
+    for name in ("lame_mu", "lame_lambda"):
+        torch.testing.assert_close(getattr(firm, name), getattr(plain, name) * on["faces"])
+    torch.testing.assert_close(firm.vertex_fabric[:, :2], plain.vertex_fabric[:, :2] * torch.as_tensor(factors)[:, None])
+    torch.testing.assert_close(firm.edge_fabric[:, :2], plain.edge_fabric[:, :2] * on["edges"][:, None])
+    for name in ("density", "thickness", "bending_stiffness", "mass"):
+        assert torch.equal(getattr(firm, name), getattr(plain, name))
+    assert all(
+        torch.equal(getattr(same, spec.name), getattr(plain, spec.name)) for spec in fields(same) if spec.name != "num_scenes"
+    )
+    with pytest.raises(ValueError, match=r"stiffness has shape \(3,\); give one factor per vertex"):
+        build_cloth(*mesh, material, stiffness=np.ones(3))
+
+
+@pytest.mark.parametrize("place", PLACES)
 def test_mass_is_conserved(place: str) -> None:
     mesh = cylinder(9, 6)
     cloth = build_cloth(*mesh, random_material(mesh, place), dtype=F64)
