@@ -292,7 +292,7 @@ def _taken_apart(scene: Scene, state: State, frame: int) -> State:
         )
         warnings.warn(
             f"outfit: {found.before} pairs of triangles passed through each other at the start and were taken apart; from the "
-            f"body outwards: {order.replace(',', ', ')}{guessed}{turned}",
+            f"body outwards: {order.replace(',', ', ')}{guessed}{turned}; this took {found.seconds:.1f} s",
             stacklevel=3,
         )
     return state

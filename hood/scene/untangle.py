@@ -6,8 +6,9 @@ Forces between layers keep what has been crossed, so the layers are sorted out b
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, permutations, product
 from typing import NamedTuple
 
@@ -61,6 +62,7 @@ class Separation:
     after: int
     stretch: float  # largest relative lengthening of an edge
     turned: tuple[tuple[int, int], ...] = ()  # garments over others, which lay under them against the order that was given
+    seconds: float = 0.0  # of computing
 
 
 class Outfit(NamedTuple):
@@ -109,9 +111,10 @@ def separate(
     """The garments at ``pos`` (V, 3) [m] taken apart, at least ``clearance`` [m] outside the body.
 
     Steps alternate edge-length projections with pushes: out of the body, and of the vertices of one layer to their side of
-    the nearest triangle of another, which gives way as much, or alone where the vertex is held. What still crosses after a
-    round is pushed farther. Matches on the rim of a layer that lie more than 45 degrees beside it are none: cloth beyond a hem
-    has no side.
+    the nearest triangle of another, which gives way as well later on, or alone where the vertex is held. What still crosses
+    after a round is pushed farther; once nothing does, both layers give way and steps are carried on with momentum
+    (:class:`hood.scene.start.Momentum`) until no edge is stretched by more than a tenth. Matches on the rim of a layer that
+    lie more than 45 degrees beside it are none: cloth beyond a hem has no side.
 
     Args:
         order: garments from the body outwards, also of those that lie the other way without touching; None: the likeliest of
@@ -120,6 +123,7 @@ def separate(
     Raises:
         TangledError: triangles of two garments still cross, or a garment is not over another one that ``order`` has it over.
     """
+    began = time.perf_counter()
     before = len(crossing_pairs(outfit, pos))
     turned = () if order is None else _against(outfit, pos, obstacle, tuple(order))
     if before == 0 and not turned:
@@ -138,7 +142,7 @@ def separate(
     assert best is not None
     if best.after:
         raise TangledError(_refusal(outfit, best, obstacle))
-    return best
+    return replace(best, seconds=time.perf_counter() - began)
 
 
 def _against(outfit: Outfit, pos: Tensor, obstacle: Obstacle | None, order: tuple[int, ...]) -> tuple[tuple[int, int], ...]:
