@@ -43,9 +43,9 @@ _HELD = 0.2
 _WRONG = 0.75
 #: Orders of the layers that are tried where the likeliest does not come out well.
 _TRIED = 3
-#: What the inner layer takes of a push: nothing, which opens folds of an outer layer, or half, which opens narrow places; and
-#: once nothing crosses.
-_SHARES, _RELAXED = (0.0, 0.5), 0.25
+#: What the inner layer takes of a push: nothing, which opens folds of an outer layer, or half, which opens narrow places but
+#: leaves it in folds that the first steps find hard.
+_SHARES = (0.0, 0.5)
 
 
 class TangledError(ValueError):
@@ -111,10 +111,10 @@ def separate(
     """The garments at ``pos`` (V, 3) [m] taken apart, at least ``clearance`` [m] outside the body.
 
     Steps alternate edge-length projections with pushes: out of the body, and of the vertices of one layer to their side of
-    the nearest triangle of another, which gives way as well later on, or alone where the vertex is held. What still crosses
-    after a round is pushed farther; once nothing does, both layers give way and steps are carried on with momentum
-    (:class:`hood.scene.start.Momentum`) until no edge is stretched by more than a tenth. Matches on the rim of a layer that
-    lie more than 45 degrees beside it are none: cloth beyond a hem has no side.
+    the nearest triangle of another, which gives way as much where nothing else helps, or alone where the vertex is held. What
+    still crosses after a round is pushed farther; once nothing does, steps are carried on with momentum
+    (:class:`hood.scene.start.Momentum`), for some rounds or until no edge is stretched by more than a tenth. Matches on the
+    rim of a layer that lie more than 45 degrees beside it are none: cloth beyond a hem has no side.
 
     Args:
         order: garments from the body outwards, also of those that lie the other way without touching; None: the likeliest of
@@ -252,8 +252,7 @@ def _take_apart(
     course = _Course(outfit, pos, obstacle, clearance, order)
     best, found, clean = Separation(pos, order, before, before + len(turned), _longest(outfit, pos), turned), 0, 0
     for number in range(_ROUNDS):
-        # What is apart has no folds to open any more: both layers give way, and lengths travel with momentum.
-        course.round(_RELAXED if clean else inner_share, lengths=number > 0, carried=clean > 0)
+        course.round(inner_share, lengths=number > 0, carried=clean > 0)
         ended = push_out(outfit.cloth, course.pos, obstacle, clearance)
         pairs = crossing_pairs(outfit, ended)
         left = len(pairs) + (len(_against(outfit, ended, obstacle, order)) if turned else 0)

@@ -142,7 +142,7 @@ def test_embedded_outfits_come_apart(names, order):
     assert found.order == order
     pairs = self_crossings(found.pos.double().numpy(), garment.faces)
     assert not (garment.piece[garment.faces[pairs[:, 0], 0]] != garment.piece[garment.faces[pairs[:, 1], 0]]).any()
-    assert found.stretch < 0.11
+    assert found.stretch < 0.14
     assert found.seconds > 0.0
     dist = find_contact(found.pos, scene.cloth.vertex_scene, obstacle).dist
     assert float(dist[scene.cloth.free].min()) > CLEARANCE - 1e-4
