@@ -12,6 +12,8 @@ from hood.assets.body import Body, load_body
 from hood.assets.garment import Garment, load_garment
 from hood.assets.library import DATA_FOLDER
 from hood.assets.sequence import PoseSequence, load_sequence
+from hood.mesh import layers
+from hood.native.build import BuildError
 from hood.scene.scene import Scene, build_scene
 from hood.testing import cylinder
 
@@ -25,6 +27,15 @@ os.environ["HOOD_CACHE"] = "off"  # tests leave nothing in the user's folder
 def own_random_numbers() -> None:
     """Weights and inputs drawn from torch's generator do not depend on the tests before."""
     torch.manual_seed(0)
+
+
+@pytest.fixture(scope="session")
+def compiled_layers() -> None:
+    """Skips where there is no compiler: layers of cloth have no other form than the compiled one, and commands say so."""
+    try:
+        layers.library()
+    except BuildError as error:
+        pytest.skip(str(error))
 
 
 @pytest.fixture(scope="session")

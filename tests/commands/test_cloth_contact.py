@@ -31,6 +31,7 @@ def _run(*more: str) -> tuple[dict[str, Any], np.ndarray]:
     return json.loads(Path("out/summary.json").read_text()), pos
 
 
+@pytest.mark.usefixtures("compiled_layers")
 def test_cloth_that_meets_none_moves_to_the_bit_as_without(capsys: pytest.CaptureFixture[str]) -> None:
     write_belt(Path("belt.obj"))
     auto, with_contact = _run("garment=belt.obj", "metrics=strain")
@@ -44,6 +45,7 @@ def test_cloth_that_meets_none_moves_to_the_bit_as_without(capsys: pytest.Captur
     np.testing.assert_array_equal(with_contact, without)
 
 
+@pytest.mark.usefixtures("compiled_layers")
 def test_a_sleeve_that_meets_itself_is_kept_apart() -> None:
     """From when the elbows are bent."""
     found, _ = _run("garment=longsleeve", "sequence=dance_mixed", "start=0.8", "surface_stride=1")

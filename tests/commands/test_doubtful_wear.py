@@ -66,6 +66,7 @@ def test_held_vertices_inside_the_body_are_told() -> None:
     assert _warnings() == []
 
 
+@pytest.mark.usefixtures("compiled_layers")
 def test_garments_in_another_order_than_they_lie_are_told() -> None:
     _belt("inner.obj", 0.19)
     _belt("outer.obj", 0.2)
@@ -76,6 +77,7 @@ def test_garments_in_another_order_than_they_lie_are_told() -> None:
     assert _warnings() == []
 
 
+@pytest.mark.usefixtures("compiled_layers")
 def test_garments_that_cannot_be_taken_apart_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
     _belt("a.obj", 0.19)
     _belt("b.obj", 0.19, aside=0.01)

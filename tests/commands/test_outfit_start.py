@@ -23,6 +23,7 @@ def test_layers_that_are_not_the_garments_are_refused(given: object) -> None:
         layer_order(given, ["tank", "skirt"])
 
 
+@pytest.mark.usefixtures("compiled_layers")
 @pytest.mark.parametrize("keys", [("stepper=newton",), ("stepper=refine", "refine=5", "layers=[trousers,tshirt]")])
 def test_an_outfit_starts_and_stays_apart(keys: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"

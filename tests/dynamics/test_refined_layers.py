@@ -21,6 +21,8 @@ from hood.scene.cloth import build_cloth
 from hood.scene.scene import RELAXING_DT
 from hood.testing import grid, make_problem
 
+pytestmark = pytest.mark.usefixtures("compiled_layers")
+
 POTENTIAL = default_potential().with_terms(layers=LayerBarrier())
 
 

@@ -13,6 +13,8 @@ from hood.losses.problem import StepProblem
 from hood.scene.cloth import build_cloth, concatenate_cloths
 from hood.testing import grid, make_problem, random_rotation
 
+pytestmark = pytest.mark.usefixtures("compiled_layers")
+
 F64 = torch.float64
 
 

@@ -19,6 +19,8 @@ from hood.scene.cloth import build_cloth, concatenate_cloths
 from hood.solver.newton import NewtonSettings, minimize
 from hood.testing import grid, make_problem
 
+pytestmark = pytest.mark.usefixtures("compiled_layers")
+
 F64 = torch.float64
 POTENTIAL = default_potential().with_terms(layers=LayerBarrier(), layer_friction=LayerFriction())
 

@@ -10,6 +10,8 @@ from hood.mesh.layer_pins import Followed, follow
 from hood.mesh.layers import LayerMesh, Layers
 from hood.testing import grid
 
+pytestmark = pytest.mark.usefixtures("compiled_layers")
+
 _SIZE = 49
 _MIDDLE = np.array([16, 17, 18, 23, 24, 25, 30, 31, 32])
 

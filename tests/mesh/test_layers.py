@@ -10,6 +10,8 @@ from hood.mesh.crossing import self_crossings
 from hood.mesh.layers import LayerMesh, Layers
 from hood.testing import grid
 
+pytestmark = pytest.mark.usefixtures("compiled_layers")
+
 
 def _sheets(n: int = 8) -> tuple[LayerMesh, np.ndarray, np.ndarray]:
     pos, faces = grid(n, n, 0.3)

@@ -21,6 +21,8 @@ from hood.scene.state import concatenate_states
 from hood.solver.newton import NewtonSettings, minimize
 from hood.solver.sweeps import sweep
 
+pytestmark = pytest.mark.usefixtures("compiled_layers")
+
 POTENTIAL = default_potential().with_terms(layers=LayerBarrier(), layer_friction=LayerFriction())
 SMALL = {
     "folding_strip": lambda dt: folding_strip(dt, n=10),
