@@ -118,6 +118,7 @@ def summarise_cloth_contact(config: Mapping[str, Any], metrics: Mapping[str, np.
         "cloth_contact": {
             "asked": asked,
             "used": "layers" if asked == "layers" else "on",
+            "friction": float(config.get("cloth_friction", 0.0)),
             "frames_with_contact": len(frames),
             "first_frame": int(frames[0]) if len(frames) else None,
             "last_frame": int(frames[-1]) if len(frames) else None,

@@ -113,6 +113,8 @@ def test_sentences_name_crossed_starts_and_forced_and_late_pins() -> None:
     columns["layer_crossed"][3] = 12
     columns["layer_forced"][4] = 2
     found = summarise_cloth_contact({"cloth_contact": "auto"}, columns)
+    rough = summarise_cloth_contact({"cloth_contact": "auto", "cloth_friction": 0.5}, columns)
+    assert (found["cloth_contact"]["friction"], rough["cloth_contact"]["friction"]) == (0.0, 0.5)
     text = "\n".join(describe_cloth_contact(found))
     assert "3 frames (2 to 4), up to 7 pairs" in text
     assert "1 steps (the first to frame 3) began with cloth through cloth, up to 12 pairs of triangles" in text
