@@ -3,6 +3,7 @@
     python benchmarks/heads.py errors                              # the exact answer with errors, on states of the solver
     python benchmarks/heads.py errors --garments dress_4k skirt_4k --states 1
     python benchmarks/heads.py models A.safetensors B.safetensors  # models on the states of their own rollouts
+    python benchmarks/heads.py controls FOLDER                     # the controls as model files, for rollouts of their own
 
 An error of 30% is 0.3 times the change from the base at every vertex, or edge, in a direction of its own; ``shrunk`` is the
 change 30% too small everywhere. Positions follow from edges by the solve of ``output=edges`` with its default weights; anchors
@@ -31,10 +32,11 @@ from hood.assets.body import load_body
 from hood.assets.garment import load_garment
 from hood.assets.library import locate
 from hood.assets.sequence import load_sequence
-from hood.dynamics.checkpoint import load_simulator
+from hood.dynamics.checkpoint import load_simulator, save_simulator
 from hood.dynamics.edge_output import EdgeOutput
 from hood.dynamics.output import Held
 from hood.dynamics.rollout import simulate
+from hood.dynamics.simulator import build_simulator
 from hood.dynamics.stepper import NewtonStepper, Stepper
 from hood.evaluation.gap import REFERENCE, starts
 from hood.evaluation.sample import StepSample
@@ -188,6 +190,21 @@ def models(paths: list[str], garments: list[str], states: int, frames: int, kern
         table.print()
 
 
+def write_controls(folder: Path) -> None:
+    """Models of ``model=edges`` whose output is the same everywhere: the base, and its edges at their rest lengths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, share, hold in (("base", 0.0, 0.0), ("rest_lengths", 1.0, FIRM)):
+        simulator = build_simulator(features="local", output="edges", schedule="1x(mesh)", latent_dim=16)
+        vertices, edges = simulator.network.decoder.third, simulator.network.edge_decoder.mlp.third
+        with torch.no_grad():
+            for layer in (vertices, edges):
+                layer.weight.zero_()
+                layer.bias.zero_()
+            vertices.bias[3], edges.bias[3] = hold, share
+        save_simulator(folder / f"{name}.safetensors", simulator)
+        print(folder / f"{name}.safetensors")
+
+
 def relative(found: Tensor, base: Tensor, exact: Tensor, weight: Tensor | float = 1.0) -> float:
     """‖found − exact‖ / ‖base − exact‖."""
     left, whole = ((value.double() - exact).square() * weight for value in (found, base))
@@ -207,8 +224,8 @@ def cpu_time(call: Callable[[], object]) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("errors", "models"))
-    parser.add_argument("models", nargs="*", help="model files or names of shipped ones")
+    parser.add_argument("what", choices=("errors", "models", "controls"))
+    parser.add_argument("models", nargs="*", help="model files or names of shipped ones; a folder for controls")
     parser.add_argument("--garments", nargs="+", default=["dress", "tshirt", "skirt"])
     parser.add_argument("--states", type=int, default=2, help="of every rollout")
     parser.add_argument("--frames", type=int, default=24)
@@ -218,6 +235,8 @@ def main() -> None:
     common = arguments.garments, arguments.states, arguments.frames
     if arguments.what == "errors":
         errors(*common)
+    elif arguments.what == "controls":
+        write_controls(Path(arguments.models[0]))
     else:
         models(arguments.models, *common, arguments.kernels)
 

@@ -73,7 +73,7 @@ def energies_and_gradient(
         return by(potential, problem, next_pos, acc)
     others, _ = split(potential)
     gradient = np.zeros(tuple(next_pos.shape))
-    values = element_energies(potential, problem, _double(next_pos), gradient)
+    values = element_energies(potential, problem, as_double(next_pos), gradient)
     total = torch.from_numpy(gradient)
     if others.active(problem):  # a gradient of nothing takes as long as the pass
         rest, found = by(others, problem, next_pos, acc)
@@ -88,7 +88,7 @@ def total_energy(potential: Potential, problem: StepProblem, next_pos: Tensor, b
     if not applies(next_pos):
         return by(potential, problem, next_pos)
     others, _ = split(potential)
-    values = element_energies(potential, problem, _double(next_pos), None).values()
+    values = element_energies(potential, problem, as_double(next_pos), None).values()
     return sum(values, start=by(others, problem, next_pos).double())
 
 
@@ -97,7 +97,7 @@ def absolute_strain(cloth: Cloth, pos: Tensor) -> np.ndarray | None:
     lib = library() if applies(pos) else None
     if lib is None:
         return None
-    constants, place = _constants_of(cloth), _double(pos)
+    constants, place = _constants_of(cloth), as_double(pos)
     strain = np.empty(len(constants.edges))
     arrays = (constants.edges, constants.edge_length, place, strain)
     lib.elements_strain(COUNT(len(strain)), *(POINTER(array.ctypes.data) for array in arrays))
@@ -186,5 +186,6 @@ def _whole(values: Tensor) -> np.ndarray:
     return np.ascontiguousarray(values.detach().numpy(), np.float64 if values.is_floating_point() else np.int64)
 
 
-def _double(pos: Tensor) -> np.ndarray:
-    return np.ascontiguousarray(pos.detach().numpy(), np.float64)
+def as_double(values: Tensor) -> np.ndarray:
+    """The same in float64 without gaps, on the host."""
+    return np.ascontiguousarray(values.detach().cpu().numpy(), np.float64)

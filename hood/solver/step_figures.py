@@ -35,7 +35,7 @@ class StepFigures:
         self._compiled = elements.applies(next_pos) and vertex_pass.applies(next_pos)
         if self._compiled:
             gradient = np.zeros(tuple(next_pos.shape))
-            found = self._compiled_energies(_double(next_pos), _double(acc), gradient)
+            found = self._compiled_energies(elements.as_double(next_pos), elements.as_double(acc), gradient)
             self.gradient = torch.from_numpy(gradient)
         else:
             self.gradient, parts = elements.energies_and_gradient(
@@ -53,8 +53,8 @@ class StepFigures:
         result = {f"energy_{name}": value for name, value in self.energies.items()}
         result["energy_total"] = sum(result.values())
         result["energy_inertial_guess"] = self._of_guess()
-        slope, mass, free = _double(self.gradient), _double(cloth.mass), cloth.free.cpu().numpy()
-        gravity = float(np.linalg.norm(_double(problem.gravity))) or STANDARD_GRAVITY
+        slope, mass, free = elements.as_double(self.gradient), elements.as_double(cloth.mass), cloth.free.cpu().numpy()
+        gravity = float(np.linalg.norm(elements.as_double(problem.gravity))) or STANDARD_GRAVITY
         size_sq, moving = np.einsum("vi,vi->v", slope, slope)[free], mass[free]
         weight_sq = gravity**2 * float(moving @ moving)
         result["gradient_norm"] = float(np.sqrt(size_sq).mean()) if len(size_sq) else 0.0
@@ -66,11 +66,11 @@ class StepFigures:
         """Φ [J] where the cloth would be without forces, pins where they go."""
         problem, dt = self._problem, float(self._problem.step.dt[0])
         state, target = problem.state, problem.step.pin_target
-        guess = _double(state.pos) + dt * _double(state.vel)
+        guess = elements.as_double(state.pos) + dt * elements.as_double(state.vel)
         acc = np.zeros_like(guess)
         if target is not None:
             pinned = problem.cloth.pinned.cpu().numpy()
-            goal = _double(target)[pinned]
+            goal = elements.as_double(target)[pinned]
             acc[pinned] = (goal - guess[pinned]) / dt**2
             guess[pinned] = goal
         if self._compiled:
@@ -96,9 +96,5 @@ class StepFigures:
         if gradient is None:
             return energies | {name: float(value) for name, value in others.energies(problem, place, given).items()}
         slope, parts_of_rest = others.gradient(problem, place, given)
-        gradient += _double(slope)
+        gradient += elements.as_double(slope)
         return energies | {name: float(value) for name, value in parts_of_rest.items()}
-
-
-def _double(values: Tensor) -> np.ndarray:
-    return np.ascontiguousarray(values.detach().cpu().numpy(), np.float64)

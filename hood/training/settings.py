@@ -20,7 +20,8 @@ class TrainerSettings:
     1 + rg / 3, so that one broken scene does not drown the others.
     ``max_skipped``: updates without a finite loss and gradient in a row after which training goes back to the last good
     checkpoint, on other scenes; ``max_rollbacks``: how often it does so without getting any further.
-    ``keep_at``: iterations whose weights and checkpoint stay, in the folder ``kept`` of the run.
+    ``keep_at``: iterations whose weights and checkpoint stay, in the folder ``kept`` of the run; not
+    of one whose own update was skipped.
     ``precision``: of the network's latents and products; ``"bf16"`` keeps weights, their gradients and energies in float32.
     ``kernels``: of the network on a CPU, see :meth:`hood.nn.model.MeshGraphNet.use_kernels`; ``auto``: those that train fastest
     here, :mod:`hood.nn.choice`.

@@ -208,6 +208,27 @@ def test_float64_takes_over_where_a_step_in_float32_leads_nowhere(monkeypatch):
     assert tried == [False, True, True]
 
 
+def test_without_a_float64_form_the_step_ends_where_it_is(monkeypatch):
+    problem = hanging()
+    system = EngineSystem(default_potential(), problem, plan_for(problem), 100)
+    (scene,) = system._engines
+    system.begin(None)
+    residual = system.model()
+    before = system.state()[0]
+    single = engine.library()
+
+    def gone(wide=False):
+        if wide:
+            raise BuildError("no C++ compiler")
+        return single
+
+    monkeypatch.setattr(engine, "library", gone)
+    monkeypatch.setattr(scene, "move", lambda *args: False)
+    assert system.move(residual, [True]) == [False]
+    assert not scene.wide
+    assert torch.equal(system.state()[0], before)
+
+
 def test_a_scene_that_is_not_finite_is_left_alone():
     problem = batch([falling(), falling()])
     pos = problem.state.pos.clone()
