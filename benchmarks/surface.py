@@ -33,6 +33,7 @@ from hood.dynamics.refine import RefinedStepper
 from hood.dynamics.rollout import simulate
 from hood.dynamics.stepper import NewtonStepper, Stepper
 from hood.dynamics.surface import SURFACE_METRICS, SURFACE_STRIDE, SurfaceMeter
+from hood.losses.collision import SIDES
 from hood.losses.layers import LayerBarrier, for_networks
 from hood.losses.potential import Potential, default_potential
 from hood.mesh.proximity import search_surface
@@ -128,6 +129,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--reach", default="curvature", choices=REACHES, help="of contact")
     parser.add_argument("--contact", default="vertices", choices=PLACES, help="where the cloth meets the body")
+    parser.add_argument("--sides", default="both", choices=SIDES, help="of folds of the body that cloth is kept off")
     parser.add_argument("--cloth-contact", default="auto", choices=["auto", "off"], help="of layers of cloth with each other")
     parser.add_argument("--motions", nargs="+", default=motion_split()["validation"])
     parser.add_argument("--frames", type=int, default=60)
@@ -135,7 +137,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--kernels", default="torch", choices=KERNELS, help="of the network; compiled ones round differently")
     chosen = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    body, plain = load_body("default"), default_potential(contact=chosen.contact, reach=chosen.reach)
+    body, plain = load_body("default"), default_potential(contact=chosen.contact, reach=chosen.reach, sides=chosen.sides)
     layered = plain.with_terms(layers=LayerBarrier()) if chosen.cloth_contact == "auto" else plain
     potentials = {name: layered if solves(name) else plain for name in chosen.steppers}
     steppers = {name: make_stepper(name, chosen.kernels, potentials[name]) for name in chosen.steppers}

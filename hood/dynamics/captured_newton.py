@@ -11,17 +11,17 @@ from torch import Tensor
 from hood.dynamics.cuda_graph import CudaGraph, InputMemory
 from hood.dynamics.fixed_problem import (
     Constants,
-    altered,
-    fixed_contact,
     problem_from,
     settled_potential,
     step_inputs,
     step_shape,
+    with_fixed_contact,
 )
 from hood.dynamics.frames import Relaxing
 from hood.dynamics.simulator import Prediction
 from hood.dynamics.stepper import NewtonStepper
 from hood.dynamics.stopwatch import Stopwatch, timed
+from hood.losses.potential import keeps_both_sides
 from hood.losses.problem import StepProblem
 from hood.scene.cloth import Cloth
 from hood.solver.fixed import FixedSystem, Piece
@@ -101,8 +101,8 @@ class _Plan:
         self.places, self._stepper, self._like = places, stepper, problem
         self._constants, self._shape = Constants(problem, stepper.potential), step_shape(problem, surface=True)
         self._inputs = InputMemory(step_inputs(problem, surface=True))
-        potential, known = settled_potential(stepper.potential, problem), problem.with_contact()
-        self._potential = potential
+        potential, known = settled_potential(stepper.potential, problem), problem.with_fold()
+        self._potential, self._folds = potential, keeps_both_sides(potential)
         others = other_terms(potential, known)
         if others is not None:
             raise ValueError(
@@ -134,8 +134,8 @@ class _Plan:
 
     def _read(self) -> StepProblem:
         problem, incidence = problem_from(self._like, self._inputs.tensors)
-        contact, self._faces = fixed_contact(problem, incidence, self.places)
-        return self._potential.with_pull(altered(problem, contact=contact), compiled=False)
+        problem, self._faces = with_fixed_contact(problem, incidence, self.places, self._folds)
+        return self._potential.with_pull(problem, compiled=False)
 
 
 def _recorded(piece: Piece) -> Piece:

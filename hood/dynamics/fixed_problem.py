@@ -13,7 +13,7 @@ from torch import Tensor
 from hood.losses.potential import Potential, PreparedTerm
 from hood.losses.problem import StepProblem
 from hood.mesh.proximity import Incidence, build_incidence
-from hood.scene.contact import Contact, find_contact, find_fixed_contact
+from hood.scene.contact import Fold, find_contact, find_fixed_contact, find_fixed_fold, find_fold
 from hood.scene.state import Attachments, Obstacle, State
 
 Item = TypeVar("Item")
@@ -44,7 +44,7 @@ def settled_potential(potential: Potential, problem: StepProblem) -> Potential:
     Raises:
         ValueError: a term searches for more than contact with the body's surface.
     """
-    with_contact = problem.with_contact()
+    with_contact = problem.with_fold()
     for name, term in potential.terms.items():
         if isinstance(term, PreparedTerm) and term.prepare(with_contact) is not with_contact:
             raise ValueError(
@@ -78,25 +78,34 @@ def problem_from(like: StepProblem, inputs: Sequence[Tensor]) -> tuple[StepProbl
         obstacle = altered(obstacle, **present)
     tables = list(values)
     step = altered(like.step, dt=dt, pin_target=pins, obstacle=obstacle)
-    problem = altered(like, state=State(pos, vel, like.state.origin), step=step, contact=None, pull=None)
+    problem = altered(like, state=State(pos, vel, like.state.origin), step=step, contact=None, pull=None, fold=None)
     return problem, Incidence(*tables) if tables else None
 
 
-def fixed_contact(
-    problem: StepProblem, incidence: Incidence | None, places: int, dense: bool = False
-) -> tuple[Contact | None, Tensor]:
-    """Contact with the body's surface, None without its connectivity, and the number (1,) of faces that need a place.
+def with_fixed_contact(
+    problem: StepProblem, incidence: Incidence | None, places: int, folds: bool = False, dense: bool = False
+) -> tuple[StepProblem, Tensor]:
+    """The problem with its contact with the body's surface, without any where the connectivity is missing, and the number (1,)
+    of faces that need a place.
 
     Args:
         places: for faces that every cloth vertex is tested against.
+        folds: on the other side of folds as well, for all vertices whatever is found.
         dense: in torch on a CPU too, as on any other device.
     """
     obstacle, pos, cloth = problem.step.obstacle, problem.state.pos, problem.cloth
     if obstacle is None or incidence is None:
-        return None, cloth.faces.new_zeros(1)
+        return altered(problem, contact=None), cloth.faces.new_zeros(1)
     if pos.device.type == "cpu" and not dense:
-        return find_contact(pos, cloth.vertex_scene, obstacle), cloth.faces.new_zeros(1)
-    return find_fixed_contact(pos, cloth.vertex_scene, obstacle, incidence, cloth.num_scenes, places)
+        contact, num_faces = find_contact(pos, cloth.vertex_scene, obstacle), cloth.faces.new_zeros(1)
+        fold = find_fold(pos, cloth.vertex_scene, obstacle, contact) if folds else None
+        if fold is not None and fold.contact is None:
+            fold = Fold(altered(contact, valid=torch.zeros_like(contact.valid)))
+    else:
+        surface = obstacle, incidence, cloth.num_scenes, places
+        contact, num_faces = find_fixed_contact(pos, cloth.vertex_scene, *surface)
+        fold = find_fixed_fold(pos, cloth.vertex_scene, contact, *surface) if folds else None
+    return altered(problem, contact=contact, fold=fold), num_faces
 
 
 def step_shape(problem: StepProblem, surface: bool = False) -> tuple[Any, ...]:

@@ -12,11 +12,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from hood.dynamics.fixed_problem import altered, fixed_contact, problem_from
+from hood.dynamics.fixed_problem import altered, problem_from, with_fixed_contact
 from hood.dynamics.simulator import Simulator
 from hood.features.inputs import EdgeRows, Inputs
 from hood.graph.fixed import Layout, build_fixed_graph
-from hood.losses.potential import Potential
+from hood.losses.potential import Potential, keeps_both_sides
 from hood.losses.problem import StepProblem
 from hood.mesh.nearest import Nearest
 from hood.mesh.proximity import Incidence
@@ -79,8 +79,8 @@ class FixedStep:
 
     def _step(self, problem: StepProblem, incidence: Incidence | None) -> tuple[Tensor, ...]:
         simulator = self.simulator
-        contact, num_faces = fixed_contact(problem, incidence, self.layout.capacity.faces, self.dense)
-        problem = altered(problem, contact=contact)
+        folds = self._potential is not None and keeps_both_sides(self._potential)
+        problem, num_faces = with_fixed_contact(problem, incidence, self.layout.capacity.faces, folds, self.dense)
         if self._potential is not None:
             problem = self._potential.with_pull(problem, compiled=False)
         seen = simulator.rules.stand(self._in_frames(problem))

@@ -46,7 +46,7 @@ def march(
     for index in range(num_steps):
         step = problem.step if step_input is None else step_input(index)
         found = None if contact is None else contact(index, state)
-        fresh = replace(problem, state=state, step=step, contact=found, point_contacts=(), pull=None, layers=())
+        fresh = replace(problem, state=state, step=step, contact=found, point_contacts=(), pull=None, layers=(), fold=None)
         now = potential.prepare(fresh)
         pos, report = minimize(potential, now, None if start is None else start(now), settings)
         state = State(pos, state.vel + now.vertex_dt * report.acc, state.origin)

@@ -30,7 +30,7 @@ _TITLES = {"vertices": "garment vertices", "edge_length": "garment mean edge", "
 
 #: Settings of terms that files from before them do not name, and what these files were trained with.
 _LATER = {
-    f"hood.losses.{name}": {"contact": "vertices", "reach": "constant"}
+    f"hood.losses.{name}": {"contact": "vertices", "reach": "constant", "sides": "nearest"}
     for name in ("collision.Collision", "collision.CentroidCollision", "friction.Friction")
 }
 #: A setting that weights take as it is, whatever they were trained with: figures in docs/contact.md.

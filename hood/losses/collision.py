@@ -9,22 +9,25 @@ import torch
 from torch import Tensor
 
 from hood.losses.problem import StepProblem, sum_per_scene
-from hood.scene.contact import CentroidContact, LaggedContact, find_centroid_contact, find_lagged_contact
+from hood.scene.contact import CentroidContact, Contact, LaggedContact, find_centroid_contact, find_lagged_contact
 from hood.scene.contact_points import PLACES
 from hood.scene.reach import REACHES, vertex_reach
 
+#: Which skin a vertex between two parts of the body is kept off: of the nearest alone, or of both.
+SIDES = ("both", "nearest")
 
-def checked_contact(term: str, contact: str, reach: str) -> tuple[str, str]:
-    """``contact`` and ``reach`` of a term: one of :data:`hood.scene.contact_points.PLACES` and of
-    :data:`hood.scene.reach.REACHES`.
+
+def checked_contact(term: str, contact: str, reach: str, sides: str) -> tuple[str, str, str]:
+    """``contact``, ``reach`` and ``sides`` of a term: of :data:`hood.scene.contact_points.PLACES`,
+    :data:`hood.scene.reach.REACHES` and :data:`SIDES`.
 
     Raises:
         ValueError: they are not.
     """
-    for key, value, choices in (("contact", contact, PLACES), ("reach", reach, REACHES)):
+    for key, value, choices in (("contact", contact, PLACES), ("reach", reach, REACHES), ("sides", sides, SIDES)):
         if value not in choices:
             raise ValueError(f"{term}: {key} is {value!r}; choose {', '.join(choices)}")
-    return contact, reach
+    return contact, reach, sides
 
 
 class Planes(NamedTuple):
@@ -46,6 +49,9 @@ class Collision:
     At vertices ε is ``epsilon`` and by ``reach=curvature`` the depth as well to which the skin would bulge through the flat
     triangles between them (:func:`hood.scene.reach.sag`). Like the correspondence it is found at t and constant in the step.
 
+    In folds of the body, as in the bend of an elbow, a vertex lies between two parts of the skin. By ``sides=both`` it is kept
+    off the one that faces the nearest as well, by the same energy (:func:`hood.scene.contact.find_fold`).
+
     With ``contact`` at more places than the vertices the same energy acts at points x_p = Σ w_i x_i of edges and faces, with w
     times the area share of the point (:class:`hood.scene.contact_points.PointContact`). Per area of cloth all points together
     press as hard as all vertices do: whatever the meshes, contact gets twice as stiff where both touch, and where an edge sags
@@ -57,49 +63,62 @@ class Collision:
         epsilon: least distance [m] at which the penalty sets in.
         contact: ``vertices``, ``edges`` or ``strict``, see :data:`hood.scene.contact_points.PLACES`.
         reach: ``curvature`` or ``constant``, see :data:`hood.scene.reach.REACHES`.
+        sides: ``both`` or ``nearest``, see :data:`SIDES`.
     """
 
-    def __init__(self, weight: float = 5e5, epsilon: float = 2e-3, contact: str = "vertices", reach: str = "curvature") -> None:
+    def __init__(
+        self,
+        weight: float = 5e5,
+        epsilon: float = 2e-3,
+        contact: str = "vertices",
+        reach: str = "curvature",
+        sides: str = "both",
+    ) -> None:
         if weight < 0 or epsilon <= 0:
             raise ValueError(f"collision: weight is {weight}, epsilon {epsilon}; give weight >= 0 and epsilon > 0")
         self.weight = weight
         self.epsilon = epsilon
-        self.contact, self.reach = checked_contact("collision", contact, reach)
+        self.contact, self.reach, self.sides = checked_contact("collision", contact, reach, sides)
 
     def with_weight(self, weight: float) -> Collision:
         """The same term with another weight, for a ramp during training."""
-        return type(self)(weight, self.epsilon, self.contact, self.reach)
+        return type(self)(weight, self.epsilon, self.contact, self.reach, self.sides)
+
+    def with_sides(self, sides: str) -> Collision:
+        """The same term with other ``sides``."""
+        return type(self)(self.weight, self.epsilon, self.contact, self.reach, sides)
 
     def prepare(self, problem: StepProblem) -> StepProblem:
         """The problem with its contact searched for, once per step."""
-        return problem.with_points(self.contact)
+        return with_places(problem, self.contact, self.sides)
 
     def applies(self, problem: StepProblem) -> bool:
         return problem.searched_contact is not None
 
-    def planes(self, problem: StepProblem) -> Planes:
-        """The planes that d is measured from; the problem must have a contact."""
-        contact = problem.contact
-        assert contact is not None
+    def contacts(self, problem: StepProblem) -> tuple[Contact, ...]:
+        """The contacts of the vertices that the term acts at; none without a body."""
+        return contacts_of(problem, self.sides)
+
+    def planes(self, problem: StepProblem, contact: Contact) -> Planes:
+        """The planes that d is measured from, of one of :meth:`contacts`."""
         return _planes(problem, contact.valid, contact.next_point, contact.next_normal)
 
-    def reaches(self, problem: StepProblem) -> Tensor:
-        """Distances ε [m] (V,) from the planes at which the penalty sets in; the problem must have a contact."""
-        assert problem.contact is not None
-        return vertex_reach(self.reach, self.epsilon, problem.cloth, problem.contact)
+    def reaches(self, problem: StepProblem, contact: Contact) -> Tensor:
+        """Distances ε [m] (V,) from the planes at which the penalty sets in, of one of :meth:`contacts`."""
+        return vertex_reach(self.reach, self.epsilon, problem.cloth, contact)
 
-    def depth(self, problem: StepProblem, next_pos: Tensor) -> tuple[Tensor, Tensor]:
-        """Depth ε - d [m] (V,), negative outside, and normals (V, 3); both 0 without a match."""
-        planes = self.planes(problem)
+    def depth(self, problem: StepProblem, contact: Contact, next_pos: Tensor) -> tuple[Tensor, Tensor]:
+        """Depth ε - d [m] (V,), negative outside, and normals (V, 3), of one of :meth:`contacts`; both 0 without a match."""
+        planes = self.planes(problem, contact)
         dist = ((next_pos - planes.point) * planes.normal).sum(dim=1)
-        return torch.where(planes.touching, self.reaches(problem) - dist, 0.0), planes.normal
+        return torch.where(planes.touching, self.reaches(problem, contact) - dist, 0.0), planes.normal
 
     def __call__(self, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> Tensor:
         """Energy [J] (B,) at ``next_pos`` (V, 3)."""
-        if problem.contact is None:
-            return next_pos.new_zeros(problem.num_scenes)
-        depth, _ = self.depth(problem, next_pos)
-        energy = problem.sum_vertices(self.weight * depth.clamp_min(0.0) ** 3)
+        energy = next_pos.new_zeros(problem.num_scenes)
+        for contact in self.contacts(problem):
+            depth, _ = self.depth(problem, contact, next_pos)
+            energy = energy + problem.sum_vertices(self.weight * depth.clamp_min(0.0) ** 3)
         points = problem.points_at(self.contact)
         if points is None:
             return energy
@@ -122,7 +141,7 @@ class CentroidCollision(Collision):
     """
 
     def __init__(self, weight: float = 5e5, epsilon: float = 2e-3, lagged: bool = False) -> None:
-        super().__init__(weight, epsilon, reach="constant")
+        super().__init__(weight, epsilon, reach="constant", sides="nearest")
         self.lagged = lagged
 
     def with_weight(self, weight: float) -> CentroidCollision:
@@ -133,15 +152,27 @@ class CentroidCollision(Collision):
         """The problem with the centroid search done, once per step."""
         return with_lagged_centroids(problem) if self.lagged else with_centroids(problem)
 
-    def planes(self, problem: StepProblem) -> Planes:
+    def planes(self, problem: StepProblem, contact: Contact) -> Planes:
         """The planes that d is measured from; the problem must have been prepared."""
-        contact = problem.contact
         if self.lagged:
             contact = lagged_contact(problem)
             return _planes(problem, contact.lagged_facing, contact.lagged_centroid, contact.lagged_normal)
         if not isinstance(contact, CentroidContact):
             raise ValueError("collision with centroids: not searched for yet; pass the problem through Potential.prepare once")
         return _planes(problem, contact.facing, contact.next_centroid, contact.next_face_normal)
+
+
+def with_places(problem: StepProblem, contact: str, sides: str) -> StepProblem:
+    """The problem with contact searched for at the places ``contact`` and on ``sides``; itself where that has been done."""
+    problem = problem.with_points(contact)
+    return problem.with_fold() if sides == "both" else problem
+
+
+def contacts_of(problem: StepProblem, sides: str) -> tuple[Contact, ...]:
+    """The contacts of vertices on ``sides``; none without a body."""
+    if sides == "both":
+        return problem.contacts
+    return () if problem.contact is None else (problem.contact,)
 
 
 def with_centroids(problem: StepProblem) -> StepProblem:

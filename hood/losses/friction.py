@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from hood.losses.collision import checked_contact, lagged_contact, with_lagged_centroids
+from hood.losses.collision import checked_contact, contacts_of, lagged_contact, with_lagged_centroids, with_places
 from hood.losses.problem import StepProblem, sum_per_scene
 from hood.scene.contact import Contact, LaggedContact
 from hood.scene.contact_points import PointContact
@@ -44,19 +44,23 @@ class LaggedFriction:
         """Lagged normal forces N [N], shape (V,)."""
         raise NotImplementedError
 
+    def contacts(self, problem: StepProblem) -> tuple[Contact, ...]:
+        """The contacts of the vertices that the term acts at; none without a body."""
+        return contacts_of(problem, "nearest")
+
     def carrier(self, contact: Contact) -> tuple[Tensor, Tensor]:
         """What the slip is measured against: the way (V, 3) [m] of the matched body points, and the normals (V, 3) there."""
         return contact.next_point - contact.point, contact.next_normal
 
     def __call__(self, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> Tensor:
         """Energy [J] (B,) at ``next_pos`` (V, 3)."""
-        contact = problem.contact
-        if contact is None:
-            return next_pos.new_zeros(problem.num_scenes)
-        force = self.normal_force(problem, contact)
-        carried, normal = self.carrier(contact)
-        moved, limit = next_pos - problem.state.pos - carried, self.slip_speed * problem.vertex_dt.squeeze(1)
-        return problem.sum_vertices(_slipping(self.coefficient * force, moved, normal, limit))
+        energy, limit = next_pos.new_zeros(problem.num_scenes), self.slip_speed * problem.vertex_dt.squeeze(1)
+        for contact in self.contacts(problem):
+            force = self.normal_force(problem, contact)
+            carried, normal = self.carrier(contact)
+            moved = next_pos - problem.state.pos - carried
+            energy = energy + problem.sum_vertices(_slipping(self.coefficient * force, moved, normal, limit))
+        return energy
 
 
 class Friction(LaggedFriction):
@@ -76,7 +80,7 @@ class Friction(LaggedFriction):
     vertices.
 
     Args:
-        weight, epsilon, contact, reach: those of the collision term, which make w [J/m³] and ε [m].
+        weight, epsilon, contact, reach, sides: those of the collision term, which make w [J/m³] and ε [m].
     """
 
     def __init__(
@@ -87,19 +91,27 @@ class Friction(LaggedFriction):
         epsilon: float = 2e-3,
         contact: str = "vertices",
         reach: str = "curvature",
+        sides: str = "both",
     ) -> None:
         super().__init__(coefficient, slip_speed)
         self.weight = weight
         self.epsilon = epsilon
-        self.contact, self.reach = checked_contact("friction", contact, reach)
+        self.contact, self.reach, self.sides = checked_contact("friction", contact, reach, sides)
 
     def with_weight(self, weight: float) -> Friction:
         """The same term with another collision weight, for a ramp during training."""
-        return Friction(self.coefficient, self.slip_speed, weight, self.epsilon, self.contact, self.reach)
+        return Friction(self.coefficient, self.slip_speed, weight, self.epsilon, self.contact, self.reach, self.sides)
+
+    def with_sides(self, sides: str) -> Friction:
+        """The same term with other ``sides``."""
+        return Friction(self.coefficient, self.slip_speed, self.weight, self.epsilon, self.contact, self.reach, sides)
 
     def prepare(self, problem: StepProblem) -> StepProblem:
         """The problem with its contact searched for, once per step, if there is friction."""
-        return problem.with_points(self.contact) if self.coefficient > 0 else problem
+        return with_places(problem, self.contact, self.sides) if self.coefficient > 0 else problem
+
+    def contacts(self, problem: StepProblem) -> tuple[Contact, ...]:
+        return contacts_of(problem, self.sides)
 
     def __call__(self, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> Tensor:
         """Energy [J] (B,) at ``next_pos`` (V, 3)."""

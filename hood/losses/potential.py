@@ -159,6 +159,11 @@ class _Settled(Potential):
         return self.terms
 
 
+def keeps_both_sides(potential: Potential) -> bool:
+    """Whether a term keeps the cloth off both sides of folds of the body."""
+    return any(getattr(term, "sides", "nearest") == "both" for term in potential.terms.values())
+
+
 def _asks_for_pull(term: Term, problem: StepProblem) -> bool:
     if isinstance(term, Friction):
         return term.coefficient > 0 and problem.contact is not None
@@ -173,9 +178,10 @@ def default_potential(
     attachment_stiffness: float = 1e3,
     contact: str = "vertices",
     reach: str = "curvature",
+    sides: str = "both",
 ) -> Potential:
     """The paper's potential in safe forms: contact with triangles, friction by normal force, rest angles."""
-    collision = collision_weight, collision_epsilon, contact, reach
+    collision = collision_weight, collision_epsilon, contact, reach, sides
     return Potential(
         {
             "stretching": Stretching(),

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from hood.scene.cloth import Cloth
-from hood.scene.contact import Contact, find_contact
+from hood.scene.contact import Contact, Fold, find_contact, find_fold
 from hood.scene.contact_points import PointContact, find_point_contact
 from hood.scene.layer_sides import LayerPairs, find_sides
 from hood.scene.layers import SceneLayers, find_layers, late_targets
@@ -27,8 +27,9 @@ class StepProblem:
     """One implicit step t → t+1 of B scenes; everything in it is constant while the next positions vary.
 
     ``contact`` is None without a body, and until somebody who needs it asks for :meth:`with_contact`; ``point_contacts`` holds
-    what terms asked for by :meth:`with_points`, ``layers`` the cloth near cloth where :meth:`with_layers` was asked for,
-    ``sides`` its sides where :meth:`with_sides` was.
+    what terms asked for by :meth:`with_points`, ``fold`` contact with the other side of folds of the body where
+    :meth:`with_fold` was asked for, ``layers`` the cloth near cloth where :meth:`with_layers` was asked for, ``sides`` its
+    sides where :meth:`with_sides` was.
     ``pull`` are the forces at x_t of everything but inertia, weight and the body, by which the cloth around a vertex presses it
     onto the skin; None where nobody has asked :meth:`hood.losses.potential.Potential.with_pull`.
     """
@@ -42,6 +43,7 @@ class StepProblem:
     pull: Tensor | None = None  # (V, 3) N
     layers: tuple[SceneLayers, ...] = ()  # one per scene, or none
     sides: LayerPairs | None = None
+    fold: Fold | None = None
 
     def __post_init__(self) -> None:
         if len(self.step.dt) != self.cloth.num_scenes:
@@ -59,6 +61,15 @@ class StepProblem:
         if self.contact is not None or obstacle is None:
             return self
         return replace(self, contact=find_contact(self.state.pos, self.cloth.vertex_scene, obstacle))
+
+    def with_fold(self) -> StepProblem:
+        """The problem with its contact on the other side of folds as well; itself where that has been done or there is no
+        body."""
+        problem, obstacle = self.with_contact(), self.step.obstacle
+        if self.fold is not None or obstacle is None or problem.contact is None:
+            return problem
+        fold = find_fold(self.state.pos, self.cloth.vertex_scene, obstacle, problem.contact)
+        return replace(problem, fold=fold)
 
     def with_points(self, place: str) -> StepProblem:
         """The problem with its contact, also at points inside edges and faces (a ``place`` of
@@ -123,6 +134,21 @@ class StepProblem:
         if self.contact is None and self.step.obstacle is not None:
             raise ValueError("step problem: contact not searched for yet; pass the problem through Potential.prepare once")
         return self.contact
+
+    @property
+    def contacts(self) -> tuple[Contact, ...]:
+        """``contact`` and that on the other side of folds, as far as there is any.
+
+        Raises:
+            ValueError: there is a body, but nobody searched for folds.
+        """
+        if self.contact is None:
+            return ()
+        if self.fold is None and self.step.obstacle is not None:
+            raise ValueError(
+                "step problem: folds of the body not searched for yet; pass the problem through Potential.prepare once"
+            )
+        return (self.contact,) if self.fold is None or self.fold.contact is None else (self.contact, self.fold.contact)
 
     @property
     def searched_pull(self) -> Tensor | None:

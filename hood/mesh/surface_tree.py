@@ -141,6 +141,7 @@ class SurfaceTree:
         self._visits = batch * leaves + 1
         self._share(1)
         centre = np.ascontiguousarray(np.nan_to_num(np.asarray(pos, np.float64)[faces].mean(axis=1)))
+        self._fitted: tuple[weakref.ref[Tensor], int | None] | None = None
         lib.surface_build(ctypes.byref(self._tree), centre.ctypes.data_as(POINTER))
 
     def _share(self, parts: int) -> None:
@@ -152,13 +153,22 @@ class SurfaceTree:
             _point(self._tree, visits)
         self._tree.parts = parts
 
-    def search(self, points: np.ndarray, pos: np.ndarray, next_pos: np.ndarray, curved: bool) -> dict[str, np.ndarray]:
-        """Fields of :class:`Match` for ``points`` (N, 3) on the surface at ``pos`` (W, 3), all float64 and C-contiguous;
-        the curvature only if it is to be ``curved``."""
-        count = len(points)
-        self._arrays["pos"][...] = pos
-        self._share(num_parts(count, _POINTS))
+    def _fit(self, vertices: Tensor) -> None:
+        """Take up where the surface is; nothing to do where it was there in the search before."""
+        known, version = self._fitted, None if vertices.is_inference() else vertices._version
+        if known is not None and version is not None and known[0]() is vertices and known[1] == version:
+            self._lib.surface_again(ctypes.byref(self._tree))
+            return
+        self._arrays["pos"][...] = _double(vertices)
         self._lib.surface_refit(ctypes.byref(self._tree))
+        self._fitted = weakref.ref(vertices), version
+
+    def search(self, points: np.ndarray, vertices: Tensor, next_pos: np.ndarray, curved: bool) -> dict[str, np.ndarray]:
+        """Fields of :class:`Match` for ``points`` (N, 3) on the surface at ``vertices`` (W, 3), with ``next_pos`` (W, 3); the
+        arrays in float64 and C-contiguous. The curvature only if it is to be ``curved``."""
+        count = len(points)
+        self._share(num_parts(count, _POINTS))
+        self._fit(vertices)
         found: dict[str, np.ndarray] = {name: np.empty(count, np.int64) for name in ("vertex", "face")}
         found |= {"vertex_dist": np.empty(count), "dist": np.empty(count)}
         found |= {name: np.empty((count, 3)) for name in ("bary", *_PLACES)}
@@ -203,15 +213,15 @@ def search(
     """
     if type(points) is not Tensor or points.device.type != "cpu" or library() is None:
         return None
-    given, pos, later = _double(points), _double(vertices), _double(next_vertices)
+    given, later = _double(points), _double(next_vertices)
     scene = _only_scene(face_scene)
     if scene is not None and scene == _only_scene(point_scene):
-        return _found(points, _tree_of(faces, None, face_scene, incidence, pos).search(given, pos, later, curved))
+        return _found(points, _tree_of(faces, None, face_scene, incidence, vertices).search(given, vertices, later, curved))
     result = _nothing(len(points), curved)
     for scene in point_scene.unique().tolist():
         rows = (point_scene == scene).numpy().nonzero()[0]
         if bool((face_scene == scene).any()):
-            part = _tree_of(faces, scene, face_scene, incidence, pos).search(given[rows], pos, later, curved)
+            part = _tree_of(faces, scene, face_scene, incidence, vertices).search(given[rows], vertices, later, curved)
             for name, values in part.items():
                 result[name][rows] = values
     return _found(points, result)
@@ -253,12 +263,12 @@ def _found(points: Tensor, arrays: dict[str, np.ndarray]) -> Match:
 _TREES: deque[tuple[Tensor, int | None, SurfaceTree]] = deque(maxlen=16)
 
 
-def _tree_of(faces: Tensor, scene: int | None, face_scene: Tensor, incidence: Sequence[Tensor], pos: np.ndarray) -> SurfaceTree:
+def _tree_of(faces: Tensor, scene: int | None, face_scene: Tensor, incidence: Sequence[Tensor], pos: Tensor) -> SurfaceTree:
     for key, known, tree in _TREES:
         if key is incidence[0] and known == scene:
             return tree
     members = np.arange(len(faces)) if scene is None else (face_scene == scene).numpy().nonzero()[0]
     arrays = [np.ascontiguousarray(part.numpy(), np.int64) for part in incidence]
-    tree = SurfaceTree(faces.numpy(), members, arrays, pos)
+    tree = SurfaceTree(faces.numpy(), members, arrays, _double(pos))
     _TREES.append((incidence[0], scene, tree))
     return tree

@@ -736,6 +736,9 @@ void surface_refit(Tree* tree) {
     fit_boxes(*tree);
 }
 
+// Makes ready for another search where the vertices are as they were.
+void surface_again(Tree* tree) { ++tree->call; }
+
 // Curvatures of vertices, see hood/mesh/curvature.py; ``memory`` is (vertices, 3), ``of_face`` (faces).
 void surface_curvature(int64_t num_faces, int64_t num_edges, int64_t num_vertices, const int64_t* faces, const int64_t* edges,
                        const int64_t* around, const int64_t* first, const int64_t* valence, const double* pos, double* memory,

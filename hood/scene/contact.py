@@ -18,6 +18,7 @@ from hood.mesh.fixed_surface import search_surface_fixed
 from hood.mesh.nearest import Nearest, nearest_dense, nearest_vertices
 from hood.mesh.proximity import Incidence, SurfaceHit, build_incidence, search_surface
 from hood.mesh.surface_tree import Match
+from hood.scene.batch import to_device
 from hood.scene.cloth import Cloth
 from hood.scene.state import Obstacle
 
@@ -64,6 +65,25 @@ class Contact:
         return ((next_pos - self.next_point) * self.next_normal).sum(dim=1)
 
 
+#: Where the other side of a fold is looked for: this far [m] off the skin, of vertices that are nearer than the second number.
+_AHEAD, _NEAR = 15e-3, 20e-3
+#: It is another side where its normal is turned by more than the angle with this cosine (73 degrees), and where it lies in
+#: front of the first one or no more than this [m] behind: what is farther behind is the back of the same limb.
+_TURNED, _BEHIND = 0.3, 1e-3
+
+
+@dataclass(frozen=True)
+class Fold:
+    """The other side of folds of the body: of vertices between two parts of the skin that face each other, as in the bend of an
+    elbow, contact with the one that is not nearest. Everything else is not ``valid``; None where nothing is."""
+
+    contact: Contact | None
+
+    def to(self, dtype: torch.dtype) -> Fold:
+        """The same with its numbers in ``dtype``."""
+        return Fold(None if self.contact is None else to_device(self.contact, dtype=dtype))
+
+
 def find_contact(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, cap: float = 0.1) -> Contact:
     """Contact data of cloth positions ``pos`` (V, 3) against the obstacle at t; one search per scene.
 
@@ -71,6 +91,62 @@ def find_contact(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, cap: flo
     """
     match = match_surface(pos, vertex_scene, obstacle, curved=True)
     return Contact(**match._asdict(), valid=match.dist.abs() <= cap)
+
+
+def find_fold(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, contact: Contact) -> Fold:
+    """The other side of folds for cloth positions ``pos`` (V, 3) at t, whose ``contact`` is known.
+
+    A vertex is matched with the nearest skin, and nothing would keep it out of what faces that: while a bend closes it would
+    pass from one side into the other and back. The other side is the skin nearest to a place 15 mm ahead of the vertex.
+    """
+    rows = (contact.valid & (contact.dist.abs() < _NEAR)).nonzero().squeeze(1)
+    if len(rows) == 0:
+        return Fold(None)
+    match = match_surface(_ahead(pos, contact)[rows], vertex_scene[rows], obstacle)
+    other = _is_other(match, contact.point[rows], contact.normal[rows]).nonzero().squeeze(1)
+    if len(other) == 0:
+        return Fold(None)
+    rows = rows[other]
+    match = match_surface(_ahead(pos, contact)[rows], vertex_scene[rows], obstacle, curved=True)
+    match = match._replace(dist=_plane_dist(pos[rows], match))
+    nothing = {name: value.new_zeros(len(pos), *value.shape[1:]) for name, value in match._asdict().items()}
+    found = {name: nothing[name].index_copy(0, rows, value) for name, value in match._asdict().items()}
+    valid = torch.zeros_like(contact.valid).index_fill(0, rows, True)
+    return Fold(Contact(**found, valid=valid))
+
+
+def find_fixed_fold(
+    pos: Tensor,
+    vertex_scene: Tensor,
+    contact: Contact,
+    obstacle: Obstacle,
+    incidence: Incidence,
+    num_scenes: int,
+    places: int,
+) -> Fold:
+    """The same as :func:`find_fold` without waiting for the device: contact of as many rows whatever is found."""
+    ahead = torch.where(contact.valid.unsqueeze(1), _ahead(pos, contact), pos)
+    match = _match_fixed(ahead, vertex_scene, obstacle, incidence, num_scenes, places)[0]
+    near = contact.valid & (contact.dist.abs() < _NEAR)
+    valid = near & _is_other(match, contact.point, contact.normal)
+    match = match._replace(dist=_plane_dist(pos, match))
+    return Fold(Contact(**match._asdict(), valid=valid))
+
+
+def _ahead(pos: Tensor, contact: Contact) -> Tensor:
+    return pos + _AHEAD * contact.normal
+
+
+def _is_other(match: Match, point: Tensor, normal: Tensor) -> Tensor:
+    """Which matches (N,) are on another side than the one with these points and normals (N, 3)."""
+    turned = (match.normal * normal).sum(dim=1) < _TURNED
+    in_front = ((match.point - point) * normal).sum(dim=1) > -_BEHIND
+    return turned & in_front & (match.dist.abs() <= _AHEAD + _NEAR)
+
+
+def _plane_dist(pos: Tensor, match: Match) -> Tensor:
+    """Signed distances [m] (N,) of positions (N, 3) to the tangent planes at matched points at t."""
+    return ((pos - match.point) * match.normal).sum(dim=1)
 
 
 def match_surface(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, curved: bool = False) -> Match:
@@ -101,11 +177,17 @@ def find_fixed_contact(
 ) -> tuple[Contact, Tensor]:
     """The same as :func:`find_contact` without waiting for the device, and the number (1,) of faces that need a place; see
     :func:`hood.mesh.fixed_surface.search_surface_fixed`."""
+    match, needed = _match_fixed(pos, vertex_scene, obstacle, incidence, num_scenes, places)
+    return Contact(**match._asdict(), valid=match.dist.abs() <= cap), needed
+
+
+def _match_fixed(
+    pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, incidence: Incidence, num_scenes: int, places: int
+) -> tuple[Match, Tensor]:
     surface = obstacle.pos, obstacle.faces, obstacle.vertex_scene, obstacle.face_scene
     hit, needed = search_surface_fixed(pos, vertex_scene, *surface, incidence, num_scenes, places)
     match = _match_of(hit, obstacle, incidence)
-    match = match._replace(curvature=_matched_curvature(match, obstacle, incidence))
-    return Contact(**match._asdict(), valid=match.dist.abs() <= cap), needed
+    return match._replace(curvature=_matched_curvature(match, obstacle, incidence)), needed
 
 
 def _match_of(hit: SurfaceHit, obstacle: Obstacle, incidence: Incidence) -> Match:

@@ -77,12 +77,11 @@ class ContactPass:
         return [torch.empty_like(pos) for _ in range(vectors)] + [pos.new_empty(len(pos)) for _ in range(numbers)]
 
 
-def contact_pass(problem: StepProblem) -> ContactPass | None:
-    """The pass over the contact of a step in float64; None where there is no contact, no compiled pass, or not for these
-    tensors."""
-    contact, pos = problem.contact, problem.state.pos
+def contact_pass(problem: StepProblem, contact: Contact) -> ContactPass | None:
+    """The pass over a contact of a step in float64; None where there is no compiled pass, or not for these tensors."""
+    pos = problem.state.pos
     plain = type(pos) is Tensor and pos.device.type == "cpu" and not pos.requires_grad
-    if contact is None or not plain or pos.dtype is not torch.float64:
+    if not plain or pos.dtype is not torch.float64:
         return None
     lib = library()
     return None if lib is None else ContactPass(lib, problem, contact)

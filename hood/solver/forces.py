@@ -20,6 +20,7 @@ from hood.losses.potential import Potential, Term
 from hood.losses.problem import StepProblem
 from hood.losses.stretching import Stretching
 from hood.mesh.kept import forget
+from hood.scene.contact import Contact
 from hood.solver import vertex_pass
 from hood.solver.contact_pass import ContactPass, contact_pass
 from hood.solver.elements import BENDINGS
@@ -156,34 +157,38 @@ def vertex_forces(potential: Potential, problem: StepProblem, compiled: bool = F
     inertia, weight = torch.zeros_like(mass), torch.zeros_like(pos)
     walls: list[Walls] = []
     grips: list[Grip] = []
-    contact = contact_pass(problem) if compiled else None
+    passes: dict[int, ContactPass | None] = {}
+
+    def pass_of(contact: Contact) -> ContactPass | None:
+        if compiled and id(contact) not in passes:
+            passes[id(contact)] = contact_pass(problem, contact)
+        return passes.get(id(contact))
+
     for term in potential.active(problem).values():
         if type(term) is Inertia:
             inertia = inertia + mass
         elif type(term) is Gravity:
             weight = weight + mass[:, None] * problem.gravity.to(pos)
         elif isinstance(term, Collision) and type(term) in COLLISIONS:
-            walls.append(walls_of(term, problem, contact))
+            walls += [walls_of(term, problem, contact, pass_of(contact)) for contact in term.contacts(problem)]
         elif isinstance(term, LaggedFriction) and type(term) in FRICTIONS:
-            grips.append(_grip(term, problem, contact))
+            grips += [_grip(term, problem, contact, pass_of(contact)) for contact in term.contacts(problem)]
     return VertexForces(inertia[:, None], inertia / problem.vertex_dt.squeeze(1) ** 2, weight, tuple(walls), tuple(grips))
 
 
-def walls_of(term: Collision, problem: StepProblem, compiled: ContactPass | None = None) -> Walls:
-    """The planes of a collision term; the problem must have a contact. By the ``compiled`` pass where there is one."""
+def walls_of(term: Collision, problem: StepProblem, contact: Contact, compiled: ContactPass | None = None) -> Walls:
+    """The planes of a collision term at one of its contacts, by the ``compiled`` pass where there is one."""
     if compiled is not None and type(term) is Collision:
         return Walls(term.weight, *compiled.planes(term))
-    planes = term.planes(problem)
-    reach = torch.where(planes.touching, term.reaches(problem), 0.0)
+    planes = term.planes(problem, contact)
+    reach = torch.where(planes.touching, term.reaches(problem, contact), 0.0)
     return Walls(term.weight, planes.point, planes.normal, reach)
 
 
-def _grip(term: LaggedFriction, problem: StepProblem, compiled: ContactPass | None) -> Grip:
+def _grip(term: LaggedFriction, problem: StepProblem, contact: Contact, compiled: ContactPass | None) -> Grip:
     if compiled is not None and type(term) is Friction:
         normal, anchor, force, limit = compiled.grips(term)
         return Grip(force, normal, anchor, limit)
-    contact = problem.contact
-    assert contact is not None
     force = term.coefficient * term.normal_force(problem, contact)
     # Rows without a match may hold infinite or undefined numbers.
     sliding = (force > 0)[:, None]
@@ -235,7 +240,7 @@ def known(potential: Potential, problem: StepProblem) -> KnownForces:
     key, terms = id(problem), {name: term for name, term in potential.terms.items() if type(term) in SINGLE}
     last = _KNOWN.get(key)
     if last is None or last.problem() is not problem or not _same(last.terms, terms):
-        found, names = vertex_forces(potential, problem, compiled=True), _names(potential.only(terms).active(problem))
+        found, names = vertex_forces(potential, problem, compiled=True), _names(potential.only(terms).active(problem), problem)
         last = _KNOWN[key] = KnownForces(weakref.ref(problem, forget(_KNOWN, key)), terms, found, names)
     return last
 
@@ -244,11 +249,17 @@ def _same(terms: Mapping[str, Term], others: Mapping[str, Term]) -> bool:
     return list(terms) == list(others) and all(a is b for a, b in zip(terms.values(), others.values(), strict=True))
 
 
-def _names(terms: Mapping[str, Term]) -> list[str] | None:
+def _names(terms: Mapping[str, Term], problem: StepProblem) -> list[str] | None:
     """Names of terms in the order of :meth:`VertexForces.energies`, "" for none; None where two share a place."""
-    kinds = (Inertia, Gravity, COLLISIONS, FRICTIONS)
-    inertia, gravity, *others = [[name for name, term in terms.items() if isinstance(term, kind)] for kind in kinds]
-    return None if max(len(inertia), len(gravity)) > 1 else [(inertia or [""])[0], (gravity or [""])[0], *others[0], *others[1]]
+    inertia, gravity = ([name for name, term in terms.items() if isinstance(term, kind)] for kind in (Inertia, Gravity))
+    if max(len(inertia), len(gravity)) > 1:
+        return None
+    names = [(inertia or [""])[0], (gravity or [""])[0]]
+    for kinds in (COLLISIONS, FRICTIONS):
+        for name, term in terms.items():
+            if isinstance(term, (Collision, LaggedFriction)) and isinstance(term, kinds):
+                names += [name] * len(term.contacts(problem))
+    return names
 
 
 @torch.no_grad()
@@ -306,7 +317,11 @@ def _single(
         gradient = forces.gradient(pos, acc) if slope else None
     else:
         sums, gradient = list(found[0].to(pos.dtype)), None if found[1] is None else found[1].to(pos.dtype)
-    return {name: part for name, part in zip(names, sums, strict=True) if name}, gradient
+    energies = {}
+    for name, part in zip(names, sums, strict=True):
+        if name:  # on both sides of folds
+            energies[name] = energies[name] + part if name in energies else part
+    return energies, gradient
 
 
 def attachment_stiffness(term: Term, problem: StepProblem) -> Tensor:

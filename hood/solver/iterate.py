@@ -139,7 +139,7 @@ def projected_guess(potential: Potential, problem: StepProblem, falls: bool = Tr
     term = next((term for term in potential.terms.values() if isinstance(term, Collision)), None)
     if problem.contact is not None and term is not None and term.weight > 0:
         carried = (cloth.mass * gravity.norm() / (3.0 * term.weight)).sqrt()
-        depth, normal = term.depth(problem, guess)
+        depth, normal = term.depth(problem, problem.contact, guess)
         guess = guess + (depth - carried).clamp_min(0.0)[:, None] * normal
     return torch.where(cloth.free.unsqueeze(1), guess, fixed_positions(problem))
 
@@ -181,6 +181,7 @@ def _in_precision(problem: StepProblem, cloth: Cloth) -> StepProblem:
         None if problem.pull is None else problem.pull.to(real),
         problem.layers,
         None if problem.sides is None else to_device(problem.sides, dtype=real),
+        None if problem.fold is None else problem.fold.to(real),
     )
 
 

@@ -93,6 +93,7 @@ def test_both_collisions_agree_on_a_flat_body():
     body = obstacle(pos - [0.15, 0, 0.15], faces, (0.002, 0.001, 0.0))
     problem = problem_on(body, 1e-3)
     prepared = CentroidCollision().prepare(problem)
+    problem = Collision().prepare(problem)
     for shift in (0.0, 5e-4):
         here = problem.state.pos + shift
         energy, other = Collision()(problem, here, here), CentroidCollision()(prepared, here, here)

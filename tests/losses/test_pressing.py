@@ -125,7 +125,7 @@ def test_who_does_not_ask_gets_no_pull_and_who_asks_too_late_is_refused() -> Non
     assert default_potential(friction_coefficient=0.0).prepare(problem).pull is None
     potential = default_potential()
     with pytest.raises(ValueError, match="pull not known yet"):
-        potential.total(problem.with_contact(), problem.state.pos)
+        potential.total(problem.with_fold(), problem.state.pos)
 
 
 def test_points_of_edges_are_bounded_as_well() -> None:

@@ -88,15 +88,15 @@ def test_collision_friction_and_walls_read_the_same_reach() -> None:
     assert contact is not None
     assert isinstance(collision, Collision)
     assert isinstance(friction, Friction)
-    depth = collision.reaches(problem) - contact.dist
+    depth = collision.reaches(problem, contact) - contact.dist
     assert int((depth > 0).sum()) == problem.cloth.num_vertices  # 2 mm off: outside a constant reach
-    torch.testing.assert_close(collision.depth(problem, problem.state.pos)[0], depth, rtol=0, atol=5e-5)
-    assert torch.equal(walls_of(collision, problem).reach, collision.reaches(problem))
+    torch.testing.assert_close(collision.depth(problem, contact, problem.state.pos)[0], depth, rtol=0, atol=5e-5)
+    assert torch.equal(walls_of(collision, problem, contact).reach, collision.reaches(problem, contact))
     assert float(friction.normal_force(problem, contact).min()) > 0
     for other in (default_potential(reach="constant"), reference_potential(), coded_potential()):
         term = other.terms["collision"]
         assert isinstance(term, Collision)
-        assert torch.equal(term.reaches(problem), torch.full_like(contact.dist, 2e-3))
+        assert torch.equal(term.reaches(problem, contact), torch.full_like(contact.dist, 2e-3))
         assert isinstance(term.with_weight(1.0), Collision)
         assert term.with_weight(1.0).reach == "constant"
 

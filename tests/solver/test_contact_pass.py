@@ -36,7 +36,7 @@ def over_a_ball(speed: float) -> StepProblem:
 
 
 def both(potential: Potential, problem: StepProblem) -> tuple[VertexForces, VertexForces]:
-    if contact_pass(problem) is None:
+    if contact_pass(problem, problem.contact) is None:
         pytest.skip("no C++ compiler")
     return vertex_forces(potential, problem, compiled=True), vertex_forces(potential, problem)
 
@@ -90,4 +90,4 @@ def test_a_velocity_that_is_not_finite_is_not_hidden() -> None:
 def test_the_pass_is_for_float64_alone() -> None:
     problem = default_potential().prepare(over_a_ball(0.0))
     single = replace(problem, state=replace(problem.state, pos=problem.state.pos.float()))
-    assert contact_pass(single) is None
+    assert contact_pass(single, single.contact) is None

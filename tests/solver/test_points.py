@@ -241,10 +241,14 @@ def test_a_ball_comes_through_between_vertices_alone(cells: int) -> None:
 def test_a_place_that_nobody_searched_is_refused() -> None:
     problem = over_ball()
     with pytest.raises(ValueError, match="contact=edges not searched for yet; pass the problem through Potential.prepare"):
-        potential_at("edges").total(problem.with_contact(), problem.state.pos)
+        potential_at("edges").total(problem.with_fold(), problem.state.pos)
+    with pytest.raises(ValueError, match="folds of the body not searched for yet; pass the problem through Potential.prepare"):
+        potential_at("vertices").total(problem.with_contact(), problem.state.pos)
     for term in (Collision, Friction):
         with pytest.raises(ValueError, match="contact is 'edge'; choose vertices, edges, strict"):
             term(contact="edge")
+        with pytest.raises(ValueError, match="sides is 'one'; choose both, nearest"):
+            term(sides="one")
 
 
 def test_friction_by_weight_acts_at_vertices() -> None:
