@@ -43,6 +43,8 @@ class _Tree(ctypes.Structure):
         ("origin", ctypes.c_double * 3),
         ("size_sq", ctypes.c_double),
         *fields("batch parts", COUNT),
+        *fields("leaf_normals normal_boxes", POINTER),
+        *fields("normals_of fits", COUNT),
         *fields("nodes leaves reach", POINTER),
     ]
 
@@ -127,6 +129,8 @@ class SurfaceTree:
             "block_pos": (blocks, 3, _WIDE),
             "vertex_normal": (num_vertices, 6),
             "bulge": (2, num_vertices),
+            "leaf_normals": (leaves, 3, _WIDE),
+            "normal_boxes": (leaves, 6, _WIDE),
         }
         self._arrays = dict(zip(("around", "first", "valence", "face_edges", "edge_faces"), incidence, strict=True))
         self._arrays |= {name: _aligned(shape, np.int32) for name, shape in integers.items()}
@@ -162,6 +166,15 @@ class SurfaceTree:
         self._arrays["pos"][...] = _double(vertices)
         self._lib.surface_refit(ctypes.byref(self._tree))
         self._fitted = weakref.ref(vertices), version
+
+    def turned(self, points: np.ndarray, normals: np.ndarray, dist: np.ndarray, vertices: Tensor, cosine: float) -> np.ndarray:
+        """The rows (N,) bool of :func:`turned_near`; the arrays in float64 and C-contiguous."""
+        found = np.zeros(len(points), bool)
+        self._share(num_parts(len(points), _POINTS))
+        self._fit(vertices)
+        given = (array.ctypes.data_as(POINTER) for array in (points, normals, dist))
+        self._lib.surface_turned(ctypes.byref(self._tree), len(points), *given, REAL(cosine), found.ctypes.data_as(POINTER))
+        return found
 
     def search(self, points: np.ndarray, vertices: Tensor, next_pos: np.ndarray, curved: bool) -> dict[str, np.ndarray]:
         """Fields of :class:`Match` for ``points`` (N, 3) on the surface at ``vertices`` (W, 3), with ``next_pos`` (W, 3); the
@@ -225,6 +238,41 @@ def search(
             for name, values in part.items():
                 result[name][rows] = values
     return _found(points, result)
+
+
+@torch.no_grad()
+def turned_near(
+    points: Tensor,
+    point_scene: Tensor,
+    vertices: Tensor,
+    faces: Tensor,
+    face_scene: Tensor,
+    incidence: Sequence[Tensor],
+    normals: Tensor,
+    dist: Tensor,
+    cosine: float,
+) -> Tensor:
+    """Points (N,) bool that may have a face within ``dist`` (N,) [m] whose unit normal has a product with ``normals`` (N, 3)
+    below ``cosine``: all that have one, and few others; all of them where there is no compiled search, or not for these.
+
+    Args:
+        incidence: as for :class:`SurfaceTree`.
+    """
+    all_of_them = torch.ones(len(points), dtype=torch.bool, device=points.device)
+    if type(points) is not Tensor or points.device.type != "cpu" or library() is None:
+        return all_of_them
+    arrays = _double(points), _double(normals), _double(dist)
+    scene = _only_scene(face_scene)
+    if scene is not None and scene == _only_scene(point_scene):
+        tree = _tree_of(faces, None, face_scene, incidence, vertices)
+        return torch.from_numpy(tree.turned(*arrays, vertices, cosine))
+    for scene in point_scene.unique().tolist():
+        rows = (point_scene == scene).numpy().nonzero()[0]
+        if bool((face_scene == scene).any()):
+            tree = _tree_of(faces, scene, face_scene, incidence, vertices)
+            part, normal, reach = (np.ascontiguousarray(array[rows]) for array in arrays)
+            all_of_them[rows] = torch.from_numpy(tree.turned(part, normal, reach, vertices, cosine))
+    return all_of_them
 
 
 _ONLY: dict[int, tuple[weakref.ref[Tensor], int, int | None]] = {}

@@ -88,6 +88,10 @@ struct Tree {
     double origin[3], size_sq;        // m, m^2: middle of everything, and how far that reaches
     int64_t batch;                    // points that are searched for together, at most 64
     int64_t parts;                    // in which the points of a call are searched for, by threads
+    double* leaf_normals;             // (L, 3, 8) unit normals of the faces of a leaf
+    double* normal_boxes;             // (M, 6, 8) least and greatest of these below the children
+    int64_t normals_of;               // the fit, see fits, that these are of
+    int64_t fits;                     // how often positions were taken up
     Visit *nodes, *leaves;            // (parts, batch * L + 1) each, what points of a batch are to visit
     double* reach;                    // (parts, batch * L + 1) m^2, to the boxes of these leaves
 };
@@ -537,6 +541,90 @@ void describe(const Tree& tree, const Query& query) {
     });
 }
 
+// Unit normals of the faces of a leaf; what is around all of them goes to the lane of its node.
+void fit_normals(const Tree& tree, int64_t leaf, double* side) {
+    const double* table = tree.corners + 9 * WIDE * leaf;
+    const Axes a = load_axes(table), u = load_axes(table + 3 * WIDE) - a, v = load_axes(table + 6 * WIDE) - a;
+    Axes normal{all(0.0), all(0.0), all(0.0)};
+    add_cross(u, v, normal);
+    normal = unit(normal);
+    const V8 axes[3] = {normal.x, normal.y, normal.z};
+    for (int k = 0; k < 3; ++k) {
+        store(tree.leaf_normals + WIDE * (3 * leaf + k), axes[k]);
+        side[WIDE * k] = least_lane(axes[k]), side[WIDE * (3 + k)] = -least_lane(-axes[k]);
+    }
+}
+
+// Those of all faces, and boxes around them from the last node to the root; nothing to do where they are of this fit.
+void fit_all_normals(Tree& tree) {
+    if (tree.normals_of == tree.fits) return;
+    tree.normals_of = tree.fits;
+    double nowhere[6 * WIDE];
+    if (!tree.num_nodes) fit_normals(tree, 0, nowhere);
+    for (int64_t node = tree.num_nodes - 1; node >= 0; --node)
+        for (int i = 0; i < WIDE; ++i) {
+            double* side = tree.normal_boxes + 6 * WIDE * node + i;
+            const int64_t child = tree.children[WIDE * node + i];
+            if (child < 0) {
+                fit_normals(tree, -1 - child, side);
+                continue;
+            }
+            for (int k = 0; k < 6; ++k) {
+                const V8 below = load<V8>(tree.normal_boxes + WIDE * (6 * child + k));
+                side[WIDE * k] = child == node ? NAN : k < 3 ? least_lane(below) : -least_lane(-below);
+            }
+        }
+}
+
+// Lanes whose least product of a normal with n is below a limit; none where there is no box.
+inline I8 may_turn(const double* box, Vec n, double limit) {
+    const V8 x = least(load<V8>(box) * n.x, load<V8>(box + 3 * WIDE) * n.x);
+    const V8 y = least(load<V8>(box + WIDE) * n.y, load<V8>(box + 4 * WIDE) * n.y);
+    const V8 z = least(load<V8>(box + 2 * WIDE) * n.z, load<V8>(box + 5 * WIDE) * n.z);
+    return x + y + z < limit;
+}
+
+inline unsigned bits_of(I8 lanes_set) {
+    alignas(64) int64_t lane[WIDE];
+    store(lane, lanes_set);
+    unsigned bits = 0;
+    for (int i = 0; i < WIDE; ++i) bits |= (unsigned)(lane[i] != 0) << i;
+    return bits;
+}
+
+// Whether a face of a leaf that is turned by more than the cosine from n has its box within a distance of a point.
+bool leaf_turns(const Tree& tree, int64_t leaf, Vec p, float limit, Vec n, double cosine) {
+    const Vec local = p - at(tree.origin, 0);
+    const F8 away = box_dist_sq<F8>(tree.face_boxes + 6 * WIDE * leaf, (float)local.x, (float)local.y, (float)local.z);
+    alignas(32) float lane[WIDE];
+    store(lane, away);
+    const Axes normal = load_axes(tree.leaf_normals + 3 * WIDE * leaf);
+    unsigned turned = bits_of(dot(normal, everywhere(n)) < cosine);
+    for (; turned; turned &= turned - 1)
+        if (lane[__builtin_ctz(turned)] <= limit) return true;
+    return false;
+}
+
+bool turns_near(const Tree& tree, Vec p, double dist_sq, Vec n, double cosine, std::vector<int64_t>& stack) {
+    const Vec local = p - at(tree.origin, 0);
+    const double size_sq = tree.size_sq + dot(local, local), limit = limit_of(dist_sq, size_sq);
+    const float face_limit = face_limit_of(dist_sq, size_sq);
+    if (!tree.num_nodes) return leaf_turns(tree, 0, p, face_limit, n, cosine);
+    for (stack.assign(1, 0); !stack.empty();) {
+        const int64_t node = stack.back();
+        stack.pop_back();
+        unsigned within = bits_of((children_dist_sq(tree, node, p) <= limit) & may_turn(tree.normal_boxes + 6 * WIDE * node, n, cosine));
+        for (; within; within &= within - 1) {
+            const int64_t child = tree.children[WIDE * node + __builtin_ctz(within)];
+            if (child >= 0)
+                stack.push_back(child);
+            else if (leaf_turns(tree, -1 - child, p, face_limit, n, cosine))
+                return true;
+        }
+    }
+    return false;
+}
+
 void finish(const Tree& tree, const Query& query, int64_t i, const Walk& walk) {
     const Found closest = first_of(walk.faces), nearest = first_of(walk.vertices);
     // A surface without a finite place has neither.
@@ -727,7 +815,7 @@ void surface_build(Tree* tree, const double* centre) {
 
 // Takes up where the vertices are now.
 void surface_refit(Tree* tree) {
-    ++tree->call;
+    ++tree->call, ++tree->fits;
     for (int64_t leaf = 0; leaf < tree->num_leaves; ++leaf) gather(*tree, leaf, tree->pos, tree->corners + 9 * WIDE * leaf);
     for (int64_t i = 0; i < WIDE * tree->num_blocks; ++i)
         for (int k = 0; k < 3; ++k)
@@ -738,6 +826,19 @@ void surface_refit(Tree* tree) {
 
 // Makes ready for another search where the vertices are as they were.
 void surface_again(Tree* tree) { ++tree->call; }
+
+// Which points (N, 3) have a face within the distances (N) whose normal has a product with those given (N, 3) below the cosine;
+// some that have none are named as well.
+void surface_turned(Tree* tree, int64_t count, const double* points, const double* normals, const double* dist, double cosine,
+                    uint8_t* found) {
+    fit_all_normals(*tree);
+    for_parts(tree->parts, [&](int64_t part) {
+        std::vector<int64_t> stack;
+        const Range range = range_of(count, part, tree->parts);
+        for (int64_t i = range.begin; i < range.end; ++i)
+            found[i] = turns_near(*tree, at(points, i), dist[i] * dist[i], at(normals, i), cosine, stack);
+    });
+}
 
 // Curvatures of vertices, see hood/mesh/curvature.py; ``memory`` is (vertices, 3), ``of_face`` (faces).
 void surface_curvature(int64_t num_faces, int64_t num_edges, int64_t num_vertices, const int64_t* faces, const int64_t* edges,

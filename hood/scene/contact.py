@@ -67,7 +67,7 @@ class Contact:
 
 #: Where the other side of a fold is looked for: this far [m] off the skin, of vertices that are nearer than the second number.
 _AHEAD, _NEAR = 15e-3, 20e-3
-#: It is another side where its normal is turned by more than the angle with this cosine (73 degrees), and where it lies in
+#: It is another side where its normals are turned by more than the angle with this cosine (73 degrees), and where it lies in
 #: front of the first one or no more than this [m] behind: what is farther behind is the back of the same limb.
 _TURNED, _BEHIND = 0.3, 1e-3
 
@@ -99,15 +99,15 @@ def find_fold(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, contact: Co
     A vertex is matched with the nearest skin, and nothing would keep it out of what faces that: while a bend closes it would
     pass from one side into the other and back. The other side is the skin nearest to a place 15 mm ahead of the vertex.
     """
-    rows = (contact.valid & (contact.dist.abs() < _NEAR)).nonzero().squeeze(1)
+    rows = _may_fold(pos, vertex_scene, obstacle, contact).nonzero().squeeze(1)
     if len(rows) == 0:
         return Fold(None)
-    match = match_surface(_ahead(pos, contact)[rows], vertex_scene[rows], obstacle)
-    other = _is_other(match, contact.point[rows], contact.normal[rows]).nonzero().squeeze(1)
+    match = match_surface(_ahead(pos, contact)[rows], vertex_scene[rows], obstacle, curved=True)
+    other = _is_other(match, obstacle, contact.point[rows], contact.normal[rows]).nonzero().squeeze(1)
     if len(other) == 0:
         return Fold(None)
     rows = rows[other]
-    match = match_surface(_ahead(pos, contact)[rows], vertex_scene[rows], obstacle, curved=True)
+    match = Match(**{name: value[other] for name, value in match._asdict().items()})
     match = match._replace(dist=_plane_dist(pos[rows], match))
     nothing = {name: value.new_zeros(len(pos), *value.shape[1:]) for name, value in match._asdict().items()}
     found = {name: nothing[name].index_copy(0, rows, value) for name, value in match._asdict().items()}
@@ -128,7 +128,7 @@ def find_fixed_fold(
     ahead = torch.where(contact.valid.unsqueeze(1), _ahead(pos, contact), pos)
     match = _match_fixed(ahead, vertex_scene, obstacle, incidence, num_scenes, places)[0]
     near = contact.valid & (contact.dist.abs() < _NEAR)
-    valid = near & _is_other(match, contact.point, contact.normal)
+    valid = near & _is_other(match, obstacle, contact.point, contact.normal)
     match = match._replace(dist=_plane_dist(pos, match))
     return Fold(Contact(**match._asdict(), valid=valid))
 
@@ -137,9 +137,25 @@ def _ahead(pos: Tensor, contact: Contact) -> Tensor:
     return pos + _AHEAD * contact.normal
 
 
-def _is_other(match: Match, point: Tensor, normal: Tensor) -> Tensor:
+def _may_fold(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, contact: Contact) -> Tensor:
+    """Vertices (V,) bool that are near the body, and to which another side may be nearest ahead: their own one is as near."""
+    near = contact.valid & (contact.dist.abs() < _NEAR)
+    if not len(obstacle.faces) or not bool(near.any()):
+        return torch.zeros_like(near)
+    rows = near.nonzero().squeeze(1)
+    ahead, normal = _ahead(pos, contact)[rows], contact.normal[rows]
+    own = (ahead - contact.point[rows]).norm(dim=1)
+    incidence = build_incidence(obstacle.faces, len(obstacle.pos))
+    surface = obstacle.pos, obstacle.faces, obstacle.face_scene, incidence.adjacency
+    turned = surface_tree.turned_near(ahead, vertex_scene[rows], *surface, normal, own, _TURNED)
+    return near.index_copy(0, rows, turned)
+
+
+def _is_other(match: Match, obstacle: Obstacle, point: Tensor, normal: Tensor) -> Tensor:
     """Which matches (N,) are on another side than the one with these points and normals (N, 3)."""
-    turned = (match.normal * normal).sum(dim=1) < _TURNED
+    # Of a sharp edge only the faces are turned, of a bulge between two faces only the normals on the way.
+    of_face = geometry.face_normals(obstacle.pos, obstacle.faces[match.face])
+    turned = ((of_face * normal).sum(dim=1) < _TURNED) & ((match.normal * normal).sum(dim=1) < _TURNED)
     in_front = ((match.point - point) * normal).sum(dim=1) > -_BEHIND
     return turned & in_front & (match.dist.abs() <= _AHEAD + _NEAR)
 

@@ -33,7 +33,7 @@ def obstacle(pos: np.ndarray, faces: np.ndarray, later: np.ndarray | None = None
 
 
 def limbs(gap: float, angle: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """The sides of two limbs that face each other across a gap [m] along z, the upper one turned by an angle about the y axis."""
+    """The sides of two limbs that face each other across a gap [m] along z, the upper one turned by an angle about y."""
     side, faces = grid(9, 9, 0.4)
     lower = side[:, [0, 2, 1]] * [1, 1, 0] - [0.1, 0.2, gap / 2]
     turn = np.array([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
@@ -147,7 +147,7 @@ def between(gap: float, speed: float = 0.0) -> StepProblem:
     cloth = build_cloth(pos + [0.07, 0.0, 0.0], faces, Material(), dtype=F64)
     start = cloth.rest_pos[:, [0, 2, 1]]  # from the plane y = 0 to z = 0
     start = start - torch.tensor([0.0, 0.03, gap / 8], dtype=F64)
-    problem = make_problem(cloth, start, np.broadcast_to([0.0, 0.0, speed], pos.shape))
+    problem = make_problem(cloth, start, np.tile([0.0, 0.0, speed], (len(pos), 1)))
     return replace(problem, step=replace(problem.step, obstacle=obstacle(*limbs(gap))), contact=None)
 
 
