@@ -49,6 +49,12 @@ class _Tree(ctypes.Structure):
     ]
 
 
+class _Matched(ctypes.Structure):
+    """``Matched`` of ``surface.cpp``."""
+
+    _fields_ = [("count", COUNT), *fields("points valid dist point normal", POINTER), *fields("ahead near cosine", REAL)]
+
+
 class _Query(ctypes.Structure):
     """``Query`` of ``surface.cpp``."""
 
@@ -63,6 +69,15 @@ class _Query(ctypes.Structure):
 
 #: What is known of a matched point, then and now.
 _PLACES = ("point", "normal", "next_point", "next_normal")
+
+
+class FoldRule(NamedTuple):
+    """What another side of a fold is, see :func:`hood.scene.contact.find_fold`."""
+
+    ahead: float  # m, it is looked for this far off the skin
+    near: float  # m, of points that are nearer
+    cosine: float  # of the angle with the normal by which its own are turned at least
+    behind: float  # m, it is no farther behind the skin
 
 
 class Match(NamedTuple):
@@ -85,8 +100,8 @@ class Match(NamedTuple):
 def library() -> ctypes.CDLL | None:
     """The compiled search; None without a compiler."""
     lib = optional(SOURCE)
-    if lib is None:
-        return None
+    if lib is not None:
+        lib.surface_ahead.restype = COUNT
     return lib
 
 
@@ -167,14 +182,20 @@ class SurfaceTree:
         self._lib.surface_refit(ctypes.byref(self._tree))
         self._fitted = weakref.ref(vertices), version
 
-    def turned(self, points: np.ndarray, normals: np.ndarray, dist: np.ndarray, vertices: Tensor, cosine: float) -> np.ndarray:
-        """The rows (N,) bool of :func:`turned_near`; the arrays in float64 and C-contiguous."""
-        found = np.zeros(len(points), bool)
-        self._share(num_parts(len(points), _POINTS))
+    def ahead(
+        self, points: np.ndarray, matched: Sequence[np.ndarray], vertices: Tensor, rule: FoldRule
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The rows (n,) of ``points`` (N, 3) whose other side :func:`search_folds` has to look for, and the places (n, 3) ahead
+        of them; those in ``matched`` are valid (N,) bool, dist (N,), point and normal (N, 3)."""
+        count = len(points)
+        self._share(num_parts(count, _POINTS))
         self._fit(vertices)
-        given = (array.ctypes.data_as(POINTER) for array in (points, normals, dist))
-        self._lib.surface_turned(ctypes.byref(self._tree), len(points), *given, REAL(cosine), found.ctypes.data_as(POINTER))
-        return found
+        values = _Matched(count=count, ahead=rule.ahead, near=rule.near, cosine=rule.cosine)
+        _point(values, {"points": points, **dict(zip(("valid", "dist", "point", "normal"), matched, strict=True))})
+        rows, places, found = np.empty(count, np.int64), np.empty((count, 3)), np.empty(count, bool)
+        given = (array.ctypes.data_as(POINTER) for array in (rows, places, found))
+        num = self._lib.surface_ahead(ctypes.byref(self._tree), ctypes.byref(values), *given)
+        return rows[:num], places[:num]
 
     def search(self, points: np.ndarray, vertices: Tensor, next_pos: np.ndarray, curved: bool) -> dict[str, np.ndarray]:
         """Fields of :class:`Match` for ``points`` (N, 3) on the surface at ``vertices`` (W, 3), with ``next_pos`` (W, 3); the
@@ -241,38 +262,60 @@ def search(
 
 
 @torch.no_grad()
-def turned_near(
+def search_folds(
     points: Tensor,
     point_scene: Tensor,
     vertices: Tensor,
     faces: Tensor,
     face_scene: Tensor,
     incidence: Sequence[Tensor],
-    normals: Tensor,
-    dist: Tensor,
-    cosine: float,
-) -> Tensor:
-    """Points (N,) bool that may have a face within ``dist`` (N,) [m] whose unit normal has a product with ``normals`` (N, 3)
-    below ``cosine``: all that have one, and few others; all of them where there is no compiled search, or not for these.
+    next_vertices: Tensor,
+    matched: Sequence[Tensor],
+    rule: FoldRule,
+) -> tuple[Match, Tensor] | None:
+    """The other side of folds, see :func:`hood.scene.contact.find_fold`, scene by scene: matches with the curvature, and the
+    rows (n,) of ``points`` (N, 3) that they are of. None where there is no compiled search, or not for these tensors.
 
     Args:
         incidence: as for :class:`SurfaceTree`.
+        next_vertices: (W, 3) m, where the surface goes.
+        matched: of the nearest side valid (N,) bool, dist (N,), point and normal (N, 3).
     """
-    all_of_them = torch.ones(len(points), dtype=torch.bool, device=points.device)
     if type(points) is not Tensor or points.device.type != "cpu" or library() is None:
-        return all_of_them
-    arrays = _double(points), _double(normals), _double(dist)
-    scene = _only_scene(face_scene)
-    if scene is not None and scene == _only_scene(point_scene):
-        tree = _tree_of(faces, None, face_scene, incidence, vertices)
-        return torch.from_numpy(tree.turned(*arrays, vertices, cosine))
-    for scene in point_scene.unique().tolist():
-        rows = (point_scene == scene).numpy().nonzero()[0]
-        if bool((face_scene == scene).any()):
-            tree = _tree_of(faces, scene, face_scene, incidence, vertices)
-            part, normal, reach = (np.ascontiguousarray(array[rows]) for array in arrays)
-            all_of_them[rows] = torch.from_numpy(tree.turned(part, normal, reach, vertices, cosine))
-    return all_of_them
+        return None
+    valid, later = matched[0].numpy(), _double(next_vertices)
+    given, near = _double(points), [_double(values) for values in matched[1:]]
+    only = _only_scene(face_scene)
+    whole = only is not None and only == _only_scene(point_scene)
+    found = []
+    for scene in [None] if whole else point_scene.unique().tolist():
+        if scene is not None and not bool((face_scene == scene).any()):
+            continue
+        tree = _tree_of(faces, scene, face_scene, incidence, vertices)
+        own = valid if scene is None else valid & (point_scene == scene).numpy()
+        rows, places = tree.ahead(given, [np.ascontiguousarray(own), *near], vertices, rule)
+        if len(rows):
+            hit = tree.search(places, vertices, later, curved=True)
+            kept = _on_other_side(hit, vertices, faces, near[1][rows], near[2][rows], rule)
+            hit |= {"dist": ((given[rows] - hit["point"]) * hit["normal"]).sum(axis=1)}
+            found.append(({name: values[kept] for name, values in hit.items()}, rows[kept]))
+    if not found:
+        return _found(points, _nothing(0, curved=True)), torch.zeros(0, dtype=torch.int64)
+    hits = {name: np.concatenate([hit[name] for hit, _ in found]) for name in found[0][0]}
+    return _found(points, hits), torch.from_numpy(np.concatenate([rows for _, rows in found]))
+
+
+def _on_other_side(
+    hit: dict[str, np.ndarray], vertices: Tensor, faces: Tensor, point: np.ndarray, normal: np.ndarray, rule: FoldRule
+) -> np.ndarray:
+    """Which matches ahead (n,) are on another side than the one with these points and normals (n, 3): what
+    :func:`hood.scene.contact.find_fold` says of tensors."""
+    corners = vertices.numpy()[faces.numpy()[hit["face"]]].astype(np.float64)
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    of_face = (across * normal).sum(axis=1) / np.linalg.norm(across, axis=1).clip(min=1e-300)
+    turned = (of_face < rule.cosine) & ((hit["normal"] * normal).sum(axis=1) < rule.cosine)
+    in_front = ((hit["point"] - point) * normal).sum(axis=1) > -rule.behind
+    return np.asarray(turned & in_front & (np.abs(hit["dist"]) <= rule.ahead + rule.near))
 
 
 _ONLY: dict[int, tuple[weakref.ref[Tensor], int, int | None]] = {}

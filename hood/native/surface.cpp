@@ -96,6 +96,15 @@ struct Tree {
     double* reach;                    // (parts, batch * L + 1) m^2, to the boxes of these leaves
 };
 
+// Points whose nearest surface points are known.
+struct Matched {
+    int64_t count;
+    const double* points;          // (N, 3)
+    const uint8_t* valid;          // (N)
+    const double *dist, *point, *normal;  // (N), (N, 3), (N, 3)
+    double ahead, near, cosine;
+};
+
 struct Query {
     int64_t count;
     const double* points;    // (N, 3)
@@ -827,17 +836,29 @@ void surface_refit(Tree* tree) {
 // Makes ready for another search where the vertices are as they were.
 void surface_again(Tree* tree) { ++tree->call; }
 
-// Which points (N, 3) have a face within the distances (N) whose normal has a product with those given (N, 3) below the cosine;
-// some that have none are named as well.
-void surface_turned(Tree* tree, int64_t count, const double* points, const double* normals, const double* dist, double cosine,
-                    uint8_t* found) {
+// Of points (N, 3) that were matched at a distance below ``near``, those that a face ahead of them, ``ahead`` off the skin, may be
+// nearer to than the skin they were matched with, if its normal has a product with theirs below the cosine: their numbers and the
+// places ahead; how many there are.
+int64_t surface_ahead(Tree* tree, const Matched* matched, int64_t* rows, double* places, uint8_t* found) {
     fit_all_normals(*tree);
     for_parts(tree->parts, [&](int64_t part) {
         std::vector<int64_t> stack;
-        const Range range = range_of(count, part, tree->parts);
-        for (int64_t i = range.begin; i < range.end; ++i)
-            found[i] = turns_near(*tree, at(points, i), dist[i] * dist[i], at(normals, i), cosine, stack);
+        const Range range = range_of(matched->count, part, tree->parts);
+        for (int64_t i = range.begin; i < range.end; ++i) {
+            found[i] = matched->valid[i] && std::fabs(matched->dist[i]) < matched->near;
+            if (!found[i]) continue;
+            const Vec normal = at(matched->normal, i), place = at(matched->points, i) + matched->ahead * normal;
+            const Vec own = place - at(matched->point, i);
+            found[i] = turns_near(*tree, place, dot(own, own), normal, matched->cosine, stack);
+        }
     });
+    int64_t count = 0;
+    for (int64_t i = 0; i < matched->count; ++i)
+        if (found[i]) {
+            put(places + 3 * count, at(matched->points, i) + matched->ahead * at(matched->normal, i));
+            rows[count++] = i;
+        }
+    return count;
 }
 
 // Curvatures of vertices, see hood/mesh/curvature.py; ``memory`` is (vertices, 3), ``of_face`` (faces).

@@ -17,7 +17,7 @@ from hood.mesh.curvature import convex_curvature
 from hood.mesh.fixed_surface import search_surface_fixed
 from hood.mesh.nearest import Nearest, nearest_dense, nearest_vertices
 from hood.mesh.proximity import Incidence, SurfaceHit, build_incidence, search_surface
-from hood.mesh.surface_tree import Match
+from hood.mesh.surface_tree import FoldRule, Match
 from hood.scene.batch import to_device
 from hood.scene.cloth import Cloth
 from hood.scene.state import Obstacle
@@ -65,11 +65,10 @@ class Contact:
         return ((next_pos - self.next_point) * self.next_normal).sum(dim=1)
 
 
-#: Where the other side of a fold is looked for: this far [m] off the skin, of vertices that are nearer than the second number.
-_AHEAD, _NEAR = 15e-3, 20e-3
-#: It is another side where its normals are turned by more than the angle with this cosine (73 degrees), and where it lies in
-#: front of the first one or no more than this [m] behind: what is farther behind is the back of the same limb.
-_TURNED, _BEHIND = 0.3, 1e-3
+#: The other side of a fold is looked for 15 mm off the skin, of vertices nearer than 20 mm. It is one where its normals are
+#: turned by more than 73 degrees, and where it lies in front of the nearest side, or no more than 1 mm behind: what is farther
+#: behind is the back of the same limb.
+_RULE = FoldRule(ahead=15e-3, near=20e-3, cosine=0.3, behind=1e-3)
 
 
 @dataclass(frozen=True)
@@ -99,20 +98,28 @@ def find_fold(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, contact: Co
     A vertex is matched with the nearest skin, and nothing would keep it out of what faces that: while a bend closes it would
     pass from one side into the other and back. The other side is the skin nearest to a place 15 mm ahead of the vertex.
     """
-    rows = _may_fold(pos, vertex_scene, obstacle, contact).nonzero().squeeze(1)
+    match, rows = _match_folds(pos, vertex_scene, obstacle, contact)
     if len(rows) == 0:
         return Fold(None)
-    match = match_surface(_ahead(pos, contact)[rows], vertex_scene[rows], obstacle, curved=True)
-    other = _is_other(match, obstacle, contact.point[rows], contact.normal[rows]).nonzero().squeeze(1)
-    if len(other) == 0:
-        return Fold(None)
-    rows = rows[other]
-    match = Match(**{name: value[other] for name, value in match._asdict().items()})
-    match = match._replace(dist=_plane_dist(pos[rows], match))
     nothing = {name: value.new_zeros(len(pos), *value.shape[1:]) for name, value in match._asdict().items()}
     found = {name: nothing[name].index_copy(0, rows, value) for name, value in match._asdict().items()}
-    valid = torch.zeros_like(contact.valid).index_fill(0, rows, True)
-    return Fold(Contact(**found, valid=valid))
+    return Fold(Contact(**found, valid=torch.zeros_like(contact.valid).index_fill(0, rows, True)))
+
+
+def _match_folds(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, contact: Contact) -> tuple[Match, Tensor]:
+    """Matches (n,) on the other side, and the vertices (n,) that they are of."""
+    if len(obstacle.faces) and len(pos):
+        incidence = build_incidence(obstacle.faces, len(obstacle.pos))
+        surface = obstacle.pos, obstacle.faces, obstacle.face_scene, incidence.adjacency, obstacle.next_pos
+        near = contact.valid, contact.dist, contact.point, contact.normal
+        found = surface_tree.search_folds(pos, vertex_scene, *surface, near, _RULE)
+        if found is not None:
+            return found
+    rows = (contact.valid & (contact.dist.abs() < _RULE.near)).nonzero().squeeze(1)
+    match = match_surface(_ahead(pos, contact)[rows], vertex_scene[rows], obstacle, curved=True)
+    other = _is_other(match, obstacle, contact.point[rows], contact.normal[rows]).nonzero().squeeze(1)
+    rows, match = rows[other], Match(**{name: value[other] for name, value in match._asdict().items()})
+    return match._replace(dist=_plane_dist(pos[rows], match)), rows
 
 
 def find_fixed_fold(
@@ -127,37 +134,23 @@ def find_fixed_fold(
     """The same as :func:`find_fold` without waiting for the device: contact of as many rows whatever is found."""
     ahead = torch.where(contact.valid.unsqueeze(1), _ahead(pos, contact), pos)
     match = _match_fixed(ahead, vertex_scene, obstacle, incidence, num_scenes, places)[0]
-    near = contact.valid & (contact.dist.abs() < _NEAR)
+    near = contact.valid & (contact.dist.abs() < _RULE.near)
     valid = near & _is_other(match, obstacle, contact.point, contact.normal)
     match = match._replace(dist=_plane_dist(pos, match))
     return Fold(Contact(**match._asdict(), valid=valid))
 
 
 def _ahead(pos: Tensor, contact: Contact) -> Tensor:
-    return pos + _AHEAD * contact.normal
-
-
-def _may_fold(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, contact: Contact) -> Tensor:
-    """Vertices (V,) bool that are near the body, and to which another side may be nearest ahead: their own one is as near."""
-    near = contact.valid & (contact.dist.abs() < _NEAR)
-    if not len(obstacle.faces) or not bool(near.any()):
-        return torch.zeros_like(near)
-    rows = near.nonzero().squeeze(1)
-    ahead, normal = _ahead(pos, contact)[rows], contact.normal[rows]
-    own = (ahead - contact.point[rows]).norm(dim=1)
-    incidence = build_incidence(obstacle.faces, len(obstacle.pos))
-    surface = obstacle.pos, obstacle.faces, obstacle.face_scene, incidence.adjacency
-    turned = surface_tree.turned_near(ahead, vertex_scene[rows], *surface, normal, own, _TURNED)
-    return near.index_copy(0, rows, turned)
+    return pos + _RULE.ahead * contact.normal
 
 
 def _is_other(match: Match, obstacle: Obstacle, point: Tensor, normal: Tensor) -> Tensor:
     """Which matches (N,) are on another side than the one with these points and normals (N, 3)."""
     # Of a sharp edge only the faces are turned, of a bulge between two faces only the normals on the way.
     of_face = geometry.face_normals(obstacle.pos, obstacle.faces[match.face])
-    turned = ((of_face * normal).sum(dim=1) < _TURNED) & ((match.normal * normal).sum(dim=1) < _TURNED)
-    in_front = ((match.point - point) * normal).sum(dim=1) > -_BEHIND
-    return turned & in_front & (match.dist.abs() <= _AHEAD + _NEAR)
+    turned = ((of_face * normal).sum(dim=1) < _RULE.cosine) & ((match.normal * normal).sum(dim=1) < _RULE.cosine)
+    in_front = ((match.point - point) * normal).sum(dim=1) > -_RULE.behind
+    return turned & in_front & (match.dist.abs() <= _RULE.ahead + _RULE.near)
 
 
 def _plane_dist(pos: Tensor, match: Match) -> Tensor:

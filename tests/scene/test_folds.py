@@ -11,15 +11,18 @@ import torch
 from torch import Tensor
 
 from hood.assets.material import Material
+from hood.assets.sequence import load_sequence
 from hood.dynamics.fixed_problem import with_fixed_contact
 from hood.losses.collision import Collision
 from hood.losses.layers import for_networks
 from hood.losses.potential import default_potential, keeps_both_sides, reference_potential
 from hood.losses.problem import StepProblem
+from hood.mesh import surface_tree
 from hood.mesh.proximity import build_incidence
 from hood.mesh.surface_tree import library
 from hood.scene.cloth import build_cloth
 from hood.scene.contact import Contact, find_contact, find_fixed_fold, find_fold
+from hood.scene.motion import body_motion
 from hood.scene.state import Obstacle, concatenate_obstacles
 from hood.solver.newton import NewtonSettings, minimize
 from hood.testing import grid, make_problem, sphere
@@ -184,3 +187,24 @@ def test_networks_are_shown_the_nearest_side_alone() -> None:
     for name in ("collision", "friction"):
         known, shown = vars(potential.terms[name]), vars(for_networks(potential).terms[name])
         assert {key for key in known if known[key] != shown[key]} == {"sides"}
+
+
+@pytest.mark.skipif(library() is None, reason="compares the compiled search with that of torch")
+def test_the_compiled_search_finds_what_torch_does(body, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Around a body whose arms are bent: elbows, armpits, fingers."""
+    motion = body_motion(body, load_sequence("dance_mixed", 30.0).window(38, 40), np.zeros(10), dtype=F64)
+    surface = motion.obstacle(0, motion.translation[0])
+    generator = torch.Generator().manual_seed(0)
+    rows = torch.randint(len(surface.pos), (3000,), generator=generator)
+    pos = surface.pos[rows] + 0.01 * torch.randn(3000, 3, generator=generator, dtype=F64)
+    scene = torch.zeros(len(pos)).long()
+    contact = find_contact(pos, scene, surface)
+    compiled = find_fold(pos, scene, surface, contact).contact
+    monkeypatch.setattr(surface_tree, "search_folds", lambda *given: None)
+    plain = find_fold(pos, scene, surface, contact).contact
+    assert compiled is not None
+    assert plain is not None
+    assert int(plain.valid.sum()) > 50
+    assert torch.equal(compiled.valid, plain.valid)
+    for name in ("face", "dist", "point", "normal", "next_point", "next_normal", "curvature"):
+        torch.testing.assert_close(getattr(compiled, name), getattr(plain, name), rtol=1e-9, atol=1e-12)
