@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import weakref
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -52,7 +52,7 @@ class _Tree(ctypes.Structure):
 class _Matched(ctypes.Structure):
     """``Matched`` of ``surface.cpp``."""
 
-    _fields_ = [("count", COUNT), *fields("points valid dist point normal", POINTER), *fields("ahead near cosine", REAL)]
+    _fields_ = [*fields("valid dist point normal", POINTER), *fields("ahead near cosine behind", REAL)]
 
 
 class _Query(ctypes.Structure):
@@ -100,8 +100,8 @@ class Match(NamedTuple):
 def library() -> ctypes.CDLL | None:
     """The compiled search; None without a compiler."""
     lib = optional(SOURCE)
-    if lib is not None:
-        lib.surface_ahead.restype = COUNT
+    if lib is None:
+        return None
     return lib
 
 
@@ -182,35 +182,38 @@ class SurfaceTree:
         self._lib.surface_refit(ctypes.byref(self._tree))
         self._fitted = weakref.ref(vertices), version
 
-    def ahead(
-        self, points: np.ndarray, matched: Sequence[np.ndarray], vertices: Tensor, rule: FoldRule
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """The rows (n,) of ``points`` (N, 3) whose other side :func:`search_folds` has to look for, and the places (n, 3) ahead
-        of them; those in ``matched`` are valid (N,) bool, dist (N,), point and normal (N, 3)."""
-        count = len(points)
-        self._share(num_parts(count, _POINTS))
-        self._fit(vertices)
-        values = _Matched(count=count, ahead=rule.ahead, near=rule.near, cosine=rule.cosine)
-        _point(values, {"points": points, **dict(zip(("valid", "dist", "point", "normal"), matched, strict=True))})
-        rows, places, found = np.empty(count, np.int64), np.empty((count, 3)), np.empty(count, bool)
-        given = (array.ctypes.data_as(POINTER) for array in (rows, places, found))
-        num = self._lib.surface_ahead(ctypes.byref(self._tree), ctypes.byref(values), *given)
-        return rows[:num], places[:num]
-
     def search(self, points: np.ndarray, vertices: Tensor, next_pos: np.ndarray, curved: bool) -> dict[str, np.ndarray]:
         """Fields of :class:`Match` for ``points`` (N, 3) on the surface at ``vertices`` (W, 3), with ``next_pos`` (W, 3); the
         arrays in float64 and C-contiguous. The curvature only if it is to be ``curved``."""
         count = len(points)
         self._share(num_parts(count, _POINTS))
         self._fit(vertices)
-        found: dict[str, np.ndarray] = {name: np.empty(count, np.int64) for name in ("vertex", "face")}
-        found |= {"vertex_dist": np.empty(count), "dist": np.empty(count)}
-        found |= {name: np.empty((count, 3)) for name in ("bary", *_PLACES)}
-        found |= {"curvature": np.empty(count)} if curved else {}
+        found = _arrays(count, curved, np.empty)
         query = _Query(count=count, most_curvature=MOST_CURVATURE, rounds=ROUNDS)
         _point(query, {"points": points, "next_pos": next_pos, **found})
         self._lib.surface_search(ctypes.byref(self._tree), ctypes.byref(query))
         return found
+
+    def folds(
+        self,
+        points: np.ndarray,
+        near: dict[str, np.ndarray],
+        vertices: Tensor,
+        next_pos: np.ndarray,
+        rule: FoldRule,
+        found: dict[str, np.ndarray],
+    ) -> np.ndarray:
+        """Which ``points`` (N, 3) have another side than that in ``near``, (N,) bool; ``found`` has room for what it is."""
+        count = len(points)
+        self._share(num_parts(count, _POINTS))
+        self._fit(vertices)
+        matched, query = _Matched(**rule._asdict()), _Query(count=count, most_curvature=MOST_CURVATURE, rounds=ROUNDS)
+        _point(matched, near)
+        _point(query, {"points": points, "next_pos": next_pos, **found})
+        other = np.empty(count, bool)
+        given = ctypes.byref(self._tree), ctypes.byref(matched), ctypes.byref(query)
+        self._lib.surface_folds(*given, other.ctypes.data_as(POINTER))
+        return other
 
 
 def _aligned(shape: tuple[int, ...], kind: type) -> np.ndarray:
@@ -270,52 +273,32 @@ def search_folds(
     face_scene: Tensor,
     incidence: Sequence[Tensor],
     next_vertices: Tensor,
-    matched: Sequence[Tensor],
+    matched: dict[str, Tensor],
     rule: FoldRule,
 ) -> tuple[Match, Tensor] | None:
-    """The other side of folds, see :func:`hood.scene.contact.find_fold`, scene by scene: matches with the curvature, and the
-    rows (n,) of ``points`` (N, 3) that they are of. None where there is no compiled search, or not for these tensors.
+    """The other side of folds, see :func:`hood.scene.contact.find_fold`, scene by scene: matches with the curvature of the
+    ``points`` (N, 3) that have one, zeros for the others, and which they are, (N,) bool. None where there is no compiled
+    search, or not for these tensors.
 
     Args:
         incidence: as for :class:`SurfaceTree`.
         next_vertices: (W, 3) m, where the surface goes.
-        matched: of the nearest side valid (N,) bool, dist (N,), point and normal (N, 3).
+        matched: of the nearest side ``valid`` (N,) bool, ``dist`` (N,), ``point`` and ``normal`` (N, 3).
     """
     if type(points) is not Tensor or points.device.type != "cpu" or library() is None:
         return None
-    valid, later = matched[0].numpy(), _double(next_vertices)
-    given, near = _double(points), [_double(values) for values in matched[1:]]
+    given, later = _double(points), _double(next_vertices)
+    near = {name: _double(values) for name, values in matched.items() if name != "valid"}
+    valid, hits = matched["valid"].numpy(), _arrays(len(points), True, np.zeros)
+    other = np.zeros(len(points), bool)
     only = _only_scene(face_scene)
     whole = only is not None and only == _only_scene(point_scene)
-    found = []
     for scene in [None] if whole else point_scene.unique().tolist():
-        if scene is not None and not bool((face_scene == scene).any()):
-            continue
-        tree = _tree_of(faces, scene, face_scene, incidence, vertices)
-        own = valid if scene is None else valid & (point_scene == scene).numpy()
-        rows, places = tree.ahead(given, [np.ascontiguousarray(own), *near], vertices, rule)
-        if len(rows):
-            hit = tree.search(places, vertices, later, curved=True)
-            kept = _on_other_side(hit, vertices, faces, near[1][rows], near[2][rows], rule)
-            hit |= {"dist": ((given[rows] - hit["point"]) * hit["normal"]).sum(axis=1)}
-            found.append(({name: values[kept] for name, values in hit.items()}, rows[kept]))
-    if not found:
-        return _found(points, _nothing(0, curved=True)), torch.zeros(0, dtype=torch.int64)
-    hits = {name: np.concatenate([hit[name] for hit, _ in found]) for name in found[0][0]}
-    return _found(points, hits), torch.from_numpy(np.concatenate([rows for _, rows in found]))
-
-
-def _on_other_side(
-    hit: dict[str, np.ndarray], vertices: Tensor, faces: Tensor, point: np.ndarray, normal: np.ndarray, rule: FoldRule
-) -> np.ndarray:
-    """Which matches ahead (n,) are on another side than the one with these points and normals (n, 3): what
-    :func:`hood.scene.contact.find_fold` says of tensors."""
-    corners = vertices.numpy()[faces.numpy()[hit["face"]]].astype(np.float64)
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    of_face = (across * normal).sum(axis=1) / np.linalg.norm(across, axis=1).clip(min=1e-300)
-    turned = (of_face < rule.cosine) & ((hit["normal"] * normal).sum(axis=1) < rule.cosine)
-    in_front = ((hit["point"] - point) * normal).sum(axis=1) > -rule.behind
-    return np.asarray(turned & in_front & (np.abs(hit["dist"]) <= rule.ahead + rule.near))
+        if scene is None or bool((face_scene == scene).any()):
+            tree = _tree_of(faces, scene, face_scene, incidence, vertices)
+            own = valid if scene is None else valid & (point_scene == scene).numpy()
+            other |= tree.folds(given, near | {"valid": np.ascontiguousarray(own)}, vertices, later, rule, hits)
+    return _found(points, hits), torch.from_numpy(other)
 
 
 _ONLY: dict[int, tuple[weakref.ref[Tensor], int, int | None]] = {}
@@ -335,11 +318,15 @@ def _double(values: Tensor) -> np.ndarray:
     return np.ascontiguousarray(values.detach().numpy(), np.float64)
 
 
+def _arrays(count: int, curved: bool, made: Callable[..., np.ndarray]) -> dict[str, np.ndarray]:
+    """Room for fields of :class:`Match`."""
+    whole: dict[str, np.ndarray] = {name: made(count, np.int64) for name in ("vertex", "face")}
+    real = {name: made(count) for name in ("vertex_dist", "dist", *(["curvature"] if curved else []))}
+    return whole | real | {name: made((count, 3)) for name in ("bary", *_PLACES)}
+
+
 def _nothing(count: int, curved: bool) -> dict[str, np.ndarray]:
-    result: dict[str, np.ndarray] = {name: np.zeros(count, np.int64) for name in ("vertex", "face")}
-    result |= {"curvature": np.zeros(count)} if curved else {}
-    result |= {name: np.full(count, np.inf) for name in ("vertex_dist", "dist")}
-    return result | {name: np.zeros((count, 3)) for name in ("bary", *_PLACES)}
+    return _arrays(count, curved, np.zeros) | {name: np.full(count, np.inf) for name in ("vertex_dist", "dist")}
 
 
 def _found(points: Tensor, arrays: dict[str, np.ndarray]) -> Match:

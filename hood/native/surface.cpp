@@ -96,13 +96,11 @@ struct Tree {
     double* reach;                    // (parts, batch * L + 1) m^2, to the boxes of these leaves
 };
 
-// Points whose nearest surface points are known.
+// The nearest surface points of the points of a query, and what another side of a fold is.
 struct Matched {
-    int64_t count;
-    const double* points;          // (N, 3)
-    const uint8_t* valid;          // (N)
+    const uint8_t* valid;                 // (N)
     const double *dist, *point, *normal;  // (N), (N, 3), (N, 3)
-    double ahead, near, cosine;
+    double ahead, near, cosine, behind;
 };
 
 struct Query {
@@ -649,6 +647,28 @@ void finish(const Tree& tree, const Query& query, int64_t i, const Walk& walk) {
     query.dist[i] = (side < 0.0 ? -1.0 : 1.0) * std::sqrt(closest.dist_sq);
 }
 
+inline Vec ahead_of(const Matched& matched, const Query& query, int64_t i) {
+    return at(query.points, i) + matched.ahead * at(matched.normal, i);
+}
+
+// Whether a face ahead of a point that is turned may be nearer than the skin that it was matched with.
+bool may_fold(const Tree& tree, const Matched& matched, const Query& query, int64_t i, std::vector<int64_t>& stack) {
+    if (!matched.valid[i] || !(std::fabs(matched.dist[i]) < matched.near)) return false;
+    const Vec place = ahead_of(matched, query, i), own = place - at(matched.point, i);
+    return turns_near(tree, place, dot(own, own), at(matched.normal, i), matched.cosine, stack);
+}
+
+// Whether what was found k-th is another side than that of the i-th point. Of a sharp edge only the faces are turned, of a bulge
+// between two faces only the normals on the way.
+bool is_other(const Tree& tree, const Matched& matched, const Query& found, int64_t k, int64_t i) {
+    const int64_t* corner = tree.faces + 3 * found.face[k];
+    const Vec normal = at(matched.normal, i), here = at(tree.pos, corner[0]);
+    const Vec of_face = unit(cross(at(tree.pos, corner[1]) - here, at(tree.pos, corner[2]) - here));
+    const bool turned = dot(of_face, normal) < matched.cosine && dot(at(found.normal, k), normal) < matched.cosine;
+    const bool in_front = dot(at(found.point, k) - at(matched.point, i), normal) > -matched.behind;
+    return turned && in_front && std::fabs(found.dist[k]) <= matched.ahead + matched.near;
+}
+
 void search(const Tree& tree, const Query& query, int64_t begin, int64_t end) {
     Walk walks[MOST];
     bool finite[MOST];
@@ -836,31 +856,6 @@ void surface_refit(Tree* tree) {
 // Makes ready for another search where the vertices are as they were.
 void surface_again(Tree* tree) { ++tree->call; }
 
-// Of points (N, 3) that were matched at a distance below ``near``, those that a face ahead of them, ``ahead`` off the skin, may be
-// nearer to than the skin they were matched with, if its normal has a product with theirs below the cosine: their numbers and the
-// places ahead; how many there are.
-int64_t surface_ahead(Tree* tree, const Matched* matched, int64_t* rows, double* places, uint8_t* found) {
-    fit_all_normals(*tree);
-    for_parts(tree->parts, [&](int64_t part) {
-        std::vector<int64_t> stack;
-        const Range range = range_of(matched->count, part, tree->parts);
-        for (int64_t i = range.begin; i < range.end; ++i) {
-            found[i] = matched->valid[i] && std::fabs(matched->dist[i]) < matched->near;
-            if (!found[i]) continue;
-            const Vec normal = at(matched->normal, i), place = at(matched->points, i) + matched->ahead * normal;
-            const Vec own = place - at(matched->point, i);
-            found[i] = turns_near(*tree, place, dot(own, own), normal, matched->cosine, stack);
-        }
-    });
-    int64_t count = 0;
-    for (int64_t i = 0; i < matched->count; ++i)
-        if (found[i]) {
-            put(places + 3 * count, at(matched->points, i) + matched->ahead * at(matched->normal, i));
-            rows[count++] = i;
-        }
-    return count;
-}
-
 // Curvatures of vertices, see hood/mesh/curvature.py; ``memory`` is (vertices, 3), ``of_face`` (faces).
 void surface_curvature(int64_t num_faces, int64_t num_edges, int64_t num_vertices, const int64_t* faces, const int64_t* edges,
                        const int64_t* around, const int64_t* first, const int64_t* valence, const double* pos, double* memory,
@@ -907,5 +902,46 @@ void surface_search(const Tree* tree, const Query* query) {
         for (int64_t i = range.begin; i < range.end; i += own.batch) search(own, *query, i, std::min(i + own.batch, range.end));
     });
     describe(*tree, *query);
+}
+
+// The other side of folds: of points whose nearest surface points are known, the rows of those that have one are filled in, and
+// ``found`` (N) says which they are. What it is, see hood/scene/contact.py.
+void surface_folds(Tree* tree, const Matched* matched, const Query* all, uint8_t* found) {
+    fit_all_normals(*tree);
+    for_parts(tree->parts, [&](int64_t part) {
+        std::vector<int64_t> stack;
+        const Range range = range_of(all->count, part, tree->parts);
+        for (int64_t i = range.begin; i < range.end; ++i) found[i] = may_fold(*tree, *matched, *all, i, stack);
+    });
+    std::vector<int64_t> rows;
+    for (int64_t i = 0; i < all->count; ++i)
+        if (found[i]) rows.push_back(i);
+    if (rows.empty()) return;
+    // A search for these alone.
+    const int64_t count = (int64_t)rows.size();
+    std::vector<int64_t> whole(2 * count);
+    std::vector<double> real(21 * count);
+    Query query = *all;
+    query.count = count;
+    query.vertex = whole.data(), query.face = query.vertex + count;
+    double* next = real.data();
+    const auto take = [&](int64_t width) { return std::exchange(next, next + width * count); };
+    double* places = take(3);
+    query.points = places, query.vertex_dist = take(1), query.dist = take(1), query.curvature = take(1);
+    query.bary = take(3), query.point = take(3), query.normal = take(3), query.next_point = take(3), query.next_normal = take(3);
+    for (int64_t k = 0; k < count; ++k) put(places + 3 * k, ahead_of(*matched, *all, rows[k]));
+    ++tree->call;
+    surface_search(tree, &query);
+    for (int64_t k = 0; k < count; ++k) {
+        const int64_t i = rows[k];
+        found[i] = is_other(*tree, *matched, query, k, i);
+        if (!found[i]) continue;
+        all->vertex[i] = query.vertex[k], all->face[i] = query.face[k], all->vertex_dist[i] = query.vertex_dist[k];
+        all->curvature[i] = query.curvature[k];
+        for (int c = 0; c < 3; ++c) all->bary[3 * i + c] = query.bary[3 * k + c];
+        put(all->point + 3 * i, at(query.point, k)), put(all->normal + 3 * i, at(query.normal, k));
+        put(all->next_point + 3 * i, at(query.next_point, k)), put(all->next_normal + 3 * i, at(query.next_normal, k));
+        all->dist[i] = dot(at(all->points, i) - at(query.point, k), at(query.normal, k));
+    }
 }
 }

@@ -98,28 +98,24 @@ def find_fold(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, contact: Co
     A vertex is matched with the nearest skin, and nothing would keep it out of what faces that: while a bend closes it would
     pass from one side into the other and back. The other side is the skin nearest to a place 15 mm ahead of the vertex.
     """
-    match, rows = _match_folds(pos, vertex_scene, obstacle, contact)
-    if len(rows) == 0:
-        return Fold(None)
-    nothing = {name: value.new_zeros(len(pos), *value.shape[1:]) for name, value in match._asdict().items()}
-    found = {name: nothing[name].index_copy(0, rows, value) for name, value in match._asdict().items()}
-    return Fold(Contact(**found, valid=torch.zeros_like(contact.valid).index_fill(0, rows, True)))
+    match, other = _match_folds(pos, vertex_scene, obstacle, contact)
+    return Fold(Contact(**match._asdict(), valid=other) if bool(other.any()) else None)
 
 
 def _match_folds(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, contact: Contact) -> tuple[Match, Tensor]:
-    """Matches (n,) on the other side, and the vertices (n,) that they are of."""
+    """Matches (V,) on the other side, and which of them there are, (V,) bool."""
+    incidence = build_incidence(obstacle.faces, len(obstacle.pos))
     if len(obstacle.faces) and len(pos):
-        incidence = build_incidence(obstacle.faces, len(obstacle.pos))
         surface = obstacle.pos, obstacle.faces, obstacle.face_scene, incidence.adjacency, obstacle.next_pos
-        near = contact.valid, contact.dist, contact.point, contact.normal
+        near = {name: getattr(contact, name) for name in ("valid", "dist", "point", "normal")}
         found = surface_tree.search_folds(pos, vertex_scene, *surface, near, _RULE)
         if found is not None:
             return found
-    rows = (contact.valid & (contact.dist.abs() < _RULE.near)).nonzero().squeeze(1)
-    match = match_surface(_ahead(pos, contact)[rows], vertex_scene[rows], obstacle, curved=True)
-    other = _is_other(match, obstacle, contact.point[rows], contact.normal[rows]).nonzero().squeeze(1)
-    rows, match = rows[other], Match(**{name: value[other] for name, value in match._asdict().items()})
-    return match._replace(dist=_plane_dist(pos[rows], match)), rows
+    near_enough = contact.valid & (contact.dist.abs() < _RULE.near)
+    ahead = torch.where(near_enough.unsqueeze(1), _ahead(pos, contact), pos)
+    match = match_surface(ahead, vertex_scene, obstacle, curved=True)
+    other = near_enough & _is_other(match, obstacle, contact.point, contact.normal)
+    return match._replace(dist=_plane_dist(pos, match)), other
 
 
 def find_fixed_fold(
