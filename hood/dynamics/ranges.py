@@ -33,8 +33,8 @@ _LATER = {
     f"hood.losses.{name}": {"contact": "vertices", "reach": "constant", "sides": "nearest"}
     for name in ("collision.Collision", "collision.CentroidCollision", "friction.Friction")
 }
-#: A setting that weights take as it is, whatever they were trained with: figures in docs/contact.md.
-_TAKEN = "reach"
+#: Settings that weights take as they are, whatever they were trained with: figures in docs/contact.md.
+_TAKEN = ("reach", "sides")
 
 Span = tuple[float, float]
 
@@ -114,7 +114,7 @@ def outside(trained: Conditions, asked: Conditions) -> list[str]:
             title = _TITLES.get(name, name)
             sentences.append(f"{title}={_range(name, (value, value))} (trained on {_range(name, (low, high))})")
     known = {
-        name: {key: asked.potential.get(name, {}).get(key, value) if key == _TAKEN else value for key, value in term.items()}
+        name: {key: asked.potential.get(name, {}).get(key, value) if key in _TAKEN else value for key, value in term.items()}
         for name, term in trained.potential.items()
     }
     return sentences + different(known, asked.potential)

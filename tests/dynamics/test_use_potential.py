@@ -133,6 +133,7 @@ def test_settings_tell_potentials_apart() -> None:
         "weight": 5e5,
         "epsilon": 2e-3,
         "contact": "vertices",
+        "sides": "both",
         "reach": "curvature",
     }
     assert reference_potential().settings["collision"]["term"] != default["collision"]["term"]
