@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from hood.dynamics.global_output import GlobalStepOutput
 from hood.dynamics.output import Held, LocalStepOutput
 from hood.features import compiled
 from hood.features.inputs import Inputs
@@ -22,25 +23,32 @@ _ROUNDS = torch.tensor(WIDE_ROUNDS)
 
 
 class Feedback:
-    """What the potential of one step says about positions, as features read it; constants of the step are gathered once."""
+    """What the potential of one step says about positions, as features read it; constants of the step are gathered once.
 
-    def __init__(self, potential: Potential, problem: StepProblem) -> None:
+    Args:
+        together: with the global step.
+        compiled: ask the compiled solver where it knows the potential, though the rest goes by torch: what the network is
+            shown has no gradient, and a global step takes twenty times as long in torch.
+    """
+
+    def __init__(self, potential: Potential, problem: StepProblem, together: bool = False, compiled: bool = False) -> None:
         self.potential = potential
         self._cloth = cloth = problem.cloth
         self._mass = cloth.mass.clamp_min(1e-12).unsqueeze(1)
         self._compiled = native.applies(problem.state.pos, self._mass)
-        self._terms = local_terms(potential, problem, self._compiled)
+        self.terms = local_terms(potential, problem, self._compiled or compiled)
+        self._together = together
         self._diffusion = None if self._compiled else Diffusion(cloth.edges, cloth.num_vertices)
 
     @torch.no_grad()
     def __call__(self, inputs: Inputs, pos: Tensor) -> tuple[Inputs, Tensor]:
         """The inputs with the view from positions (V, 3), and the forces −∂Φ/∂x (V, 3) [N] there."""
-        view = self._terms(pos)
+        view = self.terms(pos)
+        together = self.terms.solve(pos, view.force, torch.zeros_like(pos[:, 0])) if self._together else None
         residual, wide = (self._compiled_residuals if self._compiled else self._residuals)(view.force)
-        seen = replace(
-            inputs, edge_rows=inputs.edges, base_pos=pos, residual=residual, local_step=view.step, wide_residual=wide
-        )
-        return seen, view.force
+        rows, step = inputs.edges, view.step
+        seen = replace(inputs, edge_rows=rows, base_pos=pos, residual=residual, local_step=step, wide_residual=wide)
+        return replace(seen, global_step=together), view.force
 
     def _residuals(self, force: Tensor) -> tuple[Tensor, Tensor]:
         """Accelerations (V, 3) that forces ask for, and those of neighbourhoods (V, 6)."""
@@ -69,40 +77,48 @@ class Passes:
     Args:
         inputs: with the feedback at the base.
         base: (V, 3) m, where the first pass starts.
+        force: (V, 3) N, −∂Φ/∂x there.
         fixed: (V, 3) m, where vertices are that are not free.
     """
 
     def __init__(
         self,
         network: MeshGraphNet,
-        output: LocalStepOutput,
+        output: LocalStepOutput | GlobalStepOutput,
         problem: StepProblem,
         feedback: Feedback,
         inputs: Inputs,
         base: Tensor,
+        force: Tensor,
         fixed: Tensor,
     ) -> None:
         self._network, self._output, self._problem, self._feedback = network, output, problem, feedback
         self._inputs, self._last, self._held = inputs, base, Held(problem.cloth.free, fixed)
+        self._force = force
         self._before: Tensor | None = None
         self.positions: list[Tensor] = []  # (V, 3) m after every pass
         self.forces: list[Tensor] = []  # (V, 3) N there, but for the last
 
     def take(self, raw: Tensor) -> Tensor:
         """Positions (V, 3) [m] after the pass with this output."""
-        step = self._inputs.local_step
-        assert step is not None
-        index = len(self.positions)
-        pos = self._output.take(self._problem, raw, index, step, self._before, self._last, self._held)
+        pos = self._lead(raw)
         self.positions.append(pos)
         self._before, self._last = pos.detach() - self._last, pos.detach()
         return pos
 
+    def _lead(self, raw: Tensor) -> Tensor:
+        """Where the output leads."""
+        if isinstance(self._output, GlobalStepOutput):
+            return self._output.positions(self._problem, raw, self._last, self._force, self._held, self._feedback.terms)
+        step = self._inputs.local_step
+        assert step is not None
+        return self._output.take(self._problem, raw, len(self.positions), step, self._before, self._last, self._held)
+
     def look(self, index: int, raw: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """What the next pass sees of the prediction of pass ``index``."""
-        pos = self.take(raw).detach()
-        self._inputs, force = self._feedback(self._inputs, pos)
-        self.forces.append(force)
+        self.take(raw)
+        self._inputs, self._force = self._feedback(self._inputs, self._last)
+        self.forces.append(self._force)
         with torch.no_grad():
             see = compiled.look if compiled.applies(self._inputs) else look
             return see(self._inputs, self._network.pass_sets(index + 1))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -12,6 +13,7 @@ from torch import Tensor, nn
 
 from hood.dynamics.edge_output import EdgeOutput
 from hood.dynamics.frames import FrameRules, Relaxing
+from hood.dynamics.global_output import GlobalStepOutput
 from hood.dynamics.output import AccelerationOutput, Held, LocalStepOutput, Output, VelocityBaseOutput
 from hood.dynamics.passes import Feedback, Passes
 from hood.dynamics.ranges import Conditions
@@ -57,6 +59,7 @@ class Sight(NamedTuple):
     """What a network is shown of a step."""
 
     inputs: Inputs
+    force: Tensor | None  # (V, 3) N, −∂Φ/∂x at the base, where there is feedback
     base: Tensor  # (V, 3) m, what its output is relative to
     feedback: Feedback | None  # what it is told between its passes
 
@@ -232,9 +235,10 @@ class Simulator(nn.Module):
             seen.cloth, seen.state, seen.step, seen.contact, graph, guess, residual, timestep=dt, edge_rows=edge_rows
         )
         if not self._wants_feedback:
-            return Sight(inputs, base, None)
-        feedback = Feedback(potential, seen)
-        return Sight(feedback(inputs, base)[0], base, feedback)
+            return Sight(inputs, None, base, None)
+        together = isinstance(self.output, GlobalStepOutput)
+        feedback = Feedback(potential, seen, together, compiled=together and self.training)
+        return Sight(*feedback(inputs, base), base, feedback)
 
     def advance(
         self, problem: StepProblem, seen: StepProblem, sight: Sight, nodes: Tensor, edges: dict[str, Tensor]
@@ -247,8 +251,10 @@ class Simulator(nn.Module):
             return Prediction(pos, problem.acceleration(pos))
         if sight.feedback is None:
             return self.integrate(problem, base, self.network(graph, nodes, edges))
-        assert isinstance(self.output, LocalStepOutput)
-        passes = Passes(self.network, self.output, seen, sight.feedback, sight.inputs, base, self._fixed(problem))
+        assert isinstance(self.output, LocalStepOutput | GlobalStepOutput)
+        assert sight.force is not None
+        given = seen, sight.feedback, sight.inputs, base, sight.force
+        passes = Passes(self.network, self.output, *given, self._fixed(problem))
         pos = passes.take(self.network(graph, nodes, edges, passes.look))
         early = tuple(zip(passes.positions[:-1], passes.forces, strict=True))
         return Prediction(pos, problem.acceleration(pos), early=early)
@@ -305,7 +311,9 @@ class Simulator(nn.Module):
 
 
 #: What a model's output may be.
-OUTPUTS = ("acceleration", "velocity_base", "local_steps", "edges")
+OUTPUTS = ("acceleration", "velocity_base", "local_steps", "global_steps", "edges")
+#: Those that correct themselves, in one pass or in several.
+_STEPS = ("local_steps", "global_steps")
 
 
 def build_simulator(
@@ -337,10 +345,12 @@ def build_simulator(
         features: ``paper`` (node 24, edge 12, body edge 9, running statistics), ``physical`` (fixed scales, residual) or
             ``local`` (the same with what every vertex and its neighbourhood would do about the residual).
         output: ``acceleration`` (paper), ``velocity_base`` (corrections to a base that moves with the body),
-            ``local_steps`` (several such corrections with shares of the vertices' own steps; features=local) or ``edges``
+            ``local_steps`` (several such corrections with shares of the vertices' own steps; features=local),
+            ``global_steps`` (several corrections to the forces, each with a solve for the step of all vertices together;
+            features=local) or ``edges``
             (corrections to the edges of the base, and a linear solve for the positions; features=physical or local).
         schedule: name (``ours``, ``fine15``, ``fine48``) or text such as ``3x(mesh+coarse0) 3x(coarse0)``; ``|`` between
-            passes (``local_steps`` only).
+            passes (``local_steps`` and ``global_steps`` only).
         latent_dim: width of all latents.
         aggregation: ``sum`` or ``mean`` of the messages at a node.
         body_radius: reach of body edges [m].
@@ -371,10 +381,15 @@ def build_simulator(
         raise ValueError(
             "model.features=physical describes corrections to a base; it needs model.output=velocity_base or model.output=edges"
         )
-    if (features == "local") != (output == "local_steps") and output != "edges":
-        raise ValueError(f"model.features={features} with model.output={output}: local and local_steps need each other")
-    if len(parse_passes(schedule)) > 1 and output != "local_steps":
-        raise ValueError(f"model.schedule has several passes (|); they need model.output=local_steps, not {output}")
+    if (features == "local") != (output in _STEPS) and output != "edges":
+        raise ValueError(
+            f"model.features={features} with model.output={output}: local and local_steps need each other, as do local and "
+            "global_steps"
+        )
+    if len(parse_passes(schedule)) > 1 and output not in _STEPS:
+        raise ValueError(
+            f"model.schedule has several passes (|); they need model.output=local_steps or global_steps, not {output}"
+        )
     for name, count in (("embedded_levels", embedded_levels), ("coarse_encoders", coarse_encoders)):
         if count is not None and count < 1:
             raise ValueError(f"model.{name} is {count!r}; it must be at least 1, or null for the model's own number")
@@ -383,7 +398,7 @@ def build_simulator(
     if features == "paper":
         feature_set = groups.paper(num_levels, body_velocity, normalizer_decay, divisor_floor, layer_radius is not None)
     else:
-        kind = local.local if features == "local" else physical.physical
+        kind = partial(local.local, together=output == "global_steps") if features == "local" else physical.physical
         feature_set = kind(num_levels, layers=layer_radius is not None)
     head: Output
     if output == "acceleration":
@@ -392,11 +407,14 @@ def build_simulator(
         head = VelocityBaseOutput(output_scale)
     elif output == "edges":
         head = EdgeOutput(output_scale)
+    elif output == "global_steps":
+        head = GlobalStepOutput(output_scale)
     else:
         head = LocalStepOutput(output_scale, late_scale=late_scale)
     widths = (feature_set.node_width, feature_set.edge_widths)
+    looks = local.GLOBAL_LOOK_WIDTHS if output == "global_steps" else local.LOOK_WIDTHS
     network = MeshGraphNet(
-        *widths, latent_dim, schedule, head.width, aggregation, output_init, coarse_encoders, local.LOOK_WIDTHS, head.edge_width
+        *widths, latent_dim, schedule, head.width, aggregation, output_init, coarse_encoders, looks, head.edge_width
     )
     return Simulator(feature_set, network, head, body_radius, config, rules, num_levels, layer_radius)
 

@@ -135,6 +135,7 @@ FILLS: dict[type[nn.Module], Fill] = {
     physical.Residual: _view("residual"),
     local.LocalStep: _view("local_step"),
     local.WideResidual: _view("wide_residual"),
+    local.GlobalStep: _view("global_step"),
     physical.ContactDistance: _contact,
     physical.ScaledShape: _scaled_shape,
     physical.Strain: _strain,
@@ -240,7 +241,8 @@ def look(inputs: Inputs, sets: Sequence[str]) -> tuple[Tensor, dict[str, Tensor]
     assert inputs.residual is not None
     assert inputs.local_step is not None
     assert inputs.wide_residual is not None
-    out = inputs.base.new_empty(inputs.num_cloth, local.LOOK_WIDTHS[0])
+    width = (local.LOOK_WIDTHS if inputs.global_step is None else local.GLOBAL_LOOK_WIDTHS)[0]
+    out = inputs.base.new_empty(inputs.num_cloth, width)
     at, stride = out.data_ptr(), out.shape[1]
     _compressed(inputs.residual, physical.GRAVITY, at, stride)
     _compressed(inputs.local_step, local.STEP, at + 12, stride)
@@ -248,6 +250,9 @@ def look(inputs: Inputs, sets: Sequence[str]) -> tuple[Tensor, dict[str, Tensor]
     _contact(local.CONTACT, inputs, at + 36, stride, width=1)
     native.call("size", inputs.local_step.contiguous(), inputs.num_cloth, local.STEP, at + 40, stride)
     _compressed(inputs.wide_residual, physical.GRAVITY, at + 44, stride)
+    if inputs.global_step is not None:
+        _compressed(inputs.global_step, local.WAVE, at + 68, stride)
+        native.call("size", inputs.global_step.contiguous(), inputs.num_cloth, local.WAVE, at + 80, stride)
     return out, {name: _strain_of(inputs, name) for name in sets}
 
 

@@ -18,6 +18,8 @@ from hood.features.physical import GRAVITY, ContactDistance, Residual, length, p
 WIDE_ROUNDS = (4, 16)
 #: Local steps of stiff cloth are of this size [m]; displacements of a pass of that one; strains of a percent matter.
 STEP, MOVE, GAIN = 1e-4, 1e-2, 100.0
+#: Global steps are of this size [m].
+WAVE = 1e-3
 
 
 class _View(NodeGroup, ABC):
@@ -52,6 +54,18 @@ class LocalStep(_View):
         return inputs.local_step
 
 
+class GlobalStep(_View):
+    """What all vertices together would do about the residual [m]."""
+
+    width = 3
+
+    def __init__(self, scale: float = WAVE) -> None:
+        super().__init__(scale)
+
+    def value(self, inputs: Inputs) -> Tensor | None:
+        return inputs.global_step
+
+
 class WideResidual(_View):
     """The residual [m/s²] of neighbourhoods instead of single vertices: what is left where internal forces cancel. Sums over
     compressed residuals of single vertices could not recover it."""
@@ -66,15 +80,17 @@ class WideResidual(_View):
 
 
 #: What :func:`look` reads; they have no parameters.
-_RESIDUAL, _LOCAL_STEP, _WIDE, CONTACT = Residual(), LocalStep(), WideResidual(), ContactDistance()
+_RESIDUAL, _LOCAL_STEP, _WIDE, CONTACT, _GLOBAL = Residual(), LocalStep(), WideResidual(), ContactDistance(), GlobalStep()
 
 #: Columns of :func:`look` of nodes and of edges.
 LOOK_WIDTHS = (3 + 3 + 3 + 1 + 1 + WideResidual.width, 1)
+#: The same where global steps are seen.
+GLOBAL_LOOK_WIDTHS = (LOOK_WIDTHS[0] + GlobalStep.width + 1, LOOK_WIDTHS[1])
 
 
 def look(inputs: Inputs, sets: Sequence[str]) -> tuple[Tensor, dict[str, Tensor]]:
-    """What is seen of a prediction ``inputs.base`` before the next pass: columns (V, 17) of the cloth nodes, and the strain
-    (N, 1) of the edge sets ``sets``; fixed scales, outliers compressed by asinh."""
+    """What is seen of a prediction ``inputs.base`` before the next pass: columns of the cloth nodes (V, 17), or (V, 21) with
+    global steps, and the strain (N, 1) of the edge sets ``sets``; fixed scales, outliers compressed by asinh."""
     step = _demand(inputs.local_step)
     moved = inputs.state.vel * inputs.vertex_dt - (inputs.base - inputs.state.pos)
     nodes = [
@@ -85,12 +101,14 @@ def look(inputs: Inputs, sets: Sequence[str]) -> tuple[Tensor, dict[str, Tensor]
         _LOCAL_STEP.scale(length(step)),
         _WIDE.cloth(inputs),
     ]
+    if inputs.global_step is not None:
+        nodes += [_GLOBAL.cloth(inputs), _GLOBAL.scale(length(inputs.global_step))]
     return torch.cat(nodes, dim=1), {name: _strain(inputs, name) for name in sets}
 
 
-def local(num_levels: int = 3, layers: bool = False) -> FeatureSet:
-    """The physical features with local steps and wide residuals."""
-    return physical(num_levels, [LocalStep(), WideResidual()], layers)
+def local(num_levels: int = 3, layers: bool = False, together: bool = False) -> FeatureSet:
+    """The physical features with local steps and wide residuals, and with global steps (``together``)."""
+    return physical(num_levels, [LocalStep(), WideResidual(), *([GlobalStep()] if together else [])], layers)
 
 
 def _strain(inputs: Inputs, name: str) -> Tensor:
@@ -103,5 +121,8 @@ def _strain(inputs: Inputs, name: str) -> Tensor:
 
 def _demand(values: Tensor | None) -> Tensor:
     if values is None:
-        raise ValueError("features: these features say what the potential does; pass Inputs(local_step=…, wide_residual=…)")
+        raise ValueError(
+            "features: these features say what the potential does; pass Inputs(local_step=…, wide_residual=…), "
+            "and global_step=… to models that see it"
+        )
     return values

@@ -1229,4 +1229,26 @@ void newton_alone(Engine* e, const float* pos, float* force, float* step) {
     }
 }
 
+// The steps (V, 3) that free vertices would take together under other forces (V, 3), with the positive matrix at the positions that
+// were looked at last and so much more on its diagonal (V): as many iterations of conjugate gradients, however near they come.
+void newton_together(Engine* e, const float* force, const float* damping, int64_t iterations, float* step) {
+    typedef typename Four<Real>::type V4;
+    e->sharpness = 0.0;
+    gather_matrix<Real>(*e);
+    for (int64_t row = 0; row < e->num_rows; ++row) {
+        const int64_t v = e->vertex[row];
+        Real* block = (Real*)e->matrix + 9 * (int64_t)e->row_starts[row];
+        for (int k = 0; k < 3; ++k) {
+            e->gradient[4 * row + k] = -(double)force[3 * v + k];
+            block[4 * k] += (Real)damping[v];
+        }
+        const V4 rows[3] = {V4{block[0], block[1], block[2], Real(0)}, V4{block[3], block[4], block[5], Real(0)},
+                            V4{block[6], block[7], block[8], Real(0)}};
+        invert<Real>(rows, (Real*)e->inverse + 12 * row);
+    }
+    solve<Real>(*e, 0.0, iterations);
+    for (int64_t row = 0; row < e->num_rows; ++row)
+        for (int k = 0; k < 3; ++k) step[3 * e->vertex[row] + k] = (float)e->direction[4 * row + k];
+}
+
 }

@@ -16,8 +16,6 @@ CUDA graph can hold it. The derivative is the same solve.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -29,10 +27,11 @@ from torch.autograd.function import once_differentiable
 from hood.graph.builder import EdgeSet
 from hood.native import features as native
 from hood.nn.dense import sum_rows
+from hood.nn.fixed_gradients import Scenes, Steps, solve
 
 #: Steps of conjugate gradients per square root of the vertices of a scene: a square sheet that hangs from one side is left with
 #: a thousandth of the energy, at every resolution. Never fewer than the second number.
-_STEPS, _LEAST_STEPS = 2.0, 16
+STEPS = Steps(2.0, 16)
 
 
 @dataclass(frozen=True)
@@ -101,42 +100,24 @@ class _Solve(torch.autograd.Function):
         return adjoint, -(adjoint * moved).sum(dim=1), None
 
 
-def num_steps(num_vertices: int) -> int:
-    """Steps for a scene of that many vertices: their number grows with its width in edges."""
-    return max(math.ceil(_STEPS * math.sqrt(num_vertices)), _LEAST_STEPS)
-
-
 def conjugate_gradients(system: EdgeSystem, weight: Tensor, force: Tensor) -> Tensor:
-    """Approximate u (V, 3) with (diag(``weight``) + k L) u = ``force`` at free vertices and u = 0 at the others.
-
-    The scenes run side by side, each with its own step lengths and as many steps as alone.
-    """
+    """Approximate u (V, 3) with (diag(``weight``) + k L) u = ``force`` at free vertices and u = 0 at the others."""
     free = system.free.unsqueeze(1)
     diagonal = (weight + system.stiffness * system.degree.to(weight)).unsqueeze(1)
     inverse = torch.where(free, 1.0 / torch.where(free, diagonal, 1.0), 0.0)
-    dot = _dot(system)
-    u, r = torch.zeros_like(force), torch.where(free, force, 0.0)
-    p = inverse * r
-    rz = dot(r, p)
-    limit = _limits(system)
-    for step in range(max(map(num_steps, system.scene_sizes))):
+
+    def apply(p: Tensor) -> Tensor:
         # Neighbours that are not free have p = 0; what they would receive is not asked for.
-        q = diagonal * p - system.stiffness * system.neighbours(p)
-        length = _ratio(rz, dot(p, q))
-        if limit is not None:
-            length = torch.where(step < limit, length, 0.0)
-        u = u + length * p
-        r = torch.where(free, r - length * q, 0.0)
-        z = inverse * r
-        before, rz = rz, dot(r, z)
-        p = z + _ratio(rz, before) * p
-    return u
+        return torch.where(free, diagonal * p - system.stiffness * system.neighbours(p), 0.0)
+
+    scenes = Scenes(system.scene, system.scene_sizes)
+    return solve(apply, lambda r: inverse * r, torch.where(free, force, 0.0), scenes, STEPS)
 
 
 def compiled_gradients(system: EdgeSystem, weight: Tensor, force: Tensor) -> Tensor:
     """The same by the compiled library, for numbers in float32 on a CPU; every vertex must have an edge."""
     edges, scenes = system.edges, len(system.scene_sizes)
-    steps = torch.tensor([num_steps(size) for size in system.scene_sizes])
+    steps = torch.tensor([STEPS(size) for size in system.scene_sizes])
     mesh = native.Neighbours(len(force), edges.offsets.data_ptr(), edges.senders.data_ptr())
     u, memory = force.new_empty(len(force), 4), force.new_empty(4, len(force), 4)
     given = weight.contiguous(), force.contiguous(), system.free, system.scene if scenes > 1 else None
@@ -147,28 +128,3 @@ def compiled_gradients(system: EdgeSystem, weight: Tensor, force: Tensor) -> Ten
 
 def _is_compiled(system: EdgeSystem, *values: Tensor) -> bool:
     return len(system.edges.nodes) == len(system.free) and native.applies(*values)
-
-
-def _dot(system: EdgeSystem) -> Callable[[Tensor, Tensor], Tensor]:
-    """Products of two (V, 3) scene by scene, spread to the vertices: (V, 1), or (1, 1) where there is one scene."""
-    if len(system.scene_sizes) == 1:
-        return lambda a, b: (a * b).sum().view(1, 1)
-    scene, count = system.scene, len(system.scene_sizes)
-    return lambda a, b: a.new_zeros(count).index_add(0, scene, (a * b).sum(dim=1))[scene].unsqueeze(1)
-
-
-def _limits(system: EdgeSystem) -> Tensor | None:
-    """Steps of the scene of every vertex, (V, 1); None where there is one scene. Made on the device: a copy from the host could
-    not be captured."""
-    scene, count = system.scene, len(system.scene_sizes)
-    if count == 1:
-        return None
-    sizes = torch.zeros(count, dtype=torch.float64, device=scene.device)
-    sizes = sizes.index_add(0, scene, torch.ones_like(scene, dtype=torch.float64))
-    return (_STEPS * sizes.sqrt()).ceil().clamp_min(_LEAST_STEPS)[scene].unsqueeze(1)
-
-
-def _ratio(above: Tensor, below: Tensor) -> Tensor:
-    """above / below; 0 where nothing is left to do."""
-    some = below > 0
-    return torch.where(some, above / torch.where(some, below, 1.0), 0.0)

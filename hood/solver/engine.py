@@ -92,6 +92,7 @@ def library(wide: bool = False) -> ctypes.CDLL:
     lib.newton_move.argtypes = [POINTER, REAL, COUNT]
     lib.newton_matrix.argtypes = [POINTER, REAL]
     lib.newton_alone.argtypes = [POINTER] * 4
+    lib.newton_together.argtypes = [POINTER, POINTER, POINTER, COUNT, POINTER]
     for name in ("newton_move", "newton_face_record", "newton_hinge_record"):
         getattr(lib, name).restype = COUNT
     return lib
@@ -335,6 +336,11 @@ class SceneEngine:
         """Write force [N] and local step [m] of this scene's free vertices at positions: addresses of tables (V, 3) of the
         whole cloth, in float32."""
         self._lib.newton_alone(self._address, pos, force, step)
+
+    def together(self, force: int, damping: int, cg_iterations: int, step: int) -> None:
+        """Write the global step [m] of the free vertices under forces [N] with the matrix where :meth:`alone` has looked and
+        more on its diagonal [N/m]: addresses of tables (V, 3), (V,) and (V, 3) of the whole cloth."""
+        self._lib.newton_together(self._address, force, damping, cg_iterations, step)
 
     def array(self, name: str) -> np.ndarray:
         """An array that the structure points to, by its name there."""

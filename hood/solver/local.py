@@ -15,6 +15,7 @@ from hood.losses.problem import StepProblem
 from hood.mesh.kept import forget
 from hood.scene.cloth import Cloth
 from hood.solver.forces import CLOSED_FORM
+from hood.solver.global_step import PositiveMatrix, global_step
 from hood.solver.linear import invert_blocks
 from hood.solver.terms import StepTerms
 
@@ -33,6 +34,8 @@ class LocalView:
 class LocalTerms:
     """Views of one step's potential; everything constant in the step is gathered once."""
 
+    _looked_at: tuple[Tensor, PositiveMatrix, Tensor] | None = None  # positions, the matrix there and its diagonal blocks
+
     def __init__(self, potential: Potential, problem: StepProblem) -> None:
         self.problem = problem
         self.terms = StepTerms(potential, problem)
@@ -46,10 +49,10 @@ class LocalTerms:
         own = terms.vertices.model(pos, acc)
         gradient, matrix = own.gradient, own.matrix
         parts = []
-        faces = terms.faces(pos)
+        faces, hinges = terms.faces(pos), terms.hinges(pos)
         if faces is not None:
             parts.append(torch.cat([faces.gradient.transpose(0, 1), _diagonal(faces.matrix)]).flatten(1))
-        for slope, row in terms.hinges(pos):
+        for slope, row in hinges:
             parts.append(torch.cat([slope.transpose(0, 1), torch.stack([row[:, a] * row[:, b] for a, b in _PAIRS])]).flatten(1))
         if parts:
             order, offsets = self._incidence
@@ -66,15 +69,27 @@ class LocalTerms:
             matrix = matrix.index_add(
                 0, ends, stiffness[:, None, None] * torch.eye(3, dtype=matrix.dtype, device=matrix.device)
             )
-        for points in terms.points:
-            model = points.model(pos)
+        models = [points.model(pos) for points in terms.points]
+        for points, model in zip(terms.points, models, strict=True):
             gradient = gradient + points.spread(model.gradient, gradient)
             matrix = matrix + points.spread_blocks(model.matrix, len(gradient))
         other = terms.other_gradient(pos, acc)
         gradient = gradient if other is None else gradient + other
         force = torch.where(cloth.free.unsqueeze(1), -gradient, 0.0)
         step = torch.bmm(invert_blocks(matrix), force.unsqueeze(2)).squeeze(2)
+        whole = PositiveMatrix(own.matrix, faces, tuple(row for _, row in hinges), tuple(model.matrix for model in models))
+        self._looked_at = pos, whole, matrix
         return LocalView(force, torch.where(cloth.free.unsqueeze(1), step, 0.0))
+
+    @torch.no_grad()
+    def solve(self, pos: Tensor, force: Tensor, damping: Tensor) -> Tensor:
+        """The global step (V, 3) [m] under forces (V, 3) [N]: u with (A + diag(``damping``)) u = ``force`` where vertices are
+        free, 0 elsewhere, as nearly as :data:`hood.solver.global_step.STEPS` of conjugate gradients come. A is the positive
+        matrix at positions (V, 3), ``damping`` (V,) [N/m]."""
+        if self._looked_at is None or self._looked_at[0] is not pos:
+            self(pos)
+        assert self._looked_at is not None
+        return global_step(self.terms, *self._looked_at[1:], self._incidence, force, damping)
 
 
 def check_local(potential: Potential) -> None:

@@ -19,6 +19,7 @@ from hood.scene.state import Attachments
 from hood.solver import engine
 from hood.solver.engine import SceneEngine, engine_step
 from hood.solver.engine_tables import build_tables
+from hood.solver.global_step import STEPS
 from hood.solver.local import LocalTerms, LocalView
 
 _POINTER = ctypes.c_void_p
@@ -30,13 +31,19 @@ class EngineTerms:
     Energies are float64 inside: views are nearer to the exact ones than those of the torch form in float32.
     """
 
+    _looked_at: Tensor | None = None  # the positions whose matrix the engines hold
+
     def __init__(self, potential: Potential, problem: StepProblem) -> None:
         state, dt = problem.state, problem.vertex_dt.double()
         base = (state.pos.double() + dt * state.vel.double()).numpy()
-        step = replace(engine_step(potential, problem), base=base)
+        self._step = replace(engine_step(potential, problem), base=base)
         self._engines = _engines_of(problem.cloth, problem.step.attachments)
+        self._sizes = problem.cloth.scene_sizes
+        self._enter()
+
+    def _enter(self) -> None:
         for scene, own in enumerate(self._engines):
-            own.enter(step, scene)
+            own.enter(self._step, scene)
 
     def __call__(self, pos: Tensor) -> LocalView:
         """The view at positions (V, 3)."""
@@ -44,7 +51,18 @@ class EngineTerms:
         force, step = torch.zeros_like(pos), torch.zeros_like(pos)
         for own in self._engines:
             own.alone(pos.data_ptr(), force.data_ptr(), step.data_ptr())
+        self._looked_at = pos
         return LocalView(force, step)
+
+    def solve(self, pos: Tensor, force: Tensor, damping: Tensor) -> Tensor:
+        """As :meth:`hood.solver.local.LocalTerms.solve`."""
+        if self._looked_at is not pos:
+            self._enter()  # the engines may have been at another step
+            self(pos)
+        force, damping, step = force.contiguous(), damping.contiguous(), torch.zeros_like(force)
+        for own, size in zip(self._engines, self._sizes, strict=True):
+            own.together(force.data_ptr(), damping.data_ptr(), STEPS(size), step.data_ptr())
+        return step
 
 
 def local_terms(potential: Potential, problem: StepProblem, compiled: bool = True) -> LocalTerms | EngineTerms:

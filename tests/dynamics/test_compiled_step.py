@@ -7,6 +7,7 @@ from torch import Tensor
 from hood.dynamics.output import Held, LocalStepOutput, VelocityBaseOutput
 from hood.dynamics.passes import Feedback
 from hood.dynamics.simulator import Simulator, build_simulator
+from hood.features import compiled, local
 from hood.features.inputs import Inputs
 from hood.graph.builder import build_graph
 from hood.losses.potential import default_potential
@@ -38,8 +39,9 @@ def problem_of(scene: Scene, frame: int = 8) -> StepProblem:
         ("physical", "velocity_base", "1x(mesh+coarse0)"),
         ("paper", "acceleration", "1x(mesh+coarse0)"),
         ("local", "edges", "1x(mesh+coarse0)"),
+        ("local", "global_steps", PASSES),
     ],
-    ids=["local", "physical", "paper", "edges"],
+    ids=["local", "physical", "paper", "edges", "global"],
 )
 @torch.no_grad()
 def test_a_step_is_that_of_torch(name: str, arguments: tuple[str, str, str], request: pytest.FixtureRequest) -> None:
@@ -101,6 +103,21 @@ def test_residuals_of_neighbourhoods_are_those_of_torch(tank_scene: Scene) -> No
     for name in ("residual", "local_step", "wide_residual"):
         one, other = getattr(found, name), getattr(expected, name)
         assert float((one - other).norm() / other.norm()) < 1e-3
+
+
+@torch.no_grad()
+def test_global_steps_between_passes_are_those_of_torch(tank_scene: Scene) -> None:
+    problem, simulator = problem_of(tank_scene), make(output="global_steps")
+    prepared = simulator.prepare(tank_scene.cloth, tank_scene.garment.rest_pos)
+    graph = build_graph(prepared.static, problem.step, problem.contact.nearest)
+    inputs = Inputs(problem.cloth, problem.state, problem.step, problem.contact, graph)
+    pos = problem.state.pos + 1e-3 * torch.sin(60 * problem.state.pos.flip(1))
+    seen, _ = Feedback(default_potential(), problem, together=True)(inputs, pos)
+    found, expected = compiled.look(seen, ("mesh",)), local.look(seen, ("mesh",))
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-4)
+    with native.in_torch():
+        exact, _ = Feedback(default_potential(), problem, together=True)(inputs, pos)
+    assert float((seen.global_step - exact.global_step).norm() / exact.global_step.norm()) < 1e-3
 
 
 def test_training_goes_by_torch(tank_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -24,6 +24,7 @@ LOOKING = {
     "physical": {},
     "local": {"features": "local", "output": "local_steps"},
     "passes": {"features": "local", "output": "local_steps", "schedule": "1x(mesh+coarse0) | 1x(mesh)"},
+    "global": {"features": "local", "output": "global_steps", "schedule": "1x(mesh+coarse0) | 1x(mesh)"},
 }
 #: Contact from 1 cm on: cloth that starts at 2 mm is in contact, and friction acts.
 SLIPPERY, ROUGH = (default_potential(collision_epsilon=1e-2, friction_coefficient=mu) for mu in (0.0, 10.0))

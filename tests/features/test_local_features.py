@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from hood.features.inputs import Inputs
-from hood.features.local import LOOK_WIDTHS, local, look
+from hood.features.local import GLOBAL_LOOK_WIDTHS, LOOK_WIDTHS, local, look
 from hood.graph.builder import build_graph, build_static
 from hood.graph.hierarchy import build_hierarchy
 from hood.scene.contact import find_contact
@@ -36,6 +36,21 @@ def test_widths_are_those_promised(band_scene: Scene) -> None:
     assert nodes.shape == (inputs.num_cloth, LOOK_WIDTHS[0])
     assert list(edges) == ["mesh"]
     assert edges["mesh"].shape == (inputs.graph.edge_sets["mesh"].num_edges, LOOK_WIDTHS[1])
+
+
+def test_global_steps_are_seen_where_there_are_any(band_scene: Scene) -> None:
+    inputs, features = make_inputs(band_scene), local(2, together=True)
+    step = 1e-3 * torch.randn_like(inputs.base)
+    seen = replace(inputs, global_step=step)
+    nodes, _ = look(seen, ())
+    plain, _ = look(inputs, ())
+    assert nodes.shape[1] == GLOBAL_LOOK_WIDTHS[0]
+    assert torch.equal(nodes[:, : LOOK_WIDTHS[0]], plain)
+    assert torch.allclose(nodes[:, LOOK_WIDTHS[0] : -1], (step / 1e-3).asinh())
+    assert torch.allclose(nodes[:, -1], (step.norm(dim=1) / 1e-3).asinh())
+    assert features(seen)[0].shape[1] == features.node_width
+    with pytest.raises(ValueError, match="global_step"):
+        features(inputs)
 
 
 def test_strain_is_read_at_the_prediction(band_scene: Scene) -> None:
