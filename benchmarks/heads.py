@@ -52,6 +52,8 @@ POTENTIAL = default_potential()
 MOTIONS = {"dress": "walk_proud", "tshirt": "dance_mixed", "skirt": "twist_and_bend", "trousers": "plie"}
 ERRORS = (0.3, 0.1, 0.03)
 SOLVES = 10
+#: Passes of the controls of ``model=forces``.
+WHOLE_STEPS = (1, 2, 4, 8)
 #: Logarithm of how much more than by default vertices near the body are held where nothing is predicted: 300 N/m, which is best
 #: for the controls.
 FIRM = math.log(15.0)
@@ -191,7 +193,8 @@ def models(paths: list[str], garments: list[str], states: int, frames: int, kern
 
 
 def write_controls(folder: Path) -> None:
-    """Models of ``model=edges`` whose output is the same everywhere: the base, and its edges at their rest lengths."""
+    """Models whose output is the same everywhere: of ``model=edges`` the base, and its edges at their rest lengths; of
+    ``model=forces`` in several passes, whole steps of all vertices together, with the forces that there are."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, share, hold in (("base", 0.0, 0.0), ("rest_lengths", 1.0, FIRM)):
         simulator = build_simulator(features="local", output="edges", schedule="1x(mesh)", latent_dim=16)
@@ -203,6 +206,11 @@ def write_controls(folder: Path) -> None:
             vertices.bias[3], edges.bias[3] = hold, share
         save_simulator(folder / f"{name}.safetensors", simulator)
         print(folder / f"{name}.safetensors")
+    for count in WHOLE_STEPS:
+        passes = " | ".join(count * ["1x(mesh)"])
+        simulator = build_simulator(features="local", output="global_steps", schedule=passes, latent_dim=16, output_init=0.0)
+        save_simulator(folder / f"whole_steps_{count}.safetensors", simulator)
+        print(folder / f"whole_steps_{count}.safetensors")
 
 
 def relative(found: Tensor, base: Tensor, exact: Tensor, weight: Tensor | float = 1.0) -> float:

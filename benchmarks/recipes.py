@@ -7,7 +7,7 @@
     python benchmarks/recipes.py levels                     # the small model with one, two and three levels
     python benchmarks/recipes.py shipped                    # both again, told what the potential asks of single vertices
     python benchmarks/recipes.py heads                      # one pass that predicts positions, or edges to solve positions from
-    python benchmarks/recipes.py waves                      # eight passes with and without steps of all vertices together
+    python benchmarks/recipes.py forces                     # forces, and steps of all vertices together under them
 
 Every run is ``hood train`` in a process of its own with one thread, ``--jobs`` of them side by side; its time is the CPU time
 of that process, so that a busy machine changes nothing. Every finished run is evaluated by ``hood evaluate`` on motions it
@@ -82,8 +82,8 @@ LEVELS = {
 EDGES = ("model=edges",)
 EIGHT_PASSES = fast("8 passes, 11 steps", SHORT, "model=passes")
 
-#: Forces predicted and one solve for all vertices in every pass.
-GLOBAL = ("model=passes", "model.output=global_steps")
+#: The same with corrections to the forces as output, in one pass and in several.
+FORCES = ("model=forces",)
 FOUR_PASSES = "1x(mesh+coarse0) | 1x(coarse0+coarse1) 1x(mesh+coarse0) | 1x(mesh) | 1x(mesh)"
 
 SUITES: dict[str, list[Recipe]] = {
@@ -131,15 +131,10 @@ SUITES: dict[str, list[Recipe]] = {
         fast("edges", 2 * SHORT, *EDGES),
         fast("edges, physical features", 2 * SHORT, *EDGES, "model.features=physical"),
     ],
-    "waves": [
-        recipe
-        for updates in (SHORT, 2 * SHORT)
-        for recipe in (
-            fast(f"8 passes, {updates}", updates, "model=passes"),
-            fast(f"1 pass, global, {updates}", updates, *ONE_PASS, "model.output=global_steps"),
-            fast(f"4 passes, global, {updates}", updates, *GLOBAL, f"model.schedule='{FOUR_PASSES}'"),
-            fast(f"8 passes, global, {updates}", updates, *GLOBAL),
-        )
+    "forces": [
+        fast("forces", 2 * SHORT, *FORCES),
+        fast("forces, shorter", SHORT, *FORCES),
+        fast("forces, 4 passes, shorter", SHORT, *FORCES, f"model.schedule='{FOUR_PASSES}'"),
     ],
 }
 

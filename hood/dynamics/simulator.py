@@ -408,7 +408,7 @@ def build_simulator(
     elif output == "edges":
         head = EdgeOutput(output_scale)
     elif output == "global_steps":
-        head = GlobalStepOutput(output_scale)
+        head = GlobalStepOutput()
     else:
         head = LocalStepOutput(output_scale, late_scale=late_scale)
     widths = (feature_set.node_width, feature_set.edge_widths)

@@ -43,7 +43,7 @@ KINDS = {
     "base": ("paper", "velocity_base", "1x(mesh)"),
     "edges": ("physical", "edges", "1x(mesh+coarse0)"),
     "local edges": ("local", "edges", "1x(mesh)"),
-    "global": ("local", "global_steps", PASSES),
+    "global": ("local", "global_steps", "1x(mesh)"),
 }
 
 
