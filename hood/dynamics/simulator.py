@@ -347,8 +347,8 @@ def build_simulator(
         output: ``acceleration`` (paper), ``velocity_base`` (corrections to a base that moves with the body),
             ``local_steps`` (several such corrections with shares of the vertices' own steps; features=local),
             ``global_steps`` (several corrections to the forces, each with a solve for the step of all vertices together;
-            features=local) or ``edges``
-            (corrections to the edges of the base, and a linear solve for the positions; features=physical or local).
+            features=local) or ``edges`` (corrections to the edges of the base, and a linear solve for the positions;
+            features=physical or local).
         schedule: name (``ours``, ``fine15``, ``fine48``) or text such as ``3x(mesh+coarse0) 3x(coarse0)``; ``|`` between
             passes (``local_steps`` and ``global_steps`` only).
         latent_dim: width of all latents.

@@ -198,6 +198,7 @@ class SceneEngine:
 
     def __init__(self, cloth: Cloth, tables: Tables) -> None:
         self.tables = tables
+        self.step: EngineStep | None = None  # what was taken up last
         self._kept: dict[str, Any] = {}  # what the structure points to
         self._fabric: tuple[tuple[Tensor | float, ...], Fabric] | None = None
         self.values = _Engine(
@@ -260,6 +261,7 @@ class SceneEngine:
     def enter(self, step: EngineStep, scene: int) -> None:
         """Take up scene ``scene`` of a step; the state is undefined until :meth:`start`."""
         values = self.values
+        self.step = step
         self._take_fabric(step)
         self._point(base=step.base, fixed=step.fixed, inertia=step.inertia, weight=step.weight)
         self._point(spring_stiffness=step.spring_stiffness[self.tables.springs.order])

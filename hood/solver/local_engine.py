@@ -56,8 +56,10 @@ class EngineTerms:
 
     def solve(self, pos: Tensor, force: Tensor, damping: Tensor) -> Tensor:
         """As :meth:`hood.solver.local.LocalTerms.solve`."""
+        if any(own.step is not self._step for own in self._engines):  # they have been at another step since
+            self._enter()
+            self._looked_at = None
         if self._looked_at is not pos:
-            self._enter()  # the engines may have been at another step
             self(pos)
         force, damping, step = force.contiguous(), damping.contiguous(), torch.zeros_like(force)
         for own, size in zip(self._engines, self._sizes, strict=True):
