@@ -48,10 +48,11 @@ COLUMNS = ("recipe", "seed", "updates", "cpu_s", "gap", "gap_p95", "strain_p99",
 
 @dataclass(frozen=True)
 class Recipe:
-    """Settings of ``hood train`` under a name."""
+    """Settings of ``hood train`` under a name, and those of the ``hood evaluate`` that judges what comes of it."""
 
     name: str
     overrides: tuple[str, ...]
+    evaluation: tuple[str, ...] = EVALUATION
 
 
 def fast(name: str, updates: int, *overrides: str) -> Recipe:
@@ -171,7 +172,7 @@ def run(recipe: Recipe, seed: int, output: Path, kernels: str) -> dict[str, obje
             raise SystemExit(f"{recipe.name}, seed {seed}: hood train exited with {code}, see {log}")
     table = folder / "evaluation" / "table.json"
     if not table.exists():
-        code, _ = hood(["evaluate", f"models=[{folder}/run/model.safetensors]", *EVALUATION, f"output={table.parent}"], log)
+        code, _ = hood(["evaluate", f"models=[{folder}/run/model.safetensors]", *recipe.evaluation, f"output={table.parent}"], log)
         if code:
             raise SystemExit(f"{recipe.name}, seed {seed}: hood evaluate exited with {code}, see {log}")
     row = next(row for row in json.loads(table.read_text()) if row["garment"] == "all")

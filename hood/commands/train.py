@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from omegaconf import DictConfig
@@ -15,6 +16,7 @@ from tqdm import tqdm
 from hood.assets.body import load_body
 from hood.assets.garment import load_garment
 from hood.assets.library import motion_split
+from hood.assets.material import Material
 from hood.assets.motions import MotionFiles, find_motions
 from hood.assets.sequence import load_sequence
 from hood.commands.common import output_folder, prepare_folder, require_device, require_same_config, tell_choice, together
@@ -101,13 +103,21 @@ def make_trainer(config: DictConfig) -> Trainer:
         body=load_body(str(config.data.body)),
         garments=[load_garment(str(name)) for name in config.data.garments],
         sequences=_open_motions(config, names, fps, settings.horizon.maximum + 3),
-        **plain(config.data.sampling),
+        **_sampling(config),
         device=str(config.device),
     )
     potential = build(config.losses)
     folder = output_folder(config)
     watch = _make_watch(config, sampler, potential, folder) if settings.validate_every else None
     return Trainer(simulator, potential, sampler, settings, folder, int(config.seed), watch)
+
+
+def _sampling(config: DictConfig) -> dict[str, Any]:
+    """How scenes are drawn, with the fabric that was given for all of them."""
+    sampling = plain(config.data.sampling)
+    if sampling["material"] is not None:
+        sampling["material"] = build({"_target_": f"{Material.__module__}.{Material.__name__}", **sampling["material"]})
+    return sampling
 
 
 def _open_motions(config: DictConfig, names: list[str], fps: float, min_frames: int) -> MotionFiles:

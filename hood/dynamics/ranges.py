@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from hood.assets.garment import Garment
-from hood.assets.material import RANGES, Material
+from hood.assets.material import RANGES, Material, values_of
 from hood.assets.motions import MotionFiles
 from hood.losses.potential import Potential
 from hood.mesh.topology import connected_components, unique_edges
@@ -96,8 +96,7 @@ def training_conditions(sampler: SceneSampler, potential: Potential) -> Conditio
     fps = [motions.fps] if isinstance(motions, MotionFiles) else [motion.fps for motion in motions]
     spans: dict[str, Span] = {"fps": (min(fps), max(fps)), "size": (low, high)}
     spans["betas"] = (-sampler.beta_range, sampler.beta_range)
-    thickness = float(Material().thickness)  # type: ignore[arg-type]  # one number, which is not sampled
-    spans |= {f"material.{name}": span for name, span in RANGES.items()} | {"material.thickness": (thickness, thickness)}
+    spans |= {f"material.{name}": span for name, span in _fabrics(sampler.material).items()}
     spans |= _resolution(sampler.garments)
     spans["edge_length"] = (low * spans["edge_length"][0], high * spans["edge_length"][1])
     return Conditions(spans, potential.settings)
@@ -152,6 +151,13 @@ def describe(trained: Conditions | None) -> dict[str, str]:
         for name, term in trained.potential.items()
     ]
     return spans | {"trained on losses": ", ".join(term.removesuffix("()") for term in terms)}
+
+
+def _fabrics(material: Material | None) -> dict[str, Span]:
+    """Extent of every property of a fabric; None: of those that are sampled."""
+    given = {name: values_of(getattr(material or Material(), name))[0] for name in Material.names()}
+    spans = {name: (float(values.min()), float(values.max())) for name, values in given.items()}
+    return spans if material is not None else spans | RANGES
 
 
 def _resolution(garments: Iterable[Garment]) -> dict[str, Span]:

@@ -56,10 +56,11 @@ class SceneSampler:
         sequences: motions, drawn by their length; :class:`hood.assets.motions.MotionFiles` are read when drawn.
         beta_range: shape coefficients are U(-beta_range, beta_range).
         size_range: garment scale is uniform in this interval.
-        piecewise_fraction: share of the scenes with several fabrics on one garment.
+        piecewise_fraction: share of the scenes with several fabrics on one garment, where fabrics are drawn.
         random_yaw: turn the world about the vertical axis, so that no direction is special.
         mirror: show every other scene, at random, as its image x → −x, so that no side is special: without it, what a
             network learns from lopsided motions lets cloth drift sideways on a body that stands still.
+        material: fabric of every scene; None: drawn (:func:`hood.assets.material.sample_material`).
         device: where the scenes' tensors live in training.
     """
 
@@ -73,6 +74,7 @@ class SceneSampler:
         piecewise_fraction: float = 0.2,
         random_yaw: bool = True,
         mirror: bool = True,
+        material: Material | None = None,
         device: str = "cpu",
     ) -> None:
         if not garments or not sequences:
@@ -85,6 +87,7 @@ class SceneSampler:
         self.size_low, self.size_high = size_range
         self.piecewise_fraction = piecewise_fraction
         self.random_yaw, self.mirror = random_yaw, mirror
+        self.material = material
         self.device = device
 
     def sample(self, rng: np.random.Generator, num_steps: int, garment: int | None = None) -> Window:
@@ -103,7 +106,7 @@ class SceneSampler:
             window = turn_world(window, turn)
         betas = np.asarray(rng.uniform(-self.beta_range, self.beta_range, self.body.shapedirs.shape[2]))
         size = float(rng.uniform(self.size_low, self.size_high))
-        material: Material = sample_material(rng, template.rest_pos, self.piecewise_fraction)
+        material = self.material or sample_material(rng, template.rest_pos, self.piecewise_fraction)
         mirrored = self.mirror and rng.random() < 0.5
         body, dress = self._assets(index, mirrored)
         scene = build_scene(dress, body, window, material, betas, size)

@@ -1,0 +1,108 @@
+"""The paper's order of Fine15, Ours and Fine48 where physics predicts one: against (radius of the schedule) / ℓ.
+
+    nice python benchmarks/order.py train --kernels compiled   # every run of the family; goes on where it was stopped
+    python benchmarks/order.py decay                           # how far a moved pin is felt in one exact step
+    python benchmarks/order.py floor                           # what a step costs in which the pins are felt so far only
+    python benchmarks/order.py report                          # the table of what is there, and the figure
+
+The influence of a load decays over ℓ = c_p dt in one implicit step: a schedule whose radius, edges times their length, is
+shorter than that cannot be told of it. The family (:mod:`order_scenes`) is of cloth that hangs from shaken pins; from one
+scene to the next the frame rate changes on one mesh, or the mesh at one frame rate. Every run is ``hood train`` and ``hood
+evaluate`` in processes of their own (:mod:`recipes`), on motions that were not trained on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import sys
+import time
+from pathlib import Path
+
+from order_scenes import Hanging, write_body, write_scene
+from recipes import ONE_PASS, Recipe, cell, fast, folder_of, run
+
+from hood.assets.atomic import write_atomically
+from hood.assets.body import load_body
+from hood.nn.schedule import parse_schedule, radius
+
+SCHEDULES = ("fine15", "ours", "fine48")
+#: In the order in which they are trained: first what spans the ratios, then what separates edge from frame rate.
+FAMILY = (
+    Hanging("strip", 0.012, 30),
+    Hanging("strip", 0.024, 30),
+    Hanging("strip", 0.024, 60),
+    Hanging("strip", 0.024, 120),
+    Hanging("strip", 0.036, 30),
+    Hanging("strip", 0.012, 60),
+    Hanging("strip", 0.024, 240),
+    Hanging("dress", 0.036, 30),
+    Hanging("dress", 0.036, 120),
+)
+#: Scenes trained with every seed before the next ones begin.
+FIRST = 4
+UPDATES, LATENT = 200, 16
+#: Frames of the longest training rollout and of the evaluated ones.
+HORIZON = 24
+
+
+def recipe(scene: Hanging, schedule: str, updates: int, folder: Path) -> Recipe:
+    """The training of a schedule on a scene: one garment, one fabric, one body, so that the ratio is one number."""
+    stone = folder / "stone.npz"
+    garment, motions, held_out = write_scene(scene, load_body(stone), folder)
+    shared = (f"garments=[{garment}]", f"body={stone}")
+    base = fast(
+        f"{scene.name}/{schedule}_{updates}",
+        updates,
+        *ONE_PASS,
+        f"model.schedule={schedule}",
+        f"model.latent_dim={LATENT}",
+        f"trainer.horizon.maximum={HORIZON}",
+        f"trainer.schedule.warmup={max(updates // 10, 1)}",
+        *(f"data.{text}" for text in shared),
+        f"data.sequences=[{','.join(map(str, motions))}]",
+        f"data.fps={scene.fps}",
+        "data.sampling={beta_range:0,size_range:[1,1],piecewise_fraction:0,material:{}}",
+    )
+    judged = (f"sequences=[{','.join(map(str, held_out))}]", f"fps={scene.fps}", f"num_frames={HORIZON}", "gap_states=4")
+    return Recipe(base.name, base.overrides, (*shared, *judged, "gap_iterations=100"))
+
+
+def train(updates: int, seeds: list[int], output: Path, kernels: str) -> None:
+    """Train and evaluate what is not done yet, one after the other."""
+    folder = (output / "scenes").absolute()
+    folder.mkdir(parents=True, exist_ok=True)
+    if not (folder / "stone.npz").exists():
+        write_body(folder / "stone.npz")
+    begin = time.monotonic()
+    for scenes in (FAMILY[:FIRST], FAMILY[FIRST:]):
+        for seed in seeds:
+            for scene in scenes:
+                for schedule in SCHEDULES:
+                    one = recipe(scene, schedule, updates, folder)
+                    row = run(one, seed, output, kernels)
+                    whole = {"scene": scene.name, "schedule": schedule, "ratio": ratio(scene, schedule), **row}
+                    write_atomically(folder_of(output, one, seed) / "row.json", json.dumps(whole).encode())
+                    print(f"{time.monotonic() - begin:6.0f} s  {one.name}, seed {seed}: γ {cell(row.get('gap'))}", file=sys.stderr)
+
+
+def ratio(scene: Hanging, schedule: str) -> float:
+    """Radius of the schedule [m] over ℓ."""
+    return radius(parse_schedule(schedule)) * scene.edge / scene.reach
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("train", "decay", "floor", "report"))
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--updates", type=int, default=UPDATES)
+    parser.add_argument("--kernels", choices=("torch", "compiled"), default="torch", help="of every training, see hood train")
+    parser.add_argument("--output", type=Path, default=Path("runs/order"))
+    arguments = parser.parse_args()
+    if arguments.what == "train":
+        train(arguments.updates, arguments.seeds, arguments.output, arguments.kernels)
+
+
+if __name__ == "__main__":
+    main()
