@@ -1,9 +1,8 @@
 """The paper's order of Fine15, Ours and Fine48 where physics predicts one: against (radius of the schedule) / ℓ.
 
     nice python benchmarks/order.py train --kernels compiled   # every run of the family; goes on where it was stopped
-    python benchmarks/order.py decay                           # how far a moved pin is felt in one exact step
-    python benchmarks/order.py floor                           # what a step costs in which the pins are felt so far only
-    python benchmarks/order.py report                          # the table of what is there, and the figure
+    python benchmarks/order.py exact                           # the same scenes without a network, see order_exact
+    python benchmarks/order.py report --figure docs/order.png  # the table of what is there, and the figure
 
 The influence of a load decays over ℓ = c_p dt in one implicit step: a schedule whose radius, edges times their length, is
 shorter than that cannot be told of it. The family (:mod:`order_scenes`) is of cloth that hangs from shaken pins; from one
@@ -14,12 +13,14 @@ evaluate`` in processes of their own (:mod:`recipes`), on motions that were not 
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
+from order_exact import PatchStepper, about, make_scene, own_rollout
+from order_report import Results, comparisons, draw, read_rows, table, write_csv
 from order_scenes import Hanging, write_body, write_scene
 from recipes import ONE_PASS, Recipe, cell, fast, folder_of, run
 
@@ -43,8 +44,12 @@ FAMILY = (
 #: Scenes trained with every seed before the next ones begin.
 FIRST = 4
 UPDATES, LATENT = 200, 16
-#: Frames of the longest training rollout and of the evaluated ones.
-HORIZON = 24
+#: Frames of the longest training rollout and of the evaluated ones; states of each whose gap is computed.
+HORIZON, STATES = 24, 4
+#: Edges from the pins up to which they are felt in :func:`order_exact.floors`.
+RADII = (4, 8, 15, 24, 31, 48, 64)
+#: Radii of steps that are exact as far as they go, and the motions of which they take rollouts: many minimisations each.
+PATCHES, PATCHED = (15, 48), 2
 
 
 def recipe(scene: Hanging, schedule: str, updates: int, folder: Path) -> Recipe:
@@ -65,16 +70,13 @@ def recipe(scene: Hanging, schedule: str, updates: int, folder: Path) -> Recipe:
         f"data.fps={scene.fps}",
         "data.sampling={beta_range:0,size_range:[1,1],piecewise_fraction:0,material:{}}",
     )
-    judged = (f"sequences=[{','.join(map(str, held_out))}]", f"fps={scene.fps}", f"num_frames={HORIZON}", "gap_states=4")
-    return Recipe(base.name, base.overrides, (*shared, *judged, "gap_iterations=100"))
+    length = (f"fps={scene.fps}", f"num_frames={HORIZON}", f"gap_states={STATES}", "gap_iterations=100")
+    return Recipe(base.name, base.overrides, (*shared, f"sequences=[{','.join(map(str, held_out))}]", *length))
 
 
 def train(updates: int, seeds: list[int], output: Path, kernels: str) -> None:
     """Train and evaluate what is not done yet, one after the other."""
-    folder = (output / "scenes").absolute()
-    folder.mkdir(parents=True, exist_ok=True)
-    if not (folder / "stone.npz").exists():
-        write_body(folder / "stone.npz")
+    folder = scene_folder(output)
     begin = time.monotonic()
     for scenes in (FAMILY[:FIRST], FAMILY[FIRST:]):
         for seed in seeds:
@@ -84,7 +86,47 @@ def train(updates: int, seeds: list[int], output: Path, kernels: str) -> None:
                     row = run(one, seed, output, kernels)
                     whole = {"scene": scene.name, "schedule": schedule, "ratio": ratio(scene, schedule), **row}
                     write_atomically(folder_of(output, one, seed) / "row.json", json.dumps(whole).encode())
-                    print(f"{time.monotonic() - begin:6.0f} s  {one.name}, seed {seed}: γ {cell(row.get('gap'))}", file=sys.stderr)
+                    done = f"{one.name}, seed {seed}: γ {cell(row.get('gap'))}"
+                    print(f"{time.monotonic() - begin:6.0f} s  {done}", file=sys.stderr)
+
+
+def exact(output: Path) -> dict[str, dict[str, Any]]:
+    """What the solver says about every scene, by its name; goes on where it was stopped."""
+    path, folder = output / "exact.json", scene_folder(output)
+    known: dict[str, dict[str, Any]] = json.loads(path.read_text()) if path.exists() else {}
+    for scene in FAMILY:
+        stone = folder / "stone.npz"
+        garment, _, motions = write_scene(scene, load_body(stone), folder)
+        scenes = [make_scene(garment, stone, motion, scene.fps) for motion in motions]
+        entry = known.setdefault(scene.name, {})
+        if "floors" not in entry:
+            entry |= about(scenes, RADII, HORIZON, STATES)
+        for number in PATCHES:
+            if f"patch{number}" not in entry:
+                entry[f"patch{number}"] = own_rollout(PatchStepper(number), scenes[:PATCHED], HORIZON, STATES)
+                write_atomically(path, json.dumps(known).encode())
+        patches = {number: entry[f"patch{number}"] for number in PATCHES}
+        print(f"{scene.name}: decay {entry['decay'] / scene.reach:.2f} ℓ, patches {patches}")
+    return known
+
+
+def scene_folder(output: Path) -> Path:
+    """Where the scenes' files are, with the body in place."""
+    folder = (output / "scenes").absolute()
+    folder.mkdir(parents=True, exist_ok=True)
+    if not (folder / "stone.npz").exists():
+        write_body(folder / "stone.npz")
+    return folder
+
+
+def report(updates: int, output: Path, figure: Path | None) -> None:
+    """Print what is there of the runs, and draw it."""
+    known = exact(output)
+    results = Results(FAMILY, SCHEDULES, read_rows(output, updates), known)
+    write_csv(output / "order.csv", results)
+    print(table(results), comparisons(results), sep="\n\n")
+    if figure is not None:
+        draw(results, figure)
 
 
 def ratio(scene: Hanging, schedule: str) -> float:
@@ -94,14 +136,19 @@ def ratio(scene: Hanging, schedule: str) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("train", "decay", "floor", "report"))
+    parser.add_argument("what", choices=("train", "exact", "report"))
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--updates", type=int, default=UPDATES)
     parser.add_argument("--kernels", choices=("torch", "compiled"), default="torch", help="of every training, see hood train")
     parser.add_argument("--output", type=Path, default=Path("runs/order"))
+    parser.add_argument("--figure", type=Path, default=None, help="PNG that the report draws")
     arguments = parser.parse_args()
     if arguments.what == "train":
         train(arguments.updates, arguments.seeds, arguments.output, arguments.kernels)
+    elif arguments.what == "exact":
+        exact(arguments.output)
+    else:
+        report(arguments.updates, arguments.output, arguments.figure)
 
 
 if __name__ == "__main__":

@@ -172,7 +172,8 @@ def run(recipe: Recipe, seed: int, output: Path, kernels: str) -> dict[str, obje
             raise SystemExit(f"{recipe.name}, seed {seed}: hood train exited with {code}, see {log}")
     table = folder / "evaluation" / "table.json"
     if not table.exists():
-        code, _ = hood(["evaluate", f"models=[{folder}/run/model.safetensors]", *recipe.evaluation, f"output={table.parent}"], log)
+        models = f"models=[{folder}/run/model.safetensors]"
+        code, _ = hood(["evaluate", models, *recipe.evaluation, f"output={table.parent}"], log)
         if code:
             raise SystemExit(f"{recipe.name}, seed {seed}: hood evaluate exited with {code}, see {log}")
     row = next(row for row in json.loads(table.read_text()) if row["garment"] == "all")

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hood.assets.material import Material
 from hood.assets.motions import MotionFiles
 from hood.commands.train import make_trainer
 from hood.config import ConfigError, load_config
@@ -58,6 +59,16 @@ def test_motions_shorter_than_a_rollout(tmp_path: Path, capsys: pytest.CaptureFi
 def test_time_scale_reaches_the_trainer() -> None:
     settings = trainer("trainer=paper", "trainer.time_scale=0.02").settings
     assert (settings.iterations, settings.horizon.every, settings.collision.end_iteration) == (3000, 100, 3000)
+
+
+def test_one_fabric_for_every_scene() -> None:
+    sampler = trainer("data.sampling.material={density: 0.3, lame_mu: 2e4}").slots.sampler
+    assert sampler.material == Material(density=0.3, lame_mu=2e4)
+    assert trainer().slots.sampler.material is None
+    with pytest.raises(ConfigError, match="densty"):
+        trainer("data.sampling.material={densty: 0.3}")
+    with pytest.raises(ValueError, match=r"material 'density' is -1\.0; it must be finite and > 0"):
+        trainer("data.sampling.material={density: -1.0}")
 
 
 def test_buckets_by_size() -> None:

@@ -136,6 +136,10 @@ def test_every_scene_of_a_training_is_inside_of_it(tank_scene: Scene, skirt_scen
             outside(trained, scene_conditions(scene.garment, scene.cloth, scene.dt, default_potential(), scene.motion.betas))
             == []
         )
+    sampler.material = Material(density=0.3)
+    spans = training_conditions(sampler, default_potential()).spans
+    assert spans["material.density"] == (0.3, 0.3)  # a fabric that was given is all that was seen
+    assert spans["material.lame_mu"] == (23600.0, 23600.0)
     shirt = build_cloth(garments["tshirt"].rest_pos, garments["tshirt"].faces, Material())
     assert len(outside(trained, scene_conditions(garments["tshirt"], shirt, 1 / 30, default_potential()))) == 2
 

@@ -8,6 +8,7 @@ import torch
 
 from hood.assets.body import Body
 from hood.assets.garment import Garment
+from hood.assets.material import Material
 from hood.assets.sequence import PoseSequence, load_sequence
 from hood.scene.dataset import SceneSampler
 
@@ -88,6 +89,16 @@ def test_without_augmentation(body: Body, garments: dict[str, Garment], motions:
     scene = plain.sample(np.random.default_rng(0), 5).scene
     np.testing.assert_allclose(scene.cloth.rest_pos, garments["tank"].rest_pos, atol=1e-6)
     np.testing.assert_allclose(scene.motion.sequence.world_rotation, motions[0].world_rotation)
+
+
+def test_a_given_fabric_is_that_of_every_scene(body: Body, garments: dict[str, Garment], motions: list[PoseSequence]) -> None:
+    fabric = Material(density=0.11, bending_stiffness=1e-5)
+    sampler = SceneSampler(body, [garments["tank"]], motions, piecewise_fraction=1.0, material=fabric)
+    rng = np.random.default_rng(7)
+    for _ in range(3):
+        cloth = sampler.sample(rng, 2).scene.cloth
+        assert cloth.density.unique().tolist() == pytest.approx([0.11])
+        assert cloth.bending_stiffness.unique().tolist() == pytest.approx([1e-5])
 
 
 def test_nothing_to_draw_from(body: Body, motions: list[PoseSequence]) -> None:

@@ -1,0 +1,200 @@
+"""Runs of the family as a table with intervals over seeds, and as a figure."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from order_scenes import Hanging
+from scipy.stats import t
+
+from hood.assets.atomic import write_atomically
+from hood.evaluation.bootstrap import LEVEL
+from hood.media.charts import write_png
+
+COLOURS = {"fine15": "#c8503c", "ours": "#2a6fbb", "fine48": "#3f8f4f"}
+#: What is compared, all better where they are lower and positive: titles by column.
+QUANTITIES = {"gap": "γ", "loss": "L above the solver's [e0]", "gradient": "gradient [weight of a vertex]"}
+
+Row = Mapping[str, Any]
+#: What the solver says about a scene, see ``order.py exact``.
+Exact = Mapping[str, Any]
+
+
+class Mean(NamedTuple):
+    """Geometric mean over seeds and the ends of its interval; the ends are NaN for fewer than two seeds."""
+
+    value: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"{self.value:.2g} ({self.low:.2g}–{self.high:.2g})" if math.isfinite(self.low) else f"{self.value:.2g}"
+
+
+def mean(values: Sequence[float]) -> Mean:
+    """Of positive values, by Student's distribution of their logarithms."""
+    logs = np.log(values)
+    half = t.ppf((1 + LEVEL) / 2, len(logs) - 1) * logs.std(ddof=1) / math.sqrt(len(logs)) if len(logs) > 1 else math.nan
+    return Mean(*(float(np.exp(logs.mean() + side * half)) if side else float(np.exp(logs.mean())) for side in (0, -1, 1)))
+
+
+@dataclass(frozen=True)
+class Results:
+    """What is there: rows of runs that are done, and what the solver says, by the scene's name."""
+
+    family: Sequence[Hanging]
+    schedules: Sequence[str]
+    rows: Sequence[Row]
+    exact: Mapping[str, Exact]
+
+    def values(self, scene: Hanging, schedule: str, quantity: str) -> dict[int, float]:
+        """By seed."""
+        mine = [row for row in self.rows if row["scene"] == scene.name and row["schedule"] == schedule]
+        return {int(row["seed"]): self._value(row, scene, quantity) for row in mine}
+
+    def _value(self, row: Row, scene: Hanging, quantity: str) -> float:
+        exact = self.exact[scene.name]
+        if quantity == "loss":
+            return float((row["L_total"] - exact["newton"]["L_total"]) / exact["e0"])
+        if quantity == "gradient":
+            return float(row["gradient_norm"] / exact["vertex_weight"])
+        return float(row[quantity])
+
+    def behind(self, scene: Hanging, schedule: str, other: str, quantity: str) -> Mean | None:
+        """How many times as much as ``other``, seed by seed; None where no seed has both."""
+        mine, theirs = (self.values(scene, name, quantity) for name in (schedule, other))
+        both = sorted(mine.keys() & theirs.keys())
+        return mean([mine[seed] / theirs[seed] for seed in both]) if both else None
+
+
+def read_rows(output: Path, updates: int) -> list[Row]:
+    """Rows of the runs with so many updates that are done."""
+    rows = [json.loads(path.read_text()) for path in sorted(output.glob("*/*/seed*/row.json"))]
+    return [row for row in rows if row["updates"] == updates]
+
+
+def table(results: Results) -> str:
+    """A line per scene and schedule."""
+    titles = ["scene", "schedule", "radius / ℓ", *QUANTITIES.values(), "CPU s", "radius alone", "base", "seeds"]
+    lines = [titles]
+    for scene in results.family:
+        for schedule in results.schedules:
+            found = {quantity: results.values(scene, schedule, quantity) for quantity in QUANTITIES}
+            if not found["gap"]:
+                continue
+            rows = [row for row in results.rows if (row["scene"], row["schedule"]) == (scene.name, schedule)]
+            floor = results.exact[scene.name]["floors"]
+            cells = [str(mean(list(values.values()))) for values in found.values()]
+            seconds = f"{np.mean([row['cpu_s'] for row in rows]):.0f}"
+            floors = [f"{np.median(floor[name]):.2g}" for name in (str(rows[0]["radius"]), "base")]
+            lines.append([scene.name, schedule, f"{rows[0]['ratio']:.2f}", *cells, seconds, *floors, str(len(rows))])
+    return "\n".join("| " + " | ".join(line) + " |" for line in [lines[0], ["---"] * len(titles), *lines[1:]])
+
+
+def comparisons(results: Results) -> str:
+    """Fine15 and Ours against Fine48, scene by scene."""
+    lines = []
+    for scene in results.family:
+        for quantity, title in QUANTITIES.items():
+            for schedule in ("fine15", "ours"):
+                found = results.behind(scene, schedule, "fine48", quantity)
+                if found is not None:
+                    lines.append(f"{scene.name:18} {title:30} {schedule} / fine48: {found}")
+    return "\n".join(lines)
+
+
+def write_csv(path: Path, results: Results) -> None:
+    """Every run with its seed."""
+    columns = ["scene", "schedule", "seed", "ratio", "updates", "cpu_s", "gap", "gap_p95", "L_total", "gradient_norm", "rg"]
+    columns += ["strain_p99", "unconverged", "failed"]
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, extrasaction="ignore")
+    writer.writeheader()
+    writer.writerows(results.rows)
+    write_atomically(path, text.getvalue().encode())
+
+
+def draw(results: Results, path: Path) -> None:
+    """Four panels: decay, floors beside what was trained, Fine15 and Ours against Fine48, the same for loss and gradient."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    style: Any = {"font.size": 9.0, "axes.spines.top": False, "axes.spines.right": False, "legend.frameon": False}
+    with rc_context(style):
+        figure = Figure(figsize=(11.5, 8.0), layout="constrained")
+        panels = figure.subplots(2, 2)
+        _draw_decay(panels[0, 0], results)
+        _draw_gap(panels[0, 1], results)
+        _draw_behind(panels[1, 0], results, ("gap",))
+        _draw_behind(panels[1, 1], results, ("loss", "gradient"))
+    write_png(figure, path)
+
+
+def _draw_decay(axes: Any, results: Results) -> None:
+    axes.set_title("One exact step after the pins were moved", loc="left")
+    for scene in results.family:
+        exact = results.exact[scene.name]
+        distance, share = np.array(exact["distance"]) / scene.reach, np.array(exact["share"])
+        order = np.argsort(distance)
+        axes.plot(distance[order], share[order], ".", markersize=2.5, label=scene.name.replace("_", " "))
+    line = np.linspace(0.0, 4.0, 50)
+    axes.plot(line, np.exp(-line), color="#222222", linewidth=1.0, label="exp(−distance / ℓ)")
+    axes.set(xlim=(0.0, 4.0), ylim=(1e-2, 1.3), yscale="log", xlabel="distance from the pins / ℓ")
+    axes.set_ylabel("displacement / that of the pins")
+    axes.legend(fontsize=7)
+
+
+def _draw_gap(axes: Any, results: Results) -> None:
+    axes.set_title("γ: what the radius alone costs (lines), what was trained (points)", loc="left")
+    for scene in results.family:
+        floors = results.exact[scene.name]["floors"]
+        radii = sorted(int(name) for name in floors if name.isdigit())
+        ratios = [radius * scene.edge / scene.reach for radius in radii]
+        axes.plot(ratios, [max(np.median(floors[str(radius)]), 1e-5) for radius in radii], color="#999999", linewidth=0.8)
+        for schedule in results.schedules:
+            _point(axes, results, scene, schedule)
+    _legend(axes, results.schedules)
+    axes.set(xscale="log", yscale="log", ylim=(1e-4, None), xlabel="radius / ℓ", ylabel="γ (own rollouts, median)")
+
+
+def _point(axes: Any, results: Results, scene: Hanging, schedule: str) -> None:
+    values = list(results.values(scene, schedule, "gap").values())
+    if values:
+        ratio = next(row["ratio"] for row in results.rows if (row["scene"], row["schedule"]) == (scene.name, schedule))
+        _bar(axes, ratio, mean(values), COLOURS[schedule])
+
+
+def _draw_behind(axes: Any, results: Results, quantities: Sequence[str]) -> None:
+    names = " and ".join({"gap": "γ", "loss": "loss (●)", "gradient": "gradient (□)"}[name] for name in quantities)
+    axes.set_title(f"{names}: times Fine48's, same seeds", loc="left")
+    for scene in results.family:
+        ratio = 15 * scene.edge / scene.reach
+        for place, (quantity, marker) in enumerate(zip(quantities, "os", strict=False)):
+            for schedule, shift in (("fine15", 0.97), ("ours", 1.03)):
+                found = results.behind(scene, schedule, "fine48", quantity)
+                if found is not None:
+                    _bar(axes, ratio * shift * (1.0 + 0.02 * place), found, COLOURS[schedule], marker, hollow=place > 0)
+    axes.axhline(1.0, color="#222222", linewidth=0.8)
+    axes.axvline(1.0, color="#222222", linewidth=0.8, linestyle=":")
+    _legend(axes, ("fine15", "ours"))
+    axes.set(xscale="log", yscale="log", xlabel="radius of Fine15 / ℓ   (left of 1 the rule has it fall behind)")
+
+
+def _bar(axes: Any, x: float, found: Mean, colour: str, marker: str = "o", hollow: bool = False) -> None:
+    if math.isfinite(found.low):
+        axes.plot([x, x], [found.low, found.high], color=colour, linewidth=1.0, alpha=0.6)
+    axes.plot([x], [found.value], marker, color=colour, markersize=5, markerfacecolor="none" if hollow else colour)
+
+
+def _legend(axes: Any, schedules: Sequence[str]) -> None:
+    for schedule in schedules:
+        axes.plot([], [], "o", color=COLOURS[schedule], label=schedule.capitalize())
+    axes.legend(fontsize=8)
