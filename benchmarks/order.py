@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from order_exact import PatchStepper, about, make_scene, own_rollout
-from order_report import Results, comparisons, draw, read_rows, table, write_csv
+from order_report import Results, comparisons, draw, exact_table, read_rows, table, write_csv
 from order_scenes import Hanging, write_body, write_scene
 from recipes import ONE_PASS, Recipe, cell, fast, folder_of, run
 
@@ -50,6 +50,7 @@ HORIZON, STATES = 24, 4
 RADII = (4, 8, 15, 24, 31, 48, 64)
 #: Radii of steps that are exact as far as they go, and the motions of which they take rollouts: many minimisations each.
 PATCHES, PATCHED = (15, 48), 2
+EXACT = "exact.json"
 
 
 def recipe(scene: Hanging, schedule: str, updates: int, folder: Path) -> Recipe:
@@ -90,10 +91,9 @@ def train(updates: int, seeds: list[int], output: Path, kernels: str) -> None:
                     print(f"{time.monotonic() - begin:6.0f} s  {done}", file=sys.stderr)
 
 
-def exact(output: Path) -> dict[str, dict[str, Any]]:
+def exact(output: Path) -> None:
     """What the solver says about every scene, by its name; goes on where it was stopped."""
-    path, folder = output / "exact.json", scene_folder(output)
-    known: dict[str, dict[str, Any]] = json.loads(path.read_text()) if path.exists() else {}
+    folder, known = scene_folder(output), read_exact(output)
     for scene in FAMILY:
         stone = folder / "stone.npz"
         garment, _, motions = write_scene(scene, load_body(stone), folder)
@@ -104,10 +104,14 @@ def exact(output: Path) -> dict[str, dict[str, Any]]:
         for number in PATCHES:
             if f"patch{number}" not in entry:
                 entry[f"patch{number}"] = own_rollout(PatchStepper(number), scenes[:PATCHED], HORIZON, STATES)
-                write_atomically(path, json.dumps(known).encode())
-        patches = {number: entry[f"patch{number}"] for number in PATCHES}
-        print(f"{scene.name}: decay {entry['decay'] / scene.reach:.2f} ℓ, patches {patches}")
-    return known
+                write_atomically(output / EXACT, json.dumps(known).encode())
+        print(exact_table(Results([scene], SCHEDULES, [], known)), flush=True)
+
+
+def read_exact(output: Path) -> dict[str, dict[str, Any]]:
+    """What :func:`exact` has written so far."""
+    path = output / EXACT
+    return json.loads(path.read_text()) if path.exists() else {}
 
 
 def scene_folder(output: Path) -> Path:
@@ -121,10 +125,11 @@ def scene_folder(output: Path) -> Path:
 
 def report(updates: int, output: Path, figure: Path | None) -> None:
     """Print what is there of the runs, and draw it."""
-    known = exact(output)
-    results = Results(FAMILY, SCHEDULES, read_rows(output, updates), known)
+    known = read_exact(output)
+    rows = [row for row in read_rows(output, updates) if "newton" in known.get(row["scene"], {})]
+    results = Results(FAMILY, SCHEDULES, rows, known)
     write_csv(output / "order.csv", results)
-    print(table(results), comparisons(results), sep="\n\n")
+    print(exact_table(results), table(results), comparisons(results), sep="\n\n")
     if figure is not None:
         draw(results, figure)
 

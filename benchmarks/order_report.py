@@ -20,6 +20,8 @@ from hood.evaluation.bootstrap import LEVEL
 from hood.media.charts import write_png
 
 COLOURS = {"fine15": "#c8503c", "ours": "#2a6fbb", "fine48": "#3f8f4f"}
+#: Least and greatest γ of the figure.
+SHOWN = (1e-4, 1e3)
 #: What is compared, all better where they are lower and positive: titles by column.
 QUANTITIES = {"gap": "γ", "loss": "L above the solver's [e0]", "gradient": "gradient [weight of a vertex]"}
 
@@ -81,22 +83,40 @@ def read_rows(output: Path, updates: int) -> list[Row]:
     return [row for row in rows if row["updates"] == updates]
 
 
+def exact_table(results: Results) -> str:
+    """A line per scene and radius: what is so without a network."""
+    titles = ["scene", "radius", "radius / ℓ", "decay / ℓ", "γ, pins unfelt beyond", "γ, exact in the radius", "its strain p99"]
+    lines = [[*titles, "the solver's", "γ of the base", "γ of free flight"]]
+    for scene in results.family:
+        exact = results.exact.get(scene.name, {})
+        for radius in (15, 48):
+            if f"patch{radius}" in exact:
+                floors, patch = exact["floors"], exact[f"patch{radius}"]
+                unfelt, base, inertia = (f"{np.median(floors[name]):.2g}" for name in (str(radius), "base", "inertia"))
+                figures = [f"{radius * scene.edge / scene.reach:.2f}", f"{exact['decay'] / scene.reach:.2f}", unfelt]
+                strains = [f"{value:.1%}" for value in (patch["strain_p99"], exact["newton"]["strain_p99"])]
+                lines.append([scene.name, str(radius), *figures, f"{patch['gap']:.2g}", *strains, base, inertia])
+    return _markdown(lines)
+
+
 def table(results: Results) -> str:
     """A line per scene and schedule."""
-    titles = ["scene", "schedule", "radius / ℓ", *QUANTITIES.values(), "CPU s", "radius alone", "base", "seeds"]
-    lines = [titles]
+    lines = [["scene", "schedule", "radius / ℓ", *QUANTITIES.values(), "strain p99", "CPU s", "failed", "seeds"]]
     for scene in results.family:
         for schedule in results.schedules:
             found = {quantity: results.values(scene, schedule, quantity) for quantity in QUANTITIES}
             if not found["gap"]:
                 continue
             rows = [row for row in results.rows if (row["scene"], row["schedule"]) == (scene.name, schedule)]
-            floor = results.exact[scene.name]["floors"]
             cells = [str(mean(list(values.values()))) for values in found.values()]
-            seconds = f"{np.mean([row['cpu_s'] for row in rows]):.0f}"
-            floors = [f"{np.median(floor[name]):.2g}" for name in (str(rows[0]["radius"]), "base")]
-            lines.append([scene.name, schedule, f"{rows[0]['ratio']:.2f}", *cells, seconds, *floors, str(len(rows))])
-    return "\n".join("| " + " | ".join(line) + " |" for line in [lines[0], ["---"] * len(titles), *lines[1:]])
+            strain, seconds, failed = (np.mean([row[name] for row in rows]) for name in ("strain_p99", "cpu_s", "failed"))
+            figures = [f"{strain:.1%}", f"{seconds:.0f}", f"{failed:.0%}", str(len(rows))]
+            lines.append([scene.name, schedule, f"{rows[0]['ratio']:.2f}", *cells, *figures])
+    return _markdown(lines)
+
+
+def _markdown(lines: list[list[str]]) -> str:
+    return "\n".join("| " + " | ".join(line) + " |" for line in [lines[0], ["---"] * len(lines[0]), *lines[1:]])
 
 
 def comparisons(results: Results) -> str:
@@ -140,7 +160,7 @@ def draw(results: Results, path: Path) -> None:
 
 def _draw_decay(axes: Any, results: Results) -> None:
     axes.set_title("One exact step after the pins were moved", loc="left")
-    for scene in results.family:
+    for scene in _known(results):
         exact = results.exact[scene.name]
         distance, share = np.array(exact["distance"]) / scene.reach, np.array(exact["share"])
         order = np.argsort(distance)
@@ -153,16 +173,28 @@ def _draw_decay(axes: Any, results: Results) -> None:
 
 
 def _draw_gap(axes: Any, results: Results) -> None:
-    axes.set_title("γ: what the radius alone costs (lines), what was trained (points)", loc="left")
-    for scene in results.family:
+    axes.set_title("γ: trained (●), exact within the radius (◇), pins unfelt beyond it (lines)", loc="left")
+    for scene in _known(results):
         floors = results.exact[scene.name]["floors"]
         radii = sorted(int(name) for name in floors if name.isdigit())
         ratios = [radius * scene.edge / scene.reach for radius in radii]
-        axes.plot(ratios, [max(np.median(floors[str(radius)]), 1e-5) for radius in radii], color="#999999", linewidth=0.8)
+        axes.plot(ratios, [max(np.median(floors[str(radius)]), 1e-9) for radius in radii], color="#999999", linewidth=0.8)
+        for radius in (15, 48):
+            patch = results.exact[scene.name].get(f"patch{radius}")
+            if patch is not None:
+                height = min(max(patch["gap"], SHOWN[0]), SHOWN[1])  # beyond either end: at the edge
+                axes.plot([radius * scene.edge / scene.reach], [height], "D", color="#222222", markerfacecolor="none")
         for schedule in results.schedules:
             _point(axes, results, scene, schedule)
     _legend(axes, results.schedules)
-    axes.set(xscale="log", yscale="log", ylim=(1e-4, None), xlabel="radius / ℓ", ylabel="γ (own rollouts, median)")
+    axes.axvline(1.0, color="#222222", linewidth=0.8, linestyle=":")
+    ends = (SHOWN[0] / 1.5, SHOWN[1] * 1.5)
+    axes.set(xscale="log", yscale="log", ylim=ends, xlabel="radius / ℓ", ylabel="γ (own rollouts, median)")
+
+
+def _known(results: Results) -> list[Hanging]:
+    """Scenes that the solver has something to say about."""
+    return [scene for scene in results.family if "floors" in results.exact.get(scene.name, {})]
 
 
 def _point(axes: Any, results: Results, scene: Hanging, schedule: str) -> None:
