@@ -6,7 +6,7 @@ import csv
 import io
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,11 +19,14 @@ from hood.assets.atomic import write_atomically
 from hood.evaluation.bootstrap import LEVEL
 from hood.media.charts import write_png
 
+NAMES = {"fine15": "Fine15", "ours": "Ours", "fine48": "Fine48"}
 COLOURS = {"fine15": "#c8503c", "ours": "#2a6fbb", "fine48": "#3f8f4f"}
 #: Least and greatest γ of the figure.
 SHOWN = (1e-4, 1e3)
-#: What is compared, all better where they are lower and positive: titles by column.
+#: What is compared, better where it is lower: titles by column.
 QUANTITIES = {"gap": "γ", "loss": "L above the solver's [e0]", "gradient": "gradient [weight of a vertex]"}
+#: Not of one sign: own rollouts may lie lower than the solver's. Differences are looked at, of the others ratios.
+SIGNED = ("loss",)
 
 Row = Mapping[str, Any]
 #: What the solver says about a scene, see ``order.py exact``.
@@ -31,7 +34,7 @@ Exact = Mapping[str, Any]
 
 
 class Mean(NamedTuple):
-    """Geometric mean over seeds and the ends of its interval; the ends are NaN for fewer than two seeds."""
+    """Mean over seeds and the ends of its interval; the ends are NaN for fewer than two seeds."""
 
     value: float
     low: float
@@ -42,10 +45,22 @@ class Mean(NamedTuple):
 
 
 def mean(values: Sequence[float]) -> Mean:
-    """Of positive values, by Student's distribution of their logarithms."""
-    logs = np.log(values)
-    half = t.ppf((1 + LEVEL) / 2, len(logs) - 1) * logs.std(ddof=1) / math.sqrt(len(logs)) if len(logs) > 1 else math.nan
-    return Mean(*(float(np.exp(logs.mean() + side * half)) if side else float(np.exp(logs.mean())) for side in (0, -1, 1)))
+    """With an interval by Student's distribution."""
+    middle, count = float(np.mean(values)), len(values)
+    if count < 2:
+        return Mean(middle, math.nan, math.nan)
+    half = float(t.ppf((1 + LEVEL) / 2, count - 1) * np.std(values, ddof=1)) / math.sqrt(count)
+    return Mean(middle, middle - half, middle + half)
+
+
+def geometric_mean(values: Sequence[float]) -> Mean:
+    """Of positive values: that of their logarithms."""
+    return Mean(*map(math.exp, mean(np.log(values).tolist())))
+
+
+def summary(quantity: str) -> Callable[[Sequence[float]], Mean]:
+    """How values of a quantity are taken together."""
+    return mean if quantity in SIGNED else geometric_mean
 
 
 @dataclass(frozen=True)
@@ -71,10 +86,11 @@ class Results:
         return float(row[quantity])
 
     def behind(self, scene: Hanging, schedule: str, other: str, quantity: str) -> Mean | None:
-        """How many times as much as ``other``, seed by seed; None where no seed has both."""
+        """How many times as much as ``other``, or how much more, seed by seed; None where no seed has both."""
         mine, theirs = (self.values(scene, name, quantity) for name in (schedule, other))
-        both = sorted(mine.keys() & theirs.keys())
-        return mean([mine[seed] / theirs[seed] for seed in both]) if both else None
+        both, signed = sorted(mine.keys() & theirs.keys()), quantity in SIGNED
+        pairs = [mine[seed] - theirs[seed] if signed else mine[seed] / theirs[seed] for seed in both]
+        return summary(quantity)(pairs) if pairs else None
 
 
 def read_rows(output: Path, updates: int) -> list[Row]:
@@ -85,8 +101,16 @@ def read_rows(output: Path, updates: int) -> list[Row]:
 
 def exact_table(results: Results) -> str:
     """A line per scene and radius: what is so without a network."""
-    titles = ["scene", "radius", "radius / ℓ", "decay / ℓ", "γ, pins unfelt beyond", "γ, exact in the radius", "its strain p99"]
-    lines = [[*titles, "the solver's", "γ of the base", "γ of free flight"]]
+    titles = [
+        "scene",
+        "radius",
+        "radius / ℓ",
+        "decay / ℓ",
+        "γ, pins unfelt beyond",
+        "γ, exact within",
+        "strain p99, exact within",
+    ]
+    lines = [[*titles, "of the solver", "γ of the base", "γ of free flight"]]
     for scene in results.family:
         exact = results.exact.get(scene.name, {})
         for radius in (15, 48):
@@ -95,7 +119,7 @@ def exact_table(results: Results) -> str:
                 unfelt, base, inertia = (f"{np.median(floors[name]):.2g}" for name in (str(radius), "base", "inertia"))
                 figures = [f"{radius * scene.edge / scene.reach:.2f}", f"{exact['decay'] / scene.reach:.2f}", unfelt]
                 strains = [f"{value:.1%}" for value in (patch["strain_p99"], exact["newton"]["strain_p99"])]
-                lines.append([scene.name, str(radius), *figures, f"{patch['gap']:.2g}", *strains, base, inertia])
+                lines.append([scene.title, str(radius), *figures, f"{patch['gap']:.2g}", *strains, base, inertia])
     return _markdown(lines)
 
 
@@ -108,10 +132,10 @@ def table(results: Results) -> str:
             if not found["gap"]:
                 continue
             rows = [row for row in results.rows if (row["scene"], row["schedule"]) == (scene.name, schedule)]
-            cells = [str(mean(list(values.values()))) for values in found.values()]
+            cells = [str(summary(quantity)(list(values.values()))) for quantity, values in found.items()]
             strain, seconds, failed = (np.mean([row[name] for row in rows]) for name in ("strain_p99", "cpu_s", "failed"))
             figures = [f"{strain:.1%}", f"{seconds:.0f}", f"{failed:.0%}", str(len(rows))]
-            lines.append([scene.name, schedule, f"{rows[0]['ratio']:.2f}", *cells, *figures])
+            lines.append([scene.title, NAMES[schedule], f"{rows[0]['ratio']:.2f}", *cells, *figures])
     return _markdown(lines)
 
 
@@ -127,7 +151,8 @@ def comparisons(results: Results) -> str:
             for schedule in ("fine15", "ours"):
                 found = results.behind(scene, schedule, "fine48", quantity)
                 if found is not None:
-                    lines.append(f"{scene.name:18} {title:30} {schedule} / fine48: {found}")
+                    sign = "-" if quantity in SIGNED else "/"
+                    lines.append(f"{scene.title:22} {title:30} {NAMES[schedule]} {sign} Fine48: {found}")
     return "\n".join(lines)
 
 
@@ -143,7 +168,7 @@ def write_csv(path: Path, results: Results) -> None:
 
 
 def draw(results: Results, path: Path) -> None:
-    """Four panels: decay, floors beside what was trained, Fine15 and Ours against Fine48, the same for loss and gradient."""
+    """Four panels: decay, γ against the radius, γ and gradient against Fine48's, losses against Fine48's."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -153,18 +178,23 @@ def draw(results: Results, path: Path) -> None:
         panels = figure.subplots(2, 2)
         _draw_decay(panels[0, 0], results)
         _draw_gap(panels[0, 1], results)
-        _draw_behind(panels[1, 0], results, ("gap",))
-        _draw_behind(panels[1, 1], results, ("loss", "gradient"))
+        _draw_behind(panels[1, 0], results, {"gap": "o", "gradient": "s"})
+        panels[1, 0].set(title="γ (●) and gradient (□), times Fine48's with the same seed", yscale="log")
+        panels[1, 0].axhline(1.0, color="#222222", linewidth=0.8)
+        _draw_behind(panels[1, 1], results, {"loss": "o"})
+        panels[1, 1].set(title="loss L_total, above Fine48's with the same seed [e0]")
+        panels[1, 1].set_yscale("symlog", linthresh=1.0)
+        panels[1, 1].axhline(0.0, color="#222222", linewidth=0.8)
     write_png(figure, path)
 
 
 def _draw_decay(axes: Any, results: Results) -> None:
-    axes.set_title("One exact step after the pins were moved", loc="left")
+    axes.set_title("What an exact step makes of pins that are moved")
     for scene in _known(results):
         exact = results.exact[scene.name]
         distance, share = np.array(exact["distance"]) / scene.reach, np.array(exact["share"])
         order = np.argsort(distance)
-        axes.plot(distance[order], share[order], ".", markersize=2.5, label=scene.name.replace("_", " "))
+        axes.plot(distance[order], share[order], ".", markersize=2.5, label=scene.title)
     line = np.linspace(0.0, 4.0, 50)
     axes.plot(line, np.exp(-line), color="#222222", linewidth=1.0, label="exp(−distance / ℓ)")
     axes.set(xlim=(0.0, 4.0), ylim=(1e-2, 1.3), yscale="log", xlabel="distance from the pins / ℓ")
@@ -173,7 +203,7 @@ def _draw_decay(axes: Any, results: Results) -> None:
 
 
 def _draw_gap(axes: Any, results: Results) -> None:
-    axes.set_title("γ: trained (●), exact within the radius (◇), pins unfelt beyond it (lines)", loc="left")
+    axes.set_title("trained ●   exact within the radius ◇   pins unfelt beyond it –", fontsize=9)
     for scene in _known(results):
         floors = results.exact[scene.name]["floors"]
         radii = sorted(int(name) for name in floors if name.isdigit())
@@ -201,23 +231,20 @@ def _point(axes: Any, results: Results, scene: Hanging, schedule: str) -> None:
     values = list(results.values(scene, schedule, "gap").values())
     if values:
         ratio = next(row["ratio"] for row in results.rows if (row["scene"], row["schedule"]) == (scene.name, schedule))
-        _bar(axes, ratio, mean(values), COLOURS[schedule])
+        _bar(axes, ratio, geometric_mean(values), COLOURS[schedule])
 
 
-def _draw_behind(axes: Any, results: Results, quantities: Sequence[str]) -> None:
-    names = " and ".join({"gap": "γ", "loss": "loss (●)", "gradient": "gradient (□)"}[name] for name in quantities)
-    axes.set_title(f"{names}: times Fine48's, same seeds", loc="left")
+def _draw_behind(axes: Any, results: Results, markers: Mapping[str, str]) -> None:
     for scene in results.family:
         ratio = 15 * scene.edge / scene.reach
-        for place, (quantity, marker) in enumerate(zip(quantities, "os", strict=False)):
-            for schedule, shift in (("fine15", 0.97), ("ours", 1.03)):
+        for place, (quantity, marker) in enumerate(markers.items()):
+            for schedule, shift in (("fine15", 0.95), ("ours", 1.03)):
                 found = results.behind(scene, schedule, "fine48", quantity)
                 if found is not None:
-                    _bar(axes, ratio * shift * (1.0 + 0.02 * place), found, COLOURS[schedule], marker, hollow=place > 0)
-    axes.axhline(1.0, color="#222222", linewidth=0.8)
+                    _bar(axes, ratio * (shift + 0.02 * place), found, COLOURS[schedule], marker, hollow=place > 0)
     axes.axvline(1.0, color="#222222", linewidth=0.8, linestyle=":")
     _legend(axes, ("fine15", "ours"))
-    axes.set(xscale="log", yscale="log", xlabel="radius of Fine15 / ℓ   (left of 1 the rule has it fall behind)")
+    axes.set(xscale="log", xlabel="radius of Fine15 / ℓ   (left of 1 the rule has it fall behind)")
 
 
 def _bar(axes: Any, x: float, found: Mean, colour: str, marker: str = "o", hollow: bool = False) -> None:
@@ -228,5 +255,5 @@ def _bar(axes: Any, x: float, found: Mean, colour: str, marker: str = "o", hollo
 
 def _legend(axes: Any, schedules: Sequence[str]) -> None:
     for schedule in schedules:
-        axes.plot([], [], "o", color=COLOURS[schedule], label=schedule.capitalize())
+        axes.plot([], [], "o", color=COLOURS[schedule], label=NAMES[schedule])
     axes.legend(fontsize=8)

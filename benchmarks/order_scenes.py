@@ -46,6 +46,10 @@ class Hanging:
         return f"{self.cloth}_{1e3 * self.edge:.0f}mm_{self.fps}fps"
 
     @property
+    def title(self) -> str:
+        return f"{self.cloth}, {1e3 * self.edge:.0f} mm, {self.fps} fps"
+
+    @property
     def reach(self) -> float:
         """ℓ = c_p dt [m], over which the influence of a load decays in one implicit step of the default fabric."""
         return wave_speed() / self.fps
