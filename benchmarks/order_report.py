@@ -41,7 +41,8 @@ class Mean(NamedTuple):
     high: float
 
     def __str__(self) -> str:
-        return f"{self.value:.2g} ({self.low:.2g}–{self.high:.2g})" if math.isfinite(self.low) else f"{self.value:.2g}"
+        value, low, high = (f"{number:.0f}" if abs(number) >= 10 else f"{number:.2g}" for number in self)
+        return f"{value} ({low} to {high})" if math.isfinite(self.low) else value
 
 
 def mean(values: Sequence[float]) -> Mean:
@@ -85,11 +86,13 @@ class Results:
             return float(row["gradient_norm"] / exact["vertex_weight"])
         return float(row[quantity])
 
-    def behind(self, scene: Hanging, schedule: str, other: str, quantity: str) -> Mean | None:
+    def behind(self, scenes: Sequence[Hanging], schedule: str, other: str, quantity: str) -> Mean | None:
         """How many times as much as ``other``, or how much more, seed by seed; None where no seed has both."""
-        mine, theirs = (self.values(scene, name, quantity) for name in (schedule, other))
-        both, signed = sorted(mine.keys() & theirs.keys()), quantity in SIGNED
-        pairs = [mine[seed] - theirs[seed] if signed else mine[seed] / theirs[seed] for seed in both]
+        pairs: list[float] = []
+        for scene in scenes:
+            mine, theirs = (self.values(scene, name, quantity) for name in (schedule, other))
+            both = sorted(mine.keys() & theirs.keys())
+            pairs += [mine[seed] - theirs[seed] if quantity in SIGNED else mine[seed] / theirs[seed] for seed in both]
         return summary(quantity)(pairs) if pairs else None
 
 
@@ -117,9 +120,10 @@ def exact_table(results: Results) -> str:
             if f"patch{radius}" in exact:
                 floors, patch = exact["floors"], exact[f"patch{radius}"]
                 unfelt, base, inertia = (f"{np.median(floors[name]):.2g}" for name in (str(radius), "base", "inertia"))
+                reached = f"{patch['gap']:.2g}" if patch["gap"] < SHOWN[1] else "breaks"
                 figures = [f"{radius * scene.edge / scene.reach:.2f}", f"{exact['decay'] / scene.reach:.2f}", unfelt]
                 strains = [f"{value:.1%}" for value in (patch["strain_p99"], exact["newton"]["strain_p99"])]
-                lines.append([scene.title, str(radius), *figures, f"{patch['gap']:.2g}", *strains, base, inertia])
+                lines.append([scene.title, str(radius), *figures, reached, *strains, base, inertia])
     return _markdown(lines)
 
 
@@ -144,16 +148,24 @@ def _markdown(lines: list[list[str]]) -> str:
 
 
 def comparisons(results: Results) -> str:
-    """Fine15 and Ours against Fine48, scene by scene."""
+    """Fine15 and Ours against Fine48: scene by scene, then scenes where the rule has Fine15 fall behind, and the others."""
+    groups = {scene.title: [scene] for scene in results.family}
+    groups["Fine15 shorter than ℓ"] = [scene for scene in results.family if fine15_ratio(scene) < 1]
+    groups["Fine15 longer"] = [scene for scene in results.family if fine15_ratio(scene) >= 1]
     lines = []
-    for scene in results.family:
+    for name, scenes in groups.items():
         for quantity, title in QUANTITIES.items():
             for schedule in ("fine15", "ours"):
-                found = results.behind(scene, schedule, "fine48", quantity)
+                found = results.behind(scenes, schedule, "fine48", quantity)
                 if found is not None:
                     sign = "-" if quantity in SIGNED else "/"
-                    lines.append(f"{scene.title:22} {title:30} {NAMES[schedule]} {sign} Fine48: {found}")
+                    lines.append(f"{name:22} {title:30} {NAMES[schedule]} {sign} Fine48: {found}")
     return "\n".join(lines)
+
+
+def fine15_ratio(scene: Hanging) -> float:
+    """Radius of Fine15 over ℓ."""
+    return 15 * scene.edge / scene.reach
 
 
 def write_csv(path: Path, results: Results) -> None:
@@ -236,10 +248,10 @@ def _point(axes: Any, results: Results, scene: Hanging, schedule: str) -> None:
 
 def _draw_behind(axes: Any, results: Results, markers: Mapping[str, str]) -> None:
     for scene in results.family:
-        ratio = 15 * scene.edge / scene.reach
+        ratio = fine15_ratio(scene)
         for place, (quantity, marker) in enumerate(markers.items()):
             for schedule, shift in (("fine15", 0.95), ("ours", 1.03)):
-                found = results.behind(scene, schedule, "fine48", quantity)
+                found = results.behind([scene], schedule, "fine48", quantity)
                 if found is not None:
                     _bar(axes, ratio * (shift + 0.02 * place), found, COLOURS[schedule], marker, hollow=place > 0)
     axes.axvline(1.0, color="#222222", linewidth=0.8, linestyle=":")
