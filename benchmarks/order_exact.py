@@ -17,7 +17,6 @@ from hood.assets.body import load_body
 from hood.assets.garment import load_garment
 from hood.assets.sequence import load_sequence
 from hood.dynamics.equilibrium import find_equilibrium
-from hood.dynamics.frames import Relaxing
 from hood.dynamics.output import LocalStepOutput
 from hood.dynamics.rollout import simulate
 from hood.dynamics.simulator import Prediction
@@ -30,7 +29,7 @@ from hood.features.physical import GRAVITY
 from hood.losses.potential import default_potential, scale
 from hood.losses.problem import StepProblem, inertial_guess
 from hood.scene.cloth import Cloth
-from hood.scene.scene import RELAXING_DT, Scene, build_scene
+from hood.scene.scene import Scene, build_scene
 from hood.scene.state import State
 from hood.solver.iterate import in_double
 from hood.solver.newton import NewtonSettings, minimize
@@ -59,16 +58,12 @@ class PatchStepper(NewtonStepper):
     nearer to the pins, or farther from them, goes on as it came.
     """
 
-    relaxing = Relaxing.SETTLE
-
     def __init__(self, radius: int) -> None:
         super().__init__(POTENTIAL)
         self.radius = radius
 
     def predict(self, problem: StepProblem, prepared: None, watch: Stopwatch | None = None) -> Prediction:
-        """Positions from one minimisation for every number of edges from the pins; exact in relaxing steps."""
-        if float(problem.step.dt[0]) == RELAXING_DT:
-            return super().predict(problem, prepared, watch)
+        """Positions from one minimisation for every number of edges from the pins."""
         work = in_double(POTENTIAL.prepare(problem))
         hops = torch.as_tensor(from_pins(problem.cloth)[1])
         pos, farthest = goal(work, ahead(work)).clone(), int(hops.max())
