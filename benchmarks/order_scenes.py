@@ -28,7 +28,7 @@ STRAPS = 0.94
 SHAKE, PERIODS, SINES = (0.8, 0.4), (5.0, 20.0), 3
 #: The joint that moves the pins, and how far [m] from it they are: it swings them up and down and to and fro.
 JOINT, ARM = 1, 2.5
-#: The stone: a tetrahedron of this size [m], as far [m] behind the cloth as ahead of it there is nothing.
+#: The stone: a tetrahedron of this size [m], so far [m] from the cloth, where no contact is in reach.
 STONE, AWAY = 0.2, 2.0
 TRAINING_MOTIONS, HELD_OUT_MOTIONS, FRAMES = 12, 3, 100
 
@@ -107,7 +107,7 @@ def strip(edge: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         for upper in range(down - 1):
             a, b = number[left, upper : upper + 2]
             c, d = number[left + 1, upper : upper + 2]
-            # The lower of two columns' first vertices lies half an edge below the other's.
+            # Every second column lies half an edge lower; squares are cut so that all edges are of one length.
             faces += [(a, b, c), (b, d, c)] if left % 2 == 0 else [(a, d, c), (a, b, d)]
     return pos, np.array(faces), row.ravel() == 0
 
