@@ -21,6 +21,7 @@ from hood.dynamics.ranges import training_conditions
 from hood.dynamics.simulator import Simulator, build_simulator
 from hood.features.inputs import Inputs
 from hood.losses.layer_sides import LayerSides
+from hood.losses.layers import for_networks
 from hood.losses.potential import Potential, default_potential
 from hood.nn.choice import Choice
 from hood.scene.dataset import SceneSampler, Window
@@ -139,7 +140,7 @@ def test_the_model_file_says_what_it_was_trained_for(tmp_path: Path, sampler: Sc
     trainer = make(tmp_path, sampler, settings=settings, potential=default_potential(friction_coefficient=3.0))
     trainer.save()
     trained_for = load_simulator(tmp_path / "model.safetensors").trained_for
-    assert trained_for == training_conditions(sampler, default_potential(4e5, friction_coefficient=3.0))
+    assert trained_for == training_conditions(sampler, for_networks(default_potential(4e5, friction_coefficient=3.0)))
 
 
 def test_the_loss_that_is_reported_is_the_one_that_is_trained(tmp_path: Path, sampler: SceneSampler) -> None:
