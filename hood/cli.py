@@ -25,6 +25,7 @@ COMMANDS = {
     "rollout": "simulate a garment on a moving body",
     "evaluate": "table of cost and accuracy over the validation list",
     "tradeoff": "chart of time against accuracy over models, refinements and sizes",
+    "envelope": "map of where each method holds, at the extremes of everything",
     "compare": "show rollouts of one motion next to each other, coloured by strain or rg",
     "inspect": "say what files are, what is wrong with them and how to repair it",
     "prepare": "repair a garment, bind it to a body and write it for rollouts",
@@ -32,7 +33,7 @@ COMMANDS = {
 }
 
 #: Commands that take steps: libraries for these are compiled while torch is loaded, where that has not been done before.
-_SIMULATE = ("train", "rollout", "evaluate", "tradeoff")
+_SIMULATE = ("train", "rollout", "evaluate", "tradeoff", "envelope")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -167,7 +167,7 @@ def test_user_errors_are_one_line_and_leave_nothing(case: str, capsys: pytest.Ca
     assert sorted(path.name for path in tmp_path.rglob("*")) == before
 
 
-@pytest.mark.parametrize("command", ["train", "rollout", "evaluate", "tradeoff"])
+@pytest.mark.parametrize("command", ["train", "rollout", "evaluate", "tradeoff", "envelope"])
 def test_help_lists_keys_groups_and_names(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     from hood.config import load_config, plain
 
@@ -183,7 +183,7 @@ def test_help_lists_keys_groups_and_names(command: str, capsys: pytest.CaptureFi
 def test_usage_and_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([]) == 0
     usage = capsys.readouterr().out
-    assert all(command in usage for command in ("train", "rollout", "evaluate", "tradeoff", "compare"))
+    assert all(command in usage for command in ("train", "rollout", "evaluate", "tradeoff", "envelope", "compare"))
     assert main(["--version"]) == 0
     assert capsys.readouterr().out.strip() == f"hood {__version__}"
 

@@ -9,6 +9,7 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from hood.commands.cloth_contact import potential_of
+from hood.commands.common import weigh
 from hood.commands.dial import AUTO, other_dials, refined
 from hood.config import build
 from hood.dynamics.captured import network_of
@@ -86,7 +87,7 @@ def solver(config: DictConfig) -> NewtonStepper:
     alone = OmegaConf.merge(config, {"stepper": "newton"})
     assert isinstance(alone, DictConfig)
     stepper = NewtonStepper(potential_of(alone), build(config.solver))
-    stepper.gravity = stepper.gravity.to(str(config.device))
+    weigh(stepper, config)
     return stepper
 
 

@@ -25,15 +25,27 @@ from hood.evaluation.table import Candidate
 def make_candidate(name: str, config: DictConfig) -> Candidate:
     """A checkpoint by name or path, ``newton`` for the solver, ``guess`` for where it starts, or ``untrained:MODEL`` for seeded
     random weights; all but the solver with ``+k`` behind the name: every step refined by k iterations."""
+    start, iterations = split_refinement(name)
+    inner = _unrefined_candidate(start, config)
+    if iterations is None:
+        return inner
+    potential, settings = build(config.losses), build(config.solver)
+    stepper = RefinedStepper(inner.stepper, potential, Count(iterations), str(config.refine_method), settings)
+    return Candidate(f"{inner.name}+{iterations}", inner.weights, stepper, inner.training)
+
+
+def split_refinement(name: str) -> tuple[str, int | None]:
+    """``NAME+k`` as the name and k, None where there is none.
+
+    Raises:
+        ConfigError: the solver is to be refined.
+    """
     found = re.fullmatch(r"(.+)\+(\d+)", name)
     if found is None:
-        return _unrefined_candidate(name, config)
+        return name, None
     if found[1] == NEWTON:
         raise ConfigError(f"models: {name!r} refines what is solved already; {GUESS}+{found[2]} is the solver stopped early")
-    inner = _unrefined_candidate(found[1], config)
-    potential, settings = build(config.losses), build(config.solver)
-    stepper = RefinedStepper(inner.stepper, potential, Count(int(found[2])), str(config.refine_method), settings)
-    return Candidate(f"{inner.name}+{found[2]}", inner.weights, stepper, inner.training)
+    return found[1], int(found[2])
 
 
 def _unrefined_candidate(name: str, config: DictConfig) -> Candidate:

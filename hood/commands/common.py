@@ -17,6 +17,7 @@ from hood.config import ConfigError, plain, require_choice
 from hood.dynamics.checkpoint import load_simulator
 from hood.dynamics.reference import SUFFIXES, load_reference_checkpoint
 from hood.dynamics.simulator import Simulator
+from hood.dynamics.stepper import Stepper
 from hood.nn.choice import AUTO, Choice, choose_kernels
 from hood.nn.compiled import check_kernels
 from hood.nn.precision import check_precision
@@ -102,6 +103,11 @@ def read_model(path: Path, fps: float) -> Simulator:
     if frame_dt is not None and abs(fps * frame_dt - 1) > 1e-3:
         raise ConfigError(f"fps={fps:g}: {path} knows steps of 1/{1 / frame_dt:g} s only; use fps={1 / frame_dt:g}")
     return simulator
+
+
+def weigh(stepper: Stepper, config: DictConfig) -> None:
+    """Let ``config.gravity`` [m/s²] act in the stepper's steps, on ``config.device``."""
+    stepper.gravity = torch.tensor([0.0, -float(config.gravity), 0.0], device=str(config.device))
 
 
 def use_arithmetic(simulator: Simulator, config: DictConfig, traced: bool = False) -> None:

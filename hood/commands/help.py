@@ -41,6 +41,10 @@ _EXAMPLES = {
         "hood tradeoff",
         "hood tradeoff models=[runs/a/model.safetensors] precisions=[fp32] garments_4k=[] garments_12k=[] output=outputs/a",
     ],
+    "envelope": [
+        "hood envelope",
+        "hood envelope models=[runs/a/model.safetensors,newton] factors=[dt,spin,teleport] output=outputs/a",
+    ],
 }
 
 

@@ -31,6 +31,7 @@ from hood.commands.common import (
     thinning,
     together,
     use_arithmetic,
+    weigh,
 )
 from hood.commands.dial import AUTO, check_dial, chosen, exported, refined
 from hood.commands.notices import heard
@@ -214,13 +215,14 @@ def make_stepper(config: DictConfig) -> tuple[Stepper, str]:
     """What takes the steps, before they are refined, and the SHA-256 of its weights (``none`` without a network)."""
     if str(config.stepper) in ("network", AUTO):
         simulator, digest = make_simulator(config)
+        weigh(simulator, config)
         use_arithmetic(simulator, config, traced=str(config.step) == "compiled")
         stepper: Stepper = simulator if str(config.step) == PLAIN else CapturedSimulator(simulator, str(config.step))
         return stepper, digest
     potential = potential_of(config)
     kind = GuessStepper if str(config.stepper) == "refine" else NewtonStepper
     solver = kind(potential, build(config.solver))
-    solver.gravity = solver.gravity.to(str(config.device))
+    weigh(solver, config)
     if str(config.step) == PLAIN:
         return solver, "none"
     if not isinstance(solver, NewtonStepper):
@@ -344,6 +346,8 @@ def _check_numbers(config: DictConfig) -> None:
     thinning(config)
     if not 1.0 <= float(config.fps) <= 1000.0:
         raise ConfigError(f"fps={config.fps}: give the simulation's frames per second, 1 to 1000")
+    if not 0.0 <= float(config.gravity) <= 1000.0:
+        raise ConfigError(f"gravity={config.gravity}: give m/s², downwards, 0 to 1000")
 
 
 def _write_json(path: Path, value: dict[str, Any]) -> None:

@@ -19,6 +19,7 @@ from hood.assets.garment import Garment
 from hood.assets.material import RANGES, Material, values_of
 from hood.assets.motions import MotionFiles
 from hood.losses.potential import Potential
+from hood.losses.problem import STANDARD_GRAVITY
 from hood.mesh.topology import connected_components, unique_edges
 from hood.scene.cloth import Cloth
 from hood.scene.dataset import SceneSampler
@@ -38,14 +39,17 @@ _TAKEN = ("reach", "sides")
 
 Span = tuple[float, float]
 
+#: What all trainings have had, those of files that do not say included.
+_EARTH: dict[str, Span] = {"gravity": (STANDARD_GRAVITY, STANDARD_GRAVITY)}
+
 
 @dataclass(frozen=True)
 class Conditions:
     """Least and greatest values by quantity, of a training or of a scene, and the potential's settings.
 
-    Quantities: ``fps`` [1/s]; ``material.NAME`` [SI]; ``vertices`` of the largest connected piece of a garment; ``edge_length``
-    [m], the mean of a garment's edges at rest, before it grows with a body; ``size``, a factor on the garment; ``betas``, shape
-    coefficients. Those that a scene does not have (no parametric body) are absent.
+    Quantities: ``fps`` [1/s]; ``gravity`` [m/s²]; ``material.NAME`` [SI]; ``vertices`` of the largest connected piece of a
+    garment; ``edge_length`` [m], the mean of a garment's edges at rest, before it grows with a body; ``size``, a factor on the
+    garment; ``betas``, shape coefficients. Those that a scene does not have (no parametric body) are absent.
     """
 
     spans: Mapping[str, Span]
@@ -64,7 +68,7 @@ class Conditions:
         """
         try:
             content = json.loads(text)
-            spans = {str(name): (float(low), float(high)) for name, (low, high) in content["spans"].items()}
+            spans = _EARTH | {str(name): (float(low), float(high)) for name, (low, high) in content["spans"].items()}
             terms = {str(name): dict(term) for name, term in content["potential"].items()}
             potential = {name: _LATER.get(str(term.get("term")), {}) | term for name, term in terms.items()}
         except (KeyError, TypeError, ValueError, AttributeError) as error:
@@ -76,11 +80,16 @@ class Conditions:
 
 
 def scene_conditions(
-    garment: Garment, cloth: Cloth, dt: float, potential: Potential, betas: np.ndarray | None = None
+    garment: Garment,
+    cloth: Cloth,
+    dt: float,
+    potential: Potential,
+    betas: np.ndarray | None = None,
+    gravity: float = STANDARD_GRAVITY,
 ) -> Conditions:
     """What a garment of the fabric of ``cloth`` asks of a model, in steps of ``dt`` [s], at the size it has, on a body of shape
-    ``betas`` (S,)."""
-    spans: dict[str, Span] = {"fps": (1.0 / dt, 1.0 / dt), "size": (1.0, 1.0)}
+    ``betas`` (S,), under ``gravity`` [m/s²]."""
+    spans: dict[str, Span] = {"fps": (1.0 / dt, 1.0 / dt), "size": (1.0, 1.0), "gravity": (gravity, gravity)}
     fabric = {f"material.{name}": getattr(cloth, name) for name in Material.names()}
     spans |= {name: _extent(values) for name, values in fabric.items() if values.numel()}
     spans |= _resolution([garment])
@@ -94,7 +103,7 @@ def training_conditions(sampler: SceneSampler, potential: Potential) -> Conditio
     low, high = sampler.size_low, sampler.size_high
     motions = sampler.sequences
     fps = [motions.fps] if isinstance(motions, MotionFiles) else [motion.fps for motion in motions]
-    spans: dict[str, Span] = {"fps": (min(fps), max(fps)), "size": (low, high)}
+    spans: dict[str, Span] = {"fps": (min(fps), max(fps)), "size": (low, high), **_EARTH}
     spans["betas"] = (-sampler.beta_range, sampler.beta_range)
     spans |= {f"material.{name}": span for name, span in _fabrics(sampler.material).items()}
     spans |= _resolution(sampler.garments)

@@ -16,6 +16,9 @@ from hood.assets.library import locate
 from hood.assets.sequence import PoseSequence
 from hood.cli import main
 from hood.commands.cautions import evaluation_cautions, scene_cautions
+from hood.commands.common import weigh
+from hood.commands.rollout import make_stepper
+from hood.config import load_config
 from hood.dynamics.checkpoint import load_simulator, save_simulator
 from hood.dynamics.goals import Count
 from hood.dynamics.ranges import Conditions, scene_conditions
@@ -141,3 +144,23 @@ def test_inspect_prints_the_ranges(tmp_path: Path, capsys: pytest.CaptureFixture
     save_simulator(tmp_path / "old.safetensors", build_simulator("paper", "acceleration", "1x(mesh)", latent_dim=8))
     assert main(["inspect", str(tmp_path / "old.safetensors")]) == 0
     assert "trained on: unknown" in capsys.readouterr().out
+
+
+def test_a_gravity_that_nobody_was_trained_for(quickstart: Simulator, tank_scene: Scene) -> None:
+    heavy = quickstart.clone().eval()
+    weigh(heavy, load_config("rollout", ["gravity=98.1"]))
+    (sentence,) = scene_cautions(heavy, tank_scene, DEFAULT, "quickstart")
+    assert sentence.startswith("quickstart was not trained for gravity=98.1 (trained on 9.81)")
+    assert scene_cautions(quickstart, tank_scene, DEFAULT, "quickstart") == []
+
+
+@pytest.mark.parametrize("kind", ["stepper=newton", "stepper=refine", "checkpoint=small1"])
+def test_gravity_acts_in_every_stepper(kind: str) -> None:
+    stepper, _ = make_stepper(load_config("rollout", [kind, "gravity=1.62", "kernels=torch"]))
+    assert stepper.gravity.tolist() == pytest.approx([0.0, -1.62, 0.0])
+
+
+@pytest.mark.parametrize("value", ["-1", ".inf", "2000"])
+def test_a_gravity_that_is_none_is_refused(value: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["rollout", f"gravity={value}"]) == 2
+    assert "gravity" in capsys.readouterr().err

@@ -20,6 +20,7 @@ from hood.testing import grid
 
 TRAINED = Conditions(
     {
+        "gravity": (9.81, 9.81),
         "fps": (24.0, 30.0), "size": (0.9, 1.1), "betas": (-2.0, 2.0), "vertices": (900.0, 1100.0), "edge_length": (0.02, 0.04),
         "material.thickness": (4e-4, 5e-4), **{f"material.{name}": span for name, span in RANGES.items()},
     },
@@ -103,6 +104,13 @@ def test_text_is_read_back_exactly() -> None:
 def test_other_texts_are_refused(text: str) -> None:
     with pytest.raises(ValueError, match="training range"):
         Conditions.from_json(text)
+
+
+def test_files_that_do_not_tell_of_gravity_know_that_of_the_earth() -> None:
+    old = Conditions.from_json('{"spans": {"fps": [30, 30]}, "potential": {}}')
+    assert old.spans["gravity"] == (9.81, 9.81)
+    (sentence,) = outside(old, Conditions({"fps": (30.0, 30.0), "gravity": (98.1, 98.1)}, {}))
+    assert sentence == "gravity=98.1 (trained on 9.81)"
 
 
 def test_what_a_cloth_asks() -> None:
