@@ -64,7 +64,7 @@ def describe(name: str) -> str:
     if groups:
         lines += ["", "config groups (their keys can be overridden too, e.g. material.density=0.3):"]
         lines += [f"  {group + '=':<14}{' | '.join(options(group))}" for group in groups]
-    if groups or name == "tradeoff":
+    if groups or name in ("tradeoff", "envelope"):
         lines += ["", "embedded names:"]
         for kind, label in (("garments", "garment"), ("motions", "sequence"), ("body", "body"), ("weights", "checkpoint")):
             lines.append(textwrap.fill(f"  {label + '=':<14}{' '.join(library.names(kind))}", 118, subsequent_indent=" " * 16))
