@@ -32,6 +32,7 @@ from hood.losses.layers import for_networks, has_layers
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
 from hood.scene.contact import Contact, find_contact
+from hood.scene.jumps import carried, describe_jumps, find_jumps
 from hood.scene.mesh_motion import wearable
 from hood.scene.scene import LEAD_IN, RELAXING_DT, NotWornError, Scene, recentre
 from hood.scene.start import free_stretch, push_out
@@ -116,6 +117,8 @@ def simulate(
     own (:func:`own_start`) keeps ``paper``. Either way frame 0 has the velocity
     of the skinned garment.
 
+    Where the body jumps, as at a cut in a recording, the cloth is carried along (:mod:`hood.scene.jumps`); a warning says so.
+
     The cloth of a frame always belongs to the body of the same frame. A frame's energies belong to the step that led to it,
     as do its times. The simulation goes on over non-finite frames, so that their number and place are seen. ``observe`` sees
     every step from frame to frame, outside its time.
@@ -155,6 +158,7 @@ def simulate(
     known_fields = {name: torch.full((scene.cloth.num_vertices,), torch.nan) for name in fields}
     wants_potential = metrics == "all" or bool(fields)
     meter = SurfaceMeter(scene.garment, scene.motion.faces) if metrics == "all" else None
+    jumps = _jumps_within(scene, start_frame, count)
     watch = Stopwatch()
     for index in range(count):
         body_frame = start_frame + index
@@ -163,10 +167,13 @@ def simulate(
         if index + 1 < count:
             with watch.part("posing"):
                 closed = None if attachments is None else attachments(index)
-                step = scene.step_input(body_frame, state, attachments=closed)
+                if body_frame in jumps:
+                    there, step = carried(scene, body_frame, state, closed)
+                else:
+                    there, step = state, scene.step_input(body_frame, state, attachments=closed)
                 if relaxing and index == 0:
                     step = replace(step, dt=torch.full_like(step.dt, RELAXING_DT))
-                problem = StepProblem(scene.cloth, state, step, gravity=stepper.gravity.to(state.pos))
+                problem = StepProblem(scene.cloth, there, step, gravity=stepper.gravity.to(state.pos))
             with watch.part("search"):
                 problem = stepper.search(problem)
         with watch.aside("metrics"):
@@ -182,7 +189,7 @@ def simulate(
         if problem is None or known is None:
             return
         prediction = stepper.predict(problem, prepared, watch)
-        state = State(prediction.next_pos, stepper.next_velocity(problem, prediction), state.origin)
+        state = State(prediction.next_pos, stepper.next_velocity(problem, prediction), problem.state.origin)
         stepped = _times(stepper, watch.lap()) | prediction.metrics
         if has_layers(potential):
             stepped |= layer_metrics(known, prediction.next_pos)
@@ -195,6 +202,15 @@ def simulate(
         if observe is not None:
             with watch.aside("caller"):
                 observe(index + 1, known, prediction)
+
+
+def _jumps_within(scene: Scene, start_frame: int, count: int) -> dict[int, float]:
+    """Jumps of the body in these frames, by frame; a warning says so."""
+    jumps = find_jumps(scene.motion, 1.0 / scene.dt)
+    within = {frame: metres for frame, metres in jumps.items() if start_frame <= frame < start_frame + count - 1}
+    if within:
+        warnings.warn(describe_jumps(scene.motion, within), stacklevel=3)
+    return within
 
 
 def _times(stepper: Stepper, lap: dict[str, float]) -> dict[str, float]:

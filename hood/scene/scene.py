@@ -65,10 +65,10 @@ class Scene:
         """
         vel = self.start_velocity(frame) if relaxed else torch.zeros_like(self.cloth.rest_pos)
         if self.start_pos is not None and frame == 0:
-            origin = _snap(self.start_pos.mean(axis=0), 2 * _GRID)  # where a rollout would move it, see recentre
+            origin = local_origin(self.start_pos.mean(axis=0), 2 * _GRID)  # where a rollout would move it, see recentre
             pos = torch.as_tensor(self.start_pos - origin).to(self.cloth.rest_pos)
             return State(pos=pos, vel=vel, origin=torch.as_tensor(origin).unsqueeze(0))
-        origin = _snap(self.motion.translation[frame])
+        origin = local_origin(self.motion.translation[frame])
         skinned = self.motion.skinned(self.garment, frame, origin)
         obstacle = self.motion.obstacle(frame, origin, static=True)
         pos = settle(self.cloth, skinned, obstacle, self.clearance, thorough=thorough)
@@ -247,5 +247,6 @@ def _concatenate_attachments(items: Sequence[Attachments | None], vertex_counts:
     return Attachments(torch.cat(edges), torch.cat(active)) if edges else None
 
 
-def _snap(position: np.ndarray, grid: float = _GRID) -> np.ndarray:
+def local_origin(position: np.ndarray, grid: float = _GRID) -> np.ndarray:
+    """The origin (3,) [m] of a state near a position: a multiple of the grid."""
     return np.round(position / grid) * grid
