@@ -21,6 +21,7 @@ from hood.assets.library import locate
 from hood.commands.candidates import split_refinement
 from hood.commands.common import output_folder, prepare_folder, require_distinct, require_same_config, together
 from hood.commands.rollouts_beside import Ended, run_beside
+from hood.commands.surface_report import surface_warnings
 from hood.config import ConfigError, load_config, save_run_record
 from hood.dynamics.recorder import read_rollout
 from hood.evaluation.envelope import Cell, Criteria, Judged, Run, cells, judge, shares, table
@@ -195,7 +196,9 @@ def _outcome(task: Task, folder: Path) -> Run:
         data = read_rollout(at / "rollout.h5")
     except (OSError, ValueError):
         return Run(int(record["exit_code"]), str(record["error"]))
-    said = (*summary.get("warnings", ()), *summary.get("unsound_reasons", ()))
+    surface = summary.get("surface")
+    told = () if surface is None else surface_warnings(surface)
+    said = (*summary.get("warnings", ()), *summary.get("unsound_reasons", ()), *told)
     finite = np.isfinite(data.cloth_pos).all(axis=(1, 2))
     return Run(int(record["exit_code"]), str(record["error"]), said, {**data.metrics, "finite": finite})
 

@@ -48,7 +48,7 @@ def describe_surface(surface: Mapping[str, Any] | None) -> list[str]:
         f"skin at most {1e3 * depth['worst']:.1f} mm above the cloth",
         *crossed,
     ]
-    return [f"surface{every}: {', '.join(found)}", *_warnings(surface)]
+    return [f"surface{every}: {', '.join(found)}", *surface_warnings(surface)]
 
 
 def _apart_from_folds(surface: Mapping[str, Any]) -> str:
@@ -64,7 +64,7 @@ def cut_at_worst(surface: Mapping[str, Any] | None) -> str:
     return "skin through cloth n/a" if surface is None else f"skin cuts {surface['cut_face_share']['worst']:.1%} at worst"
 
 
-def _warnings(surface: Mapping[str, Any]) -> list[str]:
+def surface_warnings(surface: Mapping[str, Any]) -> list[str]:
     cut, lines = surface["cut_face_share"], []
     if cut["worst"] > WORST_CUT:
         lines.append(

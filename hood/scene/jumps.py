@@ -41,8 +41,8 @@ def describe_jumps(motion: Motion, jumps: dict[int, float]) -> str:
     named = ", ".join(map(str, frames[:4])) + ("" if len(frames) <= 4 else f" and {len(frames) - 4} more")
     many = "s" if len(frames) > 1 else ""
     return (
-        f"{motion.name!r} jumps by up to {max(jumps.values()):.2g} m after frame{many} {named}, as at a cut: the cloth is carried "
-        "along there; start and stop leave a part of the motion out"
+        f"{motion.name!r} jumps by up to {max(jumps.values()):.2g} m after frame{many} {named}, as at a cut: the cloth is "
+        "carried along there; start and stop leave a part of the motion out"
     )
 
 
