@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import weakref
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -14,6 +15,7 @@ from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
 from hood.mesh.kept import forget
 from hood.scene.cloth import Cloth
+from hood.solver.elements import FaceModel
 from hood.solver.forces import CLOSED_FORM
 from hood.solver.global_step import PositiveMatrix, global_step
 from hood.solver.linear import invert_blocks
@@ -48,15 +50,10 @@ class LocalTerms:
         acc = self.problem.acceleration(pos)
         own = terms.vertices.model(pos, acc)
         gradient, matrix = own.gradient, own.matrix
-        parts = []
         faces, hinges = terms.faces(pos), terms.hinges(pos)
-        if faces is not None:
-            parts.append(torch.cat([faces.gradient.transpose(0, 1), _diagonal(faces.matrix)]).flatten(1))
-        for slope, row in hinges:
-            parts.append(torch.cat([slope.transpose(0, 1), torch.stack([row[:, a] * row[:, b] for a, b in _PAIRS])]).flatten(1))
-        if parts:
+        if faces is not None or hinges:
             order, offsets = self._incidence
-            table = torch.cat(parts, dim=1).t().contiguous()
+            table = torch.cat([_of_faces(faces, cloth, pos), _of_hinges(hinges, cloth, pos)], dim=1).t().contiguous()
             sums = functional.embedding_bag(order, table, offsets, mode="sum", include_last_offset=True)
             gradient = gradient + sums[:, :3]
             a, b, c, d, e, f = sums[:, 3:].unbind(dim=1)
@@ -103,6 +100,21 @@ def check_local(potential: Potential) -> None:
             )
     if not any(type(term) is Inertia for term in potential.terms.values()):
         raise ValueError("losses.terms: no inertia, without which what single vertices would do is not determined")
+
+
+def _of_faces(faces: FaceModel | None, cloth: Cloth, pos: Tensor) -> Tensor:
+    """(9, 3F) gradient and diagonal block of the corners; zeros without a membrane, which has its place all the same."""
+    if faces is None:
+        return pos.new_zeros(9, cloth.faces.numel())
+    return torch.cat([faces.gradient.transpose(0, 1), _diagonal(faces.matrix)]).flatten(1)
+
+
+def _of_hinges(hinges: Sequence[tuple[Tensor, Tensor]], cloth: Cloth, pos: Tensor) -> Tensor:
+    """(9, 4H) the same of all bending terms together."""
+    parts = [
+        torch.cat([slope.transpose(0, 1), torch.stack([row[:, a] * row[:, b] for a, b in _PAIRS])]) for slope, row in hinges
+    ]
+    return sum(parts[1:], start=parts[0]).flatten(1) if parts else pos.new_zeros(9, cloth.hinges.numel())
 
 
 def _diagonal(upper: Tensor) -> Tensor:

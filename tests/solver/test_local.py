@@ -42,3 +42,14 @@ def test_a_vertex_alone_gains_by_its_step(band_scene: Scene) -> None:
         expected = 0.2 * float((view.step[vertex] * view.force[vertex]).sum())
         assert expected > 0
         assert 0.5 * expected < float(gained) < 1.1 * expected
+
+
+@pytest.mark.parametrize("left_out", [("bending",), ("stretching",), ("stretching", "bending")])
+def test_terms_that_are_left_out_have_no_part_in_it(band_scene: Scene, left_out: tuple[str, ...]) -> None:
+    potential = default_potential()
+    potential = potential.only({name: term for name, term in potential.terms.items() if name not in left_out})
+    problem, pos = problem_of(band_scene)
+    known = potential.prepare(problem)
+    force = LocalTerms(potential, known)(pos).force
+    expected = torch.where(problem.cloth.free.unsqueeze(1), -potential.gradient(known, pos)[0], 0.0)
+    torch.testing.assert_close(force, expected, rtol=1e-3, atol=1e-3 * float(expected.abs().max()))
