@@ -68,7 +68,7 @@ class Conditions:
         """
         try:
             content = json.loads(text)
-            spans = _EARTH | {str(name): (float(low), float(high)) for name, (low, high) in content["spans"].items()}
+            spans = {str(name): (float(low), float(high)) for name, (low, high) in content["spans"].items()}
             terms = {str(name): dict(term) for name, term in content["potential"].items()}
             potential = {name: _LATER.get(str(term.get("term")), {}) | term for name, term in terms.items()}
         except (KeyError, TypeError, ValueError, AttributeError) as error:
@@ -114,7 +114,7 @@ def training_conditions(sampler: SceneSampler, potential: Potential) -> Conditio
 def outside(trained: Conditions, asked: Conditions) -> list[str]:
     """One sentence for every quantity and every setting of the potential that ``asked`` has outside of ``trained``."""
     sentences = []
-    for name, (low, high) in trained.spans.items():
+    for name, (low, high) in {**_EARTH, **trained.spans}.items():
         least, most = asked.spans.get(name, (low, high))
         too_high, too_low = most > high + _ROUNDING * abs(high), least < low - _ROUNDING * abs(low)
         if too_high or too_low:
