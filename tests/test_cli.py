@@ -218,6 +218,38 @@ def test_an_interrupt_has_its_own_exit_code(
     assert not list(tmp_path.rglob("*.partial"))
 
 
+def test_a_running_rollout_is_told_from_one_that_was_stopped(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """While it runs its frames so far are read, and a second run into its folder is refused with nothing changed."""
+    from hood.dynamics.simulator import Simulator
+
+    step, calls, reports = Simulator.predict, [], []
+    command = ["rollout", *UNTRAINED, "garment=tank", "video=none", "sheet=false", "output=run"]
+
+    def look(*arguments: object) -> object:
+        calls.append(1)
+        if len(calls) == 2:
+            capsys.readouterr()
+            assert main(["inspect", "run/rollout.h5"]) in (0, 1)  # untrained weights need not be sound
+            reports.append(capsys.readouterr().out)
+            before = (tmp_path / "run" / "config.yaml").read_bytes()
+            assert main([*command, "num_frames=4"]) == 2
+            reports.append(capsys.readouterr().err)
+            assert (tmp_path / "run" / "config.yaml").read_bytes() == before
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return step(*arguments)
+
+    monkeypatch.setattr(Simulator, "predict", look)
+    assert main([*command, "num_frames=9"]) == 130
+    assert "  so far: 2 of 9 frames, its run goes on\n" in reports[0]
+    assert "not finished" not in reports[0]
+    assert "hood: error: run: another run is writing there; wait for its end or choose another output\n" in reports[1]
+    assert main(["inspect", "run/rollout.h5"]) == 1
+    assert "! not finished: 3 of 9 frames, and no run on this machine is writing it; run hood" in capsys.readouterr().out
+
+
 @pytest.fixture(scope="module")
 def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("rollout") / "run"

@@ -18,6 +18,7 @@ from hood.assets.garment import Garment, garment_of_mesh, load_garment, locate_g
 from hood.assets.library import locate
 from hood.assets.mesh_file import MESH_SUFFIXES, read_mesh_file
 from hood.assets.motion_file import read_recording
+from hood.assets.occupied import is_occupied
 from hood.assets.pins import opening_names, read_indices
 from hood.assets.placement import surrounds
 from hood.assets.standing import arms_down
@@ -309,8 +310,17 @@ def inspect_rollout(name: str) -> Finding:
         state = "not judged" if verdict.sound is None else "unsound"
         finding.problem(f"{state}: {'; '.join(verdict.reasons)}", _SIMULATE_AGAIN)
     if not finding.facts["complete"]:
-        finding.problem("it was interrupted", "run hood rollout again")
+        _tell_progress(finding, Path(name), len(data.cloth_pos), data.attributes.get("num_planned"))
     return finding
+
+
+def _tell_progress(finding: Finding, path: Path, done: int, planned: Any) -> None:
+    """How far an unfinished rollout is: a fact while its run goes on, else a problem."""
+    frames = f"{done} frames" if planned is None else f"{done} of {int(planned)} frames"
+    if is_occupied(path.parent):
+        finding.facts["so far"] = f"{frames}, its run goes on"
+    else:
+        finding.problem(f"not finished: {frames}, and no run on this machine is writing it", "run hood rollout again")
 
 
 def inspect_pickle(name: str, kind: str) -> Finding:

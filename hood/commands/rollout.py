@@ -18,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from hood.assets.library import locate
+from hood.assets.occupied import occupy
 from hood.commands.automatic import advice, choose
 from hood.commands.batch import Job, find_jobs, share
 from hood.commands.cautions import scene_cautions, warn
@@ -119,12 +120,27 @@ def _run_heard(
     _check_start(config, stepper, scene)
     tell_if_off(config, 1 if scene.outfit is None else len(scene.outfit.names))
     warn(scene_cautions(stepper, scene, build(config.losses), str(config.checkpoint)))
-    folder = prepare_folder(output_folder(config))
+    with occupy(prepare_folder(output_folder(config))):
+        return _run_there(config, asked, scene, stepper, digest, asdict(choice), warned, advise)
+
+
+def _run_there(
+    config: DictConfig,
+    asked: DictConfig,
+    scene: Scene,
+    stepper: Stepper,
+    digest: str,
+    choice: dict[str, Any],
+    warned: list[str],
+    advise: bool,
+) -> tuple[dict[str, Any], bool]:
+    """The rollout in its folder, which is there and held."""
+    folder = output_folder(config)
     (folder / "summary.json").unlink(missing_ok=True)  # its presence says that everything is there
     save_run_record(folder, config, int(config.seed))
     interrupted = _simulate_to_disk(config, scene, stepper, digest, folder / "rollout.h5", asked)
     summary = summarise(folder / "rollout.h5")
-    summary["choice"] = asdict(choice)
+    summary["choice"] = choice
     print(describe(summary))
     if advise:
         _tell(advice(config, scene, summary, _first_positions(folder / "rollout.h5")))

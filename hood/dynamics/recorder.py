@@ -1,10 +1,11 @@
-"""Rollouts on disk: frames stream into ``rollout.h5``, readable at any moment, also after the process was killed."""
+"""Rollouts on disk: frames stream into ``rollout.h5``, readable at any moment: by others while it grows, and after a kill."""
 
 from __future__ import annotations
 
 import errno
 import json
 import os
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,11 +24,15 @@ class RolloutWriter:
 
     Datasets: ``cloth/pos (T,V,3)``, ``cloth/faces``, ``cloth/rest_pos``, ``body/pos (T,W,3)``, ``body/faces``, ``time (T,)``,
     ``metrics/* (T,)``, and of every vertex ``cloth/NAME (T,V)`` for each name in ``fields``; attributes: ``num_frames`` done
-    so far, ``complete``, and what is given as ``attributes``. Real numbers are float32, positions far from the origin
-    float64; with ``double`` the cloth's are float64 anyway, for states that meet an accuracy which float32 does not resolve.
+    so far of ``num_planned``, ``complete``, and what is given as ``attributes``. Real numbers are float32, positions far from
+    the origin float64; with ``double`` the cloth's are float64 anyway, for states that meet an accuracy which float32 does
+    not resolve.
 
-    All datasets are laid out, filled with NaN, when the file is made: a full disk shows at once, and later writes never
-    touch the file's structure, so a killed process leaves a file that opens; its frames end at ``num_frames``.
+    All datasets are laid out, filled with NaN, before the file takes its name: a full disk shows at once, and later writes
+    never touch the file's structure. A frame is counted in ``num_frames`` after its values are written. So whoever opens the
+    file at any moment, with plain ``h5py.File(path)``, finds a sound file that ends at ``num_frames``, and a killed process
+    leaves one. HDF5's own mode for this (SWMR) would forbid the attributes, need a repair after a kill, and it does not hold
+    on network disks. A reader opens the file anew for later frames.
     On a normal close after fewer frames, the file is cut to the frames done.
     """
 
@@ -48,7 +53,12 @@ class RolloutWriter:
     ) -> None:
         self.path = path
         self.frames_done = 0
-        self._file = h5py.File(path, "w")
+        # Windows does not rename a file that is open.
+        self._draft = path if sys.platform == "win32" else path.with_name(path.name + ".partial")
+        try:
+            self._file = h5py.File(self._draft, "w")
+        except OSError as error:
+            raise _plain_error(error, path) from error
         try:
             real = np.float64 if farthest > _FAR else np.float32
             cloth_real = np.float64 if double else real
@@ -64,15 +74,17 @@ class RolloutWriter:
             self._file["cloth/rest_pos"] = np.asarray(cloth_rest_pos, dtype=np.float64 if double else np.float32)
             self._file["body/faces"] = np.asarray(body_faces, dtype=np.int32)
             self._file["time"] = np.arange(num_frames) * dt
-            for key, value in {"dt": dt, "num_frames": 0, "complete": False, **attributes}.items():
+            own = {"dt": dt, "num_frames": 0, "num_planned": num_frames, "complete": False}
+            for key, value in {**own, **attributes}.items():
                 self._file.attrs[key] = value if np.isscalar(value) or isinstance(value, np.ndarray) else json.dumps(value)
             self._touch_all()
             self._file.flush()
+            self._take_name()
         except OSError as error:
-            self.discard()
+            self._discard(self._draft)
             raise _plain_error(error, path) from error
         except BaseException:
-            self.discard()
+            self._discard(self._draft)
             raise
 
     def append(
@@ -90,6 +102,7 @@ class RolloutWriter:
             self._file[f"metrics/{name}"][frame] = value
         for name, values in (fields or {}).items():
             self._file[f"cloth/{name}"][frame] = values
+        self._file.flush()  # the frame before its count, for those who read meanwhile
         self.frames_done += 1
         self._file.attrs.modify("num_frames", self.frames_done)
         self._file.flush()
@@ -104,11 +117,27 @@ class RolloutWriter:
 
     def discard(self) -> None:
         """Close and delete the file: nothing half-written stays behind."""
+        self._discard(self.path)
+
+    def _discard(self, path: Path) -> None:
         try:
             self._file.close()
         except (OSError, RuntimeError):
             pass  # a full disk refuses the final flush too; the file goes away anyway
-        self.path.unlink(missing_ok=True)
+        path.unlink(missing_ok=True)
+
+    def _take_name(self) -> None:
+        """Let others read: the layout is on the disk, the file has its name and HDF5's lock on it is given back."""
+        descriptor = self._file.id.get_vfd_handle()
+        os.fsync(descriptor)
+        os.replace(self._draft, self.path)
+        if sys.platform != "win32":
+            import fcntl
+
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_UN)
+            except OSError:
+                pass  # a file system without locks: there is none to give back
 
     def _touch_all(self) -> None:
         # HDF5 lays contiguous data out at the first write; one row is enough to allocate and fill everything.
@@ -143,15 +172,17 @@ class RolloutData:
 
 
 def read_rollout(path: Path) -> RolloutData:
-    """Read ``rollout.h5``, also one whose writer was killed.
+    """Read ``rollout.h5``, also one that is being written, whose frames so far it returns, or whose writer was killed.
+
+    How many frames the whole is to have is the attribute ``num_planned``, whether it is finished ``complete``.
 
     Raises:
         ValueError: not a rollout file.
     """
     try:
         with h5py.File(path, "r") as file:
-            done = int(file.attrs["num_frames"])
             _check_extents(file, path.stat().st_size)
+            done = _frames_there(file)
             return RolloutData(
                 cloth_pos=file["cloth/pos"][:done],
                 cloth_faces=file["cloth/faces"][:],
@@ -168,6 +199,21 @@ def read_rollout(path: Path) -> RolloutData:
     except Exception as error:  # damaged files make h5py raise nearly anything
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ValueError(f"{path}: not a rollout file ({reason}); make one with hood rollout") from error
+
+
+def _frames_there(file: h5py.File) -> int:
+    """Frames done. A network disk may show the count before the values: what is still NaN as laid out is not counted."""
+    done = min(int(file.attrs["num_frames"]), len(file["time"]))
+    if not bool(file.attrs.get("complete", False)):
+        while done > 0 and not _is_there(file, done - 1):
+            done -= 1
+    return max(done, 0)
+
+
+def _is_there(file: h5py.File, index: int) -> bool:
+    """Whether a frame's values have arrived. Cloth that blew up is NaN as well, but its frame has times."""
+    cloth = (file["cloth/pos"], *(file[name] for name in _metric_paths(file)))
+    return bool(np.isfinite(file["body/pos"][index]).all() and any(np.isfinite(table[index]).any() for table in cloth))
 
 
 def _check_extents(file: h5py.File, num_bytes: int) -> None:

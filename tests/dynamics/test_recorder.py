@@ -181,3 +181,74 @@ def test_values_of_every_vertex_are_kept_and_cut_with_the_rest(tmp_path: Path) -
     assert read_rollout(tmp_path / "plain.h5").fields == {}
     with h5py.File(tmp_path / "plain.h5", "r") as file:
         assert set(file["cloth"]) == {"pos", "faces", "rest_pos"}
+
+
+READER = """
+import sys, time
+import numpy as np
+from pathlib import Path
+from hood.dynamics.recorder import read_rollout
+path, seen, polls, complete = Path(sys.argv[1]), 0, 0, False
+while not complete:
+    try:
+        data = read_rollout(path)
+    except FileNotFoundError:
+        continue
+    count, complete = len(data.cloth_pos), bool(data.attributes["complete"])
+    assert count >= seen, (count, seen)
+    assert data.attributes["num_planned"] == 1000
+    index = np.arange(count)
+    assert (data.cloth_pos == (index + 0.25)[:, None, None]).all()
+    assert (data.body_pos == (-index - 0.5)[:, None, None]).all()
+    assert np.allclose(data.metrics["strain_p99"], 0.1 * index)
+    if polls == 0 and count > 0:
+        print("met a growing file" if count < 1000 else "too late", flush=True)
+    polls, seen = polls + (count > 0), count
+    time.sleep(0.005)
+print(seen)
+"""
+
+
+def test_a_thousand_frames_while_another_process_reads(tmp_path: Path) -> None:
+    """Every file that it opens ends with the frames done and holds exactly these."""
+    path = tmp_path / "r.h5"
+    root = Path(__file__).parents[2]
+    reader = subprocess.Popen([sys.executable, "-c", READER, str(path)], cwd=root, stdout=-1, stderr=-1, text=True)
+    with writer(path, 1000) as target:
+        for index in range(1000):
+            target.append(*frame(index))
+            if index == 500:  # the reader may start late on a busy machine
+                assert reader.stdout is not None
+                assert reader.stdout.readline() == "met a growing file\n"
+    assert reader.communicate() == ("1000\n", "")
+    check(read_rollout(path), 1000)
+
+
+def test_frames_that_were_counted_but_have_not_arrived_are_left_out(tmp_path: Path) -> None:
+    """A network disk may show the count first; cloth that blew up is a frame all the same."""
+    path = tmp_path / "r.h5"
+    with writer(path) as target:
+        append(target, 2)
+        target.append(np.full((4, 3), np.nan), np.zeros((3, 3)), {"strain_p99": 1.0})
+        target._file.attrs.modify("num_frames", 5)
+        target._file.flush()
+        data = read_rollout(path)
+        assert len(data.cloth_pos) == 3
+        assert np.isnan(data.cloth_pos[2]).all()
+        append(target, 2)
+    assert len(read_rollout(path).cloth_pos) == 5
+
+
+def test_a_file_takes_its_name_when_it_is_laid_out(tmp_path: Path) -> None:
+    """A layout that is refused leaves the file of an earlier run; nobody ever opens half a layout."""
+    path = tmp_path / "r.h5"
+    with writer(path) as target:
+        append(target, 5)
+    with pytest.raises(TypeError):
+        RolloutWriter(path, 2, np.eye(3), FACES, FACES, 3, NAMES, 0.5, {"object": {1, 2}})
+    check(read_rollout(path), 5)
+    with h5py.File(path, "r") as old, writer(path) as target:
+        append(target, 1)
+        assert old.attrs["num_frames"] == 5
+        check(read_rollout(path), 1)
+    assert [file.name for file in tmp_path.iterdir()] == ["r.h5"]
