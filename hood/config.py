@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import yaml
 from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
@@ -18,12 +19,15 @@ from omegaconf.errors import OmegaConfBaseException
 
 from hood.assets.atomic import write_atomically
 from hood.assets.library import unknown
+from hood.assets.unpickle import check_size
 
 _PACKAGE = Path(__file__).resolve().parent
 #: Installed packages carry the configs inside; a clone has them beside the package.
 CONFIG_FOLDER = _PACKAGE / "configs" if (_PACKAGE / "configs").is_dir() else _PACKAGE.parent / "configs"
 #: Keys that take one word or a list.
 _ONE_OR_MORE = ("garment", "offset", "layers")
+#: Bytes of a run's record at most, levels of its nesting, and characters of a reason why it is none.
+_RECORD_LIMIT, _DEEPEST, _REASON = 1 << 20, 32, 300
 _TARGETS = ("hood.", "torch.optim.")
 
 
@@ -80,6 +84,38 @@ def plain(node: Any) -> Any:
     return OmegaConf.to_container(node, resolve=True) if isinstance(node, (DictConfig, ListConfig)) else node
 
 
+def read_record(path: Path) -> dict[str, Any]:
+    """The settings that a run left in its ``config.yaml``, as dicts, lists and scalars; nothing in them is resolved.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ConfigError: not such a record.
+    """
+    check_size(path, _RECORD_LIMIT)
+    content = path.read_bytes()
+    try:
+        text = content.decode("utf-8")
+        _require_plain(text)
+        record = OmegaConf.to_container(OmegaConf.create(text), resolve=False)
+    except (ValueError, yaml.YAMLError, OmegaConfBaseException, RecursionError) as error:
+        reason = _one_line(error)[:_REASON]
+        raise ConfigError(f"{path}: not the record of a run ({reason}); use another output") from error
+    if not isinstance(record, dict):
+        raise ConfigError(f"{path}: not the record of a run (it holds no keys); use another output")
+    return {str(key): value for key, value in record.items()}
+
+
+def _require_plain(text: str) -> None:
+    """Refuse YAML that takes long to build: references to references multiply, and deep nesting costs its square."""
+    depth = 0
+    for event in yaml.parse(text, yaml.SafeLoader):
+        if isinstance(event, yaml.AliasEvent):
+            raise ConfigError("it holds references")
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > _DEEPEST:
+            raise ConfigError(f"it is nested more than {_DEEPEST} deep")
+
+
 def options(group: str) -> list[str]:
     """Names of a config group's options."""
     return sorted(path.stem for path in (CONFIG_FOLDER / group).glob("*.yaml"))
@@ -121,7 +157,7 @@ def _check_override(name: str, text: str, defaults: DictConfig) -> tuple[str, Ov
     try:
         override = OverridesParser.create().parse_override(text)
     except HydraException as error:
-        raise ConfigError(f"cannot read {text!r}: quote values with spaces or brackets, key=\"'value'\"") from error
+        raise ConfigError(f"cannot read {text[:_REASON]!r}: quote values with spaces or brackets, key=\"'value'\"") from error
     key = override.get_key_element().lstrip("+~").split("@")[0]
     if _is_group(override) and override.value() is not None and str(override.value()) not in options(key):
         raise ConfigError(unknown(f"option of {key}", str(override.value()), options(key)))

@@ -23,6 +23,8 @@ _JSON_CHUNK, _BIN_CHUNK = 0x4E4F534A, 0x004E4942
 _COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression")
 #: Entries of one table; a character has some hundred thousand.
 _MAX_ENTRIES = 50_000_000
+#: Characters of a buffer's file name at most.
+_LONGEST_NAME = 1024
 
 
 @dataclass(frozen=True)
@@ -149,6 +151,8 @@ def _buffer(path: Path, index: int, uri: Any) -> bytes:
         raise Refused(f"buffer {index} is nowhere; the file is damaged")
     if uri.startswith("data:"):
         return base64.b64decode(uri.partition(",")[2], validate=True)
+    if len(uri) > _LONGEST_NAME:
+        raise Refused(f"buffer {index} has a name of {len(uri)} characters; the file is damaged")
     file = (path.parent / uri).resolve()
     # A document may name any file of the machine, or an address on the network; neither is part of a mesh.
     if "://" in uri or not file.is_relative_to(path.parent.resolve()):

@@ -11,6 +11,7 @@ import h5py
 from hood.assets.animated_mesh import body_kind
 from hood.assets.foreign import require_readable
 from hood.assets.gltf import read_gltf
+from hood.assets.h5_links import own_group
 from hood.assets.library import names, nearest
 from hood.assets.mesh_file import MESH_SUFFIXES
 from hood.assets.reference_garments import garment_names
@@ -84,4 +85,5 @@ def _archive_keys(path: Path) -> list[str]:
 
 def _h5_kind(path: Path) -> str:
     with h5py.File(path, "r") as file:
-        return ROLLOUT if "cloth" in file and "pos" in file["cloth"] else MOVING_MESH
+        cloth = own_group(file, "cloth")
+        return ROLLOUT if cloth is not None and cloth.get("pos", getlink=True) is not None else MOVING_MESH

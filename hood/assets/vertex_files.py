@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 
+from hood.assets.h5_links import own_dataset
 from hood.assets.library import SIZE_LIMIT, first_line, read_arrays
 from hood.assets.mesh_file import read_mesh
 from hood.assets.unpickle import load_pickle
@@ -120,14 +121,7 @@ def _pick(path: Path, fields: Mapping[Any, Any]) -> VertexFile:
 
 
 def _dataset(file: h5py.File, key: str) -> np.ndarray:
-    """A dataset that lies in this file; links and storage elsewhere may name any file of the machine."""
-    place: Any = file
-    for name in key.split("/"):
-        if not isinstance(place.get(name, getlink=True), h5py.HardLink):
-            raise ValueError(f"{key} is a link to another place; store the data itself")
-        place = place[name]
-    if not isinstance(place, h5py.Dataset) or place.external or place.is_virtual:
-        raise ValueError(f"{key} is not a dataset of its own; store the data itself")
+    place = own_dataset(file, key)
     size = math.prod(place.shape or ()) * place.dtype.itemsize
     if size > SIZE_LIMIT:
         raise ValueError(f"{key} has shape {place.shape}, {size} bytes, the limit is {SIZE_LIMIT}")

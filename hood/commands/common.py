@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
-from hood.config import ConfigError, plain, require_choice
+from hood.config import ConfigError, plain, read_record, require_choice
 from hood.dynamics.checkpoint import load_simulator
 from hood.dynamics.reference import SUFFIXES, load_reference_checkpoint
 from hood.dynamics.simulator import Simulator
@@ -147,8 +147,7 @@ def require_same_config(config: DictConfig, folder: Path, free: Sequence[str], f
     record = folder / "config.yaml"
     if not record.exists():
         return
-    before = OmegaConf.load(record)
-    assert isinstance(before, DictConfig)
+    before = read_record(record)
 
     def that_matters(value: Any) -> Any:
         value = plain(value)

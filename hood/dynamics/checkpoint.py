@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -12,6 +13,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from hood.assets.atomic import write_atomically
+from hood.assets.library import first_line
 from hood.dynamics.ranges import Conditions
 from hood.dynamics.simulator import Simulator, build_simulator
 
@@ -75,10 +77,12 @@ def load_simulator(path: Path) -> Simulator:
     except ValueError as error:
         raise ValueError(f"{path}: {error}; the file is damaged") from error
     try:
-        simulator = build_simulator(**json.loads(header["model"]))
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: names a model that this version cannot build ({error}); train it again") from error
-    expected = simulator.state_dict()
+        settings = _settings(header)
+        with torch.device("meta"):  # shapes alone: a damaged header may name a model larger than the memory
+            expected = build_simulator(**settings).state_dict()
+    except (ArithmeticError, AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        reason = first_line(error)
+        raise ValueError(f"{path}: names a model that this version cannot build ({reason}); train it again") from error
     wrong = [
         name
         for name in {*expected, *tensors}
@@ -86,9 +90,18 @@ def load_simulator(path: Path) -> Simulator:
     ]
     if wrong:
         raise ValueError(f"{path}: weights do not fit the model in the file, first at {sorted(wrong)[0]!r}; it is damaged")
+    simulator = build_simulator(**settings)
     simulator.load_state_dict({name: value.to(expected[name].dtype) for name, value in tensors.items()})
     simulator.trained_for = trained_for
     return simulator.eval()
+
+
+def _settings(header: Mapping[str, str]) -> dict[str, Any]:
+    """Arguments of :func:`build_simulator` in a header: plain values by name."""
+    settings = json.loads(header["model"])
+    if not isinstance(settings, dict) or any(isinstance(value, (dict, list)) for value in settings.values()):
+        raise TypeError("its settings are no plain values by name")
+    return settings
 
 
 def _read_file(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

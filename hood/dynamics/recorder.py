@@ -15,6 +15,8 @@ from typing import Any
 import h5py
 import numpy as np
 
+from hood.assets.h5_links import own_dataset, own_group
+
 #: World coordinates beyond this [m] are written in float64: float32 resolves only 8 µm there.
 _FAR = 100.0
 
@@ -190,7 +192,7 @@ def read_rollout(path: Path) -> RolloutData:
                 body_pos=file["body/pos"][:done],
                 body_faces=file["body/faces"][:],
                 time=file["time"][:done],
-                metrics={name: data[:done] for name, data in file.get("metrics", {}).items()},
+                metrics={name.removeprefix("metrics/"): file[name][:done] for name in _metric_paths(file)},
                 attributes=dict(file.attrs),
                 fields={name.removeprefix("cloth/"): file[name][:done] for name in _field_paths(file)},
             )
@@ -219,20 +221,21 @@ def _is_there(file: h5py.File, index: int) -> bool:
 def _check_extents(file: h5py.File, num_bytes: int) -> None:
     """Rollouts are stored as they are: a table that claims more than the file holds would be read as empty memory."""
     names = ("cloth/pos", "cloth/faces", "cloth/rest_pos", "body/pos", "body/faces", "time")
-    for name in (*names, *_field_paths(file)):
-        table = file[name]
-        if table.ndim == 0 or table.size * table.dtype.itemsize > num_bytes:
+    for name in (*names, *_field_paths(file), *_metric_paths(file)):
+        table = own_dataset(file, name)
+        if not table.shape or table.size * table.dtype.itemsize > num_bytes:
             raise ValueError(f"{name} claims the shape {table.shape}, the file has {num_bytes} bytes")
 
 
 def _field_paths(file: h5py.File) -> list[str]:
     """Values of every vertex in every frame: tables beside the positions, two axes long."""
     known = ("pos", "faces", "rest_pos")
-    return [f"cloth/{name}" for name, table in file["cloth"].items() if name not in known and table.ndim == 2]
+    beside = [f"cloth/{name}" for name in own_group(file, "cloth") or () if name not in known]
+    return [name for name in beside if own_dataset(file, name).ndim == 2]
 
 
 def _metric_paths(file: h5py.File) -> list[str]:
-    return [f"metrics/{name}" for name in file.get("metrics", ())]
+    return [f"metrics/{name}" for name in own_group(file, "metrics") or ()]
 
 
 def _plain_error(error: OSError, path: Path) -> OSError:

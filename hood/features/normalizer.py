@@ -140,7 +140,8 @@ class FixedScale(nn.Module):
         super().__init__()
         self.asinh = asinh
         self.register_buffer("scale", torch.as_tensor(scale, dtype=torch.float64), persistent=False)
-        if not bool((self.scale > 0).all()):
+        numbers = [scale] if isinstance(scale, (int, float)) else scale  # the tensor may be on a device without values
+        if not all(number > 0 for number in numbers):
             raise ValueError(f"fixed scale is {scale}; every entry must be > 0")
         # A number is part of a kernel's call; a tensor would have to be copied to an accelerator in every call.
         self._number = float(scale) if isinstance(scale, (int, float)) else None

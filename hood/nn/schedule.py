@@ -17,6 +17,8 @@ SCHEDULES: dict[str, str] = {
     "fine15": "15x(mesh)",
     "fine48": "48x(mesh)",
 }
+#: Steps of a schedule at most: twenty times the longest published one.
+_MOST_STEPS = 1000
 _BLOCK = re.compile(r"\s*(?:(\d+)\s*x\s*)?\(([^()]*)\)\s*")
 _COARSE = re.compile(r"coarse(\d+)")
 
@@ -42,6 +44,8 @@ def parse_schedule(text: str) -> tuple[Step, ...]:
         repeats = int(block[1] or 1)
         if repeats < 1:
             raise ValueError(f"schedule {source!r}: {block[0].strip()!r} repeats 0 times; remove it")
+        if len(steps) + repeats > _MOST_STEPS:
+            raise ValueError(f"schedule {source[:80]!r}: more than {_MOST_STEPS} steps; the longest published one has 48")
         steps += [_parse_sets(block[2], source)] * repeats
         position = block.end()
     return tuple(steps)

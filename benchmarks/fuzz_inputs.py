@@ -1,72 +1,49 @@
-"""Feeds damaged files to every reader, in a process of its own with little memory; prints what went wrong as JSON.
-
-    python fuzz_worker.py COUNT SEED FOLDER
-
-A file may be read, or refused by a ValueError or OSError of one line that names it. Anything else is reported: other
-exceptions, more than 10 s, more than 2 GB, commands or connections, and answers that blame the memory.
-"""
+"""Small sound files of every format that is read, each with its reader, and ways to damage them."""
 
 from __future__ import annotations
 
+import base64
 import io
 import json
 import pickle
-import resource
-import signal
-import sys
-import traceback
-import warnings
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
+import torch
+from omegaconf import DictConfig
 
 from hood.assets.animated_mesh import load_mesh_sequence
 from hood.assets.garment import load_garment
-from hood.assets.identify import identify
 from hood.assets.mesh_file import read_mesh_file
 from hood.assets.model_file import read_model
 from hood.assets.motion_file import read_recording
 from hood.assets.pins import read_indices
 from hood.assets.standing import read_pose
 from hood.assets.torch_file import load_torch
+from hood.commands.common import require_same_config
+from hood.config import load_config
 from hood.dynamics.checkpoint import load_simulator, save_simulator
 from hood.dynamics.recorder import read_rollout
 from hood.dynamics.simulator import build_simulator
 from hood.testing import cylinder
 
-MEMORY, SECONDS = 2 << 30, 10
-_HARMFUL = ("os.system", "os.exec", "os.posix_spawn", "os.fork", "subprocess.Popen", "socket.connect", "shutil.rmtree")
-
 Content = bytes | dict[str, Any]
-Sample = tuple[str, Content, Callable[[Path], Any]]
 
 
-class Execute:
-    """Pickles to a call."""
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """A sound file: its ending, its bytes or the fields that are written into it, and what reads it."""
 
-    def __init__(self, function: Any, *arguments: Any) -> None:
-        self.call = function, arguments
-
-    def __reduce__(self) -> Any:
-        return self.call
-
-
-def malicious(mark: Path) -> list[bytes]:
-    """Pickles that would leave ``mark`` behind: by a command, by code, and hidden in what looks like data."""
-    import os
-
-    command, code = f"touch {mark}", f"open({str(mark)!r}, 'w').close()"
-    system, evaluate = Execute(os.system, command), Execute(eval, code)
-    nested = Execute(map, Execute(getattr, Execute(__import__, "os"), "system"), [command])
-    contents = [system, evaluate, Execute(exec, code), nested, {"dress": {"rest_pos": system, "faces": evaluate}}]
-    contents += [{"poses": np.array([system], dtype=object), "trans": nested}, [evaluate], {system: 1}]
-    return [pickle.dumps(content, protocol) for content in contents for protocol in (0, 2, 4)] + [
-        f"cos\nsystem\n(S'{command}'\ntR.".encode(),
-        f"c__builtin__\neval\n(S{code!r}\ntR.".encode(),
-    ]
+    reader: str
+    suffix: str
+    content: Content
+    read: Callable[[Path], Any]
+    names_file: bool = True  # an error names the file; words of a command line are in none
 
 
 def samples(folder: Path) -> list[Sample]:
@@ -101,41 +78,82 @@ def samples(folder: Path) -> list[Sample]:
     }
     moving = {"verts": np.stack([pos, pos + 0.1]), "faces": faces, "fps": np.array(30.0)}
     torch_file = io.BytesIO()
-    import torch
-
     torch.save({"training_module": {"a": torch.zeros(3, 4)}}, torch_file)
     torch.manual_seed(0)  # the same bytes are damaged every time
     save_simulator(folder / "m.safetensors", build_simulator(schedule="1x(mesh)", latent_dim=2))
     return [
-        ("obj", _obj(pos, quads), mesh),
-        ("ply", _ascii_ply(pos, quads), mesh),
-        ("ply", _binary_ply(pos, quads, uniform=True), mesh),
-        ("ply", _binary_ply(pos, quads, uniform=False), mesh),
-        ("off", _off(pos, quads), mesh),
-        ("stl", _stl(pos, faces), mesh),
-        ("stl", _ascii_stl(pos, faces), mesh),
-        ("glb", _glb(pos, faces), mesh),
-        ("glb", _glb(pos, faces), load_mesh_sequence),
-        ("npz", garment, load_garment),
-        ("pkl", {"dress": entry}, load_garment),
-        ("pkl", {"vertices": pos, "faces": faces, "coarse_edges": entry["coarse_edges"]}, load_garment),
-        ("txt", b"1 2 3\n4, 5 # six\n", read_indices),
-        ("json", b"[1, 2, 3, 44]", read_indices),
-        ("json", json.dumps([0.1] * 72).encode(), read_pose),
-        ("npy", _npy(np.zeros(72)), read_pose),
-        ("npz", amass, read_recording),
-        ("npz", smplx, read_recording),
-        ("pkl", pose, read_recording),
-        ("pkl", vto, read_recording),
-        ("npz", model, read_model),
-        ("pkl", model, read_model),
-        ("npz", moving, load_mesh_sequence),
-        ("pkl", moving, load_mesh_sequence),
-        ("h5", _h5(moving), load_mesh_sequence),
-        ("h5", _rollout(pos, faces), read_rollout),
-        ("pth", torch_file.getvalue(), load_torch),
-        ("safetensors", (folder / "m.safetensors").read_bytes(), load_simulator),
+        Sample("mesh", "obj", _obj(pos, quads), mesh),
+        Sample("mesh", "ply", _ascii_ply(pos, quads), mesh),
+        Sample("mesh", "ply", _binary_ply(pos, quads, uniform=True), mesh),
+        Sample("mesh", "ply", _binary_ply(pos, quads, uniform=False), mesh),
+        Sample("mesh", "off", _off(pos, quads), mesh),
+        Sample("mesh", "stl", _stl(pos, faces), mesh),
+        Sample("mesh", "stl", _ascii_stl(pos, faces), mesh),
+        Sample("mesh", "glb", glb(pos, faces), mesh),
+        Sample("moving mesh", "glb", glb(pos, faces), load_mesh_sequence),
+        Sample("moving mesh", "gltf", gltf(pos, faces), load_mesh_sequence),
+        Sample("garment", "npz", garment, load_garment),
+        Sample("garment", "pkl", {"dress": entry}, load_garment),
+        Sample("garment", "pkl", {"vertices": pos, "faces": faces, "coarse_edges": entry["coarse_edges"]}, load_garment),
+        Sample("vertex list", "txt", b"1 2 3\n4, 5 # six\n", read_indices),
+        Sample("vertex list", "json", b"[1, 2, 3, 44]", read_indices),
+        Sample("pose", "json", json.dumps([0.1] * 72).encode(), read_pose),
+        Sample("pose", "npy", _npy(np.zeros(72)), read_pose),
+        Sample("motion", "npz", amass, read_recording),
+        Sample("motion", "npz", smplx, read_recording),
+        Sample("motion", "pkl", pose, read_recording),
+        Sample("motion", "pkl", vto, read_recording),
+        Sample("body", "npz", model, read_model),
+        Sample("body", "pkl", model, read_model),
+        Sample("moving mesh", "npz", moving, load_mesh_sequence),
+        Sample("moving mesh", "pkl", moving, load_mesh_sequence),
+        Sample("moving mesh", "h5", _h5(moving), load_mesh_sequence),
+        Sample("rollout", "h5", rollout(pos, faces), read_rollout),
+        Sample("weights", "pth", torch_file.getvalue(), load_torch),
+        Sample("weights", "safetensors", (folder / "m.safetensors").read_bytes(), load_simulator),
+        Sample("words", "txt", _WORDS, read_words, names_file=False),
+        Sample("run record", "yaml", _RECORD, read_record),
     ]
+
+
+#: Words of a command, one a line.
+_WORDS = b"""garment=tank
+num_frames=3
+material.density=0.3
+losses=default
+refine=5
+export=[rg]
+betas=[1.5,0,-1]
+cloth_friction=0.5
+solver.max_iterations=7"""
+#: What a run leaves about its settings, in a few lines.
+_RECORD = b"""seed: 0
+output: outputs/train
+losses: {_target_: hood.losses.potential.default_potential, x: [1, 2.5, null, text]}
+trainer:
+  lr: 1.0e-3
+  nested: {a: {b: [1, 2, {c: 3}]}}
+"""
+
+
+def read_words(path: Path) -> Any:
+    """The settings of ``hood rollout`` with these words."""
+    return load_config("rollout", path.read_bytes().decode("latin-1").split("\n"))
+
+
+def read_record(path: Path) -> None:
+    """A run's record, compared with settings; ones that differ are an error of their own."""
+    record = path.with_name("config.yaml")
+    path.replace(record)
+    try:
+        require_same_config(_settings(), path.parent, ())
+    finally:
+        record.replace(path)
+
+
+@cache
+def _settings() -> DictConfig:
+    return load_config("train")
 
 
 def _obj(pos: np.ndarray, quads: np.ndarray) -> bytes:
@@ -186,10 +204,11 @@ def _ascii_stl(pos: np.ndarray, faces: np.ndarray) -> bytes:
     return "\n".join([*lines, "endsolid s"]).encode()
 
 
-def _glb(pos: np.ndarray, faces: np.ndarray) -> bytes:
+def document(pos: np.ndarray, faces: np.ndarray) -> tuple[dict[str, Any], bytes]:
+    """A glTF document of two nodes, and its buffer."""
     parts = [pos.astype("<f4").tobytes(), faces.astype("<u4").tobytes(), pos[:, :2].astype("<f4").tobytes()]
     starts = np.cumsum([0, *map(len, parts)]).tolist()
-    document = {
+    content = {
         "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "translation": [0, 1, 0], "children": [1]}, {"mesh": 0, "scale": [2, 2, 2]}],
         "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 2}, "indices": 1}]}],
@@ -201,7 +220,20 @@ def _glb(pos: np.ndarray, faces: np.ndarray) -> bytes:
         "bufferViews": [{"buffer": 0, "byteOffset": a, "byteLength": b - a} for a, b in zip(starts, starts[1:], strict=False)],
         "buffers": [{"byteLength": starts[-1]}],
     }  # fmt: skip
-    text, binary = json.dumps(document).encode(), b"".join(parts)
+    return content, b"".join(parts)
+
+
+def gltf(pos: np.ndarray, faces: np.ndarray, uri: str | None = None) -> bytes:
+    """The document as text, its buffer in it or at ``uri``."""
+    content, binary = document(pos, faces)
+    content["buffers"][0]["uri"] = uri or "data:application/octet-stream;base64," + base64.b64encode(binary).decode()
+    return json.dumps(content).encode()
+
+
+def glb(pos: np.ndarray, faces: np.ndarray) -> bytes:
+    """The document and its buffer in one binary file."""
+    content, binary = document(pos, faces)
+    text = json.dumps(content).encode()
     text += b" " * (-len(text) % 4)
     chunks = np.uint32(len(text)).tobytes() + b"JSON" + text + np.uint32(len(binary)).tobytes() + b"BIN\0" + binary
     return b"glTF" + np.array([2, 12 + len(chunks)], "<u4").tobytes() + chunks
@@ -221,7 +253,8 @@ def _h5(arrays: dict[str, Any]) -> bytes:
     return content.getvalue()
 
 
-def _rollout(pos: np.ndarray, faces: np.ndarray) -> bytes:
+def rollout(pos: np.ndarray, faces: np.ndarray) -> bytes:
+    """A rollout file of two frames."""
     content = io.BytesIO()
     with h5py.File(content, "w") as file:
         file["cloth/pos"] = file["body/pos"] = np.stack([pos, pos])
@@ -301,84 +334,3 @@ def damage(content: bytes, rng: np.random.Generator) -> bytes:
     else:
         data[place : place + 32] = rng.bytes(32)
     return bytes(data)
-
-
-def attempt(path: Path, read: Callable[[Path], Any]) -> str | None:
-    """What is wrong with how ``read`` deals with the file; None: nothing."""
-    signal.setitimer(signal.ITIMER_PROF, SECONDS)
-    try:
-        read(path)
-    except (ValueError, OSError) as error:
-        text = str(error)
-        if "\n" in text:
-            return f"several lines: {text!r}"
-        if path.stem not in text and str(path) not in str(getattr(error, "filename", "")):
-            return f"does not name the file: {text!r}"
-        return f"memory: {text!r}" if "MemoryError" in text or "allocate" in text else None
-    except Slow as error:
-        return str(error)
-    except BaseException:
-        return traceback.format_exc(limit=-4)
-    finally:
-        signal.setitimer(signal.ITIMER_PROF, 0)
-    return None
-
-
-class Slow(BaseException):
-    """Raised when a reader has used up its time."""
-
-
-def main(count: int, seed: int, folder: Path) -> None:
-    """Run ``count`` damaged files; prints the failures."""
-    executed: list[str] = []
-    sys.addaudithook(lambda event, _: executed.append(event) if event in _HARMFUL else None)
-    warnings.simplefilter("ignore")
-
-    def ring(*_: Any) -> None:
-        raise Slow(f"more than {SECONDS} s")
-
-    signal.signal(signal.SIGPROF, ring)  # processor time: other work on the machine does not count
-    files = samples(folder)
-    for suffix, content, read in files:  # everything is imported and sound before the limits fall
-        path = folder / f"sound.{suffix}"
-        path.write_bytes(encode(suffix, content))
-        read(path)
-    used = int(
-        next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmSize")).split()[1]
-    )
-    resource.setrlimit(resource.RLIMIT_AS, (used * 1024 + MEMORY, resource.RLIM_INFINITY))
-    failures = []
-    marks = malicious(folder / "executed")
-    for number in range(count):
-        rng = np.random.default_rng([seed, number])
-        suffix, content, read = files[number % len(files)]
-        if number % 10 == 9 and suffix in ("pkl", "pth"):
-            data = marks[rng.integers(len(marks))]
-        else:
-            data = encode(suffix, content, rng if rng.random() < 0.5 else None)
-            data = damage(data, rng) if isinstance(content, bytes) or rng.random() < 0.5 else data
-        path = folder / f"input{number}.{suffix}"
-        path.write_bytes(data)
-        for reader in (read, lambda file: identify(str(file))):
-            wrong = attempt(path, reader)
-            if wrong:
-                failures.append(
-                    {"number": number, "suffix": suffix, "reader": getattr(reader, "__name__", "?"), "wrong": wrong}
-                )
-        path.unlink()
-    for number, data in enumerate(marks):
-        for suffix, content, read in files:
-            if suffix in ("pkl", "pth") and isinstance(content, (bytes, dict)):
-                path = folder / f"evil{number}.{suffix}"
-                path.write_bytes(data)
-                wrong = attempt(path, read)
-                if wrong:
-                    failures.append({"number": f"evil {number}", "suffix": suffix, "reader": read.__name__, "wrong": wrong})
-                path.unlink()
-    if (folder / "executed").exists() or executed:
-        failures.append({"number": -1, "suffix": "pkl", "reader": "?", "wrong": f"executed {executed}"})
-    print(json.dumps({"tried": count, "failures": failures}))
-
-
-if __name__ == "__main__":
-    main(int(sys.argv[1]), int(sys.argv[2]), Path(sys.argv[3]))
