@@ -32,6 +32,8 @@ COMMANDS = {
     "convert": "write published HOOD weights (.pth) as a model file",
 }
 
+_LESS_MEMORY = "free some, raise the limit (ulimit -v), or take a smaller garment, fewer frames or a smaller model"
+
 #: Commands that take steps: libraries for these are compiled while torch is loaded, where that has not been done before.
 _SIMULATE = ("train", "rollout", "evaluate", "tradeoff", "envelope")
 
@@ -57,7 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         print(describe(name))
         return 0
-    return _run(_command(name), overrides)
+    return _run(name, overrides)
 
 
 def script(name: str) -> None:
@@ -65,10 +67,11 @@ def script(name: str) -> None:
     entry([name, *sys.argv[1:]])
 
 
-def _run(command: Callable[[Sequence[str]], int], overrides: Sequence[str]) -> int:
-    from hood.commands.notices import heard
-
+def _run(name: str, overrides: Sequence[str]) -> int:
     try:
+        command = _command(name)
+        from hood.commands.notices import heard
+
         with heard():
             return command(overrides)
     except KeyboardInterrupt:
@@ -78,6 +81,15 @@ def _run(command: Callable[[Sequence[str]], int], overrides: Sequence[str]) -> i
         if os.environ.get("HOOD_TRACEBACK"):
             raise
         return _fail(_describe(error))
+    except (MemoryError, RuntimeError) as error:
+        if os.environ.get("HOOD_TRACEBACK") or not _is_memory(error):
+            raise
+        return _fail(f"the memory is used up; {_LESS_MEMORY}")
+
+
+def _is_memory(error: Exception) -> bool:
+    """Whether an error says that there is no memory left; torch says it in a RuntimeError, on a CPU in one without a class."""
+    return isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError" or "can't allocate memory" in str(error)
 
 
 def _describe(error: Exception) -> str:
@@ -87,11 +99,14 @@ def _describe(error: Exception) -> str:
             17: "choose another output",
             20: "choose another output",
             28: "free some space or choose another output",
+            27: "raise the limit on the size of files (ulimit -f)",
             30: "choose another output",
         }
         hint = hints.get(error.errno or 0)
         return f"{error.filename}: {error.strerror.lower()}" + (f"; {hint}" if hint else "")
-    return " ".join(str(error).split()) or type(error).__name__
+    text = " ".join(str(error).split()) or type(error).__name__
+    # A library that does not fit into the address space; the loader of the system has no class or number for it.
+    return f"{text}; {_LESS_MEMORY}" if "failed to map segment" in text else text
 
 
 def _fail(message: str) -> int:

@@ -218,6 +218,46 @@ def test_an_interrupt_has_its_own_exit_code(
     assert not list(tmp_path.rglob("*.partial"))
 
 
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (MemoryError(), "the memory is used up; free some"),
+        (RuntimeError("[enforce fail at alloc_cpu.cpp:1] DefaultCPUAllocator: can't allocate memory"), "the memory is used up"),
+        (
+            ImportError("libtorch_cpu.so: failed to map segment from shared object"),
+            "failed to map segment from shared object; ",
+        ),
+        (OSError(27, "File too large", "run/rollout.h5"), "run/rollout.h5: file too large; raise the limit on the size of"),
+    ],
+)
+def test_faults_of_the_machine_are_one_sentence(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: Exception, said: str
+) -> None:
+    from hood.dynamics.simulator import Simulator
+
+    def fail(*arguments: object) -> object:
+        raise error
+
+    monkeypatch.setattr(Simulator, "predict", fail)
+    monkeypatch.delenv("HOOD_TRACEBACK", raising=False)
+    command = ["rollout", *UNTRAINED, "garment=tank", "num_frames=3", "video=none", "sheet=false", "output=run"]
+    assert main(command) == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith("hood: error: ")
+    assert said in last
+
+
+def test_other_errors_of_a_program_keep_their_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    import hood.commands.rollout as command
+
+    def fail(words: object) -> int:
+        raise RuntimeError("a fault of the program")
+
+    monkeypatch.setattr(command, "run", fail)
+    with pytest.raises(RuntimeError, match="a fault of the program"):
+        main(["rollout"])
+
+
 def test_a_running_rollout_is_told_from_one_that_was_stopped(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

@@ -16,7 +16,7 @@ from functools import cache
 from pathlib import Path
 
 from hood.native.cache import cache_folder
-from hood.native.prebuilt import FOLDER, prebuilt, source_text
+from hood.native.prebuilt import FOLDER, load, prebuilt, source_text
 
 #: For sources that use what the processor has; arithmetic as IEEE has it.
 NATIVE_FLAGS = ("-O3", "-std=c++17", "-shared", "-fPIC", "-pthread", "-fno-math-errno", "-Wno-psabi", "-march=native")
@@ -163,7 +163,7 @@ def _digest(compiler: str, source: Path, flags: Sequence[str]) -> str:
 def _kept(path: Path) -> ctypes.CDLL | None:
     """The library at ``path``; None where there is none, or where it is damaged."""
     try:
-        return ctypes.CDLL(str(path)) if path.exists() else None
+        return load(path) if path.exists() else None
     except OSError:
         return None
 

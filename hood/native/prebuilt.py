@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import platform
+import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,6 +62,22 @@ def flags_for(flags: Sequence[str], level: Level) -> list[str]:
     return [f"-march={level.name}" if flag == "-march=native" else flag for flag in flags]
 
 
+def load(path: Path) -> ctypes.CDLL:
+    """A library that is whole: the system maps a file that was cut off as well, and ends the process when it reads on.
+
+    Raises:
+        OSError: it is cut off, or no library for this machine.
+    """
+    with open(path, "rb") as file:
+        head = file.read(64)
+    if head[:5] == b"\x7fELF\x02":  # of 64 bits; its table of sections stands at the end
+        order = "<" if head[5] == 1 else ">"
+        (table,), (size, count) = struct.unpack_from(order + "Q", head, 40), struct.unpack_from(order + "HH", head, 58)
+        if path.stat().st_size < table + size * count:
+            raise OSError(f"{path}: the library is cut off")
+    return ctypes.CDLL(str(path))
+
+
 def prebuilt(folder: Path, source: Path, flags: Sequence[str], abilities: frozenset[str] | None = None) -> ctypes.CDLL | None:
     """The library in ``folder`` with the widest vectors that this processor has; None where there is none.
 
@@ -74,7 +91,7 @@ def prebuilt(folder: Path, source: Path, flags: Sequence[str], abilities: frozen
         path = folder / file_name(source, flags, level)
         if level.needs <= able and path.exists():
             try:
-                return ctypes.CDLL(str(path))
+                return load(path)
             except OSError:  # of another system, or damaged: compiled anew
                 continue
     return None

@@ -49,6 +49,22 @@ def test_a_damaged_file_is_made_anew(source):
     assert build(source, FLAGS).answer() == 42
 
 
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9, 0.999])
+def test_a_library_that_was_cut_off_is_made_anew(source, share):
+    """The system's loader ends the process with a bus error there, so another process tries."""
+    build(source, FLAGS)
+    (kept,) = (source.parent / "kept").rglob("*.so")
+    content = kept.read_bytes()
+    kept.unlink()
+    kept.write_bytes(content[: int(share * len(content))])
+    code = (
+        "import sys; from pathlib import Path; from hood.native.build import build; "
+        f"sys.exit(build(Path({str(source)!r}), {FLAGS!r}).answer() - 42)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], env=os.environ, check=False).returncode == 0
+    assert len(kept.read_bytes()) == len(content)
+
+
 def test_a_folder_that_cannot_be_written_to_is_done_without(source, monkeypatch):
     blocked = source.parent / "a file"
     blocked.write_text("")
