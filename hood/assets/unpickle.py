@@ -10,9 +10,10 @@ from __future__ import annotations
 import io
 import os
 import pickle
+import struct
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, ClassVar
 
 from hood.assets.standins import Refused, opaque, resolve, stand_in
 
@@ -58,6 +59,12 @@ def guarded(path: Path, what: str, read: Callable[[], Any]) -> Any:
         raise ValueError(f"{path}: not a readable {what} ({reason})") from error
 
 
+def _load_bytearray(unpickler: Any) -> None:
+    """Bytes that can be written into. Python's own makes room for as many as are announced before it looks for them."""
+    (count,) = struct.unpack("<Q", unpickler.read(8))
+    unpickler.append(bytearray(unpickler.read(count)))
+
+
 class RestrictedUnpickler(pickle._Unpickler):  # type: ignore[name-defined,misc]
     """Unpickler whose names lead to stand-ins. ``inert`` lists packages whose classes become :class:`Opaque`.
 
@@ -66,6 +73,11 @@ class RestrictedUnpickler(pickle._Unpickler):  # type: ignore[name-defined,misc]
     """
 
     inert: tuple[str, ...] = ()
+    #: What is done for each code of a pickle.
+    dispatch: ClassVar[dict[int, Any]] = {
+        **pickle._Unpickler.dispatch,  # type: ignore[attr-defined]
+        pickle.BYTEARRAY8[0]: _load_bytearray,
+    }
 
     def __init__(self, file: BinaryIO | io.BytesIO) -> None:
         super().__init__(_Bounded(file), encoding="latin1")

@@ -156,3 +156,14 @@ def test_the_size_limit_and_missing_files(tmp_path: Path) -> None:
         load_pickle(tmp_path / "large.pkl", size_limit=1000)
     with pytest.raises(FileNotFoundError):
         load_pickle(tmp_path / "none.pkl")
+
+
+def test_bytes_are_read_before_room_is_made_for_them(tmp_path: Path) -> None:
+    """Also of the kind that can be written into, for which Python's own reader makes room first."""
+    sound = pickle.dumps({"bytes": bytearray(b"abc" * 100)}, protocol=5)
+    (tmp_path / "sound.pkl").write_bytes(sound)
+    assert load_pickle(tmp_path / "sound.pkl") == {"bytes": bytearray(b"abc" * 100)}
+    announced = pickle.PROTO + b"\x05" + pickle.BYTEARRAY8 + (1 << 45).to_bytes(8, "little") + b"."
+    (tmp_path / "huge.pkl").write_bytes(announced)
+    with pytest.raises(ValueError, match=r"huge\.pkl: not a readable pickle \(it announces 35184372088832 more bytes"):
+        load_pickle(tmp_path / "huge.pkl")
