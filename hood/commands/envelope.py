@@ -20,7 +20,7 @@ from hood.assets.extremes import write_garment, write_motion
 from hood.assets.library import locate
 from hood.commands.candidates import split_refinement
 from hood.commands.common import output_folder, prepare_folder, require_distinct, require_same_config, together
-from hood.commands.rollouts_beside import Ended, run_beside
+from hood.commands.rollouts_beside import Ended, interruptible, run_beside
 from hood.commands.surface_report import surface_warnings
 from hood.config import ConfigError, load_config, save_run_record
 from hood.dynamics.recorder import read_rollout
@@ -67,7 +67,8 @@ def _run(config: DictConfig) -> int:
     commands = {task: command_of(task, config, folder) for task in tasks}
     todo = [task for task in tasks if not _is_done(task, commands[task], folder)]
     mine = todo[distributed.rank() :: distributed.world_size()]
-    with tqdm(total=len(mine), desc="envelope", unit="rollout", disable=True if distributed.rank() else None) as bar:
+    quiet = True if distributed.rank() else None
+    with tqdm(total=len(mine), desc="envelope", unit="rollout", disable=quiet) as bar, interruptible():
         started = ((task, commands[task], task.folder(folder)) for task in mine)
         for task, ended in run_beside(started, int(config.jobs), float(config.timeout)):
             _note(task, commands[task], ended, folder)

@@ -7,14 +7,10 @@ import json
 import math
 import os
 import shlex
-import signal
 import subprocess
-import sys
-import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,17 +20,14 @@ from tqdm import tqdm
 from hood.assets.atomic import write_atomically
 from hood.assets.library import locate
 from hood.commands.common import UNTRAINED
+from hood.commands.rollouts_beside import PROGRAM, end, interruptible
 from hood.evaluation.grid import Point, quoted
 from hood.evaluation.reached import read_record
 
-#: What a point is measured with, before the arguments of ``hood``.
-PROGRAM = (sys.executable, "-m", "hood.cli")
 #: Written by ``hood evaluate`` when all its rollouts are done.
 _TABLE = "table.json"
 #: By which command and weights a point was begun, and the times of its turns.
 _TURNS = "turns.json"
-#: Seconds that an interrupted process has to end.
-_PATIENCE = 20.0
 
 
 @dataclass(frozen=True)
@@ -104,7 +97,7 @@ class Points:
         failures: list[Failure] = []
         with (
             tqdm(total=len(points), initial=len(points) - len(todo), desc="trade-off", unit="point") as bar,
-            _interruptible(),
+            interruptible(),
         ):
             for size in dict.fromkeys(point.size for point in todo):
                 failures += self._take_turns([point for point in todo if point.size == size], bar)
@@ -130,7 +123,7 @@ class Points:
                     failures += self._finish(item)
                     bar.update()
         finally:
-            _end(running)
+            end([item.process for item in running])
         return failures
 
     def _clear(self, point: Point) -> None:
@@ -208,31 +201,6 @@ class Points:
     def _count(self, point: Point) -> int:
         """Rollouts written down."""
         return sum(path.read_bytes().count(b'"unit"') for path in self.folder_of(point).glob("rollouts.*.jsonl"))
-
-
-def _end(running: Sequence[_Running]) -> None:
-    """End the processes. Evaluations may be killed at any moment, and processes started in the background ignore SIGINT."""
-    for item in running:
-        item.process.terminate()
-    for item in running:
-        try:
-            item.process.wait(_PATIENCE)
-        except subprocess.TimeoutExpired:
-            item.process.kill()
-            item.process.wait()
-
-
-@contextmanager
-def _interruptible() -> Iterator[None]:
-    """SIGTERM interrupts the block like Ctrl-C: the processes it started do not outlive it."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def weights_digest(point: Point) -> str:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TypeVar
@@ -64,14 +67,32 @@ def run_beside(
                     yield key, _ended(item, f"not done after {timeout:g} s" if late else "")
             time.sleep(0.05)
     finally:
-        for item in running.values():
-            item.process.terminate()
-        for item in running.values():
-            try:
-                item.process.wait(_PATIENCE)
-            except subprocess.TimeoutExpired:
-                item.process.kill()
-                item.process.wait()
+        end([item.process for item in running.values()])
+
+
+def end(processes: Sequence[subprocess.Popen[bytes]]) -> None:
+    """End them: ask first, since processes started in the background ignore SIGINT, then kill."""
+    for process in processes:
+        process.terminate()
+    for process in processes:
+        try:
+            process.wait(_PATIENCE)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """SIGTERM interrupts the block like Ctrl-C: the processes it started do not outlive it."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _start(arguments: Sequence[str], folder: Path, program: Sequence[str]) -> _Running:

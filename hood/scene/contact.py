@@ -98,6 +98,8 @@ def find_fold(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, contact: Co
     A vertex is matched with the nearest skin, and nothing would keep it out of what faces that: while a bend closes it would
     pass from one side into the other and back. The other side is the skin nearest to a place 15 mm ahead of the vertex.
     """
+    if not len(obstacle.faces) or not len(pos):
+        return Fold(None)
     match, other = _match_folds(pos, vertex_scene, obstacle, contact)
     return Fold(Contact(**match._asdict(), valid=other) if bool(other.any()) else None)
 
@@ -105,12 +107,11 @@ def find_fold(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, contact: Co
 def _match_folds(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, contact: Contact) -> tuple[Match, Tensor]:
     """Matches (V,) on the other side, and which of them there are, (V,) bool."""
     incidence = build_incidence(obstacle.faces, len(obstacle.pos))
-    if len(obstacle.faces) and len(pos):
-        surface = obstacle.pos, obstacle.faces, obstacle.face_scene, incidence.adjacency, obstacle.next_pos
-        near = {name: getattr(contact, name) for name in ("valid", "dist", "point", "normal")}
-        found = surface_tree.search_folds(pos, vertex_scene, *surface, near, _RULE)
-        if found is not None:
-            return found
+    surface = obstacle.pos, obstacle.faces, obstacle.face_scene, incidence.adjacency, obstacle.next_pos
+    near = {name: getattr(contact, name) for name in ("valid", "dist", "point", "normal")}
+    found = surface_tree.search_folds(pos, vertex_scene, *surface, near, _RULE)
+    if found is not None:
+        return found
     near_enough = contact.valid & (contact.dist.abs() < _RULE.near)
     ahead = torch.where(near_enough.unsqueeze(1), _ahead(pos, contact), pos)
     match = match_surface(ahead, vertex_scene, obstacle, curved=True)

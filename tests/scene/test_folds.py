@@ -209,3 +209,11 @@ def test_the_compiled_search_finds_what_torch_does(body, monkeypatch: pytest.Mon
     for name in ("dist", "point", "normal", "next_point", "next_normal", "curvature"):
         one, other = (getattr(fold, name)[plain.valid] for fold in (compiled, plain))
         torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-12)
+
+
+def test_nothing_folds_without_a_surface_or_without_cloth() -> None:
+    body = obstacle(*limbs(0.01))
+    pos, scene, contact = contact_at([[0.1, 0.0, 0.002]], body)
+    empty = Obstacle(body.pos, body.pos, body.pos, body.faces[:0], body.vertex_scene, body.face_scene[:0])
+    assert find_fold(pos, scene, empty, contact).contact is None
+    assert find_fold(pos[:0], scene[:0], body, contact).contact is None
