@@ -32,7 +32,7 @@ from hood.losses.layers import for_networks, has_layers
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
 from hood.scene.contact import Contact, find_contact
-from hood.scene.jumps import carried, describe_jumps, find_jumps
+from hood.scene.jumps import Jump, carried, describe_jumps, find_jumps
 from hood.scene.mesh_motion import wearable
 from hood.scene.scene import LEAD_IN, RELAXING_DT, NotWornError, Scene, recentre
 from hood.scene.start import free_stretch, push_out
@@ -204,10 +204,10 @@ def simulate(
                 observe(index + 1, known, prediction)
 
 
-def _jumps_within(scene: Scene, start_frame: int, count: int) -> dict[int, float]:
+def _jumps_within(scene: Scene, start_frame: int, count: int) -> dict[int, Jump]:
     """Jumps of the body in these frames, by frame; a warning says so."""
     jumps = find_jumps(scene.motion, 1.0 / scene.dt)
-    within = {frame: metres for frame, metres in jumps.items() if start_frame <= frame < start_frame + count - 1}
+    within = {frame: jump for frame, jump in jumps.items() if start_frame <= frame < start_frame + count - 1}
     if within:
         warnings.warn(describe_jumps(scene.motion, within), stacklevel=3)
     return within

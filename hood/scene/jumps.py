@@ -1,4 +1,4 @@
-"""Jumps of a body, as at a cut in a recording: it is somewhere else from one frame to the next.
+"""Jumps of a body, as at a cut in a recording: it is somewhere else, or looks another way, from one frame to the next.
 
 Nothing could follow such a step: the body would pass through the cloth, or drag it along by half a metre. The cloth is carried
 along instead, as one with the body, and the step is taken from there.
@@ -6,42 +6,64 @@ along instead, as one with the body, and the step is taken from there.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from hood.mesh.rigid import best_turn
 from hood.scene.motion import Motion
 from hood.scene.scene import Scene, local_origin
 from hood.scene.state import Attachments, State, StepInput
 
-#: A step is a jump where the body is so much faster [m/s] than it mostly is within so many seconds around; motions that ship
-#: with the package reach 0.3 m/s, at eight times their speed 7.
-_FASTER, _AROUND = 8.0, 0.1
+#: A step is a jump where the body is so much faster [m/s], or turns so much faster [rad/s], than it mostly does within so many
+#: seconds around; motions that ship with the package reach 0.3 m/s and 0.8 rad/s, at eight times their speed 7 and 11.
+_FASTER, _TURNING, _AROUND = 8.0, 15.0, 0.1
 #: Steps to either side that this is at least.
 _LEAST = 2
 
 
-def find_jumps(motion: Motion, fps: float) -> dict[int, float]:
-    """Metres by frame, of the steps from there in which the body jumps."""
+@dataclass(frozen=True)
+class Jump:
+    """A step in which the body jumps."""
+
+    metres: float
+    degrees: float
+
+
+def find_jumps(motion: Motion, fps: float) -> dict[int, Jump]:
+    """Jumps by frame, that of a step being the one where it begins."""
     moved = np.diff(np.asarray(motion.translation, dtype=np.float64), axis=0)
+    turned = motion.turns()
+    frames = _outliers(moved, fps, _FASTER) | _outliers(turned, fps, _TURNING)
+    return {
+        frame: Jump(float(np.linalg.norm(moved[frame])), float(np.degrees(np.linalg.norm(turned[frame]))))
+        for frame in sorted(frames)
+    }
+
+
+def _outliers(steps: np.ndarray, fps: float, most: float) -> set[int]:
+    """Rows of ``steps`` (T, 3) that differ from the median of those around by more than ``most`` per second."""
     reach = max(round(_AROUND * fps), _LEAST)
-    found = {}
-    for frame in np.flatnonzero(np.linalg.norm(moved, axis=1) * fps > _FASTER).tolist():
-        usual = np.median(moved[max(frame - reach, 0) : frame + reach + 1], axis=0)
-        if float(np.linalg.norm(moved[frame] - usual)) * fps > _FASTER:
-            found[frame] = float(np.linalg.norm(moved[frame]))
+    found = set()
+    for frame in np.flatnonzero(np.linalg.norm(steps, axis=1) * fps > most).tolist():
+        usual = np.median(steps[max(frame - reach, 0) : frame + reach + 1], axis=0)
+        if float(np.linalg.norm(steps[frame] - usual)) * fps > most:
+            found.add(frame)
     return found
 
 
-def describe_jumps(motion: Motion, jumps: dict[int, float]) -> str:
+def describe_jumps(motion: Motion, jumps: dict[int, Jump]) -> str:
     """A sentence."""
     frames = sorted(jumps)
     named = ", ".join(map(str, frames[:4])) + ("" if len(frames) <= 4 else f" and {len(frames) - 4} more")
     many = "s" if len(frames) > 1 else ""
+    metres, degrees = (max(getattr(jump, name) for jump in jumps.values()) for name in ("metres", "degrees"))
+    how = [f"jumps by up to {metres:.2g} m"] if metres * motion.fps > _FASTER else []
+    how += [f"turns by up to {degrees:.0f}° at once"] if np.radians(degrees) * motion.fps > _TURNING else []
     return (
-        f"{motion.name!r} jumps by up to {max(jumps.values()):.2g} m after frame{many} {named}, as at a cut: the cloth is "
+        f"{motion.name!r} {' and '.join(how)} after frame{many} {named}, as at a cut: the cloth is "
         "carried along there; start and stop leave a part of the motion out"
     )
 
@@ -56,7 +78,7 @@ def carried(scene: Scene, frame: int, state: State, attachments: Attachments | N
     start, end = motion.translation[frame], motion.translation[frame + 1]
     before, after = (motion.surface(k, at).cpu().double().numpy() for k, at in ((frame, start), (frame + 1, end)))
     middle, goal = before.mean(axis=0), after.mean(axis=0)
-    turn = _best_turn(before - middle, after - goal)
+    turn = best_turn(before - middle, after - goal)
     origin = local_origin(end)
 
     def along(pos: Tensor, at: np.ndarray) -> Tensor:
@@ -71,10 +93,3 @@ def carried(scene: Scene, frame: int, state: State, attachments: Attachments | N
     earlier = motion.surface(max(frame - 1, 0), start)
     now = along(torch.as_tensor(before), start)
     return moved, replace(step, obstacle=replace(step.obstacle, pos=now, prev_pos=along(earlier, start)))
-
-
-def _best_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """The rotation (3, 3) that takes points (N, 3) about their middle nearest to others."""
-    left, _, right = np.linalg.svd(end.T @ start)
-    mirrored = np.linalg.det(left @ right) < 0.0
-    return np.asarray(left @ np.diag([1.0, 1.0, -1.0 if mirrored else 1.0]) @ right)

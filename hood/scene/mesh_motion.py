@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from hood.assets.binding import bind_garment
@@ -17,12 +19,15 @@ from hood.assets.mesh_sequence import MeshSequence
 from hood.assets.skinning import linear_blend_skinning
 from hood.mesh import topology
 from hood.mesh.proximity import search_surface
+from hood.mesh.rigid import best_turn
 from hood.scene.anchors import Anchors, anchors
 from hood.scene.state import Obstacle
 
 #: A garment is worn in the first frame if at most this share of its vertices is deeper inside than ``_DEEP`` [m], and half
 #: of them are closer than ``_NEAR`` [m].
 _INSIDE, _DEEP, _NEAR = 0.2, 0.02, 0.3
+#: Vertices that say how a mesh turns.
+_SAMPLED = 500
 
 
 @dataclass(frozen=True)
@@ -58,6 +63,15 @@ class MeshMotion:
     @property
     def num_vertices(self) -> int:
         return self.sequence.verts.shape[1]
+
+    def turns(self) -> np.ndarray:
+        """(T − 1, 3) rad: those that fit some of its vertices best."""
+        verts = self.sequence.verts[:, :: -(-self.num_vertices // _SAMPLED)].astype(np.float64)
+        centred = verts - verts.mean(axis=1, keepdims=True)
+        found = [best_turn(*pair) for pair in itertools.pairwise(centred)]
+        turns = np.zeros((self.num_frames - 1, 3))
+        turns[: len(found)] = Rotation.from_matrix(np.reshape(found, (-1, 3, 3))).as_rotvec()
+        return turns
 
     def points(self, frame: int) -> np.ndarray:
         """(W, 3) m, float64, world."""
@@ -161,6 +175,10 @@ class NoBody:
     def translation(self) -> np.ndarray:
         """(T, 3): the world's origin; a scene's local frame finds the cloth by itself."""
         return np.zeros((self.num_frames, 3))
+
+    def turns(self) -> np.ndarray:
+        """(T − 1, 3) rad: none."""
+        return np.zeros((self.num_frames - 1, 3))
 
     @property
     def faces(self) -> np.ndarray:

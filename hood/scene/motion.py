@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from hood.assets.binding import bind_garment, hold_on_trunk
@@ -46,6 +47,10 @@ class Motion(Protocol):
     @property
     def translation(self) -> np.ndarray:
         """(T, 3) m, float64: a point of the world near the body in every frame."""
+        ...
+
+    def turns(self) -> np.ndarray:
+        """(T − 1, 3) rad, float64: rotation vectors of the body as a whole, from every frame to the next."""
         ...
 
     @property
@@ -118,6 +123,11 @@ class BodyMotion:
     @property
     def num_vertices(self) -> int:
         return len(self.body.v_template)
+
+    def turns(self) -> np.ndarray:
+        """(T − 1, 3) rad: of its root joint."""
+        root = Rotation.from_rotvec(self.sequence.poses[:, 0].astype(np.float64))
+        return np.asarray((root[1:] * root[:-1].inv()).as_rotvec())
 
     def local_surface(self, frame: int) -> Tensor:
         """(W, 3) m, relative to ``translation[frame]``, float64."""

@@ -21,15 +21,15 @@ def write_belt(path: Path) -> None:
     path.write_text("\n".join(rows) + "\n")
 
 
-def write_walk(path: Path, num_frames: int, turn_at: int | None = None) -> None:
-    """Steps of an embedded walk at 30 fps; from frame ``turn_at`` on the body looks the other way."""
+def write_walk(path: Path, num_frames: int, twist_at: int | None = None) -> None:
+    """Steps of an embedded walk at 30 fps; from frame ``twist_at`` on the trunk looks the other way, the legs do not."""
     recording = read_recording(locate("motions", "walk_proud"))
     every = round(recording.fps / 30.0)
     poses = recording.poses[: num_frames * every : every, :22].reshape(num_frames, 66)
     transl = recording.transl[: num_frames * every : every].copy()
-    if turn_at is not None:
-        about = Rotation.from_rotvec([0.0, 0.0, np.pi])  # the file has z up
-        poses[turn_at:, :3] = (about * Rotation.from_rotvec(poses[turn_at:, :3])).as_rotvec()
+    if twist_at is not None:
+        about = Rotation.from_rotvec([0.0, np.pi, 0.0])  # along the spine, in the frame of its joint
+        poses[twist_at:, 9:12] = (Rotation.from_rotvec(poses[twist_at:, 9:12]) * about).as_rotvec()
     path.parent.mkdir(parents=True, exist_ok=True)
     hands = np.zeros((num_frames, 90))
     np.savez(path, poses=np.c_[poses, hands], trans=transl, mocap_framerate=30.0, betas=np.zeros(16), gender="neutral")

@@ -26,9 +26,9 @@ def summary(folder: str = "out") -> dict[str, Any]:
     return json.loads((Path(folder) / "summary.json").read_text())
 
 
-def test_a_body_that_turns_at_once_ends_with_3(capsys: pytest.CaptureFixture[str]) -> None:
-    write_walk(Path("turn.npz"), 32, turn_at=24)
-    command = [*CHEAP, "sequence=turn.npz", "num_frames=32"]
+def test_a_trunk_that_turns_at_once_ends_with_3(capsys: pytest.CaptureFixture[str]) -> None:
+    write_walk(Path("twist.npz"), 32, twist_at=24)
+    command = [*CHEAP, "sequence=twist.npz", "num_frames=32"]
     assert main(command) == 3
     found, shown = summary(), capsys.readouterr()
     assert found["sound"] is False
@@ -49,8 +49,8 @@ def test_a_body_that_turns_at_once_ends_with_3(capsys: pytest.CaptureFixture[str
 
 
 def test_a_study_may_allow_it(capsys: pytest.CaptureFixture[str]) -> None:
-    write_walk(Path("turn.npz"), 9, turn_at=7)
-    command = [*CHEAP, "sequence=turn.npz", "num_frames=9"]
+    write_walk(Path("twist.npz"), 9, twist_at=7)
+    command = [*CHEAP, "sequence=twist.npz", "num_frames=9"]
     assert main(command) == 3
     assert main([*command, "allow_unsound=true"]) == 0
     assert summary()["sound"] is False
@@ -85,20 +85,20 @@ def test_what_nobody_measured_is_not_judged(capsys: pytest.CaptureFixture[str]) 
 
 def test_batches_count_the_unsound(capsys: pytest.CaptureFixture[str]) -> None:
     write_walk(Path("motions/calm.npz"), 8)
-    write_walk(Path("motions/turn.npz"), 8, turn_at=6)
+    write_walk(Path("motions/twist.npz"), 8, twist_at=6)
     command = [*CHEAP, "sequence=motions", "num_frames=8", "refine=5"]
     assert main(command) == 3
     shown = capsys.readouterr()
     assert "2 of 2 motions simulated, 1 unsound" in shown.out
     assert "; UNSOUND: strain p99 is beyond 50%" in shown.out
     # What is finished is not simulated again, and as unsound as before.
-    before = Path("out/turn/rollout.h5").stat().st_mtime_ns
+    before = Path("out/twist/rollout.h5").stat().st_mtime_ns
     assert main([*command, "resume=true"]) == 3
     assert main([*command, "resume=true", "allow_unsound=true"]) == 0
-    forgetful = {key: value for key, value in summary("out/turn").items() if key not in ("sound", "unsound_reasons")}
-    Path("out/turn/summary.json").write_text(json.dumps(forgetful))  # as earlier versions wrote it
+    forgetful = {key: value for key, value in summary("out/twist").items() if key not in ("sound", "unsound_reasons")}
+    Path("out/twist/summary.json").write_text(json.dumps(forgetful))  # as earlier versions wrote it
     assert main([*command, "resume=true"]) == 3
-    assert Path("out/turn/rollout.h5").stat().st_mtime_ns == before
+    assert Path("out/twist/rollout.h5").stat().st_mtime_ns == before
     Path("motions/broken.npz").write_bytes(b"no motion")
     assert main([*command, "resume=true"]) == 2
     assert "2 of 3 motions simulated, 1 failed, 1 unsound" in capsys.readouterr().out

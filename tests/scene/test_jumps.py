@@ -14,12 +14,14 @@ from hood.assets.body import Body
 from hood.assets.extremes import write_motion
 from hood.assets.garment import Garment
 from hood.assets.library import names
+from hood.assets.mesh_sequence import MeshSequence
 from hood.assets.sequence import PoseSequence, load_sequence
 from hood.dynamics.rollout import simulate
 from hood.dynamics.stepper import NewtonStepper
 from hood.losses.potential import default_potential
-from hood.scene.jumps import carried, describe_jumps, find_jumps
-from hood.scene.motion import body_motion
+from hood.scene.jumps import Jump, carried, describe_jumps, find_jumps
+from hood.scene.mesh_motion import mesh_motion
+from hood.scene.motion import Motion, body_motion
 from hood.scene.scene import Scene, build_scene
 from hood.solver.newton import NewtonSettings
 
@@ -44,8 +46,27 @@ def test_no_motion_of_the_package_jumps_at_any_speed(body: Body) -> None:
 def test_a_jump_is_found_at_every_frame_rate(body: Body, tmp_path: Path, fps: float) -> None:
     write_motion(tmp_path / "m.npz", "teleport:0.7", 1.0)
     found = find_jumps(body_motion(body, load_sequence(tmp_path / "m.npz", fps), np.zeros(10)), fps)
-    assert sum(found.values()) == pytest.approx(0.7)
+    assert sum(jump.metres for jump in found.values()) == pytest.approx(0.7)
+    assert sum(jump.degrees for jump in found.values()) == pytest.approx(0.0, abs=1e-6)
     assert all(abs(frame / fps - 0.5) <= 1.5 / min(fps, 60.0) for frame in found)
+
+
+@pytest.mark.parametrize("fps", [15.0, 30.0, 60.0])
+@pytest.mark.parametrize("mesh", [False, True])
+def test_a_cut_that_only_turns_the_body_is_found(body: Body, walk: PoseSequence, fps: float, mesh: bool) -> None:
+    cut = replace(jumping(walk, (0.0, 0.0, 0.0), turn=1.5), fps=fps)
+    motion: Motion = body_motion(body, cut, np.zeros(10))
+    if mesh:
+        verts = np.stack([motion.surface(frame, np.zeros(3)).numpy() for frame in range(cut.num_frames)])
+        motion = mesh_motion(MeshSequence("scan", verts, motion.faces, fps))
+    found = find_jumps(motion, fps)
+    assert list(found) == [4]
+    assert found[4].metres < 0.1
+    assert found[4].degrees == pytest.approx(np.degrees(1.5), abs=8.0)
+    text = describe_jumps(motion, found)
+    assert "turns by up to 8" in text or "turns by up to 9" in text
+    assert "jumps" not in text
+    assert "after frame 4, as at a cut" in text
 
 
 @pytest.mark.parametrize("name", ["spin:4", "stop:10", "offset:10000", "rest"])
@@ -74,13 +95,13 @@ def test_cloth_and_body_go_as_one(garments: dict[str, Garment], body: Body, walk
     assert float(moved.pos.norm(dim=1).max()) < 2.0  # the local frame has come along
 
 
-@pytest.mark.parametrize("shift", [(0.5, 0.0, 0.0), (1000.0, 0.0, -700.0)])
+@pytest.mark.parametrize(("shift", "turn"), [((0.5, 0.0, 0.0), 0.0), ((1000.0, 0.0, -700.0), 0.0), ((0.0, 0.0, 0.0), 2.0)])
 def test_a_rollout_over_a_cut(
-    garments: dict[str, Garment], body: Body, walk: PoseSequence, shift: tuple[float, float, float]
+    garments: dict[str, Garment], body: Body, walk: PoseSequence, shift: tuple[float, float, float], turn: float
 ) -> None:
     plain, cut = (
         rollout(build_scene(garments["tank"], body, motion, dtype=torch.float64), warns)
-        for motion, warns in ((walk.window(0, 10), False), (jumping(walk, shift), True))
+        for motion, warns in ((walk.window(0, 10), False), (jumping(walk, shift, turn), True))
     )
     strain = [max(metrics["strain_p99"] for metrics in found) for found in (plain, cut)]
     assert strain[1] < 1.2 * strain[0]
@@ -92,11 +113,13 @@ def rollout(scene: Scene, warns: bool) -> list[dict[str, float]]:
     frames = simulate(NewtonStepper(potential, NewtonSettings(target_rg=1e-2)), scene, potential, 10)
     if not warns:
         return [dict(frame.metrics) for frame in frames]
-    with pytest.warns(UserWarning, match="jumps by up to .* after frame 4, as at a cut: the cloth is carried along there"):
+    how = "(jumps by up to .*|turns by up to .* at once) after frame 4, as at a cut: the cloth is carried along there"
+    with pytest.warns(UserWarning, match=how):
         return [dict(frame.metrics) for frame in frames]
 
 
 def test_many_jumps_are_named_in_short(body: Body, walk: PoseSequence) -> None:
     motion = body_motion(body, walk, np.zeros(10))
-    text = describe_jumps(motion, dict.fromkeys(range(10, 70, 10), 0.3))
+    text = describe_jumps(motion, dict.fromkeys(range(10, 70, 10), Jump(0.3, 120.0)))
+    assert "jumps by up to 0.3 m and turns by up to 120° at once" in text
     assert "after frames 10, 20, 30, 40 and 2 more" in text

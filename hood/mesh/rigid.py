@@ -1,0 +1,12 @@
+"""Rigid motions of point sets."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def best_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """The rotation (3, 3) that takes points (N, 3) about their middle nearest to others, by least squares (Kabsch)."""
+    left, _, right = np.linalg.svd(end.T @ start)
+    mirrored = np.linalg.det(left @ right) < 0.0
+    return np.asarray(left @ np.diag([1.0, 1.0, -1.0 if mirrored else 1.0]) @ right)
