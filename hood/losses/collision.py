@@ -84,10 +84,6 @@ class Collision:
         """The same term with another weight, for a ramp during training."""
         return type(self)(weight, self.epsilon, self.contact, self.reach, self.sides)
 
-    def with_sides(self, sides: str) -> Collision:
-        """The same term with other ``sides``."""
-        return type(self)(self.weight, self.epsilon, self.contact, self.reach, sides)
-
     def prepare(self, problem: StepProblem) -> StepProblem:
         """The problem with its contact searched for, once per step."""
         return with_places(problem, self.contact, self.sides)

@@ -102,10 +102,6 @@ class Friction(LaggedFriction):
         """The same term with another collision weight, for a ramp during training."""
         return Friction(self.coefficient, self.slip_speed, weight, self.epsilon, self.contact, self.reach, self.sides)
 
-    def with_sides(self, sides: str) -> Friction:
-        """The same term with other ``sides``."""
-        return Friction(self.coefficient, self.slip_speed, self.weight, self.epsilon, self.contact, self.reach, sides)
-
     def prepare(self, problem: StepProblem) -> StepProblem:
         """The problem with its contact searched for, once per step, if there is friction."""
         return with_places(problem, self.contact, self.sides) if self.coefficient > 0 else problem

@@ -5,8 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from hood.losses.collision import Collision
-from hood.losses.friction import Friction
 from hood.losses.layer_friction import LayerFriction, fading
 from hood.losses.layer_sides import LayerSides
 from hood.losses.potential import Potential
@@ -93,10 +91,7 @@ def without_layers(potential: Potential) -> Potential:
 
 
 def for_networks(potential: Potential) -> Potential:
-    """What a network is shown of the potential, and known to have been trained with: no feature tells of layers of cloth, nor
-    of the other side of folds of the body."""
-    kept = {name: term for name, term in potential.terms.items() if type(term) not in (*LAYER_TERMS, LayerSides)}
-    for name, term in kept.items():
-        if isinstance(term, (Collision, Friction)) and term.sides != "nearest":
-            kept[name] = term.with_sides("nearest")
-    return potential.only(kept)
+    """What a network is shown of the potential, and known to have been trained with: no feature tells of layers of cloth."""
+    return potential.only(
+        {name: term for name, term in potential.terms.items() if type(term) not in (*LAYER_TERMS, LayerSides)}
+    )

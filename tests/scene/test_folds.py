@@ -20,10 +20,13 @@ from hood.losses.problem import StepProblem
 from hood.mesh import surface_tree
 from hood.mesh.proximity import build_incidence
 from hood.mesh.surface_tree import library
+from hood.scene.batch import to_device
 from hood.scene.cloth import build_cloth
 from hood.scene.contact import Contact, find_contact, find_fixed_fold, find_fold
 from hood.scene.motion import body_motion
 from hood.scene.state import Obstacle, concatenate_obstacles
+from hood.solver.iterate import in_single
+from hood.solver.local_engine import local_terms
 from hood.solver.newton import NewtonSettings, minimize
 from hood.testing import grid, make_problem, sphere
 
@@ -179,14 +182,25 @@ def test_cloth_between_two_limbs_does_not_pass_from_one_into_the_other() -> None
     assert deep["nearest"] > 8e-3
 
 
-def test_networks_are_shown_the_nearest_side_alone() -> None:
-    potential = default_potential()
-    assert keeps_both_sides(potential)
-    assert not keeps_both_sides(for_networks(potential))
+def test_networks_are_shown_both_sides() -> None:
+    """What a vertex alone would do at the end of its flight: the limb ahead turns it back, as the solver's energy has it."""
+    assert keeps_both_sides(for_networks(default_potential()))
     assert not keeps_both_sides(reference_potential())
-    for name in ("collision", "friction"):
-        known, shown = vars(potential.terms[name]), vars(for_networks(potential).terms[name])
-        assert {key for key in known if known[key] != shown[key]} == {"sides"}
+    views = {}
+    for sides in ("nearest", "both"):
+        shown = for_networks(default_potential(sides=sides))
+        exact = between(0.016, 0.6)
+        problem = shown.prepare(in_single(exact, to_device(exact.cloth, dtype=torch.float32)))
+        ahead = problem.state.pos + problem.vertex_dt * problem.state.vel
+        for compiled in (False, True):
+            views[sides, compiled] = local_terms(shown, problem, compiled)(ahead)
+    for compiled in (False, True):
+        assert float(views["both", compiled].force[:, 2].max()) < 0.0
+        assert float(views["nearest", compiled].force[:, 2].abs().max()) < 0.1 * float(
+            views["both", compiled].force[:, 2].abs().min()
+        )
+    torch.testing.assert_close(views["both", True].force, views["both", False].force, rtol=1e-3, atol=1e-6)
+    torch.testing.assert_close(views["both", True].step, views["both", False].step, rtol=1e-3, atol=1e-7)
 
 
 @pytest.mark.skipif(library() is None, reason="compares the compiled search with that of torch")
