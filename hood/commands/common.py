@@ -5,7 +5,8 @@ from __future__ import annotations
 import importlib.util
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 
+from hood.assets.occupied import occupy
 from hood.config import ConfigError, plain, read_record, require_choice
 from hood.dynamics.checkpoint import load_simulator
 from hood.dynamics.reference import SUFFIXES, load_reference_checkpoint
@@ -90,6 +92,20 @@ def prepare_folder(folder: Path) -> Path:
     if not os.access(folder, os.W_OK):
         raise PermissionError(13, "Permission denied", str(folder))
     return folder
+
+
+@contextmanager
+def held_folder(config: DictConfig) -> Iterator[Path]:
+    """The output folder, made, checked, and held for this run (:mod:`hood.assets.occupied`) by the first of its processes.
+
+    Raises:
+        OSError: it cannot be made or written to.
+        OccupiedError: another run is writing there.
+    """
+    folder = output_folder(config)
+    with ExitStack() as stack:
+        distributed.on_main(lambda: stack.enter_context(occupy(prepare_folder(folder))))
+        yield folder
 
 
 def read_model(path: Path, fps: float) -> Simulator:

@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from hood.assets.atomic import write_atomically
-from hood.commands.common import output_folder, prepare_folder, require_package, thinning
+from hood.commands.common import held_folder, output_folder, require_package, thinning
 from hood.config import ConfigError, load_config, require_choice
 from hood.dynamics.recorder import RolloutData, read_rollout
 
@@ -49,13 +49,13 @@ def run(arguments: Sequence[str]) -> int:
     thinning(config)
     if str(config.video) == "none" and not bool(config.sheet):
         raise ConfigError("video=none and sheet=false leave nothing to draw; leave one of them out")
-    folder = output_folder(config)
+    output_folder(config)
     require_package("PIL", "Pillow", "pictures", "hood compare")
     entries = _read(files, config)
-    prepare_folder(folder)
     if bool(config.blind):
         entries = _shuffled(entries, int(config.seed))
-    _draw(entries, config, folder)
+    with held_folder(config) as folder:
+        _draw(entries, config, folder)
     return 0
 
 

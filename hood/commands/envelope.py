@@ -19,7 +19,7 @@ from hood.assets.atomic import write_atomically
 from hood.assets.extremes import write_garment, write_motion
 from hood.assets.library import locate
 from hood.commands.candidates import split_refinement
-from hood.commands.common import output_folder, prepare_folder, require_distinct, require_same_config, together
+from hood.commands.common import held_folder, require_distinct, require_same_config, together
 from hood.commands.rollouts_beside import Ended, interruptible, run_beside
 from hood.commands.surface_report import surface_warnings
 from hood.config import ConfigError, load_config, save_run_record
@@ -61,8 +61,12 @@ def run(overrides: Sequence[str]) -> int:
 
 
 def _run(config: DictConfig) -> int:
-    folder = output_folder(config)
     tasks = make_tasks(config)
+    with held_folder(config) as folder:
+        return _make(config, tasks, folder)
+
+
+def _make(config: DictConfig, tasks: Sequence[Task], folder: Path) -> int:
     distributed.on_main(lambda: _prepare(config, folder, tasks))
     commands = {task: command_of(task, config, folder) for task in tasks}
     todo = [task for task in tasks if not _is_done(task, commands[task], folder)]
@@ -112,7 +116,6 @@ def make_tasks(config: DictConfig) -> list[Task]:
 
 
 def _prepare(config: DictConfig, folder: Path, tasks: Sequence[Task]) -> None:
-    prepare_folder(folder)
     criteria = tuple(spec.name for spec in fields(Criteria))
     require_same_config(config, folder, ("models", "garments", "factors", "jobs", "timeout", "output", *criteria))
     save_run_record(folder, config, seed=0)

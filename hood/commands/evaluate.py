@@ -23,8 +23,8 @@ from hood.commands.candidates import digest, distinct, make_candidate
 from hood.commands.cautions import evaluation_cautions, warn
 from hood.commands.circumstances import circumstances
 from hood.commands.common import (
+    held_folder,
     output_folder,
-    prepare_folder,
     require_device,
     require_distinct,
     require_package,
@@ -78,8 +78,13 @@ def run(overrides: Sequence[str]) -> int:
 
 
 def _evaluate(config: DictConfig, overrides: Sequence[str]) -> int:
-    folder = output_folder(config)
     plan = make_plan(config)
+    with held_folder(config) as folder:
+        return _run(plan, folder, overrides)
+
+
+def _run(plan: Plan, folder: Path, overrides: Sequence[str]) -> int:
+    config = plan.config
     distributed.on_main(lambda: _prepare(config, folder))
     if distributed.rank() == 0:
         warn(evaluation_cautions({one.name: one.stepper for one in plan.candidates}, plan.conditions()))
@@ -165,7 +170,6 @@ def _report(plan: Plan, measured: Mapping[Unit, Measured], folder: Path, overrid
 
 
 def _prepare(config: DictConfig, folder: Path) -> None:
-    prepare_folder(folder)
     if bool(config.resume):
         require_same_config(config, folder, ("resume", "output", "max_rollouts"))
     else:

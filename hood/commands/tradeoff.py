@@ -15,7 +15,7 @@ from hood.assets.garment import load_garment
 from hood.assets.library import names
 from hood.commands.batch import expand_sequences
 from hood.commands.circumstances import device_name
-from hood.commands.common import output_folder, prepare_folder, require_same_config
+from hood.commands.common import held_folder, output_folder, require_same_config
 from hood.commands.points import Failure, Points
 from hood.commands.tradeoff_checks import check_config, check_models, check_points, check_settings
 from hood.config import ConfigError, load_config, plain, save_run_record
@@ -53,12 +53,12 @@ def run(overrides: Sequence[str]) -> int:
     if not config.measure and not any(store.is_done(point) for point in points):
         raise ConfigError(f"measure=false: {folder} holds none of these points; leave measure out, or give their output")
     free = (*_FREE, *(f"{key}_{size}" for key in _FREE_BY_SIZE for size in SIZES))
-    prepare_folder(folder)
-    require_same_config(config, folder, free)
-    save_run_record(folder, config, seed=0)
-    failures = store.measure(points) if bool(config.measure) else []
-    reached, failures = collect(store, points, vertices, failures)
-    _write(folder, reached, failures, absent)
+    with held_folder(config):
+        require_same_config(config, folder, free)
+        save_run_record(folder, config, seed=0)
+        failures = store.measure(points) if bool(config.measure) else []
+        reached, failures = collect(store, points, vertices, failures)
+        _write(folder, reached, failures, absent)
     return 1 if failures else 0
 
 

@@ -19,7 +19,7 @@ from hood.assets.library import motion_split
 from hood.assets.material import Material
 from hood.assets.motions import MotionFiles, find_motions
 from hood.assets.sequence import load_sequence
-from hood.commands.common import output_folder, prepare_folder, require_device, require_same_config, tell_choice, together
+from hood.commands.common import held_folder, output_folder, require_device, require_same_config, tell_choice, together
 from hood.config import ConfigError, build, load_config, plain, require_choice, save_run_record
 from hood.dynamics.simulator import Simulator
 from hood.evaluation.validation import Validation
@@ -56,9 +56,13 @@ def run(overrides: Sequence[str]) -> int:
 
 def _train(config: DictConfig) -> int:
     trainer = make_trainer(config)
+    with held_folder(config) as folder:
+        return _run(config, trainer, folder)
+
+
+def _run(config: DictConfig, trainer: Trainer, folder: Path) -> int:
     main = distributed.rank() == 0
-    folder = output_folder(config)
-    if distributed.on_main(lambda: _is_resumed(config, prepare_folder(folder), trainer.checkpoint_path)):
+    if distributed.on_main(lambda: _is_resumed(config, folder, trainer.checkpoint_path)):
         trainer.resume(trainer.checkpoint_path)
     distributed.on_main(lambda: save_run_record(folder, config, int(config.seed)))
     if trainer.choice is not None:
