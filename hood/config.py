@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import platform
 from collections.abc import Sequence
 from pathlib import Path
@@ -189,7 +190,7 @@ def _siblings(known: DictConfig, key: str) -> list[str]:
 
 
 def _check_types(known: DictConfig, config: DictConfig, prefix: str) -> None:
-    """A value must have the kind of the default it replaces; a None default takes anything."""
+    """A value must have the kind of the default it replaces, and be finite as it is; a None default takes anything."""
     for key in map(str, config):
         before, after = known.get(key), config[key]
         if isinstance(after, DictConfig) and isinstance(before, DictConfig):
@@ -199,6 +200,8 @@ def _check_types(known: DictConfig, config: DictConfig, prefix: str) -> None:
         elif before is not None and not _same_kind(before, after):
             kind = "list" if isinstance(before, ListConfig) else type(before).__name__
             raise ConfigError(f"{prefix}{key}={after!r}: expected a value like {plain(before)!r} ({kind})")
+        elif isinstance(before, (int, float)) and math.isfinite(before) and not math.isfinite(after):
+            raise ConfigError(f"{prefix}{key}={after}: must be finite; {plain(before)!r} is the default")
 
 
 def _same_kind(before: Any, after: Any) -> bool:

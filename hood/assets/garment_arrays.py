@@ -56,7 +56,7 @@ def read_fields(path: Path) -> dict[str, Any]:
     if "lbs_weights" in fields:
         fields["lbs_weights"] = normalised(str(path), fields["lbs_weights"])
     if "uv" in arrays and "uv_faces" in arrays:
-        fields["uv"] = _reals(path, "uv", arrays["uv"])
+        fields["uv"] = _finite(path, "uv", _reals(path, "uv", arrays["uv"]))
     for key in _CORNERS:
         if key in arrays and (key != "uv_faces" or "uv" in fields):
             fields[key] = _corner_table(path, key, arrays[key], fields)
@@ -92,6 +92,13 @@ def check_rows(where: str, key: str, value: np.ndarray, num_vertices: int) -> No
     finite = np.isfinite(value).reshape(num_vertices, -1).all(axis=1)
     if not finite.all():
         raise ValueError(f"{where}: {key} of vertex {int(np.argmin(finite))} is not finite; repair it")
+
+
+def _finite(path: Path, key: str, value: np.ndarray) -> np.ndarray:
+    if not np.isfinite(value).all():
+        row = int(np.argwhere(~np.isfinite(value))[0][0])
+        raise ValueError(f"{path}: {key} has row {row}, which is not finite; repair it, or leave {key} out")
+    return value
 
 
 def _check_stiffness(path: Path, stiffness: np.ndarray | None) -> None:

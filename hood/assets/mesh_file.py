@@ -111,6 +111,9 @@ def _check(raw: RawMesh, split_polygons: bool) -> None:
     far = far_vertex(raw.pos) if np.isfinite(raw.pos).all() else None
     if far is not None:
         raise Unreadable(far)
+    if raw.uv is not None and not np.isfinite(raw.uv).all():
+        row = int(np.argwhere(~np.isfinite(raw.uv))[0][0])
+        raise Unreadable(f"texture coordinate {row + 1} is not finite; repair it, or export without texture coordinates")
     counts, num_vertices = raw.counts, len(raw.pos)
     bad = (counts < 3) | (counts > (MAX_CORNERS if split_polygons else 3))
     outside = (raw.corners < 0) | (raw.corners >= num_vertices)

@@ -19,10 +19,10 @@ details { margin-top: 1em; } summary { cursor: pointer; font-weight: 600; }
 """
 
 
-def whole_page(title: str, body: str) -> str:
-    """The document; ``body`` is markup."""
+def whole_page(title: str, body: str, style: str = "") -> str:
+    """The document; ``body`` is markup, ``style`` rules of its own."""
     head = f'<meta charset="utf-8"/><meta name="viewport" content="width=device-width"/><title>{escape(title)}</title>'
-    return f'<!DOCTYPE html>\n<html lang="en"><head>{head}<style>{_STYLE}</style></head><body>{body}</body></html>\n'
+    return f'<!DOCTYPE html>\n<html lang="en"><head>{head}<style>{_STYLE}{style}</style></head><body>{body}</body></html>\n'
 
 
 def section(title: str, body: str) -> str:

@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 
 from hood.cli import main
-from hood.commands import envelope
-from hood.commands.envelope import REFERENCE, Task, command_of, make_tasks
+from hood.commands import envelope, envelope_tasks
+from hood.commands.envelope_tasks import REFERENCE, Task, command_of, make_tasks, write_inputs
 from hood.commands.rollouts_beside import Ended, run_beside
 from hood.config import ConfigError, load_config
-from hood.evaluation.envelope import Cell, cells
+from hood.evaluation.cells import NOMINAL, Cell, cells
 
 NO_TIME = Cell("input", "no time", ("fps=0",), bad_input="fps")
 
@@ -33,10 +33,57 @@ def test_what_a_rollout_of_the_map_is_asked_for(tmp_path: Path) -> None:
     assert Task(finest, "dress", "quickstart").alone
 
 
+def test_the_nominal_cell_is_first_and_long_ones_are_asked_for() -> None:
+    tasks = make_tasks(load_config("envelope", ["models=[quickstart]", "factors=[spin]", "garments=[dress,tank]"]))
+    assert {task.cell.factor for task in tasks} == {NOMINAL, "spin"}
+    assert [(task.cell.factor, task.garment) for task in tasks[:6:3]] == [(NOMINAL, "dress"), (NOMINAL, "tank")]
+    short, whole, named = (
+        {task.cell for task in make_tasks(load_config("envelope", words))} for words in ([], ["long=true"], ["factors=[long]"])
+    )
+    assert whole - short == {cell for cell in cells() if cell.long} == named - short
+    long = [task for task in make_tasks(load_config("envelope", ["factors=[long]"])) if task.cell.long]
+    assert REFERENCE not in {task.model for task in long}
+
+
+def test_cells_bring_their_own_garment_body_and_motion(tmp_path: Path) -> None:
+    config = load_config("envelope", ["models=[newton]", "garments=[tank]"])
+    tasks = [task for task in make_tasks(config) if task.model == "newton"]
+
+    def words(name: str) -> tuple[str, ...]:
+        return next(command_of(task, config, tmp_path) for task in tasks if task.cell.name == name)
+
+    assert "garment=[tank,skirt]" in words("layers-tank-skirt")
+    assert {"sequence=none", f"body={tmp_path}/inputs/body.obj"} <= set(words("drop-2-m"))
+    assert {"garment=skirt", "pins=[waistband,hem]"} <= set(words("pins-hem-legs-90-degrees-apart"))
+    assert {"loop=50", "sequence=walk_proud", "surface_stride=20"} <= set(
+        command_of(Task(next(c for c in cells() if c.long and c.sequence), "tank", "newton"), config, tmp_path)
+    )
+    folders = {task.folder(tmp_path) for task in tasks}
+    assert len(folders) == len(tasks)
+    assert all(" " not in str(path.relative_to(tmp_path)) and "[" not in str(path) for path in folders)
+
+
+def test_inputs_are_written_once(tmp_path: Path) -> None:
+    chosen = [cell for cell in cells() if cell.name in ("drop-2-m", "turn-90-degrees", "together-eight")]
+    write_inputs([Task(cell, "dress", "newton") for cell in chosen], tmp_path)
+    found = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "inputs").iterdir()}
+    assert set(found) == {"body.obj", "dress_sheet_2.npz", "turn_90.npz"}
+    write_inputs([Task(cell, "dress", "newton") for cell in chosen], tmp_path)
+    assert found == {path.name: path.stat().st_mtime_ns for path in (tmp_path / "inputs").iterdir()}
+
+
+def test_a_document_without_marks_is_refused_before_anything_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "page.md"
+    path.write_text("# Page\n")
+    assert main(["envelope", f"document={path}", f"output={tmp_path / 'out'}"]) == 2
+    assert "write the lines <!-- written by hood envelope: begin -->" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
-        (["factors=[spam]"], "factors: 'spam' is none of them; choose dt, stretching"),
+        (["factors=[spam]"], "factors: 'spam' is none of them; choose nominal, garment, motion, dt"),
         (["models=[newton+5]"], "refines what is solved already"),
         (["models=[]"], "models and garments: give one of each at least"),
     ],
@@ -49,7 +96,7 @@ def test_what_is_no_map_is_refused(overrides: list[str], words: str) -> None:
 def test_a_cell_is_run_once_and_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(envelope, "cells", lambda: (NO_TIME,))
+    monkeypatch.setattr(envelope_tasks, "cells", lambda: (NO_TIME,))
     words = ["envelope", "models=[newton]", "garments=[tank]", f"output={tmp_path}"]
     assert main(words) == 0
     with open(tmp_path / "envelope.csv", newline="") as file:

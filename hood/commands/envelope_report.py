@@ -1,0 +1,115 @@
+"""What has been measured of the stability map: every cell judged, as tables, as a page and as a section of a document."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig
+
+from hood.commands.envelope_tasks import REFERENCE, Task, read_record, weights_of
+from hood.commands.surface_report import surface_warnings
+from hood.dynamics.recorder import read_rollout
+from hood.evaluation.cells import NOMINAL
+from hood.evaluation.envelope import Criteria, Run, form, judge, shares, table
+from hood.evaluation.envelope_figures import FIGURES, at_same_times, figures
+from hood.evaluation.envelope_prose import write_section
+from hood.evaluation.grid import NEWTON
+from hood.evaluation.rows import write_rows
+from hood.media.envelope_curve import Curve
+from hood.media.envelope_page import View, write_page
+from hood.media.envelope_sheet import small_sheet
+
+_COLUMNS = ("factor", "value", "garment", "model", "class", "reasons", "said", "exit_code", *FIGURES, "weights", "command")
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a rollout left."""
+
+    run: Run
+    pos: np.ndarray | None = None  # (T, V, 3) m
+    dt: float = 0.0
+
+
+def report(config: DictConfig, tasks: Sequence[Task], commands: Mapping[Task, Sequence[str]], folder: Path) -> None:
+    """Judge what is done, print how many cells are sound and write ``envelope.csv``, ``envelope.json``, ``index.html`` and the
+    section of the document."""
+    criteria = Criteria(**{spec.name: float(config[spec.name]) for spec in fields(Criteria)})
+    models, garments = [str(name) for name in config.models], [str(name) for name in config.garments]
+    usual, views = dict[tuple[str, str], set[str]](), list[View]()
+    for (cell, garment), group in groupby(tasks, key=lambda task: (task.cell, task.garment)):
+        found = {task.model: read_found(task, folder) for task in group if read_record(task, folder)}
+        for model in models:
+            if model not in found:
+                continue
+            task, run = Task(cell, garment, model), found[model].run
+            if cell.factor == NOMINAL:
+                usual[garment, model] = {form(text) for text in run.warnings}
+            against = found.get(REFERENCE if model == NEWTON else NEWTON)
+            solver = None if against is None else against.run.metrics
+            known = usual.get((garment, model), usual.get((garments[0], model), set()))
+            judged = judge(cell, run, solver, task.alone, criteria, known)
+            words = {"class": judged.kind, "reasons": "; ".join(judged.reasons), "said": "; ".join(judged.said)}
+            row = _row(task, found[model], against) | words | {"command": shlex.join(["hood", *commands[task]])}
+            picture = small_sheet(task.folder(folder)) if judged.reasons and found[model].pos is not None else None
+            views.append(View(row, judged, curve_of(run), None if against is None else curve_of(against.run), picture))
+    rows = [view.row for view in views]
+    write_rows(rows, _COLUMNS, folder, "envelope")
+    page = write_page(views, models, criteria, folder)
+    print(table(rows, models))
+    for model in models:
+        parts = shares([row["class"] for row in rows if row["model"] == model])
+        print(f"{model}: " + ", ".join(f"{kind} {share:.0%}" for kind, share in parts.items()))
+    if config.document is not None:
+        write_section(Path(str(config.document)), rows, models)
+    print(f"cells with reasons, curves and commands in {page}, as tables in {folder / 'envelope.csv'} and envelope.json")
+
+
+def read_found(task: Task, folder: Path) -> Found:
+    """What is on disk of a rollout that has ended."""
+    record, at = read_record(task, folder), task.folder(folder) / "rollout"
+    code, error = int(record["exit_code"]), str(record["error"])
+    try:
+        summary = json.loads((at / "summary.json").read_text())
+        data = read_rollout(at / "rollout.h5")
+    except (OSError, ValueError):
+        return Found(Run(code, error, late=code < 0 and bool(error)))
+    surface = summary.get("surface")
+    warnings = (*summary.get("warnings", ()), *(() if surface is None else surface_warnings(surface)))
+    unsound = tuple(summary.get("unsound_reasons", ())) if summary.get("sound") is False else ()
+    finite = np.isfinite(data.cloth_pos).all(axis=(1, 2))
+    run = Run(code, error, warnings, unsound, {**data.metrics, "finite": finite})
+    return Found(run, data.cloth_pos, float(data.attributes["dt"]))
+
+
+def curve_of(run: Run) -> Curve | None:
+    """Strain p99 and cut share by frame, for the page."""
+    if run.metrics is None:
+        return None
+    blank = np.full(len(run.metrics["finite"]), np.nan)
+    return Curve(run.metrics.get("strain_p99", blank), run.metrics.get("cut_face_share", blank))
+
+
+def _row(task: Task, found: Found, against: Found | None) -> dict[str, Any]:
+    run, measured = found.run, dict.fromkeys(FIGURES)
+    if run.metrics is not None and found.pos is not None:
+        reference = None
+        if against is not None and against.pos is not None and against is not found:
+            reference = at_same_times(against.pos, against.dt, found.dt)
+        measured = figures(run.metrics, found.pos, task.cell.motion == "rest", reference)
+    return {
+        "factor": task.cell.factor,
+        "value": task.cell.value,
+        "garment": task.garment,
+        "model": task.model,
+        "exit_code": run.exit_code,
+        **measured,
+        "weights": weights_of(task.model),
+    }
