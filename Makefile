@@ -5,7 +5,7 @@ VENV ?= .venv
 PIP_ARGS ?=
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint slow clean
+.PHONY: demo test lint slow envelope clean
 
 demo: $(VENV)/.demo
 	$(BIN)/hood rollout garment=dress_4k stepper=auto output=outputs/demo
@@ -16,6 +16,10 @@ test: lint
 
 slow: $(VENV)/.dev
 	$(BIN)/python -m pytest -m slow
+
+# Hours: the stability map, its page in outputs/envelope, and the section of docs/stability.md that is written from it.
+envelope: $(VENV)/.demo
+	$(BIN)/hood envelope output=outputs/envelope document=docs/stability.md
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .

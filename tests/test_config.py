@@ -53,6 +53,8 @@ def test_names_that_look_like_numbers_are_names() -> None:
         (["sheet=3"], ("sheet", "bool")),
         (["body_parts=1"], ("body_parts", "list")),
         (["material.density=heavy"], ("material.density", "'heavy'")),
+        (["losses.terms.friction.coefficient=nan"], ("losses.terms.friction.coefficient=nan", "finite", "0.5")),
+        (["solver.target_rg=inf"], ("solver.target_rg=inf", "finite", "0.01")),
         (["sequence=[a,b]"], ("sequence",)),
         (["garment={a:1}"], ("garment",)),
         (["+speed=3"], ("+speed=3",)),

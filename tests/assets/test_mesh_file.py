@@ -88,6 +88,7 @@ REFUSED = {
         "ply\nformat binary_little_endian 1.0\nelement vertex 4000000000\nproperty float x\nend_header\n1234",
         ("announces 4000000000 vertex rows",),
     ),
+    "nan.obj": (SQUARE + "vt 0 0\nvt 1 nan\nvt 0 1\nf 1/1 2/2 3/3\n", ("texture coordinate 2 is not finite",)),
     "texture.obj": (SQUARE + "vt 0 0\nf 1/1 2/9 3/1\n", ("texture coordinate 9 of 1",)),
     "binary.ply": ("ply\nformat binary_middle_endian 1.0\nend_header\n", ("binary_middle_endian",)),
 }
