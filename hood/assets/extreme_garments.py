@@ -10,6 +10,7 @@ import numpy as np
 from hood.assets.body import load_body
 from hood.assets.garment import Garment
 from hood.assets.isotropic import isotropic
+from hood.assets.remesh import closest
 from hood.mesh.topology import unique_edges
 
 Array = np.ndarray
@@ -78,9 +79,13 @@ def _components(garment: Garment, count: float, rng: np.random.Generator) -> Gar
 
 
 def _remesh(garment: Garment, count: float, rng: np.random.Generator) -> Garment:
-    """Triangulated anew with about so many vertices and edges of one length; nothing of it is held."""
+    """Triangulated anew with about so many vertices and edges of one length."""
     pos, faces = isotropic(garment.rest_pos, garment.faces, int(count))
-    return Garment(garment.name, pos, faces, np.zeros(len(pos), dtype=bool))
+    hit = closest(pos, garment.rest_pos, garment.faces)
+    origin, weights = garment.faces[hit.face.numpy()], hit.bary.numpy()
+    nearest = origin[np.arange(len(pos)), weights.argmax(axis=1)]
+    fields = _means(garment, origin, weights) | {key: _taken(getattr(garment, key), nearest) for key in _MARKS}
+    return replace(garment, **fields | {"rest_pos": pos}, faces=faces, **_NOTHING)  # type: ignore[arg-type]
 
 
 def _subdivide(garment: Garment, times: float, rng: np.random.Generator) -> Garment:

@@ -16,8 +16,9 @@ from omegaconf import DictConfig
 from hood.commands.envelope_tasks import REFERENCE, Task, read_record, weights_of
 from hood.commands.surface_report import surface_warnings
 from hood.dynamics.recorder import read_rollout
+from hood.dynamics.soundness import Criteria
 from hood.evaluation.cells import NOMINAL
-from hood.evaluation.envelope import Criteria, Run, form, judge, shares, table
+from hood.evaluation.envelope import Run, form, judge, shares, table
 from hood.evaluation.envelope_figures import FIGURES, at_same_times, figures
 from hood.evaluation.envelope_prose import write_section
 from hood.evaluation.grid import NEWTON

@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from hood.dynamics.soundness import Criteria
+
 #: A frame with a larger share of cut triangles is warned about.
-WORST_CUT = 0.01
+WORST_CUT = Criteria().cut_share
 
 
 def summarise_surface(metrics: Mapping[str, np.ndarray], stride: int | None) -> dict[str, Any] | None:

@@ -22,6 +22,23 @@ _MOST_RUNS = 4
 
 
 @dataclass(frozen=True)
+class Criteria:
+    """What a sound rollout is where there is a reference, as in the stability map: the solver's rollout of the same scene.
+
+    A single rollout has none, and light or soft cloth may stretch far beyond ``strain`` as it should. :func:`judge`
+    therefore has the wider limits above.
+    """
+
+    strain: float = 0.25  # 99th percentile in the worst frame, or
+    strain_ratio: float = 1.5  # so many times that of the solver, whichever is more
+    network_strain: float = 0.05  # difference of a network's to the solver's
+    cut_share: float = 0.01  # of the cloth's triangles, in the worst measured frame
+    depth: float = 0.01  # m, of a vertex in the body
+    converged: float = 0.95  # share of the solver's steps
+    climb: float = 0.005  # of the strain per 100 frames at rest
+
+
+@dataclass(frozen=True)
 class Verdict:
     """Sound, unsound, or, with None, not known."""
 

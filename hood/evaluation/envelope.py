@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from hood.dynamics.soundness import Criteria
 from hood.evaluation.cells import Cell
 
 SOUND, DEGRADED, FAILED, SILENT, REFUSED = "sound", "degraded and said", "failed and said", "silent", "refused"
@@ -18,19 +19,6 @@ CLASSES = (SOUND, DEGRADED, FAILED, SILENT, REFUSED)
 #: What differs between two sentences that say the same: names, numbers, and how many of these are listed.
 _NAME, _NUMBER = re.compile(r"'[^']*'"), re.compile(r"[-+]?\d+(?:[.,]\d+)*(?:e[-+]?\d+)?%?")
 _LISTED = re.compile(r"frames? #(?:(?:, | and |–)#)*(?: more)?")
-
-
-@dataclass(frozen=True)
-class Criteria:
-    """What a sound rollout is."""
-
-    strain: float = 0.25  # 99th percentile in the worst frame, or
-    strain_ratio: float = 1.5  # so many times that of the solver, whichever is more
-    network_strain: float = 0.05  # difference of a network's to the solver's
-    cut_share: float = 0.01  # of the cloth's triangles, in the worst measured frame
-    depth: float = 0.01  # m, of a vertex in the body
-    converged: float = 0.95  # share of the solver's steps
-    climb: float = 0.005  # of the strain per 100 frames at rest
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from html import escape
 
 import numpy as np
 
-from hood.evaluation.envelope import Criteria
+from hood.dynamics.soundness import Criteria
 
 #: Pixels of a panel, of the gap between two and around them, and points of a curve at most.
 _WIDTH, _HEIGHT, _GAP, _EDGE, _POINTS = 320, 120, 56, 30, 120
@@ -53,7 +53,7 @@ def _panel(values: np.ndarray, solver: np.ndarray | None, limit: float, title: s
     yield f'<path d="M0,0 V{_HEIGHT} H{_WIDTH}" fill="none" stroke="#999"/>'
     for share in {limit, highest}:
         y = _HEIGHT * (1.0 - share / top)
-        yield f'<text x="-4" y="{y + 4:.1f}" text-anchor="end" fill="#555">{share:.3g}</text>'
+        yield f'<text x="-4" y="{y + 4:.1f}" text-anchor="end" fill="#555">{100 * share:.3g}%</text>'
     y = _HEIGHT * (1.0 - limit / top)
     yield f'<path d="M0,{y:.1f} H{_WIDTH}" stroke="{_LIMIT}" stroke-dasharray="3 3"/>'
     if solver is not None:

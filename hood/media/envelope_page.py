@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from hood.assets.atomic import write_atomically
-from hood.evaluation.envelope import CLASSES, DEGRADED, FAILED, REFUSED, SILENT, SOUND, Criteria, Judged, shares
+from hood.dynamics.soundness import Criteria
+from hood.evaluation.envelope import CLASSES, DEGRADED, FAILED, REFUSED, SILENT, SOUND, Judged, shares
 from hood.evaluation.envelope_figures import FIGURES
 from hood.media.envelope_curve import Curve, curve_svg
 from hood.media.page import paragraph, section, table, whole_page

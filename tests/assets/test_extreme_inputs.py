@@ -202,12 +202,17 @@ def test_components_are_so_many_and_cover_the_same_cloth(tmp_path: Path) -> None
     assert len(load_garment(tmp_path / "g.npz").rest_pos) == len(load_garment("dress").rest_pos)
 
 
-def test_a_coarser_garment_covers_the_same_cloth(tmp_path: Path) -> None:
-    whole = load_garment("skirt")
-    write_garment(tmp_path / "coarse.npz", "skirt", "remesh:250")
+def test_a_coarser_garment_covers_the_same_cloth_and_is_worn_alike(tmp_path: Path) -> None:
+    whole = load_garment("dress")
+    write_garment(tmp_path / "coarse.npz", "dress", "remesh:300")
     coarse = load_garment(tmp_path / "coarse.npz")
-    assert len(coarse.rest_pos) == pytest.approx(250, rel=0.05)
+    assert len(coarse.rest_pos) == pytest.approx(300, rel=0.05)
     assert area(coarse.rest_pos, coarse.faces) == pytest.approx(area(whole.rest_pos, whole.faces), rel=0.03)
+    assert whole.skin_pos is not None
+    assert coarse.skin_pos is not None
+    near = np.linalg.norm(coarse.skin_pos[:, None] - whole.skin_pos[None], axis=2).min(axis=1)
+    assert near.max() < 0.6 * longest(whole.rest_pos, whole.faces).max()
+    assert all(getattr(coarse, key) is not None for key in ("lbs_weights", "shapedirs", "rest_turn", "stiffness"))
 
 
 def test_a_finer_garment_has_four_faces_for_one(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import sys
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from hood.commands import envelope, envelope_tasks
 from hood.commands.envelope_tasks import REFERENCE, Task, command_of, make_tasks, write_inputs
 from hood.commands.rollouts_beside import Ended, run_beside
 from hood.config import ConfigError, load_config
+from hood.dynamics.soundness import Criteria
 from hood.evaluation.cells import NOMINAL, Cell, cells
 
 NO_TIME = Cell("input", "no time", ("fps=0",), bad_input="fps")
@@ -31,6 +33,11 @@ def test_what_a_rollout_of_the_map_is_asked_for(tmp_path: Path) -> None:
     assert {"stepper=refine", "refine=5"} <= set(words["guess+5"])
     assert not any(task.alone for task in tasks)
     assert Task(finest, "dress", "quickstart").alone
+
+
+def test_the_limits_that_help_prints_are_the_librarys() -> None:
+    config = load_config("envelope")
+    assert Criteria() == Criteria(**{spec.name: config[spec.name] for spec in fields(Criteria)})
 
 
 def test_the_nominal_cell_is_first_and_long_ones_are_asked_for() -> None:

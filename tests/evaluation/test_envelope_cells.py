@@ -10,6 +10,7 @@ import pytest
 
 from hood.assets.extreme_garments import FAULTS
 from hood.assets.extreme_motions import MOTIONS
+from hood.dynamics.soundness import Criteria
 from hood.evaluation.cells import NOMINAL, ORDERED, Cell, cells
 from hood.evaluation.envelope import (
     DEGRADED,
@@ -17,7 +18,6 @@ from hood.evaluation.envelope import (
     REFUSED,
     SILENT,
     SOUND,
-    Criteria,
     Run,
     form,
     judge,
