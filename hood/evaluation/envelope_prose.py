@@ -65,15 +65,21 @@ def _shares(rows: Rows, models: Sequence[str]) -> str:
 
 def _ranges(rows: Rows, models: Sequence[str]) -> str:
     lines = [
-        "Where a method holds: *all* of a factor's settings, from one *to* another, or by their number.",
+        "Where a method is sound: how many settings of a factor, and which of those that form a range.",
         "",
         f"| factor | {' | '.join(models)} |",
         "|" + "---|" * (len(models) + 1),
     ]
-    for factor in dict.fromkeys(row["factor"] for row in rows if row["class"] != REFUSED):
-        texts = [holds([row for row in rows if row["factor"] == factor and row["model"] == model]) for model in models]
-        lines.append(f"| {factor} | {' | '.join(texts)} |")
-    return "\n".join(lines)
+    return "\n".join([*lines, *(f"| {' | '.join(row)} |" for row in ranges(rows, models))])
+
+
+def ranges(rows: Rows, models: Sequence[str]) -> list[list[str]]:
+    """A row for every factor: its name, and where each method holds."""
+    factors = dict.fromkeys(row["factor"] for row in rows if row["class"] != REFUSED)
+    return [
+        [factor, *(holds([row for row in rows if row["factor"] == factor and row["model"] == model]) for model in models)]
+        for factor in factors
+    ]
 
 
 def holds(rows: Rows) -> str:
@@ -82,14 +88,13 @@ def holds(rows: Rows) -> str:
     sound = [all(row["class"] == SOUND for row in rows if row["value"] == value) for value in values]
     if not values:
         return ""
-    if all(sound):
-        return "all" if len(values) == 1 or rows[0]["factor"] not in ORDERED else f"all, {values[0]} to {values[-1]}"
     if not any(sound):
-        return "none"
-    if rows[0]["factor"] not in ORDERED:
-        return f"{sum(sound)} of {len(values)}"
-    runs = [[values[index] for index in run] for run in _runs(sound)]
-    return ", ".join(run[0] if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs)
+        return f"none of {len(values)}"
+    count = f"all {len(values)}" if all(sound) else f"{sum(sound)} of {len(values)}"
+    if rows[0]["factor"] not in ORDERED or len(values) == 1:
+        return count
+    stretches = [[values[index] for index in run] for run in _runs(sound)]
+    return f"{count}: " + ", ".join(run[0] if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in stretches)
 
 
 def _runs(sound: Sequence[bool]) -> Iterator[list[int]]:

@@ -14,6 +14,7 @@ from hood.assets.atomic import write_atomically
 from hood.dynamics.soundness import Criteria
 from hood.evaluation.envelope import CLASSES, DEGRADED, FAILED, REFUSED, SILENT, SOUND, Judged, shares
 from hood.evaluation.envelope_figures import FIGURES
+from hood.evaluation.envelope_prose import ranges
 from hood.media.envelope_curve import Curve, curve_svg
 from hood.media.page import paragraph, section, table, whole_page
 
@@ -54,6 +55,8 @@ def write_page(views: Sequence[View], models: Sequence[str], criteria: Criteria,
     """Write ``index.html``; returns its path."""
     parts = [f"<h1>{TITLE}</h1>", *map(paragraph, _introduction(criteria)), _legend()]
     parts.append(section("Shares", _shares(views, models)))
+    holds = ranges([view.row for view in views], models)
+    parts.append(section("Where each method is sound", table(["factor", *models], holds)))
     parts.append(section("The map", paragraph(_HOW) + _heat_map(views, models)))
     parts += [_cell(number, view, criteria) for number, view in enumerate(views)]
     path = folder / "index.html"

@@ -22,10 +22,10 @@ def rows(factor: str, kinds: dict[str, str], model: str = "newton", garment: str
 @pytest.mark.parametrize(
     ("kinds", "words"),
     [
-        ({"1": SOUND, "2": SOUND, "4": SOUND}, "all, 1 to 4"),
-        ({"1": SOUND, "2": SOUND, "4": SILENT}, "1 to 2"),
-        ({"1": SOUND, "2": SILENT, "4": SOUND}, "1, 4"),
-        ({"1": DEGRADED, "2": SILENT}, "none"),
+        ({"1": SOUND, "2": SOUND, "4": SOUND}, "all 3: 1 to 4"),
+        ({"1": SOUND, "2": SOUND, "4": SILENT}, "2 of 3: 1 to 2"),
+        ({"1": SOUND, "2": SILENT, "4": SOUND}, "2 of 3: 1, 4"),
+        ({"1": DEGRADED, "2": SILENT}, "none of 2"),
         ({"1": REFUSED}, ""),
     ],
 )
@@ -35,9 +35,9 @@ def test_where_an_ordered_factor_holds(kinds: dict[str, str], words: str) -> Non
 
 def test_other_factors_are_counted_and_a_setting_holds_for_all_garments() -> None:
     assert holds(rows("pose", {"crouch": SOUND, "split": SILENT})) == "1 of 2"
-    assert holds(rows("pose", {"crouch": SOUND, "split": SOUND})) == "all"
+    assert holds(rows("pose", {"crouch": SOUND, "split": SOUND})) == "all 2"
     both = rows("spin", {"1": SOUND, "2": SOUND}) + rows("spin", {"1": SOUND, "2": SILENT}, garment="tank")
-    assert holds(both) == "1"
+    assert holds(both) == "1 of 2: 1"
 
 
 def test_the_section_replaces_what_was_between_the_marks(tmp_path: Path) -> None:
@@ -53,7 +53,7 @@ def test_the_section_replaces_what_was_between_the_marks(tmp_path: Path) -> None
         assert text.endswith(f"{END}\n\n## After\n")
         assert "outdated" not in text
     assert "| newton | 2 | 50.0% | 0.0% | 0.0% | 50.0% | 1 |" in text
-    assert "| spin | 1 | all, 1 to 2 |" in text
+    assert "| spin | 1 of 2: 1 | all 2: 1 to 2 |" in text
     assert "- **spin 2 (dress)** newton: silent, too far at 2" in text
     assert "input" not in text.replace("bad input", "")
 

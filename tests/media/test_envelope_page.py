@@ -58,6 +58,8 @@ def test_every_cell_has_a_square_that_leads_to_its_reasons(tmp_path: Path) -> No
     assert str(picture.get("src")).startswith("data:image/jpeg;base64,/9hq")
     shares = [["".join(cell.itertext()) for cell in row] for row in root.findall(".//table")[0].iter("tr")]
     assert shares[1] == ["newton", "1", "100.0%", "0.0%", "0.0%", "0.0%", "1"]
+    holds = [[cell.text for cell in row] for row in root.findall(".//table")[1].iter("tr")]
+    assert holds == [["factor", "newton", "ours"], ["spin", "all 1", "1 of 2: 2"]]
     assert shares[2] == ["ours", "2", "50.0%", "0.0%", "0.0%", "50.0%", "0"]
 
 
