@@ -123,13 +123,14 @@ def _garments() -> Iterator[Cell]:
 
 def _meshes() -> Iterator[Cell]:
     """Faults that meshes have."""
+    for power in range(2, 7):
+        yield Cell("slivers", f"1e{power}", fault=f"slivers:1e{power}")
     for kind, amounts in (
-        ("slivers", (1e2, 1e3, 1e4, 1e5, 1e6)),
         ("duplicates", (5, 20, 80)),
         ("isolated", (1, 10, 100)),
         ("flipped", (3, 30, 300)),
         ("irregular", (0.3, 0.6, 0.9)),
-        ("components", (2, 10, 50)),
+        ("components", (2, 5, 10)),
     ):
         for amount in amounts:
             yield Cell(kind, f"{amount:g}", fault=f"{kind}:{amount:g}")
