@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
 from itertools import groupby
 from pathlib import Path
@@ -43,34 +43,37 @@ def report(config: DictConfig, tasks: Sequence[Task], commands: Mapping[Task, Se
     """Judge what is done, print how many cells are sound and write ``envelope.csv``, ``envelope.json``, ``index.html`` and the
     section of the document."""
     criteria = Criteria(**{spec.name: float(config[spec.name]) for spec in fields(Criteria)})
-    models, garments = [str(name) for name in config.models], [str(name) for name in config.garments]
-    usual, views = dict[tuple[str, str], set[str]](), list[View]()
-    for (cell, garment), group in groupby(tasks, key=lambda task: (task.cell, task.garment)):
-        found = {task.model: read_found(task, folder) for task in group if read_record(task, folder)}
-        for model in models:
-            if model not in found:
-                continue
-            task, run = Task(cell, garment, model), found[model].run
-            if cell.factor == NOMINAL:
-                usual[garment, model] = {form(text) for text in run.warnings}
-            against = found.get(REFERENCE if model == NEWTON else NEWTON)
-            solver = None if against is None else against.run.metrics
-            known = usual.get((garment, model), usual.get((garments[0], model), set()))
-            judged = judge(cell, run, solver, task.alone, criteria, known)
-            words = {"class": judged.kind, "reasons": "; ".join(judged.reasons), "said": "; ".join(judged.said)}
-            row = _row(task, found[model], against) | words | {"command": shlex.join(["hood", *commands[task]])}
-            picture = small_sheet(task.folder(folder)) if judged.reasons and found[model].pos is not None else None
-            views.append(View(row, judged, curve_of(run), None if against is None else curve_of(against.run), picture))
+    models, views, usual = [str(name) for name in config.models], list[View](), dict[tuple[str, str], set[str]]()
+    for _, group in groupby(tasks, key=lambda task: (task.cell, task.garment)):
+        found = {task: read_found(task, folder) for task in group if read_record(task, folder)}
+        for task in sorted((task for task in found if task.model in models), key=lambda task: models.index(task.model)):
+            if task.cell.factor == NOMINAL:
+                usual[task.garment, task.model] = {form(text) for text in found[task].run.warnings}
+            known = usual.get((task.garment, task.model), usual.get((str(config.garments[0]), task.model), set()))
+            views.append(view_of(task, found, commands[task], criteria, known, folder))
     rows = [view.row for view in views]
     write_rows(rows, _COLUMNS, folder, "envelope")
     page = write_page(views, models, criteria, folder)
+    if config.document is not None:
+        write_section(Path(str(config.document)), rows, models)
     print(table(rows, models))
     for model in models:
         parts = shares([row["class"] for row in rows if row["model"] == model])
         print(f"{model}: " + ", ".join(f"{kind} {share:.0%}" for kind, share in parts.items()))
-    if config.document is not None:
-        write_section(Path(str(config.document)), rows, models)
     print(f"cells with reasons, curves and commands in {page}, as tables in {folder / 'envelope.csv'} and envelope.json")
+
+
+def view_of(
+    task: Task, found: Mapping[Task, Found], command: Sequence[str], criteria: Criteria, usual: Collection[str], folder: Path
+) -> View:
+    """What is shown of a rollout: its class and figures, its curve beside the solver's, and pictures where it is not sound."""
+    own, against = found[task], found.get(task.beside(REFERENCE if task.model == NEWTON else NEWTON))
+    solver = None if against is None else against.run
+    judged = judge(task.cell, own.run, None if solver is None else solver.metrics, task.alone, criteria, usual)
+    words = {"class": judged.kind, "reasons": "; ".join(judged.reasons), "said": "; ".join(judged.said)}
+    row = _row(task, own, against) | words | {"command": shlex.join(["hood", *command])}
+    picture = small_sheet(task.folder(folder)) if judged.reasons and own.pos is not None else None
+    return View(row, judged, curve_of(own.run), None if solver is None else curve_of(solver), picture)
 
 
 def read_found(task: Task, folder: Path) -> Found:
@@ -102,7 +105,7 @@ def _row(task: Task, found: Found, against: Found | None) -> dict[str, Any]:
     run, measured = found.run, dict.fromkeys(FIGURES)
     if run.metrics is not None and found.pos is not None:
         reference = None
-        if against is not None and against.pos is not None and against is not found:
+        if against is not None and against.pos is not None:
             reference = at_same_times(against.pos, against.dt, found.dt)
         measured = figures(run.metrics, found.pos, task.cell.motion == "rest", reference)
     return {

@@ -105,7 +105,8 @@ def write_inputs(tasks: Sequence[Task], folder: Path) -> None:
 
 
 def _motion(cell: Cell, folder: Path) -> Path:
-    return folder / "inputs" / f"{(cell.motion or '').replace(':', '_')}.npz"
+    longer = "_long" if cell.long else ""
+    return folder / "inputs" / f"{(cell.motion or '').replace(':', '_')}{longer}.npz"
 
 
 def _garment(cell: Cell, garment: str, folder: Path) -> Path:

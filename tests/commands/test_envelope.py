@@ -79,6 +79,13 @@ def test_inputs_are_written_once(tmp_path: Path) -> None:
     assert found == {path.name: path.stat().st_mtime_ns for path in (tmp_path / "inputs").iterdir()}
 
 
+def test_a_long_motion_has_a_file_of_its_own(tmp_path: Path) -> None:
+    config = load_config("envelope", ["models=[newton]"])
+    rest, long = (Task(cell, "dress", "newton") for cell in cells() if cell.motion == "rest")
+    assert command_of(rest, config, tmp_path)[2] != command_of(long, config, tmp_path)[2]
+    assert long.cell.seconds * long.cell.fps >= long.cell.num_frames
+
+
 def test_a_document_without_marks_is_refused_before_anything_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "page.md"
     path.write_text("# Page\n")
