@@ -131,8 +131,9 @@ def children(pid: int) -> Iterator[int]:
 
 
 def results(folder: Path) -> list[Path]:
-    """Files that the command has left and that are to open."""
-    return sorted(path for path in folder.rglob("*") if path.is_file() and path.suffix != PARTIAL)
+    """Files that the command has left and that are to open; event files of tensorboard are named by the second."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and path.suffix != PARTIAL)
+    return [path for path in files if path.parent.name != "tensorboard"]
 
 
 def fingerprint(path: Path) -> str:
