@@ -9,7 +9,7 @@ EXIT_CODES = {
     0: "done",
     1: "inspect: something needs repair",
     2: "an error, told in one line",
-    UNSOUND: "rollout: a result is unsound, see sound and unsound_reasons in summary.json",
+    UNSOUND: "rollout: a result is unsound, or guard=strict ended it; see sound, unsound_reasons and guard in summary.json",
     130: "interrupted",
 }
 

@@ -35,6 +35,7 @@ from hood.commands.common import (
     weigh,
 )
 from hood.commands.dial import AUTO, check_dial, chosen, exported, refined
+from hood.commands.guarding import GuardStopped, check_guard, guard_sentences, make_guard, write_alarms
 from hood.commands.notices import heard
 from hood.commands.performance import make_motion
 from hood.commands.summary import describe, describe_all, summarise
@@ -68,9 +69,10 @@ def run(overrides: Sequence[str]) -> int:
     _check_numbers(config)
     require_choice(config, "kernels", (AUTO, *KERNELS))
     require_choice(config, "stepper", ("network", "newton", "refine", AUTO))
-    check_dial(config)
-    check_cloth_contact(config)
     require_choice(config, "step", (PLAIN, *MODES))
+    check_dial(config)
+    check_guard(config)
+    check_cloth_contact(config)
     return together(lambda: _run(config))
 
 
@@ -140,6 +142,7 @@ def _run_there(
     save_run_record(folder, config, int(config.seed))
     interrupted = _simulate_to_disk(config, scene, stepper, digest, folder / "rollout.h5", asked)
     summary = summarise(folder / "rollout.h5")
+    warn(guard_sentences(summary.get("guard")))
     summary["choice"] = choice
     print(describe(summary))
     if advise:
@@ -272,6 +275,7 @@ def make_simulator(config: DictConfig) -> tuple[Simulator, str]:
 def _simulate_to_disk(config: DictConfig, scene: Scene, stepper: Stepper, digest: str, path: Path, asked: DictConfig) -> bool:
     """Stream the rollout into ``path``; True when the user interrupted it. ``asked`` is the config with ``auto`` in it."""
     potential = potential_of(config)
+    guard = make_guard(config, stepper, potential)
     count = min(int(config.num_frames), scene.num_frames)
     if count < int(config.num_frames):
         print(f"{scene.motion.name} has {count} frames at {1 / scene.dt:g} fps; the rollout ends there")
@@ -295,12 +299,13 @@ def _simulate_to_disk(config: DictConfig, scene: Scene, stepper: Stepper, digest
         scene.garment.faces,
         scene.motion.faces,
         scene.motion.num_vertices,
-        metric_names(potential, stepper, str(config.metrics), str(config.settle)),
+        metric_names(potential, stepper, str(config.metrics), str(config.settle), guard is not None),
         scene.dt,
         attributes,
         farthest=float(np.abs(scene.motion.translation).max()),
         fields=exported(config),
         double=_solves_in_double(config),
+        guarded=guard is not None,
     )
     frames = simulate(
         stepper,
@@ -312,12 +317,19 @@ def _simulate_to_disk(config: DictConfig, scene: Scene, stepper: Stepper, digest
         fields=exported(config),
         surface_stride=int(config.surface_stride),
         settle=str(config.settle),
+        guard=guard,
     )
     try:
         with writer:
             for frame in tqdm(frames, total=count, desc=f"rollout {scene.garment.name}", unit="frame", disable=_quiet()):
                 fields = {name: values.numpy() for name, values in frame.fields.items()}
                 writer.append(frame.world_pos.numpy(), frame.body_pos.numpy(), frame.metrics, fields)
+                write_alarms(writer, guard)
+            write_alarms(writer, guard)
+            if guard is not None and guard.stopped is not None:
+                raise GuardStopped
+    except GuardStopped:
+        return False
     except KeyboardInterrupt:
         if writer.frames_done == 0:
             raise

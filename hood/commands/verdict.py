@@ -44,7 +44,10 @@ def describe_verdict(summary: Mapping[str, Any]) -> list[str]:
 
 
 def exit_code(summaries: Iterable[Mapping[str, Any]], allow_unsound: bool) -> int:
-    """3 where one of the rollouts is unsound, unless that is allowed; says so."""
+    """3 where a guard has ended one of the rollouts, or one is unsound, unless that is allowed; says so."""
+    summaries = list(summaries)
+    if any((summary.get("guard") or {}).get("stopped") is not None for summary in summaries):
+        return UNSOUND
     count = sum(summary.get("sound") is False for summary in summaries)
     if count == 0:
         return 0

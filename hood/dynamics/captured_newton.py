@@ -82,7 +82,7 @@ class CapturedNewton:
             "solver_converged": float(bool(report.converged.all())),
             "solver_reason": reason_number(report.reason),
         }
-        return Prediction(pos, report.acc.to(pos.dtype), reached)
+        return Prediction(pos, report.acc.to(pos.dtype), reached, float(report.relative_gradient.max()))
 
     def next_velocity(self, problem: StepProblem, prediction: Prediction) -> Tensor:
         """(V, 3) m/s at t + 1: (x_{t+1} − x_t) / dt."""

@@ -19,6 +19,18 @@ from hood.assets.h5_links import own_dataset, own_group
 
 #: World coordinates beyond this [m] are written in float64: float32 resolves only 8 µm there.
 _FAR = 100.0
+#: What is said of an alarm, with the types in the file; and how many a frame can have: one of its step, one of its surface.
+ALARM_COLUMNS = {
+    "frame": np.dtype(np.int32),
+    "cause": np.dtype("S16"),
+    "value": np.dtype(np.float64),
+    "limit": np.dtype(np.float64),
+    "repair": np.dtype("S16"),
+    "iterations": np.dtype(np.int32),
+    "rg_before": np.dtype(np.float64),
+    "rg_after": np.dtype(np.float64),
+}
+_ALARMS = 2
 
 
 class RolloutWriter:
@@ -29,6 +41,11 @@ class RolloutWriter:
     so far of ``num_planned``, ``complete``, and what is given as ``attributes``. Real numbers are float32, positions far from
     the origin float64; with ``double`` the cloth's are float64 anyway, for states that meet an accuracy which float32 does
     not resolve.
+
+    With ``guarded`` there are the alarms of a guard, one a row: ``guard/frame``, ``guard/cause`` and ``guard/repair`` (words of
+    :data:`hood.dynamics.guard.CAUSES` and :mod:`hood.dynamics.mend`), ``guard/value`` and ``guard/limit`` (of the cause: share
+    of strain or of cut triangles, relative gradient, degrees, m), ``guard/iterations``, ``guard/rg_before`` and
+    ``guard/rg_after``. The attribute ``num_alarms`` counts them; rows beyond it are empty, with the frame -1.
 
     All datasets are laid out, filled with NaN, before the file takes its name: a full disk shows at once, and later writes
     never touch the file's structure. A frame is counted in ``num_frames`` after its values are written. So whoever opens the
@@ -52,9 +69,10 @@ class RolloutWriter:
         farthest: float = 0.0,
         fields: Sequence[str] = (),
         double: bool = False,
+        guarded: bool = False,
     ) -> None:
         self.path = path
-        self.frames_done = 0
+        self.frames_done = self.alarms_done = 0
         # Windows does not rename a file that is open.
         self._draft = path if sys.platform == "win32" else path.with_name(path.name + ".partial")
         try:
@@ -77,6 +95,9 @@ class RolloutWriter:
             self._file["body/faces"] = np.asarray(body_faces, dtype=np.int32)
             self._file["time"] = np.arange(num_frames) * dt
             own = {"dt": dt, "num_frames": 0, "num_planned": num_frames, "complete": False}
+            if guarded:
+                own["num_alarms"] = 0
+                _lay_out_alarms(self._file, _ALARMS * num_frames)
             for key, value in {**own, **attributes}.items():
                 self._file.attrs[key] = value if np.isscalar(value) or isinstance(value, np.ndarray) else json.dumps(value)
             self._touch_all()
@@ -108,6 +129,18 @@ class RolloutWriter:
         self.frames_done += 1
         self._file.attrs.modify("num_frames", self.frames_done)
         self._file.flush()
+
+    def append_alarms(self, alarms: Sequence[Mapping[str, Any]]) -> None:
+        """Write further alarms, each with the names of :data:`ALARM_COLUMNS`."""
+        for alarm in alarms:
+            for name, kind in ALARM_COLUMNS.items():
+                value = alarm[name]
+                self._file[f"guard/{name}"][self.alarms_done] = value.encode() if kind.kind == "S" else value
+            self.alarms_done += 1
+        if alarms:
+            self._file.flush()
+            self._file.attrs.modify("num_alarms", self.alarms_done)
+            self._file.flush()
 
     def close(self, complete: bool) -> None:
         """Finish the file; fewer frames than announced are cut off."""
@@ -143,8 +176,8 @@ class RolloutWriter:
 
     def _touch_all(self) -> None:
         # HDF5 lays contiguous data out at the first write; one row is enough to allocate and fill everything.
-        for name in ("cloth/pos", "body/pos", *_field_paths(self._file), *_metric_paths(self._file)):
-            self._file[name][-1] = np.nan
+        for name in ("cloth/pos", "body/pos", *_field_paths(self._file), *_metric_paths(self._file), *_alarm_paths(self._file)):
+            self._file[name][-1] = self._file[name].fillvalue
 
     def __enter__(self) -> RolloutWriter:
         return self
@@ -171,6 +204,7 @@ class RolloutData:
     metrics: dict[str, np.ndarray]
     attributes: dict[str, Any]
     fields: dict[str, np.ndarray] = field(default_factory=dict)  # (T, V) by name, such as rg
+    alarms: list[dict[str, Any]] = field(default_factory=list)  # of a guard, with the names of ALARM_COLUMNS
 
 
 def read_rollout(path: Path) -> RolloutData:
@@ -195,6 +229,7 @@ def read_rollout(path: Path) -> RolloutData:
                 metrics={name.removeprefix("metrics/"): file[name][:done] for name in _metric_paths(file)},
                 attributes=dict(file.attrs),
                 fields={name.removeprefix("cloth/"): file[name][:done] for name in _field_paths(file)},
+                alarms=_read_alarms(file),
             )
     except FileNotFoundError:
         raise
@@ -221,7 +256,7 @@ def _is_there(file: h5py.File, index: int) -> bool:
 def _check_extents(file: h5py.File, num_bytes: int) -> None:
     """Rollouts are stored as they are: a table that claims more than the file holds would be read as empty memory."""
     names = ("cloth/pos", "cloth/faces", "cloth/rest_pos", "body/pos", "body/faces", "time")
-    for name in (*names, *_field_paths(file), *_metric_paths(file)):
+    for name in (*names, *_field_paths(file), *_metric_paths(file), *_alarm_paths(file)):
         table = own_dataset(file, name)
         if not table.shape or table.size * table.dtype.itemsize > num_bytes:
             raise ValueError(f"{name} claims the shape {table.shape}, the file has {num_bytes} bytes")
@@ -236,6 +271,30 @@ def _field_paths(file: h5py.File) -> list[str]:
 
 def _metric_paths(file: h5py.File) -> list[str]:
     return [f"metrics/{name}" for name in own_group(file, "metrics") or ()]
+
+
+def _alarm_paths(file: h5py.File) -> list[str]:
+    known = own_group(file, "guard") or ()
+    return [f"guard/{name}" for name in ALARM_COLUMNS if name in known]
+
+
+def _lay_out_alarms(file: h5py.File, rows: int) -> None:
+    for name, kind in ALARM_COLUMNS.items():
+        fill = {"i": -1, "f": np.nan, "S": b""}[kind.kind]
+        file.create_dataset(f"guard/{name}", (rows,), dtype=kind, fillvalue=np.array(fill, dtype=kind))
+
+
+def _read_alarms(file: h5py.File) -> list[dict[str, Any]]:
+    paths = _alarm_paths(file)
+    if len(paths) < len(ALARM_COLUMNS):
+        return []
+    columns = {path.removeprefix("guard/"): file[path][: int(file.attrs["num_alarms"])] for path in paths}
+    plain = {name: _words(values) if values.dtype.kind == "S" else values.tolist() for name, values in columns.items()}
+    return [dict(zip(plain, row, strict=True)) for row in zip(*plain.values(), strict=True)]
+
+
+def _words(values: np.ndarray) -> list[str]:
+    return [value.decode("utf-8", "replace") for value in values.tolist()]
 
 
 def _plain_error(error: OSError, path: Path) -> OSError:
@@ -256,6 +315,8 @@ def _truncate(path: Path, num_frames: int) -> None:
                 target[name] = source[name][:]
             for name in per_frame:
                 target[name] = source[name][:num_frames]
+            for name in _alarm_paths(source):
+                target[name] = source[name][:]
         os.replace(temporary, path)
     except BaseException:
         temporary.unlink(missing_ok=True)

@@ -194,7 +194,8 @@ class RefinedStepper:
             "refine_phi_after": after,
             "refine_reason": reason,
         }
-        return replace(prediction, metrics={**prediction.metrics, **own, **goal.end(standing)})
+        metrics = {**prediction.metrics, **own, **goal.end(standing)}
+        return replace(prediction, metrics=metrics, residual=standing.residual)
 
     def _descend(
         self, problem: StepProblem, prediction: Prediction, elapsed: Callable[[], float]

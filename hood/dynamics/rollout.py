@@ -13,6 +13,7 @@ from torch import Tensor
 from hood.dynamics.captured import network_of
 from hood.dynamics.equilibrium import Rest, find_equilibrium, without_hold
 from hood.dynamics.frames import Relaxing
+from hood.dynamics.guard import Guard
 from hood.dynamics.measure import (
     LAYER_METRICS,
     PENETRATION_METRICS,
@@ -71,8 +72,11 @@ SETTLE_CHOICES = ("equilibrium", "paper")
 SETTLE_METRICS = ("settle_steps", "settle_seconds", "settle_speed", "settle_reached")
 
 
-def metric_names(potential: Potential, stepper: Stepper, metrics: str = "all", settle: str = "paper") -> tuple[str, ...]:
-    """Every metric a frame of a rollout can have, for one of :data:`METRIC_CHOICES` and of :data:`SETTLE_CHOICES`."""
+def metric_names(
+    potential: Potential, stepper: Stepper, metrics: str = "all", settle: str = "paper", guarded: bool = False
+) -> tuple[str, ...]:
+    """Every metric a frame of a rollout can have, for one of :data:`METRIC_CHOICES` and of :data:`SETTLE_CHOICES`, with a guard
+    or without."""
     energies = (
         *(f"energy_{name}" for name in potential.terms),
         "energy_total",
@@ -89,7 +93,8 @@ def metric_names(potential: Potential, stepper: Stepper, metrics: str = "all", s
     layers = LAYER_METRICS if has_layers(potential) else ()
     settled = SETTLE_METRICS if settle == "equilibrium" else ()
     own = (*layers, *stepper.metrics, *settled)
-    return (*measured[metrics], *own, *(f"ms_{part}" for part in stepper.times), "ms_metrics")
+    times = (*stepper.times, *(["guard"] if guarded else []), "metrics")
+    return (*measured[metrics], *own, *(f"ms_{part}" for part in times))
 
 
 @torch.no_grad()
@@ -106,6 +111,7 @@ def simulate(
     fields: Sequence[str] = (),
     surface_stride: int = SURFACE_STRIDE,
     settle: str = "paper",
+    guard: Guard | None = None,
 ) -> Iterator[Frame]:
     """Frames 0, 1, … of the garment on the moving body.
 
@@ -129,6 +135,10 @@ def simulate(
     every ``surface_stride``-th frame, the first and the last; other frames lack them.
 
     A network that looks at a potential looks at ``potential``; a solver keeps its own.
+
+    A ``guard`` sees every step from frame to frame, but for a relaxing one. The rollout goes on with what it makes of the step,
+    and ends before the frame that it stops at. Its time is ``ms_guard``, a part of ``ms_total``; what is measured for
+    ``metrics`` anyway stays in ``ms_metrics``.
 
     Raises:
         ValueError: ``metrics``, ``settle`` or a field is none of the choices, ``surface_stride`` is less than 1, or the network
@@ -182,20 +192,36 @@ def simulate(
             if meter is not None and (index % surface_stride == 0 or index + 1 == count):
                 row |= _surface_now(meter, scene, state, body_frame)
         row["ms_metrics"] = watch.spent_aside("metrics")
+        if guard is not None and index > 0:
+            guard.see_surface(index, row)
+            if guard.stopped is not None:
+                return
         with watch.aside("caller"):
             origin = state.origin[0]
             body_pos = scene.motion.surface(body_frame, origin.numpy()).cpu().double() + origin
             yield Frame(index, state, state.pos.cpu().double() + origin, body_pos, row, known_fields)
         if problem is None or known is None:
             return
-        prediction = stepper.predict(problem, prepared, watch)
+        prediction, lap, figures = stepper.predict(problem, prepared, watch), watch.lap(), None
+        if wants_potential:
+            with watch.aside("metrics"):
+                figures = StepFigures(potential, known, prediction.next_pos, prediction.acc)
+        if guard is not None and not (relaxing and index == 0):
+            with watch.aside("guard"):
+                known = known if wants_potential else potential.prepare(problem)
+                predicted, prediction = prediction, guard.see(index + 1, known, prediction, figures)
+            if guard.stopped is not None:
+                return
+            lap = _with_guard(lap, watch.spent_aside("guard"))
+            if prediction is not predicted and wants_potential:
+                with watch.aside("metrics"):
+                    figures = StepFigures(potential, known, prediction.next_pos, prediction.acc)
         state = State(prediction.next_pos, stepper.next_velocity(problem, prediction), problem.state.origin)
-        stepped = _times(stepper, watch.lap()) | prediction.metrics
+        stepped = _times(stepper, lap) | prediction.metrics
         if has_layers(potential):
             stepped |= layer_metrics(known, prediction.next_pos)
         with watch.aside("metrics"):
-            if wants_potential:
-                figures = StepFigures(potential, known, prediction.next_pos, prediction.acc)
+            if figures is not None:
                 known_fields = {name: vertex_residual(known, figures.gradient).float().cpu() for name in fields}
                 if metrics == "all":
                     stepped |= figures.metrics()
@@ -213,9 +239,15 @@ def _jumps_within(scene: Scene, start_frame: int, count: int) -> dict[int, Jump]
     return within
 
 
+def _with_guard(lap: dict[str, float], spent: float) -> dict[str, float]:
+    """A frame's times with those of its guard."""
+    return {**lap, "guard": spent, "total": lap["total"] + spent}
+
+
 def _times(stepper: Stepper, lap: dict[str, float]) -> dict[str, float]:
-    """The parts that the stepper names; the others (posing the body) go to its rest."""
-    times = {part: lap.get(part, 0.0) for part in stepper.times}
+    """The parts that the stepper names, and the guard's; the others (posing the body) go to the rest."""
+    named = (*stepper.times, *(["guard"] if "guard" in lap else []))
+    times = {part: lap.get(part, 0.0) for part in named}
     times["rest"] += sum(value for part, value in lap.items() if part not in times)
     return {f"ms_{part}": value for part, value in times.items()}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -51,6 +52,7 @@ class Prediction:
     next_pos: Tensor  # (V, 3) m, local
     acc: Tensor  # (V, 3) m/s², such that next_pos = pos + dt vel + dt² acc
     metrics: dict[str, float] = field(default_factory=dict)  # what the stepper itself has to report
+    residual: float = math.nan  # relative gradient at next_pos; NaN where the step does not know it
     #: Of models in several passes: (V, 3) m after every pass but the last, and the forces (V, 3) N there.
     early: tuple[tuple[Tensor, Tensor], ...] = ()
 

@@ -83,7 +83,7 @@ class NewtonStepper:
             "solver_converged": float(bool(report.converged.all())),
             "solver_reason": reason_number(report.reason),
         }
-        return Prediction(pos, report.acc, reached)
+        return Prediction(pos, report.acc, reached, float(report.relative_gradient.max()))
 
     def next_velocity(self, problem: StepProblem, prediction: Prediction) -> Tensor:
         """(V, 3) m/s at t + 1: (x_{t+1} − x_t) / dt."""

@@ -10,3 +10,9 @@ def best_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     left, _, right = np.linalg.svd(end.T @ start)
     mirrored = np.linalg.det(left @ right) < 0.0
     return np.asarray(left @ np.diag([1.0, 1.0, -1.0 if mirrored else 1.0]) @ right)
+
+
+def turned(start: np.ndarray, end: np.ndarray) -> float:
+    """Degrees by which points (N, 3) turn about their middle, as far as they turn as one."""
+    turn = best_turn(start - start.mean(axis=0), end - end.mean(axis=0))
+    return float(np.degrees(np.arccos(np.clip(0.5 * (np.trace(turn) - 1.0), -1.0, 1.0))))

@@ -49,18 +49,37 @@ class StepFigures:
         """Energies [J], and for comparison the potential of the inertial guess x_t + dt v_t; gradient norm [N] (the paper's:
         mean over vertices of ‖∂Φ/∂x_v‖₂), rg (:func:`hood.losses.potential.relative_gradient`) and e0 [J]
         (:func:`hood.losses.potential.scale`)."""
-        cloth, problem = self._problem.cloth, self._problem
         result = {f"energy_{name}": value for name, value in self.energies.items()}
         result["energy_total"] = sum(result.values())
         result["energy_inertial_guess"] = self._of_guess()
-        slope, mass, free = elements.as_double(self.gradient), elements.as_double(cloth.mass), cloth.free.cpu().numpy()
-        gravity = float(np.linalg.norm(elements.as_double(problem.gravity))) or STANDARD_GRAVITY
-        size_sq, moving = np.einsum("vi,vi->v", slope, slope)[free], mass[free]
-        weight_sq = gravity**2 * float(moving @ moving)
-        result["gradient_norm"] = float(np.sqrt(size_sq).mean()) if len(size_sq) else 0.0
-        result["relative_gradient"] = float(np.sqrt(size_sq.sum() / weight_sq)) if weight_sq > 0 else 0.0
-        result["e0"] = 0.5 * float(mass.sum()) * (gravity * float(problem.step.dt[0])) ** 2
+        size = np.sqrt(self._forces_sq)
+        result["gradient_norm"] = float(size.mean()) if len(size) else 0.0
+        result["relative_gradient"] = self.relative_gradient
+        dt, mass = float(self._problem.step.dt[0]), elements.as_double(self._problem.cloth.mass)
+        result["e0"] = 0.5 * float(mass.sum()) * (self._gravity * dt) ** 2
         return result
+
+    @property
+    @np.errstate(all="ignore")
+    def relative_gradient(self) -> float:
+        """rg alone: the force left over as a share of the weight."""
+        moving = elements.as_double(self._problem.cloth.mass)[self._free]
+        weight_sq = self._gravity**2 * float(moving @ moving)
+        return float(np.sqrt(self._forces_sq.sum() / weight_sq)) if weight_sq > 0 else 0.0
+
+    @property
+    def _forces_sq(self) -> np.ndarray:
+        """(N,) N², ‖∂Φ/∂x_v‖² of the free vertices."""
+        slope = elements.as_double(self.gradient)
+        return np.asarray(np.einsum("vi,vi->v", slope, slope)[self._free])
+
+    @property
+    def _free(self) -> np.ndarray:
+        return np.asarray(self._problem.cloth.free.cpu().numpy())
+
+    @property
+    def _gravity(self) -> float:
+        return float(np.linalg.norm(elements.as_double(self._problem.gravity))) or STANDARD_GRAVITY
 
     def _of_guess(self) -> float:
         """Φ [J] where the cloth would be without forces, pins where they go."""

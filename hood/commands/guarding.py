@@ -1,0 +1,125 @@
+"""The guard of a rollout: what a user says about it, and how its alarms are reported."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig
+
+from hood.config import ConfigError, build, require_choice
+from hood.dynamics.guard import CUT, FINITE, FORCE, MODES, SPEED, STRAIN, TARGET, TURN, Guard
+from hood.dynamics.mend import LEFT, NOT_TRIED, REFINED, SOLVED
+from hood.dynamics.recorder import RolloutData, RolloutWriter
+from hood.dynamics.soundness import name_frames
+from hood.dynamics.stepper import Stepper
+from hood.losses.potential import Potential
+
+OFF, REPAIR, STRICT = "off", "repair", "strict"
+#: What is so in a frame, with the worst value and the limit, and the way out where there is one.
+_TEXTS = {
+    FINITE: ("positions that are not finite", ""),
+    TARGET: ("the solver short of its target, relative gradient {value:.2g} at worst", ""),
+    STRAIN: ("strain p99 beyond {limit:.0%}, {value:.0%} at worst", ""),
+    FORCE: ("forces out of balance, {value:.3g} times the weight at worst, beyond {limit:.3g}", ""),
+    TURN: ("the body turns by {value:.0f} degrees in a step, beyond {limit:.0f}", "more steps per second (fps=…)"),
+    SPEED: ("the body moves by {value:.2g} m in a step, beyond {limit:.2g}", "more steps per second (fps=…)"),
+    CUT: ("the skin cuts {value:.1%} of the cloth's triangles at worst, beyond {limit:.0%}", ""),
+}
+
+
+class GuardStopped(Exception):
+    """``guard=strict`` has ended a rollout."""
+
+
+def check_guard(config: DictConfig) -> None:
+    """Raise ConfigError where the guard cannot do what is asked for."""
+    require_choice(config, "guard", MODES)
+    mode, step = str(config.guard), str(config.step)
+    if step == "plain":
+        return
+    if mode == REPAIR:
+        raise ConfigError(f"guard=repair: step={step} has fixed shapes, a step that is mended has not; use step=plain")
+    if mode == STRICT and str(config.metrics) != "all":
+        raise ConfigError(
+            f"guard=strict: step={step} with metrics={config.metrics} measures nothing that a guard could look at; use metrics=all"
+        )
+
+
+def make_guard(config: DictConfig, stepper: Stepper, potential: Potential) -> Guard | None:
+    """A guard for one rollout; None, with a line where that is not what was asked for, where there is none."""
+    mode = str(config.guard)
+    if mode == OFF:
+        return None
+    if str(config.step) != "plain" and str(config.metrics) != "all":
+        print(f"guard=off: step={config.step} with metrics={config.metrics} measures nothing that a guard could look at")
+        return None
+    return Guard(mode, stepper, potential, build(config.solver), int(config.refine_most))
+
+
+def write_alarms(writer: RolloutWriter, guard: Guard | None) -> None:
+    """Write what has been alarmed about since the last call."""
+    if guard is not None and len(guard.alarms) > writer.alarms_done:
+        writer.append_alarms([asdict(alarm) for alarm in guard.alarms[writer.alarms_done :]])
+
+
+def summarise_guard(mode: str, data: RolloutData) -> dict[str, Any]:
+    """Entry ``guard`` of a summary: the alarms, how many frames have any, how many were mended; empty where there was none to
+    look.
+
+    ``stopped`` is the frame that ``guard=strict`` ended the rollout before, None where it did not.
+    """
+    if mode == OFF or "num_alarms" not in data.attributes:
+        return {}
+    rows, count = data.alarms, len(data.cloth_pos)
+    kinds = {kind: sum(row["repair"] == kind for row in rows) for kind in (REFINED, SOLVED, LEFT)}
+    return {
+        "guard": {
+            "mode": mode,
+            "frames": len({row["frame"] for row in rows}),
+            "causes": {cause: sum(row["cause"] == cause for row in rows) for cause in dict.fromkeys(r["cause"] for r in rows)},
+            "repairs": kinds,
+            "stopped": rows[0]["frame"] if mode == STRICT and rows else None,
+            "sentence": _sentence(mode, rows, count),
+            "alarms": [{key: None if value != value else value for key, value in row.items()} for row in rows],
+        }
+    }
+
+
+def guard_sentences(entry: Mapping[str, Any] | None) -> list[str]:
+    """The sentence on a guard's alarms; none without alarms."""
+    return [entry["sentence"]] if entry and entry["sentence"] else []
+
+
+def _sentence(mode: str, rows: Sequence[Mapping[str, Any]], num_frames: int) -> str:
+    if not rows:
+        return ""
+    if mode == STRICT:
+        kept = f"{rows[0]['frame']} frames are kept"
+        return f"guard=strict: the rollout ends before frame {rows[0]['frame']}: {_part(rows[:1], named=False)}; {kept}"
+    parts = [_part([row for row in rows if row["cause"] == cause]) for cause in dict.fromkeys(row["cause"] for row in rows)]
+    frames = len({row["frame"] for row in rows})
+    return f"guard: {frames} of {num_frames - 1} steps: {'; '.join([*parts, *_outcome(mode, rows)])}"
+
+
+def _part(rows: Sequence[Mapping[str, Any]], named: bool = True) -> str:
+    """What was so in the frames of one cause."""
+    text, way_out = _TEXTS[rows[0]["cause"]]
+    worst = max(rows, key=lambda row: row["value"])
+    said = text.format(value=worst["value"], limit=worst["limit"]) + (f": {way_out}" if way_out else "")
+    if not named:
+        return said
+    chosen = np.zeros(1 + max(row["frame"] for row in rows), dtype=bool)
+    chosen[[row["frame"] for row in rows]] = True
+    return f"{said} ({name_frames(chosen)})"
+
+
+def _outcome(mode: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    steps = [row for row in rows if row["cause"] not in (TURN, SPEED, CUT)]
+    if mode == REPAIR:
+        mended = sum(row["repair"] in (REFINED, SOLVED) for row in steps)
+        left = sum(row["repair"] in (LEFT, NOT_TRIED) for row in steps)
+        return [f"{mended} steps were mended" + (f", {left} stay as they were" if left else "")] if steps else []
+    return ["guard=repair mends such steps"] if steps else []

@@ -1,0 +1,222 @@
+"""The guard of a rollout: sees in every frame whether the step can be trusted, says so, and mends the step or stops.
+
+Every step is looked at, and of each the gravest of these is told:
+
+===========  ======================================================================================================  ========
+cause        what is looked at                                                                                       limit
+===========  ======================================================================================================  ========
+not finite   the positions
+target       a solver's step that missed its target                                                                  the target
+strain       99th percentile of the edge strain                                                                      25%
+force        what is left unbalanced: of a network alone the median over vertices of ‖∂Φ/∂x‖ in units of the
+             vertex's own weight, else the relative gradient rg                                                      12, 50
+turn, speed  of the body within a step: degrees as one, metres of its fastest vertex; a jump that the cloth is
+             carried over is none                                                                                    15°, 0.3 m
+cut          share of the cloth's triangles that the skin cuts, in frames where it is measured                       2%
+===========  ======================================================================================================  ========
+
+Of a network alone rg is no measure: a few vertices in contact take it from 4 to 1,000 between sound frames. The force limit is
+never less than five times the rollout's own level (the median of the last 30 calm steps), three tenths of it hold while the
+body turns or moves too far, and 30 in a network's first ten steps. The strain limit follows cloth that is as strained where the solver
+takes the step: soft, heavy or tight.
+
+Where the limits come from: seven garments of 1,000 vertices on walk_proud, dance_mixed, plie and twist_and_bend, 60 frames
+each (``python benchmarks/guard.py``), median, 99.5th percentile and maximum of a step, and the body that turns:
+
+=====================  ==================  ==================  ==================  ==================================
+                       quickstart          ours                quickstart+5        newton
+=====================  ==================  ==================  ==================  ==================================
+force                  1.3   8.9   10      10   26   29        0.09   47   142     rg 0.004, no step missed 0.01
+strain [%]             7.5   18    19      11   32   34        7.9    17   18      7.9   17   18
+turn [°], speed [m]    0.5   4.0   4.2 and 0.02   0.14   0.14 for all of them
+cut, worst [%]         1.4                 0.9                 0.3                 0.4
+spin of 2 turns a s    17 at strain 23%    –                   51 at strain 21%, 1,100 at 24%, then 180%
+=====================  ==================  ==================  ==================  ==================================
+
+The three frames of refined steps beyond 50 are of the long sleeves in dance_mixed, whose forearms press into the body. Whether a step
+lowers Φ below the guess says nothing (the failures of a spinning body do), nor would substeps on suspicion pay.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from statistics import median
+
+import torch
+
+from hood.dynamics.captured_newton import CapturedNewton
+from hood.dynamics.mend import ENOUGH, LEFT, Limits, NOT_TRIED, Mended, Standing, mend, standing
+from hood.dynamics.refine import RefinedStepper
+from hood.dynamics.simulator import Prediction
+from hood.dynamics.stepper import NewtonStepper, Stepper
+from hood.losses.potential import Potential
+from hood.losses.problem import StepProblem
+from hood.scene.jumps import turned
+from hood.scene.state import Obstacle
+from hood.solver.newton import NewtonSettings
+from hood.solver.step_figures import StepFigures
+
+#: What a guard does about an alarm: writes it down, mends the step, or ends the rollout; ``off`` is no guard.
+MODES = ("report", "repair", "strict", "off")
+#: Causes, as they stand in a rollout file; of a step the gravest is told, in this order.
+FINITE, TARGET, STRAIN, FORCE, TURN, SPEED, CUT = "not finite", "target", "strain", "force", "turn", "speed", "cut"
+CAUSES = (FINITE, TARGET, STRAIN, FORCE, TURN, SPEED, CUT)
+
+STRAIN_LIMIT, CUT_LIMIT = 0.25, 0.02
+#: A body that turns by more degrees, or moves by more metres, in a step.
+TURN_LIMIT, SPEED_LIMIT = 15.0, 0.3
+#: Unbalanced force: of a network's typical vertex, or of the whole cloth where a solver or a refinement took the step.
+TYPICAL_LIMIT, FORCE_LIMIT = 12.0, 50.0
+#: Of a network whose own level is not known yet.
+_FIRST_TYPICAL = 30.0
+#: Share of the force limit that holds where the body turns or moves too far.
+_WARY = 0.3
+#: The force limit is at least so many times the median of the last calm steps, once there are some.
+FORCE_FACTOR, _WINDOW, _LEAST = 5.0, 30, 10
+#: The strain limit is at least so many times the strain of the last step that was solved for its strain.
+_STRAIN_RATIO = 1.5
+#: Relative gradient that a step is mended to where the stepper has no target of its own.
+_GOAL = 1e-2
+#: Of the body's vertices one in so many tells how it turns.
+_SPARSE = 16
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """A limit that a frame is beyond, and what was done about it."""
+
+    frame: int
+    cause: str  # of CAUSES
+    value: float
+    limit: float
+    repair: str = NOT_TRIED  # of hood.dynamics.mend
+    iterations: int = 0  # of all tries
+    rg_before: float = math.nan
+    rg_after: float = math.nan
+
+
+class Guard:
+    """Watches one rollout.
+
+    Args:
+        mode: ``report``, ``repair`` or ``strict``.
+        stepper: takes the steps.
+        potential: what they are judged by and mended down.
+        settings: of the solver that mends; default the stepper's own.
+        most: iterations at most by which a step is refined; those of a solver are taken anew instead.
+    """
+
+    def __init__(
+        self, mode: str, stepper: Stepper, potential: Potential, settings: NewtonSettings | None = None, most: int = 50
+    ) -> None:
+        if mode not in MODES[:-1]:
+            raise ValueError(f"guard is {mode!r}; choose {', '.join(MODES[:-1])}")
+        self.mode, self.alarms = mode, list[Alarm]()
+        self._potential = potential
+        own = _own_settings(stepper)
+        self._most = most if own is None else 0
+        self._target = None if own is None else own.target_rg
+        self._alone = own is None and not isinstance(stepper, RefinedStepper)
+        self._settings = replace(settings or own or NewtonSettings(), target_rg=self._target or _GOAL)
+        self._calm: deque[float] = deque(maxlen=_WINDOW)
+        self._strain_limit = STRAIN_LIMIT
+
+    @property
+    def stopped(self) -> Alarm | None:
+        """The alarm that ends the rollout; None while it goes on."""
+        return self.alarms[0] if self.mode == "strict" and self.alarms else None
+
+    @torch.no_grad()
+    def see(self, frame: int, problem: StepProblem, prediction: Prediction, figures: StepFigures | None = None) -> Prediction:
+        """The step to go on with: ``prediction`` itself where there is no alarm, and where nothing better is found.
+
+        Args:
+            frame: that the step leads to.
+            problem: prepared for the potential.
+            figures: of the step, where somebody has made them.
+        """
+        now = standing(self._potential, problem, prediction, figures, typical=self._alone)
+        moved = _motion_alarm(frame, problem.step.obstacle)
+        alarm = self._step_alarm(frame, prediction, now, wary=moved is not None)
+        if alarm is None:
+            self._calm.append(self._force(now))
+            self.alarms += [] if moved is None else [moved]
+            return prediction
+        if self.mode != "repair" or (self._target is not None and alarm.cause not in (FINITE, TARGET)):
+            # A step that met the solver's target is as good as the solver can make it.
+            self.alarms.append(alarm)
+            return prediction
+        limits = Limits(ENOUGH if self._target is None else self._target, self._strain_limit)
+        mended = mend(self._potential, problem, prediction, now, limits, self._settings, self._most)
+        if alarm.cause == STRAIN:
+            self._allow(mended)
+        figures_of_it = {"rg_before": mended.before.residual, "rg_after": mended.after.residual}
+        self.alarms.append(replace(alarm, repair=mended.kind, iterations=mended.iterations, **figures_of_it))
+        return self._told(mended)
+
+    def see_surface(self, frame: int, row: Mapping[str, float]) -> None:
+        """Look at what was measured of the cloth's surface in a frame."""
+        share = row.get("cut_face_share", math.nan)
+        if share > CUT_LIMIT:
+            self.alarms.append(Alarm(frame, CUT, share, CUT_LIMIT))
+
+    def _step_alarm(self, frame: int, prediction: Prediction, now: Standing, wary: bool) -> Alarm | None:
+        """The gravest of a step."""
+        if not now.finite:
+            return Alarm(frame, FINITE, math.nan, math.nan)
+        if self._target is not None and prediction.metrics.get("solver_converged") == 0.0:
+            return Alarm(frame, TARGET, now.residual, self._target)
+        if now.strain > self._strain_limit:
+            return Alarm(frame, STRAIN, now.strain, self._strain_limit)
+        force, limit = self._force(now), (_WARY if wary else 1.0) * self._force_limit()
+        return Alarm(frame, FORCE, force, limit) if not force <= limit else None
+
+    def _force(self, now: Standing) -> float:
+        return now.typical if self._alone else now.residual
+
+    def _force_limit(self) -> float:
+        """Against the rollout's own level, and never less than what is usual."""
+        if len(self._calm) < _LEAST:
+            return _FIRST_TYPICAL if self._alone else FORCE_LIMIT
+        return max(TYPICAL_LIMIT if self._alone else FORCE_LIMIT, FORCE_FACTOR * median(self._calm))
+
+    def _allow(self, mended: Mended) -> None:
+        """Cloth that is as strained where the solver takes the step is not held to less: it is soft, heavy or tight."""
+        if mended.after.residual <= ENOUGH and mended.after.strain > STRAIN_LIMIT:
+            self._strain_limit = _STRAIN_RATIO * mended.after.strain
+
+    def _told(self, mended: Mended) -> Prediction:
+        """The mended step with what the stepper reports of it."""
+        if mended.kind == LEFT:
+            return mended.prediction
+        metrics, residual = dict(mended.prediction.metrics), mended.after.residual
+        for name in ("solver_iterations", "refine_iterations"):
+            if name in metrics:
+                metrics[name] += mended.iterations
+        if "refine_rg" in metrics:
+            metrics["refine_rg"] = residual
+        if "solver_converged" in metrics and self._target is not None and residual <= self._target:
+            metrics |= {"solver_converged": 1.0, "solver_reason": 0.0}
+        return replace(mended.prediction, metrics=metrics, residual=residual)
+
+
+def _own_settings(stepper: Stepper) -> NewtonSettings | None:
+    """Of a solver, which has a target in every step; None of all others."""
+    if isinstance(stepper, CapturedNewton):
+        stepper = stepper.stepper
+    return stepper.settings if isinstance(stepper, NewtonStepper) else None
+
+
+def _motion_alarm(frame: int, obstacle: Obstacle | None) -> Alarm | None:
+    """Where the body turns or moves too far in a step; a jump over which the cloth was carried is none."""
+    if obstacle is None or len(obstacle.pos) < _SPARSE:
+        return None
+    start, end = (pos[::_SPARSE].cpu().double().numpy() for pos in (obstacle.pos, obstacle.next_pos))
+    turn = turned(start, end)
+    if turn > TURN_LIMIT:
+        return Alarm(frame, TURN, turn, TURN_LIMIT)
+    way = float((obstacle.next_pos - obstacle.pos).norm(dim=1).max())
+    return Alarm(frame, SPEED, way, SPEED_LIMIT) if way > SPEED_LIMIT else None

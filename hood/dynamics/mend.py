@@ -1,0 +1,120 @@
+"""A step taken anew: on from where a stepper left it, or by the solver from the state before."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from hood.dynamics.measure import strain_metrics, vertex_residual
+from hood.dynamics.simulator import Prediction
+from hood.losses.potential import Potential
+from hood.losses.problem import StepProblem
+from hood.solver.newton import NewtonSettings, minimize
+from hood.solver.step_figures import StepFigures
+
+#: A mended step is kept if its strain p99 is higher by no more than this, or this share of it.
+_MORE_STRAIN, _SHARE_MORE = 0.02, 0.1
+#: Of a step that missed the solver's target: so many times the iterations.
+PATIENCE = 2
+#: Relative gradient of a step that is good enough: forces are in balance but for the cloth's own weight.
+ENOUGH = 1.0
+#: What became of a step: nobody tried, refined on from where it was, solved from the state before, or left as it was.
+NOT_TRIED, REFINED, SOLVED, LEFT = "", "refined", "solved", "left"
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What is good enough."""
+
+    residual: float  # relative gradient
+    strain: float  # 99th percentile of the edge strain
+
+
+@dataclass(frozen=True)
+class Standing:
+    """How good a step is."""
+
+    finite: bool
+    residual: float  # relative gradient; NaN where not known
+    strain: float  # 99th percentile of the edge strain
+    typical: float = math.nan  # median over vertices of the force left over in units of a vertex's own weight; where asked for
+
+    def within(self, limits: Limits) -> bool:
+        """Whether it is good enough."""
+        return self.finite and self.residual <= limits.residual and self.strain <= limits.strain
+
+
+@dataclass(frozen=True)
+class Mended:
+    """What became of a step."""
+
+    prediction: Prediction
+    kind: str  # REFINED, SOLVED or LEFT
+    iterations: int
+    before: Standing
+    after: Standing
+
+
+def standing(
+    potential: Potential, problem: StepProblem, prediction: Prediction, figures: StepFigures | None = None, typical: bool = False
+) -> Standing:
+    """How good the step is; ``figures`` are those of it where they have been made, ``typical`` asks for the typical vertex's.
+
+    A relative gradient that the stepper knows is believed, so that nothing is computed.
+    """
+    pos = prediction.next_pos
+    if not bool(torch.isfinite(pos).all()):
+        return Standing(False, math.nan, math.nan)
+    if figures is None and (typical or math.isnan(prediction.residual)):
+        figures = StepFigures(potential, problem, pos, prediction.acc)
+    residual = prediction.residual if figures is None else figures.relative_gradient
+    median = float(vertex_residual(problem, figures.gradient).median()) if typical and figures is not None else math.nan
+    return Standing(True, residual, strain_metrics(problem.cloth, pos)["strain_p99"], median)
+
+
+@torch.no_grad()
+def mend(
+    potential: Potential,
+    problem: StepProblem,
+    prediction: Prediction,
+    before: Standing,
+    limits: Limits,
+    settings: NewtonSettings,
+    most: int,
+) -> Mended:
+    """The step, taken further down ``potential`` by at most ``most`` iterations; where that leaves it beyond ``limits``, taken
+    anew from the solver's own start. A step that the solver took (``most`` is 0) is only taken anew, with :data:`PATIENCE`.
+
+    It never gets worse: what is kept has a lower relative gradient and no more strain, but for a little; else the step stays.
+    A step that is not finite is replaced by any that is.
+
+    Args:
+        before: how good the step is.
+        settings: of the solver; the accuracy that both tries go for.
+    """
+    further = replace(settings, max_iterations=most, budget_ms=None)
+    anew = replace(settings, max_iterations=settings.max_iterations * (1 if most else PATIENCE), budget_ms=None)
+    ways = [(REFINED, prediction.next_pos, further)] if before.finite and most else []
+    tries, spent = [], 0
+    for kind, start, how in [*ways, (SOLVED, None, anew)]:
+        pos, report = minimize(potential, problem, start, how)
+        taken = Prediction(pos, report.acc, prediction.metrics)
+        spent += report.iterations
+        tries.append((kind, taken, standing(potential, problem, taken)))
+        if tries[-1][2].within(limits):
+            break
+    better = [one for one in tries if _is_better(one[2], before)]
+    if not better:
+        return Mended(prediction, LEFT, spent, before, before)
+    kind, taken, after = min(better, key=lambda one: (not one[2].within(limits), one[2].residual))
+    return Mended(taken, kind, spent, before, after)
+
+
+def _is_better(now: Standing, before: Standing) -> bool:
+    if not before.finite:
+        return now.finite
+    more = max(_MORE_STRAIN, _SHARE_MORE * before.strain)
+    return now.finite and now.residual < before.residual and now.strain <= before.strain + more
