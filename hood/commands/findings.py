@@ -28,6 +28,7 @@ from hood.assets.unpickle import load_pickle
 from hood.commands.beside_mesh import place_beside_mesh
 from hood.commands.common import read_model
 from hood.commands.describe_place import describe_place
+from hood.commands.guarding import summarise_guard
 from hood.commands.placing import find_place
 from hood.dynamics import ranges
 from hood.dynamics.recorder import read_rollout
@@ -309,7 +310,10 @@ def inspect_rollout(name: str) -> Finding:
     if not verdict.sound:
         state = "not judged" if verdict.sound is None else "unsound"
         finding.problem(f"{state}: {'; '.join(verdict.reasons)}", _SIMULATE_AGAIN)
-    if not finding.facts["complete"]:
+    guarded = summarise_guard(data).get("guard", {})
+    if guarded.get("sentence"):
+        finding.facts["guard"] = guarded["sentence"].removeprefix("guard: ")
+    if not finding.facts["complete"] and guarded.get("stopped") is None:
         _tell_progress(finding, Path(name), len(data.cloth_pos), data.attributes.get("num_planned"))
     return finding
 

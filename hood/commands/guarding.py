@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
@@ -10,8 +11,8 @@ import numpy as np
 from omegaconf import DictConfig
 
 from hood.config import ConfigError, build, require_choice
-from hood.dynamics.guard import CUT, FINITE, FORCE, MODES, SPEED, STRAIN, TARGET, TURN, Guard
-from hood.dynamics.mend import LEFT, NOT_TRIED, REFINED, SOLVED
+from hood.dynamics.guard import CUT, FINITE, FORCE, MENDED, MODES, SPEED, STRAIN, TARGET, TURN, Alarm, Guard
+from hood.dynamics.mend import LEFT, REFINED, SOLVED
 from hood.dynamics.recorder import RolloutData, RolloutWriter
 from hood.dynamics.soundness import name_frames
 from hood.dynamics.stepper import Stepper
@@ -65,13 +66,13 @@ def write_alarms(writer: RolloutWriter, guard: Guard | None) -> None:
         writer.append_alarms([asdict(alarm) for alarm in guard.alarms[writer.alarms_done :]])
 
 
-def summarise_guard(mode: str, data: RolloutData) -> dict[str, Any]:
-    """Entry ``guard`` of a summary: the alarms, how many frames have any, how many were mended; empty where there was none to
-    look.
+def summarise_guard(data: RolloutData) -> dict[str, Any]:
+    """Entry ``guard`` of a summary: the alarms, how many frames have any, how many were mended; empty where no guard looked.
 
     ``stopped`` is the frame that ``guard=strict`` ended the rollout before, None where it did not.
     """
-    if mode == OFF or "num_alarms" not in data.attributes:
+    mode = str(data.attributes.get("guard", OFF))
+    if mode == OFF:
         return {}
     rows, count = data.alarms, len(data.cloth_pos)
     kinds = {kind: sum(row["repair"] == kind for row in rows) for kind in (REFINED, SOLVED, LEFT)}
@@ -82,7 +83,7 @@ def summarise_guard(mode: str, data: RolloutData) -> dict[str, Any]:
             "causes": {cause: sum(row["cause"] == cause for row in rows) for cause in dict.fromkeys(r["cause"] for r in rows)},
             "repairs": kinds,
             "stopped": rows[0]["frame"] if mode == STRICT and rows else None,
-            "sentence": _sentence(mode, rows, count),
+            "sentence": guard_sentence(mode, [Alarm(**row) for row in rows], count),
             "alarms": [{key: None if value != value else value for key, value in row.items()} for row in rows],
         }
     }
@@ -93,33 +94,42 @@ def guard_sentences(entry: Mapping[str, Any] | None) -> list[str]:
     return [entry["sentence"]] if entry and entry["sentence"] else []
 
 
-def _sentence(mode: str, rows: Sequence[Mapping[str, Any]], num_frames: int) -> str:
-    if not rows:
+def guard_sentence(mode: str, alarms: Sequence[Alarm], num_frames: int) -> str:
+    """What is said of the alarms of a rollout; empty without any."""
+    if not alarms:
         return ""
     if mode == STRICT:
-        kept = f"{rows[0]['frame']} frames are kept"
-        return f"guard=strict: the rollout ends before frame {rows[0]['frame']}: {_part(rows[:1], named=False)}; {kept}"
-    parts = [_part([row for row in rows if row["cause"] == cause]) for cause in dict.fromkeys(row["cause"] for row in rows)]
-    frames = len({row["frame"] for row in rows})
-    return f"guard: {frames} of {num_frames - 1} steps: {'; '.join([*parts, *_outcome(mode, rows)])}"
+        first = alarms[0]
+        return (
+            f"guard=strict: the rollout ends before frame {first.frame}: {_part(alarms[:1])}; the {num_frames} frames before it "
+            "are kept"
+        )
+    causes = list(dict.fromkeys(alarm.cause for alarm in alarms))
+    parts = [_named([alarm for alarm in alarms if alarm.cause == cause]) for cause in causes]
+    frames = len({alarm.frame for alarm in alarms})
+    return f"guard: {frames} of {num_frames - 1} steps: {'; '.join([*parts, *_outcome(mode, alarms)])}"
 
 
-def _part(rows: Sequence[Mapping[str, Any]], named: bool = True) -> str:
-    """What was so in the frames of one cause."""
-    text, way_out = _TEXTS[rows[0]["cause"]]
-    worst = max(rows, key=lambda row: row["value"])
-    said = text.format(value=worst["value"], limit=worst["limit"]) + (f": {way_out}" if way_out else "")
-    if not named:
-        return said
-    chosen = np.zeros(1 + max(row["frame"] for row in rows), dtype=bool)
-    chosen[[row["frame"] for row in rows]] = True
-    return f"{said} ({name_frames(chosen)})"
+def _part(alarms: Sequence[Alarm]) -> str:
+    """What was so, of one cause."""
+    text, way_out = _TEXTS.get(alarms[0].cause, ("{value:.3g}, beyond {limit:.3g}", ""))
+    worst = max(alarms, key=lambda alarm: -math.inf if math.isnan(alarm.value) else alarm.value)
+    return text.format(value=worst.value, limit=worst.limit) + (f" ({way_out})" if way_out else "")
 
 
-def _outcome(mode: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    steps = [row for row in rows if row["cause"] not in (TURN, SPEED, CUT)]
-    if mode == REPAIR:
-        mended = sum(row["repair"] in (REFINED, SOLVED) for row in steps)
-        left = sum(row["repair"] in (LEFT, NOT_TRIED) for row in steps)
-        return [f"{mended} steps were mended" + (f", {left} stay as they were" if left else "")] if steps else []
-    return ["guard=repair mends such steps"] if steps else []
+def _named(alarms: Sequence[Alarm]) -> str:
+    """The same with its frames."""
+    chosen = np.zeros(1 + max(alarm.frame for alarm in alarms), dtype=bool)
+    chosen[[alarm.frame for alarm in alarms]] = True
+    return f"{_part(alarms)}, in {name_frames(chosen)}"
+
+
+def _outcome(mode: str, alarms: Sequence[Alarm]) -> list[str]:
+    steps = [alarm for alarm in alarms if alarm.cause in MENDED]
+    if not steps:
+        return []
+    if mode != REPAIR:
+        return ["guard=repair mends what it can"]
+    mended = sum(alarm.repair in (REFINED, SOLVED) for alarm in steps)
+    left = f", {len(steps) - mended} stay as they were" if mended < len(steps) else ""
+    return [f"{mended} of these steps were mended{left}"]

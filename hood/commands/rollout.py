@@ -35,7 +35,7 @@ from hood.commands.common import (
     weigh,
 )
 from hood.commands.dial import AUTO, check_dial, chosen, exported, refined
-from hood.commands.guarding import GuardStopped, check_guard, guard_sentences, make_guard, write_alarms
+from hood.commands.guarding import OFF, GuardStopped, check_guard, guard_sentences, make_guard, write_alarms
 from hood.commands.notices import heard
 from hood.commands.performance import make_motion
 from hood.commands.summary import describe, describe_all, summarise
@@ -291,6 +291,7 @@ def _simulate_to_disk(config: DictConfig, scene: Scene, stepper: Stepper, digest
         "sequence": scene.motion.name,
         "surface_stride": int(config.surface_stride),
         "cloth_contact_off": why_not(config),
+        "guard": OFF if guard is None else guard.mode,
     }
     writer = RolloutWriter(
         path,

@@ -12,7 +12,7 @@ import numpy as np
 
 from hood.commands.cloth_contact import describe_cloth_contact, summarise_cloth_contact
 from hood.commands.dial import describe_refinement, summarise_refinement
-from hood.commands.guarding import OFF, summarise_guard
+from hood.commands.guarding import summarise_guard
 from hood.commands.surface_report import cut_at_worst, describe_surface, summarise_surface
 from hood.commands.verdict import describe_verdict, describe_worst, summarise_verdict
 from hood.dynamics.recorder import read_rollout
@@ -58,7 +58,7 @@ def summarise(path: Path) -> dict[str, Any]:
             json.loads(data.attributes["config"]), data.metrics, str(data.attributes.get("cloth_contact_off", ""))
         ),
         **summarise_refinement(json.loads(data.attributes["config"]), data.metrics),
-        **summarise_guard(str(json.loads(data.attributes["config"]).get("guard", OFF)), data),
+        **summarise_guard(data),
         **summarise_verdict(data),
     }
 

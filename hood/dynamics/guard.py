@@ -64,6 +64,8 @@ MODES = ("report", "repair", "strict", "off")
 #: Causes, as they stand in a rollout file; of a step the gravest is told, in this order.
 FINITE, TARGET, STRAIN, FORCE, TURN, SPEED, CUT = "not finite", "target", "strain", "force", "turn", "speed", "cut"
 CAUSES = (FINITE, TARGET, STRAIN, FORCE, TURN, SPEED, CUT)
+#: Those that a step can be mended of.
+MENDED = (FINITE, TARGET, STRAIN, FORCE)
 
 STRAIN_LIMIT, CUT_LIMIT = 0.25, 0.02
 #: A body that turns by more degrees, or moves by more metres, in a step.

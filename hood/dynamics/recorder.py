@@ -289,6 +289,9 @@ def _read_alarms(file: h5py.File) -> list[dict[str, Any]]:
     if len(paths) < len(ALARM_COLUMNS):
         return []
     columns = {path.removeprefix("guard/"): file[path][: int(file.attrs["num_alarms"])] for path in paths}
+    for frame in columns["frame"].tolist():
+        if not 0 <= frame <= int(file.attrs["num_planned"]):
+            raise ValueError(f"guard/frame holds {frame}, there are {file.attrs['num_planned']} frames")
     plain = {name: _words(values) if values.dtype.kind == "S" else values.tolist() for name, values in columns.items()}
     return [dict(zip(plain, row, strict=True)) for row in zip(*plain.values(), strict=True)]
 

@@ -17,7 +17,7 @@ def coarse_dress(num_vertices: int = 300) -> Garment:
     fine = load_garment("dress")
     pos, faces = isotropic(fine.rest_pos, fine.faces, num_vertices)
     hit = closest(pos, fine.rest_pos, fine.faces)
-    corners, weights = fine.faces[hit.face.numpy()], hit.barycentric.numpy()
+    corners, weights = fine.faces[hit.face.numpy()], hit.bary.numpy()
     nearest = corners[np.arange(len(pos)), weights.argmax(axis=1)]
 
     def mean(values: np.ndarray | None) -> np.ndarray | None:

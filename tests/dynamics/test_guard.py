@@ -1,0 +1,231 @@
+"""The guard: no alarm changes nothing, alarms are written down, steps are mended and never made worse."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from hood.assets.body import Body
+from hood.assets.garment import Garment
+from hood.assets.sequence import PoseSequence
+from hood.dynamics.goals import Count
+from hood.dynamics.guard import CUT, FINITE, FORCE, SPEED, STRAIN, STRAIN_LIMIT, TARGET, TURN, Guard
+from hood.dynamics.mend import LEFT, NOT_TRIED, REFINED, SOLVED, Limits, Standing, mend, standing
+from hood.dynamics.refine import GuessStepper, RefinedStepper
+from hood.dynamics.rollout import Frame, metric_names, simulate
+from hood.dynamics.simulator import Prediction
+from hood.dynamics.stepper import NewtonStepper, Stepper
+from hood.dynamics.stopwatch import Stopwatch
+from hood.losses.potential import default_potential
+from hood.losses.problem import StepProblem
+from hood.scene.scene import Scene, build_scene
+from hood.solver.newton import NewtonSettings
+
+POTENTIAL = default_potential()
+SETTINGS = NewtonSettings(target_rg=1e-2)
+
+
+@pytest.fixture(scope="module")
+def scene(body: Body, garments: dict[str, Garment], walk: PoseSequence) -> Scene:
+    return build_scene(garments["skirt"], body, walk, dtype=torch.float64)
+
+
+def newton(**settings: Any) -> NewtonStepper:
+    return NewtonStepper(POTENTIAL, replace(SETTINGS, **settings))
+
+
+def guess(iterations: int) -> RefinedStepper:
+    return RefinedStepper(GuessStepper(POTENTIAL), POTENTIAL, Count(iterations))
+
+
+class Spoilt:
+    """The solver, but for what ``spoil`` makes of the positions of one step; it says nothing of its accuracy."""
+
+    times, relaxing, config, metrics = NewtonStepper.times, NewtonStepper.relaxing, {"stepper": "spoilt"}, ()
+
+    def __init__(self, frame: int, spoil: Any) -> None:
+        self._inner, self._frame, self._spoil, self._step = newton(), frame, spoil, 0
+        self.gravity = self._inner.gravity
+
+    def prepare(self, cloth: Any, rest_pos: Any) -> None: ...
+
+    def search(self, problem: StepProblem) -> StepProblem:
+        return self._inner.search(problem)
+
+    def predict(self, problem: StepProblem, prepared: None, watch: Stopwatch | None = None) -> Prediction:
+        self._step += 1
+        pos = self._inner.predict(problem, None, watch).next_pos
+        pos = self._spoil(pos) if self._step == self._frame else pos
+        return Prediction(pos, problem.acceleration(pos))
+
+    def next_velocity(self, problem: StepProblem, prediction: Prediction) -> torch.Tensor:
+        return self._inner.next_velocity(problem, prediction)
+
+
+def frames(stepper: Stepper, scene: Scene, guard: Guard | None, count: int = 6, **options: Any) -> list[Frame]:
+    return list(simulate(stepper, scene, POTENTIAL, count, relaxing_steps=0, guard=guard, **{"metrics": "none", **options}))
+
+
+def same(first: list[Frame], second: list[Frame]) -> bool:
+    pairs = [(a, b) for one, two in zip(first, second, strict=True) for a, b in zip(*map(kept, (one, two)), strict=True)]
+    return all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
+
+
+def kept(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+    return frame.world_pos.numpy(), frame.state.vel.numpy()
+
+
+@pytest.mark.parametrize("metrics", ["all", "none"])
+@pytest.mark.parametrize("make", [newton, lambda: guess(12)], ids=["newton", "refined"])
+def test_quiet_steps_are_the_same_to_the_bit(make: Any, metrics: str, scene: Scene) -> None:
+    plain = frames(make(), scene, None, metrics=metrics)
+    for mode in ("report", "repair", "strict"):
+        guard = Guard(mode, make(), POTENTIAL)
+        assert same(plain, frames(make(), scene, guard, metrics=metrics))
+        assert guard.alarms == []
+        assert guard.stopped is None
+
+
+def stretched(pos: torch.Tensor) -> torch.Tensor:
+    """Half as long again, downwards."""
+    top = pos[:, 1].max()
+    return torch.stack([pos[:, 0], top + 1.5 * (pos[:, 1] - top), pos[:, 2]], dim=1)
+
+
+def lost(pos: torch.Tensor) -> torch.Tensor:
+    return torch.full_like(pos, math.nan)
+
+
+def shaken(pos: torch.Tensor) -> torch.Tensor:
+    """A millimetre here and there: little strain, much force."""
+    return pos + 1e-3 * torch.sin(1e3 * pos.flip(1))
+
+
+@pytest.mark.parametrize("spoil, cause", [(stretched, STRAIN), (lost, FINITE), (shaken, FORCE)])
+def test_a_bad_step_is_told_and_mended(spoil: Any, cause: str, scene: Scene) -> None:
+    good = frames(Spoilt(99, spoil), scene, None)
+    report = Guard("report", Spoilt(3, spoil), POTENTIAL)
+    told = frames(Spoilt(3, spoil), scene, report)
+    assert same(told, frames(Spoilt(3, spoil), scene, None))
+    assert (report.alarms[0].frame, report.alarms[0].cause, report.alarms[0].repair) == (3, cause, NOT_TRIED)
+    repair = Guard("repair", Spoilt(3, spoil), POTENTIAL)
+    mended = frames(Spoilt(3, spoil), scene, repair)
+    assert [alarm.frame for alarm in repair.alarms] == [3]
+    alarm = repair.alarms[0]
+    assert alarm.repair == (SOLVED if spoil is lost else REFINED)
+    assert alarm.iterations > 0
+    assert alarm.rg_after <= 1e-2
+    assert not alarm.rg_before <= 1.0
+    # The rollout goes on from there as if nothing had happened.
+    off = (mended[-1].world_pos - good[-1].world_pos).norm(dim=1).max()
+    assert off < 2e-3
+    assert all(torch.isfinite(frame.world_pos).all() for frame in mended)
+
+
+def test_strict_keeps_the_frames_before(scene: Scene) -> None:
+    guard = Guard("strict", Spoilt(3, stretched), POTENTIAL)
+    kept = frames(Spoilt(3, stretched), scene, guard)
+    assert len(kept) == 3
+    assert guard.stopped is not None
+    assert (guard.stopped.frame, guard.stopped.cause) == (3, STRAIN)
+    assert guard.stopped.value > STRAIN_LIMIT
+
+
+def test_a_solver_that_misses_is_given_more_patience(scene: Scene) -> None:
+    hasty = newton(max_iterations=4)
+    told, mended = (Guard(mode, hasty, POTENTIAL) for mode in ("report", "repair"))
+    frames(hasty, scene, told)
+    rows = frames(hasty, scene, mended)
+    missed = [alarm.frame for alarm in told.alarms]
+    assert missed
+    assert {alarm.cause for alarm in told.alarms} == {TARGET}
+    better = [alarm for alarm in mended.alarms if alarm.repair == SOLVED]
+    assert better
+    assert all(alarm.rg_after < alarm.rg_before for alarm in better)
+    for alarm in better:
+        metrics = rows[alarm.frame].metrics
+        assert metrics["solver_iterations"] == 4 + alarm.iterations
+        assert metrics["solver_converged"] == (alarm.rg_after <= 1e-2)
+
+
+def test_what_met_the_target_is_not_solved_again(scene: Scene) -> None:
+    """Cloth that hangs heavily is strained where the solver takes the step: there is nothing to mend."""
+    guard = Guard("repair", newton(), POTENTIAL)
+    problem, prediction = one_step(scene)
+    long = replace(prediction, next_pos=stretched(prediction.next_pos), residual=1e-3)
+    assert guard.see(1, problem, long) is long
+    assert [(alarm.cause, alarm.repair) for alarm in guard.alarms] == [(STRAIN, NOT_TRIED)]
+
+
+def one_step(scene: Scene) -> tuple[StepProblem, Prediction]:
+    stepper = newton()
+    state = scene.start(0)
+    problem = stepper.search(StepProblem(scene.cloth, state, scene.step_input(0, state), gravity=stepper.gravity.to(state.pos)))
+    return problem, stepper.predict(problem, None)
+
+
+def test_a_mended_step_is_never_worse(scene: Scene) -> None:
+    problem, prediction = one_step(scene)
+    before = standing(POTENTIAL, problem, prediction)
+    hopeless = mend(POTENTIAL, problem, prediction, before, Limits(1e-12, 0.0), replace(SETTINGS, max_iterations=0), 0)
+    assert hopeless.kind == LEFT
+    assert hopeless.prediction is prediction
+    # Less force for much more strain is no bargain.
+    slack = replace(prediction, next_pos=prediction.next_pos.clone())
+    said = Standing(True, residual=1e9, strain=-1.0)
+    refused = mend(POTENTIAL, problem, slack, said, Limits(1.0, 0.25), SETTINGS, 5)
+    assert refused.kind == LEFT
+
+
+def test_the_motion_of_the_body_is_told(scene: Scene) -> None:
+    problem, prediction = one_step(scene)
+    obstacle = problem.step.obstacle
+    assert obstacle is not None
+    turn = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]).to(obstacle.pos)
+    for moved, cause, value in (
+        (obstacle.pos @ turn.T, TURN, 90.0),
+        (obstacle.pos + torch.tensor([0.5, 0.0, 0.0]).to(obstacle.pos), SPEED, 0.5),
+    ):
+        guard = Guard("repair", newton(), POTENTIAL)
+        step = replace(problem.step, obstacle=replace(obstacle, next_pos=moved))
+        assert guard.see(1, replace(problem, step=step), prediction) is prediction
+        assert [(alarm.cause, alarm.repair) for alarm in guard.alarms] == [(cause, NOT_TRIED)]
+        assert guard.alarms[0].value == pytest.approx(value, abs=1e-3)
+
+
+def test_cut_cloth_is_told_where_it_is_measured() -> None:
+    guard = Guard("report", newton(), POTENTIAL)
+    for row in ({}, {"cut_face_share": math.nan}, {"cut_face_share": 0.01}, {"cut_face_share": 0.5}):
+        guard.see_surface(7, row)
+    assert [(alarm.frame, alarm.cause, alarm.value) for alarm in guard.alarms] == [(7, CUT, 0.5)]
+
+
+def test_the_limit_follows_the_level_of_the_rollout(scene: Scene) -> None:
+    """What is usual in this rollout is no alarm, five times of it is."""
+    guard = Guard("report", guess(1), POTENTIAL)
+    problem, prediction = one_step(scene)
+    level: Iterator[float] = iter([40.0] * 12 + [150.0, 250.0])
+    for frame, residual in enumerate(level, start=1):
+        guard.see(frame, problem, replace(prediction, residual=residual))
+    assert [(alarm.frame, alarm.cause) for alarm in guard.alarms] == [(14, FORCE)]
+    assert guard.alarms[0].limit == pytest.approx(200.0)
+
+
+def test_an_unknown_mode_is_refused() -> None:
+    with pytest.raises(ValueError, match="guard is 'off'; choose report, repair, strict"):
+        Guard("off", newton(), POTENTIAL)
+
+
+def test_its_time_has_a_column(scene: Scene) -> None:
+    stepper = newton()
+    rows = [frame.metrics for frame in frames(stepper, scene, Guard("report", stepper, POTENTIAL), 3)]
+    assert set(rows[2]) <= set(metric_names(POTENTIAL, stepper, "none", guarded=True))
+    parts = [rows[2][f"ms_{part}"] for part in ("search", "solver", "rest", "guard")]
+    assert rows[2]["ms_total"] == pytest.approx(np.sum(parts))
+    assert "ms_guard" not in frames(stepper, scene, None, 3)[2].metrics

@@ -1,0 +1,127 @@
+"""Cells of the stability map on a coarse dress, run in process: what the gate judges."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from coarse_dress import coarse_dress
+from omegaconf import DictConfig, OmegaConf
+
+from hood.assets.extremes import write_garment, write_motion
+from hood.assets.garment import save_garment
+from hood.commands.cloth_contact import potential_of
+from hood.commands.common import weigh
+from hood.commands.dial import refined
+from hood.commands.guarding import guard_sentence, make_guard
+from hood.commands.rollout import make_scene, make_stepper
+from hood.config import load_config
+from hood.dynamics.guard import CUT
+from hood.dynamics.rollout import simulate
+from hood.dynamics.soundness import judge as judge_soundness
+from hood.dynamics.stepper import Stepper
+from hood.evaluation.envelope import Cell, Criteria, Judged, Run, cells, judge
+from hood.nn.compiled import check_kernels
+
+FRAMES = 20
+#: Motions of the map stand still for half a second; rollouts begin a third of a second in.
+CALM_FRAMES = 10
+METHODS = {
+    "quickstart": ("checkpoint=quickstart", "refine=0"),
+    "quickstart+5": ("checkpoint=quickstart", "refine=5"),
+    "newton": ("stepper=newton",),
+}
+#: Triangles of 5 cm on a body: the skin cuts 3% of them in a quiet dance, which says nothing about the method.
+CRITERIA = Criteria(cut_share=0.06, climb=np.inf)
+
+Metrics = Mapping[str, np.ndarray]
+
+
+def chosen(names: list[str]) -> list[Cell]:
+    """Cells of the map by name."""
+    known = {cell.name: cell for cell in cells()}
+    return [known[name] for name in names]
+
+
+class Battery:
+    """Runs cells; what they need as files is made once, in ``folder``."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self.dress = folder, folder / "dress.npz"
+        save_garment(self.dress, coarse_dress())
+        self._solved: dict[str, Metrics] = {}
+        self._configs: dict[str, DictConfig] = {}
+        self._network: Stepper | None = None
+
+    def judged(self, cell: Cell, method: str, mode: str = "report") -> Judged:
+        """The class of a cell; strain of networks is held against the solver's in the same cell."""
+        solver = None if method == "newton" else self.solved(cell)
+        return judge(cell, self.run(cell, method, mode), solver, method == "quickstart", CRITERIA)
+
+    def solved(self, cell: Cell) -> Metrics:
+        """The solver's metrics in a cell."""
+        if cell.name not in self._solved:
+            metrics = self.run(cell, "newton", "report").metrics
+            assert metrics is not None
+            self._solved[cell.name] = metrics
+        return self._solved[cell.name]
+
+    def run(self, cell: Cell, method: str, mode: str) -> Run:
+        """A rollout as of ``hood rollout``, and what it says of itself; not what the surface alone says."""
+        config = self._config(cell, method, mode)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            scene = make_scene(config)
+            potential = potential_of(config)
+            stepper = refined(self._stepper(config, method), config, scene.cloth.num_vertices, potential)
+            guard = make_guard(config, stepper, potential)
+            start = CALM_FRAMES if cell.motion is not None else 0
+            frames = list(simulate(stepper, scene, potential, FRAMES, settle="equilibrium", start_frame=start, guard=guard))
+        names = {name for frame in frames for name in frame.metrics}
+        metrics = {name: np.array([frame.metrics.get(name, np.nan) for frame in frames]) for name in names}
+        finite = np.array([bool(np.isfinite(frame.world_pos.numpy()).all()) for frame in frames])
+        verdict = judge_soundness(finite, metrics["strain_p99"], metrics)
+        assert guard is not None
+        told = guard_sentence(mode, [alarm for alarm in guard.alarms if alarm.cause != CUT], len(frames))
+        said = (*([told] if told else []), *(verdict.reasons if verdict.sound is False else ()))
+        return Run(3 if verdict.sound is False else 0, "", said, {**metrics, "finite": finite})
+
+    def _config(self, cell: Cell, method: str, mode: str) -> DictConfig:
+        """Composed once a method: to do so takes longer than a rollout."""
+        if method not in self._configs:
+            self._configs[method] = load_config("rollout", [*METHODS[method], f"kernels={_kernels()}"])
+        config = OmegaConf.merge(self._configs[method], OmegaConf.from_dotlist([*self._asked(cell), f"guard={mode}"]))
+        assert isinstance(config, DictConfig)
+        return config
+
+    def _stepper(self, config: DictConfig, method: str) -> Stepper:
+        """Weights are read once."""
+        if method == "newton":
+            return make_stepper(config)[0]
+        self._network = self._network or make_stepper(config)[0]
+        weigh(self._network, config)
+        return self._network
+
+    def _asked(self, cell: Cell) -> list[str]:
+        garment, motion = self.dress, "dance_mixed"
+        if cell.fault is not None:
+            garment = self._folder / f"{cell.fault.replace(':', '_')}.npz"
+            if not garment.exists():
+                write_garment(garment, str(self.dress), cell.fault)
+        if cell.motion is not None:
+            path = self._folder / f"{cell.motion.replace(':', '_')}_motion.npz"
+            if not path.exists():
+                write_motion(path, cell.motion, 3.0)
+            motion = str(path)
+        return [f"garment={garment}", f"sequence={motion}", *cell.settings]
+
+
+def _kernels() -> str:
+    """The same in every run on a machine, fast where there is a compiler."""
+    try:
+        check_kernels("fused", "fp32", 64)
+    except ValueError:
+        return "torch"
+    return "fused"
