@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
@@ -19,15 +20,15 @@ from hood.dynamics.stepper import Stepper
 from hood.losses.potential import Potential
 
 OFF, REPAIR, STRICT = "off", "repair", "strict"
-#: What is so in a frame, with the worst value and the limit, and the way out where there is one.
+#: What is so in a frame, with the worst value and the limit.
 _TEXTS = {
-    FINITE: ("positions that are not finite", ""),
-    TARGET: ("the solver short of its target, relative gradient {value:.2g} at worst", ""),
-    STRAIN: ("strain p99 beyond {limit:.0%}, {value:.0%} at worst", ""),
-    FORCE: ("forces out of balance, {value:.3g} times the weight at worst, beyond {limit:.3g}", ""),
-    TURN: ("the body turns by {value:.0f} degrees in a step, beyond {limit:.0f}", "more steps per second (fps=…)"),
-    SPEED: ("the body moves by {value:.2g} m in a step, beyond {limit:.2g}", "more steps per second (fps=…)"),
-    CUT: ("the skin cuts {value:.1%} of the cloth's triangles at worst, beyond {limit:.0%}", ""),
+    FINITE: "positions that are not finite",
+    TARGET: "the solver short of its target, relative gradient {value:.2g} at worst",
+    STRAIN: "strain p99 beyond {limit:.0%}, {value:.0%} at worst",
+    FORCE: "forces out of balance, {value:.3g} times the weight at worst, beyond {limit:.3g}",
+    TURN: "the body turns by {value:.0f} degrees in a step, beyond {limit:.0f} (less with a higher fps=…)",
+    SPEED: "the body moves by {value:.2g} m in a step, beyond {limit:.2g} (less with a higher fps=…)",
+    CUT: "the skin cuts {value:.1%} of the cloth's triangles at worst, beyond {limit:.0%}",
 }
 
 
@@ -45,7 +46,8 @@ def check_guard(config: DictConfig) -> None:
         raise ConfigError(f"guard=repair: step={step} has fixed shapes, a step that is mended has not; use step=plain")
     if mode == STRICT and str(config.metrics) != "all":
         raise ConfigError(
-            f"guard=strict: step={step} with metrics={config.metrics} measures nothing that a guard could look at; use metrics=all"
+            f"guard=strict: step={step} with metrics={config.metrics} measures nothing that a guard could look at; use "
+            "metrics=all"
         )
 
 
@@ -80,7 +82,7 @@ def summarise_guard(data: RolloutData) -> dict[str, Any]:
         "guard": {
             "mode": mode,
             "frames": len({row["frame"] for row in rows}),
-            "causes": {cause: sum(row["cause"] == cause for row in rows) for cause in dict.fromkeys(r["cause"] for r in rows)},
+            "causes": dict(Counter(row["cause"] for row in rows)),
             "repairs": kinds,
             "stopped": rows[0]["frame"] if mode == STRICT and rows else None,
             "sentence": guard_sentence(mode, [Alarm(**row) for row in rows], count),
@@ -112,9 +114,9 @@ def guard_sentence(mode: str, alarms: Sequence[Alarm], num_frames: int) -> str:
 
 def _part(alarms: Sequence[Alarm]) -> str:
     """What was so, of one cause."""
-    text, way_out = _TEXTS.get(alarms[0].cause, ("{value:.3g}, beyond {limit:.3g}", ""))
+    text = _TEXTS.get(alarms[0].cause, "{value:.3g}, beyond {limit:.3g}")
     worst = max(alarms, key=lambda alarm: -math.inf if math.isnan(alarm.value) else alarm.value)
-    return text.format(value=worst.value, limit=worst.limit) + (f" ({way_out})" if way_out else "")
+    return text.format(value=worst.value, limit=worst.limit)
 
 
 def _named(alarms: Sequence[Alarm]) -> str:
@@ -131,5 +133,4 @@ def _outcome(mode: str, alarms: Sequence[Alarm]) -> list[str]:
     if mode != REPAIR:
         return ["guard=repair mends what it can"]
     mended = sum(alarm.repair in (REFINED, SOLVED) for alarm in steps)
-    left = f", {len(steps) - mended} stay as they were" if mended < len(steps) else ""
-    return [f"{mended} of these steps were mended{left}"]
+    return [f"{mended} of {len(steps)} steps mended"]

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
-from torch import Tensor
 
 from hood.dynamics.measure import strain_metrics, vertex_residual
 from hood.dynamics.simulator import Prediction
@@ -59,7 +58,11 @@ class Mended:
 
 
 def standing(
-    potential: Potential, problem: StepProblem, prediction: Prediction, figures: StepFigures | None = None, typical: bool = False
+    potential: Potential,
+    problem: StepProblem,
+    prediction: Prediction,
+    figures: StepFigures | None = None,
+    typical: bool = False,
 ) -> Standing:
     """How good the step is; ``figures`` are those of it where they have been made, ``typical`` asks for the typical vertex's.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from hood.commands.cloth_contact import potential_of
 from hood.commands.common import weigh
 from hood.commands.dial import refined
 from hood.commands.guarding import guard_sentence, make_guard
+from hood.commands.notices import heard
 from hood.commands.rollout import make_scene, make_stepper
 from hood.config import load_config
 from hood.dynamics.guard import CUT
@@ -69,10 +69,10 @@ class Battery:
         return self._solved[cell.name]
 
     def run(self, cell: Cell, method: str, mode: str) -> Run:
-        """A rollout as of ``hood rollout``, and what it says of itself; not what the surface alone says."""
+        """A rollout as of ``hood rollout``, and what it says of itself. Two things that it says of every cell do not count:
+        that networks were not trained on so coarse a dress, and how much the skin cuts."""
         config = self._config(cell, method, mode)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with heard(aloud=False) as warned:
             scene = make_scene(config)
             potential = potential_of(config)
             stepper = refined(self._stepper(config, method), config, scene.cloth.num_vertices, potential)
@@ -85,7 +85,7 @@ class Battery:
         verdict = judge_soundness(finite, metrics["strain_p99"], metrics)
         assert guard is not None
         told = guard_sentence(mode, [alarm for alarm in guard.alarms if alarm.cause != CUT], len(frames))
-        said = (*([told] if told else []), *(verdict.reasons if verdict.sound is False else ()))
+        said = (*warned, *([told] if told else []), *(verdict.reasons if verdict.sound is False else ()))
         return Run(3 if verdict.sound is False else 0, "", said, {**metrics, "finite": finite})
 
     def _config(self, cell: Cell, method: str, mode: str) -> DictConfig:
