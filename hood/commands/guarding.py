@@ -103,8 +103,8 @@ def guard_sentence(mode: str, alarms: Sequence[Alarm], num_frames: int) -> str:
     if mode == STRICT:
         first = alarms[0]
         return (
-            f"guard=strict: the rollout ends before frame {first.frame}: {_part(alarms[:1])}; the {num_frames} frames before it "
-            "are kept"
+            f"guard=strict: the rollout ends before frame {first.frame}: {_part(alarms[:1])}; the {num_frames} frames before "
+            "it are kept"
         )
     causes = list(dict.fromkeys(alarm.cause for alarm in alarms))
     parts = [_named([alarm for alarm in alarms if alarm.cause == cause]) for cause in causes]

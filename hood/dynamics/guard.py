@@ -7,9 +7,9 @@ Of every step the gravest of these causes is told, and of the surface what is me
 - *strain*: the 99th percentile of the edge strain is beyond 25%. Where the solver's own step is as strained (soft, heavy or
   tight cloth), the limit of a rollout that is repaired becomes 1.5 times that.
 - *force*: too much is left unbalanced. Of a network alone this is the median over vertices of the force in units of the
-  vertex's own weight, beyond 12 (30 in the first ten steps): the relative gradient rg is no measure there, since few vertices
-  in contact take it from 4 to 1,000 between sound frames; only beyond 1e5 it counts. Else it is rg beyond 50. Either limit is at
-  least five times the rollout's own level, the median of its last 30 calm steps; three tenths of it hold in steps in which
+  vertex's own weight, beyond 12 (30 in the first ten steps): the relative gradient rg is no measure there, as few vertices
+  in contact take it from 4 to 1,000 between sound frames; only beyond 1e5 it counts. Else it is rg beyond 50. Either limit is
+  at least five times the rollout's own level, the median of its last 30 calm steps; three tenths of it hold in steps in which
   the body turns or moves too far.
 - *turn*, *speed*: the body turns by more than 15 degrees as one, or its fastest vertex moves by more than 0.3 m. A jump over
   which the cloth was carried is none.
