@@ -49,7 +49,7 @@ from hood.dynamics.simulator import Prediction
 from hood.dynamics.stepper import NewtonStepper, Stepper
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
-from hood.scene.jumps import turned
+from hood.mesh.rigid import turned
 from hood.scene.state import Obstacle
 from hood.solver.newton import NewtonSettings
 from hood.solver.step_figures import StepFigures

@@ -58,7 +58,7 @@ def test_a_quiet_rollout_is_silent(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_turn_is_told_and_mended(capsys: pytest.CaptureFixture[str]) -> None:
-    write_walk(Path("walk.npz"), 8, turn_at=4)
+    write_walk(Path("walk.npz"), 8, twist_at=4)
     main([*HASTY, "guard=off"])
     plain = positions()
     main(HASTY)
@@ -81,7 +81,7 @@ def test_a_turn_is_told_and_mended(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_strict_ends_before_the_first_alarm(capsys: pytest.CaptureFixture[str]) -> None:
-    write_walk(Path("walk.npz"), 8, turn_at=4)
+    write_walk(Path("walk.npz"), 8, twist_at=4)
     main([*HASTY, "guard=off"])
     plain = positions()
     capsys.readouterr()
@@ -129,7 +129,7 @@ def test_the_sentence_names_frames_values_and_limits() -> None:
 
 
 def test_alarms_of_a_damaged_file_are_refused() -> None:
-    write_walk(Path("walk.npz"), 6, turn_at=4)
+    write_walk(Path("walk.npz"), 6, twist_at=4)
     main(HASTY)
     with h5py.File("out/rollout.h5", "r+") as file:
         file["guard/frame"][0] = 10**9

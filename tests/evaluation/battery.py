@@ -20,9 +20,11 @@ from hood.commands.rollout import make_scene, make_stepper
 from hood.config import load_config
 from hood.dynamics.guard import CUT
 from hood.dynamics.rollout import simulate
+from hood.dynamics.soundness import Criteria
 from hood.dynamics.soundness import judge as judge_soundness
 from hood.dynamics.stepper import Stepper
-from hood.evaluation.envelope import Cell, Criteria, Judged, Run, cells, judge
+from hood.evaluation.cells import Cell, cells
+from hood.evaluation.envelope import Judged, Run, judge
 from hood.nn.compiled import check_kernels
 
 FRAMES = 20
@@ -85,8 +87,8 @@ class Battery:
         verdict = judge_soundness(finite, metrics["strain_p99"], metrics)
         assert guard is not None
         told = guard_sentence(mode, [alarm for alarm in guard.alarms if alarm.cause != CUT], len(frames))
-        said = (*warned, *([told] if told else []), *(verdict.reasons if verdict.sound is False else ()))
-        return Run(3 if verdict.sound is False else 0, "", said, {**metrics, "finite": finite})
+        unsound = verdict.reasons if verdict.sound is False else ()
+        return Run(3 if unsound else 0, "", (*warned, *([told] if told else [])), unsound, {**metrics, "finite": finite})
 
     def _config(self, cell: Cell, method: str, mode: str) -> DictConfig:
         """Composed once a method: to do so takes longer than a rollout."""
