@@ -40,6 +40,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from statistics import median
 
+import numpy as np
 import torch
 
 from hood.dynamics.captured_newton import CapturedNewton
@@ -79,7 +80,7 @@ FORCE_FACTOR, _WINDOW, _LEAST = 5.0, 30, 10
 _STRAIN_RATIO = 1.5
 #: Relative gradient that a step is mended to where the stepper has no target of its own.
 _GOAL = 1e-2
-#: Of the body's vertices one in so many tells how it turns.
+#: Of the body's vertices one in so many tells how it moves.
 _SPARSE = 16
 
 
@@ -212,11 +213,11 @@ def _own_settings(stepper: Stepper) -> NewtonSettings | None:
 
 
 def body_motion(obstacle: Obstacle | None) -> tuple[float, float]:
-    """Degrees that the body turns as one in a step, and the way [m] of its fastest vertex; 0 without a body."""
+    """Degrees that the body turns as one in a step, and the way [m] of its fastest vertex, of one in 16; 0 without a body."""
     if obstacle is None or not len(obstacle.pos):
         return 0.0, 0.0
-    start, end = (pos[::_SPARSE].cpu().double().numpy() for pos in (obstacle.pos, obstacle.next_pos))
-    return turned(start, end), float((obstacle.next_pos - obstacle.pos).norm(dim=1).max())
+    start, end = (pos[::_SPARSE].cpu().numpy().astype(np.float64) for pos in (obstacle.pos, obstacle.next_pos))
+    return turned(start, end), float(np.sqrt(np.square(end - start).sum(axis=1).max()))
 
 
 def _motion_alarm(frame: int, obstacle: Obstacle | None) -> Alarm | None:
