@@ -109,7 +109,7 @@ def _point(folder: Path) -> Point:
     ]
     measured = [line["measured"] for line in lines if "measured" in line]
     groups = [[gap["gamma"] for gap in one["gaps"]] for one in measured]
-    frames = [[frame for frame in one["frames"] if frame.get("relative_gradient") is not None] for one in measured]
+    frames = [frame for one in measured for frame in one["frames"]]
     return Point(
         run=note["run"],
         updates=note["updates"],
