@@ -182,7 +182,7 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", choices=tuple(SCENES), default=[name for name in SCENES if name not in LARGE])
     parser.add_argument("--models", nargs="+", default=["quickstart", "ours"], help="shipped names or model files")
     parser.add_argument("--states", type=int, default=16, help="of every scene")
-    parser.add_argument("--kernels", default="compiled")
+    parser.add_argument("--kernels", default="fused")
     parser.add_argument("--csv", type=Path, help="every solve")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
