@@ -116,7 +116,7 @@ def test_a_rollout_warns_once_and_writes_it_down(
     known.trained_for = scene_conditions(tank_scene.garment, tank_scene.cloth, 1 / 30, DEFAULT)
     save_simulator(tmp_path / "paper.safetensors", known)
     quick = ["num_frames=2", "video=none", "sheet=false", "metrics=none", "allow_unsound=true", "garment=tank"]
-    quick += [f"checkpoint={tmp_path}/paper.safetensors", f"output={tmp_path}/out"]
+    quick += ["guard=off", f"checkpoint={tmp_path}/paper.safetensors", f"output={tmp_path}/out"]
     (tmp_path / "list.txt").write_text("walk_proud\nplie\n")
     monkeypatch.chdir(tmp_path)
     for extra, expected in (([], []), (["fps=60", "sequence=list.txt"], ["fps=60 (trained on 30)"])):

@@ -90,9 +90,10 @@ def test_a_network_learns_to_leave_layers_on_their_sides(tmp_path: Path, body: B
         assert "layer_sides" not in trainer.simulator.potential.terms
         assert trainer.simulator.trained_for is not None
         assert "layer_sides" not in trainer.simulator.trained_for.potential
-        felt[weight] = [trainer.update()["layer_sides"] / weight for _ in range(14)][1::2]  # every other step is a relaxing one
-    assert felt[5e6][-1] < 0.8 * felt[5e6][0]
-    assert felt[5e6][-1] < 0.8 * felt[1e-3][-1]
+        felt[weight] = [trainer.update()["layer_sides"] / weight for _ in range(40)][1::2]  # every other step is a relaxing one
+    # Single updates go up and down.
+    assert np.mean(felt[5e6][5:9]) < 0.8 * felt[5e6][0]
+    assert np.mean(felt[5e6][10:]) < 0.6 * np.mean(felt[1e-3][10:])
 
 
 @pytest.mark.parametrize("options", [PAPER, PHYSICAL, PASSES], ids=["paper", "physical", "passes"])
