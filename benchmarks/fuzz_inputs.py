@@ -28,7 +28,7 @@ from hood.assets.torch_file import load_torch
 from hood.commands.common import require_same_config
 from hood.config import load_config
 from hood.dynamics.checkpoint import load_simulator, save_simulator
-from hood.dynamics.recorder import read_rollout
+from hood.dynamics.recorder import ALARM_COLUMNS, read_rollout
 from hood.dynamics.simulator import build_simulator
 from hood.testing import cylinder
 
@@ -254,13 +254,16 @@ def _h5(arrays: dict[str, Any]) -> bytes:
 
 
 def rollout(pos: np.ndarray, faces: np.ndarray) -> bytes:
-    """A rollout file of two frames."""
+    """A rollout file of two frames, with an alarm of a guard."""
     content = io.BytesIO()
     with h5py.File(content, "w") as file:
         file["cloth/pos"] = file["body/pos"] = np.stack([pos, pos])
         file["cloth/faces"] = file["body/faces"] = faces
         file["cloth/rest_pos"], file["time"], file["metrics/strain_p50"] = pos, np.arange(2.0), np.zeros(2)
-        file.attrs.update({"num_frames": 2, "complete": True, "dt": 1 / 30})
+        for name, kind in ALARM_COLUMNS.items():
+            file[f"guard/{name}"] = np.array([b"strain" if kind.kind == "S" else 1], dtype=kind)
+        own = {"num_frames": 2, "num_planned": 2, "num_alarms": 1, "guard": "report"}
+        file.attrs.update({**own, "complete": True, "dt": 1 / 30})
     return content.getvalue()
 
 

@@ -47,6 +47,7 @@ from hood.dynamics.captured_newton import CapturedNewton
 from hood.dynamics.mend import ENOUGH, LEFT, NOT_TRIED, Limits, Mended, Standing, mend, standing
 from hood.dynamics.refine import RefinedStepper
 from hood.dynamics.simulator import Prediction
+from hood.dynamics.soundness import Criteria
 from hood.dynamics.stepper import NewtonStepper, Stepper
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
@@ -63,7 +64,7 @@ CAUSES = (FINITE, TARGET, STRAIN, FORCE, TURN, SPEED, CUT)
 #: Those that a step can be mended of.
 MENDED = (FINITE, TARGET, STRAIN, FORCE)
 
-STRAIN_LIMIT, CUT_LIMIT = 0.25, 0.02
+STRAIN_LIMIT, CUT_LIMIT = Criteria.strain, 0.02
 #: A body that turns by more degrees, or moves by more metres, in a step.
 TURN_LIMIT, SPEED_LIMIT = 15.0, 0.3
 #: Unbalanced force: of a network's typical vertex, or of the whole cloth where a solver or a refinement took the step.
@@ -77,7 +78,7 @@ _WARY = 0.3
 #: The force limit is at least so many times the median of the last calm steps, once there are some.
 FORCE_FACTOR, _WINDOW, _LEAST = 5.0, 30, 10
 #: The strain limit is at least so many times the strain of the last step that was solved for its strain.
-_STRAIN_RATIO = 1.5
+_STRAIN_RATIO = Criteria.strain_ratio
 #: Relative gradient that a step is mended to where the stepper has no target of its own.
 _GOAL = 1e-2
 #: Of the body's vertices one in so many tells how it moves.

@@ -288,6 +288,12 @@ def _read_alarms(file: h5py.File) -> list[dict[str, Any]]:
     paths = _alarm_paths(file)
     if len(paths) < len(ALARM_COLUMNS):
         return []
+    for name, kind in ALARM_COLUMNS.items():
+        table = file[f"guard/{name}"]
+        if table.ndim != 1 or table.dtype.kind != kind.kind:
+            raise ValueError(
+                f"guard/{name} is {table.ndim}-dimensional, of type {table.dtype}; it has to be a column of {kind}"
+            )
     columns = {path.removeprefix("guard/"): file[path][: int(file.attrs["num_alarms"])] for path in paths}
     for frame in columns["frame"].tolist():
         if not 0 <= frame <= int(file.attrs["num_planned"]):

@@ -99,7 +99,7 @@ def _shortcomings(
         yield f"strain p99 {strain:.0%} in the worst frame, beyond {limit:.0%}"
     if network and reference is not None and abs(strain - reference) > criteria.network_strain:
         yield f"strain p99 {strain:.0%}, the solver's is {reference:.0%}"
-    for key, most, form, what in (
+    for key, most, digits, what in (
         ("cut_face_share", criteria.cut_share, ".1%", "of the cloth's triangles cut by the skin"),
         ("penetration_depth", criteria.depth, ".3g", "m deep in the body"),
         ("self_crossings", 0.0, ".0f", "pairs of triangles of the garment through each other"),
@@ -107,7 +107,7 @@ def _shortcomings(
     ):
         value = worst(metrics, key)
         if value > most and not (network and key.endswith("crossings")):
-            yield f"{value:{form}} {what}"
+            yield f"{value:{digits}} {what}"
     converged = metrics.get("solver_converged")
     if converged is not None and np.isfinite(converged).any():
         share = float(np.nanmean(converged))

@@ -135,3 +135,10 @@ def test_alarms_of_a_damaged_file_are_refused() -> None:
         file["guard/frame"][0] = 10**9
     with pytest.raises(ValueError, match="not a rollout file .guard/frame holds 1000000000, there are 6 frames"):
         read_rollout(Path("out/rollout.h5"))
+    with h5py.File("out/rollout.h5", "r+") as file:
+        del file["guard/value"]
+        file["guard/value"] = np.array([b"much"] * 12)
+    with pytest.raises(
+        ValueError, match="not a rollout file .guard/value is 1-dimensional, of type .S4; it has to be a column"
+    ):
+        read_rollout(Path("out/rollout.h5"))

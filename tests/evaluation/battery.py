@@ -6,11 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from coarse_dress import coarse_dress
 from omegaconf import DictConfig, OmegaConf
 
 from hood.assets.extremes import write_garment, write_motion
-from hood.assets.garment import save_garment
 from hood.commands.cloth_contact import potential_of
 from hood.commands.common import weigh
 from hood.commands.dial import refined
@@ -52,7 +50,7 @@ class Battery:
 
     def __init__(self, folder: Path) -> None:
         self._folder, self.dress = folder, folder / "dress.npz"
-        save_garment(self.dress, coarse_dress())
+        write_garment(self.dress, "dress", "remesh:300")
         self._solved: dict[str, Metrics] = {}
         self._configs: dict[str, DictConfig] = {}
         self._network: Stepper | None = None
