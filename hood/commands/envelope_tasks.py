@@ -22,6 +22,8 @@ from hood.evaluation.grid import GUESS, NEWTON, quoted
 
 #: The solver at a quarter of the time step, which the solver itself is held against; and no rollout has more frames per second.
 REFERENCE, _FINER, _MOST_FPS = "newton, dt/4", 4, 1000.0
+#: Behind a method's name: the guard repairs its steps.
+_REPAIR = "+repair"
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ class Task:
     @property
     def alone(self) -> bool:
         """Whether a network alone takes the steps."""
-        name, refine = split_refinement(self.model)
+        name, refine, _ = _parts(self.model)
         return refine is None and name not in (NEWTON, GUESS, REFERENCE)
 
 
@@ -63,7 +65,7 @@ def make_tasks(config: DictConfig) -> list[Task]:
     if not models or not garments:
         raise ConfigError("models and garments: give one of each at least")
     for model in models:
-        name, _ = split_refinement(model)
+        name = _parts(model)[0]
         if name not in (NEWTON, GUESS):
             locate("weights", name)
     for garment in garments:
@@ -150,18 +152,27 @@ def _performed(cell: Cell, config: DictConfig, folder: Path) -> tuple[str, ...]:
 
 
 def _method(model: str) -> tuple[str, ...]:
-    if model in (NEWTON, REFERENCE):
+    if model == REFERENCE:
         return ("stepper=newton",)
-    name, refine = split_refinement(model)
+    name, refine, repaired = _parts(model)
+    guard = ("guard=repair",) if repaired else ()
+    if name == NEWTON:
+        return ("stepper=newton", *guard)
     if name == GUESS:
-        return ("stepper=refine", f"refine={refine or 0}")
-    return (f"checkpoint={name}", f"refine={refine or 0}")
+        return ("stepper=refine", f"refine={refine or 0}", *guard)
+    return (f"checkpoint={name}", f"refine={refine or 0}", *guard)
+
+
+def _parts(model: str) -> tuple[str, int | None, bool]:
+    """``NAME+k+repair`` as the name, k (None where there is none), and whether the guard repairs."""
+    name, refine = split_refinement(model.removesuffix(_REPAIR))
+    return name, refine, model.endswith(_REPAIR)
 
 
 @cache
 def weights_of(model: str) -> str:
     """SHA-256 of the weights; a map of others of the same name is not done."""
-    name, _ = split_refinement(model)
+    name = _parts(model)[0]
     if name in (NEWTON, GUESS, REFERENCE):
         return "none"
     return hashlib.sha256(locate("weights", name).read_bytes()).hexdigest()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,11 +16,19 @@ from tqdm import tqdm
 
 from hood.assets.body import load_body
 from hood.assets.garment import load_garment
-from hood.assets.library import motion_split
+from hood.assets.library import locate, motion_split
 from hood.assets.material import Material
 from hood.assets.motions import MotionFiles, find_motions
 from hood.assets.sequence import load_sequence
-from hood.commands.common import held_folder, output_folder, require_device, require_same_config, tell_choice, together
+from hood.commands.common import (
+    held_folder,
+    output_folder,
+    read_model,
+    require_device,
+    require_same_config,
+    tell_choice,
+    together,
+)
 from hood.config import ConfigError, build, load_config, plain, require_choice, save_run_record
 from hood.dynamics.simulator import Simulator
 from hood.evaluation.validation import Validation
@@ -99,9 +108,12 @@ def make_trainer(config: DictConfig) -> Trainer:
     """Everything named in the config, put together; seeds are set before the weights are made."""
     torch.manual_seed(int(config.seed))
     simulator: Simulator = build(config.model)
-    simulator.to(str(config.device))
     settings: TrainerSettings = build(config.trainer)
     fps = float(config.data.fps)
+    if config.weights is not None:
+        _start_from(simulator, str(config.weights), fps)
+        settings = replace(settings, statistics_iterations=0)  # they come with the weights
+    simulator.to(str(config.device))
     names = find_motions(list(config.data.sequences) or motion_split()["train"])
     sampler = SceneSampler(
         body=load_body(str(config.data.body)),
@@ -114,6 +126,22 @@ def make_trainer(config: DictConfig) -> Trainer:
     folder = output_folder(config)
     watch = _make_watch(config, sampler, potential, folder) if settings.validate_every else None
     return Trainer(simulator, potential, sampler, settings, folder, int(config.seed), watch)
+
+
+def _start_from(simulator: Simulator, name: str, fps: float) -> None:
+    """Give the simulator the weights and statistics of a shipped model or of a file.
+
+    Raises:
+        ConfigError: they are of another model.
+    """
+    path = locate("weights", name)
+    given = read_model(path, fps)
+    theirs, ours = given.config, simulator.config
+    different = sorted(key for key in {*theirs, *ours} if key not in theirs or key not in ours or theirs[key] != ours[key])
+    if different:
+        keys = ", ".join(f"model.{key}={theirs.get(key, 'its default')}" for key in different)
+        raise ConfigError(f"weights={name}: {path} holds another model; its {keys}: choose the model= that it was trained as")
+    simulator.load_state_dict(given.state_dict())
 
 
 def _sampling(config: DictConfig) -> dict[str, Any]:

@@ -22,16 +22,20 @@ NO_TIME = Cell("input", "no time", ("fps=0",), bad_input="fps")
 
 
 def test_what_a_rollout_of_the_map_is_asked_for(tmp_path: Path) -> None:
-    config = load_config("envelope", ["models=[quickstart+5,guess+5]", "factors=[dt]"])
+    config = load_config("envelope", ["models=[quickstart+5,guess+5,quickstart+repair,newton+repair]", "factors=[dt]"])
     tasks = make_tasks(config)
     finest = next(cell for cell in cells() if cell.value == "1/480")
-    assert [task.model for task in tasks if task.cell == finest] == [REFERENCE, "newton", "quickstart+5", "guess+5"]
+    models = [task.model for task in tasks if task.cell == finest]
+    assert models == [REFERENCE, "newton", "quickstart+5", "guess+5", "quickstart+repair", "newton+repair"]
     words = {task.model: command_of(task, config, tmp_path) for task in tasks if task.cell == finest}
     assert "fps=960" in words[REFERENCE]  # no more than 1,000
     assert "fps=480" in words["newton"]
     assert {"checkpoint=quickstart", "refine=5"} <= set(words["quickstart+5"])
     assert {"stepper=refine", "refine=5"} <= set(words["guess+5"])
-    assert not any(task.alone for task in tasks)
+    assert {"checkpoint=quickstart", "refine=0", "guard=repair"} <= set(words["quickstart+repair"])
+    assert {"stepper=newton", "guard=repair"} <= set(words["newton+repair"])
+    assert [model for model in models if "guard=repair" in words[model]] == ["quickstart+repair", "newton+repair"]
+    assert {task.model for task in tasks if task.alone} == {"quickstart+repair"}
     assert Task(finest, "dress", "quickstart").alone
 
 

@@ -74,3 +74,26 @@ def test_one_fabric_for_every_scene() -> None:
 def test_buckets_by_size() -> None:
     slots = trainer("data.garments=[tank,dress,dress_4k]", "trainer.batch_size=1", "trainer.max_vertices=4500").slots
     assert [(bucket.templates, bucket.count) for bucket in slots.buckets] == [((0, 1), 4), ((2,), 1)]
+
+
+def test_training_from_given_weights(tmp_path: Path) -> None:
+    model = ["model=small", "model.features=paper", "model.output=acceleration", "model.latent_dim=8"]
+    first = trainer(*model, f"output={tmp_path}/first", "trainer.iterations=3", "seed=1")
+    first.run()
+    given = f"weights={tmp_path}/first/model.safetensors"
+    second = trainer(*model, given, f"output={tmp_path}/second", "seed=2")
+    expected, fresh = first.averaged().state_dict(), trainer(*model, "seed=2").simulator.state_dict()
+    for name, value in second.simulator.state_dict().items():
+        assert value.equal(expected[name]), name
+    assert any(not value.equal(expected[name]) for name, value in fresh.items())
+    assert all(value.equal(expected[name]) for name, value in second._average.items())
+    # The statistics are those of the weights: the first update learns.
+    assert "parameter_gradient_norm" in second.update()
+    assert "parameter_gradient_norm" not in trainer(*model).update()
+
+
+def test_weights_of_another_model_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"weights=ours: .*ours\.safetensors.*model\.features=local.*model\.schedule=ours"):
+        trainer("model=small", "weights=ours")
+    with pytest.raises(FileNotFoundError, match="did you mean 'quickstart'"):
+        trainer("weights=quickstrat")
