@@ -32,13 +32,18 @@ _NARROW = 96
 
 
 def affine(x: Tensor, weight: Tensor, bias: Tensor | None = None, relu: bool = False) -> Tensor:
-    """x Wᵀ + b of one block, (N, in) → (N, out) in the precision of ``x``, with a ReLU on request; no gradient."""
+    """x Wᵀ + b of one block, (N, in) → (N, out) in the precision of ``x``, with a ReLU on request; no gradient.
+
+    In float32 the ReLU keeps a NaN: oneDNN's own makes a zero of it, and a model that breaks would look whole.
+    """
     kernel = _kernel(x.device.type, x.dtype)
     if kernel is None or _whole or not torch.backends.mkldnn.enabled:
         out = functional.linear(x, weight, bias)
         return out.relu_() if relu else out
-    out = kernel(pad_rows(x), _packed(weight), bias, "relu" if relu else "none", [], "")
-    return out if out.shape[0] == x.shape[0] else out[: x.shape[0]]
+    fused = relu and x.dtype == torch.bfloat16
+    out = kernel(pad_rows(x), _packed(weight), bias, "relu" if fused else "none", [], "")
+    out = out if out.shape[0] == x.shape[0] else out[: x.shape[0]]
+    return out.relu_() if relu and not fused else out
 
 
 def affine_plus(x: Tensor, weight: Tensor, other: Tensor, out: Tensor | None = None) -> Tensor:
@@ -53,7 +58,7 @@ def affine_plus(x: Tensor, weight: Tensor, other: Tensor, out: Tensor | None = N
 
 
 def relu_(x: Tensor) -> Tensor:
-    """ReLU of one block, in place; what becomes of a NaN is left open, as in the products' own ReLU."""
+    """ReLU of one block, in place; in float32 it keeps a NaN, in bfloat16 that is left open."""
     if x.dtype == torch.bfloat16 and x.device.type == "cpu":
         # Negative numbers are negative integers of the same bits, for which a CPU has instructions: 6× faster.
         x.view(torch.int16).clamp_min_(0)

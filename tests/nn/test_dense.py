@@ -41,6 +41,15 @@ def test_affine_is_linear(count, dtype):
         torch.testing.assert_close(out, reference, rtol=TOLERANCE[dtype], atol=TOLERANCE[dtype])
 
 
+@pytest.mark.parametrize("count", [1, 300, 1024])
+def test_a_relu_keeps_a_nan(count):
+    x = make(count, 24)
+    x[-1, 3] = float("nan")
+    out = affine(x, make(40, 24), make(40), relu=True)
+    assert out[-1].isnan().all()
+    assert (out[:-1] >= 0).all()
+
+
 def test_weights_of_any_layout():
     x, table = make(300, 32), make(32, 96)
     for weight in (table[:, 32:64], table[:, 32:64].t(), table[:, ::3], table.t()[::3].contiguous().t()):
