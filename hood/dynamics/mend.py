@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
+from torch import Tensor
 
 from hood.dynamics.measure import strain_metrics, vertex_residual
 from hood.dynamics.simulator import Prediction
@@ -16,8 +17,6 @@ from hood.solver.step_figures import StepFigures
 
 #: A mended step is kept if its strain p99 is higher by no more than this, or this share of it.
 _MORE_STRAIN, _SHARE_MORE = 0.02, 0.1
-#: Of a step that missed the solver's target: so many times the iterations.
-PATIENCE = 2
 #: Relative gradient of a step that is good enough: forces are in balance but for the cloth's own weight.
 ENOUGH = 1.0
 #: What became of a step: nobody tried, refined on from where it was, solved from the state before, or left as it was.
@@ -89,7 +88,8 @@ def mend(
     most: int,
 ) -> Mended:
     """The step, taken further down ``potential`` by at most ``most`` iterations; where that leaves it beyond ``limits``, taken
-    anew from the solver's own start. A step that the solver took (``most`` is 0) is only taken anew, with :data:`PATIENCE`.
+    anew from the solver's own start. A step that the solver took (``most`` is 0) goes on from where it is, with as many
+    iterations again.
 
     It never gets worse: what is kept has a lower relative gradient and no more strain, but for a little; else the step stays.
     A step that is not finite is replaced by any that is.
@@ -98,12 +98,17 @@ def mend(
         before: how good the step is.
         settings: of the solver; the accuracy that both tries go for.
     """
-    further = replace(settings, max_iterations=most, budget_ms=None)
-    anew = replace(settings, max_iterations=settings.max_iterations * (1 if most else PATIENCE), budget_ms=None)
-    ways = [(REFINED, prediction.next_pos, further)] if before.finite and most else []
+    unhurried = replace(settings, budget_ms=None)
+    ways: list[tuple[str, Tensor | None, NewtonSettings]] = []
+    if before.finite:
+        ways.append((REFINED, prediction.next_pos, replace(unhurried, max_iterations=most) if most else unhurried))
+    if most or not before.finite:
+        ways.append((SOLVED, None, unhurried))
     tries, spent = [], 0
-    for kind, start, how in [*ways, (SOLVED, None, anew)]:
+    for kind, start, how in ways:
         pos, report = minimize(potential, problem, start, how)
+        if kind == REFINED and not report.iterations:
+            continue  # the same step
         taken = Prediction(pos, report.acc, prediction.metrics)
         spent += report.iterations
         tries.append((kind, taken, standing(potential, problem, taken)))
