@@ -75,7 +75,7 @@ CASES = (
         ("resume=true",),
     ),
     Case("prepare", ("prepare", "garment=dress", "output={out}/dress.npz")),
-    Case("envelope", ("envelope", "models=[newton,guess+1]", "factors=[input]", "garments=[tank]", "output={out}")),
+    Case("envelope", ("envelope", "models=[newton,guess+1]", "factors=[turn]", "garments=[tank]", "output={out}")),
 )  # fmt: skip
 
 

@@ -30,6 +30,8 @@ from hood.commands.common import (
     together,
 )
 from hood.config import ConfigError, build, load_config, plain, require_choice, save_run_record
+from hood.dynamics.checkpoint import read_header
+from hood.dynamics.reference import SUFFIXES
 from hood.dynamics.simulator import Simulator
 from hood.evaluation.validation import Validation
 from hood.losses.layers import for_networks
@@ -110,8 +112,9 @@ def make_trainer(config: DictConfig) -> Trainer:
     simulator: Simulator = build(config.model)
     settings: TrainerSettings = build(config.trainer)
     fps = float(config.data.fps)
+    earlier = 0
     if config.weights is not None:
-        _start_from(simulator, str(config.weights), fps)
+        earlier = _start_from(simulator, str(config.weights), fps)
         settings = replace(settings, statistics_iterations=0)  # they come with the weights
     simulator.to(str(config.device))
     names = find_motions(list(config.data.sequences) or motion_split()["train"])
@@ -125,11 +128,13 @@ def make_trainer(config: DictConfig) -> Trainer:
     potential = build(config.losses)
     folder = output_folder(config)
     watch = _make_watch(config, sampler, potential, folder) if settings.validate_every else None
-    return Trainer(simulator, potential, sampler, settings, folder, int(config.seed), watch)
+    trainer = Trainer(simulator, potential, sampler, settings, folder, int(config.seed), watch)
+    trainer.earlier = earlier
+    return trainer
 
 
-def _start_from(simulator: Simulator, name: str, fps: float) -> None:
-    """Give the simulator the weights and statistics of a shipped model or of a file.
+def _start_from(simulator: Simulator, name: str, fps: float) -> int:
+    """Give the simulator the weights and statistics of a shipped model or of a file; the updates behind them, 0 if unknown.
 
     Raises:
         ConfigError: they are of another model.
@@ -142,6 +147,7 @@ def _start_from(simulator: Simulator, name: str, fps: float) -> None:
         keys = ", ".join(f"model.{key}={theirs.get(key, 'its default')}" for key in different)
         raise ConfigError(f"weights={name}: {path} holds another model; its {keys}: choose the model= that it was trained as")
     simulator.load_state_dict(given.state_dict())
+    return 0 if path.suffix.lower() in SUFFIXES else int(read_header(path).get("iteration", 0))
 
 
 def _sampling(config: DictConfig) -> dict[str, Any]:

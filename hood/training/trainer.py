@@ -93,6 +93,7 @@ class Trainer:
                     module.shared_sum = distributed.all_reduce_sum
         self.optimizer = make_optimizer(settings.optimizer, simulator, settings.learning_rate)
         self.iteration = 0
+        self.earlier = 0  # iterations that given weights had behind them
         self.skipped = 0
         self.rollbacks = 0
         self.best = math.inf
@@ -266,7 +267,7 @@ class Trainer:
 
     def _write(self, state: dict[str, Any]) -> None:
         save_checkpoint(self.checkpoint_path, state)
-        save_simulator(self.folder / "model.safetensors", self.averaged(), {"iteration": str(self.iteration)})
+        save_simulator(self.folder / "model.safetensors", self.averaged(), {"iteration": str(self.earlier + self.iteration)})
 
     def _keep(self) -> None:
         """Copies of what was just saved, under the iteration's number."""
@@ -337,7 +338,7 @@ class Trainer:
             self._metrics.picture(self.iteration, "validation", strip)
         if values["score"] < self.best:
             self.best = values["score"]
-            header = {"iteration": str(self.iteration), "validation": json.dumps(values)}
+            header = {"iteration": str(self.earlier + self.iteration), "validation": json.dumps(values)}
             distributed.on_main(lambda: save_simulator(self.folder / "best.safetensors", averaged, header))
 
     def _damping(self, residual: Tensor) -> Tensor:

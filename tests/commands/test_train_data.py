@@ -12,6 +12,7 @@ from hood.assets.material import Material
 from hood.assets.motions import MotionFiles
 from hood.commands.train import make_trainer
 from hood.config import ConfigError, load_config
+from hood.dynamics.checkpoint import read_header
 from hood.training.trainer import Trainer
 
 SMALL = ["model.latent_dim=8", "data.garments=[tank]"]
@@ -87,6 +88,9 @@ def test_training_from_given_weights(tmp_path: Path) -> None:
         assert value.equal(expected[name]), name
     assert any(not value.equal(expected[name]) for name, value in fresh.items())
     assert all(value.equal(expected[name]) for name, value in second._average.items())
+    second.folder.mkdir()
+    second.save()  # says how long the weights have been trained in all
+    assert read_header(tmp_path / "second" / "model.safetensors")["iteration"] == "3"
     # The statistics are those of the weights: the first update learns.
     assert "parameter_gradient_norm" in second.update()
     assert "parameter_gradient_norm" not in trainer(*model).update()
