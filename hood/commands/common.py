@@ -121,6 +121,19 @@ def read_model(path: Path, fps: float) -> Simulator:
     return simulator
 
 
+def require_same_model(path: Path, held: Simulator, asked: Simulator, way_out: str) -> None:
+    """Refuse weights of another model than the one ``asked`` for, and name the settings that differ.
+
+    Raises:
+        ConfigError: see above; ends with ``way_out``.
+    """
+    theirs, ours = held.config, asked.config
+    different = sorted(key for key in {*theirs, *ours} if key not in theirs or key not in ours or theirs[key] != ours[key])
+    if different:
+        keys = ", ".join(f"{key}={theirs.get(key, 'its default')}" for key in different)
+        raise ConfigError(f"{path}: holds a model of {keys}, not the model asked for; {way_out}")
+
+
 def weigh(stepper: Stepper, config: DictConfig) -> None:
     """Let ``config.gravity`` [m/s²] act in the stepper's steps, on ``config.device``."""
     stepper.gravity = torch.tensor([0.0, -float(config.gravity), 0.0], device=str(config.device))

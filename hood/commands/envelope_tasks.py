@@ -152,11 +152,9 @@ def _performed(cell: Cell, config: DictConfig, folder: Path) -> tuple[str, ...]:
 
 
 def _method(model: str) -> tuple[str, ...]:
-    if model == REFERENCE:
-        return ("stepper=newton",)
     name, refine, repaired = _parts(model)
     guard = ("guard=repair",) if repaired else ()
-    if name == NEWTON:
+    if name in (NEWTON, REFERENCE):
         return ("stepper=newton", *guard)
     if name == GUESS:
         return ("stepper=refine", f"refine={refine or 0}", *guard)

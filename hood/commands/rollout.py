@@ -29,6 +29,7 @@ from hood.commands.common import (
     prepare_folder,
     read_model,
     require_device,
+    require_same_model,
     thinning,
     together,
     use_arithmetic,
@@ -266,9 +267,7 @@ def make_simulator(config: DictConfig) -> tuple[Simulator, str]:
     path = locate("weights", str(config.checkpoint))
     simulator = read_model(path, float(config.fps))
     if asked is not None:
-        built: Simulator = build(config.model)
-        if built.config != simulator.config:
-            raise ConfigError(f"{path}: holds model {simulator.config}, not the model asked for; drop model=… from the command")
+        require_same_model(path, simulator, build(config.model), "drop model=… from the command")
     return simulator.eval().to(device), hashlib.sha256(path.read_bytes()).hexdigest()
 
 

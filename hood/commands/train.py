@@ -26,6 +26,7 @@ from hood.commands.common import (
     read_model,
     require_device,
     require_same_config,
+    require_same_model,
     tell_choice,
     together,
 )
@@ -128,9 +129,7 @@ def make_trainer(config: DictConfig) -> Trainer:
     potential = build(config.losses)
     folder = output_folder(config)
     watch = _make_watch(config, sampler, potential, folder) if settings.validate_every else None
-    trainer = Trainer(simulator, potential, sampler, settings, folder, int(config.seed), watch)
-    trainer.earlier = earlier
-    return trainer
+    return Trainer(simulator, potential, sampler, settings, folder, int(config.seed), watch, earlier)
 
 
 def _start_from(simulator: Simulator, name: str, fps: float) -> int:
@@ -141,11 +140,7 @@ def _start_from(simulator: Simulator, name: str, fps: float) -> int:
     """
     path = locate("weights", name)
     given = read_model(path, fps)
-    theirs, ours = given.config, simulator.config
-    different = sorted(key for key in {*theirs, *ours} if key not in theirs or key not in ours or theirs[key] != ours[key])
-    if different:
-        keys = ", ".join(f"model.{key}={theirs.get(key, 'its default')}" for key in different)
-        raise ConfigError(f"weights={name}: {path} holds another model; its {keys}: choose the model= that it was trained as")
+    require_same_model(path, given, simulator, f"give the model= that weights={name} were trained as")
     simulator.load_state_dict(given.state_dict())
     return 0 if path.suffix.lower() in SUFFIXES else int(read_header(path).get("iteration", 0))
 

@@ -82,8 +82,8 @@ def _introduction(criteria: Criteria) -> Sequence[str]:
 
 _HOW = (
     "A row is a setting of a factor, a column a method: a network alone, one refined by some iterations (NAME+5), the solver's "
-    "starting guess refined (guess+5), or the converged solver (newton). The number is the strain p99 of the worst frame. A "
-    "click shows reasons, curves, pictures and the command."
+    "starting guess refined (guess+5), or the converged solver (newton); NAME+repair: with steps that the guard repairs. "
+    "The number is the strain p99 of the worst frame. A click shows reasons, curves, pictures and the command."
 )
 
 

@@ -35,12 +35,12 @@ class NewtonSettings:
 
     Args:
         target_rg: relative gradient to reach, see :func:`hood.losses.potential.relative_gradient`.
-        max_iterations: Newton iterations; ordinary steps take about 10, cloth a thousand times stiffer 100 to 250.
+        max_iterations: Newton iterations; ordinary steps take about 10, those of cloth a thousand times stiffer about 100.
         budget_ms: stop after the iteration that passes this time [ms]; None for no limit.
         linear: ``cg`` (conjugate gradients, block-Jacobi) or ``direct`` (band Cholesky, on the CPU). A Newton
             iteration with the latter takes twice the time at 1,000 vertices and three times at 4,000, for a tenth fewer.
-        cg_iterations: at most as many per Newton iteration. Ordinary cloth never takes 100. Cloth a thousand times stiffer
-            takes hundreds, and with no more than 100 hardly a step of it meets the target.
+        cg_iterations: at most as many per Newton iteration. Ordinary cloth takes as many Newton iterations with 100. Of cloth a
+            thousand times stiffer, most steps miss the target with 100.
         double: compute in float64 whatever the problem's type. In float32 the potential of a garment is known to
             1e-7 of its value, which stops a line search early; the result comes back in the problem's type anyway.
         engine: ``compiled`` (C++, compiled at its first use, on a CPU), ``torch``, or ``auto``: compiled where there is a

@@ -19,7 +19,7 @@ from hood.assets.atomic import write_atomically
 
 #: What a run cannot go on without.
 _KEYS = {"iteration", "seed", "skipped", "skipped_in_row", "rollbacks", "best", "simulator", "average", "optimizer", "slots"}
-_KEYS |= {"rng", "window", "model"}
+_KEYS |= {"rng", "window", "model", "earlier"}
 
 
 def previous(path: Path) -> Path:

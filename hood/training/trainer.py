@@ -52,7 +52,8 @@ class Trainer:
     Files in ``folder``: ``checkpoint.pt`` and ``checkpoint.previous.pt`` (resume), ``model.safetensors`` (use),
     ``best.safetensors`` (use; the best validation so far), ``kept/`` (checkpoint and weights of the iterations ``keep_at``),
     ``metrics.jsonl``, ``validation/``, TensorBoard events. Process 0 alone writes and reads them. A disk that refuses a file
-    ends the training with the last checkpoint intact.
+    ends the training with the last checkpoint intact. ``earlier``: iterations behind weights that were given; model files count
+    them with their own.
     """
 
     def __init__(
@@ -64,6 +65,7 @@ class Trainer:
         folder: Path,
         seed: int,
         watch: Watch | None = None,
+        earlier: int = 0,
     ) -> None:
         settings = settings.compressed()
         shown = for_networks(potential)
@@ -93,7 +95,7 @@ class Trainer:
                     module.shared_sum = distributed.all_reduce_sum
         self.optimizer = make_optimizer(settings.optimizer, simulator, settings.learning_rate)
         self.iteration = 0
-        self.earlier = 0  # iterations that given weights had behind them
+        self.earlier = earlier
         self.skipped = 0
         self.rollbacks = 0
         self.best = math.inf
@@ -208,6 +210,7 @@ class Trainer:
         generators = distributed.gather(generator_states(self._device))
         state: dict[str, Any] = {
             "iteration": self.iteration,
+            "earlier": self.earlier,
             "seed": self.seed,
             "skipped": self.skipped,
             "skipped_in_row": self._skipped_in_row,
@@ -251,11 +254,17 @@ class Trainer:
         self._saved_at = self.iteration if note is None else -1
         self.slots.load_state_dict(state["slots"])
         self.best = float(state["best"])
+        self.earlier = int(state["earlier"])
         self.skipped, self._skipped_in_row = int(state["skipped"]), int(state["skipped_in_row"])
         self.rollbacks, self._rollbacks_in_row, self._failed_at = state["rollbacks"]
         if len(state["rng"]) == distributed.world_size():
             set_generator_states(state["rng"][distributed.rank()], self._device)
             self._window.load_state_dict(state["window"][distributed.rank()])
+
+    @property
+    def _iterations_in_all(self) -> str:
+        """Behind the weights, for the header of their files."""
+        return str(self.earlier + self.iteration)
 
     @property
     def _device(self) -> torch.device:
@@ -267,7 +276,7 @@ class Trainer:
 
     def _write(self, state: dict[str, Any]) -> None:
         save_checkpoint(self.checkpoint_path, state)
-        save_simulator(self.folder / "model.safetensors", self.averaged(), {"iteration": str(self.earlier + self.iteration)})
+        save_simulator(self.folder / "model.safetensors", self.averaged(), {"iteration": self._iterations_in_all})
 
     def _keep(self) -> None:
         """Copies of what was just saved, under the iteration's number."""
@@ -338,7 +347,7 @@ class Trainer:
             self._metrics.picture(self.iteration, "validation", strip)
         if values["score"] < self.best:
             self.best = values["score"]
-            header = {"iteration": str(self.earlier + self.iteration), "validation": json.dumps(values)}
+            header = {"iteration": self._iterations_in_all, "validation": json.dumps(values)}
             distributed.on_main(lambda: save_simulator(self.folder / "best.safetensors", averaged, header))
 
     def _damping(self, residual: Tensor) -> Tensor:

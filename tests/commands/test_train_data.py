@@ -97,7 +97,10 @@ def test_training_from_given_weights(tmp_path: Path) -> None:
 
 
 def test_weights_of_another_model_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"weights=ours: .*ours\.safetensors.*model\.features=local.*model\.schedule=ours"):
+    with pytest.raises(
+        ConfigError,
+        match=r"ours\.safetensors: holds a model of .*features=local.*schedule=ours.*not the model asked for.*weights=ours",
+    ):
         trainer("model=small", "weights=ours")
     with pytest.raises(FileNotFoundError, match="did you mean 'quickstart'"):
         trainer("weights=quickstrat")

@@ -19,7 +19,7 @@ from hood.training.checkpoint import load_checkpoint, load_last_good, previous, 
 STATE = {
     "iteration": 3, "seed": 0, "skipped": 0, "skipped_in_row": 0, "rollbacks": [0, 0, -1], "best": 0.5,
     "simulator": {"a": torch.arange(4.0)}, "average": {}, "optimizer": {}, "slots": {0: {"live": True}},
-    "window": [[]], "rng": [{"cpu": torch.get_rng_state()}], "model": {"latent_dim": 8},
+    "window": [[]], "rng": [{"cpu": torch.get_rng_state()}], "earlier": 0, "model": {"latent_dim": 8},
 }  # fmt: skip
 
 
