@@ -1,20 +1,56 @@
-"""hood: learned clothing dynamics. One graph network dresses moving bodies (HOOD, CVPR 2023)."""
+"""hood: learned clothing dynamics. One graph network dresses moving bodies (HOOD, CVPR 2023).
+
+The names below are the public interface. They are imported when they are first used, so ``import hood`` loads no torch.
+
+    import hood
+
+    for frame in hood.simulate("dress", "plie", num_frames=60, progress=True):
+        print(frame.index, frame.world_pos.shape)
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from hood.dynamics.reference import load_reference_checkpoint
+import importlib
+from typing import Any
 
 __version__ = "0.1.0"
-__all__ = ["__version__", "load_reference_checkpoint"]
+
+#: Where each public name lives; ``__init__.pyi`` says the same to type checkers and editors.
+_HOMES = {
+    "simulate": "hood.api",
+    "Simulation": "hood.api",
+    "rollout": "hood.api",
+    "train": "hood.api",
+    "load_model": "hood.api",
+    "load_garment": "hood.assets.garment",
+    "load_body": "hood.assets.body",
+    "load_sequence": "hood.assets.sequence",
+    "names": "hood.assets.library",
+    "Garment": "hood.assets.garment",
+    "Body": "hood.assets.body",
+    "PoseSequence": "hood.assets.sequence",
+    "Material": "hood.assets.material",
+    "FaceField": "hood.assets.material",
+    "EdgeField": "hood.assets.material",
+    "Scene": "hood.scene.scene",
+    "build_scene": "hood.scene.scene",
+    "Potential": "hood.losses.potential",
+    "default_potential": "hood.losses.potential",
+    "RolloutData": "hood.dynamics.recorder",
+    "read_rollout": "hood.dynamics.recorder",
+    "load_reference_checkpoint": "hood.dynamics.reference",
+}
+__all__ = ["__version__", *_HOMES]
 
 
 def __getattr__(name: str) -> Any:
-    """Names are imported when they are asked for: ``import hood`` loads no torch."""
-    if name == "load_reference_checkpoint":
-        from hood.dynamics.reference import load_reference_checkpoint
+    """The public name ``name``, imported now."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'hood' has no attribute {name!r}")
+    value = getattr(importlib.import_module(_HOMES[name]), name)
+    globals()[name] = value
+    return value
 
-        return load_reference_checkpoint
-    raise AttributeError(f"module 'hood' has no attribute {name!r}")
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

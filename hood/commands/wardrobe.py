@@ -36,14 +36,17 @@ def read_outfit(given: Any, motion: Motion, triangulate: bool = False, pins: Any
     """The garment or garments named by a config value, as one garment that can follow ``motion``.
 
     Args:
-        given: a name, a file, or a list of them.
+        given: a name, a file, a list of them, or a garment that is read already.
         triangulate: split polygons of mesh files instead of refusing them.
         pins: what is held instead of the files' own pins, see :func:`hood.assets.pins.pin_mask`; None: the files' own.
 
     Raises:
         ValueError: a garment that cannot be read, is not in metres or does not fit, or pins it does not have.
     """
-    garments = [load_garment(name, triangulate=triangulate) for name in names_of(given)]
+    if isinstance(given, Garment):
+        garments = [given]
+    else:
+        garments = [load_garment(name, triangulate=triangulate) for name in names_of(given)]
     for garment in garments:
         if not garment.bound:
             heed(garment.name, suspect_seams(garment.rest_pos, garment.faces))

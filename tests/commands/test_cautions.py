@@ -17,7 +17,7 @@ from hood.assets.sequence import PoseSequence
 from hood.cli import main
 from hood.commands.cautions import evaluation_cautions, scene_cautions
 from hood.commands.common import weigh
-from hood.commands.rollout import make_stepper
+from hood.commands.setup import make_stepper
 from hood.config import load_config
 from hood.dynamics.checkpoint import load_simulator, save_simulator
 from hood.dynamics.goals import Count

@@ -12,7 +12,7 @@ from belt import write_belt, write_walk
 from omegaconf import OmegaConf
 
 from hood.cli import main
-from hood.commands.rollout import make_scene
+from hood.commands.setup import make_scene
 from hood.config import build
 from hood.dynamics.recorder import RolloutData, read_rollout
 from hood.losses.potential import relative_gradient

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from hood.commands.rollout import make_stepper
+from hood.commands.setup import make_stepper
 from hood.config import ConfigError, load_config
 from hood.dynamics.captured_newton import CapturedNewton
 from hood.dynamics.rollout import simulate

@@ -1,0 +1,19 @@
+from hood.api import (
+    Simulation as Simulation,
+    load_model as load_model,
+    rollout as rollout,
+    simulate as simulate,
+    train as train,
+)
+from hood.assets.body import Body as Body, load_body as load_body
+from hood.assets.garment import Garment as Garment, load_garment as load_garment
+from hood.assets.library import names as names
+from hood.assets.material import EdgeField as EdgeField, FaceField as FaceField, Material as Material
+from hood.assets.sequence import PoseSequence as PoseSequence, load_sequence as load_sequence
+from hood.dynamics.recorder import RolloutData as RolloutData, read_rollout as read_rollout
+from hood.dynamics.reference import load_reference_checkpoint as load_reference_checkpoint
+from hood.losses.potential import Potential as Potential, default_potential as default_potential
+from hood.scene.scene import Scene as Scene, build_scene as build_scene
+
+__version__: str
+__all__: list[str]

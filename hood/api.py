@@ -1,0 +1,247 @@
+"""The library from Python: simulations, rollouts and training with the keys of the commands.
+
+Every name here is also a name of the package: ``hood.simulate(…)``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from hood.assets.garment import Garment
+from hood.assets.library import locate
+from hood.assets.material import Material
+from hood.commands.cloth_contact import potential_of
+from hood.commands.common import read_model
+from hood.commands.guarding import GuardStopped, make_guard
+from hood.commands.setup import Setup, check_config, make_stepper, set_up
+from hood.config import ConfigError, load_config
+from hood.dynamics import rollout as frames
+from hood.dynamics.rollout import Frame
+from hood.dynamics.simulator import Simulator
+from hood.dynamics.stepper import Stepper
+from hood.scene.scene import Scene
+
+#: Strings that Hydra reads as they are; all others are quoted.
+_BARE = re.compile(r"[A-Za-z_][A-Za-z0-9_./+-]*")
+_WORDS = ("null", "true", "false", "nan", "inf")
+
+
+class Simulation:
+    """A garment on a moving body, put together and ready to run; made by :func:`simulate`.
+
+    Iterating yields :class:`hood.dynamics.rollout.Frame` objects, frame 0 first. A second iteration simulates again.
+    With ``guard="strict"``, :class:`hood.commands.guarding.GuardStopped` is raised before the first frame that cannot be
+    trusted.
+
+    Attributes:
+        scene: the cloth, the body and its motion (:class:`hood.scene.scene.Scene`).
+        stepper: what takes the steps, refinement included (:class:`hood.dynamics.stepper.Stepper`).
+        num_frames: how many frames there will be: no more than the motion has.
+        notes: what was chosen and why, one sentence each (kernels, refinement, start).
+    """
+
+    def __init__(self, ready: Setup, notes: list[str], progress: bool = False) -> None:
+        self._ready = ready
+        self._progress = progress
+        self.scene: Scene = ready.scene
+        self.stepper: Stepper = ready.stepper
+        self.num_frames = min(int(ready.config.num_frames), ready.scene.num_frames)
+        self.notes = notes
+
+    def __len__(self) -> int:
+        return self.num_frames
+
+    def __iter__(self) -> Iterator[Frame]:
+        config = self._ready.config
+        potential = potential_of(config)
+        guard = make_guard(config, self.stepper, potential)
+        steps = frames.simulate(
+            self.stepper,
+            self.scene,
+            potential,
+            self.num_frames,
+            int(config.relaxing_steps),
+            metrics=str(config.metrics),
+            fields=tuple(config.export),
+            surface_stride=int(config.surface_stride),
+            settle=str(config.settle),
+            guard=guard,
+        )
+        yield from tqdm(steps, total=self.num_frames, unit="frame", disable=not self._progress)
+        if guard is not None and guard.stopped is not None:
+            raise GuardStopped(f"guard=strict: the simulation ends before frame {guard.stopped.frame}, which cannot be trusted")
+
+
+def simulate(
+    garment: str | Path | list[str] | Garment = "dress",
+    sequence: str | Path = "walk_proud",
+    *,
+    material: str | Material | None = None,
+    stepper: str | Stepper = "network",
+    progress: bool = False,
+    **keys: Any,
+) -> Simulation:
+    """Dress a moving body. Nothing is written to disk; frames come one by one as they are computed.
+
+    Args:
+        garment: a name, a file, a list of them for an outfit, or a :class:`hood.Garment`.
+        sequence: a name or a file of a motion.
+        material: a name (``denim``), or a :class:`hood.Material`. None: the default fabric.
+        stepper: ``network``, ``newton``, ``refine`` or ``auto`` as in ``hood rollout``, or an own stepper.
+        progress: whether a progress bar is shown.
+        keys: all keys of ``hood rollout --help`` that concern the simulation: ``body``, ``checkpoint``, ``num_frames``,
+            ``fps`` [1/s], ``betas``, ``refine``, ``device``, … A dictionary stands for a group: ``solver={"target_rg": 1e-3}``.
+
+    Returns:
+        The :class:`Simulation`. A frame's ``world_pos`` is (V, 3) m, its ``body_pos`` (W, 3) m, both float64.
+
+    Raises:
+        ValueError: an unknown key or value, or a file that cannot be used. Names the key or the file.
+        FileNotFoundError: an unknown name.
+
+    Example:
+        >>> import hood
+        >>> for frame in hood.simulate("tank", "walk_proud", num_frames=3):
+        ...     print(frame.index, tuple(frame.world_pos.shape))
+        0 (1016, 3)
+        1 (1016, 3)
+        2 (1016, 3)
+    """
+    named: dict[str, Any] = {"sequence": sequence, **keys}
+    if not isinstance(garment, Garment):
+        named["garment"] = garment
+    if isinstance(material, str):
+        named["material"] = material
+    if isinstance(stepper, str):
+        named["stepper"] = stepper
+    config = load_config("rollout", overrides(named))
+    check_config(config)
+    notes: list[str] = []
+    told = io.StringIO()
+    with contextlib.redirect_stdout(told):  # choices are told to whoever reads the notes
+        taken = make_stepper(config)[0] if isinstance(stepper, str) else stepper
+        ready = set_up(
+            config,
+            taken,
+            garment if isinstance(garment, Garment) else None,
+            material if isinstance(material, Material) else None,
+            tell=notes.append,
+        )
+    return Simulation(ready, [*told.getvalue().splitlines(), *notes], progress)
+
+
+def rollout(**keys: Any) -> dict[str, Any]:
+    """Run ``hood rollout`` with its keys: files in ``output``, and the summary as a dictionary.
+
+    Args:
+        keys: those of ``hood rollout --help``, such as ``garment="dress", num_frames=60, output="outputs/dress"``.
+
+    Returns:
+        What ``summary.json`` holds. ``summary["sound"]`` is False where the cloth cannot be trusted.
+
+    Raises:
+        ValueError, OSError: keys or files that cannot be used.
+        KeyboardInterrupt: it was interrupted; the frames done are kept.
+
+    Example:
+        >>> import hood
+        >>> summary = hood.rollout(garment="tank", num_frames=3, video="none", output="outputs/tank")
+        tank: 3 frames, all finite
+        ...
+        >>> summary["num_frames"]
+        3
+    """
+    from hood.commands.rollout import run
+
+    words = overrides(keys)
+    if run(words) == 130:
+        raise KeyboardInterrupt
+    folder = Path(str(load_config("rollout", words).output)).expanduser()
+    summary: dict[str, Any] = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    return summary
+
+
+def train(**keys: Any) -> Path:
+    """Run ``hood train`` with its keys.
+
+    Args:
+        keys: those of ``hood train --help``, such as ``experiment="quickstart", output="runs/mine"``. A dictionary stands for a
+            group: ``trainer={"iterations": 100}``.
+
+    Returns:
+        The file of the weights, ``model.safetensors`` in ``output``; give it to ``checkpoint=``.
+
+    Raises:
+        ValueError, OSError: keys or files that cannot be used.
+        KeyboardInterrupt: it was interrupted; the checkpoint is kept and ``resume=True`` goes on.
+    """
+    from hood.commands.train import run
+
+    words = overrides(keys)
+    if run(words) != 0:
+        raise KeyboardInterrupt
+    return Path(str(load_config("train", words).output)).expanduser() / "model.safetensors"
+
+
+def load_model(name: str | Path = "quickstart", fps: float = 30.0, device: str = "cpu") -> Simulator:
+    """A trained network with its rules of motion, ready to take steps.
+
+    Args:
+        name: embedded weights, a ``model.safetensors``, or published HOOD weights (``.pth``).
+        fps: steps per second it will take; published weights know one rate only.
+        device: ``cpu`` or ``cuda``.
+
+    Raises:
+        FileNotFoundError: unknown name or missing file.
+        ValueError: not a model file, or a model of another frame rate.
+
+    Example:
+        >>> import hood
+        >>> hood.load_model("quickstart").network.latent_dim
+        48
+    """
+    return read_model(locate("weights", name), fps).eval().to(device)
+
+
+def overrides(keys: Mapping[str, Any], group: str = "") -> list[str]:
+    """Python values as the ``key=value`` words of a command.
+
+    Args:
+        keys: by name; None is ``null``, a dictionary a group of keys.
+        group: what stands before every key, with a dot.
+
+    Raises:
+        ConfigError: a value that no command line can hold.
+    """
+    words: list[str] = []
+    for key, value in keys.items():
+        if isinstance(value, Mapping):
+            words += overrides(value, f"{group}{key}.")
+        else:
+            words.append(f"{group}{key}={_word(value, group + key)}")
+    return words
+
+
+def _word(value: Any, key: str) -> str:
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, (int, float)):
+        return repr(value)
+    if isinstance(value, (list, tuple)):
+        return f"[{','.join(_word(item, key) for item in value)}]"
+    if isinstance(value, (str, Path)):
+        text = str(value)
+        if _BARE.fullmatch(text) and text.lower() not in _WORDS:
+            return text
+        return "'" + re.sub(r"(\\+)(?=')|(\\+)$", lambda found: 2 * found[0], text).replace("'", "\\'") + "'"
+    raise ConfigError(f"{key}={value!r}: give a number, a word, a path, a list of them, or None")

@@ -1,0 +1,180 @@
+"""Scene and stepper of a rollout, put together from its configuration."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from omegaconf import DictConfig
+
+from hood.assets.garment import Garment
+from hood.assets.library import locate
+from hood.assets.material import Material
+from hood.commands.automatic import Choice, choose
+from hood.commands.cautions import scene_cautions, warn
+from hood.commands.cloth_contact import check_cloth_contact, potential_of, tell_if_off
+from hood.commands.common import UNTRAINED, read_model, require_device, require_same_model, thinning, use_arithmetic, weigh
+from hood.commands.dial import AUTO, check_dial, chosen, refined
+from hood.commands.guarding import check_guard
+from hood.commands.performance import make_motion
+from hood.commands.wardrobe import heed, layer_order, names_of, read_outfit
+from hood.config import ConfigError, build, plain, require_choice
+from hood.dynamics.captured import MODES, CapturedSimulator, network_of
+from hood.dynamics.captured_newton import CapturedNewton
+from hood.dynamics.refine import GuessStepper
+from hood.dynamics.rollout import METRIC_CHOICES, SETTLE_CHOICES, own_start
+from hood.dynamics.simulator import Simulator
+from hood.dynamics.stepper import NewtonStepper, Stepper
+from hood.nn.compiled import KERNELS
+from hood.scene.fitting import doubts, misplacement
+from hood.scene.scene import Scene, dress
+
+#: ``step=plain``: shapes as the step needs them, the readable reference.
+PLAIN = "plain"
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What a rollout runs: ``config`` is the one asked for, with everything settled that it left to ``auto``."""
+
+    config: DictConfig
+    scene: Scene
+    stepper: Stepper
+    choice: Choice
+
+
+def check_config(config: DictConfig) -> None:
+    """Raise ConfigError where keys of ``hood rollout`` have values that no rollout can have, before a file is read."""
+    require_device(config)
+    require_choice(config, "video", ("mp4", "gif", "none"))
+    require_choice(config, "metrics", METRIC_CHOICES)
+    require_choice(config, "settle", SETTLE_CHOICES)
+    _check_numbers(config)
+    require_choice(config, "kernels", (AUTO, *KERNELS))
+    require_choice(config, "stepper", ("network", "newton", "refine", AUTO))
+    require_choice(config, "step", (PLAIN, *MODES))
+    check_dial(config)
+    check_guard(config)
+    check_cloth_contact(config)
+
+
+def set_up(
+    config: DictConfig,
+    stepper: Stepper,
+    garment: Garment | None = None,
+    material: Material | None = None,
+    tell: Callable[[str], None] = print,
+) -> Setup:
+    """The scene that the config names, and ``stepper`` with its steps refined as the config, or the scene, needs.
+
+    Args:
+        garment: worn instead of ``config.garment``.
+        material: of the cloth, instead of ``config.material``.
+        tell: is called with every choice that was made, a sentence each.
+
+    Raises:
+        ConfigError, ValueError, FileNotFoundError: keys, files or assets that cannot be used.
+    """
+    scene = make_scene(config, garment, material)
+    choice = choose(config, stepper, scene)
+    settled = choice.settle(config)
+    for sentence in choice.why:
+        tell(sentence)
+    if solves_in_double(settled) != solves_in_double(config):
+        scene = make_scene(settled, garment, material)
+    if choice.stepper == "newton" and network_of(stepper) is not None:
+        stepper, _ = make_stepper(settled)
+    stepper = refined(stepper, settled, scene.cloth.num_vertices, potential_of(settled))
+    _check_start(settled, stepper, scene, tell)
+    tell_if_off(settled, 1 if scene.outfit is None else len(scene.outfit.names))
+    warn(scene_cautions(stepper, scene, build(settled.losses), str(settled.checkpoint)))
+    return Setup(settled, scene, stepper, choice)
+
+
+def make_scene(config: DictConfig, garment: Garment | None = None, material: Material | None = None) -> Scene:
+    """Assets named in the config, put together; ``garment`` and ``material`` stand for those of the config where given."""
+    motion = make_motion(config, torch.float64 if solves_in_double(config) else torch.float32)
+    order = layer_order(config.layers, names_of(config.garment)) if garment is None else None
+    garment = read_outfit(config.garment if garment is None else garment, motion, bool(config.triangulate), config.pins)
+    scene = replace(dress(garment, motion, build(config.material) if material is None else material), layers=order)
+    found = misplacement(scene)
+    if found is not None and found.grave:
+        raise ValueError(
+            f"garment {garment.name!r}: not worn by {motion.name!r} in its first frame: it {found.what}; give it as it is worn "
+            f"there, {found.fix}"
+        )
+    heed(garment.name, [found] if found is not None else [])
+    for name, doubt in doubts(scene):
+        heed(name, [doubt])
+    return scene
+
+
+def solves_in_double(config: DictConfig) -> bool:
+    """Whether steps are judged in float64: then states are kept in it, rounded ones would not meet what is said of them."""
+    return bool(config.solver.double) and (str(config.stepper) not in ("network", AUTO) or chosen(config) is not None)
+
+
+def make_stepper(config: DictConfig) -> tuple[Stepper, str]:
+    """What takes the steps, before they are refined, and the SHA-256 of its weights (``none`` without a network)."""
+    if str(config.stepper) in ("network", AUTO):
+        simulator, digest = make_simulator(config)
+        weigh(simulator, config)
+        use_arithmetic(simulator, config, traced=str(config.step) == "compiled")
+        stepper: Stepper = simulator if str(config.step) == PLAIN else CapturedSimulator(simulator, str(config.step))
+        return stepper, digest
+    potential = potential_of(config)
+    kind = GuessStepper if str(config.stepper) == "refine" else NewtonStepper
+    solver = kind(potential, build(config.solver))
+    weigh(solver, config)
+    if str(config.step) == PLAIN:
+        return solver, "none"
+    if not isinstance(solver, NewtonStepper):
+        raise ConfigError(f"step={config.step}: steps of stepper={config.stepper} are plain; drop step=… from the command")
+    return CapturedNewton(solver, str(config.step)), "none"
+
+
+def make_simulator(config: DictConfig) -> tuple[Simulator, str]:
+    """The checkpoint's simulator and its SHA-256; ``checkpoint=untrained`` builds ``model`` with seeded random weights.
+
+    Raises:
+        ConfigError: the checkpoint holds another model than the one asked for.
+    """
+    torch.manual_seed(int(config.seed))
+    asked = None if config.get("model") is None else plain(config.model)
+    device = str(config.device)
+    if str(config.checkpoint) == UNTRAINED:
+        if asked is None:
+            raise ConfigError("checkpoint=untrained needs a model: add model=small (or ours, fine15, fine48)")
+        simulator: Simulator = build(config.model)
+        return simulator.eval().to(device), UNTRAINED
+    path = locate("weights", str(config.checkpoint))
+    simulator = read_model(path, float(config.fps))
+    if asked is not None:
+        require_same_model(path, simulator, build(config.model), "drop model=… from the command")
+    return simulator.eval().to(device), hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _check_start(config: DictConfig, stepper: Stepper, scene: Scene, tell: Callable[[str], None]) -> None:
+    """A line where a rollout has a start of its own; ConfigError where the number of relaxing steps would play no role."""
+    if str(config.settle) != "equilibrium":
+        return
+    reason = own_start(stepper, scene)
+    if reason is not None:
+        tell(f"settle=paper: {reason}")
+    elif int(config.relaxing_steps) != 1:
+        raise ConfigError(
+            f"relaxing_steps={config.relaxing_steps}: belongs to settle=paper, settle=equilibrium has none; add settle=paper"
+        )
+
+
+def _check_numbers(config: DictConfig) -> None:
+    for key, least in (("num_frames", 1), ("relaxing_steps", 0), ("video_stride", 1), ("surface_stride", 1), ("seed", 0)):
+        if int(config[key]) < least:
+            raise ConfigError(f"{key}={config[key]}: must be at least {least}")
+    thinning(config)
+    if not 1.0 <= float(config.fps) <= 1000.0:
+        raise ConfigError(f"fps={config.fps}: give the simulation's frames per second, 1 to 1000")
+    if not 0.0 <= float(config.gravity) <= 1000.0:
+        raise ConfigError(f"gravity={config.gravity}: give m/s², downwards, 0 to 1000")

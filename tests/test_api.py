@@ -1,0 +1,153 @@
+"""The public interface: what it promises holds, and it does what the commands do."""
+
+from __future__ import annotations
+
+import ast
+import doctest
+import importlib
+import inspect
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import hood
+from hood import api
+from hood.commands.guarding import GuardStopped
+from hood.config import ConfigError, load_config
+from hood.dynamics.stepper import NewtonStepper
+
+PACKAGE = Path(hood.__file__).parent
+SHORT = {"num_frames": 3, "metrics": "strain"}
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def test_importing_the_package_loads_nothing_heavy() -> None:
+    code = "import sys, hood; print([name for name in ('torch', 'numpy', 'hydra', 'h5py') if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent)
+    assert done.stdout.strip() == "[]"
+
+
+def test_every_public_name_is_there_and_told_to_type_checkers() -> None:
+    stub = ast.parse((PACKAGE / "__init__.pyi").read_text(encoding="utf-8"))
+    told = {(alias.asname, node.module) for node in stub.body if isinstance(node, ast.ImportFrom) for alias in node.names}
+    assert told == set(hood._HOMES.items())
+    for name in hood.__all__:
+        assert getattr(hood, name) is not None
+        assert name in dir(hood)
+    with pytest.raises(AttributeError, match="simulat"):
+        _ = hood.simulat
+
+
+def test_every_public_function_says_what_it_takes_and_raises() -> None:
+    for name, home in hood._HOMES.items():
+        thing = getattr(importlib.import_module(home), name)
+        assert inspect.getdoc(thing), name
+        if inspect.isfunction(thing) and home == "hood.api":
+            for part in ("Args:", "Raises:"):
+                assert part in str(inspect.getdoc(thing)), (name, part)
+
+
+@pytest.mark.parametrize("name", ["simulate", "rollout", "load_model"])
+def test_examples_do_what_they_show(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    test = doctest.DocTestFinder().find(getattr(api, name), name, globs={})[0]
+    assert test.examples
+    with capsys.disabled():
+        failed, _ = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE).run(test)
+    assert failed == 0
+
+
+def test_a_simulation_gives_the_frames_of_the_command() -> None:
+    frames = [frame.world_pos.numpy() for frame in hood.simulate("tank", "plie", **SHORT)]
+    summary = hood.rollout(garment="tank", sequence="plie", output="out", video="none", sheet=False, **SHORT)
+    stored = hood.read_rollout(Path("out/rollout.h5")).cloth_pos
+    assert summary["num_frames"] == len(frames) == 3
+    assert np.array_equal(np.float32(frames), np.float32(stored))
+
+
+def test_a_simulation_runs_again_the_same_and_knows_its_length() -> None:
+    simulation = hood.simulate("tank", "plie", **SHORT)
+    first, second = ([frame.world_pos for frame in simulation] for _ in range(2))
+    assert len(simulation) == len(first) == 3
+    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+    assert len(hood.simulate("tank", "plie", num_frames=10_000)) < 10_000
+
+
+def test_own_objects_stand_for_names() -> None:
+    tank = hood.load_garment("tank")
+    by_name = list(hood.simulate("tank", "plie", material="denim", **SHORT))[-1].world_pos
+    denim = hood.Material(density=0.45, lame_mu=5e4, lame_lambda=7e4, bending_stiffness=3e-4, thickness=4.7e-4)
+    by_object = list(hood.simulate(tank, "plie", material=denim, **SHORT))[-1].world_pos
+    plain = list(hood.simulate(tank, "plie", **SHORT))[-1].world_pos
+    assert torch.equal(by_name, by_object)
+    assert not torch.equal(plain, by_object)
+
+
+def test_an_own_stepper_takes_the_steps() -> None:
+    class Counting(NewtonStepper):
+        calls = 0
+
+        def predict(self, *given: object, **named: object):  # type: ignore[no-untyped-def, override]
+            type(self).calls += 1
+            return super().predict(*given, **named)
+
+    simulation = hood.simulate("tank", "plie", stepper=Counting(hood.default_potential()), **SHORT)
+    assert len(list(simulation)) == 3
+    assert Counting.calls >= 2
+
+
+def test_a_strict_guard_ends_the_simulation_and_says_where() -> None:
+    simulation = hood.simulate("tank", "plie", checkpoint="untrained", model="small", guard="strict", num_frames=9)
+    seen = []
+    with pytest.raises(GuardStopped, match="before frame"):
+        seen += simulation
+    assert len(seen) < 9
+
+
+@pytest.mark.parametrize(
+    ("keys", "error", "said"),
+    [
+        ({"garmnt": "dress"}, ValueError, "did you mean 'garment'"),
+        ({"num_frames": 0}, ValueError, "at least 1"),
+        ({"material": "denm"}, ValueError, "did you mean 'denim'"),
+        ({"fps": object()}, ValueError, "fps="),
+        ({"garment": "dres"}, FileNotFoundError, "dress"),
+        ({"solver": {"target": 1}}, ValueError, "target_rg"),
+    ],
+)
+def test_what_cannot_be_used_is_told_with_its_name(keys: dict, error: type[Exception], said: str) -> None:
+    with pytest.raises(error, match=said):
+        hood.simulate(**keys)
+
+
+ODD = (
+    "a/b.obj", "an 'odd' name.obj", "back\\slash", "ends\\", "\\'", "1.5", "null", "True", "[x]", "a=b", "a,b", "ä ö", "~/x",
+    "${x}",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("text", ODD)
+def test_any_text_reaches_the_config_as_it_is(text: str) -> None:
+    try:
+        words = api.overrides({"output": text})
+        config = load_config("rollout", words)
+    except ConfigError:
+        assert "${" in text  # an interpolation is no text
+        return
+    assert str(config.output) == text
+
+
+def test_values_and_groups_reach_the_config() -> None:
+    words = api.overrides(
+        {"betas": [1.5, -1], "body": None, "sheet": True, "solver": {"target_rg": 1e-3}, "output": Path("a/b")}
+    )
+    assert words == ["betas=[1.5,-1]", "body=null", "sheet=true", "solver.target_rg=0.001", "output=a/b"]
+    with pytest.raises(ConfigError, match="seed"):
+        api.overrides({"seed": {1, 2}})
