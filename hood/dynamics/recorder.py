@@ -207,7 +207,7 @@ class RolloutData:
     alarms: list[dict[str, Any]] = field(default_factory=list)  # of a guard, with the names of ALARM_COLUMNS
 
 
-def read_rollout(path: Path) -> RolloutData:
+def read_rollout(path: Path | str) -> RolloutData:
     """Read ``rollout.h5``, also one that is being written, whose frames so far it returns, or whose writer was killed.
 
     How many frames the whole is to have is the attribute ``num_planned``, whether it is finished ``complete``.
@@ -215,6 +215,7 @@ def read_rollout(path: Path) -> RolloutData:
     Raises:
         ValueError: not a rollout file.
     """
+    path = Path(path)
     try:
         with h5py.File(path, "r") as file:
             _check_extents(file, path.stat().st_size)

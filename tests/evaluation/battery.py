@@ -18,7 +18,8 @@ from hood.commands.setup import make_scene, make_stepper
 from hood.config import load_config
 from hood.dynamics.guard import CUT
 from hood.dynamics.rollout import simulate
-from hood.dynamics.soundness import Criteria, judge as judge_soundness
+from hood.dynamics.soundness import Criteria
+from hood.dynamics.soundness import judge as judge_soundness
 from hood.dynamics.stepper import Stepper
 from hood.evaluation.cells import Cell, cells
 from hood.evaluation.envelope import Judged, Run, judge
