@@ -21,6 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 from hood.assets.atomic import write_atomically
 from hood.assets.library import unknown
 from hood.assets.unpickle import check_size
+from hood.plugins import config_folders, packages
 
 _PACKAGE = Path(__file__).resolve().parent
 #: Installed packages carry the configs inside; a clone has them beside the package.
@@ -29,6 +30,7 @@ CONFIG_FOLDER = _PACKAGE / "configs" if (_PACKAGE / "configs").is_dir() else _PA
 _ONE_OR_MORE = ("garment", "offset", "layers")
 #: Bytes of a run's record at most, levels of its nesting, and characters of a reason why it is none.
 _RECORD_LIMIT, _DEEPEST, _REASON = 1 << 20, 32, 300
+#: What configs may name; and classes of plugins (:mod:`hood.plugins`).
 _TARGETS = ("hood.", "torch.optim.")
 
 
@@ -42,17 +44,18 @@ def load_config(name: str, overrides: Sequence[str] = ()) -> DictConfig:
     Raises:
         ConfigError: misspelt key, group option or type; Hydra's own complaints in one line.
     """
+    plugins = [f"hydra.searchpath=[{','.join(_quoted(f'file://{folder}') for folder in config_folders())}]"]
     with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
         try:
-            defaults = compose(name)
+            defaults = compose(name, plugins)
             chosen = [_check_override(name, text, defaults) for text in overrides]
             # The groups may bring keys of their own, so keys are checked against the composition with all groups chosen.
             groups = [text for text, override in chosen if _is_group(override)]
-            known = compose(name, groups)
+            known = compose(name, plugins + groups)
             for _, override in chosen:
                 if not _is_group(override):
                     _check_key(override, known)
-            config = compose(name, list(overrides))
+            config = compose(name, plugins + list(overrides))
             OmegaConf.resolve(config)
         except ConfigError:
             raise
@@ -118,8 +121,8 @@ def _require_plain(text: str) -> None:
 
 
 def options(group: str) -> list[str]:
-    """Names of a config group's options."""
-    return sorted(path.stem for path in (CONFIG_FOLDER / group).glob("*.yaml"))
+    """Names of a config group's options, those of plugins among them."""
+    return sorted({path.stem for folder in (CONFIG_FOLDER, *config_folders()) for path in (folder / group).glob("*.yaml")})
 
 
 def groups() -> list[str]:
@@ -221,7 +224,10 @@ def _check_targets(node: Any) -> None:
     if isinstance(node, DictConfig):
         target = node.get("_target_")
         if target is not None and not _is_own(str(target)):
-            raise ConfigError(f"_target_ {target!r} is not allowed: only {' and '.join(_TARGETS)} classes are built")
+            raise ConfigError(
+                f"_target_ {target!r} is not allowed: only {' and '.join(_allowed())} classes are built; a package of your own "
+                f"registers as a plugin (docs/extending.md)"
+            )
         for key in node:
             _check_targets(node[key])
     elif isinstance(node, ListConfig):
@@ -231,13 +237,22 @@ def _check_targets(node: Any) -> None:
 
 def _is_own(target: str) -> bool:
     """Whether the object is defined in an allowed package: ``hood.cli.sys.exit`` is reached through one, but is not."""
-    if not target.startswith(_TARGETS):
+    if not target.startswith(_allowed()):
         return False
     try:
         found = get_object(target)
     except Exception:  # whatever importing it raises; instantiate() says it better
         return True
-    return str(getattr(found, "__module__", "")).startswith(_TARGETS)
+    return str(getattr(found, "__module__", "") + ".").startswith(_allowed())
+
+
+def _allowed() -> tuple[str, ...]:
+    """Beginnings of the names of classes that configs may name."""
+    return (*_TARGETS, *(f"{name}." for name in packages()))
+
+
+def _quoted(text: str) -> str:
+    return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
 
 
 def _one_line(error: BaseException) -> str:
