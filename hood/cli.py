@@ -27,6 +27,7 @@ COMMANDS = {
     "tradeoff": "chart of time against accuracy over models, refinements and sizes",
     "envelope": "map of where each method holds, at the extremes of everything",
     "compare": "show rollouts of one motion next to each other, coloured by strain or rg",
+    "view": "write rollouts as one HTML page to turn and play in a browser",
     "inspect": "say what files are, what is wrong with them and how to repair it",
     "prepare": "repair a garment, bind it to a body and write it for rollouts",
     "convert": "write published HOOD weights (.pth) as a model file",

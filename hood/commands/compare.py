@@ -82,13 +82,18 @@ def _read(files: Sequence[Path], config: DictConfig) -> list[_Entry]:
     from hood.media.beside import require_same_motion
 
     paths = [path / "rollout.h5" if path.is_dir() else path for path in files]
-    read = [(str(path), _read_one(path, str(config.colour))) for path in paths]
+    read = [(str(path), read_checked(path, str(config.colour))) for path in paths]
     count = None if config.num_frames is None else int(config.num_frames)
     cut = require_same_motion(read, count)
-    return [_Entry(*one) for one in zip(paths, _names(paths), cut, strict=True)]
+    return [_Entry(*one) for one in zip(paths, names_of(paths), cut, strict=True)]
 
 
-def _read_one(path: Path, colour: str) -> RolloutData:
+def read_checked(path: Path, colour: str) -> RolloutData:
+    """A rollout that can be drawn in ``colour``.
+
+    Raises:
+        ValueError: it cannot, or the file is none.
+    """
     if not path.is_file():
         raise ConfigError(f"{path}: no such file; give the rollout.h5 of hood rollout, or its folder")
     data = read_rollout(path)
@@ -106,7 +111,7 @@ def _read_one(path: Path, colour: str) -> RolloutData:
     return data
 
 
-def _names(paths: Sequence[Path]) -> list[str]:
+def names_of(paths: Sequence[Path]) -> list[str]:
     """The shortest ends of the paths that tell them apart, ``rollout.h5`` left out."""
     parts = [path.absolute().parent.parts + (() if path.name == "rollout.h5" else (path.stem,)) for path in paths]
     for length in range(1, max(map(len, parts)) + 1):

@@ -23,6 +23,10 @@ _EXAMPLES = {
         "hood compare a=outputs/plain b=outputs/refined colour=rg output=outputs/compare",
         "hood compare outputs/plain outputs/refined colour=fabric blind=true seed=7 output=outputs/pair_7",
     ],
+    "view": [
+        "hood view outputs/dress/rollout.h5 output=dress.html",
+        "hood view outputs/network outputs/solver output=both.html",
+    ],
     "inspect": [
         "hood inspect my_shirt.obj",
         "hood inspect my_shirt.obj CMU_01_poses.npz --json",
@@ -52,7 +56,7 @@ def describe(name: str) -> str:
     """Help text of the command ``name``."""
     config = load_config(name)
     comments = _comments(name)
-    lines = [f"usage: hood {name} {'FILE ... ' if name in ('inspect', 'compare') else ''}[key=value ...]", ""]
+    lines = [f"usage: hood {name} {'FILE ... ' if name in ('inspect', 'compare', 'view') else ''}[key=value ...]", ""]
     for key in config:
         value = plain(config[key])
         if isinstance(value, dict):

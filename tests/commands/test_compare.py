@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from hood.cli import main
-from hood.commands.compare import _names
+from hood.commands.compare import names_of
 from hood.commands.help import describe
 from hood.dynamics.recorder import RolloutWriter
 from hood.testing import cylinder, sphere
@@ -149,10 +149,10 @@ def test_what_cannot_be_compared_is_refused_in_a_sentence(case: str, capsys: pyt
 
 
 def test_names_are_as_short_as_they_may_be() -> None:
-    assert _names([Path("x/one/rollout.h5"), Path("x/two/rollout.h5")]) == ["one", "two"]
-    assert _names([Path("a/run/rollout.h5"), Path("b/run/rollout.h5")]) == ["a/run", "b/run"]
-    assert _names([Path("x/p.h5"), Path("x/q.h5")]) == ["p", "q"]
-    assert _names([Path("x/p.h5"), Path("x/p.h5")]) == ["p", "p"]
+    assert names_of([Path("x/one/rollout.h5"), Path("x/two/rollout.h5")]) == ["one", "two"]
+    assert names_of([Path("a/run/rollout.h5"), Path("b/run/rollout.h5")]) == ["a/run", "b/run"]
+    assert names_of([Path("x/p.h5"), Path("x/q.h5")]) == ["p", "q"]
+    assert names_of([Path("x/p.h5"), Path("x/p.h5")]) == ["p", "p"]
 
 
 def test_help_lists_its_keys() -> None:

@@ -1,0 +1,61 @@
+"""``hood view rollout.h5 …``: rollouts as one HTML page that turns and plays in a browser, without a network."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from hood.assets.atomic import write_atomically
+from hood.commands.common import output_folder
+from hood.commands.compare import names_of, read_checked
+from hood.config import ConfigError, load_config
+from hood.dynamics.recorder import RolloutData
+
+#: More would be too narrow to see anything.
+_MOST = 4
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run the command; returns the exit code."""
+    files, config = _split(arguments)
+    count = config.num_frames
+    if count is not None and (isinstance(count, bool) or not isinstance(count, int) or count < 1):
+        raise ConfigError(f"num_frames={count}: must be a whole number, at least 1")
+    target = output_folder(config)
+    if target.suffix.lower() not in (".html", ".htm") or target.is_dir():
+        raise ConfigError(f"output={target}: name a file that ends in .html, e.g. output=view.html")
+    rollouts = [_first_frames(read_checked(path, "fabric"), count) for path in files]
+    from hood.media.viewer.page import view_page
+
+    names = names_of(files)
+    title = " and ".join(names) if config.title is None else str(config.title)
+    page = view_page(list(zip(names, rollouts, strict=True)), title).encode()
+    target.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(target, page)
+    print(f"{target}: {len(page) / 1e6:.1f} MB, {max(len(data.time) for data in rollouts)} frames; open it in a browser")
+    return 0
+
+
+def _split(arguments: Sequence[str]) -> tuple[list[Path], DictConfig]:
+    """Files in their order and the config: a word of the form ``key=value`` is an override, every other word a file."""
+    overrides = [word for word in arguments if "=" in word and not Path(word).exists()]
+    given = [word for word in arguments if word not in overrides]
+    strange = next((word for word in given if word.startswith("-")), None)
+    if strange is not None:
+        raise ConfigError(f"unknown option {strange!r}; write key=value, see hood view --help")
+    if not 1 <= len(given) <= _MOST:
+        raise ConfigError(f"{len(given)} rollouts are given, one to {_MOST} can be shown: hood view rollout.h5")
+    paths = [Path(name).expanduser() for name in given]
+    return [path / "rollout.h5" if path.is_dir() else path for path in paths], load_config("view", overrides)
+
+
+def _first_frames(data: RolloutData, count: int | None) -> RolloutData:
+    if count is None:
+        return data
+    metrics = {name: values[:count] for name, values in data.metrics.items()}
+    return replace(
+        data, cloth_pos=data.cloth_pos[:count], body_pos=data.body_pos[:count], time=data.time[:count], metrics=metrics
+    )

@@ -1,0 +1,1 @@
+"""Rollouts as one HTML page that turns and plays in a browser, without a network."""

@@ -1,0 +1,116 @@
+"""The page of ``hood view``: program, pictures of the data and drawing library in one file of HTML."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hood.dynamics.recorder import RolloutData
+from hood.media.colouring import Colouring, colouring_of
+from hood.media.film import seconds_per_frame
+from hood.media.palette import outfit_colours
+from hood.media.viewer.packing import pack_bytes, pack_integers, pack_positions
+
+_HERE = Path(__file__).parent
+#: Modules by the names under which they are imported.
+_MODULES = {"three": "three.module.min.js", "orbit": "OrbitControls.js", "data": "data.js", "figures": "figures.js"}
+#: Figures of the chart: metric, title.
+_CHARTED = (("strain_p99", "strain p99"), ("relative_gradient", "rg"), ("ms_total", "ms a frame"))
+
+
+def view_page(rollouts: Sequence[tuple[str, RolloutData]], title: str) -> str:
+    """The HTML of named rollouts, which loads nothing from anywhere.
+
+    Raises:
+        ValueError: there is none, or their frames are not equally far apart in time.
+    """
+    if not rollouts:
+        raise ValueError("no rollout is given")
+    seconds = [seconds_per_frame(data) for _, data in rollouts]
+    for (name, _), step in zip(rollouts, seconds, strict=True):
+        if abs(step - seconds[0]) > 1e-3 * seconds[0]:
+            raise ValueError(
+                f"{name}: its frames are {step:g} s apart, those of {rollouts[0][0]} {seconds[0]:g} s; "
+                "show rollouts of one frame rate together"
+            )
+    first, others = rollouts[0][1], [data for _, data in rollouts[1:]]
+    scale = colouring_of(first, "strain", others)
+    assert scale is not None  # it is for "none" only
+    content = {
+        "seconds": seconds[0],
+        "strain": {"high": scale.high, "ramp": _ramp(scale)},
+        "rollouts": [_rollout(name, data, scale.high, first if at else None) for at, (name, data) in enumerate(rollouts)],
+    }
+    return _fill(title, content)
+
+
+def _rollout(name: str, data: RolloutData, high: float, first: RolloutData | None) -> dict[str, Any]:
+    """One rollout as JSON; its body is null where it is that of the first."""
+    colouring = colouring_of(data, "strain")
+    assert colouring is not None
+    share = np.nan_to_num(np.clip(colouring.values / high, 0.0, 1.0), nan=0.0)
+    cloth, lost = _mesh(data.cloth_pos, data.cloth_faces)
+    garment = str(data.attributes.get("garment", ""))
+    fabric = outfit_colours(garment, np.asarray(data.cloth_faces, dtype=np.int64), data.cloth_pos.shape[1])
+    every = np.broadcast_to(np.asarray(fabric, dtype=np.float64), (data.cloth_pos.shape[1], 3))
+    same = first is not None and _same_body(first, data)
+    return {
+        "name": name,
+        "cloth": cloth,
+        "lost": lost,
+        "strain": pack_bytes(np.rint(255.0 * share)),
+        "fabric": pack_bytes(np.rint(255.0 * every)),
+        "body": None if same else _mesh(data.body_pos, data.body_faces)[0],
+        "figures": [
+            {"name": key, "title": label, "values": _plain(data.metrics[key])}
+            for key, label in _CHARTED
+            if key in data.metrics and np.isfinite(data.metrics[key]).any()
+        ],
+    }
+
+
+def _mesh(pos: np.ndarray, faces: np.ndarray) -> tuple[dict[str, Any], list[int]]:
+    packed, lost = pack_positions(pos)
+    return packed | {"faces": pack_integers(faces)}, lost
+
+
+def _same_body(first: RolloutData, other: RolloutData) -> bool:
+    return np.array_equal(first.body_faces, other.body_faces) and np.array_equal(first.body_pos, other.body_pos)
+
+
+def _plain(values: np.ndarray) -> list[float | None]:
+    """Four digits of every value; null where there is none."""
+    return [float(f"{value:.4g}") if np.isfinite(value) else None for value in values.tolist()]
+
+
+def _ramp(scale: Colouring) -> list[list[int]]:
+    """256 colours from no strain to the most."""
+    shades = Colouring(np.linspace(0.0, scale.high, 256)[None], 0.0, scale.high, False, "", ())
+    return np.rint(255.0 * shades.colours(0)).astype(int).tolist()
+
+
+def _fill(title: str, content: dict[str, Any]) -> str:
+    """The page with its parts in place. ``</`` ends a script wherever it stands, so that none may be in the data."""
+    sources = {name: base64.b64encode(_read(file).encode()).decode() for name, file in _MODULES.items()}
+    imports = {name: f"data:text/javascript;base64,{text}" for name, text in sources.items()}
+    parts = {
+        "TITLE": html.escape(title),
+        "STYLE": _read("viewer.css"),
+        "LICENCE": html.escape(_read("LICENSE-three.txt")).replace("--", "- -"),
+        "IMPORTS": json.dumps({"imports": imports}),
+        "CONTENT": json.dumps(content, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
+        "PROGRAM": _read("viewer.js"),
+    }
+    page = _read("viewer.html")
+    pieces = page.split("@@")  # text and names of parts in turn
+    return "".join(parts[piece] if at % 2 else piece for at, piece in enumerate(pieces))
+
+
+def _read(name: str) -> str:
+    return (_HERE / name).read_text(encoding="utf-8")
