@@ -1,32 +1,22 @@
-"""``hood view`` writes one page that holds what the rollout holds and loads nothing from elsewhere."""
+"""``hood view``: the page holds the rollouts, loads nothing, and what cannot be shown is refused in a sentence."""
 
 from __future__ import annotations
 
 import json
 import re
+import shutil
+import subprocess
 from pathlib import Path
+from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 
 from hood.cli import main
 from hood.dynamics.recorder import RolloutWriter, read_rollout
-from hood.media.viewer.packing import STEP, pack_integers, pack_positions, unpack_bytes, unpack_integers, unpack_positions
+from hood.media.viewer.packing import unpack_bytes, unpack_integers, unpack_positions
 from hood.testing import cylinder, sphere
-
-
-def write(path: Path, num_frames: int = 5, lost: int | None = None, name: str = "tube") -> None:
-    """A tube that falls about a ball that drifts sideways."""
-    rest, faces = cylinder(12, 6)
-    ball, ball_faces = sphere(1, 0.1)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    metrics, attributes = ("strain_p99", "ms_total"), {"garment": name, "sequence": "s"}
-    with RolloutWriter(path, num_frames, rest, faces, ball_faces, len(ball), metrics, 1 / 30, attributes) as writer:
-        for frame in range(num_frames):
-            pos = rest * (1 + 0.1 * frame) - [0, 0.02 * frame**2, 0]
-            if frame == lost:
-                pos = pos * np.nan
-            writer.append(pos, ball + [0.1 * frame, 0, 0], {"strain_p99": 0.1 * frame, "ms_total": 5.0 + frame})
 
 
 @pytest.fixture(autouse=True)
@@ -34,83 +24,117 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
-def content(page: Path) -> dict:
-    text = page.read_text(encoding="utf-8")
-    found = re.search(r'<script type="application/json" id="content">(.*?)</script>', text, re.DOTALL)
+def record(path: str, frames: int = 4, dt: float = 1 / 30, shift: float = 0.0, garment: str = "tube") -> str:
+    """A rollout of a tube that widens about a ball, on disk."""
+    file = Path(path)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    pos, faces = cylinder(12, 3, 0.3, 0.5)
+    ball, ball_faces = sphere(1, 0.25)
+    names = ("strain_p99", "ms_total")
+    with RolloutWriter(file, frames, pos, faces, ball_faces, len(ball), names, dt, {"garment": garment}) as out:
+        for index in range(frames):
+            measured = {"strain_p99": 0.1 * index} | ({"ms_total": 40.0} if index else {})
+            out.append(pos * (1.0 + 0.1 * index), ball + [0.0, shift, 0.0], measured, {})
+    return path
+
+
+def content(page: str) -> dict[str, Any]:
+    found = re.search(r'<script type="application/json" id="content">(.*?)</script>', page, re.DOTALL)
     assert found is not None
-    data: dict = json.loads(found[1])
-    return data
+    return json.loads(found[1])
 
 
-def test_the_page_holds_the_rollout_within_a_tenth_of_a_millimetre() -> None:
-    write(Path("run/rollout.h5"))
-    assert main(["view", "run", "output=pages/run.html"]) == 0
-    held, rollout = content(Path("pages/run.html")), read_rollout(Path("run/rollout.h5"))
-    (shown,) = held["rollouts"]
-    for mesh, pos, faces in (("cloth", rollout.cloth_pos, rollout.cloth_faces), ("body", rollout.body_pos, rollout.body_faces)):
-        assert np.abs(unpack_positions(shown[mesh]) - pos).max() <= 1e-4
-        assert np.array_equal(unpack_integers(shown[mesh]["faces"]).reshape(-1, 3), faces)
-    assert held["seconds"] == pytest.approx(1 / 30)
-    assert len(unpack_bytes(shown["strain"])) == rollout.cloth_pos[..., 0].size
-
-
-def test_nothing_is_loaded_from_elsewhere_and_a_name_cannot_run_code() -> None:
-    write(Path("</script><script>alert(1)/rollout.h5"))
-    assert main(["view", "</script><script>alert(1)", "output=page.html", "title='<b>x'"]) == 0
-    text = Path("page.html").read_text(encoding="utf-8")
-    outside = re.sub(r'<script type="importmap">.*?</script>', "", text, flags=re.DOTALL)
-    assert not re.search(r"""(?:src|href)\s*=\s*["']?(?:https?:)?//""", outside)
-    assert "default-src 'none'" in text
-    assert "<script>alert" not in text
-    assert "<b>" not in text
-
-
-def test_several_rollouts_share_a_page() -> None:
-    write(Path("a/rollout.h5"))
-    write(Path("b/rollout.h5"), num_frames=3)
-    assert main(["view", "a", "b/rollout.h5", "output=page.html"]) == 0
-    assert [one["name"] for one in content(Path("page.html"))["rollouts"]] == ["a", "b"]
-    assert main(["view", "a", "output=page.html", "num_frames=2"]) == 0
-    (shown,) = content(Path("page.html"))["rollouts"]
-    assert shown["cloth"]["frames"] == 2
-
-
-def test_frames_that_are_not_finite_are_named() -> None:
-    write(Path("run/rollout.h5"), lost=3)
-    assert main(["view", "run", "output=page.html"]) == 0
-    (shown,) = content(Path("page.html"))["rollouts"]
-    assert shown["lost"] == [3]
-    assert np.isfinite(unpack_positions(shown["cloth"])).all()
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["nowhere"], "no such file"),
-        (["run", "output=page.png"], ".html"),
-        (["run", "num_frames=0"], "at least 1"),
-        (["run", "titel=x"], "title"),
-        ([], "0 rollouts"),
-        (["run"] * 5, "5 rollouts"),
-        (["broken.h5"], "broken.h5"),
-    ],
-)
-def test_what_cannot_be_shown_is_told_and_leaves_nothing(
-    words: list[str], said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write(Path("run/rollout.h5"))
-    Path("broken.h5").write_bytes(b"no rollout")
-    before = sorted(Path().rglob("*"))
+def refused(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     assert main(["view", *words]) == 2
-    assert said in capsys.readouterr().err
-    assert sorted(Path().rglob("*")) == before
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    return said
 
 
-def test_any_positions_come_back_within_half_a_step() -> None:
-    rng = np.random.default_rng(0)
-    pos = rng.normal(size=(7, 11, 3)) * 10.0 ** rng.uniform(-4, 3, size=(7, 1, 1))
-    packed, lost = pack_positions(pos)
-    assert lost == []
-    assert np.abs(unpack_positions(packed) - pos).max() <= 0.5 * STEP * (1 + 1e-9)
-    values = rng.integers(-(2**31), 2**31, size=100)
-    assert np.array_equal(unpack_integers(pack_integers(values)), values)
+def test_the_page_holds_the_rollout() -> None:
+    path = record("run/rollout.h5")
+    assert main(["view", "run", "output=made/page.html"]) == 0
+    assert [file.name for file in Path("made").iterdir()] == ["page.html"]
+    held, data = content(Path("made/page.html").read_text()), read_rollout(Path(path))
+    only = held["rollouts"][0]
+    for packed, pos, faces in (
+        (only["cloth"], data.cloth_pos, data.cloth_faces),
+        (only["body"], data.body_pos, data.body_faces),
+    ):
+        assert np.abs(unpack_positions(packed) - pos).max() <= 1e-4
+        assert unpack_integers(packed["faces"]).reshape(-1, 3).tolist() == faces.tolist()
+    strain = np.frombuffer(unpack_bytes(only["strain"]), np.uint8).reshape(4, -1) / 255 * held["strain"]["high"]
+    assert np.allclose(strain, 0.1 * np.arange(4)[:, None], atol=0.003)
+    assert only["figures"][0] == {"name": "strain_p99", "title": "strain p99", "values": [0.0, 0.1, 0.2, 0.3]}
+    assert only["figures"][1]["values"] == [None, 40.0, 40.0, 40.0]
+    assert held["seconds"] == pytest.approx(1 / 30)
+
+
+def test_the_page_loads_nothing_and_names_cannot_break_it() -> None:
+    record("run/rollout.h5")
+    assert main(["view", "run", "output=page.html", "title=a </script><b> & --> @@STYLE@@"]) == 0
+    page = Path("page.html").read_text()
+    assert not re.search(r"""(src|href|from|import|url)\s*[=(]?\s*["']?\s*(https?:)?//\w""", page)
+    assert "default-src 'none'" in page
+    assert "a &lt;/script&gt;&lt;b&gt; &amp; --&gt; @@STYLE@@</title>" in page
+    assert page.count("</script>") == 3
+    imports = json.loads(re.search(r'<script type="importmap">(.*?)</script>', page)[1])["imports"]  # type: ignore[index]
+    assert all(address.startswith("data:text/javascript;base64,") for address in imports.values())
+    assert "Permission is hereby granted" in page
+
+
+def test_two_rollouts_share_a_body_that_is_the_same() -> None:
+    record("a/rollout.h5")
+    record("same/rollout.h5", frames=3)
+    record("b/rollout.h5")
+    record("moved/rollout.h5", shift=0.1)
+    assert main(["view", "a", "b", "moved", "same", "output=page.html"]) == 0
+    held = content(Path("page.html").read_text())["rollouts"]
+    assert [one["name"] for one in held] == ["a", "b", "moved", "same"]
+    assert [one["body"] is None for one in held] == [False, True, False, False]
+    assert held[3]["cloth"]["frames"] == 3
+
+
+def test_the_first_frames_alone() -> None:
+    record("run/rollout.h5")
+    assert main(["view", "run", "num_frames=2", "output=page.html"]) == 0
+    only = content(Path("page.html").read_text())["rollouts"][0]
+    assert (only["cloth"]["frames"], only["body"]["frames"], len(only["figures"][0]["values"])) == (2, 2, 2)
+
+
+def test_cloth_that_blew_up_is_named_by_its_frames() -> None:
+    path = record("run/rollout.h5")
+    with h5py.File(path, "r+") as file:
+        file["cloth/pos"][2, 5] = np.nan
+    assert main(["view", "run", "output=page.html"]) == 0
+    assert content(Path("page.html").read_text())["rollouts"][0]["lost"] == [2]
+
+
+def test_what_cannot_be_shown_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    record("a/rollout.h5")
+    record("slow/rollout.h5", dt=1 / 15)
+    Path("text.h5").write_text("no rollout")
+    assert "0 rollouts are given" in refused(capsys)
+    assert "5 rollouts are given" in refused(capsys, *5 * ["a"])
+    assert "no such file" in refused(capsys, "missing.h5")
+    assert "not a rollout file" in refused(capsys, "text.h5")
+    assert "unknown option '--fast'" in refused(capsys, "a", "--fast")
+    assert "num_frames=0" in refused(capsys, "a", "num_frames=0")
+    assert "ends in .html" in refused(capsys, "a", "output=page.txt")
+    assert "show rollouts of one frame rate together" in refused(capsys, "a", "slow")
+    assert sorted(path.name for path in Path().iterdir()) == ["a", "slow", "text.h5"]
+
+
+@pytest.mark.slow
+def test_a_browser_shows_the_page() -> None:
+    browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    assert browser is not None, "this test needs Chromium on the PATH (chromium, chromium-browser or google-chrome)"
+    record("run/rollout.h5")
+    assert main(["view", "run", "output=page.html"]) == 0
+    options = "--headless --no-sandbox --disable-gpu --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader"
+    quiet = "--disable-quic --no-first-run --disable-background-networking --disable-component-update --disable-sync"
+    command = [browser, *options.split(), *quiet.split(), f"--user-data-dir={Path('profile').absolute()}"]
+    command += ["--virtual-time-budget=20000", "--dump-dom", Path("page.html").absolute().as_uri()]
+    shown = subprocess.run(command, capture_output=True, text=True, timeout=240, check=True).stdout
+    assert 'data-ready="yes"' in shown
+    assert "frame 0 of 3, 0.00 s" in shown
