@@ -72,7 +72,7 @@ def test_the_page_holds_the_rollout() -> None:
 
 def test_the_page_loads_nothing_and_names_cannot_break_it() -> None:
     record("run/rollout.h5")
-    assert main(["view", "run", "output=page.html", "title=a </script><b> & --> @@STYLE@@"]) == 0
+    assert main(["view", "run", "output=page.html", "title='a </script><b> & --> @@STYLE@@'"]) == 0
     page = Path("page.html").read_text()
     assert not re.search(r"""(src|href|from|import|url)\s*[=(]?\s*["']?\s*(https?:)?//\w""", page)
     assert "default-src 'none'" in page
