@@ -28,7 +28,8 @@ def commands() -> list[tuple[str, str]]:
     """Page and line of every command in a block of code."""
     found = []
     for page in PAGES:
-        for block in re.findall(r"```(?:bash|sh)?\n(.*?)```", text_of(page), re.DOTALL):
+        fenced = re.findall(r"^ *```(\w*)\n(.*?)^ *```$", text_of(page), re.DOTALL | re.MULTILINE)
+        for block in (body for language, body in fenced if language in {"", "bash", "sh"}):
             lines = block.replace("\\\n", " ").splitlines()
             found += [(page.name, line.strip()) for line in lines if re.match(r"\s*hood \w", line)]
     return found
@@ -70,3 +71,11 @@ def test_commands_have_keys_that_exist(page: str, line: str) -> None:
     assert words[0] in COMMANDS, line
     if words[0] in CONFIGURED and "…" not in line and PLUGIN not in words:
         load_config(words[0], [word for word in words[1:] if "=" in word])
+
+
+def test_the_python_of_the_readme_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    blocks = re.findall(r"^```python\n(.*?)^```$", text_of(README), re.DOTALL | re.MULTILINE)
+    assert blocks
+    for block in blocks:
+        exec(compile(block.replace("num_frames=60", "num_frames=2"), "README.md", "exec"), {})
+    assert capsys.readouterr().out.splitlines()[-1].startswith("1 torch.Size([")
