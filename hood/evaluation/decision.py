@@ -1,0 +1,114 @@
+"""Which parts of a model a scene can do without, for an accuracy that was asked for."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from hood.evaluation.leaving_out import Effect
+
+#: A part that saves a smaller share of a frame's time stays: the time cannot be told from noise.
+LEAST_SAVING = 0.03
+#: Quantile over the windows that γ is judged by.
+QUANTILE = 0.95
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """The largest error that is accepted: of γ, or a distance in mm."""
+
+    value: float
+    unit: str  # "gamma" or "mm"
+
+    @classmethod
+    def read(cls, text: str) -> Tolerance:
+        """``0.01`` is of γ, ``5mm`` a distance.
+
+        Raises:
+            ValueError: neither.
+        """
+        match = re.fullmatch(r"([0-9.]+(?:e-?[0-9]+)?)\s*(mm)?", str(text).strip())
+        value = float(match.group(1)) if match and match.group(1).count(".") < 2 and match.group(1) != "." else 0.0
+        if match is None or not 0.0 < value < math.inf:
+            raise ValueError(f"accuracy={text}: give a γ above 0 (0.01), or a distance (5mm)")
+        return cls(value, "mm" if match.group(2) else "gamma")
+
+    def error(self, effect: Effect) -> float:
+        """What is held against the tolerance."""
+        error = effect.worst_mm if self.unit == "mm" else effect.gamma_at(QUANTILE)
+        return error if math.isfinite(error) else math.inf
+
+    def say(self, value: float) -> str:
+        return f"{value:.2g} mm" if self.unit == "mm" else f"γ = {value:.2g}"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What becomes of a part: ``absent`` (nothing in this scene uses it), ``kept`` or ``left out``, and why."""
+
+    decision: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Decision:
+    """Verdicts by part, and what was measured of all that is left out together; None where nothing is."""
+
+    verdicts: dict[str, Verdict]
+    left_out: tuple[str, ...]
+    together: Effect | None
+
+
+def decide(
+    effects: Mapping[str, Effect],
+    absent: Mapping[str, str],
+    rivals: Sequence[Sequence[str]],
+    tolerance: Tolerance,
+    measure_together: Callable[[Sequence[str]], tuple[Effect, Effect]],
+) -> Decision:
+    """The cheapest combination whose error stays within the tolerance, as far as one search from the top finds it.
+
+    Parts that pass alone and save time are tried together. While the combination misses the tolerance, the part with the
+    largest error of its own stays in.
+
+    Args:
+        effects: by part; the full model's own entry is named "".
+        absent: parts that nothing in the scene uses, with the reason.
+        rivals: parts of which at most one can be left out.
+        measure_together: the full model's and the combination's effect, measured side by side.
+    """
+    full = effects[""]
+    verdicts = {name: Verdict("absent", reason) for name, reason in absent.items()}
+    passing: dict[str, float] = {}
+    for name, effect in effects.items():
+        if not name or name in absent:
+            continue
+        error, saving = tolerance.error(effect), 1.0 - effect.median_ms / full.median_ms
+        if error > tolerance.value:
+            verdicts[name] = Verdict("kept", f"without it {tolerance.say(error)}")
+        elif saving < LEAST_SAVING:
+            verdicts[name] = Verdict("kept", f"it costs no time that can be measured ({100 * saving:+.0f}% of a frame)")
+        else:
+            passing[name] = saving
+    for group in rivals:
+        ranked = sorted((name for name in group if name in passing), key=lambda name: -passing[name])
+        for name in ranked[1:]:
+            verdicts[name] = Verdict("kept", f"{ranked[0]!r} saves more and passes as well")
+            del passing[name]
+    together: Effect | None = None
+    while passing:
+        reference, together = measure_together(tuple(passing))
+        error, saving = tolerance.error(together), 1.0 - together.median_ms / reference.median_ms
+        if error <= tolerance.value and saving >= LEAST_SAVING:
+            break
+        worst = max(passing, key=lambda name: tolerance.error(effects[name]))
+        why = f"with the others left out {tolerance.say(error)}" if error > tolerance.value else "saves nothing beside the others"
+        verdicts[worst] = Verdict("kept", why)
+        del passing[worst]
+        together = None
+    for name, saving in passing.items():
+        said = tolerance.say(tolerance.error(effects[name]))
+        verdicts[name] = Verdict("left out", f"without it {said}, {100 * saving:.0f}% of a frame saved")
+    return Decision(verdicts, tuple(passing), together)

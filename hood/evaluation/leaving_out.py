@@ -1,0 +1,170 @@
+"""What a rollout loses where a part of its model is left out: measured on states of the full model.
+
+A *variant* is the same scene with other settings. From every state it takes the same steps as the full model. Its first
+step is judged under the full potential: γ = (Φ_full(x) − Φ*_full) / e0 as in :mod:`hood.evaluation.gap`. Its positions are
+compared with those of the full model when the window is over.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hood.dynamics.rollout import prepare_stepper, simulate
+from hood.dynamics.simulator import Prediction
+from hood.dynamics.stepper import Stepper
+from hood.dynamics.stopwatch import Stopwatch
+from hood.evaluation.gap import REFERENCE
+from hood.evaluation.windows import Window
+from hood.losses.potential import Potential, relative_gradient, scale
+from hood.losses.problem import StepProblem
+from hood.scene.scene import Scene, recentre
+from hood.scene.state import State
+from hood.solver.iterate import in_double
+from hood.solver.newton import minimize
+
+#: Frames of the full model before a window's first state: the start is at rest on a still body.
+LEAD = 2
+#: Positions differ by the 95th percentile of this over the vertices: one vertex that flips says little.
+_QUANTILE = 0.95
+
+
+@dataclass(frozen=True)
+class Variant:
+    """Settings that can be compared: what takes the steps, the energy that it moves by, and the scene."""
+
+    stepper: Stepper
+    potential: Potential
+    scene: Scene
+
+
+@dataclass
+class Effect:
+    """What a variant did in every window; the full model's own entry has γ of its own steps and 0 mm."""
+
+    gamma: list[float] = field(default_factory=list)
+    mm: list[float] = field(default_factory=list)
+    ms: list[float] = field(default_factory=list)  # of every frame
+
+    def gamma_at(self, share: float) -> float:
+        """Quantile of γ over the windows."""
+        return float(np.quantile(self.gamma, share))
+
+    @property
+    def worst_mm(self) -> float:
+        """Of all windows."""
+        return max(self.mm)
+
+    @property
+    def median_ms(self) -> float:
+        """Of a frame."""
+        return float(np.median(self.ms))
+
+
+@dataclass(frozen=True)
+class Begun:
+    """A window of the full model: its first state, and the first step as it should be solved."""
+
+    window: Window
+    frame: int  # of the first state
+    state: State
+    step: StepProblem  # prepared by the full potential
+
+
+@dataclass
+class Minimum:
+    """The lowest full potential known of a window's first step [J], and whether the solver reached its accuracy."""
+
+    phi: float
+    e0: float
+    converged: bool
+
+
+def begin(full: Variant, windows: Sequence[Window], settle: str, lead: int = LEAD) -> list[Begun]:
+    """The full model's state ``lead`` frames into every window, from rest on the still body of the window's first frame."""
+    found = []
+    for window in windows:
+        kept: dict[int, StepProblem] = {}
+
+        def keep(frame: int, problem: StepProblem, _: Prediction, kept: dict[int, StepProblem] = kept) -> None:
+            kept[frame] = problem
+
+        frames = simulate(
+            full.stepper, full.scene, full.potential, lead + 2, start_frame=window.first, observe=keep, metrics="none", settle=settle
+        )
+        for _ in frames:
+            pass
+        step = kept[max(kept)]
+        found.append(Begun(window, window.first + max(kept) - 1, step.state, full.potential.prepare(step)))
+    return found
+
+
+@torch.no_grad()
+def march(variant: Variant, begun: Begun, num_frames: int, effect: Effect) -> tuple[Tensor, Tensor]:
+    """Steps of a variant from the window's first state: positions (V, 3) [m] after the first step, in that state's frame, and
+    after all of them, world. Its times [ms] go to ``effect``."""
+    stepper, scene, state = variant.stepper, variant.scene, begun.state
+    prepared, watch, first = prepare_stepper(stepper, scene), Stopwatch(), state.pos
+    for index in range(num_frames):
+        watch.lap()
+        step = begun.step.step if index == 0 else scene.step_input(begun.frame + index, state)
+        problem = stepper.search(StepProblem(scene.cloth, state, step, gravity=stepper.gravity.to(state.pos)))
+        prediction = stepper.predict(problem, prepared, watch)
+        velocity = stepper.next_velocity(problem, prediction)
+        effect.ms.append(watch.lap()["total"])
+        state = State(prediction.next_pos, velocity, state.origin)
+        first = state.pos if index == 0 else first
+        state = recentre(state, scene.cloth.vertex_scene)
+    return first, state.pos.cpu().double() + state.origin[0]
+
+
+def measure(full: Variant, variants: dict[str, Variant], begun: Sequence[Begun], num_frames: int) -> dict[str, Effect]:
+    """Effects by name, of all ``variants`` and of the full model, whose name is empty. They take turns window by window."""
+    everything = {"": full, **variants}
+    effects: dict[str, Effect] = {name: Effect() for name in everything}
+    for one in begun:
+        firsts: dict[str, Tensor] = {}
+        lasts: dict[str, Tensor] = {}
+        for name, variant in everything.items():
+            firsts[name], lasts[name] = march(variant, one, num_frames, effects[name])
+        lowest = _minimum(full.potential, one, list(firsts.values()))
+        for name, effect in effects.items():
+            effect.gamma.append((_phi(full.potential, one, firsts[name]) - lowest.phi) / lowest.e0)
+            apart = (lasts[name] - lasts[""]).norm(dim=1)
+            effect.mm.append(1e3 * float(apart.quantile(_QUANTILE)) if bool(torch.isfinite(apart).all()) else float("inf"))
+    return effects
+
+
+def active_terms(full: Variant, begun: Sequence[Begun]) -> set[str]:
+    """Names of the full potential's terms that can be anything but a constant zero in one of the windows."""
+    return {name for one in begun for name in full.potential.active(one.step)}
+
+
+def prices(full: Variant, begun: Sequence[Begun]) -> dict[str, float]:
+    """By term, the largest ‖∇E‖ / ‖M g‖ of the windows' first steps at their states: a force in units of the weight."""
+    found: dict[str, float] = {}
+    for one in begun:
+        problem = in_double(one.step)
+        for name, term in full.potential.active(one.step).items():
+            gradient, _ = full.potential.only({name: term}).gradient(problem, problem.state.pos)
+            found[name] = max(found.get(name, 0.0), float(relative_gradient(problem, gradient).max()))
+    return found
+
+
+def _phi(potential: Potential, one: Begun, pos: Tensor) -> float:
+    value = float(potential.total(in_double(one.step), pos.detach().double().cpu()).sum())
+    return value if np.isfinite(value) else float("inf")
+
+
+def _minimum(potential: Potential, one: Begun, known: Sequence[Tensor]) -> Minimum:
+    """The lowest of a tight minimisation from the best position known and of all these positions."""
+    problem = in_double(one.step)
+    values = [_phi(potential, one, pos) for pos in known]
+    best = known[int(np.argmin(values))].detach().double()
+    _, report = minimize(potential, problem, best, REFERENCE)
+    phi = min(float(report.phi.sum()), *values)
+    return Minimum(phi, float(scale(problem).sum()), bool(report.converged.all()))
