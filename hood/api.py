@@ -21,6 +21,7 @@ from hood.assets.material import Material
 from hood.commands.cloth_contact import potential_of
 from hood.commands.common import read_model
 from hood.commands.guarding import GuardStopped, make_guard
+from hood.commands.plan_file import rollout_config
 from hood.commands.setup import Setup, check_config, make_stepper, set_up
 from hood.config import ConfigError, load_config
 from hood.dynamics import rollout as frames
@@ -80,6 +81,10 @@ class Simulation:
             raise GuardStopped(f"guard=strict: the simulation ends before frame {guard.stopped.frame}, which cannot be trusted")
 
 
+#: What :func:`simulate` takes where nothing is said.
+_DEFAULTS = {"garment": "dress", "sequence": "walk_proud", "stepper": "network"}
+
+
 def simulate(
     garment: str | Path | list[str] | Garment = "dress",
     sequence: str | Path = "walk_proud",
@@ -122,7 +127,11 @@ def simulate(
         named["material"] = material
     if isinstance(stepper, str):
         named["stepper"] = stepper
-    config = load_config("rollout", overrides(named))
+    if named.get("plan") is not None:  # then what is not said is the plan's
+        if isinstance(garment, Garment) or isinstance(material, Material) or not isinstance(stepper, str):
+            raise ConfigError(f"plan={named['plan']}: names garment, material and stepper itself; leave them out")
+        named = {key: value for key, value in named.items() if _DEFAULTS.get(key) != value}
+    config = rollout_config(overrides(named))
     check_config(config)
     notes: list[str] = []
     told = io.StringIO()
@@ -164,7 +173,7 @@ def rollout(**keys: Any) -> dict[str, Any]:
     words = overrides(keys)
     if run(words) == 130:
         raise KeyboardInterrupt
-    folder = Path(str(load_config("rollout", words).output)).expanduser()
+    folder = Path(str(rollout_config(words).output)).expanduser()
     summary: dict[str, Any] = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     return summary
 

@@ -26,6 +26,7 @@ COMMANDS = {
     "evaluate": "table of cost and accuracy over the validation list",
     "tradeoff": "chart of time against accuracy over models, refinements and sizes",
     "envelope": "map of where each method holds, at the extremes of everything",
+    "plan": "measure which parts of the model a scene needs, and what each costs",
     "compare": "show rollouts of one motion next to each other, coloured by strain or rg",
     "view": "write rollouts as one HTML page to turn and play in a browser",
     "inspect": "say what files are, what is wrong with them and how to repair it",
@@ -36,7 +37,7 @@ COMMANDS = {
 _LESS_MEMORY = "free some, raise the limit (ulimit -v), or take a smaller garment, fewer frames or a smaller model"
 
 #: Commands that take steps: libraries for these are compiled while torch is loaded, where that has not been done before.
-_SIMULATE = ("train", "rollout", "evaluate", "tradeoff", "envelope")
+_SIMULATE = ("train", "rollout", "evaluate", "tradeoff", "envelope", "plan")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -28,6 +28,8 @@ _PACKAGE = Path(__file__).resolve().parent
 CONFIG_FOLDER = _PACKAGE / "configs" if (_PACKAGE / "configs").is_dir() else _PACKAGE.parent / "configs"
 #: Keys that take one word or a list.
 _ONE_OR_MORE = ("garment", "offset", "layers")
+#: Keys in here may be null: an energy that is left out.
+_OPTIONAL = "losses.terms."
 #: Bytes of a run's record at most, levels of its nesting, and characters of a reason why it is none.
 _RECORD_LIMIT, _DEEPEST, _REASON = 1 << 20, 32, 300
 #: What configs may name; and classes of plugins (:mod:`hood.plugins`).
@@ -199,6 +201,8 @@ def _check_types(known: DictConfig, config: DictConfig, prefix: str) -> None:
         if isinstance(after, DictConfig) and isinstance(before, DictConfig):
             _check_types(before, after, f"{prefix}{key}.")
         elif key in _ONE_OR_MORE and isinstance(after, ListConfig):
+            continue
+        elif after is None and prefix == _OPTIONAL:
             continue
         elif before is not None and not _same_kind(before, after):
             kind = "list" if isinstance(before, ListConfig) else type(before).__name__

@@ -18,6 +18,10 @@ _EXAMPLES = {
         "hood rollout garment=dress sequence=walk_steady num_frames=200 output=outputs/dress",
         "hood rollout garment=my_shirt.obj sequence=CMU_01_poses.npz material=denim",
     ],
+    "plan": [
+        "hood plan garment=dress sequence=plie stepper=newton accuracy=0.01",
+        "hood plan garment=[tank,skirt] sequence=walk_proud stepper=newton accuracy=5mm frames=30",
+    ],
     "compare": [
         "hood compare outputs/network/rollout.h5 outputs/solver/rollout.h5",
         "hood compare a=outputs/plain b=outputs/refined colour=rg output=outputs/compare",

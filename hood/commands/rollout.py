@@ -29,10 +29,11 @@ from hood.commands.common import (
 from hood.commands.dial import exported
 from hood.commands.guarding import OFF, GuardStopped, guard_sentences, make_guard, write_alarms
 from hood.commands.notices import heard
+from hood.commands.plan_file import rollout_config
 from hood.commands.setup import Setup, check_config, make_stepper, set_up, solves_in_double
 from hood.commands.summary import describe, describe_all, summarise
 from hood.commands.verdict import exit_code
-from hood.config import load_config, plain, save_run_record
+from hood.config import plain, save_run_record
 from hood.dynamics.captured import network_of
 from hood.dynamics.recorder import RolloutWriter, read_rollout
 from hood.dynamics.rollout import metric_names, simulate
@@ -44,7 +45,7 @@ from hood.training import distributed
 def run(overrides: Sequence[str]) -> int:
     """Run the command; returns the exit code: 130 where the user interrupted it, else 2 where a motion of many could not be
     used, else 3 where a result is unsound (:mod:`hood.dynamics.soundness`), else 0."""
-    config = load_config("rollout", overrides)
+    config = rollout_config(overrides)
     check_config(config)
     return together(lambda: _run(config))
 

@@ -104,7 +104,9 @@ def decide(
         if error <= tolerance.value and saving >= LEAST_SAVING:
             break
         worst = max(passing, key=lambda name: tolerance.error(effects[name]))
-        why = f"with the others left out {tolerance.say(error)}" if error > tolerance.value else "saves nothing beside the others"
+        why = (
+            f"with the others left out {tolerance.say(error)}" if error > tolerance.value else "saves nothing beside the others"
+        )
         verdicts[worst] = Verdict("kept", why)
         del passing[worst]
         together = None

@@ -73,6 +73,7 @@ class Begun:
     frame: int  # of the first state
     state: State
     step: StepProblem  # prepared by the full potential
+    solved: Tensor  # (V, 3) m, where the full model's step from there leads, in the state's frame
 
 
 @dataclass
@@ -88,18 +89,27 @@ def begin(full: Variant, windows: Sequence[Window], settle: str, lead: int = LEA
     """The full model's state ``lead`` frames into every window, from rest on the still body of the window's first frame."""
     found = []
     for window in windows:
-        kept: dict[int, StepProblem] = {}
+        kept: dict[int, tuple[StepProblem, Tensor]] = {}
 
-        def keep(frame: int, problem: StepProblem, _: Prediction, kept: dict[int, StepProblem] = kept) -> None:
-            kept[frame] = problem
+        def keep(
+            frame: int, problem: StepProblem, prediction: Prediction, kept: dict[int, tuple[StepProblem, Tensor]] = kept
+        ) -> None:
+            kept[frame] = problem, prediction.next_pos
 
         frames = simulate(
-            full.stepper, full.scene, full.potential, lead + 2, start_frame=window.first, observe=keep, metrics="none", settle=settle
+            full.stepper,
+            full.scene,
+            full.potential,
+            lead + 2,
+            start_frame=window.first,
+            observe=keep,
+            metrics="none",
+            settle=settle,
         )
         for _ in frames:
             pass
-        step = kept[max(kept)]
-        found.append(Begun(window, window.first + max(kept) - 1, step.state, full.potential.prepare(step)))
+        step, solved = kept[max(kept)]
+        found.append(Begun(window, window.first + max(kept) - 1, step.state, full.potential.prepare(step), solved))
     return found
 
 
@@ -125,6 +135,8 @@ def march(variant: Variant, begun: Begun, num_frames: int, effect: Effect) -> tu
 def measure(full: Variant, variants: dict[str, Variant], begun: Sequence[Begun], num_frames: int) -> dict[str, Effect]:
     """Effects by name, of all ``variants`` and of the full model, whose name is empty. They take turns window by window."""
     everything = {"": full, **variants}
+    for variant in everything.values():
+        march(variant, begun[0], 1, Effect())  # what a stepper makes at its first step is not a frame's time
     effects: dict[str, Effect] = {name: Effect() for name in everything}
     for one in begun:
         firsts: dict[str, Tensor] = {}
@@ -145,12 +157,12 @@ def active_terms(full: Variant, begun: Sequence[Begun]) -> set[str]:
 
 
 def prices(full: Variant, begun: Sequence[Begun]) -> dict[str, float]:
-    """By term, the largest ‖∇E‖ / ‖M g‖ of the windows' first steps at their states: a force in units of the weight."""
+    """By term, the largest ‖∇E‖ / ‖M g‖ where the full model's first steps lead: a force in units of the weight."""
     found: dict[str, float] = {}
     for one in begun:
         problem = in_double(one.step)
         for name, term in full.potential.active(one.step).items():
-            gradient, _ = full.potential.only({name: term}).gradient(problem, problem.state.pos)
+            gradient, _ = full.potential.only({name: term}).gradient(problem, one.solved.detach().double())
             found[name] = max(found.get(name, 0.0), float(relative_gradient(problem, gradient).max()))
     return found
 

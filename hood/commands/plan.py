@@ -1,0 +1,208 @@
+"""``hood plan``: what a scene needs of the model, what each part costs, and what would be lost without it."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig
+
+from hood.assets.library import locate
+from hood.commands.cloth_contact import potential_of
+from hood.commands.common import held_folder, output_folder
+from hood.commands.dial import refined
+from hood.commands.plan_file import write_plan
+from hood.commands.plan_parts import Part, choose_parts
+from hood.commands.setup import Setup, check_config, make_stepper, set_up
+from hood.config import ConfigError, load_config
+from hood.dynamics.captured import network_of
+from hood.evaluation.decision import QUANTILE, Decision, Tolerance, decide
+from hood.evaluation.leaving_out import LEAD, Begun, Effect, Variant, active_terms, begin, measure, prices
+from hood.evaluation.windows import Window, choose_windows
+
+
+def run(overrides: Sequence[str]) -> int:
+    """Run the command; returns the exit code."""
+    own, words = _split(overrides)
+    config = load_config("rollout", words)
+    check_config(config)
+    tolerance = _tolerance(own)
+    for key, least, most in (("windows", 1, 5), ("frames", 1, 300)):
+        if isinstance(own[key], bool) or not least <= int(own[key]) <= most:
+            raise ConfigError(f"{key}={own[key]}: give a whole number from {least} to {most}")
+    output_folder(own)
+    began = time.perf_counter()
+    ready = set_up(config, make_stepper(config)[0])
+    settled = [*words, *_settled_words(config, ready)]
+    with held_folder(own) as folder:
+        plan = _probe(ready, settled, own, tolerance)
+        plan |= {"asked": words, "seconds": time.perf_counter() - began}
+        write_plan(folder / "plan.json", plan)
+    print(describe(plan))
+    print(f"plan in {folder / 'plan.json'}; roll out by it: hood rollout plan={folder / 'plan.json'} output=outputs/mine")
+    return 0
+
+
+def _split(overrides: Sequence[str]) -> tuple[DictConfig, list[str]]:
+    """The plan's own config, and the words of the rollout."""
+    own = {str(key) for key in load_config("plan")}
+    mine = [word for word in overrides if word.partition("=")[0].lstrip("+~") in own]
+    words = [word for word in overrides if word not in mine]
+    if any(word.partition("=")[0] == "plan" for word in words):
+        raise ConfigError("plan=…: a plan is made of the full model; drop plan=…")
+    return load_config("plan", mine), words
+
+
+def _tolerance(own: DictConfig) -> Tolerance:
+    try:
+        return Tolerance.read(str(own.accuracy))
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+
+
+def _settled_words(asked: DictConfig, ready: Setup) -> list[str]:
+    """What ``auto`` became."""
+    alone = str(ready.config.stepper) == "newton"
+    keys = [key for key in ("stepper", "refine") if asked[key] != ready.config[key] and not (alone and key == "refine")]
+    return [f"{key}={ready.config[key]}" for key in keys]
+
+
+def _variant(words: Sequence[str], ready: Setup) -> Variant:
+    """The scene with these settings; its cloth, body and motion are those of the full model."""
+    config = load_config("rollout", words)
+    check_config(config)
+    stepper = refined(make_stepper(config)[0], config, ready.scene.cloth.num_vertices, potential_of(config))
+    network = network_of(stepper)
+    if network is not None:
+        network.use_potential(potential_of(config))
+    return Variant(stepper, potential_of(config), ready.scene)
+
+
+def _probe(ready: Setup, words: list[str], own: DictConfig, tolerance: Tolerance) -> dict[str, Any]:
+    config, frames = ready.config, int(own.frames)
+    parts = choose_parts(config, [str(name) for name in own.parts])
+    if not parts:
+        raise ConfigError("parts: this rollout has none that could be left out")
+    full = Variant(ready.stepper, potential_of(config), ready.scene)
+    count = min(int(config.num_frames), ready.scene.num_frames)
+    windows = _windows(ready, count, own, frames)
+    begun = begin(full, windows, str(config.settle))
+    active, price = active_terms(full, begun), prices(full, begun)
+    absent = {part.name: _why_absent(part, ready) for part in parts if part.term and part.term not in active}
+    variants = {part.name: _variant([*words, *part.words], ready) for part in parts if part.name not in absent}
+    effects = measure(full, variants, begun, frames)
+
+    def together(names: Sequence[str]) -> tuple[Effect, Effect]:
+        found = measure(full, {"all": _variant([*words, *_words_of(parts, names)], ready)}, begun, frames)
+        return found[""], found["all"]
+
+    rivals = [[part.name for part in parts if part.rivals == name] for name in sorted({part.rivals for part in parts} - {""})]
+    decision = decide(effects, absent, rivals, tolerance, together)
+    return _record(ready, words, parts, begun, effects, price, decision, tolerance, frames)
+
+
+def _windows(ready: Setup, count: int, own: DictConfig, frames: int) -> list[Window]:
+    try:
+        return choose_windows(ready.scene.motion, count, int(own.windows), LEAD + frames + 1)
+    except ValueError as error:
+        raise ConfigError(f"frames={frames}: {error}") from error
+
+
+def _why_absent(part: Part, ready: Setup) -> str:
+    if part.term in ("collision", "friction") and ready.scene.motion.num_vertices == 0:
+        return "there is no body"
+    return "nothing in these windows comes near enough" if part.term == "layers" else "nothing in this scene uses it"
+
+
+def _words_of(parts: Iterable[Part], names: Sequence[str]) -> list[str]:
+    return list(dict.fromkeys(word for part in parts if part.name in names for word in part.words))
+
+
+def _record(
+    ready: Setup,
+    words: list[str],
+    parts: Sequence[Part],
+    begun: Sequence[Begun],
+    effects: dict[str, Effect],
+    price: dict[str, float],
+    decision: Decision,
+    tolerance: Tolerance,
+    frames: int,
+) -> dict[str, Any]:
+    full, chosen = effects[""], _words_of(parts, decision.left_out)
+    rows = []
+    for part in parts:
+        verdict = decision.verdicts[part.name]
+        row = {"part": part.name, "purpose": part.purpose, "words": list(part.words), "force": price.get(part.term)}
+        row |= _numbers(effects[part.name], full) if part.name in effects else {}
+        command = " ".join(["hood plan", *words, f"'parts=[{part.name}]'", f"frames={frames}", f"windows={len(begun)}"])
+        rows.append({**row, "decision": verdict.decision, "reason": verdict.reason, "command": command})
+    checkpoint = str(ready.config.checkpoint)
+    network = network_of(ready.stepper) is not None and checkpoint != "untrained"
+    return {
+        "words": words,
+        "chosen": chosen,
+        "accuracy": {"value": tolerance.value, "unit": tolerance.unit},
+        "windows": [{"first": one.window.first, "measured_from": one.frame, "reason": one.window.reason} for one in begun],
+        "frames": frames,
+        "full": _numbers(full, full),
+        "rows": rows,
+        "together": None if decision.together is None else _numbers(decision.together, full),
+        "weights": hashlib.sha256(locate("weights", checkpoint).read_bytes()).hexdigest() if network else None,
+    }
+
+
+def _numbers(effect: Effect, full: Effect) -> dict[str, float | None]:
+    found = {
+        "gamma_p50": effect.gamma_at(0.5),
+        "gamma_p95": effect.gamma_at(QUANTILE),
+        "mm": effect.worst_mm,
+        "ms": effect.median_ms,
+        "saved": 1.0 - effect.median_ms / full.median_ms,
+    }
+    return {key: value if np.isfinite(value) else None for key, value in found.items()}
+
+
+def describe(plan: dict[str, Any]) -> str:
+    """The table and one paragraph."""
+    where = ", ".join(f"{one['measured_from']} ({one['reason']})" for one in plan["windows"])
+    lines = [
+        f"measured from frames {where}; {plan['frames']} steps each; the full model takes {plan['full']['ms']:.1f} ms a frame, "
+        f"γ {_short(plan['full']['gamma_p95'])}",
+        "",
+        f"{'part':<20}{'force/weight':>13}{'γ without':>11}{'p95':>10}{'mm':>9}{'saved':>8}  decision",
+    ]
+    for row in plan["rows"]:
+        if "ms" in row:
+            saved = f"{100 * row['saved']:>7.0f}%"
+            numbers = f"{_short(row['gamma_p50']):>11}{_short(row['gamma_p95']):>10}{_short(row['mm']):>9}{saved}"
+        else:
+            numbers = f"{'-':>11}{'-':>10}{'-':>9}{'-':>8}"
+        force = "-" if row["force"] is None else _short(row["force"])
+        lines.append(f"{row['part']:<20}{force:>13}{numbers}  {row['decision']}: {row['reason']}")
+    return "\n".join([*lines, "", sentence(plan)])
+
+
+def sentence(plan: dict[str, Any]) -> str:
+    """What was decided, for someone who does not read tables."""
+    limit = plan["accuracy"]
+    asked = f"{limit['value']:g} mm" if limit["unit"] == "mm" else f"γ = {limit['value']:g}"
+    left = [row["part"] for row in plan["rows"] if row["decision"] == "left out"]
+    needed = [row["part"] for row in plan["rows"] if row["decision"] == "kept" and row["reason"].startswith("without it")]
+    if not left:
+        text = f"Nothing is left out: no part both saves time and stays within {asked}."
+    else:
+        found = plan["together"]
+        error = f"{_short(found['mm'])} mm" if limit["unit"] == "mm" else f"γ = {_short(found['gamma_p95'])}"
+        text = (
+            f"Left out: {', '.join(left)}. Together this costs {error} where {asked} was accepted, and saves "
+            f"{100 * found['saved']:.0f}% of a frame ({plan['full']['ms']:.1f} ms before)."
+        )
+    return f"{text} Needed for this accuracy: {', '.join(needed) or 'nothing else that was looked at'}."
+
+
+def _short(value: float | None) -> str:
+    return "broken" if value is None else f"{value:.2g}"

@@ -1,0 +1,146 @@
+"""``hood plan``: what is measured is written down, and a rollout by the plan is the rollout by its words."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+import hood
+from hood.cli import main
+from hood.commands.plan_file import rollout_config
+
+WORDS = ["garment=tank", "sequence=plie", "stepper=newton", "num_frames=24"]
+QUIET = ["video=none", "sheet=false", "metrics=none", "guard=off"]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A plan of three parts, one of which a body in motion cannot do without."""
+    folder = tmp_path_factory.mktemp("plan")
+    words = ["parts=[bending,body contact,cloth contact]", "windows=2", "frames=1", "accuracy=0.05", f"output={folder}"]
+    assert main(["plan", *WORDS, *words]) == 0
+    return folder / "plan.json"
+
+
+def read(path: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return found
+
+
+def test_every_part_is_measured_and_decided(made: Path) -> None:
+    plan = read(made)
+    rows = {row["part"]: row for row in plan["rows"]}
+    assert set(rows) == {"bending", "body contact", "cloth contact"}
+    assert rows["body contact"]["decision"] == "kept"
+    assert rows["body contact"]["gamma_p95"] > 1.0
+    assert plan["full"]["gamma_p95"] < 1e-3
+    assert all(row["decision"] in ("kept", "left out", "absent") and row["reason"] for row in rows.values())
+    assert plan["windows"][0]["first"] == 0
+    assert plan["words"] == WORDS
+
+
+def test_the_printed_table_names_parts_and_command(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from hood.commands.plan import describe
+
+    text = describe(read(made))
+    assert "bending" in text
+    assert "Needed for this accuracy: " in text
+    row = read(made)["rows"][0]
+    assert row["command"].startswith("hood plan garment=tank")
+    assert "parts=[bending]" in row["command"]
+
+
+def positions(path: Path) -> np.ndarray:
+    with h5py.File(path / "rollout.h5", "r") as file:
+        return np.asarray(file["cloth/pos"])
+
+
+@pytest.fixture
+def written(tmp_path: Path) -> Path:
+    """A plan whose choice does not hang on what is faster today."""
+    path = tmp_path / "plan.json"
+    chosen = ["losses.terms.bending=null", "solver.target_rg=0.1"]
+    path.write_text(json.dumps({"format": "hood-plan/1", "words": WORDS, "chosen": chosen}))
+    return path
+
+
+def test_a_rollout_by_a_plan_is_that_of_its_words(written: Path, tmp_path: Path) -> None:
+    short = ["num_frames=6", *QUIET]
+    plain = [word for word in WORDS if not word.startswith("num_frames")]
+    by_plan, by_words, full = (tmp_path / name for name in ("plan", "words", "full"))
+    assert main(["rollout", f"plan={written}", *short, f"output={by_plan}"]) == 0
+    assert main(["rollout", *plain, "losses.terms.bending=null", "solver.target_rg=0.1", *short, f"output={by_words}"]) == 0
+    assert main(["rollout", *plain, *short, f"output={full}"]) == 0
+    assert np.array_equal(positions(by_plan), positions(by_words))
+    assert not np.array_equal(positions(by_plan), positions(full))
+
+
+def test_python_takes_a_plan_too(written: Path) -> None:
+    run = hood.simulate(plan=str(written), num_frames=3)
+    config = rollout_config([f"plan={written}"])
+    assert config.losses.terms.bending is None
+    assert config.solver.target_rg == 0.1
+    assert len(list(run)) == 3
+    with pytest.raises(ValueError, match="leave them out"):
+        hood.simulate(plan=str(written), material=hood.Material())
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("{", "not a plan"),
+        ("[]", "not a plan"),
+        ('{"format": "hood-plan/2"}', "not a plan"),
+        ('{"format": "hood-plan/1", "words": "garment=dress", "chosen": []}', "must be lists"),
+        ('{"format": "hood-plan/1", "words": ["plan=other.json"], "chosen": []}', "names another plan"),
+        ('{"format": "hood-plan/1", "words": ["material._target_=os.system"], "chosen": []}', "os.system"),
+        (None, "no such file"),
+    ],
+)
+def test_what_is_no_plan_is_refused(content: str | None, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "mine.json"
+    if content is not None:
+        path.write_text(content)
+    assert main(["rollout", f"plan={path}", f"output={tmp_path / 'out'}"]) == 2
+    told = capsys.readouterr().err
+    assert said in told
+    assert told.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_words_that_the_plan_was_not_made_for_are_refused(written: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for word, made_for in (("garment=skirt", "garment=tank"), ("material=denim", "the default of material")):
+        assert main(["rollout", f"plan={written}", word]) == 2
+        assert made_for in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["parts=[bendign]"], "bending"),
+        (["accuracy=5cm"], "accuracy=5cm"),
+        (["windows=0"], "windows=0"),
+        (["frames=0"], "frames=0"),
+        (["frames=200"], "fewer frames"),
+        (["plan=x.json"], "drop plan="),
+        (["garmet=tank"], "garmet"),
+    ],
+)
+def test_bad_words_are_told_in_a_line(words: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plan", *WORDS, f"output={tmp_path / 'plan'}", *words]) == 2
+    told = capsys.readouterr().err
+    assert said in told
+    assert not (tmp_path / "plan" / "plan.json").exists()
+
+
+def test_without_a_body_its_contact_is_absent(tmp_path: Path) -> None:
+    words = ["body=none", "garment=tank", "sequence=plie", "stepper=newton", "pins=[0,1]", "num_frames=12"]
+    assert main(["plan", *words, "windows=1", "frames=1", "parts=[friction,bending]", f"output={tmp_path}"]) == 0
+    rows = {row["part"]: row for row in read(tmp_path / "plan.json")["rows"]}
+    assert rows["friction"]["decision"] == "absent"
+    assert rows["bending"]["decision"] in ("kept", "left out")

@@ -1,0 +1,74 @@
+"""Which parts are left out: tolerances are read, held, and rivals and combinations settled."""
+
+from __future__ import annotations
+
+import pytest
+
+from hood.evaluation.decision import Tolerance, decide
+from hood.evaluation.leaving_out import Effect
+
+
+def effect(gamma: float, ms: float, mm: float = 1.0) -> Effect:
+    return Effect([gamma, gamma], [mm], [ms, ms])
+
+
+FULL = effect(0.0, 10.0)
+
+
+@pytest.mark.parametrize(("text", "value", "unit"), [("0.01", 0.01, "gamma"), ("5mm", 5.0, "mm"), ("1e-3", 1e-3, "gamma")])
+def test_tolerance_is_of_gamma_or_a_length(text: str, value: float, unit: str) -> None:
+    assert Tolerance.read(text) == Tolerance(value, unit)
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "5cm", "", "mm", ".", "1.2.3", "nan", "inf", "1e400"])
+def test_other_tolerances_are_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="accuracy="):
+        Tolerance.read(text)
+
+
+def test_parts_are_left_out_that_pass_and_save_time() -> None:
+    effects = {"": FULL, "cheap": effect(1e-4, 8.0), "needed": effect(0.5, 5.0), "free": effect(1e-4, 9.9)}
+    found = decide(effects, {"none": "no body"}, [], Tolerance(0.01, "gamma"), lambda names: (FULL, effect(1e-4, 8.0)))
+    assert found.left_out == ("cheap",)
+    assert {name: verdict.decision for name, verdict in found.verdicts.items()} == {
+        "cheap": "left out", "needed": "kept", "free": "kept", "none": "absent",
+    }  # fmt: skip
+
+
+def test_a_combination_that_misses_the_tolerance_loses_its_worst_part() -> None:
+    asked: list[tuple[str, ...]] = []
+
+    def together(names: tuple[str, ...]) -> tuple[Effect, Effect]:
+        asked.append(tuple(names))
+        return FULL, effect(0.02 if len(names) > 1 else 0.003, 7.0)
+
+    effects = {"": FULL, "a": effect(0.009, 9.0), "b": effect(0.003, 9.0)}
+    found = decide(effects, {}, [], Tolerance(0.01, "gamma"), together)
+    assert asked == [("a", "b"), ("b",)]
+    assert found.left_out == ("b",)
+    assert "γ = 0.02" in found.verdicts["a"].reason
+    assert found.together is not None
+    assert found.together.gamma == [0.003, 0.003]
+
+
+def test_of_rivals_the_one_that_saves_most_is_left_out() -> None:
+    effects = {"": FULL, "a": effect(1e-4, 9.0), "b": effect(1e-3, 6.0)}
+    found = decide(effects, {}, [["a", "b"]], Tolerance(0.01, "gamma"), lambda names: (FULL, effects["b"]))
+    assert found.left_out == ("b",)
+    assert "'b' saves more" in found.verdicts["a"].reason
+
+
+def test_what_breaks_is_needed_and_lengths_are_judged_by_the_worst_window() -> None:
+    effects = {
+        "": FULL,
+        "nan": effect(float("nan"), 1.0),
+        "far": Effect([0.0], [1.0, 6.0], [1.0]),
+        "near": effect(9.0, 5.0, 2.0),
+    }
+    by_gamma = decide({"": FULL, "nan": effects["nan"]}, {}, [], Tolerance(0.01, "gamma"), lambda names: (FULL, FULL))
+    assert by_gamma.left_out == ()
+    by_mm = decide(
+        {k: effects[k] for k in ("", "far", "near")}, {}, [], Tolerance(5.0, "mm"), lambda names: (FULL, effects["near"])
+    )
+    assert by_mm.left_out == ("near",)
+    assert by_mm.verdicts["far"].decision == "kept"
