@@ -18,7 +18,6 @@ from tqdm import tqdm
 from hood.assets.garment import Garment
 from hood.assets.library import locate
 from hood.assets.material import Material
-from hood.commands.cloth_contact import potential_of
 from hood.commands.common import read_model
 from hood.commands.guarding import GuardStopped, make_guard
 from hood.commands.plan_file import rollout_config
@@ -62,7 +61,7 @@ class Simulation:
 
     def __iter__(self) -> Iterator[Frame]:
         config = self._ready.config
-        potential = potential_of(config)
+        potential = self._ready.potential
         guard = make_guard(config, self.stepper, potential)
         steps = frames.simulate(
             self.stepper,

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import h5py
+import numpy as np
 from omegaconf import DictConfig
 
 from hood.assets.atomic import write_atomically
 from hood.assets.unpickle import check_size
 from hood.config import ConfigError, load_config
+from hood.dynamics.soundness import name_frames
+from hood.dynamics.watched import PLAN_METRICS
 
 FORMAT = "hood-plan/1"
 _LIMIT = 1 << 20
@@ -43,25 +49,83 @@ def rollout_config(overrides: Sequence[str]) -> DictConfig:
     return load_config("rollout", [*(word for word in words if word.partition("=")[0] not in given), *overrides])
 
 
+@dataclass(frozen=True)
+class Watch:
+    """When energies that a plan leaves out come back: see :class:`hood.dynamics.watched.WatchedStepper`.
+
+    Args:
+        words: of the full model.
+    """
+
+    words: list[str]
+    limit: float
+    ratio: float
+    hold: int
+
+
+def read_watch(path: Path) -> Watch | None:
+    """The watch of a plan; None where it leaves out no energy.
+
+    Raises:
+        ConfigError: its numbers are none.
+    """
+    plan = _read(path)
+    given = plan.get("watch")
+    if given is None:
+        return None
+    values = [given.get(key) for key in ("limit", "ratio", "hold")] if isinstance(given, dict) else []
+    numbers = [float(value) for value in values if isinstance(value, (int, float)) and 0.0 < value < float("inf")]
+    if len(numbers) != 3:
+        raise ConfigError(f"plan={path}: 'watch' must hold limit, ratio and hold, all above 0; make the plan again")
+    return Watch(list(plan["words"]), numbers[0], max(numbers[1], 1.0), max(int(numbers[2]), 1))
+
+
 def write_plan(path: Path, plan: Mapping[str, Any]) -> None:
     """Write a plan: ``words`` of the rollout it was made for, ``chosen`` further ones, and what else is known."""
     write_atomically(path, json.dumps({"format": FORMAT, **plan}, indent=1, allow_nan=False).encode())
 
 
 def _read_words(path: Path) -> list[str]:
+    plan = _read(path)
+    return [*plan["words"], *plan["chosen"]]
+
+
+def _read(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise ConfigError(f"plan={path}: no such file; hood plan … output=FOLDER writes FOLDER/plan.json")
     check_size(path, _LIMIT)
-    try:
+    plan: Any = None
+    with contextlib.suppress(ValueError, RecursionError):
         plan = json.loads(path.read_text(encoding="utf-8"))
-        known = isinstance(plan, dict) and plan.get("format") == FORMAT
-    except (ValueError, RecursionError):
-        known = False
-    if not known:
+    if not isinstance(plan, dict) or plan.get("format") != FORMAT:
         raise ConfigError(f"plan={path}: not a plan ({FORMAT}); hood plan … output=FOLDER writes FOLDER/plan.json")
     words = [plan.get(key) for key in ("words", "chosen")]
     if not all(isinstance(part, list) and all(isinstance(word, str) for word in part) for part in words):
         raise ConfigError(f"plan={path}: 'words' and 'chosen' must be lists of key=value; make the plan again")
-    if any(word.partition("=")[0] == "plan" for part in words for word in part):
+    if any(word.partition("=")[0] == "plan" for part in words for word in part or []):
         raise ConfigError(f"plan={path}: names another plan; make the plan again")
-    return [word for part in words for word in part]
+    return dict(plan)
+
+
+def summarise_plan(path: Path) -> dict[str, Any]:
+    """What ``summary.json`` says of a rollout that was watched; nothing of others."""
+    with h5py.File(path, "r") as file:
+        if f"metrics/{PLAN_METRICS[0]}" not in file:
+            return {}
+        price, full = (np.nan_to_num(np.asarray(file[f"metrics/{name}"])) for name in PLAN_METRICS)
+        limit = json.loads(file.attrs["model"])["plan_limit"]
+    frames = [int(frame) for frame in np.flatnonzero(full > 0)]
+    return {"plan": {"limit": limit, "price_max": float(price.max(initial=0.0)), "frames_by_full_model": frames}}
+
+
+def plan_sentences(summary: Mapping[str, Any]) -> list[str]:
+    """A line on where the full model came back; nothing without a watch."""
+    found = summary.get("plan")
+    if not found:
+        return []
+    if not found["frames_by_full_model"]:
+        worst = f"{found['price_max']:.2g} of γ at most, {found['limit']:.2g} was accepted"
+        return [f"plan: what was left out was worth {worst}"]
+    chosen = np.zeros(1 + max(found["frames_by_full_model"]), dtype=bool)
+    chosen[found["frames_by_full_model"]] = True
+    return [f"plan: the full model took {int(chosen.sum())} steps, where what is left out matters: {name_frames(chosen)}"]

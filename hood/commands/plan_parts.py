@@ -23,6 +23,7 @@ class Part:
         words: the settings without it.
         term: the energy of the potential that it is; "" where it is none.
         rivals: parts of one such name exclude each other.
+        watched: whether a rollout notices where it was wrong to leave the part out; others are measured and kept.
     """
 
     name: str
@@ -30,6 +31,7 @@ class Part:
     words: tuple[str, ...]
     term: str = ""
     rivals: str = ""
+    watched: bool = True
 
 
 def _has(name: str) -> Callable[[DictConfig], bool]:
@@ -74,8 +76,19 @@ _TERMS: tuple[tuple[Part, Callable[[DictConfig], bool]], ...] = (
         ),
         _has("collision"),
     ),
-    (Part("bulges", "long edges do not cut bulges", ("losses.terms.collision.reach=constant",), "collision"), _bulges),
-    (Part("skin folds", "cloth is off both sides of a fold", ("losses.terms.collision.sides=nearest",), "collision"), _folds),
+    (
+        Part(
+            "bulges", "long edges do not cut bulges", ("losses.terms.collision.reach=constant",), "collision", watched=False
+        ),
+        _bulges,
+    ),
+    (
+        Part(
+            "skin folds", "cloth is off both sides of a fold", ("losses.terms.collision.sides=nearest",), "collision",
+            watched=False,
+        ),
+        _folds,
+    ),
     (Part("cloth contact", "layers of cloth stay apart", ("cloth_contact=off",), "layers"), acts),
     (Part("gravity", "weight", ("gravity=0",), "gravity"), lambda config: float(config.gravity) > 0.0),
 )  # fmt: skip

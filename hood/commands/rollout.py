@@ -19,7 +19,7 @@ from hood.assets.occupied import occupy
 from hood.commands.automatic import advice
 from hood.commands.batch import Job, find_jobs, share
 from hood.commands.cautions import warn
-from hood.commands.cloth_contact import potential_of, why_not
+from hood.commands.cloth_contact import why_not
 from hood.commands.common import (
     output_folder,
     prepare_folder,
@@ -29,7 +29,7 @@ from hood.commands.common import (
 from hood.commands.dial import exported
 from hood.commands.guarding import OFF, GuardStopped, guard_sentences, make_guard, write_alarms
 from hood.commands.notices import heard
-from hood.commands.plan_file import rollout_config
+from hood.commands.plan_file import plan_sentences, rollout_config, summarise_plan
 from hood.commands.setup import Setup, check_config, make_stepper, set_up, solves_in_double
 from hood.commands.summary import describe, describe_all, summarise
 from hood.commands.verdict import exit_code
@@ -38,7 +38,6 @@ from hood.dynamics.captured import network_of
 from hood.dynamics.recorder import RolloutWriter, read_rollout
 from hood.dynamics.rollout import metric_names, simulate
 from hood.dynamics.stepper import Stepper
-from hood.scene.scene import Scene
 from hood.training import distributed
 
 
@@ -95,11 +94,13 @@ def _run_there(ready: Setup, asked: DictConfig, digest: str, warned: list[str], 
     folder = output_folder(config)
     (folder / "summary.json").unlink(missing_ok=True)  # its presence says that everything is there
     save_run_record(folder, config, int(config.seed))
-    interrupted = _simulate_to_disk(config, scene, stepper, digest, folder / "rollout.h5", asked)
+    interrupted = _simulate_to_disk(ready, digest, folder / "rollout.h5", asked)
     summary = summarise(folder / "rollout.h5")
     warn(guard_sentences(summary.get("guard")))
     summary["choice"] = asdict(ready.choice)
+    summary |= summarise_plan(folder / "rollout.h5")
     print(describe(summary))
+    _tell(plan_sentences(summary))
     if advise:
         _tell(advice(config, scene, summary, _first_positions(folder / "rollout.h5")))
     simulator = network_of(stepper)
@@ -162,9 +163,9 @@ def _finished(config: DictConfig, digest: str, folder: Path) -> dict[str, Any] |
     return summary if "sound" in summary else summarise(folder / "rollout.h5")
 
 
-def _simulate_to_disk(config: DictConfig, scene: Scene, stepper: Stepper, digest: str, path: Path, asked: DictConfig) -> bool:
+def _simulate_to_disk(ready: Setup, digest: str, path: Path, asked: DictConfig) -> bool:
     """Stream the rollout into ``path``; True when the user interrupted it. ``asked`` is the config with ``auto`` in it."""
-    potential = potential_of(config)
+    config, scene, stepper, potential = ready.config, ready.scene, ready.stepper, ready.potential
     guard = make_guard(config, stepper, potential)
     count = min(int(config.num_frames), scene.num_frames)
     if count < int(config.num_frames):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 from omegaconf import DictConfig
@@ -19,14 +20,17 @@ from hood.commands.common import UNTRAINED, read_model, require_device, require_
 from hood.commands.dial import AUTO, check_dial, chosen, refined
 from hood.commands.guarding import check_guard
 from hood.commands.performance import make_motion
+from hood.commands.plan_file import read_watch
 from hood.commands.wardrobe import heed, layer_order, names_of, read_outfit
-from hood.config import ConfigError, build, plain, require_choice
+from hood.config import ConfigError, build, load_config, plain, require_choice
 from hood.dynamics.captured import MODES, CapturedSimulator, network_of
 from hood.dynamics.captured_newton import CapturedNewton
 from hood.dynamics.refine import GuessStepper
 from hood.dynamics.rollout import METRIC_CHOICES, SETTLE_CHOICES, own_start
 from hood.dynamics.simulator import Simulator
 from hood.dynamics.stepper import NewtonStepper, Stepper
+from hood.dynamics.watched import WatchedStepper
+from hood.losses.potential import Potential
 from hood.nn.compiled import KERNELS
 from hood.scene.fitting import doubts, misplacement
 from hood.scene.scene import Scene, dress
@@ -43,6 +47,7 @@ class Setup:
     scene: Scene
     stepper: Stepper
     choice: Choice
+    potential: Potential  # what steps are judged by; of a plan, that of the full model
 
 
 def check_config(config: DictConfig) -> None:
@@ -90,7 +95,22 @@ def set_up(
     _check_start(settled, stepper, scene, tell)
     tell_if_off(settled, 1 if scene.outfit is None else len(scene.outfit.names))
     warn(scene_cautions(stepper, scene, build(settled.losses), str(settled.checkpoint)))
-    return Setup(settled, scene, stepper, choice)
+    potential = potential_of(settled)
+    if config.plan is not None:
+        stepper, potential = _watched(settled, stepper, scene)
+    return Setup(settled, scene, stepper, choice, potential)
+
+
+def _watched(config: DictConfig, lean: Stepper, scene: Scene) -> tuple[Stepper, Potential]:
+    """A plan's stepper with its watch, and the potential of the full model; what it has alone where the plan has no watch."""
+    potential, watch = potential_of(config), read_watch(Path(str(config.plan)).expanduser())
+    if watch is None:
+        return lean, potential
+    whole = load_config("rollout", watch.words)
+    check_config(whole)
+    everything = potential_of(whole)
+    full = refined(make_stepper(whole)[0], whole, scene.cloth.num_vertices, everything)
+    return WatchedStepper(lean, full, (potential, everything), scene, watch.limit, watch.ratio, watch.hold), everything
 
 
 def make_scene(config: DictConfig, garment: Garment | None = None, material: Material | None = None) -> Scene:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from hood.evaluation.leaving_out import Effect
@@ -67,6 +67,7 @@ def decide(
     rivals: Sequence[Sequence[str]],
     tolerance: Tolerance,
     measure_together: Callable[[Sequence[str]], tuple[Effect, Effect]],
+    unwatched: Collection[str] = (),
 ) -> Decision:
     """The cheapest combination whose error stays within the tolerance, as far as one search from the top finds it.
 
@@ -77,6 +78,7 @@ def decide(
         effects: by part; the full model's own entry is named "".
         absent: parts that nothing in the scene uses, with the reason.
         rivals: parts of which at most one can be left out.
+        unwatched: parts that are never left out, because a rollout would not notice where it needs them.
         measure_together: the full model's and the combination's effect, measured side by side.
     """
     full = effects[""]
@@ -90,6 +92,9 @@ def decide(
             verdicts[name] = Verdict("kept", f"without it {tolerance.say(error)}")
         elif saving < LEAST_SAVING:
             verdicts[name] = Verdict("kept", f"it costs no time that can be measured ({100 * saving:+.0f}% of a frame)")
+        elif name in unwatched:
+            said = f"{tolerance.say(error)} without it here, but a rollout would not notice where it is more"
+            verdicts[name] = Verdict("kept", said)
         else:
             passing[name] = saving
     for group in rivals:

@@ -18,6 +18,7 @@ from hood.dynamics.rollout import prepare_stepper, simulate
 from hood.dynamics.simulator import Prediction
 from hood.dynamics.stepper import Stepper
 from hood.dynamics.stopwatch import Stopwatch
+from hood.dynamics.watched import force_bound, lacking
 from hood.evaluation.gap import REFERENCE
 from hood.evaluation.windows import Window
 from hood.losses.potential import Potential, relative_gradient, scale
@@ -29,6 +30,8 @@ from hood.solver.newton import minimize
 
 #: Frames of the full model before a window's first state: the start is at rest on a still body.
 LEAD = 2
+#: More than this is not made of a few windows.
+MOST_OVERSTATED = 10.0
 #: Positions differ by the 95th percentile of this over the vertices: one vertex that flips says little.
 _QUANTILE = 0.95
 
@@ -154,6 +157,17 @@ def measure(full: Variant, variants: dict[str, Variant], begun: Sequence[Begun],
 def active_terms(full: Variant, begun: Sequence[Begun]) -> set[str]:
     """Names of the full potential's terms that can be anything but a constant zero in one of the windows."""
     return {name for one in begun for name in full.potential.active(one.step)}
+
+
+def overstatement(full: Variant, lean: Variant, begun: Sequence[Begun], gammas: Sequence[float]) -> float:
+    """How much :func:`hood.dynamics.watched.force_bound` of the energies that ``lean`` lacks overstates its γ: the least of the
+    windows, between 1 and :data:`MOST_OVERSTATED`."""
+    found, names = [MOST_OVERSTATED], lacking(lean.potential, full.potential)
+    for one, gamma in zip(begun, gammas, strict=True):
+        pos, _ = march(lean, one, 1, Effect())
+        if gamma > 1e-6:
+            found.append(force_bound(full.potential, names, one.step, pos) / gamma)
+    return max(1.0, min(found)) if len(found) > 1 else 1.0
 
 
 def prices(full: Variant, begun: Sequence[Begun]) -> dict[str, float]:

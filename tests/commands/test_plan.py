@@ -90,6 +90,26 @@ def test_python_takes_a_plan_too(written: Path) -> None:
         hood.simulate(plan=str(written), material=hood.Material())
 
 
+def test_a_rollout_watches_what_its_plan_leaves_out(written: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """With no tolerance at all every step is the full model's, and the summary says so."""
+    plan = json.loads(written.read_text())
+    chosen, short = ["losses.terms.bending=null", "cloth_contact=off"], ["num_frames=5", *QUIET]
+    written.write_text(json.dumps(plan | {"chosen": chosen, "watch": {"limit": 1e-30, "ratio": 1.0, "hold": 3}}))
+    by_plan, full = tmp_path / "plan", tmp_path / "full"
+    assert main(["rollout", f"plan={written}", *short, f"output={by_plan}"]) == 0
+    assert "plan: the full model took 4 steps" in capsys.readouterr().out
+    assert main(["rollout", *WORDS[:3], *short, f"output={full}"]) == 0
+    assert np.array_equal(positions(by_plan), positions(full))
+    found = json.loads((by_plan / "summary.json").read_text())["plan"]
+    assert found["frames_by_full_model"] == [1, 2, 3, 4]
+    assert found["price_max"] > 1e-30
+
+    written.write_text(json.dumps(plan | {"chosen": chosen, "watch": {"limit": 1e9, "ratio": 1.0, "hold": 3}}))
+    assert main(["rollout", f"plan={written}", *short, f"output={tmp_path / 'lean'}"]) == 0
+    assert "plan: what was left out was worth" in capsys.readouterr().out
+    assert json.loads((tmp_path / "lean" / "summary.json").read_text())["plan"]["frames_by_full_model"] == []
+
+
 @pytest.mark.parametrize(
     ("content", "said"),
     [
@@ -99,6 +119,7 @@ def test_python_takes_a_plan_too(written: Path) -> None:
         ('{"format": "hood-plan/1", "words": "garment=dress", "chosen": []}', "must be lists"),
         ('{"format": "hood-plan/1", "words": ["plan=other.json"], "chosen": []}', "names another plan"),
         ('{"format": "hood-plan/1", "words": ["material._target_=os.system"], "chosen": []}', "os.system"),
+        ('{"format": "hood-plan/1", "words": [], "chosen": [], "watch": {"limit": -1}}', "'watch' must hold"),
         (None, "no such file"),
     ],
 )

@@ -58,6 +58,13 @@ def test_of_rivals_the_one_that_saves_most_is_left_out() -> None:
     assert "'b' saves more" in found.verdicts["a"].reason
 
 
+def test_what_nothing_watches_stays() -> None:
+    effects = {"": FULL, "a": effect(1e-4, 9.0), "b": effect(1e-3, 6.0)}
+    found = decide(effects, {}, [], Tolerance(0.01, "gamma"), lambda names: (FULL, effects["a"]), unwatched={"b"})
+    assert found.left_out == ("a",)
+    assert "would not notice" in found.verdicts["b"].reason
+
+
 def test_what_breaks_is_needed_and_lengths_are_judged_by_the_worst_window() -> None:
     effects = {
         "": FULL,
