@@ -15,7 +15,7 @@ import torch
 from omegaconf import DictConfig
 
 from hood.assets.occupied import occupy
-from hood.config import ConfigError, plain, read_record, require_choice
+from hood.config import ConfigError, load_config, plain, read_record, require_choice
 from hood.dynamics.checkpoint import load_simulator
 from hood.dynamics.reference import SUFFIXES, load_reference_checkpoint
 from hood.dynamics.simulator import Simulator
@@ -44,6 +44,21 @@ def together(command: Callable[[], int]) -> int:
         return 2
     finally:
         distributed.stop()
+
+
+def split_words(command: str, arguments: Sequence[str]) -> tuple[list[str], DictConfig]:
+    """Files of a command that takes files, in their order, and its config: a word of the form ``key=value`` is an override,
+    every other word a file.
+
+    Raises:
+        ConfigError: a word begins like an option, or a key or value is unknown.
+    """
+    overrides = [word for word in arguments if "=" in word and not Path(word).exists()]
+    given = [word for word in arguments if word not in overrides]
+    strange = next((word for word in given if word.startswith("-")), None)
+    if strange is not None:
+        raise ConfigError(f"unknown option {strange!r}; write key=value, see hood {command} --help")
+    return given, load_config(command, overrides)
 
 
 def output_folder(config: DictConfig) -> Path:

@@ -15,8 +15,8 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from hood.assets.atomic import write_atomically
-from hood.commands.common import held_folder, output_folder, require_package, thinning
-from hood.config import ConfigError, load_config, require_choice
+from hood.commands.common import held_folder, output_folder, require_package, split_words, thinning
+from hood.config import ConfigError, require_choice
 from hood.dynamics.recorder import RolloutData, read_rollout
 
 COLOURS = ("strain", "rg", "fabric")
@@ -61,12 +61,7 @@ def run(arguments: Sequence[str]) -> int:
 
 def _split(arguments: Sequence[str]) -> tuple[list[Path], DictConfig]:
     """Files in their order and the config: a word of the form ``key=value`` is an override, every other word a file."""
-    overrides = [word for word in arguments if "=" in word and not Path(word).exists()]
-    given = [word for word in arguments if word not in overrides]
-    strange = next((word for word in given if word.startswith("-")), None)
-    if strange is not None:
-        raise ConfigError(f"unknown option {strange!r}; write key=value, see hood compare --help")
-    config = load_config("compare", overrides)
+    given, config = split_words("compare", arguments)
     files = [str(config[key]) for key in ("a", "b") if config[key] is not None] + given
     if len(files) < 2:
         raise ConfigError(f"{len(files)} rollouts are given, two or more are compared: hood compare A.h5 B.h5")

@@ -68,6 +68,8 @@ def describe(name: str) -> str:
         text = f"  {key}={_show(value)}"
         text = f"{text:<34}" if len(text) < 34 else text + "  "
         lines.append(textwrap.fill(text + comments.get(str(key), ""), 118, subsequent_indent=" " * 34))
+    if name == "plan":
+        lines += ["", "The scene and the full model are said by the keys of hood rollout: garment, sequence, stepper, fps, …"]
     groups = _groups_of(name)
     if groups:
         lines += ["", "config groups (their keys can be overridden too, e.g. material.density=0.3):"]

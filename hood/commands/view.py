@@ -9,9 +9,9 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from hood.assets.atomic import write_atomically
-from hood.commands.common import output_folder
+from hood.commands.common import output_folder, split_words
 from hood.commands.compare import names_of, read_checked
-from hood.config import ConfigError, load_config
+from hood.config import ConfigError
 from hood.dynamics.recorder import RolloutData
 
 #: More would be too narrow to see anything.
@@ -41,15 +41,11 @@ def run(arguments: Sequence[str]) -> int:
 
 def _split(arguments: Sequence[str]) -> tuple[list[Path], DictConfig]:
     """Files in their order and the config: a word of the form ``key=value`` is an override, every other word a file."""
-    overrides = [word for word in arguments if "=" in word and not Path(word).exists()]
-    given = [word for word in arguments if word not in overrides]
-    strange = next((word for word in given if word.startswith("-")), None)
-    if strange is not None:
-        raise ConfigError(f"unknown option {strange!r}; write key=value, see hood view --help")
+    given, config = split_words("view", arguments)
     if not 1 <= len(given) <= _MOST:
         raise ConfigError(f"{len(given)} rollouts are given, one to {_MOST} can be shown: hood view rollout.h5")
     paths = [Path(name).expanduser() for name in given]
-    return [path / "rollout.h5" if path.is_dir() else path for path in paths], load_config("view", overrides)
+    return [path / "rollout.h5" if path.is_dir() else path for path in paths], config
 
 
 def _first_frames(data: RolloutData, count: int | None) -> RolloutData:

@@ -14,7 +14,8 @@ from hood.dynamics.frames import Relaxing
 from hood.dynamics.simulator import Prediction
 from hood.dynamics.stepper import Stepper
 from hood.dynamics.stopwatch import Stopwatch, timed
-from hood.losses.layers import for_networks
+from hood.losses.elements import energies_and_gradient
+from hood.losses.layers import LayerBarrier, for_networks
 from hood.losses.potential import Potential, scale
 from hood.losses.problem import StepProblem
 from hood.scene.scene import Scene
@@ -36,7 +37,17 @@ def force_bound(potential: Potential, names: Sequence[str], problem: StepProblem
     terms = {name: term for name, term in potential.active(problem).items() if name in names}
     if not terms:
         return 0.0
-    gradient, _ = potential.only(terms).gradient(problem, pos)
+    others = {name: term for name, term in terms.items() if type(term) is not LayerBarrier}
+    gradient, _ = energies_and_gradient(potential.only(others), problem, pos)
+    if len(others) < len(terms):  # written out, where autograd takes as long as the step
+        gradient = gradient.double().clone()
+        for scene in problem.layers:
+            here = scene.of(pos)
+            if scene.layers.energy(here) == 0.0:
+                scene.layers.remember_apart(here)
+                continue
+            pushed, _, _, _ = scene.layers.model(here)
+            gradient[scene.first : scene.first + len(pushed)] += torch.from_numpy(pushed).to(gradient)
     movable = problem.cloth.free & (problem.cloth.mass > 0)
     square = (gradient**2).sum(dim=1)[movable] / problem.cloth.mass[movable]
     lowered = 0.5 * float(problem.step.dt.max()) ** 2 * float(square.sum())

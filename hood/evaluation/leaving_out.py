@@ -30,8 +30,8 @@ from hood.solver.newton import minimize
 
 #: Frames of the full model before a window's first state: the start is at rest on a still body.
 LEAD = 2
-#: More than this is not made of a few windows.
-MOST_OVERSTATED = 10.0
+#: What a few windows said is halved, and more than this is not made of it.
+MOST_OVERSTATED = 100.0
 #: Positions differ by the 95th percentile of this over the vertices: one vertex that flips says little.
 _QUANTILE = 0.95
 
@@ -160,14 +160,14 @@ def active_terms(full: Variant, begun: Sequence[Begun]) -> set[str]:
 
 
 def overstatement(full: Variant, lean: Variant, begun: Sequence[Begun], gammas: Sequence[float]) -> float:
-    """How much :func:`hood.dynamics.watched.force_bound` of the energies that ``lean`` lacks overstates its γ: the least of the
-    windows, between 1 and :data:`MOST_OVERSTATED`."""
-    found, names = [MOST_OVERSTATED], lacking(lean.potential, full.potential)
+    """How much :func:`hood.dynamics.watched.force_bound` of the energies that ``lean`` lacks overstates its γ: half of the
+    least of the windows, between 1 and :data:`MOST_OVERSTATED`."""
+    found, names = [2.0 * MOST_OVERSTATED], lacking(lean.potential, full.potential)
     for one, gamma in zip(begun, gammas, strict=True):
         pos, _ = march(lean, one, 1, Effect())
         if gamma > 1e-6:
             found.append(force_bound(full.potential, names, one.step, pos) / gamma)
-    return max(1.0, min(found)) if len(found) > 1 else 1.0
+    return max(1.0, min(found) / 2.0) if len(found) > 1 else 1.0
 
 
 def prices(full: Variant, begun: Sequence[Begun]) -> dict[str, float]:

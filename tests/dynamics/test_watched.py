@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from layer_scenes import sheets_on_sphere
 
 from hood.dynamics.rollout import simulate
 from hood.dynamics.stepper import NewtonStepper
@@ -14,7 +15,8 @@ from hood.dynamics.watched import PLAN_METRICS, WatchedStepper, force_bound, lac
 from hood.evaluation.gap import gap
 from hood.evaluation.leaving_out import Effect, Variant, begin, march
 from hood.evaluation.windows import Window
-from hood.losses.potential import Potential, default_potential
+from hood.losses.layers import LayerBarrier
+from hood.losses.potential import Potential, default_potential, scale
 from hood.scene.scene import Scene
 from hood.solver.newton import NewtonSettings
 
@@ -51,6 +53,20 @@ def test_a_lone_force_is_worth_what_inertia_gives_it(tank_scene: Scene) -> None:
     (one,) = begin(full, [Window(0, "the start")], "paper", lead=0)
     assert force_bound(FULL, ["gravity"], one.step, one.state.pos) == pytest.approx(1.0, rel=1e-5)
     assert force_bound(FULL, ["attachment"], one.step, one.state.pos) == 0.0
+
+
+def test_layers_are_priced_by_their_own_gradient() -> None:
+    potential = FULL.with_terms(layers=LayerBarrier())
+    problem = potential.prepare(sheets_on_sphere(1 / 30, gap=1e-3))
+    pos = problem.state.pos
+    gradient, _ = potential.only({"layers": potential.terms["layers"]}).gradient(problem, pos)
+    square = float(((gradient**2).sum(dim=1) / problem.cloth.mass).sum())
+    expected = 0.5 * float(problem.step.dt) ** 2 * square / float(scale(problem))
+    assert expected > 0.0
+    assert force_bound(potential, ["layers"], problem, pos) == pytest.approx(expected, rel=1e-4)
+    assert force_bound(potential, ["layers", "gravity"], problem, pos) != force_bound(potential, ["layers"], problem, pos)
+    apart = potential.prepare(sheets_on_sphere(1 / 30, gap=0.05))
+    assert force_bound(potential, ["layers"], apart, apart.state.pos) == 0.0
 
 
 def test_below_the_limit_the_rollout_is_the_lean_one(tank_scene: Scene) -> None:
