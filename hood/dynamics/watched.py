@@ -23,6 +23,9 @@ from hood.scene.scene import Scene
 #: Metrics of a watched rollout: the price of what is left out, as γ; and 1 where the full model took the step.
 PLAN_METRICS = ("plan_price", "plan_full")
 
+#: Steps after which the lean model is tried again at the latest.
+LONGEST = 240
+
 
 def force_bound(potential: Potential, names: Sequence[str], problem: StepProblem, pos: Tensor) -> float:
     """The most that γ can fall if some energies of ``potential`` were followed from ``pos`` (V, 3) [m].
@@ -63,7 +66,8 @@ class WatchedStepper:
     """Steps of ``lean``; each is priced, and taken by ``full`` where the price is above the limit, as are those after it.
 
     The price of a step is :func:`force_bound` of the energies that ``lean`` lacks, divided by ``ratio``. Energies are not
-    forgotten for good: after ``hold`` steps of the full model ``lean`` is tried again.
+    forgotten for good: after ``hold`` steps of the full model ``lean`` is tried again. Where that fails at once, it is tried
+    again after twice as many, :data:`LONGEST` at most.
 
     Args:
         lean, full: take the steps.
@@ -88,7 +92,7 @@ class WatchedStepper:
         self._limit, self._ratio, self._hold = limit, ratio, hold
         self._potential = potentials[1]
         self._lacking = lacking(*potentials)
-        self._remaining = 0
+        self._remaining = self._failed = 0  # steps that the full model still takes; times in a row that the lean one failed
         self.gravity = lean.gravity
         self.times = lean.times
         self.metrics = (*lean.metrics, *(name for name in full.metrics if name not in lean.metrics), *PLAN_METRICS)
@@ -107,7 +111,7 @@ class WatchedStepper:
         """What both need of the scene's garment."""
         from hood.dynamics.rollout import prepare_stepper
 
-        self._remaining = 0
+        self._remaining = self._failed = 0
         return prepare_stepper(self._lean, self._scene), prepare_stepper(self._full, self._scene)
 
     def search(self, problem: StepProblem) -> StepProblem:
@@ -122,8 +126,10 @@ class WatchedStepper:
             with timed(watch, "rest"):
                 price = self.price(problem, prediction.next_pos)
             if price <= self._limit:
+                self._failed = 0
                 return self._told(prediction, price, full=False)
-            self._remaining = self._hold
+            self._remaining = min(self._hold * 2**self._failed, LONGEST)
+            self._failed += 1
         self._remaining -= 1
         fresh = StepProblem(problem.cloth, problem.state, problem.step, gravity=problem.gravity)
         with timed(watch, "search"):

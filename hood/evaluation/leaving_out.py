@@ -32,6 +32,8 @@ from hood.solver.newton import minimize
 LEAD = 2
 #: What a few windows said is halved, and more than this is not made of it.
 MOST_OVERSTATED = 100.0
+#: A smaller γ is as much of the solver's accuracy as of what is left out.
+_TELLING = 1e-4
 #: Positions differ by the 95th percentile of this over the vertices: one vertex that flips says little.
 _QUANTILE = 0.95
 
@@ -165,7 +167,7 @@ def overstatement(full: Variant, lean: Variant, begun: Sequence[Begun], gammas: 
     found, names = [2.0 * MOST_OVERSTATED], lacking(lean.potential, full.potential)
     for one, gamma in zip(begun, gammas, strict=True):
         pos, _ = march(lean, one, 1, Effect())
-        if gamma > 1e-6:
+        if gamma > _TELLING:
             found.append(force_bound(full.potential, names, one.step, pos) / gamma)
     return max(1.0, min(found) / 2.0) if len(found) > 1 else 1.0
 

@@ -99,6 +99,20 @@ def test_the_part_is_back_within_the_frame_and_goes_again(tank_scene: Scene) -> 
     assert [frame.metrics["plan_full"] for frame in frames[1:]] == [0.0, 1.0, 1.0, 0.0, 0.0, 0.0]
 
 
+def test_a_model_that_fails_at_once_is_tried_less_often(tank_scene: Scene) -> None:
+    stepper = watched(tank_scene, without("bending"), 1e9, hold=1)
+    tried: list[int] = []
+
+    def failing(problem: Any, pos: Any) -> float:
+        tried.append(len(tried))
+        return 1e10
+
+    stepper.price = failing  # type: ignore[method-assign]
+    frames = rolled(stepper, tank_scene, 9)
+    assert [frame.metrics["plan_full"] for frame in frames[1:]] == [1.0] * 8
+    assert len(tried) == 4  # before steps 1, 2, 4 and 8
+
+
 def test_the_ratio_divides_the_price(tank_scene: Scene) -> None:
     one, ten = (rolled(watched(tank_scene, without("bending"), 1e9, ratio), tank_scene, 2)[1] for ratio in (1.0, 10.0))
     assert one.metrics["plan_price"] == pytest.approx(10.0 * ten.metrics["plan_price"], rel=1e-6)
