@@ -162,6 +162,9 @@ def _record(
         rows.append({**row, "decision": verdict.decision, "reason": verdict.reason, "command": command})
     checkpoint = str(ready.config.checkpoint)
     network = network_of(ready.stepper) is not None and checkpoint != "untrained"
+    together = None
+    if decision.together is not None:
+        together = _numbers(decision.together, full) | {"error": tolerance.error(decision.together, full)}
     return {
         "words": words,
         "chosen": chosen,
@@ -170,7 +173,7 @@ def _record(
         "frames": frames,
         "full": _numbers(full, full),
         "rows": rows,
-        "together": None if decision.together is None else _numbers(decision.together, full),
+        "together": together,
         "weights": hashlib.sha256(locate("weights", checkpoint).read_bytes()).hexdigest() if network else None,
     }
 
@@ -216,7 +219,7 @@ def sentence(plan: dict[str, Any]) -> str:
         text = f"Nothing is left out: no part both saves time and stays within {asked}."
     else:
         found = plan["together"]
-        error = f"{_short(found['mm'])} mm" if limit["unit"] == "mm" else f"γ = {_short(found['gamma_p95'])}"
+        error = f"{_short(found['error'])} mm" if limit["unit"] == "mm" else f"γ = {_short(found['error'])} more"
         text = (
             f"Left out: {', '.join(left)}. Together this costs {error} where {asked} was accepted, and saves "
             f"{100 * found['saved']:.0f}% of a frame ({plan['full']['ms']:.1f} ms before)."

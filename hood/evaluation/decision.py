@@ -7,6 +7,8 @@ import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from hood.evaluation.leaving_out import Effect
 
 #: A part that saves a smaller share of a frame's time stays: the time cannot be told from noise.
@@ -35,13 +37,17 @@ class Tolerance:
             raise ValueError(f"accuracy={text}: give a γ above 0 (0.01), or a distance (5mm)")
         return cls(value, "mm" if match.group(2) else "gamma")
 
-    def error(self, effect: Effect) -> float:
-        """What is held against the tolerance."""
-        error = effect.worst_mm if self.unit == "mm" else effect.gamma_at(QUANTILE)
-        return error if math.isfinite(error) else math.inf
+    def error(self, effect: Effect, full: Effect) -> float:
+        """What is held against the tolerance: the distance, or how much more γ is left than by the full model's own steps (those
+        of a network have a γ of their own)."""
+        if self.unit == "mm":
+            return effect.worst_mm if math.isfinite(effect.worst_mm) else math.inf
+        rises = [max(one - own, 0.0) for one, own in zip(effect.gamma, full.gamma, strict=True)]
+        return float(np.quantile(rises, QUANTILE)) if all(map(math.isfinite, rises)) else math.inf
 
     def say(self, value: float) -> str:
-        return f"{value:.2g} mm" if self.unit == "mm" else f"γ = {value:.2g}"
+        """The error in words."""
+        return f"{value:.2g} mm" if self.unit == "mm" else f"γ = {value:.2g} more"
 
 
 @dataclass(frozen=True)
@@ -87,7 +93,7 @@ def decide(
     for name, effect in effects.items():
         if not name or name in absent:
             continue
-        error, saving = tolerance.error(effect), 1.0 - effect.median_ms / full.median_ms
+        error, saving = tolerance.error(effect, full), 1.0 - effect.median_ms / full.median_ms
         if error > tolerance.value:
             verdicts[name] = Verdict("kept", f"without it {tolerance.say(error)}")
         elif saving < LEAST_SAVING:
@@ -105,10 +111,10 @@ def decide(
     together: Effect | None = None
     while passing:
         reference, together = measure_together(tuple(passing))
-        error, saving = tolerance.error(together), 1.0 - together.median_ms / reference.median_ms
+        error, saving = tolerance.error(together, reference), 1.0 - together.median_ms / reference.median_ms
         if error <= tolerance.value and saving >= LEAST_SAVING:
             break
-        worst = max(passing, key=lambda name: tolerance.error(effects[name]))
+        worst = max(passing, key=lambda name: tolerance.error(effects[name], full))
         why = (
             f"with the others left out {tolerance.say(error)}" if error > tolerance.value else "saves nothing beside the others"
         )
@@ -116,6 +122,6 @@ def decide(
         del passing[worst]
         together = None
     for name, saving in passing.items():
-        said = tolerance.say(tolerance.error(effects[name]))
+        said = tolerance.say(tolerance.error(effects[name], full))
         verdicts[name] = Verdict("left out", f"without it {said}, {100 * saving:.0f}% of a frame saved")
     return Decision(verdicts, tuple(passing), together)

@@ -46,7 +46,7 @@ def test_a_combination_that_misses_the_tolerance_loses_its_worst_part() -> None:
     found = decide(effects, {}, [], Tolerance(0.01, "gamma"), together)
     assert asked == [("a", "b"), ("b",)]
     assert found.left_out == ("b",)
-    assert "γ = 0.02" in found.verdicts["a"].reason
+    assert "γ = 0.02 more" in found.verdicts["a"].reason
     assert found.together is not None
     assert found.together.gamma == [0.003, 0.003]
 
@@ -79,3 +79,12 @@ def test_what_breaks_is_needed_and_lengths_are_judged_by_the_worst_window() -> N
     )
     assert by_mm.left_out == ("near",)
     assert by_mm.verdicts["far"].decision == "kept"
+
+
+def test_gamma_is_what_is_lost_beside_the_full_models_own() -> None:
+    """A network's own steps have a gap; a part that changes nothing about it can go."""
+    network = Effect([0.5, 0.1], [0.0], [10.0])
+    effects = {"": network, "idle": Effect([0.5, 0.1], [0.0], [8.0]), "needed": Effect([0.5, 0.2], [0.0], [8.0])}
+    found = decide(effects, {}, [], Tolerance(0.01, "gamma"), lambda names: (network, effects["idle"]))
+    assert found.left_out == ("idle",)
+    assert found.verdicts["needed"].decision == "kept"
