@@ -38,8 +38,10 @@ class Tolerance:
         return cls(value, "mm" if match.group(2) else "gamma")
 
     def error(self, effect: Effect, full: Effect) -> float:
-        """What is held against the tolerance: the distance, or how much more γ is left than by the full model's own steps; those
-        of a network have a γ of their own."""
+        """What is held against the tolerance: the distance, or how much more γ is left than by the full model's own steps.
+
+        Those of a network have a γ of their own.
+        """
         if self.unit == "mm":
             return effect.worst_mm if math.isfinite(effect.worst_mm) else math.inf
         rises = [max(one - own, 0.0) for one, own in zip(effect.gamma, full.gamma, strict=True)]
