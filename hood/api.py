@@ -6,6 +6,7 @@ Every name here is also a name of the package: ``hood.simulate(…)``.
 from __future__ import annotations
 
 import contextlib
+import inspect
 import io
 import json
 import re
@@ -80,10 +81,6 @@ class Simulation:
             raise GuardStopped(f"guard=strict: the simulation ends before frame {guard.stopped.frame}, which cannot be trusted")
 
 
-#: What :func:`simulate` takes where nothing is said.
-_DEFAULTS = {"garment": "dress", "sequence": "walk_proud", "stepper": "network"}
-
-
 def simulate(
     garment: str | Path | list[str] | Garment = "dress",
     sequence: str | Path = "walk_proud",
@@ -129,7 +126,8 @@ def simulate(
     if named.get("plan") is not None:  # then what is not said is the plan's
         if isinstance(garment, Garment) or isinstance(material, Material) or not isinstance(stepper, str):
             raise ConfigError(f"plan={named['plan']}: names garment, material and stepper itself; leave them out")
-        named = {key: value for key, value in named.items() if _DEFAULTS.get(key) != value}
+        usual = {key: parameter.default for key, parameter in inspect.signature(simulate).parameters.items()}
+        named = {key: value for key, value in named.items() if usual.get(key) != value}
     config = rollout_config(overrides(named))
     check_config(config)
     notes: list[str] = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import shlex
 import time
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -23,6 +24,7 @@ from hood.dynamics.watched import lacking
 from hood.evaluation.decision import QUANTILE, Decision, Tolerance, decide
 from hood.evaluation.leaving_out import LEAD, Begun, Effect, Variant, active_terms, begin, measure, overstatement, prices
 from hood.evaluation.windows import Window, choose_windows
+from hood.losses.layers import for_networks
 
 #: With ``accuracy=5mm``, γ may be so many times that of the windows, and this at least, before left-out energies come back.
 _TIMES_PROBED, _LEAST_LIMIT = 3.0, 1e-3
@@ -83,7 +85,7 @@ def _variant(words: Sequence[str], ready: Setup) -> Variant:
     stepper = refined(make_stepper(config)[0], config, ready.scene.cloth.num_vertices, potential_of(config))
     network = network_of(stepper)
     if network is not None:
-        network.use_potential(potential_of(config))
+        network.use_potential(for_networks(potential_of(config)))
     return Variant(stepper, potential_of(config), ready.scene)
 
 
@@ -158,7 +160,7 @@ def _record(
         verdict = decision.verdicts[part.name]
         row = {"part": part.name, "purpose": part.purpose, "words": list(part.words), "force": price.get(part.term)}
         row |= _numbers(effects[part.name], full) if part.name in effects else {}
-        command = " ".join(["hood plan", *words, f"'parts=[{part.name}]'", f"frames={frames}", f"windows={len(begun)}"])
+        command = shlex.join(["hood", "plan", *words, f"parts=[{part.name}]", f"frames={frames}", f"windows={len(begun)}"])
         rows.append({**row, "decision": verdict.decision, "reason": verdict.reason, "command": command})
     checkpoint = str(ready.config.checkpoint)
     network = network_of(ready.stepper) is not None and checkpoint != "untrained"
@@ -172,6 +174,7 @@ def _record(
         "windows": [{"first": one.window.first, "measured_from": one.frame, "reason": one.window.reason} for one in begun],
         "frames": frames,
         "full": _numbers(full, full),
+        "windows_without_minimum": full.exact.count(False),
         "rows": rows,
         "together": together,
         "weights": hashlib.sha256(locate("weights", checkpoint).read_bytes()).hexdigest() if network else None,
@@ -206,6 +209,9 @@ def describe(plan: dict[str, Any]) -> str:
             numbers = f"{'-':>11}{'-':>10}{'-':>9}{'-':>8}"
         force = "-" if row["force"] is None else _short(row["force"])
         lines.append(f"{row['part']:<20}{force:>13}{numbers}  {row['decision']}: {row['reason']}")
+    missed = plan["windows_without_minimum"]
+    if missed:
+        lines.append(f"γ is a lower bound in {missed} of {len(plan['windows'])} windows: the exact step was not reached there")
     return "\n".join([*lines, "", sentence(plan)])
 
 

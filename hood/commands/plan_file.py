@@ -21,9 +21,9 @@ from hood.dynamics.watched import PLAN_METRICS
 
 FORMAT = "hood-plan/1"
 _LIMIT = 1 << 20
-#: Keys that change nothing about the steps, so they may be given beside a plan.
+#: Keys that say nothing about the model, so they may be given beside a plan.
 _FREE = (
-    "output", "num_frames", "guard", "seed", "allow_unsound", "resume", "metrics", "surface_stride", "export", "colour",
+    "output", "num_frames", "guard", "allow_unsound", "resume", "metrics", "surface_stride", "export", "colour",
     "thin_body", "video", "video_stride", "sheet",
 )  # fmt: skip
 

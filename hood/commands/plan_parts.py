@@ -90,7 +90,7 @@ _TERMS: tuple[tuple[Part, Callable[[DictConfig], bool]], ...] = (
         _folds,
     ),
     (Part("cloth contact", "layers of cloth stay apart", ("cloth_contact=off",), "layers"), acts),
-    (Part("gravity", "weight", ("gravity=0",), "gravity"), lambda config: float(config.gravity) > 0.0),
+    (Part("gravity", "weight", ("gravity=0",), "gravity", watched=False), lambda config: float(config.gravity) > 0.0),
 )  # fmt: skip
 _ACCURACY: tuple[tuple[Part, Callable[[DictConfig], bool]], ...] = (
     (Part("last iterations", "forces balanced to 3%", ("solver.target_rg=0.03",), rivals="target"), _target(0.03)),

@@ -85,8 +85,8 @@ class WatchedStepper:
         potentials: tuple[Potential, Potential],
         scene: Scene,
         limit: float,
-        ratio: float = 1.0,
-        hold: int = 15,
+        ratio: float,
+        hold: int,
     ) -> None:
         self._lean, self._full, self._scene = lean, full, scene
         self._limit, self._ratio, self._hold = limit, ratio, hold

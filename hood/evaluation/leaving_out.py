@@ -54,6 +54,7 @@ class Effect:
     gamma: list[float] = field(default_factory=list)
     mm: list[float] = field(default_factory=list)
     ms: list[float] = field(default_factory=list)  # of every frame
+    exact: list[bool] = field(default_factory=list)  # the window's minimum was reached; where not, γ is a lower bound
 
     def gamma_at(self, share: float) -> float:
         """Quantile of γ over the windows."""
@@ -79,15 +80,6 @@ class Begun:
     state: State
     step: StepProblem  # prepared by the full potential
     solved: Tensor  # (V, 3) m, where the full model's step from there leads, in the state's frame
-
-
-@dataclass
-class Minimum:
-    """The lowest full potential known of a window's first step [J], and whether the solver reached its accuracy."""
-
-    phi: float
-    e0: float
-    converged: bool
 
 
 def begin(full: Variant, windows: Sequence[Window], settle: str, lead: int = LEAD) -> list[Begun]:
@@ -148,9 +140,11 @@ def measure(full: Variant, variants: dict[str, Variant], begun: Sequence[Begun],
         lasts: dict[str, Tensor] = {}
         for name, variant in everything.items():
             firsts[name], lasts[name] = march(variant, one, num_frames, effects[name])
-        lowest = _minimum(full.potential, one, list(firsts.values()))
-        for name, effect in effects.items():
-            effect.gamma.append((_phi(full.potential, one, firsts[name]) - lowest.phi) / lowest.e0)
+        e0, values = float(scale(in_double(one.step)).sum()), [_phi(full.potential, one, pos) for pos in firsts.values()]
+        lowest, exact = _minimum(full.potential, one, list(firsts.values()), values)
+        for phi, (name, effect) in zip(values, effects.items(), strict=True):
+            effect.gamma.append((phi - lowest) / e0)
+            effect.exact.append(exact)
             apart = (lasts[name] - lasts[""]).norm(dim=1)
             effect.mm.append(1e3 * float(apart.quantile(_QUANTILE)) if bool(torch.isfinite(apart).all()) else float("inf"))
     return effects
@@ -184,15 +178,13 @@ def prices(full: Variant, begun: Sequence[Begun]) -> dict[str, float]:
 
 
 def _phi(potential: Potential, one: Begun, pos: Tensor) -> float:
-    value = float(potential.total(in_double(one.step), pos.detach().double().cpu()).sum())
+    value = float(potential.total(in_double(one.step), pos.detach().double()).sum())
     return value if np.isfinite(value) else float("inf")
 
 
-def _minimum(potential: Potential, one: Begun, known: Sequence[Tensor]) -> Minimum:
-    """The lowest of a tight minimisation from the best position known and of all these positions."""
-    problem = in_double(one.step)
-    values = [_phi(potential, one, pos) for pos in known]
+def _minimum(potential: Potential, one: Begun, known: Sequence[Tensor], values: Sequence[float]) -> tuple[float, bool]:
+    """The lowest potential [J] of a tight minimisation from the best of ``known`` positions (V, 3) [m] and of their own
+    ``values`` [J]; whether the minimisation reached its accuracy."""
     best = known[int(np.argmin(values))].detach().double()
-    _, report = minimize(potential, problem, best, REFERENCE)
-    phi = min(float(report.phi.sum()), *values)
-    return Minimum(phi, float(scale(problem).sum()), bool(report.converged.all()))
+    _, report = minimize(potential, in_double(one.step), best, REFERENCE)
+    return min(float(report.phi.sum()), *values), bool(report.converged.all())

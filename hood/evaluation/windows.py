@@ -14,7 +14,7 @@ _MOST_POSES, _VERTEX_STRIDE = 60, 16
 
 @dataclass(frozen=True)
 class Window:
-    """Frames ``first`` to ``first + count`` of a motion, and why they were taken."""
+    """A stretch of a motion that begins at frame ``first``, and why it was taken."""
 
     first: int
     reason: str

@@ -125,7 +125,7 @@ def test_what_is_not_finite_is_taken_by_the_full_model(tank_scene: Scene) -> Non
             return replace(found, next_pos=found.next_pos * float("nan"))
 
     lean = without("bending")
-    stepper = WatchedStepper(Broken(lean, TIGHT), NewtonStepper(FULL, TIGHT), (lean, FULL), tank_scene, 0.01)
+    stepper = WatchedStepper(Broken(lean, TIGHT), NewtonStepper(FULL, TIGHT), (lean, FULL), tank_scene, 0.01, 1.0, 2)
     frames = rolled(stepper, tank_scene, 3)
     assert all(bool(torch.isfinite(frame.world_pos).all()) for frame in frames)
     assert frames[-1].metrics["plan_full"] == 1.0
