@@ -29,6 +29,7 @@ COMMANDS = {
     "plan": "measure which parts of the model a scene needs, and what each costs",
     "compare": "show rollouts of one motion next to each other, coloured by strain or rg",
     "view": "write rollouts as one HTML page to turn and play in a browser",
+    "export": "write a rollout for other programs: USD, glTF, PC2, OBJ, PLY",
     "inspect": "say what files are, what is wrong with them and how to repair it",
     "prepare": "repair a garment, bind it to a body and write it for rollouts",
     "convert": "write published HOOD weights (.pth) as a model file",

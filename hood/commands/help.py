@@ -31,6 +31,11 @@ _EXAMPLES = {
         "hood view outputs/dress/rollout.h5 output=dress.html",
         "hood view outputs/network outputs/solver output=both.html",
     ],
+    "export": [
+        "hood export outputs/dress/rollout.h5 format=usd",
+        "hood export outputs/dress format=pc2 up=z output=for_blender",
+        "hood export outputs/dress format=glb parts=[cloth] num_frames=120 output=dress.glb",
+    ],
     "inspect": [
         "hood inspect my_shirt.obj",
         "hood inspect my_shirt.obj CMU_01_poses.npz --json",
@@ -60,7 +65,7 @@ def describe(name: str) -> str:
     """Help text of the command ``name``."""
     config = load_config(name)
     comments = _comments(name)
-    lines = [f"usage: hood {name} {'FILE ... ' if name in ('inspect', 'compare', 'view') else ''}[key=value ...]", ""]
+    lines = [f"usage: hood {name} {'FILE ... ' if name in ('inspect', 'compare', 'view', 'export') else ''}[key=value ...]", ""]
     for key in config:
         value = plain(config[key])
         if isinstance(value, dict):

@@ -35,7 +35,7 @@ from hood.commands.summary import describe, describe_all, summarise
 from hood.commands.verdict import exit_code
 from hood.config import plain, save_run_record
 from hood.dynamics.captured import network_of
-from hood.dynamics.recorder import RolloutWriter, read_rollout
+from hood.dynamics.recorder import RolloutWriter, read_rollout, still_of
 from hood.dynamics.rollout import metric_names, simulate
 from hood.dynamics.stepper import Stepper
 from hood.training import distributed
@@ -198,6 +198,7 @@ def _simulate_to_disk(ready: Setup, digest: str, path: Path, asked: DictConfig) 
         fields=exported(config),
         double=solves_in_double(config),
         guarded=guard is not None,
+        still=still_of(scene.garment),
     )
     frames = simulate(
         stepper,

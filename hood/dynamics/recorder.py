@@ -15,6 +15,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from hood.assets.garment import Garment
 from hood.assets.h5_links import own_dataset, own_group
 
 #: World coordinates beyond this [m] are written in float64: float32 resolves only 8 µm there.
@@ -31,13 +32,25 @@ ALARM_COLUMNS = {
     "rg_after": np.dtype(np.float64),
 }
 _ALARMS = 2
+#: What a file may hold of the cloth beside its mesh, the same in all frames, with the types in the file.
+STILL = {"uv": np.float32, "uv_faces": np.int32, "piece": np.int32}
+
+
+def still_of(garment: Garment) -> dict[str, np.ndarray]:
+    """What a file holds of the garment beside its mesh, by the names of :data:`STILL`."""
+    found = {} if garment.piece is None else {"piece": garment.piece}
+    if garment.uv is None:
+        return found
+    return {**found, "uv": garment.uv, "uv_faces": garment.faces if garment.uv_faces is None else garment.uv_faces}
 
 
 class RolloutWriter:
     """Streams a rollout into an HDF5 file.
 
     Datasets: ``cloth/pos (T,V,3)``, ``cloth/faces``, ``cloth/rest_pos``, ``body/pos (T,W,3)``, ``body/faces``, ``time (T,)``,
-    ``metrics/* (T,)``, and of every vertex ``cloth/NAME (T,V)`` for each name in ``fields``; attributes: ``num_frames`` done
+    ``metrics/* (T,)``, of every vertex ``cloth/NAME (T,V)`` for each name in ``fields``, and those of :data:`STILL` that are
+    given: texture coordinates ``cloth/uv (U,2)`` with ``cloth/uv_faces (F,3)``, and which garment of an outfit a vertex
+    belongs to, ``cloth/piece (V,)``; attributes: ``num_frames`` done
     so far of ``num_planned``, ``complete``, and what is given as ``attributes``. Real numbers are float32, positions far from
     the origin float64; with ``double`` the cloth's are float64 anyway, for states that meet an accuracy which float32 does
     not resolve.
@@ -70,6 +83,7 @@ class RolloutWriter:
         fields: Sequence[str] = (),
         double: bool = False,
         guarded: bool = False,
+        still: Mapping[str, np.ndarray] | None = None,
     ) -> None:
         self.path = path
         self.frames_done = self.alarms_done = 0
@@ -93,6 +107,8 @@ class RolloutWriter:
             self._file["cloth/faces"] = np.asarray(cloth_faces, dtype=np.int32)
             self._file["cloth/rest_pos"] = np.asarray(cloth_rest_pos, dtype=np.float64 if double else np.float32)
             self._file["body/faces"] = np.asarray(body_faces, dtype=np.int32)
+            for name, values in (still or {}).items():
+                self._file.create_dataset(f"cloth/{name}", data=np.asarray(values, dtype=STILL[name]))
             self._file["time"] = np.arange(num_frames) * dt
             own = {"dt": dt, "num_frames": 0, "num_planned": num_frames, "complete": False}
             if guarded:
@@ -205,6 +221,7 @@ class RolloutData:
     attributes: dict[str, Any]
     fields: dict[str, np.ndarray] = field(default_factory=dict)  # (T, V) by name, such as rg
     alarms: list[dict[str, Any]] = field(default_factory=list)  # of a guard, with the names of ALARM_COLUMNS
+    still: dict[str, np.ndarray] = field(default_factory=dict)  # of the cloth, by the names of STILL
 
 
 def read_rollout(path: Path | str) -> RolloutData:
@@ -231,6 +248,7 @@ def read_rollout(path: Path | str) -> RolloutData:
                 attributes=dict(file.attrs),
                 fields={name.removeprefix("cloth/"): file[name][:done] for name in _field_paths(file)},
                 alarms=_read_alarms(file),
+                still={name.removeprefix("cloth/"): file[name][:] for name in _still_paths(file)},
             )
     except FileNotFoundError:
         raise
@@ -257,7 +275,7 @@ def _is_there(file: h5py.File, index: int) -> bool:
 def _check_extents(file: h5py.File, num_bytes: int) -> None:
     """Rollouts are stored as they are: a table that claims more than the file holds would be read as empty memory."""
     names = ("cloth/pos", "cloth/faces", "cloth/rest_pos", "body/pos", "body/faces", "time")
-    for name in (*names, *_field_paths(file), *_metric_paths(file), *_alarm_paths(file)):
+    for name in (*names, *_field_paths(file), *_metric_paths(file), *_alarm_paths(file), *_still_paths(file)):
         table = own_dataset(file, name)
         if not table.shape or table.size * table.dtype.itemsize > num_bytes:
             raise ValueError(f"{name} claims the shape {table.shape}, the file has {num_bytes} bytes")
@@ -265,13 +283,18 @@ def _check_extents(file: h5py.File, num_bytes: int) -> None:
 
 def _field_paths(file: h5py.File) -> list[str]:
     """Values of every vertex in every frame: tables beside the positions, two axes long."""
-    known = ("pos", "faces", "rest_pos")
+    known = ("pos", "faces", "rest_pos", *STILL)
     beside = [f"cloth/{name}" for name in own_group(file, "cloth") or () if name not in known]
     return [name for name in beside if own_dataset(file, name).ndim == 2]
 
 
 def _metric_paths(file: h5py.File) -> list[str]:
     return [f"metrics/{name}" for name in own_group(file, "metrics") or ()]
+
+
+def _still_paths(file: h5py.File) -> list[str]:
+    known = own_group(file, "cloth") or ()
+    return [f"cloth/{name}" for name in STILL if name in known]
 
 
 def _alarm_paths(file: h5py.File) -> list[str]:
@@ -321,7 +344,7 @@ def _truncate(path: Path, num_frames: int) -> None:
             for key, value in source.attrs.items():
                 target.attrs[key] = value
             per_frame = {"cloth/pos", "body/pos", "time", *_field_paths(source), *_metric_paths(source)}
-            for name in ("cloth/faces", "cloth/rest_pos", "body/faces"):
+            for name in ("cloth/faces", "cloth/rest_pos", "body/faces", *_still_paths(source)):
                 target[name] = source[name][:]
             for name in per_frame:
                 target[name] = source[name][:num_frames]

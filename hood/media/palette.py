@@ -25,3 +25,10 @@ def outfit_colours(name: str, faces: np.ndarray, num_vertices: int) -> ArrayLike
     order = {int(label): rank for rank, label in enumerate(dict.fromkeys(part[np.unique(faces)].tolist()))}
     colours = np.array([GARMENT_COLOR, *_OTHERS])
     return colours[[order.get(int(label), 0) % len(colours) for label in part]]
+
+
+def part_colour(rank: int) -> tuple[float, float, float]:
+    """Colour of garment number ``rank`` of an outfit, the same as in pictures."""
+    colours = (GARMENT_COLOR, *_OTHERS)
+    red, green, blue = (float(channel) for channel in colours[rank % len(colours)])
+    return red, green, blue

@@ -1,0 +1,132 @@
+"""glTF 2.0 in one binary file: every frame a morph target, and an animation that goes from one to the next."""
+
+from __future__ import annotations
+
+import json
+import struct
+from typing import Any
+
+import numpy as np
+
+from hood.media.exports.clip import Clip, Part
+
+#: Larger files [bytes] are refused: browsers and game engines keep all morph targets in memory.
+LARGEST = 256 * 2**20
+
+_FLOAT, _UNSIGNED = 5126, 5125
+
+
+class TooLarge(ValueError):
+    """A clip that glTF is not made for."""
+
+
+def estimated_size(clip: Clip) -> int:
+    """Bytes of the file, about."""
+    weights = 4 * clip.num_frames**2 * len(clip.parts)
+    return weights + sum(24 * clip.num_frames * len(_corners(part)[0]) for part in clip.parts)
+
+
+def gltf_bytes(clip: Clip) -> bytes:
+    """The file. Axes, units and origin: y up, metres; the origin is the translation of the nodes.
+
+    Raises:
+        TooLarge: above :data:`LARGEST`.
+    """
+    size = estimated_size(clip)
+    if size > LARGEST:
+        raise TooLarge(
+            f"as glb it would have {size / 2**20:.0f} MiB, more than the {LARGEST // 2**20} that programs open with ease; "
+            "give num_frames=, parts=[cloth], or format=usd"
+        )
+    file = _Buffers()
+    times = file.add(np.arange(clip.num_frames, dtype=np.float32) / np.float32(clip.fps), "SCALAR", bounds=True)
+    # One target a frame; between two frames the weights, and so the positions, go straight from one to the other.
+    weights = np.eye(clip.num_frames, dtype=np.float32)[:, 1:].reshape(-1)
+    shares = file.add(weights, "SCALAR") if clip.num_frames > 1 else None
+    nodes, meshes, materials, samplers, channels = [], [], [], list[dict[str, Any]](), list[dict[str, Any]]()
+    for index, part in enumerate(clip.parts):
+        meshes.append(_mesh(file, part, index))
+        linear = [*(float(channel) ** 2.2 for channel in part.colour), 1.0]
+        surface = {"baseColorFactor": linear, "metallicFactor": 0.0, "roughnessFactor": 0.9}
+        materials.append({"name": part.name, "pbrMetallicRoughness": surface, "doubleSided": part.name != "body"})
+        nodes.append({"name": part.name, "mesh": index, "translation": [float(value) for value in clip.origin]})
+        if shares is not None:
+            samplers.append({"input": times, "output": shares, "interpolation": "LINEAR"})
+            channels.append({"sampler": index, "target": {"node": index, "path": "weights"}})
+    document: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": "hood"},
+        "scene": 0,
+        "scenes": [{"nodes": list(range(len(nodes)))}],
+        "nodes": nodes,
+        "meshes": meshes,
+        "materials": materials,
+        "accessors": file.accessors,
+        "bufferViews": file.views,
+        "buffers": [{"byteLength": file.length}],
+    }
+    if channels:
+        document["animations"] = [{"name": "rollout", "samplers": samplers, "channels": channels}]
+    return _packed(json.dumps(document).encode(), b"".join(file.chunks))
+
+
+def _mesh(file: _Buffers, part: Part, material: int) -> dict[str, Any]:
+    corners, faces, uv = _corners(part)
+    base, normals = part.pos[0][corners].astype(np.float32), part.normals(0)[corners].astype(np.float32)
+    attributes = {"POSITION": file.add(base, "VEC3", bounds=True), "NORMAL": file.add(normals, "VEC3")}
+    if uv is not None:
+        turned = np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1)  # an image begins at its top here
+        attributes["TEXCOORD_0"] = file.add(turned.astype(np.float32), "VEC2")
+    targets = []
+    for frame in range(1, len(part.pos)):
+        moved = (part.pos[frame][corners] - base).astype(np.float32)
+        turn = part.normals(frame)[corners].astype(np.float32) - normals
+        targets.append({"POSITION": file.add(moved, "VEC3", bounds=True), "NORMAL": file.add(turn, "VEC3")})
+    indices = file.add(faces.astype(np.uint32).reshape(-1), "SCALAR")
+    primitive: dict[str, Any] = {"attributes": attributes, "indices": indices, "material": material}
+    mesh: dict[str, Any] = {"name": part.name, "primitives": [primitive]}
+    if targets:
+        primitive["targets"] = targets
+        mesh["weights"] = [0.0] * len(targets)
+    return mesh
+
+
+def _corners(part: Part) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Vertex of every point (N,), faces over points, and texture coordinates (N, 2): a vertex on a seam is several points."""
+    if part.uv is None or part.uv_faces is None:
+        return np.arange(part.pos.shape[1]), part.faces, None
+    pairs = np.stack([part.faces.reshape(-1), part.uv_faces.reshape(-1)], axis=1)
+    points, number = np.unique(pairs, axis=0, return_inverse=True)
+    return points[:, 0], number.reshape(-1, 3), part.uv[points[:, 1]]
+
+
+class _Buffers:
+    """The binary part while it grows, and the tables that say where what is."""
+
+    def __init__(self) -> None:
+        self.chunks: list[bytes] = []
+        self.views: list[dict[str, Any]] = []
+        self.accessors: list[dict[str, Any]] = []
+        self.length = 0
+
+    def add(self, values: np.ndarray, kind: str, bounds: bool = False) -> int:
+        """Number of the accessor of ``values``, float32 or uint32."""
+        content = values.tobytes()
+        self.views.append({"buffer": 0, "byteOffset": self.length, "byteLength": len(content)})
+        component = _FLOAT if values.dtype == np.float32 else _UNSIGNED
+        accessor: dict[str, Any] = {"bufferView": len(self.views) - 1, "componentType": component, "count": len(values)}
+        accessor["type"] = kind
+        if bounds:
+            low, high = (np.atleast_1d(edge(values, axis=0)) for edge in (np.min, np.max))
+            accessor["min"], accessor["max"] = [float(v) for v in low], [float(v) for v in high]
+        self.accessors.append(accessor)
+        self.chunks.append(content)
+        self.length += len(content)
+        return len(self.accessors) - 1
+
+
+def _packed(document: bytes, binary: bytes) -> bytes:
+    document += b" " * (-len(document) % 4)
+    binary += b"\0" * (-len(binary) % 4)
+    length = 12 + 8 + len(document) + 8 + len(binary)
+    head = struct.pack("<4sII", b"glTF", 2, length) + struct.pack("<I4s", len(document), b"JSON")
+    return head + document + struct.pack("<I4s", len(binary), b"BIN\0") + binary

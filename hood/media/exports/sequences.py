@@ -1,0 +1,67 @@
+"""A mesh file a frame (OBJ, PLY), and one mesh with a point cache (OBJ and PC2)."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from hood.media.exports.clip import Clip, Part
+
+
+def write_obj_sequence(folder: Path, clip: Clip) -> None:
+    """``NAME_0001.obj`` … of every part, with texture coordinates and normals."""
+    for part in clip.parts:
+        tail = _obj_faces(part)
+        for frame in range(clip.num_frames):
+            (folder / f"{part.name}_{frame + 1:04d}.obj").write_text(_obj_points(part, frame) + tail, encoding="ascii")
+
+
+def write_ply_sequence(folder: Path, clip: Clip) -> None:
+    """``NAME_0001.ply`` … of every part: binary, positions in float64, normals."""
+    for part in clip.parts:
+        num_faces, num_vertices = len(part.faces), part.pos.shape[1]
+        header = "\n".join(
+            [
+                "ply",
+                "format binary_little_endian 1.0",
+                f"element vertex {num_vertices}",
+                *(f"property double {axis}" for axis in "xyz"),
+                *(f"property float n{axis}" for axis in "xyz"),
+                f"element face {num_faces}",
+                "property list uchar int vertex_indices",
+                "end_header\n",
+            ]
+        ).encode()
+        faces = np.empty(num_faces, np.dtype([("count", "u1"), ("corners", "<i4", 3)]))
+        faces["count"], faces["corners"] = 3, part.faces
+        vertices = np.empty(num_vertices, np.dtype([("pos", "<f8", 3), ("normal", "<f4", 3)]))
+        for frame in range(clip.num_frames):
+            vertices["pos"], vertices["normal"] = part.pos[frame], part.normals(frame)
+            (folder / f"{part.name}_{frame + 1:04d}.ply").write_bytes(header + vertices.tobytes() + faces.tobytes())
+
+
+def write_point_cache(folder: Path, clip: Clip) -> None:
+    """``NAME.obj``, the first frame, and ``NAME.pc2``, all frames in float32, of every part."""
+    for part in clip.parts:
+        (folder / f"{part.name}.obj").write_text(_obj_points(part, 0) + _obj_faces(part), encoding="ascii")
+        # Version, points, first frame, frames from one sample to the next, samples.
+        header = struct.pack("<12siiffi", b"POINTCACHE2\0", 1, part.pos.shape[1], 0.0, 1.0, clip.num_frames)
+        (folder / f"{part.name}.pc2").write_bytes(header + np.ascontiguousarray(part.pos, "<f4").tobytes())
+
+
+def _obj_points(part: Part, frame: int) -> str:
+    lines = [f"o {part.name}", *("v {:.9g} {:.9g} {:.9g}".format(*row) for row in part.pos[frame].tolist())]
+    lines += ["vn {:.5f} {:.5f} {:.5f}".format(*row) for row in part.normals(frame).tolist()]
+    return "\n".join(lines) + "\n"
+
+
+def _obj_faces(part: Part) -> str:
+    """What is the same in all frames."""
+    if part.uv is None or part.uv_faces is None:
+        return "".join("f {0}//{0} {1}//{1} {2}//{2}\n".format(*face) for face in (part.faces + 1).tolist())
+    lines = ["vt {:.7g} {:.7g}\n".format(*row) for row in part.uv.tolist()]
+    both = np.concatenate([part.faces, part.uv_faces], axis=1) + 1
+    lines += ["f {0}/{3}/{0} {1}/{4}/{1} {2}/{5}/{2}\n".format(*row) for row in both.tolist()]
+    return "".join(lines)
