@@ -45,9 +45,7 @@ def run(arguments: Sequence[str]) -> int:
     print(f"{target}: {_megabytes(target):.1f} MB, {clip.num_frames} frames at {clip.fps:g} fps, metres, {up} up: {names}")
     if clip.origin.any() and form in _FOLDERS:
         x, y, z = clip.origin.tolist()
-        print(
-            f"far from the origin: positions are from ({x:g}, {y:g}, {z:g}) m, where float32 is exact enough; move objects there"
-        )
+        print(f"far from the origin: positions are from ({x:g}, {y:g}, {z:g}) m; move the objects there")
     if not bool(data.attributes.get("complete", True)):
         print(f"the rollout is not finished: {len(data.time)} of {data.attributes.get('num_planned', '?')} frames are there")
     return 0
@@ -58,8 +56,8 @@ def _checked(config: DictConfig) -> tuple[str, str, list[str]]:
     form, up = str(config.format), str(config.up)
     if form == "abc":
         raise ConfigError("format=abc: no maintained package writes Alembic; take format=usd, which the same programs read")
-    require_choice("format", form, ("usd", "glb", *_FOLDERS))
-    require_choice("up", up, ("y", "z"))
+    require_choice(config, "format", ("usd", "glb", *_FOLDERS))
+    require_choice(config, "up", ("y", "z"))
     if form == "glb" and up != "y":
         raise ConfigError("up=z: glTF has y up always, and programs turn it themselves; leave up= out")
     if form == "usd" and importlib.util.find_spec("pxr") is None:

@@ -69,7 +69,7 @@ def clip_of(data: RolloutData, parts: Sequence[str] = PARTS, num_frames: int | N
     if "cloth" in parts:
         meshes += _cloth(data, data.cloth_pos[:count])
     if "body" in parts and data.body_pos.shape[1]:
-        meshes.append(Part("body", data.body_pos[:count], data.body_faces, tuple(map(float, BODY_COLOR))))
+        meshes.append(Part("body", data.body_pos[:count], data.body_faces, BODY_COLOR))
     if not meshes:
         raise ValueError("there is no body in it, and the cloth is not asked for; nothing is left to export")
     for mesh in meshes:
