@@ -61,6 +61,18 @@ def split_words(command: str, arguments: Sequence[str]) -> tuple[list[str], Dict
     return given, load_config(command, overrides)
 
 
+def frame_count(config: DictConfig) -> int | None:
+    """``config.num_frames`` of a command that shows frames of a rollout: the first so many; None: all.
+
+    Raises:
+        ConfigError: no whole number above 0.
+    """
+    count = config.num_frames
+    if count is not None and (isinstance(count, bool) or not isinstance(count, int) or count < 1):
+        raise ConfigError(f"num_frames={count}: must be a whole number, at least 1")
+    return None if count is None else int(count)
+
+
 def output_folder(config: DictConfig) -> Path:
     """The folder that ``config.output`` names; nothing is made yet.
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from hood.assets.atomic import write_atomically
-from hood.commands.common import split_words
+from hood.commands.common import frame_count, split_words
 from hood.commands.compare import read_checked
 from hood.config import ConfigError, plain, require_choice
 from hood.media.exports.clip import PARTS, Clip, clip_of
@@ -33,11 +33,12 @@ def run(arguments: Sequence[str]) -> int:
         raise ConfigError(f"{len(files)} rollouts are given, one can be exported: hood export rollout.h5")
     source = Path(files[0]).expanduser()
     source = source / "rollout.h5" if source.is_dir() else source
+    count = frame_count(config)
     form, up, parts = _checked(config)
     target = _target(config, source, form)
     data = read_checked(source, "fabric")
     try:
-        clip = clip_of(data, parts, config.num_frames, up)
+        clip = clip_of(data, parts, count, up)
         _write(target, form, clip, up)
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from error
@@ -68,9 +69,6 @@ def _checked(config: DictConfig) -> tuple[str, str, list[str]]:
     parts = parts if isinstance(parts, list) else [parts]
     if not parts or any(part not in PARTS for part in parts):
         raise ConfigError(f"parts={plain(config.parts)}: give some of [cloth,body]")
-    count = config.num_frames
-    if count is not None and (isinstance(count, bool) or not isinstance(count, int) or count < 1):
-        raise ConfigError(f"num_frames={count}: must be a whole number, at least 1")
     return form, up, parts
 
 

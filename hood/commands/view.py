@@ -9,7 +9,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from hood.assets.atomic import write_atomically
-from hood.commands.common import output_folder, split_words
+from hood.commands.common import frame_count, output_folder, split_words
 from hood.commands.compare import names_of, read_checked
 from hood.config import ConfigError
 from hood.dynamics.recorder import RolloutData
@@ -21,9 +21,7 @@ _MOST = 4
 def run(arguments: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     files, config = _split(arguments)
-    count = config.num_frames
-    if count is not None and (isinstance(count, bool) or not isinstance(count, int) or count < 1):
-        raise ConfigError(f"num_frames={count}: must be a whole number, at least 1")
+    count = frame_count(config)
     target = output_folder(config)
     if target.suffix.lower() not in (".html", ".htm") or target.is_dir():
         raise ConfigError(f"output={target}: name a file that ends in .html, e.g. output=view.html")

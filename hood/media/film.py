@@ -50,7 +50,9 @@ class Film:
         self.data, self.width, self.height = data, width, height
         self.thinner = thinner
         self.colouring = colouring_of(data, colour, beside)
-        self._own_colour = outfit_colours(str(data.attributes.get("garment", "")), data.cloth_faces, data.cloth_pos.shape[1])
+        self._own_colour = outfit_colours(
+            str(data.attributes.get("garment", "")), data.cloth_faces, data.cloth_pos.shape[1], data.still.get("piece")
+        )
         # Without a body the camera looks at the cloth, as far as that is finite.
         shown = data.body_pos
         if not data.body_pos.shape[1]:

@@ -19,18 +19,26 @@ def write_obj(path: Path, garment: Garment, pos: np.ndarray | None = None) -> No
     pos = garment.rest_pos if pos is None else pos
     corners = garment.faces if garment.normal_faces is None else garment.normal_faces
     normals = corner_normals(pos, garment.faces, corners)
-    lines = [f"o {garment.name}", *("v {:.7g} {:.7g} {:.7g}".format(*row) for row in pos.tolist())]
-    textured = garment.uv is not None and garment.uv_faces is not None
-    if garment.uv is not None:
-        lines += ["vt {:.7g} {:.7g}".format(*row) for row in garment.uv.tolist()]
+    text = obj_points(garment.name, pos, normals) + obj_faces(garment.faces, corners, garment.uv, garment.uv_faces)
+    write_atomically(path, text.encode())
+
+
+def obj_points(name: str, pos: np.ndarray, normals: np.ndarray) -> str:
+    """Lines of an OBJ file for positions (V, 3) [m], which float32 reads back to the bit, and normals (N, 3)."""
+    lines = [f"o {name}", *("v {:.9g} {:.9g} {:.9g}".format(*row) for row in pos.tolist())]
     lines += ["vn {:.5f} {:.5f} {:.5f}".format(*row) for row in normals.tolist()]
-    uv_faces = garment.uv_faces if garment.uv_faces is not None else garment.faces
-    for face, texture, normal in zip(
-        (garment.faces + 1).tolist(), (uv_faces + 1).tolist(), (corners + 1).tolist(), strict=True
-    ):
-        words = (f"{v}/{t if textured else ''}/{n}" for v, t, n in zip(face, texture, normal, strict=True))
-        lines.append("f " + " ".join(words))
-    write_atomically(path, ("\n".join(lines) + "\n").encode())
+    return "\n".join(lines) + "\n"
+
+
+def obj_faces(faces: np.ndarray, normal_faces: np.ndarray, uv: np.ndarray | None, uv_faces: np.ndarray | None) -> str:
+    """Lines of an OBJ file for faces (F, 3) with normals, and with texture coordinates ``uv`` (U, 2) where ``uv_faces`` (F, 3)
+    says which corner has which; what is the same in every frame."""
+    lines = [] if uv is None else ["vt {:.7g} {:.7g}\n".format(*row) for row in uv.tolist()]
+    if uv is None or uv_faces is None:
+        both, form = np.concatenate([faces, normal_faces], axis=1), "f {0}//{3} {1}//{4} {2}//{5}\n"
+    else:
+        both, form = np.concatenate([faces, normal_faces, uv_faces], axis=1), "f {0}/{6}/{3} {1}/{7}/{4} {2}/{8}/{5}\n"
+    return "".join([*lines, *(form.format(*row) for row in (both + 1).tolist())])
 
 
 def corner_normals(pos: np.ndarray, faces: np.ndarray, corners: np.ndarray) -> np.ndarray:

@@ -24,3 +24,13 @@ def test_garments_of_an_outfit_differ() -> None:
     np.testing.assert_array_equal(sheets[0][0], GARMENT_COLOR)
     assert len(np.unique(np.stack([sheet[0] for sheet in sheets]), axis=0)) == 3
     assert ((colours >= 0) & (colours <= 1)).all()
+
+
+def test_the_recorded_garment_decides_over_the_components() -> None:
+    """One garment of two sheets, and one of one."""
+    faces = grid(3, 3, 1.0)[1]
+    piece = np.repeat([0, 0, 1], 9)
+    colours = np.asarray(outfit_colours("a+b", np.concatenate([faces, faces + 9, faces + 18]), 27, piece))
+    assert len(np.unique(colours[:18], axis=0)) == len(np.unique(colours[18:], axis=0)) == 1
+    np.testing.assert_array_equal(colours[0], GARMENT_COLOR)
+    assert not np.array_equal(colours[0], colours[18])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,17 +23,18 @@ class Part:
     """One moving mesh."""
 
     name: str
-    pos: np.ndarray  # (T, V, 3) float64 m, from the clip's origin
+    pos: np.ndarray  # (T, V, 3) float64 m, from the clip's origin, its axis up
     faces: np.ndarray  # (F, 3)
     colour: tuple[float, float, float]  # sRGB, 0 to 1
     uv: np.ndarray | None = None  # (U, 2)
     uv_faces: np.ndarray | None = None  # (F, 3), into uv
 
     def normals(self, frame: int) -> np.ndarray:
-        """Unit normals (V, 3) of one frame."""
+        """Unit normals (V, 3) of one frame; of vertices without a face, or with faces of no area, any."""
         found = np.zeros((self.pos.shape[1], 3))
         of_faces = corner_normals(self.pos[frame], self.faces, self.faces)
         found[: len(of_faces)] = of_faces
+        found[np.linalg.norm(found, axis=1) < 0.5] = [0.0, 1.0, 0.0]
         return found
 
 
@@ -80,7 +81,7 @@ def clip_of(data: RolloutData, parts: Sequence[str] = PARTS, num_frames: int | N
     farthest = max(float(np.abs(mesh.pos).max(initial=0.0)) for mesh in meshes)
     origin = np.round(meshes[0].pos[0].astype(np.float64).mean(axis=0)) if farthest > FAR else np.zeros(3)
     moved = (np.asarray(mesh.pos, np.float64) - origin for mesh in meshes)
-    turned = tuple(_replaced(mesh, _upright(pos, up)) for mesh, pos in zip(meshes, moved, strict=True))
+    turned = tuple(replace(mesh, pos=_upright(pos, up)) for mesh, pos in zip(meshes, moved, strict=True))
     return Clip(turned, 1.0 / dt, _upright(origin, up))
 
 
@@ -88,7 +89,14 @@ def _cloth(data: RolloutData, pos: np.ndarray) -> list[Part]:
     """One part a garment where the file says which vertex belongs to which."""
     title = str(data.attributes.get("garment", "cloth"))
     piece, uv, uv_faces = (data.still.get(name) for name in ("piece", "uv", "uv_faces"))
-    if uv is None or uv_faces is None or uv_faces.shape != data.cloth_faces.shape or _outside(uv_faces, len(uv)):
+    if (
+        uv is None
+        or uv_faces is None
+        or uv.ndim != 2
+        or uv.shape[1] != 2
+        or uv_faces.shape != data.cloth_faces.shape
+        or _outside(uv_faces, len(uv))
+    ):
         uv = uv_faces = None
     if piece is None or piece.shape != (pos.shape[1],) or piece.min(initial=0) == piece.max(initial=0):
         return [Part(_plain(title), pos, data.cloth_faces, part_colour(0), uv, uv_faces)]
@@ -120,7 +128,3 @@ def _plain(name: str) -> str:
 def _upright(pos: np.ndarray, up: str) -> np.ndarray:
     """``pos`` (…, 3) with the wanted axis up; a turn, no mirror image."""
     return pos if up == "y" else np.stack([pos[..., 0], -pos[..., 2], pos[..., 1]], axis=-1)
-
-
-def _replaced(part: Part, pos: np.ndarray) -> Part:
-    return Part(part.name, pos, part.faces, part.colour, part.uv, part.uv_faces)

@@ -16,10 +16,6 @@ LARGEST = 256 * 2**20
 _FLOAT, _UNSIGNED = 5126, 5125
 
 
-class TooLarge(ValueError):
-    """A clip that glTF is not made for."""
-
-
 def estimated_size(clip: Clip) -> int:
     """Bytes of the file, about."""
     weights = 4 * clip.num_frames**2 * len(clip.parts)
@@ -30,11 +26,11 @@ def gltf_bytes(clip: Clip) -> bytes:
     """The file. Axes, units and origin: y up, metres; the origin is the translation of the nodes.
 
     Raises:
-        TooLarge: above :data:`LARGEST`.
+        ValueError: above :data:`LARGEST`.
     """
     size = estimated_size(clip)
     if size > LARGEST:
-        raise TooLarge(
+        raise ValueError(
             f"as glb it would have {size / 2**20:.0f} MiB, more than the {LARGEST // 2**20} that programs open with ease; "
             "give num_frames=, parts=[cloth], or format=usd"
         )

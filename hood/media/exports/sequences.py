@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from hood.media.exports.clip import Clip, Part
+from hood.media.mesh_export import obj_faces, obj_points
 
 
 def write_obj_sequence(folder: Path, clip: Clip) -> None:
@@ -52,16 +53,8 @@ def write_point_cache(folder: Path, clip: Clip) -> None:
 
 
 def _obj_points(part: Part, frame: int) -> str:
-    lines = [f"o {part.name}", *("v {:.9g} {:.9g} {:.9g}".format(*row) for row in part.pos[frame].tolist())]
-    lines += ["vn {:.5f} {:.5f} {:.5f}".format(*row) for row in part.normals(frame).tolist()]
-    return "\n".join(lines) + "\n"
+    return obj_points(part.name, part.pos[frame], part.normals(frame))
 
 
 def _obj_faces(part: Part) -> str:
-    """What is the same in all frames."""
-    if part.uv is None or part.uv_faces is None:
-        return "".join("f {0}//{0} {1}//{1} {2}//{2}\n".format(*face) for face in (part.faces + 1).tolist())
-    lines = ["vt {:.7g} {:.7g}\n".format(*row) for row in part.uv.tolist()]
-    both = np.concatenate([part.faces, part.uv_faces], axis=1) + 1
-    lines += ["f {0}/{3}/{0} {1}/{4}/{1} {2}/{5}/{2}\n".format(*row) for row in both.tolist()]
-    return "".join(lines)
+    return obj_faces(part.faces, part.faces, part.uv, part.uv_faces)

@@ -57,7 +57,8 @@ def _rollout(name: str, data: RolloutData, high: float, first: RolloutData | Non
     share = np.nan_to_num(np.clip(colouring.values / high, 0.0, 1.0), nan=0.0)
     cloth, lost = _mesh(data.cloth_pos, data.cloth_faces)
     garment = str(data.attributes.get("garment", ""))
-    fabric = outfit_colours(garment, np.asarray(data.cloth_faces, dtype=np.int64), data.cloth_pos.shape[1])
+    faces, piece = np.asarray(data.cloth_faces, dtype=np.int64), data.still.get("piece")
+    fabric = outfit_colours(garment, faces, data.cloth_pos.shape[1], piece)
     every = np.broadcast_to(np.asarray(fabric, dtype=np.float64), (data.cloth_pos.shape[1], 3))
     same = first is not None and _same_body(first, data)
     return {
