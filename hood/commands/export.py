@@ -103,6 +103,8 @@ def _write(target: Path, form: str, clip: Clip, up: str) -> None:
             if target.is_dir():
                 target.rmdir()  # empty
         draft.replace(target)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(target)) from error
     finally:
         _remove(draft)
 

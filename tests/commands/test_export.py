@@ -117,6 +117,19 @@ def test_glb_moves_as_the_rollout(tmp_path: Path, shift: float) -> None:
     assert len(trimesh.load(tmp_path / "rollout.glb").geometry) == 3
 
 
+@pytest.mark.parametrize("form", ["usd", "glb", "pc2"])
+def test_a_place_that_cannot_be_written_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str], form: str) -> None:
+    if form == "usd":
+        pytest.importorskip("pxr", reason="usd-core has no wheel for this machine")
+    source, blocked = _rollout(tmp_path), tmp_path / ("x" * 250)  # too long a name with the draft's prefix
+    target = blocked.with_name(blocked.name + (".usd" if form == "usd" else f".{form}"))
+    assert main(["export", str(source), f"format={form}", f"output={target}"]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert target.name in error
+    assert [file.name for file in tmp_path.iterdir()] == ["rollout.h5"]
+
+
 def test_point_cache(tmp_path: Path) -> None:
     assert main(["export", str(_rollout(tmp_path)), "format=pc2", f"output={tmp_path / 'pc'}"]) == 0
     data = read_rollout(tmp_path / "rollout.h5")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,19 @@ def write_usd(path: Path, clip: Clip, up: str) -> None:
 
     Args:
         path: ends in ``.usd``, ``.usdc`` (binary) or ``.usda`` (text).
+
+    Raises:
+        OSError: it cannot be written.
     """
+    from pxr import Tf
+
+    try:
+        _write(path, clip, up)
+    except Tf.ErrorException as error:
+        raise OSError(errno.EIO, "cannot be written; is the folder writable, is there space?", str(path)) from error
+
+
+def _write(path: Path, clip: Clip, up: str) -> None:
     from pxr import Gf, Usd, UsdGeom, Vt
 
     stage = Usd.Stage.CreateNew(str(path))
