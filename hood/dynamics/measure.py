@@ -70,19 +70,21 @@ def _quantile(ascending: np.ndarray, share: float) -> float:
     return low + (place - below) * (high - low)
 
 
-def penetration_metrics(contact: Contact | None, num_vertices: int) -> dict[str, float]:
+def penetration_metrics(contact: Contact | None, cloth: Cloth) -> dict[str, float]:
     """Count, share and depth [m] of the vertices deeper than :data:`PENETRATION_DEPTH` inside the body at t.
 
-    Vertices beyond the reach of the contact energy count as well: there nothing pushes them out.
+    Vertices beyond the reach of the contact energy count as well: there nothing pushes them out. Massless ones do not: they
+    belong to no face, nothing moves them, and nobody sees them.
     """
     if contact is None:
         return {"penetration_count": 0.0, "penetration_share": 0.0, "penetration_depth": 0.0}
-    dist = contact.dist.detach().cpu().numpy()  # a few small calls of torch would take as long as a search
-    depth = -dist[np.isfinite(dist)]
+    # In numpy: a few small calls of torch would take as long as a search.
+    dist, seen = contact.dist.detach().cpu().numpy(), cloth.mass.cpu().numpy() > 0
+    depth = -dist[np.isfinite(dist) & seen]
     count = int(np.count_nonzero(depth > PENETRATION_DEPTH))
     return {
         "penetration_count": float(count),
-        "penetration_share": count / max(num_vertices, 1),
+        "penetration_share": count / max(int(np.count_nonzero(seen)), 1),
         "penetration_depth": float(depth.max(initial=0.0)),
     }
 

@@ -257,7 +257,7 @@ def _state_metrics(scene: Scene, state: State, frame: int, problem: StepProblem 
     measured = {} if metrics == "none" else strain_metrics(scene.cloth, state.pos)
     if metrics == "all":
         contact = _contact_now(scene, state, frame) if problem is None else problem.with_contact().contact
-        measured |= penetration_metrics(contact, scene.cloth.num_vertices)
+        measured |= penetration_metrics(contact, scene.cloth)
     return measured
 
 

@@ -15,7 +15,20 @@ from hood.assets.body import Body
 from hood.assets.garment import Garment
 from hood.assets.sequence import PoseSequence
 from hood.dynamics.goals import Count
-from hood.dynamics.guard import CUT, FINITE, FORCE, SPEED, STRAIN, STRAIN_LIMIT, TARGET, TURN, Guard
+from hood.dynamics.guard import (
+    CHECK,
+    CHECK_EVERY,
+    CHECK_LIMIT,
+    CUT,
+    FINITE,
+    FORCE,
+    SPEED,
+    STRAIN,
+    STRAIN_LIMIT,
+    TARGET,
+    TURN,
+    Guard,
+)
 from hood.dynamics.mend import LEFT, NOT_TRIED, REFINED, SOLVED, Limits, Standing, mend, standing
 from hood.dynamics.refine import GuessStepper, RefinedStepper
 from hood.dynamics.rollout import Frame, metric_names, simulate
@@ -126,6 +139,39 @@ def test_a_bad_step_is_told_and_mended(spoil: Any, cause: str, scene: Scene) -> 
     off = (mended[-1].world_pos - good[-1].world_pos).norm(dim=1).max()
     assert off < 2e-3
     assert all(torch.isfinite(frame.world_pos).all() for frame in mended)
+
+
+def test_every_twentieth_step_is_held_against_a_solver(scene: Scene) -> None:
+    """Strain that a network gets wrong by a few points is within every limit; what a solver makes of the step tells."""
+
+    def scaled(pos: torch.Tensor) -> torch.Tensor:
+        return (pos - pos.mean(0)) * 1.06 + pos.mean(0)
+
+    problem, prediction = one_step(scene)
+    solved = prediction.next_pos
+    for frame, expected in ((CHECK_EVERY, True), (CHECK_EVERY + 1, False)):
+        guard = quiet_guard("report")
+        guard.see(frame, problem, Prediction(solved, problem.acceleration(solved)))
+        assert not guard.alarms
+        wrong = Prediction(scaled(solved), problem.acceleration(scaled(solved)))
+        seen = guard.see(frame, problem, wrong)
+        assert seen is wrong
+        assert [alarm.cause for alarm in guard.alarms] == ([CHECK] if expected else [])
+    before = standing(POTENTIAL, problem, wrong)
+    mending = quiet_guard("repair")
+    kept = mending.see(CHECK_EVERY, problem, wrong)
+    (alarm,) = mending.alarms
+    assert alarm.value > CHECK_LIMIT
+    assert alarm.repair == REFINED
+    assert alarm.rg_after < 1e-2 * alarm.rg_before
+    assert abs(standing(POTENTIAL, problem, kept).strain - before.strain) == pytest.approx(alarm.value)
+
+
+def quiet_guard(mode: str) -> Guard:
+    """Of a network alone, that is used to forces out of balance."""
+    guard = Guard(mode, Spoilt(-1, None), POTENTIAL)
+    guard._calm.extend([1e6] * 30)
+    return guard
 
 
 def test_strict_keeps_the_frames_before(scene: Scene) -> None:

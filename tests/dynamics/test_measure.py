@@ -42,7 +42,7 @@ def test_penetration_counts_vertices_deeper_than_two_millimetres() -> None:
     pos = CLOTH.rest_pos.clone()
     pos[:, 1] = 0.01
     pos[0, 1], pos[1, 1], pos[2, 1] = -0.0019, -0.0021, -0.03
-    metrics = penetration_metrics(plane_contact(pos), 36)
+    metrics = penetration_metrics(plane_contact(pos), CLOTH)
     assert metrics["penetration_count"] == 2
     assert metrics["penetration_share"] == pytest.approx(2 / 36)
     assert metrics["penetration_depth"] == pytest.approx(0.03)
@@ -51,18 +51,27 @@ def test_penetration_counts_vertices_deeper_than_two_millimetres() -> None:
 def test_vertices_beyond_the_reach_of_the_contact_energy_count() -> None:
     contact = plane_contact(CLOTH.rest_pos - torch.tensor([0.0, 0.5, 0.0]).double())
     deep = replace(contact, valid=torch.zeros_like(contact.valid))
-    assert penetration_metrics(deep, 36)["penetration_count"] == 36
-    assert penetration_metrics(deep, 36)["penetration_depth"] == pytest.approx(0.5)
+    assert penetration_metrics(deep, CLOTH)["penetration_count"] == 36
+    assert penetration_metrics(deep, CLOTH)["penetration_depth"] == pytest.approx(0.5)
+
+
+def test_vertices_of_no_face_do_not_count() -> None:
+    mass = CLOTH.mass.clone()
+    mass[:6] = 0.0
+    pos = CLOTH.rest_pos - torch.tensor([0.0, 0.5, 0.0]).double()
+    pos[6:, 1] = -0.003
+    metrics = penetration_metrics(plane_contact(pos), replace(CLOTH, mass=mass))
+    assert metrics == {"penetration_count": 30, "penetration_share": 1.0, "penetration_depth": pytest.approx(0.003)}
 
 
 def test_vertices_without_any_surface_do_not_count() -> None:
     contact = plane_contact(CLOTH.rest_pos)
     nowhere = replace(contact, dist=torch.full_like(contact.dist, torch.inf))
-    assert penetration_metrics(nowhere, 36) == penetration_metrics(None, 36) == dict.fromkeys(PENETRATION_METRICS, 0.0)
+    assert penetration_metrics(nowhere, CLOTH) == penetration_metrics(None, CLOTH) == dict.fromkeys(PENETRATION_METRICS, 0.0)
 
 
 def test_depth_is_zero_outside() -> None:
-    assert penetration_metrics(plane_contact(CLOTH.rest_pos + 0.1), 36)["penetration_depth"] == 0.0
+    assert penetration_metrics(plane_contact(CLOTH.rest_pos + 0.1), CLOTH)["penetration_depth"] == 0.0
 
 
 def test_quantiles_are_those_of_numpy():

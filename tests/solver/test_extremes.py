@@ -143,7 +143,7 @@ def test_density(density, pinned):
 @pytest.mark.parametrize("dt", [1 / 480, 1 / 240, 1 / 30, 1 / 5])
 def test_time_step(dt, pinned):
     steps = bounded(march(default_potential(), draped(dt=dt, pinned=pinned), 3, DEFAULT))
-    depth = [penetration_metrics(step.problem.contact, 36)["penetration_depth"] for step in steps]
+    depth = [penetration_metrics(step.problem.contact, step.problem.cloth)["penetration_depth"] for step in steps]
     assert max(depth) < 2e-3
 
 
@@ -248,7 +248,7 @@ def test_body_speed(speed, heading):
     counts = []
     for k, step in enumerate(steps, 1):
         now = find_contact(step.state.pos, problem.cloth.vertex_scene, inputs[k].obstacle)
-        counts.append(penetration_metrics(now, problem.cloth.num_vertices)["penetration_count"])
+        counts.append(penetration_metrics(now, problem.cloth)["penetration_count"])
         assert float(step.state.vel.norm(dim=1).max()) < 2.0 * speed + G * k / 30 + 0.5
     assert max(counts) <= (0 if speed < 6.0 else 2)
     assert counts[-1] == 0
@@ -263,7 +263,7 @@ def depths(problem: StepProblem, steps: list[Marched]) -> list[float]:
     cloth, found = problem.cloth, []
     for pos in [problem.state.pos, *(step.state.pos for step in steps)]:
         contact = find_contact(pos, cloth.vertex_scene, problem.step.obstacle)
-        found.append(penetration_metrics(contact, cloth.num_vertices)["penetration_depth"])
+        found.append(penetration_metrics(contact, cloth)["penetration_depth"])
     return found
 
 
