@@ -82,6 +82,6 @@ class EdgeOutput(VelocityBaseOutput):
         inertia = _INERTIA * cloth.mass / problem.vertex_dt.squeeze(1) ** 2
         if contact is None:
             return inertia
-        gap = contact.next_dist(start) - self.clearance - sag(cloth, contact)
+        gap = contact.next_dist(start) - self.clearance - sag(cloth, contact, problem.state.pos)
         near = (1.0 - gap / _NEAR).clamp(0.0, 1.0) * contact.valid
         return inertia + _CONTACT * near * torch.exp(raw.clamp(-_RANGE, _RANGE))

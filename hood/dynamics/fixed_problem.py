@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 
 from hood.losses.potential import Potential, PreparedTerm
-from hood.losses.problem import StepProblem
+from hood.losses.problem import StepProblem, free_flight
 from hood.mesh.proximity import Incidence, build_incidence
-from hood.scene.contact import Fold, find_contact, find_fixed_contact, find_fixed_fold, find_fold
+from hood.scene.contact import Fold, find_contact, find_fixed_contact, find_fixed_fold
+from hood.scene.landing import find_other_skin
 from hood.scene.state import Attachments, Obstacle, State
 
 Item = TypeVar("Item")
@@ -98,7 +99,7 @@ def with_fixed_contact(
         return altered(problem, contact=None), cloth.faces.new_zeros(1)
     if pos.device.type == "cpu" and not dense:
         contact, num_faces = find_contact(pos, cloth.vertex_scene, obstacle), cloth.faces.new_zeros(1)
-        fold = find_fold(pos, cloth.vertex_scene, obstacle, contact) if folds else None
+        fold = find_other_skin(pos, cloth.vertex_scene, obstacle, contact, free_flight(problem)) if folds else None
         if fold is not None and fold.contact is None:
             fold = Fold(altered(contact, valid=torch.zeros_like(contact.valid)))
     else:

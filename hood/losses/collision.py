@@ -101,7 +101,7 @@ class Collision:
 
     def reaches(self, problem: StepProblem, contact: Contact) -> Tensor:
         """Distances ε [m] (V,) from the planes at which the penalty sets in, of one of :meth:`contacts`."""
-        return vertex_reach(self.reach, self.epsilon, problem.cloth, contact)
+        return vertex_reach(self.reach, self.epsilon, problem.cloth, contact, problem.state.pos)
 
     def depth(self, problem: StepProblem, contact: Contact, next_pos: Tensor) -> tuple[Tensor, Tensor]:
         """Depth ε - d [m] (V,), negative outside, and normals (V, 3), of one of :meth:`contacts`; both 0 without a match."""

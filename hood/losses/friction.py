@@ -133,7 +133,7 @@ class Friction(LaggedFriction):
 
     def normal_force(self, problem: StepProblem, contact: Contact) -> Tensor:
         touching = contact.valid & (problem.cloth.mass > 0)
-        reach = vertex_reach(self.reach, self.epsilon, problem.cloth, contact)
+        reach = vertex_reach(self.reach, self.epsilon, problem.cloth, contact, problem.state.pos)
         depth = torch.where(touching, reach - contact.dist, 0.0).clamp_min(0.0)
         force = 3.0 * self.weight * depth**2
         pull = problem.searched_pull

@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from hood.scene.cloth import Cloth
-from hood.scene.contact import Contact, Fold, find_contact, find_fold
+from hood.scene.contact import Contact, Fold, find_contact
 from hood.scene.contact_points import PointContact, find_point_contact
+from hood.scene.landing import find_other_skin
 from hood.scene.layer_sides import LayerPairs, find_sides
 from hood.scene.layers import SceneLayers, find_layers, late_targets
 from hood.scene.state import State, StepInput
@@ -68,8 +69,8 @@ class StepProblem:
         problem, obstacle = self.with_contact(), self.step.obstacle
         if self.fold is not None or obstacle is None or problem.contact is None:
             return problem
-        fold = find_fold(self.state.pos, self.cloth.vertex_scene, obstacle, problem.contact)
-        return replace(problem, fold=fold)
+        given = self.state.pos, self.cloth.vertex_scene, obstacle, problem.contact
+        return replace(problem, fold=find_other_skin(*given, free_flight(self)))
 
     def with_points(self, place: str) -> StepProblem:
         """The problem with its contact, also at points inside edges and faces (a ``place`` of
@@ -183,6 +184,12 @@ def inertial_guess(state: State, step: StepInput, vertex_scene: Tensor | None = 
     """Positions (V, 3) without any force, x_t + dt v_t; several scenes need ``vertex_scene`` (V,)."""
     dt = step.dt if vertex_scene is None else step.dt[vertex_scene]
     return state.pos + dt.unsqueeze(1) * state.vel
+
+
+def free_flight(problem: StepProblem) -> Tensor:
+    """Displacements (V, 3) [m] in the step without any force but weight, dt v_t + dt² g."""
+    dt = problem.vertex_dt
+    return dt * problem.state.vel + dt**2 * problem.gravity.to(problem.state.vel)
 
 
 def sum_per_scene(values: Tensor, scene: Tensor, num_scenes: int) -> Tensor:

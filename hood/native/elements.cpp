@@ -175,21 +175,22 @@ struct Contact {
     int64_t count;
     const uint8_t* valid;                                           // (V)
     const int64_t* scene;                                           // (V)
-    const double *mass, *length_sq, *pos, *vel;                     // (V) kg, (V) m^2, (V, 3) m, (V, 3) m/s
-    const double *dist, *curvature;                                 // (V) m, (V) 1/m
+    const double *mass, *pos, *vel;                                 // (V) kg, (V, 3) m, (V, 3) m/s
+    const double *dist, *sag;                                       // (V) m, (V) m, see hood.scene.reach
     const double *point, *next_point, *next_normal;                 // (V, 3) m, (V, 3) m, (V, 3)
     const double *pull, *dt, *gravity;                              // (V, 3) N or none, (B) s, (3) m/s^2
 };
 
-// How far off the skin contact sets in, see hood.scene.reach: ``least`` [m], and ``share`` of L^2 times the curvature up to ``most`` [m].
+// How far off the skin contact sets in, see hood.scene.reach: ``least`` [m], and the sag as well unless it is the same everywhere.
 struct Reach {
-    double least, share, most;
+    double least;
+    int64_t curved;
 };
 
 inline bool touches(const Contact& contact, int64_t v) { return contact.valid[v] && contact.mass[v] > 0.0; }
 
 inline double reach_of(const Contact& contact, const Reach& reach, int64_t v) {
-    return reach.least + std::min(reach.share * contact.length_sq[v] * contact.curvature[v], reach.most);
+    return reach.least + (reach.curved ? contact.sag[v] : 0.0);
 }
 
 // A collision term's planes and their reach, see hood.losses.collision; rows that touch nothing are zero.

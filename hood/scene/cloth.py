@@ -76,10 +76,24 @@ class Cloth:
     def edge_length_sq(self) -> Tensor:
         """Mean square [m²] (V,) of the rest lengths of the edges at every vertex; 0 at isolated ones."""
         start, end = self.edges.unbind(dim=1)
-        square = (self.rest_pos[end] - self.rest_pos[start]).square().sum(dim=1)
-        ends = torch.stack([square, torch.ones_like(square)], dim=1)
+        ends = torch.stack([self.rest_edge_sq, torch.ones_like(self.rest_edge_sq)], dim=1)
         total = ends.new_zeros(self.num_vertices, 2).index_add(0, start, ends).index_add(0, end, ends)
         return total[:, 0] / total[:, 1].clamp_min(1.0)
+
+    @cached_property
+    def rest_edge_sq(self) -> Tensor:
+        """Squares [m²] (E,) of the rest lengths of the edges."""
+        return self.edge_sq(self.rest_pos)
+
+    def edge_sq(self, pos: Tensor) -> Tensor:
+        """Squares [m²] (E,) of the lengths of the edges at ``pos`` (V, 3) [m]."""
+        start, end = self.edges.unbind(dim=1)
+        return (pos.index_select(0, end) - pos.index_select(0, start)).square().sum(dim=1)
+
+    def largest_of_edges(self, values: Tensor) -> Tensor:
+        """The largest of ``values`` (E,) >= 0 among the edges at every vertex, (V,); 0 at isolated ones."""
+        ends, twice = self.edges.t().reshape(-1), torch.cat([values, values])
+        return values.new_zeros(self.num_vertices).scatter_reduce(0, ends, twice, "amax")
 
 
 def build_cloth(

@@ -12,20 +12,39 @@ from hood.scene.contact import Contact
 REACHES = ("curvature", "constant")
 #: How much of L² κ vertices are held off: an eighth for the edges; triangles sag more, and their corners differ.
 SAG_SHARE = 1.5 / 8.0
+#: Squares of edges that have grown by up to this factor, 12% in length, change nothing.
+COVERED = 1.25
 #: They are held off by no more [m] than this beside the constant part.
 MOST_SAG = 8e-3
+#: The same of cloth that is stretched.
+MOST_STRETCHED = 20e-3
 
 
-def sag(cloth: Cloth, contact: Contact) -> Tensor:
+def sag(cloth: Cloth, contact: Contact, pos: Tensor) -> Tensor:
     """How much farther off the skin [m] (V,) vertices have to be for the triangles between them: min(1.5 L² κ/8, 8 mm).
 
     An edge of length L whose ends are at a bulge of curvature κ cuts L² κ/8 deep into it. L² is the mean square of the rest
     lengths of the edges at the vertex, κ the body's curvature where the vertex was matched (:mod:`hood.mesh.curvature`).
     Fades with the square of the edges: 3.8 mm for 35 mm on a limb 120 mm thick, 0.9 mm for 17 mm.
+
+    An edge that is stretched sags farther. What its square has grown by, beyond the quarter that the half more in
+    :data:`SAG_SHARE` covers (:data:`COVERED`), is added to L², of the edge at the vertex that has grown most; the most is then
+    :data:`MOST_STRETCHED`.
+
+    Args:
+        pos: (V, 3) m, of the cloth at t.
     """
-    return (SAG_SHARE * cloth.edge_length_sq * contact.curvature).clamp_max(MOST_SAG)
+    share = SAG_SHARE * contact.curvature
+    at_rest = (share * cloth.edge_length_sq).clamp_max(MOST_SAG)
+    return at_rest + torch.minimum(share * cloth.largest_of_edges(_growth(cloth, pos)), MOST_STRETCHED - at_rest)
 
 
-def vertex_reach(form: str, least: float, cloth: Cloth, contact: Contact) -> Tensor:
-    """Distance from the skin [m] (V,) at which contact sets in: ``least`` [m], and by ``curvature`` the :func:`sag` as well."""
-    return least + (sag(cloth, contact) if form == "curvature" else torch.zeros_like(contact.dist))
+def _growth(cloth: Cloth, pos: Tensor) -> Tensor:
+    """What the square [m²] (E,) of edges has grown by beyond :data:`COVERED`."""
+    return (cloth.edge_sq(pos) - COVERED * cloth.rest_edge_sq).clamp_min(0.0)
+
+
+def vertex_reach(form: str, least: float, cloth: Cloth, contact: Contact, pos: Tensor) -> Tensor:
+    """Distance from the skin [m] (V,) at which contact sets in: ``least`` [m], and by ``curvature`` the :func:`sag` as well,
+    of cloth that is at ``pos`` (V, 3) [m] at t."""
+    return least + (sag(cloth, contact, pos) if form == "curvature" else torch.zeros_like(contact.dist))

@@ -162,7 +162,7 @@ class LazySearch:
 
 def leave(cloth: Cloth, pos: Tensor, contact: Contact, clearance: float) -> Tensor:
     """Free vertices nearer than ``clearance`` and the :func:`sag` to their tangent planes moved there."""
-    depth = (clearance + sag(cloth, contact) - ((pos - contact.point) * contact.normal).sum(1)).clamp_min(0.0)
+    depth = (clearance + sag(cloth, contact, pos) - ((pos - contact.point) * contact.normal).sum(1)).clamp_min(0.0)
     return pos + (depth * contact.valid * cloth.free).unsqueeze(1) * contact.normal
 
 
@@ -175,7 +175,7 @@ def push_out(cloth: Cloth, pos: Tensor, obstacle: Obstacle | None, clearance: fl
     for _ in range(rounds):
         contact = find_contact(pos, cloth.vertex_scene, obstacle)
         # The margin covers the difference between the tangent plane and the true distance.
-        depth = (clearance + sag(cloth, contact) - contact.dist) * (contact.valid & free)
+        depth = (clearance + sag(cloth, contact, pos) - contact.dist) * (contact.valid & free)
         if not bool((depth > 0).any()):
             break
         pos = pos + (depth.clamp_min(0.0) + 2e-4 * (depth > 0)).unsqueeze(1) * contact.normal

@@ -17,7 +17,7 @@ from hood.losses.friction import Friction
 from hood.losses.problem import StepProblem
 from hood.native.structures import COUNT, POINTER, REAL, fields
 from hood.scene.contact import Contact
-from hood.scene.reach import MOST_SAG, SAG_SHARE
+from hood.scene.reach import sag
 from hood.solver.vertex_pass import whole
 
 
@@ -26,14 +26,14 @@ class _Contact(ctypes.Structure):
 
     _fields_ = [
         ("count", COUNT),
-        *fields("valid scene mass length_sq pos vel dist curvature point next_point next_normal pull dt gravity", POINTER),
+        *fields("valid scene mass pos vel dist sag point next_point next_normal pull dt gravity", POINTER),
     ]
 
 
 class _Reach(ctypes.Structure):
     """``Reach`` of ``elements.cpp``."""
 
-    _fields_ = fields("least share most", REAL)
+    _fields_ = [("least", REAL), ("curved", COUNT)]
 
 
 class ContactPass:
@@ -43,8 +43,8 @@ class ContactPass:
         self._lib, self._problem = lib, problem
         cloth, state = problem.cloth, problem.state
         self._values = _Contact(count=len(state.pos))
-        given = {name: getattr(contact, name) for name in ("dist", "curvature", "point", "next_point", "next_normal")}
-        given |= {"mass": cloth.mass, "length_sq": cloth.edge_length_sq, "pos": state.pos, "vel": state.vel}
+        given = {name: getattr(contact, name) for name in ("dist", "point", "next_point", "next_normal")}
+        given |= {"mass": cloth.mass, "sag": sag(cloth, contact, state.pos), "pos": state.pos, "vel": state.vel}
         given |= {"dt": problem.step.dt, "gravity": problem.gravity}
         self._kept = {name: whole(values) for name, values in given.items()}
         self._kept |= {"valid": contact.valid.contiguous(), "scene": cloth.vertex_scene.contiguous()}
@@ -69,7 +69,7 @@ class ContactPass:
         return found
 
     def _given(self, term: Collision | Friction) -> tuple[object, object]:
-        reach = _Reach(term.epsilon, SAG_SHARE if term.reach == "curvature" else 0.0, MOST_SAG)
+        reach = _Reach(term.epsilon, term.reach == "curvature")
         return ctypes.byref(self._values), ctypes.byref(reach)
 
     def _empty(self, vectors: int, numbers: int) -> list[Tensor]:
