@@ -10,7 +10,7 @@ from dataclasses import replace
 import torch
 from omegaconf import DictConfig
 
-from hood.assets.library import locate
+from hood.assets.files.library import locate
 from hood.commands.circumstances import training_note
 from hood.commands.common import UNTRAINED, read_model, use_arithmetic
 from hood.config import ConfigError, build, load_config, options

@@ -14,10 +14,11 @@ import torch
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from hood.assets.body import load_body
-from hood.assets.garment import Garment, load_garment
-from hood.assets.library import motion_split
-from hood.assets.sequence import PoseSequence, load_sequence
+from hood.assets.body.load import load_body
+from hood.assets.files.library import motion_split
+from hood.assets.garment.garment import Garment, load_garment
+from hood.assets.motion.load import load_sequence
+from hood.assets.motion.sequence import PoseSequence
 from hood.commands.batch import expand_sequences
 from hood.commands.candidates import digest, distinct, make_candidate
 from hood.commands.cautions import evaluation_cautions, warn

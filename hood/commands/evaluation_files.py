@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hood.assets.atomic import write_atomically
+from hood.assets.files.atomic import write_atomically
 from hood.evaluation.report import COLUMNS, describe, format_table
 from hood.evaluation.rows import write_rows
 from hood.evaluation.spectrum import COLUMNS as SPECTRUM_COLUMNS

@@ -12,8 +12,9 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from hood.assets import identify as kinds
-from hood.assets.animated_mesh import NO_BODY, body_kind
-from hood.assets.body import Body, load_body
+from hood.assets.body.body import Body
+from hood.assets.body.load import load_body
+from hood.assets.motion.animated_mesh import NO_BODY, body_kind
 from hood.commands import findings
 from hood.commands.findings import Finding
 from hood.commands.notices import heard

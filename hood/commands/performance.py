@@ -8,8 +8,8 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 
-from hood.assets.animated_mesh import body_kind
-from hood.assets.library import names
+from hood.assets.files.library import names
+from hood.assets.motion.animated_mesh import body_kind
 from hood.config import ConfigError, plain
 from hood.scene.cast import NO_MOTION, MotionOptions, load_motion
 from hood.scene.motion import Motion

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
-from hood.assets.library import locate
+from hood.assets.files.library import locate
 from hood.commands.cloth_contact import potential_of
 from hood.commands.common import held_folder, output_folder
 from hood.commands.dial import refined

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from omegaconf import DictConfig
 
-from hood.assets.library import unknown
+from hood.assets.files.library import unknown
 from hood.commands.cloth_contact import acts
 from hood.commands.dial import chosen
 from hood.config import ConfigError, build

@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
-from hood.assets import alterations
-from hood.assets.alterations import Fitting
-from hood.assets.binding import push_out, signed_distances
-from hood.assets.garment import Garment, save_garment
-from hood.assets.outfit import join_garments
-from hood.assets.pins import pin_mask, pin_numbers
-from hood.assets.suspicions import suspect_kind, suspect_place, suspect_seams
+from hood.assets.garment import alterations
+from hood.assets.garment.alterations import Fitting
+from hood.assets.garment.binding import push_out, signed_distances
+from hood.assets.garment.garment import Garment, save_garment
+from hood.assets.garment.outfit import join_garments
+from hood.assets.garment.pins import pin_mask, pin_numbers
+from hood.assets.garment.suspicions import suspect_kind, suspect_place, suspect_seams
 from hood.commands.common import prepare_folder
 from hood.commands.placing import AUTO, asked_keys, explain_size, find_place_on_mesh, keep_place
 from hood.commands.wardrobe import checked_pins, heed

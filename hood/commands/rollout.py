@@ -15,7 +15,7 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from hood.assets.occupied import occupy
+from hood.assets.files.folder_lock import occupy
 from hood.commands.automatic import advice
 from hood.commands.batch import Job, find_jobs, share
 from hood.commands.cautions import warn

@@ -10,8 +10,8 @@ from pathlib import Path
 import torch
 from omegaconf import DictConfig
 
-from hood.assets.garment import Garment
-from hood.assets.library import locate
+from hood.assets.files.library import locate
+from hood.assets.garment.garment import Garment
 from hood.assets.material import Material
 from hood.commands.automatic import Choice, choose
 from hood.commands.cautions import scene_cautions, warn

@@ -10,9 +10,9 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from hood.assets.atomic import write_atomically
-from hood.assets.garment import load_garment
-from hood.assets.library import names
+from hood.assets.files.atomic import write_atomically
+from hood.assets.files.library import names
+from hood.assets.garment.garment import load_garment
 from hood.commands.batch import expand_sequences
 from hood.commands.circumstances import device_name
 from hood.commands.common import held_folder, output_folder, require_same_config

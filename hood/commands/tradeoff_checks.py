@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from omegaconf import DictConfig
 
-from hood.assets.library import locate
+from hood.assets.files.library import locate
 from hood.commands.batch import expand_sequences
 from hood.commands.common import UNTRAINED, require_device, require_distinct, require_package
 from hood.commands.wardrobe import shape_coefficients

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from hood.assets.garment import Garment, load_garment
-from hood.assets.outfit import join_garments
-from hood.assets.pins import pin_mask
-from hood.assets.suspicions import Suspicion, suspect_kind, suspect_seams
-from hood.assets.units import require_metres, used
+from hood.assets.garment.garment import Garment, load_garment
+from hood.assets.garment.outfit import join_garments
+from hood.assets.garment.pins import pin_mask
+from hood.assets.garment.suspicions import Suspicion, suspect_kind, suspect_seams
+from hood.assets.garment.units import require_metres, used
 from hood.config import ConfigError, plain
 from hood.scene.motion import BodyMotion, Motion
 
@@ -38,7 +38,7 @@ def read_outfit(given: Any, motion: Motion, triangulate: bool = False, pins: Any
     Args:
         given: a name, a file, a list of them, or a garment that is read already.
         triangulate: split polygons of mesh files instead of refusing them.
-        pins: what is held instead of the files' own pins, see :func:`hood.assets.pins.pin_mask`; None: the files' own.
+        pins: what is held instead of the files' own pins, see :func:`hood.assets.garment.pins.pin_mask`; None: the files' own.
 
     Raises:
         ValueError: a garment that cannot be read, is not in metres or does not fit, or pins it does not have.

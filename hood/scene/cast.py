@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from hood.assets.animated_mesh import NO_BODY, body_kind, load_mesh_sequence
-from hood.assets.body import load_body
-from hood.assets.sequence import load_sequence
+from hood.assets.body.load import load_body
+from hood.assets.motion.animated_mesh import NO_BODY, body_kind, load_mesh_sequence
+from hood.assets.motion.load import load_sequence
 from hood.scene.mesh_motion import NoBody, mesh_motion
 from hood.scene.motion import Motion, body_motion
 
@@ -55,7 +55,7 @@ def load_motion(
 
     Args:
         body: embedded name, model file of the SMPL family or a folder of them, a moving or still mesh
-            (:func:`hood.assets.animated_mesh.load_mesh_sequence`), or "none".
+            (:func:`hood.assets.motion.animated_mesh.load_mesh_sequence`), or "none".
         sequence: embedded name or motion file; a mesh performs its own, and "none" has none: not looked at then.
 
     Raises:

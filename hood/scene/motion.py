@@ -11,12 +11,12 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from hood.assets.binding import bind_garment, hold_on_trunk
-from hood.assets.body import Body
-from hood.assets.garment import Garment
-from hood.assets.sequence import PoseSequence
-from hood.assets.sequence_edit import blend_in
-from hood.assets.skinning import linear_blend_skinning
+from hood.assets.body.body import Body
+from hood.assets.body.skinning import linear_blend_skinning
+from hood.assets.garment.binding import bind_garment, hold_on_trunk
+from hood.assets.garment.garment import Garment
+from hood.assets.motion.sequence import PoseSequence
+from hood.assets.motion.sequence_edit import blend_in
 from hood.scene.state import Obstacle
 
 #: Frames posed at once: enough to amortise the call, few enough for short training windows.
@@ -195,8 +195,8 @@ class BodyMotion:
         )
 
     def dressed(self, garment: Garment) -> Garment:
-        """The garment bound to the body (:func:`hood.assets.binding.bind_garment`), what is held there steadied
-        (:func:`hood.assets.binding.hold_on_trunk`)."""
+        """The garment bound to the body (:func:`hood.assets.garment.binding.bind_garment`), what is held there steadied
+        (:func:`hood.assets.garment.binding.hold_on_trunk`)."""
         return hold_on_trunk(bind_garment(garment, self.body), self.body)
 
     def rest_pos(self, garment: Garment) -> np.ndarray:

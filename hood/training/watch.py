@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hood.assets.atomic import write_atomically
+from hood.assets.files.atomic import write_atomically
 from hood.dynamics.reel import Reel
 from hood.dynamics.simulator import Simulator
 from hood.evaluation.validation import Validation, summarise

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
-from hood.assets.extremes import write_garment, write_motion
+from hood.assets.extremes.files import write_garment, write_motion
 from hood.commands.cloth_contact import potential_of
 from hood.commands.common import weigh
 from hood.commands.dial import refined

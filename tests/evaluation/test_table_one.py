@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from hood.assets.library import locate
+from hood.assets.files.library import locate
 from hood.commands.circumstances import command_line, training_note
 from hood.dynamics.stepper import NewtonStepper
 from hood.evaluation.table import ALL, Candidate, Measured, candidate_rows

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hood.assets.body import Body
+from hood.assets.body.body import Body
 from hood.scene.cast import MotionOptions, load_motion
 from hood.scene.mesh_motion import MeshMotion, NoBody
 from hood.scene.motion import BodyMotion

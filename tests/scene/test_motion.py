@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from hood.assets.body import Body
-from hood.assets.garment import Garment
-from hood.assets.sequence import PoseSequence
+from hood.assets.body.body import Body
+from hood.assets.garment.garment import Garment
+from hood.assets.motion.sequence import PoseSequence
 from hood.scene.motion import body_motion
 from hood.scene.scene import build_scene
 

@@ -10,10 +10,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from hood.assets.body import Body
-from hood.assets.garment import Garment
+from hood.assets.body.body import Body
+from hood.assets.garment.garment import Garment
 from hood.assets.material import Material
-from hood.assets.sequence import PoseSequence
+from hood.assets.motion.sequence import PoseSequence
 from hood.dynamics.march import Marched, march
 from hood.dynamics.measure import penetration_metrics, strain_metrics
 from hood.dynamics.rollout import simulate
