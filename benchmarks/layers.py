@@ -31,7 +31,7 @@ from hood.assets.garment.garment import Garment, load_garment
 from hood.assets.garment.outfit import join_garments
 from hood.assets.motion.load import load_sequence
 from hood.cli import ENVIRONMENT
-from hood.commands.circumstances import machine_name
+from hood.commands.conditions import machine_name
 from hood.dynamics.rollout import Frame, simulate
 from hood.dynamics.simulator import Prediction
 from hood.dynamics.stepper import NewtonStepper

@@ -1,4 +1,4 @@
-"""What a file is, by its name and its keys; only what is needed to tell is read, and nothing is run."""
+"""The kind of a file (garment, body, motion, rollout, …), from its name and its keys."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What ``hood inspect`` says of a garment that does not lie where it belongs."""
+"""Sentences of ``hood inspect`` on a garment that does not lie on its body."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ from hood.dynamics.soundness import judge_rollout, worst_frame
 from hood.mesh.defects import Defects, find_defects
 from hood.mesh.quality import check_triangles
 from hood.mesh.topology import boundary_loops
-from hood.scene.cast import NO_MOTION, MotionOptions, load_motion
+from hood.scene.load_motion import NO_MOTION, MotionOptions, load_motion
 from hood.scene.mesh_motion import MeshMotion
 
 _UNPLACED = "give prepare the body that it was made for (body=…, betas=…), or scale, up, turn, offset and pose"

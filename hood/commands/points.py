@@ -1,4 +1,4 @@
-"""Points measured in processes of their own, several side by side; what is done is not done again."""
+"""Runs the points of a chart in processes of their own, several side by side; finished ones are not run again."""
 
 from __future__ import annotations
 

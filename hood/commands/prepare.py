@@ -29,9 +29,9 @@ from hood.assets.motion.load import load_sequence
 from hood.assets.motion.poses import POSE_SUFFIXES, arms_down, read_pose
 from hood.assets.motion.sequence import PoseSequence
 from hood.commands.common import prepare_folder
+from hood.commands.garments import checked_pins, heed, names_of, shape_coefficients
 from hood.commands.placing import AUTO, arm_angle, asked_keys, explain_size, find_place, keep_place
 from hood.commands.prepare_mesh import prepare_for_mesh
-from hood.commands.wardrobe import checked_pins, heed, names_of, shape_coefficients
 from hood.config import ConfigError, load_config, plain, require_choice
 from hood.media.mesh_export import write_obj
 from hood.mesh.quality import check_triangles

@@ -24,12 +24,12 @@ from hood.assets.garment.outfit import join_garments
 from hood.assets.garment.pins import pin_mask, pin_numbers
 from hood.assets.garment.suspicions import suspect_kind, suspect_place, suspect_seams
 from hood.commands.common import prepare_folder
+from hood.commands.garments import checked_pins, heed
 from hood.commands.placing import AUTO, asked_keys, explain_size, find_place_on_mesh, keep_place
-from hood.commands.wardrobe import checked_pins, heed
 from hood.config import ConfigError, plain
 from hood.mesh.quality import check_triangles
-from hood.scene.cast import NO_MOTION, MotionOptions, load_motion
 from hood.scene.fitting import FitFigures, fit_figures
+from hood.scene.load_motion import NO_MOTION, MotionOptions, load_motion
 from hood.scene.mesh_motion import MeshMotion, worn_pos
 from hood.scene.scene import dress
 

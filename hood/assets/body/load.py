@@ -1,4 +1,4 @@
-"""The body that a name or a path means."""
+"""Loading a body by name or by path."""
 
 from __future__ import annotations
 

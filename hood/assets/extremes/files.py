@@ -1,4 +1,4 @@
-"""Motions and garments beyond what anybody would ask for, and broken files: what the stability map is made from."""
+"""Writes the input files of the stability map: extreme motions and garments, and broken files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Garments beyond what anybody would ask for, made from others: too small, torn, refined, with faults that meshes have."""
+"""Extreme garments for the stability map: too small, torn, refined, with mesh faults."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Motions beyond what anybody would ask for: a standing body that jumps, spins, falls, or bends into poses no body takes."""
+"""Extreme motions for the stability map: a standing body that jumps, spins, falls, or bends too far."""
 
 from __future__ import annotations
 

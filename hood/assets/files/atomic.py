@@ -1,4 +1,4 @@
-"""Files that are the old ones or the new ones and never something between, whatever stops the writer."""
+"""Atomic file writes: a reader finds the old file or the whole new one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Folders with one writer at a time: two runs into one folder would overwrite each other's files."""
+"""Locks on output folders: one run at a time writes into a folder."""
 
 from __future__ import annotations
 

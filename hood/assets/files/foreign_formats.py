@@ -1,4 +1,4 @@
-"""Formats of other programs that nothing here reads, and the way out of each."""
+"""File formats that are not read, each with the way to convert it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Limits on the size of files, and one kind of error for what cannot be read."""
+"""Size limits for files, and one kind of error for files that cannot be read."""
 
 from __future__ import annotations
 

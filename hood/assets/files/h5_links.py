@@ -1,4 +1,4 @@
-"""HDF5 files hold their own data: links, external storage and virtual tables may name any file of the machine."""
+"""HDF5 datasets that lie in their own file; links to other files of the machine are refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Names of the embedded defaults and their files; a name that does not exist names its nearest neighbours."""
+"""Names and files of the embedded assets, and checked reading of ``.npz`` files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""OFF and STL: the two formats that hold little more than triangles."""
+"""Readers of OFF and STL files."""
 
 from __future__ import annotations
 

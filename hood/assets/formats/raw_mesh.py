@@ -1,4 +1,4 @@
-"""What a mesh file says, before polygons are split and doubled vertices joined; shared by the readers of all formats."""
+"""The content of a mesh file before polygons are split and doubled vertices joined; what all readers return."""
 
 from __future__ import annotations
 

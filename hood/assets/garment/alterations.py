@@ -1,4 +1,4 @@
-"""What makes a garment file wearable, step by step; each step returns the garment and says what it did, with counts."""
+"""Repairs of a garment file, step by step; each step returns the garment and a report with counts."""
 
 from __future__ import annotations
 

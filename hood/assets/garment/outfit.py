@@ -1,4 +1,4 @@
-"""Several garments as one: side by side in one mesh."""
+"""Outfits: several garments joined into one mesh."""
 
 from __future__ import annotations
 

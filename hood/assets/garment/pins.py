@@ -1,4 +1,4 @@
-"""Which vertices of a garment are held: by number, by opening, by painted colour, or from a list on disk."""
+"""Pinned vertices of a garment: by number, by opening, by painted colour, or from a file."""
 
 from __future__ import annotations
 

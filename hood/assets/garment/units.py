@@ -1,4 +1,4 @@
-"""Units of a garment by its size beside the body."""
+"""The unit of length of a garment file, guessed from its size beside the body."""
 
 from __future__ import annotations
 

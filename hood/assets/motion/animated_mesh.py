@@ -1,4 +1,4 @@
-"""Any moving mesh as a body: its vertices frame by frame, at the frame rate of the simulation."""
+"""Reading a moving mesh that serves as a body, at the frame rate of the simulation."""
 
 from __future__ import annotations
 

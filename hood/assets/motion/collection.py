@@ -1,4 +1,4 @@
-"""Whole collections of motions: folders, globs and split lists, as files."""
+"""Lists of motion files from folders, globs and split lists."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The motion that a name or a path means, resampled, turned y up, cut and repeated as asked."""
+"""Loading a motion by name or by path: resampled, turned y up, cut and repeated."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A moving mesh, and what can be done to its motion: resampled, turned, cut and repeated."""
+"""Mesh sequences: a moving mesh, resampled, turned, cut and repeated."""
 
 from __future__ import annotations
 

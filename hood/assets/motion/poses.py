@@ -1,4 +1,4 @@
-"""Poses a garment may have been modelled around: T, A, and those in files."""
+"""Poses that a garment may have been modelled in: T-pose, A-pose, and poses in files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Motion files as they are: AMASS archives of every layout, the reference's pose pickles, VTO's pickles."""
+"""Motion files as recorded: AMASS archives of every layout, pose pickles of the reference implementation and of VTO."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Motions as a body performs them: of any frame rate and layout, resampled and turned y up."""
+"""Pose sequences: joint rotations and root translation over time, resampled and turned."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Parts, repetitions and lead-ins of a motion."""
+"""Edits of a pose sequence: trimming, loops, and a lead-in from a standing pose."""
 
 from __future__ import annotations
 

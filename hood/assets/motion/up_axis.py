@@ -1,4 +1,4 @@
-"""Which way a recorded body stands: what the keys of a motion file say by custom alone."""
+"""The up axis of a recorded motion, found from the poses."""
 
 from __future__ import annotations
 

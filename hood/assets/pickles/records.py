@@ -1,4 +1,4 @@
-"""Inert records in place of what a pickle names: they become numpy arrays, sparse matrices or nothing at all."""
+"""Inert records for the objects that a pickle names; they become numpy arrays, sparse matrices or nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every rollout of an evaluation gave, written down as soon as it is done: an interruption costs one rollout."""
+"""A log of the rollouts of an evaluation, one line each, so that an interrupted evaluation goes on where it was."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Unit(NamedTuple):
     shape: int = 0  # place in the list of body shapes
 
 
-class Diary:
+class RolloutLog:
     """Lines of ``rollouts.RANK.jsonl`` in ``folder``: one process appends to its own file, every process reads all of them."""
 
     def __init__(self, folder: Path, rank: int = 0) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hood.assets.body.body import Body
-from hood.scene.cast import MotionOptions, load_motion
+from hood.scene.load_motion import MotionOptions, load_motion
 from hood.scene.mesh_motion import MeshMotion, NoBody
 from hood.scene.motion import BodyMotion
 from hood.testing import sphere

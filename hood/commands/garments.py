@@ -1,4 +1,4 @@
-"""Garments as the commands are given them: one or several, repaired or not, with the vertices that are held."""
+"""Reading the garments that a command is given: one or several, repaired or not, with their pins."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The body and motion that a configuration names, for every command that has those keys."""
+"""Reading the body and motion that a command is given."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 from hood.assets.files.library import names
 from hood.assets.motion.animated_mesh import body_kind
 from hood.config import ConfigError, plain
-from hood.scene.cast import NO_MOTION, MotionOptions, load_motion
+from hood.scene.load_motion import NO_MOTION, MotionOptions, load_motion
 from hood.scene.motion import Motion
 
 
@@ -22,7 +22,7 @@ def make_motion(config: DictConfig, dtype: torch.dtype = torch.float32) -> Motio
     meant.
 
     Raises:
-        FileNotFoundError, ValueError: from :func:`hood.scene.cast.load_motion`.
+        FileNotFoundError, ValueError: from :func:`hood.scene.load_motion.load_motion`.
         ConfigError: a value of the wrong kind, or a motion file that the body cannot perform; names the key.
     """
     kind = body_kind(str(config.body))

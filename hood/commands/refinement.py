@@ -1,4 +1,4 @@
-"""The dial between speed and accuracy: what a user says about it, what it becomes, and how it is reported."""
+"""The keys of refinement (``refine``, ``target_rg``, ``budget_ms``, ``max_strain``): checked, applied, reported."""
 
 from __future__ import annotations
 
@@ -19,25 +19,27 @@ from hood.losses.potential import Potential
 from hood.solver.reasons import count_reasons, name_counts
 
 #: The ways to say how far a step is refined; a user gives one of them.
-DIALS = ("refine", "target_rg", "budget_ms", "max_strain")
+REFINEMENT_KEYS = ("refine", "target_rg", "budget_ms", "max_strain")
 #: ``refine=auto``: as the garment's size needs (:mod:`hood.commands.automatic`).
 AUTO = "auto"
 COLOURS = ("none", "strain", "rg")
 _BEGIN_FROM_TABLE = ("budget_ms", "max_strain")
-#: What says more about a dial, and its value where nothing is said.
+#: What says more about a refinement, and its value where nothing is said.
 _DETAILS = {"refine_method": "newton", "refine_most": 50, "refine_table": None}
 
 
 def chosen(config: Mapping[Any, Any]) -> tuple[str, float] | None:
-    """Name and value of the dial that is set; None where steps are taken as they come, and while it is left to ``auto``.
+    """Name and value of the refinement key that is set; None where there is none, and while it is left to ``auto``.
 
     Raises:
         ConfigError: two are set, or the value is no number.
     """
-    given = [*(["refine"] if config.get("refine") not in (None, 0, AUTO) else []), *other_dials(config)]
+    given = [*(["refine"] if config.get("refine") not in (None, 0, AUTO) else []), *other_refinement_keys(config)]
     if len(given) > 1:
         text = " and ".join(f"{name}={config[name]}" for name in given)
-        raise ConfigError(f"{text}: these say in {len(given)} ways how far a step is refined; give one of {', '.join(DIALS)}")
+        raise ConfigError(
+            f"{text}: these say in {len(given)} ways how far a step is refined; give one of {', '.join(REFINEMENT_KEYS)}"
+        )
     if not given:
         return None
     value = config[given[0]]
@@ -46,33 +48,35 @@ def chosen(config: Mapping[Any, Any]) -> tuple[str, float] | None:
     return given[0], float(value)
 
 
-def other_dials(config: Mapping[Any, Any]) -> list[str]:
-    """The dials but ``refine`` that are set."""
-    return [name for name in DIALS if name != "refine" and config.get(name) is not None]
+def other_refinement_keys(config: Mapping[Any, Any]) -> list[str]:
+    """The refinement keys but ``refine`` that are set."""
+    return [name for name in REFINEMENT_KEYS if name != "refine" and config.get(name) is not None]
 
 
-def check_dial(config: DictConfig) -> None:
+def check_refinement(config: DictConfig) -> None:
     """Raise ConfigError where what is said about refinement, export and colour does not fit together."""
-    dial = chosen(config)
+    asked = chosen(config)
     require_choice(config, "refine_method", METHODS)
     require_choice(config, "colour", COLOURS)
     exported(config)
     if int(config.refine_most) < 1:
         raise ConfigError(f"refine_most={config.refine_most}: must be at least 1")
-    if dial is None:
+    if asked is None:
         if str(config.stepper) == "refine":
-            raise ConfigError(f"stepper=refine takes its steps by refinement alone; give one of {', '.join(DIALS)}")
+            raise ConfigError(f"stepper=refine takes its steps by refinement alone; give one of {', '.join(REFINEMENT_KEYS)}")
         for name, default in _DETAILS.items():
             if config[name] != default:
-                raise ConfigError(f"{name}={config[name]}: nothing is refined; give one of {', '.join(DIALS)} as well")
+                raise ConfigError(
+                    f"{name}={config[name]}: nothing is refined; give one of {', '.join(REFINEMENT_KEYS)} as well"
+                )
         return
     if str(config.stepper) == "newton":
         raise ConfigError(
-            f"{dial[0]}={config[dial[0]]}: stepper=newton goes as far as solver.* says; use stepper=refine instead"
+            f"{asked[0]}={config[asked[0]]}: stepper=newton goes as far as solver.* says; use stepper=refine instead"
         )
-    if config.refine_table is not None and dial[0] not in _BEGIN_FROM_TABLE:
+    if config.refine_table is not None and asked[0] not in _BEGIN_FROM_TABLE:
         raise ConfigError(
-            f"refine_table={config.refine_table}: says where {' and '.join(_BEGIN_FROM_TABLE)} begin; {dial[0]} needs none"
+            f"refine_table={config.refine_table}: says where {' and '.join(_BEGIN_FROM_TABLE)} begin; {asked[0]} needs none"
         )
     make_goal(config, num_vertices=1000)
 
@@ -97,10 +101,10 @@ def make_goal(config: DictConfig, num_vertices: int) -> Goal | None:
     Raises:
         ConfigError, ValueError: a value that no refinement can have.
     """
-    dial = chosen(config)
-    if dial is None:
+    asked = chosen(config)
+    if asked is None:
         return None
-    name, value = dial
+    name, value = asked
     most = int(config.refine_most)
     if name == "refine":
         return Count(int(value))
@@ -128,14 +132,14 @@ def refined(stepper: Stepper, config: DictConfig, num_vertices: int, potential: 
 
 
 def summarise_refinement(config: Mapping[str, Any], metrics: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Entry ``refinement`` of a summary: the dial, iterations and accuracy reached, frames that met it and that missed it.
+    """Entry ``refinement`` of a summary: the key, iterations and accuracy reached, frames that met it and that missed it.
 
     Frames count from the first step on. A frame meets ``budget_ms`` with its time from one frame to the next, ``ms_total``.
     """
-    dial = chosen(config)
-    if dial is None or "refine_iterations" not in metrics:
+    asked = chosen(config)
+    if asked is None or "refine_iterations" not in metrics:
         return {}
-    name, value = dial
+    name, value = asked
     iterations, residual = metrics["refine_iterations"][1:], metrics["refine_rg"][1:]
     entry: dict[str, Any] = {
         "dial": f"{name}={value:g}",

@@ -1,4 +1,4 @@
-"""Which body and which motion a name means: everything that can move, behind one function."""
+"""Loading a body in motion: any body (model, mesh, none) with any motion, behind one function."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the figures of an evaluation depend on, in words: the command, the machine, what the models were trained with."""
+"""The conditions of an evaluation in words: its command, the machine, how the models were trained."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from omegaconf import DictConfig
 from hood.config import plain
 from hood.dynamics.checkpoint import read_header
 from hood.dynamics.reference import SUFFIXES
-from hood.evaluation.table_one import Circumstances
+from hood.evaluation.table_one import Conditions
 
 #: Arguments that change nothing about the figures.
 _ASIDE = ("output", "resume", "max_rollouts", "contact_sheets")
 
 
-def circumstances(
+def conditions(
     config: DictConfig,
     overrides: Sequence[str],
     motions: Sequence[str],
     vertices: Mapping[str, int],
     training: Mapping[str, str],
-) -> Circumstances:
+) -> Conditions:
     """Of an evaluation with ``config``: ``vertices`` by garment, ``training`` in words by model."""
-    return Circumstances(
+    return Conditions(
         command=command_line("evaluate", overrides),
         machine=machine_name(str(config.device)),
         body=f"{Path(str(config.body)).stem} (embedded)" if str(config.body) == "default" else Path(str(config.body)).name,

@@ -1,4 +1,4 @@
-"""The frames of a rollout in memory, to be drawn when it is over."""
+"""The frames of a rollout kept in memory, to be drawn when it is over."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hood.dynamics.rollout import Frame
 from hood.scene.scene import Scene
 
 
-class Reel:
+class KeptFrames:
     """Keeps every frame that it is shown, all of one scene."""
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""The dial on the command line: what is refused, what is written, what is reported."""
+"""Refinement keys on the command line: what is refused, what is written, what is reported."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 
 from hood.cli import main
-from hood.commands.dial import summarise_refinement
+from hood.commands.refinement import summarise_refinement
 from hood.dynamics.recorder import read_rollout
 
 UNTRAINED = ["checkpoint=untrained", "model=small", "model.latent_dim=4", "model.schedule='1x(mesh)'"]
 SHORT = ["rollout", *UNTRAINED, "garment=tank", "num_frames=4", "video=none", "sheet=false", "output=run"]
 REFUSED = {
-    "two dials": (["refine=3", "target_rg=0.1"], "refine=3 and target_rg=0.1: these say in 2 ways"),
-    "three dials": (["max_strain=0.1", "target_rg=0.1", "budget_ms=40"], "in 3 ways how far a step is refined; give one of"),
-    "a dial on the solver": (["stepper=newton", "refine=3"], "stepper=newton goes as far as solver.* says"),
+    "two keys": (["refine=3", "target_rg=0.1"], "refine=3 and target_rg=0.1: these say in 2 ways"),
+    "three keys": (["max_strain=0.1", "target_rg=0.1", "budget_ms=40"], "in 3 ways how far a step is refined; give one of"),
+    "a key on the solver": (["stepper=newton", "refine=3"], "stepper=newton goes as far as solver.* says"),
     "refinement of nothing by nothing": (["stepper=refine"], "stepper=refine takes its steps by refinement alone"),
-    "details without a dial": (["refine_method=sweeps"], "refine_method=sweeps: nothing is refined"),
-    "a table for another dial": (
+    "details without a key": (["refine_method=sweeps"], "refine_method=sweeps: nothing is refined"),
+    "a table for another key": (
         ["refine=2", "refine_table=t.json"],
         "says where budget_ms and max_strain begin; refine needs none",
     ),

@@ -1,4 +1,4 @@
-"""Time steps of a bare problem: any cloth and obstacle, no garment, body or file."""
+"""Implicit Euler steps of any cloth and obstacle; needs no garment, body or file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hood.solver.newton import NewtonSettings, Report, minimize
 
 
 @dataclass(frozen=True)
-class Marched:
+class EulerStep:
     """A step taken: what it solved, where it led and how well."""
 
     problem: StepProblem
@@ -23,7 +23,7 @@ class Marched:
     report: Report
 
 
-def march(
+def implicit_euler(
     potential: Potential,
     problem: StepProblem,
     num_steps: int,
@@ -31,7 +31,7 @@ def march(
     step_input: Callable[[int], StepInput] | None = None,
     contact: Callable[[int, State], Contact | None] | None = None,
     start: Callable[[StepProblem], Tensor] | None = None,
-) -> Iterator[Marched]:
+) -> Iterator[EulerStep]:
     """Implicit Euler steps from the state of ``problem``, one by one; v_{t+1} = v_t + dt a = (x_{t+1} - x_t) / dt.
 
     Steps that miss the target accuracy are taken as far as they got: read ``report.converged``. The frame of the state
@@ -50,4 +50,4 @@ def march(
         now = potential.prepare(fresh)
         pos, report = minimize(potential, now, None if start is None else start(now), settings)
         state = State(pos, state.vel + now.vertex_dt * report.acc, state.origin)
-        yield Marched(now, state, report)
+        yield EulerStep(now, state, report)

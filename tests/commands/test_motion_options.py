@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hood.commands.performance import make_motion, motion_options
+from hood.commands.motion import make_motion, motion_options
 from hood.config import ConfigError, load_config
-from hood.scene.cast import MotionOptions
+from hood.scene.load_motion import MotionOptions
 from hood.scene.mesh_motion import MeshMotion, NoBody
 from hood.scene.motion import BodyMotion
 from hood.testing import sphere
