@@ -20,10 +20,10 @@ from statistics import median
 
 import torch
 
-from hood.assets.body import load_body
-from hood.assets.garment import load_garment
-from hood.assets.library import locate
-from hood.assets.sequence import load_sequence
+from hood.assets.body.load import load_body
+from hood.assets.files.library import locate
+from hood.assets.garment.garment import load_garment
+from hood.assets.motion.load import load_sequence
 from hood.dynamics.checkpoint import load_simulator
 from hood.dynamics.simulator import Simulator
 from hood.losses.potential import Potential, default_potential

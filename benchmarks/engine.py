@@ -37,11 +37,11 @@ import numpy as np
 import torch
 from frame import refined
 
-from hood.assets.body import load_body
-from hood.assets.garment import load_garment
-from hood.assets.sequence import load_sequence
+from hood.assets.body.load import load_body
+from hood.assets.garment.garment import load_garment
+from hood.assets.motion.load import load_sequence
 from hood.cli import ENVIRONMENT
-from hood.commands.circumstances import machine_name
+from hood.commands.conditions import machine_name
 from hood.dynamics.rollout import simulate
 from hood.dynamics.simulator import Prediction
 from hood.dynamics.stepper import NewtonStepper

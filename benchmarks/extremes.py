@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from hood.assets.material import Material
-from hood.dynamics.march import march
+from hood.dynamics.implicit_euler import implicit_euler
 from hood.dynamics.measure import strain_metrics
 from hood.losses.potential import Potential, default_potential
 from hood.losses.problem import StepProblem
@@ -63,7 +63,7 @@ def mechanical_energy(problem: StepProblem, state: State) -> float:
 def measure(problem: StepProblem, frames: int, settings: NewtonSettings) -> Line:
     rows = []
     start = mechanical_energy(problem, problem.state)
-    for step in march(default_potential(), problem, frames, settings):
+    for step in implicit_euler(default_potential(), problem, frames, settings):
         rows.append(
             (
                 float(step.report.converged.all()),

@@ -25,11 +25,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hood.assets.body import load_body
-from hood.assets.garment import Garment, load_garment
-from hood.assets.library import DATA_FOLDER
+from hood.assets.body.load import load_body
+from hood.assets.files.library import DATA_FOLDER
+from hood.assets.garment.garment import Garment, load_garment
 from hood.assets.material import Material
-from hood.assets.sequence import load_sequence
+from hood.assets.motion.load import load_sequence
 from hood.cli import ENVIRONMENT
 from hood.dynamics import simulator as simulator_module
 from hood.dynamics.checkpoint import load_simulator

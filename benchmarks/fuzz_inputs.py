@@ -17,14 +17,14 @@ import numpy as np
 import torch
 from omegaconf import DictConfig
 
-from hood.assets.animated_mesh import load_mesh_sequence
-from hood.assets.garment import load_garment
-from hood.assets.mesh_file import read_mesh_file
-from hood.assets.model_file import read_model
-from hood.assets.motion_file import read_recording
-from hood.assets.pins import read_indices
-from hood.assets.standing import read_pose
-from hood.assets.torch_file import load_torch
+from hood.assets.body.model_file import read_model
+from hood.assets.formats.mesh_file import read_mesh_file
+from hood.assets.garment.garment import load_garment
+from hood.assets.garment.pins import read_indices
+from hood.assets.motion.animated_mesh import load_mesh_sequence
+from hood.assets.motion.poses import read_pose
+from hood.assets.motion.recording import read_recording
+from hood.assets.pickles.torch_file import load_torch
 from hood.commands.common import require_same_config
 from hood.config import load_config
 from hood.dynamics.checkpoint import load_simulator, save_simulator

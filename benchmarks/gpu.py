@@ -43,11 +43,11 @@ from frame import refined
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from hood.assets.body import load_body
-from hood.assets.garment import load_garment
-from hood.assets.library import locate
+from hood.assets.body.load import load_body
+from hood.assets.files.library import locate
+from hood.assets.garment.garment import load_garment
 from hood.assets.material import Material
-from hood.assets.sequence import load_sequence
+from hood.assets.motion.load import load_sequence
 from hood.cli import ENVIRONMENT
 from hood.dynamics.captured import CapturedSimulator
 from hood.dynamics.captured_newton import CapturedNewton

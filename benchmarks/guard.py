@@ -20,10 +20,10 @@ import numpy as np
 import torch
 from surface import GARMENTS, make_stepper, solves
 
-from hood.assets.body import load_body
-from hood.assets.garment import load_garment
-from hood.assets.library import motion_split
-from hood.assets.sequence import load_sequence
+from hood.assets.body.load import load_body
+from hood.assets.files.library import motion_split
+from hood.assets.garment.garment import load_garment
+from hood.assets.motion.load import load_sequence
 from hood.dynamics.guard import MENDED, Guard, body_motion
 from hood.dynamics.mend import standing
 from hood.dynamics.rollout import simulate

@@ -25,7 +25,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))  # the tests' own scenes
 from layer_scenes import SCENES
 
-from hood.dynamics.march import Marched, march
+from hood.dynamics.implicit_euler import EulerStep, implicit_euler
 from hood.losses.layer_friction import LayerFriction
 from hood.losses.layers import LayerBarrier
 from hood.losses.potential import Potential, default_potential
@@ -51,7 +51,7 @@ class Line:
     iterations: list[int] = field(default_factory=list)
     milliseconds: list[float] = field(default_factory=list)
 
-    def add(self, index: int, step: Marched, spent: float) -> None:
+    def add(self, index: int, step: EulerStep, spent: float) -> None:
         """Take a step into account."""
         pos = step.state.pos.numpy()
         self.pairs = max(self.pairs, len(self_crossings(pos, step.problem.cloth.faces.numpy())))
@@ -73,7 +73,7 @@ class Line:
         )
 
 
-def timed(steps: Iterator[Marched]) -> Iterator[tuple[Marched, float]]:
+def timed(steps: Iterator[EulerStep]) -> Iterator[tuple[EulerStep, float]]:
     """Steps with the milliseconds of CPU time that each took."""
     while True:
         began = time.process_time()
@@ -104,8 +104,8 @@ def pictures(problem: StepProblem, frames: list[np.ndarray]) -> list[Picture]:
 def run(potentials: list[Potential], problem: StepProblem, steps: int, engine: str) -> tuple[list[Line], list[np.ndarray]]:
     """A line per potential, their steps taken in turns, and the positions (V, 3) that the first went through."""
     lines, frames = [Line() for _ in potentials], [problem.state.pos.numpy()]
-    marches = [timed(march(potential, problem, steps, NewtonSettings(engine=engine))) for potential in potentials]
-    for index, turn in enumerate(zip(*marches, strict=True)):
+    runs = [timed(implicit_euler(potential, problem, steps, NewtonSettings(engine=engine))) for potential in potentials]
+    for index, turn in enumerate(zip(*runs, strict=True)):
         frames.append(turn[0][0].state.pos.numpy())
         for line, (step, spent) in zip(lines, turn, strict=True):
             line.add(index, step, spent)

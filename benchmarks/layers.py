@@ -26,12 +26,12 @@ import torch
 from frame import refined
 from torch import Tensor
 
-from hood.assets.body import load_body
-from hood.assets.garment import Garment, load_garment
-from hood.assets.outfit import join_garments
-from hood.assets.sequence import load_sequence
+from hood.assets.body.load import load_body
+from hood.assets.garment.garment import Garment, load_garment
+from hood.assets.garment.outfit import join_garments
+from hood.assets.motion.load import load_sequence
 from hood.cli import ENVIRONMENT
-from hood.commands.circumstances import machine_name
+from hood.commands.conditions import machine_name
 from hood.dynamics.rollout import Frame, simulate
 from hood.dynamics.simulator import Prediction
 from hood.dynamics.stepper import NewtonStepper

@@ -24,8 +24,8 @@ from order_report import Results, comparisons, draw, exact_table, read_rows, tab
 from order_scenes import Hanging, write_body, write_scene
 from recipes import ONE_PASS, Recipe, cell, fast, folder_of, run
 
-from hood.assets.atomic import write_atomically
-from hood.assets.body import load_body
+from hood.assets.body.load import load_body
+from hood.assets.files.atomic import write_atomically
 from hood.nn.schedule import parse_schedule, radius
 
 SCHEDULES = ("fine15", "ours", "fine48")

@@ -13,9 +13,9 @@ from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 from torch import Tensor
 
-from hood.assets.body import load_body
-from hood.assets.garment import load_garment
-from hood.assets.sequence import load_sequence
+from hood.assets.body.load import load_body
+from hood.assets.garment.garment import load_garment
+from hood.assets.motion.load import load_sequence
 from hood.dynamics.equilibrium import find_equilibrium
 from hood.dynamics.output import LocalStepOutput
 from hood.dynamics.rollout import simulate

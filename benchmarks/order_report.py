@@ -15,7 +15,7 @@ import numpy as np
 from order_scenes import Hanging
 from scipy.stats import t
 
-from hood.assets.atomic import write_atomically
+from hood.assets.files.atomic import write_atomically
 from hood.evaluation.bootstrap import LEVEL
 from hood.media.charts import write_png
 

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hood.assets.atomic import write_atomically
-from hood.assets.body import Body
-from hood.assets.garment import Garment, load_garment, save_garment
+from hood.assets.body.body import Body
+from hood.assets.files.atomic import write_atomically
+from hood.assets.garment.garment import Garment, load_garment, save_garment
 from hood.assets.material import Material
 from hood.features.physical import GRAVITY
 

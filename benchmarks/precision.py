@@ -123,7 +123,7 @@ def flipped_faces() -> Row:
     normal = face_normals(cloth.rest_pos, cloth.faces)
     pairs = face_pairs(faces)
     cosine = (normal[pairs[:, 0]] * normal[pairs[:, 1]]).sum(1).clamp(-1, 1)
-    weight = cloth.bending_stiffness.mean() * cloth.rest_length.mean() ** 2 / (4 * cloth.hinge_area.mean())
+    weight = cloth.bending_stiffness.mean() * cloth.hinge_rest_length.mean() ** 2 / (4 * cloth.hinge_area.mean())
     naive = float(0.5 * weight * torch.acos(cosine).square().sum())
     safe = float(Bending()(make_problem(cloth), cloth.rest_pos, cloth.rest_pos))
     return Row("1/7 of the faces flipped, flat sheet: energy", f"{naive:.1e} J", f"{safe:.1e} J", "0", safe == 0.0)

@@ -40,7 +40,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from hood.assets.material import Material
-from hood.commands.circumstances import device_name
+from hood.commands.conditions import device_name
 from hood.evaluation.gap import AGREEMENT
 from hood.losses.potential import default_potential, scale
 from hood.losses.problem import StepProblem, inertial_guess

@@ -27,11 +27,11 @@ import torch
 from frame import refined
 from torch import Tensor
 
-from hood.assets.body import load_body
-from hood.assets.extremes import write_motion
-from hood.assets.garment import load_garment
-from hood.assets.library import locate
-from hood.assets.sequence import load_sequence
+from hood.assets.body.load import load_body
+from hood.assets.extremes.files import write_motion
+from hood.assets.files.library import locate
+from hood.assets.garment.garment import load_garment
+from hood.assets.motion.load import load_sequence
 from hood.dynamics.checkpoint import load_simulator
 from hood.dynamics.output import VelocityBaseOutput
 from hood.dynamics.rollout import simulate
@@ -46,7 +46,7 @@ from hood.solver.iterate import in_double, in_single
 from hood.solver.newton import NewtonSettings, Report, first_guess, minimize
 
 SETTINGS = NewtonSettings(target_rg=1e-2, max_iterations=100)
-#: By name: garment, motion (of the project, or of hood.assets.extremes with an amount), frames per second, speed, frames.
+#: By name: garment, motion (of the project, or of hood.assets.extremes.files with an amount), frames per second, speed, frames.
 SCENES = {
     "walk": ("tshirt", "walk_proud", 30.0, 1.0, 40),
     "dance": ("dress", "dance_mixed", 30.0, 1.0, 40),

@@ -23,10 +23,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from hood.assets.body import load_body
-from hood.assets.garment import load_garment
-from hood.assets.library import locate, motion_split
-from hood.assets.sequence import load_sequence
+from hood.assets.body.load import load_body
+from hood.assets.files.library import locate, motion_split
+from hood.assets.garment.garment import load_garment
+from hood.assets.motion.load import load_sequence
 from hood.dynamics.checkpoint import load_simulator
 from hood.dynamics.goals import Count
 from hood.dynamics.refine import RefinedStepper

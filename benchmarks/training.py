@@ -32,7 +32,7 @@ import torch
 from network import NUM_BODY, Case, kept_rows, list_edges, naive, resident
 from torch import Tensor
 
-from hood.assets.garment import Garment, load_garment, save_garment
+from hood.assets.garment.garment import Garment, load_garment, save_garment
 from hood.cli import ENVIRONMENT
 from hood.commands.train import make_trainer
 from hood.config import load_config

@@ -5,11 +5,13 @@ from hood.api import (
     simulate as simulate,
     train as train,
 )
-from hood.assets.body import Body as Body, load_body as load_body
-from hood.assets.garment import Garment as Garment, load_garment as load_garment
-from hood.assets.library import names as names
+from hood.assets.body.body import Body as Body
+from hood.assets.body.load import load_body as load_body
+from hood.assets.garment.garment import Garment as Garment, load_garment as load_garment
+from hood.assets.files.library import names as names
 from hood.assets.material import EdgeField as EdgeField, FaceField as FaceField, Material as Material
-from hood.assets.sequence import PoseSequence as PoseSequence, load_sequence as load_sequence
+from hood.assets.motion.load import load_sequence as load_sequence
+from hood.assets.motion.sequence import PoseSequence as PoseSequence
 from hood.dynamics.recorder import RolloutData as RolloutData, read_rollout as read_rollout
 from hood.dynamics.reference import load_reference_checkpoint as load_reference_checkpoint
 from hood.losses.potential import Potential as Potential, default_potential as default_potential

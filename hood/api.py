@@ -16,8 +16,8 @@ from typing import Any
 
 from tqdm import tqdm
 
-from hood.assets.garment import Garment
-from hood.assets.library import locate
+from hood.assets.files.library import locate
+from hood.assets.garment.garment import Garment
 from hood.assets.material import Material
 from hood.commands.common import read_model
 from hood.commands.guarding import GuardStopped, make_guard

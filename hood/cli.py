@@ -54,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"hood {__version__}")
         return 0
     if name not in COMMANDS:
-        from hood.assets.library import unknown
+        from hood.assets.files.library import unknown
 
         return _fail(unknown("command", name, COMMANDS))
     if any(word in ("-h", "--help") for word in overrides):

@@ -18,9 +18,9 @@ from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from hood.assets.atomic import write_atomically
-from hood.assets.library import unknown
-from hood.assets.unpickle import check_size
+from hood.assets.files.atomic import write_atomically
+from hood.assets.files.guarded import check_size
+from hood.assets.files.library import unknown
 from hood.plugins import config_folders, packages
 
 _PACKAGE = Path(__file__).resolve().parent

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
-from hood.assets.library import DATA_FOLDER
+from hood.assets.files.library import DATA_FOLDER
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # tools/ is not installed
 
 PARTS = ("body", "garments", "motions")
 
@@ -24,15 +27,15 @@ def main() -> None:
 
     # The builders need packages that the library does not: import only what was asked for.
     if "body" in parts:
-        from hood.assets.makehuman import build_body
+        from tools.assets.makehuman import build_body
 
         print("body:", build_body(body_path, options.seed))
     if "garments" in parts:
-        from hood.assets.tailor import build_garments
+        from tools.assets.tailor import build_garments
 
         print("garments:", build_garments(options.out / "garments", body_path))
     if "motions" in parts:
-        from hood.assets.choreography import write_motions
+        from tools.assets.choreography import write_motions
 
         print("motions:", write_motions(options.out / "motions", body_path, options.seed))
 

@@ -8,10 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from hood.assets.body import Body, load_body
-from hood.assets.garment import Garment, load_garment
-from hood.assets.library import DATA_FOLDER
-from hood.assets.sequence import PoseSequence, load_sequence
+from hood.assets.body.body import Body
+from hood.assets.body.load import load_body
+from hood.assets.files.library import DATA_FOLDER
+from hood.assets.garment.garment import Garment, load_garment
+from hood.assets.motion.load import load_sequence
+from hood.assets.motion.sequence import PoseSequence
 from hood.mesh import layers
 from hood.native.build import BuildError
 from hood.scene.scene import Scene, build_scene

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hood.evaluation.diary import Diary, Unit
 from hood.evaluation.grid import GUESS, NEWTON, Grid, Point, Size
 from hood.evaluation.reached import Reached, summarise
+from hood.evaluation.rollout_log import RolloutLog, Unit
 from hood.evaluation.table import Measured
 
 PARTS = {"ms_search": 0.1, "ms_features": 0.1, "ms_network": 0.6, "ms_refine": 0.1, "ms_guess": 0.05, "ms_rest": 0.05}
@@ -62,5 +62,5 @@ def tiny_grid(*models: str, refine: tuple[int, ...] = (0, 2)) -> Grid:
 def write_point(folder: Path, one: Point, rollouts: Sequence[Measured]) -> None:
     """The folder of a point that is done."""
     for index, measured in enumerate(rollouts):
-        Diary(folder).write(Unit(0, "tank", f"motion{index}"), "none", measured)
+        RolloutLog(folder).write(Unit(0, "tank", f"motion{index}"), "none", measured)
     (folder / "point.json").write_text(json.dumps({"command": one.command, "weights": "none", "device": "CPU (made up)"}))

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from hood import __version__
-from hood.assets.library import names
+from hood.assets.files.library import names
 from hood.cli import main
 from hood.dynamics.checkpoint import save_simulator
 from hood.dynamics.recorder import read_rollout
@@ -364,7 +364,7 @@ def test_own_files_and_a_checkpoint(tmp_path: Path, capsys: pytest.CaptureFixtur
     """A garment from an OBJ, a motion of eight frames, a model file; fewer frames than asked for."""
     import hashlib
 
-    from hood.assets.garment import load_garment
+    from hood.assets.garment.garment import load_garment
 
     garment = load_garment("tank")
     lines = [f"v {x} {y} {z}" for x, y, z in garment.rest_pos] + [f"f {a} {b} {c}" for a, b, c in garment.faces + 1]

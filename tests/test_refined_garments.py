@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hood.assets.garment import load_garment
+from hood.assets.garment.garment import load_garment
 from hood.assets.material import Material
-from hood.assets.sequence import load_sequence
+from hood.assets.motion.load import load_sequence
 from hood.scene.scene import build_scene
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"

@@ -1,4 +1,4 @@
-"""What a file is, by its name and its keys; only what is needed to tell is read, and nothing is run."""
+"""The kind of a file (garment, body, motion, rollout, …), from its name and its keys."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ from pathlib import Path
 
 import h5py
 
-from hood.assets.animated_mesh import body_kind
-from hood.assets.foreign import require_readable
-from hood.assets.gltf import read_gltf
-from hood.assets.h5_links import own_group
-from hood.assets.library import names, nearest
-from hood.assets.mesh_file import MESH_SUFFIXES
-from hood.assets.reference_garments import garment_names
-from hood.assets.unpickle import guarded, load_pickle
+from hood.assets.files.foreign_formats import require_readable
+from hood.assets.files.guarded import guarded
+from hood.assets.files.h5_links import own_group
+from hood.assets.files.library import names, nearest
+from hood.assets.formats.gltf import read_gltf
+from hood.assets.formats.mesh_file import MESH_SUFFIXES
+from hood.assets.garment.reference_garments import garment_names
+from hood.assets.motion.animated_mesh import body_kind
+from hood.assets.pickles.unpickle import load_pickle
 
 GARMENT, BODY, MOTION, MOVING_MESH = "garment", "body model", "motion", "moving mesh"
 CHECKPOINT, ROLLOUT, REFERENCE_ROLLOUT, VERTEX_LIST = "checkpoint", "rollout", "rollout of the reference", "vertex list"

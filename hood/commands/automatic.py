@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from hood.commands.cloth_contact import potential_of
 from hood.commands.common import weigh
-from hood.commands.dial import AUTO, other_dials, refined
+from hood.commands.refinement import AUTO, other_refinement_keys, refined
 from hood.config import build
 from hood.dynamics.captured import network_of
 from hood.dynamics.ranges import scene_conditions
@@ -34,7 +34,7 @@ class Choice:
     """What the keys became.
 
     Args:
-        stepper, refine: their values; ``refine`` is None where another dial, or no network, says how far a step is taken.
+        stepper, refine: their values; ``refine`` is None where another key, or no network, says how far a step is taken.
         ms: of a frame, as measured, by stepper.
         why: sentences for the user.
     """
@@ -94,7 +94,7 @@ def solver(config: DictConfig) -> NewtonStepper:
 def _iterations(config: DictConfig, stepper: Stepper, scene: Scene, choice: Choice) -> int:
     """Refinement that the garment's size needs: none where the weights know it, or do not say what they know."""
     network = network_of(stepper)
-    if network is None or network.trained_for is None or other_dials(config):
+    if network is None or network.trained_for is None or other_refinement_keys(config):
         return 0
     asked = scene_conditions(scene.garment, scene.cloth, scene.dt, default_potential())
     (_, vertices), (_, known) = asked.spans["vertices"], network.trained_for.spans.get("vertices", (0.0, float("inf")))

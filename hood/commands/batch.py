@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hood.assets.collection import motions_in
-from hood.assets.motions import find_motions
+from hood.assets.motion.collection import motions_in
+from hood.assets.motion.motion_files import find_motions
 from hood.config import ConfigError
 from hood.training import distributed
 

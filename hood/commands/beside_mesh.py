@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hood.assets.binding import signed_distances
-from hood.assets.fit_search import Asked
-from hood.assets.garment import Garment
-from hood.assets.suspicions import suspect_place, suspect_sides
-from hood.assets.units import UNITS, find_scale, size_ratio, used
+from hood.assets.garment.binding import signed_distances
+from hood.assets.garment.fit_search import Asked
+from hood.assets.garment.garment import Garment
+from hood.assets.garment.suspicions import suspect_place, suspect_sides
+from hood.assets.garment.units import UNITS, find_scale, size_ratio, used
 from hood.commands.describe_place import describe_place
 from hood.commands.placing import find_place_on_mesh
 from hood.scene.mesh_motion import MeshMotion, worn_pos

@@ -10,9 +10,9 @@ from dataclasses import replace
 import torch
 from omegaconf import DictConfig
 
-from hood.assets.library import locate
-from hood.commands.circumstances import training_note
+from hood.assets.files.library import locate
 from hood.commands.common import UNTRAINED, read_model, use_arithmetic
+from hood.commands.conditions import training_note
 from hood.config import ConfigError, build, load_config, options
 from hood.dynamics.goals import Count
 from hood.dynamics.refine import GuessStepper, RefinedStepper, unrefined

@@ -1,4 +1,4 @@
-"""What a network is asked for that its weights do not know, in one sentence; it is warned about, and never refused."""
+"""Warnings where a network is used outside the range that it was trained for; nothing is refused."""
 
 from __future__ import annotations
 

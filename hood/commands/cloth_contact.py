@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
-from hood.commands.dial import chosen
+from hood.commands.refinement import chosen
 from hood.config import ConfigError, build, plain, require_choice
 from hood.dynamics.measure import LAYER_METRICS
 from hood.losses.collision import Collision

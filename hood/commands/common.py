@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 
-from hood.assets.occupied import occupy
+from hood.assets.files.folder_lock import occupy
 from hood.config import ConfigError, load_config, plain, read_record, require_choice
 from hood.dynamics.checkpoint import load_simulator
 from hood.dynamics.reference import SUFFIXES, load_reference_checkpoint
@@ -123,7 +123,8 @@ def prepare_folder(folder: Path) -> Path:
 
 @contextmanager
 def held_folder(config: DictConfig) -> Iterator[Path]:
-    """The output folder, made, checked, and held for this run (:mod:`hood.assets.occupied`) by the first of its processes.
+    """The output folder, made, checked, and held for this run by the first of its processes
+    (:mod:`hood.assets.files.folder_lock`).
 
     Raises:
         OSError: it cannot be made or written to.

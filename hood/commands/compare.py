@@ -14,7 +14,7 @@ import numpy as np
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from hood.assets.atomic import write_atomically
+from hood.assets.files.atomic import write_atomically
 from hood.commands.common import held_folder, output_folder, require_package, split_words, thinning
 from hood.config import ConfigError, require_choice
 from hood.dynamics.recorder import RolloutData, read_rollout

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from omegaconf import DictConfig
 
-from hood.assets.library import locate
+from hood.assets.files.library import locate
 from hood.commands.common import prepare_folder
 from hood.config import ConfigError, load_config
 from hood.dynamics.checkpoint import load_simulator, read_header, save_simulator

@@ -1,4 +1,4 @@
-"""What ``hood inspect`` says of a garment that does not lie where it belongs."""
+"""Sentences of ``hood inspect`` on a garment that does not lie on its body."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hood.assets.fit_search import Found
-from hood.assets.units import UNITS
+from hood.assets.garment.fit_search import Found
+from hood.assets.garment.units import UNITS
 from hood.commands.placing import explain_size
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from hood.assets.atomic import write_atomically
+from hood.assets.files.atomic import write_atomically
 from hood.commands.common import held_folder, require_distinct, require_same_config, together
 from hood.commands.envelope_report import report
 from hood.commands.envelope_tasks import Task, command_of, make_tasks, read_record, weights_of, write_inputs

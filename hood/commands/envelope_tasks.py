@@ -13,8 +13,8 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from hood.assets.extremes import write_garment, write_motion, write_still_body
-from hood.assets.library import locate
+from hood.assets.extremes.files import write_garment, write_motion, write_still_body
+from hood.assets.files.library import locate
 from hood.commands.candidates import split_refinement
 from hood.config import ConfigError
 from hood.evaluation.cells import NOMINAL, Cell, cells

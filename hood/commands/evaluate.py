@@ -14,14 +14,14 @@ import torch
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from hood.assets.body import load_body
-from hood.assets.garment import Garment, load_garment
-from hood.assets.library import motion_split
-from hood.assets.sequence import PoseSequence, load_sequence
+from hood.assets.body.load import load_body
+from hood.assets.files.library import motion_split
+from hood.assets.garment.garment import Garment, load_garment
+from hood.assets.motion.load import load_sequence
+from hood.assets.motion.sequence import PoseSequence
 from hood.commands.batch import expand_sequences
 from hood.commands.candidates import digest, distinct, make_candidate
 from hood.commands.cautions import evaluation_cautions, warn
-from hood.commands.circumstances import circumstances
 from hood.commands.common import (
     held_folder,
     output_folder,
@@ -31,15 +31,16 @@ from hood.commands.common import (
     require_same_config,
     together,
 )
+from hood.commands.conditions import conditions
 from hood.commands.evaluation_files import report_spectrum, report_table
-from hood.commands.wardrobe import shape_coefficients
+from hood.commands.garments import shape_coefficients
 from hood.config import ConfigError, build, load_config, plain, require_choice, save_run_record
+from hood.dynamics.kept_frames import KeptFrames
 from hood.dynamics.ranges import Conditions, scene_conditions
-from hood.dynamics.reel import Reel
 from hood.dynamics.refine import METHODS
-from hood.evaluation.diary import Diary, Unit
 from hood.evaluation.drift import sideways_drift, standing_scene
 from hood.evaluation.gap import REFERENCE
+from hood.evaluation.rollout_log import RolloutLog, Unit
 from hood.evaluation.spectrum import spectrum_rows
 from hood.evaluation.table import Candidate, GapSettings, Measured, candidate_rows, measure
 from hood.losses.potential import Potential
@@ -88,12 +89,12 @@ def _run(plan: Plan, folder: Path, overrides: Sequence[str]) -> int:
     distributed.on_main(lambda: _prepare(config, folder))
     if distributed.rank() == 0:
         warn(evaluation_cautions({one.name: one.stepper for one in plan.candidates}, plan.conditions()))
-    diary = Diary(folder, distributed.rank())
-    done = {key: item for part in distributed.gather(diary.read(plan.digests)) for key, item in part.items()}
+    log = RolloutLog(folder, distributed.rank())
+    done = {key: item for part in distributed.gather(log.read(plan.digests)) for key, item in part.items()}
     todo = [unit for unit in plan.units if unit not in done][: config.max_rollouts]
     if done and distributed.rank() == 0:
         print(f"{len(done)} of {len(plan.units)} rollouts were done before")
-    mine = _measure(config, plan, todo[distributed.rank() :: distributed.world_size()], diary)
+    mine = _measure(config, plan, todo[distributed.rank() :: distributed.world_size()], log)
     measured = done | {key: item for part in distributed.gather(mine) for key, item in part.items()}
     if distributed.rank() == 0:
         if len(measured) < len(plan.units):
@@ -103,7 +104,7 @@ def _run(plan: Plan, folder: Path, overrides: Sequence[str]) -> int:
     return 0
 
 
-def _measure(config: DictConfig, plan: Plan, todo: Sequence[Unit], diary: Diary) -> dict[Unit, Measured]:
+def _measure(config: DictConfig, plan: Plan, todo: Sequence[Unit], log: RolloutLog) -> dict[Unit, Measured]:
     """This process's share of the rollouts; each is written down as soon as it is done."""
     potential, count = build(config.losses), int(config.num_frames)
     reference = replace(REFERENCE, max_iterations=int(config.gap_iterations))
@@ -118,7 +119,7 @@ def _measure(config: DictConfig, plan: Plan, todo: Sequence[Unit], diary: Diary)
 
         for unit in todo:
             measured[unit] = _measure_unit(config, plan, unit, potential, count, gaps, tell)
-            diary.write(unit, plan.digests[unit.model], measured[unit])
+            log.write(unit, plan.digests[unit.model], measured[unit])
             bar.update()
     return measured
 
@@ -136,19 +137,19 @@ def _measure_unit(
     if unit.motion == STANDING:
         tell(f"{candidate.name} {unit.garment} {STANDING}")
         return Measured(drifts=[sideways_drift(candidate.stepper, scene, potential)])
-    reel, drawn = Reel(), bool(config.contact_sheets)
-    measured = measure(candidate, scene, potential, count, gaps, tell, partial(reel.see, scene) if drawn else None)
+    kept, drawn = KeptFrames(), bool(config.contact_sheets)
+    measured = measure(candidate, scene, potential, count, gaps, tell, partial(kept.see, scene) if drawn else None)
     if drawn:
         name = f"{unit.model}_{candidate.name}_{unit.garment}_{unit.motion}_{unit.shape}.png"
-        _write_sheet(reel, output_folder(config) / "sheets" / name.replace("/", "-"))
+        _write_sheet(kept, output_folder(config) / "sheets" / name.replace("/", "-"))
     return measured
 
 
-def _write_sheet(reel: Reel, path: Path) -> None:
+def _write_sheet(kept: KeptFrames, path: Path) -> None:
     from hood.media.film import write_sheet
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_sheet(reel.data(), path)
+    write_sheet(kept.data(), path)
 
 
 def _report(plan: Plan, measured: Mapping[Unit, Measured], folder: Path, overrides: Sequence[str]) -> None:
@@ -164,7 +165,7 @@ def _report(plan: Plan, measured: Mapping[Unit, Measured], folder: Path, overrid
             waves += spectrum_rows(candidate.name, name, [item for one in part for item in one.spectra])
     vertices = {name: len(garment.rest_pos) for name, garment in plan.garments.items()}
     training = {candidate.name: candidate.training for candidate in plan.candidates}
-    report_table(rows, circumstances(plan.config, overrides, plan.motions, vertices, training), folder)
+    report_table(rows, conditions(plan.config, overrides, plan.motions, vertices, training), folder)
     if plan.config.spectrum != "none":
         report_spectrum(waves, folder, picture=plan.config.spectrum == "picture")
 

@@ -6,15 +6,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hood.assets.atomic import write_atomically
+from hood.assets.files.atomic import write_atomically
 from hood.evaluation.report import COLUMNS, describe, format_table
 from hood.evaluation.rows import write_rows
 from hood.evaluation.spectrum import COLUMNS as SPECTRUM_COLUMNS
 from hood.evaluation.spectrum import bar_panels, format_spectrum
-from hood.evaluation.table_one import Circumstances, page
+from hood.evaluation.table_one import Conditions, page
 
 
-def report_table(rows: Sequence[Mapping[str, Any]], about: Circumstances, folder: Path) -> None:
+def report_table(rows: Sequence[Mapping[str, Any]], about: Conditions, folder: Path) -> None:
     """Print the table; write it as ``table.csv``, ``table.json`` and, beside the paper's, ``table1.md``."""
     print(format_table(rows))
     print(f"\n{describe(rows)}")

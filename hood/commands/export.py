@@ -9,7 +9,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from hood.assets.atomic import write_atomically
+from hood.assets.files.atomic import write_atomically
 from hood.commands.common import frame_count, split_words
 from hood.commands.compare import read_checked
 from hood.config import ConfigError, plain, require_choice

@@ -10,21 +10,22 @@ from typing import Any
 
 import numpy as np
 
-from hood.assets.bearing import bearing_notice
-from hood.assets.binding import posed_body
-from hood.assets.body import Body, load_body
-from hood.assets.fit_search import Asked
-from hood.assets.garment import Garment, garment_of_mesh, load_garment, locate_garment
-from hood.assets.library import locate
-from hood.assets.mesh_file import MESH_SUFFIXES, read_mesh_file
-from hood.assets.motion_file import read_recording
-from hood.assets.occupied import is_occupied
-from hood.assets.pins import opening_names, read_indices
-from hood.assets.placement import surrounds
-from hood.assets.standing import arms_down
-from hood.assets.suspicions import suspect_kind, suspect_sides
-from hood.assets.units import UNITS, size_ratio, used
-from hood.assets.unpickle import load_pickle
+from hood.assets.body.body import Body
+from hood.assets.body.load import load_body
+from hood.assets.files.folder_lock import is_occupied
+from hood.assets.files.library import locate
+from hood.assets.formats.mesh_file import MESH_SUFFIXES, read_mesh_file
+from hood.assets.garment.binding import posed_body
+from hood.assets.garment.fit_search import Asked
+from hood.assets.garment.garment import Garment, garment_of_mesh, load_garment, locate_garment
+from hood.assets.garment.pins import opening_names, read_indices
+from hood.assets.garment.placement import surrounds
+from hood.assets.garment.suspicions import suspect_kind, suspect_sides
+from hood.assets.garment.units import UNITS, size_ratio, used
+from hood.assets.motion.poses import arms_down
+from hood.assets.motion.recording import read_recording
+from hood.assets.motion.up_axis import bearing_notice
+from hood.assets.pickles.unpickle import load_pickle
 from hood.commands.beside_mesh import place_beside_mesh
 from hood.commands.common import read_model
 from hood.commands.describe_place import describe_place
@@ -36,7 +37,7 @@ from hood.dynamics.soundness import judge_rollout, worst_frame
 from hood.mesh.defects import Defects, find_defects
 from hood.mesh.quality import check_triangles
 from hood.mesh.topology import boundary_loops
-from hood.scene.cast import NO_MOTION, MotionOptions, load_motion
+from hood.scene.load_motion import NO_MOTION, MotionOptions, load_motion
 from hood.scene.mesh_motion import MeshMotion
 
 _UNPLACED = "give prepare the body that it was made for (body=…, betas=…), or scale, up, turn, offset and pose"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import textwrap
 
-from hood.assets import library
+from hood.assets.files import library
 from hood.commands.exit_codes import exit_code_lines
 from hood.config import CONFIG_FOLDER, load_config, options, plain
 

@@ -12,16 +12,17 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from hood.assets import identify as kinds
-from hood.assets.animated_mesh import NO_BODY, body_kind
-from hood.assets.body import Body, load_body
+from hood.assets.body.body import Body
+from hood.assets.body.load import load_body
+from hood.assets.motion.animated_mesh import NO_BODY, body_kind
 from hood.commands import findings
 from hood.commands.findings import Finding
+from hood.commands.garments import read_outfit, shape_coefficients
+from hood.commands.motion import motion_options
 from hood.commands.notices import heard
-from hood.commands.performance import motion_options
-from hood.commands.wardrobe import read_outfit, shape_coefficients
 from hood.config import ConfigError, load_config, plain, require_choice
-from hood.scene.cast import NO_MOTION, MotionOptions, load_motion
 from hood.scene.fitting import fit_figures, misplacement
+from hood.scene.load_motion import NO_MOTION, MotionOptions, load_motion
 from hood.scene.mesh_motion import MeshMotion
 from hood.scene.scene import LEAD_IN, NotWornError, Scene, dress
 

@@ -1,4 +1,4 @@
-"""Warnings as sentences: one line each on the error stream, never Python's own form, and in lists for summaries."""
+"""Warnings printed as one sentence each on the error stream, and collected for summaries."""
 
 from __future__ import annotations
 

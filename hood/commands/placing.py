@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
-from hood.assets.binding import PosedBody, posed_body
-from hood.assets.body import Body
-from hood.assets.fit_search import Asked, Found, Resized, Wearer, find_placement
-from hood.assets.garment import Garment
-from hood.assets.placement import UP_AXES, Placement
-from hood.assets.standing import A_POSE_ANGLE, arms_down
-from hood.assets.units import find_scale, size_ratio, used
+from hood.assets.body.body import Body
+from hood.assets.garment.binding import PosedBody, posed_body
+from hood.assets.garment.fit_search import Asked, Found, Resized, Wearer, find_placement
+from hood.assets.garment.garment import Garment
+from hood.assets.garment.placement import UP_AXES, Placement
+from hood.assets.garment.units import find_scale, size_ratio, used
+from hood.assets.motion.poses import A_POSE_ANGLE, arms_down
 from hood.config import ConfigError, plain, require_choice
 from hood.scene.mesh_motion import MeshMotion, wearable, worn_pos
 

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
-from hood.assets.library import locate
+from hood.assets.files.library import locate
 from hood.commands.cloth_contact import potential_of
 from hood.commands.common import held_folder, output_folder
-from hood.commands.dial import refined
 from hood.commands.plan_file import write_plan
 from hood.commands.plan_parts import Part, choose_parts
+from hood.commands.refinement import refined
 from hood.commands.setup import Setup, check_config, make_stepper, set_up
 from hood.config import ConfigError, load_config
 from hood.dynamics.captured import network_of

@@ -13,8 +13,8 @@ import h5py
 import numpy as np
 from omegaconf import DictConfig
 
-from hood.assets.atomic import write_atomically
-from hood.assets.unpickle import check_size
+from hood.assets.files.atomic import write_atomically
+from hood.assets.files.guarded import check_size
 from hood.config import ConfigError, load_config
 from hood.dynamics.soundness import name_frames
 from hood.dynamics.watched import PLAN_METRICS

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 from omegaconf import DictConfig
 
-from hood.assets.library import unknown
+from hood.assets.files.library import unknown
 from hood.commands.cloth_contact import acts
-from hood.commands.dial import chosen
+from hood.commands.refinement import chosen
 from hood.config import ConfigError, build
 from hood.losses.collision import Collision
 
@@ -57,8 +57,8 @@ def _collision(config: DictConfig, key: str, value: str) -> bool:
 
 def _iterations(config: DictConfig) -> int:
     """Iterations after the network, or from the guess; 0 where none are counted."""
-    dial = None if _solver(config) else chosen(config)
-    return int(dial[1]) if dial is not None and dial[0] == "refine" else 0
+    asked = None if _solver(config) else chosen(config)
+    return int(asked[1]) if asked is not None and asked[0] == "refine" else 0
 
 
 def _target(share: float) -> Callable[[DictConfig], bool]:

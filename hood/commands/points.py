@@ -1,4 +1,4 @@
-"""Points measured in processes of their own, several side by side; what is done is not done again."""
+"""Runs the points of a chart in processes of their own, several side by side; finished ones are not run again."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from typing import Any
 
 from tqdm import tqdm
 
-from hood.assets.atomic import write_atomically
-from hood.assets.library import locate
+from hood.assets.files.atomic import write_atomically
+from hood.assets.files.library import locate
 from hood.commands.common import UNTRAINED
 from hood.commands.rollouts_beside import PROGRAM, end, interruptible
 from hood.evaluation.grid import Point, quoted

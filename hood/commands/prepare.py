@@ -12,24 +12,26 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
-from hood.assets import alterations
-from hood.assets.alterations import Fitting
-from hood.assets.animated_mesh import body_kind
-from hood.assets.binding import PosedBody, bind_garment, posed_body
-from hood.assets.body import Body, load_body
-from hood.assets.garment import Garment, garment_of_mesh, load_garment, locate_garment, save_garment
-from hood.assets.library import locate
-from hood.assets.mesh_file import MESH_SUFFIXES, read_mesh_file
-from hood.assets.outfit import join_garments
-from hood.assets.pins import pin_mask, pin_numbers
-from hood.assets.sequence import PoseSequence, load_sequence
-from hood.assets.standing import POSE_SUFFIXES, arms_down, read_pose
-from hood.assets.suspicions import suspect_kind
-from hood.assets.units import UNITS
+from hood.assets.body.body import Body
+from hood.assets.body.load import load_body
+from hood.assets.files.library import locate
+from hood.assets.formats.mesh_file import MESH_SUFFIXES, read_mesh_file
+from hood.assets.garment import alterations
+from hood.assets.garment.alterations import Fitting
+from hood.assets.garment.binding import PosedBody, bind_garment, posed_body
+from hood.assets.garment.garment import Garment, garment_of_mesh, load_garment, locate_garment, save_garment
+from hood.assets.garment.outfit import join_garments
+from hood.assets.garment.pins import pin_mask, pin_numbers
+from hood.assets.garment.suspicions import suspect_kind
+from hood.assets.garment.units import UNITS
+from hood.assets.motion.animated_mesh import body_kind
+from hood.assets.motion.load import load_sequence
+from hood.assets.motion.poses import POSE_SUFFIXES, arms_down, read_pose
+from hood.assets.motion.sequence import PoseSequence
 from hood.commands.common import prepare_folder
+from hood.commands.garments import checked_pins, heed, names_of, shape_coefficients
 from hood.commands.placing import AUTO, arm_angle, asked_keys, explain_size, find_place, keep_place
 from hood.commands.prepare_mesh import prepare_for_mesh
-from hood.commands.wardrobe import checked_pins, heed, names_of, shape_coefficients
 from hood.config import ConfigError, load_config, plain, require_choice
 from hood.media.mesh_export import write_obj
 from hood.mesh.quality import check_triangles

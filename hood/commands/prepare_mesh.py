@@ -16,20 +16,20 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
-from hood.assets import alterations
-from hood.assets.alterations import Fitting
-from hood.assets.binding import push_out, signed_distances
-from hood.assets.garment import Garment, save_garment
-from hood.assets.outfit import join_garments
-from hood.assets.pins import pin_mask, pin_numbers
-from hood.assets.suspicions import suspect_kind, suspect_place, suspect_seams
+from hood.assets.garment import alterations
+from hood.assets.garment.alterations import Fitting
+from hood.assets.garment.binding import push_out, signed_distances
+from hood.assets.garment.garment import Garment, save_garment
+from hood.assets.garment.outfit import join_garments
+from hood.assets.garment.pins import pin_mask, pin_numbers
+from hood.assets.garment.suspicions import suspect_kind, suspect_place, suspect_seams
 from hood.commands.common import prepare_folder
+from hood.commands.garments import checked_pins, heed
 from hood.commands.placing import AUTO, asked_keys, explain_size, find_place_on_mesh, keep_place
-from hood.commands.wardrobe import checked_pins, heed
 from hood.config import ConfigError, plain
 from hood.mesh.quality import check_triangles
-from hood.scene.cast import NO_MOTION, MotionOptions, load_motion
 from hood.scene.fitting import FitFigures, fit_figures
+from hood.scene.load_motion import NO_MOTION, MotionOptions, load_motion
 from hood.scene.mesh_motion import MeshMotion, worn_pos
 from hood.scene.scene import dress
 

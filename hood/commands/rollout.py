@@ -15,7 +15,7 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from hood.assets.occupied import occupy
+from hood.assets.files.folder_lock import occupy
 from hood.commands.automatic import advice
 from hood.commands.batch import Job, find_jobs, share
 from hood.commands.cautions import warn
@@ -26,10 +26,10 @@ from hood.commands.common import (
     thinning,
     together,
 )
-from hood.commands.dial import exported
 from hood.commands.guarding import OFF, GuardStopped, guard_sentences, make_guard, write_alarms
 from hood.commands.notices import heard
 from hood.commands.plan_file import plan_sentences, rollout_config, summarise_plan
+from hood.commands.refinement import exported
 from hood.commands.setup import Setup, check_config, make_stepper, set_up, solves_in_double
 from hood.commands.summary import describe, describe_all, summarise
 from hood.commands.verdict import exit_code

@@ -1,4 +1,4 @@
-"""Commands of ``hood`` run in processes of their own, a few side by side, each with its log."""
+"""Runs commands of ``hood`` in processes of their own, several side by side, each with a log file."""
 
 from __future__ import annotations
 

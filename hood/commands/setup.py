@@ -10,18 +10,18 @@ from pathlib import Path
 import torch
 from omegaconf import DictConfig
 
-from hood.assets.garment import Garment
-from hood.assets.library import locate
+from hood.assets.files.library import locate
+from hood.assets.garment.garment import Garment
 from hood.assets.material import Material
 from hood.commands.automatic import Choice, choose
 from hood.commands.cautions import scene_cautions, warn
 from hood.commands.cloth_contact import check_cloth_contact, potential_of, tell_if_off
 from hood.commands.common import UNTRAINED, read_model, require_device, require_same_model, thinning, use_arithmetic, weigh
-from hood.commands.dial import AUTO, check_dial, chosen, refined
+from hood.commands.garments import heed, layer_order, names_of, read_outfit
 from hood.commands.guarding import check_guard
-from hood.commands.performance import make_motion
+from hood.commands.motion import make_motion
 from hood.commands.plan_file import read_watch
-from hood.commands.wardrobe import heed, layer_order, names_of, read_outfit
+from hood.commands.refinement import AUTO, check_refinement, chosen, refined
 from hood.config import ConfigError, build, load_config, plain, require_choice
 from hood.dynamics.captured import MODES, CapturedSimulator, network_of
 from hood.dynamics.captured_newton import CapturedNewton
@@ -60,7 +60,7 @@ def check_config(config: DictConfig) -> None:
     require_choice(config, "kernels", (AUTO, *KERNELS))
     require_choice(config, "stepper", ("network", "newton", "refine", AUTO))
     require_choice(config, "step", (PLAIN, *MODES))
-    check_dial(config)
+    check_refinement(config)
     check_guard(config)
     check_cloth_contact(config)
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from hood.commands.cloth_contact import describe_cloth_contact, summarise_cloth_contact
-from hood.commands.dial import describe_refinement, summarise_refinement
 from hood.commands.guarding import summarise_guard
+from hood.commands.refinement import describe_refinement, summarise_refinement
 from hood.commands.surface_report import cut_at_worst, describe_surface, summarise_surface
 from hood.commands.verdict import describe_verdict, describe_worst, summarise_verdict
 from hood.dynamics.recorder import read_rollout

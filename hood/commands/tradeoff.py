@@ -10,12 +10,12 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from hood.assets.atomic import write_atomically
-from hood.assets.garment import load_garment
-from hood.assets.library import names
+from hood.assets.files.atomic import write_atomically
+from hood.assets.files.library import names
+from hood.assets.garment.garment import load_garment
 from hood.commands.batch import expand_sequences
-from hood.commands.circumstances import device_name
 from hood.commands.common import held_folder, output_folder, require_same_config
+from hood.commands.conditions import device_name
 from hood.commands.points import Failure, Points
 from hood.commands.tradeoff_checks import check_config, check_models, check_points, check_settings
 from hood.config import ConfigError, load_config, plain, save_run_record
@@ -31,7 +31,7 @@ SIZES = ("1k", "4k", "12k")
 #: Measured on the largest garments where nothing else is said.
 _LARGEST = ("fine15", "ours")
 #: Measured with all iterations at every size where nothing else is said.
-_DIAL = "ours"
+_REFINED_MODEL = "ours"
 #: Settings that may change from one call to the next: they add points or leave some out, and change none.
 _FREE = ("models", "precisions", "refine_methods", "newton", "dial", "jobs", "turns", "measure", "output")
 _FREE_BY_SIZE = ("refine", "guess", "models", "precisions")
@@ -95,21 +95,21 @@ def _size(config: DictConfig, name: str, models: Sequence[str]) -> Size:
 
     wanted = tuple(map(str, values("models")))
     if not wanted and name == SIZES[-1]:
-        most = (*_LARGEST, _dial(config, models))
+        most = (*_LARGEST, _refined_model(config, models))
         wanted = tuple(model for model in models if {model, model_name(model)} & {*most}) or tuple(models[:1])
     garments = tuple(map(str, values("garments")))
     numbers = int(config[f"frames_{name}"]), int(config[f"states_{name}"])
     precisions = tuple(map(str, values("precisions")))
     further = () if name == SIZES[0] else tuple(plain(config[f"refine_{SIZES[0]}"]))
-    dial = (_dial(config, models), further)
+    dial = (_refined_model(config, models), further)
     shapes = tuple(tuple(map(float, shape)) for shape in values("shapes"))
     return Size(name, garments, values("refine"), values("guess"), *numbers, wanted, precisions, dial, shapes)
 
 
-def _dial(config: DictConfig, models: Sequence[str]) -> str:
+def _refined_model(config: DictConfig, models: Sequence[str]) -> str:
     """The model that is measured with every number of iterations at every size; "" for none."""
     if config.dial is None:
-        return next((model for model in models if model_name(model) == _DIAL), "")
+        return next((model for model in models if model_name(model) == _REFINED_MODEL), "")
     if str(config.dial) == "none":
         return ""
     if str(config.dial) not in (*models, *map(model_name, models)):

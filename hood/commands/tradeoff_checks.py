@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import torch
 from omegaconf import DictConfig
 
-from hood.assets.library import locate
+from hood.assets.files.library import locate
 from hood.commands.batch import expand_sequences
 from hood.commands.common import UNTRAINED, require_device, require_distinct, require_package
-from hood.commands.wardrobe import shape_coefficients
+from hood.commands.garments import shape_coefficients
 from hood.config import ConfigError, load_config, options, plain
 from hood.dynamics.checkpoint import read_header
 from hood.dynamics.reference import SUFFIXES

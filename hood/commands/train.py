@@ -14,12 +14,12 @@ import torch
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from hood.assets.body import load_body
-from hood.assets.garment import load_garment
-from hood.assets.library import locate, motion_split
+from hood.assets.body.load import load_body
+from hood.assets.files.library import locate, motion_split
+from hood.assets.garment.garment import load_garment
 from hood.assets.material import Material
-from hood.assets.motions import MotionFiles, find_motions
-from hood.assets.sequence import load_sequence
+from hood.assets.motion.load import load_sequence
+from hood.assets.motion.motion_files import MotionFiles, find_motions
 from hood.commands.common import (
     held_folder,
     output_folder,

@@ -1,4 +1,4 @@
-"""Sound or unsound: how a rollout's verdict gets into its summary, onto the screen and into the exit code."""
+"""The verdict of a rollout (sound or unsound): in its summary, on the screen, as exit code."""
 
 from __future__ import annotations
 

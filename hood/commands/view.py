@@ -8,7 +8,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from hood.assets.atomic import write_atomically
+from hood.assets.files.atomic import write_atomically
 from hood.commands.common import frame_count, output_folder, split_words
 from hood.commands.compare import names_of, read_checked
 from hood.config import ConfigError

@@ -12,8 +12,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from hood.assets.atomic import write_atomically
-from hood.assets.library import first_line
+from hood.assets.files.atomic import write_atomically
+from hood.assets.files.library import first_line
 from hood.dynamics.ranges import Conditions
 from hood.dynamics.simulator import Simulator, build_simulator
 

@@ -15,9 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hood.assets.garment import Garment
+from hood.assets.garment.garment import Garment
 from hood.assets.material import RANGES, Material, values_of
-from hood.assets.motions import MotionFiles
+from hood.assets.motion.motion_files import MotionFiles
 from hood.losses.potential import Potential
 from hood.losses.problem import STANDARD_GRAVITY
 from hood.mesh.topology import connected_components, unique_edges

@@ -15,8 +15,8 @@ from typing import Any
 import h5py
 import numpy as np
 
-from hood.assets.garment import Garment
-from hood.assets.h5_links import own_dataset, own_group
+from hood.assets.files.h5_links import own_dataset, own_group
+from hood.assets.garment.garment import Garment
 
 #: World coordinates beyond this [m] are written in float64: float32 resolves only 8 µm there.
 _FAR = 100.0

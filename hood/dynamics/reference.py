@@ -15,8 +15,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hood.assets.torch_file import load_torch
-from hood.assets.unpickle import SIZE_LIMIT
+from hood.assets.pickles.torch_file import load_torch
+from hood.assets.pickles.unpickle import SIZE_LIMIT
 from hood.dynamics.simulator import Simulator, build_simulator
 from hood.nn.reference_keys import MODEL, Layout, Source, detect_layout, match, network_sources, neutral
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hood.assets.garment import Garment
+from hood.assets.garment.garment import Garment
 from hood.mesh.compiled_crossing import Eights, eights
 from hood.mesh.crossing import crossings, self_crossings
 from hood.mesh.skin import Sheet, skin_depth

@@ -30,7 +30,7 @@ class Cell:
     factor: str
     value: str
     settings: tuple[str, ...] = ()  # keys of ``hood rollout``
-    motion: str | None = None  # of hood.assets.extremes; None: ``sequence``
+    motion: str | None = None  # of hood.assets.extremes.files; None: ``sequence``
     fault: str | None = None  # of the garment, likewise
     garment: str | None = None  # embedded garment, or a list of them; None: whichever the map is made for
     sequence: str | None = None  # embedded motion; None: the nominal one

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from hood.assets.body import Body
-from hood.assets.garment import Garment
+from hood.assets.body.body import Body
+from hood.assets.garment.garment import Garment
 from hood.assets.material import Material
-from hood.assets.standing import A_POSE_ANGLE, arms_down
+from hood.assets.motion.poses import A_POSE_ANGLE, arms_down
 from hood.dynamics.rollout import simulate
 from hood.dynamics.stepper import Stepper
 from hood.losses.potential import Potential

@@ -7,7 +7,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from hood.assets.atomic import write_atomically
+from hood.assets.files.atomic import write_atomically
 from hood.evaluation.cells import NOMINAL, ORDERED
 from hood.evaluation.envelope import CLASSES, REFUSED, SOUND, shares
 

@@ -111,7 +111,7 @@ def begin(full: Variant, windows: Sequence[Window], settle: str, lead: int = LEA
 
 
 @torch.no_grad()
-def march(variant: Variant, begun: Begun, num_frames: int, effect: Effect) -> tuple[Tensor, Tensor]:
+def take_steps(variant: Variant, begun: Begun, num_frames: int, effect: Effect) -> tuple[Tensor, Tensor]:
     """Steps of a variant from the window's first state: positions (V, 3) [m] after the first step, in that state's frame, and
     after all of them, world. Its times [ms] go to ``effect``."""
     stepper, scene, state = variant.stepper, variant.scene, begun.state
@@ -133,13 +133,13 @@ def measure(full: Variant, variants: dict[str, Variant], begun: Sequence[Begun],
     """Effects by name, of all ``variants`` and of the full model, whose name is empty. They take turns window by window."""
     everything = {"": full, **variants}
     for variant in everything.values():
-        march(variant, begun[0], 1, Effect())  # what a stepper makes at its first step is not a frame's time
+        take_steps(variant, begun[0], 1, Effect())  # what a stepper makes at its first step is not a frame's time
     effects: dict[str, Effect] = {name: Effect() for name in everything}
     for one in begun:
         firsts: dict[str, Tensor] = {}
         lasts: dict[str, Tensor] = {}
         for name, variant in everything.items():
-            firsts[name], lasts[name] = march(variant, one, num_frames, effects[name])
+            firsts[name], lasts[name] = take_steps(variant, one, num_frames, effects[name])
         e0, values = float(scale(in_double(one.step)).sum()), [_phi(full.potential, one, pos) for pos in firsts.values()]
         lowest, exact = _minimum(full.potential, one, list(firsts.values()), values)
         for phi, (name, effect) in zip(values, effects.items(), strict=True):
@@ -160,7 +160,7 @@ def overstatement(full: Variant, lean: Variant, begun: Sequence[Begun], gammas: 
     least of the windows, between 1 and :data:`MOST_OVERSTATED`."""
     found, names = [2.0 * MOST_OVERSTATED], lacking(lean.potential, full.potential)
     for one, gamma in zip(begun, gammas, strict=True):
-        pos, _ = march(lean, one, 1, Effect())
+        pos, _ = take_steps(lean, one, 1, Effect())
         if gamma > _TELLING:
             found.append(force_bound(full.potential, names, one.step, pos) / gamma)
     return max(1.0, min(found) / 2.0) if len(found) > 1 else 1.0

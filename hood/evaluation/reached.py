@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from hood.evaluation.bootstrap import Estimate, estimate, resample
-from hood.evaluation.diary import Diary
 from hood.evaluation.gap import AGREEMENT
 from hood.evaluation.grid import NEWTON, Point
+from hood.evaluation.rollout_log import RolloutLog
 from hood.evaluation.table import Measured
 
 #: Parts of a frame's time, and which entries of a frame belong to each.
@@ -106,7 +106,7 @@ def read_reached(point: Point, folder: Path, vertices: int, record: Mapping[str,
     Raises:
         ValueError: no rollout is written down there, or no frame of any is finite.
     """
-    rollouts = [measured for _, measured in sorted(Diary(folder).read(None).items())]
+    rollouts = [measured for _, measured in sorted(RolloutLog(folder).read(None).items())]
     if not any(measured.frames for measured in rollouts):
         fault = "no rollout was written down" if not rollouts else "every rollout was non-finite before a frame could be timed"
         raise ValueError(f"{folder}: {fault}")

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hood.assets.atomic import write_atomically
+from hood.assets.files.atomic import write_atomically
 
 
 def write_rows(rows: Sequence[Mapping[str, Any]], columns: Sequence[str], folder: Path, name: str) -> tuple[Path, Path]:

@@ -1,4 +1,4 @@
-"""Steps kept out of a rollout, to be looked at when it is over."""
+"""Steps kept out of a rollout, for measurements after it."""
 
 from __future__ import annotations
 

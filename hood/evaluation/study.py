@@ -1,4 +1,4 @@
-"""All that was measured for a chart of time against accuracy, and what it says."""
+"""The results behind a chart of time against accuracy."""
 
 from __future__ import annotations
 

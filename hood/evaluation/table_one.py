@@ -49,7 +49,7 @@ _MORE = (
 
 
 @dataclass(frozen=True)
-class Circumstances:
+class Conditions:
     """What the figures depend on besides the models."""
 
     command: str
@@ -86,8 +86,8 @@ def checks(rows: Sequence[Row]) -> list[Check]:
     return found
 
 
-def page(rows: Sequence[Row], about: Circumstances) -> str:
-    """The page in Markdown; the same rows and circumstances give the same text."""
+def page(rows: Sequence[Row], about: Conditions) -> str:
+    """The page in Markdown; the same rows and conditions give the same text."""
     parts = [
         "# Cost, reach and accuracy",
         f"Measured with\n\n```\n{about.command}\n```\n\non {about.machine}.",
@@ -221,7 +221,7 @@ def _check_table(found: Sequence[Check]) -> str:
     return "\n".join(lines) + "\n\n≈ stands between two models whose 95% intervals overlap, or are not known."
 
 
-def _differences(rows: Sequence[Row], about: Circumstances) -> str:
+def _differences(rows: Sequence[Row], about: Conditions) -> str:
     sizes = ", ".join(f"{name} {count:,}" for name, count in about.vertices.items())
     models = dict.fromkeys((row["model"], row["weights"]) for row in rows)
     budgets = [f"{name}: {_budget(name, weights, about)}" for name, weights in models if weights != "none"]
@@ -240,7 +240,7 @@ def _differences(rows: Sequence[Row], about: Circumstances) -> str:
     )
 
 
-def _budget(name: str, weights: str, about: Circumstances) -> str:
+def _budget(name: str, weights: str, about: Conditions) -> str:
     if weights == _UNTRAINED:
         return "random weights"
     return about.training.get(name) or "its file does not say"

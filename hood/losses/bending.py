@@ -19,7 +19,7 @@ class Bending:
     The energy does not depend on the winding of the faces. Hinges with a degenerate face at present have θ = 0
     and no force.
 
-    k → ``cloth.bending_stiffness`` (H,), l₀ → ``cloth.rest_length`` [m], A₁ + A₂ → ``cloth.hinge_area`` [m²],
+    k → ``cloth.bending_stiffness`` (H,), l₀ → ``cloth.hinge_rest_length`` [m], A₁ + A₂ → ``cloth.hinge_area`` [m²],
     θ₀ → ``cloth.rest_angle`` [rad].
     """
 
@@ -31,7 +31,7 @@ class Bending:
         cloth = problem.cloth
         bend = dihedral_angles(next_pos, cloth.hinges) - cloth.rest_angle
         bend = bend - 2.0 * math.pi * torch.round(bend.detach() / (2.0 * math.pi))
-        energy = 0.5 * bending_weight(cloth.bending_stiffness, cloth.rest_length**2, cloth.hinge_area) * bend * bend
+        energy = 0.5 * bending_weight(cloth.bending_stiffness, cloth.hinge_rest_length**2, cloth.hinge_area) * bend * bend
         return sum_per_scene(energy, cloth.hinge_scene, cloth.num_scenes)
 
 

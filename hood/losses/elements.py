@@ -11,7 +11,7 @@ import weakref
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -19,7 +19,6 @@ from torch import Tensor
 
 from hood import native
 from hood.losses.bending import Bending, CurrentLengthBending, bending_weight
-from hood.losses.potential import Potential, Term
 from hood.losses.problem import StepProblem
 from hood.losses.stretching import Stretching
 from hood.mesh.kept import forget
@@ -27,16 +26,19 @@ from hood.native.build import optional
 from hood.native.structures import COUNT, POINTER, fields
 from hood.scene.cloth import Cloth
 
+if TYPE_CHECKING:  # potentials use this pass
+    from hood.losses.potential import Potential, Term
+
 SOURCE = Path(native.__file__).with_name("elements.cpp")
 _LANES = 8
 #: Terms of the pass. A subclass may compute something else and does not count.
 ELEMENT_TERMS = (Stretching, Bending, CurrentLengthBending)
 
 #: Energies [J] (B,) by term, and their gradient [N] (V, 3) before them, of a potential.
-Evaluate = Callable[[Potential, StepProblem, Tensor, Tensor | None], tuple[Tensor, dict[str, Tensor]]]
+Evaluate = Callable[["Potential", StepProblem, Tensor, Tensor | None], tuple[Tensor, dict[str, Tensor]]]
 
 #: Potential [J] (B,) of a step at positions (V, 3).
-Sum = Callable[[Potential, StepProblem, Tensor], Tensor]
+Sum = Callable[["Potential", StepProblem, Tensor], Tensor]
 
 
 class _Faces(ctypes.Structure):
@@ -64,8 +66,18 @@ def library() -> ctypes.CDLL | None:
     return optional(SOURCE)
 
 
+def _by_gradient(
+    potential: Potential, problem: StepProblem, next_pos: Tensor, acc: Tensor | None
+) -> tuple[Tensor, dict[str, Tensor]]:
+    return potential.gradient(problem, next_pos, acc)
+
+
+def _by_total(potential: Potential, problem: StepProblem, next_pos: Tensor) -> Tensor:
+    return potential.total(problem, next_pos)
+
+
 def energies_and_gradient(
-    potential: Potential, problem: StepProblem, next_pos: Tensor, acc: Tensor | None = None, by: Evaluate = Potential.gradient
+    potential: Potential, problem: StepProblem, next_pos: Tensor, acc: Tensor | None = None, by: Evaluate = _by_gradient
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """What :meth:`hood.losses.potential.Potential.gradient` computes, element terms by the compiled pass and others ``by``
     another function."""
@@ -82,7 +94,7 @@ def energies_and_gradient(
 
 
 @torch.no_grad()
-def total_energy(potential: Potential, problem: StepProblem, next_pos: Tensor, by: Sum = Potential.total) -> Tensor:
+def total_energy(potential: Potential, problem: StepProblem, next_pos: Tensor, by: Sum = _by_total) -> Tensor:
     """Potential Φ [J] per scene (B,), what :meth:`hood.losses.potential.Potential.total` computes, element terms by the
     compiled pass and others ``by`` another function."""
     if not applies(next_pos):
@@ -112,7 +124,7 @@ def applies(pos: Tensor) -> bool:
 def split(potential: Potential) -> tuple[Potential, dict[str, Term]]:
     """The terms that torch computes, and those of the pass."""
     elements = {name: term for name, term in potential.terms.items() if type(term) in ELEMENT_TERMS}
-    return Potential({name: term for name, term in potential.terms.items() if name not in elements}), elements
+    return potential.only({name: term for name, term in potential.terms.items() if name not in elements}), elements
 
 
 def element_energies(
@@ -155,7 +167,8 @@ def _make_constants(cloth: Cloth) -> _Constants:
     stiffness, area = cloth.bending_stiffness.double(), cloth.hinge_area.double()
     faces = (cloth.faces, cloth.face_scene, cloth.rest_inverse.flatten(1), cloth.rest_area.double() * cloth.thickness.double())
     weights = (
-        bending_weight(stiffness, length_sq, area) for length_sq in (cloth.rest_length.double() ** 2, torch.ones_like(area))
+        bending_weight(stiffness, length_sq, area)
+        for length_sq in (cloth.hinge_rest_length.double() ** 2, torch.ones_like(area))
     )
     tables = [[*faces, cloth.lame_mu, cloth.lame_lambda]]
     tables += [[cloth.hinges, cloth.hinge_scene, weight, cloth.rest_angle] for weight in weights]

@@ -13,6 +13,7 @@ from torch import Tensor
 from hood.losses.attachment import Attachment
 from hood.losses.bending import Bending, CurrentLengthBending
 from hood.losses.collision import CentroidCollision, Collision
+from hood.losses.elements import energies_and_gradient
 from hood.losses.friction import CodedFriction, Friction, LaggedFriction, WeightFriction
 from hood.losses.gravity import Gravity
 from hood.losses.inertia import Inertia
@@ -96,8 +97,6 @@ class Potential:
         """
         if problem.pull is not None or not any(_asks_for_pull(term, problem) for term in self.terms.values()):
             return problem
-        from hood.losses.elements import energies_and_gradient  # knows of potentials itself
-
         pulling = Potential({name: term for name, term in self.terms.items() if not isinstance(term, _NOT_PULLING)})
         pos = problem.state.pos
         by = energies_and_gradient if compiled else Potential.gradient

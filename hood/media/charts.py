@@ -8,7 +8,7 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
-from hood.assets.atomic import write_atomically
+from hood.assets.files.atomic import write_atomically
 from hood.evaluation.comparison import RESOLUTION, pareto_front
 from hood.evaluation.grid import NEWTON, Point
 from hood.evaluation.reached import PARTS, Reached

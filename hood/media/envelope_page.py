@@ -10,7 +10,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from hood.assets.atomic import write_atomically
+from hood.assets.files.atomic import write_atomically
 from hood.dynamics.soundness import Criteria
 from hood.evaluation.envelope import CLASSES, DEGRADED, FAILED, REFUSED, SILENT, SOUND, Judged, shares
 from hood.evaluation.envelope_figures import FIGURES

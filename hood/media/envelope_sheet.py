@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hood.assets.atomic import write_atomically
+from hood.assets.files.atomic import write_atomically
 from hood.dynamics.recorder import RolloutData, read_rollout
 from hood.media.film import Film, sheet_frames
 from hood.media.render import contact_sheet

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hood.assets.atomic import write_atomically
-from hood.assets.garment import Garment
+from hood.assets.files.atomic import write_atomically
+from hood.assets.garment.garment import Garment
 
 
 def write_obj(path: Path, garment: Garment, pos: np.ndarray | None = None) -> None:

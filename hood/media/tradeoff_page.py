@@ -5,7 +5,7 @@ from __future__ import annotations
 from html import escape
 from pathlib import Path
 
-from hood.assets.atomic import write_atomically
+from hood.assets.files.atomic import write_atomically
 from hood.evaluation.bootstrap import Estimate
 from hood.evaluation.comparison import (
     NETWORK,

@@ -1,4 +1,4 @@
-"""How strongly a triangle surface bulges: what flat triangles of another mesh that lie on it have to keep clear of."""
+"""The bulge of a triangle surface: how far flat triangles that lie on it must keep clear of it."""
 
 from __future__ import annotations
 

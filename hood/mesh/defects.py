@@ -1,4 +1,4 @@
-"""What is unusual about a triangle mesh, as counts and first examples; nothing is changed or refused."""
+"""Defects of a triangle mesh, counted, with first examples; nothing is changed or refused."""
 
 from __future__ import annotations
 

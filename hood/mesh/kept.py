@@ -1,4 +1,4 @@
-"""Values that are kept by the identity of an object, as long as that lives."""
+"""A cache keyed by the identity of an object, which does not outlive it."""
 
 from __future__ import annotations
 

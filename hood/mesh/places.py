@@ -1,4 +1,4 @@
-"""Rows that a mask chooses, in a number of places that does not depend on the mask: what a captured graph can hold."""
+"""Selection by a mask into a fixed number of rows, as captured graphs need it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Refuses meshes that cannot be simulated, and says which element is wrong and how to repair it."""
+"""Checks that refuse meshes which cannot be simulated; the error names the element and the repair."""
 
 from __future__ import annotations
 

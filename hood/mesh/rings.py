@@ -1,4 +1,4 @@
-"""Which vertices of a mesh are few edges apart."""
+"""Vertices of a mesh within a few edges of each other."""
 
 from __future__ import annotations
 

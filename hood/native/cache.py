@@ -1,4 +1,4 @@
-"""Where things are kept between runs that can be made again."""
+"""The folder for files that can be made again, such as compiled libraries."""
 
 from __future__ import annotations
 

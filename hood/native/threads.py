@@ -1,4 +1,4 @@
-"""In how many parts compiled loops are done; see ``threads.h``."""
+"""The number of threads of compiled loops; see ``threads.h``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What follows a surface without skinning weights: points carried along by the vertices next to them."""
+"""Points that follow a surface without skinning weights: carried along by the vertices next to them."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ class Cloth:
     mass: Tensor = None  # type: ignore[assignment]  # (V,) kg
     rest_area: Tensor = None  # type: ignore[assignment]  # (F,) m²
     rest_inverse: Tensor = None  # type: ignore[assignment]  # (F, 2, 2) 1/m, inverse of the rest edge matrix
-    rest_length: Tensor = None  # type: ignore[assignment]  # (H,) m, hinge edge at rest
+    hinge_rest_length: Tensor = None  # type: ignore[assignment]  # (H,) m, hinge edge at rest
     hinge_area: Tensor = None  # type: ignore[assignment]  # (H,) m², sum of the two faces at rest
     rest_angle: Tensor = None  # type: ignore[assignment]  # (H,) rad
     num_scenes: int = 1
@@ -147,7 +147,7 @@ def build_cloth(
         "mass": geometry.vertex_masses(pos, tri, density),
         "rest_area": area,
         "rest_inverse": geometry.rest_inverse(pos, tri),
-        "rest_length": (pos[hinges[:, 1]] - pos[hinges[:, 0]]).norm(dim=1),
+        "hinge_rest_length": (pos[hinges[:, 1]] - pos[hinges[:, 0]]).norm(dim=1),
         "hinge_area": area[torch.as_tensor(hinge_table.faces)].sum(dim=1),
         "rest_angle": torch.zeros_like(angle) if flat_rest else angle,
     }

@@ -12,13 +12,13 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from hood.assets.binding import bind_garment, hold_on_trunk
-from hood.assets.body import Body
-from hood.assets.garment import Garment
+from hood.assets.body.body import Body
+from hood.assets.garment.binding import bind_garment, hold_on_trunk
+from hood.assets.garment.garment import Garment
+from hood.assets.garment.mirror import mirror_body, mirror_garment
 from hood.assets.material import Material, sample_material
-from hood.assets.mirror import mirror_body, mirror_garment
-from hood.assets.motions import MotionFiles, motion_lengths
-from hood.assets.sequence import PoseSequence, turn_world
+from hood.assets.motion.motion_files import MotionFiles, motion_lengths
+from hood.assets.motion.sequence import PoseSequence, turn_world
 from hood.scene.batch import to_device
 from hood.scene.cloth import Cloth
 from hood.scene.motion import BodyMotion, body_motion
@@ -53,7 +53,7 @@ class SceneSampler:
     Args:
         body: the body to dress.
         garments: templates, drawn uniformly.
-        sequences: motions, drawn by their length; :class:`hood.assets.motions.MotionFiles` are read when drawn.
+        sequences: motions, drawn by their length; :class:`hood.assets.motion.motion_files.MotionFiles` are read when drawn.
         beta_range: shape coefficients are U(-beta_range, beta_range).
         size_range: garment scale is uniform in this interval.
         piecewise_fraction: share of the scenes with several fabrics on one garment, where fabrics are drawn.

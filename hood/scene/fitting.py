@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hood.assets.suspicions import Suspicion, suspect_place, suspect_sides
+from hood.assets.garment.suspicions import Suspicion, suspect_place, suspect_sides
 from hood.scene.contact import find_contact
 from hood.scene.motion import BodyMotion
 from hood.scene.scene import Scene

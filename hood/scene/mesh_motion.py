@@ -12,11 +12,11 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from hood.assets.binding import bind_garment
-from hood.assets.body import Body
-from hood.assets.garment import Garment
-from hood.assets.mesh_sequence import MeshSequence
-from hood.assets.skinning import linear_blend_skinning
+from hood.assets.body.body import Body
+from hood.assets.body.skinning import linear_blend_skinning
+from hood.assets.garment.binding import bind_garment
+from hood.assets.garment.garment import Garment
+from hood.assets.motion.mesh_sequence import MeshSequence
 from hood.mesh import topology
 from hood.mesh.proximity import search_surface
 from hood.mesh.rigid import best_turn

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
@@ -11,12 +12,13 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from hood.assets.binding import bind_garment, hold_on_trunk
-from hood.assets.body import Body
-from hood.assets.garment import Garment
-from hood.assets.sequence import PoseSequence
-from hood.assets.sequence_edit import blend_in
-from hood.assets.skinning import linear_blend_skinning
+from hood.assets.body.body import Body
+from hood.assets.body.skinning import linear_blend_skinning
+from hood.assets.garment.binding import bind_garment, hold_on_trunk
+from hood.assets.garment.garment import Garment
+from hood.assets.motion.sequence import PoseSequence
+from hood.assets.motion.sequence_edit import blend_in
+from hood.mesh.kept import forget
 from hood.scene.state import Obstacle
 
 #: Frames posed at once: enough to amortise the call, few enough for short training windows.
@@ -195,8 +197,8 @@ class BodyMotion:
         )
 
     def dressed(self, garment: Garment) -> Garment:
-        """The garment bound to the body (:func:`hood.assets.binding.bind_garment`), what is held there steadied
-        (:func:`hood.assets.binding.hold_on_trunk`)."""
+        """The garment bound to the body (:func:`hood.assets.garment.binding.bind_garment`), what is held there steadied
+        (:func:`hood.assets.garment.binding.hold_on_trunk`)."""
         return hold_on_trunk(bind_garment(garment, self.body), self.body)
 
     def rest_pos(self, garment: Garment) -> np.ndarray:
@@ -234,7 +236,8 @@ def _forget(kept: dict[int, Any], place: int, reach: int) -> None:
         del kept[old]
 
 
-_TENSORS: dict[tuple[int, str], tuple[Body, tuple[Tensor, ...]]] = {}
+#: By body and device, as long as the body lives.
+_TENSORS: dict[tuple[int, str], tuple[weakref.ref[Body], tuple[Tensor, ...]]] = {}
 
 
 def _body_tensors(body: Body, device: torch.device) -> tuple[Tensor, ...]:
@@ -242,8 +245,9 @@ def _body_tensors(body: Body, device: torch.device) -> tuple[Tensor, ...]:
     knows of a surface with them."""
     key = (id(body), str(device))
     entry = _TENSORS.get(key)
-    if entry is None or entry[0] is not body:
+    if entry is None or entry[0]() is not body:
         faces = torch.as_tensor(body.faces, device=device)
         scenes = faces.new_zeros(len(body.v_template)), faces.new_zeros(len(faces))
-        entry = _TENSORS[key] = body, (faces, torch.as_tensor(body.omitted, device=device), *scenes)
+        tensors = (faces, torch.as_tensor(body.omitted, device=device), *scenes)
+        entry = _TENSORS[key] = weakref.ref(body, forget(_TENSORS, key)), tensors
     return entry[1]

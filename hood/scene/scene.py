@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hood.assets.body import Body
-from hood.assets.garment import Garment
+from hood.assets.body.body import Body
+from hood.assets.garment.garment import Garment
 from hood.assets.material import Material
-from hood.assets.sequence import PoseSequence
+from hood.assets.motion.sequence import PoseSequence
 from hood.scene.batch import to_device
 from hood.scene.cloth import Cloth, build_cloth
 from hood.scene.motion import BodyMotion, Motion, body_motion

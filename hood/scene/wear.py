@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from hood.assets.binding import PosedBody
-from hood.assets.garment import Garment
+from hood.assets.garment.binding import PosedBody
+from hood.assets.garment.garment import Garment
 from hood.assets.material import Material
 from hood.scene.cloth import build_cloth
 from hood.scene.start import free_stretch, settle

@@ -187,8 +187,8 @@ class HingeConstants:
 
 def hinge_constants(cloth: Cloth) -> HingeConstants:
     """Constants of the hinges of a cloth."""
-    weight = bending_weight(cloth.bending_stiffness, cloth.rest_length**2, cloth.hinge_area)
-    return HingeConstants(cloth.rest_angle, weight, cloth.rest_length)
+    weight = bending_weight(cloth.bending_stiffness, cloth.hinge_rest_length**2, cloth.hinge_area)
+    return HingeConstants(cloth.rest_angle, weight, cloth.hinge_rest_length)
 
 
 def hinge_energy(term: Term, x: Tensor, constants: HingeConstants) -> Tensor:

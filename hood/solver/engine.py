@@ -351,7 +351,7 @@ class SceneEngine:
     def _take_fabric(self, step: EngineStep) -> None:
         cloth = step.cloth
         now = (cloth.rest_inverse, cloth.rest_area, cloth.thickness, cloth.lame_mu, cloth.lame_lambda, cloth.bending_stiffness,
-               cloth.rest_angle, cloth.rest_length, cloth.hinge_area, float(step.membrane))  # fmt: skip
+               cloth.rest_angle, cloth.hinge_rest_length, cloth.hinge_area, float(step.membrane))  # fmt: skip
         known = self._fabric
         if known is None or not all(_identical(a, b) for a, b in zip(now, known[0], strict=True)):
             self._fabric = known = now, build_fabric(cloth, self.tables, float(step.membrane))

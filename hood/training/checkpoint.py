@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hood.assets.atomic import write_atomically
+from hood.assets.files.atomic import write_atomically
 
 #: What a run cannot go on without.
 _KEYS = {"iteration", "seed", "skipped", "skipped_in_row", "rollbacks", "best", "simulator", "average", "optimizer", "slots"}

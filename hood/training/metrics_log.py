@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from hood.assets.atomic import write_atomically
+from hood.assets.files.atomic import write_atomically
 
 
 class MetricsLog:

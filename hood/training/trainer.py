@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
-from hood.assets.atomic import write_atomically
+from hood.assets.files.atomic import write_atomically
 from hood.dynamics.checkpoint import save_simulator
 from hood.dynamics.output import AccelerationOutput
 from hood.dynamics.ranges import training_conditions

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hood.assets.atomic import write_atomically
-from hood.dynamics.reel import Reel
+from hood.assets.files.atomic import write_atomically
+from hood.dynamics.kept_frames import KeptFrames
 from hood.dynamics.simulator import Simulator
 from hood.evaluation.validation import Validation, summarise
 from hood.training import distributed
@@ -37,7 +37,7 @@ class Watch:
         Raises:
             OSError: the strip cannot be written.
         """
-        film = Reel()
+        film = KeptFrames()
         mine = range(distributed.rank(), len(self.validation.garments), distributed.world_size())
         rollouts = {}
         for index in mine:
@@ -49,7 +49,7 @@ class Watch:
         distributed.on_main(lambda: None if strip is None else self._write(strip, iteration))
         return values, strip
 
-    def _draw(self, film: Reel) -> np.ndarray | None:
+    def _draw(self, film: KeptFrames) -> np.ndarray | None:
         if not film.cloth:
             return None
         try:

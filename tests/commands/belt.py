@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hood.assets.body import load_body
-from hood.assets.library import locate
-from hood.assets.motion_file import read_recording
+from hood.assets.body.load import load_body
+from hood.assets.files.library import locate
+from hood.assets.motion.recording import read_recording
 from hood.testing import cylinder
 
 

@@ -8,11 +8,11 @@ import numpy as np
 from imitations import GltfWriter
 from workshop import write_npz, write_obj
 
-from hood.assets.body import Body
-from hood.assets.garment import Garment
-from hood.assets.library import locate
-from hood.assets.motion_file import read_recording
-from hood.assets.sequence import Z_UP_TO_Y_UP
+from hood.assets.body.body import Body
+from hood.assets.files.library import locate
+from hood.assets.garment.garment import Garment
+from hood.assets.motion.recording import read_recording
+from hood.assets.motion.sequence import Z_UP_TO_Y_UP
 from hood.mesh import topology
 
 #: How far the floor lies below the middle of the default body [m]: characters of other programs stand on y = 0.

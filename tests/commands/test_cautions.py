@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from hood.assets.body import Body
-from hood.assets.garment import load_garment
-from hood.assets.library import locate
-from hood.assets.sequence import PoseSequence
+from hood.assets.body.body import Body
+from hood.assets.files.library import locate
+from hood.assets.garment.garment import load_garment
+from hood.assets.motion.sequence import PoseSequence
 from hood.cli import main
 from hood.commands.cautions import evaluation_cautions, scene_cautions
 from hood.commands.common import weigh

@@ -10,8 +10,8 @@ import pytest
 from belt import write_walk
 from workshop import write_obj
 
-from hood.assets.body import load_body
-from hood.assets.garment import load_garment
+from hood.assets.body.load import load_body
+from hood.assets.garment.garment import load_garment
 from hood.cli import main
 from hood.testing import cylinder
 

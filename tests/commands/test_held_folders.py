@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hood.assets.occupied import is_occupied, occupy
+from hood.assets.files.folder_lock import is_occupied, occupy
 from hood.cli import main
 from hood.dynamics.recorder import RolloutWriter
 from hood.testing import cylinder, sphere

@@ -15,8 +15,8 @@ from imitations import write_seated
 from wild import write_wild_garment
 from workshop import write_obj
 
-from hood.assets.body import Body
-from hood.assets.garment import Garment
+from hood.assets.body.body import Body
+from hood.assets.garment.garment import Garment
 from hood.assets.identify import identify
 from hood.cli import main
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from workshop import Workshop
 
-from hood.assets.binding import signed_distances
+from hood.assets.garment.binding import signed_distances
 from hood.cli import main
 from hood.dynamics.recorder import read_rollout
 from hood.mesh import topology

@@ -14,12 +14,13 @@ import numpy as np
 import pytest
 from workshop import write_obj
 
-from hood.assets.binding import posed_body
-from hood.assets.body import Body, load_body
-from hood.assets.fit_search import Asked
-from hood.assets.garment import Garment, load_garment
-from hood.assets.placement import Placement
-from hood.assets.standing import arms_down
+from hood.assets.body.body import Body
+from hood.assets.body.load import load_body
+from hood.assets.garment.binding import posed_body
+from hood.assets.garment.fit_search import Asked
+from hood.assets.garment.garment import Garment, load_garment
+from hood.assets.garment.placement import Placement
+from hood.assets.motion.poses import arms_down
 from hood.cli import main
 from hood.commands.placing import find_place
 

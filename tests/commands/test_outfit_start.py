@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from hood.cli import main
-from hood.commands.wardrobe import layer_order
+from hood.commands.garments import layer_order
 from hood.config import ConfigError
 
 

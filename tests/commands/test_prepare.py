@@ -11,11 +11,11 @@ import pytest
 import torch
 from wild import write_wild_garment
 
-from hood.assets.binding import posed_body, signed_distances
-from hood.assets.body import Body
-from hood.assets.garment import Garment, load_garment
-from hood.assets.sequence import PoseSequence
-from hood.assets.standing import arms_down
+from hood.assets.body.body import Body
+from hood.assets.garment.binding import posed_body, signed_distances
+from hood.assets.garment.garment import Garment, load_garment
+from hood.assets.motion.poses import arms_down
+from hood.assets.motion.sequence import PoseSequence
 from hood.cli import main
 from hood.dynamics.recorder import read_rollout
 from hood.mesh import geometry, topology

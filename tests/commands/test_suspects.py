@@ -15,8 +15,8 @@ import pytest
 import suspects
 from workshop import write_obj
 
-from hood.assets.body import Body
-from hood.assets.garment import Garment, load_garment
+from hood.assets.body.body import Body
+from hood.assets.garment.garment import Garment, load_garment
 from hood.cli import main
 
 QUICK = (

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hood.assets.material import Material
-from hood.assets.motions import MotionFiles
+from hood.assets.motion.motion_files import MotionFiles
 from hood.commands.train import make_trainer
 from hood.config import ConfigError, load_config
 from hood.dynamics.checkpoint import read_header

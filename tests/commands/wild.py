@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hood.assets.binding import push_out, signed_distances
-from hood.assets.body import Body
-from hood.assets.garment import Garment
-from hood.assets.outfit import join_garments
+from hood.assets.body.body import Body
+from hood.assets.garment.binding import push_out, signed_distances
+from hood.assets.garment.garment import Garment
+from hood.assets.garment.outfit import join_garments
 from hood.mesh import topology
 from hood.testing import cylinder
 

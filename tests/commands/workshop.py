@@ -12,12 +12,14 @@ import torch
 from imitations import GltfWriter, parents_of, write_official_pickle
 from scipy.spatial.transform import Rotation
 
-from hood.assets.body import Body, load_body
-from hood.assets.garment import load_garment
-from hood.assets.library import locate
-from hood.assets.motion_file import read_recording
-from hood.assets.sequence import PoseSequence, load_sequence
-from hood.assets.standing import arms_down
+from hood.assets.body.body import Body
+from hood.assets.body.load import load_body
+from hood.assets.files.library import locate
+from hood.assets.garment.garment import load_garment
+from hood.assets.motion.load import load_sequence
+from hood.assets.motion.poses import arms_down
+from hood.assets.motion.recording import read_recording
+from hood.assets.motion.sequence import PoseSequence
 from hood.scene.scene import build_scene
 
 FPS, FIRST, COUNT = 30.0, 40, 10

@@ -12,10 +12,10 @@ import torch
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from hood.assets.body import Body
-from hood.assets.garment import Garment
+from hood.assets.body.body import Body
+from hood.assets.garment.garment import Garment
 from hood.assets.material import Material
-from hood.assets.sequence import PoseSequence
+from hood.assets.motion.sequence import PoseSequence
 from hood.dynamics.captured import CapturedSimulator, StepPrediction
 from hood.dynamics.fixed_problem import step_inputs
 from hood.dynamics.fixed_step import FixedStep

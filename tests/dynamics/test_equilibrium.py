@@ -10,11 +10,11 @@ import torch
 from reference_oracle import make_state
 from torch import Tensor
 
-from hood.assets.body import Body
-from hood.assets.garment import Garment
-from hood.assets.mesh_sequence import MeshSequence
-from hood.assets.outfit import join_garments
-from hood.assets.sequence import PoseSequence
+from hood.assets.body.body import Body
+from hood.assets.garment.garment import Garment
+from hood.assets.garment.outfit import join_garments
+from hood.assets.motion.mesh_sequence import MeshSequence
+from hood.assets.motion.sequence import PoseSequence
 from hood.dynamics import equilibrium
 from hood.dynamics.equilibrium import Rest, find_equilibrium, without_hold
 from hood.dynamics.reference import import_reference_weights

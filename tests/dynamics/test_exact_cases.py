@@ -10,7 +10,7 @@ import torch
 from scipy import integrate, optimize
 
 from hood.assets.material import Material
-from hood.dynamics.march import Marched, march
+from hood.dynamics.implicit_euler import EulerStep, implicit_euler
 from hood.dynamics.measure import edge_strain
 from hood.losses.potential import Potential, default_potential
 from hood.losses.problem import StepProblem, inertial_guess
@@ -40,7 +40,7 @@ def over(problem: StepProblem, obstacle: Obstacle | None) -> StepProblem:
     return replace(problem, step=replace(problem.step, obstacle=obstacle))
 
 
-def last(steps) -> Marched:
+def last(steps) -> EulerStep:
     """The last of the steps, all of which must have converged."""
     for step in steps:
         assert step.report.converged.all(), step.report.reason
@@ -67,7 +67,7 @@ def without_gravity(problem: StepProblem) -> torch.Tensor:
 def test_free_fall_is_the_series_of_implicit_euler(dt, start):
     problem = problem_of(wavy(), dt)
     settings = NewtonSettings(target_rg=1e-6, linear="direct")
-    for k, step in enumerate(march(default_potential(), problem, 100, settings, start=start), 1):
+    for k, step in enumerate(implicit_euler(default_potential(), problem, 100, settings, start=start), 1):
         assert step.report.converged.all()
         assert (step.report.iterations > 0) == (start is not None)
         torch.testing.assert_close(step.state.pos, free_fall(problem, k, dt), rtol=0, atol=1e-10)
@@ -111,7 +111,7 @@ def test_hanging_strip_is_the_solution_of_the_bar():
     assert linear > 1.2 * elongation
     # Implicit Euler stays there.
     settled = replace(problem, state=State(pos, torch.zeros_like(pos), problem.state.origin))
-    kept = last(march(default_potential(), settled, 2, TIGHT))
+    kept = last(implicit_euler(default_potential(), settled, 2, TIGHT))
     torch.testing.assert_close(kept.state.pos, pos, rtol=0, atol=1e-8)
 
 
@@ -138,9 +138,11 @@ def test_sliding_starts_at_the_angle_of_friction(friction, beyond, meshed):
     pos = problem.state.pos + (term.epsilon - depth)[:, None] * torch.as_tensor(normal)
     problem = replace(problem, state=replace(problem.state, pos=pos))
     if meshed:
-        steps = march(potential, over(problem, surface(plate(normal, slope))), 24, TIGHT)
+        steps = implicit_euler(potential, over(problem, surface(plate(normal, slope))), 24, TIGHT)
     else:
-        steps = march(potential, problem, 24, TIGHT, contact=lambda _, state: plane_contact(state.pos, torch.as_tensor(normal)))
+        steps = implicit_euler(
+            potential, problem, 24, TIGHT, contact=lambda _, state: plane_contact(state.pos, torch.as_tensor(normal))
+        )
     vel = last(steps).state.vel @ torch.as_tensor(slope)
     speed = float((problem.cloth.mass * vel).sum() / problem.cloth.mass.sum())
     if beyond > 0:
@@ -161,7 +163,7 @@ def draped(side: int, size: float, radius: float, subdivisions: int) -> StepProb
 
 def kinetic_energies(problem: StepProblem, steps: int, settings: NewtonSettings) -> np.ndarray:
     energies = []
-    for step in march(default_potential(), problem, steps, settings):
+    for step in implicit_euler(default_potential(), problem, steps, settings):
         assert step.report.converged.all(), step.report.reason
         energies.append(float(0.5 * (problem.cloth.mass * step.state.vel.square().sum(1)).sum()))
     return np.array(energies)
@@ -186,10 +188,10 @@ def test_contact_decides_between_falling_and_resting():
     problem = problem_of((mesh[0] + np.array([0.0, 0.06, 0.0]), mesh[1]))
     floor = surface(plate(np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0])))
     steps, dt = 60, 1 / 30
-    fallen = last(march(default_potential(), problem, steps, TIGHT)).state
+    fallen = last(implicit_euler(default_potential(), problem, steps, TIGHT)).state
     torch.testing.assert_close(fallen.pos, free_fall(problem, steps, dt), rtol=0, atol=1e-10)
     settings = NewtonSettings(target_rg=1e-4, linear="direct")
-    resting = last(march(default_potential(), over(problem, floor), steps, settings)).state
+    resting = last(implicit_euler(default_potential(), over(problem, floor), steps, settings)).state
     assert float(resting.pos[:, 1].min()) > 0.0015
     assert float(resting.pos[:, 1].max()) < 0.05  # the waves of its rest shape
     assert float(resting.vel.abs().max()) < 1e-3
@@ -203,7 +205,7 @@ def test_pinned_and_massless_vertices_are_exactly_where_they_belong(dtype):
     problem = make_problem(cloth)
     generator = torch.Generator().manual_seed(0)
     targets = [cloth.rest_pos + 0.01 * k + 0.003 * torch.rand(26, 3, generator=generator, dtype=dtype) for k in range(6)]
-    steps = march(default_potential(), problem, 6, step_input=lambda k: replace(problem.step, pin_target=targets[k]))
+    steps = implicit_euler(default_potential(), problem, 6, step_input=lambda k: replace(problem.step, pin_target=targets[k]))
     for target, step in zip(targets, steps, strict=True):
         assert torch.equal(step.state.pos[:5], target[:5])
         assert torch.equal(step.state.pos[25], cloth.rest_pos[25])
@@ -215,7 +217,7 @@ def test_pinned_and_massless_vertices_are_exactly_where_they_belong(dtype):
 def collided(mesh: Mesh, body: Mesh) -> torch.Tensor:
     """Positions after four steps in which a swinging sheet meets the body."""
     problem = over(problem_of(mesh, vel=np.tile([0.0, -1.0, 0.0], (len(mesh[0]), 1))), surface(body))
-    return last(march(default_potential(), problem, 4, TIGHT)).state.pos
+    return last(implicit_euler(default_potential(), problem, 4, TIGHT)).state.pos
 
 
 def swinging() -> tuple[Mesh, Mesh]:
@@ -271,6 +273,6 @@ def test_partners_in_a_batch_play_no_role():
         ),
         gravity=scenes[0].gravity,
     )
-    alone = [last(march(default_potential(), scene, 4, TIGHT)).state.pos for scene in scenes]
-    batch = last(march(default_potential(), together, 4, TIGHT)).state.pos
+    alone = [last(implicit_euler(default_potential(), scene, 4, TIGHT)).state.pos for scene in scenes]
+    batch = last(implicit_euler(default_potential(), together, 4, TIGHT)).state.pos
     torch.testing.assert_close(batch, torch.cat(alone), rtol=0, atol=1e-8)

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from hood.assets.body import Body
-from hood.assets.garment import Garment
-from hood.assets.library import locate
-from hood.assets.sequence import PoseSequence
+from hood.assets.body.body import Body
+from hood.assets.files.library import locate
+from hood.assets.garment.garment import Garment
+from hood.assets.motion.sequence import PoseSequence
 from hood.dynamics.captured import CapturedSimulator
 from hood.dynamics.checkpoint import load_simulator
 from hood.dynamics.fixed_problem import settled_potential, step_inputs

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import torch
 
-from hood.assets.body import Body
-from hood.assets.garment import Garment
-from hood.assets.sequence import PoseSequence
+from hood.assets.body.body import Body
+from hood.assets.garment.garment import Garment
+from hood.assets.motion.sequence import PoseSequence
 from hood.dynamics.goals import Count
 from hood.dynamics.guard import (
     CHECK,

@@ -9,10 +9,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from hood.assets.body import Body
-from hood.assets.garment import Garment
+from hood.assets.body.body import Body
+from hood.assets.garment.garment import Garment
 from hood.assets.material import Material
-from hood.assets.sequence import PoseSequence
+from hood.assets.motion.sequence import PoseSequence
 from hood.dynamics.simulator import Prepared, Simulator, build_simulator
 from hood.graph.builder import build_static
 from hood.graph.hierarchy import Hierarchy, build_hierarchy

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from imitations import write_seated
 
-from hood.assets.body import Body
-from hood.assets.garment import Garment, load_garment
-from hood.assets.library import locate
-from hood.assets.sequence import load_sequence
-from hood.assets.sequence_edit import blend_in
+from hood.assets.body.body import Body
+from hood.assets.files.library import locate
+from hood.assets.garment.garment import Garment, load_garment
+from hood.assets.motion.load import load_sequence
+from hood.assets.motion.sequence_edit import blend_in
 from hood.dynamics.checkpoint import load_simulator
 from hood.dynamics.goals import Count
 from hood.dynamics.refine import GuessStepper, RefinedStepper

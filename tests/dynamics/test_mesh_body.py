@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from hood.assets.animated_mesh import load_mesh_sequence
-from hood.assets.body import Body
-from hood.assets.garment import Garment
-from hood.assets.library import locate
-from hood.assets.sequence import PoseSequence
+from hood.assets.body.body import Body
+from hood.assets.files.library import locate
+from hood.assets.garment.garment import Garment
+from hood.assets.motion.animated_mesh import load_mesh_sequence
+from hood.assets.motion.sequence import PoseSequence
 from hood.dynamics.checkpoint import load_simulator
 from hood.dynamics.rollout import simulate
 from hood.dynamics.stepper import NewtonStepper, Stepper

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hood.assets.garment import Garment
-from hood.assets.library import locate
+from hood.assets.files.library import locate
+from hood.assets.garment.garment import Garment
 from hood.assets.material import RANGES, Material
 from hood.dynamics.checkpoint import load_simulator
 from hood.dynamics.ranges import Conditions, describe, different, outside, scene_conditions, training_conditions

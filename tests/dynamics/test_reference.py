@@ -13,10 +13,10 @@ import torch
 from reference_oracle import LAYOUTS, Oracle, OracleScene, OracleStep, make_state
 from torch import Tensor
 
-from hood.assets.body import Body
-from hood.assets.garment import Garment
+from hood.assets.body.body import Body
+from hood.assets.garment.garment import Garment
 from hood.assets.material import Material
-from hood.assets.sequence import PoseSequence
+from hood.assets.motion.sequence import PoseSequence
 from hood.dynamics.checkpoint import load_simulator, save_simulator
 from hood.dynamics.frames import Relaxing
 from hood.dynamics.reference import import_reference_weights

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hood.assets.body import Body
-from hood.assets.garment import Garment
-from hood.assets.library import locate
-from hood.assets.sequence import PoseSequence
+from hood.assets.body.body import Body
+from hood.assets.files.library import locate
+from hood.assets.garment.garment import Garment
+from hood.assets.motion.sequence import PoseSequence
 from hood.dynamics.checkpoint import load_simulator
 from hood.dynamics.goals import Count
 from hood.dynamics.refine import RefinedStepper

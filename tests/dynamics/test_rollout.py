@@ -9,9 +9,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from hood.assets.body import Body
-from hood.assets.garment import Garment
-from hood.assets.sequence import PoseSequence
+from hood.assets.body.body import Body
+from hood.assets.garment.garment import Garment
+from hood.assets.motion.sequence import PoseSequence
 from hood.dynamics.rollout import METRIC_CHOICES, Frame, metric_names, simulate, start_state
 from hood.dynamics.simulator import Simulator, build_simulator
 from hood.graph.builder import MESH, Graph

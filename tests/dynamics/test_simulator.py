@@ -10,10 +10,10 @@ import torch
 from scipy.spatial.transform import Rotation
 from small_simulators import KINDS, SCHEDULE, make, take
 
-from hood.assets.body import Body
-from hood.assets.garment import Garment
+from hood.assets.body.body import Body
+from hood.assets.garment.garment import Garment
 from hood.assets.material import Material
-from hood.assets.sequence import PoseSequence, turn_world
+from hood.assets.motion.sequence import PoseSequence, turn_world
 from hood.dynamics.simulator import build_simulator
 from hood.losses.problem import StepProblem
 from hood.scene.cloth import build_cloth, concatenate_cloths

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from hood.assets.body import Body
-from hood.assets.garment import Garment
-from hood.assets.sequence import load_sequence
+from hood.assets.body.body import Body
+from hood.assets.garment.garment import Garment
+from hood.assets.motion.load import load_sequence
 from hood.dynamics.rollout import metric_names, simulate
 from hood.dynamics.stepper import NewtonStepper
 from hood.losses.potential import default_potential

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hood.assets.garment import Garment
-from hood.assets.outfit import join_garments
+from hood.assets.garment.garment import Garment
+from hood.assets.garment.outfit import join_garments
 from hood.dynamics.rollout import simulate
 from hood.dynamics.stepper import NewtonStepper
 from hood.dynamics.surface import SURFACE_METRICS, SurfaceMeter

@@ -7,7 +7,7 @@ import torch
 from small_simulators import make
 from torch import Tensor
 
-from hood.assets.library import locate
+from hood.assets.files.library import locate
 from hood.dynamics.captured import CapturedSimulator, network_of
 from hood.dynamics.checkpoint import load_simulator
 from hood.dynamics.goals import Count

@@ -13,7 +13,7 @@ from hood.dynamics.rollout import simulate
 from hood.dynamics.stepper import NewtonStepper
 from hood.dynamics.watched import PLAN_METRICS, WatchedStepper, force_bound, lacking
 from hood.evaluation.gap import gap
-from hood.evaluation.leaving_out import Effect, Variant, begin, march
+from hood.evaluation.leaving_out import Effect, Variant, begin, take_steps
 from hood.evaluation.windows import Window
 from hood.losses.layers import LayerBarrier
 from hood.losses.potential import Potential, default_potential, scale
@@ -41,7 +41,7 @@ def test_the_bound_is_not_below_gamma(names: tuple[str, ...], tank_scene: Scene)
     full = Variant(NewtonStepper(FULL, TIGHT), FULL, tank_scene)
     lean = Variant(NewtonStepper(without(*names), TIGHT), without(*names), tank_scene)
     (one,) = begin(full, [Window(0, "the start")], "paper", lead=1)
-    pos, _ = march(lean, one, 1, Effect())
+    pos, _ = take_steps(lean, one, 1, Effect())
     gamma = float(gap(FULL, one.step, pos).gamma)
     assert gamma > 1e-6
     assert force_bound(FULL, list(names), one.step, pos) >= gamma

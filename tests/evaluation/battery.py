@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
-from hood.assets.extremes import write_garment, write_motion
+from hood.assets.extremes.files import write_garment, write_motion
 from hood.commands.cloth_contact import potential_of
 from hood.commands.common import weigh
-from hood.commands.dial import refined
 from hood.commands.guarding import guard_sentence, make_guard
 from hood.commands.notices import heard
+from hood.commands.refinement import refined
 from hood.commands.setup import make_scene, make_stepper
 from hood.config import load_config
 from hood.dynamics.guard import CUT

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from hood.assets.body import load_body
-from hood.assets.garment import load_garment
+from hood.assets.body.load import load_body
+from hood.assets.garment.garment import load_garment
 from hood.dynamics.simulator import Prediction, Simulator, build_simulator
 from hood.dynamics.stepper import NewtonStepper
 from hood.evaluation.drift import sideways_drift, standing_scene

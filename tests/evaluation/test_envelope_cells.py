@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hood.assets.extreme_garments import FAULTS
-from hood.assets.extreme_motions import MOTIONS
+from hood.assets.extremes.garments import FAULTS
+from hood.assets.extremes.motions import MOTIONS
 from hood.dynamics.soundness import Criteria
 from hood.evaluation.cells import NOMINAL, ORDERED, Cell, cells
 from hood.evaluation.envelope import (

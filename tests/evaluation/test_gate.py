@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from battery import CRITERIA, METHODS, Battery, chosen
 
-from hood.assets.body import Body
-from hood.assets.garment import Garment
-from hood.assets.sequence import PoseSequence
+from hood.assets.body.body import Body
+from hood.assets.garment.garment import Garment
+from hood.assets.motion.sequence import PoseSequence
 from hood.dynamics.rollout import simulate
 from hood.dynamics.stepper import NewtonStepper
 from hood.evaluation.envelope import CLASSES, DEGRADED, SILENT, SOUND, judge

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from hood.dynamics.stepper import NewtonStepper
 from hood.evaluation.gap import gap
-from hood.evaluation.leaving_out import Effect, Variant, active_terms, begin, march, measure, prices
+from hood.evaluation.leaving_out import Effect, Variant, active_terms, begin, measure, prices, take_steps
 from hood.evaluation.windows import Window, choose_windows
 from hood.losses.potential import Potential, default_potential
 from hood.scene.scene import Scene
@@ -28,7 +28,7 @@ def test_gamma_is_the_gap_of_the_first_step(full: Variant, tank_scene: Scene) ->
     begun = begin(full, [Window(0, "the start")], "paper", lead=0)
     limp = variant(tank_scene, "bending")
     found = measure(full, {"limp": limp}, begun, 1)["limp"]
-    pos, _ = march(limp, begun[0], 1, Effect())
+    pos, _ = take_steps(limp, begun[0], 1, Effect())
     expected = gap(full.potential, begun[0].step, pos)
     assert found.gamma[0] == pytest.approx(float(expected.gamma), rel=2e-2)
     assert found.gamma[0] > 1e-4

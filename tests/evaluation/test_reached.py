@@ -1,4 +1,4 @@
-"""What is read from a point's folder, what counts as too much strain, and the tables for the dial."""
+"""What is read from a point's folder, what counts as too much strain, and the tables for refinement."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import pytest
 from measured_points import point, reached, rollout, solver, write_point
 
 from hood.dynamics.refine_table import floor_from_table
-from hood.evaluation.diary import Diary, Unit
 from hood.evaluation.reached import overstretched, read_reached, read_record, refinement_tables, summarise
+from hood.evaluation.rollout_log import RolloutLog, Unit
 from hood.evaluation.study import Study
 from hood.evaluation.table import Measured
 
@@ -59,8 +59,8 @@ def test_what_was_not_measured_is_none_in_the_files(tmp_path: Path) -> None:
 
 
 def test_rollouts_measured_again_replace_those_with_other_weights(tmp_path: Path) -> None:
-    Diary(tmp_path).write(Unit(0, "tank", "walk"), "old", rollout([10.0], [9.0]))
-    Diary(tmp_path).write(Unit(0, "tank", "walk"), "new", rollout([20.0], [1.0]))
+    RolloutLog(tmp_path).write(Unit(0, "tank", "walk"), "old", rollout([10.0], [9.0]))
+    RolloutLog(tmp_path).write(Unit(0, "tank", "walk"), "new", rollout([20.0], [1.0]))
     found = read_reached(point(), tmp_path, 1000)
     assert (found.rollouts, found.ms.value, found.gap.value) == (1, 20.0, 1.0)
 

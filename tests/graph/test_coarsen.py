@@ -5,8 +5,8 @@ import pytest
 from scipy.sparse import csgraph
 from scipy.spatial import Delaunay
 
-from hood.assets.garment import load_garment
-from hood.assets.library import names
+from hood.assets.files.library import names
+from hood.assets.garment.garment import load_garment
 from hood.graph import coarsen
 from hood.mesh.topology import unique_edges
 from hood.testing import cylinder

@@ -10,7 +10,7 @@ import torch
 from layer_scenes import sheet_on_slope, stack
 
 from hood.assets.material import Material
-from hood.dynamics.march import march
+from hood.dynamics.implicit_euler import implicit_euler
 from hood.losses.layer_friction import LayerFriction, barrier_force
 from hood.losses.layers import LayerBarrier, without_layers
 from hood.losses.potential import Potential, default_potential
@@ -97,7 +97,7 @@ def test_barrier_force_is_the_slope_of_the_barrier() -> None:
 
 def test_layers_that_lie_still_are_pressed_with_the_weight_above_them() -> None:
     count = 4
-    *_, last = march(POTENTIAL, stack(1 / 30, n=4, count=count), 40, NewtonSettings(target_rg=1e-5))
+    *_, last = implicit_euler(POTENTIAL, stack(1 / 30, n=4, count=count), 40, NewtonSettings(target_rg=1e-5))
     assert float(last.state.vel.norm(dim=1).max()) < 0.01
     problem = POTENTIAL.prepare(replace(last.problem, state=last.state, contact=None, pull=None, layers=()))
     grips = LayerFriction(1.0).grips(problem)
@@ -120,7 +120,7 @@ def test_features_that_nearly_touch_do_not_grip_without_bound() -> None:
 def test_sheet_sticks_below_the_angle_of_friction(engine: str) -> None:
     """At 20° with μ = 0.5 it creeps, at most by the speed of slip."""
     problem, first, down = sheet_on_slope(1 / 60, 20.0)
-    *_, last = march(POTENTIAL, problem, 12, NewtonSettings(engine=engine))
+    *_, last = implicit_euler(POTENTIAL, problem, 12, NewtonSettings(engine=engine))
     assert bool(last.report.converged.all())
     speed = float((last.state.vel[first:].mean(0) * torch.as_tensor(down)).sum())
     assert 0.0 < speed < 5e-3
@@ -130,14 +130,16 @@ def test_sheet_sticks_below_the_angle_of_friction(engine: str) -> None:
 def test_sheet_slides_above_it_with_what_is_left_of_gravity(coefficient: float, degrees: float) -> None:
     problem, first, down = sheet_on_slope(1 / 60, degrees)
     potential = POTENTIAL.with_terms(layer_friction=LayerFriction(coefficient))
-    speeds = [float((m.state.vel[first:].mean(0) * torch.as_tensor(down)).sum()) for m in march(potential, problem, 18)]
+    speeds = [
+        float((m.state.vel[first:].mean(0) * torch.as_tensor(down)).sum()) for m in implicit_euler(potential, problem, 18)
+    ]
     turn = np.deg2rad(degrees)
     expected = 9.81 * (np.sin(turn) - coefficient * np.cos(turn))
     assert (speeds[-1] - speeds[5]) * 60 / 12 == pytest.approx(expected, rel=0.05)
 
 
 def test_compiled_and_torch_reach_the_same_minimum() -> None:
-    *_, before = march(POTENTIAL, stack(1 / 30, n=4, count=4), 4)
+    *_, before = implicit_euler(POTENTIAL, stack(1 / 30, n=4, count=4), 4)
     problem = POTENTIAL.prepare(replace(before.problem, state=before.state, contact=None, pull=None, layers=()))
     ends = []
     for engine in ("compiled", "torch"):
@@ -154,7 +156,9 @@ def test_compiled_and_torch_reach_the_same_minimum() -> None:
 @pytest.mark.parametrize("engine", ["compiled", "torch"])
 def test_without_pairs_steps_are_to_the_bit_those_without(engine: str) -> None:
     problem, settings = stack(1 / 30, n=5, count=1), NewtonSettings(engine=engine)
-    steps = zip(march(POTENTIAL, problem, 3, settings), march(default_potential(), problem, 3, settings), strict=True)
+    steps = zip(
+        implicit_euler(POTENTIAL, problem, 3, settings), implicit_euler(default_potential(), problem, 3, settings), strict=True
+    )
     for one, other in steps:
         assert torch.equal(one.state.pos, other.state.pos)
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from hood.assets.material import Material
-from hood.dynamics.march import march
+from hood.dynamics.implicit_euler import implicit_euler
 from hood.losses.friction import Friction
 from hood.losses.potential import Potential, default_potential, reference_potential
 from hood.losses.problem import StepProblem
@@ -73,9 +73,9 @@ def test_cloth_that_lies_still_and_cloth_over_a_ball_keep_the_contacts_own_force
     """At rest what presses is what the contact carries: friction is as without the bound."""
     potential = default_potential()
     for body, height in ((floor(), 2e-3), (sphere(3, 0.1), 0.106)):
-        for marched in march(potential, on(body, height), 40, NewtonSettings(target_rg=1e-6, linear="direct")):
-            assert marched.report.converged.all()
-        last = potential.prepare(replace(marched.problem, state=marched.state, contact=None, pull=None))
+        for taken in implicit_euler(potential, on(body, height), 40, NewtonSettings(target_rg=1e-6, linear="direct")):
+            assert taken.report.converged.all()
+        last = potential.prepare(replace(taken.problem, state=taken.state, contact=None, pull=None))
         still = State(last.state.pos, torch.zeros_like(last.state.vel), last.state.origin)
         last = replace(last, state=still)
         unbounded = force(potential, replace(last, pull=torch.full_like(last.state.pos, -1e6) * last.contact.next_normal))  # type: ignore[union-attr]

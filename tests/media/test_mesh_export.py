@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hood.assets.garment import Garment
-from hood.assets.mesh_file import read_mesh_file
+from hood.assets.formats.mesh_file import read_mesh_file
+from hood.assets.garment.garment import Garment
 from hood.media.mesh_export import corner_normals, write_obj
 from hood.testing import box, sphere
 

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from hood.assets.body import Body
-from hood.assets.garment import Garment
+from hood.assets.body.body import Body
+from hood.assets.garment.garment import Garment
 from hood.assets.material import Material
-from hood.assets.sequence import PoseSequence, load_sequence
+from hood.assets.motion.load import load_sequence
+from hood.assets.motion.sequence import PoseSequence
 from hood.scene.dataset import SceneSampler
 
 

@@ -146,7 +146,7 @@ def test_a_strip_of_two_fabrics_is_two_strips() -> None:
     assert energy(Stretching(), cloth, state) == pytest.approx(sum(energy(Stretching(), h, state) for h in halves), rel=1e-12)
     folded = torch.as_tensor(fold(pos, 1.0))  # about the seam alone
     hinge = seam[topology.edge_index(edges, cloth.hinges[:, :2].numpy())]
-    weight = 1e-3 * cloth.rest_length[hinge] ** 2 / (4 * cloth.hinge_area[hinge])
+    weight = 1e-3 * cloth.hinge_rest_length[hinge] ** 2 / (4 * cloth.hinge_area[hinge])
     assert energy(Bending(), cloth, folded) == pytest.approx(0.5 * float(weight.sum()), rel=1e-9)
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hood.assets.binding import bind_posed, posed_body
-from hood.assets.body import Body
-from hood.assets.garment import Garment
-from hood.assets.sequence import PoseSequence
-from hood.assets.standing import arms_down
+from hood.assets.body.body import Body
+from hood.assets.garment.binding import bind_posed, posed_body
+from hood.assets.garment.garment import Garment
+from hood.assets.motion.poses import arms_down
+from hood.assets.motion.sequence import PoseSequence
 from hood.scene.fitting import fit_figures
 from hood.scene.scene import build_scene
 

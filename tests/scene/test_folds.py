@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from hood.assets.material import Material
-from hood.assets.sequence import load_sequence
+from hood.assets.motion.load import load_sequence
 from hood.dynamics.fixed_problem import with_fixed_contact
 from hood.losses.collision import Collision
 from hood.losses.layers import for_networks

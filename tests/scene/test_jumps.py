@@ -10,12 +10,13 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from hood.assets.body import Body
-from hood.assets.extremes import write_motion
-from hood.assets.garment import Garment
-from hood.assets.library import names
-from hood.assets.mesh_sequence import MeshSequence
-from hood.assets.sequence import PoseSequence, load_sequence
+from hood.assets.body.body import Body
+from hood.assets.extremes.files import write_motion
+from hood.assets.files.library import names
+from hood.assets.garment.garment import Garment
+from hood.assets.motion.load import load_sequence
+from hood.assets.motion.mesh_sequence import MeshSequence
+from hood.assets.motion.sequence import PoseSequence
 from hood.dynamics.rollout import simulate
 from hood.dynamics.stepper import NewtonStepper
 from hood.losses.potential import default_potential

@@ -9,11 +9,11 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from hood.assets.body import Body
-from hood.assets.garment import Garment
-from hood.assets.mesh_sequence import MeshSequence
-from hood.assets.sequence import PoseSequence
-from hood.assets.standing import arms_down
+from hood.assets.body.body import Body
+from hood.assets.garment.garment import Garment
+from hood.assets.motion.mesh_sequence import MeshSequence
+from hood.assets.motion.poses import arms_down
+from hood.assets.motion.sequence import PoseSequence
 from hood.scene.mesh_motion import NoBody, mesh_motion, worn_pos
 from hood.scene.motion import body_motion
 from hood.scene.scene import Scene, dress

@@ -7,12 +7,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from hood.assets.binding import bind_garment
-from hood.assets.body import Body
-from hood.assets.garment import Garment
+from hood.assets.body.body import Body
+from hood.assets.garment.binding import bind_garment
+from hood.assets.garment.garment import Garment
+from hood.assets.garment.mirror import mirror_body, mirror_garment, reflect
 from hood.assets.material import Material, sample_material
-from hood.assets.mirror import mirror_body, mirror_garment, reflect
-from hood.assets.sequence import PoseSequence
+from hood.assets.motion.sequence import PoseSequence
 from hood.losses.potential import default_potential
 from hood.losses.problem import StepProblem
 from hood.scene.dataset import SceneSampler

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import gc
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from hood.assets.body import Body
-from hood.assets.garment import Garment
-from hood.assets.sequence import PoseSequence
+from hood.assets.body.body import Body
+from hood.assets.garment.garment import Garment
+from hood.assets.motion.sequence import PoseSequence
+from hood.scene import motion as module
 from hood.scene.motion import body_motion
 from hood.scene.scene import build_scene
 
@@ -84,3 +86,15 @@ def test_skinned_skin_is_the_skin(body: Body, walk: PoseSequence) -> None:
 def test_omitted_vertices_travel_with_the_obstacle(body: Body, walk: PoseSequence) -> None:
     obstacle = body_motion(body, walk.window(0, 2), np.zeros(10)).obstacle(0, np.zeros(3))
     assert int(obstacle.omitted.sum()) == pytest.approx(int(body.omitted.sum()))
+
+
+def test_a_body_that_is_gone_leaves_nothing_behind(body: Body, walk: PoseSequence) -> None:
+    """Programs may meet thousands of bodies."""
+    before = set(module._TENSORS)
+    for _ in range(3):
+        other = replace(body)
+        body_motion(other, walk.window(0, 2), np.zeros(10)).obstacle(0, np.zeros(3))
+        assert len(set(module._TENSORS) - before) == 1
+        del other
+        gc.collect()
+        assert set(module._TENSORS) <= before

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from hood.assets.material import Material
-from hood.dynamics.march import march
+from hood.dynamics.implicit_euler import implicit_euler
 from hood.losses.collision import Collision
 from hood.losses.friction import Friction
 from hood.losses.potential import coded_potential, default_potential, reference_potential
@@ -146,9 +146,9 @@ def test_scenes_of_a_batch_keep_their_own() -> None:
 def test_a_tight_sleeve_is_cut_only_with_a_constant_reach(form: str) -> None:
     """Long edges lie across the limb; counted by a check that shares nothing with contact or solver."""
     problem = sleeve(8, 0.060)
-    for marched in march(default_potential(reach=form), problem, 8, NewtonSettings(target_rg=1e-3)):
-        assert marched.report.converged.all()
-    pairs = cut(problem, marched.state.pos)
+    for taken in implicit_euler(default_potential(reach=form), problem, 8, NewtonSettings(target_rg=1e-3)):
+        assert taken.report.converged.all()
+    pairs = cut(problem, taken.state.pos)
     assert pairs == 0 if form == "curvature" else pairs > 50
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from hood.assets.body import Body
-from hood.assets.garment import Garment
-from hood.assets.sequence import PoseSequence
+from hood.assets.body.body import Body
+from hood.assets.garment.garment import Garment
+from hood.assets.motion.sequence import PoseSequence
 from hood.scene.scene import RELAXING_DT, Scene, build_scene, concatenate_step_inputs, recentre
 from hood.scene.state import Attachments, State, StepInput
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from hood.assets.body import load_body
-from hood.assets.garment import load_garment
+from hood.assets.body.load import load_body
+from hood.assets.garment.garment import load_garment
+from hood.assets.garment.outfit import join_garments
 from hood.assets.material import Material
-from hood.assets.outfit import join_garments
-from hood.assets.sequence import load_sequence
+from hood.assets.motion.load import load_sequence
 from hood.mesh.crossing import self_crossings
 from hood.scene.cloth import build_cloth
 from hood.scene.contact import find_contact

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hood.assets.binding import PosedBody, posed_body, push_out, signed_distances
-from hood.assets.body import Body
-from hood.assets.garment import Garment
-from hood.assets.standing import arms_down
+from hood.assets.body.body import Body
+from hood.assets.garment.binding import PosedBody, posed_body, push_out, signed_distances
+from hood.assets.garment.garment import Garment
+from hood.assets.motion.poses import arms_down
 from hood.mesh import topology
 from hood.scene.wear import STRETCHED, put_on
 from hood.testing import sphere

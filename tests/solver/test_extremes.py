@@ -10,11 +10,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from hood.assets.body import Body
-from hood.assets.garment import Garment
+from hood.assets.body.body import Body
+from hood.assets.garment.garment import Garment
 from hood.assets.material import Material
-from hood.assets.sequence import PoseSequence
-from hood.dynamics.march import Marched, march
+from hood.assets.motion.sequence import PoseSequence
+from hood.dynamics.implicit_euler import EulerStep, implicit_euler
 from hood.dynamics.measure import penetration_metrics, strain_metrics
 from hood.dynamics.rollout import simulate
 from hood.dynamics.stepper import NewtonStepper
@@ -66,7 +66,7 @@ def fabric(stretching: float = 1.0, bending: float = 1.0, density: float = 1.0) 
     )
 
 
-def honest(steps: Iterable[Marched], settings: NewtonSettings = DEFAULT) -> list[Marched]:
+def honest(steps: Iterable[EulerStep], settings: NewtonSettings = DEFAULT) -> list[EulerStep]:
     """The steps; each is finite, says whether it converged, and is right about it."""
     taken = list(steps)
     for step in taken:
@@ -81,7 +81,7 @@ def honest(steps: Iterable[Marched], settings: NewtonSettings = DEFAULT) -> list
     return taken
 
 
-def bounded(steps: Iterable[Marched], settings: NewtonSettings = DEFAULT) -> list[Marched]:
+def bounded(steps: Iterable[EulerStep], settings: NewtonSettings = DEFAULT) -> list[EulerStep]:
     """:func:`honest` steps of a cloth on a body at rest whose energy never exceeds that of the start: whatever speed there
     is comes from falling, or from the deformation and the penetration of the start."""
     taken = honest(steps, settings)
@@ -106,7 +106,7 @@ def energy_of_contact(problem: StepProblem) -> float:
     return float(term.total(problem, problem.state.pos, torch.zeros_like(problem.state.pos)))
 
 
-def strain(step: Marched) -> float:
+def strain(step: EulerStep) -> float:
     return strain_metrics(step.problem.cloth, step.state.pos)["strain_max"]
 
 
@@ -117,32 +117,32 @@ def test_strain_falls_as_stretching_stiffness_rises():
     strains = []
     for factor in STIFFNESS:
         problem = draped(fabric(stretching=factor), pinned=True)
-        strains.append(max(strain(step) for step in bounded(march(default_potential(), problem, 2, DEFAULT))))
+        strains.append(max(strain(step) for step in bounded(implicit_euler(default_potential(), problem, 2, DEFAULT))))
     assert all(stiffer < softer for softer, stiffer in zip(strains, strains[1:], strict=False)), strains
     assert strains[-1] < 2e-3
 
 
 @pytest.mark.parametrize("factor", STIFFNESS)
 def test_stretching_stiffness(factor):
-    bounded(march(default_potential(), draped(fabric(stretching=factor)), 2, DEFAULT))
+    bounded(implicit_euler(default_potential(), draped(fabric(stretching=factor)), 2, DEFAULT))
 
 
 @pytest.mark.parametrize("pinned", [False, True])
 @pytest.mark.parametrize("factor", [0.0, 1e-3, 1e5])
 def test_bending_stiffness(factor, pinned):
-    bounded(march(default_potential(), draped(fabric(bending=factor), pinned=pinned), 2, DEFAULT))
+    bounded(implicit_euler(default_potential(), draped(fabric(bending=factor), pinned=pinned), 2, DEFAULT))
 
 
 @pytest.mark.parametrize("pinned", [False, True])
 @pytest.mark.parametrize("density", [1e-3, 0.1 * 0.20022, 50.0])
 def test_density(density, pinned):
-    bounded(march(default_potential(), draped(Material(density=density), pinned=pinned), 2, DEFAULT))
+    bounded(implicit_euler(default_potential(), draped(Material(density=density), pinned=pinned), 2, DEFAULT))
 
 
 @pytest.mark.parametrize("pinned", [False, True])
 @pytest.mark.parametrize("dt", [1 / 480, 1 / 240, 1 / 30, 1 / 5])
 def test_time_step(dt, pinned):
-    steps = bounded(march(default_potential(), draped(dt=dt, pinned=pinned), 3, DEFAULT))
+    steps = bounded(implicit_euler(default_potential(), draped(dt=dt, pinned=pinned), 3, DEFAULT))
     depth = [penetration_metrics(step.problem.contact, step.problem.cloth)["penetration_depth"] for step in steps]
     assert max(depth) < 2e-3
 
@@ -153,7 +153,7 @@ def test_edge_length(edge):
     ends = {}
     for dtype in (torch.float32, torch.float64):
         problem = draped(mesh=grid(6, 6, 5 * edge), radius=max(0.05, edge), dtype=dtype)
-        run = march(default_potential(), problem, 2, DEFAULT)
+        run = implicit_euler(default_potential(), problem, 2, DEFAULT)
         steps = bounded(run) if dtype == torch.float64 else honest(run)
         assert all(step.report.converged for step in steps)
         ends[dtype] = steps[-1].state.pos.double()
@@ -171,9 +171,9 @@ def test_rest_aspect_ratio(aspect):
     pos, faces = grid(6, 6, 0.25)
     pos[pos[:, 0] > 0.12, 0] -= 0.05 * (1.0 - 1.0 / aspect)
     problem = draped(mesh=(pos, faces))
-    steps = honest(march(default_potential(), problem, 2, DEFAULT))
+    steps = honest(implicit_euler(default_potential(), problem, 2, DEFAULT))
     assert all(step.report.converged for step in steps) or aspect > 100
-    bounded(march(default_potential(), problem, 2, DEFAULT, start=lambda now: now.state.pos))
+    bounded(implicit_euler(default_potential(), problem, 2, DEFAULT, start=lambda now: now.state.pos))
 
 
 @pytest.mark.parametrize("pinned", [False, True])
@@ -182,7 +182,7 @@ def test_one_triangle(pinned):
     problem = draped(mesh=(pos, np.array([[0, 1, 2]])))
     if pinned:
         problem = replace(problem, cloth=replace(problem.cloth, pinned=torch.tensor([True, False, False])))
-    steps = bounded(march(default_potential(), problem, 5, DEFAULT))
+    steps = bounded(implicit_euler(default_potential(), problem, 5, DEFAULT))
     assert all(step.report.converged for step in steps)
     assert strain(steps[-1]) < 0.01
 
@@ -209,7 +209,7 @@ def test_degenerate_states(name, held):
     pinned = np.arange(len(pos)) < 6 if held else np.zeros(len(pos), dtype=bool)
     start = np.where(pinned[:, None], pos, start)
     cloth = build_cloth(pos, faces, Material(), pinned, dtype=torch.float64)
-    bounded(march(default_potential(), make_problem(cloth, start), 2, DEFAULT))
+    bounded(implicit_euler(default_potential(), make_problem(cloth, start), 2, DEFAULT))
 
 
 @pytest.mark.parametrize("name", ["collinear", "folded by π", "coincident"])
@@ -219,7 +219,7 @@ def test_degenerate_states_on_a_body(name):
     start = degenerate_states()[name]
     start = start - start.mean(axis=0) + np.array([0.0, RADIUS + 0.01, 0.0])
     problem = replace(problem, state=replace(problem.state, pos=torch.as_tensor(start)))
-    bounded(march(default_potential(), problem, 2, DEFAULT))
+    bounded(implicit_euler(default_potential(), problem, 2, DEFAULT))
 
 
 def moving(problem: StepProblem, vel: Tensor) -> list[StepInput]:
@@ -244,7 +244,7 @@ def test_body_speed(speed, heading):
     """
     problem = draped(gap=2e-3)
     inputs = moving(problem, speed * torch.tensor(heading, dtype=torch.float64))
-    steps = honest(march(default_potential(), problem, 3, DEFAULT, step_input=lambda k: inputs[k]))
+    steps = honest(implicit_euler(default_potential(), problem, 3, DEFAULT, step_input=lambda k: inputs[k]))
     counts = []
     for k, step in enumerate(steps, 1):
         now = find_contact(step.state.pos, problem.cloth.vertex_scene, inputs[k].obstacle)
@@ -258,7 +258,7 @@ def test_body_speed(speed, heading):
         assert float(steps[-1].state.pos[middle, 1]) > RADIUS - 0.02 + speed * len(steps) / 30
 
 
-def depths(problem: StepProblem, steps: list[Marched]) -> list[float]:
+def depths(problem: StepProblem, steps: list[EulerStep]) -> list[float]:
     """Penetration depth [m] that the metrics report, at the start and after every step."""
     cloth, found = problem.cloth, []
     for pos in [problem.state.pos, *(step.state.pos for step in steps)]:
@@ -276,7 +276,7 @@ def test_initial_penetration(share, dt):
     """A sheet that starts through a body of a limb's radius leaves it."""
     pos, faces = grid(7, 7, 0.25)
     problem = draped(gap=-share * LIMB, dt=dt, radius=LIMB, mesh=(pos, faces))
-    found = depths(problem, bounded(march(default_potential(), problem, 3, DEFAULT)))
+    found = depths(problem, bounded(implicit_euler(default_potential(), problem, 3, DEFAULT)))
     assert found[0] == pytest.approx(share * LIMB, abs=2e-3)
     assert all(later <= max(earlier, 1e-9) for earlier, later in zip(found, found[1:], strict=False)), found
     assert found[-1] < 1e-3
@@ -286,7 +286,7 @@ def test_penetration_to_the_middle_of_a_limb_is_reported():
     """Cut at its centre, the sheet is pushed out on both sides: depth falls, and what stays inside is in the metrics."""
     pos, faces = grid(7, 7, 0.25)
     problem = draped(gap=-LIMB, radius=LIMB, mesh=(pos, faces))
-    found = depths(problem, honest(march(default_potential(), problem, 4, DEFAULT)))
+    found = depths(problem, honest(implicit_euler(default_potential(), problem, 4, DEFAULT)))
     assert found[0] > 0.8 * LIMB
     assert all(later <= earlier + 1e-4 for earlier, later in zip(found, found[1:], strict=False)), found
 
@@ -347,7 +347,7 @@ def swinging_flag(dtype: torch.dtype = torch.float64) -> StepProblem:
 def test_nothing_grows_at_rest(num_steps, dtype):
     """A push dies out, and what remains is the accuracy of the steps."""
     settings = NewtonSettings(target_rg=1e-4, linear="direct")
-    steps = march(default_potential(), swinging_flag(dtype), num_steps, settings)
+    steps = implicit_euler(default_potential(), swinging_flag(dtype), num_steps, settings)
     speed = []
     for step in steps:
         assert step.report.converged.all(), step.report.reason

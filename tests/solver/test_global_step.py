@@ -11,7 +11,7 @@ from test_local_engine import needs_compiler
 from test_points import over_ball, potential_at, shaken
 from torch import Tensor
 
-from hood.assets.garment import Garment
+from hood.assets.garment.garment import Garment
 from hood.assets.material import Material
 from hood.losses.potential import Potential, default_potential
 from hood.losses.problem import StepProblem

@@ -9,7 +9,7 @@ import pytest
 import torch
 from layer_scenes import folding_strip, sheet_over_bar, sheets_on_sphere, stack
 
-from hood.dynamics.march import Marched, march
+from hood.dynamics.implicit_euler import EulerStep, implicit_euler
 from hood.losses.layer_friction import LayerFriction
 from hood.losses.layers import LayerBarrier
 from hood.losses.potential import default_potential
@@ -39,7 +39,7 @@ RATES = {240: 96, 60: 24, 30: 12, 15: 6}
 def _march_clean(problem: StepProblem, steps: int, settings: NewtonSettings | None = None) -> tuple[int, int]:
     """Pairs of features in reach, and steps that missed the accuracy; nothing may ever cross."""
     faces, touched, missed = problem.cloth.faces.numpy(), 0, 0
-    for now in march(POTENTIAL, problem, steps, settings):
+    for now in implicit_euler(POTENTIAL, problem, steps, settings):
         pos = now.state.pos.numpy()
         layers = now.problem.layers[0].layers
         touched += len(layers.contacts(pos).corners)
@@ -135,7 +135,7 @@ def _batch(problems: list[StepProblem]) -> StepProblem:
 
 def _drive(
     places: list[int], held: tuple[int, ...], steps: tuple[int, ...], engine: str
-) -> Iterator[tuple[Marched, int, float]]:
+) -> Iterator[tuple[EulerStep, int, float]]:
     """Steps, pairs of faces that cross after each, and how far held vertices are short of where they should be: held places of
     the upper sheet as many times 12 mm down as ``steps`` say."""
     problem = _held_sheets(places, held)
@@ -143,8 +143,8 @@ def _drive(
     down = torch.zeros_like(start)
     down[25:, 1] = -12e-3
     inputs = [replace(problem.step, pin_target=start + count * down) for count in steps]
-    marched = march(POTENTIAL, problem, len(steps), NewtonSettings(engine=engine), inputs.__getitem__)
-    for now, step in zip(marched, inputs, strict=True):
+    taken = implicit_euler(POTENTIAL, problem, len(steps), NewtonSettings(engine=engine), inputs.__getitem__)
+    for now, step in zip(taken, inputs, strict=True):
         assert step.pin_target is not None
         short = float((now.state.pos - step.pin_target)[rows].norm(dim=1).max())
         yield now, len(self_crossings(now.state.pos.numpy(), faces)), short
@@ -152,12 +152,12 @@ def _drive(
 
 def test_without_layers_the_same_sheets_cross() -> None:
     problem = SMALL["sheets_on_sphere"](1 / 30)
-    *_, last = march(default_potential(), problem, 12)
+    *_, last = implicit_euler(default_potential(), problem, 12)
     assert len(self_crossings(last.state.pos.numpy(), problem.cloth.faces.numpy())) > 0
 
 
 def test_compiled_and_torch_reach_the_same_minimum() -> None:
-    *_, before = march(POTENTIAL, SMALL["stack"](1 / 30), 4)
+    *_, before = implicit_euler(POTENTIAL, SMALL["stack"](1 / 30), 4)
     problem = replace(before.problem, state=before.state, contact=None, layers=())
     ends = []
     for engine in ("compiled", "torch"):
@@ -174,7 +174,7 @@ def test_cloth_that_meets_none_moves_to_the_bit_as_without(engine: str) -> None:
     problem = stack(1 / 30, n=5, count=1)
     settings = NewtonSettings(engine=engine)
     for one, other in zip(
-        march(POTENTIAL, problem, 3, settings), march(default_potential(), problem, 3, settings), strict=True
+        implicit_euler(POTENTIAL, problem, 3, settings), implicit_euler(default_potential(), problem, 3, settings), strict=True
     ):
         assert torch.equal(one.state.pos, other.state.pos)
 
@@ -182,7 +182,7 @@ def test_cloth_that_meets_none_moves_to_the_bit_as_without(engine: str) -> None:
 def test_steps_do_not_depend_on_those_before() -> None:
     """What is known of where the last step ended spares a search and changes nothing, to the bit."""
     spared = touched = 0
-    for now in march(POTENTIAL, sheets_on_sphere(1 / 30, n=9, gap=0.05), 6):
+    for now in implicit_euler(POTENTIAL, sheets_on_sphere(1 / 30, n=9, gap=0.05), 6):
         layers = now.problem.layers[0].layers
         spared += layers.mesh.apart is not None
         touched += len(layers.contacts(now.state.pos.numpy()).corners) > 0
@@ -195,7 +195,7 @@ def test_steps_do_not_depend_on_those_before() -> None:
 
 
 def test_report_is_that_of_the_potential() -> None:
-    *_, before = march(POTENTIAL, SMALL["stack"](1 / 30), 4)
+    *_, before = implicit_euler(POTENTIAL, SMALL["stack"](1 / 30), 4)
     problem = POTENTIAL.prepare(replace(before.problem, state=before.state, contact=None, layers=()))
     pos, report = minimize(POTENTIAL, problem)
     assert float(report.phi) == pytest.approx(float(POTENTIAL.total(problem, pos)), rel=1e-9)

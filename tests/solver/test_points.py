@@ -10,7 +10,7 @@ import torch
 from test_engine import compiler, dense, dense_of, model_at  # noqa: F401
 
 from hood.assets.material import Material
-from hood.dynamics.march import march
+from hood.dynamics.implicit_euler import implicit_euler
 from hood.losses.collision import Collision
 from hood.losses.friction import Friction, WeightFriction
 from hood.losses.potential import Potential, default_potential
@@ -228,9 +228,9 @@ def test_a_ball_comes_through_between_vertices_alone(cells: int) -> None:
         problem = over_ball(cells=cells)
         obstacle = problem.step.obstacle
         assert obstacle is not None
-        for marched in march(potential_at(place), problem, 6, NewtonSettings(target_rg=1e-3)):
-            assert marched.report.converged.all()
-        pos = marched.state.pos
+        for taken in implicit_euler(potential_at(place), problem, 6, NewtonSettings(target_rg=1e-3)):
+            assert taken.report.converged.all()
+        pos = taken.state.pos
         found = crossings(pos.numpy(), problem.cloth.faces.numpy(), obstacle.next_pos.numpy(), obstacle.faces.numpy())
         cut[place] = len(np.unique(found.pairs[:, 0]))
     assert cut["vertices"] >= 15

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from hood.assets.body import Body
-from hood.assets.garment import Garment
-from hood.assets.sequence import PoseSequence
+from hood.assets.body.body import Body
+from hood.assets.garment.garment import Garment
+from hood.assets.motion.sequence import PoseSequence
 from hood.scene.dataset import SceneSampler
 
 

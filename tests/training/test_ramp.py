@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 
-from hood.assets.body import Body
-from hood.assets.garment import Garment
-from hood.assets.library import motion_split
-from hood.assets.sequence import load_sequence
+from hood.assets.body.body import Body
+from hood.assets.files.library import motion_split
+from hood.assets.garment.garment import Garment
+from hood.assets.motion.load import load_sequence
 from hood.config import build, load_config
 from hood.dynamics.simulator import build_simulator
 from hood.losses.potential import default_potential

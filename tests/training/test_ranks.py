@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 import torch
 
-from hood.assets.body import load_body
-from hood.assets.garment import load_garment
-from hood.assets.sequence import load_sequence
+from hood.assets.body.load import load_body
+from hood.assets.garment.garment import load_garment
+from hood.assets.motion.load import load_sequence
 from hood.dynamics.recorder import read_rollout
 from hood.dynamics.simulator import build_simulator
 from hood.losses.potential import default_potential

@@ -18,9 +18,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from hood.assets.body import Body
-from hood.assets.garment import Garment
-from hood.assets.sequence import PoseSequence
+from hood.assets.body.body import Body
+from hood.assets.garment.garment import Garment
+from hood.assets.motion.sequence import PoseSequence
 from hood.dynamics.simulator import Simulator, build_simulator
 from hood.scene.dataset import SceneSampler, Window
 from hood.training import prefetch

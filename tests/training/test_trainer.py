@@ -11,9 +11,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from hood.assets.body import Body
-from hood.assets.garment import Garment
-from hood.assets.sequence import PoseSequence, load_sequence
+from hood.assets.body.body import Body
+from hood.assets.garment.garment import Garment
+from hood.assets.motion.load import load_sequence
+from hood.assets.motion.sequence import PoseSequence
 from hood.dynamics.checkpoint import load_simulator
 from hood.dynamics.output import AccelerationOutput
 from hood.dynamics.passes import Feedback

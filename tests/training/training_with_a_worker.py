@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time
 
-from hood.assets.body import load_body
-from hood.assets.garment import load_garment
-from hood.assets.sequence import load_sequence
+from hood.assets.body.load import load_body
+from hood.assets.garment.garment import load_garment
+from hood.assets.motion.load import load_sequence
 from hood.scene.dataset import SceneSampler
 from hood.training import prefetch
 

@@ -1,0 +1,1 @@
+"""Parametric bodies: model files, skinning."""

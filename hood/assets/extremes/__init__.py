@@ -1,0 +1,1 @@
+"""Inputs of the stability map: motions and garments beyond the ordinary, and broken files."""

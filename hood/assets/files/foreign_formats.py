@@ -1,0 +1,35 @@
+"""File formats that are not read, each with the way to convert it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+_SCENES = {
+    ".usd": "USD", ".usda": "USD", ".usdc": "USD", ".usdz": "USD", ".fbx": "FBX", ".dae": "COLLADA", ".blend": "Blender",
+    ".max": "3ds Max", ".mb": "Maya", ".ma": "Maya", ".abc": "Alembic", ".bvh": "BVH",
+}  # fmt: skip
+#: How each kind of asset gets out of a scene file.
+_WAY_OUT = {
+    "garments": "export the garment as OBJ or GLB (Blender imports and exports both)",
+    "motions": (
+        "export the animated character as GLB and pass it as body={stem}.glb, or retarget the motion to SMPL (AMASS .npz)"
+    ),
+    "body": "export the character with its animation as GLB (Blender imports and exports it) and pass body={stem}.glb",
+    "file": "export a garment as OBJ, a character with its animation as GLB (Blender imports and exports both)",
+}
+_BVH_BODY = (
+    "retarget it to SMPL (AMASS .npz), or animate a character with it in Blender and export that as GLB: body={stem}.glb"
+)
+
+
+def require_readable(path: Path, kind: str) -> None:
+    """Refuse a file of another program's format; ``kind`` is what it is wanted as: garments, motions, body, or any file.
+
+    Raises:
+        ValueError: names the file and what to export instead.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in _SCENES or kind not in _WAY_OUT:
+        return
+    way = _BVH_BODY if suffix == ".bvh" and kind != "garments" else _WAY_OUT[kind]
+    raise ValueError(f"{path}: {_SCENES[suffix]} files are not read; {way.format(stem=path.stem)}")

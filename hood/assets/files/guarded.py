@@ -1,0 +1,35 @@
+"""Size limits for files, and one kind of error for files that cannot be read."""
+
+from __future__ import annotations
+
+import os
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+
+class Refused(pickle.UnpicklingError):
+    """A name or a value that is not read; the message starts with it."""
+
+
+def check_size(path: str | Path, size_limit: int) -> Path:
+    """The path of an existing file that is not larger than ``size_limit`` [bytes]."""
+    path = Path(path).expanduser()
+    size = os.stat(path).st_size
+    if size > size_limit:
+        raise ValueError(f"{path}: {size} bytes, the limit is {size_limit}; raise size_limit if you trust the file")
+    return path
+
+
+def guarded(path: Path, what: str, read: Callable[[], Any]) -> Any:
+    """``read()`` with everything that broken bytes can raise turned into one ValueError that names the file."""
+    try:
+        return read()
+    except Refused as error:
+        raise ValueError(f"{path}: {error}") from error
+    except (MemoryError, RecursionError) as error:
+        raise ValueError(f"{path}: not a readable {what} ({type(error).__name__} while reading it)") from error
+    except Exception as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ValueError(f"{path}: not a readable {what} ({reason})") from error

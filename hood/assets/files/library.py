@@ -1,0 +1,125 @@
+"""Names and files of the embedded assets, and checked reading of ``.npz`` files."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import math
+import zipfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+
+from hood.assets.files.foreign_formats import require_readable
+
+DATA_FOLDER = Path(__file__).resolve().parents[2] / "data"
+#: Content beyond this size [bytes] is not read into memory.
+SIZE_LIMIT = 3 << 29
+_LABEL = {"body": "body", "garments": "garment", "motions": "sequence", "weights": "checkpoint"}
+_SUFFIX = {"body": ".npz", "garments": ".npz", "motions": ".npz", "weights": ".safetensors"}
+
+
+def names(kind: str) -> list[str]:
+    """Names of the embedded ``"body"``, ``"garments"``, ``"motions"`` or ``"weights"``."""
+    return sorted(path.stem for path in (DATA_FOLDER / kind).glob("*" + _SUFFIX[kind]))
+
+
+def locate(kind: str, name: str | Path, folders: bool = False) -> Path:
+    """File of an embedded asset, or the user's own file; with ``folders`` also the user's own folder.
+
+    Raises:
+        FileNotFoundError: neither an embedded name nor an existing file; the message lists the nearest names.
+        ValueError: a file of another program's format; names the way out.
+    """
+    embedded = DATA_FOLDER / kind / f"{name}{_SUFFIX[kind]}"
+    if embedded.is_file():
+        return embedded
+    path = Path(name).expanduser()
+    if path.is_file() or (folders and path.is_dir()):
+        require_readable(path, kind)
+        return path
+    if path.is_dir():
+        raise FileNotFoundError(f"{path}: a folder; give the path of a {_LABEL[kind]} file in it")
+    if path.suffix or len(path.parts) > 1:
+        raise FileNotFoundError(f"{path}: no such file (embedded {kind}: {', '.join(names(kind)) or 'none'})")
+    raise FileNotFoundError(unknown(_LABEL[kind], str(name), names(kind)) + "; or give the path of a file")
+
+
+def unknown(what: str, given: str, known: Iterable[str]) -> str:
+    """The sentence for a misspelt name: the nearest known one first."""
+    known = list(known)
+    near = nearest(given, known)
+    hint = f"did you mean {near!r}? " if near else ""
+    return f"unknown {what} {given!r}: {hint}known are {', '.join(known) or 'none'}"
+
+
+def nearest(given: str, known: Iterable[str]) -> str | None:
+    """The known name that a misspelt one is likeliest to mean; None where none is near."""
+    return next(iter(difflib.get_close_matches(given, list(known), n=1, cutoff=0.5)), None)
+
+
+def motion_split() -> dict[str, list[str]]:
+    """Embedded motions by split: ``{"train": [...], "validation": [...]}``."""
+    with open(DATA_FOLDER / "motions" / "split.json", encoding="utf-8") as file:
+        split: dict[str, list[str]] = json.load(file)
+    return split
+
+
+def read_arrays(path: Path, required: Iterable[str], what: str, size_limit: int = SIZE_LIMIT) -> dict:
+    """Arrays of an ``.npz`` file, never unpickled; members that would need it (strings of old files) are passed over.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: not an npz file, larger than ``size_limit`` [bytes] once unpacked, or a required key is missing; names
+            file, key and fix.
+    """
+    required = list(required)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            arrays = _members(archive, set(required), size_limit)
+    except FileNotFoundError:
+        raise
+    except Exception as error:
+        raise ValueError(f"{path}: not a readable {what} .npz file ({first_line(error)})") from error
+    missing = [key for key in required if key not in arrays]
+    if missing:
+        raise ValueError(f"{path}: not a {what} file: key {missing[0]!r} is missing (found {sorted(arrays)[:8]})")
+    return arrays
+
+
+def first_line(error: Exception) -> str:
+    """What an error says, in one line."""
+    return str(error).splitlines()[0] if str(error) else type(error).__name__
+
+
+def _members(archive: zipfile.ZipFile, required: set[str], size_limit: int) -> dict[str, np.ndarray]:
+    entries = [info for info in archive.infolist() if info.filename.endswith(".npy")]
+    total = sum(info.file_size for info in entries)
+    if total > size_limit:
+        raise ValueError(f"unpacks to {total} bytes, the limit is {size_limit}")
+    arrays = {}
+    for info in entries:
+        key = info.filename.removesuffix(".npy")
+        with archive.open(info) as file:
+            shape, dtype = _npy_header(file)
+        if dtype.hasobject:
+            if key in required:
+                raise ValueError(f"key {key!r} holds Python objects, which are not read; save it as a plain array")
+            continue
+        # Memory is taken before the content is read: a header may promise what the file does not hold.
+        if math.prod(shape) * dtype.itemsize > info.file_size:
+            raise ValueError(f"key {key!r} claims shape {shape} and holds {info.file_size} bytes; the file is damaged")
+        with archive.open(info) as file:
+            arrays[key] = np.lib.format.read_array(file, allow_pickle=False)
+    return arrays
+
+
+def _npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
+    version = np.lib.format.read_magic(file)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(file)
+    if any(size < 0 for size in shape):
+        raise ValueError(f"shape {shape} is negative; the file is damaged")
+    return shape, dtype

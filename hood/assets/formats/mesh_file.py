@@ -1,0 +1,167 @@
+"""Mesh files as the user wrote them: same vertices, same faces, same order; what cannot be kept is refused or reported."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hood.assets.files.guarded import check_size, guarded
+from hood.assets.formats.gltf_mesh import read_glb
+from hood.assets.formats.obj import read_obj
+from hood.assets.formats.off_stl import read_off, read_stl
+from hood.assets.formats.ply import read_ply
+from hood.assets.formats.raw_mesh import RawMesh, Unreadable
+from hood.mesh.polygons import MAX_CORNERS, triangulate
+from hood.mesh.quality import far_vertex
+
+_READERS: dict[str, Callable[[Path], RawMesh]] = {
+    ".obj": read_obj,
+    ".ply": read_ply,
+    ".off": read_off,
+    ".stl": read_stl,
+    ".glb": read_glb,
+    ".gltf": read_glb,
+}
+#: Formats that keep a corner of every face or every texture seam as a vertex of its own: equal positions are one vertex.
+_SPLIT_FORMATS = (".stl", ".glb", ".gltf")
+MESH_SUFFIXES = tuple(_READERS)
+#: Files beyond this size [bytes] are not opened.
+MESH_SIZE_LIMIT = 1 << 30
+
+
+@dataclass(frozen=True)
+class MeshFile:
+    """A mesh file as triangles. Texture seams and hard edges do not tear it: their tables stand apart."""
+
+    pos: np.ndarray  # (V, 3) float64, in the file's units
+    faces: np.ndarray  # (F, 3) int64
+    uv: np.ndarray | None = None  # (U, 2), v up
+    uv_faces: np.ndarray | None = None  # (F, 3) into uv
+    normal_faces: np.ndarray | None = None  # (F, 3): corners of one number share a normal; None: smooth everywhere
+    colours: np.ndarray | None = None  # (V, 3), 0 to 1
+    num_polygons: int = 0  # faces of four and more corners that were split
+    num_joined: int = 0  # vertices that the format had doubled
+    notes: tuple[str, ...] = ()  # what was not kept
+
+
+def read_mesh(path: Path, triangulate: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) float64 [m] and triangles (F, 3) int64 of a mesh file; arguments and errors of :func:`read_mesh_file`."""
+    mesh = read_mesh_file(path, triangulate)
+    return mesh.pos, mesh.faces
+
+
+def read_mesh_file(path: Path, split_polygons: bool = False) -> MeshFile:
+    """A mesh file (OBJ, PLY, OFF, STL, GLB).
+
+    Args:
+        split_polygons: split faces of four and more corners (:func:`hood.mesh.polygons.triangulate`) instead of refusing
+            them.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: unreadable file, polygons, or an index out of range; names the file, the face and the fix.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in _READERS:
+        raise ValueError(f"{path}: unknown mesh format {suffix!r}; give {', '.join(MESH_SUFFIXES)}")
+    check_size(path, MESH_SIZE_LIMIT)
+
+    def read() -> MeshFile | ValueError:
+        try:
+            return _finish(_READERS[suffix](path), split_polygons, suffix in _SPLIT_FORMATS)
+        except Unreadable as error:
+            return ValueError(f"{path}: {error}")
+        except ValueError as error:
+            if str(error).startswith(f"{path}: "):
+                return error
+            raise
+
+    result = guarded(path, f"{suffix[1:].upper()} mesh", read)
+    if isinstance(result, ValueError):
+        raise result
+    assert isinstance(result, MeshFile)
+    return result
+
+
+def _finish(raw: RawMesh, split_polygons: bool, join: bool) -> MeshFile:
+    _check(raw, split_polygons)
+    rows = triangulate(raw.pos, raw.corners, raw.counts)
+    vertex_map, kept = _equal_positions(raw.pos) if join else (np.arange(len(raw.pos)), np.arange(len(raw.pos)))
+    notes = list(raw.notes)
+    uv_faces = _corner_table(raw.uv_corners, len(raw.uv) if raw.uv is not None else 0, rows, "texture coordinate", notes)
+    faces = vertex_map[raw.corners][rows]
+    return MeshFile(
+        pos=raw.pos[kept],
+        faces=faces,
+        uv=raw.uv if uv_faces is not None else None,
+        uv_faces=uv_faces,
+        normal_faces=_shared_normals(raw, rows, faces, notes),
+        colours=None if raw.colours is None else raw.colours[kept],
+        num_polygons=int((raw.counts > 3).sum()),
+        num_joined=len(raw.pos) - len(kept),
+        notes=tuple(notes),
+    )
+
+
+def _check(raw: RawMesh, split_polygons: bool) -> None:
+    """Corner counts and vertex indices; with them in order the polygons can be split."""
+    far = far_vertex(raw.pos) if np.isfinite(raw.pos).all() else None
+    if far is not None:
+        raise Unreadable(far)
+    if raw.uv is not None and not np.isfinite(raw.uv).all():
+        row = int(np.argwhere(~np.isfinite(raw.uv))[0][0])
+        raise Unreadable(f"texture coordinate {row + 1} is not finite; repair it, or export without texture coordinates")
+    counts, num_vertices = raw.counts, len(raw.pos)
+    bad = (counts < 3) | (counts > (MAX_CORNERS if split_polygons else 3))
+    outside = (raw.corners < 0) | (raw.corners >= num_vertices)
+    face_of_corner = np.repeat(np.arange(len(counts)), np.maximum(counts, 0))
+    first_bad = int(np.argmax(bad)) if bad.any() else len(counts)
+    first_outside = int(face_of_corner[np.argmax(outside)]) if outside.any() else len(counts)
+    if first_outside < first_bad or (first_outside == first_bad < len(counts)):
+        corner = int(raw.corners[np.argmax(outside)])
+        raise Unreadable(f"face {first_outside} refers to vertex {corner + 1} of {num_vertices}; repair or remove the face")
+    if bad.any():
+        count = int(counts[first_bad])
+        fix = "remove it" if count < 3 else "split it" if split_polygons else "triangulate it or pass triangulate=true"
+        raise Unreadable(f"face {first_bad} has {count} corners; {fix}")
+
+
+def _corner_table(table: np.ndarray | None, size: int, rows: np.ndarray, what: str, notes: list[str]) -> np.ndarray | None:
+    """Indices (F, 3) of the triangles' corners; None, with a note, where some faces have none."""
+    if table is None:
+        return None
+    missing = int((table[rows] < 0).any(axis=1).sum())
+    if missing:
+        notes.append(f"{missing} of {len(rows)} triangles have no {what}s; the others' are not kept")
+        return None
+    if (table >= size).any():
+        raise Unreadable(f"a face refers to {what} {int(table.max()) + 1} of {size}; repair or remove the face")
+    return table[rows].astype(np.int64)
+
+
+def _shared_normals(raw: RawMesh, rows: np.ndarray, faces: np.ndarray, notes: list[str]) -> np.ndarray | None:
+    """Numbers (F, 3) of the different normals at the different vertices; None where no vertex has two."""
+    count = len(raw.normals) if raw.normals is not None else 0
+    table = _corner_table(raw.normal_corners, count, rows, "normal", notes)
+    if table is None or raw.normals is None or len(faces) == 0:
+        return None
+    # Files round normals: those within about half a degree are one.
+    _, value = np.unique(np.round(raw.normals, 2), axis=0, return_inverse=True)
+    key = faces * np.int64(len(raw.normals) + 1) + value.reshape(-1)[table]
+    keys, number = np.unique(key, return_inverse=True)
+    if len(keys) == len(np.unique(faces)):
+        return None
+    return number.reshape(faces.shape).astype(np.int64)
+
+
+def _equal_positions(pos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices at equal positions become one, in the order of first appearance: new number of each, and rows that stay."""
+    if len(pos) == 0:
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    _, first, inverse = np.unique(pos, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.argsort(order)
+    return rank[inverse.reshape(-1)], first[order]

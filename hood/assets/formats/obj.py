@@ -1,0 +1,74 @@
+"""Wavefront OBJ: positions, polygons, texture coordinates, normals and the colours some programs add to positions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from hood.assets.formats.raw_mesh import RawMesh, Unreadable, unit_colours
+
+
+def read_obj(path: Path) -> RawMesh:
+    """The polygons of all objects and groups of the file; lines and points are passed over.
+
+    Raises:
+        Unreadable: a line that is not numbers, or an index out of range.
+    """
+    tables: dict[str, list[list[float]]] = {"v": [], "vt": [], "vn": []}
+    corners: list[tuple[int, int, int]] = []
+    counts: list[int] = []
+    with open(path, encoding="utf-8", errors="replace") as file:
+        for number, line in enumerate(file, start=1):
+            words = line.split("#")[0].split()
+            if not words:
+                continue
+            try:
+                if words[0] in tables:
+                    tables[words[0]].append([float(word) for word in words[1:8]])
+                elif words[0] == "f":
+                    sizes = [len(tables[key]) for key in ("v", "vt", "vn")]
+                    corners.extend(_corner(word, sizes) for word in words[1:])
+                    counts.append(len(words) - 1)
+            except ValueError:
+                raise Unreadable(f"line {number} is not readable ({line.strip()[:60]!r})") from None
+    pos, colours = _positions(tables["v"])
+    table = np.array(corners, dtype=np.int64).reshape(-1, 3)
+    mesh = RawMesh(pos, table[:, 0], np.array(counts, dtype=np.int64), colours)
+    if tables["vt"] and (table[:, 1] >= 0).any():
+        mesh.uv, mesh.uv_corners = _table(tables["vt"], "vt", 2), table[:, 1]
+    if tables["vn"] and (table[:, 2] >= 0).any():
+        mesh.normals, mesh.normal_corners = _table(tables["vn"], "vn", 3), table[:, 2]
+    return mesh
+
+
+def _corner(word: str, sizes: list[int]) -> tuple[int, int, int]:
+    """Indices from 0 of position, texture coordinate and normal; -1 where there is none.
+
+    Negative indices count back from the last entry so far. 0 does not exist in the format; it and others out of range
+    become numbers that no table has, to be refused by the face they are in.
+    """
+    parts = word.split("/")
+    index = [0 if text == "" else int(text) for text in (*parts, "", "")[:3]]
+    place = [size + i if i < 0 else i - 1 for i, size in zip(index, sizes, strict=True)]
+    for k in (1, 2):
+        if k < len(parts) and parts[k] and place[k] < 0:
+            place[k] = sizes[k] + abs(index[k])
+    return place[0], place[1], place[2]
+
+
+def _positions(rows: list[list[float]]) -> tuple[np.ndarray, np.ndarray | None]:
+    for index, row in enumerate(rows):
+        if len(row) < 3:
+            raise Unreadable(f"vertex {index} has {len(row)} coordinates; give three")
+    pos = np.array([row[:3] for row in rows], dtype=np.float64).reshape(-1, 3)
+    if rows and all(len(row) >= 6 for row in rows):
+        return pos, unit_colours(np.array([row[3:6] for row in rows]))
+    return pos, None
+
+
+def _table(rows: list[list[float]], name: str, width: int) -> np.ndarray:
+    for index, row in enumerate(rows):
+        if len(row) < width:
+            raise Unreadable(f"{name} {index + 1} has {len(row)} numbers; give {width}")
+    return np.array([row[:width] for row in rows], dtype=np.float64).reshape(-1, width)

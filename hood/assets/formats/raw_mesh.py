@@ -1,0 +1,38 @@
+"""The content of a mesh file before polygons are split and doubled vertices joined; what all readers return."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+
+class Unreadable(ValueError):
+    """A mesh file that must be repaired; the message names the line, face or field. The caller adds the file's name."""
+
+
+@dataclass
+class RawMesh:
+    """Vertices, and polygons as a flat table of corners.
+
+    Per-corner tables hold an index into ``uv`` or ``normals``; -1 where the file gives none. Per-vertex texture
+    coordinates and normals are given by setting the corner tables to ``corners``.
+    """
+
+    pos: np.ndarray  # (V, 3) float64
+    corners: np.ndarray  # (N,) int64, vertex of each corner
+    counts: np.ndarray  # (P,) int64, corners of each polygon
+    colours: np.ndarray | None = None  # (V, 3), 0 to 1
+    uv: np.ndarray | None = None  # (U, 2)
+    uv_corners: np.ndarray | None = None  # (N,)
+    normals: np.ndarray | None = None  # (M, 3)
+    normal_corners: np.ndarray | None = None  # (N,)
+    notes: list[str] = field(default_factory=list)
+
+
+def unit_colours(values: np.ndarray) -> np.ndarray:
+    """Colours (V, 3) from 0 to 1: integers, and reals beyond 1, count up to 255 (65535 for 16 bits)."""
+    real = np.asarray(values, dtype=np.float64)
+    if np.issubdtype(values.dtype, np.integer):
+        return real / np.iinfo(values.dtype).max if values.dtype.itemsize <= 2 else real / 255.0
+    return real / 255.0 if real.size and np.nanmax(real) > 1.0 else real

@@ -1,0 +1,138 @@
+"""Files that hold moving vertices: archives, HDF5, pickles, folders of numbered meshes; each reader for one format."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import h5py
+import numpy as np
+
+from hood.assets.files.h5_links import own_dataset
+from hood.assets.files.library import SIZE_LIMIT, first_line, read_arrays
+from hood.assets.formats.mesh_file import read_mesh
+from hood.assets.pickles.unpickle import load_pickle
+
+#: Names of the tables; the last pair is the body of a ``rollout.h5``.
+VERTEX_KEYS = ("verts", "vertices", "body/pos")
+FACE_KEYS = ("faces", "f", "body/faces")
+FOLDER_SUFFIXES = (".obj", ".ply")
+_RATE_KEYS = ("fps", "frame_rate", "mocap_framerate", "mocap_frame_rate")
+#: An HDF5 file may be stored compressed; what it unpacks to is limited, not its size.
+_OTHER_KEYS = ("transforms", *_RATE_KEYS)
+
+
+class VertexFile(NamedTuple):
+    """Moving vertices as a file has them, not yet checked."""
+
+    verts: Any  # (N, W, 3), or (W, 3) of a still mesh
+    faces: Any  # (G, 3) or (G, 4)
+    fps: Any = None  # number, None where the file does not say
+    transforms: Any = None  # (N, J, 3, 4) or (N, J, 4, 4)
+    rest: np.ndarray | None = None  # (W, 3), of glTF
+    weights: np.ndarray | None = None  # (W, J), of glTF
+
+
+def read_vertex_archive(path: Path) -> VertexFile:
+    """``.npz`` with ``verts (N, W, 3)``, ``faces (G, 3)``, and optionally ``fps`` and ``transforms (N, J, 3 or 4, 4)``.
+
+    Raises:
+        ValueError: unreadable, larger than the limit, or a missing key; names the file.
+    """
+    return _pick(path, read_arrays(path, (), "mesh sequence"))
+
+
+def read_vertex_pickle(path: Path) -> VertexFile:
+    """The same keys in a ``.pkl``, read by the restricted unpickler.
+
+    Raises:
+        ValueError: unreadable, naming a class that is not read, or a missing key; names the file.
+    """
+    content = load_pickle(path, SIZE_LIMIT)
+    if not isinstance(content, dict):
+        raise ValueError(f"{path}: holds a {type(content).__name__}, not a mesh sequence; it must be a dict of arrays")
+    return _pick(path, content)
+
+
+def read_vertex_h5(path: Path) -> VertexFile:
+    """The same keys as datasets of an HDF5 file (``fps`` may be an attribute), or the body of a ``rollout.h5``.
+
+    Raises:
+        ValueError: unreadable, larger than the limit, data in other files, or a missing key; names the file.
+    """
+    try:
+        with h5py.File(path, "r") as file:
+            found: dict[str, Any] = {
+                key: _dataset(file, key) for key in (*VERTEX_KEYS, *FACE_KEYS, *_OTHER_KEYS) if key in file
+            }
+            found.update({key: file.attrs[key] for key in _RATE_KEYS if key in file.attrs})
+            if "body/pos" in found and "dt" in file.attrs:
+                found["fps"] = 1.0 / float(file.attrs["dt"])
+                found["body/pos"] = found["body/pos"][: int(file.attrs.get("num_frames", len(found["body/pos"])))]
+    except FileNotFoundError:
+        raise
+    except Exception as error:
+        raise ValueError(f"{path}: not a readable HDF5 mesh sequence ({first_line(error)})") from error
+    return _pick(path, found)
+
+
+def read_mesh_folder(folder: Path) -> VertexFile:
+    """A folder of OBJ or PLY files, one a frame, in the order of the numbers in their names; polygons are triangulated.
+
+    Raises:
+        ValueError: no such files, both kinds, or a frame with other vertices or faces than the first; names the file.
+    """
+    files = sorted((path for path in folder.iterdir() if path.suffix.lower() in FOLDER_SUFFIXES), key=_number)
+    if not files:
+        raise ValueError(f"{folder}: no OBJ or PLY files in this folder; give one mesh a frame, numbered")
+    if len({path.suffix.lower() for path in files}) > 1:
+        raise ValueError(f"{folder}: holds OBJ and PLY files; keep one kind")
+    if sum(path.stat().st_size for path in files) > 4 * SIZE_LIMIT:
+        raise ValueError(f"{folder}: more than {4 * SIZE_LIMIT} bytes of meshes; save them as one .npz (verts, faces)")
+    first, faces = read_mesh(files[0], True)
+    if first.nbytes * len(files) > SIZE_LIMIT:
+        raise ValueError(f"{folder}: {len(files)} frames of {len(first)} vertices are more than {SIZE_LIMIT} bytes; give fewer")
+    verts = np.empty((len(files), *first.shape))
+    verts[0] = first
+    for frame, path in enumerate(files[1:], start=1):
+        pos, own = read_mesh(path, True)
+        if pos.shape != first.shape:
+            raise ValueError(
+                f"{path}: {len(pos)} vertices, {files[0].name} has {len(first)}; every frame must be the same mesh"
+            )
+        if not np.array_equal(own, faces):
+            raise ValueError(f"{path}: its faces are not those of {files[0].name}; every frame must be the same mesh")
+        verts[frame] = pos
+    return VertexFile(verts, faces)
+
+
+def _pick(path: Path, fields: Mapping[Any, Any]) -> VertexFile:
+    verts = next((fields[key] for key in VERTEX_KEYS if key in fields), None)
+    faces = next((fields[key] for key in FACE_KEYS if key in fields), None)
+    if verts is None or faces is None:
+        missing = "verts" if verts is None else "faces"
+        found = sorted(str(key) for key in fields)[:8]
+        raise ValueError(f"{path}: not a mesh sequence: key {missing!r} is missing (found {found})")
+    rate = next((fields[key] for key in _RATE_KEYS if key in fields), None)
+    return VertexFile(verts, faces, rate, fields.get("transforms"))
+
+
+def _dataset(file: h5py.File, key: str) -> np.ndarray:
+    place = own_dataset(file, key)
+    size = math.prod(place.shape or ()) * place.dtype.itemsize
+    if size > SIZE_LIMIT:
+        raise ValueError(f"{key} has shape {place.shape}, {size} bytes, the limit is {SIZE_LIMIT}")
+    if place.dtype.kind not in "iufb":
+        raise ValueError(f"{key} holds {place.dtype} values; it must hold numbers")
+    # Chunks that were never written take no room in the file and all of it in memory.
+    if size > 1 << 24 and size > 2000 * max(place.id.get_storage_size(), 1):
+        raise ValueError(f"{key} claims {size} bytes and stores {place.id.get_storage_size()}; the file is damaged")
+    return np.asarray(place[()])
+
+
+def _number(path: Path) -> tuple[list[int], str]:
+    """Sort key: the numbers in a name, so that frame_10 comes after frame_9."""
+    return [int(digits[-18:]) for digits in re.findall(r"\d+", path.stem)], path.name

@@ -1,0 +1,1 @@
+"""Garments: their files, how they are bound to a body, and checks of both."""

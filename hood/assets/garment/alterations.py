@@ -1,0 +1,204 @@
+"""Repairs of a garment file, step by step; each step returns the garment and a report with counts."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from hood.assets.garment.binding import PosedBody, bind_posed, push_out, signed_distances
+from hood.assets.garment.garment import Garment
+from hood.assets.garment.placement import Placement
+from hood.assets.garment.suspicions import suspect_sides
+from hood.mesh import repair, topology
+
+#: A garment whose middle vertex is farther from the skin than this [m] was made for another place or body.
+_FARTHEST = 0.35
+#: With more of its vertices inside the body it does not surround it.
+_MOST_INSIDE = 0.5
+
+
+@dataclass
+class Fitting:
+    """A garment on its way from a file to a body, with a record of every change."""
+
+    garment: Garment
+    file: Garment  # as it was read
+    vertex_map: np.ndarray  # (V of the file,) present number of each vertex of the file; -1: removed
+    changes: list[Change] = field(default_factory=list)
+
+    def note(self, what: str, count: int, text: str, **details: Any) -> None:
+        """Record a change of ``count`` things; nothing is recorded for none."""
+        if count:
+            self.changes.append(Change(what, count, text, details))
+
+
+@dataclass(frozen=True)
+class Change:
+    """One change: its name for programs, how many things it touched, and a sentence."""
+
+    what: str
+    count: int
+    text: str
+    details: dict[str, Any]
+
+
+def start_fitting(garment: Garment) -> Fitting:
+    """A fitting of a garment as it was read."""
+    return Fitting(garment, garment, np.arange(len(garment.rest_pos)))
+
+
+def place(fitting: Fitting, placement: Placement) -> None:
+    """Bring the coordinates of the file to the body: scaled to metres, turned, moved."""
+    garment = fitting.garment
+    turn, skin_pos, rest_turn = placement.rotation, garment.skin_pos, garment.rest_turn
+    fitting.garment = replace(
+        garment,
+        rest_pos=placement.apply(garment.rest_pos),
+        skin_pos=None if skin_pos is None else placement.apply(skin_pos),
+        rest_turn=None if rest_turn is None else turn @ rest_turn @ turn.T,
+    )
+    count, offset = len(garment.rest_pos), np.round(placement.offset, 4).tolist()
+    if placement.scale != 1.0:
+        fitting.note("scaled", count, f"scaled by {placement.scale:g}", factor=placement.scale)
+    if placement.up != "y":
+        fitting.note("turned", count, f"turned from {placement.up} up to y up")
+    if placement.turn:
+        fitting.note("faced", count, f"turned by {placement.turn:g} degrees about the vertical", degrees=placement.turn)
+    if np.any(placement.offset):
+        fitting.note("moved", count, f"moved by {offset} m", offset=offset)
+
+
+def sew(fitting: Fitting, tolerance: float | None) -> None:
+    """Weld boundary vertices within ``tolerance`` [m]; None: a thousandth of the median edge."""
+    garment = fitting.garment
+    if tolerance is None:
+        tolerance = repair.weld_tolerance(garment.rest_pos, garment.faces)
+    welded = repair.weld(garment.rest_pos, garment.faces, tolerance)
+    count = len(garment.rest_pos) - len(welded.kept)
+    if count:
+        fitting.garment = _keep_vertices(garment, welded.vertex_map[garment.faces], welded.kept)
+        fitting.vertex_map = np.where(fitting.vertex_map < 0, -1, welded.vertex_map[fitting.vertex_map])
+    fitting.note("welded", count, f"welded {count} vertices on seams, within {1e3 * tolerance:.2g} mm", tolerance=tolerance)
+
+
+def clean(fitting: Fitting) -> None:
+    """Remove faces without area, duplicate faces and unused vertices; turn faces over that lie against their neighbours."""
+    garment = fitting.garment
+    broken = repair.broken_faces(garment.rest_pos, garment.faces)
+    garment = _keep_faces(garment, ~broken)
+    duplicate = repair.duplicate_faces(garment.faces)
+    garment = _keep_faces(garment, ~duplicate)
+    if len(garment.faces) == 0:
+        raise ValueError(f"{garment.name}: no face has an area; nothing is left of the garment")
+    flipped = repair.flipped_faces(garment.faces)
+    garment = _turn_faces(garment, flipped)
+    alone = repair.isolated_vertices(len(garment.rest_pos), garment.faces)
+    number = np.where(alone, -1, np.cumsum(~alone) - 1)
+    fitting.garment = _keep_vertices(garment, number[garment.faces], np.flatnonzero(~alone)) if alone.any() else garment
+    fitting.vertex_map = np.where(fitting.vertex_map < 0, -1, number[fitting.vertex_map])
+    for what, mask, text in (
+        ("removed_broken_faces", broken, "removed {} faces without area"),
+        ("removed_duplicate_faces", duplicate, "removed {} duplicate faces"),
+        ("turned_faces", flipped, "turned {} faces over, their winding was against their neighbours'"),
+        ("removed_unused_vertices", alone, "removed {} vertices of no face"),
+    ):
+        fitting.note(what, int(mask.sum()), text.format(int(mask.sum())))
+
+
+def face_out(fitting: Fitting, surface: np.ndarray, body_faces: np.ndarray) -> None:
+    """Turn all faces over where the garment is inside out on the body (W, 3) [m], ``body_faces`` (G, 3)."""
+    garment = fitting.garment
+    pos = garment.rest_pos if garment.skin_pos is None else garment.skin_pos
+    if suspect_sides(pos, garment.faces, surface, body_faces):
+        count = len(garment.faces)
+        fitting.garment = _turn_faces(garment, np.ones(count, dtype=bool))
+        fitting.note("turned_inside_out", count, f"turned all {count} faces over: the garment was inside out")
+
+
+def leave_body(fitting: Fitting, posed: PosedBody, clearance: float) -> np.ndarray:
+    """Positions (V, 3) [m] with the vertices that lie inside the posed body moved straight out to ``clearance`` [m].
+
+    Only these positions move. The garment keeps its rest shape: the lengths and angles that it was made with.
+
+    Raises:
+        ValueError: the garment is not around this body at all.
+    """
+    garment = fitting.garment
+    dist = signed_distances(garment.rest_pos, posed.surface, posed.faces)
+    inside = float((dist < 0).mean())
+    if np.median(np.abs(dist)) > _FARTHEST or inside > _MOST_INSIDE:
+        gap = posed.surface.mean(axis=0) - garment.rest_pos.mean(axis=0)
+        raise ValueError(
+            f"{garment.name}: does not surround the body ({100 * inside:.0f}% of the vertices inside, the middle one "
+            f"{np.median(np.abs(dist)):.2f} m from the skin, centres {np.round(gap, 2).tolist()} m apart); "
+            "check scale, up, offset and pose"
+        )
+    pushed = push_out(garment.rest_pos, posed.surface, posed.faces, clearance)
+    fitting.note(
+        "pushed_out",
+        pushed.num_inside,
+        f"{pushed.num_inside} vertices ({100 * inside:.1f}%) lie inside the body, the deepest {1e3 * pushed.depth:.1f} mm: "
+        "they start outside, the rest shape stays",
+        depth=pushed.depth,
+    )
+    # Vertices that are merely nearer than the clearance were where their maker wanted them.
+    return np.where((dist < 0)[:, None], pushed.pos, garment.rest_pos)
+
+
+def bind(fitting: Fitting, posed: PosedBody, worn_pos: np.ndarray) -> None:
+    """Bind to the body in the pose and shape the garment was made in, worn at ``worn_pos`` (V, 3) [m] there."""
+    fitting.garment = bind_posed(fitting.garment, posed, worn_pos)
+
+
+def length_ratios(fitting: Fitting, betas: np.ndarray) -> np.ndarray:
+    """Rest lengths (E',) of the garment on a body of shape ``betas``, over those in its file, scaled to metres.
+
+    Edges that are no longer there do not count: those that welding closed and those of removed vertices.
+    """
+    file, garment = fitting.file, fitting.garment
+    edges = topology.unique_edges(file.faces)
+    factor = math.prod(change.details["factor"] for change in fitting.changes if change.what == "scaled")
+    before = factor * _lengths(file.rest_pos, edges)
+    ends = fitting.vertex_map[edges]
+    kept = (ends >= 0).all(axis=1) & (ends[:, 0] != ends[:, 1]) & (before > 0)
+    rest_pos = garment.shaped(betas) if garment.bound and not file.bound else garment.rest_pos
+    return _lengths(rest_pos, ends[kept]) / before[kept]
+
+
+def _lengths(pos: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    return np.asarray(np.linalg.norm(pos[edges[:, 1]] - pos[edges[:, 0]], axis=1))
+
+
+def summary(garment: Garment) -> str:
+    """Size of a garment in one line."""
+    edges = topology.unique_edges(garment.faces)
+    used = ~repair.isolated_vertices(len(garment.rest_pos), garment.faces)
+    parts = len(np.unique(topology.connected_components(len(garment.rest_pos), edges)[used]))
+    openings = len(topology.boundary_loops(garment.faces))
+    return f"{len(garment.rest_pos)} vertices, {len(garment.faces)} triangles, {parts} component(s), {openings} openings"
+
+
+_PER_VERTEX = (
+    "rest_pos", "pinned", "lbs_weights", "shapedirs", "colours", "skin_pos", "rest_turn", "piece", "region", "stiffness",
+)  # fmt: skip
+_PER_FACE = ("faces", "uv_faces", "normal_faces")
+
+
+def _keep_vertices(garment: Garment, faces: np.ndarray, kept: np.ndarray) -> Garment:
+    """The garment with its vertices ``kept`` and ``faces`` in their numbers; its coarse edges are of another mesh now."""
+    rows = {key: getattr(garment, key)[kept] for key in _PER_VERTEX if getattr(garment, key) is not None}
+    return replace(garment, **rows | {"faces": faces, "coarse_edges": None})
+
+
+def _keep_faces(garment: Garment, kept: np.ndarray) -> Garment:
+    return replace(garment, **{k: getattr(garment, k)[kept] for k in _PER_FACE if getattr(garment, k) is not None})
+
+
+def _turn_faces(garment: Garment, turned: np.ndarray) -> Garment:
+    tables = {key: getattr(garment, key).copy() for key in _PER_FACE if getattr(garment, key) is not None}
+    for table in tables.values():
+        table[turned] = table[turned][:, ::-1]
+    return replace(garment, **tables)

@@ -1,0 +1,118 @@
+"""Garments: embedded templates, prepared files, mesh files, and the reference implementation's pickles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from hood.assets.files.library import locate
+from hood.assets.formats.mesh_file import MESH_SUFFIXES, MeshFile, read_mesh_file
+from hood.assets.garment.garment_arrays import read_fields, write_fields
+from hood.assets.garment.reference_garments import read_reference_garment
+from hood.mesh.quality import check_triangles
+
+#: What can be given as a garment, besides embedded names.
+GARMENT_SUFFIXES = (".npz", ".pkl", *MESH_SUFFIXES)
+
+
+@dataclass(frozen=True)
+class Garment:
+    """A garment at zero shape coefficients, with what it needs to follow a body's shape and pose.
+
+    The rest shape is in the body's T-pose unless ``skin_pos`` says otherwise: then ``rest_pos`` may be in any pose (a
+    garment modelled around an A-pose keeps its lengths and angles) and ``skin_pos`` is where skinning starts from.
+    """
+
+    name: str
+    rest_pos: np.ndarray  # (V, 3) m, float64
+    faces: np.ndarray  # (F, 3) int64
+    pinned: np.ndarray  # (V,) bool
+    lbs_weights: np.ndarray | None = None  # (V, J)
+    shapedirs: np.ndarray | None = None  # (V, 3, S) m per unit of beta, in T-pose
+    bound_to: str | None = None  # body whose weights and shape offsets these are; None: whichever it is put on
+    uv: np.ndarray | None = None  # (U, 2)
+    uv_faces: np.ndarray | None = None  # (F, 3)
+    normal_faces: np.ndarray | None = None  # (F, 3): corners of one number share a normal; None: smooth everywhere
+    colours: np.ndarray | None = None  # (V, 3), 0 to 1
+    skin_pos: np.ndarray | None = None  # (V, 3) m, in T-pose; None: rest_pos is
+    rest_turn: np.ndarray | None = None  # (V, 3, 3) from the T-pose into the pose of rest_pos; None: identity
+    coarse_edges: tuple[np.ndarray, ...] | None = None  # each (E, 2), levels of a hierarchy that came with the garment
+    region: np.ndarray | None = None  # (V,) int64, index into hood.assets.garment.pins.MARKS; None: not marked
+    stiffness: np.ndarray | None = None  # (V,) how many times as stiff as its fabric the cloth is there; None: once
+    piece: np.ndarray | None = None  # (V,) int64, garment of an outfit that a vertex belongs to, from 0; None: all one garment
+
+    @property
+    def bound(self) -> bool:
+        return self.lbs_weights is not None and self.shapedirs is not None
+
+    def shaped(self, betas: np.ndarray) -> np.ndarray:
+        """Rest shape (V, 3) [m], grown with the body of shape ``betas``."""
+        offset = self._offset(betas)
+        if self.rest_turn is not None:
+            offset = np.einsum("vij,vj->vi", self.rest_turn, offset)
+        return self.rest_pos + offset
+
+    def tpose(self, betas: np.ndarray) -> np.ndarray:
+        """Garment (V, 3) [m] in T-pose on the body of shape ``betas``: what skinning poses."""
+        return (self.rest_pos if self.skin_pos is None else self.skin_pos) + self._offset(betas)
+
+    def _offset(self, betas: np.ndarray) -> np.ndarray:
+        assert self.shapedirs is not None, "bind the garment first"
+        count = min(len(betas), self.shapedirs.shape[2])
+        return np.asarray(self.shapedirs[..., :count] @ np.asarray(betas[:count], dtype=np.float64))
+
+
+def load_garment(name: str | Path, triangulate: bool = False) -> Garment:
+    """An embedded garment by name, a garment ``.npz``, a mesh file (OBJ, PLY, STL, GLB, OFF) in the body's T-pose, or a
+    ``.pkl`` of the reference implementation (``garments_dict.pkl:name`` chooses one of several).
+
+    Args:
+        triangulate: split faces of four and more corners instead of refusing them.
+
+    Raises:
+        FileNotFoundError: unknown name or missing file.
+        ValueError: unreadable or broken mesh; names the file, the index and the fix.
+    """
+    path, entry = locate_garment(name)
+    suffix = path.suffix.lower()
+    if suffix == ".npz":
+        garment = Garment(path.stem, **read_fields(path))
+    elif suffix == ".pkl":
+        garment = Garment(**read_reference_garment(path, entry))
+    elif suffix in MESH_SUFFIXES:
+        garment = garment_of_mesh(path, read_mesh_file(path, triangulate))
+    else:
+        raise ValueError(f"{path}: unknown garment format {path.suffix!r}; give one of {', '.join(GARMENT_SUFFIXES)}")
+    check_triangles(garment.rest_pos, garment.faces, str(path))
+    _check_levels(garment, path)
+    return garment
+
+
+def garment_of_mesh(path: Path, mesh: MeshFile) -> Garment:
+    """The garment in a mesh file as it is written; it may still need repair."""
+    pinned = np.zeros(len(mesh.pos), dtype=bool)
+    extra = {key: getattr(mesh, key) for key in ("uv", "uv_faces", "normal_faces", "colours")}
+    return Garment(path.stem, mesh.pos, mesh.faces, pinned, **extra)
+
+
+def save_garment(path: Path, garment: Garment) -> None:
+    """Write a garment ``.npz`` that :func:`load_garment` reads back; an existing file is replaced at once or not at all."""
+    write_fields(path, {field.name: getattr(garment, field.name) for field in fields(garment)})
+
+
+def locate_garment(name: str | Path) -> tuple[Path, str | None]:
+    """File of a garment, and which of its entries is meant (``garments_dict.pkl:dress``)."""
+    head, colon, entry = str(name).rpartition(":")
+    if colon and head.lower().endswith(".pkl"):
+        return locate("garments", head), entry
+    return locate("garments", name), None
+
+
+def _check_levels(garment: Garment, path: Path) -> None:
+    for level, edges in enumerate(garment.coarse_edges or ()):
+        outside = (edges < 0) | (edges >= len(garment.rest_pos))
+        if outside.any():
+            row = int(np.argmax(outside.any(axis=1)))
+            raise ValueError(f"{path}: coarse edge {row} of level {level} is {edges[row].tolist()}; there is no such vertex")

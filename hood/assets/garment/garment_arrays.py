@@ -1,0 +1,150 @@
+"""The fields of a garment ``.npz``: read and checked, and written whole."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hood.assets.files.atomic import write_atomically
+from hood.assets.files.guarded import check_size
+from hood.assets.files.library import DATA_FOLDER, read_arrays
+
+#: Per-vertex fields and the shape of a row; None: any size.
+_ROWS: dict[str, tuple[int | None, ...]] = {
+    "pinned": (),
+    "lbs_weights": (None,),
+    "shapedirs": (3, None),
+    "skin_pos": (3,),
+    "rest_turn": (3, 3),
+    "colours": (3,),
+    "piece": (),
+    "region": (),
+    "stiffness": (),
+}
+_CORNERS = ("uv_faces", "normal_faces")
+_LEVEL = "coarse_edges_"
+_SIZE_LIMIT = 2 << 30
+
+
+def read_fields(path: Path) -> dict[str, Any]:
+    """Arguments of :class:`hood.assets.garment.garment.Garment` from a garment ``.npz``.
+
+    Raises:
+        ValueError: a field that does not fit the others; names the file, the field and its first bad row.
+    """
+    check_size(path, _SIZE_LIMIT)
+    arrays = read_arrays(path, ("rest_pos", "faces"), "garment")
+    fields: dict[str, Any] = {
+        "rest_pos": _reals(path, "rest_pos", arrays["rest_pos"]),
+        "faces": _indices(path, "faces", arrays["faces"]),
+    }
+    if fields["rest_pos"].ndim != 2 or fields["rest_pos"].shape[1] != 3:
+        raise ValueError(f"{path}: rest_pos has shape {fields['rest_pos'].shape}; give (num_vertices, 3)")
+    num_vertices = len(fields["rest_pos"])
+    for key in _ROWS:
+        if key in arrays:
+            fields[key] = _reals(path, key, arrays[key])
+            check_rows(str(path), key, fields[key], num_vertices)
+    fields["pinned"] = fields.get("pinned", np.zeros(num_vertices)).astype(bool)
+    _check_stiffness(path, fields.get("stiffness"))
+    for key in ("piece", "region"):
+        if key in fields:
+            fields[key] = fields[key].astype(np.int64)
+    if "lbs_weights" in fields:
+        fields["lbs_weights"] = normalised(str(path), fields["lbs_weights"])
+    if "uv" in arrays and "uv_faces" in arrays:
+        fields["uv"] = _finite(path, "uv", _reals(path, "uv", arrays["uv"]))
+    for key in _CORNERS:
+        if key in arrays and (key != "uv_faces" or "uv" in fields):
+            fields[key] = _corner_table(path, key, arrays[key], fields)
+    levels = sorted((key for key in arrays if key.startswith(_LEVEL)), key=lambda key: (len(key), key))
+    if levels:
+        fields["coarse_edges"] = tuple(_edge_table(path, key, arrays[key]) for key in levels)
+    if path.is_relative_to(DATA_FOLDER):
+        fields["bound_to"] = "default"
+    elif "bound_to" in arrays and arrays["bound_to"].dtype.kind == "U" and arrays["bound_to"].size == 1:
+        fields["bound_to"] = str(arrays["bound_to"].reshape(-1)[0])
+    return fields
+
+
+def write_fields(path: Path, fields: dict[str, Any]) -> None:
+    """Write a garment ``.npz`` that :func:`read_fields` reads back; fields that are None are left out."""
+    arrays = {key: value for key, value in fields.items() if value is not None and key not in ("name", "coarse_edges")}
+    for level, edges in enumerate(fields.get("coarse_edges") or ()):
+        arrays[f"{_LEVEL}{level}"] = edges
+    content = io.BytesIO()
+    np.savez_compressed(content, **arrays)
+    write_atomically(path, content.getvalue())
+
+
+def check_rows(where: str, key: str, value: np.ndarray, num_vertices: int) -> None:
+    """Raise ValueError unless ``value`` has one finite row of the field's shape per vertex."""
+    if value.ndim == 0 or len(value) != num_vertices:
+        count = len(value) if value.ndim else 0
+        raise ValueError(f"{where}: {key} has {count} rows for {num_vertices} vertices; write one row per vertex")
+    shape = _ROWS[key]
+    if value.ndim != 1 + len(shape) or any(want not in (None, have) for want, have in zip(shape, value.shape[1:], strict=True)):
+        expected = ", ".join(["V", *("n" if size is None else str(size) for size in shape)])
+        raise ValueError(f"{where}: {key} has shape {value.shape}; it must be ({expected})")
+    finite = np.isfinite(value).reshape(num_vertices, -1).all(axis=1)
+    if not finite.all():
+        raise ValueError(f"{where}: {key} of vertex {int(np.argmin(finite))} is not finite; repair it")
+
+
+def _finite(path: Path, key: str, value: np.ndarray) -> np.ndarray:
+    if not np.isfinite(value).all():
+        row = int(np.argwhere(~np.isfinite(value))[0][0])
+        raise ValueError(f"{path}: {key} has row {row}, which is not finite; repair it, or leave {key} out")
+    return value
+
+
+def _check_stiffness(path: Path, stiffness: np.ndarray | None) -> None:
+    if stiffness is not None and not (stiffness > 0).all():
+        vertex = int(np.argmin(stiffness > 0))
+        raise ValueError(
+            f"{path}: stiffness of vertex {vertex} is {stiffness[vertex]}; give a factor above 0, 1 for plain cloth"
+        )
+
+
+def normalised(where: str, weights: np.ndarray) -> np.ndarray:
+    """Skinning weights (V, J) with rows that sum to one.
+
+    Raises:
+        ValueError: a row that sums to zero or less.
+    """
+    total = weights.sum(axis=1, keepdims=True)
+    if not (total > 0).all():
+        raise ValueError(f"{where}: lbs_weights of vertex {int(np.argmin(total[:, 0] > 0))} sum to zero; repair them")
+    return np.asarray(weights / total)
+
+
+def _reals(path: Path, key: str, value: Any) -> np.ndarray:
+    array = np.asarray(value)
+    if array.dtype.kind not in "biuf":
+        raise ValueError(f"{path}: {key} is {array.dtype}; it must hold numbers")
+    return array.astype(np.float64)
+
+
+def _indices(path: Path, key: str, value: Any) -> np.ndarray:
+    array = np.asarray(value)
+    if not np.issubdtype(array.dtype, np.integer):
+        raise ValueError(f"{path}: {key} are {array.dtype}; they must be integer vertex indices")
+    return array.astype(np.int64)
+
+
+def _edge_table(path: Path, key: str, value: Any) -> np.ndarray:
+    table = _indices(path, key, value)
+    if table.ndim != 2 or table.shape[1] != 2:
+        raise ValueError(f"{path}: {key} has shape {table.shape}; coarse edges are pairs of vertices (n, 2)")
+    return table
+
+
+def _corner_table(path: Path, key: str, value: Any, fields: dict[str, Any]) -> np.ndarray:
+    table = _indices(path, key, value)
+    size = len(fields["uv"]) if key == "uv_faces" else table.max(initial=0) + 1
+    if table.shape != fields["faces"].shape or (table < 0).any() or (table >= size).any():
+        raise ValueError(f"{path}: {key} does not fit faces and uv; give one index per corner, or leave it out")
+    return table

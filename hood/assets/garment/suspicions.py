@@ -1,0 +1,134 @@
+"""Garments that can be read and simulated and are none, or are not worn: each told in one sentence with its way out.
+
+Nothing here changes or refuses anything; commands that would go on to a wrong result refuse what is ``grave``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from hood.assets.garment.openings import find_openings
+from hood.assets.garment.placement import inward_share, surrounds
+from hood.mesh import repair, topology
+
+#: A part is flat where its least extent is below this share of its greatest.
+_FLAT = 0.01
+#: With this share of its vertices on top of another one a mesh is triangles without seams: a UV-split garment has 0.05 to 0.3.
+_TORN = 0.5
+#: A closed mesh as large as this share of a body's height and as thick as that share is a body. Clothes with two sides are
+#: thinner: twice volume over area is 0.006 body heights for 1 cm, a body has 0.04.
+_BODY_SIZE, _BODY_THICKNESS = 0.8, 0.02
+#: A mesh nearer than this [body heights] to this share of the body's vertices, head, hands and feet included, is the body.
+_ON_SKIN, _ALL_SKIN = 0.006, 0.95
+#: Metres per unit of the files that bodies come in.
+_UNITS = (1.0, 0.01, 0.001)
+#: A sheet farther from the skin than this [m] in the middle does not lie on the body at first.
+_FAR = 0.35
+#: A garment is inside out where the normals of more than this share of its area point to the body; those that are not have
+#: 0 to 0.04 of it, clothes with two sides a half.
+_INSIDE_OUT = 0.75
+
+
+@dataclass(frozen=True)
+class Suspicion:
+    """What a garment seems to be, in words that follow its name, and what to do."""
+
+    what: str
+    fix: str
+    grave: bool  # a simulation of it would mean nothing
+
+    @property
+    def sentence(self) -> str:
+        return f"{self.what}; {self.fix}"
+
+
+def suspect_seams(pos: np.ndarray, faces: np.ndarray) -> list[Suspicion]:
+    """Whether a garment (V, 3), (F, 3) is torn along seams that double vertices; grave where it is loose triangles."""
+    joined = len(pos) - len(repair.weld(pos, faces, repair.weld_tolerance(pos, faces)).kept)
+    if not joined:
+        return []
+    parts = len(np.unique(topology.connected_components(len(pos), topology.unique_edges(faces))))
+    what = f"is torn: {joined} of its {len(pos)} vertices lie on another one along open seams ({parts} parts)"
+    return [Suspicion(what, "hood prepare garment=… joins them", joined > _TORN * len(pos))]
+
+
+def suspect_kind(pos: np.ndarray, faces: np.ndarray, surface: np.ndarray) -> list[Suspicion]:
+    """Whether a garment (V, 3), (F, 3), of any unit and place, is none: flat pattern pieces, or a body.
+
+    ``surface`` (W, 3) [m] is the body that would wear it. Seams are taken as sewn, and the unit as the size tells it.
+    """
+    welded = repair.weld(pos, faces, repair.weld_tolerance(pos, faces))
+    pos, faces = pos[welded.kept], welded.vertex_map[faces]
+    flat, num = _flat_parts(pos, faces)
+    if flat == num > 1:
+        what = f"is flat: all {num} of its parts lie in planes, as sewing patterns do, and nobody can wear them"
+        return [Suspicion(what, "sew and drape it where it was made, and export the draped garment", True)]
+    height = float(np.ptp(surface, axis=0).max())
+    size = float(np.ptp(pos[np.unique(faces)], axis=0).max())
+    factor = min(_UNITS, key=lambda unit: abs(np.log(max(unit * size, 1e-12) / height)))  # a body is as large as a body
+    pos, size = factor * pos, factor * size
+    if size < _BODY_SIZE * height:
+        return []
+    closed = 2 * len(topology.unique_edges(faces)) == 3 * len(faces)
+    if closed and _thickness(pos, faces) > _BODY_THICKNESS * height:
+        what = f"is a closed solid {size:.2f} m large, which is a body, not a garment"
+    elif float((cKDTree(pos).query(surface, distance_upper_bound=_ON_SKIN * height)[0] < np.inf).mean()) > _ALL_SKIN:
+        what = "lies on the skin of the whole body, head, hands and feet included: it is the body, not a garment"
+    else:
+        return []
+    return [Suspicion(what, "pass it as body=…, and a garment with openings as garment=…", True)]
+
+
+def suspect_place(pos: np.ndarray, faces: np.ndarray, surface: np.ndarray, body_faces: np.ndarray) -> list[Suspicion]:
+    """Whether a garment (V, 3) [m] is worn by the body (W, 3) [m] where both are; a sheet may lie anywhere.
+
+    Grave: it surrounds nothing of the body, or half of its openings are empty, as those of a shirt around the knees are.
+    """
+    openings = find_openings(pos, faces, surface, body_faces)
+    around = surrounds(pos, surface, body_faces)
+    fix = "hood inspect says how to place it"
+    if openings.num == 0:
+        return [Suspicion(f"{around.problem}, and falls from there", fix, False)] if around.middle > _FAR else []
+    if openings.num_empty == openings.num:
+        what = f"does not surround the body: none of its {openings.num} openings has a part of the body in it"
+        return [Suspicion(f"{what} (half of it is over {around.middle:.2g} m away from the skin)", fix, True)]
+    if openings.num_empty:
+        what = (
+            f"is not worn as it was made: {openings.num_empty} of its {openings.num} openings have no part of the body in them"
+        )
+        return [Suspicion(what, fix, 2 * openings.num_empty >= openings.num)]
+    return []
+
+
+def suspect_sides(pos: np.ndarray, faces: np.ndarray, surface: np.ndarray, body_faces: np.ndarray) -> list[Suspicion]:
+    """Whether a garment (V, 3) [m] is inside out on the body (W, 3) [m]; a sheet has no inside.
+
+    The solver asks for no side; networks that look at normals, pictures and exports do.
+    """
+    share = inward_share(pos, faces, surface, body_faces)
+    if share <= _INSIDE_OUT or find_openings(pos, faces, surface, body_faces).num == 0:
+        return []
+    what = (
+        f"is inside out: the normals of {share:.0%} of its area point to the body, which networks take for the other side and "
+        "pictures show"
+    )
+    return [Suspicion(what, "hood prepare garment=… turns it", False)]
+
+
+def _flat_parts(pos: np.ndarray, faces: np.ndarray) -> tuple[int, int]:
+    """Parts whose vertices lie in one plane, and parts in all."""
+    part = topology.connected_components(len(pos), topology.unique_edges(faces))
+    rows = [np.flatnonzero(part == number) for number in np.unique(part[faces[:, 0]])]
+    spread = [np.linalg.svd(pos[row] - pos[row].mean(axis=0), compute_uv=False) for row in rows if len(row) > 3]
+    return sum(bool(values[2] < _FLAT * values[0]) for values in spread), len(rows)
+
+
+def _thickness(pos: np.ndarray, faces: np.ndarray) -> float:
+    """Twice the volume over the area [m] of a closed mesh: the thickness of a sheet with two sides."""
+    corners = pos[faces] - pos.mean(axis=0)
+    volume = abs(float(np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])))) / 6.0
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
+    return 2.0 * volume / max(float(area), 1e-12)

@@ -1,0 +1,1 @@
+"""Motions: sequences of poses and moving meshes."""

@@ -1,0 +1,223 @@
+"""Reading a moving mesh that serves as a body, at the frame rate of the simulation."""
+
+from __future__ import annotations
+
+import mmap
+import warnings
+import zipfile
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hood.assets.files.library import DATA_FOLDER
+from hood.assets.formats import vertex_files
+from hood.assets.formats.gltf_animation import read_gltf_animation
+from hood.assets.formats.mesh_file import read_mesh
+from hood.assets.formats.vertex_files import FACE_KEYS, FOLDER_SUFFIXES, VERTEX_KEYS, VertexFile
+from hood.assets.motion.mesh_sequence import MeshSequence, loop_mesh, resample_mesh, trim_mesh, turn_mesh
+from hood.mesh import topology
+from hood.mesh.repair import sew_moving
+
+NO_BODY = "none"
+_STILL_SUFFIXES = (".obj", ".ply", ".off", ".stl")
+_GLTF_SUFFIXES = (".glb", ".gltf")
+_H5_SUFFIXES = (".h5", ".hdf5")
+#: What can be given as a moving or still mesh, besides a folder of OBJ or PLY files.
+ANIMATED_SUFFIXES = (".npz", ".pkl", *_H5_SUFFIXES, *_GLTF_SUFFIXES, *_STILL_SUFFIXES)
+_DEFAULT_FPS = 30.0
+#: A body larger than this [m] is in other units.
+_LARGEST = 30.0
+
+
+def body_kind(name: str | Path) -> str:
+    """What is meant by a body: ``"model"`` (embedded or of the SMPL family), ``"mesh"`` (moving or still), ``"none"``."""
+    path = Path(name).expanduser()
+    if str(name) == NO_BODY:
+        return NO_BODY
+    if (DATA_FOLDER / "body" / f"{name}.npz").is_file():
+        return "model"
+    if path.is_dir():
+        return "mesh" if any(entry.suffix.lower() in FOLDER_SUFFIXES for entry in path.iterdir()) else "model"
+    suffix = path.suffix.lower()
+    if suffix in (*_H5_SUFFIXES, *_GLTF_SUFFIXES, *_STILL_SUFFIXES):
+        return "mesh"
+    if suffix in (".npz", ".pkl") and path.is_file():
+        return "mesh" if _holds_vertices(path) else "model"
+    return "model"
+
+
+def load_mesh_sequence(
+    path: str | Path,
+    fps: float = 30.0,
+    up: str = "auto",
+    *,
+    start: float | str | None = None,
+    stop: float | str | None = None,
+    loop: int = 1,
+    file_fps: float | None = None,
+    scale: float | None = None,
+    animation: int | str = 0,
+    parts: Sequence[str] = (),
+) -> MeshSequence:
+    """A moving mesh at ``fps``: vertices move linearly between the frames of the file.
+
+    Accepted: a folder of numbered OBJ or PLY files; ``.npz``, ``.h5`` or ``.pkl`` with ``verts (N, W, 3)`` and ``faces``
+    (a ``rollout.h5`` as well); ``.glb`` or ``.gltf``, whose animation is evaluated at ``fps`` itself; OBJ, PLY, OFF or STL
+    for one that stands still.
+
+    Args:
+        up: axis that points up in the file: "y", "z", or "auto", y.
+        start, stop: part to keep, in seconds or in frames of the file ("120f").
+        loop: times the motion is played; it must end as it began.
+        file_fps: frame rate of the file, whatever it says itself; 30 where neither does.
+        scale: metres per unit of the file; None: 1, refused where the mesh would be larger than 30 m.
+        animation, parts: of glTF, see :func:`hood.assets.formats.gltf_animation.read_gltf_animation`.
+
+    Raises:
+        FileNotFoundError: no such file or folder.
+        ValueError: unreadable, wrong shapes or indices, not finite, other units; names the file and the fix.
+    """
+    path = Path(path).expanduser()
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such file or folder")
+    if up not in ("y", "z", "auto"):
+        raise ValueError(f"up axis {up!r}: give 'y', 'z' or 'auto'")
+    content = _read(path, fps, animation, parts)
+    rate = _rate(path, content.fps if file_fps is None else file_fps)
+    verts, faces = _checked(path, content.verts, content.faces)
+    sequence = MeshSequence(path.stem, verts, faces, rate, _bones(path, content), content.rest, content.weights)
+    sequence = turn_mesh(sequence, 1.0 if scale is None else float(scale), up)
+    _check_size(path, sequence, scale)
+    sequence = resample_mesh(trim_mesh(sequence, start, stop), fps)
+    sequence = replace(sequence, faces=_sewn(path, sequence))
+    return replace(loop_mesh(sequence, loop), faces=_outward(path, sequence))
+
+
+def _read(path: Path, fps: float, animation: int | str, parts: Sequence[str]) -> VertexFile:
+    suffix = path.suffix.lower()
+    if path.is_dir():
+        return vertex_files.read_mesh_folder(path)
+    if suffix in _GLTF_SUFFIXES:
+        scene = read_gltf_animation(path, fps, animation, parts)
+        skinned = scene.transforms is not None
+        return VertexFile(scene.verts, scene.faces, fps, scene.transforms, scene.rest if skinned else None, scene.weights)
+    if suffix in _STILL_SUFFIXES:
+        return VertexFile(*read_mesh(path, True))
+    readers = {".npz": vertex_files.read_vertex_archive, ".pkl": vertex_files.read_vertex_pickle}
+    readers |= dict.fromkeys(_H5_SUFFIXES, vertex_files.read_vertex_h5)
+    if suffix not in readers:
+        raise ValueError(f"{path}: unknown format {path.suffix!r} of a moving mesh; give one of {', '.join(ANIMATED_SUFFIXES)}")
+    return readers[suffix](path)
+
+
+def _holds_vertices(path: Path) -> bool:
+    """Whether an archive or pickle names vertices and no body model; nothing of it is read."""
+    if path.suffix == ".pkl":
+        if path.stat().st_size == 0:
+            return False
+        with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            # Keys of a dict stand in a pickle as they are.
+            named = content.find(b"verts") >= 0 or content.find(b"vertices") >= 0
+            return named and content.find(b"v_template") < 0
+    try:
+        with zipfile.ZipFile(path) as archive:
+            keys = {name.removesuffix(".npy") for name in archive.namelist()}
+    except (zipfile.BadZipFile, OSError):
+        return False
+    return bool(keys & set(VERTEX_KEYS)) and bool(keys & set(FACE_KEYS)) and "v_template" not in keys
+
+
+def _checked(path: Path, verts: Any, faces: Any) -> tuple[np.ndarray, np.ndarray]:
+    verts, faces = np.asarray(verts), np.asarray(faces)
+    if verts.dtype.kind not in "iuf" or faces.dtype.kind not in "iuf":
+        raise ValueError(f"{path}: verts hold {verts.dtype} and faces {faces.dtype} values; they must hold numbers")
+    if verts.ndim == 2:
+        verts = verts[None]
+    if verts.ndim != 3 or verts.shape[2] != 3 or verts.shape[0] < 1 or verts.shape[1] < 3:
+        raise ValueError(f"{path}: verts have shape {verts.shape}; they must be (frames, vertices, 3)")
+    if faces.ndim != 2 or faces.shape[1] not in (3, 4) or len(faces) == 0:
+        raise ValueError(f"{path}: faces have shape {faces.shape}; they must be (faces, 3) vertex indices")
+    if verts.dtype.kind != "f" or verts.dtype.itemsize < 4:
+        verts = verts.astype(np.float32 if verts.dtype.kind == "f" else np.float64)
+    indices = faces.astype(np.int64)
+    if not np.array_equal(indices, faces) or indices.min() < 0 or indices.max() >= verts.shape[1]:
+        raise ValueError(
+            f"{path}: faces refer to vertices {faces.min()} … {faces.max()} of {verts.shape[1]}; indices count from 0"
+        )
+    if indices.shape[1] == 4:
+        indices = np.concatenate([indices[:, [0, 1, 2]], indices[:, [0, 2, 3]]])
+    for frame, points in enumerate(verts):
+        if not np.isfinite(points).all():
+            raise ValueError(f"{path}: vertices are not finite in frame {frame}; remove or repair that frame")
+    return verts, indices
+
+
+def _bones(path: Path, content: VertexFile) -> np.ndarray | None:
+    if content.transforms is None:
+        return None
+    bones = np.asarray(content.transforms)
+    frames = len(content.verts) if np.ndim(content.verts) == 3 else 1
+    if bones.dtype.kind != "f" or bones.ndim != 4 or len(bones) != frames or bones.shape[2:] not in ((3, 4), (4, 4)):
+        raise ValueError(f"{path}: transforms have shape {bones.shape}; they must be ({frames}, joints, 3 or 4, 4) reals")
+    if not np.isfinite(bones).all():
+        raise ValueError(f"{path}: transforms are not finite; repair them")
+    return bones[:, :, :3].astype(np.float64)
+
+
+def _rate(path: Path, value: Any) -> float:
+    if value is None:
+        return _DEFAULT_FPS
+    flat = np.asarray(value).reshape(-1)
+    rate = float(flat[0]) if len(flat) == 1 and flat.dtype.kind in "iuf" else np.nan
+    if not np.isfinite(rate) or not 0.1 <= rate <= 1e5:
+        raise ValueError(
+            f"{path}: its frame rate is {' '.join(str(value).split())[:40]}; give file_fps, 0.1 to 100000 frames a second"
+        )
+    return rate
+
+
+def _check_size(path: Path, sequence: MeshSequence, scale: float | None) -> None:
+    extent = float(np.ptp(sequence.verts[0], axis=0).max())
+    if extent <= 0:
+        raise ValueError(f"{path}: all vertices of its first frame are at one point; it is no surface")
+    if scale is None and extent > _LARGEST:
+        factor = 0.01 if extent <= 100 * _LARGEST else 0.001
+        raise ValueError(
+            f"{path}: the mesh is {extent:.4g} m large; its unit is not the metre, pass body_scale={factor:g} "
+            "(body_scale=1 takes it as it is)"
+        )
+
+
+def _sewn(path: Path, sequence: MeshSequence) -> np.ndarray:
+    """The faces, with vertices that seams double joined: inside and outside need a closed body."""
+    before = len(topology.boundary_loops(sequence.faces))
+    if not before:
+        return sequence.faces
+    faces = sew_moving(sequence.verts, sequence.faces)
+    after = len(topology.boundary_loops(faces))
+    if after < before:
+        warnings.warn(
+            f"{path}: the body has {before} openings where seams double its vertices; joined, it has {after}", stacklevel=3
+        )
+    if after:
+        warnings.warn(
+            f"{path}: the body has {after} opening{'s' if after > 1 else ''}, and inside and outside need a closed one; "
+            "close them where it was made",
+            stacklevel=3,
+        )
+    return faces
+
+
+def _outward(path: Path, sequence: MeshSequence) -> np.ndarray:
+    """The faces, turned over where a closed mesh is inside out: cloth would be drawn into it."""
+    faces, points = sequence.faces, sequence.verts[0].astype(np.float64)
+    a, b, c = (points[faces[:, corner]] - points.mean(axis=0) for corner in range(3))
+    volume = float(np.einsum("fi,fi->", a, np.cross(b, c)))
+    closed = 2 * len(topology.unique_edges(faces)) == 3 * len(faces)
+    if volume >= 0 or not closed:
+        return faces
+    warnings.warn(f"{path}: the faces of the mesh look inwards; they are turned over", stacklevel=3)
+    return np.ascontiguousarray(faces[:, ::-1])

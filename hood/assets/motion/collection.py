@@ -1,0 +1,83 @@
+"""Lists of motion files from folders, globs and split lists."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable
+from pathlib import Path
+
+from hood.assets.files.library import locate
+from hood.assets.motion.motion_files import find_motions
+from hood.assets.motion.recording import MOTION_SUFFIXES
+
+#: What lies beside the motions in AMASS folders: subjects' shapes, stages of the fit.
+_BESIDES = ("shape", "neutral_stagei", "female_stagei", "male_stagei")
+#: Columns of a table that may name the motion.
+_NAME_COLUMNS = ("id", "file", "path", "sequence", "name")
+
+
+def expand_sequences(patterns: str | Path | Iterable[str | Path], part: str = "train") -> list[Path]:
+    """Motion files that ``patterns`` stand for: in their order, folders and globs sorted, nothing twice.
+
+    A pattern is the name of an embedded motion; a file; a folder, whose motions are all ``.npz`` and ``.pkl`` files in it and
+    below, but not the shapes that AMASS keeps beside them; a glob (``amass/**/*_poses.npz``); a list, see
+    :func:`hood.assets.motion.motion_files.find_motions`; or a ``.csv`` table with a column ``id`` (or file, path, sequence,
+    name; else its first), whose entries start from its folder and may leave the suffix out.
+
+    Args:
+        part: of a JSON split, "train" or "validation".
+
+    Raises:
+        FileNotFoundError: an unknown name, a missing file or list.
+        ValueError: nothing found for a pattern, or an unreadable list; names it.
+    """
+    found: dict[Path, None] = {}
+    for pattern in [patterns] if isinstance(patterns, (str, Path)) else patterns:
+        path = Path(pattern).expanduser()
+        if path.is_dir():
+            files = motions_in(path)
+        elif path.suffix.lower() == ".csv":
+            files = _in_table(path)
+        else:
+            files = [locate("motions", name) for name in find_motions([str(pattern)], part)]
+        found.update(dict.fromkeys(files))
+    return list(found)
+
+
+def motions_in(folder: Path) -> list[Path]:
+    """Motion files in a folder and below, sorted; not the shapes and stages of the fit that AMASS keeps beside them.
+
+    Raises:
+        ValueError: there are none.
+    """
+    files = (path for path in folder.rglob("*") if path.suffix in MOTION_SUFFIXES and path.is_file())
+    found = sorted(path for path in files if path.stem not in _BESIDES and not path.name.startswith("."))
+    if not found:
+        raise ValueError(f"{folder}: no motions ({', '.join(MOTION_SUFFIXES)}) in it or below")
+    return found
+
+
+def _in_table(path: Path) -> list[Path]:
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    try:
+        with open(path, encoding="utf-8", newline="") as file:
+            rows = list(csv.DictReader(file))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{path}: not readable as a table of comma-separated values ({error})") from error
+    if not rows:
+        raise ValueError(f"{path}: an empty table; give one row per motion below a row of column names")
+    column = next((name for name in _NAME_COLUMNS if name in rows[0]), next(iter(rows[0])))
+    names = [row[column] for row in rows]
+    if any(not name for name in names):
+        raise ValueError(f"{path}: row {next(i for i, name in enumerate(names) if not name) + 2} names no motion in {column!r}")
+    return [_beside(path.parent, str(name)) for name in names]
+
+
+def _beside(folder: Path, name: str) -> Path:
+    """File of a table's entry: beside the table, with or without its suffix, or an embedded motion."""
+    for suffix in ("", *MOTION_SUFFIXES):
+        file = folder / (name + suffix)
+        if file.is_file():
+            return file
+    return locate("motions", name)

@@ -1,0 +1,126 @@
+"""Reading the garments that a command is given: one or several, repaired or not, with their pins."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hood.assets.garment.garment import Garment, load_garment
+from hood.assets.garment.outfit import join_garments
+from hood.assets.garment.pins import pin_mask
+from hood.assets.garment.suspicions import Suspicion, suspect_kind, suspect_seams
+from hood.assets.garment.units import require_metres, used
+from hood.config import ConfigError, plain
+from hood.scene.motion import BodyMotion, Motion
+
+
+def names_of(given: Any, key: str = "garment") -> list[str]:
+    """Names in a config value that is one name or a list of them.
+
+    Raises:
+        ConfigError: neither, or an empty list.
+    """
+    value = plain(given)
+    names = value if isinstance(value, list) else [value]
+    if not names or not all(isinstance(name, (str, int, float)) and not isinstance(name, bool) for name in names):
+        raise ConfigError(f"{key}={value}: give a name, a file, or several, {key}=[shirt.obj,trousers]")
+    return [str(name) for name in names]
+
+
+def read_outfit(given: Any, motion: Motion, triangulate: bool = False, pins: Any = None) -> Garment:
+    """The garment or garments named by a config value, as one garment that can follow ``motion``.
+
+    Args:
+        given: a name, a file, a list of them, or a garment that is read already.
+        triangulate: split polygons of mesh files instead of refusing them.
+        pins: what is held instead of the files' own pins, see :func:`hood.assets.garment.pins.pin_mask`; None: the files' own.
+
+    Raises:
+        ValueError: a garment that cannot be read, is not in metres or does not fit, or pins it does not have.
+    """
+    if isinstance(given, Garment):
+        garments = [given]
+    else:
+        garments = [load_garment(name, triangulate=triangulate) for name in names_of(given)]
+    for garment in garments:
+        if not garment.bound:
+            heed(garment.name, suspect_seams(garment.rest_pos, garment.faces))
+    pins = plain(pins)
+    if pins is not None:  # what is held differs in how it follows the body
+        garments = [replace(garment, pinned=np.zeros_like(garment.pinned)) for garment in garments]
+    if motion.num_vertices:
+        surface = motion.surface(0, motion.translation[0]).cpu().numpy()
+        for garment in garments:
+            if not garment.bound:
+                require_metres(used(garment.rest_pos, garment.faces), surface, garment.name)
+                heed(garment.name, suspect_kind(garment.rest_pos, garment.faces, surface))
+    outfit = join_garments([motion.dressed(garment) for garment in garments])
+    if pins is None:
+        return outfit
+    body = motion.body if isinstance(motion, BodyMotion) else None
+    return replace(outfit, pinned=pin_mask(checked_pins(pins), outfit, body))
+
+
+def layer_order(given: Any, names: Sequence[str]) -> tuple[int, ...] | None:
+    """Garments from the body outwards, by their places among ``names`` (of files the stem is enough); None for ``auto``.
+
+    Raises:
+        ConfigError: ``given`` is not ``auto``, nor all of the names in some order.
+    """
+    if plain(given) == "auto":
+        return None
+    wanted, left, order = names_of(given, "layers"), list(enumerate(names)), []
+    for name in wanted:
+        place = next((item for item in left if name in (item[1], Path(item[1]).stem)), None)
+        if place is None:
+            break
+        left.remove(place)
+        order.append(place[0])
+    if left or len(order) != len(wanted):
+        raise ConfigError(
+            f"layers={','.join(wanted)}: give all garments from the body outwards, layers=[{','.join(names)}] or another order"
+        )
+    return tuple(order)
+
+
+def heed(name: str, suspicions: Sequence[Suspicion]) -> None:
+    """Warn about what the garment ``name`` seems to be.
+
+    Raises:
+        ValueError: a grave suspicion.
+    """
+    for suspicion in suspicions:
+        if suspicion.grave:
+            raise ValueError(f"garment {name!r} {suspicion.sentence}")
+        warnings.warn(f"garment {name!r} {suspicion.sentence}", stacklevel=2)
+
+
+def checked_pins(pins: Any) -> str | int | Sequence[str | int]:
+    """A config value for pins: a word, a number, or a list of them.
+
+    Raises:
+        ConfigError: something else.
+    """
+    if isinstance(pins, (str, int)) and not isinstance(pins, bool):
+        return pins
+    if isinstance(pins, list) and all(isinstance(pin, (str, int)) and not isinstance(pin, bool) for pin in pins):
+        return pins
+    raise ConfigError(f"pins={pins}: give vertex numbers, regions or lists, such as pins=[waistband,12,13] or pins=held.txt")
+
+
+def shape_coefficients(given: Any, key: str = "betas") -> np.ndarray:
+    """Ten shape coefficients from a config value of at most ten finite numbers; ``key`` is where it stands.
+
+    Raises:
+        ConfigError: something else.
+    """
+    values = plain(given)
+    numbers = isinstance(values, list) and all(isinstance(b, (int, float)) and np.isfinite(b) for b in values)
+    if not numbers or len(values) > 10:
+        raise ConfigError(f"{key}={values}: give at most 10 finite shape coefficients, e.g. [1.5,0,-1]")
+    return np.array([*values, *[0.0] * (10 - len(values))], dtype=np.float64)

@@ -1,0 +1,88 @@
+"""Reading the body and motion that a command is given."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+
+from hood.assets.files.library import names
+from hood.assets.motion.animated_mesh import body_kind
+from hood.config import ConfigError, plain
+from hood.scene.load_motion import NO_MOTION, MotionOptions, load_motion
+from hood.scene.motion import Motion
+
+
+def make_motion(config: DictConfig, dtype: torch.dtype = torch.float32) -> Motion:
+    """What moves in the scene, in ``dtype`` on the config's device.
+
+    A body that performs no motion but its own does so beside an embedded motion, the default, and says that; a file was
+    meant.
+
+    Raises:
+        FileNotFoundError, ValueError: from :func:`hood.scene.load_motion.load_motion`.
+        ConfigError: a value of the wrong kind, or a motion file that the body cannot perform; names the key.
+    """
+    kind = body_kind(str(config.body))
+    if kind != "model" and str(config.sequence) != NO_MOTION:
+        has = "performs its own motion" if kind == "mesh" else "does not move"
+        if str(config.sequence) not in names("motions"):
+            raise ConfigError(
+                f"sequence={config.sequence}: body={config.body} {has}; leave sequence out, or give a body of the SMPL family"
+            )
+        print(f"body={config.body} {has}: sequence={config.sequence} is not used", file=sys.stderr)
+    return load_motion(str(config.body), str(config.sequence), motion_options(config), dtype, str(config.device))
+
+
+def motion_options(config: DictConfig) -> MotionOptions:
+    """The keys of a config that say how a motion is performed.
+
+    Raises:
+        ConfigError: a value of the wrong kind; names the key.
+    """
+    return MotionOptions(
+        fps=_number(config, "fps"),
+        up=str(config.up),
+        start=config.start,
+        stop=config.stop,
+        loop=int(config.loop),
+        file_fps=_optional(config, "file_fps"),
+        num_frames=int(config.num_frames),
+        betas=_betas(plain(config.betas)),
+        gender=None if config.gender is None else str(config.gender),
+        blend_in=_number(config, "blend_in"),
+        blend_from=str(config.blend_from),
+        hands=str(config.hands),
+        scale=_optional(config, "body_scale"),
+        animation=config.animation,
+        parts=_names(config, "body_parts"),
+    )
+
+
+def _number(config: DictConfig, key: str) -> float:
+    try:
+        return float(config[key])
+    except (TypeError, ValueError):
+        raise ConfigError(f"{key}={config[key]}: give a number") from None
+
+
+def _optional(config: DictConfig, key: str) -> float | None:
+    return None if config[key] is None else _number(config, key)
+
+
+def _betas(given: Any) -> Any:
+    if given is None:
+        return None
+    # bool is an int, and no coefficient.
+    if not isinstance(given, list) or not all(isinstance(b, (int, float)) and not isinstance(b, bool) for b in given):
+        raise ConfigError(f"betas={given}: give at most 10 finite shape coefficients, e.g. betas=[1.5,0,-1]")
+    return given
+
+
+def _names(config: DictConfig, key: str) -> list[str]:
+    given = plain(config[key])
+    if not isinstance(given, list):
+        raise ConfigError(f"{key}={given}: give a list of names, e.g. {key}=[Body]")
+    return [str(name) for name in given]

@@ -1,0 +1,260 @@
+"""Moving meshes from every kind of file; what is refused names the file, the frame and the fix."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from hood.assets.motion.animated_mesh import body_kind, load_mesh_sequence
+from hood.assets.motion.mesh_sequence import MeshSequence, resample_mesh
+from hood.testing import sphere
+
+POINTS, FACES = sphere(1, 0.5)
+COUNT = 7
+
+
+def moving(count: int = COUNT) -> np.ndarray:
+    """(N, W, 3): a sphere that rises and swells."""
+    time = np.arange(count)[:, None, None] / 30
+    return POINTS * (1 + 0.3 * time) + time * np.array([0.2, 1.0, 0.0])
+
+
+def write_obj(path: Path, pos: np.ndarray, faces: np.ndarray) -> None:
+    rows = [f"v {x!r} {y!r} {z!r}" for x, y, z in pos.tolist()]
+    path.write_text("\n".join([*rows, *("f " + " ".join(str(c + 1) for c in face) for face in faces)]))
+
+
+def write_ply(path: Path, pos: np.ndarray, faces: np.ndarray) -> None:
+    head = f"ply\nformat ascii 1.0\nelement vertex {len(pos)}\nproperty double x\nproperty double y\nproperty double z\n"
+    head += f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    rows = [f"{x!r} {y!r} {z!r}" for x, y, z in pos.tolist()]
+    path.write_text(head + "\n".join([*rows, *(f"{len(f)} " + " ".join(map(str, f)) for f in faces)]) + "\n")
+
+
+def write_archive(path: Path) -> Path:
+    np.savez(path, verts=moving(), faces=FACES, fps=30.0)
+    return path
+
+
+def write_h5(path: Path) -> Path:
+    with h5py.File(path, "w") as file:
+        file["verts"], file["faces"] = moving(), FACES
+        file.attrs["fps"] = 30
+    return path
+
+
+def write_rollout(path: Path) -> Path:
+    """As ``hood rollout`` writes it, stopped before its last two frames."""
+    with h5py.File(path, "w") as file:
+        file["body/pos"], file["body/faces"] = np.concatenate([moving(), np.full((2, *POINTS.shape), np.nan)]), FACES
+        file["cloth/pos"] = np.zeros((9, 3, 3))
+        file.attrs["dt"], file.attrs["num_frames"] = 1 / 30, COUNT
+    return path
+
+
+def write_pickle(path: Path) -> Path:
+    path.write_bytes(pickle.dumps({"verts": moving(), "faces": FACES.astype(np.int32)}, 2))
+    return path
+
+
+def folder_of(suffix: str, write: Callable) -> Callable[[Path], Path]:
+    def make(path: Path) -> Path:
+        path.mkdir()
+        for frame, pos in enumerate(moving(12)):
+            write(path / f"take2_{frame + 3}{suffix}", pos, FACES)  # 10 comes after 9
+        (path / "notes.txt").write_text("x")
+        return path
+
+    return make
+
+
+FILES: dict[str, Callable[[Path], Path]] = {
+    "walk.npz": write_archive,
+    "walk.h5": write_h5,
+    "rollout.h5": write_rollout,
+    "walk.pkl": write_pickle,
+    "objs": folder_of(".obj", write_obj),
+    "plys": folder_of(".ply", write_ply),
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_every_file_is_the_same_motion(name: str, tmp_path: Path) -> None:
+    path = FILES[name](tmp_path / name)
+    assert body_kind(path) == "mesh"
+    found = load_mesh_sequence(path, 30.0)
+    np.testing.assert_array_equal(found.faces, FACES)
+    np.testing.assert_allclose(found.verts, moving(found.num_frames), rtol=0, atol=1e-15)
+    assert found.num_frames == (12 if path.is_dir() else COUNT)
+    assert found.fps == 30.0
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".ply", ".stl", ".off"])
+def test_still_meshes_have_one_frame(suffix: str, tmp_path: Path) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    path = tmp_path / f"rock{suffix}"
+    trimesh.Trimesh(POINTS, FACES, process=False).export(path)
+    found = load_mesh_sequence(path, 50.0)
+    assert found.verts.shape == (1, len(POINTS), 3)
+    assert found.fps == 50.0
+    assert np.ptp(found.verts) == pytest.approx(np.ptp(POINTS), abs=1e-5)
+
+
+def test_vertices_move_linearly_in_time() -> None:
+    sequence = MeshSequence("s", moving(61) ** 2, FACES, 60.0)
+    for fps in (30.0, 100.0, 24.0, 47.0):
+        found = resample_mesh(sequence, fps)
+        assert found.num_frames == int(np.floor(fps + 1e-9)) + 1
+        for frame in range(0, found.num_frames, 7):
+            at = frame * 60 / fps
+            low, share = int(at + 1e-9), at - int(at + 1e-9)
+            high = min(low + 1, 60)
+            expected = sequence.verts[low] * (1 - share) + sequence.verts[high] * share
+            np.testing.assert_allclose(found.verts[frame], expected, rtol=0, atol=1e-12)
+
+
+def test_no_drift_after_a_minute() -> None:
+    """100 → 30 fps: the frame at 60 s is the file's frame at 60 s, single precision kept."""
+    verts = np.zeros((6001, 3, 3), dtype=np.float32)
+    verts[:, :, 0] = np.arange(6001)[:, None] / 64  # exact in single precision
+    verts[:, 1, 1], verts[:, 2, 2] = 1.0, 1.0
+    found = resample_mesh(MeshSequence("s", verts, np.array([[0, 1, 2]]), 100.0), 30.0)
+    assert found.verts.dtype == np.float32
+    assert found.num_frames == 1801
+    np.testing.assert_allclose(found.verts[:, 0, 0], np.arange(1801) / 30 * 100 / 64, atol=1e-5)
+    np.testing.assert_array_equal(found.verts[::3, 0, 0], verts[::10, 0, 0])
+
+
+def test_up_axis_units_and_parts_of_the_motion(tmp_path: Path) -> None:
+    path = write_archive(tmp_path / "walk.npz")
+    turned = load_mesh_sequence(path, up="z")
+    x, y, z = np.moveaxis(moving(), -1, 0)
+    np.testing.assert_array_equal(turned.verts, np.stack([x, z, -y], axis=-1))
+    np.testing.assert_allclose(load_mesh_sequence(path, scale=2.0).verts, 2 * moving(), atol=1e-15)
+    np.testing.assert_array_equal(load_mesh_sequence(path, start="2f", stop="4f").verts, moving()[2:5])
+    np.testing.assert_allclose(load_mesh_sequence(path, 30.0, file_fps=60.0).verts, moving()[::2], atol=1e-15)
+    np.savez(tmp_path / "large.npz", verts=100 * moving(), faces=FACES)
+    with pytest.raises(ValueError, match=r"large\.npz: the mesh is 10.* m large.*body_scale=0\.01"):
+        load_mesh_sequence(tmp_path / "large.npz")
+    assert load_mesh_sequence(tmp_path / "large.npz", scale=1.0).num_frames == COUNT
+    np.testing.assert_allclose(load_mesh_sequence(tmp_path / "large.npz", scale=0.01).verts, moving(), atol=1e-12)
+
+
+def test_loops_must_close(tmp_path: Path) -> None:
+    path = write_archive(tmp_path / "walk.npz")
+    with pytest.raises(ValueError, match="ends as it began"):
+        load_mesh_sequence(path, loop=2)
+    there_and_back = np.concatenate([moving(), moving()[-2::-1]])
+    np.savez(path, verts=there_and_back, faces=FACES)
+    found = load_mesh_sequence(path, loop=3)
+    assert found.num_frames == 3 * 12 + 1
+    np.testing.assert_array_equal(found.verts[12:25], there_and_back)
+
+
+def test_inside_out_and_quads(tmp_path: Path) -> None:
+    np.savez(tmp_path / "in.npz", verts=moving(), faces=FACES[:, ::-1])
+    with pytest.warns(UserWarning, match=r"in\.npz: the faces of the mesh look inwards"):
+        np.testing.assert_array_equal(load_mesh_sequence(tmp_path / "in.npz").faces, FACES)
+    quad = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]])
+    np.savez(tmp_path / "q.npz", verts=quad[None], faces=np.array([[0, 1, 2, 3]]))
+    np.testing.assert_array_equal(load_mesh_sequence(tmp_path / "q.npz").faces, [[0, 1, 2], [0, 2, 3]])
+
+
+def test_joints_of_the_file_are_kept(tmp_path: Path) -> None:
+    bones = np.tile(np.eye(4), (COUNT, 5, 1, 1))
+    bones[:, :, 0, 3] = np.arange(COUNT)[:, None]
+    np.savez(tmp_path / "b.npz", verts=moving(), faces=FACES, transforms=bones, fps=60.0)
+    found = load_mesh_sequence(tmp_path / "b.npz", 30.0, scale=2.0)
+    assert found.transforms.shape == (4, 5, 3, 4)
+    np.testing.assert_allclose(found.transforms[:, 0, 0, 3], [0, 4, 8, 12])
+    np.testing.assert_allclose(found.transforms[0, 0, :, :3], np.eye(3))
+    np.savez(tmp_path / "b.npz", verts=moving(), faces=FACES, transforms=bones[:-1])
+    with pytest.raises(ValueError, match="transforms have shape"):
+        load_mesh_sequence(tmp_path / "b.npz")
+
+
+DAMAGE = {
+    "nan": ({"verts": np.where(np.arange(COUNT)[:, None, None] == 4, np.nan, moving())}, "not finite in frame 4"),
+    "flat": ({"verts": moving()[..., :2]}, r"verts have shape \(7, 42, 2\)"),
+    "index": ({"faces": FACES + 1}, "faces refer to vertices 1 … 42 of 42"),
+    "negative": ({"faces": FACES - 1}, "faces refer to vertices -1"),
+    "real faces": ({"faces": FACES + 0.5}, "faces refer"),
+    "text": ({"verts": np.array(["a"])}, "verts hold <U1"),
+    "no faces": ({"faces": np.zeros((0, 3))}, r"faces have shape \(0, 3\)"),
+    "point": ({"verts": np.zeros((2, 42, 3))}, "at one point"),
+    "rate": ({"fps": 0.0}, "frame rate is 0.0"),
+}
+
+
+@pytest.mark.parametrize("case", DAMAGE)
+def test_damaged_content_is_named(case: str, tmp_path: Path) -> None:
+    change, words = DAMAGE[case]
+    np.savez(tmp_path / "bad.npz", **({"verts": moving(), "faces": FACES} | change))
+    with pytest.raises(ValueError, match=rf"bad\.npz: .*{words}") as error:
+        load_mesh_sequence(tmp_path / "bad.npz")
+    assert "\n" not in str(error.value)
+
+
+def test_frames_of_a_folder_must_be_one_mesh(tmp_path: Path) -> None:
+    folder = folder_of(".obj", write_obj)(tmp_path / "objs")
+    write_obj(folder / "take2_9.obj", POINTS, FACES[:, [1, 2, 0]])
+    with pytest.raises(ValueError, match=r"take2_9\.obj: its faces are not those of take2_3\.obj"):
+        load_mesh_sequence(folder)
+    write_obj(folder / "take2_9.obj", POINTS[:-1], FACES[:4])
+    with pytest.raises(ValueError, match=r"take2_9\.obj: 41 vertices, take2_3\.obj has 42"):
+        load_mesh_sequence(folder)
+    write_ply(folder / "take2_99.ply", POINTS, FACES)
+    with pytest.raises(ValueError, match="OBJ and PLY"):
+        load_mesh_sequence(folder)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match="no OBJ or PLY"):
+        load_mesh_sequence(tmp_path / "empty")
+
+
+def test_hdf5_reads_nothing_elsewhere_and_nothing_absurd(tmp_path: Path) -> None:
+    """Links and external storage lead to other files; a dataset may claim what it never stored."""
+    write_h5(tmp_path / "secret.h5")
+    (tmp_path / "raw.bin").write_bytes(b"\0" * 8 * POINTS.size)
+    path = tmp_path / "bad.h5"
+    with h5py.File(path, "w") as file:
+        file["faces"] = FACES
+        file["verts"] = h5py.ExternalLink(str(tmp_path / "secret.h5"), "verts")
+    with pytest.raises(ValueError, match=r"bad\.h5.*link"):
+        load_mesh_sequence(path)
+    with h5py.File(path, "w") as file:
+        file["faces"] = FACES
+        file.create_dataset("verts", POINTS.shape, "f8", external=[(str(tmp_path / "raw.bin"), 0, h5py.h5f.UNLIMITED)])
+    with pytest.raises(ValueError, match=r"bad\.h5.*store the data itself"):
+        load_mesh_sequence(path)
+    for shape, words in (((10**6, 10**5, 3), "the limit is"), ((1000, 50000, 3), "claims 1200000000 bytes and stores")):
+        with h5py.File(path, "w") as file:
+            file["faces"] = FACES
+            file.create_dataset("verts", shape, "f8", chunks=(1, 1000, 3))
+        with pytest.raises(ValueError, match=words):
+            load_mesh_sequence(path)
+
+
+def test_unreadable_files(tmp_path: Path) -> None:
+    for name in ("x.npz", "x.h5", "x.pkl", "x.glb", "x.gltf", "x.obj", "x.stl"):
+        (tmp_path / name).write_bytes(b"\x00\x01nonsense")
+        with pytest.raises(ValueError, match=rf"x\.{name[2:]}"):
+            load_mesh_sequence(tmp_path / name)
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        load_mesh_sequence(tmp_path / "missing.npz")
+    (tmp_path / "x.fbx").write_text("x")
+    with pytest.raises(ValueError, match=r"unknown format '\.fbx'"):
+        load_mesh_sequence(tmp_path / "x.fbx")
+
+
+def test_kinds_of_bodies(tmp_path: Path, body_file: Path) -> None:
+    assert body_kind("none") == "none"
+    assert body_kind("default") == body_kind(body_file) == "model"
+    (tmp_path / "models").mkdir()
+    (tmp_path / "SMPL_MALE.pkl").write_bytes(pickle.dumps({"v_template": np.zeros((3, 3)), "vertsy": 1}, 2))
+    assert body_kind(tmp_path / "models") == body_kind(tmp_path / "SMPL_MALE.pkl") == "model"
+    assert body_kind(tmp_path / "hero.glb") == "mesh"
