@@ -75,12 +75,12 @@ def find_landing(
     skin = match.dist.view(len(rows), count)
     touched = (skin < NEAR) & (off - skin > HIDDEN)
     first = touched.to(torch.int8).argmax(dim=1)  # the first of those that are touched
-    found = Match(*(values.view(len(rows), count, *values.shape[1:])[torch.arange(len(rows)), first] for values in match))
-    dist = ((pos[rows] - found.point) * found.normal).sum(dim=1)
-    keep = touched.any(dim=1) & ((found.normal * way[rows]).sum(dim=1) < 0) & (dist > 0)
+    place = count * torch.arange(len(rows), device=pos.device) + first
+    point, normal = match.point[place], match.normal[place]
+    dist = ((pos[rows] - point) * normal).sum(dim=1)
+    keep = touched.any(dim=1) & ((normal * way[rows]).sum(dim=1) < 0) & (dist > 0)
     if not bool(keep.any()):
         return None
-    chosen, found = rows[keep], found._replace(dist=dist)
-    known = (getattr(contact, name) for name in Match._fields)
-    match = Match(*(values.index_copy(0, chosen, part[keep]) for values, part in zip(known, found, strict=True)))
-    return match, torch.zeros_like(contact.valid).index_fill(0, chosen, True)
+    chosen, found = rows[keep], match._asdict() | {"dist": match.dist.index_copy(0, place, dist)}
+    both = {name: getattr(contact, name).index_copy(0, chosen, values[place[keep]]) for name, values in found.items()}
+    return Match(**both), torch.zeros_like(contact.valid).index_fill(0, chosen, True)
