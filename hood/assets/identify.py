@@ -13,7 +13,8 @@ from hood.assets.foreign import require_readable
 from hood.assets.gltf import read_gltf
 from hood.assets.h5_links import own_group
 from hood.assets.library import names, nearest
-from hood.assets.mesh_file import MESH_SUFFIXES
+from hood.assets.mesh_file import mesh_suffixes
+from hood.assets.motion_file import MOTION_SUFFIXES, motion_suffixes
 from hood.assets.reference_garments import garment_names
 from hood.assets.unpickle import guarded, load_pickle
 
@@ -53,8 +54,10 @@ def identify(name: str) -> str:
     if suffix in (".glb", ".gltf"):
         gltf = read_gltf(path)
         return MOVING_MESH if gltf.items("animations") or gltf.items("skins") else GARMENT
-    if suffix in MESH_SUFFIXES:
+    if suffix in mesh_suffixes():
         return GARMENT
+    if suffix in motion_suffixes() and suffix not in MOTION_SUFFIXES:
+        return MOTION
     if suffix in _CHECKPOINTS:
         return CHECKPOINT
     if suffix in (".txt", ".json"):

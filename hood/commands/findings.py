@@ -16,7 +16,7 @@ from hood.assets.body import Body, load_body
 from hood.assets.fit_search import Asked
 from hood.assets.garment import Garment, garment_of_mesh, load_garment, locate_garment
 from hood.assets.library import locate
-from hood.assets.mesh_file import MESH_SUFFIXES, read_mesh_file
+from hood.assets.mesh_file import mesh_suffixes, read_mesh_file
 from hood.assets.motion_file import read_recording
 from hood.assets.occupied import is_occupied
 from hood.assets.pins import opening_names, read_indices
@@ -88,7 +88,7 @@ def inspect_garment(name: str, body: Body | MeshMotion, wearer: Sequence[str], b
     """
     finding = Finding(name, "garment", wearer=list(wearer))
     path, _ = locate_garment(name)
-    if path.suffix.lower() in MESH_SUFFIXES:
+    if path.suffix.lower() in mesh_suffixes():
         mesh = read_mesh_file(path, split_polygons=True)
         garment = garment_of_mesh(path, mesh)
         finding.kind = "garment mesh"

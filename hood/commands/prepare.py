@@ -19,7 +19,7 @@ from hood.assets.binding import PosedBody, bind_garment, posed_body
 from hood.assets.body import Body, load_body
 from hood.assets.garment import Garment, garment_of_mesh, load_garment, locate_garment, save_garment
 from hood.assets.library import locate
-from hood.assets.mesh_file import MESH_SUFFIXES, read_mesh_file
+from hood.assets.mesh_file import mesh_suffixes, read_mesh_file
 from hood.assets.outfit import join_garments
 from hood.assets.pins import pin_mask, pin_numbers
 from hood.assets.sequence import PoseSequence, load_sequence
@@ -153,7 +153,7 @@ def _wear(fitting: Fitting, posed: PosedBody, clearance: float, allow_misfit: bo
 
 def _read(name: str) -> Fitting:
     path, _ = locate_garment(name)
-    if path.suffix.lower() not in MESH_SUFFIXES:
+    if path.suffix.lower() not in mesh_suffixes():
         return alterations.start_fitting(load_garment(name))
     mesh = read_mesh_file(path, split_polygons=True)
     garment = garment_of_mesh(path, mesh)
