@@ -15,8 +15,8 @@ from hood.assets.body import Body
 from hood.assets.garment import Garment
 from hood.assets.sequence import PoseSequence, load_sequence
 from hood.dynamics.checkpoint import load_simulator
+from hood.dynamics.feedback import Feedback
 from hood.dynamics.output import AccelerationOutput
-from hood.dynamics.passes import Feedback
 from hood.dynamics.ranges import training_conditions
 from hood.dynamics.simulator import Simulator, build_simulator
 from hood.features.inputs import Inputs
