@@ -51,8 +51,9 @@ def load_config(name: str, overrides: Sequence[str] = ()) -> DictConfig:
         try:
             defaults = compose(name, plugins)
             chosen = [_check_override(name, text, defaults) for text in overrides]
+            overrides = _last_of_groups(chosen)
             # The groups may bring keys of their own, so keys are checked against the composition with all groups chosen.
-            groups = [text for text, override in chosen if _is_group(override)]
+            groups = [text for text, override in chosen if _is_group(override) and text in overrides]
             known = compose(name, plugins + groups)
             for _, override in chosen:
                 if not _is_group(override):
@@ -66,6 +67,21 @@ def load_config(name: str, overrides: Sequence[str] = ()) -> DictConfig:
     OmegaConf.set_struct(config, True)
     _check_types(known, config, "")
     return config
+
+
+def load_option(group: str, name: str) -> dict[str, Any]:
+    """An option of a config group, ours or a plugin's, by itself.
+
+    Raises:
+        ConfigError: it cannot be read.
+    """
+    plugins = [f"hydra.searchpath=[{','.join(_quoted(f'file://{folder}') for folder in config_folders())}]"]
+    with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
+        try:
+            content = OmegaConf.to_container(compose(f"{group}/{name}", plugins), resolve=True)
+        except (HydraException, OmegaConfBaseException) as error:
+            raise ConfigError(f"configuration: {_one_line(error)}") from error
+    return {str(key): value for key, value in content.items()} if isinstance(content, dict) else {}
 
 
 def build(node: DictConfig | dict[str, Any], **extra: Any) -> Any:
@@ -168,6 +184,14 @@ def _check_override(name: str, text: str, defaults: DictConfig) -> tuple[str, Ov
     if _is_group(override) and override.value() is not None and str(override.value()) not in options(key):
         raise ConfigError(unknown(f"option of {key}", str(override.value()), options(key)))
     return text, override
+
+
+def _last_of_groups(chosen: Sequence[tuple[str, Override]]) -> list[str]:
+    """The words, of several options of one group the last, as of several values of one key."""
+    last = {override.key_or_group: place for place, (_, override) in enumerate(chosen) if _is_group(override)}
+    return [
+        text for place, (text, override) in enumerate(chosen) if not _is_group(override) or last[override.key_or_group] == place
+    ]
 
 
 def _is_group(override: Override) -> bool:

@@ -105,6 +105,11 @@ class Simulator(nn.Module):
         self._wants_base = features.needs("base")
 
     @property
+    def simulator(self) -> Simulator:
+        """Whoever takes its steps by a simulator has one."""
+        return self
+
+    @property
     def potential(self) -> Potential:
         """What the network is told of, where :attr:`looks_at_potential`."""
         return self._potential
