@@ -69,21 +69,6 @@ def load_config(name: str, overrides: Sequence[str] = ()) -> DictConfig:
     return config
 
 
-def load_option(group: str, name: str) -> dict[str, Any]:
-    """An option of a config group, ours or a plugin's, by itself.
-
-    Raises:
-        ConfigError: it cannot be read.
-    """
-    plugins = [f"hydra.searchpath=[{','.join(_quoted(f'file://{folder}') for folder in config_folders())}]"]
-    with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
-        try:
-            content = OmegaConf.to_container(compose(f"{group}/{name}", plugins), resolve=True)
-        except (HydraException, OmegaConfBaseException) as error:
-            raise ConfigError(f"configuration: {_one_line(error)}") from error
-    return {str(key): value for key, value in content.items()} if isinstance(content, dict) else {}
-
-
 def build(node: DictConfig | dict[str, Any], **extra: Any) -> Any:
     """Object named by ``node._target_`` with the node's keys as arguments; only ``hood.`` and ``torch.optim.`` targets.
 

@@ -9,6 +9,8 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -16,11 +18,12 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from hood.assets.library import locate
 from hood.commands.common import UNTRAINED, read_model, require_same_model, use_arithmetic, weigh
-from hood.config import ConfigError, build, load_option, options, plain
+from hood.config import ConfigError, build, load_config, options, plain
 from hood.dynamics.captured import CapturedSimulator
 from hood.dynamics.simulator import Simulator
 from hood.dynamics.stepper import Stepper
 from hood.losses.potential import Potential
+from hood.plugins import config_folders
 
 GROUP = "stepper"
 #: ``step=plain``: shapes as the step needs them, the readable reference.
@@ -63,7 +66,7 @@ def with_stepper(config: DictConfig, name: str) -> DictConfig:
     assert isinstance(same, DictConfig)
     if str(config.stepper) != name:
         with open_dict(same):
-            same.update(load_option(GROUP, name))
+            same.update(_content(name, config_folders()))
     return same
 
 
@@ -71,9 +74,15 @@ def find_option(name: str) -> StepperOption | None:
     """The option of that name whose steps are not those of a network; None where there is none."""
     if name not in options(GROUP):
         return None
-    content = load_option(GROUP, name)
-    found = _option(name, content.get("stepping"))
+    found = _option(name, _content(name, config_folders())["stepping"])
     return None if found.network else found
+
+
+@lru_cache(maxsize=32)
+def _content(name: str, plugins: tuple[Path, ...]) -> dict[str, Any]:
+    """The keys of an option, ours or one from the config folders of ``plugins``."""
+    config = load_config("rollout", [f"{GROUP}={name}"])
+    return {key: plain(config.get(key)) for key in ("stepper", "stepping")}
 
 
 def _option(name: str, keys: Any) -> StepperOption:
