@@ -166,6 +166,8 @@ def _check_override(name: str, text: str, defaults: DictConfig) -> tuple[str, Ov
     except HydraException as error:
         raise ConfigError(f"cannot read {text[:_REASON]!r}: quote values with spaces or brackets, key=\"'value'\"") from error
     key = override.get_key_element().lstrip("+~").split("@")[0]
+    if _is_group(override) and override.value() is None and defaults.get(key) is not None:
+        raise ConfigError(f"{key}=null: cannot be left out; give one of {', '.join(options(key))}")
     if _is_group(override) and override.value() is not None and str(override.value()) not in options(key):
         raise ConfigError(unknown(f"option of {key}", str(override.value()), options(key)))
     return text, override

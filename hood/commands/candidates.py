@@ -14,9 +14,9 @@ from hood.commands.circumstances import training_note
 from hood.commands.common import UNTRAINED
 from hood.commands.steppers import ALWAYS, NEVER, find_option, make_network, make_solver
 from hood.config import ConfigError, build, load_config, options
+from hood.dynamics.captured import network_of
 from hood.dynamics.goals import Count
-from hood.dynamics.refine import RefinedStepper, unrefined
-from hood.dynamics.simulator import Simulator
+from hood.dynamics.refine import RefinedStepper
 from hood.evaluation.grid import GUESS, model_name
 from hood.evaluation.table import Candidate
 
@@ -79,11 +79,11 @@ def distinct(candidates: Sequence[Candidate]) -> list[Candidate]:
 
 def digest(candidate: Candidate) -> str:
     """SHA-256 of the weights: results are not taken over from others that had the same name."""
-    stepper = unrefined(candidate.stepper)
-    if not isinstance(stepper, Simulator):
+    network = network_of(candidate.stepper)
+    if network is None:
         return "none"
     content = hashlib.sha256()
-    for name, value in stepper.state_dict().items():
+    for name, value in network.state_dict().items():
         content.update(name.encode())
         content.update(value.detach().cpu().contiguous().numpy().tobytes())
     return content.hexdigest()

@@ -24,7 +24,8 @@ class Stepper(Protocol):
     A stepper of your own is a class with these attributes and methods. Some may be there beside them: ``simulator``, the
     :class:`hood.dynamics.simulator.Simulator` that takes its steps; ``solves_to``, the
     :class:`hood.solver.newton.NewtonSettings` that every step is to meet; ``any_precision`` where it computes in the precision
-    of the state, whatever that of its gravity is; ``in_fixed_shapes(mode)``, the same steps by functions of fixed shapes.
+    of the state, whatever that of its gravity is; ``num_coarse``, the coarse levels that it takes as a third argument of
+    ``prepare``; ``in_fixed_shapes(mode)``, the same steps by functions of fixed shapes.
     """
 
     gravity: Tensor  # (3,) m/s²

@@ -18,6 +18,9 @@ from hood import plugins
 from hood.assets.garment import load_garment
 from hood.assets.sequence import load_sequence
 from hood.cli import main
+from hood.commands.envelope_tasks import command_of, make_tasks
+from hood.commands.tradeoff_checks import check_models
+from hood.config import load_config
 from hood.dynamics.checkpoint import load_simulator, read_header
 from hood.dynamics.simulator import build_simulator
 from hood.features.sets import SetSettings, build_features
@@ -227,6 +230,19 @@ def test_a_steppers_own_key_and_word_reach_it(installed: Path) -> None:
     usual, damped, more = speeds.values()
     assert usual != damped
     assert damped != more
+
+
+def test_other_commands_take_a_steppers_word(installed: Path) -> None:
+    check_models(["damped"])
+    (task, *_) = [
+        task
+        for task in make_tasks(load_config("envelope", ["models=[damped]", "factors=[dt]"]))
+        if task.model == "damped" and not task.cell.bad_input
+    ]
+    assert not task.alone
+    words = command_of(task, load_config("envelope"), Path("map"))
+    assert {"stepper=damped", "refine=0"} <= {*words}
+    load_config("rollout", words[1:])
 
 
 def test_a_garment_and_a_motion_in_formats_of_others_are_the_same_ones(installed: Path) -> None:
