@@ -15,6 +15,7 @@ stands in a group of :data:`KINDS` has a name of its own: ``model.features=physi
 from __future__ import annotations
 
 import importlib.util
+import re
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -24,7 +25,10 @@ from typing import Any
 GROUP = "hood.plugins"
 #: Entry points of the group ``hood.KIND`` name objects: groups of features, outputs and networks of models, and readers of
 #: mesh and motion files, which have a file's suffix, without its dot, as their name.
-KINDS = ("features", "outputs", "networks", "meshes", "motions")
+READERS = ("meshes", "motions")
+KINDS = ("features", "outputs", "networks", *READERS)
+#: Suffixes that mean something already.
+TAKEN = frozenset("npz pkl obj ply off stl glb gltf txt json csv h5 hdf5 safetensors pth pt ckpt".split())
 
 
 @cache
@@ -95,11 +99,16 @@ def _points(kind: str) -> dict[str, EntryPoint]:
     """Entry points of a kind by name.
 
     Raises:
-        ValueError: two packages register one name.
+        ValueError: two packages register one name, or one registers what no name can be.
     """
     assert kind in KINDS, kind
     found: dict[str, EntryPoint] = {}
     for point in sorted(entry_points(group=f"hood.{kind}"), key=lambda point: (point.name, point.value)):
+        if not re.fullmatch(r"[a-z][a-z0-9_]*", point.name) or (kind in READERS and point.name in TAKEN):
+            raise ValueError(
+                f"plugin {point.value!r}: is registered as {point.name!r} under hood.{kind}; "
+                + ("its suffix is hood's own" if point.name in TAKEN else "give it a name of small letters, digits and _")
+            )
         other = found.setdefault(point.name, point)
         if other.value != point.value:
             raise ValueError(

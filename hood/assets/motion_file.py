@@ -103,9 +103,9 @@ def read_recording(path: Path, file_fps: float | None = None) -> Recording:
 def _fields(path: Path) -> Mapping[str, Any]:
     if path.suffix == ".npz":
         return read_arrays(path, (), "AMASS motion")
-    if path.suffix.lower()[1:] in plugins.names(PLUGINS):
-        return _read_by_plugin(path)
     if path.suffix != ".pkl":
+        if path.suffix.lower()[1:] in plugins.names(PLUGINS):
+            return _read_by_plugin(path)
         raise ValueError(
             f"{path}: unknown motion format {path.suffix!r}; give an AMASS .npz or a .pkl with body_pose, global_orient, transl"
         )

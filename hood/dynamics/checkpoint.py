@@ -15,8 +15,9 @@ from torch import Tensor
 from hood import plugins
 from hood.assets.atomic import write_atomically
 from hood.assets.library import first_line
+from hood.dynamics.parts import plugins_of
 from hood.dynamics.ranges import Conditions
-from hood.dynamics.simulator import Simulator, build_simulator, plugins_of
+from hood.dynamics.simulator import Simulator, build_simulator
 
 _FORMAT = "hood-1"
 _RANGES = "ranges"

@@ -6,24 +6,21 @@ import inspect
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from hood import plugins
-from hood.dynamics.edge_output import EdgeOutput
 from hood.dynamics.feedback import Feedback
 from hood.dynamics.frames import FrameRules, Relaxing
-from hood.dynamics.global_output import GlobalStepOutput
 from hood.dynamics.network_step import Held, NetworkStep
-from hood.dynamics.output import AccelerationOutput, LocalStepOutput, Output, OutputSettings, VelocityBaseOutput
+from hood.dynamics.output import Output, OutputSettings
+from hood.dynamics.parts import MULTILEVEL, OUTPUTS, network_class, output_class
 from hood.dynamics.ranges import Conditions
 from hood.dynamics.stopwatch import Stopwatch, timed
 from hood.features import compiled
 from hood.features.groups import FeatureSet
 from hood.features.inputs import EdgeRows, Inputs
-from hood.features.sets import PLUGINS as FEATURES
 from hood.features.sets import SETS, SetSettings, build_features, split_name
 from hood.graph.builder import Graph, StaticGraph, build_graph, build_static
 from hood.graph.cache import template_hierarchy
@@ -301,19 +298,6 @@ class Simulator(nn.Module):
         return -gradient / problem.cloth.mass.clamp_min(1e-12).unsqueeze(1) * problem.cloth.free.unsqueeze(1)
 
 
-_Kind = TypeVar("_Kind")
-#: What a model's output may be, beside the outputs of plugins (:mod:`hood.plugins`).
-OUTPUTS: dict[str, type[Output]] = {
-    "acceleration": AccelerationOutput,
-    "velocity_base": VelocityBaseOutput,
-    "local_steps": LocalStepOutput,
-    "global_steps": GlobalStepOutput,
-    "edges": EdgeOutput,
-}
-#: And its network, likewise.
-NETWORKS: dict[str, type[MeshGraphNet]] = {"multilevel": MeshGraphNet}
-
-
 def build_simulator(
     features: str = "paper",
     output: str = "acceleration",
@@ -333,7 +317,7 @@ def build_simulator(
     velocity: str = "displacement",
     late_scale: float = 1e-3,
     layer_radius: float | None = None,
-    network: str = "multilevel",
+    network: str = MULTILEVEL,
     output_options: Mapping[str, Any] | None = None,
 ) -> Simulator:
     """A simulator from plain arguments.
@@ -378,7 +362,7 @@ def build_simulator(
     for name in ("latent_dim", "body_radius", "output_scale", "late_scale", "layer_radius"):
         if name in config and not config[name] > 0:
             raise ValueError(f"model.{name} is {config[name]!r}; it must be > 0")
-    head, net = _named("output", output, OUTPUTS, Output), _named("network", network, NETWORKS, MeshGraphNet)
+    head, net = output_class(output), network_class(network)
     told, _ = split_name(features)
     if told in SETS and told not in head.feature_sets:
         others = " or ".join(name for name, kind in OUTPUTS.items() if told in kind.feature_sets)
@@ -404,31 +388,6 @@ def build_simulator(
         *widths, latent_dim, schedule, head.width, aggregation, output_init, coarse_encoders, head.look_widths, head.edge_width
     )
     return Simulator(feature_set, built, made, body_radius, config, rules, num_levels, layer_radius)
-
-
-def _named(key: str, name: str, own: Mapping[str, type[_Kind]], base: Any) -> type[_Kind]:
-    """The class of that name, ours or a plugin's.
-
-    Raises:
-        ValueError: there is none, or what is registered is no such class.
-    """
-    kind = f"{key}s"
-    if name in own:
-        return own[name]
-    if name not in plugins.names(kind):
-        raise ValueError(f"model.{key} is {name!r}; choose {' or '.join((*own, *plugins.names(kind)))}")
-    found = plugins.find(kind, name)
-    if not (isinstance(found, type) and issubclass(found, base)):
-        raise ValueError(f"plugin {name!r} of hood.{kind}: is {found!r}; register a class of {base.__name__}")
-    return cast("type[_Kind]", found)
-
-
-def plugins_of(config: Mapping[str, Any]) -> dict[str, str]:
-    """What a model with these arguments takes from plugins, ``outputs/bouncy``, and the package of each, ``my-cloth 1.0``."""
-    named = [(FEATURES, name) for name in split_name(config["features"])[1]]
-    named += [("outputs", config["output"])] if config["output"] not in OUTPUTS else []
-    named += [("networks", config["network"])] if config.get("network", "multilevel") not in NETWORKS else []
-    return {f"{kind}/{name}": plugins.origin(kind, name) for kind, name in named}
 
 
 #: Arguments of :func:`build_simulator` that are written down only where they differ from its defaults: files of models that

@@ -275,6 +275,17 @@ def test_what_a_reader_cannot_read_is_told_with_the_file(
     assert said.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    ("name", "told"), [("npz", "its suffix is hood's own"), (".tri", "small letters"), ("Tri", "small letters")]
+)
+def test_names_that_cannot_be_registered_are_told(name: str, told: str, installed: Path) -> None:
+    points = installed / "my_cloth-1.0.dist-info" / "entry_points.txt"
+    points.write_text(points.read_text(encoding="utf-8").replace("tri =", f"{name} ="), encoding="utf-8")
+    forget()
+    with pytest.raises(ValueError, match=told):
+        plugins.names("meshes")
+
+
 def test_two_packages_of_one_name_are_refused(installed: Path) -> None:
     record = installed / "other-3.0.dist-info"
     record.mkdir()
