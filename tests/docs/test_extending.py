@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import runpy
 import shlex
 import sys
 from collections.abc import Iterator
@@ -130,6 +131,11 @@ def test_a_recipe_works(recipe: str, site: Path) -> None:
     assert found
     for words in found:
         assert run(words) == 0, words
+    for test in sorted((site / "my_cloth").rglob("test_*.py")):
+        own = [function for name, function in runpy.run_path(str(test)).items() if name.startswith("test_")]
+        assert own
+        for function in own:
+            function()
 
 
 def test_every_recipe_is_short_and_tried() -> None:
