@@ -22,7 +22,7 @@ from hood.cli import main
 from hood.commands.envelope_tasks import command_of, make_tasks
 from hood.commands.tradeoff_checks import check_models
 from hood.config import load_config
-from hood.dynamics.checkpoint import load_simulator, read_header
+from hood.dynamics.checkpoint import load_simulator, read_header, save_simulator
 from hood.dynamics.simulator import build_simulator
 from hood.features.sets import SetSettings, build_features
 
@@ -300,3 +300,19 @@ def test_two_packages_of_one_name_are_refused(installed: Path) -> None:
     forget()
     with pytest.raises(ValueError, match="uninstall one of the two"):
         plugins.names("meshes")
+
+
+@pytest.mark.parametrize(
+    ("needed", "told"),
+    [
+        ("[]", "its list of plugins cannot be read"),
+        ('{"speed": "my-cloth 1.0"}', "its list of plugins cannot be read"),
+        ("nonsense", "its list of plugins cannot be read"),
+        ('{"outputs/bounded": "my-cloth 1.0"}', "is not installed here; install my-cloth"),
+    ],
+)
+def test_what_a_file_says_of_plugins_is_checked(needed: str, told: str, site: Path) -> None:
+    forget()
+    save_simulator(site / "m.safetensors", build_simulator("physical", "velocity_base", "1x(mesh)", 4), {"plugins": needed})
+    with pytest.raises(ValueError, match=told):
+        load_simulator(site / "m.safetensors")
