@@ -31,7 +31,7 @@ from hood.assets.garment.garment import Garment, load_garment
 from hood.assets.material import Material
 from hood.assets.motion.load import load_sequence
 from hood.cli import ENVIRONMENT
-from hood.dynamics import simulator as simulator_module
+from hood.dynamics import passes as passes_module
 from hood.dynamics.checkpoint import load_simulator
 from hood.dynamics.measure import penetration_metrics, strain_metrics
 from hood.dynamics.passes import Passes
@@ -166,7 +166,7 @@ def main() -> None:
         os.execve(sys.executable, [sys.executable, *sys.argv], {**ENVIRONMENT, **os.environ})
     torch.set_num_threads(args.threads)
     forms = [(form, precision) for precision in args.precision for form in args.forms if (form, precision) != ("fused", "bf16")]
-    simulator_module.Passes = Timed  # type: ignore[misc]
+    passes_module.Passes = Timed  # type: ignore[misc]
     titles = ["vertices", "model", "form", "precision", *PARTS, "network's share", "apart"]
     print("| " + " | ".join(titles) + " |\n" + "|---" * len(titles) + "|")
     for size in args.sizes:

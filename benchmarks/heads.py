@@ -34,7 +34,7 @@ from hood.assets.garment.garment import load_garment
 from hood.assets.motion.load import load_sequence
 from hood.dynamics.checkpoint import load_simulator, save_simulator
 from hood.dynamics.edge_output import EdgeOutput
-from hood.dynamics.output import Held
+from hood.dynamics.network_step import Held
 from hood.dynamics.rollout import simulate
 from hood.dynamics.simulator import build_simulator
 from hood.dynamics.stepper import NewtonStepper, Stepper

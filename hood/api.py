@@ -96,7 +96,7 @@ def simulate(
         garment: a name, a file, a list of them for an outfit, or a :class:`hood.Garment`.
         sequence: a name or a file of a motion.
         material: a name (``denim``), or a :class:`hood.Material`. None: the default fabric.
-        stepper: ``network``, ``newton``, ``refine`` or ``auto`` as in ``hood rollout``, or an own stepper.
+        stepper: ``network``, ``newton``, ``refine``, ``auto`` or another option of ``hood rollout``, or an own stepper.
         progress: whether a progress bar is shown.
         keys: all keys of ``hood rollout --help`` that concern the simulation: ``body``, ``checkpoint``, ``num_frames``,
             ``fps`` [1/s], ``betas``, ``refine``, ``device``, … A dictionary stands for a group: ``solver={"target_rg": 1e-3}``.

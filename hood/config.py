@@ -51,8 +51,9 @@ def load_config(name: str, overrides: Sequence[str] = ()) -> DictConfig:
         try:
             defaults = compose(name, plugins)
             chosen = [_check_override(name, text, defaults) for text in overrides]
+            overrides = _last_of_groups(chosen)
             # The groups may bring keys of their own, so keys are checked against the composition with all groups chosen.
-            groups = [text for text, override in chosen if _is_group(override)]
+            groups = [text for text, override in chosen if _is_group(override) and text in overrides]
             known = compose(name, plugins + groups)
             for _, override in chosen:
                 if not _is_group(override):
@@ -165,9 +166,19 @@ def _check_override(name: str, text: str, defaults: DictConfig) -> tuple[str, Ov
     except HydraException as error:
         raise ConfigError(f"cannot read {text[:_REASON]!r}: quote values with spaces or brackets, key=\"'value'\"") from error
     key = override.get_key_element().lstrip("+~").split("@")[0]
+    if _is_group(override) and override.value() is None and defaults.get(key) is not None:
+        raise ConfigError(f"{key}=null: cannot be left out; give one of {', '.join(options(key))}")
     if _is_group(override) and override.value() is not None and str(override.value()) not in options(key):
         raise ConfigError(unknown(f"option of {key}", str(override.value()), options(key)))
     return text, override
+
+
+def _last_of_groups(chosen: Sequence[tuple[str, Override]]) -> list[str]:
+    """The words, of several options of one group the last, as of several values of one key."""
+    last = {override.key_or_group: place for place, (_, override) in enumerate(chosen) if _is_group(override)}
+    return [
+        text for place, (text, override) in enumerate(chosen) if not _is_group(override) or last[override.key_or_group] == place
+    ]
 
 
 def _is_group(override: Override) -> bool:

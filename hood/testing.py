@@ -1,4 +1,4 @@
-"""Synthetic meshes and reusable contracts for tests; a new energy is tested by one call of a contract.
+"""Synthetic meshes and reusable contracts for tests; a new energy or group of features is tested by one call of a contract.
 
 Meshes are pairs (pos (V, 3) float64 [m], faces (F, 3) int64).
 """
@@ -6,7 +6,7 @@ Meshes are pairs (pos (V, 3) float64 [m], faces (F, 3) int64).
 from __future__ import annotations
 
 import itertools
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,11 +14,15 @@ import torch
 from torch import Tensor, nn
 
 from hood.assets.material import Material
+from hood.features.groups import EdgeGroup, NodeGroup
+from hood.features.inputs import Inputs
+from hood.graph.builder import build_graph, build_static
+from hood.graph.hierarchy import Hierarchy
 from hood.losses.potential import Potential, Term
 from hood.losses.problem import StepProblem
 from hood.scene.cloth import Cloth, build_cloth, concatenate_cloths
 from hood.scene.contact import Contact
-from hood.scene.state import State, StepInput
+from hood.scene.state import Obstacle, State, StepInput
 
 Mesh = tuple[np.ndarray, np.ndarray]
 
@@ -246,6 +250,52 @@ def assert_finite_when_degenerate(term: Term) -> None:
             energy, gradient = _energy_and_gradient(term, cloth, state)
             assert torch.isfinite(energy).all(), f"energy, {name}, edges of {size / 2} m, {dtype}"
             assert torch.isfinite(gradient).all(), f"gradient, {name}, edges of {size / 2} m, {dtype}"
+
+
+def assert_feature_group_contract(group: NodeGroup | EdgeGroup, seed: int = 0) -> None:
+    """Everything that a group of features must satisfy, in float64; raises AssertionError otherwise.
+
+    As many rows and columns as it promises, finite, and the same wherever in the world the scene is. The step is one of a sheet
+    on a moving body, with all that a group may need.
+    """
+    name = type(group).__name__
+    assert isinstance(group, NodeGroup) == (group.of == "nodes"), f"{name}: columns of {group.of} need the other base class"
+    group = group.double().eval()
+    with torch.no_grad():
+        inputs = feature_inputs(seed)
+        here, there = group(inputs), group(feature_inputs(seed, shift=3.0))
+    rows = inputs.num_cloth + inputs.num_body if group.of == "nodes" else len(getattr(inputs, group.of).senders)
+    assert here.shape == (rows, group.width), f"{name}: {tuple(here.shape)} instead of ({rows}, {group.width})"
+    assert bool(torch.isfinite(here).all()), f"{name}: values that are not finite"
+    furthest = float((here - there).abs().max())
+    assert furthest <= 1e-8, f"{name}: differs by {furthest:.2g} where the scene is 3 m away"
+
+
+def feature_inputs(seed: int = 0, shift: float = 0.0) -> Inputs:
+    """What groups of features read, in float64: a wavy sheet above a square body that rises, pinned at one vertex, with a
+    coarse level, two edges between layers and random views of a potential; all moved by ``shift`` [m] along every axis."""
+    draw = torch.Generator().manual_seed(seed)
+    flat, faces = _wavy_sheet()
+    cloth = build_cloth(flat, faces, Material(), np.arange(len(flat)) == 0, dtype=torch.float64)
+    count, zero = len(flat), torch.zeros(4, dtype=torch.int64)
+
+    def some(columns: int, scale: float) -> Tensor:
+        return scale * torch.randn(count, columns, dtype=torch.float64, generator=draw)
+
+    square = torch.tensor([[-1, -0.5, -1], [-1, -0.5, 1], [1, -0.5, 1], [1, -0.5, -1.0]], dtype=torch.float64) + shift
+    rise = torch.tensor([0.0, 0.01, 0.0], dtype=torch.float64)
+    sides = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    obstacle = Obstacle(square, square + rise, square - rise, sides, zero, zero[:2], zero.bool())
+    pos, step = cloth.rest_pos + some(3, 1e-3) + shift, StepInput(torch.tensor([1 / 30], dtype=torch.float64), obstacle)
+    state = State(pos, some(3, 1.0), torch.zeros(1, 3, dtype=torch.float64))
+    contact = plane_contact(pos, height=shift - 0.5, motion=rise)
+    level = torch.zeros(count, dtype=torch.int64)
+    level[:2] = 1
+    static = build_static(cloth, Hierarchy((torch.tensor([[0, 1]]),), level), ("mesh", "coarse0"))
+    layers = torch.tensor([[0, count - 1], [1, count - 2]])
+    graph = build_graph(static, step, contact.nearest, radius=10.0, layers=layers)
+    inputs = Inputs(cloth, state, step, contact, graph, pos + some(3, 1e-3), residual=some(3, 10.0))
+    return replace(inputs, wide_residual=some(6, 10.0), local_step=some(3, 1e-3), global_step=some(3, 1e-3))
 
 
 def fold(flat: np.ndarray, angle: float) -> np.ndarray:

@@ -56,8 +56,7 @@ def install(folder: Path, name: str, registered: bool) -> None:
 
 
 def forget() -> None:
-    plugins.packages.cache_clear()
-    plugins.config_folders.cache_clear()
+    plugins.forget()
     for name in ("windy_cloth", "windy_cloth_too"):
         sys.modules.pop(name, None)
 

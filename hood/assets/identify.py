@@ -13,9 +13,10 @@ from hood.assets.files.guarded import guarded
 from hood.assets.files.h5_links import own_group
 from hood.assets.files.library import names, nearest
 from hood.assets.formats.gltf import read_gltf
-from hood.assets.formats.mesh_file import MESH_SUFFIXES
+from hood.assets.formats.mesh_file import mesh_suffixes
 from hood.assets.garment.reference_garments import garment_names
 from hood.assets.motion.animated_mesh import body_kind
+from hood.assets.motion.recording import MOTION_SUFFIXES, motion_suffixes
 from hood.assets.pickles.unpickle import load_pickle
 
 GARMENT, BODY, MOTION, MOVING_MESH = "garment", "body model", "motion", "moving mesh"
@@ -54,8 +55,10 @@ def identify(name: str) -> str:
     if suffix in (".glb", ".gltf"):
         gltf = read_gltf(path)
         return MOVING_MESH if gltf.items("animations") or gltf.items("skins") else GARMENT
-    if suffix in MESH_SUFFIXES:
+    if suffix in mesh_suffixes():
         return GARMENT
+    if suffix in motion_suffixes() and suffix not in MOTION_SUFFIXES:
+        return MOTION
     if suffix in _CHECKPOINTS:
         return CHECKPOINT
     if suffix in (".txt", ".json"):

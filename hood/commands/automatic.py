@@ -6,16 +6,16 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from hood.commands.cloth_contact import potential_of
-from hood.commands.common import weigh
 from hood.commands.refinement import AUTO, other_refinement_keys, refined
+from hood.commands.steppers import make_solver, option_of, with_stepper
 from hood.config import build
 from hood.dynamics.captured import network_of
 from hood.dynamics.ranges import scene_conditions
 from hood.dynamics.rollout import simulate
-from hood.dynamics.stepper import NewtonStepper, Stepper
+from hood.dynamics.stepper import Stepper
 from hood.losses.potential import Potential, default_potential
 from hood.scene.scene import NotWornError, Scene
 
@@ -46,9 +46,9 @@ class Choice:
 
     def settle(self, config: DictConfig) -> DictConfig:
         """The config with these values in the place of ``auto``."""
-        values = {"stepper": self.stepper} | ({} if self.refine is None else {"refine": self.refine})
-        settled = OmegaConf.merge(config, values)
-        assert isinstance(settled, DictConfig)
+        settled = with_stepper(config, self.stepper)
+        if self.refine is not None:
+            settled.refine = self.refine
         return settled
 
 
@@ -82,13 +82,10 @@ def advice(config: DictConfig, scene: Scene, summary: dict[str, Any], start: np.
     ]
 
 
-def solver(config: DictConfig) -> NewtonStepper:
+def solver(config: DictConfig) -> Stepper:
     """The stepper of ``stepper=newton``."""
-    alone = OmegaConf.merge(config, {"stepper": "newton"})
-    assert isinstance(alone, DictConfig)
-    stepper = NewtonStepper(potential_of(alone), build(config.solver))
-    weigh(stepper, config)
-    return stepper
+    alone = with_stepper(config, "newton")
+    return make_solver(option_of(alone), alone, potential_of(alone))
 
 
 def _iterations(config: DictConfig, stepper: Stepper, scene: Scene, choice: Choice) -> int:

@@ -7,27 +7,30 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 
-import torch
 from omegaconf import DictConfig
 
 from hood.assets.files.library import locate
-from hood.commands.common import UNTRAINED, read_model, use_arithmetic
+from hood.commands.common import UNTRAINED
 from hood.commands.conditions import training_note
+from hood.commands.steppers import ALWAYS, NEVER, find_option, make_network, make_solver
 from hood.config import ConfigError, build, load_config, options
+from hood.dynamics.captured import network_of
 from hood.dynamics.goals import Count
-from hood.dynamics.refine import GuessStepper, RefinedStepper, unrefined
-from hood.dynamics.simulator import Simulator
-from hood.dynamics.stepper import NewtonStepper
-from hood.evaluation.grid import GUESS, NEWTON, model_name
+from hood.dynamics.refine import RefinedStepper
+from hood.evaluation.grid import GUESS, model_name
 from hood.evaluation.table import Candidate
 
 
 def make_candidate(name: str, config: DictConfig) -> Candidate:
-    """A checkpoint by name or path, ``newton`` for the solver, ``guess`` for where it starts, or ``untrained:MODEL`` for seeded
-    random weights; all but the solver with ``+k`` behind the name: every step refined by k iterations."""
+    """A checkpoint by name or path, an option of ``configs/stepper`` (``newton`` for the solver, ``guess`` for where it
+    starts), or ``untrained:MODEL`` for seeded random weights; all but the solver with ``+k`` behind the name: every step
+    refined by k iterations."""
     start, iterations = split_refinement(name)
     inner = _unrefined_candidate(start, config)
     if iterations is None:
+        option = find_option(start)
+        if option is not None and option.refinement == ALWAYS:
+            raise ConfigError(f"models: {name!r} takes its steps by refinement alone; give {name}+5, or another number")
         return inner
     potential, settings = build(config.losses), build(config.solver)
     stepper = RefinedStepper(inner.stepper, potential, Count(iterations), str(config.refine_method), settings)
@@ -43,33 +46,26 @@ def split_refinement(name: str) -> tuple[str, int | None]:
     found = re.fullmatch(r"(.+)\+(\d+)", name)
     if found is None:
         return name, None
-    if found[1] == NEWTON:
+    option = find_option(found[1])
+    if option is not None and option.refinement == NEVER:
         raise ConfigError(f"models: {name!r} refines what is solved already; {GUESS}+{found[2]} is the solver stopped early")
     return found[1], int(found[2])
 
 
 def _unrefined_candidate(name: str, config: DictConfig) -> Candidate:
-    if name == GUESS:
-        guess = GuessStepper(build(config.losses), build(config.solver))
-        guess.gravity = guess.gravity.to(str(config.device))
-        return Candidate(GUESS, "none", guess)
-    if name == NEWTON:
-        stepper = NewtonStepper(build(config.losses), build(config.solver))
-        stepper.gravity = stepper.gravity.to(str(config.device))
-        return Candidate(NEWTON, "none", stepper)
+    option = find_option(name)
+    if option is not None:
+        return Candidate(name, "none", make_solver(option, config, build(config.losses)))
     prefix = UNTRAINED + ":"
     if name.startswith(prefix):
         model = name[len(prefix) :]
         if model not in options("model"):
             raise ConfigError(f"models: unknown model {model!r} in {name!r}; known are {', '.join(options('model'))}")
-        torch.manual_seed(int(config.seed))
-        simulator = build(load_config("rollout", [f"model={model}"]).model)
-        use_arithmetic(simulator, config)
-        return Candidate(model, UNTRAINED, simulator.eval().to(str(config.device)))
+        stepper, _ = make_network(config, UNTRAINED, load_config("rollout", [f"model={model}"]).model)
+        return Candidate(model, UNTRAINED, stepper)
     path = locate("weights", name)
-    simulator = read_model(path, float(config.fps)).to(str(config.device))
-    use_arithmetic(simulator, config)
-    return Candidate(model_name(str(path)), path.name, simulator, training_note(path))
+    stepper, _ = make_network(config, str(path))
+    return Candidate(model_name(str(path)), path.name, stepper, training_note(path))
 
 
 def distinct(candidates: Sequence[Candidate]) -> list[Candidate]:
@@ -83,11 +79,11 @@ def distinct(candidates: Sequence[Candidate]) -> list[Candidate]:
 
 def digest(candidate: Candidate) -> str:
     """SHA-256 of the weights: results are not taken over from others that had the same name."""
-    stepper = unrefined(candidate.stepper)
-    if not isinstance(stepper, Simulator):
+    network = network_of(candidate.stepper)
+    if network is None:
         return "none"
     content = hashlib.sha256()
-    for name, value in stepper.state_dict().items():
+    for name, value in network.state_dict().items():
         content.update(name.encode())
         content.update(value.detach().cpu().contiguous().numpy().tobytes())
     return content.hexdigest()

@@ -10,6 +10,7 @@ import numpy as np
 from omegaconf import DictConfig
 
 from hood.commands.refinement import chosen
+from hood.commands.steppers import MAY, option_of
 from hood.config import ConfigError, build, plain, require_choice
 from hood.dynamics.measure import LAYER_METRICS
 from hood.losses.collision import Collision
@@ -76,14 +77,15 @@ def tell_if_off(config: DictConfig, garments: int) -> None:
         warnings.warn(
             f"outfit: the {garments} garments are not kept apart, and not taken apart at the start: {reason}", stacklevel=2
         )
-    elif reason and not _network_alone(config):
+    elif reason and not _rough(config):
         print(f"cloth_contact=auto: off; {reason}")
 
 
 def _hindrance(config: DictConfig) -> str:
     """Why layers cannot be kept apart in this rollout, with the way out; empty where they can."""
-    if _network_alone(config):
-        return "a network alone does not keep layers of cloth apart; add refine=5, or use stepper=newton"
+    if _rough(config):
+        taker = "a network" if option_of(config).network else f"stepper={config.stepper}"
+        return f"{taker} alone does not keep layers of cloth apart; add refine=5, or use stepper=newton"
     if str(config.refine_method) != "newton":
         return f"refine_method={config.refine_method} moves vertices through cloth; use refine_method=newton"
     if str(config.step) != "plain":
@@ -100,8 +102,9 @@ def _hindrance(config: DictConfig) -> str:
     return ""
 
 
-def _network_alone(config: DictConfig) -> bool:
-    return str(config.stepper) not in ("newton", "refine") and chosen(config) is None
+def _rough(config: DictConfig) -> bool:
+    """Whether nobody refines steps that may be refined."""
+    return option_of(config).refinement == MAY and chosen(config) is None
 
 
 def summarise_cloth_contact(config: Mapping[str, Any], metrics: Mapping[str, np.ndarray], reason: str = "") -> dict[str, Any]:

@@ -16,6 +16,7 @@ from omegaconf import DictConfig
 from hood.assets.extremes.files import write_garment, write_motion, write_still_body
 from hood.assets.files.library import locate
 from hood.commands.candidates import split_refinement
+from hood.commands.steppers import find_option
 from hood.config import ConfigError
 from hood.evaluation.cells import NOMINAL, Cell, cells
 from hood.evaluation.grid import GUESS, NEWTON, quoted
@@ -46,7 +47,7 @@ class Task:
     def alone(self) -> bool:
         """Whether a network alone takes the steps."""
         name, refine, _ = _parts(self.model)
-        return refine is None and name not in (NEWTON, GUESS, REFERENCE)
+        return refine is None and name != REFERENCE and find_option(name) is None
 
 
 def make_tasks(config: DictConfig) -> list[Task]:
@@ -66,7 +67,7 @@ def make_tasks(config: DictConfig) -> list[Task]:
         raise ConfigError("models and garments: give one of each at least")
     for model in models:
         name = _parts(model)[0]
-        if name not in (NEWTON, GUESS):
+        if find_option(name) is None:
             locate("weights", name)
     for garment in garments:
         locate("garments", garment)
@@ -156,8 +157,8 @@ def _method(model: str) -> tuple[str, ...]:
     guard = ("guard=repair",) if repaired else ()
     if name in (NEWTON, REFERENCE):
         return ("stepper=newton", *guard)
-    if name == GUESS:
-        return ("stepper=refine", f"refine={refine or 0}", *guard)
+    if find_option(name) is not None:
+        return (f"stepper={'refine' if name == GUESS else name}", f"refine={refine or 0}", *guard)
     return (f"checkpoint={name}", f"refine={refine or 0}", *guard)
 
 
@@ -171,7 +172,7 @@ def _parts(model: str) -> tuple[str, int | None, bool]:
 def weights_of(model: str) -> str:
     """SHA-256 of the weights; a map of others of the same name is not done."""
     name = _parts(model)[0]
-    if name in (NEWTON, GUESS, REFERENCE):
+    if name == REFERENCE or find_option(name) is not None:
         return "none"
     return hashlib.sha256(locate("weights", name).read_bytes()).hexdigest()
 

@@ -14,7 +14,7 @@ from hood.assets.body.body import Body
 from hood.assets.body.load import load_body
 from hood.assets.files.folder_lock import is_occupied
 from hood.assets.files.library import locate
-from hood.assets.formats.mesh_file import MESH_SUFFIXES, read_mesh_file
+from hood.assets.formats.mesh_file import mesh_suffixes, read_mesh_file
 from hood.assets.garment.binding import posed_body
 from hood.assets.garment.fit_search import Asked
 from hood.assets.garment.garment import Garment, garment_of_mesh, load_garment, locate_garment
@@ -89,7 +89,7 @@ def inspect_garment(name: str, body: Body | MeshMotion, wearer: Sequence[str], b
     """
     finding = Finding(name, "garment", wearer=list(wearer))
     path, _ = locate_garment(name)
-    if path.suffix.lower() in MESH_SUFFIXES:
+    if path.suffix.lower() in mesh_suffixes():
         mesh = read_mesh_file(path, split_polygons=True)
         garment = garment_of_mesh(path, mesh)
         finding.kind = "garment mesh"

@@ -91,7 +91,7 @@ def _comments(name: str) -> dict[str, str]:
     """Comments behind the keys of a config file: the help is written once, beside the default."""
     notes = {}
     for line in (CONFIG_FOLDER / f"{name}.yaml").read_text(encoding="utf-8").splitlines():
-        match = re.match(r"(\w+):[^#]*#\s*(.*)", line)
+        match = re.match(r"(?:  - )?(\w+):[^#]*#\s*(.*)", line)
         if match:
             notes[match.group(1)] = match.group(2)
     return notes

@@ -21,6 +21,7 @@ from hood.assets.files.atomic import write_atomically
 from hood.assets.files.library import locate
 from hood.commands.common import UNTRAINED
 from hood.commands.rollouts_beside import PROGRAM, end, interruptible
+from hood.commands.steppers import find_option
 from hood.evaluation.grid import Point, quoted
 from hood.evaluation.reached import read_record
 
@@ -209,6 +210,6 @@ def weights_digest(point: Point) -> str:
     Raises:
         FileNotFoundError: there is no such file.
     """
-    if point.alone or point.model.startswith(UNTRAINED + ":"):
+    if point.alone or point.model.startswith(UNTRAINED + ":") or find_option(point.model) is not None:
         return "none"
     return hashlib.sha256(locate("weights", point.model).read_bytes()).hexdigest()

@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 from hood.assets.body.body import Body
 from hood.assets.body.load import load_body
 from hood.assets.files.library import locate
-from hood.assets.formats.mesh_file import MESH_SUFFIXES, read_mesh_file
+from hood.assets.formats.mesh_file import mesh_suffixes, read_mesh_file
 from hood.assets.garment import alterations
 from hood.assets.garment.alterations import Fitting
 from hood.assets.garment.binding import PosedBody, bind_garment, posed_body
@@ -155,7 +155,7 @@ def _wear(fitting: Fitting, posed: PosedBody, clearance: float, allow_misfit: bo
 
 def _read(name: str) -> Fitting:
     path, _ = locate_garment(name)
-    if path.suffix.lower() not in MESH_SUFFIXES:
+    if path.suffix.lower() not in mesh_suffixes():
         return alterations.start_fitting(load_garment(name))
     mesh = read_mesh_file(path, split_polygons=True)
     garment = garment_of_mesh(path, mesh)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
+from hood.commands.steppers import ALWAYS, NEVER, option_of
 from hood.config import ConfigError, build, plain, require_choice
 from hood.dynamics.goals import Budget, Count, Goal, MaxStrain, TargetResidual
 from hood.dynamics.refine import METHODS, RefinedStepper
@@ -62,17 +63,19 @@ def check_refinement(config: DictConfig) -> None:
     if int(config.refine_most) < 1:
         raise ConfigError(f"refine_most={config.refine_most}: must be at least 1")
     if asked is None:
-        if str(config.stepper) == "refine":
-            raise ConfigError(f"stepper=refine takes its steps by refinement alone; give one of {', '.join(REFINEMENT_KEYS)}")
+        if option_of(config).refinement == ALWAYS:
+            raise ConfigError(
+                f"stepper={config.stepper} takes its steps by refinement alone; give one of {', '.join(REFINEMENT_KEYS)}"
+            )
         for name, default in _DETAILS.items():
             if config[name] != default:
                 raise ConfigError(
                     f"{name}={config[name]}: nothing is refined; give one of {', '.join(REFINEMENT_KEYS)} as well"
                 )
         return
-    if str(config.stepper) == "newton":
+    if option_of(config).refinement == NEVER:
         raise ConfigError(
-            f"{asked[0]}={config[asked[0]]}: stepper=newton goes as far as solver.* says; use stepper=refine instead"
+            f"{asked[0]}={config[asked[0]]}: stepper={config.stepper} goes as far as solver.* says; use stepper=refine instead"
         )
     if config.refine_table is not None and asked[0] not in _BEGIN_FROM_TABLE:
         raise ConfigError(

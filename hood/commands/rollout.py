@@ -157,6 +157,7 @@ def _finished(config: DictConfig, digest: str, folder: Path) -> dict[str, Any] |
     except (OSError, ValueError, KeyError):
         return None
     now = plain(config)
+    before.setdefault("stepping", now["stepping"])  # rollouts from before there were options are known by their word
     same = all(before.get(key) == now[key] for key in now if key not in ("resume", "output", "allow_unsound"))
     if not same or not bool(attributes["complete"]) or attributes["checkpoint_sha256"] != digest:
         return None

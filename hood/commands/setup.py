@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,33 +9,27 @@ from pathlib import Path
 import torch
 from omegaconf import DictConfig
 
-from hood.assets.files.library import locate
 from hood.assets.garment.garment import Garment
 from hood.assets.material import Material
 from hood.commands.automatic import Choice, choose
 from hood.commands.cautions import scene_cautions, warn
 from hood.commands.cloth_contact import check_cloth_contact, potential_of, tell_if_off
-from hood.commands.common import UNTRAINED, read_model, require_device, require_same_model, thinning, use_arithmetic, weigh
+from hood.commands.common import require_device, thinning
 from hood.commands.garments import heed, layer_order, names_of, read_outfit
 from hood.commands.guarding import check_guard
 from hood.commands.motion import make_motion
 from hood.commands.plan_file import read_watch
 from hood.commands.refinement import AUTO, check_refinement, chosen, refined
-from hood.config import ConfigError, build, load_config, plain, require_choice
-from hood.dynamics.captured import MODES, CapturedSimulator, network_of
-from hood.dynamics.captured_newton import CapturedNewton
-from hood.dynamics.refine import GuessStepper
+from hood.commands.steppers import PLAIN, make_network, make_solver, option_of
+from hood.config import ConfigError, build, load_config, require_choice
+from hood.dynamics.captured import MODES, network_of
 from hood.dynamics.rollout import METRIC_CHOICES, SETTLE_CHOICES, own_start
-from hood.dynamics.simulator import Simulator
-from hood.dynamics.stepper import NewtonStepper, Stepper
+from hood.dynamics.stepper import Stepper
 from hood.dynamics.watched import WatchedStepper
 from hood.losses.potential import Potential
 from hood.nn.compiled import KERNELS
 from hood.scene.fitting import doubts, misplacement
 from hood.scene.scene import Scene, dress
-
-#: ``step=plain``: shapes as the step needs them, the readable reference.
-PLAIN = "plain"
 
 
 @dataclass(frozen=True)
@@ -58,7 +51,7 @@ def check_config(config: DictConfig) -> None:
     require_choice(config, "settle", SETTLE_CHOICES)
     _check_numbers(config)
     require_choice(config, "kernels", (AUTO, *KERNELS))
-    require_choice(config, "stepper", ("network", "newton", "refine", AUTO))
+    option_of(config)
     require_choice(config, "step", (PLAIN, *MODES))
     check_refinement(config)
     check_guard(config)
@@ -89,7 +82,7 @@ def set_up(
         tell(sentence)
     if solves_in_double(settled) != solves_in_double(config):
         scene = make_scene(settled, garment, material)
-    if choice.stepper == "newton" and network_of(stepper) is not None:
+    if not option_of(settled).network and network_of(stepper) is not None:
         stepper, _ = make_stepper(settled)
     stepper = refined(stepper, settled, scene.cloth.num_vertices, potential_of(settled))
     _check_start(settled, stepper, scene, tell)
@@ -133,47 +126,15 @@ def make_scene(config: DictConfig, garment: Garment | None = None, material: Mat
 
 def solves_in_double(config: DictConfig) -> bool:
     """Whether steps are judged in float64: then states are kept in it, rounded ones would not meet what is said of them."""
-    return bool(config.solver.double) and (str(config.stepper) not in ("network", AUTO) or chosen(config) is not None)
+    return bool(config.solver.double) and (not option_of(config).network or chosen(config) is not None)
 
 
 def make_stepper(config: DictConfig) -> tuple[Stepper, str]:
     """What takes the steps, before they are refined, and the SHA-256 of its weights (``none`` without a network)."""
-    if str(config.stepper) in ("network", AUTO):
-        simulator, digest = make_simulator(config)
-        weigh(simulator, config)
-        use_arithmetic(simulator, config, traced=str(config.step) == "compiled")
-        stepper: Stepper = simulator if str(config.step) == PLAIN else CapturedSimulator(simulator, str(config.step))
-        return stepper, digest
-    potential = potential_of(config)
-    kind = GuessStepper if str(config.stepper) == "refine" else NewtonStepper
-    solver = kind(potential, build(config.solver))
-    weigh(solver, config)
-    if str(config.step) == PLAIN:
-        return solver, "none"
-    if not isinstance(solver, NewtonStepper):
-        raise ConfigError(f"step={config.step}: steps of stepper={config.stepper} are plain; drop step=… from the command")
-    return CapturedNewton(solver, str(config.step)), "none"
-
-
-def make_simulator(config: DictConfig) -> tuple[Simulator, str]:
-    """The checkpoint's simulator and its SHA-256; ``checkpoint=untrained`` builds ``model`` with seeded random weights.
-
-    Raises:
-        ConfigError: the checkpoint holds another model than the one asked for.
-    """
-    torch.manual_seed(int(config.seed))
-    asked = None if config.get("model") is None else plain(config.model)
-    device = str(config.device)
-    if str(config.checkpoint) == UNTRAINED:
-        if asked is None:
-            raise ConfigError("checkpoint=untrained needs a model: add model=small (or ours, fine15, fine48)")
-        simulator: Simulator = build(config.model)
-        return simulator.eval().to(device), UNTRAINED
-    path = locate("weights", str(config.checkpoint))
-    simulator = read_model(path, float(config.fps))
-    if asked is not None:
-        require_same_model(path, simulator, build(config.model), "drop model=… from the command")
-    return simulator.eval().to(device), hashlib.sha256(path.read_bytes()).hexdigest()
+    option, step = option_of(config), str(config.step)
+    if option.network:
+        return make_network(config, str(config.checkpoint), config.get("model"), step)
+    return make_solver(option, config, potential_of(config), step), "none"
 
 
 def _check_start(config: DictConfig, stepper: Stepper, scene: Scene, tell: Callable[[str], None]) -> None:

@@ -11,6 +11,7 @@ from hood.assets.files.library import locate
 from hood.commands.batch import expand_sequences
 from hood.commands.common import UNTRAINED, require_device, require_distinct, require_package
 from hood.commands.garments import shape_coefficients
+from hood.commands.steppers import find_option
 from hood.config import ConfigError, load_config, options, plain
 from hood.dynamics.checkpoint import read_header
 from hood.dynamics.reference import SUFFIXES
@@ -50,7 +51,7 @@ def check_config(config: DictConfig, sizes: Sequence[str]) -> None:
 
 
 def check_models(names: Sequence[str]) -> None:
-    """Raise an error unless every name is one of weights that are there, or of random ones.
+    """Raise an error unless every name is one of weights that are there, of random ones, or of a stepper.
 
     Raises:
         FileNotFoundError: no such weights.
@@ -63,6 +64,8 @@ def check_models(names: Sequence[str]) -> None:
         if name.startswith(UNTRAINED + ":"):
             if name.removeprefix(UNTRAINED + ":") not in options("model"):
                 raise ConfigError(f"models: {name!r} is no model; known are {', '.join(options('model'))}")
+            continue
+        if find_option(name) is not None:
             continue
         path = locate("weights", name)
         if path.suffix.lower() not in SUFFIXES:

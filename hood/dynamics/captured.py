@@ -135,9 +135,8 @@ class CapturedSimulator:
 def network_of(stepper: Stepper) -> Simulator | None:
     """The simulator that takes a stepper's steps, refined or not, in fixed shapes or not; None where a solver does."""
     stepper = unrefined(stepper)
-    if isinstance(stepper, CapturedSimulator):
-        return stepper.simulator
-    return stepper if isinstance(stepper, Simulator) else None
+    simulator: Simulator | None = getattr(stepper, "simulator", None)
+    return simulator
 
 
 class _Plan:

@@ -57,6 +57,7 @@ class CapturedNewton:
             raise ValueError(f"solver.linear={stepper.settings.linear} has no form of fixed shapes; use cg or step=plain")
         self.stepper, self.mode = stepper, mode
         self.gravity, self.config, self.metrics = stepper.gravity, stepper.config, stepper.metrics
+        self.solves_to = stepper.solves_to
         self._plan: _Plan | None = None
 
     def prepare(self, cloth: Cloth, rest_pos: Any) -> None:

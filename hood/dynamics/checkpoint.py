@@ -12,13 +12,19 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from hood import plugins
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.library import first_line
+from hood.dynamics.parts import plugins_of
 from hood.dynamics.ranges import Conditions
 from hood.dynamics.simulator import Simulator, build_simulator
 
 _FORMAT = "hood-1"
 _RANGES = "ranges"
+#: What the model takes from plugins, and the package of each; models without any have no such entry.
+_PLUGINS = "plugins"
+#: Characters of a name that is told.
+_TOLD = 80
 
 
 def save_simulator(path: Path, simulator: Simulator, metadata: Mapping[str, str] | None = None, half: bool = False) -> None:
@@ -36,6 +42,8 @@ def save_simulator(path: Path, simulator: Simulator, metadata: Mapping[str, str]
             raise ValueError(f"{name}: a weight beyond the range of float16; keep this model in float32")
     tensors = {name: value.contiguous() for name, value in tensors.items()}
     known = {} if simulator.trained_for is None else {_RANGES: simulator.trained_for.to_json()}
+    needed = plugins_of(simulator.config)
+    known |= {_PLUGINS: json.dumps(needed)} if needed else {}
     header = {"format": _FORMAT, "model": json.dumps(simulator.config), **known, **(metadata or {})}
     write_atomically(path, save(tensors, header))
 
@@ -69,13 +77,15 @@ def load_simulator(path: Path) -> Simulator:
     """Read a simulator written by :func:`save_simulator`.
 
     Raises:
-        ValueError: not such a file, or weights that do not fit the model it names.
+        ValueError: not such a file, weights that do not fit the model it names, or a model that needs a package which is
+            not installed; names the file and the package.
     """
     tensors, header = _read_file(path)
     try:
         trained_for = Conditions.from_json(header[_RANGES]) if _RANGES in header else None
     except ValueError as error:
         raise ValueError(f"{path}: {error}; the file is damaged") from error
+    _require_plugins(path, header)
     try:
         settings = _settings(header)
         with torch.device("meta"):  # shapes alone: a damaged header may name a model larger than the memory
@@ -99,9 +109,36 @@ def load_simulator(path: Path) -> Simulator:
 def _settings(header: Mapping[str, str]) -> dict[str, Any]:
     """Arguments of :func:`build_simulator` in a header: plain values by name."""
     settings = json.loads(header["model"])
-    if not isinstance(settings, dict) or any(isinstance(value, (dict, list)) for value in settings.values()):
+    plain = isinstance(settings, dict) and not any(
+        isinstance(value, list) or (isinstance(value, dict) and key != "output_options") for key, value in settings.items()
+    )
+    if not plain or any(isinstance(value, (dict, list)) for value in (settings.get("output_options") or {}).values()):
         raise TypeError("its settings are no plain values by name")
+    assert isinstance(settings, dict)
     return settings
+
+
+def _require_plugins(path: Path, header: Mapping[str, str]) -> None:
+    """Refuse a model whose plugins are not installed; nothing is imported for it.
+
+    Raises:
+        ValueError: names the file, the package and what it takes from it.
+    """
+    try:
+        needed = json.loads(header.get(_PLUGINS, "{}"))
+        pairs = [(*key.split("/", 1), str(package)) for key, package in needed.items()]
+        wanted = [(kind, name, package) for kind, name, package in pairs if kind in plugins.KINDS]
+    except (ValueError, AttributeError, TypeError) as error:
+        raise ValueError(f"{path}: its list of plugins cannot be read; the file is damaged") from error
+    for kind, name, package in wanted:
+        owner = plugins.origin(kind, name) if name in plugins.names(kind) else None
+        title = package.split(" ")[0][:_TOLD]
+        if owner is None or owner.split(" ")[0] != title:
+            here = "is not installed here" if owner is None else f"is another one here ({owner})"
+            raise ValueError(
+                f"{path}: the model takes {name[:_TOLD]!r} (hood.{kind}) from the package {package[:_TOLD]}, which {here}; "
+                f"install {title}"
+            )
 
 
 def _read_file(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

@@ -10,7 +10,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from hood.dynamics.output import Held, VelocityBaseOutput
+from hood.dynamics.network_step import Held, Moved, NetworkStep
+from hood.dynamics.output import VelocityBaseOutput
 from hood.graph.builder import MESH, Graph
 from hood.losses.problem import StepProblem
 from hood.nn.edge_solve import EdgeSystem, fit_edges
@@ -44,6 +45,11 @@ class EdgeOutput(VelocityBaseOutput):
 
     width = 4
     edge_width = 5
+    feature_sets = ("physical", "local")
+
+    def move(self, step: NetworkStep) -> Moved:
+        raw = step.network.with_edges(step.graph, step.nodes, step.edges)
+        return Moved(self.positions(step.problem, step.graph, step.base, *raw, step.held))
 
     def positions(self, problem: StepProblem, graph: Graph, base: Tensor, raw: Tensor, edge_raw: Tensor, held: Held) -> Tensor:
         """Positions (V, 3) [m] at t + 1.

@@ -8,13 +8,17 @@ hardly move the cloth, while long waves pass.
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from collections.abc import Mapping
+from typing import Any, Protocol, Self
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from hood.dynamics.output import Held, VelocityBaseOutput
+from hood.dynamics.network_step import Held, Moved, NetworkStep
+from hood.dynamics.output import OutputSettings, VelocityBaseOutput
+from hood.dynamics.passes import Pass, take_passes
+from hood.features.local import GLOBAL_LOOK_WIDTHS
 from hood.losses.problem import StepProblem
 
 #: One unit of output is this force per mass [m/s²].
@@ -40,6 +44,21 @@ class GlobalStepOutput(VelocityBaseOutput):
     """
 
     width = 4
+    feature_sets = ("local",)
+    several_passes = True
+    look_widths = GLOBAL_LOOK_WIDTHS
+    sees_global_step = True
+
+    @classmethod
+    def from_settings(cls, settings: OutputSettings, options: Mapping[str, Any]) -> Self:
+        return cls(**options)
+
+    def move(self, step: NetworkStep) -> Moved:
+        return take_passes(self, step)
+
+    def lead(self, raw: Tensor, start: Pass) -> Tensor:
+        """Positions (V, 3) [m] after a pass."""
+        return self.positions(start.problem, raw, start.last, start.force, start.held, start.feedback.terms)
 
     def positions(self, problem: StepProblem, raw: Tensor, last: Tensor, force: Tensor, held: Held, solver: Solver) -> Tensor:
         """Positions (V, 3) [m] after a pass.

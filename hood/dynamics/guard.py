@@ -48,12 +48,11 @@ from statistics import median
 import numpy as np
 import torch
 
-from hood.dynamics.captured_newton import CapturedNewton
 from hood.dynamics.mend import ENOUGH, LEFT, NOT_TRIED, REFINED, Limits, Mended, Standing, mend, standing
 from hood.dynamics.refine import RefinedStepper
 from hood.dynamics.simulator import Prediction
 from hood.dynamics.soundness import Criteria
-from hood.dynamics.stepper import NewtonStepper, Stepper
+from hood.dynamics.stepper import Stepper
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
 from hood.mesh.rigid import turned
@@ -241,9 +240,8 @@ class Guard:
 
 def _own_settings(stepper: Stepper) -> NewtonSettings | None:
     """Of a solver, which has a target in every step; None of all others."""
-    if isinstance(stepper, CapturedNewton):
-        stepper = stepper.stepper
-    return stepper.settings if isinstance(stepper, NewtonStepper) else None
+    settings: NewtonSettings | None = getattr(stepper, "solves_to", None)
+    return settings
 
 
 def body_motion(obstacle: Obstacle | None) -> tuple[float, float]:

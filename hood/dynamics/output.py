@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
 
+from hood.dynamics.network_step import Held, Moved, NetworkStep
+from hood.dynamics.passes import Pass, take_passes
 from hood.features.compiled import planes_of
+from hood.features.local import LOOK_WIDTHS
 from hood.features.normalizer import RunningNormalizer
 from hood.losses.problem import StepProblem, inertial_guess
 from hood.mesh.diffusion import neighbours_of
@@ -24,19 +28,41 @@ _DEEPEST = 3e-4
 _LONGEST_STEP = 5e-3
 
 
-class Held(NamedTuple):
-    """What the network does not move."""
+class OutputSettings(NamedTuple):
+    """The arguments of :func:`hood.dynamics.simulator.build_simulator` that concern outputs."""
 
-    free: Tensor  # (V,) bool, what it does
-    fixed: Tensor  # (V, 3) m, where the others are
+    scale: float
+    late_scale: float
+    decay: float
+    divisor_floor: float | None
 
 
 class Output(ABC, nn.Module):
-    """Turns raw network output into displacements [m] from a base position."""
+    """Turns raw network output into positions, by displacements [m] from a base if it does not say otherwise.
 
-    needs_contact = False  # of the problem that ``base`` is asked for
-    width = 3  # columns of the raw output of vertices
-    edge_width = 0  # and of mesh edges
+    What a model with this output needs is said by the attributes of the class. An output of your own is a class with a base and
+    a displacement, or with a :meth:`move` of its own.
+    """
+
+    needs_contact: ClassVar[bool] = False  # of the problem that ``base`` is asked for
+    width: ClassVar[int] = 3  # columns of the raw output of vertices
+    edge_width: ClassVar[int] = 0  # and of mesh edges
+    #: Feature sets that tell the network enough (:data:`hood.features.sets.SETS`).
+    feature_sets: ClassVar[tuple[str, ...]] = ("paper", "physical", "local")
+    #: Whether schedules of several passes can be taken, and columns of nodes and edges that are seen between them.
+    several_passes: ClassVar[bool] = False
+    look_widths: ClassVar[tuple[int, int]] = LOOK_WIDTHS
+    #: Whether features=local shows it what all vertices together would do as well.
+    sees_global_step: ClassVar[bool] = False
+    #: Whether the displacement is an acceleration per frame², from x_t + dt v_t.
+    predicts_acceleration: ClassVar[bool] = False
+    #: Whether it counts statistics (:meth:`observe`) before training starts.
+    collects_statistics: ClassVar[bool] = False
+
+    @classmethod
+    def from_settings(cls, settings: OutputSettings, options: Mapping[str, Any]) -> Self:
+        """The output of a model with these settings; ``options`` are arguments of the class."""
+        return cls(**options)
 
     @abstractmethod
     def base(self, problem: StepProblem) -> Tensor:
@@ -44,16 +70,33 @@ class Output(ABC, nn.Module):
 
     @abstractmethod
     def displacement(self, raw: Tensor) -> Tensor:
-        """Displacement (V, 3) [m] from the base for raw output (V, 3)."""
+        """Displacement (V, 3) [m] from the base for raw output (V, width)."""
+
+    def move(self, step: NetworkStep) -> Moved:
+        """Where the network's output leads; vertices that are not free stay where they are held."""
+        displacement, (free, fixed) = self.displacement(step.raw()), step.held
+        pos = torch.where(free.unsqueeze(1), step.base + displacement, fixed)
+        return Moved(pos, displacement if self.predicts_acceleration else None)
+
+    def observe(self, displacement: Tensor) -> None:
+        """Collect statistics from skinned accelerations x⁺ − 2x + x⁻ (V, 3) [m per frame²]: there is nothing to count."""
 
 
 class AccelerationOutput(Output):
     """The paper's output (section 4.2): acceleration per frame², de-normalised by running statistics; the base is the
     inertial guess x_t + dt v_t."""
 
+    feature_sets = ("paper",)
+    predicts_acceleration = True
+    collects_statistics = True
+
     def __init__(self, decay: float = 0.999, divisor_floor: float | None = None) -> None:
         super().__init__()
         self.normalizer = RunningNormalizer(3, decay, divisor_floor=divisor_floor)
+
+    @classmethod
+    def from_settings(cls, settings: OutputSettings, options: Mapping[str, Any]) -> Self:
+        return cls(settings.decay, settings.divisor_floor, **options)
 
     def base(self, problem: StepProblem) -> Tensor:
         return inertial_guess(problem.state, problem.step, problem.cloth.vertex_scene)
@@ -75,10 +118,15 @@ class VelocityBaseOutput(Output):
     """
 
     needs_contact = True
+    feature_sets: ClassVar[tuple[str, ...]] = ("paper", "physical")
 
     def __init__(self, scale: float = 5e-3, clearance: float = 2e-3) -> None:
         super().__init__()
         self.scale, self.clearance = scale, clearance
+
+    @classmethod
+    def from_settings(cls, settings: OutputSettings, options: Mapping[str, Any]) -> Self:
+        return cls(settings.scale, **options)
 
     def base(self, problem: StepProblem) -> Tensor:
         state, contact, cloth = problem.state, problem.contact, problem.cloth
@@ -128,10 +176,25 @@ class LocalStepOutput(VelocityBaseOutput):
     """
 
     width = 5
+    feature_sets = ("local",)
+    several_passes = True
 
     def __init__(self, scale: float = 5e-3, clearance: float = 2e-3, late_scale: float = 1e-3, gain: float = 0.3) -> None:
         super().__init__(scale, clearance)
         self.late_scale, self.gain = late_scale, gain
+
+    @classmethod
+    def from_settings(cls, settings: OutputSettings, options: Mapping[str, Any]) -> Self:
+        return cls(settings.scale, late_scale=settings.late_scale, **options)
+
+    def move(self, step: NetworkStep) -> Moved:
+        return take_passes(self, step)
+
+    def lead(self, raw: Tensor, start: Pass) -> Tensor:
+        """Positions (V, 3) [m] after a pass."""
+        step = start.inputs.local_step
+        assert step is not None
+        return self.take(start.problem, raw, start.index, step, start.before, start.last, start.held)
 
     def correction(self, raw: Tensor, index: int, step: Tensor, before: Tensor | None) -> Tensor:
         """Displacement (V, 3) [m] of pass ``index``, with the local steps (V, 3) [m] at its start and the displacement of the

@@ -2,123 +2,77 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from hood.dynamics.global_output import GlobalStepOutput
-from hood.dynamics.output import Held, LocalStepOutput
+from hood.dynamics.feedback import Feedback
+from hood.dynamics.network_step import Held, Moved, NetworkStep
 from hood.features import compiled
 from hood.features.inputs import Inputs
-from hood.features.local import WIDE_ROUNDS, look
-from hood.losses.potential import Potential
+from hood.features.local import look
 from hood.losses.problem import StepProblem
-from hood.mesh.diffusion import Diffusion, neighbours_of
-from hood.native import features as native
-from hood.nn.model import MeshGraphNet
-from hood.solver.local_engine import local_terms
-
-_ROUNDS = torch.tensor(WIDE_ROUNDS)
 
 
-class Feedback:
-    """What the potential of one step says about positions, as features read it; constants of the step are gathered once.
+@dataclass(frozen=True)
+class Pass:
+    """Where a pass starts."""
 
-    Args:
-        together: with the global step.
-        compiled: ask the compiled solver where it knows the potential, though the rest goes by torch: what the network is
-            shown has no gradient, and a global step takes twenty times as long in torch.
-    """
+    problem: StepProblem
+    index: int
+    inputs: Inputs  # with the view from there
+    last: Tensor  # (V, 3) m, the place itself
+    before: Tensor | None  # (V, 3) m, the displacement of the pass before
+    force: Tensor  # (V, 3) N, −∂Φ/∂x there
+    held: Held
+    feedback: Feedback
 
-    def __init__(self, potential: Potential, problem: StepProblem, together: bool = False, compiled: bool = False) -> None:
-        self.potential = potential
-        self._cloth = cloth = problem.cloth
-        self._mass = cloth.mass.clamp_min(1e-12).unsqueeze(1)
-        self._compiled = native.applies(problem.state.pos, self._mass)
-        self.terms = local_terms(potential, problem, self._compiled or compiled)
-        self._together = together
-        self._diffusion = None if self._compiled else Diffusion(cloth.edges, cloth.num_vertices)
 
-    @torch.no_grad()
-    def __call__(self, inputs: Inputs, pos: Tensor) -> tuple[Inputs, Tensor]:
-        """The inputs with the view from positions (V, 3), and the forces −∂Φ/∂x (V, 3) [N] there."""
-        view = self.terms(pos)
-        together = self.terms.solve(pos, view.force, torch.zeros_like(pos[:, 0])) if self._together else None
-        residual, wide = (self._compiled_residuals if self._compiled else self._residuals)(view.force)
-        rows, step = inputs.edges, view.step
-        seen = replace(inputs, edge_rows=rows, base_pos=pos, residual=residual, local_step=step, wide_residual=wide)
-        return replace(seen, global_step=together), view.force
+class Leads(Protocol):
+    """An output that can be taken in several passes."""
 
-    def _residuals(self, force: Tensor) -> tuple[Tensor, Tensor]:
-        """Accelerations (V, 3) that forces ask for, and those of neighbourhoods (V, 6)."""
-        # Forces and masses of a neighbourhood are added up; its residual is their ratio.
-        diffusion = self._diffusion
-        assert diffusion is not None
-        spread, wide, done = torch.cat([force, self._mass], dim=1), [], 0
-        for rounds in WIDE_ROUNDS:
-            spread, done = diffusion.spread(spread, rounds - done), rounds
-            wide.append(spread[:, :3] / spread[:, 3:])
-        return force / self._mass, torch.cat(wide, dim=1)
-
-    def _compiled_residuals(self, force: Tensor) -> tuple[Tensor, Tensor]:
-        neighbours, count = neighbours_of(self._cloth.edges, len(force)), len(WIDE_ROUNDS)
-        residual, wide = torch.empty_like(force), force.new_empty(len(force), 3 * count)
-        tables = (neighbours.pointers(), force, self._mass, _ROUNDS)
-        native.call("residuals", *tables, count, residual, wide, force.new_empty(3, len(force), 4))
-        return residual, wide
+    def lead(self, raw: Tensor, start: Pass) -> Tensor:
+        """Positions (V, 3) [m] that the raw output of a pass leads to."""
+        ...
 
 
 class Passes:
     """The passes of one step: turns each raw output into positions and shows the next pass what they look like.
 
     A pass starts from what the pass before led to, without a gradient: it answers for its own correction.
-
-    Args:
-        inputs: with the feedback at the base.
-        base: (V, 3) m, where the first pass starts.
-        force: (V, 3) N, −∂Φ/∂x there.
-        fixed: (V, 3) m, where vertices are that are not free.
     """
 
-    def __init__(
-        self,
-        network: MeshGraphNet,
-        output: LocalStepOutput | GlobalStepOutput,
-        problem: StepProblem,
-        feedback: Feedback,
-        inputs: Inputs,
-        base: Tensor,
-        force: Tensor,
-        fixed: Tensor,
-    ) -> None:
-        self._network, self._output, self._problem, self._feedback = network, output, problem, feedback
-        self._inputs, self._last, self._held = inputs, base, Held(problem.cloth.free, fixed)
-        self._force = force
-        self._before: Tensor | None = None
+    def __init__(self, output: Leads, step: NetworkStep) -> None:
+        assert step.feedback is not None, "several passes need features that look at the potential"
+        assert step.force is not None
+        self._output, self._network, self._feedback = output, step.network, step.feedback
+        self._start = Pass(step.problem, 0, step.inputs, step.base, None, step.force, step.held, step.feedback)
         self.positions: list[Tensor] = []  # (V, 3) m after every pass
         self.forces: list[Tensor] = []  # (V, 3) N there, but for the last
 
     def take(self, raw: Tensor) -> Tensor:
         """Positions (V, 3) [m] after the pass with this output."""
-        pos = self._lead(raw)
+        pos = self._output.lead(raw, self._start)
         self.positions.append(pos)
-        self._before, self._last = pos.detach() - self._last, pos.detach()
+        before, last = pos.detach() - self._start.last, pos.detach()
+        self._start = replace(self._start, index=len(self.positions), before=before, last=last)
         return pos
-
-    def _lead(self, raw: Tensor) -> Tensor:
-        """Where the output leads."""
-        if isinstance(self._output, GlobalStepOutput):
-            return self._output.positions(self._problem, raw, self._last, self._force, self._held, self._feedback.terms)
-        step = self._inputs.local_step
-        assert step is not None
-        return self._output.take(self._problem, raw, len(self.positions), step, self._before, self._last, self._held)
 
     def look(self, index: int, raw: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """What the next pass sees of the prediction of pass ``index``."""
         self.take(raw)
-        self._inputs, self._force = self._feedback(self._inputs, self._last)
-        self.forces.append(self._force)
+        inputs, force = self._feedback(self._start.inputs, self._start.last)
+        self._start = replace(self._start, inputs=inputs, force=force)
+        self.forces.append(force)
         with torch.no_grad():
-            see = compiled.look if compiled.applies(self._inputs) else look
-            return see(self._inputs, self._network.pass_sets(index + 1))
+            see = compiled.look if compiled.applies(inputs) else look
+            return see(inputs, self._network.pass_sets(index + 1))
+
+
+def take_passes(output: Leads, step: NetworkStep) -> Moved:
+    """Where the passes of a step lead."""
+    passes = Passes(output, step)
+    pos = passes.take(step.network(step.graph, step.nodes, step.edges, passes.look))
+    return Moved(pos, early=tuple(zip(passes.positions[:-1], passes.forces, strict=True)))

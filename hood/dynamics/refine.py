@@ -41,6 +41,7 @@ class GuessStepper:
     times: tuple[str, ...] = ("search", "guess", "rest", "total")
     metrics: tuple[str, ...] = ()
     relaxing = Relaxing.SETTLE
+    any_precision = True
 
     def __init__(self, potential: Potential, settings: NewtonSettings | None = None) -> None:
         self.potential, self.settings = potential, settings or NewtonSettings()
@@ -103,7 +104,7 @@ class RefinedStepper:
         self.settings = replace(settings or NewtonSettings(), target_rg=goal.accuracy, max_iterations=goal.most, budget_ms=None)
         self.gravity = inner.gravity
         # The guess can be made in any precision, a network computes in that of its weights.
-        self._inner_type = None if isinstance(inner, GuessStepper) else inner.gravity.dtype
+        self._inner_type = None if getattr(inner, "any_precision", False) else inner.gravity.dtype
         self._cloths: tuple[Cloth, Cloth] | None = None
         self.config: dict[str, Any] = {**inner.config, "refined": f"{method}, {type(goal).__name__}"}
         own = ("refine_iterations", "refine_rg", "refine_phi_before", "refine_phi_after", "refine_reason")

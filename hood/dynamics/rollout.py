@@ -24,7 +24,7 @@ from hood.dynamics.measure import (
     vertex_residual,
 )
 from hood.dynamics.refine import RefinedStepper, unrefined
-from hood.dynamics.simulator import Prediction, Simulator
+from hood.dynamics.simulator import Prediction
 from hood.dynamics.stepper import Stepper
 from hood.dynamics.stopwatch import Stopwatch
 from hood.dynamics.surface import SURFACE_METRICS, SURFACE_STRIDE, SurfaceMeter
@@ -264,13 +264,15 @@ def _state_metrics(scene: Scene, state: State, frame: int, problem: StepProblem 
 def prepare_stepper(stepper: Stepper, scene: Scene) -> Any:
     """What the stepper computes once per cloth. Coarse levels that came with the garment are used where there are enough."""
     levels = scene.garment.coarse_edges
-    network, cloth = unrefined(stepper), scene.cloth
+    inner: Any = unrefined(stepper)
+    cloth = scene.cloth
+    needed: int | None = getattr(inner, "num_coarse", None)
     if isinstance(stepper, RefinedStepper):
         stepper.begin_rollout()
         cloth = stepper.inner_cloth(cloth)
-    if isinstance(network, Simulator) and levels is not None and len(levels) >= network.num_coarse:
-        hierarchy = given_hierarchy(cloth.num_vertices, levels, network.num_coarse)
-        return network.prepare(cloth, scene.garment.rest_pos, hierarchy)
+    if needed is not None and levels is not None and len(levels) >= needed:
+        hierarchy = given_hierarchy(cloth.num_vertices, levels, needed)
+        return inner.prepare(cloth, scene.garment.rest_pos, hierarchy)
     return stepper.prepare(scene.cloth, scene.garment.rest_pos)
 
 

@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from hood.dynamics.edge_output import EdgeOutput
+from hood.dynamics.feedback import Feedback
 from hood.dynamics.frames import FrameRules, Relaxing
-from hood.dynamics.global_output import GlobalStepOutput
-from hood.dynamics.output import AccelerationOutput, Held, LocalStepOutput, Output, VelocityBaseOutput
-from hood.dynamics.passes import Feedback, Passes
+from hood.dynamics.network_step import Held, NetworkStep
+from hood.dynamics.output import Output, OutputSettings
+from hood.dynamics.parts import MULTILEVEL, OUTPUTS, network_class, output_class
 from hood.dynamics.ranges import Conditions
 from hood.dynamics.stopwatch import Stopwatch, timed
-from hood.features import compiled, groups, local, physical
+from hood.features import compiled
+from hood.features.groups import FeatureSet
 from hood.features.inputs import EdgeRows, Inputs
+from hood.features.sets import SETS, SetSettings, build_features, split_name
 from hood.graph.builder import Graph, StaticGraph, build_graph, build_static
 from hood.graph.cache import template_hierarchy
 from hood.graph.hierarchy import Hierarchy, concatenate_hierarchies
@@ -78,7 +79,7 @@ class Simulator(nn.Module):
 
     def __init__(
         self,
-        features: groups.FeatureSet,
+        features: FeatureSet,
         network: MeshGraphNet,
         output: Output,
         body_radius: float,
@@ -96,9 +97,14 @@ class Simulator(nn.Module):
         self.register_buffer("gravity", torch.tensor([0.0, -9.81, 0.0]), persistent=False)
         self.trained_for: Conditions | None = None  # None: unknown
         self._potential = default_potential()
-        self._wants_feedback = any(isinstance(group, local.LocalStep) for group in features.node)
-        self._wants_residual = not self._wants_feedback and any(isinstance(group, physical.Residual) for group in features.node)
-        self._wants_base = any(isinstance(group, physical.RelativeVelocity) for group in features.node)
+        self._wants_feedback = features.needs("feedback")
+        self._wants_residual = not self._wants_feedback and features.needs("residual")
+        self._wants_base = features.needs("base")
+
+    @property
+    def simulator(self) -> Simulator:
+        """Whoever takes its steps by a simulator has one."""
+        return self
 
     @property
     def potential(self) -> Potential:
@@ -141,7 +147,7 @@ class Simulator(nn.Module):
     @property
     def uses_statistics(self) -> bool:
         """Whether normalisers must see data before training starts."""
-        return isinstance(self.output, AccelerationOutput) or self.features.node_normalizer is not None
+        return self.output.collects_statistics or self.features.node_normalizer is not None
 
     @property
     def relaxing(self) -> Relaxing:
@@ -170,7 +176,7 @@ class Simulator(nn.Module):
     @property
     def needs_contact(self) -> bool:
         """Whether the step asks for contact with the body's surface; the paper's needs the nearest body vertices alone."""
-        return self.output.needs_contact or any(group.needs_contact for group in self.features.node)
+        return self.output.needs_contact or self.features.needs("contact")
 
     def search(self, problem: StepProblem) -> StepProblem:
         """The problem with its contact where the step needs it, and with what the potential asks for that it looks at;
@@ -238,7 +244,7 @@ class Simulator(nn.Module):
         )
         if not self._wants_feedback:
             return Sight(inputs, None, base, None)
-        together = isinstance(self.output, GlobalStepOutput)
+        together = self.features.needs("global_step")
         feedback = Feedback(potential, seen, together, compiled=together and self.training)
         return Sight(*feedback(inputs, base), base, feedback)
 
@@ -246,33 +252,13 @@ class Simulator(nn.Module):
         self, problem: StepProblem, seen: StepProblem, sight: Sight, nodes: Tensor, edges: dict[str, Tensor]
     ) -> Prediction:
         """Positions at t + 1 from the features of what was looked at."""
-        graph, base = sight.inputs.graph, sight.base
-        if isinstance(self.output, EdgeOutput):
-            held = Held(problem.cloth.free, self._fixed(problem))
-            pos = self.output.positions(seen, graph, base, *self.network.with_edges(graph, nodes, edges), held)
-            return Prediction(pos, problem.acceleration(pos))
-        if sight.feedback is None:
-            return self.integrate(problem, base, self.network(graph, nodes, edges))
-        assert isinstance(self.output, LocalStepOutput | GlobalStepOutput)
-        assert sight.force is not None
-        given = seen, sight.feedback, sight.inputs, base, sight.force
-        passes = Passes(self.network, self.output, *given, self._fixed(problem))
-        pos = passes.take(self.network(graph, nodes, edges, passes.look))
-        early = tuple(zip(passes.positions[:-1], passes.forces, strict=True))
-        return Prediction(pos, problem.acceleration(pos), early=early)
-
-    def integrate(self, problem: StepProblem, base: Tensor, raw: Tensor) -> Prediction:
-        """Positions at t + 1 from the network's output ``raw`` (V, 3), which is relative to ``base`` (V, 3) [m]."""
-        free = problem.cloth.free.unsqueeze(1)
-        displacement = self.output.displacement(raw)
-        fixed = self._fixed(problem)
-        next_pos = torch.where(free, base + displacement, fixed)
-        if isinstance(self.output, AccelerationOutput):
-            # The network's own acceleration, without the cancellation of x − 2x_t + x_{t−1} in float32.
-            acc = torch.where(free, self.rules.acceleration(problem, displacement), problem.acceleration(fixed))
-        else:
-            acc = problem.acceleration(next_pos)
-        return Prediction(next_pos, acc)
+        free, fixed = problem.cloth.free, self._fixed(problem)
+        shown = (sight.inputs, nodes, edges, sight.base, Held(free, fixed), sight.force, sight.feedback)
+        moved = self.output.move(NetworkStep(self.network, seen, *shown))
+        acc = problem.acceleration(moved.pos if moved.displacement is None else fixed)
+        if moved.displacement is not None:
+            acc = torch.where(free.unsqueeze(1), self.rules.acceleration(problem, moved.displacement), acc)
+        return Prediction(moved.pos, acc, early=moved.early)
 
     def _fixed(self, problem: StepProblem) -> Tensor:
         """(V, 3) m: targets of pinned vertices, present places of the others."""
@@ -312,12 +298,6 @@ class Simulator(nn.Module):
         return -gradient / problem.cloth.mass.clamp_min(1e-12).unsqueeze(1) * problem.cloth.free.unsqueeze(1)
 
 
-#: What a model's output may be.
-OUTPUTS = ("acceleration", "velocity_base", "local_steps", "global_steps", "edges")
-#: Those that correct themselves, in one pass or in several.
-_STEPS = ("local_steps", "global_steps")
-
-
 def build_simulator(
     features: str = "paper",
     output: str = "acceleration",
@@ -337,6 +317,8 @@ def build_simulator(
     velocity: str = "displacement",
     late_scale: float = 1e-3,
     layer_radius: float | None = None,
+    network: str = MULTILEVEL,
+    output_options: Mapping[str, Any] | None = None,
 ) -> Simulator:
     """A simulator from plain arguments.
 
@@ -345,12 +327,13 @@ def build_simulator(
 
     Args:
         features: ``paper`` (node 24, edge 12, body edge 9, running statistics), ``physical`` (fixed scales, residual) or
-            ``local`` (the same with what every vertex and its neighbourhood would do about the residual).
+            ``local`` (the same with what every vertex and its neighbourhood would do about the residual); ``+NAME`` behind it
+            adds a group of a plugin.
         output: ``acceleration`` (paper), ``velocity_base`` (corrections to a base that moves with the body),
             ``local_steps`` (several such corrections with shares of the vertices' own steps; features=local),
             ``global_steps`` (several corrections to the forces, each with a solve for the step of all vertices together;
             features=local) or ``edges`` (corrections to the edges of the base, and a linear solve for the positions;
-            features=physical or local).
+            features=physical or local); or the name of a plugin's.
         schedule: name (``ours``, ``fine15``, ``fine48``) or text such as ``3x(mesh+coarse0) 3x(coarse0)``; ``|`` between
             passes (``local_steps`` and ``global_steps`` only).
         latent_dim: width of all latents.
@@ -369,56 +352,42 @@ def build_simulator(
         late_scale: as ``output_scale``, in the later passes of ``local_steps``.
         layer_radius: reach [m] of edges between layers of cloth, which have networks of their own
             (:func:`hood.scene.near_cloth.find_near_cloth`); None: the model has none.
+        network: ``multilevel``, or the name of a plugin's.
+        output_options: further arguments of the output's class, plain values by name.
+
+    Raises:
+        ValueError: values that do not fit together, or a name that nothing has; names the key.
     """
     config = {name: value for name, value in locals().items() if name not in _CONVENTIONS or value != _CONVENTIONS[name]}
     for name in ("latent_dim", "body_radius", "output_scale", "late_scale", "layer_radius"):
         if name in config and not config[name] > 0:
             raise ValueError(f"model.{name} is {config[name]!r}; it must be > 0")
-    for name, value, known in (("features", features, ("paper", "physical", "local")), ("output", output, OUTPUTS)):
-        if value not in known:
-            raise ValueError(f"model.{name} is {value!r}; choose {' or '.join(known)}")
-    if output == "edges" and features == "paper":
-        raise ValueError("model.output=edges corrects a base; it needs model.features=physical or model.features=local")
-    if features == "physical" and output not in ("velocity_base", "edges"):
+    head, net = output_class(output), network_class(network)
+    told, _ = split_name(features)
+    if told in SETS and told not in head.feature_sets:
+        others = " or ".join(name for name, kind in OUTPUTS.items() if told in kind.feature_sets)
         raise ValueError(
-            "model.features=physical describes corrections to a base; it needs model.output=velocity_base or model.output=edges"
+            f"model.features={features} with model.output={output}: this output needs "
+            f"{' or '.join(f'model.features={name}' for name in head.feature_sets)}, these features model.output={others}"
         )
-    if (features == "local") != (output in _STEPS) and output != "edges":
-        raise ValueError(
-            f"model.features={features} with model.output={output}: local and local_steps need each other, as do local and "
-            "global_steps"
-        )
-    if len(parse_passes(schedule)) > 1 and output not in _STEPS:
-        raise ValueError(
-            f"model.schedule has several passes (|); they need model.output=local_steps or global_steps, not {output}"
-        )
+    if len(parse_passes(schedule)) > 1 and not head.several_passes:
+        able = " or ".join(name for name, kind in OUTPUTS.items() if kind.several_passes)
+        raise ValueError(f"model.schedule has several passes (|); they need model.output={able}, not {output}")
     for name, count in (("embedded_levels", embedded_levels), ("coarse_encoders", coarse_encoders)):
         if count is not None and count < 1:
             raise ValueError(f"model.{name} is {count!r}; it must be at least 1, or null for the model's own number")
     rules = FrameRules(frame_dt, pins_ahead, velocity)
     num_levels = 1 + num_coarse_levels(parse_schedule(schedule)) if embedded_levels is None else embedded_levels
-    if features == "paper":
-        feature_set = groups.paper(num_levels, body_velocity, normalizer_decay, divisor_floor, layer_radius is not None)
-    else:
-        kind = partial(local.local, together=output == "global_steps") if features == "local" else physical.physical
-        feature_set = kind(num_levels, layers=layer_radius is not None)
-    head: Output
-    if output == "acceleration":
-        head = AccelerationOutput(normalizer_decay, divisor_floor)
-    elif output == "velocity_base":
-        head = VelocityBaseOutput(output_scale)
-    elif output == "edges":
-        head = EdgeOutput(output_scale)
-    elif output == "global_steps":
-        head = GlobalStepOutput()
-    else:
-        head = LocalStepOutput(output_scale, late_scale=late_scale)
+    layers = layer_radius is not None
+    of_set = SetSettings(num_levels, layers, head.sees_global_step, body_velocity, normalizer_decay, divisor_floor)
+    feature_set = build_features(features, of_set)
+    of_output = OutputSettings(output_scale, late_scale, normalizer_decay, divisor_floor)
+    made = head.from_settings(of_output, output_options or {})
     widths = (feature_set.node_width, feature_set.edge_widths)
-    looks = local.GLOBAL_LOOK_WIDTHS if output == "global_steps" else local.LOOK_WIDTHS
-    network = MeshGraphNet(
-        *widths, latent_dim, schedule, head.width, aggregation, output_init, coarse_encoders, looks, head.edge_width
+    built = net(
+        *widths, latent_dim, schedule, head.width, aggregation, output_init, coarse_encoders, head.look_widths, head.edge_width
     )
-    return Simulator(feature_set, network, head, body_radius, config, rules, num_levels, layer_radius)
+    return Simulator(feature_set, built, made, body_radius, config, rules, num_levels, layer_radius)
 
 
 #: Arguments of :func:`build_simulator` that are written down only where they differ from its defaults: files of models that
@@ -437,6 +406,8 @@ _CONVENTIONS: dict[str, Any] = {
         "velocity",
         "late_scale",
         "layer_radius",
+        "network",
+        "output_options",
     )
 }
 

@@ -19,7 +19,14 @@ from hood.solver.reasons import reason_number
 
 
 class Stepper(Protocol):
-    """Takes steps: :class:`hood.dynamics.simulator.Simulator` by a network, :class:`NewtonStepper` by minimisation."""
+    """Takes steps: :class:`hood.dynamics.simulator.Simulator` by a network, :class:`NewtonStepper` by minimisation.
+
+    A stepper of your own is a class with these attributes and methods. Some may be there beside them: ``simulator``, the
+    :class:`hood.dynamics.simulator.Simulator` that takes its steps; ``solves_to``, the
+    :class:`hood.solver.newton.NewtonSettings` that every step is to meet; ``any_precision`` where it computes in the precision
+    of the state, whatever that of its gravity is; ``num_coarse``, the coarse levels that it takes as a third argument of
+    ``prepare``; ``in_fixed_shapes(mode)``, the same steps by functions of fixed shapes.
+    """
 
     gravity: Tensor  # (3,) m/s²
     config: dict[str, Any]  # travels into the rollout file
@@ -64,6 +71,17 @@ class NewtonStepper:
         self.potential, self.settings = potential, settings or NewtonSettings()
         self.gravity = torch.tensor([0.0, -9.81, 0.0])
         self.config: dict[str, Any] = {"stepper": "newton", **asdict(self.settings)}
+
+    @property
+    def solves_to(self) -> NewtonSettings:
+        """What every step is to meet."""
+        return self.settings
+
+    def in_fixed_shapes(self, mode: str) -> Stepper:
+        """The same steps with fixed shapes; ``mode`` is one of :data:`hood.dynamics.captured.MODES`."""
+        from hood.dynamics.captured_newton import CapturedNewton
+
+        return CapturedNewton(self, mode)
 
     def prepare(self, cloth: Cloth, rest_pos: Any) -> None:
         """Nothing: the solver keeps its plan of a cloth itself."""

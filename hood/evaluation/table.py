@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from hood.dynamics.refine import unrefined
+from hood.dynamics.captured import network_of
 from hood.dynamics.rollout import Frame, simulate
-from hood.dynamics.simulator import Simulator
 from hood.dynamics.stepper import Stepper
 from hood.evaluation.bootstrap import pooled_interval
 from hood.evaluation.gap import AGREEMENT, REFERENCE, gap
@@ -155,10 +154,10 @@ def _tell(progress: Progress, done: int, text: str) -> None:
 
 
 def _reach(stepper: Stepper) -> dict[str, int | None]:
-    stepper = unrefined(stepper)
-    if not isinstance(stepper, Simulator):
+    network = network_of(stepper)
+    if network is None:
         return {"steps": None, "radius": None}
-    return {"steps": len(stepper.schedule), "radius": measured_radius(stepper)}
+    return {"steps": len(network.schedule), "radius": measured_radius(network)}
 
 
 def _run(

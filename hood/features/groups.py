@@ -1,8 +1,8 @@
 """Feature groups. A group knows its width and computes its columns; a :class:`FeatureSet` is three lists of groups.
 
-A new group is one class here and one entry in such a list. Groups with ``normalized = False`` bypass the running
-statistics and stand at the end of their list. Relative vectors are sender − receiver; positions are read only as
-differences, so features do not depend on where the scene is.
+A new group is one class. In a package of your own it is registered (docs/extending.md); here it is one entry in such a
+list. Groups with ``normalized = False`` bypass the running statistics and stand at the end of their list. Relative vectors
+are sender − receiver; positions are read only as differences, so features do not depend on where the scene is.
 """
 
 from __future__ import annotations
@@ -27,8 +27,13 @@ class NodeGroup(nn.Module):
     """Columns of the node features: (V, width) for the cloth and (W_active, width) for the body below it."""
 
     width: int
+    of = "nodes"  # whose columns these are
     normalized = True
     needs_contact = False  # reads ``inputs.contact``, or what was computed with it
+    needs_base = False  # reads ``inputs.base``
+    needs_residual = False  # reads ``inputs.residual``
+    needs_feedback = False  # reads ``inputs.local_step`` or ``inputs.wide_residual``
+    needs_global_step = False  # reads ``inputs.global_step``
 
     def cloth(self, inputs: Inputs) -> Tensor:
         raise NotImplementedError
@@ -52,6 +57,8 @@ class EdgeGroup(nn.Module):
 
     width: int
     normalized = True
+    of = "edges"  # whose columns these are: of edges (of the cloth), body_edges or layer_edges
+    needs_contact = needs_base = needs_residual = needs_feedback = needs_global_step = False  # as of a NodeGroup
 
     def forward(self, inputs: Inputs) -> Tensor:
         """(N, width)."""
@@ -237,6 +244,7 @@ class BodyRelative(EdgeGroup):
     """Relative position and norm [m] between the cloth at t and the body at t, or at t + 1 with ``body="next"``."""
 
     width = 4
+    of = "body_edges"
 
     def __init__(self, body: str = "current") -> None:
         super().__init__()
@@ -254,6 +262,7 @@ class BodyTimestep(EdgeGroup):
     """Timestep feature [s]."""
 
     width = 1
+    of = "body_edges"
 
     def forward(self, inputs: Inputs) -> Tensor:
         return inputs.edge_timestep(inputs.body_edges.receivers)
@@ -263,6 +272,7 @@ class LayerRelative(EdgeGroup):
     """Relative position and norm [m] between layers of cloth at t, or where they go on to with ``moved``: at x + dt v."""
 
     width = 4
+    of = "layer_edges"
 
     def __init__(self, moved: bool = False) -> None:
         super().__init__()
@@ -277,6 +287,7 @@ class LayerTimestep(EdgeGroup):
     """Timestep feature [s]."""
 
     width = 1
+    of = "layer_edges"
 
     def forward(self, inputs: Inputs) -> Tensor:
         return inputs.edge_timestep(inputs.layer_edges.receivers)
@@ -307,7 +318,8 @@ class FeatureSet(nn.Module):
     are groups for them.
 
     One normaliser for nodes, one shared by mesh and coarse edges, one for body edges, one for those between layers, each over
-    the groups that ask for it; ``decay`` None normalises nothing (groups that bring their own scales).
+    the groups that ask for it; ``decay`` None normalises nothing (groups that bring their own scales). The ``more`` groups take
+    their places in the lists behind what is there, those that are normalised before those that are not.
     """
 
     def __init__(
@@ -318,8 +330,15 @@ class FeatureSet(nn.Module):
         decay: float | None = 0.999,
         divisor_floor: float | None = None,
         layer_edge: Sequence[EdgeGroup] = (),
+        more: Sequence[NodeGroup | EdgeGroup] = (),
     ) -> None:
         super().__init__()
+        node, edge, body_edge = (
+            _joined(node, more, "nodes"),
+            _joined(edge, more, "edges"),
+            _joined(body_edge, more, "body_edges"),
+        )
+        layer_edge = _joined(layer_edge, more, "layer_edges")
         self.node, self.edge, self.body_edge = nn.ModuleList(node), nn.ModuleList(edge), nn.ModuleList(body_edge)
         self.layer_edge = nn.ModuleList(layer_edge)
         self.node_normalizer = _normalizer("node", node, decay, divisor_floor)
@@ -330,6 +349,11 @@ class FeatureSet(nn.Module):
     @property
     def node_width(self) -> int:
         return _width(self.node)
+
+    def needs(self, what: str) -> bool:
+        """Whether a group needs ``contact``, ``base``, ``residual``, ``feedback`` or ``global_step``."""
+        lists = (self.node, self.edge, self.body_edge, self.layer_edge)
+        return any(bool(getattr(group, f"needs_{what}")) for groups in lists for group in groups)
 
     @property
     def edge_widths(self) -> dict[str, int]:
@@ -387,6 +411,14 @@ def _changing(found: Tensor | None, like: Tensor, width: int, normalizer: Runnin
     return none
 
 
+def _joined(groups: Sequence[Any], more: Sequence[NodeGroup | EdgeGroup], of: str) -> list[Any]:
+    """The groups and those of ``more`` whose columns are those of the same rows; a set's own order is kept."""
+    added = [group for group in more if group.of == of]
+    if not added:
+        return list(groups)
+    return sorted([*groups, *added], key=lambda group: not group.normalized)
+
+
 def _width(groups: Iterable[Any]) -> int:
     return sum(int(group.width) for group in groups)
 
@@ -408,9 +440,10 @@ def paper(
     decay: float = 0.999,
     divisor_floor: float | None = None,
     layers: bool = False,
+    more: Sequence[NodeGroup | EdgeGroup] = (),
 ) -> FeatureSet:
     """The paper's features: node 24 (20 with ``num_levels`` 1, which has no level embedding), edge 12, body edge 9; with
-    ``layers`` edges between layers of cloth as well, 9.
+    ``layers`` edges between layers of cloth as well, 9. The columns of ``more`` groups are added to theirs.
 
     ``divisor_floor`` is that of :class:`hood.features.normalizer.RunningNormalizer`.
     """
@@ -421,5 +454,6 @@ def paper(
         body_edge=[BodyRelative("current"), BodyRelative("next"), BodyTimestep()],
         decay=decay,
         divisor_floor=divisor_floor,
+        more=more,
         layer_edge=[LayerRelative(), LayerRelative(moved=True), LayerTimestep()] if layers else [],
     )

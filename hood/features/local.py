@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from hood.features.groups import FeatureSet, NodeGroup
+from hood.features.groups import EdgeGroup, FeatureSet, NodeGroup
 from hood.features.inputs import Inputs
 from hood.features.normalizer import FixedScale
 from hood.features.physical import GRAVITY, ContactDistance, Residual, length, physical
@@ -26,6 +26,7 @@ class _View(NodeGroup, ABC):
     """asinh(value/scale) of what the potential says about the cloth; 0 on the body."""
 
     needs_contact = True
+    needs_feedback = True
 
     def __init__(self, scale: float) -> None:
         super().__init__()
@@ -58,6 +59,7 @@ class GlobalStep(_View):
     """What all vertices together would do about the residual [m]."""
 
     width = 3
+    needs_global_step = True
 
     def __init__(self, scale: float = WAVE) -> None:
         super().__init__(scale)
@@ -106,9 +108,11 @@ def look(inputs: Inputs, sets: Sequence[str]) -> tuple[Tensor, dict[str, Tensor]
     return torch.cat(nodes, dim=1), {name: _strain(inputs, name) for name in sets}
 
 
-def local(num_levels: int = 3, layers: bool = False, together: bool = False) -> FeatureSet:
+def local(
+    num_levels: int = 3, layers: bool = False, together: bool = False, more: Sequence[NodeGroup | EdgeGroup] = ()
+) -> FeatureSet:
     """The physical features with local steps and wide residuals, and with global steps (``together``)."""
-    return physical(num_levels, [LocalStep(), WideResidual(), *([GlobalStep()] if together else [])], layers)
+    return physical(num_levels, [LocalStep(), WideResidual(), *([GlobalStep()] if together else [])], layers, more)
 
 
 def _strain(inputs: Inputs, name: str) -> Tensor:

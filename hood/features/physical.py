@@ -30,6 +30,7 @@ class RelativeVelocity(NodeGroup):
     change of its displacement from the last frame to this one."""
 
     width = 3
+    needs_base = True
 
     def __init__(self, scale: float = 0.01) -> None:
         super().__init__()
@@ -48,6 +49,7 @@ class Residual(NodeGroup):
 
     width = 3
     needs_contact = True
+    needs_residual = True
 
     def __init__(self, scale: float = GRAVITY) -> None:
         super().__init__()
@@ -95,6 +97,7 @@ class ContactDistance(NodeGroup):
 
     width = 4
     needs_contact = True
+    needs_base = True
 
     def __init__(self, reach: float = 0.05, scale: float = 0.02) -> None:
         super().__init__()
@@ -170,6 +173,7 @@ class Strain(EdgeGroup):
     """asinh(gain·(length/rest length − 1)) at t and at the base guess; 0 for edges of no rest length (buttons)."""
 
     width = 2
+    needs_base = True
 
     def __init__(self, gain: float = 100.0) -> None:
         super().__init__()
@@ -195,6 +199,8 @@ class BaseBodyRelative(EdgeGroup):
     """Relative position and norm between the base guess and the body at t + 1, over ``scale`` [m]."""
 
     width = 4
+    of = "body_edges"
+    needs_base = True
 
     def __init__(self, scale: float = 0.01) -> None:
         super().__init__()
@@ -209,6 +215,8 @@ class BaseLayerRelative(EdgeGroup):
     """Relative position and norm between layers of cloth at t and at the base guess, over ``scale`` [m]."""
 
     width = 8
+    of = "layer_edges"
+    needs_base = True
 
     def __init__(self, scale: float = 0.01) -> None:
         super().__init__()
@@ -237,16 +245,21 @@ def mean_rest_length(inputs: Inputs) -> Tensor:
     return (total[:, :1] / total[:, 1:].clamp_min(1.0)).index_select(0, edges.segment).clamp_min(1e-6)
 
 
-def physical(num_levels: int = 3, more: Sequence[NodeGroup] = (), layers: bool = False) -> FeatureSet:
-    """Scaled features for training without a warm-up of statistics, with ``more`` beside the residual; they need
-    ``Inputs.base_pos``. With ``layers`` there are edges between layers of cloth."""
+def physical(
+    num_levels: int = 3,
+    views: Sequence[NodeGroup] = (),
+    layers: bool = False,
+    more: Sequence[NodeGroup | EdgeGroup] = (),
+) -> FeatureSet:
+    """Scaled features for training without a warm-up of statistics, with ``views`` beside the residual; they need
+    ``Inputs.base_pos``. With ``layers`` there are edges between layers of cloth. The columns of ``more`` groups are added."""
     level = [LevelOneHot(num_levels)] if num_levels > 1 else []
     return FeatureSet(
         node=[
             RelativeVelocity(),
             Normal(),
             Residual(),
-            *more,
+            *views,
             TypeOneHot(),
             *level,
             ContactDistance(),
@@ -258,4 +271,5 @@ def physical(num_levels: int = 3, more: Sequence[NodeGroup] = (), layers: bool =
         body_edge=[BaseBodyRelative()],
         decay=None,
         layer_edge=[BaseLayerRelative()] if layers else [],
+        more=more,
     )

@@ -16,7 +16,6 @@ from torch.nn.parallel import DistributedDataParallel
 
 from hood.assets.files.atomic import write_atomically
 from hood.dynamics.checkpoint import save_simulator
-from hood.dynamics.output import AccelerationOutput
 from hood.dynamics.ranges import training_conditions
 from hood.dynamics.simulator import Simulator
 from hood.features.normalizer import RunningNormalizer
@@ -163,7 +162,7 @@ class Trainer:
         simulator.use_potential(for_networks(potential))
         problem = potential.prepare(StepProblem(cloth, state, step, gravity=simulator.gravity))
         collecting = self.iteration < settings.statistics_iterations and simulator.uses_statistics
-        if collecting and isinstance(simulator.output, AccelerationOutput):
+        if collecting and simulator.output.collects_statistics:
             simulator.output.observe(self.slots.skinned_accelerations())
         with torch.set_grad_enabled(not collecting):
             prediction = simulator(problem, prepared) if collecting else self.model(problem, prepared)

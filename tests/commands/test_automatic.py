@@ -16,6 +16,7 @@ from hood.dynamics.checkpoint import save_simulator
 from hood.dynamics.ranges import Conditions, scene_conditions
 from hood.dynamics.refine import RefinedStepper
 from hood.dynamics.simulator import build_simulator
+from hood.dynamics.stepper import NewtonStepper
 from hood.losses.potential import default_potential
 from hood.scene.scene import Scene
 
@@ -100,7 +101,7 @@ def test_finished_rollouts_are_known_by_what_was_asked(
 
 def test_times_are_measured_on_the_scene(tank_scene: Scene) -> None:
     potential = default_potential()
-    ms = automatic._ms(automatic.NewtonStepper(potential), tank_scene, potential)
+    ms = automatic._ms(NewtonStepper(potential), tank_scene, potential)
     assert ms is not None
     assert ms > 0
 

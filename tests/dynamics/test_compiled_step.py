@@ -4,8 +4,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from hood.dynamics.output import Held, LocalStepOutput, VelocityBaseOutput
-from hood.dynamics.passes import Feedback
+from hood.dynamics.feedback import Feedback
+from hood.dynamics.network_step import Held
+from hood.dynamics.output import LocalStepOutput, VelocityBaseOutput
 from hood.dynamics.simulator import Simulator, build_simulator
 from hood.features import compiled, local
 from hood.features.inputs import Inputs

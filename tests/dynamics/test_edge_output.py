@@ -14,7 +14,7 @@ from torch import Tensor
 
 from hood.dynamics.checkpoint import load_simulator, save_simulator
 from hood.dynamics.edge_output import EdgeOutput
-from hood.dynamics.output import Held
+from hood.dynamics.network_step import Held
 from hood.graph.builder import MESH, Graph, build_graph, build_static
 from hood.graph.hierarchy import build_hierarchy
 from hood.losses.problem import StepProblem

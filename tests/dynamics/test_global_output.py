@@ -9,7 +9,7 @@ from test_passes import step_of
 from torch import Tensor
 
 from hood.dynamics.global_output import GlobalStepOutput
-from hood.dynamics.output import Held
+from hood.dynamics.network_step import Held
 from hood.dynamics.simulator import Simulator, build_simulator
 from hood.losses.potential import default_potential
 from hood.scene.scene import Scene

@@ -91,7 +91,7 @@ def test_weights_travel(tmp_path, band_scene: Scene) -> None:
     "arguments, words",
     [
         (("physical", "velocity_base", SCHEDULE), "several passes"),
-        (("local", "velocity_base", "1x(mesh)"), "local and local_steps need each other"),
+        (("local", "velocity_base", "1x(mesh)"), "these features model.output=local_steps or global_steps"),
         (("physical", "local_steps", "1x(mesh)"), "velocity_base"),
         (("local", "local_steps", "1x(mesh) | | 1x(mesh)"), "pass 1 of 3 has no steps"),
     ],

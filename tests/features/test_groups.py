@@ -6,13 +6,14 @@ import pytest
 import torch
 
 from hood.assets.material import RANGES, Material
-from hood.features import groups, physical
+from hood.features import groups, local, physical
 from hood.features.inputs import Inputs
 from hood.graph.builder import build_graph, build_static
 from hood.graph.hierarchy import Hierarchy, concatenate_hierarchies
 from hood.scene.cloth import build_cloth, concatenate_cloths
 from hood.scene.contact import Contact
 from hood.scene.state import Obstacle, State, StepInput, concatenate_obstacles, concatenate_states
+from hood.testing import assert_feature_group_contract
 
 DT = 1 / 30
 REST = torch.tensor([[0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1.0]], dtype=torch.float64)
@@ -187,3 +188,33 @@ def test_massless_and_unbending_cloth_has_finite_features():
 def test_unnormalised_groups_come_last():
     with pytest.raises(ValueError, match="move the latter to the end"):
         groups.FeatureSet([groups.NodeMaterial(), groups.Normal()], [groups.EdgeTimestep()], [groups.BodyTimestep()])
+
+
+EVERY_GROUP = [
+    group
+    for features in (groups.paper(2, layers=True), physical.physical(2, layers=True), local.local(2, together=True))
+    for rows in (features.node, features.edge, features.body_edge, features.layer_edge)
+    for group in rows
+]
+
+
+@pytest.mark.parametrize("group", EVERY_GROUP, ids=lambda group: type(group).__name__)
+def test_every_group_meets_the_contract(group):
+    assert_feature_group_contract(group)
+
+
+def test_the_contract_notices_what_a_group_promises_and_does_not_keep():
+    class Place(groups.NodeGroup):
+        width = 3
+
+        def cloth(self, inputs):
+            return inputs.state.pos
+
+        def body(self, inputs):
+            return inputs.body(inputs.obstacle.pos)
+
+    with pytest.raises(AssertionError, match="Place: differs by 3 "):
+        assert_feature_group_contract(Place())
+    Place.width = 2
+    with pytest.raises(AssertionError, match="Place: .* instead of"):
+        assert_feature_group_contract(Place())

@@ -16,8 +16,8 @@ from hood.assets.garment.garment import Garment
 from hood.assets.motion.load import load_sequence
 from hood.assets.motion.sequence import PoseSequence
 from hood.dynamics.checkpoint import load_simulator
+from hood.dynamics.feedback import Feedback
 from hood.dynamics.output import AccelerationOutput
-from hood.dynamics.passes import Feedback
 from hood.dynamics.ranges import training_conditions
 from hood.dynamics.simulator import Simulator, build_simulator
 from hood.features.inputs import Inputs

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from hood import plugins
+
 _SCENES = {
     ".usd": "USD", ".usda": "USD", ".usdc": "USD", ".usdz": "USD", ".fbx": "FBX", ".dae": "COLLADA", ".blend": "Blender",
     ".max": "3ds Max", ".mb": "Maya", ".ma": "Maya", ".abc": "Alembic", ".bvh": "BVH",
@@ -17,6 +19,8 @@ _WAY_OUT = {
     "body": "export the character with its animation as GLB (Blender imports and exports it) and pass body={stem}.glb",
     "file": "export a garment as OBJ, a character with its animation as GLB (Blender imports and exports both)",
 }
+#: Plugins' readers of the kind, see :mod:`hood.plugins`.
+_READERS = {"garments": ("meshes",), "motions": ("motions",), "body": (), "file": ("meshes", "motions")}
 _BVH_BODY = (
     "retarget it to SMPL (AMASS .npz), or animate a character with it in Blender and export that as GLB: body={stem}.glb"
 )
@@ -29,7 +33,7 @@ def require_readable(path: Path, kind: str) -> None:
         ValueError: names the file and what to export instead.
     """
     suffix = path.suffix.lower()
-    if suffix not in _SCENES or kind not in _WAY_OUT:
+    if suffix not in _SCENES or kind not in _WAY_OUT or any(suffix[1:] in plugins.names(group) for group in _READERS[kind]):
         return
     way = _BVH_BODY if suffix == ".bvh" and kind != "garments" else _WAY_OUT[kind]
     raise ValueError(f"{path}: {_SCENES[suffix]} files are not read; {way.format(stem=path.stem)}")

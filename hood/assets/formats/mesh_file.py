@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from hood import plugins
 from hood.assets.files.guarded import check_size, guarded
 from hood.assets.formats.gltf_mesh import read_glb
 from hood.assets.formats.obj import read_obj
@@ -28,6 +31,8 @@ _READERS: dict[str, Callable[[Path], RawMesh]] = {
 #: Formats that keep a corner of every face or every texture seam as a vertex of its own: equal positions are one vertex.
 _SPLIT_FORMATS = (".stl", ".glb", ".gltf")
 MESH_SUFFIXES = tuple(_READERS)
+#: Their readers, see :mod:`hood.plugins`: a path in; vertices (V, 3) [m] and triangles (F, 3) out, or a :class:`RawMesh`.
+PLUGINS = "meshes"
 #: Files beyond this size [bytes] are not opened.
 MESH_SIZE_LIMIT = 1 << 30
 
@@ -47,6 +52,11 @@ class MeshFile:
     notes: tuple[str, ...] = ()  # what was not kept
 
 
+def mesh_suffixes() -> tuple[str, ...]:
+    """Suffixes of the mesh files that can be read, those of plugins last."""
+    return (*MESH_SUFFIXES, *(f".{name}" for name in plugins.names(PLUGINS)))
+
+
 def read_mesh(path: Path, triangulate: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) float64 [m] and triangles (F, 3) int64 of a mesh file; arguments and errors of :func:`read_mesh_file`."""
     mesh = read_mesh_file(path, triangulate)
@@ -54,7 +64,7 @@ def read_mesh(path: Path, triangulate: bool = False) -> tuple[np.ndarray, np.nda
 
 
 def read_mesh_file(path: Path, split_polygons: bool = False) -> MeshFile:
-    """A mesh file (OBJ, PLY, OFF, STL, GLB).
+    """A mesh file (OBJ, PLY, OFF, STL, GLB, and the formats of plugins).
 
     Args:
         split_polygons: split faces of four and more corners (:func:`hood.mesh.polygons.triangulate`) instead of refusing
@@ -65,13 +75,14 @@ def read_mesh_file(path: Path, split_polygons: bool = False) -> MeshFile:
         ValueError: unreadable file, polygons, or an index out of range; names the file, the face and the fix.
     """
     suffix = path.suffix.lower()
-    if suffix not in _READERS:
-        raise ValueError(f"{path}: unknown mesh format {suffix!r}; give {', '.join(MESH_SUFFIXES)}")
+    if suffix not in mesh_suffixes():
+        raise ValueError(f"{path}: unknown mesh format {suffix!r}; give {', '.join(mesh_suffixes())}")
+    read_raw = _READERS.get(suffix) or partial(_read_by_plugin, plugins.find(PLUGINS, suffix[1:]))
     check_size(path, MESH_SIZE_LIMIT)
 
     def read() -> MeshFile | ValueError:
         try:
-            return _finish(_READERS[suffix](path), split_polygons, suffix in _SPLIT_FORMATS)
+            return _finish(read_raw(path), split_polygons, suffix in _SPLIT_FORMATS)
         except Unreadable as error:
             return ValueError(f"{path}: {error}")
         except ValueError as error:
@@ -84,6 +95,30 @@ def read_mesh_file(path: Path, split_polygons: bool = False) -> MeshFile:
         raise result
     assert isinstance(result, MeshFile)
     return result
+
+
+def _read_by_plugin(read: Callable[[Path], Any], path: Path) -> RawMesh:
+    """What a plugin's reader gives, in the types of ours.
+
+    Raises:
+        Unreadable: the reader refuses the file, or gives no mesh.
+    """
+    try:
+        found = read(path)
+        if isinstance(found, RawMesh):
+            return found
+        pos, faces = (np.asarray(table) for table in found)
+    except OSError:
+        raise
+    except (TypeError, ValueError) as error:
+        raise Unreadable(f"the reader of {path.suffix} files: {error}") from error
+    sound = pos.ndim == faces.ndim == 2 and pos.shape[1] == faces.shape[1] == 3 and faces.dtype.kind in "iu"
+    if not sound or pos.dtype.kind not in "iuf":
+        raise Unreadable(
+            f"the reader of {path.suffix} files gives tables {pos.shape} {pos.dtype} and {faces.shape} {faces.dtype}; it has "
+            "to return vertices (V, 3) and triangles (F, 3) of whole numbers"
+        )
+    return RawMesh(pos.astype(np.float64), faces.astype(np.int64).reshape(-1), np.full(len(faces), 3, dtype=np.int64))
 
 
 def _finish(raw: RawMesh, split_polygons: bool, join: bool) -> MeshFile:

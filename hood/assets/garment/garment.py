@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from hood.assets.files.library import locate
-from hood.assets.formats.mesh_file import MESH_SUFFIXES, MeshFile, read_mesh_file
+from hood.assets.formats.mesh_file import MeshFile, mesh_suffixes, read_mesh_file
 from hood.assets.garment.garment_arrays import read_fields, write_fields
 from hood.assets.garment.reference_garments import read_reference_garment
 from hood.mesh.quality import check_triangles
 
-#: What can be given as a garment, besides embedded names.
-GARMENT_SUFFIXES = (".npz", ".pkl", *MESH_SUFFIXES)
+#: What can be given as a garment, besides embedded names and mesh files.
+GARMENT_SUFFIXES = (".npz", ".pkl")
 
 
 @dataclass(frozen=True)
@@ -81,10 +81,11 @@ def load_garment(name: str | Path, triangulate: bool = False) -> Garment:
         garment = Garment(path.stem, **read_fields(path))
     elif suffix == ".pkl":
         garment = Garment(**read_reference_garment(path, entry))
-    elif suffix in MESH_SUFFIXES:
+    elif suffix in mesh_suffixes():
         garment = garment_of_mesh(path, read_mesh_file(path, triangulate))
     else:
-        raise ValueError(f"{path}: unknown garment format {path.suffix!r}; give one of {', '.join(GARMENT_SUFFIXES)}")
+        known = ", ".join((*GARMENT_SUFFIXES, *mesh_suffixes()))
+        raise ValueError(f"{path}: unknown garment format {path.suffix!r}; give one of {known}")
     check_triangles(garment.rest_pos, garment.faces, str(path))
     _check_levels(garment, path)
     return garment

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from hood.assets.files.library import locate
 from hood.assets.motion.motion_files import find_motions
-from hood.assets.motion.recording import MOTION_SUFFIXES
+from hood.assets.motion.recording import motion_suffixes
 
 #: What lies beside the motions in AMASS folders: subjects' shapes, stages of the fit.
 _BESIDES = ("shape", "neutral_stagei", "female_stagei", "male_stagei")
@@ -50,10 +50,11 @@ def motions_in(folder: Path) -> list[Path]:
     Raises:
         ValueError: there are none.
     """
-    files = (path for path in folder.rglob("*") if path.suffix in MOTION_SUFFIXES and path.is_file())
+    suffixes = motion_suffixes()
+    files = (path for path in folder.rglob("*") if path.suffix in suffixes and path.is_file())
     found = sorted(path for path in files if path.stem not in _BESIDES and not path.name.startswith("."))
     if not found:
-        raise ValueError(f"{folder}: no motions ({', '.join(MOTION_SUFFIXES)}) in it or below")
+        raise ValueError(f"{folder}: no motions ({', '.join(suffixes)}) in it or below")
     return found
 
 
@@ -76,7 +77,7 @@ def _in_table(path: Path) -> list[Path]:
 
 def _beside(folder: Path, name: str) -> Path:
     """File of a table's entry: beside the table, with or without its suffix, or an embedded motion."""
-    for suffix in ("", *MOTION_SUFFIXES):
+    for suffix in ("", *motion_suffixes()):
         file = folder / (name + suffix)
         if file.is_file():
             return file

@@ -18,7 +18,7 @@ from typing import IO, Any, overload
 import numpy as np
 
 from hood.assets.files.library import DATA_FOLDER
-from hood.assets.motion.recording import MOTION_SUFFIXES
+from hood.assets.motion.recording import motion_suffixes
 from hood.assets.motion.sequence import PoseSequence
 
 #: Parts of a split.
@@ -153,7 +153,7 @@ def _expand(entry: str, part: str, folder: Path | None = None) -> list[str]:
     if based.is_dir():
         raise ValueError(f"{based}: a folder; write which files in it, e.g. '{based}/**/*_poses.npz'")
     # Not found beside the list: an embedded name, or an error that whoever reads it words best.
-    return [str(based) if folder is not None and (based.is_file() or path.suffix in MOTION_SUFFIXES) else entry]
+    return [str(based) if folder is not None and (based.is_file() or path.suffix in motion_suffixes()) else entry]
 
 
 def _entries(path: Path, part: str) -> list[str]:

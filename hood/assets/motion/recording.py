@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from hood import plugins
 from hood.assets.files.library import SIZE_LIMIT, read_arrays
 from hood.assets.pickles.unpickle import load_pickle
 
@@ -17,6 +18,8 @@ NUM_BODY_JOINTS = 22
 SMPL_JOINTS = 24
 NUM_FINGER_JOINTS = 30  # 15 a side, left first
 MOTION_SUFFIXES = (".npz", ".pkl")
+#: Readers of other formats, see :mod:`hood.plugins`: a path in; the arrays of one of the layouts below out, by key.
+PLUGINS = "motions"
 #: Frame rate of the layouts that never say it.
 _SILENT_FPS = 30.0
 #: No rotation [rad] or place [m] is farther from zero, no shape coefficient than a thousandth of it.
@@ -52,8 +55,14 @@ class Recording:
     up: str  # "y" or "z": the custom of the layout
 
 
+def motion_suffixes() -> tuple[str, ...]:
+    """Suffixes of the motion files that can be read, those of plugins last."""
+    return (*MOTION_SUFFIXES, *(f".{name}" for name in plugins.names(PLUGINS)))
+
+
 def read_recording(path: Path, file_fps: float | None = None) -> Recording:
-    """A motion file: ``.npz`` (never unpickled) or ``.pkl`` (restricted unpickler), told apart by their keys.
+    """A motion file: ``.npz`` (never unpickled) or ``.pkl`` (restricted unpickler), told apart by their keys; or a
+    format that a plugin reads.
 
     Accepted: AMASS ``poses (N, 66 | 72 | 156 | 165), trans`` or ``root_orient, pose_body[, pose_hand], trans`` with
     ``mocap_framerate`` or ``mocap_frame_rate``; ``body_pose (N, 63 | 69), global_orient, transl[, betas]``;
@@ -95,6 +104,8 @@ def _fields(path: Path) -> Mapping[str, Any]:
     if path.suffix == ".npz":
         return read_arrays(path, (), "AMASS motion")
     if path.suffix != ".pkl":
+        if path.suffix.lower()[1:] in plugins.names(PLUGINS):
+            return _read_by_plugin(path)
         raise ValueError(
             f"{path}: unknown motion format {path.suffix!r}; give an AMASS .npz or a .pkl with body_pose, global_orient, transl"
         )
@@ -102,6 +113,25 @@ def _fields(path: Path) -> Mapping[str, Any]:
     if not isinstance(content, dict):
         raise ValueError(f"{path}: holds a {type(content).__name__}, not a motion; it must be a dict of arrays")
     return {str(key): value for key, value in content.items()}
+
+
+def _read_by_plugin(path: Path) -> Mapping[str, Any]:
+    """What a plugin's reader gives.
+
+    Raises:
+        ValueError: the reader refuses the file, or gives no arrays by key; names the file.
+    """
+    read = plugins.find(PLUGINS, path.suffix.lower()[1:])
+    try:
+        fields = read(path)
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: the reader of {path.suffix} files: {error}") from error
+    if not isinstance(fields, Mapping):
+        raise ValueError(
+            f"{path}: the reader of {path.suffix} files gives a {type(fields).__name__}; it has to return arrays by key, "
+            "poses, trans and mocap_framerate"
+        )
+    return {str(key): value for key, value in fields.items()}
 
 
 def _unknown(path: Path, fields: Mapping[str, Any]) -> str:
