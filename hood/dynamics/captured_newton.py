@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -19,7 +19,6 @@ from hood.dynamics.fixed_problem import (
 )
 from hood.dynamics.frames import Relaxing
 from hood.dynamics.simulator import Prediction
-from hood.dynamics.stepper import NewtonStepper
 from hood.dynamics.stopwatch import Stopwatch, timed
 from hood.losses.potential import keeps_both_sides
 from hood.losses.problem import StepProblem
@@ -30,6 +29,9 @@ from hood.solver.iterate import rounded
 from hood.solver.newton import Report, run
 from hood.solver.plan import plan_for
 from hood.solver.reasons import reason_number
+
+if TYPE_CHECKING:
+    from hood.dynamics.stepper import NewtonStepper
 
 #: How the solver's step of fixed shapes is taken.
 MODES = ("fixed", "captured")
