@@ -23,7 +23,7 @@ from hood.assets.pins import opening_names, read_indices
 from hood.assets.placement import surrounds
 from hood.assets.standing import arms_down
 from hood.assets.suspicions import suspect_kind, suspect_sides
-from hood.assets.units import UNITS, size_ratio, used
+from hood.assets.units import UNITS, possible, size_ratio, used
 from hood.assets.unpickle import load_pickle
 from hood.commands.beside_mesh import place_beside_mesh
 from hood.commands.common import read_model
@@ -196,8 +196,10 @@ def _place_beside(finding: Finding, garment: Garment, body: Body, betas: np.ndar
         "misfit of the next place, beyond": round(found.margin, 3),
     }
     if found.resized is None and found.refusal is not None:
-        finding.problem(f"no place on {body.name!r} is sure: {found.refusal}", _UNPLACED)
-        finding.refused = True
+        unit = _unit_alone(garment, body, betas)
+        finding.refused = unit is None
+        fix = _UNPLACED if unit is None else f"if it was made around this body, {unit} is enough; else {_UNPLACED}"
+        finding.problem(f"no place on {body.name!r} is sure: {found.refusal}", fix, unit)
         return
     describe_place(finding, found, body.name)
     posed = posed_body(body, arms_down(placement.angle), 0, betas)
@@ -210,6 +212,15 @@ def _place_beside(finding: Finding, garment: Garment, body: Body, betas: np.ndar
     if around.inside:
         what = f"{100 * around.inside:.1f}% of its vertices are inside the body, to {1e3 * around.depth:.1f} mm"
         finding.problem(what, "prepare lets them start outside", "")
+
+
+def _unit_alone(garment: Garment, body: Body, betas: np.ndarray) -> str | None:
+    """The key of ``hood prepare`` for a garment that is worn where it lies once its unit is known; None: it is not."""
+    units = possible(used(garment.rest_pos, garment.faces), body.shaped(betas)[0])
+    if len(units) != 1 or units[0] == 1.0:
+        return None
+    found = find_place(garment, body, betas, Asked(scale=units[0]), None)
+    return found.placement.keys()[0] if found.refusal is None and found.resized is None else None
 
 
 def inspect_body(name: str) -> Finding:
