@@ -7,7 +7,6 @@ import re
 import runpy
 import shlex
 import sys
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -105,5 +104,3 @@ def test_every_benchmark_is_listed() -> None:
     listed = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
     runs = [path for path in (ROOT / "benchmarks").glob("*.py") if "__main__" in path.read_text(encoding="utf-8")]
     assert [path.name for path in runs if f"benchmarks/{path.name}" not in listed] == []
-
-

@@ -6,7 +6,10 @@ import re
 from pathlib import Path
 
 import pytest
+import yaml
 from pages import PAGES, README, ROOT, headings, prose_of, text_of
+
+import hood
 
 #: Weight of pictures: the moving one of the README, others.
 _MOVING, _STILL = 2 * 2**20, 400_000
@@ -51,3 +54,14 @@ def test_pictures_are_light_and_shown() -> None:
     for picture in [*(ROOT / "docs").glob("**/*.png"), *(ROOT / "docs").glob("**/*.gif")]:
         assert picture in shown, picture.name
         assert picture.stat().st_size <= (_MOVING if picture.suffix == ".gif" else _STILL), picture.name
+
+
+def test_the_reference_lists_every_public_name() -> None:
+    listed = re.findall(r"^::: hood\.(\w+)$", text_of(ROOT / "docs" / "api.md"), re.MULTILINE)
+    assert sorted(listed) == sorted(set(hood.__all__) - {"__version__"})
+
+
+def test_the_site_leads_to_every_page() -> None:
+    site = yaml.safe_load(text_of(ROOT / "mkdocs.yml"))
+    led = [page for entry in site["nav"] for page in ([entry] if isinstance(entry, str) else next(iter(entry.values())))]
+    assert sorted(led) == sorted(page.name for page in PAGES if page.parent.name == "docs")
