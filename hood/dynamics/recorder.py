@@ -233,7 +233,7 @@ def read_rollout(path: Path | str) -> RolloutData:
         path: the file ``rollout.h5``.
 
     Returns:
-        The :class:`RolloutData`, with ``cloth_pos`` (T, V, 3) m, ``body_pos`` (T, W, 3) m, ``time`` (T,) s, ``metrics`` by name.
+        The :class:`RolloutData`, with ``cloth_pos`` (T, V, 3) m, ``body_pos`` (T, W, 3) m and ``time`` (T,) s.
 
     Raises:
         FileNotFoundError: no such file.

@@ -38,7 +38,7 @@ def prose_of(page: Path) -> str:
 
 
 def headings(page: Path) -> set[str]:
-    """The #anchors of a page, as GitHub and MkDocs make them: lower case, hyphens for spaces, nothing but letters and digits."""
+    """The #anchors of a page, as GitHub and MkDocs make them: lower case, hyphens for spaces, no punctuation."""
     titles = re.findall(r"^#+ +(.*)$", prose_of(page), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in titles}
 

@@ -64,4 +64,4 @@ def test_the_reference_lists_every_public_name() -> None:
 def test_the_site_leads_to_every_page() -> None:
     site = yaml.safe_load(text_of(ROOT / "mkdocs.yml"))
     led = [page for entry in site["nav"] for page in ([entry] if isinstance(entry, str) else next(iter(entry.values())))]
-    assert sorted(led) == sorted(page.name for page in PAGES if page.parent.name == "docs")
+    assert sorted(led) == sorted(page.name for page in PAGES if page.parent == ROOT / "docs")
