@@ -23,13 +23,13 @@ from hood.assets.pins import opening_names, read_indices
 from hood.assets.placement import surrounds
 from hood.assets.standing import arms_down
 from hood.assets.suspicions import suspect_kind, suspect_sides
-from hood.assets.units import UNITS, possible, size_ratio, used
+from hood.assets.units import UNITS, size_ratio, used
 from hood.assets.unpickle import load_pickle
 from hood.commands.beside_mesh import place_beside_mesh
 from hood.commands.common import read_model
 from hood.commands.describe_place import describe_place
 from hood.commands.guarding import summarise_guard
-from hood.commands.placing import find_place
+from hood.commands.placing import explain_unplaced, find_place, unit_alone
 from hood.dynamics import ranges
 from hood.dynamics.recorder import read_rollout
 from hood.dynamics.soundness import judge_rollout, worst_frame
@@ -39,7 +39,6 @@ from hood.mesh.topology import boundary_loops
 from hood.scene.cast import NO_MOTION, MotionOptions, load_motion
 from hood.scene.mesh_motion import MeshMotion
 
-_UNPLACED = "give prepare the body that it was made for (body=…, betas=…), or scale, up, turn, offset and pose"
 #: Openings beyond this number are torn seams: they are counted, not named.
 _MOST_OPENINGS = 12
 _SIMULATE_AGAIN = (
@@ -196,10 +195,9 @@ def _place_beside(finding: Finding, garment: Garment, body: Body, betas: np.ndar
         "misfit of the next place, beyond": round(found.margin, 3),
     }
     if found.resized is None and found.refusal is not None:
-        unit = _unit_alone(garment, body, betas)
+        unit = unit_alone(garment, body, betas)
         finding.refused = unit is None
-        fix = _UNPLACED if unit is None else f"if it was made around this body, {unit} is enough; else {_UNPLACED}"
-        finding.problem(f"no place on {body.name!r} is sure: {found.refusal}", fix, unit)
+        finding.problem(f"no place on {body.name!r} is sure: {found.refusal}", f"prepare: {explain_unplaced(unit)}", unit)
         return
     describe_place(finding, found, body.name)
     posed = posed_body(body, arms_down(placement.angle), 0, betas)
@@ -212,15 +210,6 @@ def _place_beside(finding: Finding, garment: Garment, body: Body, betas: np.ndar
     if around.inside:
         what = f"{100 * around.inside:.1f}% of its vertices are inside the body, to {1e3 * around.depth:.1f} mm"
         finding.problem(what, "prepare lets them start outside", "")
-
-
-def _unit_alone(garment: Garment, body: Body, betas: np.ndarray) -> str | None:
-    """The key of ``hood prepare`` for a garment that is worn where it lies once its unit is known; None: it is not."""
-    units = possible(used(garment.rest_pos, garment.faces), body.shaped(betas)[0])
-    if len(units) != 1 or units[0] == 1.0:
-        return None
-    found = find_place(garment, body, betas, Asked(scale=units[0]), None)
-    return found.placement.keys()[0] if found.refusal is None and found.resized is None else None
 
 
 def inspect_body(name: str) -> Finding:
