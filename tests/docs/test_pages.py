@@ -61,6 +61,11 @@ def test_the_reference_lists_every_public_name() -> None:
     assert sorted(listed) == sorted(set(hood.__all__) - {"__version__"})
 
 
+def test_the_names_of_what_is_embedded_have_four_kinds() -> None:
+    with pytest.raises(ValueError, match="did you mean 'garments'"):
+        hood.names("garment")
+
+
 def test_the_site_leads_to_every_page() -> None:
     site = yaml.safe_load(text_of(ROOT / "mkdocs.yml"))
     led = [page for entry in site["nav"] for page in ([entry] if isinstance(entry, str) else next(iter(entry.values())))]
