@@ -18,7 +18,7 @@ GARMENTS = ("tshirt", "longsleeve", "tank", "dress", "skirt", "shorts", "trouser
 #: Fabrics and the colour that each is drawn in, sRGB.
 FABRICS = {"jersey": (0.80, 0.45, 0.22), "denim": (0.20, 0.30, 0.52), "silk": (0.62, 0.28, 0.42)}
 SEQUENCE, NUM_FRAMES = "dance_mixed", 60
-_WIDTH, _HEIGHT = 200, 300  # pixels of one still
+_WIDTH, _HEIGHT = 230, 330  # pixels of one still
 _AZIMUTH = 25.0  # degrees
 
 
