@@ -159,17 +159,6 @@ def test_values_and_groups_reach_the_config() -> None:
         api.overrides({"seed": {1, 2}})
 
 
-def test_the_page_on_python_runs_as_it_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    page = (PACKAGE.parent / "docs" / "python.md").read_text(encoding="utf-8")
-    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    assert len(blocks) == 3
-    for block in blocks:
-        exec(compile(block.replace("num_frames=60", "num_frames=2"), "python.md", "exec"), {})
-    printed = capsys.readouterr().out.splitlines()
-    assert printed[0].startswith("0 torch.Size([")
-    assert "(3, 1016, 3)" in printed
-
-
 def test_the_page_on_python_lists_every_public_name() -> None:
     table = (PACKAGE.parent / "docs" / "python.md").read_text(encoding="utf-8").partition("## All names")[2]
     assert set(re.findall(r"`(\w+)(?:\(.*?\))?`", table)) - {"motions", "weights"} >= set(hood._HOMES) - {"names"}

@@ -70,3 +70,11 @@ def test_the_site_leads_to_every_page() -> None:
     site = yaml.safe_load(text_of(ROOT / "mkdocs.yml"))
     led = [page for entry in site["nav"] for page in ([entry] if isinstance(entry, str) else next(iter(entry.values())))]
     assert sorted(led) == sorted(page.name for page in PAGES if page.parent == ROOT / "docs")
+
+
+def test_the_citation_is_that_of_the_readme_and_of_this_version() -> None:
+    citation = yaml.safe_load(text_of(ROOT / "CITATION.cff"))
+    paper = citation["preferred-citation"]
+    assert citation["version"] == hood.__version__
+    assert paper["title"].replace("HOOD", "{HOOD}") in text_of(README)
+    assert all(f"{author['family-names']}, {author['given-names']}" in text_of(README) for author in paper["authors"])

@@ -15,6 +15,9 @@ WITH_PYTHON = [page for page in PAGES if any(block.language == "python" for bloc
 #: Files that a reader brings.
 MISSING = re.compile(r"my_\w+\.(obj|npz)")
 
+#: What pages print, as far as they promise it.
+PRINTED = {"README.md": ("2 torch.Size([",), "python.md": ("2 torch.Size([", "3 1016", "True", "(3, 1016, 3)")}
+
 
 def run_page(page: Path) -> None:
     """Every block of Python of a page, in order, with the names of those before; at most three frames are simulated."""
@@ -25,18 +28,15 @@ def run_page(page: Path) -> None:
         exec(compile(code, f"{page.name}, block {number}", "exec"), known)
 
 
-@pytest.mark.parametrize(
-    "page", [page for page in WITH_PYTHON if page.stem not in ("README", "tutorial")], ids=lambda page: page.name
-)
-def test_the_python_of_a_page_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("page", [page for page in WITH_PYTHON if page.stem != "tutorial"], ids=lambda page: page.name)
+def test_the_python_of_a_page_runs(
+    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.chdir(tmp_path)
     run_page(page)
-
-
-def test_the_readme_prints_frames(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    run_page(ROOT / "README.md")
-    assert capsys.readouterr().out.splitlines()[-1].startswith("2 torch.Size([")
+    printed = capsys.readouterr().out
+    for line in PRINTED.get(page.name, ()):
+        assert line in printed
 
 
 def test_the_tutorial_leads_from_nothing_to_a_sound_rollout(
