@@ -12,6 +12,9 @@ README = ROOT / "README.md"
 #: Pages that lead a reader on; the changelog is a record.
 PAGES = [README, ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 _FENCE = re.compile(r"^( *)```(\w*)\n(.*?)^\1```$", re.DOTALL | re.MULTILINE)
+#: A page whose code is that of a package of the reader's; where it has a test of its own, that runs all of it.
+EXTENDING = "extending.md"
+EXTENDING_HAS_A_TEST = (ROOT / "tests" / "docs" / "test_extending.py").is_file()
 #: What a command line begins with: the tutorial's environment, several processes.
 _COMMAND = re.compile(r"(\.venv/bin/)?(hood [a-z]|python (benchmarks|scripts|-m hood)|torchrun |make [a-z])")
 
