@@ -5,7 +5,7 @@ VENV ?= .venv
 PIP_ARGS ?=
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint slow envelope clean
+.PHONY: demo test lint slow envelope docs clean
 
 demo: $(VENV)/.demo
 	$(BIN)/hood rollout garment=dress_4k stepper=auto output=outputs/demo
@@ -20,6 +20,11 @@ slow: $(VENV)/.dev
 # Hours: the stability map, its page in outputs/envelope, and the section of docs/stability.md that is written from it.
 envelope: $(VENV)/.demo
 	$(BIN)/hood envelope output=outputs/envelope document=docs/stability.md
+
+# The pages of docs/ with the reference of all public names, into site/; a warning is an error.
+docs: $(VENV)/.docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo "Open site/index.html"
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .
@@ -39,5 +44,9 @@ $(VENV)/.dev: pyproject.toml constraints.txt | $(VENV)/bin/python
 	$(BIN)/python -m pip install -q $(PIP_ARGS) -c constraints.txt -e ".[dev]"
 	@touch $@
 
+$(VENV)/.docs: pyproject.toml constraints.txt | $(VENV)/bin/python
+	$(BIN)/python -m pip install -q $(PIP_ARGS) -c constraints.txt -e ".[docs]"
+	@touch $@
+
 clean:
-	rm -rf $(VENV) outputs runs
+	rm -rf $(VENV) outputs runs site

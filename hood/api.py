@@ -108,7 +108,7 @@ def simulate(
         ValueError: an unknown key or value, or a file that cannot be used. Names the key or the file.
         FileNotFoundError: an unknown name.
 
-    Example:
+    Examples:
         >>> import hood
         >>> for frame in hood.simulate("tank", "walk_proud", num_frames=3):
         ...     print(frame.index, tuple(frame.world_pos.shape))
@@ -157,7 +157,7 @@ def rollout(**keys: Any) -> dict[str, Any]:
         ValueError, OSError: keys or files that cannot be used.
         KeyboardInterrupt: it was interrupted; the frames done are kept.
 
-    Example:
+    Examples:
         >>> import hood
         >>> summary = hood.rollout(garment="tank", num_frames=3, video="none", output="outputs/tank")
         tank: 3 frames, all finite
@@ -188,6 +188,14 @@ def train(**keys: Any) -> Path:
     Raises:
         ValueError, OSError: keys or files that cannot be used.
         KeyboardInterrupt: it was interrupted; the checkpoint is kept and ``resume=True`` goes on.
+
+    Examples:
+        >>> import hood
+        >>> weights = hood.train(model="small", trainer={"iterations": 1}, output="runs/first")
+        432,579 parameters, 7 garments, 22 motions
+        ...
+        >>> weights.name
+        'model.safetensors'
     """
     from hood.commands.train import run
 
@@ -209,7 +217,7 @@ def load_model(name: str | Path = "quickstart", fps: float = 30.0, device: str =
         FileNotFoundError: unknown name or missing file.
         ValueError: not a model file, or a model of another frame rate.
 
-    Example:
+    Examples:
         >>> import hood
         >>> hood.load_model("quickstart").network.latent_dim
         48

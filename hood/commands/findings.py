@@ -30,7 +30,7 @@ from hood.commands.beside_mesh import place_beside_mesh
 from hood.commands.common import read_model
 from hood.commands.describe_place import describe_place
 from hood.commands.guarding import summarise_guard
-from hood.commands.placing import find_place
+from hood.commands.placing import explain_unplaced, find_place, unit_alone
 from hood.dynamics import ranges
 from hood.dynamics.recorder import read_rollout
 from hood.dynamics.soundness import judge_rollout, worst_frame
@@ -40,7 +40,6 @@ from hood.mesh.topology import boundary_loops
 from hood.scene.load_motion import NO_MOTION, MotionOptions, load_motion
 from hood.scene.mesh_motion import MeshMotion
 
-_UNPLACED = "give prepare the body that it was made for (body=…, betas=…), or scale, up, turn, offset and pose"
 #: Openings beyond this number are torn seams: they are counted, not named.
 _MOST_OPENINGS = 12
 _SIMULATE_AGAIN = (
@@ -197,8 +196,9 @@ def _place_beside(finding: Finding, garment: Garment, body: Body, betas: np.ndar
         "misfit of the next place, beyond": round(found.margin, 3),
     }
     if found.resized is None and found.refusal is not None:
-        finding.problem(f"no place on {body.name!r} is sure: {found.refusal}", _UNPLACED)
-        finding.refused = True
+        unit = unit_alone(garment, body, betas)
+        finding.refused = unit is None
+        finding.problem(f"no place on {body.name!r} is sure: {found.refusal}", f"prepare: {explain_unplaced(unit)}", unit)
         return
     describe_place(finding, found, body.name)
     posed = posed_body(body, arms_down(placement.angle), 0, betas)

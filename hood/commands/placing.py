@@ -12,7 +12,7 @@ from hood.assets.garment.binding import PosedBody, posed_body
 from hood.assets.garment.fit_search import Asked, Found, Resized, Wearer, find_placement
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.placement import UP_AXES, Placement
-from hood.assets.garment.units import find_scale, size_ratio, used
+from hood.assets.garment.units import find_scale, possible, size_ratio, used
 from hood.assets.motion.poses import A_POSE_ANGLE, arms_down
 from hood.config import ConfigError, plain, require_choice
 from hood.scene.mesh_motion import MeshMotion, wearable, worn_pos
@@ -104,6 +104,21 @@ def explain_size(resized: Resized) -> tuple[str, str]:
         f"lies around the body more closely at {resized.factor:.3g} times its size (misfit less by {resized.gain:.2f})",
         f"{resized.placement.keys()[0]} resizes it, rest lengths too; leave scale out if its cut is meant to be so {cut}",
     )
+
+
+def unit_alone(garment: Garment, body: Body, betas: np.ndarray) -> str | None:
+    """The key of an unbound garment that is worn where it lies once its unit is known; None: it is not, or is in metres."""
+    units = possible(used(garment.rest_pos, garment.faces), body.shaped(betas)[0])
+    if len(units) != 1 or units[0] == 1.0:
+        return None
+    found = find_place(garment, body, betas, Asked(scale=units[0]), None)
+    return found.placement.keys()[0] if found.refusal is None and found.resized is None else None
+
+
+def explain_unplaced(unit: str | None) -> str:
+    """What to do with a garment that no place is sure for; ``unit`` is that of :func:`unit_alone`."""
+    enough = "" if unit is None else f"if it was made around this body, {unit} is enough; else "
+    return f"{enough}give the body that it was made for (body=…, betas=…), or scale, up, turn, offset and pose"
 
 
 def keep_place(garment: Garment, surface: np.ndarray, asked: Asked) -> Placement:

@@ -30,7 +30,16 @@ from hood.assets.motion.poses import POSE_SUFFIXES, arms_down, read_pose
 from hood.assets.motion.sequence import PoseSequence
 from hood.commands.common import prepare_folder
 from hood.commands.garments import checked_pins, heed, names_of, shape_coefficients
-from hood.commands.placing import AUTO, arm_angle, asked_keys, explain_size, find_place, keep_place
+from hood.commands.placing import (
+    AUTO,
+    arm_angle,
+    asked_keys,
+    explain_size,
+    explain_unplaced,
+    find_place,
+    keep_place,
+    unit_alone,
+)
 from hood.commands.prepare_mesh import prepare_for_mesh
 from hood.config import ConfigError, load_config, plain, require_choice
 from hood.media.mesh_export import write_obj
@@ -183,8 +192,12 @@ def _place(fitting: Fitting, config: DictConfig, body: Body, betas: np.ndarray) 
     posed = _given_pose(config, body, betas)
     found = find_place(garment, body, betas, asked, posed)
     if found.refusal is not None:
-        other = "" if found.resized is None else "; it {}: {}".format(*explain_size(found.resized))
-        raise ValueError(f"{garment.name}: {found.refusal}{other}")
+        if found.resized is not None:
+            fix = "it {}: {}".format(*explain_size(found.resized))
+        else:
+            nothing_asked = all(value is None for value in vars(asked).values())
+            fix = explain_unplaced(unit_alone(garment, body, betas) if nothing_asked and posed is None else None)
+        raise ValueError(f"{garment.name}: {found.refusal}; {fix}")
     if found.resized is not None:
         what, fix = explain_size(found.resized)
         warnings.warn(f"garment {garment.name!r} {what}; written as it is: {fix}", stacklevel=2)

@@ -229,8 +229,23 @@ def read_rollout(path: Path | str) -> RolloutData:
 
     How many frames the whole is to have is the attribute ``num_planned``, whether it is finished ``complete``.
 
+    Args:
+        path: the file ``rollout.h5``.
+
+    Returns:
+        The :class:`RolloutData`, with ``cloth_pos`` (T, V, 3) m, ``body_pos`` (T, W, 3) m and ``time`` (T,) s.
+
     Raises:
+        FileNotFoundError: no such file.
         ValueError: not a rollout file.
+
+    Examples:
+        >>> import hood
+        >>> _ = hood.rollout(garment="tank", num_frames=3, video="none", sheet=False, output="outputs/tank")
+        tank: 3 frames, all finite
+        ...
+        >>> hood.read_rollout("outputs/tank/rollout.h5").cloth_pos.shape
+        (3, 1016, 3)
     """
     path = Path(path)
     try:

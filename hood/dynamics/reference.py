@@ -47,6 +47,12 @@ def load_reference_checkpoint(path: str | Path, size_limit: int = SIZE_LIMIT) ->
     Raises:
         FileNotFoundError: no such file.
         ValueError: not such a checkpoint; names the key that does not fit and the nearest expected one.
+
+    Examples:
+        >>> import hood
+        >>> simulator = hood.load_reference_checkpoint("postcvpr.pth")
+        >>> simulator.network.latent_dim
+        128
     """
     return read_reference_checkpoint(path, size_limit)[0]
 

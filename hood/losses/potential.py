@@ -59,6 +59,12 @@ class Potential:
 
     ``next_pos`` and ``acc`` are two views of the same unknown, next_pos = x_t + dt v_t + dt² acc; terms use
     the one that is exact for them. A term that is None is left out: a config's way to have none.
+
+    Args:
+        terms: the energies by name, each of :class:`Term`.
+
+    Attributes:
+        terms: those that are not None.
     """
 
     def __init__(self, terms: Mapping[str, Term | None]) -> None:
@@ -179,7 +185,26 @@ def default_potential(
     reach: str = "curvature",
     sides: str = "both",
 ) -> Potential:
-    """The paper's potential in safe forms: contact with triangles, friction by normal force, rest angles."""
+    """The paper's potential in safe forms: contact with triangles, friction by normal force, rest angles.
+
+    Args:
+        collision_weight: of contact [J/m³], whose energy is cubic in the depth.
+        collision_epsilon: distance from the skin at which contact begins [m].
+        friction_coefficient: of Coulomb friction between cloth and body; 0: none.
+        friction_slip_speed: speed [m/s] below which friction counts as static.
+        attachment_stiffness: of the springs [N/m] that close attachments, such as buttons.
+        contact: where contact acts: ``vertices``, ``edges`` or ``strict``.
+        reach: ``curvature`` sets contact off farther where long edges meet a bulge, ``constant`` does not.
+        sides: ``both`` keeps cloth off both sides of a fold of the body, ``nearest`` off the nearer one.
+
+    Raises:
+        ValueError: a value out of range.
+
+    Examples:
+        >>> import hood
+        >>> sorted(hood.default_potential().terms)
+        ['attachment', 'bending', 'collision', 'friction', 'gravity', 'inertia', 'stretching']
+    """
     collision = collision_weight, collision_epsilon, contact, reach, sides
     return Potential(
         {

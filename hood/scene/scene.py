@@ -184,7 +184,30 @@ def build_scene(
     dtype: torch.dtype = torch.float32,
     device: torch.device | str = "cpu",
 ) -> Scene:
-    """Garment on body: bound, grown with β and scaled by ``size`` (rest shape only: the paper's resizing augmentation)."""
+    """A garment on a body in motion, ready to be simulated; an unbound garment is bound to the body.
+
+    Args:
+        garment: in the body's T-pose; it grows with the body's shape.
+        body: who wears it.
+        sequence: the body's motion; its frame rate is that of the simulation.
+        material: the fabric; None: the default one.
+        betas: (S,) shape coefficients of the body; None: zeros.
+        size: factor of the rest shape alone, the paper's resizing augmentation.
+        dtype: of the cloth's positions.
+        device: ``cpu`` or ``cuda``.
+
+    Raises:
+        ValueError: the garment cannot follow the body, or is not on it in the motion's first frame.
+
+    Examples:
+        >>> import hood
+        >>> scene = hood.build_scene(hood.load_garment("tank"), hood.load_body(), hood.load_sequence("plie"))
+        >>> scene.cloth.num_vertices, round(1 / scene.dt)
+        (1016, 30)
+        >>> state = scene.start()  # frame 0, on the body
+        >>> tuple(state.pos.shape)
+        (1016, 3)
+    """
     betas = np.zeros(10) if betas is None else np.asarray(betas, dtype=np.float64)
     return dress(garment, body_motion(body, sequence, betas, dtype, device), material, size)
 

@@ -238,6 +238,8 @@ def test_pins_keep_the_numbers_of_the_file(capsys: pytest.CaptureFixture[str], b
 REFUSED = {
     "nothing": ([], ("garment is not given",)),
     "alike": (["garment=far.obj"], ("two places fit alike", "offset")),
+    "wide": (["garment=wide.obj"], ("if it was made around this body, scale=0.01 is enough; else",)),
+    "wide, told more": (["garment=wide.obj", "scale=0.01", "up=x"], ("; give the body that it was made for",)),
     "far": (["garment=far.obj", "offset=[0,0,0]"], ("does not surround the body", "offset")),
     "flat": (["garment=flat.obj"], ("no face has an area",)),
     "output": (["garment=tank", "output=tank.obj"], (".npz",)),
@@ -256,6 +258,8 @@ def test_refusals_are_one_line(capsys: pytest.CaptureFixture[str], case: str) ->
     pos, faces = cylinder(12, 4)
     write_obj(Path("far.obj"), pos + [3.0, 0, 0], faces)
     write_obj(Path("flat.obj"), pos * [1.0, 0, 0], faces)
+    flare = 0.75 + 1.1 * (1.0 - pos[:, 1:2] / 0.5)  # a wide skirt in centimetres, from the waist down
+    write_obj(Path("wide.obj"), 100.0 * (pos * np.hstack([flare, np.ones_like(flare), flare]) + [0.0, -0.27, 0.03]), faces)
     words, expected = REFUSED[case]
     assert main(["prepare", *words]) == 2
     error = capsys.readouterr().err

@@ -1,38 +1,23 @@
-"""README and docs: short where they promise to be, their links lead somewhere, their commands have keys that exist."""
+"""README and docs: short where they promise to be, and their links lead somewhere."""
 
 from __future__ import annotations
 
 import re
-import shlex
 from pathlib import Path
 
 import pytest
+import yaml
+from pages import PAGES, README, ROOT, headings, prose_of, text_of
 
-from hood.cli import COMMANDS
-from hood.config import load_config
+import hood
 
-ROOT = Path(__file__).resolve().parents[2]
-README = ROOT / "README.md"
-PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
-#: Commands with a config of their own; others take files.
-CONFIGURED = {path.stem for path in (ROOT / "configs").glob("*.yaml")} & set(COMMANDS)
-#: The page of options that a reader makes; test_extending.py runs its commands.
-EXTENDING = "extending.md"
+#: Weight of pictures: the moving one of the README, others.
+_MOVING, _STILL = 2 * 2**20, 400_000
 
 
-def text_of(page: Path) -> str:
-    return page.read_text(encoding="utf-8")
-
-
-def commands() -> list[tuple[str, str]]:
-    """Page and line of every command in a block of code."""
-    found = []
-    for page in PAGES:
-        fenced = re.findall(r"^ *```(\w*)\n(.*?)^ *```$", text_of(page), re.DOTALL | re.MULTILINE)
-        for block in (body for language, body in fenced if language in {"", "bash", "sh"}):
-            lines = block.replace("\\\n", " ").splitlines()
-            found += [(page.name, line.strip()) for line in lines if re.match(r"\s*hood \w", line)]
-    return found
+def links(page: Path) -> list[str]:
+    """Where the links and pictures of a page lead inside the repository."""
+    return re.findall(r"\]\((?!https?:)([^)]+)\)", prose_of(page))
 
 
 def test_the_readme_is_short_and_has_a_picture_first() -> None:
@@ -41,13 +26,17 @@ def test_the_readme_is_short_and_has_a_picture_first() -> None:
     assert len(text.split()) <= 900
     picture = re.search(r"!\[[^]]+\]\(([^)]+)\)", "\n".join(text.splitlines()[:20]))
     assert picture is not None
-    assert (ROOT / picture[1]).stat().st_size <= 2 * 2**20
+    assert (ROOT / picture[1]).stat().st_size <= _MOVING
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_lead_to_what_is_there(page: Path) -> None:
-    for link in re.findall(r"\]\((?!https?:)([^)#]+)(?:#[^)]*)?\)", text_of(page)):
-        assert (page.parent / link).exists(), link
+    for link in links(page):
+        name, _, anchor = link.partition("#")
+        target = (page.parent / name).resolve() if name else page
+        assert target.exists(), link
+        if anchor:
+            assert anchor in headings(target), f"{link}: its anchors are {sorted(headings(target))}"
 
 
 def test_every_page_is_reached_from_the_readme() -> None:
@@ -56,30 +45,36 @@ def test_every_page_is_reached_from_the_readme() -> None:
         page = left.pop()
         if page not in seen:
             seen.add(page)
-            left += [(page.parent / link).resolve() for link in re.findall(r"\]\(((?!https?:)[^)#]+\.md)", text_of(page))]
+            left += [(page.parent / link.partition("#")[0]).resolve() for link in links(page) if ".md" in link]
     assert set(PAGES) <= seen
 
 
-def test_there_are_commands_to_check() -> None:
-    assert len(commands()) > 30
-    assert {page for page, _ in commands()} >= {"README.md", "rollout.md", "files.md", "train.md", "evaluation.md"}
+def test_pictures_are_light_and_shown() -> None:
+    shown = {(page.parent / link).resolve() for page in PAGES for link in links(page)}
+    for picture in [*(ROOT / "docs").glob("**/*.png"), *(ROOT / "docs").glob("**/*.gif")]:
+        assert picture in shown, picture.name
+        assert picture.stat().st_size <= (_MOVING if picture.suffix == ".gif" else _STILL), picture.name
 
 
-@pytest.mark.parametrize(("page", "line"), commands())
-def test_commands_have_keys_that_exist(page: str, line: str) -> None:
-    words = shlex.split(line, comments=True)[1:]
-    assert words[0] in COMMANDS, line
-    if words[0] == "plan":
-        own = set(load_config("plan"))
-        load_config("plan", [word for word in words[1:] if word.partition("=")[0] in own])
-        load_config("rollout", [word for word in words[1:] if word.partition("=")[0] not in own])
-    elif words[0] in CONFIGURED and "…" not in line and page != EXTENDING:
-        load_config(words[0], [word for word in words[1:] if "=" in word])
+def test_the_reference_lists_every_public_name() -> None:
+    listed = re.findall(r"^::: hood\.(\w+)$", text_of(ROOT / "docs" / "api.md"), re.MULTILINE)
+    assert sorted(listed) == sorted(set(hood.__all__) - {"__version__"})
 
 
-def test_the_python_of_the_readme_runs(capsys: pytest.CaptureFixture[str]) -> None:
-    blocks = re.findall(r"^```python\n(.*?)^```$", text_of(README), re.DOTALL | re.MULTILINE)
-    assert blocks
-    for block in blocks:
-        exec(compile(block.replace("num_frames=60", "num_frames=2"), "README.md", "exec"), {})
-    assert capsys.readouterr().out.splitlines()[-1].startswith("1 torch.Size([")
+def test_the_names_of_what_is_embedded_have_four_kinds() -> None:
+    with pytest.raises(ValueError, match="did you mean 'garments'"):
+        hood.names("garment")
+
+
+def test_the_site_leads_to_every_page() -> None:
+    site = yaml.safe_load(text_of(ROOT / "mkdocs.yml"))
+    led = [page for entry in site["nav"] for page in ([entry] if isinstance(entry, str) else next(iter(entry.values())))]
+    assert sorted(led) == sorted(page.name for page in PAGES if page.parent == ROOT / "docs")
+
+
+def test_the_citation_is_that_of_the_readme_and_of_this_version() -> None:
+    citation = yaml.safe_load(text_of(ROOT / "CITATION.cff"))
+    paper = citation["preferred-citation"]
+    assert citation["version"] == hood.__version__
+    assert paper["title"].replace("HOOD", "{HOOD}") in text_of(README)
+    assert all(f"{author['family-names']}, {author['given-names']}" in text_of(README) for author in paper["authors"])

@@ -13,16 +13,26 @@ from hood.assets.files.library import locate
 
 
 def load_body(name: str | Path = "default", gender: str | None = None) -> Body:
-    """The embedded body by name, a body model file (``.npz``, official ``.pkl``), or the fitting file of a folder of them.
+    """A body model by its embedded name or from a file.
 
-    Files of the SMPL family with pose blend shapes are evaluated through ``smplx``, see :mod:`hood.assets.body.smpl_family`.
+    Files of the SMPL family with pose blend shapes are evaluated through ``smplx``.
 
     Args:
+        name: the embedded ``default``, a body model file (``.npz``, official ``.pkl``), or a folder of them.
         gender: "neutral", "male" or "female": which model of a folder; None means neutral.
+
+    Returns:
+        The :class:`Body`, with ``v_template`` (W, 3) m in T-pose, ``faces`` (G, 3).
 
     Raises:
         FileNotFoundError: unknown name or missing file.
         ValueError: not a body model; names the file, the key and the fix.
+
+    Examples:
+        >>> import hood
+        >>> body = hood.load_body()
+        >>> body.v_template.shape, body.num_joints
+        ((6890, 3), 24)
     """
     path = locate("body", name, folders=True)
     if path.is_dir():

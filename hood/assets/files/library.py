@@ -22,7 +22,21 @@ _SUFFIX = {"body": ".npz", "garments": ".npz", "motions": ".npz", "weights": ".s
 
 
 def names(kind: str) -> list[str]:
-    """Names of the embedded ``"body"``, ``"garments"``, ``"motions"`` or ``"weights"``."""
+    """Names of what comes with the package.
+
+    Args:
+        kind: ``"body"``, ``"garments"``, ``"motions"`` or ``"weights"``.
+
+    Raises:
+        ValueError: another kind.
+
+    Examples:
+        >>> import hood
+        >>> hood.names("garments")[:3]
+        ['dress', 'dress_12k', 'dress_4k']
+    """
+    if kind not in _SUFFIX:
+        raise ValueError(unknown("kind", kind, _SUFFIX))
     return sorted(path.stem for path in (DATA_FOLDER / kind).glob("*" + _SUFFIX[kind]))
 
 

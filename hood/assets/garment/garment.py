@@ -65,15 +65,25 @@ class Garment:
 
 
 def load_garment(name: str | Path, triangulate: bool = False) -> Garment:
-    """An embedded garment by name, a garment ``.npz``, a mesh file (OBJ, PLY, STL, GLB, OFF) in the body's T-pose, or a
-    ``.pkl`` of the reference implementation (``garments_dict.pkl:name`` chooses one of several).
+    """A garment by its embedded name or from a file.
 
     Args:
+        name: an embedded name, a garment ``.npz``, a mesh file (OBJ, PLY, STL, GLB, OFF) in metres around the body's T-pose,
+            or a ``.pkl`` of the reference implementation (``garments_dict.pkl:name`` chooses one of several).
         triangulate: split faces of four and more corners instead of refusing them.
+
+    Returns:
+        The :class:`Garment`, with ``rest_pos`` (V, 3) m, ``faces`` (F, 3).
 
     Raises:
         FileNotFoundError: unknown name or missing file.
         ValueError: unreadable or broken mesh; names the file, the index and the fix.
+
+    Examples:
+        >>> import hood
+        >>> tank = hood.load_garment("tank")
+        >>> tank.rest_pos.shape, tank.faces.shape
+        ((1016, 3), (1901, 3))
     """
     path, entry = locate_garment(name)
     suffix = path.suffix.lower()

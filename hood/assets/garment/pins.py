@@ -39,6 +39,8 @@ _LIST_SUFFIXES = (".txt", ".json")
 #: An opening farther from its joint than this [m] is none of that region.
 _REGION_REACH = 0.45
 _LIST_LIMIT = 64 << 20
+#: Heights of openings that an error names.
+_MOST_HEIGHTS = 6
 #: The two that one joint does not tell apart.
 _AT_THE_HIPS = ("waistband", "hem")
 
@@ -115,7 +117,11 @@ def region_loop(garment: Garment, body: Body, region: str) -> np.ndarray:
         dist[[name != region for name in opening_names(centres, joints)]] = np.inf
     nearest = int(np.argmin(dist))
     if not np.isfinite(dist[nearest]):
-        raise ValueError(f"pins={region}: no opening of {garment.name!r} is a {region}; give vertex numbers")
+        heights = ", ".join(f"{height:.2f}" for height in centres[:_MOST_HEIGHTS, 1])
+        raise ValueError(
+            f"pins={region}: no opening of {garment.name!r} is a {region}: they are at the heights {heights} m, the hips "
+            f"of the body at {joints[JOINTS.index('left_hip'), 1]:.2f} m; put the garment in place, or give vertex numbers"
+        )
     if dist[nearest] > _REGION_REACH:
         raise ValueError(
             f"pins={region}: the nearest of the {len(loops)} openings of {garment.name!r} is {dist[nearest]:.2f} m from "

@@ -29,22 +29,33 @@ def load_sequence(
     hands: str = "flat",
     file_fps: float | None = None,
 ) -> PoseSequence:
-    """An embedded motion or a motion file (see :func:`hood.assets.motion.recording.read_recording`) as it is to be performed.
+    """A motion by its embedded name or from a file, as it is to be performed.
 
     Args:
+        name: an embedded name, an AMASS ``.npz`` of any layout, or a ``.pkl`` with joint rotations.
         fps: frames per second of the result; rotations are interpolated by slerp, translations linearly.
         up: axis of the file's world that points up: "z", "y", or "auto", along which the body stands; z for AMASS layouts and
             y for the others where that is open.
-        start, stop: part of the file to keep, in seconds, or in frames of the file as "120f".
+        start: first moment of the file to keep, in seconds, or in frames of the file as "120f"; None: its beginning.
+        stop: last moment to keep, likewise; None: its end.
         loop: times the motion is played; each play goes on from where the last one ended.
         blend_in: seconds of moving from a standing pose into the first frame, put before it.
         blend_from: that pose, "t" or "a".
         hands: "flat", or "file" for the fingers (SMPL-H, SMPL-X) or hands (SMPL) that the file holds.
         file_fps: frame rate of the file, whatever it says itself.
 
+    Returns:
+        The :class:`PoseSequence`, with ``poses`` (T, 24, 3) rad, ``transl`` (T, 3) m, y up.
+
     Raises:
         FileNotFoundError: unknown name or missing file.
         ValueError: not a motion file, nothing left of it, an option out of range; names the file and the fix.
+
+    Examples:
+        >>> import hood
+        >>> motion = hood.load_sequence("plie", fps=60, stop=2.0)
+        >>> motion.poses.shape, motion.fps
+        ((121, 24, 3), 60)
     """
     path = locate("motions", name)
     if up not in ("y", "z", "auto"):

@@ -48,7 +48,7 @@ def test_names_of_openings(garments: dict[str, Garment], body: Body) -> None:
         assert sorted(opening_names(np.stack(centres), joints)) == regions, name
     # A sash around the waist has two openings above the hips: the lower edge is its hem.
     assert opening_names(joints[3] + [[0.0, 0.02, 0.0], [0.0, -0.06, 0.0]], joints) == ["waistband", "hem"]
-    with pytest.raises(ValueError, match="no opening of 'dress' is a waistband"):
+    with pytest.raises(ValueError, match="no opening of 'dress' is a waistband: they are at the heights"):
         pin_mask("waistband", garments["dress"], body)
 
 

@@ -1,0 +1,61 @@
+"""The pages that readers see, their blocks of code and the command lines in them."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parents[2]
+README = ROOT / "README.md"
+#: Pages that lead a reader on; the changelog is a record.
+PAGES = [README, ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+_FENCE = re.compile(r"^( *)```(\w*)\n(.*?)^\1```$", re.DOTALL | re.MULTILINE)
+#: A page whose code is that of a package of the reader's; where it has a test of its own, that runs all of it.
+EXTENDING = "extending.md"
+EXTENDING_HAS_A_TEST = (ROOT / "tests" / "docs" / "test_extending.py").is_file()
+#: What a command line begins with: the tutorial's environment, several processes.
+_COMMAND = re.compile(r"(\.venv/bin/)?(hood [a-z]|python (benchmarks|scripts|-m hood)|torchrun |make [a-z])")
+
+
+class Block(NamedTuple):
+    """Code between fences, without the indentation of a list around it."""
+
+    page: str
+    language: str
+    text: str
+
+
+def text_of(page: Path) -> str:
+    return page.read_text(encoding="utf-8")
+
+
+def blocks(page: Path) -> list[Block]:
+    return [Block(page.name, language, textwrap.dedent(body)) for _, language, body in _FENCE.findall(text_of(page))]
+
+
+def prose_of(page: Path) -> str:
+    """The page without its blocks of code."""
+    return _FENCE.sub("", text_of(page))
+
+
+def headings(page: Path) -> set[str]:
+    """The #anchors of a page, as GitHub and MkDocs make them: lower case, hyphens for spaces, no punctuation."""
+    titles = re.findall(r"^#+ +(.*)$", prose_of(page), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in titles}
+
+
+def command_lines() -> list[tuple[str, str]]:
+    """Page and line of every command, in blocks and between backticks in a text."""
+    found = []
+    for page in PAGES:
+        lines = [
+            line.strip()
+            for block in blocks(page)
+            if block.language in {"", "bash", "sh"}
+            for line in block.text.replace("\\\n", " ").splitlines()
+        ]
+        lines += [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", prose_of(page))]
+        found += [(page.name, line) for line in lines if _COMMAND.match(line)]
+    return sorted(set(found))

@@ -1,0 +1,106 @@
+"""Every command line of the README and the docs: its command, keys, values and names exist. None is run."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import runpy
+import shlex
+import sys
+from typing import Any
+
+import pytest
+from omegaconf import DictConfig
+from pages import EXTENDING, EXTENDING_HAS_A_TEST, ROOT, command_lines
+
+from hood.assets.files.library import names
+from hood.cli import COMMANDS
+from hood.commands.setup import check_config
+from hood.config import load_config
+
+#: Commands with a config of their own; others take files.
+CONFIGURED = {path.stem for path in (ROOT / "configs").glob("*.yaml")} & set(COMMANDS)
+#: Options that a reader makes (docs/extending.md).
+OWN = ("losses=windy", "material=felt")
+#: Keys that take embedded names, and of what.
+NAMED = {"garment": "garments", "sequence": "motions", "checkpoint": "weights", "body": "body"}
+LINES = command_lines()
+HOOD = [(page, line) for page, line in LINES if re.search(r"\bhood [a-z]|-m hood\.cli|scripts/(rollout|train|evaluate)", line)]
+PYTHON = [(page, line) for page, line in LINES if line.startswith("python ") and (page, line) not in HOOD]
+MAKE = [(page, line) for page, line in LINES if line.startswith("make ")]
+
+
+def words_of(line: str) -> list[str]:
+    """The command and its words, without what starts it (python -m hood.cli, torchrun …)."""
+    bare = re.sub(r"^.*?(\bhood |-m hood\.cli |scripts/(?=rollout|train|evaluate))", "", line, count=1)
+    words = shlex.split(bare, comments=True)
+    return [words[0].removesuffix(".py"), *(word for word in words[1:] if "…" not in word)]
+
+
+def check_names(config: DictConfig) -> None:
+    """Names that are no files are embedded ones."""
+    for key, kind in NAMED.items():
+        value = config.get(key)
+        for name in value if isinstance(value, (list, tuple)) or not isinstance(value, (str, type(None))) else [value]:
+            if name is not None and not re.search(r"[./*]|^none$|^untrained$|^[A-Z]+$", str(name)):
+                assert str(name) in names(kind), f"{key}={name}"
+
+
+def test_there_are_commands_to_check() -> None:
+    assert len(HOOD) > 60
+    assert len(PYTHON) > 30
+    assert {page for page, _ in HOOD} >= {"README.md", "tutorial.md", "rollout.md", "files.md", "train.md", "evaluation.md"}
+
+
+@pytest.mark.parametrize(("page", "line"), HOOD)
+def test_commands_have_keys_and_values_that_exist(page: str, line: str) -> None:
+    command, *words = words_of(line)
+    assert command in COMMANDS, line
+    keys = [word for word in words if "=" in word]
+    if command not in CONFIGURED or set(OWN) & set(keys) or (page == EXTENDING and EXTENDING_HAS_A_TEST):
+        return
+    if command == "plan":
+        own = set(load_config("plan"))
+        load_config("plan", [word for word in keys if word.partition("=")[0] in own])
+        command, keys = "rollout", [word for word in keys if word.partition("=")[0] not in own]
+    config = load_config(command, keys)
+    if command == "rollout":
+        check_config(config)
+    check_names(config)
+
+
+class Parsed(Exception):
+    """The arguments of a script were understood."""
+
+
+@pytest.mark.parametrize(("page", "line"), PYTHON)
+def test_scripts_understand_their_arguments(page: str, line: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, *words = shlex.split(line, comments=True)[1:]
+    script = ROOT / path
+    assert script.is_file(), line
+    if "ArgumentParser" not in script.read_text(encoding="utf-8"):
+        assert not words or f"python {path}" in script.read_text(encoding="utf-8"), line
+        return
+    understood = argparse.ArgumentParser.parse_args
+
+    def parse(self: argparse.ArgumentParser, *given: Any, **named: Any) -> None:
+        understood(self, *given, **named)
+        raise Parsed
+
+    monkeypatch.setattr(argparse.ArgumentParser, "parse_args", parse)
+    monkeypatch.setattr(sys, "argv", [path, *words])
+    monkeypatch.setattr(sys, "path", [str(script.parent), *sys.path])
+    with pytest.raises(Parsed):
+        runpy.run_path(str(script), run_name="__main__")
+
+
+@pytest.mark.parametrize(("page", "line"), MAKE)
+def test_targets_of_make_exist(page: str, line: str) -> None:
+    target = shlex.split(line, comments=True)[1]
+    assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE), line
+
+
+def test_every_benchmark_is_listed() -> None:
+    listed = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
+    runs = [path for path in (ROOT / "benchmarks").glob("*.py") if "__main__" in path.read_text(encoding="utf-8")]
+    assert [path.name for path in runs if f"benchmarks/{path.name}" not in listed] == []
