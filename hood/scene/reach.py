@@ -16,8 +16,8 @@ SAG_SHARE = 1.5 / 8.0
 COVERED = 1.25
 #: They are held off by no more [m] than this beside the constant part.
 MOST_SAG = 8e-3
-#: The same of cloth that is stretched.
-MOST_STRETCHED = 20e-3
+#: And by no more [m] than this beside that where they are stretched.
+MOST_STRETCHED = 8e-3
 
 
 def sag(cloth: Cloth, contact: Contact, pos: Tensor) -> Tensor:
@@ -28,15 +28,15 @@ def sag(cloth: Cloth, contact: Contact, pos: Tensor) -> Tensor:
     Fades with the square of the edges: 3.8 mm for 35 mm on a limb 120 mm thick, 0.9 mm for 17 mm.
 
     An edge that is stretched sags farther. What its square has grown by, beyond the quarter that the half more in
-    :data:`SAG_SHARE` covers (:data:`COVERED`), is added to L², of the edge at the vertex that has grown most; the most is then
-    :data:`MOST_STRETCHED`.
+    :data:`SAG_SHARE` covers (:data:`COVERED`), is added to L², of the edge at the vertex that has grown most; no
+    more than :data:`MOST_STRETCHED`, since cloth that is held farther off is stretched the more.
 
     Args:
         pos: (V, 3) m, of the cloth at t.
     """
     share = SAG_SHARE * contact.curvature
     at_rest = (share * cloth.edge_length_sq).clamp_max(MOST_SAG)
-    return at_rest + torch.minimum(share * cloth.largest_of_edges(_growth(cloth, pos)), MOST_STRETCHED - at_rest)
+    return at_rest + (share * cloth.largest_of_edges(_growth(cloth, pos))).clamp_max(MOST_STRETCHED)
 
 
 def _growth(cloth: Cloth, pos: Tensor) -> Tensor:
