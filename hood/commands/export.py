@@ -13,6 +13,7 @@ from hood.assets.files.atomic import write_atomically
 from hood.commands.common import frame_count, split_words
 from hood.commands.compare import read_checked
 from hood.config import ConfigError, plain, require_choice
+from hood.dynamics.recorder import RolloutData
 from hood.media.exports.clip import PARTS, Clip, clip_of
 from hood.media.exports.gltf import gltf_bytes
 from hood.media.exports.sequences import write_obj_sequence, write_ply_sequence, write_point_cache
@@ -24,6 +25,7 @@ _FOLDERS: dict[str, Callable[[Path, Clip], None]] = {
     "obj": write_obj_sequence,
     "ply": write_ply_sequence,
 }
+FORMATS = ("usd", "glb", *_FOLDERS)
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -37,34 +39,64 @@ def run(arguments: Sequence[str]) -> int:
     form, up, parts = _checked(config)
     target = _target(config, source, form)
     data = read_checked(source, "fabric")
-    try:
-        clip = clip_of(data, parts, count, up)
-        _write(target, form, clip, up)
-    except ValueError as error:
-        raise ValueError(f"{source}: {error}") from error
-    names = ", ".join(f"{part.name} ({part.pos.shape[1]} vertices)" for part in clip.parts)
-    print(f"{target}: {_megabytes(target):.1f} MB, {clip.num_frames} frames at {clip.fps:g} fps, metres, {up} up: {names}")
-    if clip.origin.any() and form in _FOLDERS:
-        x, y, z = clip.origin.tolist()
-        print(f"far from the origin: positions are from ({x:g}, {y:g}, {z:g}) m; move the objects there")
+    print(_export(source, data, target, form, clip_arguments=(parts, count, up)))
     if not bool(data.attributes.get("complete", True)):
         print(f"the rollout is not finished: {len(data.time)} of {data.attributes.get('num_planned', '?')} frames are there")
     return 0
 
 
+def check_formats(forms: Sequence[str]) -> None:
+    """Refuse formats of ``hood rollout formats=[…]`` that cannot be written, before the first frame.
+
+    Raises:
+        ConfigError: no such format, or its package is missing; names it.
+    """
+    for form in forms:
+        _check_format(form, "formats", f"formats={list(forms)}")
+
+
+def export_beside(source: Path, forms: Sequence[str]) -> list[str]:
+    """Write all of the rollout ``source`` in every format beside it, in place of what an earlier run has left there.
+
+    Returns:
+        A sentence about each.
+    """
+    if not forms:
+        return []
+    data = read_checked(source, "fabric")
+    return [_export(source, data, _beside(source, form), form, (list(PARTS), None, "y"), True) for form in forms]
+
+
+def _export(
+    source: Path,
+    data: RolloutData,
+    target: Path,
+    form: str,
+    clip_arguments: tuple[list[str], int | None, str],
+    replace: bool = False,
+) -> str:
+    """Write one format; what there is to say of it."""
+    up = clip_arguments[2]
+    try:
+        clip = clip_of(data, *clip_arguments)
+        _write(target, form, clip, up, replace)
+    except ValueError as error:
+        raise ValueError(f"{source}: {error}") from error
+    names = ", ".join(f"{part.name} ({part.pos.shape[1]} vertices)" for part in clip.parts)
+    text = f"{target}: {_megabytes(target):.1f} MB, {clip.num_frames} frames at {clip.fps:g} fps, metres, {up} up: {names}"
+    if clip.origin.any() and form in _FOLDERS:
+        x, y, z = clip.origin.tolist()
+        text += f"\nfar from the origin: positions are from ({x:g}, {y:g}, {z:g}) m; move the objects there"
+    return text
+
+
 def _checked(config: DictConfig) -> tuple[str, str, list[str]]:
     """Format, axis that points up, and parts."""
     form, up = str(config.format), str(config.up)
-    if form == "abc":
-        raise ConfigError("format=abc: no maintained package writes Alembic; take format=usd, which the same programs read")
-    require_choice(config, "format", ("usd", "glb", *_FOLDERS))
+    _check_format(form, "format", f"format={form}")
     require_choice(config, "up", ("y", "z"))
     if form == "glb" and up != "y":
         raise ConfigError("up=z: glTF has y up always, and programs turn it themselves; leave up= out")
-    if form == "usd" and importlib.util.find_spec("pxr") is None:
-        raise ConfigError(
-            'format=usd: writing needs usd-core (pip install "hood[usd]"); glb, pc2, obj and ply need nothing more'
-        )
     parts = plain(config.parts)
     parts = parts if isinstance(parts, list) else [parts]
     if not parts or any(part not in PARTS for part in parts):
@@ -72,10 +104,23 @@ def _checked(config: DictConfig) -> tuple[str, str, list[str]]:
     return form, up, parts
 
 
+def _check_format(form: str, key: str, asked: str) -> None:
+    if form == "abc":
+        raise ConfigError(f"{asked}: no maintained package writes Alembic; take {key}=usd, which the same programs read")
+    if form not in FORMATS:
+        raise ConfigError(f"{asked}: choose {' or '.join(FORMATS)}")
+    if form == "usd" and importlib.util.find_spec("pxr") is None:
+        raise ConfigError(f'{asked}: writing needs usd-core (pip install "hood[usd]"); glb, pc2, obj and ply need nothing more')
+
+
+def _beside(source: Path, form: str) -> Path:
+    return source.with_suffix(f".{form}") if form in _SUFFIXES else source.with_name(f"{source.stem}_{form}")
+
+
 def _target(config: DictConfig, source: Path, form: str) -> Path:
     """File or folder to write."""
     if config.output is None:
-        target = source.with_suffix(f".{form}") if form in _SUFFIXES else source.with_name(f"{source.stem}_{form}")
+        target = _beside(source, form)
     else:
         target = Path(str(config.output)).expanduser()
     if form in _SUFFIXES:
@@ -86,8 +131,8 @@ def _target(config: DictConfig, source: Path, form: str) -> Path:
     return target
 
 
-def _write(target: Path, form: str, clip: Clip, up: str) -> None:
-    """Write the whole, or nothing."""
+def _write(target: Path, form: str, clip: Clip, up: str, replace: bool = False) -> None:
+    """Write the whole, or nothing; a folder that is not empty only to ``replace`` it."""
     target.parent.mkdir(parents=True, exist_ok=True)
     if form == "glb":
         write_atomically(target, gltf_bytes(clip))
@@ -100,7 +145,9 @@ def _write(target: Path, form: str, clip: Clip, up: str) -> None:
         else:
             draft.mkdir()
             _FOLDERS[form](draft, clip)
-            if target.is_dir():
+            if replace:
+                _remove(target)
+            elif target.is_dir():
                 target.rmdir()  # empty
         draft.replace(target)
     except OSError as error:

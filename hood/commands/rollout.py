@@ -26,6 +26,7 @@ from hood.commands.common import (
     thinning,
     together,
 )
+from hood.commands.export import check_formats, export_beside
 from hood.commands.guarding import OFF, GuardStopped, guard_sentences, make_guard, write_alarms
 from hood.commands.notices import heard
 from hood.commands.plan_file import plan_sentences, rollout_config, summarise_plan
@@ -46,6 +47,7 @@ def run(overrides: Sequence[str]) -> int:
     used, else 3 where a result is unsound (:mod:`hood.dynamics.soundness`), else 0."""
     config = rollout_config(overrides)
     check_config(config)
+    check_formats([str(form) for form in config.formats])
     return together(lambda: _run(config))
 
 
@@ -107,6 +109,7 @@ def _run_there(ready: Setup, asked: DictConfig, digest: str, warned: list[str], 
     try:
         if not interrupted:
             _draw(config, folder)
+            _tell(export_beside(folder / "rollout.h5", [str(form) for form in config.formats]))
     finally:
         summary["kernels"] = None if simulator is None else simulator.network.kernels
         summary["warnings"] = list(warned)
@@ -158,6 +161,7 @@ def _finished(config: DictConfig, digest: str, folder: Path) -> dict[str, Any] |
         return None
     now = plain(config)
     before.setdefault("stepping", now["stepping"])  # rollouts from before there were options are known by their word
+    before.setdefault("formats", [])
     same = all(before.get(key) == now[key] for key in now if key not in ("resume", "output", "allow_unsound"))
     if not same or not bool(attributes["complete"]) or attributes["checkpoint_sha256"] != digest:
         return None

@@ -201,3 +201,44 @@ def test_too_large_a_glb_is_refused_before_it_is_made(
     assert main(["export", str(_rollout(tmp_path)), "format=glb"]) == 2
     assert "num_frames=" in capsys.readouterr().err
     assert not (tmp_path / "rollout.glb").exists()
+
+
+SHORT = (
+    "garment=skirt",
+    "sequence=plie",
+    "num_frames=2",
+    "stepper=refine",
+    "refine=1",
+    "metrics=none",
+    "video=none",
+    "sheet=false",
+)
+
+
+def test_a_rollout_writes_formats_and_replaces_its_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "rollout_obj").mkdir()
+    (tmp_path / "rollout_obj" / "frame_9999.obj").write_text("of a longer run before")
+    assert main(["rollout", *SHORT, "formats=[glb,obj]", f"output={tmp_path}"]) == 0
+    told = capsys.readouterr().out
+    assert "rollout.glb: " in told
+    assert "2 frames at 30 fps" in told
+    pos = read_rollout(tmp_path / "rollout.h5").cloth_pos
+    document, _ = _glb(tmp_path / "rollout.glb")
+    assert {mesh["name"] for mesh in document["meshes"]} >= {"skirt", "body"}
+    files = sorted((tmp_path / "rollout_obj").glob("*.obj"))
+    assert "frame_9999.obj" not in {file.name for file in files}
+    loaded = trimesh.load(files[-1], process=False, group_material=False)
+    parts = [loaded] if isinstance(loaded, trimesh.Trimesh) else list(loaded.geometry.values())
+    vertices = np.concatenate([part.vertices for part in parts])
+    near = np.linalg.norm(vertices[:, None] - pos[-1][None, :5], axis=2).min(axis=0)
+    assert float(near.max()) < 1e-6
+    assert not list(tmp_path.glob(".partial*"))
+
+
+@pytest.mark.parametrize(("forms", "word"), [("[abc]", "Alembic"), ("[glb,fbx]", "choose usd or glb")])
+def test_formats_are_refused_before_the_first_frame(
+    forms: str, word: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["rollout", *SHORT, f"formats={forms}", f"output={tmp_path / 'run'}"]) == 2
+    assert word in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()

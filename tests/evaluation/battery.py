@@ -60,8 +60,8 @@ class Battery:
         self._network: Stepper | None = None
 
     def judged(self, cell: Cell, method: str, mode: str = "report") -> Judged:
-        """The class of a cell; strain of networks is held against the solver's in the same cell, that of the solver, where it is
-        beyond the plain limit, against its own at a quarter of the time step, as in the map."""
+        """The class of a cell. Strain of networks is held against the solver's in the same cell; that of the solver, where it
+        is beyond the plain limit, against its own at a quarter of the time step, as in the map."""
         run = self.run(cell, method, mode)
         if method != "newton":
             return judge(cell, run, self.solved(cell), method == "quickstart", CRITERIA)
@@ -87,8 +87,11 @@ class Battery:
         return self._solved[cell.name]
 
     def run(self, cell: Cell, method: str, mode: str, finer: int = 1) -> Run:
-        """A rollout as of ``hood rollout``, of ``finer`` times as many frames, and what it says of itself. Two things that it says of every cell do not count:
-        that networks were not trained on so coarse a dress, and how much the skin cuts."""
+        """A rollout as of ``hood rollout``, of ``finer`` times as many frames, and what it says of itself.
+
+        Two things that it says of every cell do not count: that networks were not trained on so coarse a dress, and how much
+        the skin cuts.
+        """
         config = self._config(cell, method, mode)
         with heard(aloud=False) as warned:
             scene = make_scene(config)
