@@ -61,7 +61,7 @@ def find_landing(
     """
     way = flight - (contact.next_point - contact.point)
     length = way.norm(dim=1)
-    far = (length > LEAST_WAY) & (contact.dist > -INSIDE) & (contact.dist - length < NEAR)
+    far = (length > LEAST_WAY) & length.isfinite() & (contact.dist > -INSIDE) & (contact.dist - length < NEAR)
     rows = far.nonzero().squeeze(1)
     if not len(rows):
         return None

@@ -162,6 +162,13 @@ def test_single_precision_and_steps_of_fixed_shapes_find_the_same_on_a_cpu() -> 
         torch.testing.assert_close(other.fold.contact.next_point.double(), double.fold.contact.next_point, rtol=0, atol=1e-5)
 
 
+@pytest.mark.parametrize("speed", [float("nan"), float("inf"), 1e30])
+def test_speeds_that_are_no_numbers_land_nowhere(speed: float) -> None:
+    lands, _, _ = landings(obstacle(*corner()), [[-0.06, 0.03, 0.0], [-0.06, 0.03, 0.1]], [[0.1, 0, 0], [speed, speed, 0]])
+    assert lands[0]
+    assert not lands[1] or speed == 1e30
+
+
 def test_free_flight_is_that_of_a_step_without_forces() -> None:
     problem = thrown(3.0)
     expected = torch.tensor([0.1, -9.81 / 900, 0.0], dtype=F64)
