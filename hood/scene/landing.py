@@ -65,9 +65,11 @@ def find_landing(
     rows = far.nonzero().squeeze(1)
     if not len(rows):
         return None
-    count = int((length[rows].max() / STRIDE).ceil().clamp(1, MOST_PLACES))
-    shares = torch.arange(1, count + 1, dtype=pos.dtype, device=pos.device) / count
-    places = pos[rows].unsqueeze(1) + shares.view(1, -1, 1) * way[rows].unsqueeze(1)
+    # Every way has places of its own number; shorter ones end in copies of their last, so that no scene changes another's.
+    counts = (length[rows] / STRIDE).ceil().clamp(1, MOST_PLACES).unsqueeze(1)
+    count = int(counts.max())
+    shares = torch.arange(1, count + 1, device=pos.device).minimum(counts) / counts
+    places = pos[rows].unsqueeze(1) + shares.unsqueeze(2) * way[rows].unsqueeze(1)
     scenes = vertex_scene[rows].repeat_interleave(count)
     match = match_surface(places.reshape(-1, 3), scenes, obstacle, curved=True)
     plane = torch.where(contact.valid, (contact.point * contact.normal).sum(dim=1), -torch.inf)[rows].unsqueeze(1)

@@ -135,7 +135,7 @@ def test_calm_cloth_has_the_folds_alone() -> None:
 def test_a_batch_finds_what_each_scene_does() -> None:
     ball, room = obstacle(*sphere(4, 0.1)), obstacle(*corner())
     points = torch.tensor([[0.02, 0.25, 0.0], [0.0, 0.3, 0.0], [-0.06, 0.03, 0.0], [-0.2, 0.3, 0.0]], dtype=F64)
-    ways = torch.tensor([[0, -0.3, 0], [0, 0.1, 0], [0.1, 0, 0], [0.1, 0, 0]], dtype=F64)
+    ways = torch.tensor([[0, -0.3, 0], [0, 0.1, 0], [0.1, 0.03, 0.02], [0.1, 0, 0]], dtype=F64)
     scene, both = torch.arange(4) // 2, concatenate_obstacles([ball, room])
     together = find_other_skin(points, scene, both, find_contact(points, scene, both), ways).contact
     assert together is not None
