@@ -187,9 +187,8 @@ def inertial_guess(state: State, step: StepInput, vertex_scene: Tensor | None = 
 
 
 def free_flight(problem: StepProblem) -> Tensor:
-    """Displacements (V, 3) [m] in the step without any force but weight, dt v_t + dt² g."""
-    dt = problem.vertex_dt
-    return dt * problem.state.vel + dt**2 * problem.gravity.to(problem.state.vel)
+    """Displacements (V, 3) [m] in the step without any force, dt v_t. Cloth at rest goes nowhere, however long the step."""
+    return problem.vertex_dt * problem.state.vel
 
 
 def sum_per_scene(values: Tensor, scene: Tensor, num_scenes: int) -> Tensor:

@@ -16,7 +16,7 @@ from hood.scene.state import Obstacle
 
 #: Vertices that move less than this [m] past the skin they are matched with are held by its tangent plane.
 LEAST_WAY = 20e-3
-#: Places on the way are no farther apart [m], as long as there are no more of them than so many: a step at 10 m/s and 30 fps.
+#: Least distance [m] from one place on a way to the next, and how many places are looked at: a step at 10 m/s and 30 fps.
 STRIDE, MOST_PLACES = 15e-3, 24
 #: A way ends where the cloth is nearer to the skin than this [m].
 NEAR = 2e-3
@@ -53,7 +53,7 @@ def find_landing(
     Args:
         pos: (V, 3) m, at t.
         contact: of the positions, valid or not.
-        flight: (V, 3) m, what they would move in the step without any force but weight.
+        flight: (V, 3) m, what they would move in the step without any force.
 
     Returns:
         Matches (V,), at t and t + 1; ``dist`` is that of ``pos`` to the tangent plane at t. Rows that do not enter are those
@@ -63,26 +63,42 @@ def find_landing(
     length = way.norm(dim=1)
     far = (length > LEAST_WAY) & length.isfinite() & (contact.dist > -INSIDE) & (contact.dist - length < NEAR)
     rows = far.nonzero().squeeze(1)
+    share = _first_touch(rows, pos, way, length, vertex_scene, obstacle, contact)
+    rows = (share > 0.0).nonzero().squeeze(1)
     if not len(rows):
         return None
-    # Every way has places of its own number; shorter ones end in copies of their last, so that no scene changes another's.
-    counts = (length[rows] / STRIDE).ceil().clamp(1, MOST_PLACES).unsqueeze(1)
-    count = int(counts.max())
-    shares = torch.arange(1, count + 1, device=pos.device).minimum(counts) / counts
-    places = pos[rows].unsqueeze(1) + shares.unsqueeze(2) * way[rows].unsqueeze(1)
-    scenes = vertex_scene[rows].repeat_interleave(count)
-    match = match_surface(places.reshape(-1, 3), scenes, obstacle, curved=True)
-    plane = torch.where(contact.valid, (contact.point * contact.normal).sum(dim=1), -torch.inf)[rows].unsqueeze(1)
-    off = (places * contact.normal[rows].unsqueeze(1)).sum(dim=2) - plane
-    skin = match.dist.view(len(rows), count)
-    touched = (skin < NEAR) & (off - skin > HIDDEN)
-    first = touched.to(torch.int8).argmax(dim=1)  # the first of those that are touched
-    place = count * torch.arange(len(rows), device=pos.device) + first
-    point, normal = match.point[place], match.normal[place]
-    dist = ((pos[rows] - point) * normal).sum(dim=1)
-    keep = touched.any(dim=1) & ((normal * way[rows]).sum(dim=1) < 0) & (dist > 0)
-    if not bool(keep.any()):
+    places = pos[rows] + share[rows].unsqueeze(1) * way[rows]
+    match = match_surface(places, vertex_scene[rows], obstacle, curved=True)
+    dist = ((pos[rows] - match.point) * match.normal).sum(dim=1)
+    keep = (((match.normal * way[rows]).sum(dim=1) < 0) & (dist > 0)).nonzero().squeeze(1)
+    if not len(keep):
         return None
-    chosen, found = rows[keep], match._asdict() | {"dist": match.dist.index_copy(0, place, dist)}
-    both = {name: getattr(contact, name).index_copy(0, chosen, values[place[keep]]) for name, values in found.items()}
+    chosen, found = rows[keep], match._asdict() | {"dist": dist}
+    both = {name: getattr(contact, name).index_copy(0, chosen, values[keep]) for name, values in found.items()}
     return Match(**both), torch.zeros_like(contact.valid).index_fill(0, chosen, True)
+
+
+def _first_touch(
+    rows: Tensor, pos: Tensor, way: Tensor, length: Tensor, vertex_scene: Tensor, obstacle: Obstacle, contact: Contact
+) -> Tensor:
+    """The share of their ways (V,) at which vertices first touch skin that their tangent planes do not show; 0 where none does.
+
+    Places follow each other by their distance from the skin, which is nowhere nearer in between, and by a stride at least. A
+    way is left when what remains of it is shorter than that distance.
+    """
+    touched = torch.zeros_like(length)
+    gone = contact.dist[rows].clamp_min(STRIDE).minimum(length[rows])
+    for _ in range(MOST_PLACES):
+        if not len(rows):
+            break
+        whole = length[rows]
+        places = pos[rows] + (gone / whole).unsqueeze(1) * way[rows]
+        skin = match_surface(places, vertex_scene[rows], obstacle).dist
+        plane = ((places - contact.point[rows]) * contact.normal[rows]).sum(dim=1)
+        hidden = ~contact.valid[rows] | (plane - skin > HIDDEN)
+        touches = (skin < NEAR) & hidden
+        touched = touched.index_copy(0, rows, torch.where(touches, gone / whole, 0.0))
+        goes_on = ~touches & (skin < whole - gone + NEAR) & (gone < whole)
+        gone = (gone + skin.clamp_min(STRIDE)).minimum(whole)[goes_on]
+        rows = rows[goes_on]
+    return touched

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import weakref
+
 import torch
 from torch import Tensor
 
@@ -36,12 +38,32 @@ def sag(cloth: Cloth, contact: Contact, pos: Tensor) -> Tensor:
     """
     share = SAG_SHARE * contact.curvature
     at_rest = (share * cloth.edge_length_sq).clamp_max(MOST_SAG)
-    return at_rest + (share * cloth.largest_of_edges(_growth(cloth, pos))).clamp_max(MOST_STRETCHED)
+    growth = _known_growth(cloth, pos)
+    return at_rest if growth is None else at_rest + (share * growth).clamp_max(MOST_STRETCHED)
 
 
-def _growth(cloth: Cloth, pos: Tensor) -> Tensor:
-    """What the square [m²] (E,) of edges has grown by beyond :data:`COVERED`."""
-    return (cloth.edge_sq(pos) - COVERED * cloth.rest_edge_sq).clamp_min(0.0)
+#: Cloth and positions that growth was asked of last, and what it was: both sides of a fold ask in turn.
+_LAST: list[tuple[weakref.ref[Cloth], weakref.ref[Tensor], int, Tensor | None]] = []
+
+
+def _known_growth(cloth: Cloth, pos: Tensor) -> Tensor | None:
+    if pos.requires_grad or pos.is_inference():
+        return _growth(cloth, pos)
+    for of, at, version, value in _LAST:
+        if of() is cloth and at() is pos and version == pos._version:
+            return value
+    value = _growth(cloth, pos)
+    _LAST[:] = [(weakref.ref(cloth), weakref.ref(pos), pos._version, value)]
+    return value
+
+
+def _growth(cloth: Cloth, pos: Tensor) -> Tensor | None:
+    """What the square of an edge at a vertex has grown by beyond :data:`COVERED`, at most, (V,) [m²]; None where none has, on
+    a CPU (elsewhere the host would wait for the answer)."""
+    growth = cloth.edge_sq(pos) - COVERED * cloth.rest_edge_sq
+    if growth.device.type == "cpu" and not growth.requires_grad and not bool((growth > 0.0).any()):
+        return None
+    return cloth.largest_of_edges(growth.clamp_min(0.0))
 
 
 def vertex_reach(form: str, least: float, cloth: Cloth, contact: Contact, pos: Tensor) -> Tensor:
