@@ -94,7 +94,7 @@ def test_a_network_learns_to_leave_layers_on_their_sides(tmp_path: Path, body: B
         felt[weight] = [trainer.update()["layer_sides"] / weight for _ in range(40)][1::2]  # every other step is a relaxing one
     # Single updates go up and down, and cloth that an untrained network stretches meets itself the more: the one that is not
     # taught shows how much.
-    assert np.mean(felt[5e6][5:9]) < 0.8 * np.mean(felt[1e-3][5:9])
+    assert np.mean(felt[5e6][5:9]) < 0.6 * np.mean(felt[1e-3][5:9])
     assert np.mean(felt[5e6][10:]) < 0.6 * np.mean(felt[1e-3][10:])
 
 
