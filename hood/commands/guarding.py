@@ -12,7 +12,22 @@ import numpy as np
 from omegaconf import DictConfig
 
 from hood.config import ConfigError, build, require_choice
-from hood.dynamics.guard import CHECK, CHECK_EVERY, CUT, FINITE, FORCE, MENDED, MODES, SPEED, STRAIN, TARGET, TURN, Alarm, Guard
+from hood.dynamics.guard import (
+    CHECK,
+    CHECK_EVERY,
+    CUT,
+    FINITE,
+    FORCE,
+    INSIDE,
+    MENDED,
+    MODES,
+    SPEED,
+    STRAIN,
+    TARGET,
+    TURN,
+    Alarm,
+    Guard,
+)
 from hood.dynamics.mend import LEFT, REFINED, SOLVED
 from hood.dynamics.recorder import RolloutData, RolloutWriter
 from hood.dynamics.soundness import name_frames
@@ -26,6 +41,7 @@ _TEXTS = {
     TARGET: "the solver short of its target, relative gradient {value:.2g} at worst",
     STRAIN: "strain p99 beyond {limit:.0%}, {value:.0%} at worst",
     FORCE: "forces out of balance, {value:.3g} times the weight at worst, beyond {limit:.3g}",
+    INSIDE: "a vertex {value:.2g} m inside the body at worst, beyond {limit:.2g}",
     CHECK: f"of every {CHECK_EVERY}th step, strain p99 {{value:.1%}} away from a solver's that goes on from it, beyond "
     "{limit:.0%} (refine=5 or stepper=newton keeps nearer to it)",
     TURN: "the body turns by {value:.0f} degrees in a step, beyond {limit:.0f} (less with a higher fps=…)",

@@ -16,6 +16,8 @@ Of every step the gravest of these causes is told, and of the surface what is me
   down, the network stretches the cloth too far, or hardly lets it stretch. Ten iterations suffice: on 14 steps of ``ours`` and
   14 of quickstart (dress and shorts on dance_mixed) they come within 0.4 points of 200, where the steps themselves are up to
   12 points off (quickstart: 0.4).
+- *inside*: a vertex is more than 10 mm inside the body. It is mended with contact where it has got to
+  (:mod:`hood.scene.entered`); a solver has tried that already.
 - *turn*, *speed*: the body turns by more than 15 degrees as one, or its fastest vertex moves by more than 0.3 m. A jump over
   which the cloth was carried is none.
 - *cut*: the skin cuts more than 2% of the cloth's triangles, in frames where that is measured.
@@ -64,12 +66,14 @@ from hood.solver.step_figures import StepFigures
 MODES = ("report", "repair", "strict", "off")
 #: Causes, as they stand in a rollout file; of a step the gravest is told, in this order.
 FINITE, TARGET, STRAIN, FORCE, CHECK = "not finite", "target", "strain", "force", "check"
-TURN, SPEED, CUT = "turn", "speed", "cut"
-CAUSES = (FINITE, TARGET, STRAIN, FORCE, CHECK, TURN, SPEED, CUT)
+INSIDE, TURN, SPEED, CUT = "inside", "turn", "speed", "cut"
+CAUSES = (FINITE, TARGET, STRAIN, FORCE, INSIDE, CHECK, TURN, SPEED, CUT)
 #: Those that a step can be mended of.
-MENDED = (FINITE, TARGET, STRAIN, FORCE, CHECK)
+MENDED = (FINITE, TARGET, STRAIN, FORCE, INSIDE, CHECK)
 
 STRAIN_LIMIT, CUT_LIMIT = Criteria.strain, 0.02
+#: Depth of a vertex in the body [m].
+DEPTH_LIMIT = Criteria.depth
 #: A body that turns by more degrees, or moves by more metres, in a step.
 TURN_LIMIT, SPEED_LIMIT = 15.0, 0.3
 #: Unbalanced force: of a network's typical vertex, or of the whole cloth where a solver or a refinement took the step.
@@ -149,7 +153,8 @@ class Guard:
         """
         now = standing(self._potential, problem, prediction, figures, typical=self._alone)
         moved = _motion_alarm(frame, problem.step.obstacle)
-        alarm = self._step_alarm(frame, prediction, now, wary=moved is not None)
+        depth = problem.next_depth(prediction.next_pos) if now.finite else math.nan
+        alarm = self._step_alarm(frame, prediction, now, depth, wary=moved is not None)
         if alarm is None and self._alone and frame % CHECK_EVERY == 0:
             checked, prediction = self._check(frame, problem, prediction, now)
             if checked is not None:
@@ -163,13 +168,18 @@ class Guard:
             # A step that met the solver's target is as good as the solver can make it.
             self.alarms.append(alarm)
             return prediction
+        given = prediction
+        if depth > DEPTH_LIMIT:
+            problem = problem.with_entered(prediction.next_pos)
+            prediction = replace(prediction, residual=math.nan, entered=problem.fold)
+            now = standing(self._potential, problem, prediction, typical=self._alone)
         limits = Limits(ENOUGH if self._target is None else self._target, self._strain_limit)
         mended = mend(self._potential, problem, prediction, now, limits, self._settings, self._most)
         if alarm.cause == STRAIN:
             self._allow(mended)
         done = replace(alarm, repair=mended.kind, iterations=mended.iterations)
         self.alarms.append(replace(done, rg_before=mended.before.residual, rg_after=mended.after.residual))
-        return self._told(mended)
+        return given if mended.kind == LEFT else self._told(mended)
 
     def see_surface(self, frame: int, row: Mapping[str, float]) -> None:
         """Look at what was measured of the cloth's surface in a frame."""
@@ -177,7 +187,7 @@ class Guard:
         if share > CUT_LIMIT:
             self.alarms.append(Alarm(frame, CUT, share, CUT_LIMIT))
 
-    def _step_alarm(self, frame: int, prediction: Prediction, now: Standing, wary: bool) -> Alarm | None:
+    def _step_alarm(self, frame: int, prediction: Prediction, now: Standing, depth: float, wary: bool) -> Alarm | None:
         """The gravest of a step."""
         if not now.finite:
             return Alarm(frame, FINITE, math.nan, math.nan)
@@ -188,7 +198,9 @@ class Guard:
         if self._alone and now.residual > WILD:
             return Alarm(frame, FORCE, now.residual, WILD)
         force, limit = self._force(now), (_WARY if wary else 1.0) * self._force_limit()
-        return Alarm(frame, FORCE, force, limit) if not force <= limit else None
+        if not force <= limit:
+            return Alarm(frame, FORCE, force, limit)
+        return Alarm(frame, INSIDE, depth, DEPTH_LIMIT) if depth > DEPTH_LIMIT else None
 
     def _check(
         self, frame: int, problem: StepProblem, prediction: Prediction, now: Standing

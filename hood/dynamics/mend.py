@@ -109,7 +109,7 @@ def mend(
         pos, report = minimize(potential, problem, start, how)
         if kind == REFINED and not report.iterations:
             continue  # the same step
-        taken = Prediction(pos, report.acc, prediction.metrics)
+        taken = Prediction(pos, report.acc, prediction.metrics, entered=prediction.entered)
         spent += report.iterations
         tries.append((kind, taken, standing(potential, problem, taken)))
         if tries[-1][2].within(limits):

@@ -203,16 +203,17 @@ def simulate(
         if problem is None or known is None:
             return
         prediction, lap, figures = stepper.predict(problem, prepared, watch), watch.lap(), None
+        known = _as_taken(known, prediction)
         if wants_potential:
             with watch.aside("metrics"):
                 figures = StepFigures(potential, known, prediction.next_pos, prediction.acc)
         if guard is not None and not (relaxing and index == 0):
             with watch.aside("guard"):
-                known = known if wants_potential else potential.prepare(problem)
+                known = known if wants_potential else _as_taken(potential.prepare(problem), prediction)
                 predicted, prediction = prediction, guard.see(index + 1, known, prediction, figures)
             if guard.stopped is not None:
                 return
-            lap = _with_guard(lap, watch.spent_aside("guard"))
+            lap, known = _with_guard(lap, watch.spent_aside("guard")), _as_taken(known, prediction)
             if prediction is not predicted and wants_potential:
                 with watch.aside("metrics"):
                     figures = StepFigures(potential, known, prediction.next_pos, prediction.acc)
@@ -237,6 +238,11 @@ def _jumps_within(scene: Scene, start_frame: int, count: int) -> dict[int, Jump]
     if within:
         warnings.warn(describe_jumps(scene.motion, within), stacklevel=3)
     return within
+
+
+def _as_taken(problem: StepProblem, prediction: Prediction) -> StepProblem:
+    """The problem with the contact that its step was taken with in the end."""
+    return problem if prediction.entered is None else replace(problem, fold=prediction.entered)
 
 
 def _with_guard(lap: dict[str, float], spent: float) -> dict[str, float]:

@@ -32,7 +32,7 @@ from hood.native import features as native
 from hood.nn.model import MeshGraphNet
 from hood.nn.schedule import edge_set_names, parse_passes, parse_schedule, set_level
 from hood.scene.cloth import Cloth
-from hood.scene.contact import find_nearest
+from hood.scene.contact import Fold, find_nearest
 from hood.scene.near_cloth import find_near_cloth
 from hood.scene.state import State, StepInput
 from hood.solver.local import check_local
@@ -56,6 +56,7 @@ class Prediction:
     residual: float = math.nan  # relative gradient at next_pos; NaN where the step does not know it
     #: Of models in several passes: (V, 3) m after every pass but the last, and the forces (V, 3) N there.
     early: tuple[tuple[Tensor, Tensor], ...] = ()
+    entered: Fold | None = None  # the second contacts that it was taken with, where the step had led into skin first
 
 
 class Sight(NamedTuple):

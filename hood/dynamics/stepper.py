@@ -17,6 +17,9 @@ from hood.scene.cloth import Cloth
 from hood.solver.newton import NewtonSettings, minimize
 from hood.solver.reasons import reason_number
 
+#: So often is a step taken again that has led into skin which its contact did not show.
+MOST_AGAIN = 3
+
 
 class Stepper(Protocol):
     """Takes steps: :class:`hood.dynamics.simulator.Simulator` by a network, :class:`NewtonStepper` by minimisation.
@@ -91,17 +94,27 @@ class NewtonStepper:
         return self.potential.prepare(problem)
 
     def predict(self, problem: StepProblem, prepared: None, watch: Stopwatch | None = None) -> Prediction:
-        """The minimum next to the contact-projected inertial guess."""
+        """The minimum next to the contact-projected inertial guess; where that lies in skin that its contact did not show, the
+        one next to it with that as well."""
         with timed(watch, "search"):
-            problem = self.search(problem)
+            problem = asked = self.search(problem)
         with timed(watch, "solver"):
             pos, report = minimize(self.potential, problem, settings=self.settings)
+            iterations = report.iterations
+            for _ in range(MOST_AGAIN if self.settings.budget_ms is None else 0):
+                again = problem.with_entered(pos)
+                if again is problem:
+                    break
+                problem = again
+                pos, report = minimize(self.potential, problem, pos, self.settings)
+                iterations += report.iterations
         reached = {
-            "solver_iterations": float(report.iterations),
+            "solver_iterations": float(iterations),
             "solver_converged": float(bool(report.converged.all())),
             "solver_reason": reason_number(report.reason),
         }
-        return Prediction(pos, report.acc, reached, float(report.relative_gradient.max()))
+        entered = None if problem is asked else problem.fold
+        return Prediction(pos, report.acc, reached, float(report.relative_gradient.max()), entered=entered)
 
     def next_velocity(self, problem: StepProblem, prediction: Prediction) -> Tensor:
         """(V, 3) m/s at t + 1: (x_{t+1} − x_t) / dt."""

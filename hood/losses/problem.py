@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from hood.scene.cloth import Cloth
-from hood.scene.contact import Contact, Fold, find_contact
+from hood.scene.contact import Contact, Fold, find_contact, skin_distance
 from hood.scene.contact_points import PointContact, find_point_contact
+from hood.scene.entered import find_entered
 from hood.scene.landing import find_other_skin
 from hood.scene.layer_sides import LayerPairs, find_sides
 from hood.scene.layers import SceneLayers, find_layers, late_targets
@@ -71,6 +72,23 @@ class StepProblem:
             return problem
         given = self.state.pos, self.cloth.vertex_scene, obstacle, problem.contact
         return replace(problem, fold=find_other_skin(*given, free_flight(self)))
+
+    def next_depth(self, next_pos: Tensor) -> float:
+        """Depth [m] of the vertex that lies deepest inside the body at t + 1, at ``next_pos`` (V, 3) [m]; 0 where none does."""
+        obstacle, cloth = self.step.obstacle, self.cloth
+        if obstacle is None or not len(obstacle.faces) or not len(next_pos):
+            return 0.0
+        dist = skin_distance(next_pos, cloth.vertex_scene, obstacle.next_pos, obstacle)
+        return float(torch.where(cloth.mass > 0, -dist, 0.0).clamp_min(0.0).max())
+
+    def with_entered(self, next_pos: Tensor) -> StepProblem:
+        """The problem with contact where its solution ``next_pos`` (V, 3) [m] lies in skin that it did not know of; itself
+        where there is none, and where contact is on the nearest side only."""
+        obstacle = self.step.obstacle
+        if obstacle is None or self.contact is None or self.fold is None:
+            return self
+        fold = find_entered(next_pos, self.state.pos, self.cloth.vertex_scene, obstacle, self.contacts)
+        return self if fold is None else replace(self, fold=fold)
 
     def with_points(self, place: str) -> StepProblem:
         """The problem with its contact, also at points inside edges and faces (a ``place`` of

@@ -161,6 +161,7 @@ class SurfaceTree:
         self._share(1)
         centre = np.ascontiguousarray(np.nan_to_num(np.asarray(pos, np.float64)[faces].mean(axis=1)))
         self._fitted: tuple[weakref.ref[Tensor], int | None] | None = None
+        self._last: tuple[np.ndarray, dict[str, np.ndarray]] | None = None  # points, and where they are, of the last search
         lib.surface_build(ctypes.byref(self._tree), centre.ctypes.data_as(POINTER))
 
     def _share(self, parts: int) -> None:
@@ -178,21 +179,36 @@ class SurfaceTree:
         if known is not None and version is not None and known[0]() is vertices and known[1] == version:
             self._lib.surface_again(ctypes.byref(self._tree))
             return
-        self._arrays["pos"][...] = _double(vertices)
+        given, self._fitted = _double(vertices), (weakref.ref(vertices), version)
+        if known is not None and np.array_equal(self._arrays["pos"], given):
+            self._lib.surface_again(ctypes.byref(self._tree))
+            return
+        self._arrays["pos"][...], self._last = given, None
         self._lib.surface_refit(ctypes.byref(self._tree))
-        self._fitted = weakref.ref(vertices), version
 
     def search(self, points: np.ndarray, vertices: Tensor, next_pos: np.ndarray, curved: bool) -> dict[str, np.ndarray]:
         """Fields of :class:`Match` for ``points`` (N, 3) on the surface at ``vertices`` (W, 3), with ``next_pos`` (W, 3); the
         arrays in float64 and C-contiguous. The curvature only if it is to be ``curved``."""
         count = len(points)
-        self._share(num_parts(count, _POINTS))
-        self._fit(vertices)
-        found = _arrays(count, curved, np.empty)
+        found = _arrays(count, curved, np.empty) | self.find(points, vertices)
         query = _Query(count=count, most_curvature=MOST_CURVATURE, rounds=ROUNDS)
         _point(query, {"points": points, "next_pos": next_pos, **found})
-        self._lib.surface_search(ctypes.byref(self._tree), ctypes.byref(query))
+        self._lib.surface_describe(ctypes.byref(self._tree), ctypes.byref(query))
         return found
+
+    def find(self, points: np.ndarray, vertices: Tensor) -> dict[str, np.ndarray]:
+        """Those of them that do not depend on where the surface goes. A step ends where the next one begins: the same points
+        on the same surface are not searched for again."""
+        count = len(points)
+        self._share(num_parts(count, _POINTS))
+        self._fit(vertices)
+        if self._last is None or not np.array_equal(self._last[0], points):
+            found = _arrays(count, False, np.empty, ("bary",))
+            query = _Query(count=count)
+            _point(query, {"points": points, **found})
+            self._lib.surface_find(ctypes.byref(self._tree), ctypes.byref(query))
+            self._last = points.copy(), found
+        return {name: values.copy() for name, values in self._last[1].items()}
 
     def folds(
         self,
@@ -265,6 +281,25 @@ def search(
 
 
 @torch.no_grad()
+def distance(
+    points: Tensor, point_scene: Tensor, vertices: Tensor, faces: Tensor, face_scene: Tensor, incidence: Sequence[Tensor]
+) -> Tensor | None:
+    """Signed distances (N,) [m] of points (N, 3) alone, as :func:`search` gives them; None where that does."""
+    if type(points) is not Tensor or points.device.type != "cpu" or library() is None:
+        return None
+    given, scene = _double(points), _only_scene(face_scene)
+    if scene is not None and scene == _only_scene(point_scene):
+        dist = _tree_of(faces, None, face_scene, incidence, vertices).find(given, vertices)["dist"]
+        return torch.from_numpy(dist).to(points.dtype)
+    dist = np.full(len(points), np.inf)
+    for scene in point_scene.unique().tolist():
+        rows = (point_scene == scene).numpy().nonzero()[0]
+        if bool((face_scene == scene).any()):
+            dist[rows] = _tree_of(faces, scene, face_scene, incidence, vertices).find(given[rows], vertices)["dist"]
+    return torch.from_numpy(dist).to(points.dtype)
+
+
+@torch.no_grad()
 def search_folds(
     points: Tensor,
     point_scene: Tensor,
@@ -318,11 +353,13 @@ def _double(values: Tensor) -> np.ndarray:
     return np.ascontiguousarray(values.detach().numpy(), np.float64)
 
 
-def _arrays(count: int, curved: bool, made: Callable[..., np.ndarray]) -> dict[str, np.ndarray]:
+def _arrays(
+    count: int, curved: bool, made: Callable[..., np.ndarray], places: Sequence[str] = ("bary", *_PLACES)
+) -> dict[str, np.ndarray]:
     """Room for fields of :class:`Match`."""
     whole: dict[str, np.ndarray] = {name: made(count, np.int64) for name in ("vertex", "face")}
     real = {name: made(count) for name in ("vertex_dist", "dist", *(["curvature"] if curved else []))}
-    return whole | real | {name: made((count, 3)) for name in ("bary", *_PLACES)}
+    return whole | real | {name: made((count, 3)) for name in places}
 
 
 def _nothing(count: int, curved: bool) -> dict[str, np.ndarray]:

@@ -893,7 +893,8 @@ void surface_curvature(int64_t num_faces, int64_t num_edges, int64_t num_vertice
     }
 }
 
-void surface_search(const Tree* tree, const Query* query) {
+// The faces nearest to the points, where on them, and how far away.
+void surface_find(const Tree* tree, const Query* query) {
     for_parts(tree->parts, [&](int64_t part) {
         Tree own = *tree;
         const int64_t visits = own.batch * own.num_leaves + 1;
@@ -901,8 +902,10 @@ void surface_search(const Tree* tree, const Query* query) {
         const Range range = range_of(query->count, part, own.parts, own.batch);
         for (int64_t i = range.begin; i < range.end; i += own.batch) search(own, *query, i, std::min(i + own.batch, range.end));
     });
-    describe(*tree, *query);
 }
+
+// What is known of places that have been found.
+void surface_describe(const Tree* tree, const Query* query) { describe(*tree, *query); }
 
 // The other side of folds: of points whose nearest surface points are known, the rows of those that have one are filled in, and
 // ``found`` (N) says which they are. What it is, see hood/scene/contact.py.
@@ -931,7 +934,8 @@ void surface_folds(Tree* tree, const Matched* matched, const Query* all, uint8_t
     query.bary = take(3), query.point = take(3), query.normal = take(3), query.next_point = take(3), query.next_normal = take(3);
     for (int64_t k = 0; k < count; ++k) put(places + 3 * k, ahead_of(*matched, *all, rows[k]));
     ++tree->call;
-    surface_search(tree, &query);
+    surface_find(tree, &query);
+    surface_describe(tree, &query);
     for (int64_t k = 0; k < count; ++k) {
         const int64_t i = rows[k];
         found[i] = is_other(*tree, *matched, query, k, i);

@@ -20,8 +20,10 @@ from hood.dynamics.guard import (
     CHECK_EVERY,
     CHECK_LIMIT,
     CUT,
+    DEPTH_LIMIT,
     FINITE,
     FORCE,
+    INSIDE,
     SPEED,
     STRAIN,
     STRAIN_LIMIT,
@@ -37,6 +39,7 @@ from hood.dynamics.stepper import NewtonStepper, Stepper
 from hood.dynamics.stopwatch import Stopwatch
 from hood.losses.potential import default_potential
 from hood.losses.problem import StepProblem
+from hood.scene.contact import find_contact
 from hood.scene.scene import Scene, build_scene
 from hood.solver.newton import NewtonSettings
 
@@ -235,15 +238,37 @@ def test_the_motion_of_the_body_is_told(scene: Scene) -> None:
     obstacle = problem.step.obstacle
     assert obstacle is not None
     turn = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]).to(obstacle.pos)
-    for moved, cause, value in (
-        (obstacle.pos @ turn.T, TURN, 90.0),
-        (obstacle.pos + torch.tensor([0.5, 0.0, 0.0]).to(obstacle.pos), SPEED, 0.5),
-    ):
+    aside = torch.tensor([0.5, 0.0, 0.0]).to(obstacle.pos)
+    for move, cause, value in ((lambda pos: pos @ turn.T, TURN, 90.0), (lambda pos: pos + aside, SPEED, 0.5)):
         guard = Guard("repair", newton(), POTENTIAL)
-        step = replace(problem.step, obstacle=replace(obstacle, next_pos=moved))
-        assert guard.see(1, replace(problem, step=step), prediction) is prediction
+        step = replace(problem.step, obstacle=replace(obstacle, next_pos=move(obstacle.next_pos)))
+        along = replace(prediction, next_pos=move(prediction.next_pos))
+        assert guard.see(1, replace(problem, step=step), along) is along
         assert [(alarm.cause, alarm.repair) for alarm in guard.alarms] == [(cause, NOT_TRIED)]
         assert guard.alarms[0].value == pytest.approx(value, abs=1e-3)
+
+
+def pushed_in(pos: torch.Tensor) -> torch.Tensor:
+    """All of it 25 mm backwards: its front is inside the body."""
+    return pos - torch.tensor([0.0, 0.0, 0.025]).to(pos)
+
+
+def test_cloth_inside_the_body_is_told_and_taken_out(scene: Scene) -> None:
+    """By the search of the surface itself: what the guard measures is not asked."""
+    problem, sound = one_step(scene)
+    obstacle = problem.step.obstacle
+    assert obstacle is not None
+    inside = replace(sound, next_pos=pushed_in(sound.next_pos), residual=1.0)
+    told = Guard("report", newton(), POTENTIAL)
+    assert told.see(1, problem, inside) is inside
+    assert (told.alarms[0].cause, told.alarms[0].repair) == (INSIDE, NOT_TRIED)
+    assert told.alarms[0].value > DEPTH_LIMIT
+    guard = Guard("repair", guess(12), POTENTIAL)
+    better = guard.see(1, problem, inside)
+    assert (guard.alarms[0].cause, guard.alarms[0].repair) == (INSIDE, REFINED)
+    later = replace(obstacle, pos=obstacle.next_pos)
+    depth = -find_contact(better.next_pos, problem.cloth.vertex_scene, later).dist
+    assert float(depth.max()) < 3e-3
 
 
 def test_cut_cloth_is_told_where_it_is_measured() -> None:

@@ -45,6 +45,30 @@ def test_a_search_does_not_depend_on_those_before_it():
         assert torch.equal(getattr(again, name), getattr(fresh, name)), name
 
 
+def test_the_same_points_are_not_searched_for_again(monkeypatch):
+    pos, faces = surface()
+    where, later = points(50), surface()[0] + 0.1
+    adjacency, scenes = build_incidence(faces, len(pos)).adjacency, (zeros(50), zeros(len(faces)))
+    fresh = surface_tree.search(where, scenes[0], pos, faces, scenes[1], adjacency, later, True)
+    found(points(50, 1), pos, faces)
+    dist = surface_tree.distance(where, scenes[0], pos.clone(), faces, scenes[1], adjacency)
+    library = surface_tree.library()
+
+    class Forbidden:
+        def __getattr__(self, name):
+            assert name not in ("surface_find", "surface_refit"), "searched again"
+            return getattr(library, name)
+
+    for _, _, tree in surface_tree._TREES:
+        monkeypatch.setattr(tree, "_lib", Forbidden())
+    again = surface_tree.search(where.clone(), scenes[0], pos.clone(), faces, scenes[1], adjacency, later, True)
+    assert torch.equal(dist, fresh.dist)
+    for name in fresh._fields:
+        assert torch.equal(getattr(again, name), getattr(fresh, name)), name
+    with pytest.raises(AssertionError, match="searched again"):
+        surface_tree.search(where + 1e-9, scenes[0], pos, faces, scenes[1], adjacency, later, True)
+
+
 def test_what_is_found_does_not_depend_on_the_threads(monkeypatch):
     pos, faces = surface()
     for seed, count in ((0, 500), (1, 3), (2, 130)):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
+from corners import corner, obstacle
 from torch import Tensor
 
 from hood.assets.material import Material
@@ -22,22 +22,6 @@ from hood.solver.newton import NewtonSettings, minimize
 from hood.testing import grid, sphere
 
 F64 = torch.float64
-
-
-def obstacle(pos: np.ndarray, faces: np.ndarray, later: np.ndarray | None = None) -> Obstacle:
-    now, after = torch.as_tensor(pos), torch.as_tensor(pos if later is None else later)
-    return Obstacle(now, after, now, torch.as_tensor(faces), torch.zeros(len(pos)).long(), torch.zeros(len(faces)).long())
-
-
-def corner() -> tuple[np.ndarray, np.ndarray]:
-    """A floor, y = 0, and a wall on it, x = 0, whose free side is x < 0."""
-    floor, faces = grid(17, 17, 0.8)
-    floor = floor.copy() - [0.4, 0.0, 0.4]
-    wall = floor[:, [1, 0, 2]] + [0.0, 0.4, 0.0]
-    down = np.cross(*(floor[faces[0, i]] - floor[faces[0, 0]] for i in (1, 2)))[1] < 0
-    side = np.cross(*(wall[faces[0, i]] - wall[faces[0, 0]] for i in (1, 2)))[0] > 0
-    both = [faces[:, ::-1] if turned else faces for turned in (down, side)]
-    return np.concatenate([floor, wall]), np.concatenate([both[0], both[1] + len(floor)])
 
 
 def landings(body: Obstacle, points: list[list[float]], ways: list[list[float]]) -> tuple[list[bool], Tensor, Tensor]:
