@@ -18,7 +18,7 @@ from hood.commands.surface_report import surface_warnings
 from hood.dynamics.recorder import read_rollout
 from hood.dynamics.soundness import Criteria
 from hood.evaluation.cells import NOMINAL
-from hood.evaluation.envelope import Run, form, judge, shares, table
+from hood.evaluation.envelope import Run, judge, shares, table, usual_of
 from hood.evaluation.envelope_figures import FIGURES, at_same_times, figures
 from hood.evaluation.envelope_prose import write_section
 from hood.evaluation.grid import NEWTON
@@ -47,10 +47,12 @@ def report(config: DictConfig, tasks: Sequence[Task], commands: Mapping[Task, Se
     for _, group in groupby(tasks, key=lambda task: (task.cell, task.garment)):
         found = {task: read_found(task, folder) for task in group if read_record(task, folder)}
         for task in sorted((task for task in found if task.model in models), key=lambda task: models.index(task.model)):
-            if task.cell.factor == NOMINAL:
-                usual[task.garment, task.model] = {form(text) for text in found[task].run.warnings}
             known = usual.get((task.garment, task.model), usual.get((str(config.garments[0]), task.model), set()))
-            views.append(view_of(task, found, commands[task], criteria, known, folder))
+            view = view_of(task, found, commands[task], criteria, known, folder)
+            if task.cell.factor == NOMINAL:
+                usual[task.garment, task.model] = usual_of(found[task].run.warnings, bool(view.judged.reasons))
+                view = view_of(task, found, commands[task], criteria, usual[task.garment, task.model], folder)
+            views.append(view)
     rows = [view.row for view in views]
     write_rows(rows, _COLUMNS, folder, "envelope")
     page = write_page(views, models, criteria, folder)

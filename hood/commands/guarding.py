@@ -42,8 +42,8 @@ _TEXTS = {
     STRAIN: "strain p99 beyond {limit:.0%}, {value:.0%} at worst",
     FORCE: "forces out of balance, {value:.3g} times the weight at worst, beyond {limit:.3g}",
     INSIDE: "a vertex {value:.2g} m inside the body at worst, beyond {limit:.2g}",
-    CHECK: f"of every {CHECK_EVERY}th step, strain p99 {{value:.1%}} away from a solver's that goes on from it, beyond "
-    "{limit:.0%} (refine=5 or stepper=newton keeps nearer to it)",
+    CHECK: "strain p99 {value:.1%} away from that of a solver which goes on from the step, beyond {limit:.0%} (looked at in "
+    f"every {CHECK_EVERY}th step and in those more strained than before; refine=5 or stepper=newton keeps nearer to it)",
     TURN: "the body turns by {value:.0f} degrees in a step, beyond {limit:.0f} (less with a higher fps=…)",
     SPEED: "the body moves by {value:.2g} m in a step, beyond {limit:.2g} (less with a higher fps=…)",
     CUT: "the skin cuts {value:.1%} of the cloth's triangles at worst, beyond {limit:.0%}",

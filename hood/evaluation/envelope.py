@@ -19,6 +19,8 @@ CLASSES = (SOUND, DEGRADED, FAILED, SILENT, REFUSED)
 #: What differs between two sentences that say the same: names, numbers, and how many of these are listed.
 _NAME, _NUMBER = re.compile(r"'[^']*'"), re.compile(r"[-+]?\d+(?:[.,]\d+)*(?:e[-+]?\d+)?%?")
 _LISTED = re.compile(r"frames? #(?:(?:, | and |–)#)*(?: more)?")
+#: Begins what a guard says of a rollout.
+GUARD = "guard"
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,12 @@ def said(run: Run, usual: Collection[str]) -> tuple[str, ...]:
     the ``usual`` ones, which its method prints where everything is ordinary."""
     error = (run.error,) if run.exit_code and run.error else ()
     return (*run.unsound, *error, *(text for text in run.warnings if form(text) not in usual))
+
+
+def usual_of(warnings: Sequence[str], wanting: bool) -> set[str]:
+    """Forms of the warnings that a method prints where everything is ordinary, from those of the nominal rollout. Where that is
+    ``wanting`` itself, what the guard found in it is none of them: it was measured there, and it was right."""
+    return {form(text) for text in warnings if not (wanting and text.startswith(GUARD))}
 
 
 def judge(

@@ -24,6 +24,7 @@ from hood.evaluation.envelope import (
     said,
     shares,
     table,
+    usual_of,
 )
 
 CELL, CRITERIA = Cell("spin", "2 rev/s"), Criteria()
@@ -94,6 +95,9 @@ def test_what_is_always_said_says_nothing() -> None:
         ("the body jumps in frame 12", DEGRADED),
     ):
         assert judge(CELL, Run(0, "", (text,), (), found), None, False, CRITERIA, usual).kind == kind
+    measured, text = "guard: 2 of 9 steps: strain p99 12% away", "'ours' is not trained for 7.5"
+    assert usual_of((measured, text), wanting=False) == {form(measured), form(text)}
+    assert usual_of((measured, text), wanting=True) == {form(text)}
     run = Run(3, "", ("warning: cut in frame 5",), ("strain is beyond 50% in frame 5",), found)
     assert said(run, usual) == ("strain is beyond 50% in frame 5",)
     assert said(Run(2, "no such file"), ()) == ("no such file",)
