@@ -35,23 +35,40 @@ _HOLD = 15
 def run(overrides: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     own, words = _split(overrides)
-    config = load_config("rollout", words)
-    check_config(config)
-    tolerance = _tolerance(own)
-    for key, least, most in (("windows", 1, 5), ("frames", 1, 300)):
-        if isinstance(own[key], bool) or not least <= int(own[key]) <= most:
-            raise ConfigError(f"{key}={own[key]}: give a whole number from {least} to {most}")
+    _check(words, own)
     output_folder(own)
-    began = time.perf_counter()
-    ready = set_up(config, make_stepper(config)[0])
-    settled = [*words, *_settled_words(config, ready)]
     with held_folder(own) as folder:
-        plan = _probe(ready, settled, own, tolerance)
-        plan |= {"asked": words, "seconds": time.perf_counter() - began}
+        plan = make_plan(words, own)
         write_plan(folder / "plan.json", plan)
     print(describe(plan))
     print(f"plan in {folder / 'plan.json'}; roll out by it: hood rollout plan={folder / 'plan.json'} output=outputs/mine")
     return 0
+
+
+def make_plan(words: list[str], own: DictConfig) -> dict[str, Any]:
+    """The plan of a rollout with these words, measured here.
+
+    Args:
+        own: the config of ``hood plan``.
+
+    Raises:
+        ConfigError, ValueError, FileNotFoundError: as for a rollout, and numbers of ``own`` that are none.
+    """
+    config, tolerance = _check(words, own)
+    began = time.perf_counter()
+    ready = set_up(config, make_stepper(config)[0])
+    plan = _probe(ready, [*words, *_settled_words(config, ready)], own, tolerance)
+    return plan | {"asked": words, "seconds": time.perf_counter() - began}
+
+
+def _check(words: list[str], own: DictConfig) -> tuple[DictConfig, Tolerance]:
+    """The rollout's config and what is accepted, before anything is read."""
+    config = load_config("rollout", words)
+    check_config(config)
+    for key, least, most in (("windows", 1, 5), ("frames", 1, 300)):
+        if isinstance(own[key], bool) or not least <= int(own[key]) <= most:
+            raise ConfigError(f"{key}={own[key]}: give a whole number from {least} to {most}")
+    return config, _tolerance(own)
 
 
 def _split(overrides: Sequence[str]) -> tuple[DictConfig, list[str]]:
