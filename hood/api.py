@@ -127,9 +127,7 @@ def simulate(
         named["stepper"] = stepper
     key = "accuracy" if named.get("accuracy") is not None else "plan" if plan_path(named) is not None else None
     if key is not None and (isinstance(garment, Garment) or isinstance(material, Material) or not isinstance(stepper, str)):
-        raise ConfigError(
-            f"{key}={named[key]}: a plan names garment, material and stepper; leave them out, or give names or files"
-        )
+        raise ConfigError(f"{key}={named[key]}: a plan names garment, material and stepper; leave them out")
     if key == "plan":  # then what is not said is the plan's
         usual = {key: parameter.default for key, parameter in inspect.signature(simulate).parameters.items()}
         named = {key: value for key, value in named.items() if usual.get(key) != value}

@@ -22,12 +22,14 @@ from hood.config import ConfigError, load_config
 from hood.dynamics.captured import network_of
 from hood.dynamics.watched import lacking
 from hood.evaluation.decision import QUANTILE, Decision, Tolerance, decide
-from hood.evaluation.leaving_out import LEAD, Begun, Effect, Variant, active_terms, begin, measure, overstatement, prices
+from hood.evaluation.leaving_out import LEAD, Begun, Effect, Variant, active_terms, begin, measure, prices
 from hood.evaluation.windows import Window, choose_windows
 from hood.losses.layers import for_networks
 
 #: With ``accuracy=5mm``, γ may be so many times that of the windows, and this at least, before left-out energies come back.
 _TIMES_PROBED, _LEAST_LIMIT = 3.0, 1e-3
+#: Why parts whose absence nobody would notice are kept.
+_UNSEEN = "a rollout would not notice where it is more"
 #: Steps for which they stay then.
 _HOLD = 15
 
@@ -125,22 +127,20 @@ def _probe(ready: Setup, words: list[str], own: DictConfig, tolerance: Tolerance
         return found[""], found["all"]
 
     rivals = [[part.name for part in parts if part.rivals == name] for name in sorted({part.rivals for part in parts} - {""})]
-    unwatched = {part.name for part in parts if not part.watched}
-    decision = decide(effects, absent, rivals, tolerance, together, unwatched)
+    stay = {part.name: part.stays or _UNSEEN for part in parts if part.stays or not part.watched}
+    decision = decide(effects, absent, rivals, tolerance, together, stay)
     plan = _record(ready, words, parts, begun, effects, price, decision, tolerance, frames)
-    return plan | {"watch": _watch(full, _variant([*words, *plan["chosen"]], ready), begun, decision, tolerance)}
+    return plan | {"watch": _watch(full, _variant([*words, *plan["chosen"]], ready), decision, tolerance)}
 
 
-def _watch(
-    full: Variant, lean: Variant, begun: Sequence[Begun], decision: Decision, tolerance: Tolerance
-) -> dict[str, float] | None:
+def _watch(full: Variant, lean: Variant, decision: Decision, tolerance: Tolerance) -> dict[str, float] | None:
     """When the left-out energies come back; None where none is left out."""
     if decision.together is None or not lacking(lean.potential, full.potential):
         return None
     limit = tolerance.value
     if tolerance.unit == "mm":  # there is no γ to hold: some more than the windows had
         limit = max(_TIMES_PROBED * decision.together.gamma_at(QUANTILE), _LEAST_LIMIT)
-    return {"limit": limit, "ratio": overstatement(full, lean, begun, decision.together.gamma), "hold": _HOLD}
+    return {"limit": limit, "hold": _HOLD}
 
 
 def _windows(ready: Setup, count: int, own: DictConfig, frames: int) -> list[Window]:

@@ -54,9 +54,7 @@ def rollout_config(overrides: Sequence[str]) -> DictConfig:
     config = load_config("rollout", overrides)
     path = plan_path(config)
     if config.accuracy is not None:
-        raise ConfigError(
-            f"accuracy={config.accuracy}: belongs to plan=auto; a plan that was made has its own, drop accuracy=…"
-        )
+        raise ConfigError(f"accuracy={config.accuracy}: belongs to plan=auto; a plan has its own, drop accuracy=…")
     if path is None:
         return config
     words = _read_words(path)
@@ -80,7 +78,6 @@ class Watch:
 
     words: list[str]
     limit: float
-    ratio: float
     hold: int
 
 
@@ -94,11 +91,11 @@ def read_watch(path: Path) -> Watch | None:
     given = plan.get("watch")
     if given is None:
         return None
-    values = [given.get(key) for key in ("limit", "ratio", "hold")] if isinstance(given, dict) else []
+    values = [given.get(key) for key in ("limit", "hold")] if isinstance(given, dict) else []
     numbers = [float(value) for value in values if isinstance(value, (int, float)) and 0.0 < value < float("inf")]
-    if len(numbers) != 3:
-        raise ConfigError(f"plan={path}: 'watch' must hold limit, ratio and hold, all above 0; make the plan again")
-    return Watch(list(plan["words"]), numbers[0], max(numbers[1], 1.0), max(int(numbers[2]), 1))
+    if len(numbers) != 2:
+        raise ConfigError(f"plan={path}: 'watch' must hold limit and hold, both above 0; make the plan again")
+    return Watch(list(plan["words"]), numbers[0], max(int(numbers[1]), 1))
 
 
 def write_plan(path: Path, plan: Mapping[str, Any]) -> None:

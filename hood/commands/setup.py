@@ -104,7 +104,7 @@ def _watched(config: DictConfig, lean: Stepper, scene: Scene, path: Path) -> tup
     check_config(whole)
     everything = potential_of(whole)
     full = refined(make_stepper(whole)[0], whole, scene.cloth.num_vertices, everything)
-    return WatchedStepper(lean, full, (potential, everything), scene, watch.limit, watch.ratio, watch.hold), everything
+    return WatchedStepper(lean, full, (potential, everything), scene, watch.limit, watch.hold), everything
 
 
 def make_scene(config: DictConfig, garment: Garment | None = None, material: Material | None = None) -> Scene:

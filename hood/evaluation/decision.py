@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 
@@ -75,7 +76,7 @@ def decide(
     rivals: Sequence[Sequence[str]],
     tolerance: Tolerance,
     measure_together: Callable[[Sequence[str]], tuple[Effect, Effect]],
-    unwatched: Collection[str] = (),
+    stay: Mapping[str, str] = MappingProxyType({}),
 ) -> Decision:
     """The cheapest combination whose error stays within the tolerance, as far as one search from the top finds it.
 
@@ -86,7 +87,7 @@ def decide(
         effects: by part; the full model's own entry is named "".
         absent: parts that nothing in the scene uses, with the reason.
         rivals: parts of which at most one can be left out.
-        unwatched: parts that are never left out, because a rollout would not notice where it needs them.
+        stay: parts that are never left out, and why.
         measure_together: the full model's and the combination's effect, measured side by side.
     """
     full = effects[""]
@@ -100,8 +101,8 @@ def decide(
             verdicts[name] = Verdict("kept", f"without it {tolerance.say(error)}")
         elif saving < LEAST_SAVING:
             verdicts[name] = Verdict("kept", f"it costs no time that can be measured ({100 * saving:+.0f}% of a frame)")
-        elif name in unwatched:
-            said = f"{tolerance.say(error)} without it here, but a rollout would not notice where it is more"
+        elif name in stay:
+            said = f"{tolerance.say(error)} without it here, but {stay[name]}"
             verdicts[name] = Verdict("kept", said)
         else:
             passing[name] = saving

@@ -18,7 +18,6 @@ from hood.dynamics.rollout import prepare_stepper, simulate
 from hood.dynamics.simulator import Prediction
 from hood.dynamics.stepper import Stepper
 from hood.dynamics.stopwatch import Stopwatch
-from hood.dynamics.watched import force_bound, lacking
 from hood.evaluation.gap import REFERENCE
 from hood.evaluation.windows import Window
 from hood.losses.potential import Potential, relative_gradient, scale
@@ -30,10 +29,6 @@ from hood.solver.newton import minimize
 
 #: Frames of the full model before a window's first state: the start is at rest on a still body.
 LEAD = 2
-#: What a few windows said is halved, and more than this is not made of it.
-MOST_OVERSTATED = 100.0
-#: A smaller γ is as much of the solver's accuracy as of what is left out.
-_TELLING = 1e-4
 #: Positions differ by the 95th percentile of this over the vertices: one vertex that flips says little.
 _QUANTILE = 0.95
 
@@ -153,17 +148,6 @@ def measure(full: Variant, variants: dict[str, Variant], begun: Sequence[Begun],
 def active_terms(full: Variant, begun: Sequence[Begun]) -> set[str]:
     """Names of the full potential's terms that can be anything but a constant zero in one of the windows."""
     return {name for one in begun for name in full.potential.active(one.step)}
-
-
-def overstatement(full: Variant, lean: Variant, begun: Sequence[Begun], gammas: Sequence[float]) -> float:
-    """How much :func:`hood.dynamics.watched.force_bound` of the energies that ``lean`` lacks overstates its γ: half of the
-    least of the windows, between 1 and :data:`MOST_OVERSTATED`."""
-    found, names = [2.0 * MOST_OVERSTATED], lacking(lean.potential, full.potential)
-    for one, gamma in zip(begun, gammas, strict=True):
-        pos, _ = take_steps(lean, one, 1, Effect())
-        if gamma > _TELLING:
-            found.append(force_bound(full.potential, names, one.step, pos) / gamma)
-    return max(1.0, min(found) / 2.0) if len(found) > 1 else 1.0
 
 
 def prices(full: Variant, begun: Sequence[Begun]) -> dict[str, float]:
