@@ -47,7 +47,7 @@ def planned(overrides: Sequence[str]) -> list[str]:
         plan = read_plan(path)
         print(f"plan of {path}, made before")
     else:
-        plan = make_plan(words, own)
+        plan, _ = make_plan(words, own)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_plan(path, plan)
         print(f"planned in {plan['seconds']:.1f} s, kept in {path}")

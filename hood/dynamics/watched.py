@@ -37,7 +37,7 @@ def force_bound(potential: Potential, names: Sequence[str], problem: StepProblem
 
 
 def vertex_bounds(potential: Potential, names: Sequence[str], problem: StepProblem, pos: Tensor) -> Tensor:
-    """By vertex, (V,) float64, the most that γ can fall if some energies of ``potential`` were followed from ``pos`` (V, 3) [m].
+    """By vertex, (V,) float64, the most that γ can fall if some energies of ``potential`` were followed from ``pos`` (V, 3) m.
 
     With the other forces in balance and a Hessian of at least M / dt², which inertia alone gives, a force f lowers the
     potential by at most ½ dt² Σ |f|² / m; this is that, in units of e0. 0 where no term applies.
@@ -84,7 +84,7 @@ class WatchedStepper:
     """Steps of ``lean``; each is priced, and taken by ``full`` where the price is above the limit.
 
     The price of a step is made of :func:`vertex_bounds` of every energy that ``lean`` lacks, each sum divided by how much it
-    overstates γ: (Σ √(bound / ratio))², since forces that pull together count more than one by one. Where it is above the limit,
+    overstates γ: (Σ √(bound / ratio))², since forces that pull together count more than one by one. Where it is too high,
     the full model takes that very step, and tells what the lean one's was worth: how much higher the full potential is there.
     If that is below the limit by :data:`MARGIN`, the bounds were too wide: what they overstate by is known for the next
     :data:`REMEMBERED` steps, of the energy that the price came from and of the forces that were there, up to :data:`GROWTH`

@@ -14,6 +14,8 @@ from hood.evaluation.leaving_out import Effect
 
 #: A part that saves a smaller share of a frame's time stays: the time cannot be told from noise.
 LEAST_SAVING = 0.03
+#: A part whose error is so many times what is accepted is not looked at in further windows.
+HOPELESS = 10.0
 #: Quantile over the windows that γ is judged by.
 QUANTILE = 0.95
 
@@ -38,6 +40,11 @@ class Tolerance:
             raise ValueError(f"accuracy={text}: give a γ above 0 (0.01), or a distance (5mm)")
         return cls(value, "mm" if match.group(2) else "gamma")
 
+    @property
+    def text(self) -> str:
+        """As :meth:`read` reads it."""
+        return f"{self.value:g}{'mm' if self.unit == 'mm' else ''}"
+
     def error(self, effect: Effect, full: Effect) -> float:
         """What is held against the tolerance: the distance, or how much more γ is left than by the full model's own steps.
 
@@ -45,8 +52,13 @@ class Tolerance:
         """
         if self.unit == "mm":
             return effect.worst_mm if math.isfinite(effect.worst_mm) else math.inf
-        rises = [max(one - own, 0.0) for one, own in zip(effect.gamma, full.gamma, strict=True)]
+        own = full.gamma[: len(effect.gamma)]  # of what is hopeless not all windows were looked at
+        rises = [max(one - other, 0.0) for one, other in zip(effect.gamma, own, strict=True)]
         return float(np.quantile(rises, QUANTILE)) if all(map(math.isfinite, rises)) else math.inf
+
+    def hopeless(self, effect: Effect, full: Effect) -> bool:
+        """Whether the windows so far say enough: the error is :data:`HOPELESS` times what is accepted."""
+        return not self.error(effect, full) <= HOPELESS * self.value
 
     def say(self, value: float) -> str:
         """The error in words."""
@@ -96,7 +108,7 @@ def decide(
     for name, effect in effects.items():
         if not name or name in absent:
             continue
-        error, saving = tolerance.error(effect, full), 1.0 - effect.median_ms / full.median_ms
+        error, saving = tolerance.error(effect, full), effect.saving(full)
         if error > tolerance.value:
             verdicts[name] = Verdict("kept", f"without it {tolerance.say(error)}")
         elif saving < LEAST_SAVING:
@@ -114,7 +126,7 @@ def decide(
     together: Effect | None = None
     while passing:
         reference, together = measure_together(tuple(passing))
-        error, saving = tolerance.error(together, reference), 1.0 - together.median_ms / reference.median_ms
+        error, saving = tolerance.error(together, reference), together.saving(reference)
         if error <= tolerance.value and saving >= LEAST_SAVING:
             break
         worst = max(passing, key=lambda name: tolerance.error(effects[name], full))

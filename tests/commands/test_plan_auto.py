@@ -29,11 +29,11 @@ def test_full_begins_every_search_afresh(monkeypatch: pytest.MonkeyPatch) -> Non
 def short(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """Plans that are made without a look (what is measured is another test's matter); the cache folder."""
 
-    def quick(words: list[str], own: object) -> dict[str, object]:
+    def quick(words: list[str], own: object) -> tuple[dict[str, object], list[object]]:
         full, limit = {"ms": 10.0}, {"value": 0.01, "unit": "gamma"}
         rows = [{"part": "later iterations", "decision": "left out", "reason": ""}]
         told = {"full": full, "accuracy": limit, "rows": rows, "together": {"error": 1e-4, "saved": 0.1}, "seconds": 1.0}
-        return {"words": words, "chosen": ["solver.target_rg=0.1"], **told}
+        return {"words": words, "chosen": ["solver.target_rg=0.1"], **told}, []
 
     monkeypatch.setattr(plan_auto, "make_plan", quick)
     monkeypatch.setattr("hood.commands.plan_auto.cache_folder", lambda: tmp_path / "cache")
