@@ -21,7 +21,8 @@ from hood.assets.garment.garment import Garment
 from hood.assets.material import Material
 from hood.commands.common import read_model
 from hood.commands.guarding import GuardStopped, make_guard
-from hood.commands.plan_file import rollout_config
+from hood.commands.plan_auto import planned
+from hood.commands.plan_file import plan_mode, plan_path, rollout_config
 from hood.commands.setup import Setup, check_config, make_stepper, set_up
 from hood.config import ConfigError, load_config
 from hood.dynamics import rollout as frames
@@ -75,6 +76,7 @@ class Simulation:
             surface_stride=int(config.surface_stride),
             settle=str(config.settle),
             guard=guard,
+            afresh=plan_mode(config) == "full",
         )
         yield from tqdm(steps, total=self.num_frames, unit="frame", disable=not self._progress)
         if guard is not None and guard.stopped is not None:
@@ -123,16 +125,17 @@ def simulate(
         named["material"] = material
     if isinstance(stepper, str):
         named["stepper"] = stepper
-    if named.get("plan") is not None:  # then what is not said is the plan's
-        if isinstance(garment, Garment) or isinstance(material, Material) or not isinstance(stepper, str):
-            raise ConfigError(f"plan={named['plan']}: names garment, material and stepper itself; leave them out")
+    key = "accuracy" if named.get("accuracy") is not None else "plan" if plan_path(named) is not None else None
+    if key is not None and (isinstance(garment, Garment) or isinstance(material, Material) or not isinstance(stepper, str)):
+        raise ConfigError(f"{key}={named[key]}: a plan names garment, material and stepper; leave them out")
+    if key == "plan":  # then what is not said is the plan's
         usual = {key: parameter.default for key, parameter in inspect.signature(simulate).parameters.items()}
         named = {key: value for key, value in named.items() if usual.get(key) != value}
-    config = rollout_config(overrides(named))
-    check_config(config)
     notes: list[str] = []
     told = io.StringIO()
     with contextlib.redirect_stdout(told):  # choices are told to whoever reads the notes
+        config = rollout_config(planned(overrides(named)))
+        check_config(config)
         taken = make_stepper(config)[0] if isinstance(stepper, str) else stepper
         ready = set_up(
             config,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 import platform
@@ -30,6 +31,8 @@ CONFIG_FOLDER = _PACKAGE / "configs" if (_PACKAGE / "configs").is_dir() else _PA
 _ONE_OR_MORE = ("garment", "offset", "layers")
 #: Keys in here may be null: an energy that is left out.
 _OPTIONAL = "losses.terms."
+#: Of a key that is not there.
+_ABSENT = object()
 #: Bytes of a run's record at most, levels of its nesting, and characters of a reason why it is none.
 _RECORD_LIMIT, _DEEPEST, _REASON = 1 << 20, 32, 300
 #: What configs may name; and classes of plugins (:mod:`hood.plugins`).
@@ -137,6 +140,21 @@ def require_choice(config: DictConfig, key: str, known: Sequence[str]) -> None:
     """Raise ConfigError unless ``config[key]`` is one of ``known``; names the near miss."""
     if str(config[key]) not in known:
         raise ConfigError(unknown(f"value for {key}", str(config[key]), known))
+
+
+def with_words(config: DictConfig, words: Sequence[str]) -> DictConfig:
+    """A loaded config with some ``key=value`` more, keys that it has; a hundredth of the time of loading it again.
+
+    Raises:
+        ConfigError: a key that it does not have.
+    """
+    changed = copy.deepcopy(config)
+    for word in words:
+        said = OverridesParser.create().parse_override(word)
+        if OmegaConf.select(config, said.key_or_group, default=_ABSENT) is _ABSENT:
+            raise ConfigError(f"{word}: no such key")
+        OmegaConf.update(changed, said.key_or_group, said.value(), merge=False)
+    return changed
 
 
 def save_run_record(folder: Path, config: DictConfig, seed: int) -> None:

@@ -6,6 +6,7 @@ import hashlib
 import shlex
 import time
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,18 +17,22 @@ from hood.commands.cloth_contact import potential_of
 from hood.commands.common import held_folder, output_folder
 from hood.commands.plan_file import write_plan
 from hood.commands.plan_parts import Part, choose_parts
+from hood.commands.plan_shown import differences, facts, show
 from hood.commands.refinement import refined
 from hood.commands.setup import Setup, check_config, make_stepper, set_up
-from hood.config import ConfigError, load_config
+from hood.config import ConfigError, load_config, with_words
 from hood.dynamics.captured import network_of
-from hood.dynamics.watched import lacking
+from hood.dynamics.watched import WatchedStepper, lacking
 from hood.evaluation.decision import QUANTILE, Decision, Tolerance, decide
-from hood.evaluation.leaving_out import LEAD, Begun, Effect, Variant, active_terms, begin, measure, overstatement, prices
+from hood.evaluation.leaving_out import LEAD, Begun, Effect, Variant, active_terms, begin, measure, prices
 from hood.evaluation.windows import Window, choose_windows
 from hood.losses.layers import for_networks
+from hood.media.plan_page import Difference
 
 #: With ``accuracy=5mm``, γ may be so many times that of the windows, and this at least, before left-out energies come back.
 _TIMES_PROBED, _LEAST_LIMIT = 3.0, 1e-3
+#: Why parts whose absence nobody would notice are kept.
+_UNSEEN = "a rollout would not notice where it is more"
 #: Steps for which they stay then.
 _HOLD = 15
 
@@ -35,23 +40,42 @@ _HOLD = 15
 def run(overrides: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     own, words = _split(overrides)
+    _check(words, own)
+    output_folder(own)
+    with held_folder(own) as folder:
+        plan, shown = make_plan(words, own)
+        write_plan(folder / "plan.json", plan)
+        page = show(folder / "plan.html", plan, sentence(plan), shown)
+    print(describe(plan))
+    print(page)
+    print(f"plan in {folder / 'plan.json'}; roll out by it: hood rollout plan={folder / 'plan.json'} output=outputs/mine")
+    return 0
+
+
+def make_plan(words: list[str], own: DictConfig) -> tuple[dict[str, Any], list[Difference]]:
+    """The plan of a rollout with these words, measured here, and the largest differences that were seen.
+
+    Args:
+        own: the config of ``hood plan``.
+
+    Raises:
+        ConfigError, ValueError, FileNotFoundError: as for a rollout, and numbers of ``own`` that are none.
+    """
+    config, tolerance = _check(words, own)
+    began = time.perf_counter()
+    ready = set_up(config, make_stepper(config)[0])
+    plan, shown = _probe(ready, [*words, *_settled_words(config, ready)], own, tolerance)
+    return plan | {"asked": words, "seconds": time.perf_counter() - began, "facts": facts(ready)}, shown
+
+
+def _check(words: list[str], own: DictConfig) -> tuple[DictConfig, Tolerance]:
+    """The rollout's config and what is accepted, before anything is read."""
     config = load_config("rollout", words)
     check_config(config)
-    tolerance = _tolerance(own)
     for key, least, most in (("windows", 1, 5), ("frames", 1, 300)):
         if isinstance(own[key], bool) or not least <= int(own[key]) <= most:
             raise ConfigError(f"{key}={own[key]}: give a whole number from {least} to {most}")
-    output_folder(own)
-    began = time.perf_counter()
-    ready = set_up(config, make_stepper(config)[0])
-    settled = [*words, *_settled_words(config, ready)]
-    with held_folder(own) as folder:
-        plan = _probe(ready, settled, own, tolerance)
-        plan |= {"asked": words, "seconds": time.perf_counter() - began}
-        write_plan(folder / "plan.json", plan)
-    print(describe(plan))
-    print(f"plan in {folder / 'plan.json'}; roll out by it: hood rollout plan={folder / 'plan.json'} output=outputs/mine")
-    return 0
+    return config, _tolerance(own)
 
 
 def _split(overrides: Sequence[str]) -> tuple[DictConfig, list[str]]:
@@ -79,8 +103,8 @@ def _settled_words(asked: DictConfig, ready: Setup) -> list[str]:
 
 
 def _variant(words: Sequence[str], ready: Setup) -> Variant:
-    """The scene with these settings; its cloth, body and motion are those of the full model."""
-    config = load_config("rollout", words)
+    """The scene with these settings beside its own; its cloth, body and motion are those of the full model."""
+    config = with_words(ready.config, words)
     check_config(config)
     stepper = refined(make_stepper(config)[0], config, ready.scene.cloth.num_vertices, potential_of(config))
     network = network_of(stepper)
@@ -89,7 +113,7 @@ def _variant(words: Sequence[str], ready: Setup) -> Variant:
     return Variant(stepper, potential_of(config), ready.scene)
 
 
-def _probe(ready: Setup, words: list[str], own: DictConfig, tolerance: Tolerance) -> dict[str, Any]:
+def _probe(ready: Setup, words: list[str], own: DictConfig, tolerance: Tolerance) -> tuple[dict[str, Any], list[Difference]]:
     config, frames = ready.config, int(own.frames)
     parts = choose_parts(config, [str(name) for name in own.parts])
     if not parts:
@@ -100,30 +124,45 @@ def _probe(ready: Setup, words: list[str], own: DictConfig, tolerance: Tolerance
     begun = begin(full, windows, str(config.settle))
     active, price = active_terms(full, begun), prices(full, begun)
     absent = {part.name: _why_absent(part, ready) for part in parts if part.term and part.term not in active}
-    variants = {part.name: _variant([*words, *part.words], ready) for part in parts if part.name not in absent}
-    effects = measure(full, variants, begun, frames)
+    variants = {part.name: _variant(part.words, ready) for part in parts if part.name not in absent}
+    stay = {part.name: part.stays or _UNSEEN for part in parts if part.stays or not part.watched}
+
+    def enough(name: str, effect: Effect, of_full: Effect) -> bool:
+        return name in stay or tolerance.hopeless(effect, of_full)
+
+    effects = measure(full, variants, begun, frames, enough)
 
     def together(names: Sequence[str]) -> tuple[Effect, Effect]:
-        found = measure(full, {"all": _variant([*words, *_words_of(parts, names)], ready)}, begun, frames)
+        lean = _variant(_words_of(parts, names), ready)
+        left = lacking(lean.potential, full.potential)
+        if len(names) == 1 and not left:
+            return effects[""], effects[names[0]]
+        if left:  # as a rollout takes its steps, with the price of what is left out
+            potentials, limit = (lean.potential, full.potential), _limit(tolerance, [effects[name] for name in names])
+            watched = WatchedStepper(lean.stepper, full.stepper, potentials, ready.scene, limit, _HOLD)
+            lean = replace(lean, stepper=watched)
+        found = measure(full, {"all": lean}, begun, frames)
         return found[""], found["all"]
 
     rivals = [[part.name for part in parts if part.rivals == name] for name in sorted({part.rivals for part in parts} - {""})]
-    unwatched = {part.name for part in parts if not part.watched}
-    decision = decide(effects, absent, rivals, tolerance, together, unwatched)
+    decision = decide(effects, absent, rivals, tolerance, together, stay)
     plan = _record(ready, words, parts, begun, effects, price, decision, tolerance, frames)
-    return plan | {"watch": _watch(full, _variant([*words, *plan["chosen"]], ready), begun, decision, tolerance)}
+    watch = _watch(full, _variant(plan["chosen"], ready), [effects[name] for name in decision.left_out], tolerance)
+    return plan | {"watch": watch}, differences(ready, begun, effects, frames)
 
 
-def _watch(
-    full: Variant, lean: Variant, begun: Sequence[Begun], decision: Decision, tolerance: Tolerance
-) -> dict[str, float] | None:
+def _limit(tolerance: Tolerance, left_out: Sequence[Effect]) -> float:
+    """The γ above which left-out energies come back; with a length, some more than they had in the windows."""
+    if tolerance.unit != "mm":
+        return tolerance.value
+    return max(_TIMES_PROBED * sum(effect.gamma_at(QUANTILE) for effect in left_out), _LEAST_LIMIT)
+
+
+def _watch(full: Variant, lean: Variant, left_out: Sequence[Effect], tolerance: Tolerance) -> dict[str, float] | None:
     """When the left-out energies come back; None where none is left out."""
-    if decision.together is None or not lacking(lean.potential, full.potential):
+    if not lacking(lean.potential, full.potential):
         return None
-    limit = tolerance.value
-    if tolerance.unit == "mm":  # there is no γ to hold: some more than the windows had
-        limit = max(_TIMES_PROBED * decision.together.gamma_at(QUANTILE), _LEAST_LIMIT)
-    return {"limit": limit, "ratio": overstatement(full, lean, begun, decision.together.gamma), "hold": _HOLD}
+    return {"limit": _limit(tolerance, left_out), "hold": _HOLD}
 
 
 def _windows(ready: Setup, count: int, own: DictConfig, frames: int) -> list[Window]:
@@ -160,7 +199,8 @@ def _record(
         verdict = decision.verdicts[part.name]
         row = {"part": part.name, "purpose": part.purpose, "words": list(part.words), "force": price.get(part.term)}
         row |= _numbers(effects[part.name], full) if part.name in effects else {}
-        command = shlex.join(["hood", "plan", *words, f"parts=[{part.name}]", f"frames={frames}", f"windows={len(begun)}"])
+        how = [f"parts=[{part.name}]", f"frames={frames}", f"windows={len(begun)}", f"accuracy={tolerance.text}"]
+        command = shlex.join(["hood", "plan", *words, *how])
         rows.append({**row, "decision": verdict.decision, "reason": verdict.reason, "command": command})
     checkpoint = str(ready.config.checkpoint)
     network = network_of(ready.stepper) is not None and checkpoint != "untrained"
@@ -187,7 +227,8 @@ def _numbers(effect: Effect, full: Effect) -> dict[str, float | None]:
         "gamma_p95": effect.gamma_at(QUANTILE),
         "mm": effect.worst_mm,
         "ms": effect.median_ms,
-        "saved": 1.0 - effect.median_ms / full.median_ms,
+        "saved": effect.saving(full),
+        "windows": len(effect.gamma),
     }
     return {key: value if np.isfinite(value) else None for key, value in found.items()}
 

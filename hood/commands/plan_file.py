@@ -22,10 +22,27 @@ from hood.dynamics.watched import PLAN_METRICS
 FORMAT = "hood-plan/1"
 _LIMIT = 1 << 20
 #: Keys that say nothing about the model, so they may be given beside a plan.
-_FREE = (
+FREE = (
     "output", "num_frames", "guard", "allow_unsound", "resume", "metrics", "surface_stride", "export", "colour",
     "thin_body", "video", "video_stride", "sheet",
 )  # fmt: skip
+
+
+#: Values of ``plan`` that name no file; null, as older records have it, is the first.
+MODES = ("auto", "full")
+
+
+def plan_path(config: Mapping[Any, Any]) -> Path | None:
+    """The file that ``plan`` names; None for ``auto`` and ``full``."""
+    asked = config.get("plan")
+    return None if asked is None or str(asked) in MODES else Path(str(asked)).expanduser()
+
+
+def plan_mode(config: Mapping[Any, Any]) -> str:
+    """``auto``, ``full`` or ``file``."""
+    if plan_path(config) is not None:
+        return "file"
+    return "full" if config.get("plan") is not None and str(config["plan"]) == "full" else "auto"
 
 
 def rollout_config(overrides: Sequence[str]) -> DictConfig:
@@ -35,13 +52,15 @@ def rollout_config(overrides: Sequence[str]) -> DictConfig:
         ConfigError: unknown keys or values, a file that is no plan, or a word that the plan was not made for.
     """
     config = load_config("rollout", overrides)
-    if config.plan is None:
+    path = plan_path(config)
+    if config.accuracy is not None:
+        raise ConfigError(f"accuracy={config.accuracy}: belongs to plan=auto; a plan has its own, drop accuracy=…")
+    if path is None:
         return config
-    path = Path(str(config.plan)).expanduser()
     words = _read_words(path)
     for word in overrides:
         key, _, value = word.partition("=")
-        if key in ("plan", *_FREE) or word in words:
+        if key in ("plan", *FREE) or word in words:
             continue
         made = next((known for known in words if known.partition("=")[0] == key), f"the default of {key}")
         raise ConfigError(f"{key}={value}: {path} was made for {made}; drop {key}=…, or make a plan with hood plan {word}")
@@ -59,7 +78,6 @@ class Watch:
 
     words: list[str]
     limit: float
-    ratio: float
     hold: int
 
 
@@ -69,15 +87,15 @@ def read_watch(path: Path) -> Watch | None:
     Raises:
         ConfigError: its numbers are none.
     """
-    plan = _read(path)
+    plan = read_plan(path)
     given = plan.get("watch")
     if given is None:
         return None
-    values = [given.get(key) for key in ("limit", "ratio", "hold")] if isinstance(given, dict) else []
+    values = [given.get(key) for key in ("limit", "hold")] if isinstance(given, dict) else []
     numbers = [float(value) for value in values if isinstance(value, (int, float)) and 0.0 < value < float("inf")]
-    if len(numbers) != 3:
-        raise ConfigError(f"plan={path}: 'watch' must hold limit, ratio and hold, all above 0; make the plan again")
-    return Watch(list(plan["words"]), numbers[0], max(numbers[1], 1.0), max(int(numbers[2]), 1))
+    if len(numbers) != 2:
+        raise ConfigError(f"plan={path}: 'watch' must hold limit and hold, both above 0; make the plan again")
+    return Watch(list(plan["words"]), numbers[0], max(int(numbers[1]), 1))
 
 
 def write_plan(path: Path, plan: Mapping[str, Any]) -> None:
@@ -86,11 +104,16 @@ def write_plan(path: Path, plan: Mapping[str, Any]) -> None:
 
 
 def _read_words(path: Path) -> list[str]:
-    plan = _read(path)
+    plan = read_plan(path)
     return [*plan["words"], *plan["chosen"]]
 
 
-def _read(path: Path) -> dict[str, Any]:
+def read_plan(path: Path) -> dict[str, Any]:
+    """What a plan holds.
+
+    Raises:
+        ConfigError: there is no such file, or it is no plan.
+    """
     if not path.is_file():
         raise ConfigError(f"plan={path}: no such file; hood plan … output=FOLDER writes FOLDER/plan.json")
     check_size(path, _LIMIT)
@@ -107,21 +130,27 @@ def _read(path: Path) -> dict[str, Any]:
     return dict(plan)
 
 
-def summarise_plan(path: Path) -> dict[str, Any]:
-    """What ``summary.json`` says of a rollout that was watched; nothing of others."""
+def summarise_plan(path: Path, config: Mapping[Any, Any]) -> dict[str, Any]:
+    """What ``summary.json`` says of a rollout's plan, and of what was left out where that was watched."""
+    file_of = plan_path(config)
+    found = {"mode": plan_mode(config)} | ({} if file_of is None else {"file": str(file_of)})
+    return {"plan": found | _watched(path)}
+
+
+def _watched(path: Path) -> dict[str, Any]:
     with h5py.File(path, "r") as file:
         if f"metrics/{PLAN_METRICS[0]}" not in file:
             return {}
         price, full = (np.nan_to_num(np.asarray(file[f"metrics/{name}"])) for name in PLAN_METRICS)
         limit = json.loads(file.attrs["model"])["plan_limit"]
     frames = [int(frame) for frame in np.flatnonzero(full > 0)]
-    return {"plan": {"limit": limit, "price_max": float(price.max(initial=0.0)), "frames_by_full_model": frames}}
+    return {"limit": limit, "price_max": float(price.max(initial=0.0)), "frames_by_full_model": frames}
 
 
 def plan_sentences(summary: Mapping[str, Any]) -> list[str]:
     """A line on where the full model came back; nothing without a watch."""
     found = summary.get("plan")
-    if not found:
+    if not found or "limit" not in found:
         return []
     if not found["frames_by_full_model"]:
         worst = f"{found['price_max']:.2g} of γ at most, {found['limit']:.2g} was accepted"

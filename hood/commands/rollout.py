@@ -15,6 +15,7 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
+from hood.assets.files.atomic import write_atomically
 from hood.assets.files.folder_lock import occupy
 from hood.commands.automatic import advice
 from hood.commands.batch import Job, find_jobs, share
@@ -29,7 +30,8 @@ from hood.commands.common import (
 from hood.commands.export import check_formats, export_beside
 from hood.commands.guarding import OFF, GuardStopped, guard_sentences, make_guard, write_alarms
 from hood.commands.notices import heard
-from hood.commands.plan_file import plan_sentences, rollout_config, summarise_plan
+from hood.commands.plan_auto import planned, without_accuracy
+from hood.commands.plan_file import plan_mode, plan_path, plan_sentences, rollout_config, summarise_plan
 from hood.commands.refinement import exported
 from hood.commands.setup import Setup, check_config, make_stepper, set_up, solves_in_double
 from hood.commands.summary import describe, describe_all, summarise
@@ -45,10 +47,10 @@ from hood.training import distributed
 def run(overrides: Sequence[str]) -> int:
     """Run the command; returns the exit code: 130 where the user interrupted it, else 2 where a motion of many could not be
     used, else 3 where a result is unsound (:mod:`hood.dynamics.soundness`), else 0."""
-    config = rollout_config(overrides)
+    config = rollout_config(without_accuracy(overrides))
     check_config(config)
     check_formats([str(form) for form in config.formats])
-    return together(lambda: _run(config))
+    return together(lambda: _run(rollout_config(distributed.on_main(lambda: planned(overrides)))))
 
 
 def _run(config: DictConfig) -> int:
@@ -73,6 +75,13 @@ def _run_one(config: DictConfig, stepper: Stepper, digest: str, advise: bool = T
 def _tell(sentences: Sequence[str]) -> None:
     for sentence in sentences:
         print(sentence)
+
+
+def _keep_plan(config: DictConfig, folder: Path) -> None:
+    """The plan beside what was made by it: the rollout can be made again when the plan's own place is gone."""
+    path, here = plan_path(config), folder / "plan.json"
+    if path is not None and path.resolve() != here.resolve():
+        write_atomically(here, path.read_bytes())
 
 
 def _first_positions(path: Path) -> np.ndarray:
@@ -100,7 +109,8 @@ def _run_there(ready: Setup, asked: DictConfig, digest: str, warned: list[str], 
     summary = summarise(folder / "rollout.h5")
     warn(guard_sentences(summary.get("guard")))
     summary["choice"] = asdict(ready.choice)
-    summary |= summarise_plan(folder / "rollout.h5")
+    summary |= summarise_plan(folder / "rollout.h5", config)
+    _keep_plan(config, folder)
     print(describe(summary))
     _tell(plan_sentences(summary))
     if advise:
@@ -162,6 +172,8 @@ def _finished(config: DictConfig, digest: str, folder: Path) -> dict[str, Any] |
     now = plain(config)
     before.setdefault("stepping", now["stepping"])  # rollouts from before there were options are known by their word
     before.setdefault("formats", [])
+    before["plan"] = before.get("plan") or now["plan"]
+    before.setdefault("accuracy", None)
     same = all(before.get(key) == now[key] for key in now if key not in ("resume", "output", "allow_unsound"))
     if not same or not bool(attributes["complete"]) or attributes["checkpoint_sha256"] != digest:
         return None
@@ -216,6 +228,7 @@ def _simulate_to_disk(ready: Setup, digest: str, path: Path, asked: DictConfig) 
         surface_stride=int(config.surface_stride),
         settle=str(config.settle),
         guard=guard,
+        afresh=plan_mode(config) == "full",
     )
     try:
         with writer:

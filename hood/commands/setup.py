@@ -18,7 +18,7 @@ from hood.commands.common import require_device, thinning
 from hood.commands.garments import heed, layer_order, names_of, read_outfit
 from hood.commands.guarding import check_guard
 from hood.commands.motion import make_motion
-from hood.commands.plan_file import read_watch
+from hood.commands.plan_file import plan_path, read_watch
 from hood.commands.refinement import AUTO, check_refinement, chosen, refined
 from hood.commands.steppers import PLAIN, make_network, make_solver, option_of
 from hood.config import ConfigError, build, load_config, require_choice
@@ -89,21 +89,22 @@ def set_up(
     tell_if_off(settled, 1 if scene.outfit is None else len(scene.outfit.names))
     warn(scene_cautions(stepper, scene, build(settled.losses), str(settled.checkpoint)))
     potential = potential_of(settled)
-    if config.plan is not None:
-        stepper, potential = _watched(settled, stepper, scene)
+    path = plan_path(config)
+    if path is not None:
+        stepper, potential = _watched(settled, stepper, scene, path)
     return Setup(settled, scene, stepper, choice, potential)
 
 
-def _watched(config: DictConfig, lean: Stepper, scene: Scene) -> tuple[Stepper, Potential]:
+def _watched(config: DictConfig, lean: Stepper, scene: Scene, path: Path) -> tuple[Stepper, Potential]:
     """A plan's stepper with its watch, and the potential of the full model; what it has alone where the plan has no watch."""
-    potential, watch = potential_of(config), read_watch(Path(str(config.plan)).expanduser())
+    potential, watch = potential_of(config), read_watch(path)
     if watch is None:
         return lean, potential
     whole = load_config("rollout", watch.words)
     check_config(whole)
     everything = potential_of(whole)
     full = refined(make_stepper(whole)[0], whole, scene.cloth.num_vertices, everything)
-    return WatchedStepper(lean, full, (potential, everything), scene, watch.limit, watch.ratio, watch.hold), everything
+    return WatchedStepper(lean, full, (potential, everything), scene, watch.limit, watch.hold), everything
 
 
 def make_scene(config: DictConfig, garment: Garment | None = None, material: Material | None = None) -> Scene:

@@ -32,6 +32,7 @@ from hood.graph.given import given_hierarchy
 from hood.losses.layers import for_networks, has_layers
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
+from hood.mesh.surface_tree import forget_searches
 from hood.scene.contact import Contact, find_contact
 from hood.scene.jumps import Jump, carried, describe_jumps, find_jumps
 from hood.scene.mesh_motion import wearable
@@ -112,6 +113,7 @@ def simulate(
     surface_stride: int = SURFACE_STRIDE,
     settle: str = "paper",
     guard: Guard | None = None,
+    afresh: bool = False,
 ) -> Iterator[Frame]:
     """Frames 0, 1, … of the garment on the moving body.
 
@@ -135,6 +137,8 @@ def simulate(
     every ``surface_stride``-th frame, the first and the last; other frames lack them.
 
     A network that looks at a potential looks at ``potential``; a solver keeps its own.
+
+    ``afresh``: no search begins with what the step before found. The frames are the same, and take longer.
 
     A ``guard`` sees every step from frame to frame, but for a relaxing one. The rollout goes on with what it makes of the step,
     and ends before the frame that it stops at. Its time is ``ms_guard``, a part of ``ms_total``; what is measured for
@@ -174,6 +178,8 @@ def simulate(
         body_frame = start_frame + index
         state = recentre(state, scene.cloth.vertex_scene)
         problem = None
+        if afresh:
+            forget_searches()
         if index + 1 < count:
             with watch.part("posing"):
                 closed = None if attachments is None else attachments(index)

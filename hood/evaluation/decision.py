@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 
@@ -13,6 +14,8 @@ from hood.evaluation.leaving_out import Effect
 
 #: A part that saves a smaller share of a frame's time stays: the time cannot be told from noise.
 LEAST_SAVING = 0.03
+#: A part whose error is so many times what is accepted is not looked at in further windows.
+HOPELESS = 10.0
 #: Quantile over the windows that γ is judged by.
 QUANTILE = 0.95
 
@@ -37,6 +40,11 @@ class Tolerance:
             raise ValueError(f"accuracy={text}: give a γ above 0 (0.01), or a distance (5mm)")
         return cls(value, "mm" if match.group(2) else "gamma")
 
+    @property
+    def text(self) -> str:
+        """As :meth:`read` reads it."""
+        return f"{self.value:g}{'mm' if self.unit == 'mm' else ''}"
+
     def error(self, effect: Effect, full: Effect) -> float:
         """What is held against the tolerance: the distance, or how much more γ is left than by the full model's own steps.
 
@@ -44,8 +52,13 @@ class Tolerance:
         """
         if self.unit == "mm":
             return effect.worst_mm if math.isfinite(effect.worst_mm) else math.inf
-        rises = [max(one - own, 0.0) for one, own in zip(effect.gamma, full.gamma, strict=True)]
+        own = full.gamma[: len(effect.gamma)]  # of what is hopeless not all windows were looked at
+        rises = [max(one - other, 0.0) for one, other in zip(effect.gamma, own, strict=True)]
         return float(np.quantile(rises, QUANTILE)) if all(map(math.isfinite, rises)) else math.inf
+
+    def hopeless(self, effect: Effect, full: Effect) -> bool:
+        """Whether the windows so far say enough: the error is :data:`HOPELESS` times what is accepted."""
+        return not self.error(effect, full) <= HOPELESS * self.value
 
     def say(self, value: float) -> str:
         """The error in words."""
@@ -75,7 +88,7 @@ def decide(
     rivals: Sequence[Sequence[str]],
     tolerance: Tolerance,
     measure_together: Callable[[Sequence[str]], tuple[Effect, Effect]],
-    unwatched: Collection[str] = (),
+    stay: Mapping[str, str] = MappingProxyType({}),
 ) -> Decision:
     """The cheapest combination whose error stays within the tolerance, as far as one search from the top finds it.
 
@@ -86,7 +99,7 @@ def decide(
         effects: by part; the full model's own entry is named "".
         absent: parts that nothing in the scene uses, with the reason.
         rivals: parts of which at most one can be left out.
-        unwatched: parts that are never left out, because a rollout would not notice where it needs them.
+        stay: parts that are never left out, and why.
         measure_together: the full model's and the combination's effect, measured side by side.
     """
     full = effects[""]
@@ -95,13 +108,13 @@ def decide(
     for name, effect in effects.items():
         if not name or name in absent:
             continue
-        error, saving = tolerance.error(effect, full), 1.0 - effect.median_ms / full.median_ms
+        error, saving = tolerance.error(effect, full), effect.saving(full)
         if error > tolerance.value:
             verdicts[name] = Verdict("kept", f"without it {tolerance.say(error)}")
         elif saving < LEAST_SAVING:
             verdicts[name] = Verdict("kept", f"it costs no time that can be measured ({100 * saving:+.0f}% of a frame)")
-        elif name in unwatched:
-            said = f"{tolerance.say(error)} without it here, but a rollout would not notice where it is more"
+        elif name in stay:
+            said = f"{tolerance.say(error)} without it here, but {stay[name]}"
             verdicts[name] = Verdict("kept", said)
         else:
             passing[name] = saving
@@ -113,7 +126,7 @@ def decide(
     together: Effect | None = None
     while passing:
         reference, together = measure_together(tuple(passing))
-        error, saving = tolerance.error(together, reference), 1.0 - together.median_ms / reference.median_ms
+        error, saving = tolerance.error(together, reference), together.saving(reference)
         if error <= tolerance.value and saving >= LEAST_SAVING:
             break
         worst = max(passing, key=lambda name: tolerance.error(effects[name], full))

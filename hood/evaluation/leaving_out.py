@@ -7,7 +7,8 @@ compared with those of the full model when the window is over.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,8 +18,6 @@ from torch import Tensor
 from hood.dynamics.rollout import prepare_stepper, simulate
 from hood.dynamics.simulator import Prediction
 from hood.dynamics.stepper import Stepper
-from hood.dynamics.stopwatch import Stopwatch
-from hood.dynamics.watched import force_bound, lacking
 from hood.evaluation.gap import REFERENCE
 from hood.evaluation.windows import Window
 from hood.losses.potential import Potential, relative_gradient, scale
@@ -30,10 +29,6 @@ from hood.solver.newton import minimize
 
 #: Frames of the full model before a window's first state: the start is at rest on a still body.
 LEAD = 2
-#: What a few windows said is halved, and more than this is not made of it.
-MOST_OVERSTATED = 100.0
-#: A smaller γ is as much of the solver's accuracy as of what is left out.
-_TELLING = 1e-4
 #: Positions differ by the 95th percentile of this over the vertices: one vertex that flips says little.
 _QUANTILE = 0.95
 
@@ -49,11 +44,12 @@ class Variant:
 
 @dataclass
 class Effect:
-    """What a variant did in every window; the full model's own entry has γ of its own steps and 0 mm."""
+    """What a variant did in every window, or in the first ones; the full model's own entry has γ of its own steps and 0 mm."""
 
     gamma: list[float] = field(default_factory=list)
     mm: list[float] = field(default_factory=list)
     ms: list[float] = field(default_factory=list)  # of every frame
+    last: list[Tensor] = field(default_factory=list)  # (V, 3) m, world, float64, at the windows' ends
     exact: list[bool] = field(default_factory=list)  # the window's minimum was reached; where not, γ is a lower bound
 
     def gamma_at(self, share: float) -> float:
@@ -64,6 +60,10 @@ class Effect:
     def worst_mm(self) -> float:
         """Of all windows."""
         return max(self.mm)
+
+    def saving(self, full: Effect) -> float:
+        """Share of a frame's time that the full model takes longer, in the windows that this was measured in."""
+        return 1.0 - self.median_ms / float(np.median(full.ms[: len(self.ms)]))
 
     @property
     def median_ms(self) -> float:
@@ -115,55 +115,59 @@ def take_steps(variant: Variant, begun: Begun, num_frames: int, effect: Effect) 
     """Steps of a variant from the window's first state: positions (V, 3) [m] after the first step, in that state's frame, and
     after all of them, world. Its times [ms] go to ``effect``."""
     stepper, scene, state = variant.stepper, variant.scene, begun.state
-    prepared, watch, first = prepare_stepper(stepper, scene), Stopwatch(), state.pos
+    prepared, first = prepare_stepper(stepper, scene), state.pos
+    # On one thread what other processes take is no time of a frame's.
+    clock = time.process_time if torch.get_num_threads() == 1 and state.pos.device.type == "cpu" else time.perf_counter
     for index in range(num_frames):
-        watch.lap()
+        began = clock()
         step = begun.step.step if index == 0 else scene.step_input(begun.frame + index, state)
         problem = stepper.search(StepProblem(scene.cloth, state, step, gravity=stepper.gravity.to(state.pos)))
-        prediction = stepper.predict(problem, prepared, watch)
+        prediction = stepper.predict(problem, prepared, None)
         velocity = stepper.next_velocity(problem, prediction)
-        effect.ms.append(watch.lap()["total"])
+        effect.ms.append(1e3 * (clock() - began))
         state = State(prediction.next_pos, velocity, state.origin)
         first = state.pos if index == 0 else first
         state = recentre(state, scene.cloth.vertex_scene)
     return first, state.pos.cpu().double() + state.origin[0]
 
 
-def measure(full: Variant, variants: dict[str, Variant], begun: Sequence[Begun], num_frames: int) -> dict[str, Effect]:
-    """Effects by name, of all ``variants`` and of the full model, whose name is empty. They take turns window by window."""
+def measure(
+    full: Variant,
+    variants: dict[str, Variant],
+    begun: Sequence[Begun],
+    num_frames: int,
+    enough: Callable[[str, Effect, Effect], bool] = lambda name, effect, of_full: False,
+) -> dict[str, Effect]:
+    """Effects by name, of all ``variants`` and of the full model, whose name is empty. They take turns window by window.
+
+    Args:
+        enough: says after every window, of a name, its effect so far and that of the full model, whether that will do.
+    """
     everything = {"": full, **variants}
     for variant in everything.values():
         take_steps(variant, begun[0], 1, Effect())  # what a stepper makes at its first step is not a frame's time
-    effects: dict[str, Effect] = {name: Effect() for name in everything}
+    effects, going = {name: Effect() for name in everything}, list(everything)
     for one in begun:
         firsts: dict[str, Tensor] = {}
         lasts: dict[str, Tensor] = {}
-        for name, variant in everything.items():
+        for name, variant in ((name, everything[name]) for name in going):
             firsts[name], lasts[name] = take_steps(variant, one, num_frames, effects[name])
         e0, values = float(scale(in_double(one.step)).sum()), [_phi(full.potential, one, pos) for pos in firsts.values()]
         lowest, exact = _minimum(full.potential, one, list(firsts.values()), values)
-        for phi, (name, effect) in zip(values, effects.items(), strict=True):
+        for phi, name in zip(values, going, strict=True):
+            effect = effects[name]
             effect.gamma.append((phi - lowest) / e0)
             effect.exact.append(exact)
+            effect.last.append(lasts[name])
             apart = (lasts[name] - lasts[""]).norm(dim=1)
             effect.mm.append(1e3 * float(apart.quantile(_QUANTILE)) if bool(torch.isfinite(apart).all()) else float("inf"))
+        going = [name for name in going if not name or not enough(name, effects[name], effects[""])]
     return effects
 
 
 def active_terms(full: Variant, begun: Sequence[Begun]) -> set[str]:
     """Names of the full potential's terms that can be anything but a constant zero in one of the windows."""
     return {name for one in begun for name in full.potential.active(one.step)}
-
-
-def overstatement(full: Variant, lean: Variant, begun: Sequence[Begun], gammas: Sequence[float]) -> float:
-    """How much :func:`hood.dynamics.watched.force_bound` of the energies that ``lean`` lacks overstates its γ: half of the
-    least of the windows, between 1 and :data:`MOST_OVERSTATED`."""
-    found, names = [2.0 * MOST_OVERSTATED], lacking(lean.potential, full.potential)
-    for one, gamma in zip(begun, gammas, strict=True):
-        pos, _ = take_steps(lean, one, 1, Effect())
-        if gamma > _TELLING:
-            found.append(force_bound(full.potential, names, one.step, pos) / gamma)
-    return max(1.0, min(found) / 2.0) if len(found) > 1 else 1.0
 
 
 def prices(full: Variant, begun: Sequence[Begun]) -> dict[str, float]:

@@ -28,6 +28,8 @@ _WIDE, _LINE = 8, 64
 _MOST, _VISITS = 64, 1 << 18
 #: Points of a part that is worth a thread: threads need the normals of all vertices made before they begin.
 _POINTS = 1000
+#: Searches for so many points at least are remembered, the last few sizes: most likely the same points come again a step later.
+_REMEMBERED, _SIZES = 256, 4
 
 
 class _Tree(ctypes.Structure):
@@ -64,6 +66,7 @@ class _Query(ctypes.Structure):
         *fields("point normal next_point next_normal curvature", POINTER),
         ("most_curvature", REAL),
         ("rounds", COUNT),
+        ("hint", POINTER),
     ]
 
 
@@ -162,7 +165,13 @@ class SurfaceTree:
         centre = np.ascontiguousarray(np.nan_to_num(np.asarray(pos, np.float64)[faces].mean(axis=1)))
         self._fitted: tuple[weakref.ref[Tensor], int | None] | None = None
         self._last: tuple[np.ndarray, dict[str, np.ndarray]] | None = None  # points, and where they are, of the last search
+        self._near: dict[int, np.ndarray] = {}  # vertices (N,) that the last search for N points found
         lib.surface_build(ctypes.byref(self._tree), centre.ctypes.data_as(POINTER))
+
+    def forget(self) -> None:
+        """Search the next time as if there had been no search before."""
+        self._near.clear()
+        self._last = None
 
     def _share(self, parts: int) -> None:
         """Search for points in as many parts, by threads of their own; what is found does not depend on it."""
@@ -204,10 +213,16 @@ class SurfaceTree:
         self._fit(vertices)
         if self._last is None or not np.array_equal(self._last[0], points):
             found = _arrays(count, False, np.empty, ("bary",))
-            query = _Query(count=count)
-            _point(query, {"points": points, **found})
+            query, given = _Query(count=count), {"points": points, **found}
+            if count in self._near:  # what is found does not depend on it, only how soon
+                given["hint"] = self._near.pop(count)
+            _point(query, given)
             self._lib.surface_find(ctypes.byref(self._tree), ctypes.byref(query))
             self._last = points.copy(), found
+            if count >= _REMEMBERED:
+                self._near[count] = found["vertex"]
+                if len(self._near) > _SIZES:
+                    del self._near[next(iter(self._near))]
         return {name: values.copy() for name, values in self._last[1].items()}
 
     def folds(
@@ -376,6 +391,12 @@ def _found(points: Tensor, arrays: dict[str, np.ndarray]) -> Match:
 
 #: Incidence, scene and tree of the last topologies.
 _TREES: deque[tuple[Tensor, int | None, SurfaceTree]] = deque(maxlen=16)
+
+
+def forget_searches() -> None:
+    """Search the next time as if there had been no searches before: what is found is the same, later where it is far away."""
+    for _, _, tree in _TREES:
+        tree.forget()
 
 
 def _tree_of(faces: Tensor, scene: int | None, face_scene: Tensor, incidence: Sequence[Tensor], pos: Tensor) -> SurfaceTree:

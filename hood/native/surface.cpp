@@ -113,6 +113,7 @@ struct Query {
     double* curvature;       // (N) 1/m, none where nobody asks
     double most_curvature;   // 1/m
     int64_t rounds;          // of averaging
+    const int64_t* hint;     // (N) vertices that are near, as those found a step before: they save visits; none where none is known
 };
 }
 
@@ -227,6 +228,7 @@ inline float face_limit_of(double dist_sq, double size_sq) { return (float)(dist
 struct Walk {
     Vec p, local;  // local: about the tree's origin
     double size_sq, limit;
+    double known_sq;  // m^2, to a vertex that was nearest before; infinite where none is known
     Least faces, vertices;
     int64_t node, parent;
     float face_limit;
@@ -236,6 +238,7 @@ inline void walk_from(Walk& walk, const Tree& tree, Vec p) {
     walk.p = p, walk.local = p - at(tree.origin, 0);
     walk.size_sq = tree.size_sq + dot(walk.local, walk.local);
     walk.faces = walk.vertices = Least{};
+    walk.known_sq = INFINITY;
     walk.node = tree.num_nodes ? 0 : -1;
     walk.parent = -1;
 }
@@ -283,6 +286,12 @@ inline bool may_hold(const Tree& tree, const Walk& walk, int64_t leaf) {
     return any;
 }
 
+// By the vertices looked at so far, and by one that was nearest in another search: that is no farther than the nearest.
+inline void bound_vertices(Walk& walk) {
+    const double dist_sq = least_lane(walk.vertices.dist_sq);
+    walk.limit = limit_of(walk.known_sq < dist_sq ? walk.known_sq : dist_sq, walk.size_sq);
+}
+
 inline void bound_faces(Walk& walk) {
     const double dist_sq = least_lane(walk.faces.dist_sq);
     walk.limit = limit_of(dist_sq, walk.size_sq), walk.face_limit = face_limit_of(dist_sq, walk.size_sq);
@@ -305,7 +314,7 @@ void walk_together(const Tree& tree, Walk* walks, int32_t count) {
         Walk& walk = walks[q];
         try_faces(tree, walk.p, -1 - walk.node, walk.faces);
         try_vertices(tree, walk.p, -1 - walk.node, walk.vertices);
-        walk.limit = limit_of(least_lane(walk.vertices.dist_sq), walk.size_sq);
+        bound_vertices(walk);
     }
     if (!tree.num_nodes) return;
     for (int32_t q = 0; q < count; ++q) list_children(tree, walks[q], q, walks[q].parent, walks[q].node, nodes, leaves);
@@ -316,7 +325,7 @@ void walk_together(const Tree& tree, Walk* walks, int32_t count) {
     }
     // Everything else within that bound.
     for (int32_t q = 0; q < count; ++q) {
-        walks[q].limit = limit_of(least_lane(walks[q].vertices.dist_sq), walks[q].size_sq);
+        bound_vertices(walks[q]);
         tree.nodes[nodes] = {q, 0};
         nodes += walks[q].parent != 0;
     }
@@ -326,7 +335,9 @@ void walk_together(const Tree& tree, Walk* walks, int32_t count) {
     }
     for (; seen < leaves; ++seen) {
         Walk& walk = walks[tree.leaves[seen].walk];
+        if (tree.reach[seen] > walk.limit) continue;
         try_vertices(tree, walk.p, tree.leaves[seen].item, walk.vertices);
+        bound_vertices(walk);
     }
     for (int32_t q = 0; q < count; ++q) bound_faces(walks[q]);
     for (int64_t i = 0; i < leaves; ++i) {
@@ -676,6 +687,9 @@ void search(const Tree& tree, const Query& query, int64_t begin, int64_t end) {
         const Vec p = at(query.points, i);
         finite[i - begin] = std::isfinite(p.x) && std::isfinite(p.y) && std::isfinite(p.z);
         walk_from(walks[i - begin], tree, finite[i - begin] ? p : Vec{0.0, 0.0, 0.0});
+        if (!query.hint || !finite[i - begin]) continue;
+        const Vec gap = p - at(tree.pos, query.hint[i]);
+        if (dot(gap, gap) >= 0.0) walks[i - begin].known_sq = dot(gap, gap);
     }
     walk_together(tree, walks, (int32_t)(end - begin));
     for (int64_t i = begin; i < end; ++i) {
@@ -925,7 +939,7 @@ void surface_folds(Tree* tree, const Matched* matched, const Query* all, uint8_t
     std::vector<int64_t> whole(2 * count);
     std::vector<double> real(21 * count);
     Query query = *all;
-    query.count = count;
+    query.count = count, query.hint = nullptr;
     query.vertex = whole.data(), query.face = query.vertex + count;
     double* next = real.data();
     const auto take = [&](int64_t width) { return std::exchange(next, next + width * count); };

@@ -94,7 +94,7 @@ def test_a_rollout_watches_what_its_plan_leaves_out(written: Path, tmp_path: Pat
     """With no tolerance at all every step is the full model's, and the summary says so."""
     plan = json.loads(written.read_text())
     chosen, short = ["losses.terms.bending=null", "cloth_contact=off"], ["num_frames=5", *QUIET]
-    written.write_text(json.dumps(plan | {"chosen": chosen, "watch": {"limit": 1e-30, "ratio": 1.0, "hold": 3}}))
+    written.write_text(json.dumps(plan | {"chosen": chosen, "watch": {"limit": 1e-30, "hold": 3}}))
     by_plan, full = tmp_path / "plan", tmp_path / "full"
     assert main(["rollout", f"plan={written}", *short, f"output={by_plan}"]) == 0
     assert "plan: the full model took 4 steps" in capsys.readouterr().out
@@ -104,7 +104,7 @@ def test_a_rollout_watches_what_its_plan_leaves_out(written: Path, tmp_path: Pat
     assert found["frames_by_full_model"] == [1, 2, 3, 4]
     assert found["price_max"] > 1e-30
 
-    written.write_text(json.dumps(plan | {"chosen": chosen, "watch": {"limit": 1e9, "ratio": 1.0, "hold": 3}}))
+    written.write_text(json.dumps(plan | {"chosen": chosen, "watch": {"limit": 1e9, "hold": 3}}))
     assert main(["rollout", f"plan={written}", *short, f"output={tmp_path / 'lean'}"]) == 0
     assert "plan: what was left out was worth" in capsys.readouterr().out
     assert json.loads((tmp_path / "lean" / "summary.json").read_text())["plan"]["frames_by_full_model"] == []

@@ -9,16 +9,30 @@ import pytest
 import torch
 from layer_scenes import sheets_on_sphere
 
+from hood.assets.body.body import Body
+from hood.assets.garment.garment import Garment
+from hood.assets.motion.load import load_sequence
 from hood.dynamics.rollout import simulate
 from hood.dynamics.stepper import NewtonStepper
-from hood.dynamics.watched import PLAN_METRICS, WatchedStepper, force_bound, lacking
+from hood.dynamics.watched import (
+    GROWTH,
+    MOST_OVERSTATED,
+    PLAN_METRICS,
+    REMEMBERED,
+    WatchedStepper,
+    _Known,
+    force_bound,
+    lacking,
+)
 from hood.evaluation.gap import gap
 from hood.evaluation.leaving_out import Effect, Variant, begin, take_steps
 from hood.evaluation.windows import Window
 from hood.losses.layers import LayerBarrier
 from hood.losses.potential import Potential, default_potential, scale
-from hood.scene.scene import Scene
+from hood.losses.problem import StepProblem
+from hood.scene.scene import Scene, build_scene
 from hood.solver.newton import NewtonSettings
+from hood.testing import cylinder
 
 FULL = default_potential()
 TIGHT = NewtonSettings(target_rg=1e-3)
@@ -28,8 +42,8 @@ def without(*names: str) -> Potential:
     return Potential({name: term for name, term in FULL.terms.items() if name not in names})
 
 
-def watched(scene: Scene, lean: Potential, limit: float, ratio: float = 1.0, hold: int = 2) -> WatchedStepper:
-    return WatchedStepper(NewtonStepper(lean, TIGHT), NewtonStepper(FULL, TIGHT), (lean, FULL), scene, limit, ratio, hold)
+def watched(scene: Scene, lean: Potential, limit: float, hold: int = 2) -> WatchedStepper:
+    return WatchedStepper(NewtonStepper(lean, TIGHT), NewtonStepper(FULL, TIGHT), (lean, FULL), scene, limit, hold)
 
 
 def rolled(stepper: Any, scene: Scene, count: int = 5) -> list[Any]:
@@ -95,6 +109,7 @@ def test_the_part_is_back_within_the_frame_and_goes_again(tank_scene: Scene) -> 
         return 1e10 if len(calls) == 2 else priced(problem, pos)
 
     stepper.price = alarmed  # type: ignore[method-assign]
+    stepper._worth = lambda *given: 1e10  # type: ignore[method-assign]
     frames = rolled(stepper, tank_scene, 7)
     assert [frame.metrics["plan_full"] for frame in frames[1:]] == [0.0, 1.0, 1.0, 0.0, 0.0, 0.0]
 
@@ -108,14 +123,78 @@ def test_a_model_that_fails_at_once_is_tried_less_often(tank_scene: Scene) -> No
         return 1e10
 
     stepper.price = failing  # type: ignore[method-assign]
+    stepper._worth = lambda *given: 1e10  # type: ignore[method-assign]
     frames = rolled(stepper, tank_scene, 9)
     assert [frame.metrics["plan_full"] for frame in frames[1:]] == [1.0] * 8
     assert len(tried) == 4  # before steps 1, 2, 4 and 8
 
 
-def test_the_ratio_divides_the_price(tank_scene: Scene) -> None:
-    one, ten = (rolled(watched(tank_scene, without("bending"), 1e9, ratio), tank_scene, 2)[1] for ratio in (1.0, 10.0))
-    assert one.metrics["plan_price"] == pytest.approx(10.0 * ten.metrics["plan_price"], rel=1e-6)
+def test_a_price_that_was_too_high_is_known_from_then_on(tank_scene: Scene) -> None:
+    """The bound of bending is several times its γ: one step by the full model, and forces like those are priced by what they
+    were worth. Forces elsewhere are priced in full."""
+    probe = rolled(watched(tank_scene, without("bending"), 1e9), tank_scene, 8)
+    bound = max(frame.metrics["plan_price"] for frame in probe[1:])
+    stepper = watched(tank_scene, without("bending"), 0.6 * bound, hold=4)
+    frames = rolled(stepper, tank_scene, 5)
+    assert [frame.metrics["plan_full"] for frame in frames[1:]] == [1.0, 0.0, 0.0, 0.0]
+    assert frames[1].metrics["plan_price"] > 0.6 * bound
+    known = stepper._known["bending"]
+    assert 1.0 < known.ratio <= MOST_OVERSTATED
+    assert known.left == REMEMBERED - 3
+    seen = stepper._priced("bending", known.forces / GROWTH)
+    stepper._known["bending"] = known
+    elsewhere = (known.forces / GROWTH).roll(300)
+    assert seen == pytest.approx(float(known.forces.sum()) / GROWTH / known.ratio)
+    assert stepper._priced("bending", elsewhere) > 1.5 * seen
+
+
+def test_what_was_known_of_a_price_is_forgotten(tank_scene: Scene) -> None:
+    stepper, forces = watched(tank_scene, without("bending"), 0.01), torch.ones(5, dtype=torch.float64)
+    stepper._known["bending"] = _Known(10.0, forces, 2)
+    assert [stepper._priced("bending", forces) for _ in range(3)] == pytest.approx([0.5, 0.5, 5.0])
+
+
+def test_layers_are_always_priced_in_full() -> None:
+    full = FULL.with_terms(layers=LayerBarrier())
+    stepper = object.__new__(WatchedStepper)
+    stepper._potential, stepper._known = full, {"layers": _Known(10.0, torch.ones(5), 9)}
+    assert stepper._priced("layers", torch.ones(5)) == 5.0
+
+
+@pytest.mark.parametrize(
+    ("motion", "first", "radius", "names"),
+    [
+        ("kicks", 40, 0.35, ("collision", "friction")),  # a leg comes up
+        ("squats", 30, 0.24, ("collision", "friction")),  # she sits down
+        ("lunges", 30, 0.23, ("collision", "friction")),
+        ("walk_proud", 60, 0.21, ("bending",)),
+        ("dance_mixed", 100, 0.21, ("bending", "friction")),
+    ],
+)
+def test_no_step_is_left_to_the_lean_model_that_the_full_one_would_take_otherwise(
+    motion: str, first: int, radius: float, names: tuple[str, ...], body: Body
+) -> None:
+    """A band around the waist, of which the second half of a motion asks what the first did not: in every frame that is worth
+    more than the limit the full model takes the step, in that very frame."""
+    pos, faces = cylinder(24, 8, radius, 0.3)
+    garment = Garment("band", pos + [0.0, -0.1, 0.02], faces, pos[:, 1] > 0.149)
+    scene = build_scene(garment, body, load_sequence(motion).window(first, first + 24))
+    stepper, limit, worths = watched(scene, without(*names), 0.01, hold=3), 0.01, []
+    inner, prepared = NewtonStepper(FULL, TIGHT), {}
+    taken = stepper.predict
+
+    def judged(problem: Any, given: Any, watch: Any = None) -> Any:
+        found = taken(problem, given, watch)
+        fresh = FULL.prepare(StepProblem(problem.cloth, problem.state, problem.step, gravity=problem.gravity))
+        right = inner.predict(fresh, prepared.setdefault("", inner.prepare(scene.cloth, scene.garment.rest_pos)))
+        worths.append((found.metrics["plan_full"], stepper._worth(fresh, found.next_pos, right.next_pos)))
+        return found
+
+    stepper.predict = judged  # type: ignore[method-assign]
+    rolled(stepper, scene, 24)
+    left = [worth for full, worth in worths if not full]
+    assert all(worth <= limit for worth in left)
+    assert {full for full, _ in worths} == {0.0, 1.0}
 
 
 def test_what_is_not_finite_is_taken_by_the_full_model(tank_scene: Scene) -> None:
@@ -125,7 +204,7 @@ def test_what_is_not_finite_is_taken_by_the_full_model(tank_scene: Scene) -> Non
             return replace(found, next_pos=found.next_pos * float("nan"))
 
     lean = without("bending")
-    stepper = WatchedStepper(Broken(lean, TIGHT), NewtonStepper(FULL, TIGHT), (lean, FULL), tank_scene, 0.01, 1.0, 2)
+    stepper = WatchedStepper(Broken(lean, TIGHT), NewtonStepper(FULL, TIGHT), (lean, FULL), tank_scene, 0.01, 2)
     frames = rolled(stepper, tank_scene, 3)
     assert all(bool(torch.isfinite(frame.world_pos).all()) for frame in frames)
     assert frames[-1].metrics["plan_full"] == 1.0

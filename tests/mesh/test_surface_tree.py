@@ -83,6 +83,40 @@ def test_what_is_found_does_not_depend_on_the_threads(monkeypatch):
         monkeypatch.undo()
 
 
+def test_what_was_near_before_changes_nothing_but_the_visits():
+    pos, faces = surface()
+    where = points(300)
+    found(where, pos, faces)
+    (tree,) = [tree for _, _, tree in surface_tree._TREES if tree._tree.num_vertices == len(pos)][-1:]
+    generator = np.random.default_rng(0)
+    for step in range(6):  # the surface and the points move on; places that are not finite and vertices far away are known too
+        moved, there = pos * (1 + 0.3 * step) + 0.1 * step * pos.flip(1), where.roll(step, 1) + 0.2 * step
+        moved[step], there[2 * step] = torch.nan, torch.nan
+        if step % 2:
+            tree._near[300] = generator.integers(0, len(pos), 300)
+        assert len(tree._near[300]) == 300
+        known = found(there, moved, faces)
+        surface_tree.forget_searches()
+        assert not tree._near
+        fresh = found(there, moved, faces)
+        assert all(torch.equal(a.nan_to_num(-7), b.nan_to_num(-7)) for a, b in zip(known, fresh, strict=True))
+
+
+def test_a_far_search_visits_less_after_one_like_it():
+    """The way from a point is bounded by what was nearest before, so a list of leaves that was full is short."""
+    pos, faces = surface()
+    tree = surface_tree.SurfaceTree(
+        faces.numpy(), np.arange(len(faces)), [part.numpy() for part in build_incidence(faces, len(pos)).adjacency], pos
+    )
+    where = np.ascontiguousarray(40.0 * points(400).numpy())
+    visits = []
+    for _ in range(2):
+        tree._arrays["reach"].fill(np.nan)
+        tree.search(where, pos, pos.numpy(), False)
+        visits.append(int(np.isfinite(tree._arrays["reach"]).sum()))
+    assert visits[1] < visits[0]
+
+
 def test_of_faces_at_the_same_distance_the_first_is_taken():
     pos, faces = surface(box(4))
     corners = pos[:: max(len(pos) // 6, 1)]

@@ -1,0 +1,85 @@
+"""``plan=auto accuracy=…``: a rollout that plans first. Plans are kept by scene, settings and processor."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from hood import __version__
+from hood.assets.files.library import locate
+from hood.commands.common import output_folder
+from hood.commands.plan import make_plan, sentence
+from hood.commands.plan_file import FREE, plan_path, read_plan, write_plan
+from hood.config import ConfigError, load_config
+from hood.native.build import processor
+from hood.native.cache import cache_folder
+
+#: Words of these keys name files whose content decides.
+_FILES = ("garment", "sequence", "body", "checkpoint", "pins", "refine_table")
+
+
+def without_accuracy(overrides: Sequence[str]) -> list[str]:
+    """The words of the full model of a rollout that may plan first."""
+    return [word for word in overrides if _key(word) != "accuracy"]
+
+
+def planned(overrides: Sequence[str]) -> list[str]:
+    """The words of a rollout; with ``accuracy`` its plan is made, or found where it was kept, and stands in them.
+
+    A plan lies in the user's cache folder, or beside the rollout where nothing may be kept.
+
+    Raises:
+        ConfigError: ``accuracy`` beside a plan that is not ``auto``, and what ``hood plan`` refuses.
+    """
+    config = load_config("rollout", overrides)
+    if config.accuracy is None:
+        return list(overrides)
+    if plan_path(config) is not None or str(config.plan) == "full":
+        raise ConfigError(f"accuracy={config.accuracy}: belongs to plan=auto, not to plan={config.plan}; drop one of the two")
+    rest = [word for word in overrides if _key(word) not in ("accuracy", "plan")]
+    words = [word for word in rest if _key(word) not in FREE or _key(word) == "num_frames"]
+    own = load_config("plan", [f"accuracy={config.accuracy}"])
+    cache = cache_folder()
+    path = (output_folder(config) if cache is None else cache / "plans") / f"plan-{_digest(words, str(config.accuracy))}.json"
+    if path.is_file():
+        plan = read_plan(path)
+        print(f"plan of {path}, made before")
+    else:
+        plan, _ = make_plan(words, own)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_plan(path, plan)
+        print(f"planned in {plan['seconds']:.1f} s, kept in {path}")
+    print(sentence(plan))
+    return [*rest, f"plan='{path}'"]
+
+
+def _key(word: str) -> str:
+    return word.partition("=")[0].lstrip("+~")
+
+
+def _digest(words: Sequence[str], accuracy: str) -> str:
+    """Of everything that a plan depends on, the processor that its times are of among it."""
+    said = hashlib.sha256("\0".join([__version__, processor(), accuracy, *sorted(words)]).encode())
+    config = load_config("rollout", words)
+    for key in _FILES:
+        for name in config[key] if isinstance(config[key], Sequence) and not isinstance(config[key], str) else [config[key]]:
+            said.update(f"\0{key}".encode())
+            for path in _files_of(key, str(name)):
+                said.update(path.read_bytes())
+    return said.hexdigest()[:24]
+
+
+def _files_of(key: str, name: str) -> list[Path]:
+    """The files that a value names; none where it is something else."""
+    path = Path(name).expanduser()
+    if path.is_dir():
+        return sorted(Path(folder) / file for folder, _, files in os.walk(path) for file in files)
+    if path.is_file():
+        return [path]
+    kind = {"garment": "garments", "sequence": "motions", "body": "body", "checkpoint": "weights"}.get(key)
+    try:
+        return [] if kind is None else [locate(kind, name)]
+    except (ValueError, FileNotFoundError):
+        return []
