@@ -13,7 +13,7 @@ from hood.assets.garment.garment import Garment
 from hood.assets.material import Material
 from hood.commands.automatic import Choice, choose
 from hood.commands.cautions import scene_cautions, warn
-from hood.commands.cloth_contact import check_cloth_contact, potential_of, tell_if_off
+from hood.commands.cloth_contact import acts, check_cloth_contact, potential_of, tell_if_off
 from hood.commands.common import require_device, thinning
 from hood.commands.garments import heed, layer_order, names_of, read_outfit
 from hood.commands.guarding import check_guard
@@ -29,6 +29,7 @@ from hood.dynamics.watched import WatchedStepper
 from hood.losses.potential import Potential
 from hood.nn.compiled import KERNELS
 from hood.scene.fitting import doubts, misplacement
+from hood.scene.held_layers import with_held_layers_apart
 from hood.scene.scene import Scene, dress
 
 
@@ -82,6 +83,8 @@ def set_up(
         tell(sentence)
     if solves_in_double(settled) != solves_in_double(config):
         scene = make_scene(settled, garment, material)
+    if acts(settled):
+        scene = with_held_layers_apart(scene)
     if not option_of(settled).network and network_of(stepper) is not None:
         stepper, _ = make_stepper(settled)
     stepper = refined(stepper, settled, scene.cloth.num_vertices, potential_of(settled))
