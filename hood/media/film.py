@@ -28,7 +28,7 @@ class Film:
         data: the rollout.
         width, height: pixels.
         azimuth_deg: viewing direction, 0 is the front of the first frame.
-        colour: what the garment's colour shows, with a bar that says so: ``strain``, ``rg``, or ``none``, its own.
+        colour: what the garment's colour shows, with a bar that says so: ``strain``, ``rg``, ``contact``, or ``none``, its own.
         thinner: [m] by which the body is drawn thinner near the cloth, which hides skin that sticks out through it; the picture
             says so. 0: as it is.
         beside: rollouts whose films are shown next to this one: a colour means the same in all of them, and without a body
