@@ -11,11 +11,11 @@ from omegaconf import DictConfig
 
 from hood.commands.steppers import ALWAYS, NEVER, option_of
 from hood.config import ConfigError, build, plain, require_choice
-from hood.dynamics.goals import Budget, Count, Goal, MaxStrain, TargetResidual
 from hood.dynamics.refine import METHODS, RefinedStepper
 from hood.dynamics.refine_table import costs_from_table, floor_from_table
 from hood.dynamics.rollout import FIELD_CHOICES
 from hood.dynamics.stepper import Stepper
+from hood.dynamics.stopping import Budget, Count, MaxStrain, StoppingCriterion, TargetResidual
 from hood.losses.potential import Potential
 from hood.solver.reasons import count_reasons, name_counts
 
@@ -100,7 +100,7 @@ def exported(config: DictConfig) -> tuple[str, ...]:
     return tuple(dict.fromkeys([*names, *([drawn] if drawn in FIELD_CHOICES else [])]))
 
 
-def make_goal(config: DictConfig, num_vertices: int) -> Goal | None:
+def make_goal(config: DictConfig, num_vertices: int) -> StoppingCriterion | None:
     """A new goal for one rollout of a cloth of this size; None where nothing is refined.
 
     Raises:
