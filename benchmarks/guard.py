@@ -7,7 +7,7 @@
 Rollouts as of ``hood rollout`` with ``metrics=none`` and ``guard=report``. A line per rollout: median, 99.5th percentile and
 maximum of the relative gradient, of the typical vertex's force (of networks alone), of the strain p99, of the body's turn
 [degrees] and way [m] in a step, and the alarms; at the end the same over all, and the share of steps that ``guard=repair``
-would mend. With ``--cost`` the time of a frame with the guard over that without.
+would repair. With ``--cost`` the time of a frame with the guard over that without.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from hood.assets.files.library import motion_split
 from hood.assets.garment.garment import load_garment
 from hood.assets.motion.load import load_sequence
 from hood.dynamics.guard import MENDED, Guard, body_motion
-from hood.dynamics.mend import standing
 from hood.dynamics.rollout import simulate
 from hood.dynamics.simulator import Prediction
+from hood.dynamics.step_repair import step_quality
 from hood.dynamics.stepper import Stepper
 from hood.losses.layers import LayerBarrier
 from hood.losses.potential import Potential, default_potential
@@ -47,7 +47,7 @@ class Watched(Guard):
         self._typical = alone
 
     def see(self, frame: int, problem: StepProblem, prediction: Prediction, figures: Any = None) -> Prediction:
-        found = standing(self._potential, problem, prediction, figures, typical=self._typical)
+        found = step_quality(self._potential, problem, prediction, figures, typical=self._typical)
         self.rows.append([found.residual, found.typical, found.strain, *body_motion(problem.step.obstacle)])
         return super().see(frame, problem, prediction, figures)
 
@@ -66,14 +66,14 @@ def cost(stepper: Stepper, scene: Scene, potential: Potential, frames: int, roun
     return float(np.median(with_it / without))
 
 
-def line(title: str, rows: np.ndarray, mended: int, alarms: int) -> str:
+def line(title: str, rows: np.ndarray, repaired: int, alarms: int) -> str:
     """Figures of steps (N, 5)."""
     parts = [
         f"{name} {np.nanmedian(values):.3g} {np.nanquantile(values, 0.995):.3g} {np.nanmax(values):.3g}"
         for name, values in zip(COLUMNS, rows.T, strict=True)
         if np.isfinite(values).any()
     ]
-    return f"{title:38} {' | '.join(parts)} | alarms {alarms}, to be mended {mended} of {len(rows)} ({mended / len(rows):.2%})"
+    return f"{title:38} {' | '.join(parts)} | alarms {alarms}, repairs {repaired} of {len(rows)} ({repaired / len(rows):.2%})"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

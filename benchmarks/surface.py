@@ -28,10 +28,10 @@ from hood.assets.files.library import locate, motion_split
 from hood.assets.garment.garment import load_garment
 from hood.assets.motion.load import load_sequence
 from hood.dynamics.checkpoint import load_simulator
-from hood.dynamics.goals import Count
 from hood.dynamics.refine import RefinedStepper
 from hood.dynamics.rollout import simulate
 from hood.dynamics.stepper import NewtonStepper, Stepper
+from hood.dynamics.stopping import Count
 from hood.dynamics.surface import SURFACE_METRICS, SURFACE_STRIDE, SurfaceMeter
 from hood.losses.collision import SIDES
 from hood.losses.layers import LayerBarrier, for_networks

@@ -12,6 +12,7 @@ import numpy as np
 from PIL import Image
 
 import hood
+from hood.media.hem import hem_distance
 from hood.media.render import BODY_COLOR, Camera, RenderMesh, contact_sheet, render_frame
 
 GARMENTS = ("tshirt", "longsleeve", "tank", "dress", "skirt", "shorts", "trousers")
@@ -31,9 +32,10 @@ def still(garment: str, fabric: str) -> np.ndarray:
     *_, last = simulation
     body, cloth = last.body_pos.numpy(), last.world_pos.numpy()
     camera = Camera.framing(body[None], _AZIMUTH, 8.0, aspect=_WIDTH / _HEIGHT)
+    worn = simulation.scene.garment
     meshes = [
-        RenderMesh(body, simulation.scene.motion.faces, BODY_COLOR),
-        RenderMesh(cloth, simulation.scene.garment.faces, FABRICS[fabric]),
+        RenderMesh(body, simulation.scene.motion.faces, BODY_COLOR, behind=1e-3),
+        RenderMesh(cloth, worn.faces, FABRICS[fabric], hem_distance(worn.rest_pos, worn.faces)),
     ]
     return render_frame(meshes, camera, width=_WIDTH, height=_HEIGHT)
 

@@ -41,7 +41,7 @@ class Material:
     Energies use a field exactly where it lies on what they sum over (faces for all but ``bending_stiffness``, edges for
     that); elsewhere it is carried over by the rules of :mod:`hood.scene.fabric`.
 
-    Defaults: the paper's default fabric (density 0.20022 kg/m², μ 23600 Pa, λ 44400 Pa, bending 3.9626e-5).
+    Defaults: the paper's default fabric (density 0.20022 kg/m², μ 23600 Pa, λ 44400 Pa, bending stiffness 3.9626e-5 J).
 
     Raises:
         ValueError: a value is not finite or not physical; names the property and the index.
@@ -50,7 +50,7 @@ class Material:
     density: Field = 0.20022  # kg/m²
     lame_mu: Field = 23600.0  # Pa
     lame_lambda: Field = 44400.0  # Pa
-    bending_stiffness: Field = 3.9626e-5  # k of the dihedral energy
+    bending_stiffness: Field = 3.9626e-5  # J (N·m), k of the dihedral energy ½ k l₀² / (4 (A₁ + A₂)) θ²
     thickness: Field = 4.7e-4  # m
 
     @staticmethod

@@ -15,8 +15,8 @@ from hood.commands.conditions import training_note
 from hood.commands.steppers import ALWAYS, NEVER, find_option, make_network, make_solver
 from hood.config import ConfigError, build, load_config, options
 from hood.dynamics.captured import network_of
-from hood.dynamics.goals import Count
 from hood.dynamics.refine import RefinedStepper
+from hood.dynamics.stopping import Count
 from hood.evaluation.grid import GUESS, model_name
 from hood.evaluation.table import Candidate
 

@@ -19,7 +19,7 @@ from hood.commands.common import held_folder, output_folder, require_package, sp
 from hood.config import ConfigError, require_choice
 from hood.dynamics.recorder import RolloutData, read_rollout
 
-COLOURS = ("strain", "rg", "fabric")
+COLOURS = ("strain", "rg", "contact", "fabric")
 #: Written above a rollout where its file holds them: medians over the frames that have a value.
 _NOTED = (
     ("gap", "gap {:.2g}"),
@@ -103,6 +103,8 @@ def read_checked(path: Path, colour: str) -> RolloutData:
         raise ValueError(f"{path}: holds no frames; run hood rollout again")
     if colour == "rg" and "rg" not in data.fields:
         raise ValueError(f"{path}: colour=rg needs cloth/rg, which is missing; simulate it with export=[rg]")
+    if colour == "contact" and not len(data.body_faces):
+        raise ValueError(f"{path}: colour=contact shows the distance from the body, and the rollout has none")
     return data
 
 

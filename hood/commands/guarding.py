@@ -28,9 +28,9 @@ from hood.dynamics.guard import (
     Alarm,
     Guard,
 )
-from hood.dynamics.mend import LEFT, REFINED, SOLVED
 from hood.dynamics.recorder import RolloutData, RolloutWriter
 from hood.dynamics.soundness import name_frames
+from hood.dynamics.step_repair import LEFT, REFINED, SOLVED
 from hood.dynamics.stepper import Stepper
 from hood.losses.potential import Potential
 
@@ -61,7 +61,7 @@ def check_guard(config: DictConfig) -> None:
     if step == "plain":
         return
     if mode == REPAIR:
-        raise ConfigError(f"guard=repair: step={step} has fixed shapes, a step that is mended has not; use step=plain")
+        raise ConfigError(f"guard=repair: step={step} has fixed shapes, a step that is repaired has not; use step=plain")
     if mode == STRICT and str(config.metrics) != "all":
         raise ConfigError(
             f"guard=strict: step={step} with metrics={config.metrics} measures nothing that a guard could look at; use "
@@ -87,7 +87,7 @@ def write_alarms(writer: RolloutWriter, guard: Guard | None) -> None:
 
 
 def summarise_guard(data: RolloutData) -> dict[str, Any]:
-    """Entry ``guard`` of a summary: the alarms, how many frames have any, how many were mended; empty where no guard looked.
+    """Entry ``guard`` of a summary: the alarms, how many frames have any, how many were repaired; empty where no guard looked.
 
     ``stopped`` is the frame that ``guard=strict`` ended the rollout before, None where it did not.
     """
@@ -150,5 +150,5 @@ def _outcome(mode: str, alarms: Sequence[Alarm]) -> list[str]:
         return []
     if mode != REPAIR:
         return ["guard=repair mends what it can"]
-    mended = sum(alarm.repair in (REFINED, SOLVED) for alarm in steps)
-    return [f"{mended} of {len(steps)} steps mended"]
+    repaired = sum(alarm.repair in (REFINED, SOLVED) for alarm in steps)
+    return [f"{repaired} of {len(steps)} steps repaired"]

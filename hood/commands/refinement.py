@@ -11,11 +11,11 @@ from omegaconf import DictConfig
 
 from hood.commands.steppers import ALWAYS, NEVER, option_of
 from hood.config import ConfigError, build, plain, require_choice
-from hood.dynamics.goals import Budget, Count, Goal, MaxStrain, TargetResidual
 from hood.dynamics.refine import METHODS, RefinedStepper
 from hood.dynamics.refine_table import costs_from_table, floor_from_table
 from hood.dynamics.rollout import FIELD_CHOICES
 from hood.dynamics.stepper import Stepper
+from hood.dynamics.stopping import Budget, Count, MaxStrain, StoppingCriterion, TargetResidual
 from hood.losses.potential import Potential
 from hood.solver.reasons import count_reasons, name_counts
 
@@ -23,7 +23,7 @@ from hood.solver.reasons import count_reasons, name_counts
 REFINEMENT_KEYS = ("refine", "target_rg", "budget_ms", "max_strain")
 #: ``refine=auto``: as the garment's size needs (:mod:`hood.commands.automatic`).
 AUTO = "auto"
-COLOURS = ("none", "strain", "rg")
+COLOURS = ("none", "strain", "rg", "contact")
 _BEGIN_FROM_TABLE = ("budget_ms", "max_strain")
 #: What says more about a refinement, and its value where nothing is said.
 _DETAILS = {"refine_method": "newton", "refine_most": 50, "refine_table": None}
@@ -59,6 +59,8 @@ def check_refinement(config: DictConfig) -> None:
     asked = chosen(config)
     require_choice(config, "refine_method", METHODS)
     require_choice(config, "colour", COLOURS)
+    if config.colour == "contact" and config.body == "none":
+        raise ConfigError("colour=contact shows the distance from the body, and body=none has none; choose colour=strain")
     exported(config)
     if int(config.refine_most) < 1:
         raise ConfigError(f"refine_most={config.refine_most}: must be at least 1")
@@ -98,7 +100,7 @@ def exported(config: DictConfig) -> tuple[str, ...]:
     return tuple(dict.fromkeys([*names, *([drawn] if drawn in FIELD_CHOICES else [])]))
 
 
-def make_goal(config: DictConfig, num_vertices: int) -> Goal | None:
+def make_goal(config: DictConfig, num_vertices: int) -> StoppingCriterion | None:
     """A new goal for one rollout of a cloth of this size; None where nothing is refined.
 
     Raises:

@@ -50,10 +50,20 @@ from statistics import median
 import numpy as np
 import torch
 
-from hood.dynamics.mend import ENOUGH, LEFT, NOT_TRIED, REFINED, Limits, Mended, Standing, mend, standing
 from hood.dynamics.refine import RefinedStepper
 from hood.dynamics.simulator import Prediction
 from hood.dynamics.soundness import Criteria
+from hood.dynamics.step_repair import (
+    ENOUGH,
+    LEFT,
+    NOT_TRIED,
+    REFINED,
+    Limits,
+    RepairedStep,
+    StepQuality,
+    repair_step,
+    step_quality,
+)
 from hood.dynamics.stepper import Stepper
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
@@ -68,7 +78,7 @@ MODES = ("report", "repair", "strict", "off")
 FINITE, TARGET, STRAIN, FORCE, CHECK = "not finite", "target", "strain", "force", "check"
 INSIDE, TURN, SPEED, CUT = "inside", "turn", "speed", "cut"
 CAUSES = (FINITE, TARGET, STRAIN, FORCE, INSIDE, CHECK, TURN, SPEED, CUT)
-#: Those that a step can be mended of.
+#: Those that a repair of the step can help.
 MENDED = (FINITE, TARGET, STRAIN, FORCE, INSIDE, CHECK)
 
 STRAIN_LIMIT, CUT_LIMIT = Criteria.strain, 0.02
@@ -93,7 +103,7 @@ _STRAIN_RATIO = Criteria.strain_ratio
 CHECK_EVERY, _CHECK_ITERATIONS, CHECK_LIMIT = 20, 10, 0.03
 #: And every step that is so many times as strained as the most strained that was.
 CHECK_GROWTH = 1.1
-#: Relative gradient that a step is mended to where the stepper has no target of its own.
+#: Relative gradient that a step is repaired to where the stepper has no target of its own.
 _GOAL = 1e-2
 #: Of the body's vertices one in so many tells how it moves.
 _SPARSE = 16
@@ -107,7 +117,7 @@ class Alarm:
     cause: str  # of CAUSES
     value: float
     limit: float
-    repair: str = NOT_TRIED  # of hood.dynamics.mend
+    repair: str = NOT_TRIED  # of hood.dynamics.step_repair
     iterations: int = 0  # of all tries
     rg_before: float = math.nan
     rg_after: float = math.nan
@@ -119,7 +129,7 @@ class Guard:
     Args:
         mode: ``report``, ``repair`` or ``strict``.
         stepper: takes the steps.
-        potential: what they are judged by and mended down.
+        potential: what they are judged by, and minimised by a repair.
         settings: of the solver that mends; default the stepper's own.
         most: iterations at most by which a step is refined; those of a solver are taken anew instead.
     """
@@ -154,7 +164,7 @@ class Guard:
             problem: prepared for the potential.
             figures: of the step, where somebody has made them.
         """
-        now = standing(self._potential, problem, prediction, figures, typical=self._alone)
+        now = step_quality(self._potential, problem, prediction, figures, typical=self._alone)
         moved = _motion_alarm(frame, problem.step.obstacle)
         depth = problem.next_depth(prediction.next_pos) if now.finite else math.nan
         alarm = self._step_alarm(frame, prediction, now, depth, wary=moved is not None)
@@ -175,14 +185,14 @@ class Guard:
         if depth > DEPTH_LIMIT:
             problem = problem.with_entered(prediction.next_pos)
             prediction = replace(prediction, residual=math.nan, entered=problem.fold)
-            now = standing(self._potential, problem, prediction, typical=self._alone)
+            now = step_quality(self._potential, problem, prediction, typical=self._alone)
         limits = Limits(ENOUGH if self._target is None else self._target, self._strain_limit)
-        mended = mend(self._potential, problem, prediction, now, limits, self._settings, self._most)
+        repaired = repair_step(self._potential, problem, prediction, now, limits, self._settings, self._most)
         if alarm.cause == STRAIN:
-            self._allow(mended)
-        done = replace(alarm, repair=mended.kind, iterations=mended.iterations)
-        self.alarms.append(replace(done, rg_before=mended.before.residual, rg_after=mended.after.residual))
-        return given if mended.kind == LEFT else self._told(mended)
+            self._allow(repaired)
+        done = replace(alarm, repair=repaired.kind, iterations=repaired.iterations)
+        self.alarms.append(replace(done, rg_before=repaired.before.residual, rg_after=repaired.after.residual))
+        return given if repaired.kind == LEFT else self._told(repaired)
 
     def see_surface(self, frame: int, row: Mapping[str, float]) -> None:
         """Look at what was measured of the cloth's surface in a frame."""
@@ -190,7 +200,7 @@ class Guard:
         if share > CUT_LIMIT:
             self.alarms.append(Alarm(frame, CUT, share, CUT_LIMIT))
 
-    def _step_alarm(self, frame: int, prediction: Prediction, now: Standing, depth: float, wary: bool) -> Alarm | None:
+    def _step_alarm(self, frame: int, prediction: Prediction, now: StepQuality, depth: float, wary: bool) -> Alarm | None:
         """The gravest of a step."""
         if not now.finite:
             return Alarm(frame, FINITE, math.nan, math.nan)
@@ -213,12 +223,12 @@ class Guard:
         return True
 
     def _check(
-        self, frame: int, problem: StepProblem, prediction: Prediction, now: Standing
+        self, frame: int, problem: StepProblem, prediction: Prediction, now: StepQuality
     ) -> tuple[Alarm | None, Prediction]:
         """Whether the strain is what a solver makes of it; the step to go on with, which is the solver's where it mends."""
         settings = replace(self._settings, target_rg=_GOAL, max_iterations=_CHECK_ITERATIONS, budget_ms=None)
         pos, report = minimize(self._potential, problem, prediction.next_pos, settings)
-        after = standing(self._potential, problem, Prediction(pos, report.acc))
+        after = step_quality(self._potential, problem, Prediction(pos, report.acc))
         off = abs(after.strain - now.strain)
         if not after.finite or off <= CHECK_LIMIT:
             return None, prediction
@@ -227,11 +237,11 @@ class Guard:
             return alarm, prediction
         kind = REFINED if after.residual < now.residual else LEFT
         taken = prediction if kind == LEFT else Prediction(pos, report.acc, prediction.metrics)
-        mended = Mended(taken, kind, report.iterations, now, after if kind == REFINED else now)
-        done = replace(alarm, repair=kind, iterations=mended.iterations)
-        return replace(done, rg_before=mended.before.residual, rg_after=mended.after.residual), self._told(mended)
+        repaired = RepairedStep(taken, kind, report.iterations, now, after if kind == REFINED else now)
+        done = replace(alarm, repair=kind, iterations=repaired.iterations)
+        return replace(done, rg_before=repaired.before.residual, rg_after=repaired.after.residual), self._told(repaired)
 
-    def _force(self, now: Standing) -> float:
+    def _force(self, now: StepQuality) -> float:
         return now.typical if self._alone else now.residual
 
     def _force_limit(self) -> float:
@@ -240,24 +250,24 @@ class Guard:
             return _FIRST_TYPICAL if self._alone else FORCE_LIMIT
         return max(TYPICAL_LIMIT if self._alone else FORCE_LIMIT, FORCE_FACTOR * median(self._calm))
 
-    def _allow(self, mended: Mended) -> None:
+    def _allow(self, repaired: RepairedStep) -> None:
         """Cloth that is as strained where the solver takes the step is not held to less: it is soft, heavy or tight."""
-        if mended.after.residual <= ENOUGH and mended.after.strain > STRAIN_LIMIT:
-            self._strain_limit = _STRAIN_RATIO * mended.after.strain
+        if repaired.after.residual <= ENOUGH and repaired.after.strain > STRAIN_LIMIT:
+            self._strain_limit = _STRAIN_RATIO * repaired.after.strain
 
-    def _told(self, mended: Mended) -> Prediction:
-        """The mended step with what the stepper reports of it."""
-        if mended.kind == LEFT:
-            return mended.prediction
-        metrics, residual = dict(mended.prediction.metrics), mended.after.residual
+    def _told(self, repaired: RepairedStep) -> Prediction:
+        """The repaired step with what the stepper reports of it."""
+        if repaired.kind == LEFT:
+            return repaired.prediction
+        metrics, residual = dict(repaired.prediction.metrics), repaired.after.residual
         for name in ("solver_iterations", "refine_iterations"):
             if name in metrics:
-                metrics[name] += mended.iterations
+                metrics[name] += repaired.iterations
         if "refine_rg" in metrics:
             metrics["refine_rg"] = residual
         if "solver_converged" in metrics and self._target is not None and residual <= self._target:
             metrics |= {"solver_converged": 1.0, "solver_reason": 0.0}
-        return replace(mended.prediction, metrics=metrics, residual=residual)
+        return replace(repaired.prediction, metrics=metrics, residual=residual)
 
 
 def _own_settings(stepper: Stepper) -> NewtonSettings | None:

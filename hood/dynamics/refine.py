@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from hood.dynamics.frames import Relaxing
-from hood.dynamics.goals import Goal, Standing
 from hood.dynamics.simulator import Prediction
 from hood.dynamics.stepper import Stepper
+from hood.dynamics.stopping import RefinementState, StoppingCriterion
 from hood.dynamics.stopwatch import Stopwatch, timed
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
@@ -93,7 +93,7 @@ class RefinedStepper:
         self,
         inner: Stepper,
         potential: Potential,
-        goal: Goal,
+        goal: StoppingCriterion,
         method: str = "newton",
         settings: NewtonSettings | None = None,
     ) -> None:
@@ -180,23 +180,23 @@ class RefinedStepper:
     def _refine(self, problem: StepProblem, prediction: Prediction, elapsed: Callable[[], float]) -> Prediction:
         goal, nan = self.goal, float("nan")
         prediction = self._apart(problem, prediction)
-        standing = Standing(problem, prediction.next_pos, 0, nan, elapsed())
+        reached = RefinementState(problem, prediction.next_pos, 0, nan, elapsed())
         before = after = reason = nan
-        if goal.begin(standing):
+        if goal.begin(reached):
             prediction, history, reason = self._descend(problem, prediction, elapsed)
             before, after = _sum(history[0].phi), _sum(history[-1].phi)
             kept = sum(_sum(b.phi) < _sum(a.phi) for a, b in zip(history, history[1:], strict=False))
             residual = float(history[-1].relative_gradient.max())
-            standing = Standing(problem, prediction.next_pos, kept, residual, elapsed())
+            reached = RefinementState(problem, prediction.next_pos, kept, residual, elapsed())
         own = {
-            "refine_iterations": float(standing.iterations),
-            "refine_rg": standing.residual,
+            "refine_iterations": float(reached.iterations),
+            "refine_rg": reached.residual,
             "refine_phi_before": before,
             "refine_phi_after": after,
             "refine_reason": reason,
         }
-        metrics = {**prediction.metrics, **own, **goal.end(standing)}
-        return replace(prediction, metrics=metrics, residual=standing.residual)
+        metrics = {**prediction.metrics, **own, **goal.end(reached)}
+        return replace(prediction, metrics=metrics, residual=reached.residual)
 
     def _descend(
         self, problem: StepProblem, prediction: Prediction, elapsed: Callable[[], float]
@@ -208,7 +208,7 @@ class RefinedStepper:
             nonlocal done
             done += 1
             residual = float(progress.relative_gradient.max())
-            return self.goal.proceed(Standing(problem, pos, done, residual, elapsed()))
+            return self.goal.proceed(RefinementState(problem, pos, done, residual, elapsed()))
 
         start = prediction.next_pos
         if self.method == "newton":

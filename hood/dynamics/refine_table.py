@@ -20,7 +20,7 @@ class Costs:
 
 
 def floor_from_table(path: Path, limit: float, num_vertices: int, method: str) -> int:
-    """Iterations with which a table of measurements stays at ``limit`` or below, for :class:`hood.dynamics.goals.MaxStrain`.
+    """Iterations with which a table of measurements stays at ``limit`` or below, for :class:`hood.dynamics.stopping.MaxStrain`.
 
     The file is JSON: ``{"rows": [{"method": "newton", "vertices": 1014, "refine": 5, "strain_p99": 0.04}, …]}``; further
     entries of a row are not read. Of the method's rows those count whose number of vertices is nearest by ratio; where none
@@ -35,7 +35,7 @@ def floor_from_table(path: Path, limit: float, num_vertices: int, method: str) -
 
 
 def costs_from_table(path: Path, num_vertices: int, method: str) -> Costs:
-    """What an iteration costs, for :class:`hood.dynamics.goals.Budget`, from the same rows' ``ms`` of a whole frame.
+    """What an iteration costs, for :class:`hood.dynamics.stopping.Budget`, from the same rows' ``ms`` of a whole frame.
 
     An iteration costs the median of what it costs between neighbouring rows with ``refine`` of 1 or more; with a single one
     of them, its share of what that row takes longer than the row without refinement.

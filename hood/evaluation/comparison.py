@@ -174,7 +174,7 @@ def _same_network(one: Point, other: Point) -> bool:
 
 
 @dataclass(frozen=True)
-class Standing:
+class SizeVerdict:
     """Who is the better choice at one size."""
 
     size: str
@@ -183,7 +183,7 @@ class Standing:
     best: AtEqualGap | None  # the network's setting that does best beside the solver; None: none is a choice at all
 
 
-def standings(reached: Sequence[Reached], rejected: Collection[Point] = ()) -> list[Standing]:
+def verdicts_by_size(reached: Sequence[Reached], rejected: Collection[Point] = ()) -> list[SizeVerdict]:
     """Per size, smallest first, whether a network earns its place beside the solver.
 
     The network does where one of its settings is faster than the solver at equal γ; the more settings are tried, the more
@@ -206,12 +206,12 @@ def standings(reached: Sequence[Reached], rejected: Collection[Point] = ()) -> l
         if not compared:
             enough = min(item.rollouts for item in here) >= LEAST_ROLLOUTS
             useful = enough and not learned and any(item.gap.high <= USEFUL for item in alone)
-            found.append(Standing(size, vertices, SOLVER if useful else OPEN, None))
+            found.append(SizeVerdict(size, vertices, SOLVER if useful else OPEN, None))
             continue
         best = max(compared, key=lambda c: (c.verdict == NETWORK, c.ratio if c.ratio is not None else c.low))
         won, lost = best.verdict == NETWORK, _all_lost(compared, alone)
-        found.append(Standing(size, vertices, NETWORK if won else SOLVER if lost else OPEN, best))
-    return sorted(found, key=lambda standing: standing.vertices)
+        found.append(SizeVerdict(size, vertices, NETWORK if won else SOLVER if lost else OPEN, best))
+    return sorted(found, key=lambda verdict: verdict.vertices)
 
 
 def _all_lost(compared: Sequence[AtEqualGap], alone: Sequence[Reached]) -> bool:
@@ -221,7 +221,7 @@ def _all_lost(compared: Sequence[AtEqualGap], alone: Sequence[Reached]) -> bool:
     return rollouts >= LEAST_ROLLOUTS and interval(best, rollouts=rollouts)[1] < 1.0
 
 
-def crossover(found: Sequence[Standing], device: str) -> str:
+def crossover(found: Sequence[SizeVerdict], device: str) -> str:
     """In a sentence: from which size on a network is worth its time on this device, as far as the intervals say."""
     if not found:
         return "No network was measured, so nothing can be said about network or solver."
@@ -258,18 +258,18 @@ def crossover(found: Sequence[Standing], device: str) -> str:
     return f"On this {device} no crossover was seen." + doubt
 
 
-def _undecided(standing: Standing) -> str:
+def _undecided(verdict: SizeVerdict) -> str:
     """What was measured where nothing is claimed."""
-    best = standing.best
+    best = verdict.best
     if best is None or best.ratio is None:
         return ""
     high = f"{1 / best.low:.2g}" if best.low > 0 else "∞"
     return (
-        f" The network's best setting at {standing.vertices:,} vertices, {best.reached.label}, took {1 / best.ratio:.2g} times "
+        f" The network's best setting at {verdict.vertices:,} vertices, {best.reached.label}, took {1 / best.ratio:.2g} times "
         f"the solver's time ({1 / best.high:.2g} to {high})."
     )
 
 
-def _sizes(found: Sequence[Standing]) -> str:
-    numbers = [f"{standing.vertices:,}" for standing in found]
+def _sizes(found: Sequence[SizeVerdict]) -> str:
+    numbers = [f"{verdict.vertices:,}" for verdict in found]
     return (numbers[0] if len(numbers) == 1 else f"{', '.join(numbers[:-1])} and {numbers[-1]}") + " vertices"

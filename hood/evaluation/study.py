@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from hood.evaluation.comparison import crossover, standings
+from hood.evaluation.comparison import crossover, verdicts_by_size
 from hood.evaluation.grid import Point
 from hood.evaluation.reached import Reached
 
@@ -59,4 +59,4 @@ class Study:
     @property
     def sentence(self) -> str:
         """Where a network gives way to the solver alone."""
-        return crossover(standings(self.reached, self.rejected), self.device)
+        return crossover(verdicts_by_size(self.reached, self.rejected), self.device)

@@ -28,7 +28,7 @@ class EdgeRows:
     scene: Tensor  # (N,)
     segment: Tensor  # (N,) one number per pair of edge set and scene
     num_segments: int
-    fabric: Tensor  # (N, 3) lame_mu, lame_lambda, bending_stiffness
+    fabric: Tensor  # (N, 3) lame_mu [Pa], lame_lambda [Pa], bending_stiffness [J]
     kept: dict[str, Tensor] = field(default_factory=dict)
 
     def once(self, name: str, compute: Callable[[], Tensor]) -> Tensor:

@@ -19,7 +19,7 @@ class Bending:
     The energy does not depend on the winding of the faces. Hinges with a degenerate face at present have θ = 0
     and no force.
 
-    k → ``cloth.bending_stiffness`` (H,), l₀ → ``cloth.hinge_rest_length`` [m], A₁ + A₂ → ``cloth.hinge_area`` [m²],
+    k → ``cloth.bending_stiffness`` [J] (H,), l₀ → ``cloth.hinge_rest_length`` [m], A₁ + A₂ → ``cloth.hinge_area`` [m²],
     θ₀ → ``cloth.rest_angle`` [rad].
     """
 
@@ -44,7 +44,7 @@ class CurrentLengthBending:
     Equal to :class:`Bending` where the rest shape is flat and the edges have their rest length. Hinges with a
     degenerate face have no force.
 
-    k → ``cloth.bending_stiffness`` (H,), A₁ + A₂ → ``cloth.hinge_area`` [m²].
+    k → ``cloth.bending_stiffness`` [J] (H,), A₁ + A₂ → ``cloth.hinge_area`` [m²].
     """
 
     def applies(self, problem: StepProblem) -> bool:

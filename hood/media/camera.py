@@ -53,6 +53,10 @@ class Camera:
         position = target - (distance + middle) * view[2]
         return Camera(_triple(position), _triple(target), fov)
 
+    def focal(self, height: int) -> float:
+        """Pixels of a picture of this height that 1 m takes at a distance of 1 m."""
+        return float(0.5 * height / np.tan(np.radians(self.fov) / 2))
+
     def axes(self) -> Array:
         """Rows right, up, forward, shape (3, 3)."""
         return view_axes(np.subtract(self.target, self.position))

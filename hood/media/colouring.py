@@ -6,9 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from hood.dynamics.recorder import RolloutData
+from hood.mesh.proximity import search_surface
 
 Picture = NDArray[np.uint8]
 
@@ -20,13 +22,17 @@ _SCALE = np.array(
 _UNKNOWN = (0.62, 0.64, 0.67)
 #: Share of all values that the scale spans; the few beyond take its last colour.
 _SPANNED = 0.995
+#: What a garment's colour can show.
+COLOURINGS = ("strain", "rg", "contact")
+#: Distance from the body [m] where the scale of contact begins; it ends at the skin.
+_APART = 0.02
 #: Powers of ten from one end of a logarithmic scale to the other.
 _DECADES = 4
 
 
 @dataclass(frozen=True)
 class Colouring:
-    """Values (T, V) with the range that the colours span, one for all frames."""
+    """Values (T, V) with the range that the colours span, one for all frames; ``low`` may be the greater of its ends."""
 
     values: np.ndarray
     low: float
@@ -37,7 +43,7 @@ class Colouring:
 
     def colours(self, frame: int) -> np.ndarray:
         """(V, 3) in 0..1 of the vertices in ``frame``."""
-        return self._colour(self._place(self.values[frame]))
+        return colours_at(self.place(self.values[frame]))
 
     def with_bar(self, picture: Picture, size: int | None = None) -> Picture:
         """A copy of ``picture`` with the bar, its ticks and title along the lower edge, in letters of ``size`` pixels."""
@@ -51,35 +57,36 @@ class Colouring:
         bottom = height - size // 2 - size
         top = bottom - max(size // 2, 5)
         marked = picture.copy()
-        ramp = 255.0 * self._colour(np.linspace(0.0, 1.0, right - left))
+        ramp = 255.0 * colours_at(np.linspace(0.0, 1.0, right - left))
         marked[top:bottom, left:right] = np.broadcast_to(ramp, (bottom - top, right - left, 3)).astype(np.uint8)
         canvas = Image.fromarray(marked)
         draw, font, ink = ImageDraw.Draw(canvas), ImageFont.load_default(size), (60, 62, 66)
         draw.rectangle((left, top, right - 1, bottom - 1), outline=ink)
         draw.text((width / 2, top - 2), self.title, fill=ink, font=font, anchor="mb")
         for value, label in self.ticks:
-            at = left + float(self._place(np.array(value))) * (right - left - 1)
+            at = left + float(self.place(np.array(value))) * (right - left - 1)
             draw.line((at, bottom - 1, at, bottom + 2), fill=ink)
             draw.text((at, bottom + 2), label, fill=ink, font=font, anchor="mt")
         return np.asarray(canvas)
 
-    def _place(self, values: np.ndarray) -> np.ndarray:
+    def place(self, values: np.ndarray) -> np.ndarray:
         """Where values lie on the scale, 0..1; NaN where there is none."""
         if self.logarithmic:
             with np.errstate(divide="ignore"):  # zero lies below every scale
                 return np.clip(np.log(values / self.low) / np.log(self.high / self.low), 0.0, 1.0)
         return np.clip((values - self.low) / (self.high - self.low), 0.0, 1.0)
 
-    @staticmethod
-    def _colour(place: np.ndarray) -> np.ndarray:
-        known = np.isfinite(place)
-        at = np.where(known, place, 0.0) * (len(_SCALE) - 1)
-        channels = [np.interp(at, np.arange(len(_SCALE)), _SCALE[:, channel]) for channel in range(3)]
-        return np.where(known[..., None], np.stack(channels, axis=-1), _UNKNOWN)
+
+def colours_at(place: np.ndarray) -> np.ndarray:
+    """(..., 3) colours in 0..1 of places (...) on a scale, 0..1; grey where there is none."""
+    known = np.isfinite(place)
+    at = np.where(known, place, 0.0) * (len(_SCALE) - 1)
+    channels = [np.interp(at, np.arange(len(_SCALE)), _SCALE[:, channel]) for channel in range(3)]
+    return np.where(known[..., None], np.stack(channels, axis=-1), _UNKNOWN)
 
 
 def colouring_of(data: RolloutData, colour: str, beside: Sequence[RolloutData] = ()) -> Colouring | None:
-    """The colouring of a rollout by ``strain`` or ``rg``; None for ``none``.
+    """The colouring of a rollout by ``strain``, ``rg`` or ``contact``; None for ``none``.
 
     Args:
         beside: rollouts that are shown next to it: the same colour means the same value in all of them.
@@ -89,8 +96,11 @@ def colouring_of(data: RolloutData, colour: str, beside: Sequence[RolloutData] =
     """
     if colour == "none":
         return None
-    if colour not in ("strain", "rg"):
-        raise ValueError(f"colour is {colour!r}; choose none, strain or rg")
+    if colour not in COLOURINGS:
+        raise ValueError(f"colour is {colour!r}; choose none, strain, rg or contact")
+    if colour == "contact":
+        ticks = tuple((share * _APART, f"{1e3 * share * _APART:g} mm") for share in (1.0, 0.5, 0.0))
+        return Colouring(skin_distance(data), _APART, 0.0, False, "distance from the body", ticks)
     read = vertex_strain if colour == "strain" else _residual
     values = read(data)
     most = max(_most(values), *(_most(read(other)) for other in beside)) if beside else _most(values)
@@ -121,6 +131,24 @@ def vertex_strain(data: RolloutData) -> np.ndarray:
         with np.errstate(invalid="ignore"):  # frames that are not finite
             for end in (0, 1):
                 np.maximum.at(result[frame], edges[:, end], strain)
+    return result
+
+
+def skin_distance(data: RolloutData) -> np.ndarray:
+    """(T, V) signed distance [m] of every vertex from the body's surface; NaN where a frame is not finite.
+
+    Raises:
+        ValueError: the rollout has no body.
+    """
+    if not len(data.body_faces):
+        raise ValueError("colour=contact: the rollout has no body; choose strain")
+    faces = torch.from_numpy(np.asarray(data.body_faces, dtype=np.int64))
+    result = np.full(data.cloth_pos.shape[:2], np.nan)
+    for frame, (cloth, body) in enumerate(zip(data.cloth_pos, data.body_pos, strict=True)):
+        if np.isfinite(cloth).all() and np.isfinite(body).all():
+            points, skin = (torch.from_numpy(np.asarray(pos, dtype=np.float64)) for pos in (cloth, body))
+            scene = [torch.zeros(count, dtype=torch.int64) for count in (len(points), len(skin), len(faces))]
+            result[frame] = search_surface(points, scene[0], skin, faces, scene[1], scene[2]).dist.numpy()
     return result
 
 

@@ -36,9 +36,10 @@ class SeenValues(ctypes.Structure):
     """``Seen`` of ``picture.cpp``."""
 
     _fields_ = [
-        *fields("pos color normal screen depth faces face image", POINTER),
-        *fields("width height", COUNT),
+        *fields("pos color normal screen depth hem faces face nearness around axes image", POINTER),
+        *fields("width height num_around", COUNT),
         ("eye", _TRIPLE),
+        *fields("focal reach inside", REAL),
     ]
 
 
@@ -47,7 +48,7 @@ class FloorValues(ctypes.Structure):
 
     _fields_ = [
         *fields("dark image", POINTER),
-        *fields("width height cells", COUNT),
+        *fields("width height cells samples", COUNT),
         *fields("eye right up forward center", _TRIPLE),
         *fields("tan_y floor cell", REAL),
         *fields("ground horizon zenith", _TRIPLE),

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from hood.dynamics.recorder import RolloutData
 from hood.media.colouring import colouring_of
+from hood.media.hem import hem_distance
 from hood.media.palette import outfit_colours
 from hood.media.render import BODY_COLOR, Camera, RenderMesh, captioned, contact_sheet, render_frame
 from hood.media.video import VideoWriter, save_png
@@ -18,6 +19,14 @@ from hood.media.video import VideoWriter, save_png
 _SHEET_FRAMES = 12
 #: Where the body is to be drawn thinner, it is where cloth is this near [m].
 _REACH = 0.04
+#: The body is drawn this much [m] farther away, so that cloth on the skin is not cut by rounding.
+_BEHIND = 1e-3
+#: Room around what the picture holds, as a share of it.
+_MARGIN = 1.18
+#: Head and feet are in the picture where the garment comes this near [m] to them.
+_ENDS = 0.4
+#: Cloth farther than this [m] from the body's box does not widen the picture: it blew up.
+_ASTRAY = 0.6
 _SMOOTHING = 15  # frames over which the camera averages the walker's path
 
 
@@ -28,7 +37,7 @@ class Film:
         data: the rollout.
         width, height: pixels.
         azimuth_deg: viewing direction, 0 is the front of the first frame.
-        colour: what the garment's colour shows, with a bar that says so: ``strain``, ``rg``, or ``none``, its own.
+        colour: what the garment's colour shows, with a bar that says so: ``strain``, ``rg``, ``contact``, or ``none``, its own.
         thinner: [m] by which the body is drawn thinner near the cloth, which hides skin that sticks out through it; the picture
             says so. 0: as it is.
         beside: rollouts whose films are shown next to this one: a colour means the same in all of them, and without a body
@@ -59,9 +68,10 @@ class Film:
             cloths = [data.cloth_pos, *(other.cloth_pos for other in beside)]
             shown = np.nan_to_num(np.concatenate(cloths, axis=1), posinf=0.0, neginf=0.0)
         self._path = _smooth_path(shown)
-        centred = shown[:: max(len(shown) // 20, 1)] - self._path[:: max(len(shown) // 20, 1), None]
+        self._hem = None if self.colouring else hem_distance(data.rest_pos, data.cloth_faces)
         self._floor = float(shown[..., 1].min())
-        self._camera = Camera.framing(centred, azimuth_deg, 8.0, aspect=width / height)
+        framed = _framed([data, *beside], self._path) if data.body_pos.shape[1] else shown - self._path[:, None]
+        self._camera = Camera.framing(framed, azimuth_deg, 8.0, aspect=width / height, margin=_MARGIN)
 
     def frame(self, index: int) -> np.ndarray:
         """Picture (H, W, 3) uint8 of frame ``index``, with the bar of its colours."""
@@ -78,10 +88,10 @@ class Film:
         if len(body):
             thin = dressed and self.thinner > 0
             shown_body = _beneath(body, self.data.body_faces, cloth, self.thinner) if thin else body
-            meshes.append(RenderMesh(shown_body, self.data.body_faces, BODY_COLOR))
+            meshes.append(RenderMesh(shown_body, self.data.body_faces, BODY_COLOR, behind=_BEHIND))
         if dressed:
             shown = self._own_colour if self.colouring is None else self.colouring.colours(index)
-            meshes.append(RenderMesh(cloth, self.data.cloth_faces, shown))
+            meshes.append(RenderMesh(cloth, self.data.cloth_faces, shown, self._hem))
         picture = render_frame(meshes, camera, width=self.width, height=self.height, floor=self._floor)
         told = f"body drawn {1e3 * self.thinner:g} mm thinner" if self.thinner > 0 and len(body) else ""
         return captioned(picture, told) if told else picture
@@ -139,6 +149,27 @@ def _beneath(body: np.ndarray, faces: np.ndarray, cloth: np.ndarray, thinner: fl
     dist, _ = cKDTree(cloth).query(body, distance_upper_bound=_REACH)
     share = np.clip(2.0 * (1.0 - np.where(np.isfinite(dist), dist, _REACH) / _REACH), 0.0, 1.0)
     return body - thinner * share[:, None] * normal
+
+
+def _framed(rollouts: Sequence[RolloutData], path: np.ndarray) -> np.ndarray:
+    """Points (N, 3) that the picture is to hold, about the camera's ``path`` (T, 3): the cloth of a few frames, and the
+    body's ends near it."""
+    points = []
+    for data in rollouts:
+        body, cloth = data.body_pos, data.cloth_pos
+        for frame in range(0, min(len(body), len(path)), max(len(body) // 20, 1)):
+            low, high = body[frame].min(axis=0) - _ASTRAY, body[frame].max(axis=0) + _ASTRAY
+            inside = ((cloth[frame] >= low) & (cloth[frame] <= high)).all(axis=1)  # false for NaN
+            chosen = cloth[frame][inside] if inside.any() else body[frame]
+            middle, low, high = chosen.mean(axis=0), body[frame][:, 1].min(), body[frame][:, 1].max()
+            near = [
+                end
+                for end, cloth_end in ((low, chosen[:, 1].min()), (high, chosen[:, 1].max()))
+                if abs(end - cloth_end) < _ENDS
+            ]
+            ends = np.array([[middle[0], end, middle[2]] for end in near]).reshape(-1, 3)
+            points.append(np.concatenate([chosen, ends]) - path[frame])
+    return np.concatenate(points)
 
 
 def _smooth_path(body_pos: np.ndarray) -> np.ndarray:

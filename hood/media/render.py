@@ -2,8 +2,8 @@
 
 Deferred shading: `raster.rasterise` finds the nearest face of every pixel at twice the resolution, then
 one vectorised pass lights the covered pixels (key light with a soft shadow map, sky and bounce light, a
-rim) and the floor behind them. Lights turn with the camera, so that every view is lit from the upper
-left.
+rim) and the floor behind them, darker in creases and where one surface lies near another. Lights turn
+with the camera, so that every view is lit from the upper left.
 """
 
 from __future__ import annotations
@@ -17,7 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from hood.media.camera import NEAR, Camera, unit
 from hood.media.drawing import SeenValues, address, library, packed
-from hood.media.raster import barycentric, rasterise
+from hood.media.hem import FAR, sewn
+from hood.media.occlusion import AROUND, REACH, openness
+from hood.media.raster import VisibilityBuffer, barycentric, rasterise
 from hood.media.shading import Light, Surface, backdrop
 
 Array = NDArray[np.float64]
@@ -27,18 +29,24 @@ BODY_COLOR = (0.74, 0.70, 0.66)
 GARMENT_COLOR = (0.20, 0.42, 0.66)
 
 _SUPERSAMPLING = 2
+#: Share of its colour that a face seen from inside shows.
+_INSIDE = 0.62
 
 
 @dataclass(frozen=True)
 class RenderMesh:
     """A surface to draw: `pos` (V, 3) [m], y up, `faces` (F, 3), `color` (3,) or per vertex (V, 3) in 0..1.
 
-    Both sides are drawn; the side that faces against its normal is slightly darker.
+    Both sides are drawn; the side that faces against its normal is darker. `hem` (V,) [m] is the distance from the next
+    hem, along which a line and a seam are drawn; without it there is none. `behind` [m] draws the surface farther from
+    the eye than it is: what lies closer upon it is not cut by it.
     """
 
     pos: ArrayLike
     faces: ArrayLike
     color: ArrayLike = GARMENT_COLOR
+    hem: ArrayLike | None = None
+    behind: float = 0.0
 
 
 def render_frame(
@@ -58,8 +66,7 @@ def render_frame(
     surface = _join(meshes)
     light = Light(camera, surface.pos, surface.faces)
     floor_height = float(surface.pos[:, 1].min()) if floor is None else floor
-    behind = backdrop(camera, light, surface, floor_height, width, height)
-    image = np.repeat(np.repeat(behind, _SUPERSAMPLING, axis=0), _SUPERSAMPLING, axis=1)
+    image = backdrop(camera, light, surface, floor_height, width, height, _SUPERSAMPLING)
     _draw_surface(image, camera, light, surface)
     lib = library()
     if lib is not None:
@@ -116,7 +123,7 @@ def _written(image: Picture, text: str, size: int, place: tuple[int, int], ancho
 def _join(meshes: Sequence[RenderMesh]) -> Surface:
     if not meshes:
         raise ValueError("render_frame: no meshes given; pass at least one RenderMesh")
-    parts: list[tuple[Array, NDArray[np.int64], Array, Array]] = []
+    parts: list[tuple[Array, NDArray[np.int64], Array, Array, Array, Array]] = []
     offset = 0
     for index, mesh in enumerate(meshes):
         pos, faces = np.asarray(mesh.pos, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
@@ -127,7 +134,11 @@ def _join(meshes: Sequence[RenderMesh]) -> Surface:
         if color.shape not in ((3,), pos.shape):
             raise ValueError(f"render_frame: mesh {index}: color is {color.shape}, needs (3,) or {pos.shape}")
         linear = np.broadcast_to(np.clip(color, 0.0, 1.0) ** 2.2, pos.shape)
-        parts.append((pos, faces + offset, linear, _vertex_normals(pos, faces)))
+        hem = np.full(len(pos), FAR) if mesh.hem is None else np.asarray(mesh.hem, dtype=np.float64)
+        if hem.shape != (len(pos),):
+            raise ValueError(f"render_frame: mesh {index}: hem is {hem.shape}, needs ({len(pos)},)")
+        behind = np.full(len(pos), mesh.behind)
+        parts.append((pos, faces + offset, linear, _vertex_normals(pos, faces), hem, behind))
         offset += len(pos)
     return Surface(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
@@ -138,12 +149,13 @@ def _draw_surface(image: Array, camera: Camera, light: Light, surface: Surface) 
     seen = (surface.pos - np.asarray(camera.position)) @ axes.T
     faces = surface.faces[(seen[surface.faces, 2] > NEAR).all(axis=1)]
     depth = np.maximum(seen[:, 2], NEAR)
-    focal = 0.5 * height / np.tan(np.radians(camera.fov) / 2)
+    focal = camera.focal(height)
     offset = focal * seen[:, :2] / depth[:, None]
     screen = np.stack([0.5 * width + offset[:, 0], 0.5 * height - offset[:, 1]], axis=1)
-    visible = rasterise(screen, 1.0 / depth, faces, width, height).face
+    buffer = rasterise(screen, 1.0 / (depth + surface.behind), faces, width, height)
+    visible = buffer.face
     if library() is not None:
-        _shade_compiled(image, camera, light, replace(surface, faces=faces), (screen, depth, visible))
+        _shade_compiled(image, camera, light, replace(surface, faces=faces), (screen, depth, buffer))
         return
     row, column = np.nonzero(visible >= 0)
     if len(row) == 0:
@@ -160,22 +172,27 @@ def _draw_surface(image: Array, camera: Camera, light: Light, surface: Surface) 
     turned = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) > (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
     inside = turned[visible[row, column]]
     normal[inside] *= -1.0
-    color = np.where(inside[:, None], 0.72 * color, color)
-    image[row, column] = light.shade(pos, normal, view, color)
+    foot = np.asarray(1.0 / (focal * buffer.nearness[row, column]), dtype=np.float64)
+    color = np.where(inside[:, None], _INSIDE * color, color)
+    color = sewn((weights * surface.hem[corners]).sum(axis=1), foot)[:, None] * color
+    image[row, column] = light.shade(pos, normal, view, color, openness(buffer, focal, row, column, normal @ axes.T))
 
 
 def _shade_compiled(
-    image: Array, camera: Camera, light: Light, surface: Surface, view: tuple[Array, Array, NDArray[np.integer]]
+    image: Array, camera: Camera, light: Light, surface: Surface, view: tuple[Array, Array, VisibilityBuffer]
 ) -> None:
-    """The rest of :func:`_draw_surface` in C++, from the pixels, depths and faces of a ``view``."""
+    """The rest of :func:`_draw_surface` in C++, from a ``view``: pixels and depths of vertices, and what is seen."""
     lib = library()
     assert lib is not None
     assert image.flags.c_contiguous
-    screen, depth, visible = view
-    arrays = [packed(value) for value in (surface.pos, surface.color, surface.normal, screen, depth)]
-    arrays += [packed(surface.faces, np.int64), packed(visible, np.int32), image]
+    screen, depth, buffer = view
+    arrays = [packed(value) for value in (surface.pos, surface.color, surface.normal, screen, depth, surface.hem)]
+    arrays += [packed(surface.faces, np.int64), packed(buffer.face, np.int32)]
+    arrays += [packed(value) for value in (buffer.nearness, AROUND, camera.axes())] + [image]
+    height, width = image.shape[:2]
     eye = tuple(float(value) for value in camera.position)
-    seen = SeenValues(*(address(value) for value in arrays), image.shape[1], image.shape[0], eye)
+    sizes = width, height, AROUND.shape[1]
+    seen = SeenValues(*(address(value) for value in arrays), *sizes, eye, camera.focal(height), REACH, _INSIDE)
     lib.picture_shade(ctypes.byref(light.values()), ctypes.byref(seen))
 
 

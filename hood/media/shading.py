@@ -34,12 +34,15 @@ _BOUNCE = 0.18 * np.array([1.0, 0.97, 0.94])
 
 @dataclass(frozen=True)
 class Surface:
-    """Everything drawn as one mesh: `pos` (V, 3), `faces` (F, 3), linear `color` and unit `normal` (V, 3)."""
+    """Everything drawn as one mesh: `pos` (V, 3), `faces` (F, 3), linear `color` and unit `normal` (V, 3), distance from
+    the next `hem` and how far the vertices are drawn `behind` where they are (V,) [m]."""
 
     pos: Array
     faces: Faces
     color: Array
     normal: Array
+    hem: Array
+    behind: Array
 
 
 class Light:
@@ -83,34 +86,40 @@ class Light:
             shade += self._map[row, column] > bias - seen[:, 2]
         return 1.0 - shade / len(_PROBES)
 
-    def shade(self, pos: Array, normal: Array, view: Array, color: Array) -> Array:
-        """Linear colours (P, 3) of points with these unit normals, directions to the eye and colours."""
+    def shade(self, pos: Array, normal: Array, view: Array, color: Array, openness: Array) -> Array:
+        """Linear colours (P, 3) of points with these unit normals, directions to the eye and colours.
+
+        Args:
+            openness: (P,) share of the light from all sides that is not kept off by what is near.
+        """
         key = normal @ self.key
         # Wrapped diffuse light: soft terminators, as under a large lamp.
         diffuse = np.clip((key + 0.25) / 1.25, 0.0, 1.0)
-        shadow = 0.25 + 0.75 * self.lit(pos + 0.006 * normal, spread=0.9)
+        shadow = (0.25 + 0.75 * self.lit(pos + 0.006 * normal, spread=0.9)) * (0.5 + 0.5 * openness)
         fill = np.clip(normal @ self.fill, 0.0, 1.0)
         up = 0.5 + 0.5 * normal[:, 1]
         facing = np.clip(_dot(normal, view), 0.0, 1.0)
         half = unit(view + self.key)
         gloss = 0.06 * np.clip(_dot(normal, half), 0.0, 1.0) ** 24 * shadow
         rim = 0.10 * (1.0 - facing) ** 3 * up
-        received = (
-            (diffuse * shadow)[:, None] * _KEY + fill[:, None] * _FILL + up[:, None] * _SKY + (1.0 - up)[:, None] * _BOUNCE
-        )
+        around = fill[:, None] * _FILL + up[:, None] * _SKY + (1.0 - up)[:, None] * _BOUNCE
+        received = (diffuse * shadow)[:, None] * _KEY + openness[:, None] * around
         return color * received * (0.72 + 0.28 * facing[:, None]) + (gloss + rim)[:, None]
 
 
-def backdrop(camera: Camera, light: Light, surface: Surface, floor: float, width: int, height: int) -> Array:
-    """Linear colours (height, width, 3) of the floor, which fades into a plain background."""
+def backdrop(camera: Camera, light: Light, surface: Surface, floor: float, width: int, height: int, samples: int) -> Array:
+    """Linear colours (samples * height, samples * width, 3) of the floor, which fades into a plain background.
+
+    A pixel of the picture of this ``width`` and ``height`` has one colour, in all its ``samples`` rows and columns.
+    """
     right, up, forward = camera.axes()
     tan_y = np.tan(np.radians(camera.fov) / 2)
     lib = library()
     if lib is not None:
-        image, dark = np.empty((height, width, 3)), _dark_map(surface, floor)
+        image, dark = np.empty((samples * height, samples * width, 3)), _dark_map(surface, floor)
         where = (tuple(value) for value in (camera.position, right, up, forward, _middle(surface)))
         colors = (tuple(value) for value in (_GROUND**2.2, _HORIZON, _ZENITH))
-        sizes = width, height, len(dark)
+        sizes = width, height, len(dark), samples
         values = FloorValues(address(dark), address(image), *sizes, *where, tan_y, floor, _CELL, *colors)
         lib.picture_backdrop(ctypes.byref(light.values()), ctypes.byref(values))
         return image
@@ -124,7 +133,7 @@ def backdrop(camera: Camera, light: Light, surface: Surface, floor: float, width
     drop = eye[1] - floor
     row, column = np.nonzero(rays[..., 1] < -1e-4)
     if drop < 1e-3:
-        return image
+        return _repeated(image, samples)
     reach = drop / -rays[row, column, 1]
     pos = eye + reach[:, None] * rays[row, column]
     pixel = reach * 2.0 * tan_y / height
@@ -135,7 +144,11 @@ def backdrop(camera: Camera, light: Light, surface: Surface, floor: float, width
     ground *= _floor_shadow(light, surface, pos, floor, away)[:, None]
     blend = np.clip(fade, 0.0, 1.0)[:, None]
     image[row, column] = blend * ground + (1.0 - blend) * image[row, column]
-    return image
+    return _repeated(image, samples)
+
+
+def _repeated(image: Array, samples: int) -> Array:
+    return np.repeat(np.repeat(image, samples, axis=0), samples, axis=1)
 
 
 def _grid_lines(pos: Array, pixel: Array, stretch: Array) -> Array:

@@ -29,18 +29,23 @@ struct Light {
 // As `SeenValues` of hood/media/drawing.py: what is drawn, and from where.
 struct Seen {
     const double *pos, *color, *normal, *screen, *depth;  // of vertices: (V, 3) three times, (V, 2) pixels, (V,) m
+    const double* hem;                                    // (V,) m from the next hem
     const int64_t* faces;                                 // (F, 3)
     const int32_t* face;                                  // (height, width) of each pixel, -1 where nothing is drawn
+    const double* nearness;                               // (height, width) 1/m
+    const double* around;                                 // (4, num_around, 2) shares of the reach, by the pixel's place in its four
+    const double* axes;                                   // (3, 3) right, up, forward
     double* image;                                        // (height, width, 3) linear colours
-    int64_t width, height;
+    int64_t width, height, num_around;
     double eye[3];
+    double focal, reach, inside;  // pixels, m, share of the colour that an inside shows
 };
 
 // As `FloorValues` of hood/media/drawing.py: what lies behind the surface.
 struct Floor {
     const double* dark;  // (cells, cells) shade under low parts
-    double* image;       // (height, width, 3) linear colours
-    int64_t width, height, cells;
+    double* image;       // (samples * height, samples * width, 3) linear colours
+    int64_t width, height, cells, samples;
     double eye[3], right[3], up[3], forward[3], center[3];
     double tan_y, floor, cell;
     double ground[3], horizon[3], zenith[3];  // ground linear, the others as shown
@@ -117,18 +122,46 @@ double power_24(double v) {
     return eighth * eighth * eighth;
 }
 
-void shade(const Light& light, Vec pos, Vec normal, Vec view, Vec color, double* out) {
+// Share of the light from all sides that is not kept off by what is near: as `openness` of hood/media/occlusion.py.
+double openness(const Seen& s, int64_t row, int64_t column, Vec normal) {
+    const double across = 0.5 * s.width, up = 0.5 * s.height, depth = 1.0 / s.nearness[row * s.width + column];
+    const double x = (column + 0.5 - across) / s.focal * depth, y = (up - row - 0.5) / s.focal * depth;
+    const double n[3] = {dot(at(s.axes, 0), normal), dot(at(s.axes, 1), normal), dot(at(s.axes, 2), normal)};
+    const double reach = s.focal * s.reach / depth;
+    const double* offset = s.around + 2 * s.num_around * (2 * (row % 2) + column % 2);
+    double kept = 0.0;
+    for (int64_t k = 0; k < s.num_around; ++k) {
+        const int64_t c = (int64_t)std::floor(column + 0.5 + reach * offset[2 * k]);
+        const int64_t r = (int64_t)std::floor(row + 0.5 + reach * offset[2 * k + 1]);
+        if (c < 0 || r < 0 || c >= s.width || r >= s.height || s.face[r * s.width + c] < 0) continue;
+        const double there = 1.0 / s.nearness[r * s.width + c];
+        const double dx = (c + 0.5 - across) / s.focal * there - x, dy = (up - r - 0.5) / s.focal * there - y, dz = there - depth;
+        const double dist_sq = dx * dx + dy * dy + dz * dz, far = dist_sq / (s.reach * s.reach);
+        if (far >= 1.0 || dist_sq <= 0.0) continue;
+        kept += std::max((n[0] * dx + n[1] * dy + n[2] * dz) / std::sqrt(dist_sq) - 0.1, 0.0) * (1.0 - far);
+    }
+    return clip(1.0 - 2.2 * kept / s.num_around, 0.2, 1.0);
+}
+
+// Share of the colour left by the hem's edge and its seam, smoothed over the pixel's footprint [m].
+double sewn(double dist, double foot) {
+    const double edge = clip((0.0025 - dist) / foot + 0.5, 0.0, 1.0);
+    const double seam = clip((0.0015 - std::fabs(dist - 0.02)) / foot + 0.5, 0.0, 1.0) * std::min(1.0, 0.003 / foot);
+    return 1.0 - 0.3 * edge - 0.35 * seam;
+}
+
+void shade(const Light& light, Vec pos, Vec normal, Vec view, Vec color, double open, double* out) {
     const Vec key = at(light.key, 0);
     const double diffuse = clip((dot(normal, key) + 0.25) / 1.25, 0.0, 1.0);
-    const double shadow = 0.25 + 0.75 * lit_at(light, pos + 0.006 * normal, 0.9);
+    const double shadow = (0.25 + 0.75 * lit_at(light, pos + 0.006 * normal, 0.9)) * (0.5 + 0.5 * open);
     const double fill = clip(dot(normal, at(light.fill, 0)), 0.0, 1.0);
     const double up = 0.5 + 0.5 * normal.y, facing = clip(dot(normal, view), 0.0, 1.0);
     const double gloss = 0.06 * power_24(clip(dot(normal, unit(view + key)), 0.0, 1.0)) * shadow;
     const double away = 1.0 - facing, shine = gloss + 0.10 * away * away * away * up, dim = 0.72 + 0.28 * facing;
     const double own[3] = {color.x, color.y, color.z};
     for (int k = 0; k < 3; ++k) {
-        const double received = diffuse * shadow * light.key_color[k] + fill * light.fill_color[k] + up * light.sky_color[k] +
-                                (1.0 - up) * light.bounce_color[k];
+        const double around = fill * light.fill_color[k] + up * light.sky_color[k] + (1.0 - up) * light.bounce_color[k];
+        const double received = diffuse * shadow * light.key_color[k] + open * around;
         out[k] = own[k] * received * dim + shine;
     }
 }
@@ -158,29 +191,43 @@ void picture_shade(const Light* light, const Seen* seen) {
             double weight[3] = {1.0 - second - third, second, third}, sum = 0.0;
             for (int k = 0; k < 3; ++k) sum += weight[k] /= seen->depth[corner[k]];
             Vec pos{0, 0, 0}, color{0, 0, 0}, normal{0, 0, 0};
+            double hem = 0.0;
             for (int k = 0; k < 3; ++k) {
                 const double share = clip(weight[k] / sum, 0.0, 1.0);
                 pos = pos + share * at(seen->pos, corner[k]);
                 color = color + share * at(seen->color, corner[k]);
                 normal = normal + share * at(seen->normal, corner[k]);
+                hem += share * seen->hem[corner[k]];
             }
             normal = unit(normal);
             if (turned > 0) {
                 normal = -normal;
-                color = 0.72 * color;
+                color = seen->inside * color;
             }
-            shade(*light, pos, normal, unit(eye - pos), color, seen->image + 3 * pixel);
+            color = sewn(hem, 1.0 / (seen->focal * seen->nearness[pixel])) * color;
+            const double open = openness(*seen, row, column, normal);
+            shade(*light, pos, normal, unit(eye - pos), color, open, seen->image + 3 * pixel);
         }
 }
 
 // Average of 2 x 2 samples, as shown: (height, width, 3) of 0 to 255 from linear colours of twice the size.
 void picture_resolve(const double* samples, int64_t width, int64_t height, uint8_t* out) {
+    double least[257];  // mean from which a number is shown
+    for (int k = 0; k < 257; ++k) least[k] = k == 0 ? -1.0 : k == 256 ? 2.0 : std::pow((k - 0.5) / 255.0, 2.2);
+    uint8_t guess[1025];  // the number at the beginning of every 1024th
+    for (int i = 0, k = 0; i < 1025; ++i) {
+        while (least[k + 1] <= i / 1024.0) ++k;
+        guess[i] = (uint8_t)k;
+    }
     for (int64_t row = 0; row < height; ++row)
         for (int64_t i = 0; i < 3 * width; ++i) {
             const int64_t left = 2 * row * 6 * width + 6 * (i / 3) + i % 3;
             const double* low = samples + left + 6 * width;
             const double mean = (((samples[left] + samples[left + 3]) + low[0]) + low[3]) / 4.0;
-            out[row * 3 * width + i] = (uint8_t)(255.0 * std::pow(clip(mean, 0.0, 1.0), 1 / 2.2) + 0.5);
+            const double shown = clip(mean, 0.0, 1.0);
+            int k = guess[(int)(1024.0 * shown)];
+            while (least[k + 1] <= shown) ++k;
+            out[row * 3 * width + i] = (uint8_t)k;
         }
 }
 
@@ -235,15 +282,24 @@ extern "C" {
 void picture_backdrop(const Light* light, const Floor* floor) {
     const Floor& f = *floor;
     const double drop = f.eye[1] - f.floor;
+    double horizon[3];
+    for (int k = 0; k < 3; ++k) horizon[k] = std::pow(f.horizon[k], 2.2);
     for (int64_t row = 0; row < f.height; ++row)
         for (int64_t column = 0; column < f.width; ++column) {
             const double x = (column + 0.5 - 0.5 * f.width) / (0.5 * f.height) * f.tan_y;
             const double y = (0.5 * f.height - row - 0.5) / (0.5 * f.height) * f.tan_y;
             const Vec ray = at(f.forward, 0) + x * at(f.right, 0) + y * at(f.up, 0);
             const double high = clip(1.6 * ray.y / std::sqrt(dot(ray, ray)), 0.0, 1.0);
-            double* out = f.image + 3 * (row * f.width + column);
-            for (int k = 0; k < 3; ++k) out[k] = std::pow(f.horizon[k] + (f.zenith[k] - f.horizon[k]) * high, 2.2);
+            double* out = f.image + 3 * f.samples * (row * f.samples * f.width + column);
+            for (int k = 0; k < 3; ++k) out[k] = high > 0 ? std::pow(f.horizon[k] + (f.zenith[k] - f.horizon[k]) * high, 2.2) : horizon[k];
             if (ray.y < -1e-4 && drop >= 1e-3) floor_color(*light, f, ray, drop, out);
+            for (int64_t i = 1; i < f.samples; ++i) std::copy(out, out + 3, out + 3 * i);
+        }
+    const int64_t line = 3 * f.samples * f.width;
+    for (int64_t row = 0; row < f.height; ++row)
+        for (int64_t i = 1; i < f.samples; ++i) {
+            const double* first = f.image + row * f.samples * line;
+            std::copy(first, first + line, f.image + (row * f.samples + i) * line);
         }
 }
 

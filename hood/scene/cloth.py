@@ -26,7 +26,7 @@ class Cloth:
     """B garments, concatenated. Derived fields (masses, rest quantities) are constant during a rollout.
 
     Fabric fields live where the energies need them (faces, hinges); ``vertex_fabric`` and ``edge_fabric`` hold
-    (lame_mu [Pa], lame_lambda [Pa], bending_stiffness) where the network's features need them. How a property given
+    (lame_mu [Pa], lame_lambda [Pa], bending_stiffness [J]) where the network's features need them. How a property given
     elsewhere gets there: :mod:`hood.scene.fabric`.
     """
 
@@ -44,7 +44,7 @@ class Cloth:
     thickness: Tensor = None  # type: ignore[assignment]  # (F,) m
     lame_mu: Tensor = None  # type: ignore[assignment]  # (F,) Pa
     lame_lambda: Tensor = None  # type: ignore[assignment]  # (F,) Pa
-    bending_stiffness: Tensor = None  # type: ignore[assignment]  # (H,)
+    bending_stiffness: Tensor = None  # type: ignore[assignment]  # (H,) J
     vertex_fabric: Tensor = None  # type: ignore[assignment]  # (V, 3)
     edge_fabric: Tensor = None  # type: ignore[assignment]  # (E, 3)
     # derived from the rest shape

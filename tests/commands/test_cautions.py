@@ -20,10 +20,10 @@ from hood.commands.common import weigh
 from hood.commands.setup import make_stepper
 from hood.config import load_config
 from hood.dynamics.checkpoint import load_simulator, save_simulator
-from hood.dynamics.goals import Count
 from hood.dynamics.ranges import Conditions, scene_conditions
 from hood.dynamics.refine import GuessStepper, RefinedStepper
 from hood.dynamics.simulator import Simulator, build_simulator
+from hood.dynamics.stopping import Count
 from hood.losses.potential import default_potential
 from hood.scene.scene import Scene, build_scene
 from hood.solver.newton import NewtonSettings

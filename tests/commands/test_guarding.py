@@ -14,8 +14,8 @@ from belt import write_belt, write_walk
 from hood.cli import main
 from hood.commands.guarding import guard_sentence
 from hood.dynamics.guard import CUT, FORCE, TURN, Alarm
-from hood.dynamics.mend import LEFT, REFINED
 from hood.dynamics.recorder import read_rollout
+from hood.dynamics.step_repair import LEFT, REFINED
 
 CHEAP = ["rollout", "stepper=refine", "refine=20", "metrics=none", "garment=belt.obj", "sequence=walk.npz", "video=none",
          "sheet=false", "output=out"]  # fmt: skip
@@ -70,14 +70,14 @@ def test_a_turn_is_told_and_mended(capsys: pytest.CaptureFixture[str]) -> None:
     assert f"hood: warning: {told['sentence']}\n" in capsys.readouterr().err
     assert told["sentence"].endswith("guard=repair mends what it can")
     main([*HASTY, "guard=repair"])
-    mended = summary()["guard"]
-    assert mended["repairs"]["refined"] + mended["repairs"]["solved"] > 0
+    repaired = summary()["guard"]
+    assert repaired["repairs"]["refined"] + repaired["repairs"]["solved"] > 0
     rows = read_rollout(Path("out/rollout.h5")).alarms
-    assert [row["frame"] for row in rows] == [row["frame"] for row in mended["alarms"]]
+    assert [row["frame"] for row in rows] == [row["frame"] for row in repaired["alarms"]]
     for row in rows:
         assert not row["rg_after"] > row["rg_before"]
     assert main(["inspect", "out/rollout.h5"]) in (0, 1)
-    assert mended["sentence"].removeprefix("guard: ") in capsys.readouterr().out
+    assert repaired["sentence"].removeprefix("guard: ") in capsys.readouterr().out
 
 
 def test_strict_ends_before_the_first_alarm(capsys: pytest.CaptureFixture[str]) -> None:
@@ -123,7 +123,7 @@ def test_the_sentence_names_frames_values_and_limits() -> None:
     assert guard_sentence("repair", alarms, 11) == (
         "guard: 3 of 10 steps: forces out of balance, 120 times the weight at worst, beyond 50, in frames 3–4; the skin cuts "
         "3.1% of the cloth's triangles at worst, beyond 2%, in frame 4; the body turns by 24 degrees in a step, beyond 15 "
-        "(less with a higher fps=…), in frame 6; 1 of 2 steps mended"
+        "(less with a higher fps=…), in frame 6; 1 of 2 steps repaired"
     )
     assert guard_sentence("report", [], 11) == ""
 

@@ -1,4 +1,4 @@
-"""The guard: no alarm changes nothing, alarms are written down, steps are mended and never made worse."""
+"""The guard: no alarm changes nothing, alarms are written down, steps are repaired and never made worse."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ import torch
 from hood.assets.body.body import Body
 from hood.assets.garment.garment import Garment
 from hood.assets.motion.sequence import PoseSequence
-from hood.dynamics.goals import Count
 from hood.dynamics.guard import (
     CHECK,
     CHECK_EVERY,
@@ -32,11 +31,12 @@ from hood.dynamics.guard import (
     TURN,
     Guard,
 )
-from hood.dynamics.mend import LEFT, NOT_TRIED, REFINED, SOLVED, Limits, Standing, mend, standing
 from hood.dynamics.refine import GuessStepper, RefinedStepper
 from hood.dynamics.rollout import Frame, metric_names, simulate
 from hood.dynamics.simulator import Prediction
+from hood.dynamics.step_repair import LEFT, NOT_TRIED, REFINED, SOLVED, Limits, StepQuality, repair_step, step_quality
 from hood.dynamics.stepper import NewtonStepper, Stepper
+from hood.dynamics.stopping import Count
 from hood.dynamics.stopwatch import Stopwatch
 from hood.losses.potential import default_potential
 from hood.losses.problem import StepProblem
@@ -132,7 +132,7 @@ def test_a_bad_step_is_told_and_mended(spoil: Any, cause: str, scene: Scene) -> 
     assert same(told, frames(Spoilt(3, spoil), scene, None))
     assert (report.alarms[0].frame, report.alarms[0].cause, report.alarms[0].repair) == (3, cause, NOT_TRIED)
     repair = Guard("repair", Spoilt(3, spoil), POTENTIAL)
-    mended = frames(Spoilt(3, spoil), scene, repair)
+    repaired = frames(Spoilt(3, spoil), scene, repair)
     assert [alarm.frame for alarm in repair.alarms] == [3]
     alarm = repair.alarms[0]
     assert alarm.repair == (SOLVED if spoil is lost else REFINED)
@@ -140,9 +140,9 @@ def test_a_bad_step_is_told_and_mended(spoil: Any, cause: str, scene: Scene) -> 
     assert alarm.rg_after <= 1e-2
     assert not alarm.rg_before <= 1.0
     # The rollout goes on from there as if nothing had happened.
-    off = (mended[-1].world_pos - good[-1].world_pos).norm(dim=1).max()
+    off = (repaired[-1].world_pos - good[-1].world_pos).norm(dim=1).max()
     assert off < 2e-3
-    assert all(torch.isfinite(frame.world_pos).all() for frame in mended)
+    assert all(torch.isfinite(frame.world_pos).all() for frame in repaired)
 
 
 def test_every_twentieth_step_and_the_most_strained_are_held_against_a_solver(scene: Scene) -> None:
@@ -153,7 +153,7 @@ def test_every_twentieth_step_and_the_most_strained_are_held_against_a_solver(sc
 
     problem, prediction = one_step(scene)
     solved = prediction.next_pos
-    strained = standing(POTENTIAL, problem, replace(prediction, next_pos=scaled(solved))).strain
+    strained = step_quality(POTENTIAL, problem, replace(prediction, next_pos=scaled(solved))).strain
     for frame, looked_at, expected in (
         (CHECK_EVERY, 1.0, True),
         (CHECK_EVERY + 1, strained, False),  # as strained as one that was looked at before
@@ -167,14 +167,14 @@ def test_every_twentieth_step_and_the_most_strained_are_held_against_a_solver(sc
         seen = guard.see(frame, problem, wrong)
         assert seen is wrong
         assert [alarm.cause for alarm in guard.alarms] == ([CHECK] if expected else [])
-    before = standing(POTENTIAL, problem, wrong)
+    before = step_quality(POTENTIAL, problem, wrong)
     mending = quiet_guard("repair")
     kept = mending.see(CHECK_EVERY, problem, wrong)
     (alarm,) = mending.alarms
     assert alarm.value > CHECK_LIMIT
     assert alarm.repair == REFINED
     assert alarm.rg_after < 1e-2 * alarm.rg_before
-    assert abs(standing(POTENTIAL, problem, kept).strain - before.strain) == pytest.approx(alarm.value)
+    assert abs(step_quality(POTENTIAL, problem, kept).strain - before.strain) == pytest.approx(alarm.value)
 
 
 def quiet_guard(mode: str) -> Guard:
@@ -195,13 +195,13 @@ def test_strict_keeps_the_frames_before(scene: Scene) -> None:
 
 def test_a_solver_that_misses_is_given_more_patience(scene: Scene) -> None:
     hasty = newton(max_iterations=4)
-    told, mended = (Guard(mode, hasty, POTENTIAL) for mode in ("report", "repair"))
+    told, repaired = (Guard(mode, hasty, POTENTIAL) for mode in ("report", "repair"))
     frames(hasty, scene, told)
-    rows = frames(hasty, scene, mended)
+    rows = frames(hasty, scene, repaired)
     missed = [alarm.frame for alarm in told.alarms]
     assert missed
     assert {alarm.cause for alarm in told.alarms} == {TARGET}
-    better = [alarm for alarm in mended.alarms if alarm.repair == REFINED]
+    better = [alarm for alarm in repaired.alarms if alarm.repair == REFINED]
     assert better
     assert all(alarm.rg_after < alarm.rg_before for alarm in better)
     for alarm in better:
@@ -212,7 +212,7 @@ def test_a_solver_that_misses_is_given_more_patience(scene: Scene) -> None:
 
 
 def test_what_met_the_target_is_not_solved_again(scene: Scene) -> None:
-    """Cloth that hangs heavily is strained where the solver takes the step: there is nothing to mend."""
+    """Cloth that hangs heavily is strained where the solver takes the step: there is nothing to repair."""
     guard = Guard("repair", newton(), POTENTIAL)
     problem, prediction = one_step(scene)
     long = replace(prediction, next_pos=stretched(prediction.next_pos), residual=1e-3)
@@ -229,14 +229,14 @@ def one_step(scene: Scene) -> tuple[StepProblem, Prediction]:
 
 def test_a_mended_step_is_never_worse(scene: Scene) -> None:
     problem, prediction = one_step(scene)
-    before = standing(POTENTIAL, problem, prediction)
-    hopeless = mend(POTENTIAL, problem, prediction, before, Limits(1e-12, 0.0), replace(SETTINGS, max_iterations=0), 0)
+    before = step_quality(POTENTIAL, problem, prediction)
+    hopeless = repair_step(POTENTIAL, problem, prediction, before, Limits(1e-12, 0.0), replace(SETTINGS, max_iterations=0), 0)
     assert hopeless.kind == LEFT
     assert hopeless.prediction is prediction
     # Less force for much more strain is no bargain.
     slack = replace(prediction, next_pos=prediction.next_pos.clone())
-    said = Standing(True, residual=1e9, strain=-1.0)
-    refused = mend(POTENTIAL, problem, slack, said, Limits(1.0, 0.25), SETTINGS, 5)
+    said = StepQuality(True, residual=1e9, strain=-1.0)
+    refused = repair_step(POTENTIAL, problem, slack, said, Limits(1.0, 0.25), SETTINGS, 5)
     assert refused.kind == LEFT
 
 

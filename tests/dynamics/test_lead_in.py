@@ -16,10 +16,10 @@ from hood.assets.garment.garment import Garment, load_garment
 from hood.assets.motion.load import load_sequence
 from hood.assets.motion.sequence_edit import blend_in
 from hood.dynamics.checkpoint import load_simulator
-from hood.dynamics.goals import Count
 from hood.dynamics.refine import GuessStepper, RefinedStepper
 from hood.dynamics.rollout import simulate
 from hood.dynamics.simulator import Prediction
+from hood.dynamics.stopping import Count
 from hood.losses.potential import default_potential
 from hood.scene.scene import LEAD_IN, NotWornError, build_scene
 

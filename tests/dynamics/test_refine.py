@@ -11,12 +11,12 @@ from reference_oracle import make_state
 from torch import Tensor
 
 from hood.dynamics.captured import CapturedSimulator
-from hood.dynamics.goals import Budget, Count, Goal, MaxStrain, TargetResidual
 from hood.dynamics.reference import import_reference_weights
 from hood.dynamics.refine import METHODS, GuessStepper, RefinedStepper, unrefined
 from hood.dynamics.rollout import Frame, metric_names, prepare_stepper, simulate, start_state
 from hood.dynamics.simulator import Prediction, build_simulator
 from hood.dynamics.stepper import Stepper
+from hood.dynamics.stopping import Budget, Count, MaxStrain, StoppingCriterion, TargetResidual
 from hood.losses.potential import default_potential, reference_potential
 from hood.losses.problem import StepProblem
 from hood.scene.scene import Scene
@@ -162,7 +162,7 @@ def test_a_refined_rollout_is_nearer_to_equilibrium(kind: str, band_scene: Scene
 
 
 @pytest.mark.parametrize("goal", [lambda: Budget(1e4, 3), lambda: MaxStrain(0.02, 5)], ids=["budget", "strain"])
-def test_other_goals_in_a_rollout(goal: Callable[[], Goal], band_scene: Scene) -> None:
+def test_other_goals_in_a_rollout(goal: Callable[[], StoppingCriterion], band_scene: Scene) -> None:
     frames = list(simulate(RefinedStepper(single_pass(), POTENTIAL, goal()), band_scene, POTENTIAL, 4, metrics="strain"))
     for frame in frames[1:]:
         assert frame.metrics["refine_iterations"] > 0

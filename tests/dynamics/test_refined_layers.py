@@ -10,9 +10,9 @@ import torch
 
 from hood.assets.material import Material
 from hood.dynamics.frames import Relaxing
-from hood.dynamics.goals import Count
 from hood.dynamics.refine import RefinedStepper
 from hood.dynamics.simulator import Simulator, build_simulator
+from hood.dynamics.stopping import Count
 from hood.losses.layers import LayerBarrier
 from hood.losses.potential import default_potential
 from hood.losses.problem import StepProblem

@@ -10,10 +10,10 @@ from hood.assets.files.library import locate
 from hood.assets.garment.garment import Garment
 from hood.assets.motion.sequence import PoseSequence
 from hood.dynamics.checkpoint import load_simulator
-from hood.dynamics.goals import Count
 from hood.dynamics.refine import RefinedStepper
 from hood.dynamics.rollout import simulate
 from hood.dynamics.stepper import Stepper
+from hood.dynamics.stopping import Count
 from hood.losses.potential import default_potential
 from hood.scene.scene import build_scene
 

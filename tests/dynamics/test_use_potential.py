@@ -10,10 +10,10 @@ from torch import Tensor
 from hood.assets.files.library import locate
 from hood.dynamics.captured import CapturedSimulator, network_of
 from hood.dynamics.checkpoint import load_simulator
-from hood.dynamics.goals import Count
 from hood.dynamics.refine import GuessStepper, RefinedStepper
 from hood.dynamics.rollout import simulate
 from hood.dynamics.simulator import Simulator
+from hood.dynamics.stopping import Count
 from hood.losses.gravity import Gravity
 from hood.losses.potential import Potential, default_potential, reference_potential
 from hood.losses.problem import StepProblem

@@ -20,7 +20,7 @@ from hood.evaluation.comparison import (
     crossover,
     pareto_front,
     refined_networks,
-    standings,
+    verdicts_by_size,
 )
 from hood.evaluation.reached import Reached
 
@@ -87,8 +87,8 @@ def test_what_is_below_the_resolution_is_equally_accurate(gap: float) -> None:
 
 def test_the_solver_wins_a_size_only_if_it_beats_the_best_setting() -> None:
     slow, level = exact("net", 0, 200.0, 0.04), reached("net", 2, 50.0, 0.04, noise=0.3)
-    assert standings([*solver(CURVE), slow])[0].winner == SOLVER
-    assert standings([*solver(CURVE), slow, level])[0].winner == OPEN
+    assert verdicts_by_size([*solver(CURVE), slow])[0].winner == SOLVER
+    assert verdicts_by_size([*solver(CURVE), slow, level])[0].winner == OPEN
 
 
 @pytest.mark.parametrize("ms, verdict", [(20.0, NETWORK), (48.0, OPEN), (52.0, OPEN), (120.0, SOLVER)])
@@ -135,7 +135,7 @@ def scene(size: str, vertices: int, network_ms: float, noise: float = 0.02) -> l
 
 def test_the_crossover_is_named_where_the_solver_gives_way() -> None:
     items = scene("1k", 1000, 200.0, noise=0.0) + scene("4k", 4000, 12.5, noise=0.0)
-    found = standings(items)
+    found = verdicts_by_size(items)
     assert [(s.size, s.winner) for s in found] == [("1k", SOLVER), ("4k", NETWORK)]
     said = crossover(found, "CPU (made up)")
     assert said == (
@@ -146,7 +146,7 @@ def test_the_crossover_is_named_where_the_solver_gives_way() -> None:
 
 def test_an_undecided_size_between_is_named_and_every_winner_has_its_own_size() -> None:
     sizes = scene("1k", 1000, 200.0), scene("4k", 4000, 50.0, noise=0.4), scene("12k", 12000, 12.5), scene("40k", 40000, 10.0)
-    said = crossover(standings([item for size in sizes for item in size]), "CPU")
+    said = crossover(verdicts_by_size([item for size in sizes for item in size]), "CPU")
     assert said.startswith("Up to 1,000 vertices on this CPU the solver alone is the better choice, from 12,000 on a network")
     assert "net, fp32 at 12,000 vertices (γ = 0.04); net, fp32 at 40,000 vertices (γ = 0.04)." in said
     assert "At 4,000 vertices no claim is made" in said
@@ -154,47 +154,47 @@ def test_an_undecided_size_between_is_named_and_every_winner_has_its_own_size() 
 
 def test_a_fast_network_that_is_far_off_is_no_choice() -> None:
     items = [*solver(CURVE), reached("net", 0, 1.0, 2.3), reached("net", 1, 2.0, 0.9)]
-    assert [(one.winner, one.best) for one in standings(items)] == [(SOLVER, None)]
+    assert [(one.winner, one.best) for one in verdicts_by_size(items)] == [(SOLVER, None)]
     few = [replace(item, rollouts=LEAST_ROLLOUTS - 1) for item in items]
-    assert [(one.winner, one.best) for one in standings(few)] == [(OPEN, None)]
+    assert [(one.winner, one.best) for one in verdicts_by_size(few)] == [(OPEN, None)]
 
 
 def test_few_rollouts_allow_no_verdict() -> None:
     few = [replace(item, rollouts=LEAST_ROLLOUTS - 1) for item in scene("1k", 1000, 10.0)]
-    assert standings(few)[0].winner == OPEN
-    assert "rollouts are fewer than 6" in crossover(standings(few), "CPU")
+    assert verdicts_by_size(few)[0].winner == OPEN
+    assert "rollouts are fewer than 6" in crossover(verdicts_by_size(few), "CPU")
     found = at_equal_time(replace(exact("net", 1, 9.9, 0.05), rollouts=3), [exact("net", 0, 10.0, 0.5)])
     assert found is not None
     assert found.verdict == OPEN
 
 
 def test_no_crossover_is_said_as_well() -> None:
-    all_lost = crossover(standings(scene("1k", 1000, 200.0) + scene("4k", 4000, 300.0)), "CPU")
+    all_lost = crossover(verdicts_by_size(scene("1k", 1000, 200.0) + scene("4k", 4000, 300.0)), "CPU")
     assert "At 1,000 vertices and 4,000" not in all_lost
     assert "At 1,000 and 4,000 vertices on this CPU the solver alone is the better choice; no crossover" in all_lost
-    assert "No size was seen below which" in crossover(standings(scene("1k", 1000, 10.0)), "CPU")
-    backwards = crossover(standings(scene("1k", 1000, 10.0) + scene("4k", 4000, 300.0)), "CPU")
+    assert "No size was seen below which" in crossover(verdicts_by_size(scene("1k", 1000, 10.0)), "CPU")
+    backwards = crossover(verdicts_by_size(scene("1k", 1000, 10.0) + scene("4k", 4000, 300.0)), "CPU")
     assert "there is no single size" in backwards
 
 
 def test_intervals_that_overlap_make_no_claim() -> None:
-    found = standings(scene("1k", 1000, 50.0, noise=0.4))
+    found = verdicts_by_size(scene("1k", 1000, 50.0, noise=0.4))
     assert found[0].winner == OPEN
     said = crossover(found, "CPU")
     assert said.startswith("On this CPU no crossover was seen. At 1,000 vertices no claim is made")
     assert "The network's best setting at 1,000 vertices, net, fp32, took" in said
     assert found[0].best is not None
     assert f"({1 / found[0].best.high:.2g} to {1 / found[0].best.low:.2g})." in said
-    mixed = crossover(standings(scene("1k", 1000, 200.0) + scene("4k", 4000, 50.0, noise=0.4)), "CPU")
+    mixed = crossover(verdicts_by_size(scene("1k", 1000, 200.0) + scene("4k", 4000, 50.0, noise=0.4)), "CPU")
     assert "At 4,000 vertices no claim is made: the intervals overlap" in mixed
     assert crossover([], "CPU").startswith("No network was measured")
 
 
 def test_a_setting_that_overstretches_wins_nothing() -> None:
     items = scene("1k", 1000, 10.0)
-    assert standings(items)[0].winner == NETWORK
-    assert [(one.winner, one.best) for one in standings(items, {items[-1].point})] == [(SOLVER, None)]
-    assert standings(solver(CURVE)) == []
+    assert verdicts_by_size(items)[0].winner == NETWORK
+    assert [(one.winner, one.best) for one in verdicts_by_size(items, {items[-1].point})] == [(SOLVER, None)]
+    assert verdicts_by_size(solver(CURVE)) == []
 
 
 def test_refinement_is_held_against_the_same_network_at_the_same_size() -> None:

@@ -46,7 +46,8 @@ def test_pictures_stand_side_by_side_with_one_camera_and_one_scale() -> None:
     # Nothing is stretched on the left, and the scale is that of the right.
     middle = slice(HEIGHT // 2 - 10, HEIGHT // 2 + 10), slice(WIDTH // 2 - 8, WIDTH // 2 + 8)
     assert left[middle].mean() > right[middle].mean() + 30
-    np.testing.assert_array_equal(view(calm, calm).frame(2)[top : top + HEIGHT, :WIDTH], left)
+    alone = view(calm, calm).frame(2)[top : top + HEIGHT, :WIDTH]
+    assert abs(alone[middle].mean() - left[middle].mean()) < 3  # the same colour; the camera holds the wild one as well
     bare = view(calm, wild, colour="none")
     assert bare.frame(0).shape[0] == picture.shape[0] - 60
 

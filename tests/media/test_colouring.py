@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hood.dynamics.recorder import RolloutData
-from hood.media.colouring import colouring_of, vertex_strain
+from hood.media.colouring import colouring_of, skin_distance, vertex_strain
 from hood.media.film import Film
 from hood.testing import cylinder, sphere
 
@@ -52,6 +52,25 @@ def test_a_range_for_all_frames(data: RolloutData) -> None:
     assert colouring_of(data, "none") is None
 
 
+def test_contact_is_the_distance_from_the_body(data: RolloutData) -> None:
+    """The tube stands 5 cm off the ball's equator and farther elsewhere; cloth on the ball itself touches it."""
+    far, near = skin_distance(data), skin_distance(replace(data, cloth_pos=data.body_pos))
+    reference = np.linalg.norm(data.cloth_pos - [0.0, 0.25, 0.0], axis=2) - 0.25
+    assert np.abs(far - reference).max() < 0.01  # the ball is a polyhedron
+    assert np.abs(near).max() < 1e-9
+    blown = data.cloth_pos.copy()
+    blown[1, 3] = np.inf
+    assert np.isnan(skin_distance(replace(data, cloth_pos=blown))).all(axis=1).tolist() == [False, True, False]
+    colouring = colouring_of(replace(data, cloth_pos=data.body_pos), "contact")
+    assert colouring is not None
+    touching = replace(colouring, values=np.linspace(0.03, -0.01, 50)[None]).colours(0) @ LUMINANCE
+    assert (np.diff(touching) <= 1e-12).all()
+    assert touching[0] - touching[-1] > 0.8
+    assert [label for _, label in colouring.ticks] == ["20 mm", "10 mm", "0 mm"]
+    with pytest.raises(ValueError, match="the rollout has no body"):
+        colouring_of(replace(data, body_faces=np.empty((0, 3), dtype=np.int64)), "contact")
+
+
 def test_rollouts_side_by_side_share_their_range(data: RolloutData) -> None:
     calm = replace(data, cloth_pos=data.cloth_pos[:1].repeat(3, 0), fields={"rg": 1e-2 * data.fields["rg"]})
     for colour in ("strain", "rg"):
@@ -80,7 +99,7 @@ def test_colours_get_darker_and_the_unknown_is_grey(data: RolloutData) -> None:
 def test_what_cannot_be_shown_is_refused(data: RolloutData) -> None:
     with pytest.raises(ValueError, match=r"no cloth/rg; simulate it with export=\[rg\]"):
         colouring_of(replace(data, fields={}), "rg")
-    with pytest.raises(ValueError, match="colour is 'heat'; choose none, strain or rg"):
+    with pytest.raises(ValueError, match="colour is 'heat'; choose none, strain, rg or contact"):
         colouring_of(data, "heat")
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from hood.media import drawing, raster, render, shading
 from hood.media.camera import Camera
+from hood.media.hem import hem_distance
 from hood.media.raster import rasterise
 from hood.media.render import RenderMesh, render_frame
 from hood.testing import cylinder
@@ -31,7 +32,8 @@ def scene() -> list[RenderMesh]:
     """An open tube, seen from outside and inside, coloured by vertex, round a thinner one."""
     pos, faces = (np.asarray(values) for values in cylinder(24, 9, radius=0.3, height=0.8))
     colour = np.abs(np.sin(7.0 * pos))
-    return [RenderMesh(0.5 * pos + 0.02, faces, (0.7, 0.7, 0.6)), RenderMesh(pos, faces, colour)]
+    inner = RenderMesh(0.5 * pos + 0.02, faces, (0.7, 0.7, 0.6), behind=0.001)
+    return [inner, RenderMesh(pos, faces, colour, hem_distance(pos, faces))]
 
 
 def same(one: np.ndarray, other: np.ndarray) -> bool:

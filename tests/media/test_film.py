@@ -45,3 +45,21 @@ def test_the_picture_says_so() -> None:
     assert (plain - hardly).max() > 80
     bare = replace(data, body_pos=np.empty((1, 0, 3)), body_faces=np.empty((0, 3), dtype=np.int64))
     assert (Film(bare, 160, 224, thinner=0.002).frame(0) == Film(bare, 160, 224).frame(0)).all()
+
+
+def test_the_camera_frames_the_garment() -> None:
+    """A skirt on a tall body fills the picture; the head of a tall one is not in it. Cloth that blew up does not count."""
+    pos, faces = cylinder(24, 12, 0.2, 0.5)
+    ball, ball_faces = sphere(2, 0.1)
+    cloth = pos + [0.0, 0.9 - pos[:, 1].mean(), 0.0]
+    body = ball * [1.0, 9.0, 1.0] + [0.0, 0.9, 0.0]
+    still = RolloutData(np.stack([cloth] * 3), faces, pos, np.stack([body] * 3), ball_faces, np.arange(3) / 30, {}, {})
+    film = Film(still, 160, 224)
+    blue = film.frame(0).astype(int)
+    rows = np.flatnonzero((blue[..., 2] > blue[..., 0] + 40).any(axis=1))
+    assert 0.55 < (rows[-1] - rows[0]) / 224 < 0.95
+    lost = still.cloth_pos.copy()
+    lost[1] *= 1e6
+    lost[2] = np.nan
+    near, wild = film._camera, Film(replace(still, cloth_pos=lost), 160, 224)._camera
+    assert np.linalg.norm(np.subtract(wild.position, wild.target)) < 4 * np.linalg.norm(np.subtract(near.position, near.target))

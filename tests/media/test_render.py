@@ -79,6 +79,32 @@ def test_both_sides_are_drawn_and_the_inner_one_is_darker() -> None:
     assert outside[0] > inside[0] > 60
 
 
+@pytest.mark.parametrize("tilt", [0.0, 0.7])
+def test_cloth_on_the_skin_is_not_cut_by_it(tilt: float) -> None:
+    """Two coplanar meshes with different triangles, in either order: what is behind does not show."""
+    skin = square(color=GREEN)
+    turn = np.array([[np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, np.cos(tilt)]])
+    pos = np.asarray(skin.pos) @ turn.T
+    body = RenderMesh(pos, skin.faces, GREEN, behind=1e-3)
+    cloth = RenderMesh(pos + [0.0, 0.0, 1e-9], np.array([[0, 1, 3], [1, 2, 3]]), RED)
+    for meshes in ([body, cloth], [cloth, body]):
+        image = render_frame(meshes, front(), 60, 80).astype(int)
+        assert (image[..., 0] > 2 * image[..., 1]).sum() > 300
+        assert not (image[..., 1] > 2 * image[..., 0]).any()
+
+
+def test_a_hem_is_drawn_where_it_is_given() -> None:
+    plain, close = square(), Camera((0.0, 1.4, 1.5), (0.0, 1.4, 0.0), fov=30.0)
+    hem = 1.5 - np.asarray(plain.pos)[:, 1]
+    meshes = [RenderMesh(plain.pos, plain.faces, RED, given) for given in (None, hem)]
+    bare, sewn = (render_frame([mesh], close, 180, 240).astype(int)[:, 90] for mesh in meshes)
+    rows = np.flatnonzero((bare - sewn).sum(axis=1) > 12)
+    top = np.flatnonzero(bare[:, 0] > 2 * bare[:, 1])[0]
+    assert (rows[0] - top, rows[-1] - top) in [(0, 5), (0, 6), (0, 7)]  # the edge, and the seam 2 cm or 6 pixels below
+    with pytest.raises(ValueError, match=r"mesh 0: hem is \(3,\), needs \(4,\)"):
+        render_frame([RenderMesh(plain.pos, plain.faces, RED, np.zeros(3))], front())
+
+
 def test_vertex_colours_are_interpolated() -> None:
     colors = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, 0, 1.0], [1.0, 0, 0]])
     image = render_frame([square(color=colors)], front(), 90, 80).astype(int)

@@ -35,6 +35,24 @@ export function positionsAt(mesh, frame, target) {
   for (let i = 0; i < mesh.width; i++) target[i] = mesh.whole[start + i] * mesh.step;
 }
 
+/** Unit normals of the vertices into `target`, the mean of the faces around by their areas. */
+export function normalsOf(at, faces, target) {
+  target.fill(0);
+  for (let f = 0; f < faces.length; f += 3) {
+    const a = 3 * faces[f], b = 3 * faces[f + 1], c = 3 * faces[f + 2];
+    const ux = at[b] - at[a], uy = at[b + 1] - at[a + 1], uz = at[b + 2] - at[a + 2];
+    const vx = at[c] - at[a], vy = at[c + 1] - at[a + 1], vz = at[c + 2] - at[a + 2];
+    const x = uy * vz - uz * vy, y = uz * vx - ux * vz, z = ux * vy - uy * vx;
+    target[a] += x; target[a + 1] += y; target[a + 2] += z;
+    target[b] += x; target[b + 1] += y; target[b + 2] += z;
+    target[c] += x; target[c + 1] += y; target[c + 2] += z;
+  }
+  for (let i = 0; i < target.length; i += 3) {
+    const scale = 1 / (Math.sqrt(target[i] ** 2 + target[i + 1] ** 2 + target[i + 2] ** 2) || 1);
+    target[i] *= scale; target[i + 1] *= scale; target[i + 2] *= scale;
+  }
+}
+
 /** Middle [m] of a mesh in a frame: that of its box. */
 export function middleAt(mesh, frame) {
   const start = Math.min(frame, mesh.frames - 1) * mesh.width;

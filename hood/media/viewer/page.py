@@ -5,18 +5,22 @@ from __future__ import annotations
 import base64
 import html
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hood.dynamics.recorder import RolloutData
-from hood.media.colouring import Colouring, colouring_of
+from hood.media.colouring import COLOURINGS, Colouring, colouring_of, colours_at
 from hood.media.film import seconds_per_frame
 from hood.media.palette import outfit_colours
 from hood.media.viewer.packing import pack_bytes, pack_integers, pack_positions
 
+#: The ramp's last colour, of vertices without a value.
+_UNKNOWN = 255
+#: What the menu calls a colouring, where that is not its name.
+_LABELS = {"rg": "unbalanced force"}
 _HERE = Path(__file__).parent
 #: Modules by the names under which they are imported.
 _MODULES = {"three": "three.module.min.js", "orbit": "OrbitControls.js", "data": "data.js", "figures": "figures.js"}
@@ -39,22 +43,38 @@ def view_page(rollouts: Sequence[tuple[str, RolloutData]], title: str) -> str:
                 f"{name}: its frames are {step:g} s apart, those of {rollouts[0][0]} {seconds[0]:g} s; "
                 "show rollouts of one frame rate together"
             )
-    first, others = rollouts[0][1], [data for _, data in rollouts[1:]]
-    scale = colouring_of(first, "strain", others)
-    assert scale is not None  # it is for "none" only
+    every = [data for _, data in rollouts]
+    painted = {name: _colourings(every, name) for name in COLOURINGS if all(_has(data, name) for data in every)}
     content = {
         "seconds": seconds[0],
-        "strain": {"high": scale.high, "ramp": _ramp(scale)},
-        "rollouts": [_rollout(name, data, scale.high, first if at else None) for at, (name, data) in enumerate(rollouts)],
+        "ramp": np.rint(255.0 * colours_at(np.append(np.linspace(0.0, 1.0, _UNKNOWN), np.nan))).astype(int).tolist(),
+        "scales": [_scale(name, by[0]) for name, by in painted.items()],
+        "rollouts": [
+            _rollout(name, data, {kind: by[at] for kind, by in painted.items()}, every[0] if at else None)
+            for at, (name, data) in enumerate(rollouts)
+        ],
     }
     return _fill(title, content)
 
 
-def _rollout(name: str, data: RolloutData, high: float, first: RolloutData | None) -> dict[str, Any]:
+def _has(data: RolloutData, colour: str) -> bool:
+    """Whether a rollout holds what ``colour`` shows."""
+    return {"strain": True, "rg": "rg" in data.fields, "contact": len(data.body_faces) > 0}[colour]
+
+
+def _colourings(rollouts: Sequence[RolloutData], colour: str) -> list[Colouring]:
+    """That of every rollout, with one scale."""
+    found = [colouring_of(data, colour, [other for other in rollouts if other is not data]) for data in rollouts]
+    return [one for one in found if one is not None]
+
+
+def _scale(name: str, colouring: Colouring) -> dict[str, str]:
+    low, high = colouring.ticks[0][1], colouring.ticks[-1][1]
+    return {"name": name, "label": _LABELS.get(name, name), "title": colouring.title, "low": low, "high": high}
+
+
+def _rollout(name: str, data: RolloutData, painted: Mapping[str, Colouring], first: RolloutData | None) -> dict[str, Any]:
     """One rollout as JSON; its body is null where it is that of the first."""
-    colouring = colouring_of(data, "strain")
-    assert colouring is not None
-    share = np.nan_to_num(np.clip(colouring.values / high, 0.0, 1.0), nan=0.0)
     cloth, lost = _mesh(data.cloth_pos, data.cloth_faces)
     garment = str(data.attributes.get("garment", ""))
     faces, piece = np.asarray(data.cloth_faces, dtype=np.int64), data.still.get("piece")
@@ -65,7 +85,7 @@ def _rollout(name: str, data: RolloutData, high: float, first: RolloutData | Non
         "name": name,
         "cloth": cloth,
         "lost": lost,
-        "strain": pack_bytes(np.rint(255.0 * share)),
+        "values": {kind: pack_bytes(_places(colouring)) for kind, colouring in painted.items()},
         "fabric": pack_bytes(np.rint(255.0 * every)),
         "body": None if same else _mesh(data.body_pos, data.body_faces)[0],
         "figures": [
@@ -90,10 +110,10 @@ def _plain(values: np.ndarray) -> list[float | None]:
     return [float(f"{value:.4g}") if np.isfinite(value) else None for value in values.tolist()]
 
 
-def _ramp(scale: Colouring) -> list[list[int]]:
-    """256 colours from no strain to the most."""
-    shades = Colouring(np.linspace(0.0, scale.high, 256)[None], 0.0, scale.high, False, "", ())
-    return np.rint(255.0 * shades.colours(0)).astype(int).tolist()
+def _places(colouring: Colouring) -> np.ndarray:
+    """(T, V) numbers of the ramp's colours."""
+    place = colouring.place(colouring.values)
+    return np.where(np.isfinite(place), np.rint((_UNKNOWN - 1) * np.nan_to_num(place)), _UNKNOWN)
 
 
 def _fill(title: str, content: dict[str, Any]) -> str:

@@ -1,14 +1,14 @@
 // Draws the rollouts of the page, lets the user turn and play them, and keeps the chart in step.
 import * as THREE from 'three';
 import { OrbitControls } from 'orbit';
-import { middleAt, positionsAt, unpackBytes, unpackMesh } from 'data';
+import { middleAt, normalsOf, positionsAt, unpackBytes, unpackMesh } from 'data';
 import { drawChart, figureNames, frameUnder } from 'figures';
 
 const byId = (id) => document.getElementById(id);
 const content = JSON.parse(byId('content').textContent);
-const PLAIN = [0.72, 0.74, 0.78];
+const PLAIN = [184, 189, 199];
 const SKIN = 0xcdb5a3;
-const OVERLAID = [null, [0.85, 0.45, 0.2], [0.3, 0.55, 0.35], [0.62, 0.28, 0.42]];
+const OVERLAID = [null, [217, 115, 51], [77, 140, 89], [158, 71, 107]];
 const state = { frame: 0, playing: false, since: 0 };
 
 /** Cloth is drawn from both sides, the inside darker. */
@@ -31,6 +31,7 @@ function surface(mesh, material) {
   const geometry = new THREE.BufferGeometry();
   geometry.setAttribute('position', new THREE.BufferAttribute(new Float32Array(mesh.width), 3));
   geometry.setAttribute('color', new THREE.BufferAttribute(new Float32Array(mesh.width).fill(1), 3));
+  geometry.setAttribute('normal', new THREE.BufferAttribute(new Float32Array(mesh.width), 3));
   geometry.setIndex(new THREE.BufferAttribute(new Uint32Array(mesh.faces), 1));
   const drawn = new THREE.Mesh(geometry, material);
   drawn.frustumCulled = false;
@@ -42,47 +43,67 @@ async function actor(rollout, first) {
   const cloth = await unpackMesh(rollout.cloth);
   const body = rollout.body ? await unpackMesh(rollout.body) : first.body;
   const made = { rollout, cloth, body, lost: new Set(rollout.lost), group: new THREE.Group() };
-  made.strain = await unpackBytes(rollout.strain);
-  made.fabric = (await unpackBytes(rollout.fabric));
+  made.values = {};
+  for (const name of Object.keys(rollout.values)) made.values[name] = await unpackBytes(rollout.values[name]);
+  made.fabric = linear(await unpackBytes(rollout.fabric));
   made.clothMesh = surface(cloth, clothMaterial());
   made.bodyMesh = surface(body, bodyMaterial());
   made.group.add(made.clothMesh, made.bodyMesh);
   return made;
 }
 
-/** Colours of the cloth's vertices in a frame, by what the user chose. */
-function paint(made, at, frame) {
-  const mode = byId('colour').value;
-  const count = made.cloth.width / 3;
-  const target = made.clothMesh.geometry.attributes.color;
-  const start = Math.min(frame, made.cloth.frames - 1) * count;
-  const tint = byId('layout').value === 'over' ? OVERLAID[at % OVERLAID.length] : null;
+/** Linear parts of colours whose parts are bytes, as the drawing library wants them. */
+function linear(bytes) {
+  const parts = new Float32Array(bytes.length);
   const colour = new THREE.Color();
+  for (let i = 0; i < bytes.length; i += 3) {
+    colour.setRGB(bytes[i] / 255, bytes[i + 1] / 255, bytes[i + 2] / 255, THREE.SRGBColorSpace).toArray(parts, i);
+  }
+  return parts;
+}
+
+/** Colours of the cloth's vertices that stay as they are, by what the user chose. */
+function dye(made, at) {
+  const target = made.clothMesh.geometry.attributes.color;
+  const overlaid = byId('layout').value === 'over' ? OVERLAID[at % OVERLAID.length] : null;
+  if (!overlaid && byId('colour').value === 'fabric') target.array.set(made.fabric);
+  else {
+    const tint = linear(overlaid ?? PLAIN);
+    for (let i = 0; i < target.array.length; i++) target.array[i] = tint[i % 3];
+  }
+  target.needsUpdate = true;
+}
+
+/** Colours of the cloth's vertices by their values in a frame. */
+function paint(made, frame, values) {
+  const target = made.clothMesh.geometry.attributes.color;
+  const count = made.cloth.width / 3;
+  const start = Math.min(frame, made.cloth.frames - 1) * count;
+  const out = target.array;
   for (let i = 0; i < count; i++) {
-    let [r, g, b] = PLAIN;
-    if (mode === 'strain') [r, g, b] = content.strain.ramp[made.strain[start + i]].map((value) => value / 255);
-    else if (tint) [r, g, b] = tint;
-    else if (mode === 'fabric') [r, g, b] = [0, 1, 2].map((c) => made.fabric[3 * i + c] / 255);
-    colour.setRGB(r, g, b, THREE.SRGBColorSpace);
-    target.setXYZ(i, colour.r, colour.g, colour.b);
+    const place = 3 * values[start + i];
+    out[3 * i] = ramp[place];
+    out[3 * i + 1] = ramp[place + 1];
+    out[3 * i + 2] = ramp[place + 2];
   }
   target.needsUpdate = true;
 }
 
 function pose(drawn, mesh, frame) {
-  const positions = drawn.geometry.attributes.position;
-  positionsAt(mesh, frame, positions.array);
-  positions.needsUpdate = true;
-  drawn.geometry.computeVertexNormals();
+  const { position, normal } = drawn.geometry.attributes;
+  positionsAt(mesh, frame, position.array);
+  normalsOf(position.array, mesh.faces, normal.array);
+  position.needsUpdate = normal.needsUpdate = true;
 }
 
+const ramp = linear(content.ramp.flat());
 const renderer = new THREE.WebGLRenderer({ canvas: byId('canvas'), antialias: true, preserveDrawingBuffer: true });
 const scene = new THREE.Scene();
 scene.background = new THREE.Color(0xf1f2f4);
 const camera = new THREE.PerspectiveCamera(35, 1, 0.02, 200);
 const controls = new OrbitControls(camera, byId('canvas'));
-const lamp = new THREE.DirectionalLight(0xffffff, 2.0);
-scene.add(new THREE.HemisphereLight(0xffffff, 0xb0a8a0, 1.6), lamp, lamp.target);
+const lamp = new THREE.DirectionalLight(0xffffff, 2.4);
+scene.add(new THREE.HemisphereLight(0xffffff, 0xb0a8a0, 1.1), lamp, lamp.target);
 let actors = [];
 let frames = 1;
 
@@ -90,11 +111,12 @@ let frames = 1;
 function show(frame, moveCamera = true) {
   const before = actors[0].centres[state.frame];
   state.frame = frame;
-  actors.forEach((made, at) => {
+  for (const made of actors) {
+    const values = made.values[byId('colour').value];
     pose(made.clothMesh, made.cloth, frame);
     pose(made.bodyMesh, made.body, frame);
-    paint(made, at, frame);
-  });
+    if (values) paint(made, frame, values);
+  }
   if (moveCamera && byId('follow').checked) {
     const shift = new THREE.Vector3(...actors[0].centres[frame]).sub(new THREE.Vector3(...before));
     camera.position.add(shift);
@@ -114,7 +136,7 @@ function draw() {
   const parts = beside ? actors.map((made) => [made]) : [actors];
   camera.aspect = width / parts.length / height;
   camera.updateProjectionMatrix();
-  lamp.position.copy(camera.position).add(new THREE.Vector3(1, 2.5, 0.5));
+  lamp.position.set(-0.8, 1, 0.4).applyQuaternion(camera.quaternion).multiplyScalar(3).add(camera.position);
   lamp.target.position.copy(controls.target);
   renderer.setScissorTest(true);
   parts.forEach((shown, at) => {
@@ -166,16 +188,18 @@ function still() {
 }
 
 function dress() {
-  const strain = byId('colour').value === 'strain';
-  const colours = content.strain.ramp.filter((_, at) => at % 15 === 0).map((rgb) => `rgb(${rgb})`);
-  byId('scale').style.display = strain ? 'block' : 'none';
-  byId('scale').innerHTML = `<i></i>strain 0 to ${+(100 * content.strain.high).toPrecision(3)}%`;
+  const scale = content.scales.find((one) => one.name === byId('colour').value);
+  const colours = content.ramp.slice(0, -1).filter((_, at) => at % 15 === 0).map((rgb) => `rgb(${rgb})`);
+  byId('scale').style.display = scale ? 'block' : 'none';
+  byId('scale').innerHTML = '<i></i><b></b>';
   byId('scale').firstChild.style.background = `linear-gradient(to right, ${colours})`;
+  byId('scale').lastChild.textContent = scale ? `${scale.title}: ${scale.low} to ${scale.high}` : '';
+  if (!scale) actors.forEach(dye);
   const beside = byId('layout').value === 'beside';
   byId('names').replaceChildren(...content.rollouts.map((rollout, at) => {
     const name = document.createElement('span');
     name.textContent = rollout.name;
-    if (!beside && OVERLAID[at % OVERLAID.length]) name.style.color = `rgb(${OVERLAID[at % OVERLAID.length].map((v) => 200 * v)})`;
+    if (!beside && OVERLAID[at % OVERLAID.length]) name.style.color = `rgb(${OVERLAID[at % OVERLAID.length].map((part) => 0.8 * part)})`;
     return name;
   }));
   for (const made of actors) made.clothMesh.material.wireframe = byId('wire').checked;
@@ -206,11 +230,12 @@ async function start() {
   for (const made of actors) scene.add(made.group);
   byId('time').max = frames - 1;
   byId('two').hidden = actors.length < 2;
+  for (const { name, label } of content.scales) byId('colour').add(new Option(label, name));
   for (const [name, title] of figureNames(content.rollouts)) byId('figure').add(new Option(title, name));
   if (!byId('figure').length) byId('chart').hidden = byId('which').hidden = true;
   const { middle, extent } = middleAt(guide(), 0);
   controls.target.set(...middle);
-  camera.position.set(middle[0], middle[1] + 0.15 * extent, middle[2] + 2.0 * extent);
+  camera.position.set(middle[0], middle[1] + 0.15 * extent, middle[2] + 1.7 * extent);
   resize();
   listen();
   dress();

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from hood.assets.material import Material
-from hood.dynamics.goals import Budget, Count, MaxStrain, Standing, TargetResidual
 from hood.dynamics.refine_table import Costs
+from hood.dynamics.stopping import Budget, Count, MaxStrain, RefinementState, TargetResidual
 from hood.losses.problem import StepProblem
 from hood.scene.cloth import build_cloth
 from hood.testing import grid, make_problem
@@ -21,8 +21,10 @@ def problem() -> StepProblem:
     return make_problem(build_cloth(*grid(5, 5, 0.2), Material()))
 
 
-def at(problem: StepProblem, iterations: int, residual: float = 1.0, stretch: float = 0.0, elapsed: float = 0.0) -> Standing:
-    return Standing(problem, (1.0 + stretch) * problem.cloth.rest_pos, iterations, residual, elapsed)
+def at(
+    problem: StepProblem, iterations: int, residual: float = 1.0, stretch: float = 0.0, elapsed: float = 0.0
+) -> RefinementState:
+    return RefinementState(problem, (1.0 + stretch) * problem.cloth.rest_pos, iterations, residual, elapsed)
 
 
 def test_a_count_counts(problem: StepProblem) -> None:
@@ -187,5 +189,5 @@ def test_values_that_mean_nothing_are_refused() -> None:
 
 
 def test_strain_of_frames_that_are_not_finite_is_missed(problem: StepProblem) -> None:
-    broken = Standing(problem, torch.full_like(problem.cloth.rest_pos, torch.nan), 3, 1.0, 0.0)
+    broken = RefinementState(problem, torch.full_like(problem.cloth.rest_pos, torch.nan), 3, 1.0, 0.0)
     assert MaxStrain(0.05, floor=3).end(broken) == {"refine_met": 0.0}

@@ -20,7 +20,7 @@ CONVERGED = 1e-4
 
 
 @dataclass(frozen=True)
-class Standing:
+class RefinementState:
     """Where the refinement of a frame stands."""
 
     problem: StepProblem
@@ -35,24 +35,24 @@ class Standing:
         return strain_metrics(self.problem.cloth, self.pos)["strain_p99"]
 
 
-class Goal(Protocol):
+class StoppingCriterion(Protocol):
     """Decides, iteration by iteration, how far a frame is refined; learns from frame to frame."""
 
     most: int  # iterations of a frame at most
     accuracy: float  # relative gradient at which every frame is done
     decides: bool  # whether it stops a frame for other reasons than ``most`` and ``accuracy``
-    wants_residual: bool  # whether it reads ``Standing.residual`` before every iteration
+    wants_residual: bool  # whether it reads ``RefinementState.residual`` before every iteration
     metrics: tuple[str, ...]  # names of what ``end`` returns
 
-    def begin(self, standing: Standing) -> bool:
+    def begin(self, state: RefinementState) -> bool:
         """Whether this frame is refined at all; asked before anything is computed for it."""
         ...
 
-    def proceed(self, standing: Standing) -> bool:
+    def proceed(self, state: RefinementState) -> bool:
         """Whether to take one more iteration."""
         ...
 
-    def end(self, standing: Standing) -> dict[str, float]:
+    def end(self, state: RefinementState) -> dict[str, float]:
         """Told where the frame ended, also one that was not refined; what there is to report."""
         ...
 
@@ -70,13 +70,13 @@ class Count:
             raise ValueError(f"refine is {count}; give 0 or more iterations")
         self.most = count
 
-    def begin(self, standing: Standing) -> bool:
+    def begin(self, state: RefinementState) -> bool:
         return self.most > 0
 
-    def proceed(self, standing: Standing) -> bool:
-        return standing.iterations < self.most
+    def proceed(self, state: RefinementState) -> bool:
+        return state.iterations < self.most
 
-    def end(self, standing: Standing) -> dict[str, float]:
+    def end(self, state: RefinementState) -> dict[str, float]:
         return {}
 
 
@@ -92,14 +92,14 @@ class TargetResidual:
             raise ValueError(f"target_rg is {target:g}; give a relative gradient > 0 (0.1: a tenth of the weight)")
         self.target, self.most, self.accuracy = target, most, min(target, CONVERGED)
 
-    def begin(self, standing: Standing) -> bool:
+    def begin(self, state: RefinementState) -> bool:
         return True
 
-    def proceed(self, standing: Standing) -> bool:
-        return not standing.residual <= self.target and standing.iterations < self.most
+    def proceed(self, state: RefinementState) -> bool:
+        return not state.residual <= self.target and state.iterations < self.most
 
-    def end(self, standing: Standing) -> dict[str, float]:
-        return {"refine_met": float(standing.residual <= self.target)}
+    def end(self, state: RefinementState) -> dict[str, float]:
+        return {"refine_met": float(state.residual <= self.target)}
 
 
 class MaxStrain:
@@ -123,17 +123,17 @@ class MaxStrain:
             raise ValueError(f"max_strain is {limit:g}; give a relative change of length > 0 (0.05: 5%)")
         self.limit, self.most, self.floor = limit, most, min(floor, most)
 
-    def begin(self, standing: Standing) -> bool:
-        return self.floor > 0 or not standing.strain <= self.limit
+    def begin(self, state: RefinementState) -> bool:
+        return self.floor > 0 or not state.strain <= self.limit
 
-    def proceed(self, standing: Standing) -> bool:
-        if standing.iterations >= self.most:
+    def proceed(self, state: RefinementState) -> bool:
+        if state.iterations >= self.most:
             return False
-        return standing.iterations < self.floor or not standing.strain <= self.limit
+        return state.iterations < self.floor or not state.strain <= self.limit
 
-    def end(self, standing: Standing) -> dict[str, float]:
-        strain = standing.strain
-        if standing.iterations > self.floor:
+    def end(self, state: RefinementState) -> dict[str, float]:
+        strain = state.strain
+        if state.iterations > self.floor:
             self.floor += 1
         elif strain <= self._COMFORT * self.limit:
             self.floor = max(self.floor - 1, 0)
@@ -194,13 +194,13 @@ class Budget:
         """What is planned for an iteration [ms]; 0 before the first, where no table says it."""
         return self._dear(self._costs, 0.0 if self.measured is None else self.measured.iteration)
 
-    def begin(self, standing: Standing) -> bool:
-        self._last = standing.elapsed
+    def begin(self, state: RefinementState) -> bool:
+        self._last = state.elapsed
         self._frames += 1
-        self._late_before += standing.elapsed > self.budget_ms
-        if self.measured is not None and self.measured.frame and not _relaxes(standing.problem):
-            self._scale = standing.elapsed / self.measured.frame
-        self._refined = self._fits(standing.elapsed + self._dear(self._setups, self.measured.setup if self.measured else 0.0))
+        self._late_before += state.elapsed > self.budget_ms
+        if self.measured is not None and self.measured.frame and not _relaxes(state.problem):
+            self._scale = state.elapsed / self.measured.frame
+        self._refined = self._fits(state.elapsed + self._dear(self._setups, self.measured.setup if self.measured else 0.0))
         if not self._refined and self.risk > 0:
             self._trust *= self._FEW_HOPE
             for past in (self._costs, self._setups):
@@ -209,18 +209,18 @@ class Budget:
                     past[index] = hope * value
         return self._refined
 
-    def proceed(self, standing: Standing) -> bool:
-        (self._costs if standing.iterations else self._setups).append(standing.elapsed - self._last)
-        self._last = standing.elapsed
+    def proceed(self, state: RefinementState) -> bool:
+        (self._costs if state.iterations else self._setups).append(state.elapsed - self._last)
+        self._last = state.elapsed
         # Before the first measurement an iteration may cost anything: one is tried.
         known = bool(self._costs) or self.measured is not None
-        fits = self._fits(standing.elapsed) if known else standing.iterations == 0
-        return fits and standing.iterations < self.most
+        fits = self._fits(state.elapsed) if known else state.iterations == 0
+        return fits and state.iterations < self.most
 
-    def end(self, standing: Standing) -> dict[str, float]:
+    def end(self, state: RefinementState) -> dict[str, float]:
         if self._refined:
-            self._endings.append(standing.elapsed - self._last)
-        late = standing.elapsed > self.budget_ms
+            self._endings.append(state.elapsed - self._last)
+        late = state.elapsed > self.budget_ms
         self._risk = min(self._risk + self._PACE * (self._LATE - late), self._MOST_RISK)
         return {}
 

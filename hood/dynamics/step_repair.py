@@ -15,7 +15,7 @@ from hood.losses.problem import StepProblem
 from hood.solver.newton import NewtonSettings, minimize
 from hood.solver.step_figures import StepFigures
 
-#: A mended step is kept if its strain p99 is higher by no more than this, or this share of it.
+#: A repaired step is kept if its strain p99 is higher by no more than this, or this share of it.
 _MORE_STRAIN, _SHARE_MORE = 0.02, 0.1
 #: Relative gradient of a step that is good enough: forces are in balance but for the cloth's own weight.
 ENOUGH = 1.0
@@ -32,7 +32,7 @@ class Limits:
 
 
 @dataclass(frozen=True)
-class Standing:
+class StepQuality:
     """How good a step is."""
 
     finite: bool
@@ -46,47 +46,47 @@ class Standing:
 
 
 @dataclass(frozen=True)
-class Mended:
+class RepairedStep:
     """What became of a step."""
 
     prediction: Prediction
     kind: str  # REFINED, SOLVED or LEFT
     iterations: int
-    before: Standing
-    after: Standing
+    before: StepQuality
+    after: StepQuality
 
 
-def standing(
+def step_quality(
     potential: Potential,
     problem: StepProblem,
     prediction: Prediction,
     figures: StepFigures | None = None,
     typical: bool = False,
-) -> Standing:
+) -> StepQuality:
     """How good the step is; ``figures`` are those of it where they have been made, ``typical`` asks for the typical vertex's.
 
     A relative gradient that the stepper knows is believed, so that nothing is computed.
     """
     pos = prediction.next_pos
     if not bool(torch.isfinite(pos).all()):
-        return Standing(False, math.nan, math.nan)
+        return StepQuality(False, math.nan, math.nan)
     if figures is None and (typical or math.isnan(prediction.residual)):
         figures = StepFigures(potential, problem, pos, prediction.acc)
     residual = prediction.residual if figures is None else figures.relative_gradient
     median = float(vertex_residual(problem, figures.gradient).median()) if typical and figures is not None else math.nan
-    return Standing(True, residual, strain_metrics(problem.cloth, pos)["strain_p99"], median)
+    return StepQuality(True, residual, strain_metrics(problem.cloth, pos)["strain_p99"], median)
 
 
 @torch.no_grad()
-def mend(
+def repair_step(
     potential: Potential,
     problem: StepProblem,
     prediction: Prediction,
-    before: Standing,
+    before: StepQuality,
     limits: Limits,
     settings: NewtonSettings,
     most: int,
-) -> Mended:
+) -> RepairedStep:
     """The step, taken further down ``potential`` by at most ``most`` iterations; where that leaves it beyond ``limits``, taken
     anew from the solver's own start. A step that the solver took (``most`` is 0) goes on from where it is, with as many
     iterations again.
@@ -111,17 +111,17 @@ def mend(
             continue  # the same step
         taken = Prediction(pos, report.acc, prediction.metrics, entered=prediction.entered)
         spent += report.iterations
-        tries.append((kind, taken, standing(potential, problem, taken)))
+        tries.append((kind, taken, step_quality(potential, problem, taken)))
         if tries[-1][2].within(limits):
             break
     better = [one for one in tries if _is_better(one[2], before)]
     if not better:
-        return Mended(prediction, LEFT, spent, before, before)
+        return RepairedStep(prediction, LEFT, spent, before, before)
     kind, taken, after = min(better, key=lambda one: (not one[2].within(limits), one[2].residual))
-    return Mended(taken, kind, spent, before, after)
+    return RepairedStep(taken, kind, spent, before, after)
 
 
-def _is_better(now: Standing, before: Standing) -> bool:
+def _is_better(now: StepQuality, before: StepQuality) -> bool:
     if not before.finite:
         return now.finite
     more = max(_MORE_STRAIN, _SHARE_MORE * before.strain)
