@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from hood.scene.cloth import Cloth
-from hood.scene.contact import Contact, Fold, find_contact, skin_distance
+from hood.scene.contact import Contact, Fold, find_contact
 from hood.scene.contact_points import PointContact, find_point_contact
-from hood.scene.entered import find_entered
+from hood.scene.entered import find_entered, skin_distance
 from hood.scene.landing import find_other_skin
 from hood.scene.layer_sides import LayerPairs, find_sides
 from hood.scene.layers import SceneLayers, find_layers, late_targets

@@ -172,16 +172,6 @@ def match_surface(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, curved:
     return match._replace(curvature=_matched_curvature(match, obstacle, incidence)) if curved else match
 
 
-def skin_distance(pos: Tensor, vertex_scene: Tensor, surface: Tensor, obstacle: Obstacle) -> Tensor:
-    """Signed distances [m] (V,) of positions (V, 3) to the obstacle with its vertices at ``surface`` (W, 3) [m]; infinite in
-    scenes without any."""
-    incidence = build_incidence(obstacle.faces, len(obstacle.pos))
-    found = surface_tree.distance(pos, vertex_scene, surface, obstacle.faces, obstacle.face_scene, incidence.adjacency)
-    if found is not None:
-        return found
-    return search_surface(pos, vertex_scene, surface, obstacle.faces, obstacle.vertex_scene, obstacle.face_scene).dist
-
-
 def find_fixed_contact(
     pos: Tensor,
     vertex_scene: Tensor,

@@ -12,8 +12,10 @@ from dataclasses import replace
 
 from torch import Tensor
 
+from hood.mesh import surface_tree
+from hood.mesh.proximity import build_incidence, search_surface
 from hood.mesh.surface_tree import Match
-from hood.scene.contact import Contact, Fold, match_surface, skin_distance
+from hood.scene.contact import Contact, Fold, match_surface
 from hood.scene.state import Obstacle
 
 #: Vertices no deeper than this [m] have not entered: contact gives way by some millimetres.
@@ -50,6 +52,16 @@ def find_entered(
     both = {name: getattr(known, name).index_copy(0, rows, values) for name, values in match._asdict().items()}
     valid = entered | known.valid if len(contacts) > 1 else entered
     return Fold(Contact(**both, valid=valid))
+
+
+def skin_distance(pos: Tensor, vertex_scene: Tensor, surface: Tensor, obstacle: Obstacle) -> Tensor:
+    """Signed distances [m] (V,) of positions (V, 3) to the obstacle with its vertices at ``surface`` (W, 3) [m]; infinite in
+    scenes without any."""
+    incidence = build_incidence(obstacle.faces, len(obstacle.pos))
+    found = surface_tree.distance(pos, vertex_scene, surface, obstacle.faces, obstacle.face_scene, incidence.adjacency)
+    if found is not None:
+        return found
+    return search_surface(pos, vertex_scene, surface, obstacle.faces, obstacle.vertex_scene, obstacle.face_scene).dist
 
 
 def _match_at_end(next_pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle) -> Match:

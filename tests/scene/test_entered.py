@@ -14,7 +14,8 @@ from hood.losses.potential import default_potential
 from hood.losses.problem import StepProblem
 from hood.mesh import surface_tree
 from hood.scene.cloth import build_cloth
-from hood.scene.contact import find_contact, skin_distance
+from hood.scene.contact import find_contact
+from hood.scene.entered import skin_distance
 from hood.scene.state import State, StepInput, concatenate_obstacles
 from hood.solver.newton import NewtonSettings, minimize
 from hood.testing import grid, sphere
