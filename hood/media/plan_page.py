@@ -14,7 +14,9 @@ import numpy as np
 from hood.assets.files.atomic import write_atomically
 from hood.media.page import paragraph, section, table, whole_page
 
-_STYLE = "figure img { max-width: 100%; } dt { font-weight: 600; margin-top: .8em; } td { max-width: 34em; white-space: normal; }"
+_STYLE = (
+    "figure img { max-width: 100%; } dt { font-weight: 600; margin-top: .8em; } td { max-width: 34em; white-space: normal; }"
+)
 #: Pixels of a picture, and how many parts are shown.
 _WIDTH, _HEIGHT, SHOWN = 360, 480, 3
 
@@ -76,8 +78,8 @@ def _of_part(plan: Mapping[str, Any], name: str) -> str:
         return f"This rollout has no {name}, or it was not among the parts that were measured."
     if row.get("saved") is None:
         return f"It is {row['decision']}: {row['reason']}."
-    cost = f"A frame takes {plan['full']['ms']:.1f} ms with it and {row['ms']:.1f} ms without it in the same windows"
-    return f"It is {row['decision']}: {row['reason']}. {cost}."
+    saved = f"{row['saved'] * plan['full']['ms']:.1f} ms of the {plan['full']['ms']:.1f} ms of a frame"
+    return f"It is {row['decision']}: {row['reason']}. Without it {saved} would be saved, as measured here."
 
 
 def _mesh(facts: Mapping[str, Any]) -> str:
