@@ -103,8 +103,8 @@ def decide(
         absent: parts that nothing in the scene uses, with the reason.
         rivals: parts of which at most one can be left out.
         stay: parts that are never left out, and why.
-        priced: parts that come back where they are worth more than is accepted; by γ, they are left out only where they are worth
-            :data:`HEADROOM` times less, since a step that is taken twice costs more than any part saves.
+        priced: parts that come back where they are worth more than is accepted; by γ, they are left out only where they are
+            worth :data:`HEADROOM` times less, since a step that is taken twice costs more than any part saves.
         measure_together: the full model's and the combination's effect, measured side by side.
     """
     full = effects[""]

@@ -41,8 +41,8 @@ def write_page(path: Path, plan: Mapping[str, Any], sentence: str, differences: 
     parts += [section("Questions", _questions(plan)), section("Every part", _table(plan)), _pictures(differences)]
     where = ", ".join(f"{one['measured_from']} ({one['reason']})" for one in plan["windows"])
     method = (
-        f"From frames {where}, {plan['frames']} steps each. In every window the full model and each variant take the same steps "
-        "from the same state. γ is the energy that the first step leaves above the exact one, in units of what it costs to be "
+        f"From frames {where}, {plan['frames']} steps each. In every window the full model and each variant take the same "
+        "steps from the same state. γ is the energy that the first step leaves above the exact one, in units of what it costs to be "
         "wrong by 1 g everywhere; mm is the distance from the full model when the window ends. Parts that are far off, or kept "
         "anyway, are looked at in the first window alone."
     )
@@ -85,8 +85,8 @@ def _of_part(plan: Mapping[str, Any], name: str) -> str:
 def _mesh(facts: Mapping[str, Any]) -> str:
     edge = facts["edge_mm"]
     text = (
-        f"The mesh has {facts['vertices']:,} vertices and edges of {edge:.0f} mm. A fold takes about four edges, so it shows folds "
-        f"wider than {4 * edge:.0f} mm and none that are narrower; no setting changes that."
+        f"The mesh has {facts['vertices']:,} vertices and edges of {edge:.0f} mm. A fold takes about four edges, so it shows "
+        f"folds wider than {4 * edge:.0f} mm and none that are narrower; no setting changes that."
     )
     finer = facts["finer"]
     if not finer:
