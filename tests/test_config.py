@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from hood.assets.material import Material
-from hood.config import ConfigError, build, groups, load_config, options, plain, require_choice, save_run_record
+from hood.config import ConfigError, build, groups, load_config, options, plain, require_choice, save_run_record, with_words
 from hood.dynamics.simulator import Simulator
 from hood.losses.potential import Potential, default_potential
 from hood.training.curriculum import WarmupCosine
@@ -158,3 +158,12 @@ def test_run_record(tmp_path: Path) -> None:
     record = json.loads((tmp_path / "run" / "versions.json").read_text())
     assert record["seed"] == 5
     assert {"hood", "python", "torch", "numpy", "platform"} <= set(record)
+
+
+def test_words_more_are_those_of_the_command_line():
+    config = load_config("rollout", ["garment=tank"])
+    words = ["cloth_contact=off", "losses.terms.bending=null", "solver.target_rg=0.1", "gravity=0"]
+    assert with_words(config, words) == load_config("rollout", ["garment=tank", *words])
+    assert config == load_config("rollout", ["garment=tank"])
+    with pytest.raises(ConfigError, match="gravty=0: no such key"):
+        with_words(config, ["gravty=0"])

@@ -145,7 +145,7 @@ def _probe(ready: Setup, words: list[str], own: DictConfig, tolerance: Tolerance
         return found[""], found["all"]
 
     rivals = [[part.name for part in parts if part.rivals == name] for name in sorted({part.rivals for part in parts} - {""})]
-    decision = decide(effects, absent, rivals, tolerance, together, stay)
+    decision = decide(effects, absent, rivals, tolerance, together, stay, {part.name for part in parts if part.term})
     plan = _record(ready, words, parts, begun, effects, price, decision, tolerance, frames)
     watch = _watch(full, _variant(plan["chosen"], ready), [effects[name] for name in decision.left_out], tolerance)
     return plan | {"watch": watch}, differences(ready, begun, effects, frames)

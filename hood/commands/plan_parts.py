@@ -94,7 +94,7 @@ _TERMS: tuple[tuple[Part, Callable[[DictConfig], bool]], ...] = (
     (
         Part(
             "cloth contact", "layers of cloth stay apart", ("cloth_contact=off",), "layers",
-            stays="where layers meet nothing it is a check of that alone already, and without the check nobody would know",
+            stays="where layers meet nothing it is only the check that they do, which nothing can replace",
         ),
         acts,
     ),

@@ -88,7 +88,8 @@ class WatchedStepper:
     the full model takes that very step, and tells what the lean one's was worth: how much higher the full potential is there.
     If that is below the limit by :data:`MARGIN`, the bounds were too wide: what they overstate by is known for the next
     :data:`REMEMBERED` steps, of the energy that the price came from and of the forces that were there, up to :data:`GROWTH`
-    times as large at a vertex; the next step is the lean model's. Else the full model takes the steps after it too.
+    times as large at a vertex (of what is new, its square root); the next step is the lean model's. Else the full model takes
+    the steps after it too.
     After ``hold`` of them ``lean`` is tried again; where that fails at once, after twice as many, :data:`LONGEST` at most.
 
     What keeps layers of cloth apart is always priced in full: through each other, they are worth nothing any more.
@@ -215,7 +216,7 @@ class WatchedStepper:
         if known.left > 1:
             self._known[name] = replace(known, left=known.left - 1)
         seen = float(torch.minimum(bounds, known.forces).sum())
-        return seen / known.ratio + whole - seen
+        return seen / known.ratio + (whole - seen) / known.ratio**0.5
 
     @staticmethod
     def _told(prediction: Prediction, price: float, full: bool) -> Prediction:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -16,6 +16,8 @@ from hood.evaluation.leaving_out import Effect
 LEAST_SAVING = 0.03
 #: A part whose error is so many times what is accepted is not looked at in further windows.
 HOPELESS = 10.0
+#: How far below what is accepted a part has to be that is priced in every frame.
+HEADROOM = 10.0
 #: Quantile over the windows that γ is judged by.
 QUANTILE = 0.95
 
@@ -89,6 +91,7 @@ def decide(
     tolerance: Tolerance,
     measure_together: Callable[[Sequence[str]], tuple[Effect, Effect]],
     stay: Mapping[str, str] = MappingProxyType({}),
+    priced: Collection[str] = (),
 ) -> Decision:
     """The cheapest combination whose error stays within the tolerance, as far as one search from the top finds it.
 
@@ -100,6 +103,8 @@ def decide(
         absent: parts that nothing in the scene uses, with the reason.
         rivals: parts of which at most one can be left out.
         stay: parts that are never left out, and why.
+        priced: parts that come back where they are worth more than is accepted; by γ, they are left out only where they are
+            worth :data:`HEADROOM` times less, since a step that is taken twice costs more than any part saves.
         measure_together: the full model's and the combination's effect, measured side by side.
     """
     full = effects[""]
@@ -113,6 +118,10 @@ def decide(
             verdicts[name] = Verdict("kept", f"without it {tolerance.say(error)}")
         elif saving < LEAST_SAVING:
             verdicts[name] = Verdict("kept", f"it costs no time that can be measured ({100 * saving:+.0f}% of a frame)")
+        elif name in priced and tolerance.unit == "gamma" and error * HEADROOM > tolerance.value:
+            verdicts[name] = Verdict(
+                "kept", f"without it {tolerance.say(error)}, so near to the limit that it would come back often"
+            )
         elif name in stay:
             said = f"{tolerance.say(error)} without it here, but {stay[name]}"
             verdicts[name] = Verdict("kept", said)

@@ -22,6 +22,7 @@ from hood.evaluation.gap import REFERENCE
 from hood.evaluation.windows import Window
 from hood.losses.potential import Potential, relative_gradient, scale
 from hood.losses.problem import StepProblem
+from hood.mesh.surface_tree import forget_searches
 from hood.scene.scene import Scene, recentre
 from hood.scene.state import State
 from hood.solver.iterate import in_double
@@ -118,6 +119,7 @@ def take_steps(variant: Variant, begun: Begun, num_frames: int, effect: Effect) 
     prepared, first = prepare_stepper(stepper, scene), state.pos
     # On one thread what other processes take is no time of a frame's.
     clock = time.process_time if torch.get_num_threads() == 1 and state.pos.device.type == "cpu" else time.perf_counter
+    forget_searches()  # those of the variant before were of the same state
     for index in range(num_frames):
         began = clock()
         step = begun.step.step if index == 0 else scene.step_input(begun.frame + index, state)

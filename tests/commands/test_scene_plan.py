@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import html
 import json
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +55,32 @@ def test_the_printed_table_names_parts_and_command(made: Path, capsys: pytest.Ca
     row = read(made)["rows"][0]
     assert row["command"].startswith("hood plan garment=tank")
     assert "parts=[bending]" in row["command"]
+
+
+def test_a_line_is_made_again_by_the_command_beside_it(made: Path, tmp_path: Path) -> None:
+    row = next(row for row in read(made)["rows"] if row["part"] == "bending")
+    words = shlex.split(row["command"])
+    assert words[:2] == ["hood", "plan"]
+    assert main([*words[1:], f"output={tmp_path}"]) == 0
+    (again,) = read(tmp_path / "plan.json")["rows"]
+    assert {key: again[key] for key in ("force", "gamma_p50", "gamma_p95", "mm")} == {
+        key: row[key] for key in ("force", "gamma_p50", "gamma_p95", "mm")
+    }
+
+
+def test_the_page_lies_beside_the_plan_and_answers(made: Path) -> None:
+    page = (made.parent / "plan.html").read_text(encoding="utf-8")
+    rows = {row["part"]: row for row in read(made)["rows"]}
+    assert html.escape(rows["bending"]["command"]) in page
+    assert "edges of" in page
+    assert "dress_4k" not in page
+    assert "tank_4k" in page
+
+
+def test_what_is_hopeless_or_stays_is_looked_at_once(made: Path) -> None:
+    rows = {row["part"]: row for row in read(made)["rows"]}
+    assert (rows["body contact"]["windows"], rows["cloth contact"]["windows"]) == (1, 1)
+    assert rows["bending"]["windows"] == 2
 
 
 def positions(path: Path) -> np.ndarray:

@@ -131,7 +131,7 @@ def test_a_model_that_fails_at_once_is_tried_less_often(tank_scene: Scene) -> No
 
 def test_a_price_that_was_too_high_is_known_from_then_on(tank_scene: Scene) -> None:
     """The bound of bending is several times its γ: one step by the full model, and forces like those are priced by what they
-    were worth. Forces elsewhere are priced in full."""
+    were worth."""
     probe = rolled(watched(tank_scene, without("bending"), 1e9), tank_scene, 8)
     bound = max(frame.metrics["plan_price"] for frame in probe[1:])
     stepper = watched(tank_scene, without("bending"), 0.6 * bound, hold=4)
@@ -142,10 +142,14 @@ def test_a_price_that_was_too_high_is_known_from_then_on(tank_scene: Scene) -> N
     assert 1.0 < known.ratio <= MOST_OVERSTATED
     assert known.left == REMEMBERED - 3
     seen = stepper._priced("bending", known.forces / GROWTH)
-    stepper._known["bending"] = known
-    elsewhere = (known.forces / GROWTH).roll(300)
     assert seen == pytest.approx(float(known.forces.sum()) / GROWTH / known.ratio)
-    assert stepper._priced("bending", elsewhere) > 1.5 * seen
+
+
+def test_forces_where_there_were_none_are_priced_higher(tank_scene: Scene) -> None:
+    stepper, forces = watched(tank_scene, without("bending"), 0.01), torch.tensor([2.0, 0.0], dtype=torch.float64)
+    stepper._known["bending"] = _Known(16.0, forces, 9)
+    assert stepper._priced("bending", torch.tensor([1.0, 3.0], dtype=torch.float64)) == pytest.approx(1.0 / 16.0 + 3.0 / 4.0)
+    assert stepper._priced("bending", torch.tensor([5.0, 0.0], dtype=torch.float64)) == pytest.approx(2.0 / 16.0 + 3.0 / 4.0)
 
 
 def test_what_was_known_of_a_price_is_forgotten(tank_scene: Scene) -> None:

@@ -90,3 +90,26 @@ def test_gamma_is_what_is_lost_beside_the_full_models_own() -> None:
     found = decide(effects, {}, [], Tolerance(0.01, "gamma"), lambda names: (network, effects["idle"]))
     assert found.left_out == ("idle",)
     assert found.verdicts["needed"].decision == "kept"
+
+
+def test_of_hopeless_parts_the_first_windows_say_enough() -> None:
+    tolerance = Tolerance(0.01, "gamma")
+    assert tolerance.hopeless(Effect([0.2], [1.0], [1.0]), FULL)
+    assert not tolerance.hopeless(Effect([0.05], [1.0], [1.0]), FULL)
+    assert tolerance.hopeless(Effect([float("nan")], [1.0], [1.0]), FULL)
+    assert (tolerance.text, Tolerance(5.0, "mm").text) == ("0.01", "5mm")
+
+
+def test_a_part_saves_against_the_same_windows() -> None:
+    full = Effect([0.0, 0.0], [0.0, 0.0], [4.0, 10.0])
+    assert Effect([0.0], [0.0], [3.0]).saving(full) == 0.25
+    assert Effect([0.0, 0.0], [0.0, 0.0], [3.0, 4.0]).saving(full) == 0.5
+
+
+def test_what_is_priced_in_every_frame_needs_headroom() -> None:
+    effects = {"": FULL, "a": effect(5e-3, 6.0), "b": effect(5e-4, 6.0)}
+    found = decide(effects, {}, [], Tolerance(0.01, "gamma"), lambda names: (FULL, effects["b"]), priced={"a", "b"})
+    assert found.left_out == ("b",)
+    assert "come back often" in found.verdicts["a"].reason
+    by_length = decide(effects, {}, [], Tolerance(100.0, "mm"), lambda names: (FULL, effects["b"]), priced={"a", "b"})
+    assert by_length.left_out == ("a", "b")
