@@ -84,6 +84,22 @@ class Decision:
     together: Effect | None
 
 
+def _why_kept(
+    name: str, effect: Effect, full: Effect, tolerance: Tolerance, stay: Mapping[str, str], priced: Collection[str]
+) -> str:
+    """Why a part stays, by what was measured of it alone; "" where it may go."""
+    error, saving = tolerance.error(effect, full), effect.saving(full)
+    if error > tolerance.value:
+        return f"without it {tolerance.say(error)}"
+    if saving < LEAST_SAVING:
+        return f"it costs no time that can be measured ({100 * saving:+.0f}% of a frame)"
+    if name in stay:
+        return f"{tolerance.say(error)} without it here, but {stay[name]}"
+    if name in priced and tolerance.unit == "gamma" and error * HEADROOM > tolerance.value:
+        return f"without it {tolerance.say(error)}, so near to the limit that it would come back often"
+    return ""
+
+
 def decide(
     effects: Mapping[str, Effect],
     absent: Mapping[str, str],
@@ -113,20 +129,11 @@ def decide(
     for name, effect in effects.items():
         if not name or name in absent:
             continue
-        error, saving = tolerance.error(effect, full), effect.saving(full)
-        if error > tolerance.value:
-            verdicts[name] = Verdict("kept", f"without it {tolerance.say(error)}")
-        elif saving < LEAST_SAVING:
-            verdicts[name] = Verdict("kept", f"it costs no time that can be measured ({100 * saving:+.0f}% of a frame)")
-        elif name in priced and tolerance.unit == "gamma" and error * HEADROOM > tolerance.value:
-            verdicts[name] = Verdict(
-                "kept", f"without it {tolerance.say(error)}, so near to the limit that it would come back often"
-            )
-        elif name in stay:
-            said = f"{tolerance.say(error)} without it here, but {stay[name]}"
-            verdicts[name] = Verdict("kept", said)
+        reason = _why_kept(name, effect, full, tolerance, stay, priced)
+        if reason:
+            verdicts[name] = Verdict("kept", reason)
         else:
-            passing[name] = saving
+            passing[name] = effect.saving(full)
     for group in rivals:
         ranked = sorted((name for name in group if name in passing), key=lambda name: -passing[name])
         for name in ranked[1:]:

@@ -43,8 +43,8 @@ def write_page(path: Path, plan: Mapping[str, Any], sentence: str, differences: 
     method = (
         f"From frames {where}, {plan['frames']} steps each. In every window the full model and each variant take the same "
         "steps from the same state. γ is the energy that the first step leaves above the exact one, in units of what it costs "
-        "to be wrong by 1 g everywhere; mm is the distance from the full model when the window ends. Parts that are far off, or "
-        "kept anyway, are looked at in the first window alone."
+        "to be wrong by 1 g everywhere; mm is the distance from the full model when the window ends. Parts that are far off, "
+        "or kept anyway, are looked at in the first window alone."
     )
     parts.append(section("How it was measured", paragraph(method)))
     write_atomically(path, whole_page("What this scene needs", "".join(parts), _STYLE).encode())
