@@ -166,11 +166,13 @@ class Scene:
         if bool(self.cloth.pinned.any()):
             pins = self.motion.skinned(self.garment, frame if relaxing else frame + 1, origin)
         dt = RELAXING_DT if relaxing else self.dt
+        time = (frame if relaxing else frame + 1) * self.dt
         return StepInput(
             dt=torch.tensor([dt], dtype=state.pos.dtype, device=state.pos.device),
             obstacle=self.motion.obstacle(frame, origin, static=relaxing),
             pin_target=pins,
             attachments=attachments,
+            time=state.pos.new_tensor([time]),
         )
 
 
@@ -257,7 +259,15 @@ def concatenate_step_inputs(steps: Sequence[StepInput], vertex_counts: Sequence[
         obstacle=concatenate_obstacles(obstacles) if obstacles else None,
         pin_target=pins,
         attachments=_concatenate_attachments([step.attachments for step in steps], vertex_counts),
+        time=_concatenate_times(steps),
     )
+
+
+def _concatenate_times(steps: Sequence[StepInput]) -> Tensor | None:
+    """Steps that do not say are at 0, as alone."""
+    if all(step.time is None for step in steps):
+        return None
+    return torch.cat([torch.zeros_like(step.dt) if step.time is None else step.time.to(step.dt) for step in steps])
 
 
 def _concatenate_attachments(items: Sequence[Attachments | None], vertex_counts: Sequence[int]) -> Attachments | None:
