@@ -21,6 +21,7 @@ from hood.commands.guarding import check_guard
 from hood.commands.motion import make_motion
 from hood.commands.plan_file import read_watch
 from hood.commands.refinement import AUTO, check_refinement, chosen, refined
+from hood.commands.sizes import checked_sizes
 from hood.commands.steppers import PLAIN, make_network, make_solver, option_of
 from hood.config import ConfigError, build, load_config, require_choice
 from hood.dynamics.captured import MODES, network_of
@@ -52,6 +53,7 @@ def check_config(config: DictConfig) -> None:
     require_choice(config, "settle", SETTLE_CHOICES)
     _check_numbers(config)
     checked_fabrics(config)
+    checked_sizes(config)
     require_choice(config, "kernels", (AUTO, *KERNELS))
     option_of(config)
     require_choice(config, "step", (PLAIN, *MODES))
@@ -114,7 +116,7 @@ def make_scene(config: DictConfig, garment: Garment | None = None, material: Mat
     order = layer_order(config.layers, names_of(config.garment)) if garment is None else None
     garment = read_outfit(config.garment if garment is None else garment, motion, bool(config.triangulate), config.pins)
     fabric = fabric_of(config, garment, motion) if material is None else material
-    scene = replace(dress(garment, motion, fabric), layers=order)
+    scene = replace(dress(garment, motion, fabric, checked_sizes(config)), layers=order)
     found = misplacement(scene)
     if found is not None and found.grave:
         raise ValueError(
