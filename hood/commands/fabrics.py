@@ -39,7 +39,9 @@ def checked_fabrics(config: DictConfig) -> dict[str, str]:
     if value is None:
         return {}
     if not isinstance(value, dict) or not all(isinstance(fabric, str) for fabric in value.values()):
-        raise ConfigError(f"fabrics={value}: give fabrics by part, such as fabrics={{below_waistband:silk,above_waistband:denim}}")
+        raise ConfigError(
+            f"fabrics={value}: give fabrics by part, such as fabrics={{below_waistband:silk,above_waistband:denim}}"
+        )
     parts = {str(part): str(fabric) for part, fabric in value.items()}
     known = options("material")
     for part, fabric in parts.items():

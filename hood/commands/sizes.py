@@ -26,7 +26,9 @@ def checked_sizes(config: DictConfig) -> Sizes:
         key = f"size={plain(config.size)} size_end={end} size_seconds={config.size_seconds}"
         raise ConfigError(f"{key}: {error}") from error
     if sizes.changing and str(config.step) != "plain":
-        raise ConfigError(f"size_end={end}: step={config.step} has fixed shapes, which a garment that grows has not; use step=plain")
+        raise ConfigError(
+            f"size_end={end}: step={config.step} has fixed shapes, which a garment that grows has not; use step=plain"
+        )
     return sizes
 
 
@@ -46,8 +48,8 @@ def describe_ease(summary: Mapping[str, Any]) -> list[str]:
     for name, when in (("first", "frame 0"), ("last", "the last frame")):
         ease = found[name]
         low, middle, high = (1e3 * value for value in ease["gap"])
-        words.append(
-            f"{when}: {ease['word']} (skin {low:.0f}, {middle:.0f}, {high:.0f} mm away at p5, p50, p95; on the skin "
-            f"{100 * ease['on_skin']:.0f}%, stretched by {100 * ease['stretch']:.1f}% there; {100 * ease['slid']:.0f} cm down)"
-        )
+        skin = f"skin {low:.0f}, {middle:.0f}, {high:.0f} mm away at p5, p50, p95; on the skin {100 * ease['on_skin']:.0f}%"
+        skin = skin if low == low else "no skin within 10 cm"
+        stretched = f"stretched by {100 * ease['stretch']:.1f}% there; upper rim {100 * ease['slid']:.0f} cm down"
+        words.append(f"{when}: {ease['word']} ({skin}, {stretched})")
     return ["size, " + "; ".join(words)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -115,7 +115,7 @@ class Wind:
         return (1.0 + gust).unsqueeze(1) * mean
 
 
-def air(velocity: float | Sequence[float] | None = None, **settings: float) -> Wind | None:
+def air(velocity: float | Sequence[float] | None = None, **settings: Any) -> Wind | None:
     """The term of a config; None, which a potential leaves out, where there is no air.
 
     Args:
@@ -128,7 +128,9 @@ def air(velocity: float | Sequence[float] | None = None, **settings: float) -> W
     gusts = settings.get("gusts", 0.0)
     if velocity is None:
         if gusts:
-            raise ValueError(f"wind: gusts is {gusts}, but there is no wind that they could be a share of; give wind=3, or gusts=0")
+            raise ValueError(
+                f"wind: gusts is {gusts}, but there is no wind that they could be a share of; give wind=3, or gusts=0"
+            )
         return None
     if isinstance(velocity, (int, float)):
         velocity = (0.0, 0.0, 0.0 - float(velocity))

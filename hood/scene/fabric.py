@@ -123,9 +123,7 @@ class FabricMap:
         return np.broadcast_to(values, (self._counts[place],))
 
 
-def patchwork(
-    material: Material, parts: Sequence[tuple[np.ndarray, Material]], pos: np.ndarray, faces: np.ndarray
-) -> Material:
+def patchwork(material: Material, parts: Sequence[tuple[np.ndarray, Material]], pos: np.ndarray, faces: np.ndarray) -> Material:
     """A fabric of which some faces are others, each property a field on faces.
 
     Away from the seams every part is what a garment of its own fabric would be. The bend of an edge between two fabrics is the

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -81,7 +82,8 @@ def resized(cloth: Cloth, before: tuple[float, float, float], now: tuple[float, 
     if len(set(share.tolist())) > 1:
         change = geometry.dihedral_angles(pos, hinges) - geometry.dihedral_angles(cloth.rest_pos.double(), hinges)
         real["rest_angle"] = cloth.rest_angle.double() + change
-    return replace(cloth, **{name: value.to(cloth.rest_pos.dtype) for name, value in real.items()})
+    rounded: dict[str, Any] = {name: value.to(cloth.rest_pos.dtype) for name, value in real.items()}
+    return replace(cloth, **rounded)
 
 
 def _three(size: Size) -> tuple[float, float, float]:

@@ -316,7 +316,9 @@ class SceneEngine:
             if damping is None:
                 setattr(self.values, f"{kind}_rate", None)
             else:
-                self._point(**{f"{kind}_{name}": elements.padded(a) for name, a in zip(("rate", "before"), damping, strict=True)})
+                self._point(
+                    **{f"{kind}_{name}": elements.padded(a) for name, a in zip(("rate", "before"), damping, strict=True)}
+                )
 
     def _take_layers(self, scene: SceneLayers | None) -> None:
         self.layers = scene

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from hood.losses.attachment import Attachment
 from hood.losses.collision import CentroidCollision, Collision
+from hood.losses.damping import StretchDamping
 from hood.losses.friction import CodedFriction, Friction, LaggedFriction, WeightFriction, mollified_norm
-from hood.losses.damping import BendDamping, StretchDamping
 from hood.losses.gravity import Gravity
 from hood.losses.inertia import Inertia
 from hood.losses.potential import Potential, Term
@@ -105,7 +105,8 @@ class VertexForces:
 
     def take(self, rows: Tensor) -> VertexForces:
         """Those of some vertices."""
-        walls, grips, drags = (tuple(one.take(rows) for one in kind) for kind in (self.walls, self.grips, self.drags))
+        walls, grips = tuple(wall.take(rows) for wall in self.walls), tuple(grip.take(rows) for grip in self.grips)
+        drags = tuple(drag.take(rows) for drag in self.drags)
         return VertexForces(self.inertia[rows], self.stiffness[rows], self.weight[rows], walls, grips, drags)
 
     def without_walls(self) -> VertexForces:

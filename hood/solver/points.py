@@ -112,8 +112,8 @@ class PointBlocks:
 
 
 def point_blocks(pattern: BlockPattern, vertices: np.ndarray, weights: Tensor, unknown: np.ndarray) -> PointBlocks:
-    """Blocks of points at ``vertices`` (N, 3) with ``weights`` (N, 3); ``unknown`` (V,) are the numbers of the free vertices, -1
-    for the others."""
+    """Blocks of points at ``vertices`` (N, 3) with ``weights`` (N, 3); ``unknown`` (V,) are the numbers of the free vertices,
+    -1 for the others."""
     corners, pairs = unknown[vertices], list(product(range(3), repeat=2))
     target = np.stack([pattern.triples(corners[:, a], corners[:, b]) for a, b in pairs], axis=1).reshape(-1)
     kept = torch.as_tensor(np.flatnonzero(target >= 0), device=weights.device)

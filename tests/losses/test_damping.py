@@ -46,7 +46,7 @@ def test_from_rest_it_is_the_elastic_energy_times_time_over_dt(damping, elastic)
 
 
 def test_stress_opposes_the_rate_of_strain():
-    """A sheet that is stretched and goes on stretching is held back by more than its elastic force, one that returns by less."""
+    """A sheet that is stretched and goes on stretching is held back by more than its elastic force, one that returns is not."""
     cloth = build_cloth(*grid(4, 4, 0.3), Material(lame_lambda=0.0), dtype=F64)
     start = cloth.rest_pos * torch.tensor([1.1, 1.0, 1.0])
     problem, rest_edge = make_problem(cloth, start), cloth.rest_pos[:, 0] > 0.29

@@ -21,11 +21,8 @@ from hood.solver.newton import NewtonSettings, minimize, run
 from hood.solver.plan import plan_for
 from hood.testing import without_values
 
-
 POTENTIAL = default_potential()
-BLOWN = POTENTIAL.with_terms(
-    wind=Wind([3.0, 1.0, -2.0]), stretch_damping=StretchDamping(2e-3), bend_damping=BendDamping(2e-3)
-)
+BLOWN = POTENTIAL.with_terms(wind=Wind([3.0, 1.0, -2.0]), stretch_damping=StretchDamping(2e-3), bend_damping=BendDamping(2e-3))
 
 
 def problem_of(scene: Scene, frame: int = 2) -> StepProblem:

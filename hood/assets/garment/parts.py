@@ -18,8 +18,8 @@ _STRENGTH = 0.5
 
 
 def part_faces(part: str, garment: Garment, body: Body | None) -> np.ndarray:
-    """(F,) bool: the faces of a part of ``garment``. Where it borders on others, a face is of the side of its centre, or of most
-    of its corners.
+    """(F,) bool: the faces of a part of ``garment``. Where it borders on others, a face is of the side of its centre, or of
+    most of its corners.
 
     Args:
         part: the name of a garment of an outfit; ``above_JOINT`` or ``below_JOINT``, by the height of the centre in T-pose, the
