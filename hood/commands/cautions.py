@@ -18,7 +18,8 @@ def scene_cautions(stepper: Stepper, scene: Scene, potential: Potential, name: s
     """Of a rollout: one sentence on values outside of what the network ``name`` was trained for, and one on a potential that
     it does not look at. None where a solver takes the steps."""
     betas = scene.motion.betas if isinstance(scene.motion, BodyMotion) else None
-    asked = scene_conditions(scene.garment, scene.cloth, scene.dt, potential, betas, float(stepper.gravity.norm()))
+    gravity = float(stepper.gravity.norm())
+    asked = scene_conditions(scene.garment, scene.cloth, scene.dt, potential, betas, gravity, scene.sizes)
     way_out = "stepper=newton needs no weights" + ("" if _is_refined(stepper) else ", refine=10 corrects every step")
     sentences = []
     strange = strange_values(stepper, {scene.garment.name: asked})

@@ -34,13 +34,16 @@ from hood.commands.plan_auto import planned, without_accuracy
 from hood.commands.plan_file import plan_mode, plan_path, plan_sentences, rollout_config, summarise_plan
 from hood.commands.refinement import exported
 from hood.commands.setup import Setup, check_config, make_stepper, set_up, solves_in_double
+from hood.commands.sizes import describe_ease, summarise_ease
 from hood.commands.summary import describe, describe_all, summarise
 from hood.commands.verdict import exit_code
 from hood.config import plain, save_run_record
 from hood.dynamics.captured import network_of
+from hood.dynamics.ease import Ease, measure_ease
 from hood.dynamics.recorder import RolloutWriter, read_rollout, still_of
 from hood.dynamics.rollout import metric_names, simulate
 from hood.dynamics.stepper import Stepper
+from hood.scene.sizing import Sizes
 from hood.training import distributed
 
 
@@ -105,13 +108,17 @@ def _run_there(ready: Setup, asked: DictConfig, digest: str, warned: list[str], 
     folder = output_folder(config)
     (folder / "summary.json").unlink(missing_ok=True)  # its presence says that everything is there
     save_run_record(folder, config, int(config.seed))
-    interrupted = _simulate_to_disk(ready, digest, folder / "rollout.h5", asked)
+    eases: list[Ease | None] = []
+    interrupted = _simulate_to_disk(ready, digest, folder / "rollout.h5", asked, eases)
     summary = summarise(folder / "rollout.h5")
+    if eases:
+        summary |= summarise_ease(eases[0], eases[-1])
     warn(guard_sentences(summary.get("guard")))
     summary["choice"] = asdict(ready.choice)
     summary |= summarise_plan(folder / "rollout.h5", config)
     _keep_plan(config, folder)
     print(describe(summary))
+    _tell(describe_ease(summary))
     _tell(plan_sentences(summary))
     if advise:
         _tell(advice(config, scene, summary, _first_positions(folder / "rollout.h5")))
@@ -180,8 +187,9 @@ def _finished(config: DictConfig, digest: str, folder: Path) -> dict[str, Any] |
     return summary if "sound" in summary else summarise(folder / "rollout.h5")
 
 
-def _simulate_to_disk(ready: Setup, digest: str, path: Path, asked: DictConfig) -> bool:
-    """Stream the rollout into ``path``; True when the user interrupted it. ``asked`` is the config with ``auto`` in it."""
+def _simulate_to_disk(ready: Setup, digest: str, path: Path, asked: DictConfig, eases: list[Ease | None]) -> bool:
+    """Stream the rollout into ``path``; True when the user interrupted it. ``asked`` is the config with ``auto`` in it. Where a
+    size was asked for, how the garment sat is added to ``eases``, at the beginning and the end."""
     config, scene, stepper, potential = ready.config, ready.scene, ready.stepper, ready.potential
     guard = make_guard(config, stepper, potential)
     count = min(int(config.num_frames), scene.num_frames)
@@ -236,6 +244,8 @@ def _simulate_to_disk(ready: Setup, digest: str, path: Path, asked: DictConfig) 
                 fields = {name: values.numpy() for name, values in frame.fields.items()}
                 writer.append(frame.world_pos.numpy(), frame.body_pos.numpy(), frame.metrics, fields)
                 write_alarms(writer, guard)
+                if scene.sizes != Sizes() and frame.index in (0, count - 1):
+                    eases.append(measure_ease(scene, scene.cloth_at(frame.index), frame.state, frame.index))
             write_alarms(writer, guard)
             if guard is not None and guard.stopped is not None:
                 raise GuardStopped

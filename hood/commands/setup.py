@@ -15,11 +15,13 @@ from hood.commands.automatic import Choice, choose
 from hood.commands.cautions import scene_cautions, warn
 from hood.commands.cloth_contact import acts, check_cloth_contact, potential_of, tell_if_off
 from hood.commands.common import require_device, thinning
+from hood.commands.fabrics import checked_fabrics, fabric_of
 from hood.commands.garments import heed, layer_order, names_of, read_outfit
 from hood.commands.guarding import check_guard
 from hood.commands.motion import make_motion
 from hood.commands.plan_file import plan_path, read_watch
 from hood.commands.refinement import AUTO, check_refinement, chosen, refined
+from hood.commands.sizes import checked_sizes
 from hood.commands.steppers import PLAIN, make_network, make_solver, option_of
 from hood.config import ConfigError, build, load_config, require_choice
 from hood.dynamics.captured import MODES, network_of
@@ -51,6 +53,8 @@ def check_config(config: DictConfig) -> None:
     require_choice(config, "metrics", METRIC_CHOICES)
     require_choice(config, "settle", SETTLE_CHOICES)
     _check_numbers(config)
+    checked_fabrics(config)
+    checked_sizes(config)
     require_choice(config, "kernels", (AUTO, *KERNELS))
     option_of(config)
     require_choice(config, "step", (PLAIN, *MODES))
@@ -115,7 +119,8 @@ def make_scene(config: DictConfig, garment: Garment | None = None, material: Mat
     motion = make_motion(config, torch.float64 if solves_in_double(config) else torch.float32)
     order = layer_order(config.layers, names_of(config.garment)) if garment is None else None
     garment = read_outfit(config.garment if garment is None else garment, motion, bool(config.triangulate), config.pins)
-    scene = replace(dress(garment, motion, build(config.material) if material is None else material), layers=order)
+    fabric = fabric_of(config, garment, motion) if material is None else material
+    scene = replace(dress(garment, motion, fabric, checked_sizes(config)), layers=order)
     found = misplacement(scene)
     if found is not None and found.grave:
         raise ValueError(

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from hood.losses.potential import Potential, PreparedTerm
 from hood.losses.problem import StepProblem, free_flight
+from hood.losses.wind import Wind
 from hood.mesh.proximity import Incidence, build_incidence
 from hood.scene.contact import Fold, find_contact, find_fixed_contact, find_fixed_fold
 from hood.scene.landing import find_other_skin
@@ -43,10 +44,15 @@ def settled_potential(potential: Potential, problem: StepProblem) -> Potential:
     """The terms of ``potential`` that play a role in ``problem`` and in all problems like it.
 
     Raises:
-        ValueError: a term searches for more than contact with the body's surface.
+        ValueError: a term searches for more than contact with the body's surface, or has gusts.
     """
     with_contact = problem.with_fold()
     for name, term in potential.terms.items():
+        if isinstance(term, Wind) and term.gusts > 0:
+            raise ValueError(
+                f"losses.terms.{name} has gusts, which are another in every step and place; steps of fixed shapes have no form "
+                "of that: use step=plain, or gusts=0"
+            )
         if isinstance(term, PreparedTerm) and term.prepare(with_contact) is not with_contact:
             raise ValueError(
                 f"losses.terms.{name} is a {type(term).__name__}, which searches for more than contact with the body's "

@@ -23,6 +23,7 @@ from hood.losses.problem import STANDARD_GRAVITY
 from hood.mesh.topology import connected_components, unique_edges
 from hood.scene.cloth import Cloth
 from hood.scene.dataset import SceneSampler
+from hood.scene.sizing import Sizes
 
 #: A value this share beyond an end of its range is on it: float32 and text have rounded.
 _ROUNDING = 1e-4
@@ -86,10 +87,13 @@ def scene_conditions(
     potential: Potential,
     betas: np.ndarray | None = None,
     gravity: float = STANDARD_GRAVITY,
+    sizes: Sizes | None = None,
 ) -> Conditions:
-    """What a garment of the fabric of ``cloth`` asks of a model, in steps of ``dt`` [s], at the size it has, on a body of shape
-    ``betas`` (S,), under ``gravity`` [m/s²]."""
-    spans: dict[str, Span] = {"fps": (1.0 / dt, 1.0 / dt), "size": (1.0, 1.0), "gravity": (gravity, gravity)}
+    """What a garment of the fabric of ``cloth`` asks of a model, in steps of ``dt`` [s], at the size it has or at ``sizes``, on
+    a body of shape ``betas`` (S,), under ``gravity`` [m/s²]."""
+    factors = (1.0,) if sizes is None else (*sizes.start, *sizes.end)
+    size = min(factors), max(factors)
+    spans: dict[str, Span] = {"fps": (1.0 / dt, 1.0 / dt), "size": size, "gravity": (gravity, gravity)}
     fabric = {f"material.{name}": getattr(cloth, name) for name in Material.names()}
     spans |= {name: _extent(values) for name, values in fabric.items() if values.numel()}
     spans |= _resolution([garment])

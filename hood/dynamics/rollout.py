@@ -33,6 +33,7 @@ from hood.losses.layers import for_networks, has_layers
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
 from hood.mesh.surface_tree import forget_searches
+from hood.scene.cloth import Cloth
 from hood.scene.contact import Contact, find_contact
 from hood.scene.jumps import Jump, carried, describe_jumps, find_jumps
 from hood.scene.mesh_motion import wearable
@@ -173,11 +174,11 @@ def simulate(
     wants_potential = metrics == "all" or bool(fields)
     meter = SurfaceMeter(scene.garment, scene.motion.faces) if metrics == "all" else None
     jumps = _jumps_within(scene, start_frame, count)
-    watch = Stopwatch()
+    watch, cloth = Stopwatch(), scene.cloth
     for index in range(count):
         body_frame = start_frame + index
         state = recentre(state, scene.cloth.vertex_scene)
-        problem = None
+        problem, here = None, cloth
         if afresh:
             forget_searches()
         if index + 1 < count:
@@ -189,12 +190,14 @@ def simulate(
                     there, step = state, scene.step_input(body_frame, state, attachments=closed)
                 if relaxing and index == 0:
                     step = replace(step, dt=torch.full_like(step.dt, RELAXING_DT))
-                problem = StepProblem(scene.cloth, there, step, gravity=stepper.gravity.to(state.pos))
+                if scene.sizes.changing:
+                    cloth = scene.cloth_at(body_frame + 1, start_frame)
+                problem = StepProblem(cloth, there, step, gravity=stepper.gravity.to(state.pos))
             with watch.part("search"):
                 problem = stepper.search(problem)
         with watch.aside("metrics"):
             known = potential.prepare(problem) if problem is not None and wants_potential else problem
-            row = {**_state_metrics(scene, state, body_frame, known, metrics), **stepped}
+            row = {**_state_metrics(scene, here, state, body_frame, known, metrics), **stepped}
             if meter is not None and (index % surface_stride == 0 or index + 1 == count):
                 row |= _surface_now(meter, scene, state, body_frame)
         row["ms_metrics"] = watch.spent_aside("metrics")
@@ -264,9 +267,12 @@ def _times(stepper: Stepper, lap: dict[str, float]) -> dict[str, float]:
     return {f"ms_{part}": value for part, value in times.items()}
 
 
-def _state_metrics(scene: Scene, state: State, frame: int, problem: StepProblem | None, metrics: str) -> dict[str, float]:
-    """Strain and penetration at ``frame``, as far as ``metrics`` asks for them; ``problem`` is the step from there."""
-    measured = {} if metrics == "none" else strain_metrics(scene.cloth, state.pos)
+def _state_metrics(
+    scene: Scene, cloth: Cloth, state: State, frame: int, problem: StepProblem | None, metrics: str
+) -> dict[str, float]:
+    """Strain and penetration at ``frame``, as far as ``metrics`` asks for them, of the ``cloth`` there; ``problem`` is the step
+    from there."""
+    measured = {} if metrics == "none" else strain_metrics(cloth, state.pos)
     if metrics == "all":
         contact = _contact_now(scene, state, frame) if problem is None else problem.with_contact().contact
         measured |= penetration_metrics(contact, scene.cloth)

@@ -34,9 +34,9 @@ template <> struct Four<double> { typedef D4 type; };
 
 extern "C" {
 
-// Walls and grips at points inside edges and faces, weighted sums of up to three vertices; rows of points where those are of vertices.
+// Walls, grips and drag at points inside edges and faces, weighted sums of up to three vertices; rows of points where those are of vertices.
 struct Points {
-    int64_t count, num_walls, num_grips;
+    int64_t count, num_walls, num_grips, num_drags;
     const int32_t* corners;  // (N, 3), in the new numbering; what is not needed repeats one
     const double* weights;   // (N, 3), 0 for those
     // Points at a row's vertex: (R + 1) starts; (., 5) point, corner, then places in the row of the blocks with the point's
@@ -44,6 +44,7 @@ struct Points {
     const int32_t *starts, *uses;
     const Wall* walls;
     const Grip* grips;
+    const Drag* drags;
     double* model;  // (N, 16) gradient, matrix and slack by the point, and 1 where there are any
     double* path;   // (W, N, 14) of the line search: give of the corners, compliance, depth, 1 where it acts, push
 };
@@ -61,6 +62,9 @@ struct Engine {
     // The fabric: constant as long as the cloth's numbers.
     const double *shape, *area, *mu, *lambda, *bulk, *soft;  // (6, F) 1/m, (F) m^3, Pa, Pa and roots of moduli times area
     const double *rest_angle, *hinge_weight, *rest_length;   // (H)
+    // Damping in the step: viscous stress or moment over the elastic one of what the step adds, and the shape before; or none.
+    const double *face_rate, *face_before;    // (F), (3, F) Green strains
+    const double *hinge_rate, *hinge_before;  // (H), (H) angles
     // The step.
     const double *base, *fixed;  // (V, 3) m original: free flight, and where fixed vertices are
     const double *inertia, *weight;  // (V) kg, (V, 3) N original
@@ -148,6 +152,13 @@ inline void strain_of(const Engine& e, const double* pos, int64_t i, Strain& s) 
     s.g11 = 0.5 * (dot(s.f[1], s.f[1]) - 1.0);
 }
 
+// Changes strains by what the step has not added to them.
+inline void since_start(const Engine& e, int64_t i, Strain& s) {
+    s.g00 -= load<V8>(e.face_before + i);
+    s.g01 -= load<V8>(e.face_before + e.num_faces + i);
+    s.g11 -= load<V8>(e.face_before + 2 * e.num_faces + i);
+}
+
 double face_energy(const Engine& e, const double* pos, Range range) {
     double sum = 0.0;
     for (int64_t i = range.begin; i < range.end; i += LANES) {
@@ -156,6 +167,11 @@ double face_energy(const Engine& e, const double* pos, Range range) {
         const V8 trace = s.g00 + s.g11, square = s.g00 * s.g00 + s.g11 * s.g11 + 2.0 * s.g01 * s.g01;
         const V8 density = load<V8>(e.mu + i) * square + 0.5 * load<V8>(e.lambda + i) * trace * trace;
         sum += total(load<V8>(e.area + i) * density);
+        if (!e.face_rate) continue;
+        since_start(e, i, s);
+        const V8 added = s.g00 + s.g11, both = s.g00 * s.g00 + s.g11 * s.g11 + 2.0 * s.g01 * s.g01;
+        const V8 viscous = load<V8>(e.mu + i) * both + 0.5 * load<V8>(e.lambda + i) * added * added;
+        sum += total(load<V8>(e.area + i) * load<V8>(e.face_rate + i) * viscous);
     }
     return sum;
 }
@@ -168,14 +184,21 @@ template <class T> void face_models(const Engine& e, const double* pos, Range ra
         strain_of(e, pos, i, s);
         const V8 mu = load<V8>(e.mu + i), area = load<V8>(e.area + i);
         const V8 pressure = load<V8>(e.lambda + i) * (s.g00 + s.g11);
-        const V8 s00 = 2.0 * mu * s.g00 + pressure, s01 = 2.0 * mu * s.g01, s11 = 2.0 * mu * s.g11 + pressure;
+        V8 s00 = 2.0 * mu * s.g00 + pressure, s01 = 2.0 * mu * s.g01, s11 = 2.0 * mu * s.g11 + pressure;
+        V8 bulk = load<V8>(e.bulk + i), soft = load<V8>(e.soft + i);
+        if (e.face_rate) {
+            const V8 rate = load<V8>(e.face_rate + i), stiffer = root(1.0 + rate);
+            since_start(e, i, s);
+            const V8 added = load<V8>(e.lambda + i) * (s.g00 + s.g11);
+            s00 += rate * (2.0 * mu * s.g00 + added), s01 += rate * 2.0 * mu * s.g01, s11 += rate * (2.0 * mu * s.g11 + added);
+            bulk *= stiffer, soft *= stiffer;
+        }
         // The positive part of the stress, from the eigenvalues of a 2 x 2 matrix.
         const V8 mean = 0.5 * (s00 + s11), half = 0.5 * (s00 - s11), radius = root(half * half + s01 * s01);
         const V8 most = mean + radius, least = mean - radius;
         const V8 high = most > zero ? most : zero, low = least > zero ? least : zero;
         const V8 centre = 0.5 * (high + low), slope = radius > zero ? 0.5 * (high - low) / (radius > zero ? radius : one) : zero;
         const V8 t00 = centre + slope * half, t01 = slope * s01, t11 = centre - slope * half;
-        const V8 bulk = load<V8>(e.bulk + i), soft = load<V8>(e.soft + i);
         V8 b0[3], b1[3], pull0[3], pull1[3], ten0[3], ten1[3];
         for (int c = 0; c < 3; ++c) {
             b0[c] = load<V8>(e.shape + c * e.num_faces + i);
@@ -261,6 +284,9 @@ double hinge_energy(const Engine& e, const double* pos, Range range) {
         } else {
             const V8 bend = bend_of(h.angle, load<V8>(e.rest_angle + i));
             sum += total(0.5 * weight * bend * bend);
+            if (!e.hinge_rate) continue;
+            const V8 added = bend_of(h.angle, load<V8>(e.hinge_before + i));
+            sum += total(0.5 * load<V8>(e.hinge_rate + i) * weight * added * added);
         }
     }
     return sum;
@@ -296,7 +322,13 @@ template <class T> void hinge_models(const Engine& e, const double* pos, Range r
         } else {
             residual = bend_of(h.angle, load<V8>(e.rest_angle + i));
         }
-        const V8 weight = load<V8>(e.hinge_weight + i), force = weight * residual, size = root(weight);
+        const V8 weight = load<V8>(e.hinge_weight + i);
+        V8 force = weight * residual, size = root(weight);
+        if (e.hinge_rate) {
+            const V8 rate = load<V8>(e.hinge_rate + i);
+            force += rate * weight * bend_of(h.angle, load<V8>(e.hinge_before + i));
+            size *= root(1.0 + rate);
+        }
         for (int c = 0; c < 4; ++c)
             for (int k = 0; k < 3; ++k) {
                 const V8 pull = force * slope[c][k], row = size * slope[c][k];
@@ -349,6 +381,21 @@ template <class Set> inline bool add_contact(const Set& set, int64_t v, const do
     return any;
 }
 
+// The same of drag.
+inline bool add_drag(const Points& set, int64_t i, const double* pos, double* gradient, double* upper) {
+    for (int64_t w = 0; w < set.num_drags; ++w) {
+        const Drag& drag = set.drags[w];
+        double slip[3], across;
+        const double *normal = drag.normal + 3 * i, size = drift_of(drag, i, pos, slip, &across);
+        const double pressed = drag.across[i] * std::fabs(across), dragged = drag.along[i] * size;
+        for (int k = 0; k < 3; ++k) gradient[k] += pressed * across * normal[k] + dragged * slip[k];
+        upper[0] += dragged, upper[3] += dragged, upper[5] += dragged;
+        add_outer(upper, 2.0 * pressed - dragged, normal);
+        if (size > 0.0) add_outer(upper, dragged / (size * size), slip);
+    }
+    return set.num_drags > 0;
+}
+
 inline void vertex_model(const Engine& e, int64_t row, double* gradient, double* upper, double* slack) {
     const int64_t v = e.vertex[row];
     const double *pos = e.pos + 4 * row, *acc = e.acc + 4 * row, *weight = e.weight + 3 * v;
@@ -371,7 +418,8 @@ void point_models(const Points& set, const double* pos, Range range) {
         double x[3], *model = set.model + 16 * i;
         for (int k = 0; k < 16; ++k) model[k] = 0.0;
         point_at(set, i, pos, x);
-        model[15] = add_contact(set, i, x, model, model + 3, model + 9);
+        const bool touched = add_contact(set, i, x, model, model + 3, model + 9);
+        model[15] = add_drag(set, i, x, model, model + 3) || touched;
     }
 }
 
@@ -509,6 +557,14 @@ void energy(const Engine& e, const double* pos, const double* acc, double* phi, 
             for (int64_t i = 0; i < set.count; ++i) {
                 point_at(set, i, pos, x);
                 part += w < set.num_walls ? wall_energy(set.walls[w], i, x) : grip_energy(set.grips[w - set.num_walls], i, x);
+            }
+            add(part);
+        }
+        for (int64_t w = 0; w < set.num_drags; ++w) {
+            double part = 0.0;
+            for (int64_t i = 0; i < set.count; ++i) {
+                point_at(set, i, pos, x);
+                part += drag_energy(set.drags[w], i, x);
             }
             add(part);
         }

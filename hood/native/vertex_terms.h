@@ -1,4 +1,4 @@
-// Contact and friction as they act on one vertex, or at one point of the cloth.
+// Contact, friction and drag as they act on one vertex, or at one point of the cloth.
 #pragma once
 #include <cmath>
 #include <cstdint>
@@ -13,6 +13,10 @@ struct Wall {
 };
 struct Grip {
     const double *force, *normal, *anchor, *limit;  // (V), (V, 3), (V, 3), (V)
+};
+// Drag of the air; rows of points.
+struct Drag {
+    const double *normal, *target, *across, *along;  // (N, 3), (N, 3), (N), (N)
 };
 }
 
@@ -51,6 +55,21 @@ inline double grip_energy(const Grip& grip, int64_t v, const double* pos) {
     if (!(grip.force[v] > 0.0)) return 0.0;
     double slip[3];
     return grip.force[v] * mollified(slip_of(grip, v, pos, slip), grip.limit[v]);
+}
+
+// Slip against the air in the plane of the normal, its length, and the slip along the normal.
+inline double drift_of(const Drag& drag, int64_t v, const double* pos, double* slip, double* across) {
+    const double *target = drag.target + 3 * v, *normal = drag.normal + 3 * v;
+    for (int k = 0; k < 3; ++k) slip[k] = pos[k] - target[k];
+    *across = dot3(slip, normal);
+    for (int k = 0; k < 3; ++k) slip[k] -= *across * normal[k];
+    return std::sqrt(dot3(slip, slip));
+}
+
+inline double drag_energy(const Drag& drag, int64_t v, const double* pos) {
+    double slip[3], across;
+    const double size = drift_of(drag, v, pos, slip, &across);
+    return (drag.across[v] * std::fabs(across) * across * across + drag.along[v] * size * size * size) / 3.0;
 }
 
 // Force along the slip, of length ``size``, in units of it.

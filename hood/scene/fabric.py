@@ -14,11 +14,12 @@ network's features reads it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
 
-from hood.assets.material import Material, check_lame, values_of
+from hood.assets.material import FaceField, Material, check_lame, values_of
 from hood.mesh import topology
 
 
@@ -120,6 +121,34 @@ class FabricMap:
 
     def _broadcast(self, values: np.ndarray, place: str) -> np.ndarray:
         return np.broadcast_to(values, (self._counts[place],))
+
+
+def patchwork(material: Material, parts: Sequence[tuple[np.ndarray, Material]], pos: np.ndarray, faces: np.ndarray) -> Material:
+    """A fabric of which some faces are others, each property a field on faces.
+
+    Away from the seams every part is what a garment of its own fabric would be. The bend of an edge between two fabrics is the
+    mean of both.
+
+    Args:
+        material: of all other faces.
+        parts: masks (F,) bool and their fabrics; of several that hold a face the last counts.
+        pos: (V, 3) m at rest.
+        faces: (F, 3).
+    """
+    edges = topology.unique_edges(faces)
+    corners = pos[faces]
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    whole, others = (
+        [FabricMap(fabric, len(pos), faces, edges, area) for fabric in fabrics]
+        for fabrics in ([material], [fabric for _, fabric in parts])
+    )
+    fields = {}
+    for name in Material.names():
+        values = whole[0].on_faces(name).copy()
+        for (mask, _), own in zip(parts, others, strict=True):
+            values[mask] = own.on_faces(name)[mask]
+        fields[name] = FaceField(values)
+    return Material(**fields)
 
 
 #: What a garment's stiffness multiplies.

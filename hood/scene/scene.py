@@ -16,6 +16,7 @@ from hood.assets.motion.sequence import PoseSequence
 from hood.scene.batch import to_device
 from hood.scene.cloth import Cloth, build_cloth
 from hood.scene.motion import BodyMotion, Motion, body_motion
+from hood.scene.sizing import Size, Sizes, resized, sizes_of
 from hood.scene.start import free_stretch, settle
 from hood.scene.state import Attachments, Obstacle, State, StepInput, concatenate_obstacles
 from hood.scene.untangle import Outfit, Separation, separate, smooth_out
@@ -47,6 +48,12 @@ class Scene:
     start_pos: np.ndarray | None = None  # (V, 3) m, world, float64: frame 0 starts there, and is not settled
     start_vel: np.ndarray | None = None  # (V, 3) m/s, likewise
     layers: tuple[int, ...] | None = None  # garments of an outfit from the body outwards; None: as they lie at the start
+    sizes: Sizes = Sizes()  # of the rest shape; that of ``cloth`` is the first
+
+    def cloth_at(self, frame: int, start: int = 0) -> Cloth:
+        """The cloth at ``frame`` of a rollout that begins at the frame ``start``: ``cloth`` where its size does not change."""
+        now = self.sizes.at((frame - start) * self.dt)
+        return self.cloth if now == self.sizes.start else resized(self.cloth, self.sizes.start, now)
 
     @property
     def num_frames(self) -> int:
@@ -166,11 +173,13 @@ class Scene:
         if bool(self.cloth.pinned.any()):
             pins = self.motion.skinned(self.garment, frame if relaxing else frame + 1, origin)
         dt = RELAXING_DT if relaxing else self.dt
+        time = (frame if relaxing else frame + 1) * self.dt
         return StepInput(
             dt=torch.tensor([dt], dtype=state.pos.dtype, device=state.pos.device),
             obstacle=self.motion.obstacle(frame, origin, static=relaxing),
             pin_target=pins,
             attachments=attachments,
+            time=state.pos.new_tensor([time]),
         )
 
 
@@ -180,7 +189,7 @@ def build_scene(
     sequence: PoseSequence,
     material: Material | None = None,
     betas: np.ndarray | None = None,
-    size: float = 1.0,
+    size: Size | Sizes = 1.0,
     dtype: torch.dtype = torch.float32,
     device: torch.device | str = "cpu",
 ) -> Scene:
@@ -192,7 +201,8 @@ def build_scene(
         sequence: the body's motion; its frame rate is that of the simulation.
         material: the fabric; None: the default one.
         betas: (S,) shape coefficients of the body; None: zeros.
-        size: factor of the rest shape alone, the paper's resizing augmentation.
+        size: factor of the rest shape alone, the paper's resizing augmentation; three factors along its axes, or
+            :class:`hood.scene.sizing.Sizes` that change during the rollout.
         dtype: of the cloth's positions.
         device: ``cpu`` or ``cuda``.
 
@@ -212,17 +222,18 @@ def build_scene(
     return dress(garment, body_motion(body, sequence, betas, dtype, device), material, size)
 
 
-def dress(garment: Garment, motion: Motion, material: Material | None = None, size: float = 1.0) -> Scene:
+def dress(garment: Garment, motion: Motion, material: Material | None = None, size: Size | Sizes = 1.0) -> Scene:
     """Garment on whatever moves, in the motion's precision and on its device; ``size`` scales the rest shape.
 
     Raises:
         ValueError: the garment cannot follow the body, or is not on it in the motion's first frame.
     """
     garment = motion.dressed(garment)
-    rest_pos = motion.rest_pos(garment) * size
+    sizes = size if isinstance(size, Sizes) else sizes_of(size)
+    rest_pos = motion.rest_pos(garment) * np.array(sizes.start)
     fabric = material or Material()
     cloth = build_cloth(rest_pos, garment.faces, fabric, garment.pinned, stiffness=garment.stiffness, dtype=motion.dtype)
-    return Scene(to_device(cloth, motion.device), garment, motion, 1.0 / motion.fps)
+    return Scene(to_device(cloth, motion.device), garment, motion, 1.0 / motion.fps, sizes=sizes)
 
 
 def recentre(state: State, vertex_scene: Tensor) -> State:
@@ -257,7 +268,15 @@ def concatenate_step_inputs(steps: Sequence[StepInput], vertex_counts: Sequence[
         obstacle=concatenate_obstacles(obstacles) if obstacles else None,
         pin_target=pins,
         attachments=_concatenate_attachments([step.attachments for step in steps], vertex_counts),
+        time=_concatenate_times(steps),
     )
+
+
+def _concatenate_times(steps: Sequence[StepInput]) -> Tensor | None:
+    """Steps that do not say are at 0, as alone."""
+    if all(step.time is None for step in steps):
+        return None
+    return torch.cat([torch.zeros_like(step.dt) if step.time is None else step.time.to(step.dt) for step in steps])
 
 
 def _concatenate_attachments(items: Sequence[Attachments | None], vertex_counts: Sequence[int]) -> Attachments | None:

@@ -50,6 +50,7 @@ class StepInput:
     obstacle: Obstacle | None = None
     pin_target: Tensor | None = None  # (V, 3) m local at t + 1; read at pinned vertices only
     attachments: Attachments | None = None
+    time: Tensor | None = None  # (B,) s since frame 0, at t + 1; what changes by itself (gusts) reads it, None: 0
 
     def __post_init__(self) -> None:
         sound = [0.0 < dt < float("inf") for dt in self.dt.reshape(-1).tolist()]

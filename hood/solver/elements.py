@@ -9,18 +9,19 @@ rows of their upper triangle, see :func:`hood.solver.pattern.upper_pairs`.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from hood.losses.bending import Bending, CurrentLengthBending, bending_weight
+from hood.losses.damping import BendDamping
 from hood.losses.potential import Term
 from hood.nn.dense import is_whole
 from hood.scene.cloth import Cloth
 
-BENDINGS = (Bending, CurrentLengthBending)
+BENDINGS = (Bending, CurrentLengthBending, BendDamping)
 #: As in hood.mesh.geometry: a triangle is degenerate when a sine in it is below this many units of rounding.
 _DEGENERATE_ULPS = 8.0
 _TURN = 2.0 * math.pi
@@ -50,12 +51,20 @@ class FaceConstants:
     weight: Tensor  # (N,) m³, rest area times thickness
     lame_mu: Tensor  # (N,) Pa
     lame_lambda: Tensor  # (N,) Pa
+    rate: Tensor | None = None  # (N,) viscous stress is so many times the elastic one of the step's strain; None: no damping
+    before: Tensor | None = None  # (3, N) Green strains at t, with ``rate``
 
     def take(self, faces: Tensor, first: Tensor) -> FaceConstants:
         """Those of some ``faces`` (M,) with their corners turned so that ``first`` (M,) leads."""
         corner = (first + torch.arange(3, device=first.device)[:, None]) % 3
         shape = self.shape[:, corner, faces]
-        return FaceConstants(shape, self.weight[faces], self.lame_mu[faces], self.lame_lambda[faces])
+        rate, before = (None if values is None else values[..., faces] for values in (self.rate, self.before))
+        return FaceConstants(shape, self.weight[faces], self.lame_mu[faces], self.lame_lambda[faces], rate, before)
+
+    def damped(self, rate: Tensor, pos: Tensor, faces: Tensor) -> FaceConstants:
+        """The same with damping of ``rate`` (N,) about the strains of ``faces`` (N, 3) at ``pos`` (V, 3)."""
+        _, _, before = _strain(Corners(faces)(pos), self.shape)
+        return replace(self, rate=rate, before=torch.stack(before))
 
 
 def face_constants(cloth: Cloth, factor: float = 1.0) -> FaceConstants:
@@ -76,10 +85,20 @@ class FaceModel:
 
 def face_energy(x: Tensor, constants: FaceConstants) -> Tensor:
     """Energy [J] (N,) of faces with corners ``x`` (3, 3, N), as in :class:`hood.losses.stretching.Stretching`."""
-    _, _, (g00, g01, g11) = _strain(x, constants.shape)
+    _, _, strain = _strain(x, constants.shape)
+    energy = _density(strain, constants)
+    if constants.rate is not None and constants.before is not None:
+        g00, g01, g11 = (now - then for now, then in zip(strain, constants.before, strict=True))
+        energy = energy + constants.rate * _density((g00, g01, g11), constants)
+    return constants.weight * energy
+
+
+def _density(strain: tuple[Tensor, Tensor, Tensor], constants: FaceConstants) -> Tensor:
+    """Energy density [J/m³] (N,) of Green strains."""
+    g00, g01, g11 = strain
     trace = g00 + g11
     square = g00 * g00 + g11 * g11 + 2.0 * g01 * g01
-    return constants.weight * (constants.lame_mu * square + 0.5 * constants.lame_lambda * trace * trace)
+    return constants.lame_mu * square + 0.5 * constants.lame_lambda * trace * trace
 
 
 def face_model(x: Tensor, constants: FaceConstants, num_corners: int = 3, out: Tensor | None = None) -> FaceModel:
@@ -87,7 +106,8 @@ def face_model(x: Tensor, constants: FaceConstants, num_corners: int = 3, out: T
 
     With S = 2 μ G + λ tr(G) I the gradient by corner j is A h F S b_j. The second derivative has a material part,
     positive for μ, λ + μ >= 0, and (b_j · S b_k) I₃, which is indefinite under compression: S is replaced there by
-    its positive part, from the eigenvalues of a 2 × 2 matrix. The rest is the slack.
+    its positive part, from the eigenvalues of a 2 × 2 matrix. The rest is the slack. Damping adds its stress to S and makes
+    the material part stiffer.
 
     Args:
         x: (3, 3, N) m, of corner and axis.
@@ -97,19 +117,29 @@ def face_model(x: Tensor, constants: FaceConstants, num_corners: int = 3, out: T
     f0, f1, (g00, g01, g11) = _strain(x, constants.shape)
     b, mu = constants.shape[:, :num_corners], constants.lame_mu
     weighted = constants.weight * b
-    pressure = constants.lame_lambda * (g00 + g11)
-    stress = (2.0 * mu * g00 + pressure, 2.0 * mu * g01, 2.0 * mu * g11 + pressure)
+    stress = _stress((g00, g01, g11), constants)
     pull = _apply(stress, weighted)
     gradient = pull[0][:, None] * f0 + pull[1][:, None] * f1
     tension = _apply(_positive_part(*stress), weighted)
     # Strains G00 ± G11 and 2 G01 diagonalise the material: moduli λ + μ, μ, μ.
-    bulk, soft = (constants.weight * (constants.lame_lambda + mu)).sqrt(), (constants.weight * mu).sqrt()
+    weight = constants.weight if constants.rate is None else constants.weight * (1.0 + constants.rate)
+    bulk, soft = (weight * (constants.lame_lambda + mu)).sqrt(), (weight * mu).sqrt()
     along, across = b[0, :, None] * f0, b[1, :, None] * f1
     shear = b[0, :, None] * f1 + b[1, :, None] * f0
     matrix = _outer_sum([bulk * (along + across), soft * (along - across), soft * shear], out)
     axial = _symmetric(tension, b)
     _add_axial(matrix, axial, num_corners)
     return FaceModel(gradient, matrix, _symmetric(pull, b) - axial)
+
+
+def _stress(strain: tuple[Tensor, Tensor, Tensor], constants: FaceConstants) -> tuple[Tensor, Tensor, Tensor]:
+    """Second Piola-Kirchhoff stresses S00, S01, S11 [Pa] (N,), elastic and viscous."""
+    if constants.rate is not None and constants.before is not None:
+        rate = constants.rate
+        strain = tuple((1.0 + rate) * now - rate * then for now, then in zip(strain, constants.before, strict=True))  # type: ignore[assignment]
+    g00, g01, g11 = strain
+    mu, pressure = constants.lame_mu, constants.lame_lambda * (g00 + g11)
+    return 2.0 * mu * g00 + pressure, 2.0 * mu * g01, 2.0 * mu * g11 + pressure
 
 
 def _strain(x: Tensor, shape: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]]:
@@ -179,10 +209,23 @@ class HingeConstants:
     rest_angle: Tensor  # (N,) rad
     weight: Tensor  # (N,) J, second derivative of the rest shape's energy by the angle
     rest_length: Tensor  # (N,) m
+    before: Tensor | None = None  # (N,) rad, angles at t, of damping alone
+    per_dt: Tensor | None = None  # (N,) 1/s, with it
 
     def take(self, hinges: Tensor) -> HingeConstants:
         """Those of some ``hinges`` (M,)."""
-        return HingeConstants(self.rest_angle[hinges], self.weight[hinges], self.rest_length[hinges])
+        own = (self.rest_angle, self.weight, self.rest_length, self.before, self.per_dt)
+        return HingeConstants(*(None if values is None else values[hinges] for values in own))  # type: ignore[arg-type]
+
+    def moving(self, pos: Tensor, hinges: Tensor, dt: Tensor) -> HingeConstants:
+        """The same with what damping needs to know of a step of ``dt`` (N,) from ``pos`` (V, 3)."""
+        return replace(self, before=_angles(Corners(hinges)(pos), self.rest_length)[0], per_dt=1.0 / dt)
+
+    def of(self, term: Term) -> HingeConstants:
+        """Constants of the rest shape that ``term`` is about: itself, or of damping the shape at t."""
+        if type(term) is not BendDamping or self.before is None or self.per_dt is None:
+            return self
+        return HingeConstants(self.before, term.time * self.per_dt * self.weight, self.rest_length)
 
 
 def hinge_constants(cloth: Cloth) -> HingeConstants:
@@ -193,6 +236,7 @@ def hinge_constants(cloth: Cloth) -> HingeConstants:
 
 def hinge_energy(term: Term, x: Tensor, constants: HingeConstants) -> Tensor:
     """Energy [J] (N,) of hinges with corners ``x`` (4, 3, N): edge start, edge end, opposite vertices."""
+    constants = constants.of(term)
     angle, _ = _angles(x, constants.rest_length)
     if type(term) is CurrentLengthBending:
         edge = x[1] - x[0]
@@ -206,6 +250,7 @@ def hinge_model(term: Term, x: Tensor, constants: HingeConstants) -> tuple[Tenso
     The energy is ½ weight r² with r = θ - θ₀, or θ l / l₀ in the published code's form, where l is the edge's length now:
     the gradient is weight r ∇r and the row √weight ∇r.
     """
+    constants = constants.of(term)
     angle, geometry = _angles(x, constants.rest_length)
     slope = geometry.slope()
     if type(term) is CurrentLengthBending:

@@ -18,12 +18,14 @@ from torch import Tensor
 
 from hood import native
 from hood.losses.attachment import Attachment
-from hood.losses.bending import CurrentLengthBending
+from hood.losses.bending import Bending, CurrentLengthBending
+from hood.losses.damping import BendDamping
 from hood.losses.layer_friction import LayerGrips
 from hood.losses.layers import LAYER_TERMS
-from hood.losses.potential import Potential
+from hood.losses.potential import Potential, Term
 from hood.losses.problem import STANDARD_GRAVITY, StepProblem, inertial_guess
-from hood.losses.stretching import Stretching
+from hood.losses.stretching import Stretching, green_strain
+from hood.mesh.geometry import dihedral_angles
 from hood.mesh.layers import EASED, LEFT
 from hood.native.build import NATIVE_FLAGS, BuildError, build
 from hood.native.libraries import WIDE_FLAGS
@@ -38,7 +40,8 @@ from hood.solver.iterate import fixed_positions
 from hood.solver.layers import approached, grips_of, layers_of
 from hood.solver.plan import SolverPlan
 from hood.solver.points import PointForces, point_forces
-from hood.solver.vertex_pass import grip_structures, wall_structures, whole
+from hood.solver.terms import stretch_rate
+from hood.solver.vertex_pass import drag_structures, grip_structures, wall_structures, whole
 
 #: Vertices of a part that is worth a thread: an iteration of conjugate gradients takes 20 us at 1,000 vertices.
 _ROWS = 400
@@ -48,8 +51,8 @@ SOURCE = Path(native.__file__).with_name("newton.cpp")
 
 class _Points(ctypes.Structure):
     _fields_ = [
-        *fields("count num_walls num_grips", COUNT),
-        *fields("corners weights starts uses walls grips model path", POINTER),
+        *fields("count num_walls num_grips num_drags", COUNT),
+        *fields("corners weights starts uses walls grips drags model path", POINTER),
     ]
 
 
@@ -61,6 +64,7 @@ class _Engine(ctypes.Structure):
         *fields("vertex face_corners hinge_corners row_starts cols", POINTER),
         *fields("face_starts face_uses hinge_starts hinge_uses spring_starts spring_uses spring_ends", POINTER),
         *fields("shape area mu lambda bulk soft rest_angle hinge_weight rest_length", POINTER),
+        *fields("face_rate face_before hinge_rate hinge_before", POINTER),
         *fields("base fixed inertia weight spring_stiffness walls grips points", POINTER),
         *fields("num_walls num_grips num_points bending membrane", COUNT),
         ("dt_sq", REAL),
@@ -100,10 +104,12 @@ def library(wide: bool = False) -> ctypes.CDLL:
 
 def applies(potential: Potential, problem: StepProblem) -> bool:
     """Whether the compiled solver knows every term of the potential that plays a role in ``problem``, on a CPU."""
-    bendings = [term for term in potential.terms.values() if type(term) in BENDINGS and term.applies(problem)]
+    bendings = [type(term) for term in potential.terms.values() if type(term) in BENDINGS and term.applies(problem)]
+    about_rest = bendings.count(BendDamping) == 0 or (bendings.count(Bending) == 1 and bendings.count(BendDamping) == 1)
     others = other_terms(potential, problem)
     known = others is None or all(type(term) in LAYER_TERMS for term in others.terms.values())
-    return problem.state.pos.device.type == "cpu" and len(bendings) <= 1 and known
+    one = len(bendings) - bendings.count(BendDamping) <= 1 and about_rest
+    return problem.state.pos.device.type == "cpu" and one and known
 
 
 @dataclass(frozen=True)
@@ -157,13 +163,15 @@ class EngineStep:
     membrane: int  # how many such terms
     layers: tuple[SceneLayers, ...]  # one per scene, or none
     layer_grips: LayerGrips | None  # of the whole batch
+    stretch_damping: tuple[np.ndarray, np.ndarray] | None  # (F,) rates and (3, F) strains at t
+    bend_damping: tuple[np.ndarray, np.ndarray] | None  # (H,) rates and (H,) angles at t
 
 
 def engine_step(potential: Potential, problem: StepProblem) -> EngineStep:
     """The step ``problem``, in float64 and prepared, with the terms of ``potential``."""
     terms = [term for term in potential.terms.values() if term.applies(problem)]
     forces: VertexForces = known_forces(potential, problem)
-    bending = next((term for term in terms if type(term) in BENDINGS), None)
+    bending = next((term for term in terms if type(term) in BENDINGS and type(term) is not BendDamping), None)
     springs = [attachment_stiffness(term, problem) for term in terms if type(term) is Attachment]
     stiffness = torch.stack(springs).sum(0) if springs else problem.state.pos.new_zeros(_num_attachments(problem))
     base = inertial_guess(problem.state, problem.step, problem.cloth.vertex_scene)
@@ -182,7 +190,25 @@ def engine_step(potential: Potential, problem: StepProblem) -> EngineStep:
         membrane=sum(type(term) is Stretching for term in terms),
         layers=layers_of(potential, problem),
         layer_grips=grips_of(potential, problem),
+        stretch_damping=_stretch_damping(potential, problem),
+        bend_damping=_bend_damping(terms, problem),
     )
+
+
+def _stretch_damping(potential: Potential, problem: StepProblem) -> tuple[np.ndarray, np.ndarray] | None:
+    rate, cloth = stretch_rate(potential, problem), problem.cloth
+    if rate is None:
+        return None
+    before = green_strain(problem.state.pos.double(), cloth.faces, cloth.rest_inverse.double())
+    return _array(rate), _array(torch.stack(before))
+
+
+def _bend_damping(terms: list[Term], problem: StepProblem) -> tuple[np.ndarray, np.ndarray] | None:
+    term = next((term for term in terms if type(term) is BendDamping), None)
+    if term is None:
+        return None
+    rate = term.time / problem.step.dt[problem.cloth.hinge_scene]
+    return _array(rate), _array(dihedral_angles(problem.state.pos.double(), problem.cloth.hinges))
 
 
 def _num_attachments(problem: StepProblem) -> int:
@@ -277,9 +303,22 @@ class SceneEngine:
         values.bending, values.membrane = step.bending, step.membrane > 0
         values.dt_sq = float(step.dt[scene]) ** 2
         values.raised, values.cg_used = 0.0, 0
+        self._take_damping(step)
         self._take_layers(step.layers[scene] if step.layers else None)
         self._take_layer_grips(step.layer_grips, scene, step.cloth.num_vertices)
         self.share(num_parts(values.num_rows, _ROWS))
+
+    def _take_damping(self, step: EngineStep) -> None:
+        for kind, damping, elements in (
+            ("face", step.stretch_damping, self.tables.faces),
+            ("hinge", step.bend_damping, self.tables.hinges),
+        ):
+            if damping is None:
+                setattr(self.values, f"{kind}_rate", None)
+            else:
+                self._point(
+                    **{f"{kind}_{name}": elements.padded(a) for name, a in zip(("rate", "before"), damping, strict=True)}
+                )
 
     def _take_layers(self, scene: SceneLayers | None) -> None:
         self.layers = scene
@@ -385,12 +424,13 @@ class _ScenePoints:
             "model": np.zeros((len(corners), 16)),
             "path": np.zeros((len(walls), len(corners), 14)),
         }
-        structures = wall_structures(walls), grip_structures(grips)
+        drags = points.forces.drags
+        structures = wall_structures(walls), grip_structures(grips), drag_structures(drags)
         self._kept = arrays, structures
-        self.values = _Points(count=len(corners), num_walls=len(walls), num_grips=len(grips))
+        self.values = _Points(count=len(corners), num_walls=len(walls), num_grips=len(grips), num_drags=len(drags))
         for name, array in arrays.items():
             setattr(self.values, name, array.ctypes.data)
-        self.values.walls, self.values.grips = (ctypes.addressof(one) for one, _ in structures)
+        self.values.walls, self.values.grips, self.values.drags = (ctypes.addressof(one) for one, _ in structures)
 
 
 def _aligned(count: int, kind: type) -> np.ndarray:

@@ -13,23 +13,26 @@ from torch import Tensor
 
 from hood.losses.attachment import Attachment
 from hood.losses.collision import CentroidCollision, Collision
+from hood.losses.damping import StretchDamping
 from hood.losses.friction import CodedFriction, Friction, LaggedFriction, WeightFriction, mollified_norm
 from hood.losses.gravity import Gravity
 from hood.losses.inertia import Inertia
 from hood.losses.potential import Potential, Term
 from hood.losses.problem import StepProblem
 from hood.losses.stretching import Stretching
+from hood.losses.wind import Wind
 from hood.mesh.kept import forget
 from hood.scene.contact import Contact
 from hood.solver import vertex_pass
 from hood.solver.contact_pass import ContactPass, contact_pass
+from hood.solver.drag import Drag
 from hood.solver.elements import BENDINGS
 from hood.solver.vertex_pass import VertexPass
 
 COLLISIONS = (Collision, CentroidCollision)
 FRICTIONS = (Friction, WeightFriction, CodedFriction)
 #: Terms whose derivatives are written out. A subclass may compute something else and does not count.
-CLOSED_FORM = (Stretching, *BENDINGS, Attachment, Inertia, Gravity, *COLLISIONS, *FRICTIONS)
+CLOSED_FORM = (Stretching, StretchDamping, *BENDINGS, Attachment, Inertia, Gravity, *COLLISIONS, *FRICTIONS, Wind)
 #: Those that act on single vertices.
 SINGLE = (Inertia, Gravity, *COLLISIONS, *FRICTIONS)
 
@@ -93,6 +96,7 @@ class VertexForces:
     weight: Tensor  # (N, 3) N
     walls: tuple[Walls, ...]
     grips: tuple[Grip, ...]
+    drags: tuple[Drag, ...] = ()  # at points inside faces alone
 
     @cached_property
     def compiled(self) -> VertexPass:
@@ -102,11 +106,12 @@ class VertexForces:
     def take(self, rows: Tensor) -> VertexForces:
         """Those of some vertices."""
         walls, grips = tuple(wall.take(rows) for wall in self.walls), tuple(grip.take(rows) for grip in self.grips)
-        return VertexForces(self.inertia[rows], self.stiffness[rows], self.weight[rows], walls, grips)
+        drags = tuple(drag.take(rows) for drag in self.drags)
+        return VertexForces(self.inertia[rows], self.stiffness[rows], self.weight[rows], walls, grips, drags)
 
     def without_walls(self) -> VertexForces:
         """The same without contact."""
-        return VertexForces(self.inertia, self.stiffness, self.weight, (), self.grips)
+        return VertexForces(self.inertia, self.stiffness, self.weight, (), self.grips, self.drags)
 
     def energies(self, pos: Tensor, acc: Tensor, dt: Tensor) -> list[Tensor]:
         """Energies [J] (N,) of the terms at positions and accelerations (N, 3); time step ``dt`` (N, 1)."""
@@ -114,12 +119,12 @@ class VertexForces:
         return [0.5 * self.stiffness * _rows(moved, moved), -_rows(self.weight, pos), *self.contact_energies(pos)]
 
     def contact_energies(self, pos: Tensor) -> list[Tensor]:
-        """Those of contact and friction alone."""
+        """Those of contact, friction and drag alone."""
         parts = [wall.weight * wall.depth(pos).clamp_min(0.0) ** 3 for wall in self.walls]
         for grip in self.grips:
             slip = grip.slip(pos)
             parts.append(grip.force * mollified_norm(_rows(slip, slip), grip.limit))
-        return parts
+        return parts + [drag.energy(pos) for drag in self.drags]
 
     def gradient(self, pos: Tensor, acc: Tensor) -> Tensor:
         """Gradient [N] (N, 3) at positions and accelerations (N, 3)."""
@@ -129,6 +134,8 @@ class VertexForces:
         for grip in self.grips:
             slip, _, slope = _slope(grip, pos)
             gradient = gradient + slope[:, None] * slip
+        for drag in self.drags:
+            gradient = gradient + drag.derivatives(pos)[0]
         return gradient
 
     def model(self, pos: Tensor, acc: Tensor) -> VertexModel:
@@ -148,6 +155,9 @@ class VertexForces:
             force, block, less = _friction(grip, pos)
             gradient, matrix = gradient + force, matrix.add_(block)
             slack = less if slack is None else slack + less
+        for drag in self.drags:
+            force, block = drag.derivatives(pos)
+            gradient, matrix = gradient + force, matrix + block
         return VertexModel(gradient, matrix, slack)
 
 
@@ -334,7 +344,10 @@ def attachment_stiffness(term: Term, problem: StepProblem) -> Tensor:
 
 def other_terms(potential: Potential, problem: StepProblem) -> Potential | None:
     """The terms that have no closed form here and play a role in the problem; None without any."""
-    others = {name: term for name, term in potential.active(problem).items() if type(term) not in CLOSED_FORM}
+    active = potential.active(problem)
+    others = {name: term for name, term in active.items() if type(term) not in CLOSED_FORM}
+    if not any(type(term) is Stretching for term in active.values()):  # the two share a closed form
+        others |= {name: term for name, term in active.items() if type(term) is StretchDamping}
     return potential.only(others) if others else None
 
 

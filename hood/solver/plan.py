@@ -20,7 +20,7 @@ from hood.scene.state import Attachments
 from hood.solver import elements
 from hood.solver.layers import LayerRows, layer_rows
 from hood.solver.pattern import BlockPattern, Scatter, axial_targets, matrix_targets, to_vertices, upper_pairs
-from hood.solver.points import PointBlocks
+from hood.solver.points import PointBlocks, point_blocks
 from hood.solver.terms import StepTerms
 
 
@@ -70,6 +70,12 @@ class SolverPlan:
     @cached_property
     def attachment_vertices(self) -> Scatter:
         return to_vertices(self._corners[2], len(self.unknown))
+
+    @cached_property
+    def centroids(self) -> PointBlocks:
+        """Blocks of points in the middle of every face."""
+        thirds = torch.full((len(self._corners[0]), 3), 1.0 / 3.0, dtype=torch.float64, device=self.vertices.device)
+        return point_blocks(self.pattern, self._corners[0], thirds, self.unknown)
 
     @property
     def _unknowns(self) -> list[np.ndarray]:
@@ -121,7 +127,12 @@ class ModelBuilder:
         parts = self._values.split([*sizes, len(self._values) - sum(sizes)])
         self._vertices, self._faces, self._hinges, self._springs = parts
         self._vertex_slack, self._face_slack = self._slack.split([sizes[0], len(self._slack) - sizes[0]])
-        self._blocks = [PointBlocks(plan.pattern, points, plan.unknown) for points in terms.points]
+        self._blocks = [
+            plan.centroids
+            if points.centroids
+            else point_blocks(plan.pattern, points.vertices.cpu().numpy(), points.weights, plan.unknown)
+            for points in terms.points
+        ]
 
     def __call__(self, pos: Tensor, acc: Tensor) -> QuadraticModel:
         """The model at ``pos`` (V, 3) reached with ``acc`` (V, 3)."""

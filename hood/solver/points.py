@@ -1,4 +1,4 @@
-"""Contact and friction at points inside the cloth's edges and faces, each a weighted sum of up to three vertices.
+"""Contact, friction and drag at points inside the cloth's edges and faces, each a weighted sum of up to three vertices.
 
 Energies at a point x_p = Σ w_i x_i pull vertex i with w_i times the force at the point, and couple vertices i and j by w_i w_j
 times the second derivative there. The vertices of a point share an edge or a face, so that this lies within the pattern of
@@ -18,19 +18,22 @@ from hood.losses.collision import Collision
 from hood.losses.friction import Friction
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
+from hood.losses.wind import Wind
 from hood.scene.contact_points import PointContact
+from hood.solver.drag import Drag, drag_of
 from hood.solver.forces import Grip, VertexForces, VertexModel, Walls
 from hood.solver.pattern import BlockPattern
 
 
 @dataclass(frozen=True)
 class PointForces:
-    """Contact and friction at N points."""
+    """Contact, friction and drag at N points."""
 
     vertices: Tensor  # (N, 3)
     weights: Tensor  # (N, 3), 0 where a point has fewer vertices
     scene: Tensor  # (N,)
     forces: VertexForces  # on the points, as on vertices without mass
+    centroids: bool = False  # of all faces, in their order: known before the step
 
     def take(self, rows: Tensor) -> PointForces:
         """Those at some points."""
@@ -71,7 +74,16 @@ def point_forces(potential: Potential, problem: StepProblem) -> tuple[PointForce
             none = torch.zeros_like(points.dist)
             forces = VertexForces(none[:, None], none, torch.zeros_like(points.point), tuple(walls), tuple(grips))
             found.append(PointForces(points.vertices, points.weights, points.scene, forces))
-    return tuple(found)
+    drags = tuple(drag_of(term, problem) for term in terms if type(term) is Wind)
+    return (*found, _at_centroids(problem, drags)) if drags else tuple(found)
+
+
+def _at_centroids(problem: StepProblem, drags: tuple[Drag, ...]) -> PointForces:
+    """Drag on the faces, in equal shares of their corners."""
+    cloth, none = problem.cloth, torch.zeros_like(drags[0].across)
+    forces = VertexForces(none[:, None], none, torch.zeros_like(drags[0].normal), (), (), drags)
+    thirds = torch.full_like(drags[0].normal, 1.0 / 3.0)
+    return PointForces(cloth.faces, thirds, cloth.face_scene, forces, centroids=True)
 
 
 def _walls(term: Collision, points: PointContact) -> Walls:
@@ -85,23 +97,25 @@ def _grip(term: Friction, points: PointContact, problem: StepProblem) -> Grip:
     return Grip(term.coefficient * term.point_force(problem, points), points.next_normal, anchor, limit)
 
 
+@dataclass(frozen=True)
 class PointBlocks:
-    """Adds the matrices of some points to a matrix of the free vertices.
+    """Adds the matrices of N points to a matrix of the free vertices."""
 
-    Args:
-        unknown: (V,) numbers of the free vertices, -1 for the others.
-    """
-
-    def __init__(self, pattern: BlockPattern, points: PointForces, unknown: np.ndarray) -> None:
-        corners = unknown[points.vertices.cpu().numpy()]
-        pairs = list(product(range(3), repeat=2))
-        target = np.stack([pattern.triples(corners[:, a], corners[:, b]) for a, b in pairs], axis=1).reshape(-1)
-        device = points.weights.device
-        self._kept = torch.as_tensor(np.flatnonzero(target >= 0), device=device)
-        self._target = torch.as_tensor(target, device=device)[self._kept]
-        self._products = torch.stack([points.weights[:, a] * points.weights[:, b] for a, b in pairs], dim=1)
+    kept: Tensor  # (K,) which rows of the points' products are rows of the matrix
+    target: Tensor  # (K,) and which
+    products: Tensor  # (N, 9) of the weights of two corners
 
     def add(self, triples: Tensor, matrix: Tensor) -> Tensor:
         """``triples`` (R, 3) of the pattern with matrices (N, 3, 3) by the points."""
-        blocks = self._products[:, :, None, None] * matrix[:, None]
-        return triples.index_add(0, self._target, blocks.reshape(-1, 3)[self._kept])
+        blocks = self.products.to(matrix)[:, :, None, None] * matrix[:, None]
+        return triples.index_add(0, self.target, blocks.reshape(-1, 3)[self.kept])
+
+
+def point_blocks(pattern: BlockPattern, vertices: np.ndarray, weights: Tensor, unknown: np.ndarray) -> PointBlocks:
+    """Blocks of points at ``vertices`` (N, 3) with ``weights`` (N, 3); ``unknown`` (V,) are the numbers of the free vertices,
+    -1 for the others."""
+    corners, pairs = unknown[vertices], list(product(range(3), repeat=2))
+    target = np.stack([pattern.triples(corners[:, a], corners[:, b]) for a, b in pairs], axis=1).reshape(-1)
+    kept = torch.as_tensor(np.flatnonzero(target >= 0), device=weights.device)
+    products = torch.stack([weights[:, a] * weights[:, b] for a, b in pairs], dim=1)
+    return PointBlocks(kept, torch.as_tensor(target, device=weights.device)[kept], products)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from hood.losses.attachment import Attachment
+from hood.losses.damping import BendDamping, StretchDamping
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem, sum_per_scene
 from hood.losses.stretching import Stretching
@@ -34,6 +35,12 @@ class StepTerms:
         self.has_membrane = num_membranes > 0
         self.face_constants = elements.face_constants(cloth, num_membranes)
         self.hinge_constants = elements.hinge_constants(cloth)
+        rate = stretch_rate(potential, problem)
+        if rate is not None:
+            self.face_constants = self.face_constants.damped(rate, problem.state.pos, cloth.faces)
+        if any(type(term) is BendDamping for term in self.bendings):
+            dt = problem.step.dt[cloth.hinge_scene]
+            self.hinge_constants = self.hinge_constants.moving(problem.state.pos, cloth.hinges, dt)
         self._face_corners, self._hinge_corners = Corners(cloth.faces), Corners(cloth.hinges)
 
     def energies(self, pos: Tensor, acc: Tensor) -> list[Tensor]:
@@ -75,6 +82,13 @@ class StepTerms:
     def other_gradient(self, pos: Tensor, acc: Tensor) -> Tensor | None:
         """Gradient (V, 3) [N] of the energies that have no closed form here, by autograd; None without any."""
         return None if self.others is None else self.others.gradient(self.problem, pos, acc)[0]
+
+
+def stretch_rate(potential: Potential, problem: StepProblem) -> Tensor | None:
+    """Viscous stress of the membrane in units of the elastic one of the step's strain, (F,); None without damping."""
+    terms = potential.active(problem).values()
+    time, elastic = sum(term.time for term in terms if type(term) is StretchDamping), sum(type(t) is Stretching for t in terms)
+    return time / elastic / problem.step.dt[problem.cloth.face_scene] if time and elastic else None
 
 
 def _sum(values: Tensor, scene: Tensor, num_scenes: int) -> Tensor:

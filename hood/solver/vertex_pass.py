@@ -13,6 +13,7 @@ from hood.losses.elements import library
 from hood.native.structures import COUNT, POINTER, REAL, fields
 
 if TYPE_CHECKING:
+    from hood.solver.drag import Drag
     from hood.solver.forces import Grip, VertexForces, Walls
 
 
@@ -26,6 +27,12 @@ class GripStructure(ctypes.Structure):
     """``Grip`` of ``vertex_terms.h``."""
 
     _fields_ = fields("force normal anchor limit", POINTER)
+
+
+class DragStructure(ctypes.Structure):
+    """``Drag`` of ``vertex_terms.h``."""
+
+    _fields_ = fields("normal target across along", POINTER)
 
 
 class _Vertices(ctypes.Structure):
@@ -57,7 +64,15 @@ def grip_structures(grips: tuple[Grip, ...]) -> tuple[ctypes.Array[GripStructure
     return structures, kept
 
 
-def _pointed(structure: ctypes.Structure, item: Walls | Grip, names: tuple[str, ...]) -> list[Tensor]:
+def drag_structures(drags: tuple[Drag, ...]) -> tuple[ctypes.Array[DragStructure], list[Tensor]]:
+    """The same for drags."""
+    structures, kept = (DragStructure * len(drags))(), list[Tensor]()
+    for structure, drag in zip(structures, drags, strict=True):
+        kept += _pointed(structure, drag, ("normal", "target", "across", "along"))
+    return structures, kept
+
+
+def _pointed(structure: ctypes.Structure, item: Walls | Grip | Drag, names: tuple[str, ...]) -> list[Tensor]:
     tensors = [whole(getattr(item, name)) for name in names]
     for name, tensor in zip(names, tensors, strict=True):
         setattr(structure, name, tensor.data_ptr())

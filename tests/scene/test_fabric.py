@@ -10,11 +10,14 @@ import pytest
 import torch
 
 from hood.assets.material import EdgeField, FaceField, Field, Material
+from hood.dynamics.implicit_euler import implicit_euler
 from hood.losses.bending import Bending
 from hood.losses.potential import default_potential
 from hood.losses.stretching import Stretching
 from hood.mesh import topology
 from hood.scene.cloth import Cloth, build_cloth, concatenate_cloths
+from hood.scene.fabric import patchwork
+from hood.solver.newton import NewtonSettings
 from hood.testing import cylinder, fold, grid, make_problem, sphere, strip
 
 F64 = torch.float64
@@ -196,3 +199,34 @@ def test_moduli_that_meet_badly_are_refused() -> None:
     lame_lambda[3] = -150.0
     with pytest.raises(ValueError, match=r"lame_mu \+ lame_lambda is -50.0 at face 3"):
         build_cloth(*mesh, Material(lame_mu=np.full(16, 100.0), lame_lambda=FaceField(lame_lambda)))
+
+
+def test_parts_that_do_not_touch_are_garments_of_their_own_fabric() -> None:
+    """Two hanging tubes of one cloth, each of its fabric, fall as each does alone."""
+    pos, faces = cylinder(10, 6)
+    fabrics = Material(density=0.06, bending_stiffness=4e-7), Material(density=0.45, lame_mu=5e4, bending_stiffness=3e-4)
+    both = np.concatenate([pos, pos + [1.0, 0.0, 0.0]]), np.concatenate([faces, faces + len(pos)])
+    second = np.arange(len(both[1])) >= len(faces)
+    sewn = patchwork(fabrics[0], [(second, fabrics[1])], *both)
+    held = pos[:, 1] > pos[:, 1].max() - 1e-6
+
+    def fallen(mesh: tuple[np.ndarray, np.ndarray], material: Material, pinned: np.ndarray) -> np.ndarray:
+        cloth = build_cloth(*mesh, material, pinned, dtype=F64)
+        start = cloth.rest_pos * torch.tensor([1.0, 0.9, 1.05])  # creased
+        steps = implicit_euler(default_potential(), make_problem(cloth, start), 5, NewtonSettings(target_rg=1e-8))
+        return [step.state.pos.numpy() for step in steps][-1]
+
+    together = fallen(both, sewn, np.tile(held, 2))
+    for place, material in enumerate(fabrics):
+        own = fallen((pos + [place, 0.0, 0.0], faces), material, held)
+        # The start is scaled about the origin.
+        np.testing.assert_allclose(together[place * len(pos) :][: len(pos)], own, rtol=0, atol=1e-6)
+    assert np.abs(together[len(pos) :] - [1.0, 0.0, 0.0] - together[: len(pos)]).max() > 1e-3
+
+
+def test_of_parts_that_overlap_the_last_counts() -> None:
+    mesh = grid(4, 4)
+    count = len(mesh[1])
+    masks = np.arange(count) < 9, np.arange(count) < 4
+    sewn = patchwork(Material(), [(masks[0], Material(density=0.3)), (masks[1], Material(density=0.4))], *mesh)
+    np.testing.assert_allclose(sewn.density.values, [0.4] * 4 + [0.3] * 5 + [0.20022] * (count - 9))

@@ -12,8 +12,10 @@ from test_newton import batch, falling, hanging, pieces
 from test_plan import states, touching_sheet
 
 from hood.assets.material import Material
+from hood.losses.damping import BendDamping, StretchDamping
 from hood.losses.gravity import Gravity
 from hood.losses.potential import default_potential, reference_potential
+from hood.losses.wind import Wind
 from hood.native import build as native_build
 from hood.native.build import BuildError
 from hood.scene.batch import to_device
@@ -72,7 +74,10 @@ def dense_of(plan, triples) -> np.ndarray:
     return result.reshape(3 * plan.pattern.size, -1)
 
 
-POTENTIALS = {"default": default_potential(), "reference": reference_potential()}
+BLOWN = default_potential().with_terms(
+    wind=Wind([3.0, 1.0, -2.0], gusts=0.3), stretch_damping=StretchDamping(0.02), bend_damping=BendDamping(0.03)
+)
+POTENTIALS = {"default": default_potential(), "reference": reference_potential(), "wind and damping": BLOWN}
 
 
 @pytest.mark.parametrize("name", ["near", "stretched", "compressed", "folded", "coincident vertices"])
@@ -101,13 +106,14 @@ def test_potential_gradient_and_matrix_are_those_of_the_torch_form(name, kind):
     assert np.abs(dense(half, "matrix") - matrix).max() <= 1e-6 * np.abs(matrix).max()
 
 
+@pytest.mark.parametrize("potential", [default_potential(), BLOWN], ids=["default", "wind and damping"])
 @pytest.mark.parametrize("make", [hanging, falling, touching_sheet])
-def test_iterations_are_those_of_the_torch_form(make):
+def test_iterations_are_those_of_the_torch_form(make, potential):
     """With its linear solver in float32; sums in another order part slowly."""
     problem = make()
     for count in range(4):
-        there, expected = minimize(default_potential(), problem, settings=replace(TORCH, max_iterations=count))
-        here, report = minimize(default_potential(), problem, settings=replace(COMPILED, max_iterations=count))
+        there, expected = minimize(potential, problem, settings=replace(TORCH, max_iterations=count))
+        here, report = minimize(potential, problem, settings=replace(COMPILED, max_iterations=count))
         assert report.iterations == expected.iterations
         assert float((here - there).norm()) <= 1e-4 * float((there - problem.state.pos).norm())
         torch.testing.assert_close(report.phi, expected.phi, rtol=1e-5, atol=1e-9)

@@ -7,8 +7,10 @@ import pytest
 import torch
 from torch._subclasses.fake_tensor import FakeTensorMode
 
+from hood.losses.damping import BendDamping, StretchDamping
 from hood.losses.potential import default_potential, scale
 from hood.losses.problem import StepProblem
+from hood.losses.wind import Wind
 from hood.nn.dense import whole_arrays
 from hood.scene.cloth import concatenate_cloths
 from hood.scene.scene import Scene, concatenate_step_inputs
@@ -19,24 +21,27 @@ from hood.solver.newton import NewtonSettings, minimize, run
 from hood.solver.plan import plan_for
 from hood.testing import without_values
 
+POTENTIAL = default_potential()
+BLOWN = POTENTIAL.with_terms(wind=Wind([3.0, 1.0, -2.0]), stretch_damping=StretchDamping(2e-3), bend_damping=BendDamping(2e-3))
+
 
 def problem_of(scene: Scene, frame: int = 2) -> StepProblem:
     state = scene.start(frame)
     return default_potential().prepare(StepProblem(scene.cloth, state, scene.step_input(frame, state)))
 
 
-def solve(problem, settings, start=None):
+def solve(problem, settings, start=None, potential=POTENTIAL):
     """Positions and report by the pieces."""
     work = in_double(problem)
-    system = FixedSystem(default_potential().settled(work), lambda: work, plan_for(work), settings.cg_iterations)
+    system = FixedSystem(potential.settled(work), lambda: work, plan_for(work), settings.cg_iterations)
     system.enter()
     system.begin(start)
     return run(system, work.state.pos, settings, 0.0, None)
 
 
-def assert_same(problem, settings, start=None):
-    expected, reference = minimize(default_potential(), in_double(problem), start, replace(settings, engine="torch"))
-    pos, report = solve(problem, settings, start)
+def assert_same(problem, settings, start=None, potential=POTENTIAL):
+    expected, reference = minimize(potential, in_double(problem), start, replace(settings, engine="torch"))
+    pos, report = solve(problem, settings, start, potential)
     assert report.iterations == reference.iterations
     assert report.reason == reference.reason
     e0 = scale(in_double(problem))
@@ -60,6 +65,10 @@ def test_to_convergence_from_a_given_start(band_scene):
     assert bool(report.converged.all())
 
 
+def test_wind_and_damping(band_scene):
+    assert_same(problem_of(band_scene), NewtonSettings(max_iterations=4), potential=BLOWN)
+
+
 def test_springs_and_no_body(tank_scene):
     problem = problem_of(tank_scene)
     buttons = Attachments(torch.tensor([[0, 70], [3, 60]]), torch.tensor([True, False]))
@@ -77,12 +86,13 @@ def test_scenes_of_a_batch_stop_each_on_its_own(tank_scene, band_scene):
     assert_same(default_potential().prepare(both), NewtonSettings(max_iterations=8, target_rg=1e-2))
 
 
-def test_nothing_in_a_piece_depends_on_data(skirt_scene):
+@pytest.mark.parametrize("potential", [default_potential(), BLOWN], ids=["default", "wind and damping"])
+def test_nothing_in_a_piece_depends_on_data(skirt_scene, potential):
     """Tensors without values, not on the CPU: whoever asks for one, or for an array whose size follows from one, fails."""
     problem = in_double(problem_of(skirt_scene))
     buttons = Attachments(torch.tensor([[0, 70], [3, 60]]), torch.tensor([True, False]))
     problem = replace(problem, step=replace(problem.step, attachments=buttons))
-    potential, plan = default_potential().settled(problem), plan_for(problem)
+    potential, plan = potential.settled(problem), plan_for(problem)
     system = FixedSystem(potential, lambda: problem, plan, 100)
     scatters = ("matrix", "slack", "face_vertices", "hinge_vertices", "attachment_vertices")
     made = {name: getattr(plan, name) for name in scatters}
@@ -93,7 +103,7 @@ def test_nothing_in_a_piece_depends_on_data(skirt_scene):
             if isinstance(value, torch.Tensor):
                 setattr(system, name, without_values(value))
         system._plan = copy.copy(plan)
-        tables = {name: without_values(getattr(plan, name)) for name in ("vertices", "scene")}
+        tables = {name: without_values(getattr(plan, name)) for name in ("vertices", "scene", "centroids")}
         vars(system._plan).update({name: _empty_scatter(scatter) for name, scatter in made.items()} | tables)
         for piece in system.pieces.values():
             piece()

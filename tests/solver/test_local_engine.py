@@ -9,9 +9,11 @@ from test_local import problem_of
 from hood.losses.attachment import Attachment
 from hood.losses.bending import CurrentLengthBending
 from hood.losses.collision import CentroidCollision
+from hood.losses.damping import BendDamping, StretchDamping
 from hood.losses.friction import WeightFriction
 from hood.losses.potential import Potential, default_potential
 from hood.losses.problem import StepProblem
+from hood.losses.wind import Wind
 from hood.native.build import BuildError
 from hood.scene.scene import Scene
 from hood.scene.state import Attachments
@@ -61,8 +63,9 @@ def test_views_are_nearer_to_the_exact_ones_than_those_of_torch_in_float32(name:
     [
         {"bending": CurrentLengthBending()},
         {"collision": CentroidCollision(), "friction": WeightFriction()},
+        {"wind": Wind([3.0, 0.0, -4.0], gusts=0.2), "stretch_damping": StretchDamping(5e-3), "bend_damping": BendDamping(5e-3)},
     ],
-    ids=["current length", "published contact"],
+    ids=["current length", "published contact", "wind and damping"],
 )
 def test_other_terms(terms: dict, band_scene: Scene) -> None:
     potential = default_potential().with_terms(**terms)

@@ -9,7 +9,9 @@ import pytest
 import torch
 
 from hood.assets.material import Material
+from hood.losses.damping import BendDamping, StretchDamping
 from hood.losses.potential import default_potential, relative_gradient, scale
+from hood.losses.wind import Wind
 from hood.scene.cloth import build_cloth, concatenate_cloths
 from hood.scene.contact import Contact
 from hood.scene.state import Attachments, State, StepInput
@@ -137,8 +139,13 @@ def test_negative_count_is_refused():
         sweep(default_potential(), problem, problem.state.pos, -1)
 
 
-def test_vertex_systems_are_the_diagonal_of_the_model():
+@pytest.mark.parametrize("blown", [False, True])
+def test_vertex_systems_are_the_diagonal_of_the_model(blown):
     potential, problem = default_potential(), sheet(attached=True)
+    if blown:
+        damping = {"stretch_damping": StretchDamping(0.02), "bend_damping": BendDamping(0.03)}
+        potential = potential.with_terms(wind=Wind([3.0, 1.0, -2.0]), **damping)
+        problem = replace(problem, state=replace(problem.state, pos=noisy(problem.state.pos, 2e-3, seed=5)))
     pos = noisy(problem.state.pos, 3e-3)
     acc, plan = problem.acceleration(pos), plan_for(problem)
     model = quadratic_model(potential, problem, plan, pos, acc)

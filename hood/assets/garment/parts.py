@@ -1,0 +1,90 @@
+"""Parts of a garment by name: a garment of an outfit, what is above or below a joint, a painted colour, a list of vertices."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from hood.assets.body.body import Body
+from hood.assets.files.library import unknown
+from hood.assets.garment.garment import Garment
+from hood.assets.garment.pins import JOINTS, REGIONS, read_indices
+
+#: Colours of vertices that are names of parts.
+COLOURS = ("red", "green", "blue")
+#: A vertex is of a colour that exceeds the two others by this much of the full scale.
+_STRENGTH = 0.5
+
+
+def part_faces(part: str, garment: Garment, body: Body | None) -> np.ndarray:
+    """(F,) bool: the faces of a part of ``garment``. Where it borders on others, a face is of the side of its centre, or of
+    most of its corners.
+
+    Args:
+        part: the name of a garment of an outfit; ``above_JOINT`` or ``below_JOINT``, by the height of the centre in T-pose, the
+            joint by its own name or that of an opening (:data:`hood.assets.garment.pins.REGIONS`); one of :data:`COLOURS`, of
+            the vertices in the mesh file; or the path of a ``.txt`` or ``.json`` list of vertices.
+        body: whose joints are meant, in T-pose; None refuses them.
+
+    Raises:
+        ValueError: the garment has no such part, or no face in it; names what there is.
+    """
+    side, _, joint = part.partition("_")
+    if side in ("above", "below") and joint:
+        found = _beside(part, side, joint, garment, body)
+    elif Path(part).suffix.lower() in (".txt", ".json"):
+        found = _listed(Path(part).expanduser(), garment)
+    elif part in COLOURS:
+        found = _coloured(part, garment)
+    else:
+        found = _piece(part, garment)
+    if not found.any():
+        raise ValueError(f"part {part!r}: no face of garment {garment.name!r} is in it; leave it out, or choose another")
+    return found
+
+
+def _piece(part: str, garment: Garment) -> np.ndarray:
+    names = garment.name.split("+")
+    if part not in names:
+        known = unknown("part", part, [*names, "above_JOINT", "below_JOINT", *COLOURS])
+        raise ValueError(f"garment {garment.name!r}: {known}; or a .txt or .json list of vertices")
+    if garment.piece is None or len(names) == 1:
+        return np.ones(len(garment.faces), dtype=bool)
+    return np.asarray(garment.piece[garment.faces[:, 0]] == names.index(part))
+
+
+def _beside(part: str, side: str, joint: str, garment: Garment, body: Body | None) -> np.ndarray:
+    name = REGIONS.get(joint, joint)
+    if name not in JOINTS:
+        raise ValueError(f"part {part!r}: {unknown('joint', joint, [*REGIONS, *JOINTS])}")
+    if body is None:
+        raise ValueError(f"part {part!r}: heights of joints need a body with joints; give a list of vertices")
+    joints = body.shaped(np.zeros(0))[1]
+    if JOINTS.index(name) >= len(joints):
+        raise ValueError(f"part {part!r}: the body has {len(joints)} joints and no {name}; give another joint")
+    pos = garment.rest_pos if garment.skin_pos is None else garment.skin_pos
+    above = pos[garment.faces, 1].mean(axis=1) > joints[JOINTS.index(name), 1]
+    return np.asarray(above if side == "above" else ~above)
+
+
+def _listed(path: Path, garment: Garment) -> np.ndarray:
+    numbers, count = read_indices(path), len(garment.rest_pos)
+    outside = (numbers < 0) | (numbers >= count)
+    if outside.any():
+        raise ValueError(f"{path}: vertex {int(numbers[np.argmax(outside)])} of {count}; they are numbered from 0")
+    inside = np.zeros(count, dtype=bool)
+    inside[numbers] = True
+    return _of_most_corners(inside, garment)
+
+
+def _coloured(colour: str, garment: Garment) -> np.ndarray:
+    if garment.colours is None:
+        raise ValueError(f"part {colour!r}: {garment.name!r} has no vertex colours; paint the part and export colours")
+    own = COLOURS.index(colour)
+    others = np.delete(garment.colours, own, axis=1).max(axis=1)
+    return _of_most_corners(garment.colours[:, own] - others > _STRENGTH, garment)
+
+
+def _of_most_corners(inside: np.ndarray, garment: Garment) -> np.ndarray:
+    return np.asarray(inside[garment.faces].sum(axis=1) >= 2)

@@ -1,0 +1,45 @@
+"""Fabrics of a rollout, part by part."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hood.assets.material import FaceField
+from hood.commands.fabrics import checked_fabrics, fabric_named
+from hood.commands.setup import make_scene
+from hood.config import ConfigError, load_config
+
+
+def test_parts_of_a_dress_have_their_fabrics_in_the_scene() -> None:
+    words = ["garment=dress", "fabrics={below_waistband:silk,above_waistband:denim}", "num_frames=3"]
+    cloth = make_scene(load_config("rollout", words)).cloth
+    silk, denim = fabric_named("silk"), fabric_named("denim")
+    below = np.isclose(cloth.density.numpy(), silk.density)
+    np.testing.assert_allclose(cloth.density.numpy()[~below], denim.density, rtol=1e-6)
+    np.testing.assert_allclose(cloth.lame_mu.numpy()[below], silk.lame_mu, rtol=1e-6)
+    assert 0.3 < below.mean() < 0.9
+    # One of the two in a hinge inside a part, between them on the seam.
+    stiffness = cloth.bending_stiffness.numpy()
+    inside = np.isclose(stiffness, silk.bending_stiffness) | np.isclose(stiffness, denim.bending_stiffness)
+    assert 0.9 < inside.mean() < 1.0
+    np.testing.assert_allclose(stiffness[~inside], 0.5 * (silk.bending_stiffness + denim.bending_stiffness), rtol=1e-5)
+
+
+def test_without_parts_the_fabric_is_that_of_the_option() -> None:
+    cloth = make_scene(load_config("rollout", ["garment=tank", "material=jersey", "num_frames=3"])).cloth
+    assert not isinstance(fabric_named("jersey").density, FaceField)
+    np.testing.assert_allclose(cloth.density.numpy(), 0.16, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("fabrics=silk", "fabrics=silk: give fabrics by part"),
+        ("fabrics={dress:slik}", "fabrics: dress: unknown material 'slik': did you mean 'silk'"),
+        ("fabrics={dress:0.3}", "give fabrics by part"),
+    ],
+)
+def test_what_is_no_table_of_fabrics_is_refused(word: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        checked_fabrics(load_config("rollout", [word]))
