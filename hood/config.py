@@ -27,8 +27,8 @@ from hood.plugins import config_folders, packages
 _PACKAGE = Path(__file__).resolve().parent
 #: Installed packages carry the configs inside; a clone has them beside the package.
 CONFIG_FOLDER = _PACKAGE / "configs" if (_PACKAGE / "configs").is_dir() else _PACKAGE.parent / "configs"
-#: Keys that take one word or a list.
-_ONE_OR_MORE = ("garment", "offset", "layers")
+#: Keys that take one word or number, or a list.
+_ONE_OR_MORE = ("garment", "offset", "layers", "size")
 #: Keys in here may be null: an energy that is left out.
 _OPTIONAL = "losses.terms."
 #: Of a key that is not there.

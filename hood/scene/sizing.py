@@ -61,7 +61,7 @@ def sizes_of(size: Size, end: Size | None = None, seconds: float = 1.0) -> Sizes
         ValueError: neither one number nor three, or one that is no size.
     """
     start = _three(size)
-    return Sizes(start, start if end is None else _three(end), seconds)
+    return Sizes(start, start) if end is None else Sizes(start, _three(end), seconds)
 
 
 def resized(cloth: Cloth, before: tuple[float, float, float], now: tuple[float, float, float]) -> Cloth:
