@@ -151,7 +151,7 @@ def test_every_scene_of_a_training_is_inside_of_it(tank_scene: Scene, skirt_scen
     assert len(outside(trained, scene_conditions(garments["tshirt"], shirt, 1 / 30, default_potential()))) == 2
 
 
-@pytest.mark.parametrize("name", ["quickstart", "fine15", "ours", "fine48", "small1", "small2", "small3"])
+@pytest.mark.parametrize("name", ["quickstart", "fine15", "ours", "fine48", "small1", "small2", "small3", "edges"])
 def test_the_shipped_files_say_what_they_were_trained_for(name: str, garments: dict[str, Garment]) -> None:
     trained = load_simulator(locate("weights", name)).trained_for
     assert trained is not None
@@ -159,7 +159,7 @@ def test_the_shipped_files_say_what_they_were_trained_for(name: str, garments: d
         cloth = build_cloth(garment.rest_pos, garment.faces, Material())
         assert outside(trained, scene_conditions(garment, cloth, 1 / 30, default_potential(), np.zeros(10))) == []
     assert describe(trained)["trained on garment mean edge"] == (
-        "11.7 to 39.6 mm" if name == "quickstart" else "22.2 to 39.7 mm"
+        "11.7 to 39.6 mm" if name in ("quickstart", "edges") else "22.2 to 39.7 mm"
     )
 
 
