@@ -74,12 +74,12 @@ class StepProblem:
         return replace(problem, fold=find_other_skin(*given, free_flight(self)))
 
     def next_depth(self, next_pos: Tensor) -> float:
-        """Depth [m] of the vertex that lies deepest inside the body at t + 1, at ``next_pos`` (V, 3) [m]; 0 where none does."""
+        """Depth [m] of the free vertex that lies deepest inside the body at t + 1, at ``next_pos`` (V, 3) [m]; 0 where none."""
         obstacle, cloth = self.step.obstacle, self.cloth
         if obstacle is None or not len(obstacle.faces) or not len(next_pos):
             return 0.0
         dist = skin_distance(next_pos, cloth.vertex_scene, obstacle.next_pos, obstacle)
-        return float(torch.where(cloth.mass > 0, -dist, 0.0).clamp_min(0.0).max())
+        return float(torch.where(cloth.free, -dist, 0.0).clamp_min(0.0).max())
 
     def with_entered(self, next_pos: Tensor) -> StepProblem:
         """The problem with contact where its solution ``next_pos`` (V, 3) [m] lies in skin that it did not know of; itself
@@ -87,7 +87,7 @@ class StepProblem:
         obstacle = self.step.obstacle
         if obstacle is None or self.contact is None or self.fold is None:
             return self
-        fold = find_entered(next_pos, self.state.pos, self.cloth.vertex_scene, obstacle, self.contacts)
+        fold = find_entered(next_pos, self.state.pos, self.cloth, obstacle, self.contacts)
         return self if fold is None else replace(self, fold=fold)
 
     def with_points(self, place: str) -> StepProblem:

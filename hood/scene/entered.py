@@ -15,6 +15,7 @@ from torch import Tensor
 from hood.mesh import surface_tree
 from hood.mesh.proximity import build_incidence, search_surface
 from hood.mesh.surface_tree import Match
+from hood.scene.cloth import Cloth
 from hood.scene.contact import Contact, Fold, match_surface
 from hood.scene.state import Obstacle
 
@@ -26,9 +27,7 @@ SHOWN = 3e-3
 DEEPEST = 50e-3
 
 
-def find_entered(
-    next_pos: Tensor, pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, contacts: Sequence[Contact]
-) -> Fold | None:
+def find_entered(next_pos: Tensor, pos: Tensor, cloth: Cloth, obstacle: Obstacle, contacts: Sequence[Contact]) -> Fold | None:
     """The contacts of a step with the skin that its solution ``next_pos`` (V, 3) [m] lies in added; None where there is none.
 
     Args:
@@ -37,8 +36,8 @@ def find_entered(
     """
     if not len(obstacle.faces) or not len(pos):
         return None
-    depth = -skin_distance(next_pos, vertex_scene, obstacle.next_pos, obstacle)
-    entered = (depth > ALLOWED) & (depth < DEEPEST)
+    depth = -skin_distance(next_pos, cloth.vertex_scene, obstacle.next_pos, obstacle)
+    entered = cloth.free & (depth > ALLOWED) & (depth < DEEPEST)
     for contact in contacts:
         if not bool(entered.any()):
             return None
@@ -46,7 +45,7 @@ def find_entered(
     rows = entered.nonzero().squeeze(1)
     if not len(rows):
         return None
-    match = _match_at_end(next_pos[rows], vertex_scene[rows], obstacle)
+    match = _match_at_end(next_pos[rows], cloth.vertex_scene[rows], obstacle)
     match = match._replace(dist=((pos[rows] - match.point) * match.normal).sum(dim=1))
     known = contacts[-1]
     both = {name: getattr(known, name).index_copy(0, rows, values) for name, values in match._asdict().items()}

@@ -6,6 +6,7 @@ apart.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +19,9 @@ from hood.scene.scene import LEAD_IN, Scene
 from hood.scene.start import settle
 from hood.scene.untangle import TangledError, crossing_pairs, likely_orders, separate
 
+#: Held vertices are moved by so much [m] at most.
+MOST_MOVED = 0.03
+
 
 def with_held_layers_apart(scene: Scene) -> Scene:
     """The scene with the places that held vertices are held at moved off each other, where those of two garments lie in each
@@ -25,7 +29,8 @@ def with_held_layers_apart(scene: Scene) -> Scene:
 
     In the T-pose all vertices but those held by the innermost garment are free, and the garments are taken apart
     (:func:`hood.scene.untangle.separate`); held vertices follow the body from where that leaves them. The rest shape stays.
-    A scene that cannot be taken apart there is left as it is: its start says why it is refused.
+    A warning says how far. A scene that cannot be taken apart there, or only by more than :data:`MOST_MOVED`, is left as it
+    is: its start says why it is refused.
     """
     outfit, motion = scene.outfit, scene.motion
     if outfit is None or not isinstance(motion, BodyMotion) or scene.start_pos is not None:
@@ -50,6 +55,15 @@ def with_held_layers_apart(scene: Scene) -> Scene:
         return scene
     moves = scene.cloth.pinned & ~fixed
     shift = torch.where(moves.unsqueeze(1), apart.pos - given, 0.0)
+    farthest = shift.norm(dim=1)
+    if float(farthest.max()) > MOST_MOVED:
+        return scene
+    moved = sorted({outfit.names[number] for number in outfit.piece[(farthest > 0).numpy()]})
+    warnings.warn(
+        f"outfit: the places at which {', '.join(map(repr, moved))} is held are moved off the garment below by up to "
+        f"{1e3 * float(farthest.max()):.0f} mm; their rest shapes stay",
+        stacklevel=2,
+    )
     return replace(scene, garment=_shifted(scene.garment, lead, shift))
 
 

@@ -80,7 +80,7 @@ def test_garments_in_another_order_than_they_lie_are_told() -> None:
 @pytest.mark.usefixtures("compiled_layers")
 def test_garments_that_cannot_be_taken_apart_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
     _belt("a.obj", 0.19)
-    _belt("b.obj", 0.19, aside=0.01)
+    _belt("b.obj", 0.19, aside=0.08)
     assert main([*QUICK, "garment=[a.obj,b.obj]", f"pins={list(range(200))}".replace(" ", "")]) == 2
     said = capsys.readouterr().err
     assert "pairs of triangles of 'a' and 'b' pass through each other at the start and could not be taken apart" in said

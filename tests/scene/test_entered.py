@@ -71,12 +71,17 @@ def test_what_is_known_already_is_not_entered() -> None:
     assert problem.with_entered(there - torch.tensor([0.1, 0.0, 0.0], dtype=F64)) is problem
 
 
-def test_depth_is_that_of_vertices_with_mass() -> None:
+def test_depth_is_that_of_free_vertices() -> None:
     problem = pushed(0.08)
     assert problem.next_depth(problem.state.pos) == pytest.approx(0.02, abs=1e-3)
     assert replace(problem, step=replace(problem.step, obstacle=None)).next_depth(problem.state.pos) == 0.0
     massless = replace(problem, cloth=replace(problem.cloth, mass=torch.zeros_like(problem.cloth.mass)))
     assert massless.next_depth(problem.state.pos) == 0.0
+    held = default_potential().prepare(
+        replace(problem, cloth=replace(problem.cloth, pinned=torch.ones_like(problem.cloth.pinned)))
+    )
+    assert held.next_depth(held.state.pos) == 0.0
+    assert held.with_entered(held.state.pos) is held
 
 
 def test_distances_of_a_batch_are_those_of_contact(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,7 @@ from hood.assets.body.body import Body
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.outfit import join_garments
 from hood.assets.motion.sequence import PoseSequence
-from hood.scene.held_layers import with_held_layers_apart
+from hood.scene.held_layers import MOST_MOVED, with_held_layers_apart
 from hood.scene.scene import Scene, build_scene
 from hood.scene.untangle import TangledError
 
@@ -23,14 +23,15 @@ def test_a_skirt_over_shorts_starts_apart(garments: dict[str, Garment], body: Bo
     scene = outfit(["shorts", "skirt"], garments, body, walk)
     with pytest.raises(TangledError):
         scene.taken_apart(scene.start(thorough=True))
-    lifted = with_held_layers_apart(scene)
+    with pytest.warns(UserWarning, match="the places at which 'skirt' is held are moved off the garment below by up to"):
+        lifted = with_held_layers_apart(scene)
     _, found = lifted.taken_apart(lifted.start(thorough=True))
     assert found is not None
     assert found.after == 0
     assert found.stretch < 0.15
     # Held places alone have moved, by millimetres, and no rest shape has.
     moved = np.linalg.norm(lifted.garment.tpose(np.zeros(10)) - scene.garment.tpose(np.zeros(10)), axis=1)
-    assert 1e-3 < moved.max() < 0.03
+    assert 1e-3 < moved.max() < MOST_MOVED
     assert not moved[~scene.garment.pinned].any()
     assert lifted.cloth is scene.cloth
     np.testing.assert_array_equal(lifted.motion.rest_pos(lifted.garment), scene.motion.rest_pos(scene.garment))
