@@ -134,6 +134,8 @@ def air(velocity: float | Sequence[float] | None = None, **settings: Any) -> Win
         return None
     if isinstance(velocity, (int, float)):
         velocity = (0.0, 0.0, 0.0 - float(velocity))
+    if isinstance(velocity, str) or not all(isinstance(value, (int, float)) for value in velocity):
+        raise ValueError(f"wind={velocity}: give m/s, a number (wind=3) or three (wind=[3,0,0])")
     return Wind(velocity, **settings)
 
 

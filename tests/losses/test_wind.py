@@ -9,7 +9,7 @@ import torch
 from hood.assets.material import Material
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
-from hood.losses.wind import Wind
+from hood.losses.wind import Wind, air
 from hood.scene.cloth import build_cloth, concatenate_cloths
 from hood.scene.state import State
 from hood.testing import grid, make_problem
@@ -134,3 +134,9 @@ def test_scenes_of_a_batch_have_their_own_air():
 def test_bad_values_are_refused(given, message):
     with pytest.raises(ValueError, match=message):
         Wind(**given)
+
+
+@pytest.mark.parametrize("given", ["abc", [1.0, "x", 0.0]])
+def test_a_wind_that_is_no_number_is_refused(given):
+    with pytest.raises(ValueError, match="give m/s, a number"):
+        air(given)
