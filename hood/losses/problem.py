@@ -10,7 +10,7 @@ from torch import Tensor
 from hood.scene.cloth import Cloth
 from hood.scene.contact import Contact, Fold, find_contact
 from hood.scene.contact_points import PointContact, find_point_contact
-from hood.scene.entered import find_entered, skin_distance
+from hood.scene.entered import find_entered, signed_distance
 from hood.scene.landing import find_other_skin
 from hood.scene.layer_sides import LayerPairs, find_sides
 from hood.scene.layers import SceneLayers, find_layers, late_targets
@@ -78,7 +78,7 @@ class StepProblem:
         obstacle, cloth = self.step.obstacle, self.cloth
         if obstacle is None or not len(obstacle.faces) or not len(next_pos):
             return 0.0
-        dist = skin_distance(next_pos, cloth.vertex_scene, obstacle.next_pos, obstacle)
+        dist = signed_distance(next_pos, cloth.vertex_scene, obstacle.next_pos, obstacle)
         return float(torch.where(cloth.free, -dist, 0.0).clamp_min(0.0).max())
 
     def with_entered(self, next_pos: Tensor) -> StepProblem:

@@ -36,7 +36,7 @@ def find_entered(next_pos: Tensor, pos: Tensor, cloth: Cloth, obstacle: Obstacle
     """
     if not len(obstacle.faces) or not len(pos):
         return None
-    depth = -skin_distance(next_pos, cloth.vertex_scene, obstacle.next_pos, obstacle)
+    depth = -signed_distance(next_pos, cloth.vertex_scene, obstacle.next_pos, obstacle)
     entered = cloth.free & (depth > ALLOWED) & (depth < DEEPEST)
     for contact in contacts:
         if not bool(entered.any()):
@@ -53,7 +53,7 @@ def find_entered(next_pos: Tensor, pos: Tensor, cloth: Cloth, obstacle: Obstacle
     return Fold(Contact(**both, valid=valid))
 
 
-def skin_distance(pos: Tensor, vertex_scene: Tensor, surface: Tensor, obstacle: Obstacle) -> Tensor:
+def signed_distance(pos: Tensor, vertex_scene: Tensor, surface: Tensor, obstacle: Obstacle) -> Tensor:
     """Signed distances [m] (V,) of positions (V, 3) to the obstacle with its vertices at ``surface`` (W, 3) [m]; infinite in
     scenes without any."""
     incidence = build_incidence(obstacle.faces, len(obstacle.pos))

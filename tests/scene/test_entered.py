@@ -15,7 +15,7 @@ from hood.losses.problem import StepProblem
 from hood.mesh import surface_tree
 from hood.scene.cloth import build_cloth
 from hood.scene.contact import find_contact
-from hood.scene.entered import skin_distance
+from hood.scene.entered import signed_distance
 from hood.scene.state import State, StepInput, concatenate_obstacles
 from hood.solver.newton import NewtonSettings, minimize
 from hood.testing import grid, sphere
@@ -89,6 +89,6 @@ def test_distances_of_a_batch_are_those_of_contact(monkeypatch: pytest.MonkeyPat
     points = torch.tensor([[0.02, 0.25, 0.0], [0.0, 0.05, 0.0], [-0.06, 0.03, 0.0], [-0.2, 0.3, 0.0]], dtype=F64)
     scene = torch.arange(4) // 2
     known = find_contact(points, scene, both).dist
-    assert torch.equal(skin_distance(points, scene, both.pos, both), known)
+    assert torch.equal(signed_distance(points, scene, both.pos, both), known)
     monkeypatch.setattr(surface_tree, "library", lambda: None)
-    torch.testing.assert_close(skin_distance(points, scene, both.pos, both), known, rtol=0, atol=1e-12)
+    torch.testing.assert_close(signed_distance(points, scene, both.pos, both), known, rtol=0, atol=1e-12)
