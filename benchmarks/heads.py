@@ -3,6 +3,7 @@
     python benchmarks/heads.py errors                              # the exact answer with errors, on states of the solver
     python benchmarks/heads.py errors --garments dress_4k skirt_4k --states 1
     python benchmarks/heads.py models A.safetensors B.safetensors  # models on the states of their own rollouts
+    python benchmarks/heads.py projective --solves 1 10 30         # the control of edges after so many solves, on its own states
     python benchmarks/heads.py controls FOLDER                     # the controls as model files, for rollouts of their own
 
 An error of 30% is 0.3 times the change from the base at every vertex, or edge, in a direction of its own; ``shrunk`` is the
@@ -34,7 +35,7 @@ from hood.assets.garment.garment import load_garment
 from hood.assets.motion.load import load_sequence
 from hood.dynamics.checkpoint import load_simulator, save_simulator
 from hood.dynamics.edge_output import EdgeOutput
-from hood.dynamics.network_step import Held
+from hood.dynamics.network_step import Held, Moved, NetworkStep
 from hood.dynamics.rollout import simulate
 from hood.dynamics.simulator import build_simulator
 from hood.dynamics.stepper import NewtonStepper, Stepper
@@ -57,6 +58,8 @@ WHOLE_STEPS = (1, 2, 4, 8)
 #: Logarithm of how much more than by default vertices near the body are held where nothing is predicted: 300 N/m, which is best
 #: for the controls.
 FIRM = math.log(15.0)
+#: The same of the strength along the body, which by default is a quarter of that towards it.
+ALIKE = math.log(4.0)
 
 
 @dataclass
@@ -103,7 +106,9 @@ class Case:
         """Positions from edges (N, 3) and anchors (V, 3) by the head, ``hold`` being its output for how firm these are."""
         base = self.base if base is None else base
         head = _Given(vector)
-        raw = torch.cat([(anchor - base) / head.scale, torch.full_like(anchor[:, :1], hold)], dim=1)
+        # As firmly along the body as towards it.
+        firmness = torch.tensor([hold, hold + ALIKE]).to(anchor).expand(len(anchor), 2)
+        raw = torch.cat([(anchor - base) / head.scale, firmness], dim=1)
         return head.positions(self.problem, self.graph, base, raw, vector, self.held)
 
     def projective(self, solves: int) -> Tensor:
@@ -129,6 +134,38 @@ class _Given(EdgeOutput):
 
     def vectors(self, problem: StepProblem, graph: Graph, vector: Tensor, raw: Tensor) -> Tensor:
         return self._vector
+
+
+class _Projective(EdgeOutput):
+    """Edges of the base at their rest lengths, solved for again and again: projective dynamics, with nothing learned."""
+
+    def __init__(self, solves: int) -> None:
+        super().__init__()
+        self._solves = solves
+
+    def move(self, step: NetworkStep) -> Moved:
+        pos, count = step.base, step.graph.edge_sets[MESH].num_edges
+        raw = pos.new_tensor([0.0, 0.0, 0.0, FIRM, FIRM + ALIKE]).expand(len(pos), self.width)
+        edge_raw = pos.new_tensor([0.0, 0.0, 0.0, 1.0, 0.0]).expand(count, self.edge_width)
+        for _ in range(self._solves):
+            pos = self.positions(step.problem, step.graph, pos, raw, edge_raw, step.held)
+        return Moved(pos)
+
+
+def projective(solves: list[int], garments: list[str], states: int, frames: int) -> None:
+    """γ and time of what ``output=edges`` makes without a network, on the states of its own rollouts."""
+    for count in solves:
+        simulator = build_simulator(features="physical", output="edges", schedule="1x(mesh)", latent_dim=16).eval()
+        simulator.output = _Projective(count)
+        table = Table()
+        for garment in garments:
+            scene = make_scene(garment)
+            prepared = simulator.prepare(scene.cloth, scene.garment.rest_pos)
+            for case, problem, pos in cases(simulator, scene, states, frames):
+                table.add("γ", case.gamma(pos))
+                table.add("CPU ms of a step", 1e3 * cpu_time(partial(simulator.predict, problem, prepared)))
+        print(f"rest lengths, solves: {count}")
+        table.print()
 
 
 def make_scene(garment: str) -> Scene:
@@ -203,7 +240,7 @@ def write_controls(folder: Path) -> None:
             for layer in (vertices, edges):
                 layer.weight.zero_()
                 layer.bias.zero_()
-            vertices.bias[3], edges.bias[3] = hold, share
+            vertices.bias[3], vertices.bias[4], edges.bias[3] = hold, hold + ALIKE, share
         save_simulator(folder / f"{name}.safetensors", simulator)
         print(folder / f"{name}.safetensors")
     for count in WHOLE_STEPS:
@@ -232,17 +269,21 @@ def cpu_time(call: Callable[[], object]) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("errors", "models", "controls"))
+    parser.add_argument("what", choices=("errors", "models", "projective", "controls"))
     parser.add_argument("models", nargs="*", help="model files or names of shipped ones; a folder for controls")
     parser.add_argument("--garments", nargs="+", default=["dress", "tshirt", "skirt"])
     parser.add_argument("--states", type=int, default=2, help="of every rollout")
     parser.add_argument("--frames", type=int, default=24)
     parser.add_argument("--kernels", default="fused")
+    parser.add_argument("--solves", type=int, nargs="+", default=[1, 10, 30], help="of projective")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     common = arguments.garments, arguments.states, arguments.frames
     if arguments.what == "errors":
         errors(*common)
+    elif arguments.what == "projective":
+        with torch.no_grad():
+            projective(arguments.solves, *common)
     elif arguments.what == "controls":
         write_controls(Path(arguments.models[0]))
     else:

@@ -3,6 +3,10 @@
 To move a garment by a long wave without stretching it, positions have to be right to a thousandth of the move; the edges of the
 same move need not be. An error in the edges that differs from one to the next is averaged away by the solve, and its cost does
 not grow as meshes get finer.
+
+Cloth slides along a body that it cannot enter: near the body vertices are held towards it and across at strengths of their own.
+The network is shown the step of all vertices together. Its matrix knows nothing of a body until cloth touches it, so for that
+view vertices near the body are held back.
 """
 
 from __future__ import annotations
@@ -14,12 +18,15 @@ from hood.dynamics.network_step import Held, Moved, NetworkStep
 from hood.dynamics.output import VelocityBaseOutput
 from hood.graph.builder import MESH, Graph
 from hood.losses.problem import StepProblem
-from hood.nn.edge_solve import EdgeSystem, fit_edges
+from hood.nn.edge_solve import EdgeSystem, Firm, fit_edges
+from hood.nn.fixed_gradients import Steps
 from hood.scene.reach import sag
 
 #: Stiffness [N/m] of the edges in the solve, and of the anchors of vertices that touch the body where the network does not ask
-#: for another one.
-_STIFFNESS, _CONTACT = 40.0, 20.0
+#: for another one: towards the body and along it, where cloth slides.
+_STIFFNESS, _TOWARDS, _ALONG = 40.0, 20.0, 5.0
+#: Stiffness [N/m] that holds vertices near the body back in the global step that the network is shown.
+_VIEW = 8.0
 #: Share of inertia, m / dt², in the anchors of all vertices: it decides where nothing else does.
 _INERTIA = 0.1
 #: Anchors are up to exp(±this) times as strong as they are by default.
@@ -36,16 +43,18 @@ class EdgeOutput(VelocityBaseOutput):
     """Corrections to the edges of the base, and one linear solve for the positions (:mod:`hood.nn.edge_solve`).
 
     The raw output of an edge (N, 5) turns its vector, takes a share of the way to its rest length, and stretches it by
-    hundredths. That of a vertex (V, 4) is a displacement of its anchor in units of ``scale``, and the logarithm of how much
-    more than by default it is held there if it is near the body. Zero output is the base. At last the cloth is taken out of
-    the body.
+    hundredths. That of a vertex (V, 5) is a displacement of its anchor in units of ``scale``, and the logarithms of how much
+    more than by default it is held there, along the body's normal and across it, if it is near the body. Zero output is the
+    base. At last the cloth is taken out of the body.
 
     Everything turns with the world if the output does, and lengths are relative to the edges: the same at every resolution.
     """
 
-    width = 4
+    width = 5
     edge_width = 5
     feature_sets = ("physical", "local")
+    sees_global_step = True
+    view_steps = Steps(1.0, 16)
 
     def move(self, step: NetworkStep) -> Moved:
         raw = step.network.with_edges(step.graph, step.nodes, step.edges)
@@ -58,15 +67,15 @@ class EdgeOutput(VelocityBaseOutput):
             problem: with its contact, as the network saw it.
             graph: its mesh edges, attachments included, are solved for.
             base: (V, 3) m.
-            raw: (V, 4) of the vertices.
+            raw: (V, 5) of the vertices.
             edge_raw: (N, 5) of the rows of the graph's mesh edges.
         """
         cloth, free = problem.cloth, held.free.unsqueeze(1)
         system = EdgeSystem(graph.edge_sets[MESH], held.free, cloth.vertex_scene, cloth.scene_sizes, _STIFFNESS)
         start = torch.where(free, base, held.fixed)
         vector = self.vectors(problem, graph, system.vectors(start), edge_raw)
-        anchor, weight = start + self.scale * raw[:, :3], self.weights(problem, start, raw[:, 3])
-        pos = fit_edges(system, start, vector, anchor, weight)
+        anchor = start + self.scale * raw[:, :3]
+        pos = fit_edges(system, start, vector, anchor, *self.weights(problem, start, raw[:, 3:]))
         return torch.where(free, self.outside(problem, pos), held.fixed)
 
     def vectors(self, problem: StepProblem, graph: Graph, vector: Tensor, raw: Tensor) -> Tensor:
@@ -82,12 +91,23 @@ class EdgeOutput(VelocityBaseOutput):
         length = (now + share * (goal - now) + _STRETCH * goal * stretch).clamp_min(0.0)
         return turned * (length / turned.norm(dim=1, keepdim=True).clamp_min(_SHORTEST))
 
-    def weights(self, problem: StepProblem, start: Tensor, raw: Tensor) -> Tensor:
-        """How strongly vertices are held at their anchors, (V,) [N/m]."""
+    def weights(self, problem: StepProblem, start: Tensor, raw: Tensor) -> tuple[Tensor, Firm | None]:
+        """How strongly vertices are held at their anchors, (V,) [N/m], and how much more towards the body."""
         cloth, contact = problem.cloth, problem.contact
         inertia = _INERTIA * cloth.mass / problem.vertex_dt.squeeze(1) ** 2
         if contact is None:
-            return inertia
-        gap = contact.next_dist(start) - self.clearance - sag(cloth, contact, problem.state.pos)
-        near = (1.0 - gap / _NEAR).clamp(0.0, 1.0) * contact.valid
-        return inertia + _CONTACT * near * torch.exp(raw.clamp(-_RANGE, _RANGE))
+            return inertia, None
+        near, (towards, along) = self.nearness(problem, start), torch.exp(raw.clamp(-_RANGE, _RANGE)).unbind(dim=1)
+        least = _ALONG * torch.minimum(along, towards * (_TOWARDS / _ALONG))
+        return inertia + near * least, Firm(near * (_TOWARDS * towards - least), contact.next_normal)
+
+    def nearness(self, problem: StepProblem, pos: Tensor) -> Tensor:
+        """From 0, a vertex (V,) that does not reach the body from ``pos``, to 1, one that touches it."""
+        contact = problem.contact
+        if contact is None:
+            return torch.zeros_like(pos[:, 0])
+        gap = contact.next_dist(pos) - self.clearance - sag(problem.cloth, contact, problem.state.pos)
+        return (1.0 - gap / _NEAR).clamp(0.0, 1.0) * contact.valid
+
+    def held_back(self, problem: StepProblem, base: Tensor) -> Tensor:
+        return _VIEW * self.nearness(problem, base)

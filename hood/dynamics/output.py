@@ -17,7 +17,9 @@ from hood.features.normalizer import RunningNormalizer
 from hood.losses.problem import StepProblem, inertial_guess
 from hood.mesh.diffusion import neighbours_of
 from hood.native import features as native
+from hood.nn.fixed_gradients import Steps
 from hood.scene.contact import Contact
+from hood.solver.global_step import STEPS
 
 _SMOOTHING_ROUNDS = 16
 #: A body this far away [m] has a quarter of the say over a vertex's base motion.
@@ -54,6 +56,8 @@ class Output(ABC, nn.Module):
     look_widths: ClassVar[tuple[int, int]] = LOOK_WIDTHS
     #: Whether features=local shows it what all vertices together would do as well.
     sees_global_step: ClassVar[bool] = False
+    #: Steps of conjugate gradients in that.
+    view_steps: ClassVar[Steps] = STEPS
     #: Whether the displacement is an acceleration per frame², from x_t + dt v_t.
     predicts_acceleration: ClassVar[bool] = False
     #: Whether it counts statistics (:meth:`observe`) before training starts.
@@ -71,6 +75,10 @@ class Output(ABC, nn.Module):
     @abstractmethod
     def displacement(self, raw: Tensor) -> Tensor:
         """Displacement (V, 3) [m] from the base for raw output (V, width)."""
+
+    def held_back(self, problem: StepProblem, base: Tensor) -> Tensor:
+        """How much vertices (V,) [N/m] are held back in the global step that the network is shown of the base (V, 3) [m]."""
+        return torch.zeros_like(base[:, 0])
 
     def move(self, step: NetworkStep) -> Moved:
         """Where the network's output leads; vertices that are not free stay where they are held."""

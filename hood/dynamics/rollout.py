@@ -251,7 +251,8 @@ def _jumps_within(scene: Scene, start_frame: int, count: int) -> dict[int, Jump]
 
 def _as_taken(problem: StepProblem, prediction: Prediction) -> StepProblem:
     """The problem with the contact that its step was taken with in the end."""
-    return problem if prediction.entered is None else replace(problem, fold=prediction.entered)
+    problem = problem if prediction.entered is None else replace(problem, fold=prediction.entered)
+    return problem if prediction.held_off is None else replace(problem, contact=prediction.held_off)
 
 
 def _with_guard(lap: dict[str, float], spent: float) -> dict[str, float]:

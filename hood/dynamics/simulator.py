@@ -32,7 +32,7 @@ from hood.native import features as native
 from hood.nn.model import MeshGraphNet
 from hood.nn.schedule import edge_set_names, parse_passes, parse_schedule, set_level
 from hood.scene.cloth import Cloth
-from hood.scene.contact import Fold, find_nearest
+from hood.scene.contact import Contact, Fold, find_nearest
 from hood.scene.near_cloth import find_near_cloth
 from hood.scene.state import State, StepInput
 from hood.solver.local import check_local
@@ -57,6 +57,7 @@ class Prediction:
     #: Of models in several passes: (V, 3) m after every pass but the last, and the forces (V, 3) N there.
     early: tuple[tuple[Tensor, Tensor], ...] = ()
     entered: Fold | None = None  # the second contacts that it was taken with, where the step had led into skin first
+    held_off: Contact | None = None  # the contact that it was taken with, where it had left triangles in the skin first
 
 
 class Sight(NamedTuple):
@@ -246,8 +247,9 @@ class Simulator(nn.Module):
         if not self._wants_feedback:
             return Sight(inputs, None, base, None)
         together = self.features.needs("global_step")
-        feedback = Feedback(potential, seen, together, compiled=together and self.training)
-        return Sight(*feedback(inputs, base), base, feedback)
+        feedback = Feedback(potential, seen, together, together and self.training, self.output.view_steps)
+        held_back = self.output.held_back(seen, base) if together else None
+        return Sight(*feedback(inputs, base, held_back), base, feedback)
 
     def advance(
         self, problem: StepProblem, seen: StepProblem, sight: Sight, nodes: Tensor, edges: dict[str, Tensor]
@@ -380,7 +382,8 @@ def build_simulator(
     rules = FrameRules(frame_dt, pins_ahead, velocity)
     num_levels = 1 + num_coarse_levels(parse_schedule(schedule)) if embedded_levels is None else embedded_levels
     layers = layer_radius is not None
-    of_set = SetSettings(num_levels, layers, head.sees_global_step, body_velocity, normalizer_decay, divisor_floor)
+    of_edges = head.sees_global_step and head.edge_width > 0
+    of_set = SetSettings(num_levels, layers, head.sees_global_step, of_edges, body_velocity, normalizer_decay, divisor_floor)
     feature_set = build_features(features, of_set)
     of_output = OutputSettings(output_scale, late_scale, normalizer_decay, divisor_floor)
     made = head.from_settings(of_output, output_options or {})

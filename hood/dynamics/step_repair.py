@@ -109,7 +109,7 @@ def repair_step(
         pos, report = minimize(potential, problem, start, how)
         if kind == REFINED and not report.iterations:
             continue  # the same step
-        taken = Prediction(pos, report.acc, prediction.metrics, entered=prediction.entered)
+        taken = Prediction(pos, report.acc, prediction.metrics, entered=prediction.entered, held_off=prediction.held_off)
         spent += report.iterations
         tries.append((kind, taken, step_quality(potential, problem, taken)))
         if tries[-1][2].within(limits):

@@ -73,6 +73,8 @@ class NewtonStepper:
     def __init__(self, potential: Potential, settings: NewtonSettings | None = None) -> None:
         self.potential, self.settings = potential, settings or NewtonSettings()
         self.gravity = torch.tensor([0.0, -9.81, 0.0])
+        held_by_curvature = any(getattr(term, "reach", None) == "curvature" for term in potential.terms.values())
+        self._holds_off = held_by_curvature and self.settings.budget_ms is None
         self.config: dict[str, Any] = {"stepper": "newton", **asdict(self.settings)}
 
     @property
@@ -95,7 +97,7 @@ class NewtonStepper:
 
     def predict(self, problem: StepProblem, prepared: None, watch: Stopwatch | None = None) -> Prediction:
         """The minimum next to the contact-projected inertial guess; where that lies in skin that its contact did not show, the
-        one next to it with that as well."""
+        one next to it with that as well, and where it leaves triangles in the skin, the one that holds them farther off."""
         with timed(watch, "search"):
             problem = asked = self.search(problem)
         with timed(watch, "solver"):
@@ -108,13 +110,22 @@ class NewtonStepper:
                 problem = again
                 pos, report = minimize(self.potential, problem, pos, self.settings)
                 iterations += report.iterations
+            for _ in range(MOST_AGAIN if self._holds_off else 0):
+                again = problem.with_held_off(pos)
+                if again is problem:
+                    break
+                problem = again
+                pos, report = minimize(self.potential, problem, pos, self.settings)
+                iterations += report.iterations
         reached = {
             "solver_iterations": float(iterations),
             "solver_converged": float(bool(report.converged.all())),
             "solver_reason": reason_number(report.reason),
         }
-        entered = None if problem is asked else problem.fold
-        return Prediction(pos, report.acc, reached, float(report.relative_gradient.max()), entered=entered)
+        entered = None if problem.fold is asked.fold else problem.fold
+        held_off = None if problem.contact is asked.contact else problem.contact
+        rg = float(report.relative_gradient.max())
+        return Prediction(pos, report.acc, reached, rg, entered=entered, held_off=held_off)
 
     def next_velocity(self, problem: StepProblem, prediction: Prediction) -> Tensor:
         """(V, 3) m/s at t + 1: (x_{t+1} − x_t) / dt."""

@@ -9,17 +9,17 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from hood.features.groups import EdgeGroup, FeatureSet, NodeGroup
+from hood.features.groups import EdgeGroup, FeatureSet, NodeGroup, cloth_difference
 from hood.features.inputs import Inputs
 from hood.features.normalizer import FixedScale
-from hood.features.physical import GRAVITY, ContactDistance, Residual, length, physical
+from hood.features.physical import GRAVITY, ContactDistance, Residual, length, mean_rest_length, physical
 
 #: Rounds of diffusion of the residuals of small and of large neighbourhoods.
 WIDE_ROUNDS = (4, 16)
 #: Local steps of stiff cloth are of this size [m]; displacements of a pass of that one; strains of a percent matter.
 STEP, MOVE, GAIN = 1e-4, 1e-2, 100.0
-#: Global steps are of this size [m].
-WAVE = 1e-3
+#: Global steps are of this size [m]; they turn and stretch edges by such shares of their lengths.
+WAVE, TURN, STRETCH = 1e-3, 0.03, 0.01
 
 
 class _View(NodeGroup, ABC):
@@ -81,6 +81,25 @@ class WideResidual(_View):
         return inputs.wide_residual
 
 
+class EdgeGlobalStep(EdgeGroup):
+    """What the global step makes of an edge: asinh(change/``turn``), in mean rest lengths of its set, and of its length,
+    asinh(change/``stretch``). Differences of compressed columns of the two vertices could not recover either."""
+
+    width = 4
+    needs_base = True
+    needs_global_step = True
+
+    def __init__(self, turn: float = TURN, stretch: float = STRETCH) -> None:
+        super().__init__()
+        self.turn, self.stretch = FixedScale(turn, asinh=True), FixedScale(stretch, asinh=True)
+
+    def forward(self, inputs: Inputs) -> Tensor:
+        unit = inputs.edges.once("mean length", lambda: mean_rest_length(inputs))
+        change, before = (cloth_difference(pos, inputs) for pos in (_demand(inputs.global_step), inputs.base))
+        longer = length(before + change) - length(before)
+        return torch.cat([self.turn(change / unit), self.stretch(longer / unit)], dim=1)
+
+
 #: What :func:`look` reads; they have no parameters.
 _RESIDUAL, _LOCAL_STEP, _WIDE, CONTACT, _GLOBAL = Residual(), LocalStep(), WideResidual(), ContactDistance(), GlobalStep()
 
@@ -109,10 +128,18 @@ def look(inputs: Inputs, sets: Sequence[str]) -> tuple[Tensor, dict[str, Tensor]
 
 
 def local(
-    num_levels: int = 3, layers: bool = False, together: bool = False, more: Sequence[NodeGroup | EdgeGroup] = ()
+    num_levels: int = 3,
+    layers: bool = False,
+    together: bool = False,
+    more: Sequence[NodeGroup | EdgeGroup] = (),
+    of_edges: bool = False,
 ) -> FeatureSet:
-    """The physical features with local steps and wide residuals, and with global steps (``together``)."""
-    return physical(num_levels, [LocalStep(), WideResidual(), *([GlobalStep()] if together else [])], layers, more)
+    """The physical features with local steps and wide residuals, and with global steps (``together``), of edges as well
+    (``of_edges``)."""
+    views: list[NodeGroup | EdgeGroup] = [LocalStep(), WideResidual()]
+    views += [GlobalStep()] if together else []
+    views += [EdgeGlobalStep()] if together and of_edges else []
+    return physical(num_levels, views, layers, more)
 
 
 def _strain(inputs: Inputs, name: str) -> Tensor:

@@ -247,7 +247,7 @@ def mean_rest_length(inputs: Inputs) -> Tensor:
 
 def physical(
     num_levels: int = 3,
-    views: Sequence[NodeGroup] = (),
+    views: Sequence[NodeGroup | EdgeGroup] = (),
     layers: bool = False,
     more: Sequence[NodeGroup | EdgeGroup] = (),
 ) -> FeatureSet:
@@ -259,7 +259,7 @@ def physical(
             RelativeVelocity(),
             Normal(),
             Residual(),
-            *views,
+            *(view for view in views if isinstance(view, NodeGroup)),
             TypeOneHot(),
             *level,
             ContactDistance(),
@@ -267,7 +267,7 @@ def physical(
             LogMaterial(),
             LogTimestep(),
         ],
-        edge=[ScaledShape(), Strain(), EdgeLogMaterial()],
+        edge=[ScaledShape(), Strain(), EdgeLogMaterial(), *(view for view in views if isinstance(view, EdgeGroup))],
         body_edge=[BaseBodyRelative()],
         decay=None,
         layer_edge=[BaseLayerRelative()] if layers else [],

@@ -21,12 +21,14 @@ class SetSettings:
         num_levels: told apart by the level feature, the mesh included.
         layers: with edges between layers of cloth.
         together: with what all vertices together would do (``local``).
+        of_edges: and what that would make of edges.
         body_velocity, decay, divisor_floor: of ``paper``, see :func:`hood.features.groups.paper`.
     """
 
     num_levels: int
     layers: bool = False
     together: bool = False
+    of_edges: bool = False
     body_velocity: str = "previous"
     decay: float = 0.999
     divisor_floor: float | None = None
@@ -44,7 +46,7 @@ def _physical(of: SetSettings, more: Groups) -> FeatureSet:
 
 
 def _local(of: SetSettings, more: Groups) -> FeatureSet:
-    return local.local(of.num_levels, of.layers, of.together, more)
+    return local.local(of.num_levels, of.layers, of.together, more, of.of_edges)
 
 
 SETS: dict[str, Callable[[SetSettings, Groups], FeatureSet]] = {"paper": _paper, "physical": _physical, "local": _local}

@@ -235,13 +235,16 @@ void features_residuals(const Neighbours* mesh, const float* force, const float*
     }
 }
 
-// u (V, 4) with (diag(weight) + k L) u = force (V, 3) where free, L the mesh's graph Laplacian, and u = 0 elsewhere: conjugate
-// gradients with the diagonal as preconditioner. The scenes do not touch each other and take as many steps as `steps` says of each;
-// a vertex is of scene[v], all of the first one if there is no such table. sums (3, scenes), memory (4, V, 4).
-void features_fit(const Neighbours* mesh, const float* weight, const float* force, const uint8_t* free, const int64_t* scene,
-                  int64_t scenes, const int64_t* steps, float k, float* u, double* sums, float* memory) {
+// u (V, 4) with (diag(weight) + firm n nT + k L) u = force (V, 3) where free, L the mesh's graph Laplacian, and u = 0 elsewhere:
+// conjugate gradients with the blocks of single vertices as preconditioner. firm (V) and its unit directions n (V, 3) may be null.
+// The scenes do not touch each other and take as many steps as `steps` says of each; a vertex is of scene[v], all of the first one
+// if there is no such table. sums (3, scenes), memory (5, V, 4).
+void features_fit(const Neighbours* mesh, const float* weight, const float* firm, const float* normal, const float* force,
+                  const uint8_t* free, const int64_t* scene, int64_t scenes, const int64_t* steps, float k, float* u, double* sums,
+                  float* memory) {
     const int64_t count = mesh->count;
     float *r = memory, *p = memory + 4 * count, *q = memory + 8 * count, *inverse = memory + 12 * count;
+    float* across = memory + 16 * count;  // n, and by how much less it is preconditioned along n
     double *rz = sums, *pq = sums + scenes, *after = sums + 2 * scenes;
     int64_t most = 0;
     for (int64_t s = 0; s < scenes; ++s) {
@@ -253,13 +256,23 @@ void features_fit(const Neighbours* mesh, const float* weight, const float* forc
         const F4 c = a * b;
         *sum += (double)c[0] + (double)c[1] + (double)c[2];
     };
+    const auto along = [](F4 n, F4 value) { return n[0] * value[0] + n[1] * value[1] + n[2] * value[2]; };
+    const auto precondition = [&](int64_t v, F4 value) {
+        if (!firm) return inverse[4 * v] * value;
+        const F4 n = load(across + 4 * v);
+        return inverse[4 * v] * (value - n[3] * along(n, value) * F4{n[0], n[1], n[2], 0.0f});
+    };
     for (int64_t v = 0; v < count; ++v) {
         const float degree = (float)(mesh->first[v + 1] - mesh->first[v]), diagonal = weight[v] + k * degree;
+        if (firm) {
+            const float* n = normal + 3 * v;
+            store(across + 4 * v, F4{n[0], n[1], n[2], firm[v] / (diagonal + firm[v])});
+        }
         inverse[4 * v] = free[v] ? 1.0f / diagonal : 0.0f;
         inverse[4 * v + 1] = diagonal;
         const F4 given = free[v] ? F4{force[3 * v], force[3 * v + 1], force[3 * v + 2], 0.0f} : F4{};
         store(r + 4 * v, given);
-        store(p + 4 * v, inverse[4 * v] * given);
+        store(p + 4 * v, precondition(v, given));
         store(u + 4 * v, F4{});
         add(rz + of(v), given, load(p + 4 * v));
     }
@@ -268,7 +281,12 @@ void features_fit(const Neighbours* mesh, const float* weight, const float* forc
         for (int64_t v = 0; v < count; ++v) {
             F4 sum = F4{};
             for (int64_t i = mesh->first[v]; i < mesh->first[v + 1]; ++i) sum += load(p + 4 * mesh->other[i]);
-            const F4 own = load(p + 4 * v), here = inverse[4 * v + 1] * own - k * sum;
+            const F4 own = load(p + 4 * v);
+            F4 here = inverse[4 * v + 1] * own - k * sum;
+            if (firm) {
+                const F4 n = load(across + 4 * v);
+                here += firm[v] * along(n, own) * F4{n[0], n[1], n[2], 0.0f};
+            }
             store(q + 4 * v, here);
             add(pq + of(v), own, here);
         }
@@ -278,12 +296,12 @@ void features_fit(const Neighbours* mesh, const float* weight, const float* forc
             store(u + 4 * v, load(u + 4 * v) + length * load(p + 4 * v));
             const F4 left = free[v] ? load(r + 4 * v) - length * load(q + 4 * v) : F4{};
             store(r + 4 * v, left);
-            add(after + s, left, inverse[4 * v] * left);
+            add(after + s, left, precondition(v, left));
         }
         for (int64_t v = 0; v < count; ++v) {
             const int64_t s = of(v);
             const float share = rz[s] > 0.0 ? (float)(after[s] / rz[s]) : 0.0f;
-            store(p + 4 * v, inverse[4 * v] * load(r + 4 * v) + share * load(p + 4 * v));
+            store(p + 4 * v, precondition(v, load(r + 4 * v)) + share * load(p + 4 * v));
         }
         for (int64_t s = 0; s < scenes; ++s) rz[s] = after[s];
     }

@@ -31,7 +31,7 @@ _SIGNATURES = {
     "residuals": "ppppippp",
     "base": "pppppffipp",
     "take": "pppppppiffffp",
-    "fit": "pppppipfppp",
+    "fit": "pppppppipfppp",
 }
 
 

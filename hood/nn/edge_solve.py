@@ -1,16 +1,17 @@
 """Positions whose edges are as predicted, as nearly as they can be: one linear least-squares solve.
 
-    x = argmin Σ_i w_i/2 |x_i − a_i|² + Σ_ij k/2 |x_i − x_j − p_ij|²
+    x = argmin Σ_i w_i/2 |x_i − a_i|² + f_i/2 (n_i·(x_i − a_i))² + Σ_ij k/2 |x_i − x_j − p_ij|²
 
 | symbol | variable | |
 |---|---|---|
 | a_i | ``anchor`` | m, where vertex i is drawn to, (V, 3) |
 | w_i | ``weight`` | N/m, how strongly, > 0, (V,) |
+| f_i, n_i | ``firm`` | N/m, how much more strongly along n, ≥ 0, (V,), and unit vectors n (V, 3); left out where None |
 | p_ij | ``vector`` | m, what the edge from j to i should be, (N, 3) |
 | k | ``stiffness`` | N/m, of every edge |
 
-The matrix is a Laplacian and a diagonal, the same for the three coordinates. It is solved by conjugate gradients with the
-diagonal as preconditioner, as many steps as the size of the mesh asks for: no shape and no branch depends on a value, so that a
+The matrix is a Laplacian and blocks of single vertices. It is solved by conjugate gradients with the blocks of its diagonal as
+preconditioner, as many steps as the size of the mesh asks for: no shape and no branch depends on a value, so that a
 CUDA graph can hold it. The derivative is the same solve.
 """
 
@@ -18,7 +19,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -69,58 +70,85 @@ class EdgeSystem:
         return values.new_zeros(count, *values.shape[1:]).index_copy(0, self.edges.nodes, values)
 
 
-def fit_edges(system: EdgeSystem, start: Tensor, vector: Tensor, anchor: Tensor, weight: Tensor) -> Tensor:
+class Firm(NamedTuple):
+    """By how much more vertices are held along one direction than along the others."""
+
+    weight: Tensor  # (V,) N/m, >= 0
+    normal: Tensor  # (V, 3) unit vectors; constants
+
+    def times(self, values: Tensor) -> Tensor:
+        """f n (n·v) of ``values`` (V, 3)."""
+        return (self.weight.unsqueeze(1) * self.normal) * (self.normal * values).sum(dim=1, keepdim=True)
+
+
+def fit_edges(
+    system: EdgeSystem, start: Tensor, vector: Tensor, anchor: Tensor, weight: Tensor, firm: Firm | None = None
+) -> Tensor:
     """The positions x (V, 3) [m] above, solved for from ``start`` (V, 3) [m].
 
-    Differentiable in ``vector``, ``anchor`` and ``weight``, as if the solve were exact. What is not free stays at ``start``.
-    Where edges and anchors are those of ``start``, that is the result, to the bit.
+    Differentiable in ``vector``, ``anchor``, ``weight`` and ``firm.weight``, as if the solve were exact. What is not free stays
+    at ``start``. Where edges and anchors are those of ``start``, that is the result, to the bit.
     """
-    force = weight.unsqueeze(1) * (anchor - start) + system.stiffness * system.sums(vector - system.vectors(start))
-    moved: Tensor = _Solve.apply(force, weight, system)
+    away = anchor - start
+    pull = weight.unsqueeze(1) * away
+    pull = pull if firm is None else pull + firm.times(away)
+    force = pull + system.stiffness * system.sums(vector - system.vectors(start))
+    moved: Tensor = _Solve.apply(force, weight, *((None, None) if firm is None else firm), system)
     return start + moved
 
 
 class _Solve(torch.autograd.Function):
-    """u with A u = ``force`` (V, 3) for A = diag(w) + k L."""
+    """u with A u = ``force`` (V, 3) for A = diag(w) + f n nᵀ + k L."""
 
     @staticmethod
-    def forward(ctx: Any, force: Tensor, weight: Tensor, system: EdgeSystem) -> Tensor:
+    def forward(
+        ctx: Any, force: Tensor, weight: Tensor, firm: Tensor | None, normal: Tensor | None, system: EdgeSystem
+    ) -> Tensor:
+        along = None if firm is None or normal is None else Firm(firm, normal)
         ctx.solve = compiled_gradients if _is_compiled(system, weight, force) else conjugate_gradients
-        moved: Tensor = ctx.solve(system, weight, force)
-        ctx.save_for_backward(weight, moved)
+        moved: Tensor = ctx.solve(system, weight, force, along)
+        ctx.save_for_backward(weight, moved, firm, normal)
         ctx.system = system
         return moved
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        weight, moved = ctx.saved_tensors
-        adjoint = ctx.solve(ctx.system, weight, grad)
-        # A symmetric, ∂A/∂w_i = 1 at (i, i): dw = −λ·u.
-        return adjoint, -(adjoint * moved).sum(dim=1), None
+        weight, moved, firm, normal = ctx.saved_tensors
+        along = None if firm is None else Firm(firm, normal)
+        adjoint = ctx.solve(ctx.system, weight, grad, along)
+        # A symmetric, ∂A/∂w_i = 1 at (i, i) and ∂A/∂f_i = n nᵀ: dw = −λ·u, df = −(λ·n)(u·n).
+        of_firm = None if along is None else -(adjoint * normal).sum(dim=1) * (moved * normal).sum(dim=1)
+        return adjoint, -(adjoint * moved).sum(dim=1), of_firm, None, None
 
 
-def conjugate_gradients(system: EdgeSystem, weight: Tensor, force: Tensor) -> Tensor:
-    """Approximate u (V, 3) with (diag(``weight``) + k L) u = ``force`` at free vertices and u = 0 at the others."""
+def conjugate_gradients(system: EdgeSystem, weight: Tensor, force: Tensor, firm: Firm | None = None) -> Tensor:
+    """Approximate u (V, 3) with (diag(``weight``) + f n nᵀ + k L) u = ``force`` at free vertices and u = 0 at the others."""
     free = system.free.unsqueeze(1)
     diagonal = (weight + system.stiffness * system.degree.to(weight)).unsqueeze(1)
     inverse = torch.where(free, 1.0 / torch.where(free, diagonal, 1.0), 0.0)
+    less = None if firm is None else Firm(firm.weight / (diagonal.squeeze(1) + firm.weight), firm.normal)
 
     def apply(p: Tensor) -> Tensor:
         # Neighbours that are not free have p = 0; what they would receive is not asked for.
-        return torch.where(free, diagonal * p - system.stiffness * system.neighbours(p), 0.0)
+        found = diagonal * p - system.stiffness * system.neighbours(p)
+        return torch.where(free, found if firm is None else found + firm.times(p), 0.0)
+
+    def precondition(r: Tensor) -> Tensor:
+        return inverse * (r if less is None else r - less.times(r))
 
     scenes = Scenes(system.scene, system.scene_sizes)
-    return solve(apply, lambda r: inverse * r, torch.where(free, force, 0.0), scenes, STEPS)
+    return solve(apply, precondition, torch.where(free, force, 0.0), scenes, STEPS)
 
 
-def compiled_gradients(system: EdgeSystem, weight: Tensor, force: Tensor) -> Tensor:
+def compiled_gradients(system: EdgeSystem, weight: Tensor, force: Tensor, firm: Firm | None = None) -> Tensor:
     """The same by the compiled library, for numbers in float32 on a CPU; every vertex must have an edge."""
     edges, scenes = system.edges, len(system.scene_sizes)
     steps = torch.tensor([STEPS(size) for size in system.scene_sizes])
     mesh = native.Neighbours(len(force), edges.offsets.data_ptr(), edges.senders.data_ptr())
-    u, memory = force.new_empty(len(force), 4), force.new_empty(4, len(force), 4)
-    given = weight.contiguous(), force.contiguous(), system.free, system.scene if scenes > 1 else None
+    u, memory = force.new_empty(len(force), 4), force.new_empty(5, len(force), 4)
+    more = (None, None) if firm is None else (firm.weight.contiguous(), firm.normal.contiguous())
+    given = weight.contiguous(), *more, force.contiguous(), system.free, system.scene if scenes > 1 else None
     sums = torch.empty(3, scenes, dtype=torch.float64)
     native.call("fit", mesh, *given, scenes, steps, system.stiffness, u, sums, memory)
     return u[:, :3]

@@ -6,7 +6,7 @@ a step that needs body edges alone is spared the triangles.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -54,6 +54,8 @@ class Contact:
     next_point: Tensor  # (V, 3) m, the same material point at t + 1
     next_normal: Tensor  # (V, 3) outward unit normal there at t + 1
     curvature: Tensor  # (V,) 1/m, of the body there at t, see hood.mesh.curvature
+    #: (V,) m, how much farther off vertices are held, see hood.scene.held_off.
+    raised: Tensor | None = field(default=None, kw_only=True)
 
     @property
     def nearest(self) -> Nearest:

@@ -31,13 +31,15 @@ def sag(cloth: Cloth, contact: Contact, pos: Tensor) -> Tensor:
 
     An edge that is stretched sags farther. What its square has grown by, beyond the quarter that the half more in
     :data:`SAG_SHARE` covers (:data:`COVERED`), is added to L², of the edge at the vertex that has grown most; no
-    more than :data:`MOST_STRETCHED`, since cloth that is held farther off is stretched the more.
+    more than :data:`MOST_STRETCHED`, since cloth that is held farther off is stretched the more. Where a step has shown that it
+    takes more (:mod:`hood.scene.held_off`), that is added.
 
     Args:
         pos: (V, 3) m, of the cloth at t.
     """
     share = SAG_SHARE * contact.curvature
     at_rest = (share * cloth.edge_length_sq).clamp_max(MOST_SAG)
+    at_rest = at_rest if contact.raised is None else at_rest + contact.raised
     growth = _known_growth(cloth, pos)
     return at_rest if growth is None else at_rest + (share * growth).clamp_max(MOST_STRETCHED)
 

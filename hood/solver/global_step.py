@@ -41,6 +41,7 @@ def global_step(
     incidence: tuple[Tensor, Tensor],
     force: Tensor,
     damping: Tensor,
+    steps: Steps = STEPS,
 ) -> Tensor:
     """Approximate u (V, 3) [m] with (A + diag(``damping``)) u = ``force`` (V, 3) [N] at free vertices and u = 0 at the others.
 
@@ -62,7 +63,7 @@ def global_step(
         return torch.where(free, torch.bmm(inverse, r.unsqueeze(2)).squeeze(2), 0.0)
 
     scenes = Scenes(cloth.vertex_scene, cloth.scene_sizes)
-    return solve(apply, precondition, torch.where(free, force, 0.0), scenes, STEPS)
+    return solve(apply, precondition, torch.where(free, force, 0.0), scenes, steps)
 
 
 def _product(terms: StepTerms, matrix: PositiveMatrix, incidence: tuple[Tensor, Tensor]) -> Callable[[Tensor], Tensor]:

@@ -14,10 +14,11 @@ from hood.losses.inertia import Inertia
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
 from hood.mesh.kept import forget
+from hood.nn.fixed_gradients import Steps
 from hood.scene.cloth import Cloth
 from hood.solver.elements import FaceModel
 from hood.solver.forces import CLOSED_FORM
-from hood.solver.global_step import PositiveMatrix, global_step
+from hood.solver.global_step import STEPS, PositiveMatrix, global_step
 from hood.solver.linear import invert_blocks
 from hood.solver.terms import StepTerms
 
@@ -79,14 +80,14 @@ class LocalTerms:
         return LocalView(force, torch.where(cloth.free.unsqueeze(1), step, 0.0))
 
     @torch.no_grad()
-    def solve(self, pos: Tensor, force: Tensor, damping: Tensor) -> Tensor:
+    def solve(self, pos: Tensor, force: Tensor, damping: Tensor, steps: Steps = STEPS) -> Tensor:
         """The global step (V, 3) [m] under forces (V, 3) [N]: u with (A + diag(``damping``)) u = ``force`` where vertices are
-        free, 0 elsewhere, as nearly as :data:`hood.solver.global_step.STEPS` of conjugate gradients come. A is the positive
-        matrix at positions (V, 3), ``damping`` (V,) [N/m]."""
+        free, 0 elsewhere, as nearly as ``steps`` of conjugate gradients come. A is the positive matrix at positions (V, 3),
+        ``damping`` (V,) [N/m]."""
         if self._looked_at is None or self._looked_at[0] is not pos:
             self(pos)
         assert self._looked_at is not None
-        return global_step(self.terms, *self._looked_at[1:], self._incidence, force, damping)
+        return global_step(self.terms, *self._looked_at[1:], self._incidence, force, damping, steps)
 
 
 def check_local(potential: Potential) -> None:

@@ -14,6 +14,7 @@ from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
 from hood.mesh.kept import forget
 from hood.native.build import BuildError
+from hood.nn.fixed_gradients import Steps
 from hood.scene.cloth import Cloth
 from hood.scene.state import Attachments
 from hood.solver import engine
@@ -54,7 +55,7 @@ class EngineTerms:
         self._looked_at = pos
         return LocalView(force, step)
 
-    def solve(self, pos: Tensor, force: Tensor, damping: Tensor) -> Tensor:
+    def solve(self, pos: Tensor, force: Tensor, damping: Tensor, steps: Steps = STEPS) -> Tensor:
         """As :meth:`hood.solver.local.LocalTerms.solve`."""
         if any(own.step is not self._step for own in self._engines):  # they have been at another step since
             self._enter()
@@ -63,7 +64,7 @@ class EngineTerms:
             self(pos)
         force, damping, step = force.contiguous(), damping.contiguous(), torch.zeros_like(force)
         for own, size in zip(self._engines, self._sizes, strict=True):
-            own.together(force.data_ptr(), damping.data_ptr(), STEPS(size), step.data_ptr())
+            own.together(force.data_ptr(), damping.data_ptr(), steps(size), step.data_ptr())
         return step
 
 

@@ -38,7 +38,7 @@ def positions(problem: StepProblem, raw: Tensor, edge_raw: Tensor) -> Tensor:
 
 def draw(problem: StepProblem, size: float = 1.0) -> tuple[Tensor, Tensor]:
     num_rows = 2 * len(problem.cloth.edges)
-    return size * torch.randn(problem.cloth.num_vertices, 4).double(), size * torch.randn(num_rows, 5).double()
+    return size * torch.randn(problem.cloth.num_vertices, 5).double(), size * torch.randn(num_rows, 5).double()
 
 
 def turned(problem: StepProblem) -> StepProblem:
@@ -109,13 +109,30 @@ def test_buttons_keep_their_length_and_hold_their_ends_together() -> None:
 def test_vertices_near_the_body_are_anchored_and_others_follow_inertia() -> None:
     output = EdgeOutput()
     near, far = ball_problem(STILL, np.zeros(3), gap=2e-3), ball_problem(STILL, np.zeros(3), gap=0.05)
-    zero = torch.zeros(near.cloth.num_vertices).double()
+    zero = torch.zeros(near.cloth.num_vertices, 2).double()
     inertia = 0.1 * near.cloth.mass * 30**2
-    torch.testing.assert_close(output.weights(far, far.state.pos, zero + 3.0), inertia * (far.cloth.mass / near.cloth.mass))
-    by_default = output.weights(near, near.state.pos, zero)
-    assert float(by_default.min()) > 5.0 > 10 * float(inertia.max())
-    torch.testing.assert_close(output.weights(near, near.state.pos, zero + 1.0) - inertia, np.e * (by_default - inertia))
-    assert float(output.weights(near, near.state.pos, zero - 100.0).min()) > 0
+    weight, firm = output.weights(far, far.state.pos, zero + 3.0)
+    torch.testing.assert_close(weight, inertia * (far.cloth.mass / near.cloth.mass))
+    assert firm is not None
+    assert float(firm.weight.abs().max()) == 0
+    along, firm = by_default = output.weights(near, near.state.pos, zero)
+    assert firm is not None
+    assert float(along.min()) > 1.5 > 3 * float(inertia.max())
+    torch.testing.assert_close(along - inertia + firm.weight, 4 * (along - inertia))  # cloth slides
+    assert firm.normal is near.contact.next_normal
+    for column, (of_along, of_sum) in enumerate(((1.0, np.e), (np.e, 1.0))):
+        raw = zero.clone()
+        raw[:, column] = 1.0
+        now, more = output.weights(near, near.state.pos, raw)
+        assert more is not None
+        torch.testing.assert_close(now - inertia, of_along * (along - inertia))
+        torch.testing.assert_close(now - inertia + more.weight, of_sum * (by_default[0] - inertia + firm.weight))
+    # Never held less towards the body than along it, and always held.
+    for towards, across in ((-100.0, 100.0), (-100.0, -100.0), (100.0, 100.0)):
+        now, more = output.weights(near, near.state.pos, torch.stack([zero[:, 0] + towards, zero[:, 1] + across], dim=1))
+        assert more is not None
+        assert float(now.min()) > 0
+        assert float(more.weight.min()) >= 0
 
 
 def test_cloth_is_taken_out_of_the_body() -> None:

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from hood.graph.builder import edge_set
 from hood.mesh.topology import unique_edges
 from hood.native import features as native
-from hood.nn.edge_solve import EdgeSystem, compiled_gradients, conjugate_gradients, fit_edges
+from hood.nn.edge_solve import EdgeSystem, Firm, compiled_gradients, conjugate_gradients, fit_edges
 from hood.testing import grid
 
 
@@ -38,8 +39,16 @@ def draw(system: EdgeSystem, start: Tensor, low: float = 1.0) -> tuple[Tensor, T
     return vector, start + 0.1 * torch.randn_like(start), low + low * torch.rand(len(start), dtype=start.dtype)
 
 
-def dense(system: EdgeSystem, start: Tensor, vector: Tensor, anchor: Tensor, weight: Tensor) -> Tensor:
+def draw_firm(start: Tensor, most: float = 30.0) -> Firm:
+    return Firm(most * torch.rand(len(start), dtype=start.dtype), functional.normalize(torch.randn_like(start), dim=1))
+
+
+def dense(
+    system: EdgeSystem, start: Tensor, vector: Tensor, anchor: Tensor, weight: Tensor, firm: Firm | None = None
+) -> Tensor:
     """The minimum of the energy by its normal equations, edge by edge."""
+    if firm is not None:
+        return dense_in_three(system, start, vector, anchor, weight, firm)
     count, edges = len(start), system.edges
     rows = [(i, j, p) for i, j, p in zip(edges.receivers.tolist(), edges.senders.tolist(), vector, strict=True) if i < j]
     matrix, rhs = torch.diag(weight), weight.unsqueeze(1) * anchor
@@ -54,11 +63,31 @@ def dense(system: EdgeSystem, start: Tensor, vector: Tensor, anchor: Tensor, wei
     return pos
 
 
+def dense_in_three(system: EdgeSystem, start: Tensor, vector: Tensor, anchor: Tensor, weight: Tensor, firm: Firm) -> Tensor:
+    """Where coordinates hang together: the minimum by the energy's own second derivative."""
+
+    def energy(flat: Tensor) -> Tensor:
+        pos = torch.where(system.free.unsqueeze(1), flat.view(-1, 3), start)
+        away = pos - anchor
+        held = weight * away.square().sum(dim=1) + firm.weight * (away * firm.normal).sum(dim=1).square()
+        # Every edge is listed in both directions.
+        return 0.5 * held.sum() + 0.25 * system.stiffness * (system.vectors(pos) - vector).square().sum()
+
+    flat = start.flatten()
+    slope, curvature = torch.func.grad(energy)(flat), torch.func.hessian(energy)(flat)
+    free = system.free.repeat_interleave(3)
+    pos = flat.clone()
+    pos[free] -= torch.linalg.solve(curvature[free][:, free], slope[free])
+    return pos.view(-1, 3)
+
+
 @pytest.mark.parametrize("held", [(), (0, 3)])
-def test_the_positions_are_those_of_a_dense_solve(held: tuple[int, ...]) -> None:
+@pytest.mark.parametrize("firm", [False, True])
+def test_the_positions_are_those_of_a_dense_solve(held: tuple[int, ...], firm: bool) -> None:
     system, start = make_system()
     system = without(system, *held)
-    given = draw(system, start)
+    given = (*draw(system, start), draw_firm(start) if firm else None)
+    system = replace(system, scene_sizes=(900,))  # as many steps as a larger sheet takes
     found, expected = fit_edges(system, start, *given), dense(system, start, *given)
     assert float((expected - start).abs().max()) > 0.05
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-7)
@@ -67,15 +96,17 @@ def test_the_positions_are_those_of_a_dense_solve(held: tuple[int, ...]) -> None
 
 def test_the_derivative_is_that_of_the_positions() -> None:
     system, start = make_system(3)
-    system = without(system, 4)
+    system = replace(without(system, 4), scene_sizes=(900,))
     vector, anchor, weight = draw(system, start, low=20.0)
     half = [row for row in range(len(vector)) if system.edges.receivers[row] < system.edges.senders[row]]
 
-    def positions(part: Tensor, anchor: Tensor, weight: Tensor) -> Tensor:
-        whole = torch.zeros_like(vector).index_copy(0, torch.tensor(half), part)
-        return fit_edges(system, start, whole - whole[system.edges.reverse], anchor, weight)
+    firm = draw_firm(start)
 
-    given = [value.clone().requires_grad_(True) for value in (vector[half], anchor, weight)]
+    def positions(part: Tensor, anchor: Tensor, weight: Tensor, along: Tensor) -> Tensor:
+        whole = torch.zeros_like(vector).index_copy(0, torch.tensor(half), part)
+        return fit_edges(system, start, whole - whole[system.edges.reverse], anchor, weight, firm._replace(weight=along))
+
+    given = [value.clone().requires_grad_(True) for value in (vector[half], anchor, weight, firm.weight)]
     assert torch.autograd.gradcheck(positions, given)
 
 
@@ -131,18 +162,20 @@ def test_partners_in_a_batch_change_nothing(solve) -> None:
 
 
 @pytest.mark.skipif(native.library() is None, reason="no C++ compiler")
-def test_the_compiled_solve_is_that_of_torch() -> None:
+@pytest.mark.parametrize("held_firmly", [False, True])
+def test_the_compiled_solve_is_that_of_torch(held_firmly: bool) -> None:
     system, start = make_system(30, dtype=torch.float32)
     system = without(system, 0, 17)
     weight, force = 0.1 + torch.rand(len(start)), torch.randn_like(start)
-    found, expected = compiled_gradients(system, weight, force), conjugate_gradients(system, weight, force)
+    firm = draw_firm(start) if held_firmly else None
+    found, expected = (solve(system, weight, force, firm) for solve in (compiled_gradients, conjugate_gradients))
     assert float((found - expected).abs().max()) < 1e-5 * float(expected.abs().max())
     assert bool((found[~system.free] == 0).all())
     with torch.no_grad():
         given = draw(system, start)
-        inside = fit_edges(system, start, *given)
+        inside = fit_edges(system, start, *given, firm)
         with native.in_torch():
-            torch.testing.assert_close(inside, fit_edges(system, start, *given), rtol=0, atol=1e-5)
+            torch.testing.assert_close(inside, fit_edges(system, start, *given, firm), rtol=0, atol=1e-5)
 
 
 def test_vertices_without_edges_are_held_by_their_anchors_alone() -> None:
