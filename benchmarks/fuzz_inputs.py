@@ -6,6 +6,7 @@ import base64
 import io
 import json
 import pickle
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -113,6 +114,7 @@ def samples(folder: Path) -> list[Sample]:
         Sample("weights", "safetensors", (folder / "m.safetensors").read_bytes(), load_simulator),
         Sample("words", "txt", _WORDS, read_words, names_file=False),
         Sample("run record", "yaml", _RECORD, read_record),
+        Sample("moving mesh", "pc2", _pc2(np.stack([pos, pos + 0.1])), lambda path: read_cache(path, _obj(pos, quads))),
     ]
 
 
@@ -139,6 +141,21 @@ trainer:
 def read_words(path: Path) -> Any:
     """The settings of ``hood rollout`` with these words."""
     return load_config("rollout", path.read_bytes().decode("latin-1").split("\n"))
+
+
+def read_cache(path: Path, mesh: bytes) -> Any:
+    """A point cache with its mesh beside it."""
+    beside = path.with_suffix(".obj")
+    beside.write_bytes(mesh)
+    try:
+        return load_mesh_sequence(path)
+    finally:
+        beside.unlink()
+
+
+def _pc2(verts: np.ndarray) -> bytes:
+    head = struct.pack("<12siiffi", b"POINTCACHE2\0", 1, verts.shape[1], 0.0, 1.0, len(verts))
+    return head + verts.astype("<f4").tobytes()
 
 
 def read_record(path: Path) -> None:

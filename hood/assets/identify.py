@@ -14,6 +14,7 @@ from hood.assets.files.h5_links import own_group
 from hood.assets.files.library import names, nearest
 from hood.assets.formats.gltf import read_gltf
 from hood.assets.formats.mesh_file import mesh_suffixes
+from hood.assets.formats.point_cache import CACHE_SUFFIX
 from hood.assets.garment.reference_garments import garment_names
 from hood.assets.motion.animated_mesh import body_kind
 from hood.assets.motion.recording import MOTION_SUFFIXES, motion_suffixes
@@ -55,6 +56,8 @@ def identify(name: str) -> str:
     if suffix in (".glb", ".gltf"):
         gltf = read_gltf(path)
         return MOVING_MESH if gltf.items("animations") or gltf.items("skins") else GARMENT
+    if suffix == CACHE_SUFFIX:
+        return MOVING_MESH
     if suffix in mesh_suffixes():
         return GARMENT
     if suffix in motion_suffixes() and suffix not in MOTION_SUFFIXES:

@@ -65,14 +65,14 @@ class Finding:
         """The command that repairs a garment; None where nothing needs repair, or no command can."""
         if self.refused or not self.repairs:
             return None
-        words = [f"garment={self.file}", *self.wearer, *dict.fromkeys(self.repairs)]
+        words = [f"garment={self.file}", *self.wearer, *filter(None, dict.fromkeys(self.repairs))]
         return " ".join(["hood prepare", *map(shlex.quote, words)])
 
     def problem(self, what: str, fix: str, repair: str | None = None) -> None:
         """Record a problem; ``repair`` is what prepare needs to be told, "" where it does it unasked."""
         self.problems.append((what, fix))
         if repair is not None:
-            self.repairs.append(repair or "weld=auto")
+            self.repairs.append(repair)
 
 
 def unreadable(name: str, kind: str, error: Exception) -> Finding:
@@ -183,19 +183,19 @@ def _place_beside(finding: Finding, garment: Garment, body: Body, betas: np.ndar
     """Units, up axis, facing, place and pose of an unbound garment: what ``hood prepare`` finds for itself."""
     found = find_place(garment, body, betas, Asked(), None)
     placement = found.placement if found.resized is None else found.resized.placement
+    unsure = found.resized is None and found.refusal is not None
+    place = {"up axis": placement.up, "turned by [degrees]": placement.turn, "arms below the T-pose [degrees]": placement.angle}
     finding.facts |= {
         "size in body heights": float(f"{size_ratio(used(garment.rest_pos, garment.faces), body.shaped(betas)[0]):.3g}"),
         "units": UNITS.get(found.placement.scale, "unknown"),
         "times its size it fits about alike": "its shape does not say"
         if found.sizes is None
         else np.round(found.sizes, 2).tolist(),
-        "up axis": placement.up,
-        "turned by [degrees]": placement.turn,
-        "arms below the T-pose [degrees]": placement.angle,
+        **({f"closest place, not sure: {what}": value for what, value in place.items()} if unsure else place),
         "misfit on the body, 0 to 1": round(found.misfit, 3),
         "misfit of the next place, beyond": round(found.margin, 3),
     }
-    if found.resized is None and found.refusal is not None:
+    if unsure:
         unit = unit_alone(garment, body, betas)
         finding.refused = unit is None
         finding.problem(f"no place on {body.name!r} is sure: {found.refusal}", f"prepare: {explain_unplaced(unit)}", unit)

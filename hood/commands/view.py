@@ -16,6 +16,8 @@ from hood.dynamics.recorder import RolloutData
 
 #: More would be too narrow to see anything.
 _MOST = 4
+#: A page beyond this [bytes] is slow to send and to open.
+_HEAVY = 12_000_000
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -33,7 +35,12 @@ def run(arguments: Sequence[str]) -> int:
     page = view_page(list(zip(names, rollouts, strict=True)), title).encode()
     target.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(target, page)
-    print(f"{target}: {len(page) / 1e6:.1f} MB, {max(len(data.time) for data in rollouts)} frames; open it in a browser")
+    frames = max(len(data.time) for data in rollouts)
+    print(f"{target}: {len(page) / 1e6:.1f} MB, {frames} frames; open it in a browser")
+    if len(page) > _HEAVY and frames > 1:
+        most = max(max(data.cloth_pos.shape[1], data.body_pos.shape[1]) for data in rollouts)
+        fewer = max(int(frames * _HEAVY / len(page)), 1)
+        print(f"that is a heavy page, of up to {most:,} vertices a mesh: num_frames={fewer} keeps it below {_HEAVY / 1e6:g} MB")
     return 0
 
 

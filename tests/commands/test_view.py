@@ -103,6 +103,15 @@ def test_the_first_frames_alone() -> None:
     assert (only["cloth"]["frames"], only["body"]["frames"], len(only["figures"][0]["values"])) == (2, 2, 2)
 
 
+def test_a_heavy_page_says_how_to_lighten_it(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    record("run/rollout.h5")
+    assert main(["view", "run", "output=page.html"]) == 0
+    assert capsys.readouterr().out.count("\n") == 1
+    monkeypatch.setattr("hood.commands.view._HEAVY", Path("page.html").stat().st_size - 1)
+    assert main(["view", "run", "output=page.html"]) == 0
+    assert "of up to 42 vertices a mesh: num_frames=3 keeps it below" in capsys.readouterr().out
+
+
 def test_cloth_that_blew_up_is_named_by_its_frames() -> None:
     path = record("run/rollout.h5")
     with h5py.File(path, "r+") as file:

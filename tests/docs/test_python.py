@@ -65,9 +65,9 @@ def test_the_tutorial_leads_from_nothing_to_a_sound_rollout(
     shown = next(block.text for block in texts if block.language == "text")
     assert all(line.partition("…")[0] in inspected for line in shown.splitlines())
     assert "nothing to repair" in inspected
-    assert "holds 64 of 2624 vertices" in prepared
+    assert "holds 80 of 4240 vertices" in prepared
     assert "sound" in simulated.splitlines()
-    assert read_rollout("outputs/twirl/rollout.h5").cloth_pos.shape == (3, 2624, 3)
+    assert read_rollout("outputs/twirl/rollout.h5").cloth_pos.shape == (3, 4240, 3)
     for block in python[1:]:
         exec(compile(block.replace("num_frames=10", "num_frames=2"), page.name, "exec"), {})
     assert Path("body.obj").is_file()

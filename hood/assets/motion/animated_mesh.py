@@ -16,6 +16,7 @@ from hood.assets.files.library import DATA_FOLDER
 from hood.assets.formats import vertex_files
 from hood.assets.formats.gltf_animation import read_gltf_animation
 from hood.assets.formats.mesh_file import read_mesh
+from hood.assets.formats.point_cache import CACHE_SUFFIX, caches, read_point_cache
 from hood.assets.formats.vertex_files import FACE_KEYS, FOLDER_SUFFIXES, VERTEX_KEYS, VertexFile
 from hood.assets.motion.mesh_sequence import MeshSequence, loop_mesh, resample_mesh, trim_mesh, turn_mesh
 from hood.mesh import topology
@@ -26,7 +27,7 @@ _STILL_SUFFIXES = (".obj", ".ply", ".off", ".stl")
 _GLTF_SUFFIXES = (".glb", ".gltf")
 _H5_SUFFIXES = (".h5", ".hdf5")
 #: What can be given as a moving or still mesh, besides a folder of OBJ or PLY files.
-ANIMATED_SUFFIXES = (".npz", ".pkl", *_H5_SUFFIXES, *_GLTF_SUFFIXES, *_STILL_SUFFIXES)
+ANIMATED_SUFFIXES = (".npz", ".pkl", CACHE_SUFFIX, *_H5_SUFFIXES, *_GLTF_SUFFIXES, *_STILL_SUFFIXES)
 _DEFAULT_FPS = 30.0
 #: A body larger than this [m] is in other units.
 _LARGEST = 30.0
@@ -40,9 +41,9 @@ def body_kind(name: str | Path) -> str:
     if (DATA_FOLDER / "body" / f"{name}.npz").is_file():
         return "model"
     if path.is_dir():
-        return "mesh" if any(entry.suffix.lower() in FOLDER_SUFFIXES for entry in path.iterdir()) else "model"
+        return "mesh" if any(entry.suffix.lower() in (*FOLDER_SUFFIXES, CACHE_SUFFIX) for entry in path.iterdir()) else "model"
     suffix = path.suffix.lower()
-    if suffix in (*_H5_SUFFIXES, *_GLTF_SUFFIXES, *_STILL_SUFFIXES):
+    if suffix in (CACHE_SUFFIX, *_H5_SUFFIXES, *_GLTF_SUFFIXES, *_STILL_SUFFIXES):
         return "mesh"
     if suffix in (".npz", ".pkl") and path.is_file():
         return "mesh" if _holds_vertices(path) else "model"
@@ -64,9 +65,9 @@ def load_mesh_sequence(
 ) -> MeshSequence:
     """A moving mesh at ``fps``: vertices move linearly between the frames of the file.
 
-    Accepted: a folder of numbered OBJ or PLY files; ``.npz``, ``.h5`` or ``.pkl`` with ``verts (N, W, 3)`` and ``faces``
-    (a ``rollout.h5`` as well); ``.glb`` or ``.gltf``, whose animation is evaluated at ``fps`` itself; OBJ, PLY, OFF or STL
-    for one that stands still.
+    Accepted: a folder of numbered OBJ or PLY files; a PC2 point cache with its OBJ or PLY beside it, or their folder;
+    ``.npz``, ``.h5`` or ``.pkl`` with ``verts (N, W, 3)`` and ``faces`` (a ``rollout.h5`` as well); ``.glb`` or ``.gltf``,
+    whose animation is evaluated at ``fps`` itself; OBJ, PLY, OFF or STL for one that stands still.
 
     Args:
         up: axis that points up in the file: "y", "z", or "auto", y.
@@ -98,6 +99,8 @@ def load_mesh_sequence(
 
 def _read(path: Path, fps: float, animation: int | str, parts: Sequence[str]) -> VertexFile:
     suffix = path.suffix.lower()
+    if suffix == CACHE_SUFFIX or (path.is_dir() and caches(path)):
+        return read_point_cache(path)
     if path.is_dir():
         return vertex_files.read_mesh_folder(path)
     if suffix in _GLTF_SUFFIXES:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -73,6 +74,14 @@ def folder_of(suffix: str, write: Callable) -> Callable[[Path], Path]:
     return make
 
 
+def write_cache(path: Path, apart: float = 1.0) -> Path:
+    """A PC2 file with its OBJ, as programs write them."""
+    write_obj(path.with_suffix(".obj"), moving()[0], FACES)
+    head = struct.pack("<12siiffi", b"POINTCACHE2\0", 1, len(POINTS), 0.0, apart, COUNT)
+    path.write_bytes(head + moving().astype("<f4").tobytes())
+    return path
+
+
 FILES: dict[str, Callable[[Path], Path]] = {
     "walk.npz": write_archive,
     "walk.h5": write_h5,
@@ -103,6 +112,43 @@ def test_still_meshes_have_one_frame(suffix: str, tmp_path: Path) -> None:
     assert found.verts.shape == (1, len(POINTS), 3)
     assert found.fps == 50.0
     assert np.ptp(found.verts) == pytest.approx(np.ptp(POINTS), abs=1e-5)
+
+
+def test_a_point_cache_moves_the_mesh_beside_it(tmp_path: Path) -> None:
+    path = write_cache(tmp_path / "walk.pc2")
+    for given in (path, tmp_path):  # the file or its folder
+        assert body_kind(given) == "mesh"
+        found = load_mesh_sequence(given, 30.0)
+        np.testing.assert_array_equal(found.faces, FACES)
+        np.testing.assert_array_equal(found.verts, moving().astype(np.float32))
+    assert load_mesh_sequence(write_cache(path, 2.0), 30.0).num_frames == 2 * COUNT - 1  # a sample every second frame
+    assert load_mesh_sequence(path, 30.0, file_fps=30.0).num_frames == COUNT
+    (tmp_path / "walk.obj").rename(tmp_path / "body.obj")
+    assert load_mesh_sequence(path, 30.0).num_frames == 2 * COUNT - 1
+
+
+def test_a_point_cache_that_does_not_fit_is_refused(tmp_path: Path) -> None:
+    path = write_cache(tmp_path / "walk.pc2")
+    content = path.read_bytes()
+    for damaged, said in (
+        (content[:-5], "it is cut off"),
+        (b"PC2" + content[3:], "not a PC2 point cache"),
+        (content[:24] + struct.pack("<f", np.nan) + content[28:], "nan frames apart"),
+        (content[:16] + struct.pack("<i", -1) + content[20:], "of -1 points"),
+    ):
+        path.write_bytes(damaged)
+        with pytest.raises(ValueError, match=rf"walk\.pc2: .*{said}"):
+            load_mesh_sequence(path)
+    write_cache(path)
+    write_obj(tmp_path / "walk.obj", POINTS[:-1], FACES[(FACES < len(POINTS) - 1).all(axis=1)])
+    with pytest.raises(ValueError, match=r"walk\.obj beside it has \d+ vertices"):
+        load_mesh_sequence(path)
+    (tmp_path / "walk.obj").unlink()
+    with pytest.raises(ValueError, match=r"0 meshes could have them.*walk\.obj"):
+        load_mesh_sequence(path)
+    (tmp_path / "other.pc2").write_bytes(content)
+    with pytest.raises(ValueError, match=r"2 point caches \(other\.pc2, walk\.pc2\); give the one"):
+        load_mesh_sequence(tmp_path)
 
 
 def test_vertices_move_linearly_in_time() -> None:
