@@ -39,7 +39,13 @@ _THICKNESS = 4.7e-4
 
 
 def measured(
-    density: float, stretch_warp: float, stretch_weft: float, shear: float, bending_warp: float, bending_weft: float
+    density: float,
+    stretch_warp: float,
+    stretch_weft: float,
+    shear: float,
+    bending_warp: float,
+    bending_weft: float,
+    friction: float = 1.0,
 ) -> Material:
     """The isotropic fabric nearest to a measured cloth, by the rules above.
 
@@ -48,6 +54,7 @@ def measured(
         stretch_warp, stretch_weft: force per width over extension, N/m; of knits along wales and courses.
         shear: force per width over the angle of shear in radians, N/m.
         bending_warp, bending_weft: bending rigidity of a strip along warp or weft per width, N·m.
+        friction: times the coefficient of friction on the body.
 
     Raises:
         ValueError: a value is not finite, or not positive (bending may be 0); names the key.
@@ -73,6 +80,7 @@ def measured(
         lame_lambda=2.0 * mu * poisson / (1.0 - poisson),
         bending_stiffness=4.0 * 0.5 * (bending_warp + bending_weft),
         thickness=_THICKNESS,
+        friction=friction,
     )
 
 

@@ -18,6 +18,7 @@ from hood.commands.common import output_folder, prepare_folder, require_distinct
 from hood.config import ConfigError, build, load_config, options, plain
 from hood.evaluation.drape import COARSEST, FINEST, Drape, drape
 
+_PLAIN = ("density", "lame_mu", "lame_lambda", "bending_stiffness", "thickness")
 _MEASURED = f"{measured.__module__}.{measured.__name__}"
 
 
@@ -85,7 +86,8 @@ def described(name: str) -> Described:
     material: Material = build(node)
     if any(values_of(getattr(material, key))[1] for key in Material.names()):
         raise ConfigError(f"fabric {name!r} is not the same everywhere, and has no one value of its properties; name another")
-    density, mu, lam, k, thickness = (float(values_of(getattr(material, key))[0]) for key in Material.names())
+    numbers = {key: float(values_of(getattr(material, key))[0]) for key in Material.names()}
+    density, mu, lam, k, thickness = (numbers[key] for key in _PLAIN)
     stretch = stretch_stiffness(mu, lam, thickness)
     told = str(node.get("_target_")) == _MEASURED
     warp, weft = (node.stretch_warp, node.stretch_weft) if told else (stretch, stretch)
@@ -107,7 +109,9 @@ def _checked_edges(config: DictConfig) -> list[float]:
     edges = plain(config.edges)
     for edge in edges:
         if isinstance(edge, bool) or not isinstance(edge, (int, float)) or not FINEST <= edge <= COARSEST:
-            raise ConfigError(f"edges: {edge!r} is no edge of a mesh; give metres from {FINEST} to {COARSEST}, e.g. [0.01,0.007]")
+            raise ConfigError(
+                f"edges: {edge!r} is no edge of a mesh; give metres from {FINEST} to {COARSEST}, e.g. [0.01,0.007]"
+            )
     require_distinct("edges", edges)
     return [float(edge) for edge in edges]
 

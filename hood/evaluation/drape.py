@@ -203,7 +203,9 @@ def cast_shadow(pos: Array, faces: Faces) -> NDArray[np.bool_]:
         low = np.clip(np.floor(corners.min(axis=0) / PIXEL).astype(int) + half, 0, 2 * half)
         high = np.clip(np.ceil(corners.max(axis=0) / PIXEL).astype(int) + half, 0, 2 * half)
         x, z = centre[low[0] : high[0]][None, :], centre[low[1] : high[1]][:, None]
-        side = [(b[0] - a[0]) * (z - a[1]) - (b[1] - a[1]) * (x - a[0]) for a, b in zip(corners, corners[[1, 2, 0]], strict=True)]
+        side = [
+            (b[0] - a[0]) * (z - a[1]) - (b[1] - a[1]) * (x - a[0]) for a, b in zip(corners, corners[[1, 2, 0]], strict=True)
+        ]
         shadow[low[1] : high[1], low[0] : high[0]] |= (np.minimum.reduce(side) >= 0) | (np.maximum.reduce(side) <= 0)
     return shadow
 

@@ -21,7 +21,11 @@ def test_every_fabric_has_a_panel_and_dark_is_what_the_shadow_covers(tmp_path: P
     radius = np.hypot(*np.meshgrid(centre, centre))
     small = Rest(0.0, 0, 0.0, np.zeros((0, 3)), radius < DISC, True)
     large = replace(small, coefficient=0.6, folds=6, shadow=radius < 0.13)
-    for name, states in {"one": {"a": small}, "six": {str(k): small for k in range(6)}, "two": {"a": small, "b": large}}.items():
+    for name, states in {
+        "one": {"a": small},
+        "six": {str(k): small for k in range(6)},
+        "two": {"a": small, "b": large},
+    }.items():
         write_shadows(states, tmp_path / f"{name}.png")
     one, two, six = (Image.open(tmp_path / f"{name}.png").convert("RGB") for name in ("one", "two", "six"))
     assert two.width == 2 * one.width
