@@ -43,8 +43,8 @@ _SHORTEST, _LONGEST, _STRIDE = 1.0 / 30.0, 1.0, 0.02
 _REST = 5e-4
 _MOST_STEPS = 200
 _ON_THE_WAY, _FINE = NewtonSettings(target_rg=1e-2, max_iterations=30), NewtonSettings(target_rg=1e-3)
-#: Width of the held faces inside the edge of the disc, as a share of the mean edge: a hinge there has the cloth of its outer face
-#: alone to bend, as cloth held by a disc has.
+#: Width of the held faces inside the edge of the disc, as a share of the mean edge: a hinge there has the cloth of its outer
+#: face alone to bend, as cloth that a disc holds has.
 _HEM = 0.02
 #: Pixel [m] of the shadow.
 PIXEL = 5e-4
@@ -160,8 +160,8 @@ def settled(cloth: Cloth, start: Array) -> tuple[Array, bool]:
 
 @cache
 def sample_mesh(edge: float) -> tuple[Array, Faces]:
-    """The ring of the sample that hangs, with a rim of the disc by which it is held: positions (V, 3) [m] in the plane y = 0 and
-    faces (F, 3), nearly equilateral."""
+    """The ring of the sample that hangs, and a narrow rim by which it is held: positions (V, 3) [m] in the plane y = 0 and
+    faces (F, 3), nearly equilateral where they hang."""
     height = edge * math.sqrt(3.0) / 2.0
     disc = _ring(DISC, edge)
     fixed = np.concatenate([(1.0 - _HEM * edge / DISC) * disc, disc, _ring(SAMPLE, edge)])
