@@ -86,7 +86,8 @@ def describe(name: str) -> str:
     groups = _groups_of(name)
     if groups:
         lines += ["", "config groups (their keys can be overridden too, e.g. material.density=0.3):"]
-        lines += [f"  {group + '=':<14}{' | '.join(options(group))}" for group in groups]
+        rows = [f"  {group + '=':<14}{' | '.join(options(group))}" for group in groups]
+        lines += [textwrap.fill(row, 118, subsequent_indent=" " * 16) for row in rows]
     if groups or name in ("tradeoff", "envelope"):
         lines += ["", "embedded names:"]
         for kind, label in (("garments", "garment"), ("motions", "sequence"), ("body", "body"), ("weights", "checkpoint")):
