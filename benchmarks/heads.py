@@ -3,7 +3,7 @@
     python benchmarks/heads.py errors                              # the exact answer with errors, on states of the solver
     python benchmarks/heads.py errors --garments dress_4k skirt_4k --states 1
     python benchmarks/heads.py models A.safetensors B.safetensors  # models on the states of their own rollouts
-    python benchmarks/heads.py projective --solves 1 10 30         # the control of edges after so many solves, on its own states
+    python benchmarks/heads.py projective --solves 1 10 30         # the control of edges after so many solves
     python benchmarks/heads.py controls FOLDER                     # the controls as model files, for rollouts of their own
 
 An error of 30% is 0.3 times the change from the base at every vertex, or edge, in a direction of its own; ``shrunk`` is the

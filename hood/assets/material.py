@@ -42,6 +42,7 @@ class Material:
     that); elsewhere it is carried over by the rules of :mod:`hood.scene.fabric`.
 
     Defaults: the paper's default fabric (density 0.20022 kg/m², μ 23600 Pa, λ 44400 Pa, bending stiffness 3.9626e-5 J).
+    ``friction`` is a factor, not a coefficient, for friction on the body is of two: fabrics and regions that grip or slide.
 
     Raises:
         ValueError: a value is not finite or not physical; names the property and the index.
@@ -52,6 +53,7 @@ class Material:
     lame_lambda: Field = 44400.0  # Pa
     bending_stiffness: Field = 3.9626e-5  # J (N·m), k of the dihedral energy ½ k l₀² / (4 (A₁ + A₂)) θ²
     thickness: Field = 4.7e-4  # m
+    friction: Field = 1.0  # times the coefficient of the potential's friction on the body
 
     @staticmethod
     def names() -> tuple[str, ...]:
@@ -63,6 +65,7 @@ class Material:
             "lame_mu": ("> 0", lambda v: v > 0),
             "bending_stiffness": (">= 0", lambda v: v >= 0),
             "thickness": ("> 0", lambda v: v > 0),
+            "friction": (">= 0", lambda v: v >= 0),
         }
         for name in self.names():
             values, place = values_of(getattr(self, name))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 from omegaconf import DictConfig
 
 from hood.assets.files.library import unknown
@@ -25,29 +28,41 @@ def fabric_of(config: DictConfig, garment: Garment, motion: Motion) -> Material:
     if not parts:
         return material
     body = motion.body if isinstance(motion, BodyMotion) else None
-    pieces = [(part_faces(part, garment, body), fabric_named(fabric)) for part, fabric in parts.items()]
+    pieces = [(part_faces(part, garment, body), fabric) for part, fabric in parts.items()]
     return patchwork(material, pieces, garment.rest_pos, garment.faces)
 
 
-def checked_fabrics(config: DictConfig) -> dict[str, str]:
-    """``fabrics`` of a config: names of fabrics by part.
+def checked_fabrics(config: DictConfig) -> dict[str, Material]:
+    """``fabrics`` of a config: fabrics by part.
 
     Raises:
-        ConfigError: it is something else, or a fabric is unknown.
+        ConfigError: it is something else, or a fabric or a property is unknown.
+        ValueError: a property has no physical value.
     """
     value = plain(config.fabrics)
     if value is None:
         return {}
-    if not isinstance(value, dict) or not all(isinstance(fabric, str) for fabric in value.values()):
+    if not isinstance(value, dict) or not all(isinstance(fabric, (str, dict)) for fabric in value.values()):
         raise ConfigError(
             f"fabrics={value}: give fabrics by part, such as fabrics={{below_waistband:silk,above_waistband:denim}}"
         )
-    parts = {str(part): str(fabric) for part, fabric in value.items()}
+    return {str(part): _fabric(str(part), fabric, config) for part, fabric in value.items()}
+
+
+def _fabric(part: str, given: str | dict[str, Any], config: DictConfig) -> Material:
+    """The fabric of a part: an option of ``material=``, or a table of one and of properties instead of its own."""
+    own = {} if isinstance(given, str) else {str(key): value for key, value in given.items()}
+    name = given if isinstance(given, str) else own.pop("material", None)
     known = options("material")
-    for part, fabric in parts.items():
-        if fabric not in known:
-            raise ConfigError(f"fabrics: {part}: {unknown('material', fabric, known)}")
-    return parts
+    if name is not None and name not in known:
+        raise ConfigError(f"fabrics: {part}: {unknown('material', str(name), known)}")
+    for key, value in own.items():
+        if key not in Material.names():
+            raise ConfigError(f"fabrics: {part}: {unknown('property', key, ['material', *Material.names()])}")
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise ConfigError(f"fabrics: {part}: {key} is {value!r}; give a number")
+    base: Material = build(config.material) if name is None else fabric_named(name)
+    return replace(base, **own)
 
 
 def fabric_named(name: str) -> Material:

@@ -27,6 +27,10 @@ _EXAMPLES = {
         "hood compare a=outputs/plain b=outputs/refined colour=rg output=outputs/compare",
         "hood compare outputs/plain outputs/refined colour=fabric blind=true seed=7 output=outputs/pair_7",
     ],
+    "fabric": [
+        "hood fabric",
+        "hood fabric silk_habotai denim_12oz wool_suiting output=outputs/fabrics",
+    ],
     "view": [
         "hood view outputs/dress/rollout.h5 output=dress.html",
         "hood view outputs/network outputs/solver output=both.html",
@@ -59,13 +63,15 @@ _EXAMPLES = {
         "hood envelope models=[runs/a/model.safetensors,newton] factors=[dt,spin,teleport] output=outputs/a",
     ],
 }
+#: Words of a command that are no keys.
+_BEFORE_KEYS = {**dict.fromkeys(("inspect", "compare", "view", "export"), "FILE ... "), "fabric": "[NAME ...] "}
 
 
 def describe(name: str) -> str:
     """Help text of the command ``name``."""
     config = load_config(name)
     comments = _comments(name)
-    lines = [f"usage: hood {name} {'FILE ... ' if name in ('inspect', 'compare', 'view', 'export') else ''}[key=value ...]", ""]
+    lines = [f"usage: hood {name} {_BEFORE_KEYS.get(name, '')}[key=value ...]", ""]
     for key in config:
         value = plain(config[key])
         if isinstance(value, dict):
@@ -75,10 +81,13 @@ def describe(name: str) -> str:
         lines.append(textwrap.fill(text + comments.get(str(key), ""), 118, subsequent_indent=" " * 34))
     if name == "plan":
         lines += ["", "The scene and the full model are said by the keys of hood rollout: garment, sequence, stepper, fps, …"]
+    if name == "fabric":
+        lines += ["", textwrap.fill(f"  {'NAME':<14}{' '.join(options('material'))}", 118, subsequent_indent=" " * 16)]
     groups = _groups_of(name)
     if groups:
         lines += ["", "config groups (their keys can be overridden too, e.g. material.density=0.3):"]
-        lines += [f"  {group + '=':<14}{' | '.join(options(group))}" for group in groups]
+        rows = [f"  {group + '=':<14}{' | '.join(options(group))}" for group in groups]
+        lines += [textwrap.fill(row, 118, subsequent_indent=" " * 16) for row in rows]
     if groups or name in ("tradeoff", "envelope"):
         lines += ["", "embedded names:"]
         for kind, label in (("garments", "garment"), ("motions", "sequence"), ("body", "body"), ("weights", "checkpoint")):

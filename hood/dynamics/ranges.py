@@ -41,7 +41,7 @@ _TAKEN = ("reach", "sides")
 Span = tuple[float, float]
 
 #: What all trainings have had, those of files that do not say included.
-_EARTH: dict[str, Span] = {"gravity": (STANDARD_GRAVITY, STANDARD_GRAVITY)}
+_USUAL: dict[str, Span] = {"gravity": (STANDARD_GRAVITY, STANDARD_GRAVITY), "material.friction": (1.0, 1.0)}
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ def training_conditions(sampler: SceneSampler, potential: Potential) -> Conditio
     low, high = sampler.size_low, sampler.size_high
     motions = sampler.sequences
     fps = [motions.fps] if isinstance(motions, MotionFiles) else [motion.fps for motion in motions]
-    spans: dict[str, Span] = {"fps": (min(fps), max(fps)), "size": (low, high), **_EARTH}
+    spans: dict[str, Span] = {"fps": (min(fps), max(fps)), "size": (low, high), **_USUAL}
     spans["betas"] = (-sampler.beta_range, sampler.beta_range)
     spans |= {f"material.{name}": span for name, span in _fabrics(sampler.material).items()}
     spans |= _resolution(sampler.garments)
@@ -118,7 +118,7 @@ def training_conditions(sampler: SceneSampler, potential: Potential) -> Conditio
 def outside(trained: Conditions, asked: Conditions) -> list[str]:
     """One sentence for every quantity and every setting of the potential that ``asked`` has outside of ``trained``."""
     sentences = []
-    for name, (low, high) in {**_EARTH, **trained.spans}.items():
+    for name, (low, high) in {**_USUAL, **trained.spans}.items():
         least, most = asked.spans.get(name, (low, high))
         too_high, too_low = most > high + _ROUNDING * abs(high), least < low - _ROUNDING * abs(low)
         if too_high or too_low:

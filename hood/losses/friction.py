@@ -13,12 +13,14 @@ from hood.scene.reach import vertex_reach
 
 
 class LaggedFriction:
-    """Friction energy [J], the sum over vertices of μ_f N f(‖u_T‖); subclasses say what the normal force N is.
+    """Friction energy [J], the sum over vertices of μ_f φ N f(‖u_T‖); subclasses say what the normal force N is.
 
     u_T is the tangential slip from t to t+1 relative to the matched body point, N is taken at t (lagged, so that
     the friction is a potential). f is the C¹ mollifier of Li et al. ("Incremental Potential Contact", 2020, eq.
     12 and 13) with e = ``slip_speed`` · dt: quadratic-cubic below a slip of e, equal to ‖u_T‖ above. The force
-    is at most μ_f N and reaches it at ``slip_speed``; below, contacts creep.
+    is at most μ_f φ N and reaches it at ``slip_speed``; below, contacts creep.
+
+    φ → ``cloth.friction`` (V,), what the fabric makes of the coefficient.
 
     Args:
         coefficient: μ_f.
@@ -44,6 +46,10 @@ class LaggedFriction:
         """Lagged normal forces N [N], shape (V,)."""
         raise NotImplementedError
 
+    def greatest(self, problem: StepProblem, contact: Contact) -> Tensor:
+        """Greatest forces of friction [N], μ_f φ N, shape (V,)."""
+        return self.coefficient * problem.cloth.friction * self.normal_force(problem, contact)
+
     def contacts(self, problem: StepProblem) -> tuple[Contact, ...]:
         """The contacts of the vertices that the term acts at; none without a body."""
         return contacts_of(problem, "nearest")
@@ -56,10 +62,10 @@ class LaggedFriction:
         """Energy [J] (B,) at ``next_pos`` (V, 3)."""
         energy, limit = next_pos.new_zeros(problem.num_scenes), self.slip_speed * problem.vertex_dt.squeeze(1)
         for contact in self.contacts(problem):
-            force = self.normal_force(problem, contact)
+            force = self.greatest(problem, contact)
             carried, normal = self.carrier(contact)
             moved = next_pos - problem.state.pos - carried
-            energy = energy + problem.sum_vertices(_slipping(self.coefficient * force, moved, normal, limit))
+            energy = energy + problem.sum_vertices(_slipping(force, moved, normal, limit))
         return energy
 
 
@@ -117,8 +123,13 @@ class Friction(LaggedFriction):
             return energy
         moved = points.at(next_pos - problem.state.pos) - (points.next_point - points.point)
         limit = self.slip_speed * problem.step.dt[points.scene]
-        slipping = _slipping(self.coefficient * self.point_force(problem, points), moved, points.next_normal, limit)
+        slipping = _slipping(self.greatest_at(problem, points), moved, points.next_normal, limit)
         return energy + sum_per_scene(slipping, points.scene, problem.num_scenes)
+
+    def greatest_at(self, problem: StepProblem, points: PointContact) -> Tensor:
+        """Greatest forces of friction [N] (N,) at the points, φ as the weighted vertices have it."""
+        factor = 1.0 + (problem.cloth.friction - 1.0)[points.vertices].mul(points.weights).sum(dim=1)
+        return self.coefficient * factor * self.point_force(problem, points)
 
     def point_force(self, problem: StepProblem, points: PointContact) -> Tensor:
         """Lagged normal forces [N] (N,) at the points."""

@@ -45,6 +45,7 @@ class Cloth:
     lame_mu: Tensor = None  # type: ignore[assignment]  # (F,) Pa
     lame_lambda: Tensor = None  # type: ignore[assignment]  # (F,) Pa
     bending_stiffness: Tensor = None  # type: ignore[assignment]  # (H,) J
+    friction: Tensor = None  # type: ignore[assignment]  # (V,) factor on the coefficient of friction on the body
     vertex_fabric: Tensor = None  # type: ignore[assignment]  # (V, 3)
     edge_fabric: Tensor = None  # type: ignore[assignment]  # (E, 3)
     # derived from the rest shape
@@ -142,6 +143,7 @@ def build_cloth(
         "density": density,
         **{name: torch.tensor(fabric.on_faces(name)) for name in ("thickness", "lame_mu", "lame_lambda")},
         "bending_stiffness": torch.tensor(fabric.on_edges("bending_stiffness")[hinge_edges]),
+        "friction": torch.tensor(fabric.on_vertices("friction")),
         "vertex_fabric": torch.tensor(np.stack([fabric.on_vertices(name) for name in _FEATURES], axis=1)),
         "edge_fabric": torch.tensor(np.stack([fabric.on_edges(name) for name in _FEATURES], axis=1)),
         "mass": geometry.vertex_masses(pos, tri, density),

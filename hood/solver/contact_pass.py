@@ -66,6 +66,7 @@ class ContactPass:
         found = self._empty(2, 2)
         numbers = (REAL(value) for value in (term.weight, term.coefficient, term.slip_speed))
         self._lib.elements_grip(*self._given(term), *numbers, *_addresses(found))
+        found[2].mul_(self._problem.cloth.friction)
         return found
 
     def _given(self, term: Collision | Friction) -> tuple[object, object]:

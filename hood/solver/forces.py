@@ -199,7 +199,7 @@ def _grip(term: LaggedFriction, problem: StepProblem, contact: Contact, compiled
     if compiled is not None and type(term) is Friction:
         normal, anchor, force, limit = compiled.grips(term)
         return Grip(force, normal, anchor, limit)
-    force = term.coefficient * term.normal_force(problem, contact)
+    force = term.greatest(problem, contact)
     # Rows without a match may hold infinite or undefined numbers.
     sliding = (force > 0)[:, None]
     carried, normal = term.carrier(contact)

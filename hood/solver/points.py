@@ -94,7 +94,7 @@ def _walls(term: Collision, points: PointContact) -> Walls:
 def _grip(term: Friction, points: PointContact, problem: StepProblem) -> Grip:
     anchor = points.at(problem.state.pos) + points.next_point - points.point
     limit = term.slip_speed * problem.step.dt[points.scene]
-    return Grip(term.coefficient * term.point_force(problem, points), points.next_normal, anchor, limit)
+    return Grip(term.greatest_at(problem, points), points.next_normal, anchor, limit)
 
 
 @dataclass(frozen=True)

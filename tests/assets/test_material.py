@@ -24,6 +24,7 @@ def test_default_is_inside_the_training_ranges() -> None:
         ("lame_lambda", float("inf"), "finite"),
         ("bending_stiffness", -1e-9, ">= 0"),
         ("thickness", 0.0, "> 0"),
+        ("friction", -0.1, ">= 0"),
     ],
 )
 def test_unphysical_values_are_refused(name: str, value: float, rule: str) -> None:

@@ -38,8 +38,30 @@ def test_without_parts_the_fabric_is_that_of_the_option() -> None:
         ("fabrics=silk", "fabrics=silk: give fabrics by part"),
         ("fabrics={dress:slik}", "fabrics: dress: unknown material 'slik': did you mean 'silk'"),
         ("fabrics={dress:0.3}", "give fabrics by part"),
+        ("fabrics={dress:{material:slik}}", "fabrics: dress: unknown material 'slik'"),
+        ("fabrics={dress:{frictoin:2}}", "fabrics: dress: unknown property 'frictoin': did you mean 'friction'"),
+        ("fabrics={dress:{friction:high}}", "fabrics: dress: friction is 'high'; give a number"),
     ],
 )
 def test_what_is_no_table_of_fabrics_is_refused(word: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         checked_fabrics(load_config("rollout", [word]))
+
+
+def test_a_part_may_have_properties_of_its_own() -> None:
+    words = ["garment=dress", "fabrics={below_waistband:{friction:3},above_waistband:{material:denim,density:0.3}}"]
+    cloth = make_scene(load_config("rollout", [*words, "num_frames=3"])).cloth
+    above = np.isclose(cloth.density.numpy(), 0.3)
+    default, denim = fabric_named("default"), fabric_named("denim")
+    stiffened = make_scene(load_config("rollout", ["garment=dress", "num_frames=3"])).cloth.lame_mu.numpy()
+    expected = stiffened * np.where(above, denim.lame_mu, default.lame_mu) / default.lame_mu
+    np.testing.assert_allclose(cloth.lame_mu.numpy(), expected, rtol=1e-5)
+    friction = cloth.friction.numpy()
+    assert ((friction >= 1) & (friction <= 3 + 1e-6)).all()
+    inside = np.isclose(friction, 1) | np.isclose(friction, 3)
+    assert 0.9 < inside.mean() < 1.0
+
+
+def test_a_property_of_a_part_is_checked() -> None:
+    with pytest.raises(ValueError, match="material 'friction' is -1.0; it must be finite and >= 0"):
+        checked_fabrics(load_config("rollout", ["fabrics={dress:{friction:-1}}"]))

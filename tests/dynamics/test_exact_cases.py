@@ -122,17 +122,18 @@ def plate(normal: np.ndarray, slope: np.ndarray) -> Mesh:
     return pos[:, :1] * slope + pos[:, 1:2] * normal + pos[:, 2:] * np.array([0.0, 0.0, 1.0]), faces
 
 
-@pytest.mark.parametrize("friction, meshed", [(0.3, False), (0.5, True)])
+@pytest.mark.parametrize("coefficient, factor, meshed", [(0.3, 1.0, False), (0.5, 1.0, True), (0.5, 0.6, True)])
 @pytest.mark.parametrize("beyond", [-1.0, 1.0])
-def test_sliding_starts_at_the_angle_of_friction(friction, beyond, meshed):
+def test_sliding_starts_at_the_angle_of_friction(coefficient, factor, beyond, meshed):
     """One degree below it the sheet creeps slower than ε_v, one degree above it accelerates like a point mass."""
+    friction = coefficient * factor
     angle = np.arctan(friction) + np.deg2rad(beyond)
     normal, slope = np.array([np.sin(angle), np.cos(angle), 0.0]), np.array([np.cos(angle), -np.sin(angle), 0.0])
-    potential = default_potential(friction_coefficient=friction)
+    potential = default_potential(friction_coefficient=coefficient)
     term, duration, dt = potential.terms["friction"], 0.8, 1 / 30
     flat, faces = grid(4, 4, 0.15)
     rest = flat[:, :1] * slope + flat[:, 2:] * np.array([0.0, 0.0, 1.0])
-    problem = problem_of((rest, faces), dt)
+    problem = problem_of((rest, faces), dt, Material(friction=factor))
     # The normal force is that of the step before: start with the depth at which contact carries each vertex.
     depth = (problem.cloth.mass * G * np.cos(angle) / (3.0 * term.weight)).sqrt()
     pos = problem.state.pos + (term.epsilon - depth)[:, None] * torch.as_tensor(normal)

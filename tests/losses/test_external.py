@@ -7,7 +7,7 @@ import torch
 from hood.assets.material import Material
 from hood.losses.attachment import Attachment
 from hood.losses.collision import Collision
-from hood.losses.friction import Friction, mollified_norm
+from hood.losses.friction import Friction, WeightFriction, mollified_norm
 from hood.losses.gravity import Gravity
 from hood.losses.inertia import Inertia
 from hood.losses.potential import Potential
@@ -120,6 +120,18 @@ def test_friction_force_is_at_most_coulomb_and_opposes_the_slip():
     torch.testing.assert_close(force[sliding], expected[sliding])
     aligned = (force * tangential).sum(dim=1) / (force.norm(dim=1) * size)
     torch.testing.assert_close(aligned, torch.ones_like(aligned))
+
+
+@pytest.mark.parametrize("term", [Friction(0.3), WeightFriction(0.3)])
+def test_the_fabric_multiplies_the_coefficient_where_it_lies(term):
+    cloth, pos = sheet(height=1e-3)
+    factor = torch.linspace(0.0, 2.0, len(pos), dtype=F64)
+    rest, faces = cloth.rest_pos.numpy(), cloth.faces.numpy()
+    both = [build_cloth(rest, faces, Material(friction=field), dtype=F64) for field in (1.0, factor.numpy())]
+    slid = pos + torch.tensor([1e-2, 0.0, 0.0], dtype=F64)
+    usual, own = (gradient(term, make_problem(cloth, pos, contact=plane_contact(pos)), slid) for cloth in both)
+    assert float(usual.abs().sum(dim=1).min()) > 0
+    torch.testing.assert_close(own, factor[:, None] * usual)
 
 
 def test_friction_is_finite_and_zero_when_moving_along_and_absent_when_apart():

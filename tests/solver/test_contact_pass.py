@@ -24,7 +24,8 @@ def over_a_ball(speed: float) -> StepProblem:
     """An uneven sheet, in and over a ball that moves, falling or rising at ``speed`` [m/s]; a vertex without faces."""
     rng = np.random.default_rng(2)
     rest, faces = grid(8, 7, 0.3)
-    cloth = build_cloth(np.concatenate([rest, [[0.1, 0.0, 0.1]]]), faces, Material(), dtype=F64)
+    rest = np.concatenate([rest, [[0.1, 0.0, 0.1]]])
+    cloth = build_cloth(rest, faces, Material(friction=np.linspace(0.0, 2.0, len(rest))), dtype=F64)
     noise = rng.normal(size=cloth.rest_pos.shape)
     pos = cloth.rest_pos + torch.as_tensor([-0.15, 0.1, -0.15] + 4e-3 * noise)
     vel = 0.3 * noise + [0.0, speed, 0.0]

@@ -43,7 +43,8 @@ def potential_at(place: str) -> Potential:
 def over_ball(height: float = 1e-3, cells: int = 4, dtype: torch.dtype = F64, seed: int = 0) -> StepProblem:
     """A coarse sheet on a moving ball, which comes up between its vertices; one corner is held."""
     pos, faces = grid(cells + 1, cells + 1, 0.3)
-    cloth = build_cloth(pos, faces, Material(), np.arange(len(pos)) == 0, dtype=dtype)
+    fabric = Material(friction=np.linspace(0.5, 2.0, len(pos)))
+    cloth = build_cloth(pos, faces, fabric, np.arange(len(pos)) == 0, dtype=dtype)
     ball, ball_faces = sphere(3, 0.1)
     now = torch.as_tensor(ball) + CENTRE
     zeros = torch.zeros(len(ball)).long(), torch.zeros(len(ball_faces)).long()
