@@ -181,6 +181,8 @@ def _finished(config: DictConfig, digest: str, folder: Path) -> dict[str, Any] |
     before.setdefault("formats", [])
     before["plan"] = before.get("plan") or now["plan"]
     before.setdefault("accuracy", None)
+    before.setdefault("events", [])
+    before.setdefault("events_speed", now["events_speed"])
     same = all(before.get(key) == now[key] for key in now if key not in ("resume", "output", "allow_unsound"))
     if not same or not bool(attributes["complete"]) or attributes["checkpoint_sha256"] != digest:
         return None
