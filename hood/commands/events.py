@@ -1,4 +1,4 @@
-"""``events=``: fasteners of a garment that are opened and closed during a rollout, and what its summary says of that."""
+"""``events=``: fasteners of a garment that are opened and closed during a rollout."""
 
 from __future__ import annotations
 
@@ -112,3 +112,14 @@ def _warn_if_late(event: Asked, frame: int, num_frames: int, dt: float) -> None:
             f"{max(num_frames - 2, 0) * dt:.2f} s; it has no effect",
             stacklevel=3,
         )
+
+
+def fastening_attributes(scene: Scene) -> dict[str, Any]:
+    """What ``rollout.h5`` says of fasteners beside their pairs: names of the rows, whether they are closed at first, and events,
+    each a frame, a row and whether it closes. Nothing of scenes without any."""
+    fastening = scene.fastening
+    if fastening is None:
+        return {}
+    events = [[event.frame, event.name, event.closes] for event in fastening.events]
+    closed = [name for name, state in zip(fastening.names, fastening.closed(-1), strict=True) if state]
+    return {"fastening": {"names": list(fastening.names), "closed_at_first": closed, "events": events}}

@@ -27,6 +27,7 @@ from hood.commands.common import (
     thinning,
     together,
 )
+from hood.commands.events import fastening_attributes
 from hood.commands.export import check_formats, export_beside
 from hood.commands.guarding import OFF, GuardStopped, guard_sentences, make_guard, write_alarms
 from hood.commands.notices import heard
@@ -210,6 +211,7 @@ def _simulate_to_disk(ready: Setup, digest: str, path: Path, asked: DictConfig, 
         "surface_stride": int(config.surface_stride),
         "cloth_contact_off": why_not(config),
         "guard": OFF if guard is None else guard.mode,
+        **fastening_attributes(scene),
     }
     writer = RolloutWriter(
         path,
@@ -225,7 +227,7 @@ def _simulate_to_disk(ready: Setup, digest: str, path: Path, asked: DictConfig, 
         fields=exported(config),
         double=solves_in_double(config),
         guarded=guard is not None,
-        still=still_of(scene.garment),
+        still=still_of(scene.garment, scene.fastening),
     )
     frames = simulate(
         stepper,

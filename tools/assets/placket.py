@@ -1,4 +1,4 @@
-"""Garments that open in front: a right half that is mirrored, with the back joined and the front a slit with vertices in pairs."""
+"""Garments that open in front: one half and its mirror image, joined at the back, with a slit of paired vertices in front."""
 
 from __future__ import annotations
 

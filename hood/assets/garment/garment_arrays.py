@@ -112,7 +112,8 @@ def check_fasteners(where: str, fasteners: Mapping[str, np.ndarray], num_vertice
         if wrong.any():
             row = int(np.argmax(wrong))
             raise ValueError(
-                f"{where}: pair {row} of fastener {name!r} is {pairs[row].tolist()}; give two different vertices below {num_vertices}"
+                f"{where}: pair {row} of fastener {name!r} is {pairs[row].tolist()}; give two different vertices below "
+                f"{num_vertices}"
             )
 
 
