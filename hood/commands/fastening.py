@@ -14,8 +14,8 @@ from hood.config import ConfigError, plain
 
 
 def fasten_as_asked(fitting: Fitting, config: DictConfig) -> np.ndarray:
-    """Give the garment on its way the rows that the config asks for; the pairs (N, 2) of vertices of the file along their edges,
-    which nothing joins.
+    """Give the garment on its way the rows that the config asks for; the pairs (N, 2) along their edges, in the numbers of the
+    file, which nothing joins.
 
     Raises:
         ConfigError: ``fasten`` is no table of rows, or the garment is one of several.

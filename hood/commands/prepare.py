@@ -29,8 +29,8 @@ from hood.assets.motion.load import load_sequence
 from hood.assets.motion.poses import POSE_SUFFIXES, arms_down, read_pose
 from hood.assets.motion.sequence import PoseSequence
 from hood.commands.common import prepare_folder
-from hood.commands.garments import checked_pins, heed, names_of, shape_coefficients
 from hood.commands.fastening import fasten_as_asked, give_room
+from hood.commands.garments import checked_pins, heed, names_of, shape_coefficients
 from hood.commands.placing import (
     AUTO,
     arm_angle,

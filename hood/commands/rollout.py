@@ -27,6 +27,7 @@ from hood.commands.common import (
     thinning,
     together,
 )
+from hood.commands.event_report import describe_held, summarise_held
 from hood.commands.events import fastening_attributes
 from hood.commands.export import check_formats, export_beside
 from hood.commands.guarding import OFF, GuardStopped, guard_sentences, make_guard, write_alarms
@@ -114,11 +115,14 @@ def _run_there(ready: Setup, asked: DictConfig, digest: str, warned: list[str], 
     summary = summarise(folder / "rollout.h5")
     if eases:
         summary |= summarise_ease(eases[0], eases[-1])
+    if scene.holding is not None:
+        summary |= summarise_held(scene, read_rollout(folder / "rollout.h5"))
     warn(guard_sentences(summary.get("guard")))
     summary["choice"] = asdict(ready.choice)
     summary |= summarise_plan(folder / "rollout.h5", config)
     _keep_plan(config, folder)
     print(describe(summary))
+    _tell(describe_held(summary))
     _tell(describe_ease(summary))
     _tell(plan_sentences(summary))
     if advise:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from hood.commands.cloth_contact import describe_cloth_contact, summarise_cloth_contact
-from hood.commands.fastener_report import describe_fasteners, summarise_fasteners
+from hood.commands.event_report import describe_fasteners, summarise_fasteners
 from hood.commands.guarding import summarise_guard
 from hood.commands.refinement import describe_refinement, summarise_refinement
 from hood.commands.surface_report import cut_at_worst, describe_surface, summarise_surface

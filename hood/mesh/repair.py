@@ -39,7 +39,7 @@ def weld_tolerance(pos: np.ndarray, faces: np.ndarray) -> float:
 
 
 def weld(pos: np.ndarray, faces: np.ndarray, tolerance: float, left_out: np.ndarray | None = None) -> Welded:
-    """Vertices on the boundary within ``tolerance`` [m] of each other become the first of them, but for those ``left_out`` (N,).
+    """Vertices on the boundary within ``tolerance`` [m] of each other become the first of them, but for some ``left_out`` (N,).
 
     Only boundary vertices: layers that touch (a pocket on a shirt) stay apart. Vertices that share a face are joined only
     where they coincide, or a tolerance beyond the edge length would eat the mesh. Chains count: a–b and b–c join a, b and c.

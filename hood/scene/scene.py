@@ -15,6 +15,7 @@ from hood.assets.motion.sequence import PoseSequence
 from hood.scene.batch import to_device
 from hood.scene.cloth import Cloth, build_cloth
 from hood.scene.fastening import Fastening, fastening_of
+from hood.scene.holding import Holding
 from hood.scene.motion import BodyMotion, Motion, body_motion
 from hood.scene.sizing import Size, Sizes, resized, sizes_of
 from hood.scene.start import free_stretch, settle
@@ -50,11 +51,18 @@ class Scene:
     layers: tuple[int, ...] | None = None  # garments of an outfit from the body outwards; None: as they lie at the start
     sizes: Sizes = Sizes()  # of the rest shape; that of ``cloth`` is the first
     fastening: Fastening | None = None  # of steps that are given no attachments; None: nothing is fastened
+    holding: Holding | None = None  # what is held and let go; None: the pins of ``cloth``, throughout
 
     def cloth_at(self, frame: int, start: int = 0) -> Cloth:
         """The cloth at ``frame`` of a rollout that begins at the frame ``start``: ``cloth`` where its size does not change."""
         now = self.sizes.at((frame - start) * self.dt)
         return self.cloth if now == self.sizes.start else resized(self.cloth, self.sizes.start, now)
+
+    def cloth_of_step(self, frame: int, start: int = 0) -> Cloth:
+        """The cloth of the step ``frame`` → ``frame + 1`` of a rollout that begins at the frame ``start``: of the size that it
+        ends with, with what is held in it."""
+        cloth = self.cloth_at(frame + 1, start) if self.sizes.changing else self.cloth
+        return cloth if self.holding is None else self.holding.cloth(cloth, frame)
 
     @property
     def num_frames(self) -> int:
@@ -143,7 +151,8 @@ class Scene:
         if not isinstance(self.motion, BodyMotion):
             return None
         fastening = None if self.fastening is None else self.fastening.still(frame)
-        lead = replace(self, motion=self.motion.lead_in(frame, LEAD_IN), start_pos=None, start_vel=None, fastening=fastening)
+        motion = self.motion.lead_in(frame, LEAD_IN)
+        lead = replace(self, motion=motion, start_pos=None, start_vel=None, fastening=fastening, holding=None)
         start = lead.start(0, relaxed=False, thorough=True)
         return replace(lead, start_pos=start.pos.cpu().double().numpy() + start.origin[0].numpy())
 
@@ -168,15 +177,26 @@ class Scene:
         before, now, after = (self.motion.skinned(self.garment, frame + k, origin) for k in (-1, 0, 1))
         return after - 2 * now + before
 
-    def step_input(self, frame: int, state: State, relaxing: bool = False, attachments: Attachments | None = None) -> StepInput:
+    def step_input(
+        self,
+        frame: int,
+        state: State,
+        relaxing: bool = False,
+        attachments: Attachments | None = None,
+        jumping: bool = False,
+    ) -> StepInput:
         """What is prescribed for ``frame`` → ``frame + 1``; a relaxing step freezes the body at ``frame``. Without
-        ``attachments`` they are those of the scene's fastening."""
+        ``attachments`` they are those of the scene's fastening. Where the body is ``jumping``, held vertices jump with it."""
         if attachments is None and self.fastening is not None:
             attachments = self.fastening.at(frame)
         origin = state.origin[0].numpy()
         pins = None
-        if bool(self.cloth.pinned.any()):
+        cloth = self.cloth if self.holding is None or relaxing else self.holding.cloth(self.cloth, frame)
+        if bool(cloth.pinned.any()):
             pins = self.motion.skinned(self.garment, frame if relaxing else frame + 1, origin)
+            if self.holding is not None and not relaxing and not jumping:
+                here = self.motion.skinned(self.garment, frame, origin)
+                pins = self.holding.targets(frame, here, pins, state.pos, self.dt)
         dt = RELAXING_DT if relaxing else self.dt
         time = (frame if relaxing else frame + 1) * self.dt
         return StepInput(

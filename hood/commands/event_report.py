@@ -1,4 +1,5 @@
-"""What ``summary.json`` says of fasteners: when each row was opened and closed, and how well it then held."""
+"""What ``summary.json`` says of events: when each row of fasteners was opened and closed and how well it then held, and when
+vertices were held and let go."""
 
 from __future__ import annotations
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from hood.dynamics.recorder import RolloutData
 from hood.scene.fastening import CLOSED
+from hood.scene.scene import Scene
 
 
 def summarise_fasteners(data: RolloutData) -> dict[str, Any]:
@@ -84,3 +86,49 @@ def _sentence(event: Mapping[str, Any], pairs: int) -> str:
     if event["within_frame"] is None:
         return f"closing from {when} on, {event['left_open']} of {pairs} pairs still apart in the end"
     return f"closing from {when} on, within 1 mm at {event['within_time']:.2f} s (frame {event['within_frame']})"
+
+
+def summarise_held(scene: Scene, data: RolloutData) -> dict[str, Any]:
+    """Of every event that holds vertices or lets them go: its frame and how many; of vertices that are taken hold of, from which
+    frame on all are within a millimetre of where the skinned garment has them. Nothing of scenes without such events."""
+    if scene.holding is None:
+        return {}
+    rows, last = [], len(data.time) - 1
+    for place, grasp in enumerate(scene.holding.grasps):
+        if grasp.frame >= last:
+            break
+        row: dict[str, Any] = {
+            "action": "attach" if grasp.holds else "detach",
+            "frame": grasp.frame,
+            "time": float(data.time[grasp.frame]),
+            "vertices": int(grasp.vertices.sum()),
+        }
+        if grasp.holds:
+            end = next((later.frame for later in scene.holding.grasps[place + 1 :] if not later.holds), last)
+            chosen = grasp.vertices.cpu().numpy()
+            within = (f for f in range(grasp.frame + 1, min(end, last) + 1) if _off(scene, data, f, chosen) <= CLOSED)
+            first = next(within, None)
+            row |= {"within_frame": first, "within_time": None if first is None else float(data.time[first])}
+        rows.append(row)
+    return {"held": rows}
+
+
+def _off(scene: Scene, data: RolloutData, frame: int, chosen: np.ndarray) -> float:
+    """How far [m] chosen vertices (V,) are from where the skinned garment has them, at most."""
+    origin = scene.motion.translation[frame]
+    there = scene.motion.skinned(scene.garment, frame, origin).cpu().double().numpy() + origin
+    return float(np.linalg.norm(data.cloth_pos[frame][chosen] - there[chosen], axis=1).max())
+
+
+def describe_held(summary: Mapping[str, Any]) -> list[str]:
+    """A line on vertices that were held or let go."""
+    said = []
+    for event in summary.get("held", []):
+        when = f"{event['vertices']} vertices from {event['time']:.2f} s (frame {event['frame']}) on"
+        if event["action"] == "detach":
+            said.append(f"let go of {when}")
+        elif event["within_frame"] is None:
+            said.append(f"holds {when}, not in their places by the end")
+        else:
+            said.append(f"holds {when}, in their places at {event['within_time']:.2f} s (frame {event['within_frame']})")
+    return ["; ".join(said)] if said else []
