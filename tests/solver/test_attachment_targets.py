@@ -42,7 +42,9 @@ def test_gradients_are_those_of_the_potential(name):
         gradient, _ = vertex_systems(terms, group, pos, acc)
         torch.testing.assert_close(gradient, expected[group.colour.vertices], rtol=1e-9, atol=1e-9)
     free = problem.cloth.free.unsqueeze(1)
-    torch.testing.assert_close(LocalTerms(potential, problem)(pos).force, torch.where(free, -expected, 0.0), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(
+        LocalTerms(potential, problem)(pos).force, torch.where(free, -expected, 0.0), rtol=1e-9, atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("active", [(True, False), (True, True), (False, False)])

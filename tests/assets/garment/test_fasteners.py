@@ -72,7 +72,7 @@ def test_edges_on_each_other_stay_two_where_they_are_fastened_and_get_room() -> 
     assert moved == 10
     gaps = np.linalg.norm(apart.rest_pos[edges[:, 0]] - apart.rest_pos[edges[:, 1]], axis=1)
     np.testing.assert_allclose(gaps, ROOM)
-    assert (apart.rest_pos[left, 0] > 0).all() == (garment.rest_pos[:15, 0].mean() > 0)
+    assert (apart.rest_pos[left, 0] > 0).all()
     assert with_room(apart, edges) == (apart, 0)
     bare = start_fitting(garment)
     sew(bare, None)
@@ -136,7 +136,7 @@ def test_broken_rows_of_a_file_are_refused(tmp_path: Path, pairs: Any, message: 
         ({"heights": [0, 1], "left": [1], "right": [2]}, "in 2 ways"),
         ({"high": 3}, "unknown key 'high'"),
         ({"heights": [1, 0]}, r"heights is \[1, 0\]; give the lower and the upper"),
-        ({"heights": [3, 4]}, "between 3 and 4 m the garment has no edges left and right.*from -0.10 to 0.10 m"),
+        ({"heights": [3, 4]}, "between 3 and 4 m the garment has no edges left and right.*from 0.00 to 0.20 m"),
         ({"heights": [-1, 1], "every": 0}, "every is 0; give a whole number"),
         ({"left": [1, 2], "right": [3]}, "2 vertices left and 1 right"),
         ({"left": [1], "right": [33]}, r"right\[0\] is vertex 33 of 33"),
