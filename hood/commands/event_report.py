@@ -89,8 +89,8 @@ def _sentence(event: Mapping[str, Any], pairs: int) -> str:
 
 
 def summarise_held(scene: Scene, data: RolloutData) -> dict[str, Any]:
-    """Of every event that holds vertices or lets them go: its frame and how many; of vertices that are taken hold of, from which
-    frame on all are within a millimetre of where the skinned garment has them. Nothing of scenes without such events."""
+    """Of every event that holds vertices or lets them go: its frame and how many; of vertices that are taken hold of, the first
+    frame in which all are within a millimetre of where the skinned garment has them. Nothing of scenes without such events."""
     if scene.holding is None:
         return {}
     rows, last = [], len(data.time) - 1

@@ -171,14 +171,14 @@ def test_what_is_no_event_names_its_place_and_the_fix(words: list[str], message:
         ("[{time: 0, open: seam}, {time: 0, open: seams}]", "events[1]: unknown fastener 'seams': did you mean 'seam'?"),
         (
             "[{time: 0.1, open: seam}, {frame: 3, close: seam}]",
-            "events[1]: closes seam in frame 3, where events[0] does the opp",
+            "events[1]: closes seam in frame 3, where events[0] does",
         ),
         ("[{time: 0, detach: [20]}]", "events[0]: detach: none of these vertices are held then; pins=… holds vertices"),
         ("[{time: 0, attach: pins}]", "events[0]: attach: all of these vertices are held already"),
         ("[{time: 0, attach: [24]}]", "events[0]: attach: vertex 24 of 24; they are numbered from 0"),
         (
             "[{time: 0, attach: [5, 6]}, {time: 0, detach: [6]}]",
-            "events[1]: detach: another event in frame 0 does the opposite",
+            "events[1]: detach: another event in frame 0 does",
         ),
         ("[{time: 0, attach: hems}]", "events[0]: attach: unknown region 'hems': did you mean 'hem'?"),
     ],

@@ -108,7 +108,7 @@ def _in_front(where: str, given: Any, garment: Garment) -> list[np.ndarray]:
     numbers = isinstance(given, list) and len(given) == 2
     if not numbers or not all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in given) or given[0] >= given[1]:
         raise ValueError(f"{where}: heights is {given}; give the lower and the upper one in m, such as heights: [0.0, 0.55]")
-    pos, low, high = garment.rest_pos, *given
+    pos, low, high = garment.rest_pos, float(given[0]), float(given[1])
     loops = topology.boundary_loops(garment.faces)
     border = np.unique(np.concatenate(loops)) if loops else np.zeros(0, dtype=np.int64)
     height, depth = pos[border, 1], pos[border, 2]
