@@ -21,7 +21,7 @@ from hood.assets.garment.pins import MARKS, opening_names
 from hood.assets.motion.poses import arms_down
 from hood.mesh import topology
 from hood.mesh.isotropic import isotropic
-from hood.mesh.local_edits import Array, Faces, closest, flip_edges, relax
+from hood.mesh.local_edits import Array, Faces, closest, compact, flip_edges, relax
 from tools.assets.isosurface import zero_level
 from tools.assets.patterns import CLEARANCE, ORIGIN, PATTERNS, SIZES, VOXEL, Fields, Pattern, body_fields
 from tools.assets.placket import open_front, pull_apart, sewn_together, slit_pairs
@@ -74,7 +74,10 @@ def tailor(pattern: Pattern, model: Model, verts: Array, faces: Faces) -> dict[s
     weights, shapedirs = bind(pattern, verts, faces, model.posed)
     for values in (weights, shapedirs):  # both edges of a slit move as one
         values[slit] = values[slit].mean(axis=1, keepdims=True)
-    panel = panels(verts, faces, [part(verts) for part in pattern.parts])
+    sewn = compact(verts, closed)
+    panel = panels(*sewn, [part(sewn[0]) for part in pattern.parts])
+    if pattern.front is not None:
+        panel[(panel == 0) & (verts[faces, 0].mean(axis=1) < 0)] = 2 ** (len(pattern.parts) + 1)  # a front of two halves
     uv, uv_faces = unwrap(verts, faces, panel)
     worn = {}
     tpose = verts
