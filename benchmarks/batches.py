@@ -29,8 +29,8 @@ from hood.dynamics.simulator import Simulator
 from hood.losses.potential import Potential, default_potential
 from hood.losses.problem import StepProblem
 from hood.scene.cloth import concatenate_cloths
-from hood.scene.scene import Scene, build_scene, concatenate_step_inputs
-from hood.scene.state import concatenate_states
+from hood.scene.scene import Scene, build_scene
+from hood.scene.state import concatenate_states, concatenate_step_inputs
 from hood.solver.newton import NewtonSettings, minimize
 
 SOLVERS = {"solver, 5 iterations": NewtonSettings(max_iterations=5), "solver, until 0.01": NewtonSettings(target_rg=1e-2)}

@@ -29,6 +29,7 @@ from hood.assets.motion.load import load_sequence
 from hood.assets.motion.poses import POSE_SUFFIXES, arms_down, read_pose
 from hood.assets.motion.sequence import PoseSequence
 from hood.commands.common import prepare_folder
+from hood.commands.fastening import fasten_as_asked, give_room
 from hood.commands.garments import checked_pins, heed, names_of, shape_coefficients
 from hood.commands.placing import (
     AUTO,
@@ -120,8 +121,9 @@ def _fit(name: str, config: DictConfig, body: Body, betas: np.ndarray) -> _Fitte
         heed(fitting.garment.name, suspect_kind(fitting.garment.rest_pos, fitting.garment.faces, body.v_template))
     tolerance = None if str(config.weld) == "none" else _number(config, "weld", "auto")
     posed = _place(fitting, config, body, betas)
+    sides = fasten_as_asked(fitting, config)
     if str(config.weld) != "none":
-        alterations.sew(fitting, tolerance)
+        alterations.sew(fitting, tolerance, sides)
     alterations.clean(fitting)
     check_triangles(fitting.garment.rest_pos, fitting.garment.faces, name)
     alterations.face_out(fitting, body.v_template if posed is None else posed.surface, body.faces)
@@ -139,6 +141,7 @@ def _fit(name: str, config: DictConfig, body: Body, betas: np.ndarray) -> _Fitte
             f"{100 * _CHANGED:.0f}%, the most by {100 * fitted.length_change:.0f}%; give a smaller weld, "
             "metres between vertices that are one"
         )
+    give_room(fitting, sides)
     return fitted
 
 
@@ -272,6 +275,7 @@ def _report(
         "num_vertices": len(outfit.rest_pos),
         "num_faces": len(outfit.faces),
         "num_pinned": int(outfit.pinned.sum()),
+        "fasteners": {name: len(pairs) for name, pairs in (outfit.fasteners or {}).items()},
         "starts": {name: asdict(figures) for name, figures in starts.items()},
         "output": str(target),
     }
@@ -286,6 +290,7 @@ def _text(report: dict[str, Any]) -> str:
         lines.append(f"  now {part['result']}")
     if report["num_pinned"]:
         lines.append(f"holds {report['num_pinned']} of {report['num_vertices']} vertices")
+    lines += [f"fastens {name}: {count} pairs of vertices" for name, count in report["fasteners"].items()]
     for name, start in report["starts"].items():
         lines.append(
             f"start in {name}: edges stretched by at most {100 * start['stretch_max']:.1f}%, "

@@ -24,6 +24,7 @@ from hood.assets.garment.outfit import join_garments
 from hood.assets.garment.pins import pin_mask, pin_numbers
 from hood.assets.garment.suspicions import suspect_kind, suspect_place, suspect_seams
 from hood.commands.common import prepare_folder
+from hood.commands.fastening import fasten_as_asked, give_room
 from hood.commands.garments import checked_pins, heed
 from hood.commands.placing import AUTO, asked_keys, explain_size, find_place_on_mesh, keep_place
 from hood.config import ConfigError, plain
@@ -80,10 +81,11 @@ def _fit(fitting: Fitting, name: str, config: DictConfig, motion: MeshMotion) ->
         alterations.place(fitting, keep_place(garment, surface, asked))
     else:
         alterations.place(fitting, found.placement)
+    sides = fasten_as_asked(fitting, config)
     if str(config.weld) == "none":
         heed(garment.name, suspect_seams(fitting.garment.rest_pos, fitting.garment.faces))
     else:
-        alterations.sew(fitting, None if str(config.weld) == AUTO else float(config.weld))
+        alterations.sew(fitting, None if str(config.weld) == AUTO else float(config.weld), sides)
     alterations.clean(fitting)
     check_triangles(fitting.garment.rest_pos, fitting.garment.faces, name)
     # What another body's weights say does not hold here: the place of a garment is where it is worn.
@@ -91,6 +93,7 @@ def _fit(fitting: Fitting, name: str, config: DictConfig, motion: MeshMotion) ->
         fitting.garment, lbs_weights=None, shapedirs=None, bound_to=None, rest_turn=None, skin_pos=worn_pos(fitting.garment)
     )
     _leave_mesh(fitting, motion, clearance)
+    give_room(fitting, sides)
     return fitting
 
 

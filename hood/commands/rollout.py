@@ -27,6 +27,8 @@ from hood.commands.common import (
     thinning,
     together,
 )
+from hood.commands.event_report import describe_held, summarise_held
+from hood.commands.events import fastening_attributes
 from hood.commands.export import check_formats, export_beside
 from hood.commands.guarding import OFF, GuardStopped, guard_sentences, make_guard, write_alarms
 from hood.commands.notices import heard
@@ -113,11 +115,14 @@ def _run_there(ready: Setup, asked: DictConfig, digest: str, warned: list[str], 
     summary = summarise(folder / "rollout.h5")
     if eases:
         summary |= summarise_ease(eases[0], eases[-1])
+    if scene.holding is not None:
+        summary |= summarise_held(scene, read_rollout(folder / "rollout.h5"))
     warn(guard_sentences(summary.get("guard")))
     summary["choice"] = asdict(ready.choice)
     summary |= summarise_plan(folder / "rollout.h5", config)
     _keep_plan(config, folder)
     print(describe(summary))
+    _tell(describe_held(summary))
     _tell(describe_ease(summary))
     _tell(plan_sentences(summary))
     if advise:
@@ -181,6 +186,8 @@ def _finished(config: DictConfig, digest: str, folder: Path) -> dict[str, Any] |
     before.setdefault("formats", [])
     before["plan"] = before.get("plan") or now["plan"]
     before.setdefault("accuracy", None)
+    before.setdefault("events", [])
+    before.setdefault("events_speed", now["events_speed"])
     same = all(before.get(key) == now[key] for key in now if key not in ("resume", "output", "allow_unsound"))
     if not same or not bool(attributes["complete"]) or attributes["checkpoint_sha256"] != digest:
         return None
@@ -208,6 +215,7 @@ def _simulate_to_disk(ready: Setup, digest: str, path: Path, asked: DictConfig, 
         "surface_stride": int(config.surface_stride),
         "cloth_contact_off": why_not(config),
         "guard": OFF if guard is None else guard.mode,
+        **fastening_attributes(scene),
     }
     writer = RolloutWriter(
         path,
@@ -223,7 +231,7 @@ def _simulate_to_disk(ready: Setup, digest: str, path: Path, asked: DictConfig, 
         fields=exported(config),
         double=solves_in_double(config),
         guarded=guard is not None,
-        still=still_of(scene.garment),
+        still=still_of(scene.garment, scene.fastening),
     )
     frames = simulate(
         stepper,

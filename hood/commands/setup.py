@@ -15,6 +15,7 @@ from hood.commands.automatic import Choice, choose
 from hood.commands.cautions import scene_cautions, warn
 from hood.commands.cloth_contact import acts, check_cloth_contact, potential_of, tell_if_off
 from hood.commands.common import require_device, thinning
+from hood.commands.events import checked_events, with_events
 from hood.commands.fabrics import checked_fabrics, fabric_of
 from hood.commands.garments import heed, layer_order, names_of, read_outfit
 from hood.commands.guarding import check_guard
@@ -55,6 +56,7 @@ def check_config(config: DictConfig) -> None:
     _check_numbers(config)
     checked_fabrics(config)
     checked_sizes(config)
+    checked_events(config)
     require_choice(config, "kernels", (AUTO, *KERNELS))
     option_of(config)
     require_choice(config, "step", (PLAIN, *MODES))
@@ -120,7 +122,7 @@ def make_scene(config: DictConfig, garment: Garment | None = None, material: Mat
     order = layer_order(config.layers, names_of(config.garment)) if garment is None else None
     garment = read_outfit(config.garment if garment is None else garment, motion, bool(config.triangulate), config.pins)
     fabric = fabric_of(config, garment, motion) if material is None else material
-    scene = replace(dress(garment, motion, fabric, checked_sizes(config)), layers=order)
+    scene = with_events(replace(dress(garment, motion, fabric, checked_sizes(config)), layers=order), config)
     found = misplacement(scene)
     if found is not None and found.grave:
         raise ValueError(

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from hood.commands.cloth_contact import describe_cloth_contact, summarise_cloth_contact
+from hood.commands.event_report import describe_fasteners, summarise_fasteners
 from hood.commands.guarding import summarise_guard
 from hood.commands.refinement import describe_refinement, summarise_refinement
 from hood.commands.surface_report import cut_at_worst, describe_surface, summarise_surface
@@ -58,6 +59,7 @@ def summarise(path: Path) -> dict[str, Any]:
             json.loads(data.attributes["config"]), data.metrics, str(data.attributes.get("cloth_contact_off", ""))
         ),
         **summarise_refinement(json.loads(data.attributes["config"]), data.metrics),
+        **summarise_fasteners(data),
         **summarise_guard(data),
         **summarise_verdict(data),
     }
@@ -78,6 +80,7 @@ def describe(summary: dict[str, Any]) -> str:
             *describe_refinement(summary),
             *describe_surface(summary["surface"]),
             *describe_cloth_contact(summary),
+            *describe_fasteners(summary),
             *_missed(summary),
             *describe_verdict(summary),
         ]

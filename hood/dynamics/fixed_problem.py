@@ -28,7 +28,7 @@ class Constants:
     def __init__(self, problem: StepProblem, potential: Potential | None) -> None:
         attachments = problem.step.attachments
         self._cloth, self._gravity, self._potential = problem.cloth, problem.gravity, potential
-        self._attachments = None if attachments is None else (attachments.edges.clone(), attachments.active.clone())
+        self._attachments = None if attachments is None else _values(attachments)
 
     def hold(self, problem: StepProblem, potential: Potential | None) -> bool:
         """Whether they are the same in another problem; gravity counts where a potential does."""
@@ -131,7 +131,13 @@ def altered(item: Item, **values: Any) -> Item:
     return altered
 
 
-def _same_attachments(known: tuple[Tensor, Tensor] | None, now: Attachments | None) -> bool:
+def _values(attachments: Attachments) -> list[Tensor | None]:
+    given = [getattr(attachments, field.name) for field in fields(attachments)]
+    return [None if value is None else value.clone() for value in given]
+
+
+def _same_attachments(known: list[Tensor | None] | None, now: Attachments | None) -> bool:
     if known is None or now is None:
         return known is None and now is None
-    return torch.equal(known[0], now.edges) and torch.equal(known[1], now.active)
+    pairs = zip(known, _values(now), strict=True)
+    return all(b is None if a is None else b is not None and torch.equal(a, b) for a, b in pairs)

@@ -17,6 +17,7 @@ import numpy as np
 
 from hood.assets.files.h5_links import own_dataset, own_group
 from hood.assets.garment.garment import Garment
+from hood.scene.fastening import Fastening
 
 #: World coordinates beyond this [m] are written in float64: float32 resolves only 8 µm there.
 _FAR = 100.0
@@ -33,12 +34,23 @@ ALARM_COLUMNS = {
 }
 _ALARMS = 2
 #: What a file may hold of the cloth beside its mesh, the same in all frames, with the types in the file.
-STILL = {"uv": np.float32, "uv_faces": np.int32, "piece": np.int32}
+STILL = {
+    "uv": np.float32,
+    "uv_faces": np.int32,
+    "piece": np.int32,
+    "fastened": np.int32,
+    "fastened_row": np.int32,
+    "fastened_length": np.float64,
+}
 
 
-def still_of(garment: Garment) -> dict[str, np.ndarray]:
-    """What a file holds of the garment beside its mesh, by the names of :data:`STILL`."""
+def still_of(garment: Garment, fastening: Fastening | None = None) -> dict[str, np.ndarray]:
+    """What a file holds of the garment and its fasteners beside its mesh, by the names of :data:`STILL`."""
     found = {} if garment.piece is None else {"piece": garment.piece}
+    if fastening is not None:
+        pairs = fastening.pairs
+        tables = {"fastened": pairs.edges, "fastened_row": fastening.row, "fastened_length": pairs.length}
+        found |= {name: table.cpu().numpy() for name, table in tables.items() if table is not None}
     if garment.uv is None:
         return found
     return {**found, "uv": garment.uv, "uv_faces": garment.faces if garment.uv_faces is None else garment.uv_faces}
@@ -49,8 +61,9 @@ class RolloutWriter:
 
     Datasets: ``cloth/pos (T,V,3)``, ``cloth/faces``, ``cloth/rest_pos``, ``body/pos (T,W,3)``, ``body/faces``, ``time (T,)``,
     ``metrics/* (T,)``, of every vertex ``cloth/NAME (T,V)`` for each name in ``fields``, and those of :data:`STILL` that are
-    given: texture coordinates ``cloth/uv (U,2)`` with ``cloth/uv_faces (F,3)``, and which garment of an outfit a vertex
-    belongs to, ``cloth/piece (V,)``; attributes: ``num_frames`` done
+    given: texture coordinates ``cloth/uv (U,2)`` with ``cloth/uv_faces (F,3)``, which garment of an outfit a vertex
+    belongs to, ``cloth/piece (V,)``, and pairs of vertices that are fastened to each other, ``cloth/fastened (A,2)``, with the
+    number of their row and the distance [m] that they are held at; attributes: ``num_frames`` done
     so far of ``num_planned``, ``complete``, and what is given as ``attributes``. Real numbers are float32, positions far from
     the origin float64; with ``double`` the cloth's are float64 anyway, for states that meet an accuracy which float32 does
     not resolve.

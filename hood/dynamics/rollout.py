@@ -190,8 +190,7 @@ def simulate(
                     there, step = state, scene.step_input(body_frame, state, attachments=closed)
                 if relaxing and index == 0:
                     step = replace(step, dt=torch.full_like(step.dt, RELAXING_DT))
-                if scene.sizes.changing:
-                    cloth = scene.cloth_at(body_frame + 1, start_frame)
+                cloth = scene.cloth_of_step(body_frame, start_frame)
                 problem = StepProblem(cloth, there, step, gravity=stepper.gravity.to(state.pos))
             with watch.part("search"):
                 problem = stepper.search(problem)

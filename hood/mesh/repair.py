@@ -38,13 +38,14 @@ def weld_tolerance(pos: np.ndarray, faces: np.ndarray) -> float:
     return WELD_RATIO * float(np.median(positive)) if len(positive) else 0.0
 
 
-def weld(pos: np.ndarray, faces: np.ndarray, tolerance: float) -> Welded:
-    """Vertices on the boundary within ``tolerance`` [m] of each other become the first of them.
+def weld(pos: np.ndarray, faces: np.ndarray, tolerance: float, left_out: np.ndarray | None = None) -> Welded:
+    """Vertices on the boundary within ``tolerance`` [m] of each other become the first of them, but for some ``left_out`` (N,).
 
     Only boundary vertices: layers that touch (a pocket on a shirt) stay apart. Vertices that share a face are joined only
     where they coincide, or a tolerance beyond the edge length would eat the mesh. Chains count: a–b and b–c join a, b and c.
     """
     candidates = boundary_vertices(faces)
+    candidates = candidates if left_out is None else np.setdiff1d(candidates, left_out)
     pairs = cKDTree(pos[candidates]).query_pairs(tolerance, output_type="ndarray") if len(candidates) else np.zeros((0, 2), int)
     pairs = candidates[pairs]
     edges = topology.unique_edges(faces)

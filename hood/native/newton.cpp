@@ -68,7 +68,7 @@ struct Engine {
     // The step.
     const double *base, *fixed;  // (V, 3) m original: free flight, and where fixed vertices are
     const double *inertia, *weight;  // (V) kg, (V, 3) N original
-    const double* spring_stiffness;  // (A) N/m
+    const double *spring_stiffness, *spring_target;  // (A) N/m, (A, 4) m: what the difference of the ends is drawn to
     const Wall* walls;
     const Grip* grips;
     const Points* points;
@@ -579,7 +579,9 @@ void energy(const Engine& e, const double* pos, const double* acc, double* phi, 
     double springs = 0.0;
     for (int64_t s = 0; s < e.num_springs; ++s) {
         double gap[3];
-        for (int k = 0; k < 3; ++k) gap[k] = pos[4 * e.spring_ends[s] + k] - pos[4 * e.spring_ends[e.num_springs + s] + k];
+        for (int k = 0; k < 3; ++k) {
+            gap[k] = pos[4 * e.spring_ends[s] + k] - pos[4 * e.spring_ends[e.num_springs + s] + k] - e.spring_target[4 * s + k];
+        }
         springs += 0.5 * e.spring_stiffness[s] * dot3(gap, gap);
     }
     if (e.num_springs) add(springs);
@@ -618,8 +620,8 @@ template <class T> void gather_gradient(const Engine& e, Range range, bool near)
             const int64_t spring = e.spring_uses[6 * i], corner = e.spring_uses[6 * i + 1];
             const int64_t here = e.spring_ends[corner * e.num_springs + spring];
             const int64_t there = e.spring_ends[(1 - corner) * e.num_springs + spring];
-            const D4 gap = load<D4>(e.pos + 4 * here) - load<D4>(e.pos + 4 * there);
-            force += e.spring_stiffness[spring] * gap;
+            const D4 gap = load<D4>(e.pos + 4 * here) - load<D4>(e.pos + 4 * there), target = load<D4>(e.spring_target + 4 * spring);
+            force += e.spring_stiffness[spring] * (corner == 0 ? gap - target : gap + target);
         }
         store(e.gradient + 4 * row, D4{force[0], force[1], force[2], 0.0});
         for (int k = 0; k < 6; ++k) own[6 * row + k] = (T)upper[k], own_slack[6 * row + k] = (T)slack[k];

@@ -21,6 +21,7 @@ from hood.assets.motion.motion_files import MotionFiles, motion_lengths
 from hood.assets.motion.sequence import PoseSequence, turn_world
 from hood.scene.batch import to_device
 from hood.scene.cloth import Cloth
+from hood.scene.fastening import fastening_of
 from hood.scene.motion import BodyMotion, body_motion
 from hood.scene.scene import Scene, build_scene
 
@@ -135,7 +136,8 @@ class SceneSampler:
         cloth = Cloth(**{spec.name: values[spec.name] for spec in fields(Cloth)})
         motion = body_motion(body, packed["sequence"], packed["betas"], cloth.rest_pos.dtype)
         surfaces = {chunk: torch.from_numpy(surface) for chunk, surface in packed["surfaces"].items()}
-        scene = Scene(cloth, garment, motion.with_surfaces(surfaces, "cpu"), 1.0 / packed["sequence"].fps)
+        posed, fastening = motion.with_surfaces(surfaces, "cpu"), fastening_of(garment.fasteners, cloth.rest_pos)
+        scene = Scene(cloth, garment, posed, 1.0 / packed["sequence"].fps, fastening=fastening)
         return Window(scene, packed["start_frame"], packed["template"], packed["mirrored"])
 
     def _draw_motion(self, rng: np.random.Generator, num_steps: int) -> tuple[PoseSequence, int]:

@@ -88,7 +88,7 @@ def carried(scene: Scene, frame: int, state: State, attachments: Attachments | N
 
     velocity = torch.as_tensor(state.vel.cpu().double().numpy() @ turn.T).to(like)
     moved = State(along(state.pos, state.origin[0].numpy()), velocity, torch.as_tensor(origin).unsqueeze(0))
-    step = scene.step_input(frame, moved, attachments=attachments)
+    step = scene.step_input(frame, moved, attachments=attachments, jumping=True)
     assert step.obstacle is not None  # nothing jumps without a body
     earlier = motion.surface(max(frame - 1, 0), start)
     now = along(torch.as_tensor(before), start)

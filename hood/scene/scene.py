@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,10 +14,12 @@ from hood.assets.material import Material
 from hood.assets.motion.sequence import PoseSequence
 from hood.scene.batch import to_device
 from hood.scene.cloth import Cloth, build_cloth
+from hood.scene.fastening import Fastening, fastening_of
+from hood.scene.holding import Holding
 from hood.scene.motion import BodyMotion, Motion, body_motion
 from hood.scene.sizing import Size, Sizes, resized, sizes_of
 from hood.scene.start import free_stretch, settle
-from hood.scene.state import Attachments, Obstacle, State, StepInput, concatenate_obstacles
+from hood.scene.state import Attachments, Obstacle, State, StepInput
 from hood.scene.untangle import Outfit, Separation, separate, smooth_out
 
 #: Time step [s] of the relaxing first step: inertia shrinks by 100, the paper's α (section 3.4).
@@ -49,11 +50,19 @@ class Scene:
     start_vel: np.ndarray | None = None  # (V, 3) m/s, likewise
     layers: tuple[int, ...] | None = None  # garments of an outfit from the body outwards; None: as they lie at the start
     sizes: Sizes = Sizes()  # of the rest shape; that of ``cloth`` is the first
+    fastening: Fastening | None = None  # of steps that are given no attachments; None: nothing is fastened
+    holding: Holding | None = None  # what is held and let go; None: the pins of ``cloth``, throughout
 
     def cloth_at(self, frame: int, start: int = 0) -> Cloth:
         """The cloth at ``frame`` of a rollout that begins at the frame ``start``: ``cloth`` where its size does not change."""
         now = self.sizes.at((frame - start) * self.dt)
         return self.cloth if now == self.sizes.start else resized(self.cloth, self.sizes.start, now)
+
+    def cloth_of_step(self, frame: int, start: int = 0) -> Cloth:
+        """The cloth of the step ``frame`` → ``frame + 1`` of a rollout that begins at the frame ``start``: of the size that it
+        ends with, with what is held in it."""
+        cloth = self.cloth_at(frame + 1, start) if self.sizes.changing else self.cloth
+        return cloth if self.holding is None else self.holding.cloth(cloth, frame)
 
     @property
     def num_frames(self) -> int:
@@ -141,7 +150,9 @@ class Scene:
         """
         if not isinstance(self.motion, BodyMotion):
             return None
-        lead = replace(self, motion=self.motion.lead_in(frame, LEAD_IN), start_pos=None, start_vel=None)
+        fastening = None if self.fastening is None else self.fastening.still(frame)
+        motion = self.motion.lead_in(frame, LEAD_IN)
+        lead = replace(self, motion=motion, start_pos=None, start_vel=None, fastening=fastening, holding=None)
         start = lead.start(0, relaxed=False, thorough=True)
         return replace(lead, start_pos=start.pos.cpu().double().numpy() + start.origin[0].numpy())
 
@@ -166,12 +177,26 @@ class Scene:
         before, now, after = (self.motion.skinned(self.garment, frame + k, origin) for k in (-1, 0, 1))
         return after - 2 * now + before
 
-    def step_input(self, frame: int, state: State, relaxing: bool = False, attachments: Attachments | None = None) -> StepInput:
-        """What is prescribed for ``frame`` → ``frame + 1``; a relaxing step freezes the body at ``frame``."""
+    def step_input(
+        self,
+        frame: int,
+        state: State,
+        relaxing: bool = False,
+        attachments: Attachments | None = None,
+        jumping: bool = False,
+    ) -> StepInput:
+        """What is prescribed for ``frame`` → ``frame + 1``; a relaxing step freezes the body at ``frame``. Without
+        ``attachments`` they are those of the scene's fastening. Where the body is ``jumping``, held vertices jump with it."""
+        if attachments is None and self.fastening is not None:
+            attachments = self.fastening.at(frame)
         origin = state.origin[0].numpy()
         pins = None
-        if bool(self.cloth.pinned.any()):
+        cloth = self.cloth if self.holding is None or relaxing else self.holding.cloth(self.cloth, frame)
+        if bool(cloth.pinned.any()):
             pins = self.motion.skinned(self.garment, frame if relaxing else frame + 1, origin)
+            if self.holding is not None and not relaxing and not jumping:
+                here = self.motion.skinned(self.garment, frame, origin)
+                pins = self.holding.targets(frame, here, pins, state.pos, self.dt)
         dt = RELAXING_DT if relaxing else self.dt
         time = (frame if relaxing else frame + 1) * self.dt
         return StepInput(
@@ -233,7 +258,9 @@ def dress(garment: Garment, motion: Motion, material: Material | None = None, si
     rest_pos = motion.rest_pos(garment) * np.array(sizes.start)
     fabric = material or Material()
     cloth = build_cloth(rest_pos, garment.faces, fabric, garment.pinned, stiffness=garment.stiffness, dtype=motion.dtype)
-    return Scene(to_device(cloth, motion.device), garment, motion, 1.0 / motion.fps, sizes=sizes)
+    cloth = to_device(cloth, motion.device)
+    fastening = fastening_of(garment.fasteners, cloth.rest_pos)
+    return Scene(cloth, garment, motion, 1.0 / motion.fps, sizes=sizes, fastening=fastening)
 
 
 def recentre(state: State, vertex_scene: Tensor) -> State:
@@ -245,48 +272,6 @@ def recentre(state: State, vertex_scene: Tensor) -> State:
     if not bool(shift.any()):
         return state
     return State(state.pos - shift[vertex_scene], state.vel, state.origin + shift.cpu().to(torch.float64))
-
-
-def concatenate_step_inputs(steps: Sequence[StepInput], vertex_counts: Sequence[int]) -> StepInput:
-    """Inputs of several scenes as one flat batch; scenes without pins get their targets as zeros (never read)."""
-    if len(steps) == 1:
-        return steps[0]
-    obstacles = [step.obstacle for step in steps if step.obstacle is not None]
-    if obstacles and len(obstacles) != len(steps):
-        raise ValueError("a batch mixes scenes with and without a body; put them in separate batches")
-    pins = None
-    if any(step.pin_target is not None for step in steps):
-        like = next(step.pin_target for step in steps if step.pin_target is not None)
-        pins = torch.cat(
-            [
-                step.pin_target if step.pin_target is not None else like.new_zeros(count, 3)
-                for step, count in zip(steps, vertex_counts, strict=True)
-            ]
-        )
-    return StepInput(
-        dt=torch.cat([step.dt for step in steps]),
-        obstacle=concatenate_obstacles(obstacles) if obstacles else None,
-        pin_target=pins,
-        attachments=_concatenate_attachments([step.attachments for step in steps], vertex_counts),
-        time=_concatenate_times(steps),
-    )
-
-
-def _concatenate_times(steps: Sequence[StepInput]) -> Tensor | None:
-    """Steps that do not say are at 0, as alone."""
-    if all(step.time is None for step in steps):
-        return None
-    return torch.cat([torch.zeros_like(step.dt) if step.time is None else step.time.to(step.dt) for step in steps])
-
-
-def _concatenate_attachments(items: Sequence[Attachments | None], vertex_counts: Sequence[int]) -> Attachments | None:
-    edges, active, offset = [], [], 0
-    for item, count in zip(items, vertex_counts, strict=True):
-        if item is not None:
-            edges.append(item.edges + offset)
-            active.append(item.active)
-        offset += count
-    return Attachments(torch.cat(edges), torch.cat(active)) if edges else None
 
 
 def local_origin(position: np.ndarray, grid: float = _GRID) -> np.ndarray:

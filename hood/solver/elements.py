@@ -313,9 +313,11 @@ def _regular(cross_sq: Tensor, product_sq: Tensor) -> Tensor:
     return (cross_sq > (_DEGENERATE_ULPS * info.eps) ** 2 * product_sq) & (cross_sq > info.tiny / info.eps)
 
 
-def spring_model(stiffness: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
-    """Springs of rest length 0: gradient (2, 3, N) and upper triangle (21, N) of their matrices."""
-    pull = stiffness * (x[0] - x[1])
+def spring_model(stiffness: Tensor, x: Tensor, target: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Springs that draw x[0] - x[1] to ``target`` (3, N), None for 0: gradient (2, 3, N) and upper triangle (21, N) of their
+    matrices."""
+    gap = x[0] - x[1]
+    pull = stiffness * (gap if target is None else gap - target)
     matrix = stiffness.new_zeros(21, len(stiffness))
     for axis in range(3):
         first = axis * 6 - axis * (axis - 1) // 2

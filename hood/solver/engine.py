@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from hood import native
-from hood.losses.attachment import Attachment
+from hood.losses.attachment import Attachment, attachment_targets
 from hood.losses.bending import Bending, CurrentLengthBending
 from hood.losses.damping import BendDamping
 from hood.losses.layer_friction import LayerGrips
@@ -65,7 +65,7 @@ class _Engine(ctypes.Structure):
         *fields("face_starts face_uses hinge_starts hinge_uses spring_starts spring_uses spring_ends", POINTER),
         *fields("shape area mu lambda bulk soft rest_angle hinge_weight rest_length", POINTER),
         *fields("face_rate face_before hinge_rate hinge_before", POINTER),
-        *fields("base fixed inertia weight spring_stiffness walls grips points", POINTER),
+        *fields("base fixed inertia weight spring_stiffness spring_target walls grips points", POINTER),
         *fields("num_walls num_grips num_points bending membrane", COUNT),
         ("dt_sq", REAL),
         *fields("pos acc trial_pos trial_acc gradient direction path face_force hinge_force", POINTER),
@@ -156,6 +156,7 @@ class EngineStep:
     inertia: np.ndarray  # (V,) kg
     weight: np.ndarray  # (V, 3) N
     spring_stiffness: np.ndarray  # (A,) N/m
+    spring_target: np.ndarray  # (A, 4) m, what the difference of the ends is drawn to, and 0
     walls: tuple[Walls, ...]
     grips: tuple[Grip, ...]
     points: tuple[PointForces, ...]
@@ -183,6 +184,7 @@ def engine_step(potential: Potential, problem: StepProblem) -> EngineStep:
         inertia=_array(forces.inertia.squeeze(1)),
         weight=_array(forces.weight),
         spring_stiffness=_array(stiffness),
+        spring_target=_spring_target(problem, len(stiffness)),
         walls=tuple(Walls(w.weight, *(whole(t) for t in (w.point, w.normal, w.reach))) for w in forces.walls),
         grips=tuple(Grip(*(whole(t) for t in (g.force, g.normal, g.anchor, g.limit))) for g in forces.grips),
         points=point_forces(potential, problem),
@@ -213,6 +215,11 @@ def _bend_damping(terms: list[Term], problem: StepProblem) -> tuple[np.ndarray, 
 
 def _num_attachments(problem: StepProblem) -> int:
     return 0 if problem.step.attachments is None else len(problem.step.attachments.edges)
+
+
+def _spring_target(problem: StepProblem, count: int) -> np.ndarray:
+    target = attachment_targets(problem)
+    return np.zeros((count, 4)) if target is None else np.pad(_array(target), ((0, 0), (0, 1)))
 
 
 def _array(values: Tensor) -> np.ndarray:
@@ -290,7 +297,8 @@ class SceneEngine:
         self.step = step
         self._take_fabric(step)
         self._point(base=step.base, fixed=step.fixed, inertia=step.inertia, weight=step.weight)
-        self._point(spring_stiffness=step.spring_stiffness[self.tables.springs.order])
+        springs = self.tables.springs.order
+        self._point(spring_stiffness=step.spring_stiffness[springs], spring_target=step.spring_target[springs])
         walls, grips = wall_structures(step.walls), grip_structures(step.grips)
         own = [_ScenePoints(points, self.tables, step.cloth.num_vertices) for points in step.points] if step.points else []
         points = (_Points * len(own))(*(one.values for one in own))

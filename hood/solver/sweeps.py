@@ -125,7 +125,7 @@ class Neighbourhood:
     hinge_corners: Corners
     hinge_constants: HingeConstants
     points: tuple[PointForces, ...]  # those that have a vertex of the colour
-    springs: tuple[Tensor, Tensor] | None  # stiffness (M,) and ends (M, 2), own one first
+    springs: tuple[Tensor, Tensor, Tensor | None] | None  # stiffness (M,), ends (M, 2), own one first, and targets (3, M)
 
 
 def neighbourhoods(terms: StepTerms) -> list[Neighbourhood]:
@@ -138,8 +138,11 @@ def neighbourhoods(terms: StepTerms) -> list[Neighbourhood]:
         if attachments is not None and terms.springs and colour.attachments is not None:
             around = colour.attachments
             ends = attachments.edges[around.element]
-            ends = torch.where((around.own == 1)[:, None], ends.flip(1), ends)
-            springs = terms.spring_stiffness()[around.element], ends
+            second = around.own == 1
+            ends, targets = torch.where(second[:, None], ends.flip(1), ends), terms.spring_targets
+            if targets is not None:
+                targets = torch.where(second, -targets[:, around.element], targets[:, around.element])
+            springs = terms.spring_stiffness()[around.element], ends, targets
         groups.append(
             Neighbourhood(
                 colour,
@@ -227,6 +230,6 @@ def _around(terms: StepTerms, group: Neighbourhood, pos: Tensor) -> Iterator[tup
             elements.outer_upper(row, block)
             yield colour.hinges, slope[own, :, each].t(), block
     if group.springs is not None and colour.attachments is not None:
-        stiffness, ends = group.springs
-        slope, matrix = elements.spring_model(stiffness, Corners(ends)(pos))
+        stiffness, ends, targets = group.springs
+        slope, matrix = elements.spring_model(stiffness, Corners(ends)(pos), targets)
         yield colour.attachments, slope[0], matrix[[0, 1, 2, 6, 7, 11]]

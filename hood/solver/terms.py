@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from hood.losses.attachment import Attachment
+from hood.losses.attachment import Attachment, attachment_targets
 from hood.losses.damping import BendDamping, StretchDamping
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem, sum_per_scene
@@ -31,6 +31,8 @@ class StepTerms:
         self.bendings = [term for term in terms if type(term) in BENDINGS]
         self.springs = [term for term in terms if type(term) is Attachment]
         self.others = other_terms(potential, problem)
+        targets = attachment_targets(problem) if self.springs else None
+        self.spring_targets = None if targets is None else targets.t()  # (3, A) m
         num_membranes = sum(type(term) is Stretching for term in terms)
         self.has_membrane = num_membranes > 0
         self.face_constants = elements.face_constants(cloth, num_membranes)
@@ -73,7 +75,7 @@ class StepTerms:
         attachments = self.problem.step.attachments
         if attachments is None or not self.springs:
             return None
-        return elements.spring_model(self.spring_stiffness(), Corners(attachments.edges)(pos))
+        return elements.spring_model(self.spring_stiffness(), Corners(attachments.edges)(pos), self.spring_targets)
 
     def spring_stiffness(self) -> Tensor:
         """Spring constants [N/m] (A,), of all terms together."""

@@ -13,8 +13,8 @@ from hood.dynamics.measure import edge_strain
 from hood.dynamics.simulator import Prepared, Simulator
 from hood.scene.cloth import Cloth, concatenate_cloths
 from hood.scene.dataset import SceneSampler, Window
-from hood.scene.scene import concatenate_step_inputs, recentre
-from hood.scene.state import State, StepInput, concatenate_states
+from hood.scene.scene import recentre
+from hood.scene.state import State, StepInput, concatenate_states, concatenate_step_inputs
 from hood.training.buckets import make_buckets, next_bucket
 from hood.training.prefetch import MAX_DRAWS, Request, SceneFeed, choose_workers, draw_window
 

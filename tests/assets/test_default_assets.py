@@ -19,12 +19,16 @@ from hood.assets.motion.poses import arms_down
 from hood.mesh import topology
 from hood.mesh.proximity import search_surface
 
-LOOPS = {"tshirt": 4, "tank": 4, "longsleeve": 4, "shorts": 3, "trousers": 3, "dress": 4, "skirt": 2}
+LOOPS = {
+    "tshirt": 4, "tank": 4, "longsleeve": 4, "shorts": 3, "trousers": 3, "dress": 4, "skirt": 2, "shirt": 3, "jacket": 3,
+}  # fmt: skip
 COUNTS = {"": (940, 1060), "4k": (4000, 5000), "12k": (11500, 12500)}
 PINNED = ("shorts", "trousers", "skirt")
-GARMENTS = [name + suffix for name in LOOPS for suffix in ("", "_4k", "_12k")]
+#: Garments that open in front, in one size: how many pairs of vertices hold them together.
+OPENING = {"shirt": ("front_buttons", 11), "jacket": ("front_zip", 19)}
+GARMENTS = [name + suffix for name in LOOPS for suffix in (("",) if name in OPENING else ("", "_4k", "_12k"))]
 #: Garments that reach the shoulders are drafted around arms lowered by 45 degrees.
-TOPS = ("tshirt", "longsleeve", "tank", "dress")
+TOPS = ("tshirt", "longsleeve", "tank", "dress", "shirt", "jacket")
 #: Least and greatest length [m] of the edge of a sleeve, around an arm of 0.26 and a wrist of 0.15 m.
 SLEEVE_ENDS = {"tshirt": (0.33, 0.36), "longsleeve": (0.20, 0.222)}
 
@@ -234,7 +238,9 @@ def test_garment_texture_coordinates(garment: tuple[str, dict[str, np.ndarray]])
     assert area.sum() <= 1.0
     scale = np.sqrt(area / face_areas(arrays["rest_pos"], arrays["faces"].astype(np.int64)))
     assert np.mean(np.abs(scale / np.median(scale) - 1.0) < 0.25) > 0.9
-    num_panels = 6 if name.split("_")[0] in SLEEVE_ENDS else 4 if LOOPS[name.split("_")[0]] == 3 else 2
+    num_panels = (
+        7 if name in OPENING else 6 if name.split("_")[0] in SLEEVE_ENDS else 4 if LOOPS[name.split("_")[0]] == 3 else 2
+    )
     links = np.sort(np.concatenate([uv_faces[:, [0, 1]], uv_faces[:, [1, 2]]]).astype(np.int64), axis=1)
     assert topology.connected_components(len(uv), np.unique(links, axis=0)).max() == num_panels - 1
 
@@ -271,9 +277,12 @@ def test_sleeve_ends_go_around_the_arm_with_little_ease(name: str, size: str) ->
 def test_every_opening_and_the_seams_are_marked(garment: tuple[str, dict[str, np.ndarray]]) -> None:
     name, arrays = garment
     region, faces = arrays["region"], arrays["faces"].astype(np.int64)
-    loops = topology.boundary_loops(faces)
     on_rims = np.zeros(len(region), dtype=bool)
-    for loop in loops:
+    for loop in topology.boundary_loops(faces):
+        if name in OPENING and len(loop) > 40:  # neck, front and hem are one loop: of the front nothing is marked but a seam
+            assert set(np.unique(region[loop])) == {MARKS.index(mark) for mark in ("seam", "neckline", "hem")}
+            on_rims[loop[region[loop] != MARKS.index("seam")]] = True
+            continue
         assert len(np.unique(region[loop])) == 1
         on_rims[loop] = True
     marked = {MARKS[index] for index in np.unique(region)}
@@ -286,7 +295,26 @@ def test_every_opening_and_the_seams_are_marked(garment: tuple[str, dict[str, np
     copies = np.zeros(len(region), dtype=np.int64)
     pairs = np.unique(np.stack([faces.ravel(), arrays["uv_faces"].astype(np.int64).ravel()], axis=1), axis=0)
     np.add.at(copies, pairs[:, 0], 1)
+    on_rims[np.concatenate(topology.boundary_loops(faces))] = True
     np.testing.assert_array_equal(copies[~on_rims] > 1, region[~on_rims] == MARKS.index("seam"))
+
+
+@pytest.mark.parametrize("name", OPENING)
+def test_fronts_are_held_together_by_pairs_opposite_of_each_other(name: str) -> None:
+    garment, (row, count) = load_garment(name), OPENING[name]
+    assert garment.fasteners is not None
+    assert {key: len(pairs) for key, pairs in garment.fasteners.items()} == {row: count}
+    pairs = garment.fasteners[row]
+    for pos in (garment.rest_pos, garment.skin_pos):
+        assert pos is not None
+        right, left = pos[pairs[:, 0]], pos[pairs[:, 1]]
+        np.testing.assert_allclose(left - right, np.tile([0.004, 0.0, 0.0], (count, 1)), atol=1e-6)
+        assert (left[:, 2] > 0.05).all()
+    assert (np.diff(garment.rest_pos[pairs[:, 0], 1]) < 0).all()
+    assert np.isin(pairs, np.concatenate(topology.boundary_loops(garment.faces))).all()
+    assert len(np.unique(pairs)) == 2 * count
+    assert garment.lbs_weights is not None
+    np.testing.assert_array_equal(garment.lbs_weights[pairs[:, 0]], garment.lbs_weights[pairs[:, 1]])
 
 
 def test_data_folder_is_small_and_free_of_pickles() -> None:

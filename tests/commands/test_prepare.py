@@ -276,3 +276,41 @@ def test_posed_body_is_where_the_scene_has_it(body: Body, walk: PoseSequence) ->
     rest = np.concatenate([body.shaped(betas)[0], np.ones((len(body.v_template), 1))], axis=1)
     skinned = np.einsum("wj,jab,wb->wa", body.weights, posed.transforms, rest)
     np.testing.assert_allclose(skinned, surface, atol=1e-5)
+
+
+@pytest.mark.parametrize("weld", ["auto", "none"])
+def test_a_coat_of_ones_own_gets_a_zipper(capsys: pytest.CaptureFixture[str], weld: str) -> None:
+    """The edges of its front lie on each other in the file, where open seams are welded."""
+    jacket = load_garment("jacket")
+    assert jacket.skin_pos is not None
+    assert jacket.fasteners is not None
+    pos, pairs = jacket.skin_pos.copy(), jacket.fasteners["front_zip"]
+    pos[pairs, 0] = 0.0
+    write_obj(Path("coat.obj"), pos, jacket.faces)
+    words = ("garment=coat.obj", "output=coat.npz", "pose=tpose", f"weld={weld}", *AS_GIVEN)
+    report = prepare(capsys, *words, "fasten={front_zip: {heights: [-0.1, 0.62]}}")
+    assert report["fasteners"] == {"front_zip": len(pairs)}
+    assert changes(report)["drawn_apart"] == 2 * len(pairs)
+    coat = load_garment("coat.npz")
+    assert len(coat.rest_pos) == len(pos)
+    assert coat.fasteners is not None
+    found = coat.fasteners["front_zip"]
+    assert {frozenset(pair) for pair in found.tolist()} == {frozenset(pair) for pair in pairs.tolist()}
+    np.testing.assert_allclose(np.linalg.norm(np.diff(coat.rest_pos[found], axis=1)[:, 0], axis=1), 0.004, atol=1e-6)
+    assert main(["inspect", "coat.npz"]) == 0
+    assert f"fasteners: front_zip ({len(pairs)} pairs)" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("garment=tank", "fasten=3"), "fasten=3: give rows by name, such as fasten={front_zip:"),
+        (("garment=[tank,skirt]", "fasten={a: {heights: [0, 1]}}"), "fasten=…: prepare the garments one by one"),
+        (("garment=tank", "fasten={a: {heights: [2, 3]}}"), "fasten: a: between 2 and 3 m the garment has no edges"),
+    ],
+)
+def test_fasteners_that_cannot_be_made_are_refused(
+    words: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["prepare", *words, "output=out.npz"]) == 2
+    assert message in capsys.readouterr().err

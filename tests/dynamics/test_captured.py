@@ -26,8 +26,8 @@ from hood.graph.fixed import Capacity, lay_out
 from hood.losses.potential import default_potential
 from hood.losses.problem import StepProblem
 from hood.scene.cloth import build_cloth, concatenate_cloths
-from hood.scene.scene import Scene, build_scene, concatenate_step_inputs
-from hood.scene.state import Attachments, State, StepInput, concatenate_states
+from hood.scene.scene import Scene, build_scene
+from hood.scene.state import Attachments, State, StepInput, concatenate_states, concatenate_step_inputs
 from hood.testing import grid, without_values
 
 SMALL = "1x(mesh+coarse0) 1x(coarse0+coarse1) 1x(coarse1)"

@@ -19,8 +19,8 @@ from hood.graph.hierarchy import Hierarchy, build_hierarchy
 from hood.losses.problem import StepProblem
 from hood.scene.cloth import Cloth, build_cloth, concatenate_cloths
 from hood.scene.contact import find_contact
-from hood.scene.scene import build_scene, concatenate_step_inputs
-from hood.scene.state import Obstacle, State, StepInput, concatenate_states
+from hood.scene.scene import build_scene
+from hood.scene.state import Obstacle, State, StepInput, concatenate_states, concatenate_step_inputs
 from hood.testing import cylinder, grid, sphere, strip
 
 SCHEDULES = ["fine15", "ours"]

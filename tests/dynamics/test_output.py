@@ -89,8 +89,7 @@ def test_without_a_body_the_base_is_the_inertial_guess() -> None:
 def test_one_scene_does_not_see_the_other() -> None:
     """The averages run along edges only."""
     from hood.scene.cloth import concatenate_cloths
-    from hood.scene.scene import concatenate_step_inputs
-    from hood.scene.state import concatenate_states
+    from hood.scene.state import concatenate_states, concatenate_step_inputs
 
     problems = [ball_problem(np.eye(3), np.array(move)) for move in ([0.02, 0, 0], [0, 0.03, 0])]
     cloth = concatenate_cloths([p.cloth for p in problems])

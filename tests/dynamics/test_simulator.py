@@ -17,8 +17,8 @@ from hood.assets.motion.sequence import PoseSequence, turn_world
 from hood.dynamics.simulator import build_simulator
 from hood.losses.problem import StepProblem
 from hood.scene.cloth import build_cloth, concatenate_cloths
-from hood.scene.scene import Scene, build_scene, concatenate_step_inputs
-from hood.scene.state import State, StepInput, concatenate_states
+from hood.scene.scene import Scene, build_scene
+from hood.scene.state import State, StepInput, concatenate_states, concatenate_step_inputs
 from hood.testing import grid
 
 

@@ -13,8 +13,8 @@ from hood.losses.problem import StepProblem
 from hood.losses.wind import Wind
 from hood.nn.dense import whole_arrays
 from hood.scene.cloth import concatenate_cloths
-from hood.scene.scene import Scene, concatenate_step_inputs
-from hood.scene.state import Attachments, concatenate_states
+from hood.scene.scene import Scene
+from hood.scene.state import Attachments, concatenate_states, concatenate_step_inputs
 from hood.solver.fixed import FixedSystem
 from hood.solver.iterate import in_double
 from hood.solver.newton import NewtonSettings, minimize, run

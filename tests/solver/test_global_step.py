@@ -18,8 +18,8 @@ from hood.losses.problem import StepProblem
 from hood.nn.fixed_gradients import Steps
 from hood.scene.batch import to_device
 from hood.scene.cloth import build_cloth, concatenate_cloths
-from hood.scene.scene import Scene, concatenate_step_inputs
-from hood.scene.state import Attachments, concatenate_states
+from hood.scene.scene import Scene
+from hood.scene.state import Attachments, concatenate_states, concatenate_step_inputs
 from hood.solver import global_step
 from hood.solver.iterate import in_double, in_single
 from hood.solver.linear import block_product

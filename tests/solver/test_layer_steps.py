@@ -16,8 +16,7 @@ from hood.losses.potential import default_potential
 from hood.losses.problem import StepProblem
 from hood.mesh.crossing import self_crossings
 from hood.scene.cloth import concatenate_cloths
-from hood.scene.scene import concatenate_step_inputs
-from hood.scene.state import concatenate_states
+from hood.scene.state import concatenate_states, concatenate_step_inputs
 from hood.solver.newton import NewtonSettings, minimize
 from hood.solver.sweeps import sweep
 

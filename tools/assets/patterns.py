@@ -1,4 +1,4 @@
-"""The seven default garments: scalar fields around the T-posed body, and smooth cuts.
+"""The nine default garments: scalar fields around the T-posed body, and smooth cuts.
 
 The zero level of a field is the cloth: the body's signed distance minus the ease, plus *hanging*: cloth
 below a wide place (chest, thigh, hip) does not follow the body back in. Such surfaces never intersect
@@ -61,6 +61,14 @@ class Fields:
 
 
 @dataclass(frozen=True)
+class Front:
+    """How a garment is fastened in front: the ``name`` of the row, and every how many pairs of vertices one is fastened."""
+
+    name: str
+    every: int
+
+
+@dataclass(frozen=True)
 class Pattern:
     """What a garment is: its field, its cuts (kept where positive) and how it follows the body.
 
@@ -69,7 +77,8 @@ class Pattern:
     waist; those without `legs` share the thighs' motion. `weight_reach` [m] is the length over which
     skinning weights are smoothed. `parts` are negative on what is cut from panels of its own, a leg or a sleeve. `arms` is how
     far the arms hang down [degrees] in the pose it is drafted in: sleeves drafted for level arms crumple at the armpit of
-    lowered ones. `firm` names what is sewn stiffer: ``rims`` (neckline and armholes) or ``crotch``.
+    lowered ones. `firm` names what is sewn stiffer: ``rims`` (neckline and armholes) or ``crotch``. With a `front` it is open
+    there, and made in the smallest size alone.
     """
 
     field: Callable[[Fields], Array]
@@ -81,6 +90,7 @@ class Pattern:
     parts: tuple[Callable[[Array], Array], ...] = ()
     arms: float = 0.0
     firm: str | None = None
+    front: Front | None = None
 
 
 def body_fields(posed: PosedBody) -> Fields:
@@ -279,6 +289,20 @@ PATTERNS = {
         (scoop(0.088, 0.060, 0.030), sleeve_end(0.470), above(-0.03)),
         arms=45.0,
         parts=_SLEEVES,
+    ),
+    "shirt": Pattern(
+        lambda f: top_field(f, 0.019, 0.06, ((0.0, 0.072), (0.10, 0.065), (0.21, 0.058))),
+        (scoop(0.084, 0.062, 0.030), sleeve_end(0.190), above(-0.05)),
+        arms=45.0,
+        parts=_SLEEVES,
+        front=Front("front_buttons", 2),
+    ),
+    "jacket": Pattern(
+        lambda f: top_field(f, 0.022, 0.08, ((0.0, 0.074), (0.10, 0.067), (0.26, 0.060), (0.36, 0.053), (0.47, 0.043))),
+        (scoop(0.086, 0.052, 0.026), sleeve_end(0.465), above(-0.04)),
+        arms=45.0,
+        parts=_SLEEVES,
+        front=Front("front_zip", 1),
     ),
     "shorts": Pattern(
         lambda f: leg_field(f, 0.016, 0.0),

@@ -21,9 +21,10 @@ from hood.assets.garment.pins import MARKS, opening_names
 from hood.assets.motion.poses import arms_down
 from hood.mesh import topology
 from hood.mesh.isotropic import isotropic
-from hood.mesh.local_edits import Array, Faces, closest, flip_edges, relax
+from hood.mesh.local_edits import Array, Faces, closest, compact, flip_edges, relax
 from tools.assets.isosurface import zero_level
 from tools.assets.patterns import CLEARANCE, ORIGIN, PATTERNS, SIZES, VOXEL, Fields, Pattern, body_fields
+from tools.assets.placket import open_front, pull_apart, sewn_together, slit_pairs
 from tools.assets.remesh import collapse_short, cut, diffuse, largest_component, push_out, smooth_loops
 from tools.assets.unwrap import panels, unwrap
 
@@ -65,14 +66,25 @@ def tailor(pattern: Pattern, model: Model, verts: Array, faces: Faces) -> dict[s
         faces = flip_edges(verts, faces)
         verts = relax(verts, faces, 8)
         verts = push_out(verts, faces, skin, skin_faces, CLEARANCE)
+    closed, fastened, slit = faces, {}, np.zeros((0, 2), dtype=np.int64)
+    if pattern.front is not None:
+        slit = slit_pairs(verts, faces)
+        verts = pull_apart(verts, slit)
+        closed, fastened = sewn_together(faces, slit), {pattern.front.name: slit[:: pattern.front.every]}
     weights, shapedirs = bind(pattern, verts, faces, model.posed)
-    panel = panels(verts, faces, [part(verts) for part in pattern.parts])
+    for values in (weights, shapedirs):  # both edges of a slit move as one
+        values[slit] = values[slit].mean(axis=1, keepdims=True)
+    sewn = compact(verts, closed)
+    panel = panels(*sewn, [part(sewn[0]) for part in pattern.parts])
+    if pattern.front is not None:
+        panel[(panel == 0) & (verts[faces, 0].mean(axis=1) < 0)] = 2 ** (len(pattern.parts) + 1)  # a front of two halves
     uv, uv_faces = unwrap(verts, faces, panel)
     worn = {}
     tpose = verts
     if pattern.arms:
         tpose, turn = undo_skinning(weights, model.posed.transforms, verts)
         tpose = push_out(tpose, faces, model.rest.surface, skin_faces, _TPOSE_CLEARANCE, near=_TPOSE_NEAR)
+        tpose = pull_apart(tpose, slit)
         worn = {"skin_pos": tpose.astype(np.float32), "rest_turn": turn.astype(np.float16)}
     return {
         "rest_pos": verts.astype(np.float32),
@@ -82,8 +94,9 @@ def tailor(pattern: Pattern, model: Model, verts: Array, faces: Faces) -> dict[s
         "shapedirs": _steps(shapedirs).astype(np.float16),
         "lbs_weights": weights.astype(np.float16),
         "pinned": pinned_vertices(pattern, verts, faces),
-        "region": (region := mark_regions(tpose, faces, panel, model.rest.body)),
+        "region": (region := mark_regions(tpose, faces, closed, panel, model.rest.body)),
         "stiffness": firmness(pattern.firm, verts, faces, region),
+        "fasteners": fastened,
         **worn,
     }
 
@@ -112,14 +125,15 @@ def _crotch(verts: Array, faces: Faces) -> Array:
     return points[points[:, 1].argmin()][None]
 
 
-def mark_regions(tpose: Array, faces: Faces, panel: NDArray[np.int64], body: Body) -> NDArray[np.uint8]:
+def mark_regions(tpose: Array, faces: Faces, closed: Faces, panel: NDArray[np.int64], body: Body) -> NDArray[np.uint8]:
     """Region (V,) of every vertex, an index into :data:`hood.assets.garment.pins.MARKS`: on a seam, on an opening's edge,
-    or cloth."""
+    or cloth. Openings are those of the ``closed`` faces; other edges, which a front has, are seams."""
     region = np.zeros(len(tpose), dtype=np.uint8)
     hinges = topology.hinges(faces)
     seams = hinges.vertices[panel[hinges.faces[:, 0]] != panel[hinges.faces[:, 1]], :2]
     region[seams] = MARKS.index("seam")
-    loops = topology.boundary_loops(faces)
+    region[np.concatenate(topology.boundary_loops(faces))] = MARKS.index("seam")
+    loops = topology.boundary_loops(closed)
     centres = np.stack([tpose[loop].mean(axis=0) for loop in loops])
     for loop, name in zip(loops, opening_names(centres, body.shaped(np.zeros(0))[1]), strict=True):
         region[loop] = MARKS.index(name)
@@ -205,6 +219,11 @@ def build_garments(folder: Path, body_path: Path, names: tuple[str, ...] = tuple
         fields = body_fields(posed)
         for name in (name for name in names if PATTERNS[name].arms == angle):
             verts, faces = sew(PATTERNS[name], fields)
+            if PATTERNS[name].front is not None:
+                arrays = tailor(PATTERNS[name], Model(rest, posed), *open_front(verts, faces, *SIZES[""]))
+                write_fields(folder / f"{name}.npz", arrays)
+                counts[name] = len(arrays["rest_pos"])
+                continue
             for suffix, (num_vertices, tolerance) in sorted(SIZES.items(), key=lambda size: -size[1][0]):
                 verts, faces = isotropic(verts, faces, num_vertices, tolerance)
                 verts = smooth_loops(verts, faces, 6 * max(1, num_vertices // 1000))

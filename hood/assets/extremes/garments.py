@@ -85,7 +85,7 @@ def _remesh(garment: Garment, count: float, rng: np.random.Generator) -> Garment
     origin, weights = garment.faces[hit.face.numpy()], hit.bary.numpy()
     nearest = origin[np.arange(len(pos)), weights.argmax(axis=1)]
     fields = _means(garment, origin, weights) | {key: _taken(getattr(garment, key), nearest) for key in _MARKS}
-    return replace(garment, **fields | {"rest_pos": pos}, faces=faces, **_NOTHING)  # type: ignore[arg-type]
+    return replace(garment, **fields | {"rest_pos": pos}, faces=faces, fasteners=None, **_NOTHING)  # type: ignore[arg-type]
 
 
 def _subdivide(garment: Garment, times: float, rng: np.random.Generator) -> Garment:

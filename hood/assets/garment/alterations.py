@@ -71,15 +71,18 @@ def place(fitting: Fitting, placement: Placement) -> None:
         fitting.note("moved", count, f"moved by {offset} m", offset=offset)
 
 
-def sew(fitting: Fitting, tolerance: float | None) -> None:
-    """Weld boundary vertices within ``tolerance`` [m]; None: a thousandth of the median edge."""
+def sew(fitting: Fitting, tolerance: float | None, left_out: np.ndarray | None = None) -> None:
+    """Weld boundary vertices within ``tolerance`` [m], but for those in ``left_out`` and those of fasteners; None: a thousandth
+    of the median edge."""
     garment = fitting.garment
     if tolerance is None:
         tolerance = repair.weld_tolerance(garment.rest_pos, garment.faces)
-    welded = repair.weld(garment.rest_pos, garment.faces, tolerance)
+    sides = [*(garment.fasteners or {}).values(), *([] if left_out is None else [left_out])]
+    open_edges = np.concatenate([np.zeros(0, dtype=np.int64), *(pairs.reshape(-1) for pairs in sides)])
+    welded = repair.weld(garment.rest_pos, garment.faces, tolerance, open_edges)
     count = len(garment.rest_pos) - len(welded.kept)
     if count:
-        fitting.garment = _keep_vertices(garment, welded.vertex_map[garment.faces], welded.kept)
+        fitting.garment = _keep_vertices(garment, welded.vertex_map[garment.faces], welded.kept, welded.vertex_map)
         fitting.vertex_map = np.where(fitting.vertex_map < 0, -1, welded.vertex_map[fitting.vertex_map])
     fitting.note("welded", count, f"welded {count} vertices on seams, within {1e3 * tolerance:.2g} mm", tolerance=tolerance)
 
@@ -97,7 +100,8 @@ def clean(fitting: Fitting) -> None:
     garment = _turn_faces(garment, flipped)
     alone = repair.isolated_vertices(len(garment.rest_pos), garment.faces)
     number = np.where(alone, -1, np.cumsum(~alone) - 1)
-    fitting.garment = _keep_vertices(garment, number[garment.faces], np.flatnonzero(~alone)) if alone.any() else garment
+    kept = np.flatnonzero(~alone)
+    fitting.garment = _keep_vertices(garment, number[garment.faces], kept, number) if alone.any() else garment
     fitting.vertex_map = np.where(fitting.vertex_map < 0, -1, number[fitting.vertex_map])
     for what, mask, text in (
         ("removed_broken_faces", broken, "removed {} faces without area"),
@@ -187,9 +191,12 @@ _PER_VERTEX = (
 _PER_FACE = ("faces", "uv_faces", "normal_faces")
 
 
-def _keep_vertices(garment: Garment, faces: np.ndarray, kept: np.ndarray) -> Garment:
-    """The garment with its vertices ``kept`` and ``faces`` in their numbers; its coarse edges are of another mesh now."""
-    rows = {key: getattr(garment, key)[kept] for key in _PER_VERTEX if getattr(garment, key) is not None}
+def _keep_vertices(garment: Garment, faces: np.ndarray, kept: np.ndarray, number: np.ndarray) -> Garment:
+    """The garment with its vertices ``kept`` and ``faces`` in their numbers, where ``number`` (V,) says what became of each,
+    -1 if it is gone; its coarse edges are of another mesh now."""
+    rows: dict[str, Any] = {key: getattr(garment, key)[kept] for key in _PER_VERTEX if getattr(garment, key) is not None}
+    pairs = {name: number[row][(number[row] >= 0).all(axis=1)] for name, row in (garment.fasteners or {}).items()}
+    rows["fasteners"] = {name: row for name, row in pairs.items() if len(row)} or None
     return replace(garment, **rows | {"faces": faces, "coarse_edges": None})
 
 

@@ -42,6 +42,9 @@ class Garment:
     region: np.ndarray | None = None  # (V,) int64, index into hood.assets.garment.pins.MARKS; None: not marked
     stiffness: np.ndarray | None = None  # (V,) how many times as stiff as its fabric the cloth is there; None: once
     piece: np.ndarray | None = None  # (V,) int64, garment of an outfit that a vertex belongs to, from 0; None: all one garment
+    fasteners: dict[str, np.ndarray] | None = (
+        None  # (P, 2) each: pairs of vertices that a seam, buttons or a zipper hold together
+    )
 
     @property
     def bound(self) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ _ROWS: dict[str, tuple[int | None, ...]] = {
 }
 _CORNERS = ("uv_faces", "normal_faces")
 _LEVEL = "coarse_edges_"
+_FASTENER = "fastener_"
 _SIZE_LIMIT = 2 << 30
 
 
@@ -63,6 +65,10 @@ def read_fields(path: Path) -> dict[str, Any]:
     levels = sorted((key for key in arrays if key.startswith(_LEVEL)), key=lambda key: (len(key), key))
     if levels:
         fields["coarse_edges"] = tuple(_edge_table(path, key, arrays[key]) for key in levels)
+    rows = sorted(key for key in arrays if key.startswith(_FASTENER))
+    if rows:
+        fields["fasteners"] = {key[len(_FASTENER) :]: _edge_table(path, key, arrays[key], "fasteners") for key in rows}
+        check_fasteners(str(path), fields["fasteners"], num_vertices)
     if path.is_relative_to(DATA_FOLDER):
         fields["bound_to"] = "default"
     elif "bound_to" in arrays and arrays["bound_to"].dtype.kind == "U" and arrays["bound_to"].size == 1:
@@ -72,9 +78,12 @@ def read_fields(path: Path) -> dict[str, Any]:
 
 def write_fields(path: Path, fields: dict[str, Any]) -> None:
     """Write a garment ``.npz`` that :func:`read_fields` reads back; fields that are None are left out."""
-    arrays = {key: value for key, value in fields.items() if value is not None and key not in ("name", "coarse_edges")}
+    tables = ("name", "coarse_edges", "fasteners")
+    arrays = {key: value for key, value in fields.items() if value is not None and key not in tables}
     for level, edges in enumerate(fields.get("coarse_edges") or ()):
         arrays[f"{_LEVEL}{level}"] = edges
+    for name, pairs in (fields.get("fasteners") or {}).items():
+        arrays[f"{_FASTENER}{name}"] = pairs
     content = io.BytesIO()
     np.savez_compressed(content, **arrays)
     write_atomically(path, content.getvalue())
@@ -92,6 +101,20 @@ def check_rows(where: str, key: str, value: np.ndarray, num_vertices: int) -> No
     finite = np.isfinite(value).reshape(num_vertices, -1).all(axis=1)
     if not finite.all():
         raise ValueError(f"{where}: {key} of vertex {int(np.argmin(finite))} is not finite; repair it")
+
+
+def check_fasteners(where: str, fasteners: Mapping[str, np.ndarray], num_vertices: int) -> None:
+    """Raise ValueError unless every row of pairs (P, 2) has some, of two different vertices that there are."""
+    for name, pairs in fasteners.items():
+        if len(pairs) == 0:
+            raise ValueError(f"{where}: fastener {name!r} has no pairs; give at least one pair of vertices, or leave it out")
+        wrong = ((pairs < 0) | (pairs >= num_vertices)).any(axis=1) | (pairs[:, 0] == pairs[:, 1])
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            raise ValueError(
+                f"{where}: pair {row} of fastener {name!r} is {pairs[row].tolist()}; give two different vertices below "
+                f"{num_vertices}"
+            )
 
 
 def _finite(path: Path, key: str, value: np.ndarray) -> np.ndarray:
@@ -135,10 +158,10 @@ def _indices(path: Path, key: str, value: Any) -> np.ndarray:
     return array.astype(np.int64)
 
 
-def _edge_table(path: Path, key: str, value: Any) -> np.ndarray:
+def _edge_table(path: Path, key: str, value: Any, what: str = "coarse edges") -> np.ndarray:
     table = _indices(path, key, value)
     if table.ndim != 2 or table.shape[1] != 2:
-        raise ValueError(f"{path}: {key} has shape {table.shape}; coarse edges are pairs of vertices (n, 2)")
+        raise ValueError(f"{path}: {key} has shape {table.shape}; {what} are pairs of vertices (n, 2)")
     return table
 
 

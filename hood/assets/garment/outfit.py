@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import chain, count
 
 import numpy as np
 
@@ -43,6 +44,7 @@ def join_garments(garments: Sequence[Garment]) -> Garment:
         piece=_join_pieces(garments),
         stiffness=_join_rows(garments, "stiffness", lambda garment: np.ones(len(garment.rest_pos))),
         region=_join_rows(garments, "region", lambda garment: np.zeros(len(garment.rest_pos), dtype=np.int64)),
+        fasteners=_join_fasteners(garments, starts),
     )
 
 
@@ -92,6 +94,16 @@ def _join_pieces(garments: Sequence[Garment]) -> np.ndarray:
         own = np.zeros(len(garment.rest_pos), dtype=np.int64) if garment.piece is None else garment.piece
         pieces.append(own + (1 + int(pieces[-1].max()) if pieces else 0))
     return np.concatenate(pieces)
+
+
+def _join_fasteners(garments: Sequence[Garment], starts: np.ndarray) -> dict[str, np.ndarray] | None:
+    """Rows of all garments; of two with one name the later one is called ``name_2``, and so on."""
+    rows: dict[str, np.ndarray] = {}
+    for garment, start in zip(garments, starts, strict=True):
+        for name, pairs in (garment.fasteners or {}).items():
+            free = (key for key in chain([name], (f"{name}_{k}" for k in count(2))) if key not in rows)
+            rows[next(free)] = pairs + start
+    return rows or None
 
 
 def _join_levels(garments: Sequence[Garment], starts: np.ndarray) -> tuple[np.ndarray, ...] | None:

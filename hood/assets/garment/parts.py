@@ -79,11 +79,20 @@ def _listed(path: Path, garment: Garment) -> np.ndarray:
 
 
 def _coloured(colour: str, garment: Garment) -> np.ndarray:
+    return _of_most_corners(coloured_vertices(colour, garment), garment)
+
+
+def coloured_vertices(colour: str, garment: Garment) -> np.ndarray:
+    """(V,) bool: the vertices of one of :data:`COLOURS`.
+
+    Raises:
+        ValueError: the garment has no colours.
+    """
     if garment.colours is None:
         raise ValueError(f"part {colour!r}: {garment.name!r} has no vertex colours; paint the part and export colours")
     own = COLOURS.index(colour)
     others = np.delete(garment.colours, own, axis=1).max(axis=1)
-    return _of_most_corners(garment.colours[:, own] - others > _STRENGTH, garment)
+    return np.asarray(garment.colours[:, own] - others > _STRENGTH)
 
 
 def _of_most_corners(inside: np.ndarray, garment: Garment) -> np.ndarray:

@@ -1,0 +1,74 @@
+"""When rows of fasteners are open and closed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from hood.scene.fastening import SPEED, Event, Fastening, fastening_of, first_step
+from hood.scene.scene import Scene
+
+ROWS = {"zip": np.array([[0, 1], [2, 3]]), "buttons": np.array([[4, 5]])}
+
+
+def fastening(*events: Event, speed: float = SPEED) -> Fastening:
+    pos = torch.zeros(6, 3)
+    pos[1::2, 0] = torch.tensor([0.004, 0.005, 0.006])
+    made = fastening_of(ROWS, pos)
+    assert made is not None
+    return made.with_events(events, speed)
+
+
+def test_pairs_keep_the_distance_that_they_have_at_rest() -> None:
+    made = fastening(speed=0.2)
+    assert made.names == ("buttons", "zip")
+    assert made.pairs.edges.tolist() == [[4, 5], [0, 1], [2, 3]]
+    torch.testing.assert_close(made.pairs.length, torch.tensor([0.006, 0.004, 0.005]))
+    assert made.pairs.speed.tolist() == pytest.approx([0.2] * 3)
+    assert fastening_of(None, torch.zeros(6, 3)) is None
+    assert fastening_of({}, torch.zeros(6, 3)) is None
+
+
+def test_events_act_from_their_frame_on_in_any_order() -> None:
+    made = fastening(Event(9, "zip", True), Event(3, "zip", False), Event(5, "buttons", True))
+    assert [made.closed(frame) for frame in (0, 2, 3, 5, 8, 9, 50)] == [
+        (False, True), (False, True), (False, False), (True, False), (True, False), (True, True), (True, True)
+    ]  # fmt: skip
+    assert made.at(4).active.tolist() == [False, False, False]
+    assert made.at(5).active.tolist() == [True, False, False]
+    assert fastening().at(7).active.all()
+
+
+def test_the_edges_are_the_same_object_in_all_steps() -> None:
+    """Solvers and captured steps know a plan by it."""
+    made = fastening(Event(3, "zip", False))
+    assert made.at(0).edges is made.at(3).edges
+    assert made.at(3) is made.at(8)
+
+
+def test_what_is_still_has_no_events() -> None:
+    made = fastening(Event(3, "zip", False), Event(6, "buttons", True)).still(4)
+    assert {made.closed(frame) for frame in (0, 3, 6, 100)} == {(False, False)}
+
+
+@pytest.mark.parametrize(("seconds", "frame"), [(0.0, 0), (1.0, 30), (1.0 / 30, 1), (0.034, 2), (2.0, 60)])
+def test_an_event_acts_in_the_first_step_that_begins_at_its_time_or_later(seconds: float, frame: int) -> None:
+    assert first_step(seconds, 1 / 30) == frame
+
+
+def test_a_scene_gives_its_fastening_to_steps(tank_scene: Scene) -> None:
+    rows = fastening_of({"zip": np.array([[0, 1]])}, tank_scene.cloth.rest_pos)
+    assert rows is not None
+    scene = replace(tank_scene, fastening=rows.with_events([Event(2, "zip", False)]))
+    state = scene.start()
+    assert scene.step_input(1, state).attachments.active.tolist() == [True]
+    assert scene.step_input(2, state).attachments.active.tolist() == [False]
+    given = replace(rows.pairs, active=torch.tensor([False]))
+    assert scene.step_input(1, state, attachments=given).attachments is given
+    assert tank_scene.step_input(1, state).attachments is None
+    lead = scene.lead_in(3)
+    assert lead is not None
+    assert lead.step_input(0, lead.start()).attachments.active.tolist() == [False]
