@@ -124,6 +124,12 @@ def plane_contact(pos: Tensor, normal: Tensor | None = None, height: float = 0.0
     )
 
 
+def concatenate_contacts(contacts: list[Contact]) -> Contact:
+    """Contact of several scenes as that of one batch; what none of them has stays None."""
+    values = {field.name: [getattr(contact, field.name) for contact in contacts] for field in fields(Contact)}
+    return Contact(**{name: None if v[0] is None else torch.cat(v) for name, v in values.items()})
+
+
 def assert_nearest(points: Tensor, targets: Tensor, found: Tensor) -> None:
     """``targets[found]`` (N, 3) are as near to ``points`` (N, 3) as any of ``targets`` (M, 3), to ten roundings of float64.
 

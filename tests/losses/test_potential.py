@@ -9,9 +9,8 @@ from hood.losses.collision import Collision
 from hood.losses.potential import Potential, default_potential, relative_gradient, scale
 from hood.losses.problem import StepProblem, inertial_guess
 from hood.scene.cloth import build_cloth, concatenate_cloths
-from hood.scene.contact import Contact
 from hood.scene.state import Attachments, Obstacle, State, StepInput, concatenate_states
-from hood.testing import cylinder, grid, make_problem, plane_contact, sphere
+from hood.testing import concatenate_contacts, cylinder, grid, make_problem, plane_contact, sphere
 
 F64 = torch.float64
 
@@ -25,9 +24,7 @@ def sheet_problem(seed=0, dtype=F64, dt=1 / 30, pinned=None):
 
 
 def concatenate_problems(problems: list[StepProblem]) -> StepProblem:
-    contacts = [problem.contact for problem in problems]
-    names = Contact.__dataclass_fields__
-    contact = Contact(**{name: torch.cat([getattr(item, name) for item in contacts]) for name in names})
+    contact = concatenate_contacts([problem.contact for problem in problems])
     return StepProblem(
         concatenate_cloths([problem.cloth for problem in problems]),
         concatenate_states([problem.state for problem in problems]),

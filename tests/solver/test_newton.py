@@ -14,12 +14,11 @@ from hood.losses.potential import Potential, default_potential, relative_gradien
 from hood.losses.problem import StepProblem, inertial_guess
 from hood.scene.batch import to_device
 from hood.scene.cloth import build_cloth, concatenate_cloths
-from hood.scene.contact import Contact
 from hood.scene.state import Attachments, State, StepInput, concatenate_states
 from hood.solver import linear
 from hood.solver.newton import NewtonSettings, minimize
 from hood.solver.pattern import Scatter
-from hood.testing import cylinder, grid, make_problem, plane_contact, strip
+from hood.testing import concatenate_contacts, cylinder, grid, make_problem, plane_contact, strip
 
 F64 = torch.float64
 TIGHT = NewtonSettings(target_rg=1e-8, max_iterations=60, cg_iterations=300)
@@ -42,9 +41,7 @@ def falling(height=0.01, contact=True, dtype=F64, material=None, dt=1 / 30):
 
 
 def batch(problems):
-    contact = Contact(
-        **{name: torch.cat([getattr(p.contact, name) for p in problems]) for name in Contact.__dataclass_fields__}
-    )
+    contact = concatenate_contacts([p.contact for p in problems])
     return StepProblem(
         concatenate_cloths([p.cloth for p in problems]),
         concatenate_states([p.state for p in problems]),

@@ -13,14 +13,13 @@ from hood.losses.damping import BendDamping, StretchDamping
 from hood.losses.potential import default_potential, relative_gradient, scale
 from hood.losses.wind import Wind
 from hood.scene.cloth import build_cloth, concatenate_cloths
-from hood.scene.contact import Contact
 from hood.scene.state import Attachments, State, StepInput
 from hood.solver.colouring import colours_of, greedy_colours
 from hood.solver.newton import NewtonSettings, minimize
 from hood.solver.plan import plan_for, quadratic_model
 from hood.solver.sweeps import neighbourhoods, sweep, vertex_systems
 from hood.solver.terms import StepTerms
-from hood.testing import cylinder, grid, make_problem, plane_contact
+from hood.testing import concatenate_contacts, cylinder, grid, make_problem, plane_contact
 
 F64 = torch.float64
 
@@ -105,9 +104,7 @@ def test_batch_equals_singles():
     potential = default_potential()
     tube = build_cloth(*cylinder(6, 4, 0.1, 0.2), Material(), dtype=F64)
     problems = [sheet(pins=0), make_problem(tube, dt=1 / 60, contact=plane_contact(tube.rest_pos))]
-    contact = Contact(
-        **{name: torch.cat([getattr(p.contact, name) for p in problems]) for name in Contact.__dataclass_fields__}
-    )
+    contact = concatenate_contacts([p.contact for p in problems])
     together = replace(
         problems[0],
         cloth=concatenate_cloths([p.cloth for p in problems]),
