@@ -99,6 +99,7 @@ def _is_memory(error: Exception) -> bool:
 def _describe(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename and error.strerror:
         hints = {
+            2: "check the path",
             13: "choose a folder you may write to",
             17: "choose another output",
             20: "choose another output",

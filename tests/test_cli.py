@@ -77,7 +77,7 @@ ERRORS: dict[str, tuple[list[str], tuple[str, ...], Prepare]] = {
     "missing checkpoint": (["rollout", "checkpoint=a/m.safetensors"], ("a/m.safetensors", "no such file"), lambda: None),
     "misspelt device": (["rollout", *UNTRAINED, "device=cup"], ("'cup'", "'cpu'"), lambda: None),
     "misspelt video": (["rollout", *UNTRAINED, "video=mp5"], ("'mp5'", "'mp4'"), lambda: None),
-    "wrong type": (["rollout", *UNTRAINED, "num_frames=abc"], ("num_frames", "'abc'"), lambda: None),
+    "wrong type": (["rollout", *UNTRAINED, "num_frames=abc"], ("num_frames=abc", "a whole number"), lambda: None),
     "no frames": (["rollout", *UNTRAINED, "num_frames=0"], ("num_frames=0",), lambda: None),
     "negative seed": (["rollout", *UNTRAINED, "seed=-1"], ("seed=-1",), lambda: None),
     "frame rate": (["rollout", *UNTRAINED, "fps=0"], ("fps",), lambda: None),

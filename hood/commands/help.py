@@ -7,7 +7,7 @@ import textwrap
 
 from hood.assets.files import library
 from hood.commands.exit_codes import exit_code_lines
-from hood.config import CONFIG_FOLDER, load_config, options, plain
+from hood.config import CONFIG_FOLDER, load_config, notes, options, plain, shown
 
 _EXAMPLES = {
     "train": [
@@ -70,13 +70,13 @@ _BEFORE_KEYS = {**dict.fromkeys(("inspect", "compare", "view", "export"), "FILE 
 def describe(name: str) -> str:
     """Help text of the command ``name``."""
     config = load_config(name)
-    comments = _comments(name)
+    comments = notes(name)
     lines = [f"usage: hood {name} {_BEFORE_KEYS.get(name, '')}[key=value ...]", ""]
     for key in config:
         value = plain(config[key])
         if isinstance(value, dict):
             continue
-        text = f"  {key}={_show(value)}"
+        text = f"  {key}={shown(value)}"
         text = f"{text:<34}" if len(text) < 34 else text + "  "
         lines.append(textwrap.fill(text + comments.get(str(key), ""), 118, subsequent_indent=" " * 34))
     if name == "plan":
@@ -96,26 +96,6 @@ def describe(name: str) -> str:
     return "\n".join(lines)
 
 
-def _comments(name: str) -> dict[str, str]:
-    """Comments behind the keys of a config file: the help is written once, beside the default."""
-    notes = {}
-    for line in (CONFIG_FOLDER / f"{name}.yaml").read_text(encoding="utf-8").splitlines():
-        match = re.match(r"(?:  - )?(\w+):[^#]*#\s*(.*)", line)
-        if match:
-            notes[match.group(1)] = match.group(2)
-    return notes
-
-
 def _groups_of(name: str) -> list[str]:
     text = (CONFIG_FOLDER / f"{name}.yaml").read_text(encoding="utf-8")
     return [match for match in re.findall(r"^\s+- (?:override )?/?(\w+):", text, flags=re.M) if match != "_self_"]
-
-
-def _show(value: object) -> str:
-    if isinstance(value, list):
-        return "[" + ",".join(_show(item) for item in value) + "]"
-    if value is None:
-        return "null"
-    if isinstance(value, bool):
-        return str(value).lower()
-    return f"{value:g}" if isinstance(value, float) else str(value)

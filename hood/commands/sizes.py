@@ -8,7 +8,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from hood.config import ConfigError, plain
+from hood.config import ConfigError, plain, shown
 from hood.dynamics.ease import Ease
 from hood.scene.sizing import Sizes, sizes_of
 
@@ -19,12 +19,15 @@ def checked_sizes(config: DictConfig) -> Sizes:
     Raises:
         ConfigError: they are none, or they change in steps of fixed shapes.
     """
-    end = plain(config.size_end)
-    try:
-        sizes = sizes_of(plain(config.size), end, float(config.size_seconds))
-    except (ValueError, TypeError) as error:
-        key = f"size={plain(config.size)} size_end={end} size_seconds={config.size_seconds}"
-        raise ConfigError(f"{key}: {error}") from error
+    end, seconds = plain(config.size_end), float(config.size_seconds)
+    if not seconds > 0:
+        raise ConfigError(f"size_seconds={config.size_seconds}: give seconds above 0, such as size_seconds=2")
+    for key in ("size", "size_end"):
+        try:
+            sizes = sizes_of(plain(config.size) if config[key] is None else plain(config[key]))
+        except (ValueError, TypeError) as error:
+            raise ConfigError(f"{key}={shown(config[key])}: {error}") from error
+    sizes = sizes_of(plain(config.size), end, seconds)
     if sizes.changing and str(config.step) != "plain":
         raise ConfigError(
             f"size_end={end}: step={config.step} has fixed shapes, which a garment that grows has not; use step=plain"
