@@ -39,7 +39,7 @@ _ABSENT = object()
 #: What a value must be, by the type of the default that it replaces.
 _KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text", ListConfig: "a list in brackets"}
 #: Characters of a comment that is repeated in a message; a longer one is read in --help.
-_SHORT_NOTE = 200
+_SHORT_NOTE = 160
 #: Bytes of a run's record at most, levels of its nesting, and characters of a reason why it is none.
 _RECORD_LIMIT, _DEEPEST, _REASON = 1 << 20, 32, 300
 #: What configs may name; and classes of plugins (:mod:`hood.plugins`).
@@ -135,10 +135,21 @@ def _require_plain(text: str) -> None:
 
 
 def notes(name: str) -> dict[str, str]:
-    """The comments behind the keys of ``configs/<name>.yaml``: what ``--help`` says of each."""
-    lines = (CONFIG_FOLDER / f"{name}.yaml").read_text(encoding="utf-8").splitlines()
-    found = [re.match(r"(?:  - )?(\w+):[^#]*#\s*(.*)", line) for line in lines]
-    return {match.group(1): match.group(2) for match in found if match}
+    """The comments behind the keys of ``configs/<name>.yaml``: what ``--help`` says of each, ``a.b`` for a key in another."""
+    found, path = {}, []
+    for line in (CONFIG_FOLDER / f"{name}.yaml").read_text(encoding="utf-8").splitlines():
+        match = re.match(r"( *)(- )?(\w+):[^#]*(?:#\s*(.*))?$", line)
+        if match:
+            group = match.group(2) is not None  # an entry of the list of groups
+            path = [] if group else [*path[: len(match.group(1)) // 2], match.group(3)]
+            found[match.group(3) if group else ".".join(path)] = match.group(4) or ""
+    return {key: note for key, note in found.items() if note}
+
+
+def headings(name: str) -> dict[str, str]:
+    """The lines ``#: …`` of ``configs/<name>.yaml``, by the key that follows each."""
+    text = (CONFIG_FOLDER / f"{name}.yaml").read_text(encoding="utf-8")
+    return {key: title for title, key in re.findall(r"^#: (.*)\n(\w+):", text, flags=re.MULTILINE)}
 
 
 def shown(value: Any) -> str:

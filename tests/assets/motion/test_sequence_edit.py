@@ -123,7 +123,7 @@ def test_options_out_of_range(walk: PoseSequence) -> None:
         loop(walk, 10**7)
     with pytest.raises(ValueError, match="blend_in=-1"):
         blend_in(walk, -1)
-    with pytest.raises(ValueError, match="hands 'x'"):
+    with pytest.raises(ValueError, match="hands=x: give flat, or file"):
         load_sequence("walk_proud", hands="x")
 
 
