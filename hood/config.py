@@ -136,7 +136,8 @@ def _require_plain(text: str) -> None:
 
 def notes(name: str) -> dict[str, str]:
     """The comments behind the keys of ``configs/<name>.yaml``: what ``--help`` says of each, ``a.b`` for a key in another."""
-    found, path = {}, []
+    found: dict[str, str] = {}
+    path: list[str] = []
     for line in (CONFIG_FOLDER / f"{name}.yaml").read_text(encoding="utf-8").splitlines():
         match = re.match(r"( *)(- )?(\w+):[^#]*(?:#\s*(.*))?$", line)
         if match:
