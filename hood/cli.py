@@ -29,6 +29,7 @@ COMMANDS = {
     "plan": "measure which parts of the model a scene needs, and what each costs",
     "compare": "show rollouts of one motion next to each other, coloured by strain or rg",
     "fabric": "compare fabrics, and drape them over a disc",
+    "sizes": "size run: several sizes of a garment on several bodies",
     "view": "write rollouts as one HTML page to turn and play in a browser",
     "export": "write a rollout for other programs: USD, glTF, PC2, OBJ, PLY",
     "inspect": "say what files are, what is wrong with them and how to repair it",
@@ -39,7 +40,7 @@ COMMANDS = {
 _LESS_MEMORY = "free some, raise the limit (ulimit -v), or take a smaller garment, fewer frames or a smaller model"
 
 #: Commands that take steps: libraries for these are compiled while torch is loaded, where that has not been done before.
-_SIMULATE = ("train", "rollout", "evaluate", "tradeoff", "envelope", "plan", "fabric")
+_SIMULATE = ("train", "rollout", "evaluate", "tradeoff", "envelope", "plan", "fabric", "sizes")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
