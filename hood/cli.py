@@ -28,6 +28,7 @@ COMMANDS = {
     "inspect": "say what files are, what is wrong with them and how to repair it",
     "prepare": "repair a garment, fit it to a body and write it for rollouts",
     "fabric": "compare fabrics, and drape them over a disc",
+    "sizes": "show several sizes of a garment on several bodies: how each sits, and one sheet",
     "plan": "measure which parts of the model a scene needs, and what each costs",
     "train": "train a network",
     "evaluate": "measure cost and accuracy of networks and of the solver, as a table",
@@ -39,7 +40,7 @@ COMMANDS = {
 _LESS_MEMORY = "free some, raise the limit (ulimit -v), or take a smaller garment, fewer frames or a smaller model"
 
 #: Commands that take steps: libraries for these are compiled while torch is loaded, where that has not been done before.
-_SIMULATE = ("train", "rollout", "evaluate", "tradeoff", "envelope", "plan", "fabric")
+_SIMULATE = ("train", "rollout", "evaluate", "tradeoff", "envelope", "plan", "fabric", "sizes")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -30,6 +30,8 @@ _PACKAGE = Path(__file__).resolve().parent
 CONFIG_FOLDER = _PACKAGE / "configs" if (_PACKAGE / "configs").is_dir() else _PACKAGE.parent / "configs"
 #: Keys that take one word or number, or a list.
 _ONE_OR_MORE = ("garment", "offset", "layers", "size")
+#: Keys that take a table of parts as well.
+_BY_PART = ("size",)
 #: Keys in here may be null: an energy that is left out.
 _OPTIONAL = "losses.terms."
 #: A key that its command checks itself.
@@ -281,6 +283,8 @@ def _check_types(name: str, known: DictConfig, config: DictConfig, prefix: str) 
         if isinstance(after, DictConfig) and isinstance(before, DictConfig):
             _check_types(name, before, after, f"{prefix}{key}.")
         elif key in _ONE_OR_MORE and isinstance(after, ListConfig):
+            continue
+        elif key in _BY_PART and isinstance(after, DictConfig):
             continue
         elif after is None and (prefix == _OPTIONAL or key == _FOLDER):
             continue

@@ -127,7 +127,8 @@ def plane_contact(pos: Tensor, normal: Tensor | None = None, height: float = 0.0
 def concatenate_contacts(contacts: list[Contact]) -> Contact:
     """Contact of several scenes as that of one batch; what none of them has stays None."""
     values = {field.name: [getattr(contact, field.name) for contact in contacts] for field in fields(Contact)}
-    return Contact(**{name: None if v[0] is None else torch.cat(v) for name, v in values.items()})
+    joined: dict[str, Any] = {name: None if v[0] is None else torch.cat(v) for name, v in values.items()}
+    return Contact(**joined)
 
 
 def assert_nearest(points: Tensor, targets: Tensor, found: Tensor) -> None:

@@ -12,6 +12,10 @@ from hood.commands.exit_codes import exit_code_lines
 from hood.config import CONFIG_FOLDER, headings, load_config, notes, options, plain, shown
 
 _EXAMPLES = {
+    "sizes": [
+        "hood sizes garment=tshirt",
+        "hood sizes garment=dress 'sizes={S:0.95,L:1.05}' 'shapes=[[],[2]]' sequence=plie output=outputs/dress_sizes",
+    ],
     "train": [
         "hood train experiment=quickstart output=runs/quickstart",
         "hood train model=ours trainer=paper data.garments=[dress]",
@@ -78,6 +82,7 @@ def describe(name: str) -> str:
     config = load_config(name)
     said, titles = notes(name), headings(name)
     lines = [f"usage: hood {name} {_BEFORE_KEYS.get(name, '')}[key=value ...]", ""]
+    lines += ["In a shell, words with brackets or braces stand in quotes: 'betas=[1.5,0]'.", ""]
     for key in config:
         value = plain(config[key])
         if isinstance(value, dict):

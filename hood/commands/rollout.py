@@ -35,8 +35,8 @@ from hood.commands.notices import heard
 from hood.commands.plan_auto import planned, without_accuracy
 from hood.commands.plan_file import plan_mode, plan_path, plan_sentences, rollout_config, summarise_plan
 from hood.commands.refinement import exported
+from hood.commands.resizing import describe_ease, summarise_ease
 from hood.commands.setup import Setup, check_config, make_stepper, set_up, solves_in_double
-from hood.commands.sizes import describe_ease, summarise_ease
 from hood.commands.summary import describe, describe_all, summarise
 from hood.commands.verdict import exit_code
 from hood.config import plain, save_run_record
@@ -186,6 +186,7 @@ def _finished(config: DictConfig, digest: str, folder: Path) -> dict[str, Any] |
     before.setdefault("formats", [])
     before["plan"] = before.get("plan") or now["plan"]
     before.setdefault("accuracy", None)
+    before.setdefault("fit", "betas")
     before.setdefault("events", [])
     before.setdefault("events_speed", now["events_speed"])
     same = all(before.get(key) == now[key] for key in now if key not in ("resume", "output", "allow_unsound"))

@@ -22,7 +22,7 @@ from hood.commands.guarding import check_guard
 from hood.commands.motion import check_motion_options, make_motion
 from hood.commands.plan_file import plan_path, read_watch
 from hood.commands.refinement import AUTO, check_refinement, chosen, refined
-from hood.commands.sizes import checked_sizes
+from hood.commands.resizing import checked_sizes, cut_to_size
 from hood.commands.steppers import PLAIN, make_network, make_solver, option_of
 from hood.config import ConfigError, build, load_config, require_choice
 from hood.dynamics.captured import MODES, network_of
@@ -123,6 +123,7 @@ def make_scene(config: DictConfig, garment: Garment | None = None, material: Mat
     motion = make_motion(config, torch.float64 if solves_in_double(config) else torch.float32)
     order = layer_order(config.layers, names_of(config.garment)) if garment is None else None
     garment = read_outfit(config.garment if garment is None else garment, motion, bool(config.triangulate), config.pins)
+    garment = cut_to_size(config, garment, motion)
     fabric = fabric_of(config, garment, motion) if material is None else material
     scene = with_events(replace(dress(garment, motion, fabric, checked_sizes(config)), layers=order), config)
     found = misplacement(scene)

@@ -1,58 +1,153 @@
-"""``size=`` and how the garment sits: keys of a rollout, and what its summary says."""
+"""``hood sizes``: a size run, how a garment in several sizes sits on bodies of several shapes, as one sheet."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict
+import json
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
+import numpy as np
 from omegaconf import DictConfig
+from tqdm import tqdm
 
-from hood.config import ConfigError, plain, shown
-from hood.dynamics.ease import Ease
-from hood.scene.sizing import Sizes, sizes_of
+from hood.assets.files.atomic import write_atomically
+from hood.commands.common import output_folder, prepare_folder, require_package
+from hood.commands.resizing import FITS
+from hood.commands.setup import check_config, make_stepper, set_up
+from hood.config import ConfigError, load_config, plain, require_choice
+from hood.dynamics.ease import Ease, measure_ease
+from hood.dynamics.recorder import RolloutData, still_of
+from hood.dynamics.rollout import simulate
+from hood.media.film import Film
+from hood.media.render import contact_sheet
+from hood.media.video import save_png
+
+#: The sizes of a run that names none.
+_USUAL = {"XS": 0.9, "S": 0.95, "M": 1.0, "L": 1.05, "XL": 1.1}
+#: Pixels of one picture of the sheet.
+_WIDTH, _HEIGHT = 300, 460
+#: Keys that are those of ``hood rollout``.
+_KEYS = ("garment", "fit", "sequence", "num_frames", "body", "material", "stepper", "checkpoint", "refine", "pins")
 
 
-def checked_sizes(config: DictConfig) -> Sizes:
-    """The sizes that the config asks for.
+@dataclass(frozen=True)
+class Worn:
+    """A size on a body at the last frame.
 
-    Raises:
-        ConfigError: they are none, or they change in steps of fixed shapes.
+    Args:
+        size: its name.
+        shape: the body's shape coefficients.
+        ease: how it sits.
+        still: that frame alone, to be drawn.
     """
-    end, seconds = plain(config.size_end), float(config.size_seconds)
-    if not seconds > 0:
-        raise ConfigError(f"size_seconds={config.size_seconds}: give seconds above 0, such as size_seconds=2")
-    for key in ("size", "size_end"):
-        try:
-            sizes = sizes_of(plain(config.size) if config[key] is None else plain(config[key]))
-        except (ValueError, TypeError) as error:
-            raise ConfigError(f"{key}={shown(config[key])}: {error}") from error
-    sizes = sizes_of(plain(config.size), end, seconds)
-    if sizes.changing and str(config.step) != "plain":
+
+    size: str
+    shape: tuple[float, ...]
+    ease: Ease
+    still: RolloutData
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run the command; returns the exit code."""
+    config = load_config("sizes", arguments)
+    require_choice(config, "fit", FITS)
+    folder = output_folder(config)
+    require_package("PIL", "Pillow", "pictures", "the sheet of hood sizes")
+    asked = [_rollout_config(config, size, shape) for shape in _shapes(config) for size in _sizes(config).values()]
+    for one in asked:
+        check_config(one)
+    prepare_folder(folder)
+    names = [(size, shape) for shape in _shapes(config) for size in _sizes(config)]
+    runs = zip(names, asked, strict=True)
+    worn = [_wear(size, shape, one) for (size, shape), one in tqdm(runs, total=len(names), desc="sizes", disable=None)]
+    print("\n".join(_table(worn)))
+    record = [{"size": one.size, "shape": one.shape} | asdict(one.ease) | {"word": one.ease.word} for one in worn]
+    write_atomically(folder / "sizes.json", json.dumps(record, indent=1).encode())
+    save_png(folder / "sheet.png", _sheet(worn, len(_sizes(config))))
+    print(f"\nwritten: {folder / 'sheet.png'}, {folder / 'sizes.json'}")
+    return 0
+
+
+def _sizes(config: DictConfig) -> dict[str, Any]:
+    """What ``size`` of a rollout is to be, by the names of the sizes."""
+    sizes = _USUAL if config.sizes is None else plain(config.sizes)
+    if not isinstance(sizes, dict) or not sizes:
+        raise ConfigError(f"sizes={sizes}: give names and factors, such as sizes={{S:0.95,M:1,L:1.05}}")
+    return {str(name): size for name, size in sizes.items()}
+
+
+def _shapes(config: DictConfig) -> list[tuple[float, ...]]:
+    shapes = plain(config.shapes)
+    if not isinstance(shapes, list) or not shapes or not all(isinstance(shape, list) for shape in shapes):
         raise ConfigError(
-            f"size_end={end}: step={config.step} has fixed shapes, which a garment that grows has not; use step=plain"
+            f"shapes={shapes}: give lists of shape coefficients, such as shapes=[[],[2],[-2]]; [] is the mean body"
         )
-    return sizes
+    return [tuple(shape) for shape in shapes]
 
 
-def summarise_ease(first: Ease | None, last: Ease | None) -> dict[str, Any]:
-    """What ``summary.json`` says of how the garment sat in frame 0 and in the last one; nothing where it was not measured."""
-    if first is None or last is None:
-        return {}
-    return {"ease": {name: asdict(ease) | {"word": ease.word} for name, ease in (("first", first), ("last", last))}}
+def _rollout_config(config: DictConfig, size: Any, shape: tuple[float, ...]) -> DictConfig:
+    """The rollout of one size on one body: nothing is measured on the way."""
+    keys = {key: config[key] for key in _KEYS} | {"size": size, "betas": list(shape)}
+    words = [f"{key}={_word(plain(value))}" for key, value in keys.items() if value is not None]
+    return load_config("rollout", [*words, "metrics=none", "guard=off", "video=none"])
 
 
-def describe_ease(summary: Mapping[str, Any]) -> list[str]:
-    """A line on it; none where the summary does not say."""
-    found = summary.get("ease")
-    if not found:
-        return []
-    words = []
-    for name, when in (("first", "frame 0"), ("last", "the last frame")):
-        ease = found[name]
-        low, middle, high = (1e3 * value for value in ease["gap"])
-        skin = f"skin {low:.0f}, {middle:.0f}, {high:.0f} mm away at p5, p50, p95; on the skin {100 * ease['on_skin']:.0f}%"
-        skin = skin if low == low else "no skin within 10 cm"
-        stretched = f"stretched by {100 * ease['stretch']:.1f}% there; upper rim {100 * ease['slid']:.0f} cm down"
-        words.append(f"{when}: {ease['word']} ({skin}, {stretched})")
-    return ["size, " + "; ".join(words)]
+def _word(value: Any) -> str:
+    """As Hydra writes it."""
+    if isinstance(value, dict):
+        return "{" + ",".join(f"{key}:{_word(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ",".join(map(_word, value)) + "]"
+    return json.dumps(value) if isinstance(value, str) and not value.isidentifier() else str(value)
+
+
+def _wear(size: str, shape: tuple[float, ...], config: DictConfig) -> Worn:
+    """The garment after the frames of its rollout."""
+    ready = set_up(config, make_stepper(config)[0], tell=lambda sentence: None)
+    scene, count = ready.scene, min(int(config.num_frames), ready.scene.num_frames)
+    frames = simulate(ready.stepper, scene, ready.potential, count, metrics="none", settle=str(ready.config.settle))
+    (frame,) = deque(frames, maxlen=1)
+    ease = measure_ease(scene, scene.cloth_at(frame.index), frame.state, frame.index)
+    if ease is None:
+        raise ConfigError(f"body={config.body}: there is nobody who wears the garment; give a body")
+    still = RolloutData(
+        frame.world_pos.numpy()[None],
+        scene.garment.faces,
+        scene.cloth.rest_pos.cpu().numpy(),
+        frame.body_pos.numpy()[None],
+        np.asarray(scene.motion.faces),
+        np.zeros(1),
+        {},
+        {"garment": scene.garment.name},
+        still=still_of(scene.garment),
+    )
+    return Worn(size, shape, ease, still)
+
+
+def _table(worn: Sequence[Worn]) -> list[str]:
+    head = ("shape", "size", "sits", "skin mm, p5", "p50", "p95", "on skin", "stretched", "slid cm")
+    rows: list[tuple[str, ...]] = [head]
+    for one in worn:
+        ease = one.ease
+        gaps = [f"{1e3 * value:.0f}" for value in ease.gap]
+        shares = (f"{100 * ease.on_skin:.0f}%", f"{100 * ease.stretch:.1f}%", f"{100 * ease.slid:.1f}")
+        rows.append((_shown(one.shape), one.size, ease.word, *gaps, *shares))
+    widths = [max(len(row[column]) for row in rows) + 2 for column in range(len(head))]
+    return ["".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
+def _shown(shape: tuple[float, ...]) -> str:
+    return f"[{','.join(f'{value:g}' for value in shape)}]" if shape else "mean"
+
+
+def _sheet(worn: Sequence[Worn], columns: int) -> np.ndarray:
+    """A row for each body, a column for each size; one scale of strain for all."""
+    stills = [one.still for one in worn]
+    pictures = []
+    for place, one in enumerate(worn):
+        others = stills[:place] + stills[place + 1 :]
+        pictures.append(Film(one.still, _WIDTH, _HEIGHT, colour="strain", beside=others).frame(0))
+    labels = [f"{one.size}, body {_shown(one.shape)}: {one.ease.word}" for one in worn]
+    return contact_sheet(pictures, columns, labels)

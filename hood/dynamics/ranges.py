@@ -91,7 +91,7 @@ def scene_conditions(
 ) -> Conditions:
     """What a garment of the fabric of ``cloth`` asks of a model, in steps of ``dt`` [s], at the size it has or at ``sizes``, on
     a body of shape ``betas`` (S,), under ``gravity`` [m/s²]."""
-    factors = (1.0,) if sizes is None else (*sizes.start, *sizes.end)
+    factors = (1.0,) if sizes is None else (*sizes.start, *sizes.end, *sizes.parts)
     size = min(factors), max(factors)
     spans: dict[str, Span] = {"fps": (1.0 / dt, 1.0 / dt), "size": size, "gravity": (gravity, gravity)}
     fabric = {f"material.{name}": getattr(cloth, name) for name in Material.names()}

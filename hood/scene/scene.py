@@ -248,14 +248,15 @@ def build_scene(
 
 
 def dress(garment: Garment, motion: Motion, material: Material | None = None, size: Size | Sizes = 1.0) -> Scene:
-    """Garment on whatever moves, in the motion's precision and on its device; ``size`` scales the rest shape.
+    """Garment on whatever moves, in the motion's precision and on its device; ``size`` scales the rest shape, which is that of
+    the body's shape if it is made to measure.
 
     Raises:
         ValueError: the garment cannot follow the body, or is not on it in the motion's first frame.
     """
     garment = motion.dressed(garment)
     sizes = size if isinstance(size, Sizes) else sizes_of(size)
-    rest_pos = motion.rest_pos(garment) * np.array(sizes.start)
+    rest_pos = (motion.rest_pos(garment) if sizes.to_measure else garment.rest_pos) * np.array(sizes.start)
     fabric = material or Material()
     cloth = build_cloth(rest_pos, garment.faces, fabric, garment.pinned, stiffness=garment.stiffness, dtype=motion.dtype)
     cloth = to_device(cloth, motion.device)

@@ -25,6 +25,10 @@ class Sizes:
 
     On the way the factor is a polynomial of fifth degree whose speed and acceleration are zero at both ends: nothing jerks.
 
+    Args:
+        parts: factors by which parts of the garment were cut before (:mod:`hood.assets.garment.tailoring`).
+        to_measure: whether the rest shape is that of the body's shape, or of the mean body whoever wears it.
+
     Raises:
         ValueError: a factor that is no size, or a time that is not positive.
     """
@@ -32,9 +36,11 @@ class Sizes:
     start: tuple[float, float, float] = (1.0, 1.0, 1.0)
     end: tuple[float, float, float] = (1.0, 1.0, 1.0)
     seconds: float = 1.0
+    parts: tuple[float, ...] = ()
+    to_measure: bool = True
 
     def __post_init__(self) -> None:
-        for factor in (*self.start, *self.end):
+        for factor in (*self.start, *self.end, *self.parts):
             if not LEAST <= factor <= MOST:
                 raise ValueError(f"size is {factor:g}; give a factor of the garment, {LEAST:g} to {MOST:g}")
         if not (math.isfinite(self.seconds) and self.seconds > 0):

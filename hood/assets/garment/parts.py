@@ -1,4 +1,4 @@
-"""Parts of a garment by name: a garment of an outfit, what is above or below a joint, a painted colour, a list of vertices."""
+"""Parts of a garment by name: one of an outfit, sleeves, what is above or below a joint, a painted colour, listed vertices."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from hood.assets.garment.pins import JOINTS, REGIONS, read_indices
 
 #: Colours of vertices that are names of parts.
 COLOURS = ("red", "green", "blue")
+#: Cloth farther out than the shoulders, by the sides of the body on which it is.
+SLEEVES = {"sleeves": ("left", "right"), "sleeve_left": ("left",), "sleeve_right": ("right",)}
 #: A vertex is of a colour that exceeds the two others by this much of the full scale.
 _STRENGTH = 0.5
 
@@ -23,15 +25,17 @@ def part_faces(part: str, garment: Garment, body: Body | None) -> np.ndarray:
 
     Args:
         part: the name of a garment of an outfit; ``above_JOINT`` or ``below_JOINT``, by the height of the centre in T-pose, the
-            joint by its own name or that of an opening (:data:`hood.assets.garment.pins.REGIONS`); one of :data:`COLOURS`, of
-            the vertices in the mesh file; or the path of a ``.txt`` or ``.json`` list of vertices.
+            joint by its own name or that of an opening (:data:`hood.assets.garment.pins.REGIONS`); one of :data:`SLEEVES`; one
+            of :data:`COLOURS`, of the vertices in the mesh file; or the path of a ``.txt`` or ``.json`` list of vertices.
         body: whose joints are meant, in T-pose; None refuses them.
 
     Raises:
         ValueError: the garment has no such part, or no face in it; names what there is.
     """
     side, _, joint = part.partition("_")
-    if side in ("above", "below") and joint:
+    if part in SLEEVES:
+        found = _sleeves(part, garment, body)
+    elif side in ("above", "below") and joint:
         found = _beside(part, side, joint, garment, body)
     elif Path(part).suffix.lower() in (".txt", ".json"):
         found = _listed(Path(part).expanduser(), garment)
@@ -47,7 +51,7 @@ def part_faces(part: str, garment: Garment, body: Body | None) -> np.ndarray:
 def _piece(part: str, garment: Garment) -> np.ndarray:
     names = garment.name.split("+")
     if part not in names:
-        known = unknown("part", part, [*names, "above_JOINT", "below_JOINT", *COLOURS])
+        known = unknown("part", part, [*names, "above_JOINT", "below_JOINT", *SLEEVES, *COLOURS])
         raise ValueError(f"garment {garment.name!r}: {known}; or a .txt or .json list of vertices")
     if garment.piece is None or len(names) == 1:
         return np.ones(len(garment.faces), dtype=bool)
@@ -58,14 +62,35 @@ def _beside(part: str, side: str, joint: str, garment: Garment, body: Body | Non
     name = REGIONS.get(joint, joint)
     if name not in JOINTS:
         raise ValueError(f"part {part!r}: {unknown('joint', joint, [*REGIONS, *JOINTS])}")
+    above = _centres(garment)[:, 1] > _joint(part, name, body)[1]
+    return np.asarray(above if side == "above" else ~above)
+
+
+def _sleeves(part: str, garment: Garment, body: Body | None) -> np.ndarray:
+    """Farther out than a shoulder, and above the chest: a wide skirt is no sleeve."""
+    centres = _centres(garment)
+    high = centres[:, 1] > _joint(part, "spine2", body)[1]
+    found = np.zeros(len(centres), dtype=bool)
+    for side in SLEEVES[part]:
+        out = _joint(part, f"{side}_shoulder", body)[0]
+        found |= high & (centres[:, 0] * np.sign(out) > abs(out))
+    return found
+
+
+def _centres(garment: Garment) -> np.ndarray:
+    """(F, 3) m, in T-pose."""
+    pos = garment.rest_pos if garment.skin_pos is None else garment.skin_pos
+    return np.asarray(pos[garment.faces].mean(axis=1))
+
+
+def _joint(part: str, name: str, body: Body | None) -> np.ndarray:
+    """(3,) m, of the mean body in T-pose."""
     if body is None:
-        raise ValueError(f"part {part!r}: heights of joints need a body with joints; give a list of vertices")
+        raise ValueError(f"part {part!r}: places of joints need a body with joints; give a list of vertices")
     joints = body.shaped(np.zeros(0))[1]
     if JOINTS.index(name) >= len(joints):
-        raise ValueError(f"part {part!r}: the body has {len(joints)} joints and no {name}; give another joint")
-    pos = garment.rest_pos if garment.skin_pos is None else garment.skin_pos
-    above = pos[garment.faces, 1].mean(axis=1) > joints[JOINTS.index(name), 1]
-    return np.asarray(above if side == "above" else ~above)
+        raise ValueError(f"part {part!r}: the body has {len(joints)} joints and no {name}; give another part")
+    return np.asarray(joints[JOINTS.index(name)])
 
 
 def _listed(path: Path, garment: Garment) -> np.ndarray:

@@ -25,6 +25,19 @@ def test_above_and_below_a_joint_are_the_whole(garments: dict[str, Garment], bod
     np.testing.assert_array_equal(part_faces("above_spine1", dress, body), above)
 
 
+def test_sleeves_lie_farther_out_than_the_shoulders(garments: dict[str, Garment], body: Body) -> None:
+    shirt = garments["longsleeve"]
+    both, left, right = (part_faces(name, shirt, body) for name in ("sleeves", "sleeve_left", "sleeve_right"))
+    np.testing.assert_array_equal(both, left | right)
+    assert not (left & right).any()
+    centres = shirt.tpose(np.zeros(0))[shirt.faces].mean(axis=1)
+    shoulder = body.shaped(np.zeros(0))[1][JOINTS.index("left_shoulder"), 0]
+    assert centres[left, 0].min() > shoulder > 0 > -shoulder > centres[right, 0].max()
+    assert 0.3 < both.mean() < 0.7
+    with pytest.raises(ValueError, match="part 'sleeves': no face of garment 'skirt'"):
+        part_faces("sleeves", garments["skirt"], body)
+
+
 def test_garments_of_an_outfit(garments: dict[str, Garment]) -> None:
     outfit = join_garments([garments["tank"], garments["skirt"]])
     tank, skirt = (part_faces(name, outfit, None) for name in ("tank", "skirt"))
@@ -46,7 +59,8 @@ def test_painted_and_listed_parts_are_the_faces_with_most_corners_there(tmp_path
 @pytest.mark.parametrize(
     ("part", "message"),
     [
-        ("sleeve", "garment 'tank': unknown part 'sleeve'.*known are tank, above_JOINT"),
+        ("sleeve", "garment 'tank': unknown part 'sleeve': did you mean 'sleeves'"),
+        ("collar", "garment 'tank': unknown part 'collar'.*known are tank, above_JOINT"),
         ("below_wristband", "part 'below_wristband': unknown joint 'wristband': did you mean 'waistband'"),
         ("red", "part 'red': 'tank' has no vertex colours; paint the part"),
         ("above_head", "part 'above_head': no face of garment 'tank' is in it"),
@@ -58,7 +72,7 @@ def test_parts_that_a_garment_does_not_have(part: str, message: str, garments: d
 
 
 def test_what_needs_more_says_so(tmp_path: Path, garments: dict[str, Garment]) -> None:
-    with pytest.raises(ValueError, match="heights of joints need a body with joints"):
+    with pytest.raises(ValueError, match="places of joints need a body with joints"):
         part_faces("above_waistband", garments["tank"], None)
     (tmp_path / "far.txt").write_text("5 99999")
     with pytest.raises(ValueError, match=r"far.txt: vertex 99999 of 1016"):
