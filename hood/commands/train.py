@@ -64,6 +64,11 @@ def run(overrides: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     config = load_config("train", overrides)
     require_device(config)
+    return together(lambda: _train(config))
+
+
+def _check_values(config: DictConfig) -> None:
+    """Raise ConfigError where a key has a value that no training can have, before a file is read."""
     for key, least in (("seed", 0), ("validation_states", 0), ("data.validation_frames", 2)):
         if int(OmegaConf.select(config, key)) < least:
             raise ConfigError(f"{key}={OmegaConf.select(config, key)}: must be at least {least}")
@@ -72,7 +77,6 @@ def run(overrides: Sequence[str]) -> int:
     check_rate(config, "data.fps")
     if not len(config.data.garments):
         raise ConfigError("data.garments=[]: give at least one, such as data.garments=[dress]")
-    return together(lambda: _train(config))
 
 
 def _train(config: DictConfig) -> int:
@@ -118,6 +122,7 @@ def _run(config: DictConfig, trainer: Trainer, folder: Path) -> int:
 
 def make_trainer(config: DictConfig) -> Trainer:
     """Everything named in the config, put together; seeds are set before the weights are made."""
+    _check_values(config)
     torch.manual_seed(int(config.seed))
     simulator: Simulator = build(config.model)
     settings: TrainerSettings = build(config.trainer)

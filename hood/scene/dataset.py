@@ -84,7 +84,7 @@ class SceneSampler:
         device: str = "cpu",
     ) -> None:
         if not garments or not sequences:
-            raise ValueError("training needs at least one garment (data.garments) and one motion (data.sequences)")
+            raise ValueError("training needs at least one garment and one motion (data.garments, data.sequences)")
         _check_ranges(beta_range, size_range, piecewise_fraction)
         self.body = body
         self.garments = [hold_on_trunk(bind_garment(garment, body), body) for garment in garments]
