@@ -82,7 +82,7 @@ def describe(name: str) -> str:
     config = load_config(name)
     said, titles = notes(name), headings(name)
     lines = [f"usage: hood {name} {_BEFORE_KEYS.get(name, '')}[key=value ...]", ""]
-    lines += ["In a shell, words with brackets or braces stand in quotes: 'betas=[1.5,0]'.", ""]
+    lines += ["In a shell, put words with brackets or braces in quotes: 'key=[1,2]'.", ""]
     for key in config:
         value = plain(config[key])
         if isinstance(value, dict):
