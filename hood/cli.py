@@ -21,19 +21,19 @@ ENVIRONMENT = {
     "MALLOC_TOP_PAD_": "67108864",
 }
 COMMANDS = {
-    "train": "train a model from a config",
-    "rollout": "simulate a garment on a moving body",
-    "evaluate": "table of cost and accuracy over the validation list",
-    "tradeoff": "chart of time against accuracy over models, refinements and sizes",
-    "envelope": "map of where each method holds, at the extremes of everything",
-    "plan": "measure which parts of the model a scene needs, and what each costs",
-    "compare": "show rollouts of one motion next to each other, coloured by strain or rg",
-    "fabric": "compare fabrics, and drape them over a disc",
-    "sizes": "size run: several sizes of a garment on several bodies",
+    "rollout": "simulate garments on a moving body: positions, a film, a verdict",
     "view": "write rollouts as one HTML page to turn and play in a browser",
+    "compare": "film rollouts of one motion side by side, coloured by strain, unbalanced force or distance",
     "export": "write a rollout for other programs: USD, glTF, PC2, OBJ, PLY",
     "inspect": "say what files are, what is wrong with them and how to repair it",
-    "prepare": "repair a garment, bind it to a body and write it for rollouts",
+    "prepare": "repair a garment, fit it to a body and write it for rollouts",
+    "fabric": "compare fabrics, and drape them over a disc",
+    "sizes": "show several sizes of a garment on several bodies: how each sits, and one sheet",
+    "plan": "measure which parts of the model a scene needs, and what each costs",
+    "train": "train a network",
+    "evaluate": "measure cost and accuracy of networks and of the solver, as a table",
+    "tradeoff": "measure time against accuracy for many settings, as a chart",
+    "envelope": "measure where each method holds and fails, in extreme scenes, as a map",
     "convert": "write published HOOD weights (.pth) as a model file",
 }
 
@@ -100,6 +100,7 @@ def _is_memory(error: Exception) -> bool:
 def _describe(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename and error.strerror:
         hints = {
+            2: "check the path",
             13: "choose a folder you may write to",
             17: "choose another output",
             20: "choose another output",
@@ -130,7 +131,13 @@ def _command(name: str) -> Callable[[Sequence[str]], int]:
 def _usage() -> str:
     lines = ["usage: hood COMMAND [key=value ...]", ""]
     lines += [f"  {name:<10}{text}" for name, text in COMMANDS.items()]
-    lines += ["", "hood COMMAND --help lists the keys, their defaults and the names that can be given.", "", *exit_code_lines()]
+    lines += [
+        "",
+        "hood COMMAND --help lists the keys, their defaults and the names that can be given.",
+        "hood --version: the version.",
+        "",
+    ]
+    lines += ["begin with: hood rollout garment=dress sequence=walk_proud output=outputs/first", "", *exit_code_lines()]
     return "\n".join(lines)
 
 

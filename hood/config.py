@@ -6,6 +6,7 @@ import copy
 import json
 import math
 import platform
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -33,8 +34,14 @@ _ONE_OR_MORE = ("garment", "offset", "layers", "size")
 _BY_PART = ("size",)
 #: Keys in here may be null: an energy that is left out.
 _OPTIONAL = "losses.terms."
+#: A key that its command checks itself.
+_FOLDER = "output"
 #: Of a key that is not there.
 _ABSENT = object()
+#: What a value must be, by the type of the default that it replaces.
+_KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text", ListConfig: "a list in brackets"}
+#: Characters of a comment that is repeated in a message; a longer one is read in --help.
+_SHORT_NOTE = 160
 #: Bytes of a run's record at most, levels of its nesting, and characters of a reason why it is none.
 _RECORD_LIMIT, _DEEPEST, _REASON = 1 << 20, 32, 300
 #: What configs may name; and classes of plugins (:mod:`hood.plugins`).
@@ -64,13 +71,14 @@ def load_config(name: str, overrides: Sequence[str] = ()) -> DictConfig:
                 if not _is_group(override):
                     _check_key(override, known)
             config = compose(name, plugins + list(overrides))
+            _check_sources(config)
             OmegaConf.resolve(config)
         except ConfigError:
             raise
         except (HydraException, OmegaConfBaseException) as error:
             raise ConfigError(f"configuration: {_one_line(error)}") from error
     OmegaConf.set_struct(config, True)
-    _check_types(known, config, "")
+    _check_types(name, known, config, "")
     return config
 
 
@@ -128,6 +136,39 @@ def _require_plain(text: str) -> None:
             raise ConfigError(f"it is nested more than {_DEEPEST} deep")
 
 
+def notes(name: str) -> dict[str, str]:
+    """The comments behind the keys of ``configs/<name>.yaml``: what ``--help`` says of each, ``a.b`` for a key in another."""
+    found: dict[str, str] = {}
+    path: list[str] = []
+    for line in (CONFIG_FOLDER / f"{name}.yaml").read_text(encoding="utf-8").splitlines():
+        match = re.match(r"( *)(- )?(\w+):[^#]*(?:#\s*(.*))?$", line)
+        if match:
+            group = match.group(2) is not None  # an entry of the list of groups
+            path = [] if group else [*path[: len(match.group(1)) // 2], match.group(3)]
+            found[match.group(3) if group else ".".join(path)] = match.group(4) or ""
+    return {key: note for key, note in found.items() if note}
+
+
+def headings(name: str) -> dict[str, str]:
+    """The lines ``#: …`` of ``configs/<name>.yaml``, by the key that follows each."""
+    text = (CONFIG_FOLDER / f"{name}.yaml").read_text(encoding="utf-8")
+    return {key: title for title, key in re.findall(r"^#: (.*)\n(\w+):", text, flags=re.MULTILINE)}
+
+
+def shown(value: Any) -> str:
+    """A value as it is written behind its key: ``true``, ``null``, ``[a,b]``, ``0.01``."""
+    value = plain(value)
+    if isinstance(value, (list, tuple)):
+        return "[" + ",".join(shown(item) for item in value) + "]"
+    if isinstance(value, dict):
+        return "{" + ",".join(f"{key}:{shown(item)}" for key, item in value.items()) + "}"
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
 def options(group: str) -> list[str]:
     """Names of a config group's options, those of plugins among them."""
     return sorted({path.stem for folder in (CONFIG_FOLDER, *config_folders()) for path in (folder / group).glob("*.yaml")})
@@ -140,8 +181,9 @@ def groups() -> list[str]:
 
 def require_choice(config: DictConfig, key: str, known: Sequence[str]) -> None:
     """Raise ConfigError unless ``config[key]`` is one of ``known``; names the near miss."""
-    if str(config[key]) not in known:
-        raise ConfigError(unknown(f"value for {key}", str(config[key]), known))
+    given = str(OmegaConf.select(config, key))
+    if given not in known:
+        raise ConfigError(unknown(f"value for {key}", given, known))
 
 
 def with_words(config: DictConfig, words: Sequence[str]) -> DictConfig:
@@ -179,12 +221,18 @@ def save_run_record(folder: Path, config: DictConfig, seed: int) -> None:
 
 
 def _check_override(name: str, text: str, defaults: DictConfig) -> tuple[str, Override]:
+    if text.startswith("-"):
+        word = text.lstrip("-") if "=" in text else "key=value"
+        raise ConfigError(f"{text!r}: keys have no dashes; write {word}, hood {name} --help lists the keys")
     if "=" not in text and not text.startswith("~"):
         raise ConfigError(f"argument {text!r} is not of the form key=value; keys of {name}: {', '.join(defaults)}")
     try:
         override = OverridesParser.create().parse_override(text)
     except HydraException as error:
-        raise ConfigError(f"cannot read {text[:_REASON]!r}: quote values with spaces or brackets, key=\"'value'\"") from error
+        raise ConfigError(
+            f"cannot read {text[:_REASON]!r}: close every bracket, and put a value that holds one of = , [ ] {{ }} or a space "
+            f"into two pairs of quotes, key=\"'value'\""
+        ) from error
     key = override.get_key_element().lstrip("+~").split("@")[0]
     if _is_group(override) and override.value() is None and defaults.get(key) is not None:
         raise ConfigError(f"{key}=null: cannot be left out; give one of {', '.join(options(key))}")
@@ -225,23 +273,51 @@ def _siblings(known: DictConfig, key: str) -> list[str]:
     return []
 
 
-def _check_types(known: DictConfig, config: DictConfig, prefix: str) -> None:
-    """A value must have the kind of the default it replaces, and be finite as it is; a None default takes anything."""
-    for key in map(str, config):
+def _check_types(name: str, known: DictConfig, config: DictConfig, prefix: str) -> None:
+    """A value must have the kind of the default it replaces, and be finite as it is; a None default takes anything.
+
+    Plain keys come before those below them, which may take their values from them.
+    """
+    for key in sorted(map(str, config), key=lambda key: isinstance(config[key], DictConfig)):
         before, after = known.get(key), config[key]
         if isinstance(after, DictConfig) and isinstance(before, DictConfig):
-            _check_types(before, after, f"{prefix}{key}.")
+            _check_types(name, before, after, f"{prefix}{key}.")
         elif key in _ONE_OR_MORE and isinstance(after, ListConfig):
             continue
         elif key in _BY_PART and isinstance(after, DictConfig):
             continue
-        elif after is None and prefix == _OPTIONAL:
+        elif after is None and (prefix == _OPTIONAL or key == _FOLDER):
             continue
         elif before is not None and not _same_kind(before, after):
-            kind = "list" if isinstance(before, ListConfig) else type(before).__name__
-            raise ConfigError(f"{prefix}{key}={after!r}: expected a value like {plain(before)!r} ({kind})")
+            raise ConfigError(_wrong_kind(name, f"{prefix}{key}", before, after))
         elif isinstance(before, (int, float)) and math.isfinite(before) and not math.isfinite(after):
-            raise ConfigError(f"{prefix}{key}={after}: must be finite; {plain(before)!r} is the default")
+            raise ConfigError(f"{prefix}{key}={after}: must be finite; {shown(before)} is the default")
+
+
+def _wrong_kind(name: str, key: str, before: Any, after: Any) -> str:
+    """The sentence for a value of another kind than the default's: what the key takes, and where to read more."""
+    kind = _KINDS.get(type(before), "keys and values in braces")
+    if key in _ONE_OR_MORE:
+        kind += " or a list in brackets"
+    elif isinstance(before, str) and isinstance(after, ListConfig):
+        kind = "one text, not a list"
+    usual = f"such as {key}={shown(before)}" if shown(before) not in ("", "[]") else f"the default is {key}={shown(before)}"
+    note = notes(name).get(key, "")
+    note = f"hood {name} --help says of {key}: {note}" if 0 < len(note) <= _SHORT_NOTE else f"see hood {name} --help"
+    return f"{key}={shown(after)[:_REASON]}: give {kind}, {usual}; {note}"
+
+
+def _check_sources(config: DictConfig) -> None:
+    """Raise ConfigError where an energy is left out from which another one takes values."""
+    terms = OmegaConf.to_container(config, resolve=False).get("losses", {}).get("terms", {})  # type: ignore[union-attr]
+    for holder, values in terms.items():
+        sources = re.findall(rf"\$\{{{re.escape(_OPTIONAL)}(\w+)\.", str(values))
+        source = next((source for source in sources if terms.get(source) is None), None)
+        if source is not None:
+            raise ConfigError(
+                f"{_OPTIONAL}{source}=null: {_OPTIONAL}{holder} takes values from it; add {_OPTIONAL}{holder}=null as well, "
+                f"or give {_OPTIONAL}{source}.weight=0 instead"
+            )
 
 
 def _same_kind(before: Any, after: Any) -> bool:
@@ -251,7 +327,7 @@ def _same_kind(before: Any, after: Any) -> bool:
         return isinstance(after, (int, float))
     if isinstance(before, str):
         # Names may look like numbers (garment=12): taken as text.
-        return isinstance(after, (str, int, float)) or after is None
+        return isinstance(after, (str, int, float))
     if isinstance(before, ListConfig):
         return isinstance(after, ListConfig)
     return isinstance(after, type(before))

@@ -13,7 +13,7 @@ import torch
 
 from hood import __version__
 from hood.assets.files.library import names
-from hood.cli import main
+from hood.cli import COMMANDS, main
 from hood.dynamics.checkpoint import save_simulator
 from hood.dynamics.recorder import read_rollout
 from hood.dynamics.simulator import build_simulator
@@ -77,7 +77,7 @@ ERRORS: dict[str, tuple[list[str], tuple[str, ...], Prepare]] = {
     "missing checkpoint": (["rollout", "checkpoint=a/m.safetensors"], ("a/m.safetensors", "no such file"), lambda: None),
     "misspelt device": (["rollout", *UNTRAINED, "device=cup"], ("'cup'", "'cpu'"), lambda: None),
     "misspelt video": (["rollout", *UNTRAINED, "video=mp5"], ("'mp5'", "'mp4'"), lambda: None),
-    "wrong type": (["rollout", *UNTRAINED, "num_frames=abc"], ("num_frames", "'abc'"), lambda: None),
+    "wrong type": (["rollout", *UNTRAINED, "num_frames=abc"], ("num_frames=abc", "a whole number"), lambda: None),
     "no frames": (["rollout", *UNTRAINED, "num_frames=0"], ("num_frames=0",), lambda: None),
     "negative seed": (["rollout", *UNTRAINED, "seed=-1"], ("seed=-1",), lambda: None),
     "frame rate": (["rollout", *UNTRAINED, "fps=0"], ("fps",), lambda: None),
@@ -165,6 +165,43 @@ def test_user_errors_are_one_line_and_leave_nothing(case: str, capsys: pytest.Ca
     assert captured.err.count("\n") == 1, captured.err
     assert all(word in captured.err for word in words), captured.err
     assert sorted(path.name for path in tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_a_help_that_says_what_each_key_is(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    from hood.config import load_config, notes, plain
+
+    assert main([command, "--help"]) == 0
+    text = capsys.readouterr().out
+    assert f"\n  hood {command}" in text  # an example
+    said = notes(command)
+    for key, value in load_config(command).items():
+        if not isinstance(plain(value), dict):
+            assert f"  {key}=" in text
+            assert len(said[str(key)]) > 10, key
+    assert max(len(line) for line in text.splitlines()) <= 120
+
+
+def test_help_of_groups_has_each_key_with_its_meaning(capsys: pytest.CaptureFixture[str]) -> None:
+    for command, keys in (
+        ("train", ("trainer.iterations", "trainer.horizon.start", "data.sampling.mirror")),
+        ("rollout", ("material.density", "solver.target_rg")),
+    ):
+        assert main([command, "--help"]) == 0
+        text = capsys.readouterr().out
+        for key in keys:
+            (line,) = [line for line in text.splitlines() if line.startswith(f"  {key}=")]
+            assert len(line.split("  ")[-1]) > 10, line
+
+
+def test_the_help_of_a_rollout_has_headings(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["rollout", "--help"]) == 0
+    text = capsys.readouterr().out
+    places = [
+        text.index(f"\n{title}\n  {key}=")
+        for title, key in (("The scene", "garment"), ("The run", "seed"), ("Time and forces", "fps"))
+    ]
+    assert places == sorted(places)
 
 
 @pytest.mark.parametrize("command", ["train", "rollout", "evaluate", "tradeoff", "envelope"])

@@ -75,7 +75,8 @@ def identify(name: str) -> str:
         if garment_names(content):
             return GARMENT
         return _kind_of_keys(path, [str(key) for key in content] if isinstance(content, dict) else [])
-    raise ValueError(f"{path}: unknown file type {path.suffix!r}; nothing here reads it")
+    kind = f"unknown file type {path.suffix!r}" if path.suffix else "its name has no ending, such as .obj or .npz"
+    raise ValueError(f"{path}: {kind}; convert or rename it, docs/files.md lists what is read")
 
 
 def _kind_of_keys(path: Path, keys: Collection[str]) -> str:

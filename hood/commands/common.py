@@ -115,7 +115,12 @@ def prepare_folder(folder: Path) -> Path:
     Raises:
         OSError: it cannot be made or written to.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    if folder.exists() and not folder.is_dir():
+        raise FileExistsError(f"output={folder}: a file of this name exists; choose another output, a folder")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileNotFoundError as error:  # as below /proc
+        raise FileNotFoundError(f"output={folder}: the folder cannot be made there; choose another output") from error
     if not os.access(folder, os.W_OK):
         raise PermissionError(13, "Permission denied", str(folder))
     return folder

@@ -64,7 +64,7 @@ def _split(arguments: Sequence[str]) -> tuple[list[Path], DictConfig]:
     given, config = split_words("compare", arguments)
     files = [str(config[key]) for key in ("a", "b") if config[key] is not None] + given
     if len(files) < 2:
-        raise ConfigError(f"{len(files)} rollouts are given, two or more are compared: hood compare A.h5 B.h5")
+        raise ConfigError(f"number of rollouts given: {len(files)}; give two or more, hood compare A.h5 B.h5")
     return [Path(name).expanduser() for name in files], config
 
 

@@ -15,7 +15,7 @@ from hood.commands.common import held_folder, require_distinct, require_same_con
 from hood.commands.envelope_report import report
 from hood.commands.envelope_tasks import Task, command_of, make_tasks, read_record, weights_of, write_inputs
 from hood.commands.rollouts_beside import Ended, interruptible, run_beside
-from hood.config import load_config, save_run_record
+from hood.config import ConfigError, load_config, save_run_record, shown
 from hood.dynamics.soundness import Criteria
 from hood.evaluation.envelope_prose import require_marks
 from hood.training import distributed
@@ -31,9 +31,18 @@ def run(overrides: Sequence[str]) -> int:
     config = load_config("envelope", overrides)
     for key in ("models", "garments", "factors"):
         require_distinct(key, [str(value) for value in config[key]])
+    _check_numbers(config)
     if config.document is not None:
         require_marks(Path(str(config.document)))  # now, not in some hours
     return together(lambda: _run(config))
+
+
+def _check_numbers(config: DictConfig) -> None:
+    if int(config.jobs) < 1:
+        raise ConfigError(f"jobs={config.jobs}: must be at least 1, rollouts side by side")
+    for key in ("timeout", *(spec.name for spec in fields(Criteria))):
+        if not float(config[key]) > 0:
+            raise ConfigError(f"{key}={shown(config[key])}: give a number above 0")
 
 
 def _run(config: DictConfig) -> int:

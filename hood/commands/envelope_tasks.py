@@ -55,7 +55,7 @@ def make_tasks(config: DictConfig) -> list[Task]:
 
     Raises:
         ConfigError: no such factor, or no model or garment.
-        FileNotFoundError: there is no such model or garment.
+        FileNotFoundError: there is no such model, garment or motion.
     """
     known = list(dict.fromkeys(cell.factor for cell in cells()))
     wanted = [str(name) for name in config.factors]
@@ -64,13 +64,15 @@ def make_tasks(config: DictConfig) -> list[Task]:
         raise ConfigError(f"factors: {unknown[0]!r} is none of them; choose {', '.join(known)}")
     models, garments = [str(name) for name in config.models], [str(name) for name in config.garments]
     if not models or not garments:
-        raise ConfigError("models and garments: give one of each at least")
+        empty = "garments" if models else "models"
+        raise ConfigError(f"{empty}=[]: give at least one, such as {empty}={'[dress]' if models else '[newton]'}")
     for model in models:
         name = _parts(model)[0]
         if find_option(name) is None:
             locate("weights", name)
     for garment in garments:
         locate("garments", garment)
+    locate("motions", str(config.sequence))
     methods = [REFERENCE, NEWTON, *(model for model in models if model != NEWTON)]
     return [
         Task(cell, garment, model)

@@ -264,6 +264,7 @@ def _check_numbers(config: DictConfig) -> None:
         raise ConfigError(f"max_rollouts={most}: must be a whole number of at least 1; null for all")
     for key, least, why in (
         ("num_frames", 4, "the first frames are not timed"),
+        ("seed", 0, "it seeds random weights"),
         ("drift_frames", 0, "0 measures no drift"),
         ("gap_states", 0, "0 computes no gap"),
         ("gap_iterations", 1, "a reference needs iterations; gap_states=0 computes no gap"),

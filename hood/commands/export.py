@@ -32,7 +32,7 @@ def run(arguments: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     files, config = split_words("export", arguments)
     if len(files) != 1:
-        raise ConfigError(f"{len(files)} rollouts are given, one can be exported: hood export rollout.h5")
+        raise ConfigError(f"number of rollouts given: {len(files)}; give one, hood export rollout.h5")
     source = Path(files[0]).expanduser()
     source = source / "rollout.h5" if source.is_dir() else source
     count = frame_count(config)

@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import re
 import textwrap
+from collections.abc import Iterator
+from typing import Any
 
 from hood.assets.files import library
 from hood.commands.exit_codes import exit_code_lines
-from hood.config import CONFIG_FOLDER, load_config, options, plain
+from hood.config import CONFIG_FOLDER, headings, load_config, notes, options, plain, shown
 
 _EXAMPLES = {
+    "sizes": [
+        "hood sizes garment=tshirt",
+        "hood sizes garment=dress 'sizes={S:0.95,L:1.05}' 'shapes=[[],[2]]' sequence=plie output=outputs/dress_sizes",
+    ],
     "train": [
         "hood train experiment=quickstart output=runs/quickstart",
         "hood train model=ours trainer=paper data.garments=[dress]",
@@ -67,55 +73,63 @@ _EXAMPLES = {
 _BEFORE_KEYS = {**dict.fromkeys(("inspect", "compare", "view", "export"), "FILE ... "), "fabric": "[NAME ...] "}
 
 
+#: Groups whose keys a command's help lists one by one, those of the chosen option.
+_LISTED = {"train": {"data": "default", "trainer": "fast"}, "rollout": {"material": "default", "solver": "newton"}}
+
+
 def describe(name: str) -> str:
     """Help text of the command ``name``."""
     config = load_config(name)
-    comments = _comments(name)
+    said, titles = notes(name), headings(name)
     lines = [f"usage: hood {name} {_BEFORE_KEYS.get(name, '')}[key=value ...]", ""]
+    lines += ["In a shell, put words with brackets or braces in quotes: 'key=[1,2]'.", ""]
     for key in config:
         value = plain(config[key])
         if isinstance(value, dict):
             continue
-        text = f"  {key}={_show(value)}"
-        text = f"{text:<34}" if len(text) < 34 else text + "  "
-        lines.append(textwrap.fill(text + comments.get(str(key), ""), 118, subsequent_indent=" " * 34))
+        if key in titles:
+            lines += ["", titles[key]]
+        lines.append(_row(str(key), value, said.get(str(key), "")))
     if name == "plan":
-        lines += ["", "The scene and the full model are said by the keys of hood rollout: garment, sequence, stepper, fps, …"]
+        lines += [
+            "",
+            "The keys of hood rollout say the scene and the full model: garment, sequence, stepper, fps, …",
+        ]
     if name == "fabric":
         lines += ["", textwrap.fill(f"  {'NAME':<14}{' '.join(options('material'))}", 118, subsequent_indent=" " * 16)]
     groups = _groups_of(name)
     if groups:
-        lines += ["", "config groups (their keys can be overridden too, e.g. material.density=0.3):"]
+        lines += ["", f"config groups: one word stands for several keys, such as {groups[0]}={options(groups[0])[-1]}"]
         rows = [f"  {group + '=':<14}{' | '.join(options(group))}" for group in groups]
         lines += [textwrap.fill(row, 118, subsequent_indent=" " * 16) for row in rows]
+    for group, option in _LISTED.get(name, {}).items():
+        lines += ["", f"keys of {group}={option}, which can be changed one by one"]
+        within = notes(f"{group}/{option}")
+        lines += [_row(f"{group}.{key}", value, within.get(key, "")) for key, value in _leaves(plain(config[group]))]
     if groups or name in ("tradeoff", "envelope"):
-        lines += ["", "embedded names:"]
+        lines += ["", "embedded names; these keys take files as well"]
         for kind, label in (("garments", "garment"), ("motions", "sequence"), ("body", "body"), ("weights", "checkpoint")):
             lines.append(textwrap.fill(f"  {label + '=':<14}{' '.join(library.names(kind))}", 118, subsequent_indent=" " * 16))
     lines += ["", "examples:", *(f"  {example}" for example in _EXAMPLES[name]), "", *exit_code_lines()]
     return "\n".join(lines)
 
 
-def _comments(name: str) -> dict[str, str]:
-    """Comments behind the keys of a config file: the help is written once, beside the default."""
-    notes = {}
-    for line in (CONFIG_FOLDER / f"{name}.yaml").read_text(encoding="utf-8").splitlines():
-        match = re.match(r"(?:  - )?(\w+):[^#]*#\s*(.*)", line)
-        if match:
-            notes[match.group(1)] = match.group(2)
-    return notes
+def _row(key: str, value: object, note: str) -> str:
+    """A key with its default, and behind it what it is."""
+    text = f"  {key}={shown(value)}"
+    text = f"{text:<34}" if len(text) < 34 else text + "  "
+    return textwrap.fill(text + note, 118, subsequent_indent=" " * 34)
+
+
+def _leaves(node: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Keys and values of a group, ``a.b`` for a key in another, without the names of classes."""
+    for key, value in node.items():
+        if isinstance(value, dict):
+            yield from _leaves(value, f"{prefix}{key}.")
+        elif key != "_target_":
+            yield f"{prefix}{key}", value
 
 
 def _groups_of(name: str) -> list[str]:
     text = (CONFIG_FOLDER / f"{name}.yaml").read_text(encoding="utf-8")
     return [match for match in re.findall(r"^\s+- (?:override )?/?(\w+):", text, flags=re.M) if match != "_self_"]
-
-
-def _show(value: object) -> str:
-    if isinstance(value, list):
-        return "[" + ",".join(_show(item) for item in value) + "]"
-    if value is None:
-        return "null"
-    if isinstance(value, bool):
-        return str(value).lower()
-    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -18,7 +18,7 @@ from hood.assets.motion.animated_mesh import NO_BODY, body_kind
 from hood.commands import findings
 from hood.commands.findings import Finding
 from hood.commands.garments import read_outfit, shape_coefficients
-from hood.commands.motion import motion_options
+from hood.commands.motion import check_motion_options, motion_options
 from hood.commands.notices import heard
 from hood.config import ConfigError, load_config, plain, require_choice
 from hood.scene.fitting import fit_figures, misplacement
@@ -38,6 +38,8 @@ def run(arguments: Sequence[str]) -> int:
     """Run the command; returns the exit code: 0 where nothing needs repair, 1 where something does."""
     files, config = _split(arguments)
     require_choice(config, "format", ("text", "json"))
+    require_choice(config, "up", ("auto", "y", "z"))
+    check_motion_options(config)
     known = [_identify(name, str(config.body)) for name in files]
     beside = next((finding.file for finding in known if finding.kind in _BODIES), str(config.body))
     if body_kind(beside) == "mesh" and beside not in files:  # what is wrong with it is told as well

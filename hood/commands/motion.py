@@ -6,13 +6,38 @@ import sys
 from typing import Any
 
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from hood.assets.files.library import names
 from hood.assets.motion.animated_mesh import body_kind
-from hood.config import ConfigError, plain
+from hood.assets.motion.load import HANDS
+from hood.config import ConfigError, plain, require_choice, shown
 from hood.scene.load_motion import NO_MOTION, MotionOptions, load_motion
 from hood.scene.motion import Motion
+
+#: Values of the keys that take numbers.
+_SUCH_AS = {"fps": 30, "file_fps": 120, "blend_in": 1, "body_scale": 0.01}
+#: Keys of one word and their words; a null is the file's own.
+_WORDS = {"hands": HANDS, "blend_from": ("t", "a"), "gender": ("neutral", "male", "female")}
+
+
+def check_motion_options(config: DictConfig) -> None:
+    """Raise ConfigError where a key that says how a motion is performed has a value that none can have, used or not."""
+    for key, known in _WORDS.items():
+        if config[key] is not None:
+            require_choice(config, key, known)
+    for key in ("file_fps", "body_scale"):
+        value = _optional(config, key)
+        if value is not None and not value > 0:
+            raise ConfigError(f"{key}={shown(config[key])}: give a number above 0, such as {key}={_SUCH_AS[key]}")
+    check_rate(config)
+
+
+def check_rate(config: DictConfig, key: str = "fps") -> None:
+    """Raise ConfigError unless a key is a frame rate at which steps can be taken."""
+    value = OmegaConf.select(config, key)
+    if not 1.0 <= float(value) <= 1000.0:
+        raise ConfigError(f"{key}={value}: give the simulation's frames per second, 1 to 1000")
 
 
 def make_motion(config: DictConfig, dtype: torch.dtype = torch.float32) -> Motion:
@@ -65,7 +90,7 @@ def _number(config: DictConfig, key: str) -> float:
     try:
         return float(config[key])
     except (TypeError, ValueError):
-        raise ConfigError(f"{key}={config[key]}: give a number") from None
+        raise ConfigError(f"{key}={shown(config[key])}: give a number, such as {key}={_SUCH_AS[key]}") from None
 
 
 def _optional(config: DictConfig, key: str) -> float | None:

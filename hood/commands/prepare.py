@@ -31,6 +31,7 @@ from hood.assets.motion.sequence import PoseSequence
 from hood.commands.common import prepare_folder
 from hood.commands.fastening import fasten_as_asked, give_room
 from hood.commands.garments import checked_pins, heed, names_of, shape_coefficients
+from hood.commands.motion import check_rate
 from hood.commands.placing import (
     AUTO,
     arm_angle,
@@ -42,7 +43,7 @@ from hood.commands.placing import (
     unit_alone,
 )
 from hood.commands.prepare_mesh import prepare_for_mesh
-from hood.config import ConfigError, load_config, plain, require_choice
+from hood.config import ConfigError, load_config, plain, require_choice, shown
 from hood.media.mesh_export import write_obj
 from hood.mesh.quality import check_triangles
 from hood.scene.fitting import FitFigures, fit_figures
@@ -72,6 +73,12 @@ def run(overrides: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     config = load_config("prepare", overrides)
     require_choice(config, "format", ("text", "json"))
+    require_choice(config, "body_up", ("auto", "y", "z"))
+    check_rate(config)
+    if int(config.frame) < 0:
+        raise ConfigError(f"frame={config.frame}: must be at least 0, frames count from 0")
+    if config.body_scale is not None and not (isinstance(config.body_scale, (int, float)) and config.body_scale > 0):
+        raise ConfigError(f"body_scale={shown(config.body_scale)}: give metres per unit of the file, such as body_scale=0.01")
     if config.garment is None:
         raise ConfigError("garment is not given: hood prepare garment=shirt.obj output=shirt.npz")
     names = names_of(config.garment)

@@ -10,7 +10,7 @@ import numpy as np
 from omegaconf import DictConfig
 
 from hood.commands.steppers import ALWAYS, NEVER, option_of
-from hood.config import ConfigError, build, plain, require_choice
+from hood.config import ConfigError, build, plain, require_choice, shown
 from hood.dynamics.refine import METHODS, RefinedStepper
 from hood.dynamics.refine_table import costs_from_table, floor_from_table
 from hood.dynamics.rollout import FIELD_CHOICES
@@ -45,7 +45,8 @@ def chosen(config: Mapping[Any, Any]) -> tuple[str, float] | None:
         return None
     value = config[given[0]]
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ConfigError(f"{given[0]}={value!r}: give a number")
+        what = "a whole number of iterations, or auto" if given[0] == "refine" else "a number"
+        raise ConfigError(f"{given[0]}={shown(value)}: give {what}")
     return given[0], float(value)
 
 
@@ -95,7 +96,7 @@ def exported(config: DictConfig) -> tuple[str, ...]:
     names = [str(name) for name in plain(config.export)]
     for name in names:
         if name not in FIELD_CHOICES:
-            raise ConfigError(f"export={plain(config.export)}: {name!r} is not known; choose of {', '.join(FIELD_CHOICES)}")
+            raise ConfigError(f"export={shown(config.export)}: unknown {name!r}; give some of [{','.join(FIELD_CHOICES)}]")
     drawn = str(config.colour)
     return tuple(dict.fromkeys([*names, *([drawn] if drawn in FIELD_CHOICES else [])]))
 

@@ -10,7 +10,7 @@ from omegaconf import DictConfig
 
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.tailoring import tailored
-from hood.config import ConfigError, plain, require_choice
+from hood.config import ConfigError, plain, require_choice, shown
 from hood.dynamics.ease import Ease
 from hood.scene.motion import BodyMotion, Motion
 from hood.scene.sizing import Sizes, sizes_of
@@ -29,12 +29,16 @@ def checked_sizes(config: DictConfig) -> Sizes:
     require_choice(config, "fit", FITS)
     if parts and end is not None:
         raise ConfigError(f"size_end={end}: parts of a garment keep their size; give size as one factor or three")
-    try:
-        size = 1.0 if parts else plain(config.size)
-        sizes = replace(sizes_of(size, end, float(config.size_seconds)), parts=tuple(parts.values()))
-    except (ValueError, TypeError) as error:
-        key = f"size={plain(config.size)} size_end={end} size_seconds={config.size_seconds}"
-        raise ConfigError(f"{key}: {error}") from error
+    seconds = float(config.size_seconds)
+    if not seconds > 0:
+        raise ConfigError(f"size_seconds={config.size_seconds}: give seconds above 0, such as size_seconds=2")
+    size = 1.0 if parts else plain(config.size)
+    for key, value in (("size", size), ("size_end", size if end is None else end)):
+        try:
+            sizes = replace(sizes_of(value), parts=tuple(parts.values()))
+        except (ValueError, TypeError) as error:
+            raise ConfigError(f"{key}={shown(config[key])}: {error}") from error
+    sizes = replace(sizes_of(size, end, seconds), parts=tuple(parts.values()))
     if sizes.changing and str(config.step) != "plain":
         raise ConfigError(
             f"size_end={end}: step={config.step} has fixed shapes, which a garment that grows has not; use step=plain"

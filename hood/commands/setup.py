@@ -19,7 +19,7 @@ from hood.commands.events import checked_events, with_events
 from hood.commands.fabrics import checked_fabrics, fabric_of
 from hood.commands.garments import heed, layer_order, names_of, read_outfit
 from hood.commands.guarding import check_guard
-from hood.commands.motion import make_motion
+from hood.commands.motion import check_motion_options, make_motion
 from hood.commands.plan_file import plan_path, read_watch
 from hood.commands.refinement import AUTO, check_refinement, chosen, refined
 from hood.commands.resizing import checked_sizes, cut_to_size
@@ -31,6 +31,7 @@ from hood.dynamics.stepper import Stepper
 from hood.dynamics.watched import WatchedStepper
 from hood.losses.potential import Potential
 from hood.nn.compiled import KERNELS
+from hood.nn.precision import PRECISIONS, TF32
 from hood.scene.fitting import doubts, misplacement
 from hood.scene.held_layers import with_held_layers_apart
 from hood.scene.scene import Scene, dress
@@ -58,6 +59,7 @@ def check_config(config: DictConfig) -> None:
     checked_sizes(config)
     checked_events(config)
     require_choice(config, "kernels", (AUTO, *KERNELS))
+    require_choice(config, "precision", (*PRECISIONS, TF32))
     option_of(config)
     require_choice(config, "step", (PLAIN, *MODES))
     check_refinement(config)
@@ -167,7 +169,6 @@ def _check_numbers(config: DictConfig) -> None:
         if int(config[key]) < least:
             raise ConfigError(f"{key}={config[key]}: must be at least {least}")
     thinning(config)
-    if not 1.0 <= float(config.fps) <= 1000.0:
-        raise ConfigError(f"fps={config.fps}: give the simulation's frames per second, 1 to 1000")
+    check_motion_options(config)
     if not 0.0 <= float(config.gravity) <= 1000.0:
         raise ConfigError(f"gravity={config.gravity}: give m/s², downwards, 0 to 1000")

@@ -16,7 +16,7 @@ from hood.assets.files.atomic import write_atomically
 from hood.commands.common import output_folder, prepare_folder, require_package
 from hood.commands.resizing import FITS
 from hood.commands.setup import check_config, make_stepper, set_up
-from hood.config import ConfigError, load_config, plain, require_choice
+from hood.config import ConfigError, load_config, plain, require_choice, shown
 from hood.dynamics.ease import Ease, measure_ease
 from hood.dynamics.recorder import RolloutData, still_of
 from hood.dynamics.rollout import simulate
@@ -74,7 +74,12 @@ def _sizes(config: DictConfig) -> dict[str, Any]:
     """What ``size`` of a rollout is to be, by the names of the sizes."""
     sizes = _USUAL if config.sizes is None else plain(config.sizes)
     if not isinstance(sizes, dict) or not sizes:
-        raise ConfigError(f"sizes={sizes}: give names and factors, such as sizes={{S:0.95,M:1,L:1.05}}")
+        raise ConfigError(f"sizes={shown(sizes)}: give names and factors, such as sizes={{S:0.95,M:1,L:1.05}}")
+    for name, size in sizes.items():
+        if isinstance(size, bool) or not isinstance(size, (int, float, list, dict)):
+            raise ConfigError(
+                f"sizes: {name} is {shown(size)}; give what size of hood rollout takes, such as sizes={{{name}:0.95}}"
+            )
     return {str(name): size for name, size in sizes.items()}
 
 

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from hood.assets.body.load import load_body
-from hood.assets.files.library import locate, motion_split
+from hood.assets.files.library import locate, motion_split, unknown
 from hood.assets.garment.garment import load_garment
 from hood.assets.material import Material
 from hood.assets.motion.load import load_sequence
@@ -30,7 +30,8 @@ from hood.commands.common import (
     tell_choice,
     together,
 )
-from hood.config import ConfigError, build, load_config, plain, require_choice, save_run_record
+from hood.commands.motion import check_rate
+from hood.config import ConfigError, build, load_config, plain, require_choice, save_run_record, shown
 from hood.dynamics.checkpoint import read_header
 from hood.dynamics.reference import SUFFIXES
 from hood.dynamics.simulator import Simulator
@@ -64,6 +65,18 @@ def run(overrides: Sequence[str]) -> int:
     config = load_config("train", overrides)
     require_device(config)
     return together(lambda: _train(config))
+
+
+def _check_values(config: DictConfig) -> None:
+    """Raise ConfigError where a key has a value that no training can have, before a file is read."""
+    for key, least in (("seed", 0), ("validation_states", 0), ("data.validation_frames", 2)):
+        if int(OmegaConf.select(config, key)) < least:
+            raise ConfigError(f"{key}={OmegaConf.select(config, key)}: must be at least {least}")
+    require_choice(config, "data.unusable", ("refuse", "skip"))
+    require_choice(config, "data.up", ("auto", "y", "z"))
+    check_rate(config, "data.fps")
+    if not len(config.data.garments):
+        raise ConfigError("data.garments=[]: give at least one, such as data.garments=[dress]")
 
 
 def _train(config: DictConfig) -> int:
@@ -109,6 +122,7 @@ def _run(config: DictConfig, trainer: Trainer, folder: Path) -> int:
 
 def make_trainer(config: DictConfig) -> Trainer:
     """Everything named in the config, put together; seeds are set before the weights are made."""
+    _check_values(config)
     torch.manual_seed(int(config.seed))
     simulator: Simulator = build(config.model)
     settings: TrainerSettings = build(config.trainer)
@@ -148,14 +162,23 @@ def _start_from(simulator: Simulator, name: str, fps: float) -> int:
 def _sampling(config: DictConfig) -> dict[str, Any]:
     """How scenes are drawn, with the fabric that was given for all of them."""
     sampling = plain(config.data.sampling)
-    if sampling["material"] is not None:
-        sampling["material"] = build({"_target_": f"{Material.__module__}.{Material.__name__}", **sampling["material"]})
+    fabric = sampling["material"]
+    if fabric is not None:
+        key = f"data.sampling.material={shown(fabric)}"
+        if not isinstance(fabric, dict):
+            raise ConfigError(f"{key}: give properties of a fabric in braces, such as data.sampling.material={{density:0.2}}")
+        strange = next((name for name in fabric if name not in Material.names()), None)
+        if strange is not None:
+            raise ConfigError(f"{key}: {unknown('property', str(strange), Material.names())}")
+        text = next((name for name, value in fabric.items() if isinstance(value, str)), None)
+        if text is not None:
+            raise ConfigError(f"{key}: {text} is {fabric[text]!r}; give a number")
+        sampling["material"] = Material(**fabric)
     return sampling
 
 
 def _open_motions(config: DictConfig, names: list[str], fps: float, min_frames: int) -> MotionFiles:
     """The training motions, read when they are drawn."""
-    require_choice(config.data, "unusable", ("refuse", "skip"))
     load = partial(load_sequence, fps=fps, up=str(config.data.up))
     motions = MotionFiles(names, load, fps, min_frames, str(config.data.unusable) == "skip")
     if motions.skipped and distributed.rank() == 0:

@@ -48,7 +48,7 @@ def _split(arguments: Sequence[str]) -> tuple[list[Path], DictConfig]:
     """Files in their order and the config: a word of the form ``key=value`` is an override, every other word a file."""
     given, config = split_words("view", arguments)
     if not 1 <= len(given) <= _MOST:
-        raise ConfigError(f"{len(given)} rollouts are given, one to {_MOST} can be shown: hood view rollout.h5")
+        raise ConfigError(f"number of rollouts given: {len(given)}; give one to {_MOST}, hood view rollout.h5")
     paths = [Path(name).expanduser() for name in given]
     return [path / "rollout.h5" if path.is_dir() else path for path in paths], config
 

@@ -27,6 +27,8 @@ from hood.scene.scene import Scene, build_scene
 
 #: Draws before a set of motions that cannot be read is given up.
 _MAX_UNREADABLE = 100
+#: Shape coefficients beyond are no body's: the models' axes are standard deviations.
+_MOST_BETA = 10.0
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,9 @@ class SceneSampler:
             network learns from lopsided motions lets cloth drift sideways on a body that stands still.
         material: fabric of every scene; None: drawn (:func:`hood.assets.material.sample_material`).
         device: where the scenes' tensors live in training.
+
+    Raises:
+        ValueError: no garment, no motion, or a range that nothing can be drawn from; names the key.
     """
 
     def __init__(
@@ -79,7 +84,8 @@ class SceneSampler:
         device: str = "cpu",
     ) -> None:
         if not garments or not sequences:
-            raise ValueError("training needs at least one garment and one motion")
+            raise ValueError("training needs at least one garment and one motion (data.garments, data.sequences)")
+        _check_ranges(beta_range, size_range, piecewise_fraction)
         self.body = body
         self.garments = [hold_on_trunk(bind_garment(garment, body), body) for garment in garments]
         self.sequences = sequences if isinstance(sequences, MotionFiles) else list(sequences)
@@ -176,3 +182,16 @@ class SceneSampler:
 
 def _to_numpy(value: Any) -> Any:
     return value.numpy() if isinstance(value, Tensor) else value
+
+
+def _check_ranges(beta_range: float, size_range: Sequence[float], piecewise_fraction: float) -> None:
+    """Raise ValueError for ranges that nothing can be drawn from; names the key."""
+    if not 0 <= beta_range <= _MOST_BETA:
+        raise ValueError(f"data.sampling.beta_range is {beta_range}; give 0 (the mean body) to {_MOST_BETA:g}, such as 2.0")
+    numbers = all(isinstance(size, (int, float)) for size in size_range)
+    if not numbers or len(size_range) != 2 or not 0 < size_range[0] <= size_range[1]:
+        raise ValueError(
+            f"data.sampling.size_range is {list(size_range)}; give the least and the largest factor, above 0, such as [0.9,1.1]"
+        )
+    if not 0 <= piecewise_fraction <= 1:
+        raise ValueError(f"data.sampling.piecewise_fraction is {piecewise_fraction}; give a share of the scenes, 0 to 1")

@@ -19,6 +19,9 @@ class Horizon:
     maximum: int = 5
     start: int = 1
 
+    def __post_init__(self) -> None:
+        _require_least("horizon", self, every=0, maximum=1, start=1)
+
     def __call__(self, iteration: int) -> int:
         return min(self.start + iteration // max(self.every, 1), self.maximum)
 
@@ -34,6 +37,9 @@ class StepDecay:
     every: int = 50000
     floor: float = 0.01
 
+    def __post_init__(self) -> None:
+        _require_least("schedule", self, every=1, floor=0)
+
     def __call__(self, iteration: int, num_iterations: int) -> float:
         return 0.5 ** (iteration // self.every) + self.floor
 
@@ -48,6 +54,9 @@ class WarmupCosine:
 
     warmup: int = 50
     floor: float = 0.01
+
+    def __post_init__(self) -> None:
+        _require_least("schedule", self, warmup=0, floor=0)
 
     def __call__(self, iteration: int, num_iterations: int) -> float:
         if iteration < self.warmup:
@@ -70,6 +79,9 @@ class InverseRoot:
     warmup: int = 50
     steady: int = 100
 
+    def __post_init__(self) -> None:
+        _require_least("schedule", self, warmup=0, steady=0)
+
     def __call__(self, iteration: int, num_iterations: int) -> float:
         return min((iteration + 1) / max(self.warmup, 1), math.sqrt(max(self.steady, 1) / max(iteration, 1)), 1.0)
 
@@ -89,6 +101,9 @@ class CollisionRamp:
     end: float = 5e5
     begin_iteration: int = 0
     end_iteration: int = 0
+
+    def __post_init__(self) -> None:
+        _require_least("collision", self, start=0, end=0, begin_iteration=0, end_iteration=0)
 
     def __call__(self, iteration: int) -> float:
         if iteration >= self.end_iteration:
@@ -110,6 +125,14 @@ class CollisionRamp:
         weight = self(iteration)
         names = [name for name in ("collision", "friction") if name in potential.terms]
         return potential.with_terms(**{name: potential.terms[name].with_weight(weight) for name in names})  # type: ignore[attr-defined]
+
+
+def _require_least(part: str, settings: object, **least: int) -> None:
+    """Raise ValueError where a number is below its least value; names the key."""
+    for name, lowest in least.items():
+        value = getattr(settings, name)
+        if not value >= lowest:
+            raise ValueError(f"trainer.{part}.{name} is {value}; it must be at least {lowest}")
 
 
 def scaled_count(name: str, count: int, factor: float) -> int:

@@ -70,10 +70,13 @@ class TrainerSettings:
             if getattr(self, name) < 0:
                 raise ValueError(f"trainer.{name} is {getattr(self, name)}; it must be at least 0")
         object.__setattr__(self, "keep_at", tuple(self.keep_at))  # a list in a config
-        if any(iteration < 1 for iteration in self.keep_at):
-            raise ValueError(f"trainer.keep_at is {list(self.keep_at)}; iterations are at least 1")
-        if self.learning_rate <= 0 or self.clip_norm <= 0:
-            raise ValueError("trainer.learning_rate and trainer.clip_norm must be > 0")
+        if any(not isinstance(iteration, int) or iteration < 1 for iteration in self.keep_at):
+            raise ValueError(f"trainer.keep_at is {list(self.keep_at)}; iterations are whole numbers of at least 1")
+        for name in ("learning_rate", "clip_norm"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"trainer.{name} is {getattr(self, name)}; it must be > 0")
+        if not 0 <= self.ema_decay < 1:
+            raise ValueError(f"trainer.ema_decay is {self.ema_decay}; it must be at least 0 and below 1")
         if self.time_scale != 1.0:
             self.compressed()  # refused here rather than after the data has been read
 

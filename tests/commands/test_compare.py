@@ -110,8 +110,8 @@ def empty(path: str) -> str:
 
 
 REFUSED = {
-    "one file": (lambda: ["a.h5"], "1 rollouts are given, two or more are compared"),
-    "no file": (lambda: [], "0 rollouts are given"),
+    "one file": (lambda: ["a.h5"], "number of rollouts given: 1; give two or more"),
+    "no file": (lambda: [], "number of rollouts given: 0; give two or more"),
     "a file that is not there": (lambda: ["a.h5", "c.h5"], "c.h5: no such file; give the rollout.h5"),
     "text": (lambda: ["a.h5", text("t.h5")], "t.h5: not a rollout file"),
     "another HDF5 file": (lambda: ["a.h5", no_rollout("n.h5")], "n.h5: not a rollout file"),

@@ -103,7 +103,7 @@ def test_a_document_without_marks_is_refused_before_anything_runs(tmp_path: Path
     [
         (["factors=[spam]"], "factors: 'spam' is none of them; choose nominal, garment, motion, dt"),
         (["models=[newton+5]"], "refines what is solved already"),
-        (["models=[]"], "models and garments: give one of each at least"),
+        (["models=[]"], r"models=\[\]: give at least one"),
     ],
 )
 def test_what_is_no_map_is_refused(overrides: list[str], words: str) -> None:

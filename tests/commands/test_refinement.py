@@ -29,9 +29,9 @@ REFUSED = {
     "misspelt method": (["refine=2", "refine_method=sweep"], "'sweeps'"),
     "zero budget": (["budget_ms=0"], "budget_ms is 0; give the milliseconds of a frame"),
     "negative count": (["refine=-1"], "refine is -1; give 0 or more iterations"),
-    "a word": (["target_rg=low"], "target_rg='low': give a number"),
+    "a word": (["target_rg=low"], "target_rg=low: give a number"),
     "no iterations": (["target_rg=0.1", "refine_most=0"], "refine_most=0: must be at least 1"),
-    "unknown export": (["export=[gamma]"], "'gamma' is not known; choose of rg"),
+    "unknown export": (["export=[gamma]"], "unknown 'gamma'; give some of"),
     "unknown colour": (["colour=heat"], "unknown value for colour 'heat'"),
 }
 

@@ -28,7 +28,7 @@ def test_a_size_is_one_factor_or_three_and_may_change() -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["size=[1,2]"], r"size=\[1, 2\].*give one factor, such as 1.1, or three"),
+        (["size=[1,2]"], r"size=\[1,2\].*give one factor, such as 1.1, or three"),
         (["size=20"], "size=20.*give a factor of the garment, 0.2 to 5"),
         (["size_end=large"], "size_end=large.*give one factor"),
         (["size={sleeves:1.2}", "size_end=1.1"], "size_end=1.1: parts of a garment keep their size"),

@@ -11,12 +11,13 @@ from typing import Any
 
 import pytest
 from omegaconf import DictConfig
-from pages import EXTENDING, EXTENDING_HAS_A_TEST, ROOT, command_lines
+from pages import CARDS, EXTENDING, EXTENDING_HAS_A_TEST, PAGES, ROOT, command_lines, prose_of
 
 from hood.assets.files.library import names
 from hood.cli import COMMANDS
+from hood.commands.help import _EXAMPLES
 from hood.commands.setup import check_config
-from hood.config import load_config
+from hood.config import groups, load_config, options, plain
 
 #: Commands with a config of their own; others take files.
 CONFIGURED = {path.stem for path in (ROOT / "configs").glob("*.yaml")} & set(COMMANDS)
@@ -104,3 +105,59 @@ def test_every_benchmark_is_listed() -> None:
     listed = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
     runs = [path for path in (ROOT / "benchmarks").glob("*.py") if "__main__" in path.read_text(encoding="utf-8")]
     assert [path.name for path in runs if f"benchmarks/{path.name}" not in listed] == []
+
+
+def keys_below(node: dict[str, Any], prefix: str = "") -> set[str]:
+    """Keys of a config and of what stands in it, ``a.b``."""
+    keys = set()
+    for key, value in node.items():
+        keys.add(prefix + key)
+        if isinstance(value, dict):
+            keys |= keys_below(value, f"{prefix}{key}.")
+    return keys
+
+
+def known_keys() -> set[str]:
+    """Keys of all commands under all options of their groups; keys of a model or an energy also by their last word alone."""
+    known = set(groups())
+    for command in CONFIGURED:
+        known |= keys_below(plain(load_config(command)))
+    for command, of in (("train", ("model", "trainer", "data")), ("rollout", ("losses", "material", "solver", "stepper"))):
+        for group in of:
+            for option in options(group):
+                known |= keys_below(plain(load_config(command, [f"{group}={option}"])))
+    return known | {key.rpartition(".")[2] for key in known if key.startswith(("model.", "losses.terms."))}
+
+
+def test_keys_in_the_text_of_pages_exist() -> None:
+    known = known_keys()
+    seen = 0
+    for page in [page for page in [*PAGES, *CARDS] if page.name != EXTENDING]:
+        for span in re.findall(r"`([^`\n]+)`", prose_of(page)):
+            for key, value in re.findall(r"(?<![\w.\[{(,'\"-])([a-z_][\w.]*)=(\w*)", re.sub(r"\(.*\)", "", span)):
+                seen += 1
+                assert key in known, f"{page.name}: {span}"
+                if key in groups() and value:
+                    assert value in {*options(key), "…", "null"}, f"{page.name}: {span}"
+    assert seen > 300
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_examples_of_the_help_have_keys_and_values_that_exist(command: str) -> None:
+    for example in _EXAMPLES[command]:
+        name, *words = words_of(example)
+        assert name == command
+        keys = [word for word in words if "=" in word]
+        own = load_config("plan") if command == "plan" else None
+        config = load_config(
+            "rollout" if own is not None else command, [w for w in keys if own is None or w.split("=")[0] not in own]
+        )
+        check_names(config)
+
+
+def test_commands_that_messages_name_exist() -> None:
+    """``hood WORD`` in the texts of the code is a command."""
+    for path in (ROOT / "hood").rglob("*.py"):
+        for word in re.findall(r"``hood (\w+)|[:;(] ?hood ([a-z]+) [\w.{]+=", path.read_text(encoding="utf-8")):
+            name = word[0] or word[1]
+            assert name in {*COMMANDS, "COMMAND"}, f"{path.name}: hood {name}"

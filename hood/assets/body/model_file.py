@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from hood.assets.files.library import SIZE_LIMIT, read_arrays
+from hood.assets.files.library import SIZE_LIMIT, read_arrays, unknown_suffix
 from hood.assets.pickles.unpickle import load_pickle
 
 MODEL_SUFFIXES = (".npz", ".pkl")
@@ -75,7 +75,7 @@ def read_model(path: Path) -> dict[str, np.ndarray]:
     elif path.suffix == ".npz":
         fields = read_arrays(path, (), "body model")
     else:
-        raise ValueError(f"{path}: unknown body model format {path.suffix!r}; give .npz or .pkl")
+        raise ValueError(f"{path}: {unknown_suffix(path, 'body model')}; give .npz or .pkl")
     missing = [key for key in MODEL_KEYS if key not in fields]
     if missing:
         found = sorted(str(key) for key in fields)[:8]

@@ -29,7 +29,13 @@ def guarded(path: Path, what: str, read: Callable[[], Any]) -> Any:
     except Refused as error:
         raise ValueError(f"{path}: {error}") from error
     except (MemoryError, RecursionError) as error:
-        raise ValueError(f"{path}: not a readable {what} ({type(error).__name__} while reading it)") from error
+        raise ValueError(unreadable(path, what, f"{type(error).__name__} while reading it")) from error
     except Exception as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ValueError(f"{path}: not a readable {what} ({reason})") from error
+        raise ValueError(unreadable(path, what, reason)) from error
+
+
+def unreadable(path: str | Path, what: str, reason: str) -> str:
+    """The sentence for a file that is not, or no longer, a ``what``; an empty file is called so."""
+    empty = Path(path).is_file() and not os.stat(path).st_size
+    return f"{path}: not a readable {what} ({'it is empty' if empty else reason}); write or download the file again"

@@ -13,6 +13,7 @@ from typing import IO
 import numpy as np
 
 from hood.assets.files.foreign_formats import require_readable
+from hood.assets.files.guarded import unreadable
 
 DATA_FOLDER = Path(__file__).resolve().parents[2] / "data"
 #: Content beyond this size [bytes] is not read into memory.
@@ -61,6 +62,11 @@ def locate(kind: str, name: str | Path, folders: bool = False) -> Path:
     raise FileNotFoundError(unknown(_LABEL[kind], str(name), names(kind)) + "; or give the path of a file")
 
 
+def unknown_suffix(path: Path, what: str) -> str:
+    """The beginning of a sentence for a file whose name says another kind, or none."""
+    return f"unknown {what} format {path.suffix!r}" if path.suffix else "its name has no ending that says the format"
+
+
 def unknown(what: str, given: str, known: Iterable[str]) -> str:
     """The sentence for a misspelt name: the nearest known one first."""
     known = list(known)
@@ -96,7 +102,7 @@ def read_arrays(path: Path, required: Iterable[str], what: str, size_limit: int 
     except FileNotFoundError:
         raise
     except Exception as error:
-        raise ValueError(f"{path}: not a readable {what} .npz file ({first_line(error)})") from error
+        raise ValueError(unreadable(path, f"{what} .npz file", first_line(error))) from error
     missing = [key for key in required if key not in arrays]
     if missing:
         raise ValueError(f"{path}: not a {what} file: key {missing[0]!r} is missing (found {sorted(arrays)[:8]})")

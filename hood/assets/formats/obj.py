@@ -31,7 +31,10 @@ def read_obj(path: Path) -> RawMesh:
                     corners.extend(_corner(word, sizes) for word in words[1:])
                     counts.append(len(words) - 1)
             except ValueError:
-                raise Unreadable(f"line {number} is not readable ({line.strip()[:60]!r})") from None
+                raise Unreadable(
+                    f"line {number} is not readable ({line.strip()[:60]!r}); behind {words[0]} stand numbers alone, repair or "
+                    f"remove the line"
+                ) from None
     pos, colours = _positions(tables["v"])
     table = np.array(corners, dtype=np.int64).reshape(-1, 3)
     mesh = RawMesh(pos, table[:, 0], np.array(counts, dtype=np.int64), colours)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hood.assets.files.library import locate
+from hood.assets.files.library import locate, unknown_suffix
 from hood.assets.formats.mesh_file import MeshFile, mesh_suffixes, read_mesh_file
 from hood.assets.garment.garment_arrays import read_fields, write_fields
 from hood.assets.garment.reference_garments import read_reference_garment
@@ -98,7 +98,7 @@ def load_garment(name: str | Path, triangulate: bool = False) -> Garment:
         garment = garment_of_mesh(path, read_mesh_file(path, triangulate))
     else:
         known = ", ".join((*GARMENT_SUFFIXES, *mesh_suffixes()))
-        raise ValueError(f"{path}: unknown garment format {path.suffix!r}; give one of {known}")
+        raise ValueError(f"{path}: {unknown_suffix(path, 'garment')}; give one of {known}")
     check_triangles(garment.rest_pos, garment.faces, str(path))
     _check_levels(garment, path)
     return garment

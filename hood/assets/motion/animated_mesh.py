@@ -85,7 +85,7 @@ def load_mesh_sequence(
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder")
     if up not in ("y", "z", "auto"):
-        raise ValueError(f"up axis {up!r}: give 'y', 'z' or 'auto'")
+        raise ValueError(f"up={up}: give y, z or auto, the axis that points up in the file")
     content = _read(path, fps, animation, parts)
     rate = _rate(path, content.fps if file_fps is None else file_fps)
     verts, faces = _checked(path, content.verts, content.faces)

@@ -54,7 +54,7 @@ def motions_in(folder: Path) -> list[Path]:
     files = (path for path in folder.rglob("*") if path.suffix in suffixes and path.is_file())
     found = sorted(path for path in files if path.stem not in _BESIDES and not path.name.startswith("."))
     if not found:
-        raise ValueError(f"{folder}: no motions ({', '.join(suffixes)}) in it or below")
+        raise ValueError(f"{folder}: no motions ({', '.join(suffixes)}) in it or below; give a folder that holds such files")
     return found
 
 

@@ -59,9 +59,9 @@ def load_sequence(
     """
     path = locate("motions", name)
     if up not in ("y", "z", "auto"):
-        raise ValueError(f"up axis {up!r}: give 'z' (AMASS), 'y' or 'auto'")
+        raise ValueError(f"up={up}: give z (AMASS), y or auto, the axis that points up in the file")
     if hands not in HANDS:
-        raise ValueError(f"hands {hands!r}: give 'flat' or 'file'")
+        raise ValueError(f"hands={hands}: give flat, or file for fingers as recorded")
     recording = read_recording(path, file_fps)
     poses, fingers = recording.poses, recording.fingers
     if hands == "flat":

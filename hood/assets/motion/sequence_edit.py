@@ -26,7 +26,7 @@ def standing_pose(kind: str) -> np.ndarray:
         ValueError: another kind.
     """
     if kind not in ("t", "a"):
-        raise ValueError(f"standing pose {kind!r}: give 't' or 'a'")
+        raise ValueError(f"blend_from={kind}: give t (arms out) or a (arms lowered by 45 degrees)")
     pose = np.zeros((24, 3))
     if kind == "a":
         # The left arm points along +x: turning it about z by a negative angle lowers it.
@@ -48,9 +48,10 @@ def trim(sequence: PoseSequence, start: float | str | None = None, stop: float |
     last = min(last, sequence.num_frames - 1)
     if last - first < 1:
         seconds = (sequence.num_frames - 1) / sequence.fps
+        said = " and ".join(f"{key}={value}" for key, value in (("start", start), ("stop", stop)) if value is not None)
         raise ValueError(
-            f"{sequence.name}: start={start}, stop={stop} leave fewer than two of its {sequence.num_frames} frames "
-            f"({seconds:.2f} s); choose a longer part"
+            f"{sequence.name}: with {said} fewer than two of its {sequence.num_frames} frames ({seconds:.2f} s) are left; "
+            "choose a longer part"
         )
     return sequence.window(first, last + 1)
 

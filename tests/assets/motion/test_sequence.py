@@ -200,7 +200,7 @@ def test_files_that_are_no_archives(tmp_path: Path) -> None:
 
 
 def test_unknown_up_axis() -> None:
-    with pytest.raises(ValueError, match="up axis 'x'"):
+    with pytest.raises(ValueError, match="up=x: give z"):
         load_sequence("walk_proud", up="x")
 
 

@@ -41,7 +41,7 @@ def test_trim_counts_frames_of_the_file() -> None:
 
 @pytest.mark.parametrize("start, stop", [(5.0, 4.0), ("9999f", None), (1.0, 1.0)])
 def test_nothing_left(walk: PoseSequence, start: object, stop: object) -> None:
-    with pytest.raises(ValueError, match="walk_proud: start=.* fewer than two"):
+    with pytest.raises(ValueError, match="walk_proud: with start=.* fewer than two"):
         trim(walk, start, stop)
 
 
@@ -112,7 +112,7 @@ def test_the_a_pose_lowers_both_arms(body: Body) -> None:
         before = t_pose[wrist] - t_pose[shoulder]
         angle = np.degrees(np.arctan2(-arm[1], abs(arm[0])) - np.arctan2(-before[1], abs(before[0])))
         assert angle == pytest.approx(45, abs=0.1)
-    with pytest.raises(ValueError, match="'x'"):
+    with pytest.raises(ValueError, match="blend_from=x: give t"):
         standing_pose("x")
 
 
@@ -123,7 +123,7 @@ def test_options_out_of_range(walk: PoseSequence) -> None:
         loop(walk, 10**7)
     with pytest.raises(ValueError, match="blend_in=-1"):
         blend_in(walk, -1)
-    with pytest.raises(ValueError, match="hands 'x'"):
+    with pytest.raises(ValueError, match="hands=x: give flat, or file"):
         load_sequence("walk_proud", hands="x")
 
 
