@@ -46,8 +46,8 @@ class Material:
 
     Defaults: the paper's default fabric (density 0.20022 kg/m², μ 23600 Pa, λ 44400 Pa, bending stiffness 3.9626e-5 J).
     ``friction`` is a factor, not a coefficient, for friction on the body is of two: fabrics and regions that grip or slide.
-    ``warp``, ``weft`` and ``shear`` are factors on the stiffness of the isotropic fabric, see :mod:`hood.losses.weave`: of a strip
-    along the warp, of one along the weft, and against shear between the two. All 1: isotropic.
+    ``warp``, ``weft`` and ``shear`` are factors on the stiffness of the isotropic fabric, see :mod:`hood.losses.weave`: of a
+    strip along the warp, of one along the weft, and against shear between the two. All 1: isotropic.
 
     Raises:
         ValueError: a value is not finite or not physical; names the property and the index.

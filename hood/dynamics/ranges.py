@@ -96,7 +96,8 @@ def scene_conditions(
     size = min(factors), max(factors)
     spans: dict[str, Span] = {"fps": (1.0 / dt, 1.0 / dt), "size": size, "gravity": (gravity, gravity)}
     fabric = {name: getattr(cloth, name) for name in Material.names() if name not in WEAVE}
-    fabric |= dict(zip(WEAVE, cloth.rest_area.new_ones(3, 1) if cloth.weave is None else cloth.weave.unbind(dim=1), strict=True))
+    weave = cloth.rest_area.new_ones(1, 3) if cloth.weave is None else cloth.weave
+    fabric |= dict(zip(WEAVE, weave.unbind(dim=1), strict=True))
     spans |= {f"material.{name}": _extent(values) for name, values in fabric.items() if values.numel()}
     spans |= _resolution([garment])
     if betas is not None and len(betas):

@@ -258,9 +258,7 @@ def dress(garment: Garment, motion: Motion, material: Material | None = None, si
     rest_pos = motion.rest_pos(garment) * np.array(sizes.start)
     fabric = material or Material()
     uv = None if garment.uv is None or garment.uv_faces is None else (garment.uv, garment.uv_faces)
-    cloth = build_cloth(
-        rest_pos, garment.faces, fabric, garment.pinned, stiffness=garment.stiffness, dtype=motion.dtype, uv=uv
-    )
+    cloth = build_cloth(rest_pos, garment.faces, fabric, garment.pinned, stiffness=garment.stiffness, dtype=motion.dtype, uv=uv)
     cloth = to_device(cloth, motion.device)
     fastening = fastening_of(garment.fasteners, cloth.rest_pos)
     return Scene(cloth, garment, motion, 1.0 / motion.fps, sizes=sizes, fastening=fastening)
