@@ -14,8 +14,10 @@ from hood.assets.measured import stretch_stiffness
 from hood.losses.damping import StretchDamping
 from hood.losses.elements import element_energies, library
 from hood.losses.potential import Potential
-from hood.losses.stretching import Stretching
+from hood.losses.problem import sum_per_scene
+from hood.losses.stretching import Stretching, green_strain
 from hood.losses.weave import weave_roots
+from hood.mesh import geometry
 from hood.scene.cloth import Cloth, build_cloth, concatenate_cloths
 from hood.testing import cylinder, grid, make_problem, random_rotation, sphere
 
@@ -61,6 +63,17 @@ def test_the_default_fabric_has_no_weave_and_a_factor_gives_it_one():
     assert build_cloth(*grid(3, 3), Material(), dtype=F64).weave is None
     assert build_cloth(*grid(3, 3), Material(warp=FaceField(np.ones(8))), dtype=F64).grain is None
     assert woven(grid(3, 3)).weave.tolist() == [[40.0, 15.0, 0.3]] * 8
+
+
+def test_isotropic_cloth_is_computed_as_ever_to_the_last_bit():
+    cloth = build_cloth(*cylinder(7, 4), Material(warp=1.0, weft=1.0, shear=1.0))
+    pos = deformed(cloth).float()
+    assert torch.equal(cloth.rest_inverse, geometry.rest_inverse(cloth.rest_pos.double(), cloth.faces).float())
+    g00, g01, g11 = green_strain(pos, cloth.faces, cloth.rest_inverse)
+    trace, square = g00 + g11, g00 * g00 + g11 * g11 + 2.0 * g01 * g01
+    density = cloth.lame_mu * square + 0.5 * cloth.lame_lambda * trace * trace
+    expected = sum_per_scene(cloth.rest_area * cloth.thickness * density, cloth.face_scene, 1)
+    assert torch.equal(Stretching()(make_problem(cloth), pos, pos), expected)
 
 
 def test_every_stiffness_is_what_its_factor_says():

@@ -23,6 +23,7 @@ from hood.native.build import BuildError
 from hood.scene.cloth import Cloth, build_cloth, concatenate_cloths
 from hood.solver import engine
 from hood.solver.elements import Corners, face_constants, face_model
+from hood.solver.engine import EngineSystem
 from hood.solver.iterate import Unknowns
 from hood.solver.newton import NewtonSettings, minimize
 from hood.solver.plan import plan_for, quadratic_model
@@ -156,6 +157,8 @@ def test_the_compiled_solver_sees_a_changed_weave():
     found = [minimize(default_potential(), one, settings=COMPILED)[1] for one in (problem, softer, plain, problem)]
     energies = [float(report.phi) for report in found]
     assert energies[0] == energies[3]
+    (scene,) = EngineSystem(default_potential(), plain, plan_for(plain), 100)._engines
+    assert scene.values.weave is None  # isotropic again: the compiled solver runs what it ran before
     assert len(set(energies)) == 3
 
 
