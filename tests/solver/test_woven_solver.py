@@ -11,7 +11,7 @@ from test_engine import COMPILED, TORCH, dense, dense_of, model_at
 from test_plan import states, touching_sheet
 from torch import Tensor
 
-from hood.assets.material import FaceField, Material
+from hood.assets.material import Material
 from hood.assets.measured import stretch_stiffness
 from hood.losses.damping import BendDamping, StretchDamping
 from hood.losses.gravity import Gravity
@@ -28,7 +28,7 @@ from hood.solver.iterate import Unknowns
 from hood.solver.newton import NewtonSettings, minimize
 from hood.solver.plan import plan_for, quadratic_model
 from hood.solver.sweeps import sweep
-from hood.testing import cylinder, grid, make_problem
+from hood.testing import cylinder, grid, make_problem, with_weave
 
 F64 = torch.float64
 WOVEN = Material(warp=40.0, weft=15.0, shear=0.3)
@@ -46,12 +46,9 @@ def compiler():
 def woven_sheet() -> StepProblem:
     """The touching sheet of the solver's tests, of which one half is woven and the other as it was."""
     problem = touching_sheet()
-    whole = problem.cloth
-    centre = whole.rest_pos[whole.faces].mean(dim=1)[:, 0]
-    half = (centre > centre.mean()).numpy()
-    factors = {name: FaceField(np.where(half, getattr(WOVEN, name), 1.0)) for name in ("warp", "weft", "shear")}
-    made = build_cloth(whole.rest_pos.numpy(), whole.faces.numpy(), Material(**factors), dtype=F64)
-    return replace(problem, cloth=replace(whole, weave=made.weave, grain=made.grain, rest_inverse=made.rest_inverse))
+    cloth = with_weave(problem.cloth)
+    centre = cloth.rest_pos[cloth.faces].mean(dim=1)[:, :1]
+    return replace(problem, cloth=replace(cloth, weave=torch.where(centre > centre.mean(), cloth.weave, 1.0)))
 
 
 @pytest.mark.parametrize("damped", [False, True])
