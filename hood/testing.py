@@ -22,6 +22,7 @@ from hood.losses.potential import Potential, Term
 from hood.losses.problem import StepProblem
 from hood.scene.cloth import Cloth, build_cloth, concatenate_cloths
 from hood.scene.contact import Contact
+from hood.scene.grain import along_grain, grain_of
 from hood.scene.state import Obstacle, State, StepInput
 
 Mesh = tuple[np.ndarray, np.ndarray]
@@ -84,6 +85,13 @@ def random_rotation(rng: np.random.Generator) -> np.ndarray:
     q, r = np.linalg.qr(rng.normal(size=(3, 3)))
     q *= np.sign(np.diag(r))
     return q if np.linalg.det(q) > 0 else -q
+
+
+def with_weave(cloth: Cloth, warp: float = 40.0, weft: float = 15.0, shear: float = 0.3) -> Cloth:
+    """The same cloth with these factors along its warp, which runs upwards at rest; see :mod:`hood.losses.weave`."""
+    grain = torch.as_tensor(grain_of(cloth.rest_pos.double().numpy(), cloth.faces.numpy())).to(cloth.rest_pos)
+    weave = cloth.rest_area.new_tensor([warp, weft, shear]).repeat(len(cloth.faces), 1)
+    return replace(cloth, weave=weave, grain=grain, rest_inverse=along_grain(cloth.rest_inverse, grain))
 
 
 def make_problem(

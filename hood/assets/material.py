@@ -25,6 +25,9 @@ class EdgeField:
 #: is said, never guessed: meshes may have as many vertices as faces.
 Field = float | np.ndarray | FaceField | EdgeField
 
+#: Properties that make a fabric differ along warp and weft, in the order of ``Cloth.weave``.
+WEAVE = ("warp", "weft", "shear")
+
 #: Ranges of the paper [SI]; the features are normalised by them, training samples inside them.
 RANGES: dict[str, tuple[float, float]] = {
     "density": (0.0434, 0.7),
@@ -43,6 +46,8 @@ class Material:
 
     Defaults: the paper's default fabric (density 0.20022 kg/m², μ 23600 Pa, λ 44400 Pa, bending stiffness 3.9626e-5 J).
     ``friction`` is a factor, not a coefficient, for friction on the body is of two: fabrics and regions that grip or slide.
+    ``warp``, ``weft`` and ``shear`` are factors on the stiffness of the isotropic fabric, see :mod:`hood.losses.weave`: of a
+    strip along the warp, of one along the weft, and against shear between the two. All 1: isotropic.
 
     Raises:
         ValueError: a value is not finite or not physical; names the property and the index.
@@ -54,6 +59,9 @@ class Material:
     bending_stiffness: Field = 3.9626e-5  # J (N·m), k of the dihedral energy ½ k l₀² / (4 (A₁ + A₂)) θ²
     thickness: Field = 4.7e-4  # m
     friction: Field = 1.0  # times the coefficient of the potential's friction on the body
+    warp: Field = 1.0  # times the stretch stiffness of the isotropic fabric, along the warp
+    weft: Field = 1.0  # the same along the weft
+    shear: Field = 1.0  # times its shear stiffness, between warp and weft
 
     @staticmethod
     def names() -> tuple[str, ...]:
@@ -66,6 +74,7 @@ class Material:
             "bending_stiffness": (">= 0", lambda v: v >= 0),
             "thickness": ("> 0", lambda v: v > 0),
             "friction": (">= 0", lambda v: v >= 0),
+            **dict.fromkeys(WEAVE, ("> 0", lambda v: v > 0)),
         }
         for name in self.names():
             values, place = values_of(getattr(self, name))

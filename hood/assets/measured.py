@@ -22,6 +22,9 @@ shear stiffness", J. Text. Inst. 56, 1965). Y is the geometric mean of warp and 
 has a stretch stiffness of 4 G at most, and of 3 G at ν = 0.5; woven cloth has some hundred G. So the stretch stiffness of
 wovens is not reached, which matters where they are pulled: see docs/fabrics.md.
 
+Fabrics that are ``woven`` reach it, by the energy of :mod:`hood.losses.weave`: ``warp`` and ``weft`` are the measured stretch
+stiffnesses over that of the isotropic fabric, whose G and ν stay.
+
 k = 4 B: on a mesh of equilateral triangles the hinge energy of a sheet bent to a cylinder is that of a plate of rigidity k/4,
 in every direction. B is the mean of warp and weft.
 """
@@ -46,8 +49,9 @@ def measured(
     bending_warp: float,
     bending_weft: float,
     friction: float = 1.0,
+    woven: bool = False,
 ) -> Material:
-    """The isotropic fabric nearest to a measured cloth, by the rules above.
+    """The fabric nearest to a measured cloth, by the rules above.
 
     Args:
         density: kg/m².
@@ -55,9 +59,11 @@ def measured(
         shear: force per width over the angle of shear in radians, N/m.
         bending_warp, bending_weft: bending rigidity of a strip along warp or weft per width, N·m.
         friction: times the coefficient of friction on the body.
+        woven: whether it stretches along warp and weft as measured; otherwise it is isotropic.
 
     Raises:
-        ValueError: a value is not finite, or not positive (bending may be 0); names the key.
+        ValueError: a value is not finite, or not positive (bending may be 0), or ``woven`` is neither true nor false; names
+            the key.
 
     Examples:
         >>> fabric = measured(0.2635, 8134.0, 8134.0, 54.4, 1.331e-5, 1.331e-5)
@@ -72,15 +78,21 @@ def measured(
         bending = key.startswith("bending")
         if not math.isfinite(value) or value < 0 or (value == 0 and not bending):
             raise ValueError(f"material {key!r} is {value}; it must be finite and {'>= 0' if bending else '> 0'}")
+    if not isinstance(woven, bool):
+        raise ValueError(f"material 'woven' is {woven!r}; give true (warp and weft as measured) or false (isotropic)")
     poisson = min(max(0.5 * math.sqrt(stretch_warp * stretch_weft) / shear - 1.0, 0.0), _POISSON)
     mu = shear / _THICKNESS
+    lam = 2.0 * mu * poisson / (1.0 - poisson)
+    isotropic = stretch_stiffness(mu, lam, _THICKNESS)
     return Material(
         density=density,
         lame_mu=mu,
-        lame_lambda=2.0 * mu * poisson / (1.0 - poisson),
+        lame_lambda=lam,
         bending_stiffness=4.0 * 0.5 * (bending_warp + bending_weft),
         thickness=_THICKNESS,
         friction=friction,
+        warp=stretch_warp / isotropic if woven else 1.0,
+        weft=stretch_weft / isotropic if woven else 1.0,
     )
 
 

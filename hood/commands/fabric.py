@@ -13,13 +13,13 @@ from omegaconf import DictConfig
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.library import unknown
 from hood.assets.material import Material, values_of
-from hood.assets.measured import bending_length, measured, stretch_stiffness
+from hood.assets.measured import bending_length, stretch_stiffness
 from hood.commands.common import output_folder, prepare_folder, require_distinct, require_package, split_words
-from hood.config import ConfigError, build, load_config, options, plain
+from hood.commands.fabrics import fabric_named, is_measured
+from hood.config import ConfigError, load_config, options, plain
 from hood.evaluation.drape import COARSEST, FINEST, Drape, drape
 
 _PLAIN = ("density", "lame_mu", "lame_lambda", "bending_stiffness", "thickness")
-_MEASURED = f"{measured.__module__}.{measured.__name__}"
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Described:
         bending: N·m along warp and weft.
         bending_length: [m] of the mean of warp and weft.
         material: of the simulation.
-        simulated_stretch: N/m, of ``material``, in every direction.
+        simulated_stretch: N/m along warp and weft, of ``material``.
         measured: whether the file tells measured cloth; else all is that of the isotropic ``material``.
     """
 
@@ -44,7 +44,7 @@ class Described:
     bending: tuple[float, float]
     bending_length: float
     material: Material
-    simulated_stretch: float
+    simulated_stretch: tuple[float, float]
     measured: bool
 
 
@@ -56,7 +56,7 @@ def run(arguments: Sequence[str]) -> int:
     folder = None if config.output is None else output_folder(config)
     if folder is not None and names and edges:
         require_package("matplotlib", "matplotlib", "charts", "hood fabric output=…")
-    fabrics = [described(name) for name in names or options("material")]
+    fabrics = [described(name, bool(config.woven)) for name in names or options("material")]
     if folder is not None:
         prepare_folder(folder)
     print("\n".join(_table(fabrics)), flush=True)
@@ -73,8 +73,8 @@ def run(arguments: Sequence[str]) -> int:
     return 0
 
 
-def described(name: str) -> Described:
-    """The fabric of an option of ``material=``.
+def described(name: str, woven: bool = False) -> Described:
+    """The fabric of an option of ``material=``; measured cloth stretches as measured if ``woven``.
 
     Raises:
         ConfigError: there is none of this name, or it is not the same everywhere.
@@ -82,21 +82,22 @@ def described(name: str) -> Described:
     known = options("material")
     if name not in known:
         raise ConfigError(unknown("fabric", name, known))
-    node = load_config("rollout", [f"material={name}"]).material
-    material: Material = build(node)
+    told = is_measured(name)
+    material = fabric_named(name, woven if told else None)
     if any(values_of(getattr(material, key))[1] for key in Material.names()):
         raise ConfigError(f"fabric {name!r} is not the same everywhere, and has no one value of its properties; name another")
     numbers = {key: float(values_of(getattr(material, key))[0]) for key in Material.names()}
     density, mu, lam, k, thickness = (numbers[key] for key in _PLAIN)
-    stretch = stretch_stiffness(mu, lam, thickness)
-    told = str(node.get("_target_")) == _MEASURED
-    warp, weft = (node.stretch_warp, node.stretch_weft) if told else (stretch, stretch)
+    isotropic = stretch_stiffness(mu, lam, thickness)
+    stretch = isotropic * numbers["warp"], isotropic * numbers["weft"]
+    node = load_config("rollout", [f"material={name}"]).material
+    warp, weft = (node.stretch_warp, node.stretch_weft) if told else stretch
     along, across = (node.bending_warp, node.bending_weft) if told else (0.25 * k, 0.25 * k)
     return Described(
         name,
         density,
         (float(warp), float(weft)),
-        thickness * mu,
+        thickness * mu * numbers["shear"],
         (float(along), float(across)),
         bending_length(0.25 * k, density),
         material,
@@ -123,7 +124,9 @@ def _table(fabrics: Sequence[Described]) -> list[str]:
         [
             fabric.name,
             f"{1e3 * fabric.density:.0f}",
-            *(f"{value:.0f}" for value in (*fabric.stretch, fabric.simulated_stretch, fabric.shear)),
+            *(f"{value:.0f}" for value in fabric.stretch),
+            "/".join(dict.fromkeys(f"{value:.0f}" for value in fabric.simulated_stretch)),
+            f"{fabric.shear:.0f}",
             "/".join(f"{1e6 * value:.3g}" for value in dict.fromkeys(fabric.bending)),
             f"{1e3 * fabric.bending_length:.1f}",
         ]
@@ -133,7 +136,7 @@ def _table(fabrics: Sequence[Described]) -> list[str]:
 
 
 def _row(cells: Sequence[str]) -> str:
-    return f"{cells[0]:<18}" + "".join(f"{cell:>11}" for cell in cells[1:])
+    return f"{cells[0]:<18}" + "".join(f"{cell:>12}" for cell in cells[1:])
 
 
 def _drape_row(name: str, drapes: Sequence[Drape]) -> str:
@@ -165,7 +168,8 @@ def _as_dict(fabric: Described, drapes: Sequence[Drape]) -> dict[str, Any]:
         "bending_length": fabric.bending_length,
         "measured": fabric.measured,
         "simulated": {
-            "stretch": fabric.simulated_stretch,
+            "stretch_warp": fabric.simulated_stretch[0],
+            "stretch_weft": fabric.simulated_stretch[1],
             **{key: float(values_of(getattr(fabric.material, key))[0]) for key in Material.names()},
         },
         "drape": [

@@ -11,9 +11,12 @@ from hood.assets.files.library import unknown
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.parts import part_faces
 from hood.assets.material import Material
+from hood.assets.measured import measured
 from hood.config import ConfigError, build, load_config, options, plain
 from hood.scene.fabric import patchwork
 from hood.scene.motion import BodyMotion, Motion
+
+_MEASURED = f"{measured.__module__}.{measured.__name__}"
 
 
 def fabric_of(config: DictConfig, garment: Garment, motion: Motion) -> Material:
@@ -56,16 +59,26 @@ def _fabric(part: str, given: str | dict[str, Any], config: DictConfig) -> Mater
     known = options("material")
     if name is not None and name not in known:
         raise ConfigError(f"fabrics: {part}: {unknown('material', str(name), known)}")
+    woven = own.pop("woven", None)
     for key, value in own.items():
         if key not in Material.names():
-            raise ConfigError(f"fabrics: {part}: {unknown('property', key, ['material', *Material.names()])}")
+            raise ConfigError(f"fabrics: {part}: {unknown('property', key, ['material', 'woven', *Material.names()])}")
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise ConfigError(f"fabrics: {part}: {key} is {value!r}; give a number")
-    base: Material = build(config.material) if name is None else fabric_named(name)
+    if woven is not None and (name is None or not is_measured(name)):
+        raise ConfigError(f"fabrics: {part}: woven is for measured cloth by its name (material: linen); give warp and weft")
+    base: Material = build(config.material) if name is None else fabric_named(name, woven)
     return replace(base, **own)
 
 
-def fabric_named(name: str) -> Material:
-    """The fabric of an option of ``material=``."""
-    material: Material = build(load_config("rollout", [f"material={name}"]).material)
+def fabric_named(name: str, woven: Any = None) -> Material:
+    """The fabric of an option of ``material=``; of measured cloth also with another ``woven`` than its own."""
+    material: Material = build(
+        load_config("rollout", [f"material={name}"]).material, **({} if woven is None else {"woven": woven})
+    )
     return material
+
+
+def is_measured(name: str) -> bool:
+    """Whether an option of ``material=`` tells measured cloth."""
+    return str(load_config("rollout", [f"material={name}"]).material.get("_target_")) == _MEASURED

@@ -34,8 +34,10 @@ def facts(ready: Setup) -> dict[str, Any]:
 
 
 def wave_speed(cloth: Cloth) -> float:
-    """Speed [m/s] of waves in the plane of the cloth, √((λ + 2 μ) h / ρ), of its mean fabric."""
+    """Speed [m/s] of waves in the plane of the cloth, √((λ + 2 μ) h / ρ), of its mean fabric along the stiffer thread."""
     stiffness = (cloth.lame_lambda + 2.0 * cloth.lame_mu) * cloth.thickness
+    if cloth.weave is not None:
+        stiffness = stiffness * cloth.weave[:, :2].amax(dim=1)
     density = cloth.mass.sum() / cloth.rest_area.sum()
     return float((torch.as_tensor(stiffness).double().mean() / density.double()).sqrt())
 

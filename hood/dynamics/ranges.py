@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from hood.assets.garment.garment import Garment
-from hood.assets.material import RANGES, Material, values_of
+from hood.assets.material import RANGES, WEAVE, Material, values_of
 from hood.assets.motion.motion_files import MotionFiles
 from hood.losses.potential import Potential
 from hood.losses.problem import STANDARD_GRAVITY
@@ -42,6 +42,7 @@ Span = tuple[float, float]
 
 #: What all trainings have had, those of files that do not say included.
 _USUAL: dict[str, Span] = {"gravity": (STANDARD_GRAVITY, STANDARD_GRAVITY), "material.friction": (1.0, 1.0)}
+_USUAL |= {f"material.{name}": (1.0, 1.0) for name in WEAVE}
 
 
 @dataclass(frozen=True)
@@ -94,8 +95,10 @@ def scene_conditions(
     factors = (1.0,) if sizes is None else (*sizes.start, *sizes.end, *sizes.parts)
     size = min(factors), max(factors)
     spans: dict[str, Span] = {"fps": (1.0 / dt, 1.0 / dt), "size": size, "gravity": (gravity, gravity)}
-    fabric = {f"material.{name}": getattr(cloth, name) for name in Material.names()}
-    spans |= {name: _extent(values) for name, values in fabric.items() if values.numel()}
+    fabric = {name: getattr(cloth, name) for name in Material.names() if name not in WEAVE}
+    weave = cloth.rest_area.new_ones(1, 3) if cloth.weave is None else cloth.weave
+    fabric |= dict(zip(WEAVE, weave.unbind(dim=1), strict=True))
+    spans |= {f"material.{name}": _extent(values) for name, values in fabric.items() if values.numel()}
     spans |= _resolution([garment])
     if betas is not None and len(betas):
         spans["betas"] = (float(np.min(betas)), float(np.max(betas)))

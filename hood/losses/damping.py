@@ -9,7 +9,7 @@ from torch import Tensor
 
 from hood.losses.bending import bending_weight
 from hood.losses.problem import StepProblem, sum_per_scene
-from hood.losses.stretching import green_strain
+from hood.losses.stretching import green_strain, membrane_density
 from hood.mesh.geometry import dihedral_angles
 
 
@@ -18,7 +18,8 @@ class StretchDamping:
 
     ΔG = G(x) - G(x_t) is the Green strain that the step adds: a Kelvin-Voigt solid, whose viscous stress is η times the rate
     of its elastic one (stiffness-proportional Rayleigh damping). A small vibration of ω [1/s] dies as exp(-η ω² t / 2).
-    Rigid motion is not damped; no net force or torque.
+    Rigid motion is not damped; no net force or torque. Cloth with warp and weft has the density of
+    :mod:`hood.losses.weave` in place of μ tr ΔG² + ½ λ tr² ΔG.
 
     Args:
         time: η [s], the retardation time of the fabric.
@@ -35,8 +36,7 @@ class StretchDamping:
         cloth = problem.cloth
         now, before = (green_strain(pos, cloth.faces, cloth.rest_inverse) for pos in (next_pos, problem.state.pos))
         g00, g01, g11 = (a - b for a, b in zip(now, before, strict=True))
-        trace = g00 + g11
-        density = cloth.lame_mu * (g00 * g00 + g11 * g11 + 2.0 * g01 * g01) + 0.5 * cloth.lame_lambda * trace * trace
+        density = membrane_density(cloth, (g00, g01, g11))
         rate = self.time / problem.step.dt[cloth.face_scene]
         return sum_per_scene(rate * cloth.rest_area * cloth.thickness * density, cloth.face_scene, cloth.num_scenes)
 

@@ -21,6 +21,7 @@ from hood import native
 from hood.losses.bending import Bending, CurrentLengthBending, bending_weight
 from hood.losses.problem import StepProblem
 from hood.losses.stretching import Stretching
+from hood.losses.weave import weave_roots
 from hood.mesh.kept import forget
 from hood.native.build import optional
 from hood.native.structures import COUNT, POINTER, fields
@@ -42,7 +43,7 @@ Sum = Callable[["Potential", StepProblem, Tensor], Tensor]
 
 
 class _Faces(ctypes.Structure):
-    _fields_ = [*fields("count padded", COUNT), *fields("corners scene inverse weight mu lambda_", POINTER)]
+    _fields_ = [*fields("count padded", COUNT), *fields("corners scene inverse weight mu lambda_ weave", POINTER)]
 
 
 class _Hinges(ctypes.Structure):
@@ -173,16 +174,18 @@ def _make_constants(cloth: Cloth) -> _Constants:
     tables = [[*faces, cloth.lame_mu, cloth.lame_lambda]]
     tables += [[cloth.hinges, cloth.hinge_scene, weight, cloth.rest_angle] for weight in weights]
     kept = [[_padded(tensor) for tensor in table] for table in tables]
+    roots = weave_roots(cloth, torch.float64)
+    weave = [] if roots is None else [_padded(roots.t())]
     sizes = [(len(elements), table[1].shape[-1]) for elements, table in zip((cloth.faces, cloth.hinges), kept, strict=False)]
     ends = cloth.edges.unbind(dim=1)
     rest = cloth.rest_pos.double()
     return _Constants(
-        _Faces(*sizes[0], *(array.ctypes.data for array in kept[0])),
+        _Faces(*sizes[0], *(array.ctypes.data for array in (*kept[0], *weave))),
         _Hinges(*sizes[1], 0, *(array.ctypes.data for array in kept[1])),
         _Hinges(*sizes[1], 1, *(array.ctypes.data for array in kept[2])),
         _whole(cloth.edges),
         _whole((rest[ends[1]] - rest[ends[0]]).norm(dim=1)),
-        [array for table in kept for array in table],
+        [array for table in (*kept, weave) for array in table],
     )
 
 

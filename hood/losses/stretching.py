@@ -1,10 +1,12 @@
-"""Membrane energy of St. Venant-Kirchhoff cloth."""
+"""Membrane energy of St. Venant-Kirchhoff cloth; that of cloth with warp and weft is in :mod:`hood.losses.weave`."""
 
 from __future__ import annotations
 
 from torch import Tensor
 
 from hood.losses.problem import StepProblem, sum_per_scene
+from hood.losses.weave import weave_density, weave_roots
+from hood.scene.cloth import Cloth
 
 
 class Stretching:
@@ -15,7 +17,8 @@ class Stretching:
     invariant under rigid motion, no net force or torque; finite for every shape, as F enters as a polynomial.
 
     A → ``cloth.rest_area`` [m²], h → ``cloth.thickness`` [m], μ, λ → ``cloth.lame_mu``, ``cloth.lame_lambda``
-    [Pa], D_m⁻¹ → ``cloth.rest_inverse`` [1/m].
+    [Pa], D_m⁻¹ → ``cloth.rest_inverse`` [1/m]. Cloth that has a ``weave`` has the orthotropic energy of
+    :mod:`hood.losses.weave` instead.
     """
 
     def applies(self, problem: StepProblem) -> bool:
@@ -24,11 +27,19 @@ class Stretching:
     def __call__(self, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> Tensor:
         """Energy [J] (B,) at ``next_pos`` (V, 3)."""
         cloth = problem.cloth
-        g00, g01, g11 = green_strain(next_pos, cloth.faces, cloth.rest_inverse)
-        trace = g00 + g11
-        square = g00 * g00 + g11 * g11 + 2.0 * g01 * g01
-        density = cloth.lame_mu * square + 0.5 * cloth.lame_lambda * trace * trace
+        density = membrane_density(cloth, green_strain(next_pos, cloth.faces, cloth.rest_inverse))
         return sum_per_scene(cloth.rest_area * cloth.thickness * density, cloth.face_scene, cloth.num_scenes)
+
+
+def membrane_density(cloth: Cloth, strain: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+    """Elastic energy per volume [J/m³] (F,) of Green strains of the faces."""
+    roots = weave_roots(cloth)
+    if roots is not None:
+        return weave_density(roots, strain)
+    g00, g01, g11 = strain
+    trace = g00 + g11
+    square = g00 * g00 + g11 * g11 + 2.0 * g01 * g01
+    return cloth.lame_mu * square + 0.5 * cloth.lame_lambda * trace * trace
 
 
 def green_strain(pos: Tensor, faces: Tensor, rest_inverse: Tensor) -> tuple[Tensor, Tensor, Tensor]:

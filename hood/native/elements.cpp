@@ -49,6 +49,7 @@ struct Faces {
     int64_t count, padded;
     const int32_t *corners, *scene;                // (3, F), (F)
     const double *inverse, *weight, *mu, *lambda;  // (4, F) 1/m, (F) m^3, Pa, Pa
+    const double* weave;  // (4, F) roots of the stiffness of cloth with warp and weft, see hood.losses.weave; or none
 };
 
 struct Hinges {
@@ -71,13 +72,24 @@ void elements_faces(const Faces* faces, const double* pos, double* energy, doubl
             f0[k] = m[0] * d1 + m[2] * d2, f1[k] = m[1] * d1 + m[3] * d2;
         }
         const V8 g00 = 0.5 * (dot(f0, f0) - 1.0), g01 = 0.5 * dot(f0, f1), g11 = 0.5 * (dot(f1, f1) - 1.0);
-        const V8 trace = g00 + g11, square = g00 * g00 + g11 * g11 + 2.0 * g01 * g01;
-        const V8 weight = load<V8>(faces->weight + i), mu = load<V8>(faces->mu + i), lambda = load<V8>(faces->lambda + i);
-        add_energy(weight * (mu * square + 0.5 * lambda * trace * trace), faces->scene + i, count, energy);
+        const V8 weight = load<V8>(faces->weight + i);
+        V8 s00, s01, s11;
+        if (faces->weave) {
+            const double* roots = faces->weave + i;
+            const V8 first = load<V8>(roots), coupled = load<V8>(roots + padded);
+            const V8 second = load<V8>(roots + 2 * padded), turn = load<V8>(roots + 3 * padded);
+            const V8 a = first * g00 + coupled * g11, b = second * g11, c = 2.0 * turn * g01;
+            add_energy(0.5 * weight * (a * a + b * b + c * c), faces->scene + i, count, energy);
+            s00 = weight * first * a, s01 = weight * turn * c, s11 = weight * (coupled * a + second * b);
+        } else {
+            const V8 trace = g00 + g11, square = g00 * g00 + g11 * g11 + 2.0 * g01 * g01;
+            const V8 mu = load<V8>(faces->mu + i), lambda = load<V8>(faces->lambda + i);
+            add_energy(weight * (mu * square + 0.5 * lambda * trace * trace), faces->scene + i, count, energy);
+            s00 = weight * (2.0 * mu * g00 + lambda * trace), s01 = weight * 2.0 * mu * g01;
+            s11 = weight * (2.0 * mu * g11 + lambda * trace);
+        }
         if (!gradient) continue;
-        // First Piola-Kirchhoff stress F S, S = 2 mu G + lambda tr G, pulled back to the two edges.
-        const V8 s00 = weight * (2.0 * mu * g00 + lambda * trace), s01 = weight * 2.0 * mu * g01;
-        const V8 s11 = weight * (2.0 * mu * g11 + lambda * trace);
+        // First Piola-Kirchhoff stress F S, S = 2 mu G + lambda tr G or that of the weave, pulled back to the two edges.
         V8 force[3][3];
         for (int k = 0; k < 3; ++k) {
             const V8 p0 = s00 * f0[k] + s01 * f1[k], p1 = s01 * f0[k] + s11 * f1[k];

@@ -62,6 +62,8 @@ struct Engine {
     // The fabric: constant as long as the cloth's numbers.
     const double *shape, *area, *mu, *lambda, *bulk, *soft;  // (6, F) 1/m, (F) m^3, Pa, Pa and roots of moduli times area
     const double *rest_angle, *hinge_weight, *rest_length;   // (H)
+    // Cloth with warp and weft: (4, F) roots of its stiffness, see hood.losses.weave, in place of mu, lambda, bulk and soft; or none.
+    const double* weave;
     // Damping in the step: viscous stress or moment over the elastic one of what the step adds, and the shape before; or none.
     const double *face_rate, *face_before;    // (F), (3, F) Green strains
     const double *hinge_rate, *hinge_before;  // (H), (H) angles
@@ -159,6 +161,41 @@ inline void since_start(const Engine& e, int64_t i, Strain& s) {
     s.g11 -= load<V8>(e.face_before + 2 * e.num_faces + i);
 }
 
+// Cloth with warp and weft: half the sum of squares is the density; one root of each line acts on 00, one on 11, one on 2 01.
+struct Weave {
+    V8 first, coupled, second, turn;
+};
+
+inline Weave weave_of(const Engine& e, int64_t i) {
+    const double* roots = e.weave + i;
+    return {load<V8>(roots), load<V8>(roots + e.num_faces), load<V8>(roots + 2 * e.num_faces), load<V8>(roots + 3 * e.num_faces)};
+}
+
+inline V8 density_of(const Weave& w, const Strain& s) {
+    const V8 a = w.first * s.g00 + w.coupled * s.g11, b = w.second * s.g11, c = 2.0 * w.turn * s.g01;
+    return 0.5 * (a * a + b * b + c * c);
+}
+
+inline void add_stress(const Weave& w, const Strain& s, V8 factor, V8& s00, V8& s01, V8& s11) {
+    const V8 a = w.first * s.g00 + w.coupled * s.g11;
+    s00 += factor * w.first * a, s01 += factor * 2.0 * w.turn * w.turn * s.g01;
+    s11 += factor * (w.coupled * a + w.second * w.second * s.g11);
+}
+
+double woven_energy(const Engine& e, const double* pos, Range range) {
+    double sum = 0.0;
+    for (int64_t i = range.begin; i < range.end; i += LANES) {
+        Strain s;
+        strain_of(e, pos, i, s);
+        const Weave w = weave_of(e, i);
+        sum += total(load<V8>(e.area + i) * density_of(w, s));
+        if (!e.face_rate) continue;
+        since_start(e, i, s);
+        sum += total(load<V8>(e.area + i) * load<V8>(e.face_rate + i) * density_of(w, s));
+    }
+    return sum;
+}
+
 double face_energy(const Engine& e, const double* pos, Range range) {
     double sum = 0.0;
     for (int64_t i = range.begin; i < range.end; i += LANES) {
@@ -186,7 +223,20 @@ template <class T> void face_models(const Engine& e, const double* pos, Range ra
         const V8 pressure = load<V8>(e.lambda + i) * (s.g00 + s.g11);
         V8 s00 = 2.0 * mu * s.g00 + pressure, s01 = 2.0 * mu * s.g01, s11 = 2.0 * mu * s.g11 + pressure;
         V8 bulk = load<V8>(e.bulk + i), soft = load<V8>(e.soft + i);
-        if (e.face_rate) {
+        Weave weave;
+        if (e.weave) {
+            weave = weave_of(e, i);
+            s00 = s01 = s11 = zero;
+            add_stress(weave, s, one, s00, s01, s11);
+            V8 size = root(area);
+            if (e.face_rate) {
+                const V8 rate = load<V8>(e.face_rate + i);
+                since_start(e, i, s);
+                add_stress(weave, s, rate, s00, s01, s11);
+                size *= root(1.0 + rate);
+            }
+            weave.first *= size, weave.coupled *= size, weave.second *= size, weave.turn *= size;
+        } else if (e.face_rate) {
             const V8 rate = load<V8>(e.face_rate + i), stiffer = root(1.0 + rate);
             since_start(e, i, s);
             const V8 added = load<V8>(e.lambda + i) * (s.g00 + s.g11);
@@ -211,8 +261,12 @@ template <class T> void face_models(const Engine& e, const double* pos, Range ra
             for (int k = 0; k < 3; ++k) {
                 const V8 force = pull0[c] * s.f[0][k] + pull1[c] * s.f[1][k];
                 const V8 along = b0[c] * s.f[0][k], across = b1[c] * s.f[1][k];
-                const V8 roots[3] = {bulk * (along + across), soft * (along - across),
-                                     soft * (b0[c] * s.f[1][k] + b1[c] * s.f[0][k])};
+                const V8 turned = b0[c] * s.f[1][k] + b1[c] * s.f[0][k];
+                V8 roots[3] = {bulk * (along + across), soft * (along - across), soft * turned};
+                if (e.weave) {
+                    roots[0] = weave.first * along + weave.coupled * across;
+                    roots[1] = weave.second * across, roots[2] = weave.turn * turned;
+                }
                 for (int lane = 0; lane < LANES; ++lane) {
                     e.face_force[10 * (i + lane) + 3 * c + k] = force[lane];
                     for (int m = 0; m < 3; ++m) records[i + lane].root[9 * m + 3 * c + k] = (T)roots[m][lane];
@@ -571,7 +625,7 @@ void energy(const Engine& e, const double* pos, const double* acc, double* phi, 
     }
     Sums<double> faces, hinges;
     for_parts(e.parts, [&](int64_t part) {
-        if (e.membrane) faces[part] = face_energy(e, pos, faces_of(e, part));
+        if (e.membrane) faces[part] = e.weave ? woven_energy(e, pos, faces_of(e, part)) : face_energy(e, pos, faces_of(e, part));
         if (e.bending) hinges[part] = hinge_energy(e, pos, hinges_of(e, part));
     });
     if (e.membrane) add(faces.total(e.parts));

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from hood.assets.material import Material
+from hood.assets.material import WEAVE, Material
 from hood.mesh import geometry, topology
 from hood.mesh.quality import check_triangles
 from hood.scene.batch import concatenate, indexes
 from hood.scene.fabric import FabricMap
+from hood.scene.grain import along_grain, grain_of
 
 #: Faces longer than this many times their height are warned about: their elements are stiff and lose digits.
 _ASPECT_LIMIT = 1e3
@@ -51,10 +52,13 @@ class Cloth:
     # derived from the rest shape
     mass: Tensor = None  # type: ignore[assignment]  # (V,) kg
     rest_area: Tensor = None  # type: ignore[assignment]  # (F,) m²
-    rest_inverse: Tensor = None  # type: ignore[assignment]  # (F, 2, 2) 1/m, inverse of the rest edge matrix
+    rest_inverse: Tensor = None  # type: ignore[assignment]  # (F, 2, 2) 1/m, inverse of the rest edge matrix; with a weave in the frame of warp and weft
     hinge_rest_length: Tensor = None  # type: ignore[assignment]  # (H,) m, hinge edge at rest
     hinge_area: Tensor = None  # type: ignore[assignment]  # (H,) m², sum of the two faces at rest
     rest_angle: Tensor = None  # type: ignore[assignment]  # (H,) rad
+    # None where the fabric is the same in all directions
+    weave: Tensor | None = None  # (F, 3) factors on its stiffness along the warp, along the weft and in shear
+    grain: Tensor | None = None  # (F, 2) warp as shares of the edges x₁ - x₀ and x₂ - x₀; zero where it plays no role
     num_scenes: int = 1
 
     @property
@@ -105,6 +109,7 @@ def build_cloth(
     flat_rest: bool = False,
     stiffness: np.ndarray | None = None,
     dtype: torch.dtype = torch.float32,
+    uv: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Cloth:
     """Cloth of one garment.
 
@@ -120,6 +125,8 @@ def build_cloth(
         pinned: (V,) bool, vertices that follow prescribed positions.
         stiffness: (V,) factors on both Lamé parameters, of bindings and seams; faces and edges have the mean of their corners.
         flat_rest: take 0 as rest angle of every hinge instead of the angle in ``rest_pos``.
+        uv: texture coordinates (U, 2) and those of every face's corners, (F, 3): along v runs the warp of a fabric that has
+            one. None: see :func:`hood.scene.grain.grain_of`.
 
     Raises:
         ValueError: the mesh cannot be simulated (see :func:`hood.mesh.quality.check_triangles`), a fabric's field or
@@ -153,6 +160,10 @@ def build_cloth(
         "hinge_area": area[torch.as_tensor(hinge_table.faces)].sum(dim=1),
         "rest_angle": torch.zeros_like(angle) if flat_rest else angle,
     }
+    weave = np.stack([fabric.on_faces(name) for name in WEAVE], axis=1)
+    if (weave != 1.0).any():
+        grain = torch.as_tensor(grain_of(points, triangles, uv))
+        real |= {"weave": torch.tensor(weave), "grain": grain, "rest_inverse": along_grain(real["rest_inverse"], grain)}
     return Cloth(
         faces=tri,
         edges=edges,
@@ -170,7 +181,15 @@ def build_cloth(
 def concatenate_cloths(cloths: Sequence[Cloth]) -> Cloth:
     """Several cloths as one flat batch; scene *i* of the result is the *i*-th scene of the inputs in order."""
     counts = {"vertices": [c.num_vertices for c in cloths], "scenes": [c.num_scenes for c in cloths]}
+    if any(cloth.weave is not None for cloth in cloths):
+        cloths = [cloth if cloth.weave is not None else _without_grain(cloth) for cloth in cloths]
     return concatenate(cloths, counts)
+
+
+def _without_grain(cloth: Cloth) -> Cloth:
+    """An isotropic cloth as one with a weave: the same energy to rounding."""
+    like, count = cloth.rest_area, len(cloth.faces)
+    return replace(cloth, weave=like.new_ones(count, 3), grain=like.new_zeros(count, 2))
 
 
 #: What vertex_fabric and edge_fabric hold, in this order.

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from hood.mesh import geometry
 from hood.scene.cloth import Cloth
+from hood.scene.grain import along_grain
 
 #: Sizes outside are no garment's.
 LEAST, MOST = 0.2, 5.0
@@ -85,6 +86,8 @@ def resized(cloth: Cloth, before: tuple[float, float, float], now: tuple[float, 
         "hinge_rest_length": (pos[hinges[:, 1]] - pos[hinges[:, 0]]).norm(dim=1),
         "hinge_area": sum(geometry.triangle_areas(pos, hinges[:, [0, 1, side]]) for side in (2, 3)),  # type: ignore[dict-item]
     }
+    if cloth.grain is not None:
+        real["rest_inverse"] = along_grain(real["rest_inverse"], cloth.grain.double())
     if len(set(share.tolist())) > 1:
         change = geometry.dihedral_angles(pos, hinges) - geometry.dihedral_angles(cloth.rest_pos.double(), hinges)
         real["rest_angle"] = cloth.rest_angle.double() + change

@@ -18,6 +18,7 @@ from torch import Tensor
 from hood.losses.bending import Bending, CurrentLengthBending, bending_weight
 from hood.losses.damping import BendDamping
 from hood.losses.potential import Term
+from hood.losses.weave import weave_density, weave_roots, weave_stress
 from hood.nn.dense import is_whole
 from hood.scene.cloth import Cloth
 
@@ -53,13 +54,14 @@ class FaceConstants:
     lame_lambda: Tensor  # (N,) Pa
     rate: Tensor | None = None  # (N,) viscous stress is so many times the elastic one of the step's strain; None: no damping
     before: Tensor | None = None  # (3, N) Green strains at t, with ``rate``
+    weave: Tensor | None = None  # (4, N) √Pa, see hood.losses.weave, in place of the Lamé parameters; None: isotropic
 
     def take(self, faces: Tensor, first: Tensor) -> FaceConstants:
         """Those of some ``faces`` (M,) with their corners turned so that ``first`` (M,) leads."""
         corner = (first + torch.arange(3, device=first.device)[:, None]) % 3
         shape = self.shape[:, corner, faces]
-        rate, before = (None if values is None else values[..., faces] for values in (self.rate, self.before))
-        return FaceConstants(shape, self.weight[faces], self.lame_mu[faces], self.lame_lambda[faces], rate, before)
+        own = (self.weight, self.lame_mu, self.lame_lambda, self.rate, self.before, self.weave)
+        return FaceConstants(shape, *(None if values is None else values[..., faces] for values in own))  # type: ignore[arg-type]
 
     def damped(self, rate: Tensor, pos: Tensor, faces: Tensor) -> FaceConstants:
         """The same with damping of ``rate`` (N,) about the strains of ``faces`` (N, 3) at ``pos`` (V, 3)."""
@@ -71,7 +73,8 @@ def face_constants(cloth: Cloth, factor: float = 1.0) -> FaceConstants:
     """Constants of the faces of a cloth, with a ``factor`` to its energy."""
     inverse = cloth.rest_inverse.permute(2, 1, 0)  # column, corner 1 and 2, face
     shape = torch.cat([-inverse.sum(dim=1, keepdim=True), inverse], dim=1)
-    return FaceConstants(shape.contiguous(), factor * cloth.rest_area * cloth.thickness, cloth.lame_mu, cloth.lame_lambda)
+    weight, weave = factor * cloth.rest_area * cloth.thickness, weave_roots(cloth)
+    return FaceConstants(shape.contiguous(), weight, cloth.lame_mu, cloth.lame_lambda, weave=weave)
 
 
 @dataclass(frozen=True)
@@ -95,6 +98,8 @@ def face_energy(x: Tensor, constants: FaceConstants) -> Tensor:
 
 def _density(strain: tuple[Tensor, Tensor, Tensor], constants: FaceConstants) -> Tensor:
     """Energy density [J/m³] (N,) of Green strains."""
+    if constants.weave is not None:
+        return weave_density(constants.weave, strain)
     g00, g01, g11 = strain
     trace = g00 + g11
     square = g00 * g00 + g11 * g11 + 2.0 * g01 * g01
@@ -107,7 +112,7 @@ def face_model(x: Tensor, constants: FaceConstants, num_corners: int = 3, out: T
     With S = 2 μ G + λ tr(G) I the gradient by corner j is A h F S b_j. The second derivative has a material part,
     positive for μ, λ + μ >= 0, and (b_j · S b_k) I₃, which is indefinite under compression: S is replaced there by
     its positive part, from the eigenvalues of a 2 × 2 matrix. The rest is the slack. Damping adds its stress to S and makes
-    the material part stiffer.
+    the material part stiffer. Cloth with warp and weft has the S and the material part of :mod:`hood.losses.weave`.
 
     Args:
         x: (3, 3, N) m, of corner and axis.
@@ -121,12 +126,17 @@ def face_model(x: Tensor, constants: FaceConstants, num_corners: int = 3, out: T
     pull = _apply(stress, weighted)
     gradient = pull[0][:, None] * f0 + pull[1][:, None] * f1
     tension = _apply(_positive_part(*stress), weighted)
-    # Strains G00 ± G11 and 2 G01 diagonalise the material: moduli λ + μ, μ, μ.
     weight = constants.weight if constants.rate is None else constants.weight * (1.0 + constants.rate)
-    bulk, soft = (weight * (constants.lame_lambda + mu)).sqrt(), (weight * mu).sqrt()
     along, across = b[0, :, None] * f0, b[1, :, None] * f1
     shear = b[0, :, None] * f1 + b[1, :, None] * f0
-    matrix = _outer_sum([bulk * (along + across), soft * (along - across), soft * shear], out)
+    if constants.weave is None:
+        # Strains G00 ± G11 and 2 G01 diagonalise the material: moduli λ + μ, μ, μ.
+        bulk, soft = (weight * (constants.lame_lambda + mu)).sqrt(), (weight * mu).sqrt()
+        roots = [bulk * (along + across), soft * (along - across), soft * shear]
+    else:
+        first, coupled, second, turn = weight.sqrt() * constants.weave
+        roots = [first * along + coupled * across, second * across, turn * shear]
+    matrix = _outer_sum(roots, out)
     axial = _symmetric(tension, b)
     _add_axial(matrix, axial, num_corners)
     return FaceModel(gradient, matrix, _symmetric(pull, b) - axial)
@@ -137,6 +147,8 @@ def _stress(strain: tuple[Tensor, Tensor, Tensor], constants: FaceConstants) -> 
     if constants.rate is not None and constants.before is not None:
         rate = constants.rate
         strain = tuple((1.0 + rate) * now - rate * then for now, then in zip(strain, constants.before, strict=True))  # type: ignore[assignment]
+    if constants.weave is not None:
+        return weave_stress(constants.weave, strain)
     g00, g01, g11 = strain
     mu, pressure = constants.lame_mu, constants.lame_lambda * (g00 + g11)
     return 2.0 * mu * g00 + pressure, 2.0 * mu * g01, 2.0 * mu * g11 + pressure

@@ -64,7 +64,7 @@ class _Engine(ctypes.Structure):
         *fields("vertex face_corners hinge_corners row_starts cols", POINTER),
         *fields("face_starts face_uses hinge_starts hinge_uses spring_starts spring_uses spring_ends", POINTER),
         *fields("shape area mu lambda bulk soft rest_angle hinge_weight rest_length", POINTER),
-        *fields("face_rate face_before hinge_rate hinge_before", POINTER),
+        *fields("weave face_rate face_before hinge_rate hinge_before", POINTER),
         *fields("base fixed inertia weight spring_stiffness spring_target walls grips points", POINTER),
         *fields("num_walls num_grips num_points bending membrane", COUNT),
         ("dt_sq", REAL),
@@ -125,6 +125,7 @@ class Fabric:
     rest_angle: np.ndarray
     hinge_weight: np.ndarray
     rest_length: np.ndarray
+    weave: np.ndarray | None  # roots of the stiffness of cloth with warp and weft
 
 
 def build_fabric(cloth: Cloth, tables: Tables, factor: float) -> Fabric:
@@ -142,6 +143,7 @@ def build_fabric(cloth: Cloth, tables: Tables, factor: float) -> Fabric:
         rest_angle=about(hinges.rest_angle.numpy()),
         hinge_weight=about(hinges.weight.numpy()),
         rest_length=about(hinges.rest_length.numpy(), padding=1.0),
+        weave=None if faces.weave is None else padded(faces.weave.numpy()),
     )
 
 
@@ -233,7 +235,7 @@ class SceneEngine:
         self.tables = tables
         self.step: EngineStep | None = None  # what was taken up last
         self._kept: dict[str, Any] = {}  # what the structure points to
-        self._fabric: tuple[tuple[Tensor | float, ...], Fabric] | None = None
+        self._fabric: tuple[tuple[Tensor | float | None, ...], Fabric] | None = None
         self.values = _Engine(
             num_vertices=len(tables.vertex),
             num_rows=tables.num_rows,
@@ -398,12 +400,13 @@ class SceneEngine:
     def _take_fabric(self, step: EngineStep) -> None:
         cloth = step.cloth
         now = (cloth.rest_inverse, cloth.rest_area, cloth.thickness, cloth.lame_mu, cloth.lame_lambda, cloth.bending_stiffness,
-               cloth.rest_angle, cloth.hinge_rest_length, cloth.hinge_area, float(step.membrane))  # fmt: skip
+               cloth.rest_angle, cloth.hinge_rest_length, cloth.hinge_area, cloth.weave, float(step.membrane))  # fmt: skip
         known = self._fabric
         if known is None or not all(_identical(a, b) for a, b in zip(now, known[0], strict=True)):
             self._fabric = known = now, build_fabric(cloth, self.tables, float(step.membrane))
-        fabric = vars(known[1])
-        self._point(**{("lambda" if name == "lam" else name): value for name, value in fabric.items()})
+        fabric = {("lambda" if name == "lam" else name): value for name, value in vars(known[1]).items()}
+        self.values.weave = None
+        self._point(**{name: value for name, value in fabric.items() if value is not None})
 
     def _point(self, **arrays: np.ndarray) -> None:
         for name, array in arrays.items():

@@ -25,6 +25,9 @@ def test_default_is_inside_the_training_ranges() -> None:
         ("bending_stiffness", -1e-9, ">= 0"),
         ("thickness", 0.0, "> 0"),
         ("friction", -0.1, ">= 0"),
+        ("warp", 0.0, "> 0"),
+        ("weft", -2.0, "> 0"),
+        ("shear", float("nan"), "finite"),
     ],
 )
 def test_unphysical_values_are_refused(name: str, value: float, rule: str) -> None:

@@ -126,3 +126,23 @@ def test_wool_suiting_is_the_mean_of_its_source() -> None:
     assert node.shear == pytest.approx(10**-0.0143 * GF / (0.01 * math.radians(1.0)), rel=2e-3)
     extension = 2.0 * 10**0.9621 / (500.0 * 0.6082)
     assert node.stretch_warp == pytest.approx(500.0 * GF / 0.01 / extension, rel=2e-3)
+
+
+def test_woven_cloth_has_the_stretch_stiffness_that_was_measured_and_the_same_shear() -> None:
+    """Strips of a cloth that may narrow, and the sheared sheet: the warp of a sheet in the plane z = 0 is along y."""
+    fabric = measured(0.2, 9000.0, 5000.0, 40.0, 1e-5, 2e-5, woven=True)
+    pos, faces = triangular_sheet(8, 8, 0.01)
+    cloth = build_cloth(pos, faces, fabric, dtype=torch.float64)
+    area, e = float(cloth.rest_area.sum()), 1e-5
+    poisson = float(fabric.lame_lambda) / float(fabric.lame_lambda + 2.0 * fabric.lame_mu)
+    warp, weft = 0.5 * 9000.0 * e**2 * area, 0.5 * 5000.0 * e**2 * area
+    along = np.array([1 - poisson * math.sqrt(9.0 / 5.0) * e, 1 + e, 1.0])
+    across = np.array([1 + e, 1 - poisson * math.sqrt(5.0 / 9.0) * e, 1.0])
+    assert energy(Stretching(), cloth, pos * along) == pytest.approx(warp, rel=1e-3)
+    assert energy(Stretching(), cloth, pos * across) == pytest.approx(weft, rel=1e-3)
+    sheared = pos + np.stack([e * pos[:, 1], 0 * pos[:, 0], 0 * pos[:, 0]], axis=1)
+    assert energy(Stretching(), cloth, sheared) == pytest.approx(0.5 * 40.0 * e**2 * area, rel=1e-3)
+    plain = measured(0.2, 9000.0, 5000.0, 40.0, 1e-5, 2e-5)
+    assert (plain.warp, plain.weft, plain.shear) == (1.0, 1.0, 1.0)
+    with pytest.raises(ValueError, match="material 'woven' is 1; give true"):
+        measured(0.2, 9000.0, 5000.0, 40.0, 1e-5, 2e-5, woven=1)  # type: ignore[arg-type]

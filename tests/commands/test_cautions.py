@@ -13,6 +13,7 @@ import torch
 from hood.assets.body.body import Body
 from hood.assets.files.library import locate
 from hood.assets.garment.garment import load_garment
+from hood.assets.material import Material
 from hood.assets.motion.sequence import PoseSequence
 from hood.cli import main
 from hood.commands.cautions import evaluation_cautions, scene_cautions
@@ -174,3 +175,14 @@ def test_gravity_acts_in_every_stepper(kind: str) -> None:
 def test_a_gravity_that_is_none_is_refused(value: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["rollout", f"gravity={value}"]) == 2
     assert "gravity" in capsys.readouterr().err
+
+
+def test_a_network_says_that_it_knows_no_warp_and_weft(quickstart: Simulator, body: Body, walk: PoseSequence) -> None:
+    woven = build_scene(load_garment("tank"), body, walk.window(0, 4), Material(warp=50.0, weft=20.0, shear=0.5))
+    for stepper, ways in ((quickstart, "refine=10 corrects every step"), (refined(quickstart), "needs no weights")):
+        (sentence,) = scene_cautions(stepper, woven, DEFAULT, "quickstart")
+        for key, value in (("warp", "50"), ("weft", "20"), ("shear", "0.5")):
+            assert f"material.{key}={value} (trained on 1)" in sentence
+        assert sentence.endswith(ways)
+    solver, _ = make_stepper(load_config("rollout", ["stepper=newton"]))
+    assert scene_cautions(solver, woven, DEFAULT, "newton") == []

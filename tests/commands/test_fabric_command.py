@@ -26,10 +26,21 @@ def test_a_plain_fabric_is_told_as_the_isotropic_one_it_is() -> None:
     fabric = described("default")
     default = Material()
     assert not fabric.measured
-    assert fabric.stretch == (fabric.simulated_stretch, fabric.simulated_stretch)
+    assert fabric.stretch == fabric.simulated_stretch
+    assert fabric.stretch[0] == fabric.stretch[1]
     assert fabric.shear == pytest.approx(default.lame_mu * default.thickness)
     assert fabric.bending == pytest.approx((0.25 * default.bending_stiffness,) * 2)
     assert described("linen").measured
+
+
+def test_woven_cloth_is_simulated_as_it_was_measured(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["fabric", "denim_12oz", "linen", "default", "woven=true", "edges=[]"]) == 0
+    rows = {line.split()[0]: line.split() for line in capsys.readouterr().out.splitlines() if line}
+    assert rows["denim_12oz"][2:6] == ["24000", "10000", "24000/10000", "169"]
+    assert rows["linen"][2:6] == ["20000", "14000", "20000/14000", "45"]
+    assert rows["default"][4] == rows["default"][2]
+    assert described("linen", woven=True).simulated_stretch == pytest.approx((20000.0, 14000.0))
+    assert described("linen").simulated_stretch == pytest.approx((135.0, 135.0))
 
 
 def test_fabrics_are_draped_and_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -67,6 +78,7 @@ def test_without_a_drape_test_only_the_table_is_written(tmp_path: Path) -> None:
         (["linen", "edges=[a]"], "edges: 'a' is no edge of a mesh"),
         (["linen", "edges=[0.01,0.01]"], "edges: 0.01 is given twice"),
         (["linen", "edge=0.01"], "unknown key 'edge': did you mean 'edges'"),
+        (["linen", "woven=yes please"], "woven='yes please': expected a value like False (bool)"),
         (["linen", "--json"], "unknown option '--json'"),
     ],
 )

@@ -40,6 +40,9 @@ def test_without_parts_the_fabric_is_that_of_the_option() -> None:
         ("fabrics={dress:0.3}", "give fabrics by part"),
         ("fabrics={dress:{material:slik}}", "fabrics: dress: unknown material 'slik'"),
         ("fabrics={dress:{frictoin:2}}", "fabrics: dress: unknown property 'frictoin': did you mean 'friction'"),
+        ("fabrics={dress:{woven:true}}", "fabrics: dress: woven is for measured cloth by its name"),
+        ("fabrics={dress:{material:denim,woven:true}}", "woven is for measured cloth by its name"),
+        ("fabrics={dress:{wrap:2}}", "fabrics: dress: unknown property 'wrap': did you mean 'warp'"),
         ("fabrics={dress:{friction:high}}", "fabrics: dress: friction is 'high'; give a number"),
     ],
 )
@@ -65,3 +68,25 @@ def test_a_part_may_have_properties_of_its_own() -> None:
 def test_a_property_of_a_part_is_checked() -> None:
     with pytest.raises(ValueError, match="material 'friction' is -1.0; it must be finite and >= 0"):
         checked_fabrics(load_config("rollout", ["fabrics={dress:{friction:-1}}"]))
+
+
+def test_a_part_may_be_woven_and_the_rest_is_isotropic() -> None:
+    words = ["garment=dress", "fabrics={below_waistband:{material:linen,woven:true},above_waistband:silk}", "num_frames=3"]
+    cloth = make_scene(load_config("rollout", words)).cloth
+    linen = fabric_named("linen", True)
+    below = np.isclose(cloth.density.numpy(), linen.density)
+    assert 0.3 < below.mean() < 0.9
+    assert cloth.weave is not None
+    np.testing.assert_allclose(cloth.weave.numpy()[below], [[linen.warp, linen.weft, 1.0]] * int(below.sum()), rtol=1e-6)
+    assert (cloth.weave.numpy()[~below] == 1.0).all()
+
+
+def test_keys_of_the_material_make_it_woven() -> None:
+    cloth = make_scene(load_config("rollout", ["garment=tank", "material.warp=3", "material.shear=0.5", "num_frames=3"])).cloth
+    assert cloth.weave is not None
+    assert cloth.weave.unique(dim=0).tolist() == [[3.0, 1.0, 0.5]]
+    linen = make_scene(load_config("rollout", ["garment=tank", "material=linen", "material.woven=true", "num_frames=3"])).cloth
+    assert linen.weave is not None
+    assert make_scene(load_config("rollout", ["garment=tank", "material=linen", "num_frames=3"])).cloth.weave is None
+    with pytest.raises(ValueError, match="material 'warp' is 0.0; it must be finite and > 0"):
+        make_scene(load_config("rollout", ["garment=tank", "material.warp=0", "num_frames=3"]))

@@ -19,7 +19,7 @@ from hood.solver.fixed import FixedSystem
 from hood.solver.iterate import in_double
 from hood.solver.newton import NewtonSettings, minimize, run
 from hood.solver.plan import plan_for
-from hood.testing import without_values
+from hood.testing import with_weave, without_values
 
 POTENTIAL = default_potential()
 BLOWN = POTENTIAL.with_terms(wind=Wind([3.0, 1.0, -2.0]), stretch_damping=StretchDamping(2e-3), bend_damping=BendDamping(2e-3))
@@ -49,6 +49,11 @@ def assert_same(problem, settings, start=None, potential=POTENTIAL):
         assert bool(((now.phi - then.phi).abs() <= 1e-6 * e0 + 1e-9 * then.phi.abs()).all())
     assert float((pos - expected).abs().max()) < 1e-6
     return report
+
+
+def test_iterations_on_cloth_with_warp_and_weft_are_those_of_the_torch_form(band_scene):
+    problem = problem_of(band_scene)
+    assert_same(replace(problem, cloth=with_weave(problem.cloth)), NewtonSettings(max_iterations=6, target_rg=1e-6))
 
 
 @pytest.mark.parametrize("name", ["band_scene", "skirt_scene", "tank_scene"])

@@ -21,6 +21,7 @@ from hood.solver import engine, local_engine
 from hood.solver.iterate import in_double
 from hood.solver.local import LocalTerms
 from hood.solver.local_engine import EngineTerms, local_terms
+from hood.testing import with_weave
 
 
 def compiler_is_missing() -> bool:
@@ -55,6 +56,13 @@ def test_views_are_nearer_to_the_exact_ones_than_those_of_torch_in_float32(name:
     view = EngineTerms(default_potential(), problem)(pos)
     assert not view.force[~problem.cloth.free].any()
     assert not view.step[~problem.cloth.free].any()
+
+
+@needs_compiler
+def test_cloth_with_warp_and_weft(band_scene: Scene) -> None:
+    problem, pos = problem_of(band_scene)
+    for compiled, _ in errors(default_potential(), replace(problem, cloth=with_weave(problem.cloth)), pos):
+        assert compiled < 2e-5
 
 
 @needs_compiler
