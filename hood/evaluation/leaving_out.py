@@ -8,7 +8,7 @@ compared with those of the full model when the window is over.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -24,7 +24,7 @@ from hood.losses.potential import Potential, relative_gradient, scale
 from hood.losses.problem import StepProblem
 from hood.mesh.surface_tree import forget_searches
 from hood.scene.scene import Scene, recentre
-from hood.scene.state import State
+from hood.scene.state import State, StepInput
 from hood.solver.iterate import in_double
 from hood.solver.newton import minimize
 
@@ -49,6 +49,7 @@ class Effect:
 
     gamma: list[float] = field(default_factory=list)
     mm: list[float] = field(default_factory=list)
+    half_mm: list[float] = field(default_factory=list)  # the same of half of the vertices: the median
     ms: list[float] = field(default_factory=list)  # of every frame
     last: list[Tensor] = field(default_factory=list)  # (V, 3) m, world, float64, at the windows' ends
     exact: list[bool] = field(default_factory=list)  # the window's minimum was reached; where not, γ is a lower bound
@@ -81,6 +82,7 @@ class Begun:
     state: State
     step: StepProblem  # prepared by the full potential
     solved: Tensor  # (V, 3) m, where the full model's step from there leads, in the state's frame
+    rest: State  # at rest in the window's own first frame
 
 
 def begin(full: Variant, windows: Sequence[Window], settle: str, lead: int = LEAD) -> list[Begun]:
@@ -104,33 +106,53 @@ def begin(full: Variant, windows: Sequence[Window], settle: str, lead: int = LEA
             metrics="none",
             settle=settle,
         )
+        rest = next(frames).state
         for _ in frames:
             pass
         step, solved = kept[max(kept)]
-        found.append(Begun(window, window.first + max(kept) - 1, step.state, full.potential.prepare(step), solved))
+        found.append(Begun(window, window.first + max(kept) - 1, step.state, full.potential.prepare(step), solved, rest))
     return found
 
 
 @torch.no_grad()
-def take_steps(variant: Variant, begun: Begun, num_frames: int, effect: Effect) -> tuple[Tensor, Tensor]:
-    """Steps of a variant from the window's first state: positions (V, 3) [m] after the first step, in that state's frame, and
-    after all of them, world. Its times [ms] go to ``effect``."""
-    stepper, scene, state = variant.stepper, variant.scene, begun.state
-    prepared, first = prepare_stepper(stepper, scene), state.pos
+def advance(
+    variant: Variant, state: State, frame: int, num_steps: int, ms: list[float], first: StepInput | None = None
+) -> Iterator[tuple[Tensor, State]]:
+    """Positions (V, 3) [m] after every step, in the frame of the state before it, and the state there. Times go to ``ms``.
+
+    Args:
+        state, frame: where it begins.
+        first: what is prescribed for the first step, where that is known.
+    """
+    stepper, scene = variant.stepper, variant.scene
+    prepared = prepare_stepper(stepper, scene)
     # On one thread what other processes take is no time of a frame's.
     clock = time.process_time if torch.get_num_threads() == 1 and state.pos.device.type == "cpu" else time.perf_counter
     forget_searches()  # those of the variant before were of the same state
-    for index in range(num_frames):
+    for index in range(num_steps):
         began = clock()
-        step = begun.step.step if index == 0 else scene.step_input(begun.frame + index, state)
+        step = scene.step_input(frame + index, state) if first is None or index > 0 else first
         problem = stepper.search(StepProblem(scene.cloth, state, step, gravity=stepper.gravity.to(state.pos)))
         prediction = stepper.predict(problem, prepared, None)
         velocity = stepper.next_velocity(problem, prediction)
-        effect.ms.append(1e3 * (clock() - began))
-        state = State(prediction.next_pos, velocity, state.origin)
-        first = state.pos if index == 0 else first
-        state = recentre(state, scene.cloth.vertex_scene)
-    return first, state.pos.cpu().double() + state.origin[0]
+        ms.append(1e3 * (clock() - began))
+        state = recentre(State(prediction.next_pos, velocity, state.origin), scene.cloth.vertex_scene)
+        yield prediction.next_pos, state
+
+
+def take_steps(variant: Variant, begun: Begun, num_frames: int, effect: Effect) -> tuple[Tensor, Tensor]:
+    """Steps of a variant from the window's first state: positions (V, 3) [m] after the first step, in that state's frame, and
+    after all of them, world. Its times [ms] go to ``effect``."""
+    firsts: list[Tensor] = []
+    state = begun.state
+    for pos, state in advance(variant, begun.state, begun.frame, num_frames, effect.ms, begun.step.step):
+        firsts = firsts or [pos]
+    return firsts[0], world(state)
+
+
+def world(state: State) -> Tensor:
+    """Positions (V, 3) [m] in the world, float64, on the CPU."""
+    return state.pos.cpu().double() + state.origin[0]
 
 
 def measure(
@@ -161,10 +183,19 @@ def measure(
             effect.gamma.append((phi - lowest) / e0)
             effect.exact.append(exact)
             effect.last.append(lasts[name])
-            apart = (lasts[name] - lasts[""]).norm(dim=1)
-            effect.mm.append(1e3 * float(apart.quantile(_QUANTILE)) if bool(torch.isfinite(apart).all()) else float("inf"))
+            half, most = distances(lasts[name], lasts[""])
+            effect.half_mm.append(half)
+            effect.mm.append(most)
         going = [name for name in going if not name or not enough(name, effects[name], effects[""])]
     return effects
+
+
+def distances(one: Tensor, other: Tensor) -> tuple[float, float]:
+    """Median and 95th percentile [mm] of the distances between points (N, 3) [m]; infinite where one is not finite."""
+    apart = (one - other).norm(dim=1)
+    if not bool(torch.isfinite(apart).all()):
+        return float("inf"), float("inf")
+    return 1e3 * float(apart.median()), 1e3 * float(apart.quantile(_QUANTILE))
 
 
 def active_terms(full: Variant, begun: Sequence[Begun]) -> set[str]:
