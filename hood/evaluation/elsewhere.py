@@ -96,9 +96,7 @@ class Apart:
 
 def rest_at(variant: Variant, frame: int, settle: str) -> State:
     """The first state of a rollout that begins at ``frame``."""
-    frames = simulate(
-        variant.stepper, variant.scene, variant.potential, 1, start_frame=frame, metrics="none", settle=settle
-    )
+    frames = simulate(variant.stepper, variant.scene, variant.potential, 1, start_frame=frame, metrics="none", settle=settle)
     return next(frames).state
 
 
@@ -131,15 +129,15 @@ class Reference:
 
 
 def measure_elsewhere(reference: Reference, other: Elsewhere, firsts: Sequence[int], steps: int) -> Apart:
-    """How far ``other`` is from the full model ``steps`` of its steps after the frames ``firsts``, and the time that it takes."""
+    """How far ``other`` is from the full model ``steps`` steps after the frames ``firsts``, and the time that it takes."""
     found = Apart()
     for given in firsts:
         first, count = other.span(given, steps)
         end = reference.end(first, count)
-        state = other.rest(first, reference.settle, reference.rest(first))
-        for _, state in advance(other.variant, state, round(first * other.pace), round(count * other.pace), found.ms):
-            pass
-        there = world(state)
+        rest = other.rest(first, reference.settle, reference.rest(first))
+        frame, steps_there = round(first * other.pace), round(count * other.pace)
+        *_, (_, last) = advance(other.variant, rest, frame, steps_there, found.ms)
+        there = world(last)
         if other.points is not None:
             end, there = other.points[0].of(end), other.points[1].of(there)
         half, most = distances(there, end)

@@ -49,10 +49,10 @@ class Effect:
 
     gamma: list[float] = field(default_factory=list)
     mm: list[float] = field(default_factory=list)
-    half_mm: list[float] = field(default_factory=list)  # the same of half of the vertices: the median
     ms: list[float] = field(default_factory=list)  # of every frame
     last: list[Tensor] = field(default_factory=list)  # (V, 3) m, world, float64, at the windows' ends
     exact: list[bool] = field(default_factory=list)  # the window's minimum was reached; where not, γ is a lower bound
+    half_mm: list[float] = field(default_factory=list)  # as ``mm``, the median of the vertices
 
     def gamma_at(self, share: float) -> float:
         """Quantile of γ over the windows."""
@@ -125,7 +125,9 @@ def advance(
         first: what is prescribed for the first step, where that is known.
     """
     stepper, scene = variant.stepper, variant.scene
-    prepared = prepare_stepper(stepper, scene)
+    prepared, dtype = prepare_stepper(stepper, scene), scene.cloth.rest_pos.dtype
+    if state.pos.dtype != dtype:  # networks take their steps in float32
+        state, first = State(state.pos.to(dtype), state.vel.to(dtype), state.origin), None
     # On one thread what other processes take is no time of a frame's.
     clock = time.process_time if torch.get_num_threads() == 1 and state.pos.device.type == "cpu" else time.perf_counter
     forget_searches()  # those of the variant before were of the same state
@@ -143,11 +145,11 @@ def advance(
 def take_steps(variant: Variant, begun: Begun, num_frames: int, effect: Effect) -> tuple[Tensor, Tensor]:
     """Steps of a variant from the window's first state: positions (V, 3) [m] after the first step, in that state's frame, and
     after all of them, world. Its times [ms] go to ``effect``."""
-    firsts: list[Tensor] = []
-    state = begun.state
-    for pos, state in advance(variant, begun.state, begun.frame, num_frames, effect.ms, begun.step.step):
-        firsts = firsts or [pos]
-    return firsts[0], world(state)
+    steps = advance(variant, begun.state, begun.frame, num_frames, effect.ms, begun.step.step)
+    first, state = next(steps)
+    for _, last in steps:
+        state = last
+    return first, world(state)
 
 
 def world(state: State) -> Tensor:
