@@ -16,6 +16,7 @@ from hood.assets.files.library import locate
 from hood.commands.common import held_folder, output_folder
 from hood.commands.plan_file import write_plan
 from hood.commands.plan_probe import HOLD, Asked, Probed, probe
+from hood.commands.plan_reach import reach_sentence
 from hood.commands.plan_shown import differences, facts, show
 from hood.commands.plan_table import command_line, describe, sentence
 from hood.commands.setup import Setup, check_config, make_stepper, set_up
@@ -24,7 +25,7 @@ from hood.dynamics.captured import network_of
 from hood.evaluation.combining import Combination
 from hood.evaluation.decision import QUANTILE, Tolerance
 from hood.evaluation.elsewhere import Apart
-from hood.evaluation.leaving_out import Effect
+from hood.evaluation.leaving_out import Begun, Effect
 from hood.media.plan_page import Difference
 
 
@@ -38,6 +39,7 @@ def run(overrides: Sequence[str]) -> int:
         write_plan(folder / "plan.json", plan)
         page = show(folder / "plan.html", plan, sentence(plan), shown)
     print(describe(plan))
+    print(reach_sentence(plan["facts"]))
     print(page)
     print(f"plan in {folder / 'plan.json'}; roll out by it: hood rollout plan={folder / 'plan.json'} output=outputs/mine")
     watched = "" if plan["watch"] is None else " (what is left out does not come back where it matters; by the plan it does)"
@@ -112,7 +114,7 @@ def _record(ready: Setup, words: list[str], asked: Asked, found: Probed) -> dict
         row = {"part": one.name, "kind": one.kind, "purpose": one.purpose, "words": list(one.words), "force": None}
         rows.append(row | _numbers_apart(found.apart[one.name], one.pace, found.full_ms, float(ready.config.fps)))
     for row in rows:
-        verdict = found.verdicts[row["part"]]
+        verdict = found.verdicts[str(row["part"])]
         how = [f"parts=[{row['part']}]", f"frames={asked.frames}", f"windows={len(begun)}", f"accuracy={tolerance.text}"]
         how += [] if asked.budget_ms is None else [f"budget_ms={asked.budget_ms:g}"]
         row |= {"decision": verdict.decision, "reason": verdict.reason, "command": shlex.join(["hood", "plan", *words, *how])}
@@ -130,6 +132,7 @@ def _record(ready: Setup, words: list[str], asked: Asked, found: Probed) -> dict
         "windows": [{"first": one.window.first, "measured_from": one.frame, "reason": one.window.reason} for one in begun],
         "frames": asked.frames,
         "full": _numbers(full, full),
+        "times": _times(begun),
         "windows_without_minimum": full.exact.count(False),
         "rows": rows,
         "together": together,
@@ -137,6 +140,13 @@ def _record(ready: Setup, words: list[str], asked: Asked, found: Probed) -> dict
         "watch": None if found.limit is None else {"limit": found.limit, "hold": HOLD},
         "weights": hashlib.sha256(locate("weights", checkpoint).read_bytes()).hexdigest() if network else None,
     }
+
+
+def _times(begun: Sequence[Begun]) -> dict[str, float]:
+    """Milliseconds of the parts of a frame of the full model, the medians of the windows; the longest first."""
+    names = [name for name in begun[0].times if name not in ("total", "metrics")]
+    found = {name: float(np.median([one.times[name] for one in begun])) for name in names}
+    return dict(sorted(found.items(), key=lambda pair: -pair[1]))
 
 
 def _combined(found: Probed) -> dict[str, Any]:

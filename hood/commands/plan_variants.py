@@ -24,7 +24,7 @@ class Variants:
     def __init__(self, ready: Setup) -> None:
         self.config = ready.config
         self.full = Variant(ready.stepper, potential_of(ready.config), ready.scene)
-        self._scenes = {((), solves_in_double(ready.config)): ready.scene}
+        self._scenes: dict[tuple[tuple[str, ...], bool], Scene] = {((), solves_in_double(ready.config)): ready.scene}
 
     def make(self, words: Sequence[str], other: tuple[str, ...] = ()) -> Variant:
         """The steps by further settings, in the scene with the words of ``other`` choices, in the precision they need.

@@ -83,6 +83,7 @@ class Begun:
     step: StepProblem  # prepared by the full potential
     solved: Tensor  # (V, 3) m, where the full model's step from there leads, in the state's frame
     rest: State  # at rest in the window's own first frame
+    times: dict[str, float] = field(default_factory=dict)  # ms of the parts of the last frame before, by name
 
 
 def begin(full: Variant, windows: Sequence[Window], settle: str, lead: int = LEAD) -> list[Begun]:
@@ -107,10 +108,11 @@ def begin(full: Variant, windows: Sequence[Window], settle: str, lead: int = LEA
             settle=settle,
         )
         rest = next(frames).state
-        for _ in frames:
-            pass
+        *_, last = frames
+        times = {name[3:]: value for name, value in last.metrics.items() if name.startswith("ms_")}
         step, solved = kept[max(kept)]
-        found.append(Begun(window, window.first + max(kept) - 1, step.state, full.potential.prepare(step), solved, rest))
+        prepared = full.potential.prepare(step)
+        found.append(Begun(window, window.first + max(kept) - 1, step.state, prepared, solved, rest, times))
     return found
 
 

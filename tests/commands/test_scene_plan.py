@@ -74,7 +74,9 @@ def test_the_page_lies_beside_the_plan_and_answers(made: Path) -> None:
     assert html.escape(rows["bending"]["command"]) in page
     assert "edges of" in page
     assert "dress_4k" not in page
-    assert "tank_4k" in page
+    assert "parts=[mesh tank_4k]" in page
+    assert "A frame of the full model is made of " in page
+    assert html.escape(read(made)["command"]) in page
 
 
 def test_what_is_hopeless_or_stays_is_looked_at_once(made: Path) -> None:
