@@ -19,6 +19,8 @@ from hood.commands.plan_probe import HOLD, Asked, Probed, probe
 from hood.commands.plan_reach import reach_sentence
 from hood.commands.plan_shown import differences, facts, show
 from hood.commands.plan_table import command_line, describe, sentence
+from hood.commands.plan_training import OWN as TRAINING_KEYS
+from hood.commands.plan_training import checked, describe_training, is_training, plan_training, write_training_plan
 from hood.commands.setup import Setup, check_config, make_stepper, set_up
 from hood.config import ConfigError, load_config
 from hood.dynamics.captured import network_of
@@ -30,8 +32,12 @@ from hood.media.plan_page import Difference
 
 
 def run(overrides: Sequence[str]) -> int:
-    """Run the command; returns the exit code."""
+    """Run the command, for a rollout or for a training; returns the exit code."""
     own, words = _split(overrides)
+    given = [word for word in overrides if word not in words]
+    if is_training(words):
+        return _run_training(own, words, given)
+    _refuse(given, TRAINING_KEYS, "belongs to the plan of a training (with experiment=, trainer= or data.*=)")
     _check(words, own)
     output_folder(own)
     with held_folder(own) as folder:
@@ -45,6 +51,26 @@ def run(overrides: Sequence[str]) -> int:
     watched = "" if plan["watch"] is None else " (what is left out does not come back where it matters; by the plan it does)"
     print(f"the same in words{watched}: {plan['command']}")
     return 0
+
+
+def _run_training(own: DictConfig, words: list[str], given: Sequence[str]) -> int:
+    """The plan of a training."""
+    others = [str(key) for key in own if key not in ("output", *TRAINING_KEYS)]
+    _refuse(given, others, "belongs to the plan of a rollout")
+    config = checked(words, own)
+    output_folder(own)
+    with held_folder(own) as folder:
+        plan = plan_training(config, words, int(own.updates), int(own.scenes))
+        path = write_training_plan(folder, plan)
+    print(describe_training(plan))
+    print(f"all of it in {path}")
+    return 0
+
+
+def _refuse(given: Sequence[str], keys: Sequence[str], why: str) -> None:
+    for word in given:
+        if word.partition("=")[0].lstrip("+~") in keys:
+            raise ConfigError(f"{word}: {why}; drop it")
 
 
 def make_plan(words: list[str], own: DictConfig, choices: bool = True) -> tuple[dict[str, Any], list[Difference]]:
