@@ -47,6 +47,7 @@ def run(overrides: Sequence[str]) -> int:
     print(describe(plan))
     print(reach_sentence(plan["facts"]))
     print(page)
+    print(f"measured in {plan['cpu_seconds']:.1f} s of the processor")
     print(f"plan in {folder / 'plan.json'}; roll out by it: hood rollout plan={folder / 'plan.json'} output=outputs/mine")
     watched = "" if plan["watch"] is None else " (what is left out does not come back where it matters; by the plan it does)"
     print(f"the same in words{watched}: {plan['command']}")
@@ -73,24 +74,26 @@ def _refuse(given: Sequence[str], keys: Sequence[str], why: str) -> None:
             raise ConfigError(f"{word}: {why}; drop it")
 
 
-def make_plan(words: list[str], own: DictConfig, choices: bool = True) -> tuple[dict[str, Any], list[Difference]]:
+def make_plan(words: list[str], own: DictConfig, evidence: bool = True) -> tuple[dict[str, Any], list[Difference]]:
     """The plan of a rollout with these words, measured here, and the largest differences that were seen.
 
     Args:
         own: the config of ``hood plan``.
-        choices: whether other meshes and time steps are looked at; without, parts alone are left out.
+        evidence: whether other meshes and time steps are looked at, and parts that are kept whatever they are worth; without,
+            parts alone are left out, in half the time.
 
     Raises:
         ConfigError, ValueError, FileNotFoundError: as for a rollout, and numbers of ``own`` that are none.
     """
     config, tolerance, budget = _check(words, own)
-    began = time.perf_counter()
+    began, spent = time.perf_counter(), time.process_time()
     ready = set_up(config, make_stepper(config)[0])
-    asked = Asked(tolerance, budget, [str(name) for name in own.parts], int(own.windows), int(own.frames), choices=choices)
+    asked = Asked(tolerance, budget, [str(name) for name in own.parts], int(own.windows), int(own.frames), evidence=evidence)
     found = probe(ready, asked)
     plan = _record(ready, [*words, *_settled_words(config, ready)], asked, found)
     shown = differences(ready, found.begun, found.effects, asked.frames)
-    return plan | {"asked": words, "seconds": time.perf_counter() - began, "facts": facts(ready)}, shown
+    plan |= {"asked": words, "facts": facts(ready), "seconds": time.perf_counter() - began}
+    return plan | {"cpu_seconds": time.process_time() - spent}, shown
 
 
 def _check(words: list[str], own: DictConfig) -> tuple[DictConfig, Tolerance, float | None]:

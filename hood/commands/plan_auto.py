@@ -48,7 +48,7 @@ def planned(overrides: Sequence[str]) -> list[str]:
         plan = read_plan(path)
         print(f"plan of {path}, made before")
     else:
-        plan, _ = make_plan(words, own, choices=False)
+        plan, _ = make_plan(words, own, evidence=False)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_plan(path, plan)
         print(f"planned in {plan['seconds']:.1f} s, kept in {path}")

@@ -23,6 +23,8 @@ from hood.evaluation.windows import Window, choose_windows
 
 #: With a length, γ may be so many times that of the windows, and this at least, before left-out energies come back.
 _TIMES_PROBED, _LEAST_LIMIT = 3.0, 1e-3
+#: Steps of settling where windows need no rest, since nothing but single steps from one state is compared.
+_ROUGH = 4
 #: Why parts whose absence nobody would notice are kept.
 _UNSEEN = "a rollout would not notice where it is more"
 #: Steps for which left-out energies stay where they came back.
@@ -38,7 +40,7 @@ class Asked:
         budget_ms: of a frame; None where only the tolerance counts.
         parts: names of rows; empty: all.
         windows, frames: how many windows, and steps of each.
-        choices: whether other meshes and time steps are looked at.
+        evidence: whether other meshes and time steps are looked at, and parts that are kept whatever they are worth.
     """
 
     tolerance: Tolerance
@@ -46,12 +48,12 @@ class Asked:
     parts: list[str]
     windows: int
     frames: int
-    choices: bool = True
+    evidence: bool = True
 
     @property
     def decides(self) -> bool:
         """Whether other meshes, time steps and steppers can be chosen: they are judged in mm."""
-        return self.choices and (self.budget_ms is not None or self.tolerance.unit == "mm")
+        return self.evidence and (self.budget_ms is not None or self.tolerance.unit == "mm")
 
 
 @dataclass(frozen=True)
@@ -100,14 +102,17 @@ class _Probe:
 
     def __init__(self, ready: Setup, asked: Asked) -> None:
         self.ready, self.asked, self.config = ready, asked, ready.config
-        others = [one.name for one in choices_of(self.config)] if asked.choices else []
+        others = [one.name for one in choices_of(self.config)] if asked.evidence else []
         self.parts = choose_parts(self.config, asked.parts, asked.decides, others)
-        self.choices = choose_choices(self.config, asked.parts) if asked.choices else []
+        self.choices = choose_choices(self.config, asked.parts) if asked.evidence else []
+        if not asked.evidence:
+            self.parts = [part for part in self.parts if part.watched and not part.stays]
         if not self.parts and not self.choices:
             raise ConfigError("parts: this rollout has none that could be left out")
         self.made = Variants(ready)
         self.full = self.made.full
-        self.begun = begin(self.full, self._windows(), str(self.config.settle))
+        self.settle = str(self.config.settle)
+        self.begun = begin(self.full, self._windows(), self.settle, most_steps=None if asked.decides else _ROUGH)
 
     def run(self) -> Probed:
         active, price = active_terms(self.full, self.begun), prices(self.full, self.begun)
@@ -122,7 +127,7 @@ class _Probe:
             return name in stay or far or (self.asked.decides and broken(effect, of_full))
 
         self.effects = measure(self.full, self.variants, self.begun, self.asked.frames, enough)
-        apart = {one.name: self._apart((one.name,), finer=one.finer) for one in self.choices}
+        apart = {one.name: self._compare(one) for one in self.choices}
         verdicts = {name: Verdict("absent", reason) for name, reason in absent.items()}
         together, search = None, None
         if self.asked.decides:
@@ -207,7 +212,9 @@ class _Probe:
 
     @cached_property
     def _reference(self) -> Reference:
-        return Reference(self.full, str(self.config.settle), {one.window.first: one.rest for one in self.begun})
+        # Of meshes the rest itself is compared, so it has to be one.
+        rough = not self.asked.decides and any(one.kind == MESH for one in self.choices)
+        return Reference(self.full, self.settle, {} if rough else {one.window.first: one.rest for one in self.begun})
 
     def _full_ms(self) -> float:
         return float(np.median(self._reference.ms))
@@ -217,11 +224,13 @@ class _Probe:
         firsts = [one.window.first for one in self.begun[:2]]
         return firsts[-1:] if few else firsts
 
-    def _apart(self, names: tuple[str, ...], finer: bool = False) -> Apart:
-        """How far a combination is from the full model; one that only informs, in one window."""
-        few = finer or not self.asked.decides
-        other = self._elsewhere(names)
-        return measure_elsewhere(self._reference, other, self._firsts(few), LEAD + self.asked.frames)
+    def _apart(self, names: tuple[str, ...], few: bool = False) -> Apart:
+        """How far a combination is from the full model; in one window where ``few`` will do."""
+        return measure_elsewhere(self._reference, self._elsewhere(names), self._firsts(few), LEAD + self.asked.frames)
+
+    def _compare(self, one: Choice) -> Apart:
+        """How far a choice is from the full model; one that only informs, in one window."""
+        return self._apart((one.name,), few=one.finer or not self.asked.decides)
 
     def _elsewhere(self, names: tuple[str, ...]) -> Elsewhere:
         chosen = [one for one in self.choices if one.name in names]

@@ -10,7 +10,7 @@ from hood.commands.cloth_contact import potential_of
 from hood.commands.plan_choices import scene_of
 from hood.commands.refinement import refined
 from hood.commands.setup import Setup, check_config, make_stepper, solves_in_double
-from hood.commands.steppers import with_stepper
+from hood.commands.steppers import make_solver, option_of, with_stepper
 from hood.config import with_words
 from hood.dynamics.captured import network_of
 from hood.evaluation.leaving_out import Variant
@@ -54,8 +54,9 @@ def settled_with(words: Sequence[str], config: DictConfig) -> DictConfig:
 
 def variant(config: DictConfig, scene: Scene) -> Variant:
     """What a settled config says of the steps, in a scene whose cloth, body and motion are given."""
-    potential = potential_of(config)
-    stepper = refined(make_stepper(config)[0], config, scene.cloth.num_vertices, potential)
+    potential, option = potential_of(config), option_of(config)
+    stepper = make_stepper(config)[0] if option.network else make_solver(option, config, potential, str(config.step))
+    stepper = refined(stepper, config, scene.cloth.num_vertices, potential)
     network = network_of(stepper)
     if network is not None:
         network.use_potential(for_networks(potential))

@@ -14,8 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hood.dynamics.rollout import simulate
-from hood.evaluation.leaving_out import Variant, advance, distances, world
+from hood.evaluation.leaving_out import Variant, advance, distances, rest_at, world
 from hood.mesh.proximity import search_surface
 from hood.scene.scene import Scene
 from hood.scene.state import State
@@ -92,12 +91,6 @@ class Apart:
     def frame_ms(self, pace: float) -> float:
         """Of a frame of the full model: the median step times the steps that a frame takes."""
         return float(np.median(self.ms)) * pace
-
-
-def rest_at(variant: Variant, frame: int, settle: str) -> State:
-    """The first state of a rollout that begins at ``frame``."""
-    frames = simulate(variant.stepper, variant.scene, variant.potential, 1, start_frame=frame, metrics="none", settle=settle)
-    return next(frames).state
 
 
 class Reference:

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hood.dynamics.rollout import prepare_stepper, simulate
+from hood.dynamics.rollout import own_start, prepare_stepper, rest_state, simulate
 from hood.dynamics.simulator import Prediction
 from hood.dynamics.stepper import Stepper
 from hood.evaluation.gap import REFERENCE
@@ -86,8 +86,14 @@ class Begun:
     times: dict[str, float] = field(default_factory=dict)  # ms of the parts of the last frame before, by name
 
 
-def begin(full: Variant, windows: Sequence[Window], settle: str, lead: int = LEAD) -> list[Begun]:
-    """The full model's state ``lead`` frames into every window, from rest on the still body of the window's first frame."""
+def begin(
+    full: Variant, windows: Sequence[Window], settle: str, lead: int = LEAD, most_steps: int | None = None
+) -> list[Begun]:
+    """The full model's state ``lead`` frames into every window, from rest on the still body of the window's first frame.
+
+    Args:
+        most_steps: a rough rest after so many steps of settling is enough, where ``settle`` settles; None: to rest.
+    """
     found = []
     for window in windows:
         kept: dict[int, tuple[StepProblem, Tensor]] = {}
@@ -106,6 +112,7 @@ def begin(full: Variant, windows: Sequence[Window], settle: str, lead: int = LEA
             observe=keep,
             metrics="none",
             settle=settle,
+            start=None if most_steps is None else rest_at(full, window.first, settle, most_steps),
         )
         rest = next(frames).state
         *_, last = frames
@@ -116,11 +123,21 @@ def begin(full: Variant, windows: Sequence[Window], settle: str, lead: int = LEA
     return found
 
 
+def rest_at(variant: Variant, frame: int, settle: str, most_steps: int | None = None) -> State:
+    """The first state of a rollout that begins at ``frame``; ``most_steps`` as in :func:`begin`."""
+    stepper, scene, potential = variant.stepper, variant.scene, variant.potential
+    if most_steps is not None and settle == "equilibrium" and own_start(stepper, scene, frame) is None:
+        return rest_state(stepper, scene, potential, 1, frame, most_steps=most_steps)[0]
+    frames = simulate(stepper, scene, potential, 1, start_frame=frame, metrics="none", settle=settle)
+    return next(frames).state
+
+
 @torch.no_grad()
 def advance(
     variant: Variant, state: State, frame: int, num_steps: int, ms: list[float], first: StepInput | None = None
 ) -> Iterator[tuple[Tensor, State]]:
-    """Positions (V, 3) [m] after every step, in the frame of the state before it, and the state there. Times go to ``ms``.
+    """Positions (V, 3) [m] after every step, in the frame of the state before it, and the state there. Times [ms], without
+    that of posing the body, go to ``ms``.
 
     Args:
         state, frame: where it begins.
@@ -134,6 +151,8 @@ def advance(
     clock = time.process_time if torch.get_num_threads() == 1 and state.pos.device.type == "cpu" else time.perf_counter
     forget_searches()  # those of the variant before were of the same state
     for index in range(num_steps):
+        # The body is posed a few frames at once, and kept: whoever comes first would pay for all others.
+        scene.motion.surface(frame + index + 1, state.origin[0].numpy())
         began = clock()
         step = scene.step_input(frame + index, state) if first is None or index > 0 else first
         problem = stepper.search(StepProblem(scene.cloth, state, step, gravity=stepper.gravity.to(state.pos)))
@@ -172,7 +191,7 @@ def measure(
         enough: says after every window, of a name, its effect so far and that of the full model, whether that will do.
     """
     everything = {"": full, **variants}
-    for variant in everything.values():
+    for variant in everything.values() if num_frames == 1 else ():
         take_steps(variant, begun[0], 1, Effect())  # what a stepper makes at its first step is not a frame's time
     effects, going = {name: Effect() for name in everything}, list(everything)
     for one in begun:
@@ -180,6 +199,8 @@ def measure(
         lasts: dict[str, Tensor] = {}
         for name, variant in ((name, everything[name]) for name in going):
             firsts[name], lasts[name] = take_steps(variant, one, num_frames, effects[name])
+            if one is begun[0] and num_frames > 1:
+                del effects[name].ms[0]  # nor is it here
         e0, values = float(scale(in_double(one.step)).sum()), [_phi(full.potential, one, pos) for pos in firsts.values()]
         lowest, exact = _minimum(full.potential, one, list(firsts.values()), values)
         for phi, name in zip(values, going, strict=True):
