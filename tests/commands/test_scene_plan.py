@@ -15,6 +15,7 @@ import pytest
 import hood
 from hood.cli import main
 from hood.commands.plan_file import rollout_config
+from hood.evaluation.leaving_out import Effect
 
 WORDS = ["garment=tank", "sequence=plie", "stepper=newton", "num_frames=24"]
 QUIET = ["video=none", "sheet=false", "metrics=none", "guard=off"]
@@ -108,15 +109,20 @@ def test_the_full_model_is_chosen_where_it_is_fast_enough(tmp_path: Path, capsys
     assert (plan["chosen"], plan["combination"]["names"], plan["combination"]["mm"]) == ([], [], 0.0)
 
 
-def test_where_nothing_is_fast_enough_the_nearest_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_where_nothing_is_fast_enough_the_nearest_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What is named was run as a whole, its command can be pasted, and the plan rolls out as the command does."""
+    monkeypatch.setattr(Effect, "saving", lambda effect, full: 0.5)  # whatever the clock says of three steps
     words = ["parts=[2 iterations]", "windows=1", "frames=2", "budget_ms=0.001", f"output={tmp_path / 'plan'}"]
     assert main(["plan", *WORDS, *words]) == 0
     told = capsys.readouterr().out
     assert "Nothing takes 0.001 ms a frame or less; the nearest is" in told
     plan = read(tmp_path / "plan" / "plan.json")
     assert plan["combination"]["fits"] is False
-    assert plan["combination"]["tried"]
+    (tried,) = plan["combination"]["tried"]
+    assert tried["names"] == ["2 iterations"]
+    assert 0.0 < tried["mm_p50"] < tried["mm"]
     assert plan["command"] in told
     command = shlex.split(plan["command"])
     assert command[:2] == ["hood", "rollout"]
