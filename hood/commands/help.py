@@ -21,6 +21,8 @@ _EXAMPLES = {
     "plan": [
         "hood plan garment=dress sequence=plie stepper=newton accuracy=0.01",
         "hood plan garment=[tank,skirt] sequence=walk_proud stepper=newton accuracy=5mm frames=30",
+        "hood plan garment=dress_4k sequence=dance_mixed stepper=newton budget_ms=15",
+        "hood plan experiment=quickstart",
     ],
     "compare": [
         "hood compare outputs/network/rollout.h5 outputs/solver/rollout.h5",
@@ -81,6 +83,7 @@ def describe(name: str) -> str:
         lines.append(textwrap.fill(text + comments.get(str(key), ""), 118, subsequent_indent=" " * 34))
     if name == "plan":
         lines += ["", "The scene and the full model are said by the keys of hood rollout: garment, sequence, stepper, fps, …"]
+        lines += ["A training is said by the keys of hood train, experiment=, trainer= or data.* among them."]
     if name == "fabric":
         lines += ["", textwrap.fill(f"  {'NAME':<14}{' '.join(options('material'))}", 118, subsequent_indent=" " * 16)]
     groups = _groups_of(name)

@@ -42,8 +42,9 @@ def _cell(row: Mapping[str, Any], key: str) -> str:
 def sentence(plan: Mapping[str, Any]) -> str:
     """What was decided, for someone who does not read tables."""
     needed = [row["part"] for row in plan["rows"] if row["decision"] == "kept" and row["reason"].startswith("without it")]
-    text = _found(plan) if plan.get("combination") else _left_out(plan)
-    return f"{text} Needed for this accuracy: {', '.join(needed) or 'nothing else that was looked at'}."
+    if plan.get("combination"):
+        return _found(plan) + (f" Not to be spared: {', '.join(needed)}." if needed else "")
+    return f"{_left_out(plan)} Needed for this accuracy: {', '.join(needed) or 'nothing else that was looked at'}."
 
 
 def _left_out(plan: Mapping[str, Any]) -> str:

@@ -15,6 +15,7 @@ from pages import EXTENDING, EXTENDING_HAS_A_TEST, ROOT, command_lines
 
 from hood.assets.files.library import names
 from hood.cli import COMMANDS
+from hood.commands.plan_training import is_training
 from hood.commands.setup import check_config
 from hood.config import load_config
 
@@ -62,7 +63,8 @@ def test_commands_have_keys_and_values_that_exist(page: str, line: str) -> None:
     if command == "plan":
         own = set(load_config("plan"))
         load_config("plan", [word for word in keys if word.partition("=")[0] in own])
-        command, keys = "rollout", [word for word in keys if word.partition("=")[0] not in own]
+        keys = [word for word in keys if word.partition("=")[0] not in own]
+        command = "train" if is_training(keys) else "rollout"
     config = load_config(command, keys)
     if command == "rollout":
         check_config(config)
