@@ -8,6 +8,7 @@ import math
 import platform
 import re
 from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -61,12 +62,12 @@ def load_config(name: str, overrides: Sequence[str] = ()) -> DictConfig:
     plugins = [f"hydra.searchpath=[{','.join(_quoted(f'file://{folder}') for folder in config_folders())}]"]
     with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
         try:
-            defaults = compose(name, plugins)
+            defaults = _composed(CONFIG_FOLDER, name, tuple(plugins))
             chosen = [_check_override(name, text, defaults) for text in overrides]
             overrides = _last_of_groups(chosen)
             # The groups may bring keys of their own, so keys are checked against the composition with all groups chosen.
             groups = [text for text, override in chosen if _is_group(override) and text in overrides]
-            known = compose(name, plugins + groups)
+            known = _composed(CONFIG_FOLDER, name, (*plugins, *groups))
             for _, override in chosen:
                 if not _is_group(override):
                     _check_key(override, known)
@@ -80,6 +81,12 @@ def load_config(name: str, overrides: Sequence[str] = ()) -> DictConfig:
     OmegaConf.set_struct(config, True)
     _check_types(name, known, config, "")
     return config
+
+
+@lru_cache(maxsize=32)
+def _composed(folder: Path, name: str, words: tuple[str, ...]) -> DictConfig:
+    """A composition that is read and never changed; several commands in one process need the same ones."""
+    return compose(name, list(words))
 
 
 def build(node: DictConfig | dict[str, Any], **extra: Any) -> Any:

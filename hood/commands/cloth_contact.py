@@ -38,7 +38,7 @@ def potential_of(config: DictConfig) -> Potential:
     """The potential of the config's losses, with a barrier and friction between layers of cloth where ``cloth_contact`` and the
     rest of the settled config ask for them."""
     potential: Potential = build(config.losses)
-    if not acts(config):
+    if str(config.cloth_contact) == "off" or _why_not(config, potential):
         return potential
     potential = potential.with_terms(layers=LayerBarrier(between=str(config.cloth_contact) == "layers"))
     coefficient = float(config.cloth_friction)
@@ -60,8 +60,13 @@ def why_not(config: DictConfig) -> str:
     Raises:
         ConfigError: the key asks for it, but the config's steps cannot do it.
     """
+    return _why_not(config)
+
+
+def _why_not(config: DictConfig, potential: Potential | None = None) -> str:
+    """The same, with the potential of the config's losses where it is known."""
     asked = str(config.cloth_contact)
-    reason = "" if asked == "off" else _hindrance(config)
+    reason = "" if asked == "off" else _hindrance(config, potential)
     if reason and asked != "auto":
         raise ConfigError(f"cloth_contact={asked}: {reason}")
     return reason
@@ -81,8 +86,9 @@ def tell_if_off(config: DictConfig, garments: int) -> None:
         print(f"cloth_contact=auto: off; {reason}")
 
 
-def _hindrance(config: DictConfig) -> str:
-    """Why layers cannot be kept apart in this rollout, with the way out; empty where they can."""
+def _hindrance(config: DictConfig, potential: Potential | None = None) -> str:
+    """Why layers cannot be kept apart in this rollout, with the way out; empty where they can. ``potential`` is that of the
+    config's losses, where it is known."""
     if _rough(config):
         taker = "a network" if option_of(config).network else f"stepper={config.stepper}"
         return f"{taker} alone does not keep layers of cloth apart; add refine=5, or use stepper=newton"
@@ -92,7 +98,8 @@ def _hindrance(config: DictConfig) -> str:
         return f"step={config.step} has fixed shapes, which contact of cloth with cloth has not; use step=plain"
     if str(config.cloth_contact) == "auto" and str(config.device) != "cpu":
         return "its search is done on the CPU, between steps on another device; cloth_contact=on does so"
-    collision = [term for term in build(config.losses).terms.values() if isinstance(term, Collision)]
+    terms = (potential or build(config.losses)).terms.values()
+    collision = [term for term in terms if isinstance(term, Collision)]
     if str(config.cloth_contact) == "auto" and not any(type(term) is Collision for term in collision):
         return "losses=… are those of published code, which has none; cloth_contact=on adds it"
     try:

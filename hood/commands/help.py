@@ -27,6 +27,8 @@ _EXAMPLES = {
     "plan": [
         "hood plan garment=dress sequence=plie stepper=newton accuracy=0.01",
         "hood plan garment=[tank,skirt] sequence=walk_proud stepper=newton accuracy=5mm frames=30",
+        "hood plan garment=dress_4k sequence=dance_mixed stepper=newton budget_ms=15",
+        "hood plan experiment=quickstart",
     ],
     "compare": [
         "hood compare outputs/network/rollout.h5 outputs/solver/rollout.h5",
@@ -91,10 +93,8 @@ def describe(name: str) -> str:
             lines += ["", titles[key]]
         lines.append(_row(str(key), value, said.get(str(key), "")))
     if name == "plan":
-        lines += [
-            "",
-            "The keys of hood rollout say the scene and the full model: garment, sequence, stepper, fps, …",
-        ]
+        lines += ["", "The keys of hood rollout say the scene and the full model: garment, sequence, stepper, fps, …"]
+        lines += ["The keys of hood train say a training; experiment=, trainer= or data.* has to be among them."]
     if name == "fabric":
         lines += ["", textwrap.fill(f"  {'NAME':<14}{' '.join(options('material'))}", 118, subsequent_indent=" " * 16)]
     groups = _groups_of(name)

@@ -3,43 +3,41 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import shlex
 import time
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from omegaconf import DictConfig
 
 from hood.assets.files.library import locate
-from hood.commands.cloth_contact import potential_of
 from hood.commands.common import held_folder, output_folder
 from hood.commands.plan_file import write_plan
-from hood.commands.plan_parts import Part, choose_parts
+from hood.commands.plan_probe import HOLD, Asked, Probed, probe
+from hood.commands.plan_reach import reach_sentence
 from hood.commands.plan_shown import differences, facts, show
-from hood.commands.refinement import refined
+from hood.commands.plan_table import command_line, describe, sentence
+from hood.commands.plan_training import OWN as TRAINING_KEYS
+from hood.commands.plan_training import checked, describe_training, is_training, plan_training, write_training_plan
 from hood.commands.setup import Setup, check_config, make_stepper, set_up
-from hood.config import ConfigError, load_config, with_words
+from hood.config import ConfigError, load_config
 from hood.dynamics.captured import network_of
-from hood.dynamics.watched import WatchedStepper, lacking
-from hood.evaluation.decision import QUANTILE, Decision, Tolerance, decide
-from hood.evaluation.leaving_out import LEAD, Begun, Effect, Variant, active_terms, begin, measure, prices
-from hood.evaluation.windows import Window, choose_windows
-from hood.losses.layers import for_networks
+from hood.evaluation.combining import Combination
+from hood.evaluation.decision import QUANTILE, Tolerance
+from hood.evaluation.elsewhere import Apart
+from hood.evaluation.leaving_out import Begun, Effect
 from hood.media.plan_page import Difference
-
-#: With ``accuracy=5mm``, γ may be so many times that of the windows, and this at least, before left-out energies come back.
-_TIMES_PROBED, _LEAST_LIMIT = 3.0, 1e-3
-#: Why parts whose absence nobody would notice are kept.
-_UNSEEN = "a rollout would not notice where it is more"
-#: Steps for which they stay then.
-_HOLD = 15
 
 
 def run(overrides: Sequence[str]) -> int:
-    """Run the command; returns the exit code."""
+    """Run the command, for a rollout or for a training; returns the exit code."""
     own, words = _split(overrides)
+    given = [word for word in overrides if word not in words]
+    if is_training(words):
+        return _run_training(own, words, given)
+    _refuse(given, TRAINING_KEYS, "belongs to the plan of a training (with experiment=, trainer= or data.*=)")
     _check(words, own)
     output_folder(own)
     with held_folder(own) as folder:
@@ -47,35 +45,68 @@ def run(overrides: Sequence[str]) -> int:
         write_plan(folder / "plan.json", plan)
         page = show(folder / "plan.html", plan, sentence(plan), shown)
     print(describe(plan))
+    print(reach_sentence(plan["facts"]))
     print(page)
+    print(f"measured in {plan['cpu_seconds']:.1f} s of the processor")
     print(f"plan in {folder / 'plan.json'}; roll out by it: hood rollout plan={folder / 'plan.json'} output=outputs/mine")
+    watched = "" if plan["watch"] is None else " (what is left out does not come back where it matters; by the plan it does)"
+    print(f"the same in words{watched}: {plan['command']}")
     return 0
 
 
-def make_plan(words: list[str], own: DictConfig) -> tuple[dict[str, Any], list[Difference]]:
+def _run_training(own: DictConfig, words: list[str], given: Sequence[str]) -> int:
+    """The plan of a training."""
+    others = [str(key) for key in own if key not in ("output", *TRAINING_KEYS)]
+    _refuse(given, others, "belongs to the plan of a rollout")
+    config = checked(words, own)
+    output_folder(own)
+    with held_folder(own) as folder:
+        plan = plan_training(config, words, int(own.updates), int(own.scenes))
+        path = write_training_plan(folder, plan)
+    print(describe_training(plan))
+    print(f"all of it in {path}")
+    return 0
+
+
+def _refuse(given: Sequence[str], keys: Sequence[str], why: str) -> None:
+    for word in given:
+        if word.partition("=")[0].lstrip("+~") in keys:
+            raise ConfigError(f"{word}: {why}; drop it")
+
+
+def make_plan(words: list[str], own: DictConfig, evidence: bool = True) -> tuple[dict[str, Any], list[Difference]]:
     """The plan of a rollout with these words, measured here, and the largest differences that were seen.
 
     Args:
         own: the config of ``hood plan``.
+        evidence: whether other meshes and time steps are looked at, and parts that are kept whatever they are worth; without,
+            parts alone are left out, in half the time.
 
     Raises:
         ConfigError, ValueError, FileNotFoundError: as for a rollout, and numbers of ``own`` that are none.
     """
-    config, tolerance = _check(words, own)
-    began = time.perf_counter()
+    config, tolerance, budget = _check(words, own)
+    began, spent = time.perf_counter(), time.process_time()
     ready = set_up(config, make_stepper(config)[0])
-    plan, shown = _probe(ready, [*words, *_settled_words(config, ready)], own, tolerance)
-    return plan | {"asked": words, "seconds": time.perf_counter() - began, "facts": facts(ready)}, shown
+    asked = Asked(tolerance, budget, [str(name) for name in own.parts], int(own.windows), int(own.frames), evidence=evidence)
+    found = probe(ready, asked)
+    plan = _record(ready, [*words, *_settled_words(config, ready)], asked, found)
+    shown = differences(ready, found.begun, found.effects, asked.frames)
+    plan |= {"asked": words, "facts": facts(ready), "seconds": time.perf_counter() - began}
+    return plan | {"cpu_seconds": time.process_time() - spent}, shown
 
 
-def _check(words: list[str], own: DictConfig) -> tuple[DictConfig, Tolerance]:
-    """The rollout's config and what is accepted, before anything is read."""
+def _check(words: list[str], own: DictConfig) -> tuple[DictConfig, Tolerance, float | None]:
+    """The rollout's config, what is accepted and how long a frame may take, before anything is read."""
     config = load_config("rollout", words)
     check_config(config)
     for key, least, most in (("windows", 1, 5), ("frames", 1, 300)):
         if isinstance(own[key], bool) or not least <= int(own[key]) <= most:
             raise ConfigError(f"{key}={own[key]}: give a whole number from {least} to {most}")
-    return config, _tolerance(own)
+    budget = own.budget_ms
+    if budget is not None and (isinstance(budget, bool) or not isinstance(budget, (int, float)) or not 0 < budget < math.inf):
+        raise ConfigError(f"budget_ms={budget}: give milliseconds of a frame, above 0 (budget_ms=10)")
+    return config, _tolerance(own), None if budget is None else float(budget)
 
 
 def _split(overrides: Sequence[str]) -> tuple[DictConfig, list[str]]:
@@ -102,177 +133,88 @@ def _settled_words(asked: DictConfig, ready: Setup) -> list[str]:
     return [f"{key}={ready.config[key]}" for key in keys]
 
 
-def _variant(words: Sequence[str], ready: Setup) -> Variant:
-    """The scene with these settings beside its own; its cloth, body and motion are those of the full model."""
-    config = with_words(ready.config, words)
-    check_config(config)
-    stepper = refined(make_stepper(config)[0], config, ready.scene.cloth.num_vertices, potential_of(config))
-    network = network_of(stepper)
-    if network is not None:
-        network.use_potential(for_networks(potential_of(config)))
-    return Variant(stepper, potential_of(config), ready.scene)
-
-
-def _probe(ready: Setup, words: list[str], own: DictConfig, tolerance: Tolerance) -> tuple[dict[str, Any], list[Difference]]:
-    config, frames = ready.config, int(own.frames)
-    parts = choose_parts(config, [str(name) for name in own.parts])
-    if not parts:
-        raise ConfigError("parts: this rollout has none that could be left out")
-    full = Variant(ready.stepper, potential_of(config), ready.scene)
-    count = min(int(config.num_frames), ready.scene.num_frames)
-    windows = _windows(ready, count, own, frames)
-    begun = begin(full, windows, str(config.settle))
-    active, price = active_terms(full, begun), prices(full, begun)
-    absent = {part.name: _why_absent(part, ready) for part in parts if part.term and part.term not in active}
-    variants = {part.name: _variant(part.words, ready) for part in parts if part.name not in absent}
-    stay = {part.name: part.stays or _UNSEEN for part in parts if part.stays or not part.watched}
-
-    def enough(name: str, effect: Effect, of_full: Effect) -> bool:
-        return name in stay or tolerance.hopeless(effect, of_full)
-
-    effects = measure(full, variants, begun, frames, enough)
-
-    def together(names: Sequence[str]) -> tuple[Effect, Effect]:
-        lean = _variant(_words_of(parts, names), ready)
-        left = lacking(lean.potential, full.potential)
-        if len(names) == 1 and not left:
-            return effects[""], effects[names[0]]
-        if left:  # as a rollout takes its steps, with the price of what is left out
-            potentials, limit = (lean.potential, full.potential), _limit(tolerance, [effects[name] for name in names])
-            watched = WatchedStepper(lean.stepper, full.stepper, potentials, ready.scene, limit, _HOLD)
-            lean = replace(lean, stepper=watched)
-        found = measure(full, {"all": lean}, begun, frames)
-        return found[""], found["all"]
-
-    rivals = [[part.name for part in parts if part.rivals == name] for name in sorted({part.rivals for part in parts} - {""})]
-    decision = decide(effects, absent, rivals, tolerance, together, stay, {part.name for part in parts if part.term})
-    plan = _record(ready, words, parts, begun, effects, price, decision, tolerance, frames)
-    watch = _watch(full, _variant(plan["chosen"], ready), [effects[name] for name in decision.left_out], tolerance)
-    return plan | {"watch": watch}, differences(ready, begun, effects, frames)
-
-
-def _limit(tolerance: Tolerance, left_out: Sequence[Effect]) -> float:
-    """The γ above which left-out energies come back; with a length, some more than they had in the windows."""
-    if tolerance.unit != "mm":
-        return tolerance.value
-    return max(_TIMES_PROBED * sum(effect.gamma_at(QUANTILE) for effect in left_out), _LEAST_LIMIT)
-
-
-def _watch(full: Variant, lean: Variant, left_out: Sequence[Effect], tolerance: Tolerance) -> dict[str, float] | None:
-    """When the left-out energies come back; None where none is left out."""
-    if not lacking(lean.potential, full.potential):
-        return None
-    return {"limit": _limit(tolerance, left_out), "hold": _HOLD}
-
-
-def _windows(ready: Setup, count: int, own: DictConfig, frames: int) -> list[Window]:
-    try:
-        return choose_windows(ready.scene.motion, count, int(own.windows), LEAD + frames + 1)
-    except ValueError as error:
-        raise ConfigError(f"frames={frames}: {error}") from error
-
-
-def _why_absent(part: Part, ready: Setup) -> str:
-    if part.term in ("collision", "friction") and ready.scene.motion.num_vertices == 0:
-        return "there is no body"
-    return "nothing in these windows comes near enough" if part.term == "layers" else "nothing in this scene uses it"
-
-
-def _words_of(parts: Iterable[Part], names: Sequence[str]) -> list[str]:
-    return list(dict.fromkeys(word for part in parts if part.name in names for word in part.words))
-
-
-def _record(
-    ready: Setup,
-    words: list[str],
-    parts: Sequence[Part],
-    begun: Sequence[Begun],
-    effects: dict[str, Effect],
-    price: dict[str, float],
-    decision: Decision,
-    tolerance: Tolerance,
-    frames: int,
-) -> dict[str, Any]:
-    full, chosen = effects[""], _words_of(parts, decision.left_out)
-    rows = []
-    for part in parts:
-        verdict = decision.verdicts[part.name]
-        row = {"part": part.name, "purpose": part.purpose, "words": list(part.words), "force": price.get(part.term)}
-        row |= _numbers(effects[part.name], full) if part.name in effects else {}
-        how = [f"parts=[{part.name}]", f"frames={frames}", f"windows={len(begun)}", f"accuracy={tolerance.text}"]
-        command = shlex.join(["hood", "plan", *words, *how])
-        rows.append({**row, "decision": verdict.decision, "reason": verdict.reason, "command": command})
+def _record(ready: Setup, words: list[str], asked: Asked, found: Probed) -> dict[str, Any]:
+    full, begun, tolerance = found.effects[""], found.begun, asked.tolerance
+    rows: list[dict[str, Any]] = []
+    for part in found.parts:
+        row = {"part": part.name, "purpose": part.purpose, "words": list(part.words), "force": found.price.get(part.term)}
+        rows.append(row | (_numbers(found.effects[part.name], full) if part.name in found.effects else {}))
+    for one in found.choices:
+        row = {"part": one.name, "kind": one.kind, "purpose": one.purpose, "words": list(one.words), "force": None}
+        rows.append(row | _numbers_apart(found.apart[one.name], one.pace, found.full_ms, float(ready.config.fps)))
+    for row in rows:
+        verdict = found.verdicts[str(row["part"])]
+        how = [f"parts=[{row['part']}]", f"frames={asked.frames}", f"windows={len(begun)}", f"accuracy={tolerance.text}"]
+        how += [] if asked.budget_ms is None else [f"budget_ms={asked.budget_ms:g}"]
+        row |= {"decision": verdict.decision, "reason": verdict.reason, "command": shlex.join(["hood", "plan", *words, *how])}
     checkpoint = str(ready.config.checkpoint)
     network = network_of(ready.stepper) is not None and checkpoint != "untrained"
     together = None
-    if decision.together is not None:
-        together = _numbers(decision.together, full) | {"error": tolerance.error(decision.together, full)}
+    if found.together is not None:
+        together = _numbers(found.together, full) | {"error": tolerance.error(found.together, full)}
     return {
         "words": words,
-        "chosen": chosen,
+        "chosen": found.words,
+        "command": command_line(words, found.words),
         "accuracy": {"value": tolerance.value, "unit": tolerance.unit},
+        "budget_ms": asked.budget_ms,
         "windows": [{"first": one.window.first, "measured_from": one.frame, "reason": one.window.reason} for one in begun],
-        "frames": frames,
+        "frames": asked.frames,
         "full": _numbers(full, full),
+        "times": _times(begun),
         "windows_without_minimum": full.exact.count(False),
         "rows": rows,
         "together": together,
+        "combination": None if found.search is None else _combined(found),
+        "watch": None if found.limit is None else {"limit": found.limit, "hold": HOLD},
         "weights": hashlib.sha256(locate("weights", checkpoint).read_bytes()).hexdigest() if network else None,
     }
+
+
+def _times(begun: Sequence[Begun]) -> dict[str, float]:
+    """Milliseconds of the parts of a frame of the full model, the medians of the windows; the longest first."""
+    names = [name for name in begun[0].times if name not in ("total", "metrics")]
+    found = {name: float(np.median([one.times[name] for one in begun])) for name in names}
+    return dict(sorted(found.items(), key=lambda pair: -pair[1]))
+
+
+def _combined(found: Probed) -> dict[str, Any]:
+    """What the search for a combination found, and what it tried."""
+    assert found.search is not None
+
+    def told(one: Combination) -> dict[str, Any]:
+        return {"names": list(one.names), "mm_p50": _finite(one.half_mm), "mm": _finite(one.mm), "ms": one.ms}
+
+    tried = [told(one) for one in found.search.tried]
+    return told(found.search.chosen) | {"fits": found.search.fits, "full_ms": found.full_ms, "tried": tried}
 
 
 def _numbers(effect: Effect, full: Effect) -> dict[str, float | None]:
     found = {
         "gamma_p50": effect.gamma_at(0.5),
         "gamma_p95": effect.gamma_at(QUANTILE),
+        "mm_p50": max(effect.half_mm),
         "mm": effect.worst_mm,
         "ms": effect.median_ms,
         "saved": effect.saving(full),
         "windows": len(effect.gamma),
     }
-    return {key: value if np.isfinite(value) else None for key, value in found.items()}
+    return {key: _finite(value) for key, value in found.items()}
 
 
-def describe(plan: dict[str, Any]) -> str:
-    """The table and one paragraph."""
-    where = ", ".join(f"{one['measured_from']} ({one['reason']})" for one in plan["windows"])
-    lines = [
-        f"measured from frames {where}; {plan['frames']} steps each; the full model takes {plan['full']['ms']:.1f} ms a frame, "
-        f"γ {_short(plan['full']['gamma_p95'])}",
-        "",
-        f"{'part':<20}{'force/weight':>13}{'γ without':>11}{'p95':>10}{'mm':>9}{'saved':>8}  decision",
-    ]
-    for row in plan["rows"]:
-        if "ms" in row:
-            saved = f"{100 * row['saved']:>7.0f}%"
-            numbers = f"{_short(row['gamma_p50']):>11}{_short(row['gamma_p95']):>10}{_short(row['mm']):>9}{saved}"
-        else:
-            numbers = f"{'-':>11}{'-':>10}{'-':>9}{'-':>8}"
-        force = "-" if row["force"] is None else _short(row["force"])
-        lines.append(f"{row['part']:<20}{force:>13}{numbers}  {row['decision']}: {row['reason']}")
-    missed = plan["windows_without_minimum"]
-    if missed:
-        lines.append(f"γ is a lower bound in {missed} of {len(plan['windows'])} windows: the exact step was not reached there")
-    return "\n".join([*lines, "", sentence(plan)])
+def _numbers_apart(apart: Apart, pace: float, full_ms: float, fps: float) -> dict[str, float | None]:
+    """Of another mesh or time step; ``ms`` is of a frame of the full model, whatever the steps in it."""
+    ms = apart.frame_ms(pace)
+    found = {
+        "mm_p50": max(apart.half_mm),
+        "mm": max(apart.mm),
+        "ms": ms,
+        "ms_per_second": ms * fps,
+        "saved": 1.0 - ms / full_ms,
+        "windows": len(apart.mm),
+    }
+    return {key: _finite(value) for key, value in found.items()}
 
 
-def sentence(plan: dict[str, Any]) -> str:
-    """What was decided, for someone who does not read tables."""
-    limit = plan["accuracy"]
-    asked = f"{limit['value']:g} mm" if limit["unit"] == "mm" else f"γ = {limit['value']:g}"
-    left = [row["part"] for row in plan["rows"] if row["decision"] == "left out"]
-    needed = [row["part"] for row in plan["rows"] if row["decision"] == "kept" and row["reason"].startswith("without it")]
-    if not left:
-        text = f"Nothing is left out: no part both saves time and stays within {asked}."
-    else:
-        found = plan["together"]
-        error = f"{_short(found['error'])} mm" if limit["unit"] == "mm" else f"γ = {_short(found['error'])} more"
-        text = (
-            f"Left out: {', '.join(left)}. Together this costs {error} where {asked} was accepted, and saves "
-            f"{100 * found['saved']:.0f}% of a frame ({plan['full']['ms']:.1f} ms before)."
-        )
-    return f"{text} Needed for this accuracy: {', '.join(needed) or 'nothing else that was looked at'}."
-
-
-def _short(value: float | None) -> str:
-    return "broken" if value is None else f"{value:.2g}"
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None

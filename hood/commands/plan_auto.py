@@ -10,8 +10,9 @@ from pathlib import Path
 from hood import __version__
 from hood.assets.files.library import locate
 from hood.commands.common import output_folder
-from hood.commands.plan import make_plan, sentence
+from hood.commands.plan import make_plan
 from hood.commands.plan_file import FREE, plan_path, read_plan, write_plan
+from hood.commands.plan_table import sentence
 from hood.config import ConfigError, load_config
 from hood.native.build import processor
 from hood.native.cache import cache_folder
@@ -47,7 +48,7 @@ def planned(overrides: Sequence[str]) -> list[str]:
         plan = read_plan(path)
         print(f"plan of {path}, made before")
     else:
-        plan, _ = make_plan(words, own)
+        plan, _ = make_plan(words, own, evidence=False)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_plan(path, plan)
         print(f"planned in {plan['seconds']:.1f} s, kept in {path}")

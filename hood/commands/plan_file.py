@@ -58,14 +58,15 @@ def rollout_config(overrides: Sequence[str]) -> DictConfig:
     if path is None:
         return config
     words = _read_words(path)
+    said = {word.partition("=")[0]: word for word in words}  # what was chosen stands for what was asked for
     for word in overrides:
         key, _, value = word.partition("=")
-        if key in ("plan", *FREE) or word in words:
+        if key in ("plan", *FREE) or said.get(key) == word:
             continue
-        made = next((known for known in words if known.partition("=")[0] == key), f"the default of {key}")
+        made = said.get(key, f"the default of {key}")
         raise ConfigError(f"{key}={value}: {path} was made for {made}; drop {key}=…, or make a plan with hood plan {word}")
     given = {word.partition("=")[0] for word in overrides}
-    return load_config("rollout", [*(word for word in words if word.partition("=")[0] not in given), *overrides])
+    return load_config("rollout", [*(word for key, word in said.items() if key not in given), *overrides])
 
 
 @dataclass(frozen=True)

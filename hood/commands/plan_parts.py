@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 from omegaconf import DictConfig
 
 from hood.assets.files.library import unknown
 from hood.commands.cloth_contact import acts
-from hood.commands.refinement import chosen
+from hood.commands.refinement import chosen, other_refinement_keys
 from hood.config import ConfigError, build
 from hood.losses.collision import Collision
 
@@ -25,6 +25,7 @@ class Part:
         rivals: parts of one such name exclude each other.
         watched: whether a rollout notices where it was wrong to leave the part out; others are measured and kept.
         stays: why one that is noticed is kept all the same; "" where it is not.
+        instead: the name is that of another way to take the steps, not of what is left out.
     """
 
     name: str
@@ -34,6 +35,11 @@ class Part:
     rivals: str = ""
     watched: bool = True
     stays: str = ""
+    instead: bool = False
+
+
+#: Iterations after the inertial guess, and after a network, that are measured as ways to take the steps.
+_FROM_GUESS, _FROM_NETWORK = (8, 4, 2), (0, 5)
 
 
 def _has(name: str) -> Callable[[DictConfig], bool]:
@@ -101,31 +107,52 @@ _TERMS: tuple[tuple[Part, Callable[[DictConfig], bool]], ...] = (
     (Part("gravity", "weight", ("gravity=0",), "gravity", watched=False), lambda config: float(config.gravity) > 0.0),
 )  # fmt: skip
 _ACCURACY: tuple[tuple[Part, Callable[[DictConfig], bool]], ...] = (
-    (Part("last iterations", "forces balanced to 3%", ("solver.target_rg=0.03",), rivals="target"), _target(0.03)),
-    (Part("later iterations", "forces balanced to 10%", ("solver.target_rg=0.1",), rivals="target"), _target(0.1)),
+    (Part("last iterations", "forces balanced to 3%", ("solver.target_rg=0.03",), rivals="steps"), _target(0.03)),
+    (Part("later iterations", "forces balanced to 10%", ("solver.target_rg=0.1",), rivals="steps"), _target(0.1)),
 )
 
 
-def parts_of(config: DictConfig) -> list[Part]:
-    """The parts that a settled config of ``hood rollout`` has."""
+def parts_of(config: DictConfig, steppers: bool = False) -> list[Part]:
+    """The parts that a settled config of ``hood rollout`` has; with ``steppers`` other ways to take its steps as well."""
     found = [part for part, there in (*_TERMS, *_ACCURACY) if there(config)]
     iterations = _iterations(config)
     for count in sorted({iterations // 2, 1} - {0, iterations}, reverse=True) if iterations else []:
         words = (f"refine={count}",)
-        found.append(Part(f"iterations above {count}", "refinement of every step", words, rivals="refine"))
+        found.append(Part(f"iterations above {count}", "refinement of every step", words, rivals="steps"))
     if str(config.stepper) == "network" and str(config.precision) == "fp32":
         found.append(Part("float32", "latents and products in full precision", ("precision=bf16",)))
-    return found
+    return [*found, *_steppers(config)] if steppers else found
 
 
-def choose_parts(config: DictConfig, names: list[str]) -> list[Part]:
-    """Those of the names; all where none is given.
+def _steppers(config: DictConfig) -> list[Part]:
+    """Other ways to take the steps: of a solver a network and fewer iterations, of a network the solver."""
+    if other_refinement_keys(config) or str(config.step) != "plain":
+        return []
+    asked = str(config.stepper)
+    ways: list[tuple[str, str, tuple[str, ...]]] = []
+    if asked == "newton":
+        for count in _FROM_GUESS:
+            ways.append((f"{count} iterations", "from the inertial guess", ("stepper=refine", f"refine={count}")))
+        for count in _FROM_NETWORK:
+            name = "network" if count == 0 else f"network, {count} iterations"
+            purpose = f"steps of {config.checkpoint}" + (", refined" if count else "")
+            ways.append((name, purpose, ("stepper=network", f"refine={count}")))
+    elif asked == "network":
+        ways.append(("newton", "steps by the solver alone", ("stepper=newton", "refine=0")))
+    return [Part(name, purpose, words, rivals="steps", instead=True) for name, purpose, words in ways]
+
+
+def choose_parts(config: DictConfig, names: list[str], steppers: bool = False, others: Collection[str] = ()) -> list[Part]:
+    """Those of the names; where none is given all, other ways to take the steps if ``steppers``.
+
+    Args:
+        others: names that may be asked for and are no parts.
 
     Raises:
-        ConfigError: a part that this rollout does not have, or none at all.
+        ConfigError: a part that this rollout does not have.
     """
-    there = {part.name: part for part in parts_of(config)}
+    there = {part.name: part for part in parts_of(config, True)}
     for name in names:
-        if name not in there:
-            raise ConfigError(unknown("part", name, list(there)))
-    return [there[name] for name in names] if names else list(there.values())
+        if name not in there and name not in others:
+            raise ConfigError(unknown("part", name, [*there, *others]))
+    return [there[name] for name in names if name in there] if names else parts_of(config, steppers)

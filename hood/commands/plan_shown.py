@@ -7,47 +7,36 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
-from hood.assets.files.library import names
+from hood.commands.cloth_contact import acts, why_not
+from hood.commands.plan_choices import levels_of
+from hood.commands.plan_reach import mean_edge, reach_facts
 from hood.commands.setup import Setup
 from hood.dynamics.captured import network_of
 from hood.evaluation.leaving_out import Begun, Effect
 from hood.media.plan_page import SHOWN, Difference, write_page
-from hood.scene.cloth import Cloth
-
-#: Nine tenths of what a push does in one step is felt within so many times the way of a wave.
-_FELT = 2.9
 
 
 def facts(ready: Setup) -> dict[str, Any]:
     """Of the mesh, its fabric and the network: numbers that say what they can show."""
-    cloth, network = ready.scene.cloth, network_of(ready.stepper)
-    edge = float((cloth.rest_pos[cloth.edges[:, 0]] - cloth.rest_pos[cloth.edges[:, 1]]).norm(dim=1).mean())
+    cloth, network, garment = ready.scene.cloth, network_of(ready.stepper), str(ready.config.garment)
+    levels = list(levels_of(garment))
     return {
         "vertices": cloth.num_vertices,
-        "edge_mm": 1e3 * edge,
-        "influence_edges": _FELT * wave_speed(cloth) * ready.scene.dt / edge,
+        "edge_mm": 1e3 * mean_edge(cloth),
+        **reach_facts(cloth, ready.scene.dt),
+        "network": None if network is None else str(ready.config.checkpoint),
         "levels": None if network is None else network.num_coarse,
-        "finer": _finer(str(ready.config.garment)),
+        "no_cloth_contact": _why_no_contact(ready),
+        "finer": levels[levels.index(garment) + 1 :] if levels else [],
     }
 
 
-def wave_speed(cloth: Cloth) -> float:
-    """Speed [m/s] of waves in the plane of the cloth, √((λ + 2 μ) h / ρ), of its mean fabric along the stiffer thread."""
-    stiffness = (cloth.lame_lambda + 2.0 * cloth.lame_mu) * cloth.thickness
-    if cloth.weave is not None:
-        stiffness = stiffness * cloth.weave[:, :2].amax(dim=1)
-    density = cloth.mass.sum() / cloth.rest_area.sum()
-    return float((torch.as_tensor(stiffness).double().mean() / density.double()).sqrt())
-
-
-def _finer(garment: str) -> list[str]:
-    """Embedded meshes of the same garment that are finer: ``dress_4k`` of ``dress``."""
-    sizes = [name for name in names("garments") if name.startswith(f"{garment.partition('_')[0]}_")]
-    known = {name: int(name.rpartition("_")[2].rstrip("k")) for name in sizes}
-    own = known.get(garment, 0 if garment in names("garments") else 1 << 30)
-    return sorted((name for name, size in known.items() if size > own), key=known.__getitem__)
+def _why_no_contact(ready: Setup) -> str | None:
+    """Why layers of cloth are not kept apart in this rollout; None where they are."""
+    if acts(ready.config):
+        return None
+    return why_not(ready.config) or "cloth_contact=off was asked for"
 
 
 def differences(ready: Setup, begun: Sequence[Begun], effects: Mapping[str, Effect], frames: int) -> list[Difference]:

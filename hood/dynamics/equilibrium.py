@@ -71,6 +71,7 @@ def find_equilibrium(
     frame: int,
     gravity: Tensor,
     attachments: Attachments | None = None,
+    most_steps: int | None = None,
 ) -> Rest:
     """The cloth of ``state`` settled on the still body of ``frame``.
 
@@ -86,24 +87,25 @@ def find_equilibrium(
         state: positions outside the body, near rest lengths; its velocity plays no role.
         gravity: (3,) m/s².
         attachments: closed in ``frame``.
+        most_steps: a rough rest after so many steps is enough, and nothing is warned about; None: to rest.
     """
     began = time.perf_counter()
     cloth, start = to_device(scene.cloth, "cpu"), to_device(state, "cpu")
     step = _on_cpu(scene.step_input(frame, state, relaxing=True, attachments=attachments))
     problem = StepProblem(cloth, replace(start, vel=torch.zeros_like(start.vel)), step, gravity=gravity.to(start.pos))
     parts = _Parts(cloth)
-    *_, (count, pos, speed) = _steps(potential, problem, parts)
+    *_, (count, pos, speed) = _steps(potential, problem, parts, most_steps or _MOST_STEPS)
     lost = parts.lost(pos - start.pos)
     rest = Rest((start.pos if lost else pos).to(state.pos), count, time.perf_counter() - began, speed, lost)
-    if not rest.reached:
+    if not rest.reached and most_steps is None:
         _warn(scene, rest)
     return rest
 
 
-def _steps(potential: Potential, problem: StepProblem, parts: _Parts) -> Iterator[tuple[int, Tensor, float]]:
+def _steps(potential: Potential, problem: StepProblem, parts: _Parts, most_steps: int) -> Iterator[tuple[int, Tensor, float]]:
     """Number, positions (V, 3) and speed [m/s] after each step, until the cloth is at rest, lost, or out of steps."""
     start, dt = problem.state.pos, _SHORTEST
-    for count in range(1, _MOST_STEPS + 1):
+    for count in range(1, most_steps + 1):
         here = problem.state
         longest = dt >= _LONGEST
         problem = replace(problem, step=replace(problem.step, dt=torch.full_like(problem.step.dt, dt)))

@@ -115,6 +115,7 @@ def simulate(
     settle: str = "paper",
     guard: Guard | None = None,
     afresh: bool = False,
+    start: State | None = None,
 ) -> Iterator[Frame]:
     """Frames 0, 1, … of the garment on the moving body.
 
@@ -138,6 +139,8 @@ def simulate(
     every ``surface_stride``-th frame, the first and the last; other frames lack them.
 
     A network that looks at a potential looks at ``potential``; a solver keeps its own.
+
+    ``start`` is frame 0, where it is given; ``settle`` plays no role then.
 
     ``afresh``: no search begins with what the step before found. The frames are the same, and take longer.
 
@@ -164,7 +167,9 @@ def simulate(
         network.use_potential(for_networks(potential))
     prepared = prepare_stepper(stepper, scene)
     rest = None
-    if settle == "equilibrium" and own_start(stepper, scene, start_frame) is None:
+    if start is not None:
+        state = start
+    elif settle == "equilibrium" and own_start(stepper, scene, start_frame) is None:
         state, rest = rest_state(stepper, scene, potential, relaxing_steps, start_frame, attachments)
     else:
         state = start_state(stepper, scene, potential, relaxing_steps, start_frame)
@@ -383,16 +388,18 @@ def rest_state(
     relaxing_steps: int,
     frame: int = 0,
     attachments: AttachmentSchedule | None = None,
+    most_steps: int | None = None,
 ) -> tuple[State, Rest | None]:
     """Start at rest on the still body of ``frame``, moving with the skinned garment, and how it was found; that of
-    :func:`start_state`, None and a warning where nothing holds the garment."""
+    :func:`start_state`, None and a warning where nothing holds the garment. ``most_steps`` as in
+    :func:`hood.dynamics.equilibrium.find_equilibrium`."""
     falls = without_hold(scene)
     if falls is not None:
         warnings.warn(f"garment {scene.garment.name!r} is not settled, it falls from its start: {falls}", stacklevel=2)
         return start_state(stepper, scene, potential, relaxing_steps, frame), None
     start = start_state(stepper, scene, potential, 0, frame)
     closed = None if attachments is None else attachments(0)
-    rest = find_equilibrium(scene, potential, start, frame, stepper.gravity, closed)
+    rest = find_equilibrium(scene, potential, start, frame, stepper.gravity, closed, most_steps)
     return State(rest.pos, scene.start_velocity(frame), start.origin), rest
 
 

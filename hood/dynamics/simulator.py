@@ -270,9 +270,9 @@ class Simulator(nn.Module):
             return problem.state.pos
         return torch.where(problem.cloth.pinned.unsqueeze(1), target, problem.state.pos)
 
-    def forward(self, problem: StepProblem, prepared: Prepared) -> Prediction:
+    def forward(self, problem: StepProblem, prepared: Prepared, watch: Stopwatch | None = None) -> Prediction:
         """The same as :meth:`predict`; the call that wrappers such as DistributedDataParallel see."""
-        return self.predict(problem, prepared)
+        return self.predict(problem, prepared, watch)
 
     def next_velocity(self, problem: StepProblem, prediction: Prediction) -> Tensor:
         """(V, 3) m/s at t + 1 of the implicit Euler step: (x_{t+1} − x_t) / dt."""

@@ -84,7 +84,7 @@ class Decision:
     together: Effect | None
 
 
-def _why_kept(
+def why_kept(
     name: str, effect: Effect, full: Effect, tolerance: Tolerance, stay: Mapping[str, str], priced: Collection[str]
 ) -> str:
     """Why a part stays, by what was measured of it alone; "" where it may go."""
@@ -129,7 +129,7 @@ def decide(
     for name, effect in effects.items():
         if not name or name in absent:
             continue
-        reason = _why_kept(name, effect, full, tolerance, stay, priced)
+        reason = why_kept(name, effect, full, tolerance, stay, priced)
         if reason:
             verdicts[name] = Verdict("kept", reason)
         else:

@@ -8,14 +8,14 @@ compared with those of the full model when the window is over.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from hood.dynamics.rollout import prepare_stepper, simulate
+from hood.dynamics.rollout import own_start, prepare_stepper, rest_state, simulate
 from hood.dynamics.simulator import Prediction
 from hood.dynamics.stepper import Stepper
 from hood.evaluation.gap import REFERENCE
@@ -24,7 +24,7 @@ from hood.losses.potential import Potential, relative_gradient, scale
 from hood.losses.problem import StepProblem
 from hood.mesh.surface_tree import forget_searches
 from hood.scene.scene import Scene, recentre
-from hood.scene.state import State
+from hood.scene.state import State, StepInput
 from hood.solver.iterate import in_double
 from hood.solver.newton import minimize
 
@@ -52,6 +52,7 @@ class Effect:
     ms: list[float] = field(default_factory=list)  # of every frame
     last: list[Tensor] = field(default_factory=list)  # (V, 3) m, world, float64, at the windows' ends
     exact: list[bool] = field(default_factory=list)  # the window's minimum was reached; where not, γ is a lower bound
+    half_mm: list[float] = field(default_factory=list)  # as ``mm``, the median of the vertices
 
     def gamma_at(self, share: float) -> float:
         """Quantile of γ over the windows."""
@@ -63,8 +64,9 @@ class Effect:
         return max(self.mm)
 
     def saving(self, full: Effect) -> float:
-        """Share of a frame's time that the full model takes longer, in the windows that this was measured in."""
-        return 1.0 - self.median_ms / float(np.median(full.ms[: len(self.ms)]))
+        """Share of a frame's time that the full model takes longer: the median over pairs of the same steps, as far as this was
+        measured."""
+        return 1.0 - float(np.median(np.divide(self.ms, full.ms[: len(self.ms)])))
 
     @property
     def median_ms(self) -> float:
@@ -81,10 +83,18 @@ class Begun:
     state: State
     step: StepProblem  # prepared by the full potential
     solved: Tensor  # (V, 3) m, where the full model's step from there leads, in the state's frame
+    rest: State  # at rest in the window's own first frame
+    times: dict[str, float] = field(default_factory=dict)  # ms of the parts of the last frame before, by name
 
 
-def begin(full: Variant, windows: Sequence[Window], settle: str, lead: int = LEAD) -> list[Begun]:
-    """The full model's state ``lead`` frames into every window, from rest on the still body of the window's first frame."""
+def begin(
+    full: Variant, windows: Sequence[Window], settle: str, lead: int = LEAD, most_steps: int | None = None
+) -> list[Begun]:
+    """The full model's state ``lead`` frames into every window, from rest on the still body of the window's first frame.
+
+    Args:
+        most_steps: a rough rest after so many steps of settling is enough, where ``settle`` settles; None: to rest.
+    """
     found = []
     for window in windows:
         kept: dict[int, tuple[StepProblem, Tensor]] = {}
@@ -103,34 +113,70 @@ def begin(full: Variant, windows: Sequence[Window], settle: str, lead: int = LEA
             observe=keep,
             metrics="none",
             settle=settle,
+            start=None if most_steps is None else rest_at(full, window.first, settle, most_steps),
         )
-        for _ in frames:
-            pass
+        rest = next(frames).state
+        *_, last = frames
+        times = {name[3:]: value for name, value in last.metrics.items() if name.startswith("ms_")}
         step, solved = kept[max(kept)]
-        found.append(Begun(window, window.first + max(kept) - 1, step.state, full.potential.prepare(step), solved))
+        prepared = full.potential.prepare(step)
+        found.append(Begun(window, window.first + max(kept) - 1, step.state, prepared, solved, rest, times))
     return found
 
 
+def rest_at(variant: Variant, frame: int, settle: str, most_steps: int | None = None) -> State:
+    """The first state of a rollout that begins at ``frame``; ``most_steps`` as in :func:`begin`."""
+    stepper, scene, potential = variant.stepper, variant.scene, variant.potential
+    if most_steps is not None and settle == "equilibrium" and own_start(stepper, scene, frame) is None:
+        return rest_state(stepper, scene, potential, 1, frame, most_steps=most_steps)[0]
+    frames = simulate(stepper, scene, potential, 1, start_frame=frame, metrics="none", settle=settle)
+    return next(frames).state
+
+
 @torch.no_grad()
-def take_steps(variant: Variant, begun: Begun, num_frames: int, effect: Effect) -> tuple[Tensor, Tensor]:
-    """Steps of a variant from the window's first state: positions (V, 3) [m] after the first step, in that state's frame, and
-    after all of them, world. Its times [ms] go to ``effect``."""
-    stepper, scene, state = variant.stepper, variant.scene, begun.state
-    prepared, first = prepare_stepper(stepper, scene), state.pos
+def advance(
+    variant: Variant, state: State, frame: int, num_steps: int, ms: list[float], first: StepInput | None = None
+) -> Iterator[tuple[Tensor, State]]:
+    """Positions (V, 3) [m] after every step, in the frame of the state before it, and the state there. Times [ms], without
+    that of posing the body, go to ``ms``.
+
+    Args:
+        state, frame: where it begins.
+        first: what is prescribed for the first step, where that is known.
+    """
+    stepper, scene = variant.stepper, variant.scene
+    prepared, dtype = prepare_stepper(stepper, scene), scene.cloth.rest_pos.dtype
+    if state.pos.dtype != dtype:  # networks take their steps in float32
+        state, first = State(state.pos.to(dtype), state.vel.to(dtype), state.origin), None
     # On one thread what other processes take is no time of a frame's.
     clock = time.process_time if torch.get_num_threads() == 1 and state.pos.device.type == "cpu" else time.perf_counter
     forget_searches()  # those of the variant before were of the same state
-    for index in range(num_frames):
+    for index in range(num_steps):
+        # The body is posed a few frames at once, and kept: whoever comes first would pay for all others.
+        scene.motion.surface(frame + index + 1, state.origin[0].numpy())
         began = clock()
-        step = begun.step.step if index == 0 else scene.step_input(begun.frame + index, state)
+        step = scene.step_input(frame + index, state) if first is None or index > 0 else first
         problem = stepper.search(StepProblem(scene.cloth, state, step, gravity=stepper.gravity.to(state.pos)))
         prediction = stepper.predict(problem, prepared, None)
         velocity = stepper.next_velocity(problem, prediction)
-        effect.ms.append(1e3 * (clock() - began))
-        state = State(prediction.next_pos, velocity, state.origin)
-        first = state.pos if index == 0 else first
-        state = recentre(state, scene.cloth.vertex_scene)
-    return first, state.pos.cpu().double() + state.origin[0]
+        ms.append(1e3 * (clock() - began))
+        state = recentre(State(prediction.next_pos, velocity, state.origin), scene.cloth.vertex_scene)
+        yield prediction.next_pos, state
+
+
+def take_steps(variant: Variant, begun: Begun, num_frames: int, effect: Effect) -> tuple[Tensor, Tensor]:
+    """Steps of a variant from the window's first state: positions (V, 3) [m] after the first step, in that state's frame, and
+    after all of them, world. Its times [ms] go to ``effect``."""
+    steps = advance(variant, begun.state, begun.frame, num_frames, effect.ms, begun.step.step)
+    first, state = next(steps)
+    for _, last in steps:
+        state = last
+    return first, world(state)
+
+
+def world(state: State) -> Tensor:
+    """Positions (V, 3) [m] in the world, float64, on the CPU."""
+    return state.pos.cpu().double() + state.origin[0]
 
 
 def measure(
@@ -146,7 +192,7 @@ def measure(
         enough: says after every window, of a name, its effect so far and that of the full model, whether that will do.
     """
     everything = {"": full, **variants}
-    for variant in everything.values():
+    for variant in everything.values() if num_frames == 1 else ():
         take_steps(variant, begun[0], 1, Effect())  # what a stepper makes at its first step is not a frame's time
     effects, going = {name: Effect() for name in everything}, list(everything)
     for one in begun:
@@ -154,6 +200,8 @@ def measure(
         lasts: dict[str, Tensor] = {}
         for name, variant in ((name, everything[name]) for name in going):
             firsts[name], lasts[name] = take_steps(variant, one, num_frames, effects[name])
+            if one is begun[0] and num_frames > 1:
+                del effects[name].ms[0]  # nor is it here
         e0, values = float(scale(in_double(one.step)).sum()), [_phi(full.potential, one, pos) for pos in firsts.values()]
         lowest, exact = _minimum(full.potential, one, list(firsts.values()), values)
         for phi, name in zip(values, going, strict=True):
@@ -161,10 +209,19 @@ def measure(
             effect.gamma.append((phi - lowest) / e0)
             effect.exact.append(exact)
             effect.last.append(lasts[name])
-            apart = (lasts[name] - lasts[""]).norm(dim=1)
-            effect.mm.append(1e3 * float(apart.quantile(_QUANTILE)) if bool(torch.isfinite(apart).all()) else float("inf"))
+            half, most = distances(lasts[name], lasts[""])
+            effect.half_mm.append(half)
+            effect.mm.append(most)
         going = [name for name in going if not name or not enough(name, effects[name], effects[""])]
     return effects
+
+
+def distances(one: Tensor, other: Tensor) -> tuple[float, float]:
+    """Median and 95th percentile [mm] of the distances between points (N, 3) [m]; infinite where one is not finite."""
+    apart = (one - other).norm(dim=1)
+    if not bool(torch.isfinite(apart).all()):
+        return float("inf"), float("inf")
+    return 1e3 * float(apart.median()), 1e3 * float(apart.quantile(_QUANTILE))
 
 
 def active_terms(full: Variant, begun: Sequence[Begun]) -> set[str]:

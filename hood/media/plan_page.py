@@ -37,25 +37,29 @@ class Difference:
 
 def write_page(path: Path, plan: Mapping[str, Any], sentence: str, differences: Sequence[Difference]) -> None:
     """Write the page of ``plan``, as its file holds it; ``sentence`` says what was decided."""
+    plan = {**plan, "sentence": sentence}
     parts = ["<h1>What this scene needs</h1>", f'<p class="lead">{escape(sentence)}</p>']
     parts += [section("Questions", _questions(plan)), section("Every part", _table(plan)), _pictures(differences)]
     where = ", ".join(f"{one['measured_from']} ({one['reason']})" for one in plan["windows"])
     method = (
         f"From frames {where}, {plan['frames']} steps each. In every window the full model and each variant take the same "
-        "steps from the same state. γ is the energy that the first step leaves above the exact one, in units of what it costs "
-        "to be wrong by 1 g everywhere; mm is the distance from the full model when the window ends. Parts that are far off, "
-        "or kept anyway, are looked at in the first window alone."
+        "steps from the same state; other meshes and time steps begin at rest, as a rollout does. γ is the energy that the "
+        "first step leaves above the exact one, in units of what it costs to be wrong by 1 g everywhere; mm is the distance "
+        "from the full model when the window ends. Parts that are far off, or kept anyway, are looked at in the first window "
+        "alone."
     )
     parts.append(section("How it was measured", paragraph(method)))
     write_atomically(path, whole_page("What this scene needs", "".join(parts), _STYLE).encode())
 
 
 def _table(plan: Mapping[str, Any]) -> str:
-    head = ("part", "what it is for", "force / weight", "γ without", "mm", "ms saved", "decision", "reason", "again")
+    head = (
+        "row", "what it is for", "force / weight", "γ without", "mm p50", "mm p95", "ms saved", "decision", "reason", "again"
+    )  # fmt: skip
     rows = []
     for row in plan["rows"]:
         saved = "" if row.get("saved") is None else f"{row['saved'] * plan['full']['ms']:.1f} ({100 * row['saved']:.0f}%)"
-        numbers = [_short(row.get(key)) for key in ("force", "gamma_p95", "mm")]
+        numbers = [_short(row.get(key)) for key in ("force", "gamma_p95", "mm_p50", "mm")]
         said = [row["decision"], row["reason"]]
         rows.append([row["part"], row["purpose"], *numbers, saved, *said, f"<code>{escape(row['command'])}</code>"])
     return table(head, rows, raw=len(head) - 1)
@@ -63,11 +67,13 @@ def _table(plan: Mapping[str, Any]) -> str:
 
 def _questions(plan: Mapping[str, Any]) -> str:
     asked = {
-        "Why is contact of cloth with cloth on or off?": _of_part(plan, "cloth contact"),
+        "Why is contact of cloth with cloth on or off?": _contact(plan),
         "What would bending cost?": _of_part(plan, "bending"),
-        "Is a finer mesh needed?": _mesh(plan["facts"]),
+        "Is a finer mesh needed, or is a coarser one enough?": _mesh(plan),
+        "Is the time step short enough?": _time_step(plan),
         "How many levels does the network need?": _levels(plan["facts"]),
         "What limits the speed now?": _limit(plan),
+        "What was chosen, and how far is it from the full model?": _chosen(plan),
     }
     return "<dl>" + "".join(f"<dt>{escape(key)}</dt><dd>{escape(text)}</dd>" for key, text in asked.items()) + "</dl>"
 
@@ -82,35 +88,76 @@ def _of_part(plan: Mapping[str, Any], name: str) -> str:
     return f"It is {row['decision']}: {row['reason']}. Without it {saved} would be saved, as measured here."
 
 
-def _mesh(facts: Mapping[str, Any]) -> str:
+def _contact(plan: Mapping[str, Any]) -> str:
+    reason = plan["facts"]["no_cloth_contact"]
+    return _of_part(plan, "cloth contact") if reason is None else f"It is off: {reason}."
+
+
+def _mesh(plan: Mapping[str, Any]) -> str:
+    facts = plan["facts"]
     edge = facts["edge_mm"]
     text = (
         f"The mesh has {facts['vertices']:,} vertices and edges of {edge:.0f} mm. A fold takes about four edges, so it shows "
         f"folds wider than {4 * edge:.0f} mm and none that are narrower; no setting changes that."
     )
-    finer = facts["finer"]
-    if not finer:
-        return text + " Where narrower ones are wanted, hood prepare can refine the garment."
-    return text + f" Where narrower ones are wanted, take {' or '.join(finer)}, and plan again: hood plan garment={finer[0]}."
+    rows = [row for row in plan["rows"] if row.get("kind") == "mesh"]
+    for row in rows:
+        text += f" {row['part'].removeprefix('mesh ')}: {_apart(row)}."
+    measured = {row["part"].removeprefix("mesh ") for row in rows}
+    finer = [name for name in facts["finer"] if name not in measured]
+    if finer:
+        return f"{text} How far it is from {' or '.join(finer)} says hood plan … parts=[mesh {finer[0]}]."
+    return text if rows or facts["finer"] else f"{text} Where narrower ones are wanted, hood prepare can refine the garment."
+
+
+def _apart(row: Mapping[str, Any]) -> str:
+    """Of another mesh or time step."""
+    if row.get("mm") is None:
+        return f"{row['decision']}, it did not stay finite"
+    far = f"{_short(row['mm_p50'])} mm from this one in the median and {_short(row['mm'])} mm at the 95th percentile"
+    cost = f"{100 * row['saved']:.0f}% less time" if row["saved"] > 0 else f"{1 - row['saved']:.1f} times the time"
+    return f"{far} when a window ends, at points that both have, for {cost}; {row['decision']}"
+
+
+def _time_step(plan: Mapping[str, Any]) -> str:
+    rows = [row for row in plan["rows"] if row.get("kind") == "time step"]
+    if not rows:
+        return "It was not among what was measured; networks know the step of their training alone."
+    return " ".join(f"{row['part']}: {_apart(row)}." for row in rows)
 
 
 def _levels(facts: Mapping[str, Any]) -> str:
-    edges = facts["influence_edges"]
-    reach = f"In one step a push on this fabric is felt {edges:.0f} edges away (2.9 c dt, c the speed of waves in it)"
+    edges, needed = facts["influence_edges"], facts["needed_edges"]
+    reach = (
+        f"In one step a push on this fabric is felt {edges:.0f} edges away (2.9 c dt, c = {facts['wave_speed']:.0f} m/s the "
+        f"speed of waves in it), and the mesh is {facts['diameter_edges']} edges wide"
+    )
     if facts["levels"] is None:
-        return f"None: no network takes the steps. {reach}, which the solver follows by itself."
+        return f"None: no network takes the steps. {reach}; the solver follows that by itself."
+    enough = ", ".join(f"{one['name']} ({one['radius']})" for one in facts["models"] if one["suffices"])
+    own = next((one for one in facts["models"] if one["name"] == facts["network"]), None)
+    used = f"the one used here has {facts['levels']} coarse level(s)"
+    if own is not None:
+        used += f" and passes {own['radius']}, {'enough' if own['suffices'] else 'what is farther off waits for the next step'}"
     return (
-        f"{reach}. A network without coarse levels passes a message on by one edge in every pass, so it needs as many passes; "
-        f"the one used here has {facts['levels']} coarse level(s)."
+        f"{reach}. So messages have to pass {needed:.0f} edges in a step; every coarse level doubles the way of a pass. "
+        f"Shipped networks that reach so far: {enough or 'none'}; {used}."
     )
 
 
 def _limit(plan: Mapping[str, Any]) -> str:
     kept = [row for row in plan["rows"] if row["decision"] == "kept" and (row.get("saved") or 0.0) > 0.0]
+    times = ", ".join(f"{name} {ms:.1f} ms" for name, ms in plan["times"].items())
+    parts = f"A frame of the full model is made of {times}."
     if not kept:
-        return "None of the parts that were measured: what is left is stretching, inertia and the step itself."
+        return f"{parts} None of the parts that were measured: what is left is stretching, inertia and the step itself."
     most = max(kept, key=lambda row: row["saved"])
-    return f"Of what is kept, {most['part']} costs most, {100 * most['saved']:.0f}% of a frame, and stays: {most['reason']}."
+    costs = f"{most['part']} costs most, {100 * most['saved']:.0f}% of a frame"
+    return f"{parts} Of what is kept, {costs}, and stays: {most['reason']}."
+
+
+def _chosen(plan: Mapping[str, Any]) -> str:
+    return f"{plan['sentence']} In words: {plan['command']}"
 
 
 def _pictures(differences: Sequence[Difference]) -> str:

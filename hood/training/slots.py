@@ -16,7 +16,7 @@ from hood.scene.dataset import SceneSampler, Window
 from hood.scene.scene import recentre
 from hood.scene.state import State, StepInput, concatenate_states, concatenate_step_inputs
 from hood.training.buckets import make_buckets, next_bucket
-from hood.training.prefetch import MAX_DRAWS, Request, SceneFeed, choose_workers, draw_window
+from hood.training.prefetch import MAX_DRAWS, Request, SceneFeed, Start, choose_workers, draw_window, make_start
 
 #: A training rollout is given up once 1% of its edges are strained beyond this: nothing can be learned from debris.
 _BROKEN_STRAIN = 1.5
@@ -180,6 +180,11 @@ class Slots:
         slot.age = 0
         self._batches.pop(slot.bucket, None)
         self.feed.expect(self._request(index, slot))
+
+    def scene(self, index: int, draw: int) -> Start:
+        """Scene number ``draw`` of a slot of this process, made here; the running rollouts stay as they are."""
+        slot = self._slots[index]
+        return make_start(self.sampler, self._request(index, _Slot(slot.bucket, slot.place, draw)))
 
     def _request(self, index: int, slot: _Slot) -> Request:
         """The next scene of a slot."""

@@ -17,7 +17,8 @@ from torch.nn.parallel import DistributedDataParallel
 from hood.assets.files.atomic import write_atomically
 from hood.dynamics.checkpoint import save_simulator
 from hood.dynamics.ranges import training_conditions
-from hood.dynamics.simulator import Simulator
+from hood.dynamics.simulator import Prediction, Simulator
+from hood.dynamics.stopwatch import Stopwatch, timed
 from hood.features.normalizer import RunningNormalizer
 from hood.losses.layers import for_networks
 from hood.losses.potential import Potential, relative_gradient, scale
@@ -43,6 +44,8 @@ from hood.training.watch import Watch
 
 #: Told the iteration and what was measured; None instead of a report: time passed that was not training.
 Progress = Callable[[int, dict[str, float] | None], None]
+#: Told of an update: what had to be solved, by which potential, the prediction, and its residual (B,).
+Observer = Callable[[StepProblem, Potential, Prediction, Tensor], None]
 
 
 class Trainer:
@@ -98,6 +101,8 @@ class Trainer:
         self.skipped = 0
         self.rollbacks = 0
         self.best = math.inf
+        self.stopwatch: Stopwatch | None = None  # told where an update's time goes
+        self.observe: Observer | None = None
         self._skipped_in_row = 0
         self._rollbacks_in_row = 0
         self._failed_at = -1
@@ -156,19 +161,24 @@ class Trainer:
         """One step of every slot and one optimiser update; returns what was measured."""
         settings, simulator = self.settings, self.simulator
         simulator.train()
-        horizon = settings.horizon(self.iteration)
-        cloth, prepared, state, step = self.slots.batch(horizon)
+        horizon, clock = settings.horizon(self.iteration), self.stopwatch
+        with timed(clock, "scenes"):
+            cloth, prepared, state, step = self.slots.batch(horizon)
         potential = settings.collision.apply(self.potential, self.iteration)
         simulator.use_potential(for_networks(potential))
-        problem = potential.prepare(StepProblem(cloth, state, step, gravity=simulator.gravity))
+        with timed(clock, "search"):
+            problem = potential.prepare(StepProblem(cloth, state, step, gravity=simulator.gravity))
         collecting = self.iteration < settings.statistics_iterations and simulator.uses_statistics
         if collecting and simulator.output.collects_statistics:
             simulator.output.observe(self.slots.skinned_accelerations())
         with torch.set_grad_enabled(not collecting):
-            prediction = simulator(problem, prepared) if collecting else self.model(problem, prepared)
-        gradient, energies = potential.gradient(problem, prediction.next_pos.detach(), prediction.acc.detach())
-        gradient = gradient * cloth.free.unsqueeze(1)
-        residual = relative_gradient(problem, gradient)
+            prediction = (simulator if collecting else self.model)(problem, prepared, clock)
+        with timed(clock, "losses"):
+            gradient, energies = potential.gradient(problem, prediction.next_pos.detach(), prediction.acc.detach())
+            gradient = gradient * cloth.free.unsqueeze(1)
+            residual = relative_gradient(problem, gradient)
+        if self.observe is not None:
+            self.observe(problem, potential, prediction, residual)
         report = {name: float(value.mean()) for name, value in energies.items()}
         report |= {
             "total": sum(report.values()),
@@ -187,7 +197,8 @@ class Trainer:
                 # A share without body edges leaves their networks out; all processes must reduce the same parameters.
                 surrogate = surrogate + 0.0 * sum(p.sum() for p in simulator.parameters())
             report |= self._optimise(surrogate, math.isfinite(report["total"]))
-        self.slots.advance(prediction.next_pos, simulator.next_velocity(problem, prediction))
+        with timed(clock, "scenes"):
+            self.slots.advance(prediction.next_pos, simulator.next_velocity(problem, prediction))
         self.iteration += 1
         return report
 
@@ -363,15 +374,17 @@ class Trainer:
         for group in self.optimizer.param_groups:
             group["lr"] = settings.learning_rate * factor
         self.optimizer.zero_grad(set_to_none=True)
-        surrogate.backward()
-        norm = float(torch.nn.utils.clip_grad_norm_(self.simulator.parameters(), settings.clip_norm))
-        if distributed.any_rank(not (finite and math.isfinite(norm))):
-            self.skipped += 1
-            self._skipped_in_row += 1
-        else:
-            self.optimizer.step()
-            self._update_average()
-            self._skipped_in_row = 0
+        with timed(self.stopwatch, "backward"):
+            surrogate.backward()
+        with timed(self.stopwatch, "optimiser"):
+            norm = float(torch.nn.utils.clip_grad_norm_(self.simulator.parameters(), settings.clip_norm))
+            if distributed.any_rank(not (finite and math.isfinite(norm))):
+                self.skipped += 1
+                self._skipped_in_row += 1
+            else:
+                self.optimizer.step()
+                self._update_average()
+                self._skipped_in_row = 0
         return {
             "parameter_gradient_norm": norm,
             "learning_rate": settings.learning_rate * factor,

@@ -29,7 +29,7 @@ def test_full_begins_every_search_afresh(monkeypatch: pytest.MonkeyPatch) -> Non
 def short(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """Plans that are made without a look (what is measured is another test's matter); the cache folder."""
 
-    def quick(words: list[str], own: object) -> tuple[dict[str, object], list[object]]:
+    def quick(words: list[str], own: object, evidence: bool) -> tuple[dict[str, object], list[object]]:
         full, limit = {"ms": 10.0}, {"value": 0.01, "unit": "gamma"}
         rows = [{"part": "later iterations", "decision": "left out", "reason": ""}]
         told = {"full": full, "accuracy": limit, "rows": rows, "together": {"error": 1e-4, "saved": 0.1}, "seconds": 1.0}
@@ -54,10 +54,10 @@ def test_with_an_accuracy_a_rollout_plans_once(
     assert rollout_config([f"plan={beside}"]).garment == "tank"
     assert rollout_config([f"plan={beside}"]).solver.target_rg == 0.1
 
-    monkeypatch.setattr(plan_auto, "make_plan", lambda words, own: pytest.fail("planned again"))
+    monkeypatch.setattr(plan_auto, "make_plan", lambda words, own, evidence: pytest.fail("planned again"))
     assert main([*command, "surface_stride=7"]) == 0
     assert "made before" in capsys.readouterr().out
-    monkeypatch.setattr(plan_auto, "make_plan", lambda words, own: (_ for _ in ()).throw(ValueError("plans again")))
+    monkeypatch.setattr(plan_auto, "make_plan", lambda words, own, evidence: (_ for _ in ()).throw(ValueError("plans again")))
     for other in ("accuracy=0.02", "material=denim", "num_frames=7"):
         assert main([*command, other]) == 2
         assert "plans again" in capsys.readouterr().err

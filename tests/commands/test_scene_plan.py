@@ -15,6 +15,7 @@ import pytest
 import hood
 from hood.cli import main
 from hood.commands.plan_file import rollout_config
+from hood.evaluation.leaving_out import Effect
 
 WORDS = ["garment=tank", "sequence=plie", "stepper=newton", "num_frames=24"]
 QUIET = ["video=none", "sheet=false", "metrics=none", "guard=off"]
@@ -47,7 +48,7 @@ def test_every_part_is_measured_and_decided(made: Path) -> None:
 
 
 def test_the_printed_table_names_parts_and_command(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from hood.commands.plan import describe
+    from hood.commands.plan_table import describe
 
     text = describe(read(made))
     assert "bending" in text
@@ -74,13 +75,88 @@ def test_the_page_lies_beside_the_plan_and_answers(made: Path) -> None:
     assert html.escape(rows["bending"]["command"]) in page
     assert "edges of" in page
     assert "dress_4k" not in page
-    assert "tank_4k" in page
+    assert "parts=[mesh tank_4k]" in page
+    assert "A frame of the full model is made of " in page
+    assert html.escape(read(made)["command"]) in page
 
 
 def test_what_is_hopeless_or_stays_is_looked_at_once(made: Path) -> None:
     rows = {row["part"]: row for row in read(made)["rows"]}
     assert (rows["body contact"]["windows"], rows["cloth contact"]["windows"]) == (1, 1)
     assert rows["bending"]["windows"] == 2
+
+
+def test_another_mesh_and_time_step_are_compared_in_mm(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["parts=[mesh tank_4k,60 fps]", "windows=1", "frames=1", f"output={tmp_path}"]
+    assert main(["plan", *WORDS, *words]) == 0
+    rows = {row["part"]: row for row in read(tmp_path / "plan.json")["rows"]}
+    assert set(rows) == {"mesh tank_4k", "60 fps"}
+    for row in rows.values():
+        assert row["decision"] == "compared"
+        assert 0.0 < row["mm_p50"] < row["mm"] < 60.0
+        assert "gamma_p95" not in row
+        assert row["ms_per_second"] == pytest.approx(30.0 * row["ms"])
+        assert row["saved"] < 0.0
+    assert rows["60 fps"]["words"] == ["fps=60", "num_frames=47"]
+    assert "mesh tank_4k" in capsys.readouterr().out
+
+
+def test_the_full_model_is_chosen_where_it_is_fast_enough(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["parts=[2 iterations]", "windows=1", "frames=1", "budget_ms=100000", f"output={tmp_path}"]
+    assert main(["plan", *WORDS, *words]) == 0
+    assert "within 100000 ms a frame: the full model" in capsys.readouterr().out
+    plan = read(tmp_path / "plan.json")
+    assert (plan["chosen"], plan["combination"]["names"], plan["combination"]["mm"]) == ([], [], 0.0)
+
+
+def test_where_nothing_is_fast_enough_the_nearest_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is named was run as a whole, its command can be pasted, and the plan rolls out as the command does."""
+    monkeypatch.setattr(Effect, "saving", lambda effect, full: 0.5)  # whatever the clock says of three steps
+    words = ["parts=[2 iterations]", "windows=1", "frames=2", "budget_ms=0.001", f"output={tmp_path / 'plan'}"]
+    assert main(["plan", *WORDS, *words]) == 0
+    told = capsys.readouterr().out
+    assert "Nothing takes 0.001 ms a frame or less; the nearest is" in told
+    plan = read(tmp_path / "plan" / "plan.json")
+    assert plan["combination"]["fits"] is False
+    (tried,) = plan["combination"]["tried"]
+    assert tried["names"] == ["2 iterations"]
+    assert 0.0 < tried["mm_p50"] < tried["mm"]
+    assert plan["command"] in told
+    command = shlex.split(plan["command"])
+    assert command[:2] == ["hood", "rollout"]
+    assert {"garment=tank", "sequence=plie"} <= set(command)
+    if plan["combination"]["names"]:  # two iterations were faster here than the solver
+        assert {"stepper=refine", "refine=2"} <= set(command)
+    short = ["num_frames=4", *QUIET]
+    assert main([*command[1:], *short, f"output={tmp_path / 'pasted'}"]) == 0
+    assert main(["rollout", f"plan={tmp_path / 'plan' / 'plan.json'}", *short, f"output={tmp_path / 'by_plan'}"]) == 0
+    assert np.array_equal(positions(tmp_path / "pasted"), positions(tmp_path / "by_plan"))
+
+
+def test_a_length_is_met_by_what_was_run_as_a_whole(tmp_path: Path) -> None:
+    words = ["parts=[2 iterations,4 iterations]", "windows=1", "frames=1", "accuracy=200mm", f"output={tmp_path}"]
+    assert main(["plan", *WORDS, *words]) == 0
+    plan = read(tmp_path / "plan.json")
+    found, rows = plan["combination"], {row["part"]: row for row in plan["rows"]}
+    assert found["fits"]
+    assert found["mm"] <= 200.0
+    assert len(found["names"]) <= 1  # one way to take the steps
+    assert all(row["decision"] == ("taken" if name in found["names"] else "not taken") for name, row in rows.items())
+    assert rows["4 iterations"]["mm"] < rows["2 iterations"]["mm"]
+
+
+def test_what_a_plan_chose_stands_for_what_was_asked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "plan.json"
+    words = ["garment=tank_4k", "sequence=plie", "fps=60", "num_frames=61"]
+    chosen = ["garment=tank", "fps=30", "num_frames=31"]
+    path.write_text(json.dumps({"format": "hood-plan/1", "words": words, "chosen": chosen}))
+    config = rollout_config([f"plan={path}"])
+    assert (config.garment, config.fps, config.num_frames) == ("tank", 30, 31)
+    assert rollout_config([f"plan={path}", "num_frames=5"]).num_frames == 5
+    assert main(["rollout", f"plan={path}", "garment=tank_4k"]) == 2
+    assert "was made for garment=tank;" in capsys.readouterr().err
 
 
 def positions(path: Path) -> np.ndarray:
@@ -177,6 +253,8 @@ def test_words_that_the_plan_was_not_made_for_are_refused(written: Path, capsys:
         (["frames=0"], "frames=0"),
         (["frames=200"], "fewer frames"),
         (["plan=x.json"], "drop plan="),
+        (["budget_ms=0"], "budget_ms=0: give milliseconds"),
+        (["parts=[mesh dress]"], "mesh tank_4k"),
         (["garmet=tank"], "garmet"),
     ],
 )

@@ -16,6 +16,7 @@ from pages import CARDS, EXTENDING, EXTENDING_HAS_A_TEST, PAGES, ROOT, command_l
 from hood.assets.files.library import names
 from hood.cli import COMMANDS
 from hood.commands.help import _EXAMPLES
+from hood.commands.plan_training import is_training
 from hood.commands.setup import check_config
 from hood.config import groups, load_config, options, plain
 
@@ -63,7 +64,8 @@ def test_commands_have_keys_and_values_that_exist(page: str, line: str) -> None:
     if command == "plan":
         own = set(load_config("plan"))
         load_config("plan", [word for word in keys if word.partition("=")[0] in own])
-        command, keys = "rollout", [word for word in keys if word.partition("=")[0] not in own]
+        keys = [word for word in keys if word.partition("=")[0] not in own]
+        command = "train" if is_training(keys) else "rollout"
     config = load_config(command, keys)
     if command == "rollout":
         check_config(config)

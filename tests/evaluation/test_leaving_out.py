@@ -7,10 +7,11 @@ from torch import Tensor
 
 from hood.dynamics.stepper import NewtonStepper
 from hood.evaluation.gap import gap
-from hood.evaluation.leaving_out import Effect, Variant, active_terms, begin, measure, prices, take_steps
+from hood.evaluation.leaving_out import Effect, Variant, active_terms, begin, measure, prices, rest_at, take_steps, world
 from hood.evaluation.windows import Window, choose_windows
 from hood.losses.potential import Potential, default_potential
 from hood.scene.scene import Scene
+from hood.scene.state import State
 from hood.solver.newton import NewtonSettings
 
 
@@ -42,8 +43,21 @@ def test_the_full_model_loses_nothing_against_itself(full: Variant, tank_scene: 
     assert 0.0 <= effects[""].gamma[0] < 1e-5
     assert effects["bare"].worst_mm > 1.0
     assert effects["bare"].gamma[0] > 100 * max(effects[""].gamma[0], 1e-6)
-    assert len(effects["bare"].ms) == 2
+    assert len(effects["bare"].ms) == 1  # a first step makes tables
     assert min(effects["bare"].ms) > 0.0
+
+
+def test_a_rough_rest_is_near_the_rest(full: Variant) -> None:
+    """Nearer the more steps it takes, and where the first state of a rollout is given, that is its first."""
+    rest = world(rest_at(full, 0, "equilibrium"))
+
+    def apart(state: State) -> float:
+        return float((world(state) - rest).norm(dim=1).median())
+
+    near = [apart(rest_at(full, 0, "equilibrium", count)) for count in (1, 8)]
+    assert near[1] < near[0] < 0.1
+    (rough,) = begin(full, [Window(0, "the start")], "equilibrium", lead=0, most_steps=1)
+    assert apart(rough.rest) == pytest.approx(near[0])
 
 
 def test_weight_is_one_and_absent_terms_have_no_price(full: Variant) -> None:

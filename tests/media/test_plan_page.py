@@ -19,12 +19,20 @@ ROWS = [
      "decision": "kept", "reason": "without it γ = 0.3 more", "command": "hood plan 'parts=[friction]'"},
     {"part": "gravity", "purpose": "weight", "words": [], "force": 1.0, "decision": "absent", "reason": "none", "command": "x"},
 ]  # fmt: skip
-FACTS = {"vertices": 995, "edge_mm": 36.0, "influence_edges": 40.0, "levels": None, "finer": ["dress_4k", "dress_12k"]}
+MESH = {"part": "mesh dress", "kind": "mesh", "purpose": "fewer", "words": [], "force": None, "mm_p50": 5.0, "mm": 15.0,
+        "ms": 2.0, "saved": 0.8, "decision": "taken", "reason": "15 mm", "command": "y"}  # fmt: skip
+FPS = MESH | {"part": "60 fps", "kind": "time step", "mm": 2.7, "saved": -0.9, "decision": "compared"}
+MODELS = [{"name": "short", "radius": 8, "levels": 0, "suffices": False},
+          {"name": "long", "radius": 48, "levels": 2, "suffices": True}]  # fmt: skip
+FACTS = {"vertices": 995, "edge_mm": 36.0, "influence_edges": 40.0, "diameter_edges": 32, "needed_edges": 32.0,
+         "wave_speed": 15.0, "models": MODELS, "network": None, "levels": None, "finer": ["dress_4k", "dress_12k"],
+         "no_cloth_contact": None}  # fmt: skip
 
 
-def plan(**facts: Any) -> dict[str, Any]:
+def plan(*rows: dict[str, Any], **facts: Any) -> dict[str, Any]:
     windows = [{"first": 0, "measured_from": 2, "reason": "the start"}]
-    return {"rows": ROWS, "full": {"ms": 10.0}, "frames": 3, "windows": windows, "facts": FACTS | facts}
+    told = {"times": {"solver": 6.0, "search": 2.5}, "command": "hood rollout garment=dress", "windows": windows}
+    return {"rows": [*ROWS, *rows], "full": {"ms": 10.0}, "frames": 3, "facts": FACTS | facts} | told
 
 
 def written(tmp_path: Path, given: dict[str, Any], shown: list[Difference]) -> str:
@@ -40,16 +48,34 @@ def test_every_question_has_an_answer_of_the_plan(tmp_path: Path) -> None:
     assert "It is left out: without it &lt;γ&gt; = 0.002 more. Without it 2.0 ms of the 10.0 ms" in text
     assert "no cloth contact" in text
     assert "wider than 144 mm" in text
-    assert "dress_4k or dress_12k" in text
+    assert "from dress_4k or dress_12k says hood plan … parts=[mesh dress_4k]" in text
     assert "felt 40 edges away" in text
+    assert "made of solver 6.0 ms, search 2.5 ms." in text
+    assert "In words: hood rollout garment=dress" in text
     assert "friction costs most, 10% of a frame" in text
     assert "hood plan &#x27;parts=[bending]&#x27;" in text
 
 
 def test_a_network_has_levels_and_the_finest_mesh_no_finer_one(tmp_path: Path) -> None:
-    text = written(tmp_path, plan(levels=2, finer=[]), [])
-    assert "2 coarse level(s)" in text
+    text = written(tmp_path, plan(levels=2, finer=[], network="short"), [])
+    assert "messages have to pass 32 edges in a step" in text
+    assert "reach so far: long (48)" in text
+    assert "2 coarse level(s) and passes 8, what is farther off waits" in text
     assert "hood prepare can refine" in text
+    assert "passes 48, enough" in written(tmp_path, plan(levels=2, network="long"), [])
+
+
+def test_meshes_and_time_steps_answer_in_mm(tmp_path: Path) -> None:
+    text = written(tmp_path, plan(MESH, FPS, finer=[]), [])
+    assert "dress: 5 mm from this one in the median and 15 mm at the 95th percentile" in text
+    assert "for 80% less time; taken" in text
+    assert "60 fps: 5 mm from this one in the median and 2.7 mm" in text
+    assert "for 1.9 times the time; compared" in text
+    assert "hood prepare" not in text
+
+
+def test_contact_that_is_off_has_its_reason(tmp_path: Path) -> None:
+    assert "It is off: a network &lt;alone&gt;." in written(tmp_path, plan(no_cloth_contact="a network <alone>"), [])
 
 
 @pytest.mark.parametrize("with_body", [True, False])
