@@ -161,7 +161,7 @@ inline void since_start(const Engine& e, int64_t i, Strain& s) {
     s.g11 -= load<V8>(e.face_before + 2 * e.num_faces + i);
 }
 
-// Cloth with warp and weft: half the sum of squares is the density; one root of each line acts on 00, one on 11, one on 2 01.
+// Cloth with warp and weft: its density is half the sum of the squares of first g00 + coupled g11, second g11 and turn 2 g01.
 struct Weave {
     V8 first, coupled, second, turn;
 };

@@ -52,7 +52,7 @@ class Cloth:
     # derived from the rest shape
     mass: Tensor = None  # type: ignore[assignment]  # (V,) kg
     rest_area: Tensor = None  # type: ignore[assignment]  # (F,) m²
-    rest_inverse: Tensor = None  # type: ignore[assignment]  # (F, 2, 2) 1/m, inverse of the rest edge matrix; with a weave in the frame of warp and weft
+    rest_inverse: Tensor = None  # type: ignore[assignment]  # (F, 2, 2) 1/m, inverse rest edges; along warp and weft if woven
     hinge_rest_length: Tensor = None  # type: ignore[assignment]  # (H,) m, hinge edge at rest
     hinge_area: Tensor = None  # type: ignore[assignment]  # (H,) m², sum of the two faces at rest
     rest_angle: Tensor = None  # type: ignore[assignment]  # (H,) rad
