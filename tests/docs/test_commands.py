@@ -15,7 +15,7 @@ from pages import EXTENDING, EXTENDING_HAS_A_TEST, ROOT, command_lines
 
 from hood.assets.files.library import names
 from hood.cli import COMMANDS
-from hood.commands.plan_training import is_training
+from hood.commands.plan import is_training
 from hood.commands.setup import check_config
 from hood.config import load_config
 
