@@ -19,8 +19,6 @@ from hood.commands.plan_probe import HOLD, Asked, Probed, probe
 from hood.commands.plan_reach import reach_sentence
 from hood.commands.plan_shown import differences, facts, show
 from hood.commands.plan_table import command_line, describe, sentence
-from hood.commands.plan_training import OWN as TRAINING_KEYS
-from hood.commands.plan_training import checked, describe_training, is_training, plan_training, write_training_plan
 from hood.commands.setup import Setup, check_config, make_stepper, set_up
 from hood.config import ConfigError, load_config
 from hood.dynamics.captured import network_of
@@ -30,6 +28,11 @@ from hood.evaluation.elsewhere import Apart
 from hood.evaluation.leaving_out import Begun, Effect
 from hood.media.plan_page import Difference
 
+#: Words of these keys belong to a training, and to no rollout.
+_TRAINING_GROUPS = ("experiment", "trainer", "data")
+#: Keys of ``hood plan`` that the plan of a training has, beside its folder.
+_TRAINING_KEYS = ("updates", "scenes")
+
 
 def run(overrides: Sequence[str]) -> int:
     """Run the command, for a rollout or for a training; returns the exit code."""
@@ -37,7 +40,7 @@ def run(overrides: Sequence[str]) -> int:
     given = [word for word in overrides if word not in words]
     if is_training(words):
         return _run_training(own, words, given)
-    _refuse(given, TRAINING_KEYS, "belongs to the plan of a training (with experiment=, trainer= or data.*=)")
+    _refuse(given, _TRAINING_KEYS, "belongs to the plan of a training (with experiment=, trainer= or data.*=)")
     _check(words, own)
     output_folder(own)
     with held_folder(own) as folder:
@@ -56,7 +59,9 @@ def run(overrides: Sequence[str]) -> int:
 
 def _run_training(own: DictConfig, words: list[str], given: Sequence[str]) -> int:
     """The plan of a training."""
-    others = [str(key) for key in own if key not in ("output", *TRAINING_KEYS)]
+    from hood.commands.plan_training import checked, describe_training, plan_training, write_training_plan  # not for rollouts
+
+    others = [str(key) for key in own if key not in ("output", *_TRAINING_KEYS)]
     _refuse(given, others, "belongs to the plan of a rollout")
     config = checked(words, own)
     output_folder(own)
@@ -66,6 +71,11 @@ def _run_training(own: DictConfig, words: list[str], given: Sequence[str]) -> in
     print(describe_training(plan))
     print(f"all of it in {path}")
     return 0
+
+
+def is_training(words: Sequence[str]) -> bool:
+    """Whether these are words of ``hood train``."""
+    return any(word.partition("=")[0].partition(".")[0].lstrip("+~") in _TRAINING_GROUPS for word in words)
 
 
 def _refuse(given: Sequence[str], keys: Sequence[str], why: str) -> None:

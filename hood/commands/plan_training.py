@@ -29,10 +29,6 @@ from hood.scene.cloth import Cloth
 from hood.training.trainer import Trainer
 
 FORMAT, FILE = "hood-training-plan/1", "training_plan.json"
-#: Words of these keys belong to a training, and to no rollout.
-_GROUPS = ("experiment", "trainer", "data")
-#: Keys of ``hood plan`` that a training plan has, beside its folder.
-OWN = ("updates", "scenes")
 #: A term whose force stays below this share of the residual teaches nothing in the scenes that were looked at.
 _SMALL = 1e-3
 #: Updates before the timed ones: kernels are compiled, and statistics collected.
@@ -42,11 +38,6 @@ _TIMES_MORE = 4
 #: Equal shares of every range, on a logarithmic axis, that are looked for among the scenes.
 _BANDS = 5
 _PARTS = ("scenes", "search", "features", "network", "losses", "backward", "optimiser", "rest")
-
-
-def is_training(words: Sequence[str]) -> bool:
-    """Whether these are words of ``hood train``."""
-    return any(word.partition("=")[0].partition(".")[0].lstrip("+~") in _GROUPS for word in words)
 
 
 def checked(words: Sequence[str], own: DictConfig) -> DictConfig:

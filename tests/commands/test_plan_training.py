@@ -12,7 +12,8 @@ import torch
 
 from hood.assets.material import RANGES
 from hood.cli import main
-from hood.commands.plan_training import _empty_bands, is_training
+from hood.commands.plan import is_training
+from hood.commands.plan_training import _empty_bands
 from hood.commands.train import make_trainer
 from hood.config import load_config
 from hood.dynamics.stopwatch import Stopwatch
