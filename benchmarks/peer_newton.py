@@ -1,0 +1,196 @@
+"""Cloth of NVIDIA Newton in the scenes of benchmarks/peers.py: its solvers VBD and XPBD, on a CPU.
+
+How hood's fabric is said in Newton's terms:
+
+- mass: that of every vertex is hood's; what is held is inactive.
+- VBD's membrane is stable neo-Hookean; with tri_ke = h μ and tri_ka = h λ [N/m] it is hood's in the limit of small strain.
+- VBD's bending is hood's, hinge by hinge: edge_ke = k l₀ / (4 (A₁ + A₂)).
+- XPBD has no membrane: springs along the edges, of E h Σ A / l², and bending. The gradient of the angle that its kernel takes is
+  larger by 2 A, the double area of a face, than the angle's; edge_ke is divided by A₁ + A₂ for that.
+- contact: radius of the particles 2 mm; soft_contact_ke as :func:`peer_scenes.contact_stiffness`, linear where hood's is
+  quadratic; friction with the same coefficient and, in VBD, the same speed below which it counts as static.
+- no damping (tri_kd, edge_kd, soft_contact_kd are 0), no contact of cloth with cloth.
+
+The body is one mesh shape whose vertices and their velocities are set in every substep, in between frames on a straight line.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from peer_scenes import CONTACT_RADIUS, FABRIC, FPS, FRICTION, GRAVITY, SLIP_SPEED, Moment, Setting
+from peer_scenes import contact_stiffness, hinge_stiffness, membrane, spring_stiffness
+
+#: The weight of hood's contact [J/m³] that contact is made as stiff as.
+COLLISION_WEIGHT = 5e5
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much one frame is worked on."""
+
+    solver: str  # vbd or xpbd
+    substeps: int
+    iterations: int
+
+    @property
+    def name(self) -> str:
+        return f"newton {self.solver} {self.substeps}x{self.iterations}"
+
+
+def packages() -> tuple[Any, Any]:
+    """The modules ``newton`` and ``warp``.
+
+    Raises:
+        SystemExit: they are not installed.
+    """
+    try:
+        import newton
+        import warp
+    except ImportError as missing:
+        raise SystemExit(f"{missing}; Newton comes with: pip install newton==1.8.0 warp-lang==1.19.0") from None
+    warp.config.quiet = True
+    return newton, warp
+
+
+class Newton:
+    """A scene in Newton, from frame 0."""
+
+    def __init__(self, setting: Setting, effort: Effort) -> None:
+        self.newton, self.warp = packages()
+        self.name, self.setting, self.effort = effort.name, setting, effort
+        self._frame = 0
+        self._mesh: Any = None
+        self.model = self._build()
+        self._states = [self.model.state(), self.model.state()]
+        self.put(setting.start)
+        options: dict[str, Any] = {"iterations": effort.iterations}
+        if effort.solver == "vbd":
+            options |= {"friction_epsilon": SLIP_SPEED}
+            self.solver = self.newton.solvers.SolverVBD(self.model, **options)
+        else:
+            self.solver = self.newton.solvers.SolverXPBD(self.model, **options)
+        self._control = self.model.control()
+        self._pipeline = self.newton.CollisionPipeline(self.model) if self._mesh is not None else None
+        self._contacts = None if self._pipeline is None else self._pipeline.contacts()
+        self._graph: Any = None
+
+    def _build(self) -> Any:
+        newton, wp = self.newton, self.warp
+        setting, law = self.setting, membrane()
+        rest, faces = setting.cloth.rest_pos.numpy(), setting.cloth.faces.numpy()
+        builder = newton.ModelBuilder(up_axis=newton.Axis.Y, gravity=(0.0, -GRAVITY, 0.0))
+        vbd = self.effort.solver == "vbd"
+        builder.add_cloth_mesh(
+            pos=wp.vec3(0.0, 0.0, 0.0),
+            rot=wp.quat_identity(),
+            scale=1.0,
+            vel=wp.vec3(0.0, 0.0, 0.0),
+            vertices=[wp.vec3(*point) for point in rest],
+            indices=faces.reshape(-1).tolist(),
+            density=float(np.asarray(FABRIC.density)),
+            tri_ke=law.mu,
+            tri_ka=law.lam,
+            tri_kd=0.0,
+            edge_ke=1.0,
+            edge_kd=0.0,
+            particle_radius=CONTACT_RADIUS,
+        )
+        if not vbd:
+            ends = setting.cloth.edges.numpy()
+            for (a, b), stiffness in zip(ends.tolist(), spring_stiffness(rest, faces, ends, law.young), strict=True):
+                builder.add_spring(a, b, float(stiffness), 0.0, control=0.0)
+        contact = contact_stiffness(setting.cloth, COLLISION_WEIGHT)
+        if setting.body.shape[1]:
+            self._mesh = newton.Mesh(
+                setting.body[0].astype(np.float32), np.asarray(setting.scene.motion.faces).reshape(-1).astype(np.int32)
+            )
+            config = newton.ModelBuilder.ShapeConfig(ke=contact, kd=0.0, mu=FRICTION)
+            builder.add_shape_mesh(body=-1, mesh=self._mesh, cfg=config)
+        if vbd:
+            builder.color(include_bending=True)
+        model = builder.finalize(device="cpu")
+        model.edge_bending_properties.assign(self._bending(model.edge_indices.numpy(), vbd))
+        self._hold(model)
+        model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_mu = contact, 0.0, FRICTION
+        model.particle_mu = FRICTION
+        if self._mesh is not None:
+            self._bound(model)
+        return model
+
+    def _bending(self, edges: np.ndarray, vbd: bool) -> np.ndarray:
+        """(E, 2) stiffness and damping of Newton's ``edges`` (E, 4): two opposite vertices, then the edge's."""
+        cloth = self.setting.cloth
+        stiffness = hinge_stiffness(cloth)
+        stiffness = stiffness / (cloth.hinge_rest_length if vbd else cloth.hinge_area).double().numpy()
+        known = {frozenset(pair): float(k) for pair, k in zip(cloth.hinges[:, :2].tolist(), stiffness, strict=True)}
+        return np.array([[known.get(frozenset(row[2:]), 0.0), 0.0] for row in edges.tolist()], dtype=np.float32)
+
+    def _hold(self, model: Any) -> None:
+        mass = self.setting.cloth.mass.numpy().astype(np.float32)
+        held = self.setting.pinned
+        flags = model.particle_flags.numpy()
+        flags[held] &= ~int(self.newton.ParticleFlags.ACTIVE)
+        model.particle_flags = self.warp.array(flags, dtype=self.warp.int32, device="cpu")
+        model.particle_mass.assign(mass)
+        model.particle_inv_mass.assign(np.where(held, 0.0, 1.0 / np.where(mass > 0, mass, 1.0)).astype(np.float32))
+
+    def _bound(self, model: Any) -> None:
+        """The box that contact with the body is searched in holds all of its frames."""
+        low, high = self.setting.body.min(axis=(0, 1)), self.setting.body.max(axis=(0, 1))
+        model.shape_collision_aabb_lower.assign(low[None].astype(np.float32))
+        model.shape_collision_aabb_upper.assign(high[None].astype(np.float32))
+        model.shape_collision_radius.assign(np.array([np.linalg.norm(np.abs(self.setting.body).max(axis=(0, 1)))], np.float32))
+
+    def put(self, moment: Moment, frame: int = 0) -> None:
+        """The cloth to ``moment`` at ``frame``."""
+        for state in self._states:
+            state.particle_q.assign(moment.pos.astype(np.float32))
+            state.particle_qd.assign(moment.vel.astype(np.float32))
+        self._frame = frame
+
+    def step(self) -> float:
+        """From one frame to the next; milliseconds on the clock, without those that the body's poses took before."""
+        count, dt = self.effort.substeps, 1.0 / FPS / self.effort.substeps
+        body = self.setting.body
+        ends = body[self._frame].astype(np.float32), body[min(self._frame + 1, len(body) - 1)].astype(np.float32)
+        began = time.perf_counter()
+        if self._graph is not None:
+            self.warp.capture_launch(self._graph)
+        else:
+            for number in range(count):
+                if self._mesh is not None:
+                    self._pose(ends, (number + 1) / count)
+                self._substep(dt)
+        self._frame += 1
+        return 1e3 * (time.perf_counter() - began)
+
+    def _substep(self, dt: float) -> None:
+        here, there = self._states
+        here.clear_forces()
+        if self._pipeline is not None:
+            self._pipeline.collide(here, self._contacts)
+        self.solver.step(here, there, self._control, self._contacts, dt)
+        self._states = [there, here]
+
+    def capture(self) -> None:
+        """Frames from now on are replays of one graph of launches, as Newton's examples have it; the place is lost."""
+        dt = 1.0 / FPS / self.effort.substeps
+        with self.warp.ScopedCapture(device="cpu") as capture:
+            for _ in range(self.effort.substeps):
+                self._substep(dt)
+        self._graph = capture.graph
+
+    def _pose(self, ends: tuple[np.ndarray, np.ndarray], share: float) -> None:
+        mesh = self._mesh.mesh
+        mesh.points.assign(ends[0] + np.float32(share) * (ends[1] - ends[0]))
+        mesh.velocities.assign(np.float32(FPS) * (ends[1] - ends[0]))
+        mesh.refit()
+
+    def now(self) -> Moment:
+        """The cloth at this frame."""
+        state = self._states[0]
+        return Moment(state.particle_q.numpy().astype(np.float64), state.particle_qd.numpy().astype(np.float64))
