@@ -21,8 +21,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 from peer_scenes import CONTACT_RADIUS, FABRIC, FPS, FRICTION, GRAVITY, SLIP_SPEED, Moment, Setting
 from peer_scenes import contact_stiffness, hinge_stiffness, membrane, spring_stiffness
+from scipy import optimize
+from torch import Tensor
+
+from hood.losses.potential import Potential, scale
+from hood.losses.problem import StepProblem, sum_per_scene
+from hood.losses.stretching import green_strain
 
 #: The weight of hood's contact [J/m³] that contact is made as stiff as.
 COLLISION_WEIGHT = 5e5
@@ -35,10 +42,12 @@ class Effort:
     solver: str  # vbd or xpbd
     substeps: int
     iterations: int
+    radius: float = CONTACT_RADIUS  # m, of the particles
 
     @property
     def name(self) -> str:
-        return f"newton {self.solver} {self.substeps}x{self.iterations}"
+        apart = "" if self.radius == CONTACT_RADIUS else f", {1e3 * self.radius:g} mm"
+        return f"{self.solver} {self.substeps}x{self.iterations}{apart}"
 
 
 def packages() -> tuple[Any, Any]:
@@ -76,7 +85,8 @@ class Newton:
         self._control = self.model.control()
         self._pipeline = self.newton.CollisionPipeline(self.model) if self._mesh is not None else None
         self._contacts = None if self._pipeline is None else self._pipeline.contacts()
-        self._graph: Any = None
+        self._graphs: list[Any] = []
+        self._capture()
 
     def _build(self) -> Any:
         newton, wp = self.newton, self.warp
@@ -97,7 +107,7 @@ class Newton:
             tri_kd=0.0,
             edge_ke=1.0,
             edge_kd=0.0,
-            particle_radius=CONTACT_RADIUS,
+            particle_radius=self.effort.radius,
         )
         if not vbd:
             ends = setting.cloth.edges.numpy()
@@ -158,12 +168,14 @@ class Newton:
         body = self.setting.body
         ends = body[self._frame].astype(np.float32), body[min(self._frame + 1, len(body) - 1)].astype(np.float32)
         began = time.perf_counter()
-        if self._graph is not None:
-            self.warp.capture_launch(self._graph)
-        else:
-            for number in range(count):
-                if self._mesh is not None:
-                    self._pose(ends, (number + 1) / count)
+        for number in range(count):
+            if self._mesh is not None:
+                self._pose(ends, (number + 1) / count)
+            if self._graphs:
+                self.warp.capture_launch(self._graphs[0])
+                self._graphs.reverse()
+                self._states.reverse()
+            else:
                 self._substep(dt)
         self._frame += 1
         return 1e3 * (time.perf_counter() - began)
@@ -176,13 +188,19 @@ class Newton:
         self.solver.step(here, there, self._control, self._contacts, dt)
         self._states = [there, here]
 
-    def capture(self) -> None:
-        """Frames from now on are replays of one graph of launches, as Newton's examples have it; the place is lost."""
+    def _capture(self) -> None:
+        """Substeps from now on are replays of graphs of launches, as in Newton's examples: one from the first of the two states
+        to the second, one back."""
         dt = 1.0 / FPS / self.effort.substeps
-        with self.warp.ScopedCapture(device="cpu") as capture:
-            for _ in range(self.effort.substeps):
+        self._substep(dt)  # compiles
+        self.put(self.setting.start)
+        graphs = []
+        for _ in range(2):
+            with self.warp.ScopedCapture(device="cpu") as capture:
                 self._substep(dt)
-        self._graph = capture.graph
+            graphs.append(capture.graph)
+        self.put(self.setting.start)
+        self._graphs = graphs
 
     def _pose(self, ends: tuple[np.ndarray, np.ndarray], share: float) -> None:
         mesh = self._mesh.mesh
@@ -194,3 +212,48 @@ class Newton:
         """The cloth at this frame."""
         state = self._states[0]
         return Moment(state.particle_q.numpy().astype(np.float64), state.particle_qd.numpy().astype(np.float64))
+
+
+class NeoHookean:
+    """Energy [J] of VBD's membrane, the sum over faces of A (½ μ (tr FᵀF - 2) + ½ L (J - 1 - μ / L)²) with J the ratio of areas
+    and L = λ + μ, as Newton 1.8 has it (after Smith et al., "Stable Neo-Hookean flesh simulation", 2018); less a constant, so that
+    it is 0 at rest. μ and λ are those of :func:`peer_scenes.membrane`."""
+
+    def applies(self, problem: StepProblem) -> bool:
+        return True
+
+    def __call__(self, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> Tensor:
+        """Energy [J] (B,) at ``next_pos`` (V, 3)."""
+        cloth = problem.cloth
+        mu, lam = cloth.thickness * cloth.lame_mu, cloth.thickness * cloth.lame_lambda
+        g00, g01, g11 = green_strain(next_pos, cloth.faces, cloth.rest_inverse)
+        c00, c01, c11 = 2.0 * g00 + 1.0, 2.0 * g01, 2.0 * g11 + 1.0
+        ratio = (c00 * c11 - c01 * c01).clamp_min(1e-20).sqrt()
+        stiff = lam + mu
+        density = 0.5 * mu * (c00 + c11 - 2.0) + 0.5 * stiff * ((ratio - 1.0 - mu / stiff) ** 2 - (mu / stiff) ** 2)
+        return sum_per_scene(cloth.rest_area * density, cloth.face_scene, cloth.num_scenes)
+
+
+def own_gamma(potential: Potential, problem: StepProblem, origin: np.ndarray, next_pos: np.ndarray) -> float:
+    """γ of ``next_pos`` (V, 3) for a ``potential`` of any terms, above the minimum that L-BFGS finds from there.
+
+    hood's solver is not asked: its matrices are of its own energies. Without contact only, which is searched for by hood.
+    """
+    cloth, start = problem.cloth, next_pos - origin
+    free = (~cloth.pinned).numpy()
+    # In units of the way that a vertex of mean mass goes for inertia alone, all directions are as stiff as the cloth makes them.
+    size = (cloth.mass.mean() / cloth.mass).sqrt().numpy()[free, None]
+
+    def at(moved: np.ndarray) -> Tensor:
+        pos = start.copy()
+        pos[free] += size * moved.reshape(-1, 3)
+        return torch.as_tensor(pos)
+
+    def value(moved: np.ndarray) -> tuple[float, np.ndarray]:
+        gradient, energies = potential.gradient(problem, at(moved))
+        return float(sum(energies.values())) / e0, (size * gradient.numpy()[free]).reshape(-1) / e0
+
+    e0 = float(scale(problem))
+    zero = np.zeros(3 * int(free.sum()))
+    found = optimize.minimize(value, zero, jac=True, method="L-BFGS-B", options={"maxiter": 3000, "maxfun": 4000, "ftol": 1e-13})
+    return value(zero)[0] - float(found.fun)

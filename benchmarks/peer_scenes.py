@@ -44,6 +44,10 @@ GRAVITY = 9.81
 _NO_STEP = StepInput(torch.tensor([1.0 / FPS], dtype=torch.float64))
 
 
+class CannotDoError(ValueError):
+    """A program has no means for a scene."""
+
+
 class Moment(NamedTuple):
     """A cloth at one time: positions and velocities (V, 3) [m], [m/s] in float64, in the world."""
 
@@ -99,11 +103,7 @@ class Setting:
         """The scene in another precision."""
         if dtype == torch.float64:
             return self.scene
-        return replace(
-            build_scene(self.scene.garment, load_body("default"), load_sequence(MOTION, FPS), FABRIC, dtype=dtype),
-            start_pos=self.start.pos,
-            start_vel=self.start.vel,
-        )
+        return replace(_scene_of(self.name, self.num_frames, dtype), start_pos=self.start.pos, start_vel=self.start.vel)
 
 
 #: Garment and motion of the scene with a body.
@@ -148,18 +148,21 @@ def make_setting(name: str, num_frames: int, potential: Potential) -> Setting:
     Raises:
         ValueError: there is no such scene.
     """
+    scene = _scene_of(name, num_frames, torch.float64)
     if name in SHEETS:
-        garment = sheet(SHEETS[name])
-        scene = dress(garment, NoBody(num_frames, FPS, torch.float64), FABRIC)
-        start = Moment(worn_pos(garment), np.zeros_like(garment.rest_pos))
-    elif name == "body":
-        parts = load_garment(GARMENT), load_body("default"), load_sequence(MOTION, FPS)
-        scene = build_scene(*parts, FABRIC, dtype=torch.float64)
+        start = Moment(worn_pos(scene.garment), np.zeros_like(scene.garment.rest_pos))
+    else:
         state, _ = rest_state(NewtonStepper(potential), scene, potential, 0)
         start = Moment(state.pos.numpy() + state.origin[0].numpy(), state.vel.numpy())
-    else:
-        raise ValueError(f"scene {name!r}: choose of {', '.join(SCENES)}")
     return Setting(name, replace(scene, start_pos=start.pos, start_vel=start.vel), start, num_frames)
+
+
+def _scene_of(name: str, num_frames: int, dtype: torch.dtype) -> Scene:
+    if name in SHEETS:
+        return dress(sheet(SHEETS[name]), NoBody(num_frames, FPS, dtype), FABRIC)
+    if name != "body":
+        raise ValueError(f"scene {name!r}: choose of {', '.join(SCENES)}")
+    return build_scene(load_garment(GARMENT), load_body("default"), load_sequence(MOTION, FPS), FABRIC, dtype=dtype)
 
 
 class Membrane(NamedTuple):
@@ -275,11 +278,15 @@ class Measures:
 WARM_UP = 3
 
 
-def problem_at(setting: Setting, frame: int, moment: Moment) -> tuple[StepProblem, np.ndarray]:
-    """hood's step from ``frame``, of a cloth that is at ``moment``, and the origin (3,) [m] of its positions."""
+def problem_at(setting: Setting, frame: int, moment: Moment, scene: Scene | None = None) -> tuple[StepProblem, np.ndarray]:
+    """hood's step from ``frame``, of a cloth that is at ``moment``, and the origin (3,) [m] of its positions; ``scene`` is that of
+    the setting in another precision."""
+    scene = scene or setting.scene
     origin = local_origin(moment.pos.mean(axis=0))
-    state = State(torch.as_tensor(moment.pos - origin), torch.as_tensor(moment.vel), torch.as_tensor(origin)[None])
-    return StepProblem(setting.cloth, state, setting.scene.step_input(frame, state)), origin
+    pos = torch.as_tensor(moment.pos - origin).to(scene.cloth.rest_pos)
+    state = State(pos, torch.as_tensor(moment.vel).to(pos), torch.as_tensor(origin)[None])
+    gravity = torch.tensor([0.0, -GRAVITY, 0.0]).to(pos)
+    return StepProblem(scene.cloth, state, scene.step_input(frame, state), gravity=gravity), origin
 
 
 def gamma(setting: Setting, potential: Potential, frame: int, moment: Moment, next_pos: np.ndarray) -> float:
