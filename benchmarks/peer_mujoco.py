@@ -3,9 +3,9 @@
 How hood's fabric is said in MuJoCo's terms:
 
 - mass: that of every vertex is hood's; what is held is pinned.
-- stretching: young, poisson and thickness of a membrane in plane stress, E h = 4 h μ (λ + μ) / (λ + 2 μ), ν = λ / (λ + 2 μ); its
-  law is St. Venant-Kirchhoff's, as hood's is.
-- bending: a flex bends as the solid of its thickness does, E h³ / (12 (1 - ν²)), and hood's fabric has a stiffness of its own. The
+- stretching: young, poisson and thickness of a membrane in plane stress, E h = 4 h μ (λ + μ) / (λ + 2 μ) and ν = λ / (λ + 2 μ);
+  its law is St. Venant-Kirchhoff's, as hood's is.
+- bending: a flex bends as the solid of its thickness does, E h³ / (12 (1 - ν²)); hood's fabric has a stiffness of its own. The
   compiled coefficients are multiplied so that a sheet on a wide cylinder feels as great a force as hood's: :func:`bend_factor`.
 - no damping, no contact of cloth with cloth.
 

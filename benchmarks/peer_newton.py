@@ -5,8 +5,8 @@ How hood's fabric is said in Newton's terms:
 - mass: that of every vertex is hood's; what is held is inactive.
 - VBD's membrane is stable neo-Hookean; with tri_ke = h μ and tri_ka = h λ [N/m] it is hood's in the limit of small strain.
 - VBD's bending is hood's, hinge by hinge: edge_ke = k l₀ / (4 (A₁ + A₂)).
-- XPBD has no membrane: springs along the edges, of E h Σ A / l², and bending. The gradient of the angle that its kernel takes is
-  larger by 2 A, the double area of a face, than the angle's; edge_ke is divided by A₁ + A₂ for that.
+- XPBD has no membrane: springs along the edges, of E h Σ A / l², and bending. The gradient of the angle that its kernel takes
+  is 2 A times the angle's, with A the area of a face; edge_ke is divided by A₁ + A₂ for that.
 - contact: radius of the particles 2 mm; soft_contact_ke as :func:`peer_scenes.contact_stiffness`, linear where hood's is
   quadratic; friction with the same coefficient and, in VBD, the same speed below which it counts as static.
 - no damping (tri_kd, edge_kd, soft_contact_kd are 0), no contact of cloth with cloth.
@@ -22,8 +22,20 @@ from typing import Any
 
 import numpy as np
 import torch
-from peer_scenes import CONTACT_RADIUS, FABRIC, FPS, FRICTION, GRAVITY, SLIP_SPEED, Moment, Setting
-from peer_scenes import contact_stiffness, hinge_stiffness, membrane, spring_stiffness
+from peer_scenes import (
+    CONTACT_RADIUS,
+    FABRIC,
+    FPS,
+    FRICTION,
+    GRAVITY,
+    SLIP_SPEED,
+    Moment,
+    Setting,
+    contact_stiffness,
+    hinge_stiffness,
+    membrane,
+    spring_stiffness,
+)
 from scipy import optimize
 from torch import Tensor
 
@@ -57,11 +69,12 @@ def packages() -> tuple[Any, Any]:
         SystemExit: they are not installed.
     """
     try:
-        import newton
         import warp
+
+        warp.config.log_level = warp.LOG_ERROR
+        import newton
     except ImportError as missing:
         raise SystemExit(f"{missing}; Newton comes with: pip install newton==1.8.0 warp-lang==1.19.0") from None
-    warp.config.quiet = True
     return newton, warp
 
 
@@ -188,6 +201,10 @@ class Newton:
         self.solver.step(here, there, self._control, self._contacts, dt)
         self._states = [there, here]
 
+    def substep(self) -> None:
+        """The first substep of a frame alone, of a scene without a body."""
+        self._substep(1.0 / FPS / self.effort.substeps)
+
     def _capture(self) -> None:
         """Substeps from now on are replays of graphs of launches, as in Newton's examples: one from the first of the two states
         to the second, one back."""
@@ -216,8 +233,8 @@ class Newton:
 
 class NeoHookean:
     """Energy [J] of VBD's membrane, the sum over faces of A (½ μ (tr FᵀF - 2) + ½ L (J - 1 - μ / L)²) with J the ratio of areas
-    and L = λ + μ, as Newton 1.8 has it (after Smith et al., "Stable Neo-Hookean flesh simulation", 2018); less a constant, so that
-    it is 0 at rest. μ and λ are those of :func:`peer_scenes.membrane`."""
+    and L = λ + μ, as Newton 1.8 has it (after Smith et al., "Stable Neo-Hookean flesh simulation", 2018), less its value at
+    rest. μ and λ are those of :func:`peer_scenes.membrane`."""
 
     def applies(self, problem: StepProblem) -> bool:
         return True
@@ -241,7 +258,7 @@ def own_gamma(potential: Potential, problem: StepProblem, origin: np.ndarray, ne
     """
     cloth, start = problem.cloth, next_pos - origin
     free = (~cloth.pinned).numpy()
-    # In units of the way that a vertex of mean mass goes for inertia alone, all directions are as stiff as the cloth makes them.
+    # Light vertices go farther for the same energy.
     size = (cloth.mass.mean() / cloth.mass).sqrt().numpy()[free, None]
 
     def at(moved: np.ndarray) -> Tensor:
@@ -255,5 +272,5 @@ def own_gamma(potential: Potential, problem: StepProblem, origin: np.ndarray, ne
 
     e0 = float(scale(problem))
     zero = np.zeros(3 * int(free.sum()))
-    found = optimize.minimize(value, zero, jac=True, method="L-BFGS-B", options={"maxiter": 3000, "maxfun": 4000, "ftol": 1e-13})
+    found = optimize.minimize(value, zero, jac=True, method="L-BFGS-B", options={"maxiter": 3000, "maxfun": 4000, "ftol": 0.0})
     return value(zero)[0] - float(found.fun)

@@ -99,11 +99,13 @@ class Setting:
         frames = (self.scene.motion.surface(frame, np.zeros(3)).double().numpy() for frame in range(self.num_frames))
         return np.stack(list(frames))
 
-    def at(self, dtype: torch.dtype) -> Scene:
-        """The scene in another precision."""
-        if dtype == torch.float64:
+    def at(self, dtype: torch.dtype, substeps: int = 1) -> Scene:
+        """The scene in another precision, or with so many steps a frame."""
+        if dtype == torch.float64 and substeps == 1:
             return self.scene
-        return replace(_scene_of(self.name, self.num_frames, dtype), start_pos=self.start.pos, start_vel=self.start.vel)
+        return replace(
+            _scene_of(self.name, self.num_frames, dtype, substeps), start_pos=self.start.pos, start_vel=self.start.vel
+        )
 
 
 #: Garment and motion of the scene with a body.
@@ -157,12 +159,13 @@ def make_setting(name: str, num_frames: int, potential: Potential) -> Setting:
     return Setting(name, replace(scene, start_pos=start.pos, start_vel=start.vel), start, num_frames)
 
 
-def _scene_of(name: str, num_frames: int, dtype: torch.dtype) -> Scene:
+def _scene_of(name: str, num_frames: int, dtype: torch.dtype, substeps: int = 1) -> Scene:
+    fps = FPS * substeps
     if name in SHEETS:
-        return dress(sheet(SHEETS[name]), NoBody(num_frames, FPS, dtype), FABRIC)
+        return dress(sheet(SHEETS[name]), NoBody((num_frames - 1) * substeps + 1, fps, dtype), FABRIC)
     if name != "body":
         raise ValueError(f"scene {name!r}: choose of {', '.join(SCENES)}")
-    return build_scene(load_garment(GARMENT), load_body("default"), load_sequence(MOTION, FPS), FABRIC, dtype=dtype)
+    return build_scene(load_garment(GARMENT), load_body("default"), load_sequence(MOTION, fps), FABRIC, dtype=dtype)
 
 
 class Membrane(NamedTuple):
@@ -279,8 +282,8 @@ WARM_UP = 3
 
 
 def problem_at(setting: Setting, frame: int, moment: Moment, scene: Scene | None = None) -> tuple[StepProblem, np.ndarray]:
-    """hood's step from ``frame``, of a cloth that is at ``moment``, and the origin (3,) [m] of its positions; ``scene`` is that of
-    the setting in another precision."""
+    """hood's step from ``frame``, of a cloth that is at ``moment``, and the origin (3,) [m] of its positions; ``scene`` is that
+    of the setting in another precision."""
     scene = scene or setting.scene
     origin = local_origin(moment.pos.mean(axis=0))
     pos = torch.as_tensor(moment.pos - origin).to(scene.cloth.rest_pos)
@@ -306,10 +309,10 @@ def resting_energy(cloth: Cloth, pos: np.ndarray) -> float:
     return sum(float(term(problem, here, state.vel)) for term in (Stretching(), Bending(), Gravity()))
 
 
-def static_minimum(setting: Setting, potential: Potential, pos: np.ndarray) -> tuple[float, bool]:
-    """[J] of :func:`resting_energy` where a sheet that is at ``pos`` (V, 3) comes to rest, and whether it did; NaN with a body."""
+def static_minimum(setting: Setting, potential: Potential, pos: np.ndarray) -> float:
+    """[J] of :func:`resting_energy` where a sheet that is at ``pos`` (V, 3) comes to rest; NaN with a body."""
     if setting.name not in SHEETS:
-        return math.nan, False
+        return math.nan
     state = State(torch.as_tensor(pos), torch.zeros_like(torch.as_tensor(pos)), torch.zeros(1, 3, dtype=torch.float64))
     rest = find_equilibrium(setting.scene, potential, state, 0, torch.tensor([0.0, -GRAVITY, 0.0], dtype=torch.float64))
-    return resting_energy(setting.cloth, rest.pos.numpy()), rest.reached
+    return resting_energy(setting.cloth, rest.pos.numpy())

@@ -1,25 +1,26 @@
 """hood beside other open simulators, with equal cloth, body and motion, on one thread of a CPU.
 
-    python benchmarks/peers.py drape_1k                                # a sheet of 1,024 vertices hangs from two corners, 1 s
-    python benchmarks/peers.py drape_4k --methods newton vbd:10x10 xpbd:10x10 mujoco-discrete:1
-    python benchmarks/peers.py body --frames 60 --picture outputs/peers.png       # the dress on the embedded body, walk_proud
-    python benchmarks/peers.py drape_1k --one-step                     # the error of single steps of a frame, under two energies
+    python benchmarks/peers.py drape_1k                                      # 1,024 vertices hang from two corners, 1 s
+    python benchmarks/peers.py drape_4k --methods newton vbd:10x10 xpbd:40x5 mujoco-discrete:1
+    python benchmarks/peers.py body --frames 60 --picture outputs/peers.png  # the dress on the embedded body, walk_proud
+    python benchmarks/peers.py drape_1k --one-step                           # the error of one frame, under two energies
 
 The others are no part of hood: NVIDIA Newton (``pip install newton==1.8.0 warp-lang==1.19.0``), of which ``vbd:SxI`` and
-``xpbd:SxI`` are its solvers VBD and XPBD with S substeps a frame of I iterations each, and MuJoCo (``pip install mujoco==4.0.0``)
-with S steps a frame, ``mujoco-discrete:S`` and ``mujoco-Euler:S``. ``vbd:SxI:R`` has contact set in at R mm instead of 2. hood's
-are ``newton`` (its solver, as ``stepper=newton``), weights, ``weights+K`` refined by K iterations, and ``guess+K`` (as
-``stepper=refine``). How the fabric is said in the terms of each is in ``peer_newton.py`` and ``peer_mujoco.py``.
+``xpbd:SxI`` are its solvers VBD and XPBD with S substeps a frame of I iterations each, and MuJoCo (``pip install
+mujoco==4.0.0``) with S steps a frame, ``mujoco-discrete:S`` and ``mujoco-Euler:S``. By ``vbd:SxI:R`` contact sets in at R mm
+instead of 2. hood's are ``newton`` (its solver, as ``stepper=newton``), ``newton:S`` (the same with S steps a frame), weights,
+``weights+K`` refined by K iterations, and ``guess+K`` (as ``stepper=refine``). How the fabric is said in the terms of the
+others is in ``peer_newton.py`` and ``peer_mujoco.py``.
 
-All methods start from the same positions and velocities and go frame by frame in turns, so that a busy machine slows all of them.
-A row a method: median milliseconds of a frame on the clock; mean 99th percentile of the edge strain; of the frames that --stride
-says, the mean share of the cloth's triangles that the skin cuts, the greatest height of skin above the cloth and the median γ;
-and of a sheet at the end the energy of stretching, bending and gravity above the minimum at rest, and the kinetic energy. γ is the
-energy that a step of a frame leaves above the exact implicit step of hood's potential, from the method's own state: whoever
-divides a frame into substeps follows another path through it, and γ is large for that alone.
+All methods start from the same positions and velocities and go frame by frame in turns: a busy machine slows all of them. A row
+a method: median milliseconds of a frame on the clock; mean 99th percentile of the edge strain; of the frames that --stride says
+the mean share of the cloth's triangles that the skin cuts, the greatest height of skin above the cloth and the median γ; and of
+a sheet at the end the energy of stretching, bending and gravity above the minimum at rest, and the kinetic energy. γ is the
+energy that a frame leaves above the exact implicit step of hood's potential, from the method's own state: whoever divides a
+frame into substeps follows another path through it, and γ is large for that alone.
 
-``--one-step`` gives every method the same states, of hood's solver, and one step of a whole frame: γ of hood's potential, and of
-VBD as well that of its own energy, above the lowest minimum that L-BFGS finds of it.
+``--one-step`` gives every method the same states, of hood's solver, and lets it take one frame: γ of hood's potential, and of
+VBD's first substep as well that of its own energy, above the minimum that L-BFGS finds of it. For a sheet.
 """
 
 from __future__ import annotations
@@ -34,8 +35,20 @@ import numpy as np
 import peer_mujoco
 import peer_newton
 import torch
-from peer_scenes import SCENES, SHEETS, CannotDoError, Measures, Moment, Row, Setting, Simulation
-from peer_scenes import gamma, make_setting, problem_at, static_minimum
+from peer_scenes import (
+    SCENES,
+    SHEETS,
+    CannotDoError,
+    Measures,
+    Moment,
+    Row,
+    Setting,
+    Simulation,
+    gamma,
+    make_setting,
+    problem_at,
+    static_minimum,
+)
 
 from hood.assets.files.library import locate
 from hood.commands.conditions import machine_name
@@ -52,12 +65,12 @@ from hood.nn.choice import choose_kernels
 from hood.solver.newton import NewtonSettings
 
 VBD = ("vbd:10x5", "vbd:10x10", "vbd:10x20", "vbd:20x10")
-XPBD = ("xpbd:10x5", "xpbd:10x10", "xpbd:10x20", "xpbd:20x10")
+XPBD = ("xpbd:10x10", "xpbd:20x2", "xpbd:20x10", "xpbd:40x5")
 MUJOCO = ("mujoco-discrete:1", "mujoco-discrete:10", "mujoco-Euler:40")
-HOOD = ("newton", "guess+5", "quickstart", "quickstart+5")
-HEADER = (
-    f"{'':22}{'ms':>9}{'strain p99':>12}{'cut':>8}{'skin, mm':>10}{'gamma':>10}{'above rest, mJ':>16}{'kinetic, mJ':>13}"
-)
+HOOD = ("newton", "newton:10", "guess+5", "quickstart", "quickstart+5")
+HEADER = f"{'':22}{'ms':>9}{'strain p99':>12}{'cut':>8}{'skin, mm':>10}{'gamma':>10}{'above rest, mJ':>16}{'kinetic, mJ':>13}"
+#: A cloth whose edges are longer by so many times their length has come apart.
+DIVERGED = 3.0
 #: Frames whose states single steps are taken from.
 STEPS_FROM = (5, 15, 25)
 
@@ -67,15 +80,18 @@ class Hood:
 
     def __init__(self, setting: Setting, name: str, potential: Potential) -> None:
         self.name = f"hood {name}"
-        self.stepper, dtype = make_stepper(name, potential)
-        self.scene, self._potential = setting.at(dtype), potential
-        self._frames: Iterator[Frame] = simulate(self.stepper, self.scene, potential, setting.num_frames, 0, metrics="none")
+        base, _, substeps = name.partition(":")
+        self._substeps = int(substeps or 1)
+        self.stepper, dtype = make_stepper(base, potential)
+        self.scene, count = setting.at(dtype, self._substeps), (setting.num_frames - 1) * self._substeps + 1
+        self._frames: Iterator[Frame] = simulate(self.stepper, self.scene, potential, count, 0, metrics="none")
         self._now = next(self._frames)
 
     def step(self) -> float:
         """From one frame to the next; milliseconds on the clock, the body's poses among them."""
         began = time.perf_counter()
-        self._now = next(self._frames)
+        for _ in range(self._substeps):
+            self._now = next(self._frames)
         return 1e3 * (time.perf_counter() - began)
 
     def now(self) -> Moment:
@@ -117,6 +133,9 @@ def make_method(name: str, setting: Setting, potential: Potential) -> Simulation
 def line(row: Row) -> str:
     """A row of the table; what a scene does not have is a dash."""
 
+    if not row.strain < DIVERGED:
+        return f"{row.name:22}{row.ms:>9.1f}  diverged"
+
     def known(value: float, form: str) -> str:
         return format(value, form) if np.isfinite(value) else "-"
 
@@ -126,7 +145,9 @@ def line(row: Row) -> str:
     )
 
 
-def compare(setting: Setting, names: Sequence[str], potential: Potential, stride: int) -> tuple[list[Row], dict[str, np.ndarray]]:
+def compare(
+    setting: Setting, names: Sequence[str], potential: Potential, stride: int
+) -> tuple[list[Row], dict[str, np.ndarray]]:
     """All methods through the setting, frame by frame in turns: their rows, and the last positions (V, 3) by name."""
     methods: list[Simulation] = []
     for name in names:
@@ -139,24 +160,27 @@ def compare(setting: Setting, names: Sequence[str], potential: Potential, stride
         for method, measure in zip(methods, measures, strict=True):
             ms = method.step()
             measure.see(frame, ms, method.now())
-    minimum, reached = static_minimum(setting, potential, methods[0].now().pos)
+    minimum = min(static_minimum(setting, potential, method.now().pos) for method in methods if isinstance(method, Hood))
     if setting.name in SHEETS:
-        print(f"at rest: {minimum:.6f} J{'' if reached else ', not quite'}, from the last frame of {methods[0].name}")
+        print(f"at rest: {minimum:.6f} J, the lowest that hood's solver comes to from the last frames of hood's methods")
     rows = [measure.row(method.name, minimum) for method, measure in zip(methods, measures, strict=True)]
-    return rows, {method.name: method.now().pos for method in methods}
+    whole = [method for method, row in zip(methods, rows, strict=True) if row.strain < DIVERGED]
+    return rows, {method.name: method.now().pos for method in whole}
 
 
 def draw(setting: Setting, last: dict[str, np.ndarray], path: Path) -> None:
-    """The last frame of every method, side by side."""
+    """The last frame of every method, at most six in a row."""
     faces, body = setting.cloth.faces.numpy(), setting.body[-1]
     cloud = np.concatenate([body.reshape(-1, 3), setting.start.pos, *last.values()])
-    camera = Camera.framing(cloud[np.isfinite(cloud).all(axis=1)], azimuth_deg=25.0, aspect=0.55)
+    camera = Camera.framing(cloud, azimuth_deg=25.0, aspect=264 / 480)
     pictures = []
     for name, pos in last.items():
         skin = [RenderMesh(body, setting.scene.motion.faces, BODY_COLOR)] if len(body) else []
         floor = float(cloud[:, 1].min()) - 0.01
         pictures.append(captioned(render_frame([*skin, RenderMesh(pos, faces)], camera, 264, 480, floor=floor), name))
-    save_png(path, np.concatenate(pictures, axis=1))
+    pictures += [np.full_like(pictures[0], 255)] * (-len(pictures) % min(len(pictures), 6))
+    rows = [np.concatenate(pictures[start : start + 6], axis=1) for start in range(0, len(pictures), 6)]
+    save_png(path, np.concatenate(rows))
 
 
 def one_steps(setting: Setting, names: Sequence[str], potential: Potential) -> None:
@@ -177,9 +201,20 @@ def one_steps(setting: Setting, names: Sequence[str], potential: Potential) -> N
             times.append(ms)
             ours.append(gamma(setting, potential, frame, states[frame], pos))
             if name.startswith("vbd"):
-                theirs.append(peer_newton.own_gamma(own, *problem_at(setting, frame, states[frame]), pos))
+                theirs.append(_own_gamma(own, name, setting, potential, frame, states[frame]))
         shown = f"{np.median(theirs):.3g}" if theirs else "-"
         print(f"{name:22}{np.median(times):>9.1f}{np.median(ours):>10.3g}{shown:>12}", flush=True)
+
+
+def _own_gamma(own: Potential, name: str, setting: Setting, potential: Potential, frame: int, moment: Moment) -> float:
+    """γ of VBD's first substep from a state, of its own energy."""
+    method = make_method(name, setting, potential)
+    assert isinstance(method, peer_newton.Newton)
+    method.put(moment, frame)
+    method.substep()
+    problem, origin = problem_at(setting, frame, moment)
+    dt = problem.step.dt / method.effort.substeps
+    return peer_newton.own_gamma(own, replace(problem, step=replace(problem.step, dt=dt)), origin, method.now().pos)
 
 
 def _taking(name: str, setting: Setting, potential: Potential) -> Callable[[int, Moment], tuple[float, np.ndarray]]:
