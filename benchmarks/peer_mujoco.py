@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from peer_scenes import CONTACT_RADIUS, FABRIC, FPS, GRAVITY, CannotDoError, Moment, Setting, membrane
+from peer_scenes import CONTACT_RADIUS, FPS, GRAVITY, CannotDoError, Moment, Setting, membrane
 
 from hood.losses.bending import Bending
 from hood.losses.potential import Potential
@@ -29,6 +29,10 @@ from hood.scene.state import State, StepInput
 
 #: Radius [m] of the cylinder that bending is compared on.
 _WIDE = 2.0
+_RIGID = (
+    "meshes of MuJoCo 4.0 are rigid and collide as convex hulls; a moving skin would be a second flex with a mocap body at "
+    "every vertex, which is not built here"
+)
 
 
 @dataclass(frozen=True)
@@ -58,7 +62,7 @@ def package() -> Any:
 
 def model_of(setting: Setting, effort: Effort, elastic: str) -> Any:
     """MuJoCo's model of a sheet at rest; ``elastic`` says what its elasticity does: bend, stretch or both."""
-    law, thickness = membrane(), float(np.asarray(FABRIC.thickness))
+    law, thickness = membrane(setting.fabric), float(np.asarray(setting.fabric.thickness))
     points = " ".join(f"{value:.9g}" for value in setting.cloth.rest_pos.reshape(-1).tolist())
     elements = " ".join(map(str, setting.cloth.faces.reshape(-1).tolist()))
     held = " ".join(map(str, np.flatnonzero(setting.pinned)))
@@ -82,12 +86,12 @@ class MuJoCo:
     """A sheet in MuJoCo, from frame 0.
 
     Raises:
-        CannotDoError: the scene has a body: MuJoCo 4.0 has no collider that changes its shape.
+        CannotDoError: the scene has a body.
     """
 
     def __init__(self, setting: Setting, effort: Effort) -> None:
         if setting.body.shape[1]:
-            raise CannotDoError("MuJoCo 4.0 has no collider that changes its shape, and meshes collide as their convex hulls")
+            raise CannotDoError(_RIGID)
         self.mujoco = package()
         self.name, self.setting, self._substeps = effort.name, setting, effort.substeps
         self.model = model_of(setting, effort, "both")
@@ -120,10 +124,10 @@ class MuJoCo:
         self.mujoco.mj_forward(self.model, self._data)
 
     def step(self) -> float:
-        """From one frame to the next; milliseconds on the clock."""
-        began = time.perf_counter()
+        """From one frame to the next; CPU milliseconds."""
+        began = time.process_time()
         self.mujoco.mj_step(self.model, self._data, self._substeps)
-        return 1e3 * (time.perf_counter() - began)
+        return 1e3 * (time.process_time() - began)
 
     def now(self) -> Moment:
         """The cloth at this frame."""

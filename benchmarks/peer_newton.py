@@ -24,7 +24,6 @@ import numpy as np
 import torch
 from peer_scenes import (
     CONTACT_RADIUS,
-    FABRIC,
     FPS,
     FRICTION,
     GRAVITY,
@@ -103,7 +102,8 @@ class Newton:
 
     def _build(self) -> Any:
         newton, wp = self.newton, self.warp
-        setting, law = self.setting, membrane()
+        setting = self.setting
+        law = membrane(setting.fabric)
         rest, faces = setting.cloth.rest_pos.numpy(), setting.cloth.faces.numpy()
         builder = newton.ModelBuilder(up_axis=newton.Axis.Y, gravity=(0.0, -GRAVITY, 0.0))
         vbd = self.effort.solver == "vbd"
@@ -114,7 +114,7 @@ class Newton:
             vel=wp.vec3(0.0, 0.0, 0.0),
             vertices=[wp.vec3(*point) for point in rest],
             indices=faces.reshape(-1).tolist(),
-            density=float(np.asarray(FABRIC.density)),
+            density=float(np.asarray(setting.fabric.density)),
             tri_ke=law.mu,
             tri_ka=law.lam,
             tri_kd=0.0,
@@ -176,11 +176,11 @@ class Newton:
         self._frame = frame
 
     def step(self) -> float:
-        """From one frame to the next; milliseconds on the clock, without those that the body's poses took before."""
+        """From one frame to the next; CPU milliseconds, without those that the body's poses took before."""
         count, dt = self.effort.substeps, 1.0 / FPS / self.effort.substeps
         body = self.setting.body
         ends = body[self._frame].astype(np.float32), body[min(self._frame + 1, len(body) - 1)].astype(np.float32)
-        began = time.perf_counter()
+        began = time.process_time()
         for number in range(count):
             if self._mesh is not None:
                 self._pose(ends, (number + 1) / count)
@@ -191,7 +191,7 @@ class Newton:
             else:
                 self._substep(dt)
         self._frame += 1
-        return 1e3 * (time.perf_counter() - began)
+        return 1e3 * (time.process_time() - began)
 
     def _substep(self, dt: float) -> None:
         here, there = self._states

@@ -61,7 +61,7 @@ class Simulation(Protocol):
     name: str
 
     def step(self) -> float:
-        """From one frame to the next; milliseconds on the clock that this took."""
+        """From one frame to the next; CPU milliseconds that this took."""
         ...
 
     def now(self) -> Moment:
@@ -83,6 +83,7 @@ class Setting:
     scene: Scene
     start: Moment
     num_frames: int
+    fabric: Material = FABRIC
 
     @property
     def cloth(self) -> Cloth:
@@ -103,9 +104,8 @@ class Setting:
         """The scene in another precision, or with so many steps a frame."""
         if dtype == torch.float64 and substeps == 1:
             return self.scene
-        return replace(
-            _scene_of(self.name, self.num_frames, dtype, substeps), start_pos=self.start.pos, start_vel=self.start.vel
-        )
+        scene = _scene_of(self.name, self.num_frames, self.fabric, dtype, substeps)
+        return replace(scene, start_pos=self.start.pos, start_vel=self.start.vel)
 
 
 #: Garment and motion of the scene with a body.
@@ -141,31 +141,33 @@ def sheet(side: int) -> Garment:
     return Garment(f"sheet {side} × {side}", flat, faces, pinned, skin_pos=hung)
 
 
-def make_setting(name: str, num_frames: int, potential: Potential) -> Setting:
+def make_setting(name: str, num_frames: int, potential: Potential, stretch: float = 1.0) -> Setting:
     """The scene of a name in :data:`SCENES`.
 
     A sheet starts at rest; the dress starts settled on the still body by hood's solver for ``potential``, with the
-    velocity of the skinned garment.
+    velocity of the skinned garment. The fabric is ``stretch`` times as hard to stretch as the default one.
 
     Raises:
         ValueError: there is no such scene.
     """
-    scene = _scene_of(name, num_frames, torch.float64)
+    mu, lam = float(np.asarray(FABRIC.lame_mu)), float(np.asarray(FABRIC.lame_lambda))
+    fabric = replace(FABRIC, lame_mu=stretch * mu, lame_lambda=stretch * lam)
+    scene = _scene_of(name, num_frames, fabric, torch.float64)
     if name in SHEETS:
         start = Moment(worn_pos(scene.garment), np.zeros_like(scene.garment.rest_pos))
     else:
         state, _ = rest_state(NewtonStepper(potential), scene, potential, 0)
         start = Moment(state.pos.numpy() + state.origin[0].numpy(), state.vel.numpy())
-    return Setting(name, replace(scene, start_pos=start.pos, start_vel=start.vel), start, num_frames)
+    return Setting(name, replace(scene, start_pos=start.pos, start_vel=start.vel), start, num_frames, fabric)
 
 
-def _scene_of(name: str, num_frames: int, dtype: torch.dtype, substeps: int = 1) -> Scene:
+def _scene_of(name: str, num_frames: int, fabric: Material, dtype: torch.dtype, substeps: int = 1) -> Scene:
     fps = FPS * substeps
     if name in SHEETS:
-        return dress(sheet(SHEETS[name]), NoBody((num_frames - 1) * substeps + 1, fps, dtype), FABRIC)
+        return dress(sheet(SHEETS[name]), NoBody((num_frames - 1) * substeps + 1, fps, dtype), fabric)
     if name != "body":
         raise ValueError(f"scene {name!r}: choose of {', '.join(SCENES)}")
-    return build_scene(load_garment(GARMENT), load_body("default"), load_sequence(MOTION, fps), FABRIC, dtype=dtype)
+    return build_scene(load_garment(GARMENT), load_body("default"), load_sequence(MOTION, fps), fabric, dtype=dtype)
 
 
 class Membrane(NamedTuple):
@@ -185,7 +187,7 @@ class Membrane(NamedTuple):
         return self.lam / (self.lam + 2.0 * self.mu)
 
 
-def membrane(material: Material = FABRIC) -> Membrane:
+def membrane(material: Material) -> Membrane:
     """Of a fabric of one number a property; h is its ``thickness``."""
     thickness = float(np.asarray(material.thickness))
     return Membrane(thickness * float(np.asarray(material.lame_mu)), thickness * float(np.asarray(material.lame_lambda)))

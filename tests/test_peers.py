@@ -69,7 +69,7 @@ def test_a_setting_starts_every_method_from_the_same_place(peers, scenes):
 
 def test_a_strip_stretches_as_the_membrane_says(scenes):
     """A sheet pulled along x whose sides are free: force by strain and width is E h, narrowing by stretching is ν."""
-    law = scenes.membrane()
+    law = scenes.membrane(scenes.FABRIC)
     strain = 1e-5
     pos, faces = grid(3, 3, 1.0)
     cloth = build_cloth(pos, faces, scenes.FABRIC, dtype=torch.float64)
