@@ -54,11 +54,12 @@ class Effort:
     substeps: int
     iterations: int
     radius: float = CONTACT_RADIUS  # m, of the particles
+    surface: bool = False  # contact of edges and faces as well
 
     @property
     def name(self) -> str:
         apart = "" if self.radius == CONTACT_RADIUS else f", {1e3 * self.radius:g} mm"
-        return f"{self.solver} {self.substeps}x{self.iterations}{apart}"
+        return f"{self.solver}{'-surface' * self.surface} {self.substeps}x{self.iterations}{apart}"
 
 
 def packages() -> tuple[Any, Any]:
@@ -95,7 +96,10 @@ class Newton:
         else:
             self.solver = self.newton.solvers.SolverXPBD(self.model, **options)
         self._control = self.model.control()
-        self._pipeline = self.newton.CollisionPipeline(self.model) if self._mesh is not None else None
+        self._pipeline: Any = None
+        if self._mesh is not None:
+            surface = {"enable_rigid_soft_full_surface_contact": effort.surface}
+            self._pipeline = self.newton.CollisionPipeline(self.model, **surface)
         self._contacts = None if self._pipeline is None else self._pipeline.contacts()
         self._graphs: list[Any] = []
         self._capture()
@@ -272,5 +276,7 @@ def own_gamma(potential: Potential, problem: StepProblem, origin: np.ndarray, ne
 
     e0 = float(scale(problem))
     zero = np.zeros(3 * int(free.sum()))
-    found = optimize.minimize(value, zero, jac=True, method="L-BFGS-B", options={"maxiter": 3000, "maxfun": 4000, "ftol": 0.0})
+    found = optimize.minimize(
+        value, zero, jac=True, method="L-BFGS-B", options={"maxiter": 3000, "maxfun": 4000, "ftol": 1e-13}
+    )
     return value(zero)[0] - float(found.fun)

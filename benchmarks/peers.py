@@ -9,16 +9,17 @@
 The others are no part of hood: NVIDIA Newton (``pip install newton==1.8.0 warp-lang==1.19.0``), of which ``vbd:SxI`` and
 ``xpbd:SxI`` are its solvers VBD and XPBD with S substeps a frame of I iterations each, and MuJoCo (``pip install
 mujoco==4.0.0``) with S steps a frame, ``mujoco-discrete:S`` and ``mujoco-Euler:S``. By ``vbd:SxI:R`` contact sets in at R mm
-instead of 2. hood's are ``newton`` (its solver, as ``stepper=newton``), ``newton:S`` (the same with S steps a frame), weights,
-``weights+K`` refined by K iterations, and ``guess+K`` (as ``stepper=refine``). How the fabric is said in the terms of the
-others is in ``peer_newton.py`` and ``peer_mujoco.py``.
+instead of 2, by ``vbd-surface:SxI`` edges and faces touch the body as well. hood's are ``newton`` (its solver, as
+``stepper=newton``), ``newton:S`` (the same with S steps a frame), weights, ``weights+K`` refined by K iterations, and
+``guess+K`` (as ``stepper=refine``). How the fabric is said in the terms of the others is in ``peer_newton.py`` and
+``peer_mujoco.py``.
 
 All methods start from the same positions and velocities and go frame by frame in turns: a busy machine slows all of them. A row
 a method: median CPU milliseconds of a frame; mean 99th percentile of the edge strain; of the frames that --stride says the mean
-share of the cloth's triangles that the skin cuts, the greatest height of skin above the cloth and the median γ; and of a sheet at
-the end the energy of stretching, bending and gravity above the minimum at rest, and the kinetic energy. γ is the energy that a
-frame leaves above the exact implicit step of hood's potential, from the method's own state: whoever divides a frame into substeps
-follows another path through it, and γ is large for that alone.
+share of the cloth's triangles that the skin cuts, the greatest height of skin above the cloth and the median γ; and of a sheet
+at the end the energy of stretching, bending and gravity above the minimum at rest, and the kinetic energy. γ is the energy that
+a frame leaves above the exact implicit step of hood's potential, from the method's own state: whoever divides a frame into
+substeps follows another path through it, and γ is large for that alone.
 
 ``--one-step`` gives every method the same states, of hood's solver, and lets it take one frame: γ of hood's potential, and of
 VBD's first substep as well that of its own energy, above the minimum that L-BFGS finds of it. For a sheet.
@@ -121,10 +122,10 @@ def make_method(name: str, setting: Setting, potential: Potential) -> Simulation
         SystemExit: its package is not installed.
     """
     kind, _, effort = name.partition(":")
-    if kind in ("vbd", "xpbd"):
+    if kind in ("vbd", "vbd-surface", "xpbd"):
         counts, _, radius = effort.partition(":")
         substeps, iterations = map(int, counts.split("x"))
-        chosen = peer_newton.Effort(kind, substeps, iterations)
+        chosen = peer_newton.Effort(kind.removesuffix("-surface"), substeps, iterations, surface=kind == "vbd-surface")
         return peer_newton.Newton(setting, replace(chosen, radius=1e-3 * float(radius)) if radius else chosen)
     if kind.startswith("mujoco-"):
         return peer_mujoco.MuJoCo(setting, peer_mujoco.Effort(kind.removeprefix("mujoco-"), int(effort)))
@@ -170,17 +171,18 @@ def compare(
 
 
 def draw(setting: Setting, last: dict[str, np.ndarray], path: Path) -> None:
-    """The last frame of every method, at most six in a row."""
+    """The last frame of every method, five in a row."""
     faces, body = setting.cloth.faces.numpy(), setting.body[-1]
     cloud = np.concatenate([body.reshape(-1, 3), setting.start.pos, *last.values()])
-    camera = Camera.framing(cloud, azimuth_deg=25.0, aspect=264 / 480)
+    camera = Camera.framing(cloud, azimuth_deg=25.0, aspect=200 / 364)
     pictures = []
     for name, pos in last.items():
         skin = [RenderMesh(body, setting.scene.motion.faces, BODY_COLOR)] if len(body) else []
         floor = float(cloud[:, 1].min()) - 0.01
-        pictures.append(captioned(render_frame([*skin, RenderMesh(pos, faces)], camera, 264, 480, floor=floor), name))
-    pictures += [np.full_like(pictures[0], 255)] * (-len(pictures) % min(len(pictures), 6))
-    rows = [np.concatenate(pictures[start : start + 6], axis=1) for start in range(0, len(pictures), 6)]
+        pictures.append(captioned(render_frame([*skin, RenderMesh(pos, faces)], camera, 200, 364, floor=floor), name))
+    columns = min(len(pictures), 5)
+    pictures += [np.full_like(pictures[0], 255)] * (-len(pictures) % columns)
+    rows = [np.concatenate(pictures[start : start + columns], axis=1) for start in range(0, len(pictures), columns)]
     save_png(path, np.concatenate(rows))
 
 
