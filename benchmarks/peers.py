@@ -28,6 +28,7 @@ VBD's first substep as well that of its own energy, above the minimum that L-BFG
 from __future__ import annotations
 
 import argparse
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -171,7 +172,7 @@ def compare(
 
 
 def draw(setting: Setting, last: dict[str, np.ndarray], path: Path) -> None:
-    """The last frame of every method, five in a row."""
+    """The last frame of every method, at most six in a row."""
     faces, body = setting.cloth.faces.numpy(), setting.body[-1]
     cloud = np.concatenate([body.reshape(-1, 3), setting.start.pos, *last.values()])
     camera = Camera.framing(cloud, azimuth_deg=25.0, aspect=200 / 364)
@@ -180,7 +181,7 @@ def draw(setting: Setting, last: dict[str, np.ndarray], path: Path) -> None:
         skin = [RenderMesh(body, setting.scene.motion.faces, BODY_COLOR)] if len(body) else []
         floor = float(cloud[:, 1].min()) - 0.01
         pictures.append(captioned(render_frame([*skin, RenderMesh(pos, faces)], camera, 200, 364, floor=floor), name))
-    columns = min(len(pictures), 5)
+    columns = math.ceil(len(pictures) / math.ceil(len(pictures) / 6))
     pictures += [np.full_like(pictures[0], 255)] * (-len(pictures) % columns)
     rows = [np.concatenate(pictures[start : start + columns], axis=1) for start in range(0, len(pictures), columns)]
     save_png(path, np.concatenate(rows))
