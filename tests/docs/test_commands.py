@@ -15,12 +15,8 @@ from pages import CARDS, EXTENDING, EXTENDING_HAS_A_TEST, PAGES, ROOT, command_l
 
 from hood.assets.files.library import names
 from hood.cli import COMMANDS
-<<<<<<< HEAD
 from hood.commands.help import _EXAMPLES
-from hood.commands.plan_training import is_training
-=======
 from hood.commands.plan import is_training
->>>>>>> plan
 from hood.commands.setup import check_config
 from hood.config import groups, load_config, options, plain
 
