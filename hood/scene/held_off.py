@@ -24,8 +24,9 @@ from hood.scene.state import Obstacle
 
 #: Up to this share of a garment's triangles may be in the skin.
 ALLOWED = 0.005
-#: Corners of a triangle in the skin are held off by so much more [m], and by no more than that in all.
-RISE, MOST = 3e-3, 12e-3
+#: Corners of a triangle in the skin are held off by so much more [m], by twice as much where that was not enough, and by no
+#: more than that in all.
+RISE, MOST = 3e-3, 24e-3
 
 
 def hold_off(next_pos: Tensor, cloth: Cloth, obstacle: Obstacle, contact: Contact) -> Contact | None:
@@ -35,8 +36,9 @@ def hold_off(next_pos: Tensor, cloth: Cloth, obstacle: Obstacle, contact: Contac
     rows = torch.zeros_like(contact.valid)
     for cut in _cut_faces(next_pos, cloth, obstacle):
         rows[cut.reshape(-1)] = True
+    after = (2.0 * before + RISE).clamp_max(MOST)
     rows &= contact.valid & cloth.free & (before + 0.5 * RISE < MOST)
-    return replace(contact, raised=torch.where(rows, before + RISE, before)) if bool(rows.any()) else None
+    return replace(contact, raised=torch.where(rows, after, before)) if bool(rows.any()) else None
 
 
 def _cut_faces(next_pos: Tensor, cloth: Cloth, obstacle: Obstacle) -> list[Tensor]:

@@ -185,6 +185,15 @@ def summary(garment: Garment) -> str:
     return f"{len(garment.rest_pos)} vertices, {len(garment.faces)} triangles, {parts} component(s), {openings} openings"
 
 
+def piece_of(garment: Garment, kept: np.ndarray) -> Garment:
+    """The piece of a garment that its faces ``kept`` (F,) bool are, with the vertices that they use; without texture."""
+    left = _keep_faces(replace(garment, uv=None, uv_faces=None, normal_faces=None), kept)
+    used = np.zeros(len(garment.rest_pos), dtype=bool)
+    used[left.faces] = True
+    number = np.where(used, np.cumsum(used) - 1, -1)
+    return _keep_vertices(left, number[left.faces], np.flatnonzero(used), number)
+
+
 _PER_VERTEX = (
     "rest_pos", "pinned", "lbs_weights", "shapedirs", "colours", "skin_pos", "rest_turn", "piece", "region", "stiffness",
 )  # fmt: skip

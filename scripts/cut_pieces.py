@@ -1,0 +1,69 @@
+"""Pieces of the finest garments, as large in vertices as garments of 4,400, to train on.
+
+    python scripts/cut_pieces.py outputs/pieces
+
+Writes ``dress_side.npz``, ``dress_side_right.npz`` and ``skirt_front.npz``: bands of the meshes of 12,000 vertices from top to
+bottom, held at their upper rims. Long waves cross as many edges in them as in the whole garment.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from hood.assets.garment.alterations import piece_of
+from hood.assets.garment.garment import Garment, load_garment, save_garment
+
+#: Bands of the dress lie beyond this share of its half width at every height, which is measured in so many steps.
+_SHARE, _HEIGHTS = 0.42, 40
+#: Held are vertices this far [m] below the top: of the dress at the shoulder, of the skirt at its waistband.
+_SHOULDER, _WAIST = 0.05, 0.02
+
+
+def worn(garment: Garment) -> np.ndarray:
+    """(V, 3) m, in T-pose."""
+    return garment.rest_pos if garment.skin_pos is None else garment.skin_pos
+
+
+def beyond(centres: np.ndarray, sign: float) -> np.ndarray:
+    """(F,) bool: face centres (F, 3) that lie farther out to a side than the share of the half width at their height."""
+    height = centres[:, 1]
+    step = np.digitize(height, np.linspace(height.min(), height.max(), _HEIGHTS))
+    width = np.zeros(_HEIGHTS + 2)
+    np.maximum.at(width, step, np.abs(centres[:, 0]))
+    return np.asarray(sign * centres[:, 0] > _SHARE * width[step])
+
+
+def held(name: str, piece: Garment, top: float, depth: float) -> Garment:
+    """The piece with a name, held where it is no farther than ``depth`` [m] below ``top`` [m]."""
+    return replace(piece, name=name, pinned=piece.pinned | (worn(piece)[:, 1] > top - depth))
+
+
+def pieces() -> list[Garment]:
+    dress, skirt = load_garment("dress_12k"), load_garment("skirt_12k")
+    centres, shoulder = worn(dress)[dress.faces].mean(axis=1), worn(dress)[:, 1].max()
+    found = [
+        held(name, piece_of(dress, beyond(centres, sign)), shoulder, _SHOULDER)
+        for name, sign in (("dress_side", 1.0), ("dress_side_right", -1.0))
+    ]
+    centres = worn(skirt)[skirt.faces].mean(axis=1)
+    front = (centres[:, 2] > 0.0) & (np.abs(centres[:, 0]) < 0.7 * np.abs(centres[:, 0]).max())
+    piece = piece_of(skirt, front)
+    return [*found, held("skirt_front", piece, worn(piece)[:, 1].max(), _WAIST)]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    folder = parser.parse_args().folder
+    folder.mkdir(parents=True, exist_ok=True)
+    for piece in pieces():
+        save_garment(folder / f"{piece.name}.npz", piece)
+        print(f"{folder / piece.name}.npz: {len(piece.rest_pos)} vertices, {int(piece.pinned.sum())} held")
+
+
+if __name__ == "__main__":
+    main()
