@@ -54,13 +54,9 @@ def test_there_are_commands_to_check() -> None:
     assert {page for page, _ in HOOD} >= {"README.md", "tutorial.md", "rollout.md", "files.md", "train.md", "evaluation.md"}
 
 
-@pytest.mark.parametrize(("page", "line"), HOOD)
-def test_commands_have_keys_and_values_that_exist(page: str, line: str) -> None:
-    command, *words = words_of(line)
-    assert command in COMMANDS, line
-    keys = [word for word in words if "=" in word]
-    if command not in CONFIGURED or set(OWN) & set(keys) or (page == EXTENDING and EXTENDING_HAS_A_TEST):
-        return
+def check_command(command: str, keys: list[str]) -> None:
+    """The keys and values of a command, and the names among them, exist; those of a plan are its own and a rollout's or a
+    training's."""
     if command == "plan":
         own = set(load_config("plan"))
         load_config("plan", [word for word in keys if word.partition("=")[0] in own])
@@ -70,6 +66,16 @@ def test_commands_have_keys_and_values_that_exist(page: str, line: str) -> None:
     if command == "rollout":
         check_config(config)
     check_names(config)
+
+
+@pytest.mark.parametrize(("page", "line"), HOOD)
+def test_commands_have_keys_and_values_that_exist(page: str, line: str) -> None:
+    command, *words = words_of(line)
+    assert command in COMMANDS, line
+    keys = [word for word in words if "=" in word]
+    if command not in CONFIGURED or set(OWN) & set(keys) or (page == EXTENDING and EXTENDING_HAS_A_TEST):
+        return
+    check_command(command, keys)
 
 
 class Parsed(Exception):
@@ -120,7 +126,7 @@ def keys_below(node: dict[str, Any], prefix: str = "") -> set[str]:
 
 
 def known_keys() -> set[str]:
-    """Keys of all commands under all options of their groups; keys of a model or an energy also by their last word alone."""
+    """Keys of all commands under all options of groups; those of a model, a material or an energy also by the last word."""
     known = set(groups())
     for command in CONFIGURED:
         known |= keys_below(plain(load_config(command)))
@@ -128,14 +134,15 @@ def known_keys() -> set[str]:
         for group in of:
             for option in options(group):
                 known |= keys_below(plain(load_config(command, [f"{group}={option}"])))
-    return known | {key.rpartition(".")[2] for key in known if key.startswith(("model.", "losses.terms."))}
+    return known | {key.rpartition(".")[2] for key in known if key.startswith(("model.", "material.", "losses.terms."))}
 
 
 def test_keys_in_the_text_of_pages_exist() -> None:
     known = known_keys()
     seen = 0
     for page in [page for page in [*PAGES, *CARDS] if page.name != EXTENDING]:
-        for span in re.findall(r"`([^`\n]+)`", prose_of(page)):
+        spans = [span for span in re.findall(r"`([^`\n]+)`", prose_of(page)) if not span.startswith("pip ")]
+        for span in spans:
             for key, value in re.findall(r"(?<![\w.\[{(,'\"-])([a-z_][\w.]*)=(\w*)", re.sub(r"\(.*\)", "", span)):
                 seen += 1
                 assert key in known, f"{page.name}: {span}"
@@ -149,12 +156,7 @@ def test_examples_of_the_help_have_keys_and_values_that_exist(command: str) -> N
     for example in _EXAMPLES[command]:
         name, *words = words_of(example)
         assert name == command
-        keys = [word for word in words if "=" in word]
-        own = load_config("plan") if command == "plan" else None
-        config = load_config(
-            "rollout" if own is not None else command, [w for w in keys if own is None or w.split("=")[0] not in own]
-        )
-        check_names(config)
+        check_command(name, [word for word in words if "=" in word])
 
 
 def test_commands_that_messages_name_exist() -> None:
