@@ -127,9 +127,9 @@ def test_features_look_at_the_potential_that_is_trained(
     looked_at: list[dict] = []
     gradient = Feedback.__call__
 
-    def watched(feedback: Feedback, inputs: Inputs, pos: Tensor) -> tuple[Inputs, Tensor]:
+    def watched(feedback: Feedback, inputs: Inputs, pos: Tensor, held_back: Tensor | None = None) -> tuple[Inputs, Tensor]:
         looked_at.append(feedback.potential.settings)
-        return gradient(feedback, inputs, pos)
+        return gradient(feedback, inputs, pos, held_back)
 
     monkeypatch.setattr(Feedback, "__call__", watched)
     for _ in range(3):
