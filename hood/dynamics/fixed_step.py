@@ -110,7 +110,8 @@ class FixedStep:
         and what is computed for the first time while a function is traced has no values."""
         like = self._like
         graph = build_fixed_graph(self.layout, None, None, self.simulator.body_radius)
-        given = Inputs(like.cloth, like.state, like.step, None, graph, base_pos=like.state.pos)
+        here = like.state.pos
+        given = Inputs(like.cloth, like.state, like.step, None, graph, base_pos=here, global_step=torch.zeros_like(here))
         given = replace(given, edge_rows=given.make_edge_rows())
         for group in self.simulator.features.edge:
             group(given)

@@ -78,7 +78,7 @@ def test_without_a_drape_test_only_the_table_is_written(tmp_path: Path) -> None:
         (["linen", "edges=[a]"], "edges: 'a' is no edge of a mesh"),
         (["linen", "edges=[0.01,0.01]"], "edges: 0.01 is given twice"),
         (["linen", "edge=0.01"], "unknown key 'edge': did you mean 'edges'"),
-        (["linen", "woven=yes please"], "woven='yes please': expected a value like False (bool)"),
+        (["linen", "woven=yes please"], "woven=yes please: give true or false, such as woven=false"),
         (["linen", "--json"], "unknown option '--json'"),
     ],
 )

@@ -38,7 +38,7 @@ def test_sizes_on_bodies_give_a_table_a_record_and_a_sheet(tmp_path: Path, capsy
 @pytest.mark.parametrize(
     ("word", "message"),
     [
-        ("sizes=[1,2]", "sizes=[1, 2]: give names and factors"),
+        ("sizes=[1,2]", "sizes=[1,2]: give names and factors"),
         ("sizes={M:9}", "size=9"),
         ("shapes=[1]", "shapes=[1]: give lists of shape coefficients"),
         ("fit=everybody", "unknown value for fit 'everybody'"),

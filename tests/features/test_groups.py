@@ -13,7 +13,7 @@ from hood.graph.hierarchy import Hierarchy, concatenate_hierarchies
 from hood.scene.cloth import build_cloth, concatenate_cloths
 from hood.scene.contact import Contact
 from hood.scene.state import Obstacle, State, StepInput, concatenate_obstacles, concatenate_states
-from hood.testing import assert_feature_group_contract
+from hood.testing import assert_feature_group_contract, concatenate_contacts
 
 DT = 1 / 30
 REST = torch.tensor([[0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1.0]], dtype=torch.float64)
@@ -158,7 +158,7 @@ def test_batch_equals_singles(features):
     items = [single, other]
     cloth = concatenate_cloths([i.cloth for i in items])
     obstacle = concatenate_obstacles([i.step.obstacle for i in items])
-    contact = Contact(**{k: torch.cat([getattr(i.contact, k) for i in items]) for k in vars(single.contact)})
+    contact = concatenate_contacts([i.contact for i in items])
     contact = replace(contact, vertex=contact.vertex + 4 * (torch.arange(8) // 4))
     hierarchy = Hierarchy((torch.tensor([[0, 2]]),), torch.tensor([1, 0, 1, 0]))
     step = StepInput(torch.cat([i.step.dt for i in items]), obstacle)
