@@ -165,3 +165,10 @@ def test_commands_that_messages_name_exist() -> None:
         for word in re.findall(r"``hood (\w+)|[:;(] ?hood ([a-z]+) [\w.{]+=", path.read_text(encoding="utf-8")):
             name = word[0] or word[1]
             assert name in {*COMMANDS, "COMMAND"}, f"{path.name}: hood {name}"
+
+
+@pytest.mark.parametrize(("page", "line"), LINES)
+def test_a_shell_leaves_tables_in_commands_as_they_are(page: str, line: str) -> None:
+    """Bash makes several words of ``key={a:1,b:2}`` without quotes."""
+    bare = re.sub(r"'[^']*'|\"[^\"]*\"", "", line)
+    assert not re.search(r"\{[^{}]*,[^{}]*\}", bare), f"{page}: quote the word with braces: {line}"
