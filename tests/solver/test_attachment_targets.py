@@ -10,9 +10,7 @@ from test_newton import batch
 from test_plan import states, touching_sheet
 
 from hood.losses.potential import default_potential
-from hood.native.build import BuildError
 from hood.scene.state import Attachments
-from hood.solver import engine
 from hood.solver.local import LocalTerms
 from hood.solver.newton import NewtonSettings, minimize
 from hood.solver.plan import plan_for, quadratic_model
@@ -47,12 +45,9 @@ def test_gradients_are_those_of_the_potential(name):
     )
 
 
+@pytest.mark.usefixtures("compiled_solver")
 @pytest.mark.parametrize("active", [(True, False), (True, True), (False, False)])
 def test_the_compiled_solver_finds_the_same_minimum_alone_and_in_a_batch(active):
-    try:
-        engine.library()
-    except BuildError as error:
-        pytest.skip(str(error))
     problem, other = fastened(active), touching_sheet(attached=False)
     potential, tight = default_potential(), NewtonSettings(target_rg=1e-9, engine="torch")
     expected, _ = minimize(potential, problem, settings=tight)

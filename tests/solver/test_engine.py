@@ -27,16 +27,8 @@ from hood.solver.newton import NewtonSettings, TorchSystem, minimize
 from hood.solver.plan import plan_for, quadratic_model
 from hood.testing import grid, make_problem
 
-pytestmark = pytest.mark.usefixtures("compiler")
+pytestmark = pytest.mark.usefixtures("compiled_solver")
 TORCH, COMPILED = NewtonSettings(engine="torch"), NewtonSettings(engine="compiled")
-
-
-@pytest.fixture(scope="module")
-def compiler():
-    try:
-        engine.library()
-    except BuildError as error:
-        pytest.skip(str(error))
 
 
 def model_at(problem, potential, pos, wide):

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from test_engine import COMPILED, compiler, dense, model_at
+from test_engine import COMPILED, dense, model_at
 from test_newton import batch, falling, hanging, pieces
 from test_plan import states, touching_sheet
 from test_points import PLACES, pressed
@@ -20,8 +20,7 @@ from hood.losses.potential import default_potential
 from hood.solver import engine
 from hood.solver.newton import minimize
 
-__all__ = ["compiler"]
-pytestmark = pytest.mark.usefixtures("compiler")
+pytestmark = pytest.mark.usefixtures("compiled_solver")
 PARTS = [2, 3, 7]
 
 

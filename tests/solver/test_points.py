@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from test_engine import compiler, dense, dense_of, model_at  # noqa: F401
+from test_engine import dense, dense_of, model_at
 
 from hood.assets.material import Material
 from hood.dynamics.implicit_euler import implicit_euler
@@ -105,7 +105,7 @@ def test_matrix_and_slack_are_the_hessian(place: str) -> None:
     assert np.linalg.eigvalsh(dense_of(plan, model.slack)).max() <= 1e-9 * eigenvalues.max()
 
 
-@pytest.mark.usefixtures("compiler")
+@pytest.mark.usefixtures("compiled_solver")
 @pytest.mark.parametrize("place", PLACES)
 def test_compiled_model_is_that_of_the_torch_form(place: str) -> None:
     potential, problem, pos = pressed(place)
@@ -129,7 +129,7 @@ def test_compiled_model_is_that_of_the_torch_form(place: str) -> None:
     assert np.abs(found - inverse).max() <= 1e-12 * np.abs(inverse).max()
 
 
-@pytest.mark.usefixtures("compiler")
+@pytest.mark.usefixtures("compiled_solver")
 @pytest.mark.parametrize("place", PLACES)
 def test_iterations_are_those_of_the_torch_form(place: str) -> None:
     """Fast and crumpled cloth: paths are bent, systems meet negative curvature."""
@@ -145,7 +145,7 @@ def test_iterations_are_those_of_the_torch_form(place: str) -> None:
         torch.testing.assert_close(report.phi, expected.phi, rtol=1e-5, atol=1e-9)
 
 
-@pytest.mark.usefixtures("compiler")
+@pytest.mark.usefixtures("compiled_solver")
 @pytest.mark.parametrize("place", PLACES)
 def test_runs_are_bit_identical_and_scenes_do_not_touch_each_other(place: str) -> None:
     potential, settings = potential_at(place), NewtonSettings(target_rg=1e-4, engine="compiled")
@@ -172,7 +172,7 @@ def joined(problems: list[StepProblem]) -> StepProblem:
     return StepProblem(concatenate_cloths([one.cloth for one in problems]), state, step, gravity=problems[0].gravity)
 
 
-@pytest.mark.usefixtures("compiler")
+@pytest.mark.usefixtures("compiled_solver")
 @pytest.mark.parametrize("place", PLACES)
 def test_views_of_single_vertices_have_the_points(place: str) -> None:
     potential, problem = potential_at(place), over_ball(height=-1e-3, dtype=torch.float32)

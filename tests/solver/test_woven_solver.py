@@ -19,9 +19,7 @@ from hood.losses.inertia import Inertia
 from hood.losses.potential import Potential, default_potential
 from hood.losses.problem import StepProblem
 from hood.losses.stretching import Stretching
-from hood.native.build import BuildError
 from hood.scene.cloth import Cloth, build_cloth, concatenate_cloths
-from hood.solver import engine
 from hood.solver.elements import Corners, face_constants, face_model
 from hood.solver.engine import EngineSystem
 from hood.solver.iterate import Unknowns
@@ -33,14 +31,6 @@ from hood.testing import cylinder, grid, make_problem, with_weave
 F64 = torch.float64
 WOVEN = Material(warp=40.0, weft=15.0, shear=0.3)
 DAMPED = default_potential().with_terms(stretch_damping=StretchDamping(0.02), bend_damping=BendDamping(0.03))
-
-
-@pytest.fixture(scope="module")
-def compiler():
-    try:
-        engine.library()
-    except BuildError as error:
-        pytest.skip(str(error))
 
 
 def woven_sheet() -> StepProblem:
@@ -88,7 +78,7 @@ def test_matrix_and_slack_are_the_hessian_and_the_matrix_is_positive(damped, siz
     torch.testing.assert_close(matrix + slack, exact, rtol=1e-10, atol=1e-12 * float(exact.abs().max()))
 
 
-@pytest.mark.usefixtures("compiler")
+@pytest.mark.usefixtures("compiled_solver")
 @pytest.mark.parametrize("name", ["near", "stretched", "compressed", "folded", "coincident vertices"])
 @pytest.mark.parametrize("potential", [default_potential(), DAMPED], ids=["elastic", "damped"])
 def test_the_compiled_model_is_that_of_the_torch_form(name, potential):
@@ -126,7 +116,7 @@ def together(problems: list[StepProblem]) -> StepProblem:
     return make_problem(cloth, pos, vel)
 
 
-@pytest.mark.usefixtures("compiler")
+@pytest.mark.usefixtures("compiled_solver")
 def test_the_compiled_solver_finds_the_same_minimum_alone_and_in_a_batch():
     plain = hanging(Material())
     problems = [hanging(), hanging(angle=0.6), plain, hanging(Material(warp=1000.0, weft=300.0))]
@@ -146,7 +136,7 @@ def test_the_compiled_solver_finds_the_same_minimum_alone_and_in_a_batch():
     assert torch.equal(woven, torch.cat(alone[:2]))
 
 
-@pytest.mark.usefixtures("compiler")
+@pytest.mark.usefixtures("compiled_solver")
 def test_the_compiled_solver_sees_a_changed_weave():
     problem = hanging()
     softer = replace(problem, cloth=replace(problem.cloth, weave=0.1 * problem.cloth.weave))
@@ -168,7 +158,7 @@ def test_sweeps_lower_the_energy_of_woven_cloth():
 
 @pytest.mark.parametrize("settings", [TORCH, COMPILED], ids=["torch", "compiled"])
 @pytest.mark.parametrize("factors", [(1000.0, 1.0, 1.0), (1.0, 1000.0, 1.0), (1000.0, 1000.0, 1.0), (1.0, 1.0, 1e-3)])
-def test_stiffnesses_a_thousand_times_apart_converge(compiler, settings, factors):
+def test_stiffnesses_a_thousand_times_apart_converge(compiled_solver, settings, factors):
     material = Material(warp=factors[0], weft=factors[1], shear=factors[2])
     problem = hanging(material, angle=0.4)
     for _ in range(5):
