@@ -9,8 +9,7 @@ import contextlib
 import inspect
 import io
 import json
-import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,16 +23,13 @@ from hood.commands.guarding import GuardStopped, make_guard
 from hood.commands.plan_auto import planned
 from hood.commands.plan_file import plan_mode, plan_path, rollout_config
 from hood.commands.setup import Setup, check_config, make_stepper, set_up
+from hood.commands.words import overrides
 from hood.config import ConfigError, load_config
 from hood.dynamics import rollout as frames
 from hood.dynamics.rollout import Frame
 from hood.dynamics.simulator import Simulator
 from hood.dynamics.stepper import Stepper
 from hood.scene.scene import Scene
-
-#: Strings that Hydra reads as they are; all others are quoted.
-_BARE = re.compile(r"[A-Za-z_][A-Za-z0-9_./+-]*")
-_WORDS = ("null", "true", "false", "nan", "inf")
 
 
 class Simulation:
@@ -226,39 +222,3 @@ def load_model(name: str | Path = "quickstart", fps: float = 30.0, device: str =
         48
     """
     return read_model(locate("weights", name), fps).eval().to(device)
-
-
-def overrides(keys: Mapping[str, Any], group: str = "") -> list[str]:
-    """Python values as the ``key=value`` words of a command.
-
-    Args:
-        keys: by name; None is ``null``, a dictionary a group of keys.
-        group: what stands before every key, with a dot.
-
-    Raises:
-        ConfigError: a value that no command line can hold.
-    """
-    words: list[str] = []
-    for key, value in keys.items():
-        if isinstance(value, Mapping):
-            words += overrides(value, f"{group}{key}.")
-        else:
-            words.append(f"{group}{key}={_word(value, group + key)}")
-    return words
-
-
-def _word(value: Any, key: str) -> str:
-    if value is None:
-        return "null"
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, (int, float)):
-        return repr(value)
-    if isinstance(value, (list, tuple)):
-        return f"[{','.join(_word(item, key) for item in value)}]"
-    if isinstance(value, (str, Path)):
-        text = str(value)
-        if _BARE.fullmatch(text) and text.lower() not in _WORDS:
-            return text
-        return "'" + re.sub(r"(\\+)(?=')|(\\+)$", lambda found: 2 * found[0], text).replace("'", "\\'") + "'"
-    raise ConfigError(f"{key}={value!r}: give a number, a word, a path, a list of them, or None")

@@ -31,8 +31,8 @@ _PACKAGE = Path(__file__).resolve().parent
 CONFIG_FOLDER = _PACKAGE / "configs" if (_PACKAGE / "configs").is_dir() else _PACKAGE.parent / "configs"
 #: Keys that take one word or number, or a list.
 _ONE_OR_MORE = ("garment", "offset", "layers", "size")
-#: Keys that take a table of parts as well.
-_BY_PART = ("size",)
+#: Keys that take a table of parts, some beside numbers and lists.
+TABLES = ("size", "fabrics")
 #: Keys in here may be null: an energy that is left out.
 _OPTIONAL = "losses.terms."
 #: A key that its command checks itself.
@@ -291,7 +291,7 @@ def _check_types(name: str, known: DictConfig, config: DictConfig, prefix: str) 
             _check_types(name, before, after, f"{prefix}{key}.")
         elif key in _ONE_OR_MORE and isinstance(after, ListConfig):
             continue
-        elif key in _BY_PART and isinstance(after, DictConfig):
+        elif key in TABLES and isinstance(after, DictConfig):
             continue
         elif after is None and (prefix == _OPTIONAL or key == _FOLDER):
             continue

@@ -18,7 +18,7 @@ import torch
 import hood
 from hood import api
 from hood.commands.guarding import GuardStopped
-from hood.config import ConfigError, load_config
+from hood.config import ConfigError, load_config, plain
 from hood.dynamics.stepper import NewtonStepper
 
 sys.path.insert(0, str(Path(__file__).parent / "dynamics"))
@@ -157,6 +157,29 @@ def test_values_and_groups_reach_the_config() -> None:
     assert words == ["betas=[1.5,-1]", "body=null", "sheet=true", "solver.target_rg=0.001", "output=a/b"]
     with pytest.raises(ConfigError, match="seed"):
         api.overrides({"seed": {1, 2}})
+
+
+def test_tables_reach_the_config() -> None:
+    words = api.overrides({"size": {"sleeves": 1.2}, "fabrics": {"above_waistband": {"material": "silk", "friction": 2}}})
+    assert words == ["size={sleeves:1.2}", "fabrics={above_waistband:{material:silk,friction:2}}"]
+    events = [{"time": 0.5, "open": "front_buttons"}]
+    config = load_config("rollout", [*words, *api.overrides({"events": events})])
+    assert plain(config.size) == {"sleeves": 1.2}
+    assert plain(config.fabrics) == {"above_waistband": {"material": "silk", "friction": 2}}
+    assert plain(config.events) == events
+    with pytest.raises(ConfigError, match="fabrics: 'a part' cannot be a key of a table"):
+        api.overrides({"fabrics": {"a part": "silk"}})
+
+
+def test_a_simulation_takes_tables_and_events() -> None:
+    shirt = hood.simulate(
+        "shirt", num_frames=1, stepper="guess", size={"sleeves": 1.1}, fabrics={"sleeves": "silk"},
+        events=[{"time": 0.0, "open": "front_buttons"}],
+    )  # fmt: skip
+    plain_shirt = hood.simulate("shirt", num_frames=1, stepper="guess")
+    longer = shirt.scene.cloth.rest_area.sum() / plain_shirt.scene.cloth.rest_area.sum()
+    assert 1.02 < float(longer) < 1.21
+    assert len(shirt.scene.cloth.lame_mu.unique()) == 2
 
 
 def test_the_page_on_python_lists_every_public_name() -> None:

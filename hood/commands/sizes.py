@@ -16,10 +16,12 @@ from hood.assets.files.atomic import write_atomically
 from hood.commands.common import output_folder, prepare_folder, require_package
 from hood.commands.resizing import FITS
 from hood.commands.setup import check_config, make_stepper, set_up
+from hood.commands.words import overrides
 from hood.config import ConfigError, load_config, plain, require_choice, shown
 from hood.dynamics.ease import Ease, measure_ease
 from hood.dynamics.recorder import RolloutData, still_of
 from hood.dynamics.rollout import simulate
+from hood.dynamics.stepper import Stepper
 from hood.media.film import Film
 from hood.media.render import contact_sheet
 from hood.media.video import save_png
@@ -58,10 +60,13 @@ def run(arguments: Sequence[str]) -> int:
     asked = [_rollout_config(config, size, shape) for shape in _shapes(config) for size in _sizes(config).values()]
     for one in asked:
         check_config(one)
+    if str(config.body) == "none":
+        raise ConfigError("body=none: there is nobody who wears the garment; give a body")
     prepare_folder(folder)
     names = [(size, shape) for shape in _shapes(config) for size in _sizes(config)]
-    runs = zip(names, asked, strict=True)
-    worn = [_wear(size, shape, one) for (size, shape), one in tqdm(runs, total=len(names), desc="sizes", disable=None)]
+    stepper, _ = make_stepper(asked[0])
+    runs = tqdm(zip(names, asked, strict=True), total=len(names), desc="sizes", disable=None)
+    worn = [_wear(size, shape, one, stepper) for (size, shape), one in runs]
     print("\n".join(_table(worn)))
     record = [{"size": one.size, "shape": one.shape} | asdict(one.ease) | {"word": one.ease.word} for one in worn]
     write_atomically(folder / "sizes.json", json.dumps(record, indent=1).encode())
@@ -95,28 +100,18 @@ def _shapes(config: DictConfig) -> list[tuple[float, ...]]:
 def _rollout_config(config: DictConfig, size: Any, shape: tuple[float, ...]) -> DictConfig:
     """The rollout of one size on one body: nothing is measured on the way."""
     keys = {key: config[key] for key in _KEYS} | {"size": size, "betas": list(shape)}
-    words = [f"{key}={_word(plain(value))}" for key, value in keys.items() if value is not None]
-    return load_config("rollout", [*words, "metrics=none", "guard=off", "video=none"])
+    keys |= {"metrics": "none", "guard": "off", "video": "none"}
+    return load_config("rollout", overrides({key: plain(value) for key, value in keys.items()}))
 
 
-def _word(value: Any) -> str:
-    """As Hydra writes it."""
-    if isinstance(value, dict):
-        return "{" + ",".join(f"{key}:{_word(item)}" for key, item in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ",".join(map(_word, value)) + "]"
-    return json.dumps(value) if isinstance(value, str) and not value.isidentifier() else str(value)
-
-
-def _wear(size: str, shape: tuple[float, ...], config: DictConfig) -> Worn:
+def _wear(size: str, shape: tuple[float, ...], config: DictConfig, stepper: Stepper) -> Worn:
     """The garment after the frames of its rollout."""
-    ready = set_up(config, make_stepper(config)[0], tell=lambda sentence: None)
+    ready = set_up(config, stepper, tell=lambda sentence: None)
     scene, count = ready.scene, min(int(config.num_frames), ready.scene.num_frames)
     frames = simulate(ready.stepper, scene, ready.potential, count, metrics="none", settle=str(ready.config.settle))
     (frame,) = deque(frames, maxlen=1)
     ease = measure_ease(scene, scene.cloth_at(frame.index), frame.state, frame.index)
-    if ease is None:
-        raise ConfigError(f"body={config.body}: there is nobody who wears the garment; give a body")
+    assert ease is not None  # there is a body
     still = RolloutData(
         frame.world_pos.numpy()[None],
         scene.garment.faces,

@@ -1,0 +1,61 @@
+"""Python values as the ``key=value`` words of a command."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from hood.config import TABLES, ConfigError
+
+#: Strings that Hydra reads as they are; all others are quoted.
+_BARE = re.compile(r"[A-Za-z_][A-Za-z0-9_./+-]*")
+_WORDS = ("null", "true", "false", "nan", "inf")
+#: What Hydra reads as a key of a table, without quotes.
+_KEY = re.compile(r"[A-Za-z0-9_./+-]+")
+
+
+def overrides(keys: Mapping[str, Any], group: str = "") -> list[str]:
+    """Python values as the ``key=value`` words of a command.
+
+    Args:
+        keys: by name; None is ``null``. A dictionary is a group of keys, of :data:`hood.config.TABLES` and in lists a table.
+        group: what stands before every key, with a dot.
+
+    Raises:
+        ConfigError: a value that no command line can hold.
+    """
+    words: list[str] = []
+    for key, value in keys.items():
+        if isinstance(value, Mapping) and (group or key not in TABLES):
+            words += overrides(value, f"{group}{key}.")
+        else:
+            words.append(f"{group}{key}={_word(value, group + key)}")
+    return words
+
+
+def _word(value: Any, key: str) -> str:
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, (int, float)):
+        return repr(value)
+    if isinstance(value, (list, tuple)):
+        return f"[{','.join(_word(item, key) for item in value)}]"
+    if isinstance(value, Mapping):
+        return "{" + ",".join(f"{_key(name, key)}:{_word(item, key)}" for name, item in value.items()) + "}"
+    if isinstance(value, (str, Path)):
+        text = str(value)
+        if _BARE.fullmatch(text) and text.lower() not in _WORDS:
+            return text
+        return "'" + re.sub(r"(\\+)(?=')|(\\+)$", lambda found: 2 * found[0], text).replace("'", "\\'") + "'"
+    raise ConfigError(f"{key}={value!r}: give a number, a word, a path, a list or a table of them, or None")
+
+
+def _key(name: Any, key: str) -> str:
+    text = str(name)
+    if not _KEY.fullmatch(text):
+        raise ConfigError(f"{key}: {text!r} cannot be a key of a table; use letters, digits and _ . / + -")
+    return text
