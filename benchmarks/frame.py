@@ -53,7 +53,7 @@ POTENTIAL = default_potential()
 
 def refined(garment: Garment, count: int) -> Garment:
     """The garment's shape in T-pose with the longest edges halved until it has ``count`` vertices; unbound, nothing pinned."""
-    pos, faces = garment.rest_pos if garment.skin_pos is None else garment.skin_pos, garment.faces
+    pos, faces = garment.worn_pos, garment.faces
     while len(pos) < count:
         pos, faces = _halve(pos, faces, count - len(pos))
     return Garment(garment.name, pos, faces, np.zeros(len(pos), dtype=bool))

@@ -27,7 +27,7 @@ from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
 from hood.losses.stretching import Stretching
 from hood.scene.cloth import Cloth
-from hood.scene.mesh_motion import NoBody, worn_pos
+from hood.scene.mesh_motion import NoBody
 from hood.scene.scene import Scene, build_scene, dress, local_origin
 from hood.scene.state import State, StepInput
 from hood.testing import grid
@@ -154,7 +154,7 @@ def make_setting(name: str, num_frames: int, potential: Potential, stretch: floa
     fabric = replace(FABRIC, lame_mu=stretch * mu, lame_lambda=stretch * lam)
     scene = _scene_of(name, num_frames, fabric, torch.float64)
     if name in SHEETS:
-        start = Moment(worn_pos(scene.garment), np.zeros_like(scene.garment.rest_pos))
+        start = Moment(scene.garment.worn_pos, np.zeros_like(scene.garment.rest_pos))
     else:
         state, _ = rest_state(NewtonStepper(potential), scene, potential, 0)
         start = Moment(state.pos.numpy() + state.origin[0].numpy(), state.vel.numpy())

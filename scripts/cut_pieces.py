@@ -23,11 +23,6 @@ _SHARE, _HEIGHTS = 0.42, 40
 _SHOULDER, _WAIST = 0.05, 0.02
 
 
-def worn(garment: Garment) -> np.ndarray:
-    """(V, 3) m, in T-pose."""
-    return garment.rest_pos if garment.skin_pos is None else garment.skin_pos
-
-
 def beyond(centres: np.ndarray, sign: float) -> np.ndarray:
     """(F,) bool: face centres (F, 3) that lie farther out to a side than the share of the half width at their height."""
     height = centres[:, 1]
@@ -39,20 +34,20 @@ def beyond(centres: np.ndarray, sign: float) -> np.ndarray:
 
 def held(name: str, piece: Garment, top: float, depth: float) -> Garment:
     """The piece with a name, held where it is no farther than ``depth`` [m] below ``top`` [m]."""
-    return replace(piece, name=name, pinned=piece.pinned | (worn(piece)[:, 1] > top - depth))
+    return replace(piece, name=name, pinned=piece.pinned | (piece.worn_pos[:, 1] > top - depth))
 
 
 def pieces() -> list[Garment]:
     dress, skirt = load_garment("dress_12k"), load_garment("skirt_12k")
-    centres, shoulder = worn(dress)[dress.faces].mean(axis=1), worn(dress)[:, 1].max()
+    centres, shoulder = dress.worn_pos[dress.faces].mean(axis=1), dress.worn_pos[:, 1].max()
     found = [
         held(name, piece_of(dress, beyond(centres, sign)), shoulder, _SHOULDER)
         for name, sign in (("dress_side", 1.0), ("dress_side_right", -1.0))
     ]
-    centres = worn(skirt)[skirt.faces].mean(axis=1)
+    centres = skirt.worn_pos[skirt.faces].mean(axis=1)
     front = (centres[:, 2] > 0.0) & (np.abs(centres[:, 0]) < 0.7 * np.abs(centres[:, 0]).max())
     piece = piece_of(skirt, front)
-    return [*found, held("skirt_front", piece, worn(piece)[:, 1].max(), _WAIST)]
+    return [*found, held("skirt_front", piece, piece.worn_pos[:, 1].max(), _WAIST)]
 
 
 def main() -> None:

@@ -38,7 +38,7 @@ def _made(garment: Garment) -> np.ndarray:
     body = load_body()
     surface = body.shaped(np.zeros(0))[0]
     # as it starts: outside of the body
-    cloth = garment.rest_pos if garment.skin_pos is None else garment.skin_pos
+    cloth = garment.worn_pos
     meshes = [
         RenderMesh(surface, body.faces, BODY_COLOR, behind=1e-3),
         RenderMesh(cloth, garment.faces, part_colour(0), hem_distance(garment.rest_pos, garment.faces)),

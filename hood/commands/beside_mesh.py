@@ -13,7 +13,7 @@ from hood.assets.garment.suspicions import suspect_place, suspect_sides
 from hood.assets.garment.units import UNITS, find_scale, size_ratio, used
 from hood.commands.describe_place import describe_place
 from hood.commands.placing import find_place_on_mesh
-from hood.scene.mesh_motion import MeshMotion, worn_pos
+from hood.scene.mesh_motion import MeshMotion
 
 if TYPE_CHECKING:
     from hood.commands.findings import Finding
@@ -23,7 +23,7 @@ def place_beside_mesh(finding: Finding, garment: Garment, motion: MeshMotion) ->
     """Record units, up axis, facing and place of ``garment`` on the first frame of a mesh, or on its rest pose where that is
     nearer: what ``hood prepare`` finds for itself. Where it finds no place, the garment is looked at where it is."""
     surfaces = [motion.points(0)] + ([] if motion.sequence.rest is None else [motion.sequence.rest])
-    pos = worn_pos(garment)
+    pos = garment.worn_pos
     finding.facts["size in body heights"] = float(f"{size_ratio(used(pos, garment.faces), surfaces[0]):.3g}")
     found = find_place_on_mesh(garment, motion, Asked())
     if found is not None and (found.refusal is None or found.resized is not None):

@@ -109,7 +109,7 @@ def inspect_garment(name: str, body: Body | MeshMotion, wearer: Sequence[str], b
     if isinstance(body, MeshMotion):
         place_beside_mesh(finding, garment, body)
     elif garment.bound:
-        _name_openings(finding, garment.rest_pos if garment.skin_pos is None else garment.skin_pos, garment.faces, body)
+        _name_openings(finding, garment.worn_pos, garment.faces, body)
     else:
         _place_beside(finding, garment, body, np.zeros(10) if betas is None else betas)
     return finding

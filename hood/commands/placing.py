@@ -15,7 +15,7 @@ from hood.assets.garment.placement import UP_AXES, Placement
 from hood.assets.garment.units import find_scale, possible, size_ratio, used
 from hood.assets.motion.poses import A_POSE_ANGLE, arms_down
 from hood.config import ConfigError, plain, require_choice
-from hood.scene.mesh_motion import MeshMotion, wearable, worn_pos
+from hood.scene.mesh_motion import MeshMotion, wearable
 
 AUTO = "auto"
 #: Meshes larger than this [m] are rooms and vehicles: places on them are not searched for.
@@ -86,7 +86,7 @@ def find_place_on_mesh(garment: Garment, motion: MeshMotion, asked: Asked) -> Fo
         return None
     best: Found | None = None
     for surface in surfaces:
-        found = find_placement(worn_pos(garment), garment.faces, _statue(surface, motion.faces), asked)
+        found = find_placement(garment.worn_pos, garment.faces, _statue(surface, motion.faces), asked)
         known = best is not None and (found.refusal is not None, found.misfit) >= (best.refusal is not None, best.misfit)
         best = best if known else found
     return best

@@ -31,7 +31,7 @@ from hood.config import ConfigError, plain
 from hood.mesh.quality import check_triangles
 from hood.scene.fitting import FitFigures, fit_figures
 from hood.scene.load_motion import NO_MOTION, MotionOptions, load_motion
-from hood.scene.mesh_motion import MeshMotion, worn_pos
+from hood.scene.mesh_motion import MeshMotion
 from hood.scene.scene import dress
 
 #: Keys that say in which pose and shape of a model a garment was made: a mesh has one of each.
@@ -90,7 +90,7 @@ def _fit(fitting: Fitting, name: str, config: DictConfig, motion: MeshMotion) ->
     check_triangles(fitting.garment.rest_pos, fitting.garment.faces, name)
     # What another body's weights say does not hold here: the place of a garment is where it is worn.
     fitting.garment = replace(
-        fitting.garment, lbs_weights=None, shapedirs=None, bound_to=None, rest_turn=None, skin_pos=worn_pos(fitting.garment)
+        fitting.garment, lbs_weights=None, shapedirs=None, bound_to=None, rest_turn=None, skin_pos=fitting.garment.worn_pos
     )
     _leave_mesh(fitting, motion, clearance)
     give_room(fitting, sides)
@@ -100,7 +100,7 @@ def _fit(fitting: Fitting, name: str, config: DictConfig, motion: MeshMotion) ->
 def _leave_mesh(fitting: Fitting, motion: MeshMotion, clearance: float) -> None:
     """Where the garment is worn, outside the mesh in its first frame, or in its rest pose where that is nearer; its outside
     away from it."""
-    rest, pos = motion.sequence.rest, worn_pos(fitting.garment)
+    rest, pos = motion.sequence.rest, fitting.garment.worn_pos
     surfaces = [motion.points(0)] if rest is None else [motion.points(0), rest]
     dist, surface = min(
         ((signed_distances(pos, surface, motion.faces), surface) for surface in surfaces),

@@ -69,7 +69,7 @@ def with_held_layers_apart(scene: Scene) -> Scene:
 
 def _shifted(garment: Garment, motion: BodyMotion, shift: Tensor) -> Garment:
     """The garment that skinning takes ``shift`` (V, 3) [m] farther in the first frame of ``motion``."""
-    origin, skin = motion.translation[0], garment.rest_pos if garment.skin_pos is None else garment.skin_pos
+    origin, skin = motion.translation[0], garment.worn_pos
     here = motion.skinned(garment, 0, origin)
     axes = [motion.skinned(replace(garment, skin_pos=skin + axis), 0, origin) - here for axis in np.eye(3)]
     turn = torch.stack(axes, dim=2).cpu().double().numpy()  # (V, 3, 3): what a metre of the T-pose becomes

@@ -104,7 +104,7 @@ class MeshMotion:
         """
         if self._bones(garment) is not None:
             return garment
-        pos, faces = worn_pos(garment), self.faces
+        pos, faces = garment.worn_pos, self.faces
         first = _misfit(pos, self.points(0), faces)
         if self.sequence.rest is not None and self.sequence.weights is not None:
             rest = _misfit(pos, self.sequence.rest, faces)
@@ -135,7 +135,7 @@ class MeshMotion:
         bones = self._bones(garment)
         if bones is not None:
             pose = torch.as_tensor(bones[min(frame, len(bones) - 1)][None])
-            rest, weights = (torch.as_tensor(table, dtype=pose.dtype) for table in (worn_pos(garment), garment.lbs_weights))
+            rest, weights = (torch.as_tensor(table, dtype=pose.dtype) for table in (garment.worn_pos, garment.lbs_weights))
             pos = linear_blend_skinning(rest, weights, pose)[0].numpy()
         else:
             pos = self._anchored(garment).carried(self.points(frame))
@@ -156,7 +156,7 @@ class MeshMotion:
     def _anchored(self, garment: Garment) -> Anchors:
         known = self._anchors.get(id(garment))
         if known is None or known[0] is not garment:
-            known = (garment, anchors(worn_pos(garment), self.points(0)))
+            known = (garment, anchors(garment.worn_pos, self.points(0)))
             self._anchors[id(garment)] = known
         return known[1]
 
@@ -205,7 +205,7 @@ class NoBody:
 
     def skinned(self, garment: Garment, frame: int, origin: np.ndarray) -> Tensor:
         """(V, 3) m: the garment where it was given; pins stay there."""
-        return torch.as_tensor(worn_pos(garment) - origin).to(self.device, self.dtype)
+        return torch.as_tensor(garment.worn_pos - origin).to(self.device, self.dtype)
 
 
 def mesh_motion(
@@ -221,11 +221,6 @@ def mesh_motion(
         boxes = np.repeat(boxes, count, axis=0)
     faces = torch.as_tensor(sequence.faces, device=device)
     return MeshMotion(sequence, count, boxes, dtype, torch.device(device), faces)
-
-
-def worn_pos(garment: Garment) -> np.ndarray:
-    """(V, 3) m: where a garment is in the first frame of a body without a skin, or in the bind pose of its weights."""
-    return garment.rest_pos if garment.skin_pos is None else garment.skin_pos
 
 
 class _Misfit(NamedTuple):

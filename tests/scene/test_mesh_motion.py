@@ -14,7 +14,7 @@ from hood.assets.garment.garment import Garment
 from hood.assets.motion.mesh_sequence import MeshSequence
 from hood.assets.motion.poses import arms_down
 from hood.assets.motion.sequence import PoseSequence
-from hood.scene.mesh_motion import NoBody, mesh_motion, worn_pos
+from hood.scene.mesh_motion import NoBody, mesh_motion
 from hood.scene.motion import body_motion
 from hood.scene.scene import Scene, dress
 from hood.scene.start import free_stretch
@@ -78,7 +78,7 @@ def test_the_garment_starts_where_it_was_given() -> None:
     state = dress(TUBE, motion).start(0)
     np.testing.assert_allclose(state.pos.double().numpy() + state.origin.numpy(), TUBE.rest_pos, atol=1e-6)
     elsewhere = replace(TUBE, rest_pos=TUBE.rest_pos @ Rotation.from_euler("x", 1).as_matrix() + 3, skin_pos=TUBE.rest_pos)
-    np.testing.assert_array_equal(worn_pos(elsewhere), TUBE.rest_pos)
+    np.testing.assert_array_equal(elsewhere.worn_pos, TUBE.rest_pos)
     scene = dress(elsewhere, motion)
     np.testing.assert_allclose(scene.cloth.rest_pos, elsewhere.rest_pos, atol=1e-6)
     pos = scene.start(0).pos.double().numpy() + scene.start(0).origin.numpy()

@@ -21,7 +21,7 @@ _SIDE, _EDGES = 1.0, 24
 
 def _size(garment: Garment, factor: float, rng: np.random.Generator) -> Garment:
     """Its rest shape, put on as it was."""
-    worn = garment.rest_pos if garment.skin_pos is None else garment.skin_pos
+    worn = garment.worn_pos
     return replace(garment, rest_pos=garment.rest_pos * factor, skin_pos=worn)
 
 

@@ -115,7 +115,7 @@ def clean(fitting: Fitting) -> None:
 def face_out(fitting: Fitting, surface: np.ndarray, body_faces: np.ndarray) -> None:
     """Turn all faces over where the garment is inside out on the body (W, 3) [m], ``body_faces`` (G, 3)."""
     garment = fitting.garment
-    pos = garment.rest_pos if garment.skin_pos is None else garment.skin_pos
+    pos = garment.worn_pos
     if suspect_sides(pos, garment.faces, surface, body_faces):
         count = len(garment.faces)
         fitting.garment = _turn_faces(garment, np.ones(count, dtype=bool))

@@ -69,7 +69,7 @@ def bind_garment(garment: Garment, body: Body) -> Garment:
     fits = garment.lbs_weights is not None and garment.lbs_weights.shape[1] == body.num_joints
     if garment.bound and fits and garment.bound_to in (None, body.name):
         return garment
-    at = garment.rest_pos if garment.skin_pos is None else garment.skin_pos
+    at = garment.worn_pos
     weights, shapedirs = _spread_skin(at, garment.faces, body, body.v_template)
     return replace(garment, lbs_weights=weights, shapedirs=shapedirs, bound_to=body.name)
 

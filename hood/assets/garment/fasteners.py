@@ -134,7 +134,7 @@ def _nearest(pos: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray
 def with_room(garment: Garment, pairs: np.ndarray) -> tuple[Garment, int]:
     """The garment with ``pairs`` (N, 2) that are nearer to each other than :data:`ROOM` drawn apart, each vertex towards the
     cloth of its own side, and how many vertices were moved."""
-    worn = garment.rest_pos if garment.skin_pos is None else garment.skin_pos
+    worn = garment.worn_pos
     apart = np.linalg.norm(worn[pairs[:, 0]] - worn[pairs[:, 1]], axis=1)
     pairs = np.unique(pairs[apart < ROOM - _ROUNDING], axis=0)
     if len(pairs) == 0:

@@ -50,6 +50,11 @@ class Garment:
     def bound(self) -> bool:
         return self.lbs_weights is not None and self.shapedirs is not None
 
+    @property
+    def worn_pos(self) -> np.ndarray:
+        """(V, 3) m: where it is worn, on the mean body in T-pose or in the first frame of a body without a skin."""
+        return self.rest_pos if self.skin_pos is None else self.skin_pos
+
     def shaped(self, betas: np.ndarray) -> np.ndarray:
         """Rest shape (V, 3) [m], grown with the body of shape ``betas``."""
         offset = self._offset(betas)
@@ -59,7 +64,7 @@ class Garment:
 
     def tpose(self, betas: np.ndarray) -> np.ndarray:
         """Garment (V, 3) [m] in T-pose on the body of shape ``betas``: what skinning poses."""
-        return (self.rest_pos if self.skin_pos is None else self.skin_pos) + self._offset(betas)
+        return self.worn_pos + self._offset(betas)
 
     def _offset(self, betas: np.ndarray) -> np.ndarray:
         assert self.shapedirs is not None, "bind the garment first"

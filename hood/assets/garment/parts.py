@@ -79,7 +79,7 @@ def _sleeves(part: str, garment: Garment, body: Body | None) -> np.ndarray:
 
 def _centres(garment: Garment) -> np.ndarray:
     """(F, 3) m, in T-pose."""
-    pos = garment.rest_pos if garment.skin_pos is None else garment.skin_pos
+    pos = garment.worn_pos
     return np.asarray(pos[garment.faces].mean(axis=1))
 
 

@@ -107,7 +107,7 @@ def region_loop(garment: Garment, body: Body, region: str) -> np.ndarray:
     joints = body.shaped(np.zeros(0))[1]
     if joint >= len(joints):
         raise ValueError(f"pins={region}: the body has {len(joints)} joints and no {JOINTS[joint]}; give vertex numbers")
-    pos = garment.rest_pos if garment.skin_pos is None else garment.skin_pos
+    pos = garment.worn_pos
     loops = topology.boundary_loops(garment.faces)
     if not loops:
         raise ValueError(f"pins={region}: garment {garment.name!r} is closed, it has no openings; give vertex numbers")

@@ -36,7 +36,7 @@ def tailored(garment: Garment, factors: Mapping[str, float], body: Body | None =
     factor = np.ones(len(garment.faces))
     for part, value in factors.items():
         factor[part_faces(part, garment, body)] = value
-    worn = garment.rest_pos if garment.skin_pos is None else garment.skin_pos
+    worn = garment.worn_pos
     return replace(garment, rest_pos=_stretched(garment.rest_pos, garment.faces, factor), skin_pos=worn)
 
 

@@ -177,7 +177,7 @@ def test_other_faults(tmp_path: Path) -> None:
     small = load_garment(tmp_path / "small.npz")
     np.testing.assert_allclose(small.rest_pos, 0.5 * whole.rest_pos)
     assert small.skin_pos is not None
-    np.testing.assert_allclose(small.skin_pos, whole.rest_pos if whole.skin_pos is None else whole.skin_pos)
+    np.testing.assert_allclose(small.skin_pos, whole.worn_pos)
     write_garment(tmp_path / "flipped.npz", "tank", "flipped:30")
     assert int((load_garment(tmp_path / "flipped.npz").faces != whole.faces).any(axis=1).sum()) == 30
 
