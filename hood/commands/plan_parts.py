@@ -26,6 +26,7 @@ class Part:
         watched: whether a rollout notices where it was wrong to leave the part out; others are measured and kept.
         stays: why one that is noticed is kept all the same; "" where it is not.
         instead: the name is that of another way to take the steps, not of what is left out.
+        refitted: the words change the fabric, so the cloth is made anew with them.
     """
 
     name: str
@@ -36,6 +37,7 @@ class Part:
     watched: bool = True
     stays: str = ""
     instead: bool = False
+    refitted: bool = False
 
 
 #: Iterations after the inertial guess, and after a network, that are measured as ways to take the steps.
@@ -73,6 +75,18 @@ def _target(share: float) -> Callable[[DictConfig], bool]:
     return lambda config: _solver(config) and float(config.solver.target_rg) < share
 
 
+def _given(key: str) -> Callable[[DictConfig], bool]:
+    return lambda config: config.get(key) is not None
+
+
+def _by_factors(config: DictConfig) -> bool:
+    # Measured cloth has a shear stiffness of the same name.
+    material = config.material
+    return "woven" not in material and any(float(material.get(name, 1.0)) != 1.0 for name in ("warp", "weft", "shear"))
+
+
+#: Words that make woven cloth isotropic: measured cloth, and fabrics with factors.
+_MEASURED, _FACTORS = ("material.woven=false",), ("material.warp=1", "material.weft=1", "material.shear=1")
 #: Part, and whether a settled config has it.
 _TERMS: tuple[tuple[Part, Callable[[DictConfig], bool]], ...] = (
     (Part("bending", "folds are wide, not sharp", ("losses.terms.bending=null",), "bending"), _has("bending")),
@@ -104,8 +118,35 @@ _TERMS: tuple[tuple[Part, Callable[[DictConfig], bool]], ...] = (
         ),
         acts,
     ),
+    (
+        Part("cloth friction", "layers hang on each other", ("cloth_friction=0",), "layers", watched=False),
+        lambda config: acts(config) and float(config.cloth_friction) > 0.0,
+    ),
+    (Part("air", "wind pushes, still air brakes", ("losses.terms.air=null",), "air"), _given("wind")),
+    (
+        Part(
+            "damping", "vibrations die", ("losses.terms.stretch_damping=null", "losses.terms.bend_damping=null"),
+            "stretch_damping",
+        ),
+        lambda config: float(config.damping) > 0.0,
+    ),
     (Part("gravity", "weight", ("gravity=0",), "gravity", watched=False), lambda config: float(config.gravity) > 0.0),
 )  # fmt: skip
+#: Of the fabric. Their rows are evidence: no energy is left out whose return would be noticed.
+_FABRIC: tuple[tuple[Part, Callable[[DictConfig], bool]], ...] = (
+    (
+        Part("fabrics of parts", "parts are of other cloth", ("fabrics=null",), watched=False, refitted=True),
+        _given("fabrics"),
+    ),
+    (
+        Part("warp and weft", "threads stretch less than they shear", _MEASURED, watched=False, refitted=True),
+        lambda config: config.material.get("woven") is True,
+    ),
+    (
+        Part("warp and weft", "threads stretch less than they shear", _FACTORS, watched=False, refitted=True),
+        _by_factors,
+    ),
+)
 _ACCURACY: tuple[tuple[Part, Callable[[DictConfig], bool]], ...] = (
     (Part("last iterations", "forces balanced to 3%", ("solver.target_rg=0.03",), rivals="steps"), _target(0.03)),
     (Part("later iterations", "forces balanced to 10%", ("solver.target_rg=0.1",), rivals="steps"), _target(0.1)),
@@ -114,7 +155,7 @@ _ACCURACY: tuple[tuple[Part, Callable[[DictConfig], bool]], ...] = (
 
 def parts_of(config: DictConfig, steppers: bool = False) -> list[Part]:
     """The parts that a settled config of ``hood rollout`` has; with ``steppers`` other ways to take its steps as well."""
-    found = [part for part, there in (*_TERMS, *_ACCURACY) if there(config)]
+    found = [part for part, there in (*_TERMS, *_FABRIC, *_ACCURACY) if there(config)]
     iterations = _iterations(config)
     for count in sorted({iterations // 2, 1} - {0, iterations}, reverse=True) if iterations else []:
         words = (f"refine={count}",)

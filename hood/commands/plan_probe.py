@@ -167,7 +167,7 @@ class _Probe:
         found = {}
         for part in there:
             try:
-                found[part.name] = self.made.make(part.words)
+                found[part.name] = self.made.make(part.words, part.words if part.refitted else ())
             except ValueError as error:
                 if not part.instead:
                     raise

@@ -19,7 +19,7 @@ NOMINAL = "nominal"
 #: Factors whose cells go from one end of a range to the other.
 ORDERED = frozenset(
     "dt stretching bending density gravity friction speed teleport turn spin stop fall offset size resolution drop slivers "
-    "duplicates isolated flipped irregular components".split()
+    "duplicates isolated flipped irregular components damping".split()
 )
 
 
@@ -54,7 +54,8 @@ class Cell:
 
 def cells() -> tuple[Cell, ...]:
     """All of them, the nominal one first; those of a factor from one end of its range to the other."""
-    groups = (_nominal, _scene, _motions, _poses, _garments, _meshes, _pins_and_layers, _pairs, _together, _long, _inputs)
+    settings = (_nominal, _scene, _motions, _poses, _garments, _meshes, _pins_and_layers, _air, _cloth, _changes)
+    groups = (*settings, _pairs, _together, _long, _inputs)
     return tuple(cell for group in groups for cell in group())
 
 
@@ -148,9 +149,48 @@ def _pins_and_layers() -> Iterator[Cell]:
     for outfit in ("[tank,skirt]", "[shorts,skirt]", "[tank,trousers]"):
         yield Cell("layers", outfit, garment=outfit)
         yield Cell("layers", f"{outfit} crouching", motion="crouch:110", garment=outfit)
+    for friction in (0.5, 2.0):
+        yield Cell("layers", f"[tank,skirt], friction {friction:g}", (f"cloth_friction={friction:g}",), garment="[tank,skirt]")
     for garment, pose in (("dress", "crouch:110"), ("longsleeve", "crossed:110"), ("trousers", "crouch:130")):
         name = f"{garment} {pose.replace(':', ' ')}"
         yield Cell("compression", name, motion=pose, garment=garment)
+
+
+def _air() -> Iterator[Cell]:
+    """Wind, from still air to a storm, and damping of the fabric."""
+    for wind, word in (("0", "still air"), ("5", "5 m/s"), ("20", "20 m/s"), ("[40,0,0]", "40 m/s from a side")):
+        yield Cell("wind", word, (f"wind={wind}",))
+    yield Cell("wind", "10 m/s, gusts of half as much", ("wind=10", "gusts=0.5"))
+    for seconds in (1e-3, 1e-2, 0.1, 1.0):
+        yield Cell("damping", f"{seconds:g} s", (f"damping={seconds:g}",))
+
+
+def _cloth() -> Iterator[Cell]:
+    """Cloth of threads, and cloth that differs from part to part."""
+    for name in ("silk_habotai", "denim_12oz", "wool_felt"):
+        yield Cell("woven", name, (f"material={name}", "material.woven=true"))
+    for factor in (0.1, 10.0, 100.0, 1e3):
+        yield Cell("woven", f"warp ×{factor:g}", (f"material.warp={factor:g}",))
+    yield Cell("fabrics", "silk below, denim above", ("fabrics={below_waistband:silk,above_waistband:denim}",))
+    for factor in (0.01, 100.0, 1e3):
+        words = ",".join(f"{name}:{_times(name, factor)}" for name in ("lame_mu", "lame_lambda"))
+        yield Cell("fabrics", f"stretching ×{factor:g} below", (f"fabrics={{below_waistband:{{{words}}}}}",))
+    for friction in (0.0, 5.0):
+        yield Cell("fabrics", f"friction {friction:g} below", (f"fabrics={{below_waistband:{{friction:{friction:g}}}}}",))
+
+
+def _changes() -> Iterator[Cell]:
+    """Garments that grow and shrink, and what opens, closes and comes off on the way."""
+    for first, last in ((0.9, 1.1), (1.3, 0.9), (1.0, 1.5)):
+        yield Cell("growth", f"×{first:g} to ×{last:g}", (f"size={first:g}", f"size_end={last:g}", "size_seconds=1"))
+    for factor in (0.8, 1.2):
+        yield Cell("growth", f"sleeves ×{factor:g}", (f"size={{sleeves:{factor:g}}}",), garment="longsleeve")
+    for garment, row in (("shirt", "front_buttons"), ("jacket", "front_zip")):
+        turns = f"[{{time: 0.4, open: {row}}}, {{time: 1.0, close: {row}}}]"
+        yield Cell("events", f"{garment}, slowly", (f"events={turns}",), garment=garment)
+        yield Cell("events", f"{garment}, 3 m/s", (f"events={turns}", "events_speed=3"), garment=garment)
+        yield Cell("events", f"{garment}, jog", (f"events={turns}",), garment=garment, sequence="jog")
+    yield Cell("events", "skirt comes off", ("events=[{time: 0.5, detach: pins}]",), garment="skirt")
 
 
 def _pairs() -> Iterator[Cell]:

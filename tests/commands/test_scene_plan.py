@@ -86,6 +86,24 @@ def test_what_is_hopeless_or_stays_is_looked_at_once(made: Path) -> None:
     assert rows["bending"]["windows"] == 2
 
 
+def test_forces_and_fabrics_of_a_scene_are_parts_of_it(tmp_path: Path) -> None:
+    scene = ["garment=skirt", "sequence=twists", "stepper=newton", "num_frames=24", "wind=5", "damping=0.01", "material.warp=8"]
+    wanted = "parts=[air,damping,fabrics of parts,warp and weft]"
+    fabrics = "fabrics={below_waistband:denim}"
+    assert main(["plan", *scene, fabrics, wanted, "windows=1", "frames=1", "accuracy=1e-6", f"output={tmp_path}"]) == 0
+    rows = {row["part"]: row for row in read(tmp_path / "plan.json")["rows"]}
+    assert set(rows) == {"air", "damping", "fabrics of parts", "warp and weft"}
+    # What their settings say is what is missing: an omission that changes nothing would leave γ where it is.
+    assert all(row["gamma_p95"] > 1e-5 and row["mm"] > 0.01 for row in rows.values()), rows
+    assert all(row["decision"] == "kept" for row in rows.values())
+    assert all(rows[name]["force"] > 0.0 for name in ("air", "damping"))
+
+
+def test_rows_of_what_a_scene_lacks_do_not_exist(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plan", *WORDS, "parts=[damping]", f"output={tmp_path}"]) == 2
+    assert "damping" in capsys.readouterr().err
+
+
 def test_another_mesh_and_time_step_are_compared_in_mm(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["parts=[mesh tank_4k,60 fps]", "windows=1", "frames=1", f"output={tmp_path}"]
     assert main(["plan", *WORDS, *words]) == 0
