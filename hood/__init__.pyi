@@ -1,5 +1,6 @@
 from hood.api import (
     Simulation as Simulation,
+    export as export,
     load_model as load_model,
     rollout as rollout,
     simulate as simulate,

@@ -174,6 +174,33 @@ def rollout(**keys: Any) -> dict[str, Any]:
     return summary
 
 
+def export(rollout: str | Path, **keys: Any) -> Path:
+    """Run ``hood export``: a rollout as a file that other programs open.
+
+    Args:
+        rollout: its ``rollout.h5``, or the folder of it.
+        keys: those of ``hood export --help``, such as ``format="usd", output="dance.usd"``. Positions are written in metres.
+
+    Returns:
+        The file, or the folder of a format of many files.
+
+    Raises:
+        ValueError, OSError: keys or files that cannot be used.
+
+    Examples:
+        >>> import hood
+        >>> _ = hood.rollout(garment="tank", num_frames=3, video="none", output="outputs/tank")
+        tank: 3 frames, all finite
+        ...
+        >>> hood.export("outputs/tank", format="glb").name
+        outputs/tank/rollout.glb: ...
+        'rollout.glb'
+    """
+    from hood.commands.export import export as write
+
+    return write([str(Path(rollout)), *overrides(keys)])
+
+
 def train(**keys: Any) -> Path:
     """Run ``hood train`` with its keys.
 

@@ -30,6 +30,12 @@ FORMATS = ("usd", "glb", *_FOLDERS)
 
 def run(arguments: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
+    export(arguments)
+    return 0
+
+
+def export(arguments: Sequence[str]) -> Path:
+    """Write what the command's words ask for; returns the file or folder."""
     files, config = split_words("export", arguments)
     if len(files) != 1:
         raise ConfigError(f"number of rollouts given: {len(files)}; give one, hood export rollout.h5")
@@ -42,7 +48,7 @@ def run(arguments: Sequence[str]) -> int:
     print(_export(source, data, target, form, clip_arguments=(parts, count, up)))
     if not bool(data.attributes.get("complete", True)):
         print(f"the rollout is not finished: {len(data.time)} of {data.attributes.get('num_planned', '?')} frames are there")
-    return 0
+    return target
 
 
 def check_formats(forms: Sequence[str]) -> None:

@@ -148,7 +148,7 @@ def summarise_refinement(config: Mapping[str, Any], metrics: Mapping[str, np.nda
     name, value = asked
     iterations, residual = metrics["refine_iterations"][1:], metrics["refine_rg"][1:]
     entry: dict[str, Any] = {
-        "dial": f"{name}={value:g}",
+        "asked": f"{name}={value:g}",
         "method": str(config["refine_method"]),
         "iterations_median": _of(np.median, iterations),
         "iterations_max": _of(np.max, iterations),
@@ -174,7 +174,7 @@ def describe_refinement(summary: Mapping[str, Any]) -> list[str]:
     if entry is None:
         return []
     iterations, residual = entry["iterations_median"], entry["rg_median"]
-    text = f"refined, {entry['dial']}: median {iterations or 0:.0f} iterations ({entry['method']})"
+    text = f"refined, {entry['asked']}: median {iterations or 0:.0f} iterations ({entry['method']})"
     # Where every frame's is measured, it is told with its worst.
     told = residual is None or summary.get("relative_gradient_median") is not None
     text += "" if told else f", relative gradient {residual:.2g}"

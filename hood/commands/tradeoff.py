@@ -33,7 +33,7 @@ _LARGEST = ("fine15", "ours")
 #: Measured with all iterations at every size where nothing else is said.
 _REFINED_MODEL = "ours"
 #: Settings that may change from one call to the next: they add points or leave some out, and change none.
-_FREE = ("models", "precisions", "refine_methods", "newton", "dial", "jobs", "turns", "measure", "output")
+_FREE = ("models", "precisions", "refine_methods", "newton", "refined", "jobs", "turns", "measure", "output")
 _FREE_BY_SIZE = ("refine", "guess", "models", "precisions")
 
 
@@ -101,20 +101,20 @@ def _size(config: DictConfig, name: str, models: Sequence[str]) -> Size:
     numbers = int(config[f"frames_{name}"]), int(config[f"states_{name}"])
     precisions = tuple(map(str, values("precisions")))
     further = () if name == SIZES[0] else tuple(plain(config[f"refine_{SIZES[0]}"]))
-    dial = (_refined_model(config, models), further)
+    refined = (_refined_model(config, models), further)
     shapes = tuple(tuple(map(float, shape)) for shape in values("shapes"))
-    return Size(name, garments, values("refine"), values("guess"), *numbers, wanted, precisions, dial, shapes)
+    return Size(name, garments, values("refine"), values("guess"), *numbers, wanted, precisions, refined, shapes)
 
 
 def _refined_model(config: DictConfig, models: Sequence[str]) -> str:
     """The model that is measured with every number of iterations at every size; "" for none."""
-    if config.dial is None:
+    if config.refined is None:
         return next((model for model in models if model_name(model) == _REFINED_MODEL), "")
-    if str(config.dial) == "none":
+    if str(config.refined) == "none":
         return ""
-    if str(config.dial) not in (*models, *map(model_name, models)):
-        raise ConfigError(f"dial={config.dial}: is none of the models ({', '.join(models) or 'none'})")
-    return str(config.dial)
+    if str(config.refined) not in (*models, *map(model_name, models)):
+        raise ConfigError(f"refined={config.refined}: is none of the models ({', '.join(models) or 'none'})")
+    return str(config.refined)
 
 
 def collect(

@@ -25,7 +25,7 @@ class Size:
         guess: iterations of the solver alone.
         models: names of the models that are measured at this size; empty for all.
         precisions: those that are measured at this size; empty for all.
-        dial: a model that is measured with further numbers of iterations in the first precision, and these numbers.
+        refined: a model that is measured with further numbers of iterations in the first precision, and these numbers.
         shapes: coefficients of the bodies; every motion is done by each.
     """
 
@@ -37,12 +37,12 @@ class Size:
     gap_states: int
     models: tuple[str, ...] = ()
     precisions: tuple[str, ...] = ()
-    dial: tuple[str, tuple[int, ...]] = ("", ())
+    refined: tuple[str, tuple[int, ...]] = ("", ())
     shapes: tuple[tuple[float, ...], ...] = ((),)
 
     def iterations(self, model: str) -> list[int]:
         """All that this network is measured with in the first precision, in order."""
-        further = self.dial[1] if self.dial[0] in (model, model_name(model)) else ()
+        further = self.refined[1] if self.refined[0] in (model, model_name(model)) else ()
         return sorted({*self.refine, *further}) if further else list(self.refine)
 
 

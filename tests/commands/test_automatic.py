@@ -61,7 +61,7 @@ def test_a_larger_garment_is_not_left_to_the_network(capsys: pytest.CaptureFixtu
     found = summary()
     assert found["choice"]["stepper"] == "network"
     assert found["choice"]["refine"] == 5
-    assert found["refinement"]["dial"] == "refine=5"
+    assert found["refinement"]["asked"] == "refine=5"
     assert found["refinement"]["iterations_max"] > 0
 
 
@@ -71,8 +71,8 @@ def test_a_larger_garment_is_not_left_to_the_network(capsys: pytest.CaptureFixtu
 def test_what_is_given_wins_and_what_is_known_needs_nothing(key: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*QUICK, key]) == 0
     assert "refine=5" not in capsys.readouterr().out
-    dial = {"refine=2": "refine=2", "target_rg=0.5": "target_rg=0.5"}.get(key)
-    assert summary().get("refinement", {}).get("dial") == dial
+    asked = {"refine=2": "refine=2", "target_rg=0.5": "target_rg=0.5"}.get(key)
+    assert summary().get("refinement", {}).get("asked") == asked
 
 
 def test_auto_takes_the_faster_one(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

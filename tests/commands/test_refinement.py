@@ -62,7 +62,7 @@ def test_a_target_is_reported_frame_by_frame(capsys: pytest.CaptureFixture[str])
     assert (data.metrics["refine_iterations"] <= 4)[1:].all()
     assert (data.metrics["ms_refine"] > 0)[1:].all()
     entry = json.loads(Path("run/summary.json").read_text())["refinement"]
-    assert entry["dial"] == "target_rg=0.5"
+    assert entry["asked"] == "target_rg=0.5"
     assert (entry["frames_met"], entry["frames_missed"]) == ((met == 1).sum(), (met == 0).sum())
     assert f"{entry['frames_met']} frames met it, {entry['frames_missed']} missed it\n" in capsys.readouterr().out
     assert data.fields["rg"].shape == data.cloth_pos.shape[:2]

@@ -113,8 +113,8 @@ def test_the_dial_brings_its_model_to_every_size_or_is_off() -> None:
 
     every = {0, 1, 2, 5, 10, 20}
     assert most() == {"fine15": {0, 5}, "ours": every, "quickstart": set()}
-    assert most("dial=quickstart") == {"fine15": {0, 5}, "ours": {0, 5}, "quickstart": every}
-    assert most("dial=none") == {"fine15": {0, 5}, "ours": {0, 5}, "quickstart": set()}
+    assert most("refined=quickstart") == {"fine15": {0, 5}, "ours": {0, 5}, "quickstart": every}
+    assert most("refined=none") == {"fine15": {0, 5}, "ours": {0, 5}, "quickstart": set()}
 
 
 def test_every_command_is_one_that_evaluate_reads() -> None:
@@ -309,7 +309,7 @@ REFUSED = {
     "nothing to measure": (["garments_1k=[]"], "no point is left to measure"),
     "no bodies": (["shapes_1k=[]"], "shapes_1k=[]: give shape coefficients"),
     "a body that is none": (["shapes_1k=[[tall]]"], "shapes_1k"),
-    "unknown model on the dial": (["dial=ours"], "dial=ours: is none of the models (untrained:small)"),
+    "unknown model to refine": (["refined=ours"], "refined=ours: is none of the models (untrained:small)"),
     "unknown precision at a size": (["precisions_1k=[bf16]"], "precisions_1k: 'bf16' is none of the precisions (fp32)"),
     "unknown model at a size": (["models_1k=[ours]"], "models_1k: 'ours' is none of the models"),
 }

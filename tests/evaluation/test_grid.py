@@ -54,7 +54,7 @@ def test_without_iterations_methods_are_one() -> None:
 
 
 def test_one_model_is_measured_with_every_number_of_iterations_and_a_size_with_some_precisions() -> None:
-    size = Size("4k", ("dress_4k",), (0, 5), (2,), 24, 5, dial=("ours", (0, 1, 10)))
+    size = Size("4k", ("dress_4k",), (0, 5), (2,), 24, 5, refined=("ours", (0, 1, 10)))
     grid = Grid(("runs/ours/model.safetensors", "fine15"), ("fp32", "bf16"), ("newton",), (size,), newton=False)
     found = [(p.name, p.precision, p.refine) for p in grid.points() if not p.alone]
     assert found == [
