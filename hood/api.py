@@ -29,6 +29,7 @@ from hood.dynamics import rollout as frames
 from hood.dynamics.rollout import Frame
 from hood.dynamics.simulator import Simulator
 from hood.dynamics.stepper import Stepper
+from hood.losses.potential import Potential
 from hood.scene.scene import Scene
 
 
@@ -42,6 +43,7 @@ class Simulation:
     Attributes:
         scene: the cloth, the body and its motion (:class:`hood.scene.scene.Scene`).
         stepper: what takes the steps, refinement included (:class:`hood.dynamics.stepper.Stepper`).
+        potential: the energies that it moves by (:class:`hood.Potential`).
         num_frames: how many frames there will be: no more than the motion has.
         notes: what was chosen and why, one sentence each (kernels, refinement, start).
     """
@@ -51,6 +53,7 @@ class Simulation:
         self._progress = progress
         self.scene: Scene = ready.scene
         self.stepper: Stepper = ready.stepper
+        self.potential: Potential = ready.potential
         self.num_frames = min(int(ready.config.num_frames), ready.scene.num_frames)
         self.notes = notes
 
@@ -59,12 +62,11 @@ class Simulation:
 
     def __iter__(self) -> Iterator[Frame]:
         config = self._ready.config
-        potential = self._ready.potential
-        guard = make_guard(config, self.stepper, potential)
+        guard = make_guard(config, self.stepper, self.potential)
         steps = frames.simulate(
             self.stepper,
             self.scene,
-            potential,
+            self.potential,
             self.num_frames,
             int(config.relaxing_steps),
             metrics=str(config.metrics),
