@@ -11,8 +11,8 @@
 - ``bending``: 4 cm long, held level at one end, at rest under its weight: how far its tip hangs down. The elastica is a rod of
   a quarter of the bending stiffness, which is what the hinges of a regular mesh amount to.
 - ``garment``: a dress in walk_proud for half a second. The distance is the root mean square over its vertices, at the last
-  frame, to the solver's rollout of the same mesh at 960 fps (480 at 12k, 240 at 48k). γ is that of four steps (two at 48k), each
-  against the minimum of its own potential. All begin at one rest.
+  frame, to the solver's rollout of the same mesh at 960 fps (480 at 12k, 240 at 48k). γ is that of four steps (two at 48k),
+  each against the minimum of its own potential. All begin at one rest.
 """
 
 from __future__ import annotations
@@ -165,9 +165,8 @@ def run_garment(mesh: str, fps: int, seconds: float, judged: int, **keys: Any) -
 def garment(sizes: list[str], rates: list[int], methods: list[str], folder: Path) -> None:
     seconds, folder = 0.5, folder / "garments"
     folder.mkdir(parents=True, exist_ok=True)
-    print(
-        f"{'mesh':6}{'fps':>5}  {'method':14}{'distance mm':>13}{'strain p99':>12}{'γ median':>10}{'most':>9}{'ms':>8}{'ms per s':>10}"
-    )
+    columns = f"{'distance mm':>13}{'strain p99':>12}{'γ median':>10}{'most':>9}{'ms':>8}{'ms per s':>10}"
+    print(f"{'mesh':6}{'fps':>5}  {'method':14}{columns}")
     for size in sizes:
         mesh, finest, judged = garment_of(size, folder), FINEST.get(size, 960), 2 if size == "48k" else 4
         exact = run_garment(mesh, finest, seconds, 0, **METHODS["newton"]).pos
