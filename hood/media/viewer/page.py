@@ -14,6 +14,7 @@ import numpy as np
 from hood.dynamics.recorder import RolloutData
 from hood.media.colouring import COLOURINGS, Colouring, colouring_of, colours_at
 from hood.media.film import seconds_per_frame
+from hood.media.moments import shared_moments, wind_of
 from hood.media.palette import outfit_colours
 from hood.media.pieces import pieces_of, split_seams
 from hood.media.texture import Texture
@@ -59,6 +60,7 @@ def view_page(
     content = {
         "images": [image.address for image in images],
         "seconds": seconds[0],
+        "moments": [{"frame": frame, "words": words} for frame, words in shared_moments(rollouts)],
         "ramp": np.rint(255.0 * colours_at(np.append(np.linspace(0.0, 1.0, _UNKNOWN), np.nan))).astype(int).tolist(),
         "scales": [_scale(name, by[0]) for name, by in painted.items()],
         "rollouts": [
@@ -96,6 +98,7 @@ def _rollout(name: str, data: RolloutData, painted: Mapping[str, Colouring], fir
     same = first is not None and _same_body(first, data)
     return {
         "name": name,
+        "note": wind_of(data),
         "cloth": cloth,
         "lost": lost,
         "values": {kind: pack_bytes(_places(colouring)) for kind, colouring in painted.items()},

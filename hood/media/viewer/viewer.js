@@ -2,13 +2,14 @@
 import * as THREE from 'three';
 import { OrbitControls } from 'orbit';
 import { middleAt, normalsOf, positionsAt, spread, unpackBytes, unpackMapped, unpackMesh } from 'data';
-import { drawChart, figureNames, frameUnder } from 'figures';
+import { drawChart, figureNames, frameUnder, placeOf, rowsOf } from 'figures';
 
 const byId = (id) => document.getElementById(id);
 const content = JSON.parse(byId('content').textContent);
 const PLAIN = [184, 189, 199];
 const SKIN = 0xcdb5a3;
 const OVERLAID = [null, [217, 115, 51], [77, 140, 89], [158, 71, 107]];
+const ROW = 20; // pixels from one row of labels to the next
 const state = { frame: 0, playing: false, since: 0 };
 
 /** Cloth is drawn from both sides, the inside darker; with an image on it, or in the colours of its vertices. */
@@ -150,7 +151,7 @@ function show(frame, moveCamera = true) {
   byId('frame').textContent = `frame ${frame} of ${frames - 1}, ${(frame * content.seconds).toFixed(2)} s`;
   const lost = actors.filter((made) => made.lost.has(frame)).map((made) => made.rollout.name);
   byId('said').textContent = lost.length ? `${lost.join(', ')}: no finite positions in this frame` : '';
-  drawChart(byId('chart'), content.rollouts, byId('figure').value, frame, frames);
+  drawChart(byId('chart'), content.rollouts, byId('figure').value, frame, frames, content.moments);
 }
 
 /** One picture: a part of the canvas for every rollout, or all of them in one. */
@@ -197,9 +198,33 @@ function play(on) {
 }
 
 function resize() {
+  mark(); // its height is part of the page's
   renderer.setPixelRatio(window.devicePixelRatio);
   renderer.setSize(byId('stage').clientWidth, byId('stage').clientHeight, false);
-  drawChart(byId('chart'), content.rollouts, byId('figure').value, state.frame, frames);
+  drawChart(byId('chart'), content.rollouts, byId('figure').value, state.frame, frames, content.moments);
+}
+
+/** A button that leads to the frame of an event, with its words. */
+function momentButton({ frame, words }) {
+  const button = document.createElement('button');
+  button.textContent = words;
+  button.title = `frame ${frame}, ${(frame * content.seconds).toFixed(2)} s`;
+  button.onclick = () => show(frame);
+  return button;
+}
+
+/** Put the buttons of events above their places in the chart, in as few rows as they need. */
+function mark() {
+  const wide = byId('moments').clientWidth;
+  const buttons = [...byId('moments').children];
+  const widths = buttons.map((button) => button.offsetWidth);
+  const lefts = widths.map((width, at) => Math.max(0, Math.min(placeOf(wide, content.moments[at].frame, frames), wide - width)));
+  const rows = rowsOf(lefts, widths);
+  buttons.forEach((button, at) => {
+    button.style.left = `${lefts[at]}px`;
+    button.style.top = `${ROW * rows[at]}px`;
+  });
+  byId('moments').style.height = `${ROW * (1 + Math.max(-1, ...rows))}px`;
 }
 
 /** Save what is seen as a PNG. */
@@ -223,6 +248,7 @@ function dress() {
   byId('names').replaceChildren(...content.rollouts.map((rollout, at) => {
     const name = document.createElement('span');
     name.textContent = rollout.name;
+    if (rollout.note) name.append(Object.assign(document.createElement('small'), { textContent: rollout.note }));
     if (!beside && OVERLAID[at % OVERLAID.length]) name.style.color = `rgb(${OVERLAID[at % OVERLAID.length].map((part) => 0.8 * part)})`;
     return name;
   }));
@@ -275,6 +301,7 @@ async function start() {
   }
   for (const { name, label } of content.scales) byId('colour').add(new Option(label, name));
   for (const [name, title] of figureNames(content.rollouts)) byId('figure').add(new Option(title, name));
+  byId('moments').append(...content.moments.map(momentButton));
   if (!byId('figure').length) byId('chart').hidden = byId('which').hidden = true;
   const { middle, extent } = middleAt(guide(), 0);
   controls.target.set(...middle);

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import io
+import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -174,6 +175,30 @@ def test_rollouts_beside_and_over_each_other(data: RolloutData, tmp_path: Path) 
         over = covered(canvas(browser, "canvas"))
         columns = np.flatnonzero(over.any(axis=0))
         assert abs(columns.mean() - half) < 3
+        assert browser.complaints == []
+
+
+def test_events_are_marked_and_lead_to_their_frames(data: RolloutData, tmp_path: Path) -> None:
+    """Of three events close to each other no label covers another, and each begins at its place in the chart."""
+    events = [{"frame": frame, "open": "front_buttons"} for frame in (100, 104, 108)]
+    told = {"dt": 1 / 30, "config": json.dumps({"events": events, "wind": 3})}
+    path = tmp_path / "events.html"
+    path.write_text(view_page([("one", replace(data, attributes=told))], "a tube"), encoding="utf-8")
+    with Browser() as browser:
+        browser.open(path)
+        boxes = np.array(
+            browser.run(
+                "[...document.querySelectorAll('#moments button')].map((one) => { const box = one.getBoundingClientRect();"
+                "return [box.left, box.top, box.right, box.bottom]; })"
+            )
+        )
+        assert len(boxes) == 3
+        assert (boxes[1:, 1] >= boxes[:-1, 3]).all()
+        wide = browser.run("document.getElementById('chart').clientWidth")
+        assert np.allclose(boxes[:, 0], 60 + (wide - 72) * np.array([100, 104, 108]) / (FRAMES - 1), atol=1.0)
+        browser.press(boxes[1, 0] + 8, 0.5 * (boxes[1, 1] + boxes[1, 3]))
+        assert said(browser, "frame").startswith("frame 104 of")
+        assert said(browser, "names") == "onewind 3 m/s"
         assert browser.complaints == []
 
 
