@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from hood.assets.formats.image import read_texture
 from hood.dynamics.recorder import read_rollout
 from hood.media.film import Film
 from hood.media.pieces import pieces_of
-from hood.media.texture import read_texture
 from hood.media.video import save_png
 
 _WIDTH, _HEIGHT, _FRAME = 230, 330, 59

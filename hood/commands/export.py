@@ -10,6 +10,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from hood.assets.files.atomic import write_atomically
+from hood.assets.formats.image import Texture
 from hood.commands.common import frame_count, split_words
 from hood.commands.compare import read_checked
 from hood.commands.textures import lay_on, read_textures
@@ -19,7 +20,6 @@ from hood.media.exports.clip import PARTS, Clip, clip_of
 from hood.media.exports.gltf import gltf_bytes
 from hood.media.exports.sequences import write_obj_sequence, write_ply_sequence, write_point_cache
 from hood.media.exports.usd import image_name, write_usd
-from hood.media.texture import Texture
 
 _SUFFIXES = {"usd": (".usd", ".usdc", ".usda"), "glb": (".glb",)}
 _FOLDERS: dict[str, Callable[[Path, Clip], None]] = {

@@ -9,11 +9,11 @@ from typing import Any
 from omegaconf import DictConfig
 
 from hood.assets.files.library import unknown
+from hood.assets.formats.image import Texture, read_texture
 from hood.assets.garment.garment import Garment
 from hood.config import ConfigError, plain
 from hood.dynamics.recorder import RolloutData, still_of
 from hood.media.pieces import Piece, pieces_by, pieces_of, plain_name
-from hood.media.texture import Texture, read_texture
 
 #: The one image of all garments.
 _EVERY = ""

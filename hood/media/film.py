@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
+from hood.assets.formats.image import Texture
 from hood.dynamics.recorder import RolloutData
 from hood.media.colouring import colouring_of
 from hood.media.hem import hem_distance
@@ -16,7 +17,6 @@ from hood.media.palette import outfit_colours
 from hood.media.pieces import pieces_of
 from hood.media.prints import Print, pixels_of
 from hood.media.render import BODY_COLOR, Camera, RenderMesh, captioned, contact_sheet, render_frame
-from hood.media.texture import Texture
 from hood.media.video import VideoWriter, save_png
 
 _SHEET_FRAMES = 12

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hood.media.texture import Texture
+from hood.assets.formats.image import Texture
 
 Array = NDArray[np.float64]
 #: Larger images [pixels along a side] are drawn smaller: pictures are small, and their pixels would miss most of it.
@@ -45,17 +44,7 @@ def pixels_of(texture: Texture) -> Array:
         ImportError: Pillow is missing.
         ValueError: the image is damaged.
     """
-    try:
-        from PIL import Image
-    except ImportError as error:
-        raise ImportError("images on pictures need Pillow: pip install hood[pictures]") from error
-    try:
-        with Image.open(io.BytesIO(texture.content)) as opened:
-            image = opened.convert("RGB")
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise ValueError(f"texture: the {texture.kind} image cannot be decoded ({error}); save it again") from error
-    image.thumbnail((_SIDE, _SIDE))
-    return np.asarray((np.asarray(image) / 255.0) ** 2.2)
+    return np.asarray((texture.pixels(_SIDE) / 255.0) ** 2.2)
 
 
 def printed(prints: Sequence[tuple[int, Print]], face: NDArray[np.int64], weights: Array) -> Array:

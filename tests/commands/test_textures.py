@@ -12,9 +12,9 @@ from PIL import Image
 from test_export import DT, FACES, FRAMES, UV, UV_FACES, _glb, _rollout
 from test_view import content
 
+from hood.assets.formats import image as texture_module
 from hood.cli import main
 from hood.dynamics.recorder import RolloutWriter, read_rollout
-from hood.media import texture as texture_module
 from hood.media.viewer.packing import unpack_integers
 
 CHECKS = np.indices((16, 16)).sum(axis=0)[..., None] // 4 % 2 * np.array([200, 100, 50], np.uint8)

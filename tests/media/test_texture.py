@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hood.assets.formats import image as texture_module
+from hood.assets.formats.image import Texture, read_texture
 from hood.dynamics.recorder import RolloutData
 from hood.media import drawing, raster, render, shading
-from hood.media import texture as texture_module
 from hood.media.camera import Camera
 from hood.media.pieces import pieces_of, split_seams
 from hood.media.prints import Print, pixels_of
 from hood.media.render import RenderMesh, render_frame
-from hood.media.texture import Texture, read_texture
 
 RED, GREEN, BLUE, WHITE = (255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 255)
 #: Left to right, the top row first.

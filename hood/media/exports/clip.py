@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hood.assets.formats.image import Texture
 from hood.dynamics.recorder import RolloutData
 from hood.media.mesh_export import corner_normals
 from hood.media.palette import part_colour
 from hood.media.pieces import pieces_of
 from hood.media.render import BODY_COLOR
-from hood.media.texture import Texture
 
 #: Farther from the origin than this [m] float32, which most formats hold, is no longer good to 2 µm.
 FAR = 32.0

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from hood.assets.formats.image import Texture
 from hood.media.exports.clip import Clip, Part
 from hood.media.pieces import split_seams
-from hood.media.texture import Texture
 
 #: Larger files [bytes] are refused: browsers and game engines keep all morph targets in memory.
 LARGEST = 256 * 2**20

@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
+from hood.assets.formats.image import Texture
 from hood.dynamics.recorder import RolloutData
 from hood.media.colouring import COLOURINGS, Colouring, colouring_of, colours_at
 from hood.media.film import seconds_per_frame
 from hood.media.moments import shared_moments, wind_of
 from hood.media.palette import outfit_colours
 from hood.media.pieces import pieces_of, split_seams
-from hood.media.texture import Texture
 from hood.media.viewer.packing import pack_bytes, pack_integers, pack_positions
 
 #: The ramp's last colour, of vertices without a value.

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hood.assets.formats.image import Texture
 from hood.dynamics.recorder import RolloutData
 from hood.media.camera import Camera
 from hood.media.render import RenderMesh, render_frame
-from hood.media.texture import Texture
 from hood.media.viewer.page import view_page
 from hood.testing import cylinder, sphere
 from tools.browser import Browser
