@@ -43,6 +43,8 @@ def run(arguments: Sequence[str]) -> int:
     form, up, parts = _checked(config)
     textures = read_textures(config)
     _check_textured(textures, [form], "format", f"format={form}")
+    if textures and "cloth" not in parts:
+        raise ConfigError(f"texture: parts={parts} leaves the garments out; leave texture= out, or take parts=[cloth,body]")
     target = _target(config, source, form)
     data = read_checked(source, "fabric")
     print(_export(source, data, target, form, textures, clip_arguments=(parts, count, up)))

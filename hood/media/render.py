@@ -161,17 +161,20 @@ def _draw_surface(
     screen = np.stack([0.5 * width + offset[:, 0], 0.5 * height - offset[:, 1]], axis=1)
     buffer = rasterise(screen, 1.0 / (depth + surface.behind), faces, width, height)
     visible = buffer.face
+    compiled, own = library() is not None, None
+    if compiled and not prints:
+        _shade_compiled(image, camera, light, replace(surface, faces=faces), (screen, depth, buffer), None)
+        return
     row, column = np.nonzero(visible >= 0)
     if len(row) == 0:
         return
-    corners, own = faces[visible[row, column]], None
-    if prints or library() is None:
-        weights = barycentric(screen, corners, np.stack([column + 0.5, row + 0.5], axis=1)) / depth[corners]
-        weights = np.clip(weights / (weights @ np.ones(3))[:, None], 0.0, 1.0)
+    corners = faces[visible[row, column]]
+    weights = barycentric(screen, corners, np.stack([column + 0.5, row + 0.5], axis=1)) / depth[corners]
+    weights = np.clip(weights / (weights @ np.ones(3))[:, None], 0.0, 1.0)
     if prints:
         own = np.full(image.shape, np.nan)
         own[row, column] = printed(prints, np.flatnonzero(before)[visible[row, column]], weights)
-    if library() is not None:
+    if compiled:
         _shade_compiled(image, camera, light, replace(surface, faces=faces), (screen, depth, buffer), own)
         return
 

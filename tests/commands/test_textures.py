@@ -141,6 +141,7 @@ def test_pictures_and_formats_of_a_rollout_show_it(tmp_path: Path) -> None:
         (["texture={top:3}"], "give an image, texture=plaid.png"),
         (["texture=[PNG]"], "give an image, texture=plaid.png"),
         (["texture=PNG", "format=ply"], "format=ply shows no images; take format=usd or glb"),
+        (["texture=PNG", "parts=[body]"], "leaves the garments out"),
         (["texture=BARE"], "neither PNG nor JPEG"),
     ],
 )

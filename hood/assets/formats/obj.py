@@ -61,27 +61,29 @@ class _Names:
 
     def __init__(self) -> None:
         self._now: dict[str, tuple[str, ...]] = {}
-        self._known: list[tuple[str, ...]] = [()]
+        self._places: dict[tuple[str, ...], int] = {(): 0}
+        self._place = 0
         self._of_polygons: list[int] = []
 
     def change(self, kind: str, words: list[str]) -> None:
         """The polygons that follow are of another object, of other groups or of another material."""
         given = words if kind == "g" else [" ".join(words)]
         self._now[kind] = tuple(name for name in given if name not in _NAMELESS)
-        self._known.append(tuple(name for names in self._now.values() for name in names))
+        combination = tuple(name for names in self._now.values() for name in names)
+        self._place = self._places.setdefault(combination, len(self._places))
 
     def add_polygon(self) -> None:
-        self._of_polygons.append(len(self._known) - 1)
+        self._of_polygons.append(self._place)
 
     def panels(self) -> tuple[dict[str, np.ndarray] | None, list[str]]:
         """(P,) bool of every name that some polygons have and others do not; None without any. And what was not kept."""
-        used = sorted(set(self._of_polygons))
-        shared = set(self._known[used[0]]).intersection(*(self._known[at] for at in used)) if used else set()
-        names = list(dict.fromkeys(name for at in used for name in self._known[at] if name not in shared))
+        combinations, used = list(self._places), sorted(set(self._of_polygons))
+        shared = set(combinations[used[0]]).intersection(*(combinations[at] for at in used)) if used else set()
+        names = list(dict.fromkeys(name for at in used for name in combinations[at] if name not in shared))
         if len(names) > MOST_PANELS:
             return None, [f"{len(names)} names of objects, groups and materials are more than {MOST_PANELS}; none is kept"]
         of_polygons = np.array(self._of_polygons, dtype=np.int64)
-        known = {name: np.array([name in combination for combination in self._known]) for name in names}
+        known = {name: np.array([name in combination for combination in combinations]) for name in names}
         return {name: mask[of_polygons] for name, mask in known.items()} or None, []
 
 
