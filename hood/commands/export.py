@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import importlib.util
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from omegaconf import DictConfig
 
 from hood.assets.files.atomic import write_atomically
+from hood.assets.formats.image import Texture
 from hood.commands.common import frame_count, split_words
 from hood.commands.compare import read_checked
+from hood.commands.textures import lay_on, read_textures
 from hood.config import ConfigError, plain, require_choice
 from hood.dynamics.recorder import RolloutData
 from hood.media.exports.clip import PARTS, Clip, clip_of
 from hood.media.exports.gltf import gltf_bytes
 from hood.media.exports.sequences import write_obj_sequence, write_ply_sequence, write_point_cache
-from hood.media.exports.usd import write_usd
+from hood.media.exports.usd import image_name, write_usd
 
 _SUFFIXES = {"usd": (".usd", ".usdc", ".usda"), "glb": (".glb",)}
 _FOLDERS: dict[str, Callable[[Path, Clip], None]] = {
@@ -26,6 +28,8 @@ _FOLDERS: dict[str, Callable[[Path, Clip], None]] = {
     "ply": write_ply_sequence,
 }
 FORMATS = ("usd", "glb", *_FOLDERS)
+#: Those that hold images.
+_TEXTURED = ("usd", "glb", "pc2", "obj")
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -43,26 +47,45 @@ def export(arguments: Sequence[str]) -> Path:
     source = source / "rollout.h5" if source.is_dir() else source
     count = frame_count(config)
     form, up, parts = _checked(config)
+    textures = read_textures(config)
+    _check_textured(textures, [form], "format", f"format={form}")
+    if textures and "cloth" not in parts:
+        raise ConfigError(f"texture: parts={parts} leaves the garments out; leave texture= out, or take parts=[cloth,body]")
     target = _target(config, source, form)
     data = read_checked(source, "fabric")
-    print(_export(source, data, target, form, clip_arguments=(parts, count, up)))
+    print(_export(source, data, target, form, textures, clip_arguments=(parts, count, up)))
     if not bool(data.attributes.get("complete", True)):
         print(f"the rollout is not finished: {len(data.time)} of {data.attributes.get('num_planned', '?')} frames are there")
     return target
 
 
-def check_formats(forms: Sequence[str]) -> None:
-    """Refuse formats of ``hood rollout formats=[…]`` that cannot be written, before the first frame.
+def check_outputs(config: DictConfig) -> None:
+    """Refuse formats of ``hood rollout formats=[…]`` that cannot be written, and images that nothing would show, before the
+    first frame.
 
     Raises:
-        ConfigError: no such format, or its package is missing; names it.
+        ConfigError: no such format, or its package is missing; or no picture and no format shows ``texture``.
+        ValueError: an image cannot be used.
     """
+    forms = [str(form) for form in config.formats]
     for form in forms:
-        _check_format(form, "formats", f"formats={list(forms)}")
+        _check_format(form, "formats", f"formats={forms}")
+    textures = read_textures(config)
+    drawn = str(config.video) != "none" or bool(config.sheet)
+    if not drawn or str(config.colour) != "none":
+        _check_textured(textures, forms, "formats", f"colour={config.colour} formats={forms}")
 
 
-def export_beside(source: Path, forms: Sequence[str]) -> list[str]:
+def _check_textured(textures: Mapping[str, Texture], forms: Sequence[str], key: str, asked: str) -> None:
+    if textures and not any(form in _TEXTURED for form in forms):
+        raise ConfigError(f"texture: {asked} shows no images; take {key}={' or '.join(_TEXTURED)}, or hood view")
+
+
+def export_beside(source: Path, forms: Sequence[str], textures: Mapping[str, Texture]) -> list[str]:
     """Write all of the rollout ``source`` in every format beside it, in place of what an earlier run has left there.
+
+    Args:
+        textures: images of garments, of :func:`hood.commands.textures.read_textures`.
 
     Returns:
         A sentence about each.
@@ -70,7 +93,7 @@ def export_beside(source: Path, forms: Sequence[str]) -> list[str]:
     if not forms:
         return []
     data = read_checked(source, "fabric")
-    return [_export(source, data, _beside(source, form), form, (list(PARTS), None, "y"), True) for form in forms]
+    return [_export(source, data, _beside(source, form), form, textures, (list(PARTS), None, "y"), True) for form in forms]
 
 
 def _export(
@@ -78,13 +101,14 @@ def _export(
     data: RolloutData,
     target: Path,
     form: str,
+    textures: Mapping[str, Texture],
     clip_arguments: tuple[list[str], int | None, str],
     replace: bool = False,
 ) -> str:
     """Write one format; what there is to say of it."""
     up = clip_arguments[2]
     try:
-        clip = clip_of(data, *clip_arguments)
+        clip = clip_of(data, *clip_arguments, lay_on(textures, [data])[0])
         _write(target, form, clip, up, replace)
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from error
@@ -147,7 +171,10 @@ def _write(target: Path, form: str, clip: Clip, up: str, replace: bool = False) 
     _remove(draft)
     try:
         if form == "usd":
-            write_usd(draft, clip, up)
+            write_usd(draft, clip, up, target.name)
+            for part in clip.parts:
+                if part.texture is not None:
+                    write_atomically(target.with_name(image_name(target.stem, part)), part.texture.content)
         else:
             draft.mkdir()
             _FOLDERS[form](draft, clip)

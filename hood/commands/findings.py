@@ -132,6 +132,7 @@ def _garment_facts(garment: Garment) -> dict[str, Any]:
         "bound to": (garment.bound_to or "any body of its skeleton") if garment.bound else None,
         "held vertices": int(garment.pinned.sum()),
         "fasteners": ", ".join(f"{name} ({len(pairs)} pairs)" for name, pairs in (garment.fasteners or {}).items()) or None,
+        "panels": ", ".join(f"{name} ({int(mask.sum())} faces)" for name, mask in (garment.panels or {}).items()) or None,
         "stiffer than the fabric": _stiffer(garment),
         "texture coordinates": 0 if garment.uv is None else len(garment.uv),
         "hard edges": garment.normal_faces is not None,

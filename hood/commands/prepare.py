@@ -283,6 +283,7 @@ def _report(
         "num_faces": len(outfit.faces),
         "num_pinned": int(outfit.pinned.sum()),
         "fasteners": {name: len(pairs) for name, pairs in (outfit.fasteners or {}).items()},
+        "panels": {name: int(mask.sum()) for name, mask in (outfit.panels or {}).items()},
         "starts": {name: asdict(figures) for name, figures in starts.items()},
         "output": str(target),
     }
@@ -298,6 +299,8 @@ def _text(report: dict[str, Any]) -> str:
     if report["num_pinned"]:
         lines.append(f"holds {report['num_pinned']} of {report['num_vertices']} vertices")
     lines += [f"fastens {name}: {count} pairs of vertices" for name, count in report["fasteners"].items()]
+    if report["panels"]:
+        lines.append("panels: " + ", ".join(f"{name} ({count} faces)" for name, count in report["panels"].items()))
     for name, start in report["starts"].items():
         lines.append(
             f"start in {name}: edges stretched by at most {100 * start['stretch_max']:.1f}%, "

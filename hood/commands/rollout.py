@@ -29,7 +29,7 @@ from hood.commands.common import (
 )
 from hood.commands.event_report import describe_held, summarise_held
 from hood.commands.events import fastening_attributes
-from hood.commands.export import check_formats, export_beside
+from hood.commands.export import check_outputs, export_beside
 from hood.commands.guarding import OFF, GuardStopped, guard_sentences, make_guard, write_alarms
 from hood.commands.notices import heard
 from hood.commands.plan_auto import planned, without_accuracy
@@ -38,6 +38,7 @@ from hood.commands.refinement import exported
 from hood.commands.resizing import describe_ease, summarise_ease
 from hood.commands.setup import Setup, check_config, make_stepper, set_up, solves_in_double
 from hood.commands.summary import describe, describe_all, summarise
+from hood.commands.textures import check_worn, lay_on, read_textures
 from hood.commands.verdict import exit_code
 from hood.config import plain, save_run_record
 from hood.dynamics.captured import network_of
@@ -54,7 +55,7 @@ def run(overrides: Sequence[str]) -> int:
     used, else 3 where a result is unsound (:mod:`hood.dynamics.soundness`), else 0."""
     config = rollout_config(without_accuracy(overrides))
     check_config(config)
-    check_formats([str(form) for form in config.formats])
+    check_outputs(config)
     return together(lambda: _run(rollout_config(distributed.on_main(lambda: planned(overrides)))))
 
 
@@ -100,6 +101,7 @@ def _run_heard(
 ) -> tuple[dict[str, Any], bool]:
     """The rollout of one motion; ``warned`` is what has been warned about when the summary is written."""
     ready = set_up(config, stepper)
+    check_worn(read_textures(config), ready.scene.garment)
     with occupy(prepare_folder(output_folder(config))):
         return _run_there(ready, config, digest, warned, advise)
 
@@ -131,7 +133,7 @@ def _run_there(ready: Setup, asked: DictConfig, digest: str, warned: list[str], 
     try:
         if not interrupted:
             _draw(config, folder)
-            _tell(export_beside(folder / "rollout.h5", [str(form) for form in config.formats]))
+            _tell(export_beside(folder / "rollout.h5", [str(form) for form in config.formats], read_textures(config)))
     finally:
         summary["kernels"] = None if simulator is None else simulator.network.kernels
         summary["warnings"] = list(warned)
@@ -187,6 +189,7 @@ def _finished(config: DictConfig, digest: str, folder: Path) -> dict[str, Any] |
     before["plan"] = before.get("plan") or now["plan"]
     before.setdefault("accuracy", None)
     before.setdefault("fit", "betas")
+    before.setdefault("texture", None)
     before.setdefault("events", [])
     before.setdefault("events_speed", now["events_speed"])
     same = all(before.get(key) == now[key] for key in now if key not in ("resume", "output", "allow_unsound"))
@@ -277,11 +280,12 @@ def _draw(config: DictConfig, folder: Path) -> None:
         print(f"no pictures: {error}", file=sys.stderr)
         return
     data, colour, thinner = read_rollout(folder / "rollout.h5"), str(config.colour), thinning(config)
+    textures = lay_on(read_textures(config), [data])[0]
     if bool(config.sheet):
-        write_sheet(data, folder / "contact_sheet.png", colour, thinner)
+        write_sheet(data, folder / "contact_sheet.png", colour, thinner, textures)
     if str(config.video) != "none":
         frames = tqdm(range(0, len(data.cloth_pos), int(config.video_stride)), desc="video", unit="frame", disable=_quiet())
-        write_video(data, folder / f"rollout.{config.video}", frames, int(config.video_stride), colour, thinner)
+        write_video(data, folder / f"rollout.{config.video}", frames, int(config.video_stride), colour, thinner, textures)
 
 
 def _write_json(path: Path, value: dict[str, Any]) -> None:

@@ -11,6 +11,7 @@ from omegaconf import DictConfig
 from hood.assets.files.atomic import write_atomically
 from hood.commands.common import frame_count, output_folder, split_words
 from hood.commands.compare import names_of, read_checked
+from hood.commands.textures import lay_on, read_textures
 from hood.config import ConfigError
 from hood.dynamics.recorder import RolloutData
 
@@ -27,12 +28,13 @@ def run(arguments: Sequence[str]) -> int:
     target = output_folder(config)
     if target.suffix.lower() not in (".html", ".htm") or target.is_dir():
         raise ConfigError(f"output={target}: name a file that ends in .html, e.g. output=view.html")
+    textures = read_textures(config)
     rollouts = [_first_frames(read_checked(path, "fabric"), count) for path in files]
     from hood.media.viewer.page import view_page
 
     names = names_of(files)
     title = " and ".join(names) if config.title is None else str(config.title)
-    page = view_page(list(zip(names, rollouts, strict=True)), title).encode()
+    page = view_page(list(zip(names, rollouts, strict=True)), title, lay_on(textures, rollouts)).encode()
     target.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(target, page)
     frames = max(len(data.time) for data in rollouts)

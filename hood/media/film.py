@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from hood.assets.formats.image import Texture
 from hood.dynamics.recorder import RolloutData
 from hood.media.colouring import colouring_of
 from hood.media.hem import hem_distance
 from hood.media.palette import outfit_colours
+from hood.media.pieces import pieces_of
+from hood.media.prints import Print, pixels_of
 from hood.media.render import BODY_COLOR, Camera, RenderMesh, captioned, contact_sheet, render_frame
 from hood.media.video import VideoWriter, save_png
 
@@ -42,6 +45,7 @@ class Film:
             says so. 0: as it is.
         beside: rollouts whose films are shown next to this one: a colour means the same in all of them, and without a body
             the camera sees the cloth of all of them.
+        textures: images of garments in their own colour, by the names of :func:`hood.media.pieces.pieces_of`.
     """
 
     def __init__(
@@ -53,6 +57,7 @@ class Film:
         colour: str = "none",
         beside: Sequence[RolloutData] = (),
         thinner: float = 0.0,
+        textures: Mapping[str, Texture] | None = None,
     ) -> None:
         if len(data.cloth_pos) == 0:
             raise ValueError("the rollout has no frames to draw")
@@ -62,6 +67,7 @@ class Film:
         self._own_colour = outfit_colours(
             str(data.attributes.get("garment", "")), data.cloth_faces, data.cloth_pos.shape[1], data.still.get("piece")
         )
+        self._prints = () if self.colouring else _prints(data, textures or {})
         # Without a body the camera looks at the cloth, as far as that is finite.
         shown = data.body_pos
         if not data.body_pos.shape[1]:
@@ -91,7 +97,7 @@ class Film:
             meshes.append(RenderMesh(shown_body, self.data.body_faces, BODY_COLOR, behind=_BEHIND))
         if dressed:
             shown = self._own_colour if self.colouring is None else self.colouring.colours(index)
-            meshes.append(RenderMesh(cloth, self.data.cloth_faces, shown, self._hem))
+            meshes.append(RenderMesh(cloth, self.data.cloth_faces, shown, self._hem, prints=self._prints))
         picture = render_frame(meshes, camera, width=self.width, height=self.height, floor=self._floor)
         told = f"body drawn {1e3 * self.thinner:g} mm thinner" if self.thinner > 0 and len(body) else ""
         return captioned(picture, told) if told else picture
@@ -107,9 +113,15 @@ def sheet_frames(num_frames: int, count: int = _SHEET_FRAMES) -> list[int]:
     return sorted({int(i) for i in np.linspace(0, num_frames - 1, min(count, num_frames)).round()})
 
 
-def write_sheet(data: RolloutData, path: Path, colour: str = "none", thinner: float = 0.0) -> Path:
-    """Contact sheet of the rollout as PNG; ``colour`` and ``thinner`` as in :class:`Film`."""
-    return save_png(path, Film(data, colour=colour, thinner=thinner).sheet())
+def write_sheet(
+    data: RolloutData,
+    path: Path,
+    colour: str = "none",
+    thinner: float = 0.0,
+    textures: Mapping[str, Texture] | None = None,
+) -> Path:
+    """Contact sheet of the rollout as PNG; ``colour``, ``thinner`` and ``textures`` as in :class:`Film`."""
+    return save_png(path, Film(data, colour=colour, thinner=thinner, textures=textures).sheet())
 
 
 def write_video(
@@ -119,18 +131,28 @@ def write_video(
     stride: int = 1,
     colour: str = "none",
     thinner: float = 0.0,
+    textures: Mapping[str, Texture] | None = None,
 ) -> Path:
     """Video of the rollout at its own speed; every ``stride``-th frame is drawn. Returns the file written.
 
     ``frames`` is the iterable that drives the loop (a progress bar, say); all frames by default.
     """
-    film = Film(data, colour=colour, thinner=thinner)
+    film = Film(data, colour=colour, thinner=thinner, textures=textures)
     step = seconds_per_frame(data)
     chosen: Sequence[int] | Iterable[int] = range(0, len(data.cloth_pos), stride) if frames is None else frames
     with VideoWriter(path, fps=1.0 / (step * stride)) as writer:
         for index in chosen:
             writer.append(film.frame(index))
     return writer.path
+
+
+def _prints(data: RolloutData, textures: Mapping[str, Texture]) -> list[Print]:
+    found = []
+    for piece in pieces_of(data):
+        texture = textures.get(piece.name)
+        if texture is not None and piece.uv is not None and piece.uv_faces is not None:
+            found.append(Print(pixels_of(texture), piece.faces, piece.uv[piece.uv_faces].astype(np.float64)))
+    return found
 
 
 def seconds_per_frame(data: RolloutData) -> float:

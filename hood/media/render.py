@@ -19,6 +19,7 @@ from hood.media.camera import NEAR, Camera, unit
 from hood.media.drawing import SeenValues, address, library, packed
 from hood.media.hem import FAR, sewn
 from hood.media.occlusion import AROUND, REACH, openness
+from hood.media.prints import Print, printed
 from hood.media.raster import VisibilityBuffer, barycentric, rasterise
 from hood.media.shading import Light, Surface, backdrop
 
@@ -39,7 +40,7 @@ class RenderMesh:
 
     Both sides are drawn; the side that faces against its normal is darker. `hem` (V,) [m] is the distance from the next
     hem, along which a line and a seam are drawn; without it there is none. `behind` [m] draws the surface farther from
-    the eye than it is: what lies closer upon it is not cut by it.
+    the eye than it is: what lies closer upon it is not cut by it. `prints` are images on some of its faces.
     """
 
     pos: ArrayLike
@@ -47,6 +48,7 @@ class RenderMesh:
     color: ArrayLike = GARMENT_COLOR
     hem: ArrayLike | None = None
     behind: float = 0.0
+    prints: Sequence[Print] = ()
 
 
 def render_frame(
@@ -67,7 +69,9 @@ def render_frame(
     light = Light(camera, surface.pos, surface.faces)
     floor_height = float(surface.pos[:, 1].min()) if floor is None else floor
     image = backdrop(camera, light, surface, floor_height, width, height, _SUPERSAMPLING)
-    _draw_surface(image, camera, light, surface)
+    firsts = np.cumsum([0, *(len(np.asarray(mesh.faces)) for mesh in meshes)]).tolist()
+    prints = [(first, one) for first, mesh in zip(firsts, meshes, strict=False) for one in mesh.prints]
+    _draw_surface(image, camera, light, surface, prints)
     lib = library()
     if lib is not None:
         picture = np.empty((height, width, 3), dtype=np.uint8)
@@ -143,19 +147,23 @@ def _join(meshes: Sequence[RenderMesh]) -> Surface:
     return Surface(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def _draw_surface(image: Array, camera: Camera, light: Light, surface: Surface) -> None:
+def _draw_surface(
+    image: Array, camera: Camera, light: Light, surface: Surface, prints: Sequence[tuple[int, Print]] = ()
+) -> None:
     height, width = image.shape[:2]
     axes = camera.axes()
     seen = (surface.pos - np.asarray(camera.position)) @ axes.T
-    faces = surface.faces[(seen[surface.faces, 2] > NEAR).all(axis=1)]
+    before = (seen[surface.faces, 2] > NEAR).all(axis=1)
+    faces = surface.faces[before]
     depth = np.maximum(seen[:, 2], NEAR)
     focal = camera.focal(height)
     offset = focal * seen[:, :2] / depth[:, None]
     screen = np.stack([0.5 * width + offset[:, 0], 0.5 * height - offset[:, 1]], axis=1)
     buffer = rasterise(screen, 1.0 / (depth + surface.behind), faces, width, height)
     visible = buffer.face
-    if library() is not None:
-        _shade_compiled(image, camera, light, replace(surface, faces=faces), (screen, depth, buffer))
+    compiled, own = library() is not None, None
+    if compiled and not prints:
+        _shade_compiled(image, camera, light, replace(surface, faces=faces), (screen, depth, buffer), None)
         return
     row, column = np.nonzero(visible >= 0)
     if len(row) == 0:
@@ -163,9 +171,17 @@ def _draw_surface(image: Array, camera: Camera, light: Light, surface: Surface) 
     corners = faces[visible[row, column]]
     weights = barycentric(screen, corners, np.stack([column + 0.5, row + 0.5], axis=1)) / depth[corners]
     weights = np.clip(weights / (weights @ np.ones(3))[:, None], 0.0, 1.0)
+    if prints:
+        own = np.full(image.shape, np.nan)
+        own[row, column] = printed(prints, np.flatnonzero(before)[visible[row, column]], weights)
+    if compiled:
+        _shade_compiled(image, camera, light, replace(surface, faces=faces), (screen, depth, buffer), own)
+        return
 
     pos = _blend(weights, surface.pos, corners)
     color = _blend(weights, surface.color, corners)
+    if own is not None:
+        color = np.where(np.isnan(own[row, column]), color, own[row, column])
     normal = unit(_blend(weights, surface.normal, corners))
     view = unit(np.asarray(camera.position) - pos)
     a, b, c = (screen[faces[:, k]] for k in range(3))
@@ -179,9 +195,15 @@ def _draw_surface(image: Array, camera: Camera, light: Light, surface: Surface) 
 
 
 def _shade_compiled(
-    image: Array, camera: Camera, light: Light, surface: Surface, view: tuple[Array, Array, VisibilityBuffer]
+    image: Array,
+    camera: Camera,
+    light: Light,
+    surface: Surface,
+    view: tuple[Array, Array, VisibilityBuffer],
+    own: Array | None,
 ) -> None:
-    """The rest of :func:`_draw_surface` in C++, from a ``view``: pixels and depths of vertices, and what is seen."""
+    """The rest of :func:`_draw_surface` in C++, from a ``view``: pixels and depths of vertices, and what is seen; with colours
+    ``own`` (H, W, 3) of pixels instead of those of vertices, where they are not NaN."""
     lib = library()
     assert lib is not None
     assert image.flags.c_contiguous
@@ -192,7 +214,8 @@ def _shade_compiled(
     height, width = image.shape[:2]
     eye = tuple(float(value) for value in camera.position)
     sizes = width, height, AROUND.shape[1]
-    seen = SeenValues(*(address(value) for value in arrays), *sizes, eye, camera.focal(height), REACH, _INSIDE)
+    addresses = *(address(value) for value in arrays), None if own is None else address(own)
+    seen = SeenValues(*addresses, *sizes, eye, camera.focal(height), REACH, _INSIDE)
     lib.picture_shade(ctypes.byref(light.values()), ctypes.byref(seen))
 
 

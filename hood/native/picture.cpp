@@ -36,6 +36,7 @@ struct Seen {
     const double* around;                                 // (4, num_around, 2) shares of the reach, by the pixel's place in its four
     const double* axes;                                   // (3, 3) right, up, forward
     double* image;                                        // (height, width, 3) linear colours
+    const double* own;  // (height, width, 3) colours instead of those of vertices where not NaN; null: nowhere
     int64_t width, height, num_around;
     double eye[3];
     double focal, reach, inside;  // pixels, m, share of the colour that an inside shows
@@ -199,6 +200,7 @@ void picture_shade(const Light* light, const Seen* seen) {
                 normal = normal + share * at(seen->normal, corner[k]);
                 hem += share * seen->hem[corner[k]];
             }
+            if (seen->own && !std::isnan(seen->own[3 * pixel])) color = at(seen->own, pixel);
             normal = unit(normal);
             if (turned > 0) {
                 normal = -normal;

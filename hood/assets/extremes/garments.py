@@ -122,7 +122,7 @@ FAULTS: Mapping[str, Callable[[Garment, float, np.random.Generator], Garment]] =
 
 #: Fields of a vertex that have means, those that have none, and those that do not fit other faces.
 _SMOOTH, _MARKS = ("rest_pos", "skin_pos", "lbs_weights", "shapedirs"), ("pinned", "region", "stiffness", "piece", "rest_turn")
-_NOTHING = dict.fromkeys(("uv", "uv_faces", "normal_faces", "colours", "coarse_edges"))
+_NOTHING = dict.fromkeys(("uv", "uv_faces", "normal_faces", "colours", "coarse_edges", "panels"))
 
 
 def _split(garment: Garment, chosen: Array, weights: Array | tuple[float, float, float]) -> Garment:

@@ -47,6 +47,7 @@ class MeshFile:
     uv_faces: np.ndarray | None = None  # (F, 3) into uv
     normal_faces: np.ndarray | None = None  # (F, 3): corners of one number share a normal; None: smooth everywhere
     colours: np.ndarray | None = None  # (V, 3), 0 to 1
+    panels: dict[str, np.ndarray] | None = None  # (F,) bool each: the triangles of an object, group or material, by its name
     num_polygons: int = 0  # faces of four and more corners that were split
     num_joined: int = 0  # vertices that the format had doubled
     notes: tuple[str, ...] = ()  # what was not kept
@@ -128,6 +129,7 @@ def _finish(raw: RawMesh, split_polygons: bool, join: bool) -> MeshFile:
     notes = list(raw.notes)
     uv_faces = _corner_table(raw.uv_corners, len(raw.uv) if raw.uv is not None else 0, rows, "texture coordinate", notes)
     faces = vertex_map[raw.corners][rows]
+    polygon = np.repeat(np.arange(len(raw.counts)), raw.counts)[rows[:, 0]]
     return MeshFile(
         pos=raw.pos[kept],
         faces=faces,
@@ -135,6 +137,7 @@ def _finish(raw: RawMesh, split_polygons: bool, join: bool) -> MeshFile:
         uv_faces=uv_faces,
         normal_faces=_shared_normals(raw, rows, faces, notes),
         colours=None if raw.colours is None else raw.colours[kept],
+        panels=None if raw.panels is None else {name: mask[polygon] for name, mask in raw.panels.items()},
         num_polygons=int((raw.counts > 3).sum()),
         num_joined=len(raw.pos) - len(kept),
         notes=tuple(notes),

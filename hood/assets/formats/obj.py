@@ -1,4 +1,4 @@
-"""Wavefront OBJ: positions, polygons, texture coordinates, normals and the colours some programs add to positions."""
+"""Wavefront OBJ: positions, polygons and their names, texture coordinates, normals, and colours that some programs add."""
 
 from __future__ import annotations
 
@@ -8,9 +8,14 @@ import numpy as np
 
 from hood.assets.formats.raw_mesh import RawMesh, Unreadable, unit_colours
 
+#: Lines that name the polygons after them, and names that programs write for none.
+_NAMED, _NAMELESS = ("o", "g", "usemtl"), ("", "default", "off", "None", "(null)")
+#: A garment has not so many panels: the names mean something else, such as single faces.
+MOST_PANELS = 256
+
 
 def read_obj(path: Path) -> RawMesh:
-    """The polygons of all objects and groups of the file; lines and points are passed over.
+    """The polygons of all objects and groups of the file, whose names become panels; lines and points are passed over.
 
     Raises:
         Unreadable: a line that is not numbers, or an index out of range.
@@ -18,6 +23,7 @@ def read_obj(path: Path) -> RawMesh:
     tables: dict[str, list[list[float]]] = {"v": [], "vt": [], "vn": []}
     corners: list[tuple[int, int, int]] = []
     counts: list[int] = []
+    names = _Names()
     with open(path, encoding="utf-8", errors="replace") as file:
         for number, line in enumerate(file, start=1):
             words = line.split("#")[0].split()
@@ -30,6 +36,9 @@ def read_obj(path: Path) -> RawMesh:
                     sizes = [len(tables[key]) for key in ("v", "vt", "vn")]
                     corners.extend(_corner(word, sizes) for word in words[1:])
                     counts.append(len(words) - 1)
+                    names.add_polygon()
+                elif words[0] in _NAMED:
+                    names.change(words[0], words[1:])
             except ValueError:
                 raise Unreadable(
                     f"line {number} is not readable ({line.strip()[:60]!r}); behind {words[0]} stand numbers alone, repair or "
@@ -38,11 +47,44 @@ def read_obj(path: Path) -> RawMesh:
     pos, colours = _positions(tables["v"])
     table = np.array(corners, dtype=np.int64).reshape(-1, 3)
     mesh = RawMesh(pos, table[:, 0], np.array(counts, dtype=np.int64), colours)
+    mesh.panels, notes = names.panels()
+    mesh.notes.extend(notes)
     if tables["vt"] and (table[:, 1] >= 0).any():
         mesh.uv, mesh.uv_corners = _table(tables["vt"], "vt", 2), table[:, 1]
     if tables["vn"] and (table[:, 2] >= 0).any():
         mesh.normals, mesh.normal_corners = _table(tables["vn"], "vn", 3), table[:, 2]
     return mesh
+
+
+class _Names:
+    """Which objects, groups and materials each polygon of a file is of, while it is read."""
+
+    def __init__(self) -> None:
+        self._now: dict[str, tuple[str, ...]] = {}
+        self._places: dict[tuple[str, ...], int] = {(): 0}
+        self._place = 0
+        self._of_polygons: list[int] = []
+
+    def change(self, kind: str, words: list[str]) -> None:
+        """The polygons that follow are of another object, of other groups or of another material."""
+        given = words if kind == "g" else [" ".join(words)]
+        self._now[kind] = tuple(name for name in given if name not in _NAMELESS)
+        combination = tuple(name for names in self._now.values() for name in names)
+        self._place = self._places.setdefault(combination, len(self._places))
+
+    def add_polygon(self) -> None:
+        self._of_polygons.append(self._place)
+
+    def panels(self) -> tuple[dict[str, np.ndarray] | None, list[str]]:
+        """(P,) bool of every name that some polygons have and others do not; None without any. And what was not kept."""
+        combinations, used = list(self._places), sorted(set(self._of_polygons))
+        shared = set(combinations[used[0]]).intersection(*(combinations[at] for at in used)) if used else set()
+        names = list(dict.fromkeys(name for at in used for name in combinations[at] if name not in shared))
+        if len(names) > MOST_PANELS:
+            return None, [f"{len(names)} names of objects, groups and materials are more than {MOST_PANELS}; none is kept"]
+        of_polygons = np.array(self._of_polygons, dtype=np.int64)
+        known = {name: np.array([name in combination for combination in combinations]) for name in names}
+        return {name: mask[of_polygons] for name, mask in known.items()} or None, []
 
 
 def _corner(word: str, sizes: list[int]) -> tuple[int, int, int]:

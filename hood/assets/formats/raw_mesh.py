@@ -27,6 +27,7 @@ class RawMesh:
     uv_corners: np.ndarray | None = None  # (N,)
     normals: np.ndarray | None = None  # (M, 3)
     normal_corners: np.ndarray | None = None  # (N,)
+    panels: dict[str, np.ndarray] | None = None  # (P,) bool each: the polygons of a name
     notes: list[str] = field(default_factory=list)
 
 

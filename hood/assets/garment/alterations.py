@@ -210,7 +210,9 @@ def _keep_vertices(garment: Garment, faces: np.ndarray, kept: np.ndarray, number
 
 
 def _keep_faces(garment: Garment, kept: np.ndarray) -> Garment:
-    return replace(garment, **{k: getattr(garment, k)[kept] for k in _PER_FACE if getattr(garment, k) is not None})
+    tables = {k: getattr(garment, k)[kept] for k in _PER_FACE if getattr(garment, k) is not None}
+    panels = {name: mask[kept] for name, mask in (garment.panels or {}).items()}
+    return replace(garment, **tables, panels={name: mask for name, mask in panels.items() if mask.any()} or None)
 
 
 def _turn_faces(garment: Garment, turned: np.ndarray) -> Garment:

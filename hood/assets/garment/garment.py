@@ -45,6 +45,7 @@ class Garment:
     fasteners: dict[str, np.ndarray] | None = (
         None  # (P, 2) each: pairs of vertices that a seam, buttons or a zipper hold together
     )
+    panels: dict[str, np.ndarray] | None = None  # (F,) bool each: faces that the mesh file gives a name, as its pattern pieces
 
     @property
     def bound(self) -> bool:
@@ -112,7 +113,7 @@ def load_garment(name: str | Path, triangulate: bool = False) -> Garment:
 def garment_of_mesh(path: Path, mesh: MeshFile) -> Garment:
     """The garment in a mesh file as it is written; it may still need repair."""
     pinned = np.zeros(len(mesh.pos), dtype=bool)
-    extra = {key: getattr(mesh, key) for key in ("uv", "uv_faces", "normal_faces", "colours")}
+    extra = {key: getattr(mesh, key) for key in ("uv", "uv_faces", "normal_faces", "colours", "panels")}
     return Garment(path.stem, mesh.pos, mesh.faces, pinned, **extra)
 
 

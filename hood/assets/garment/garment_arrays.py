@@ -28,6 +28,7 @@ _ROWS: dict[str, tuple[int | None, ...]] = {
 _CORNERS = ("uv_faces", "normal_faces")
 _LEVEL = "coarse_edges_"
 _FASTENER = "fastener_"
+_PANEL = "panel_"
 _SIZE_LIMIT = 2 << 30
 
 
@@ -69,6 +70,9 @@ def read_fields(path: Path) -> dict[str, Any]:
     if rows:
         fields["fasteners"] = {key[len(_FASTENER) :]: _edge_table(path, key, arrays[key], "fasteners") for key in rows}
         check_fasteners(str(path), fields["fasteners"], num_vertices)
+    panels = [key for key in arrays if key.startswith(_PANEL)]
+    if panels:
+        fields["panels"] = {key[len(_PANEL) :]: _panel(path, key, arrays[key], len(fields["faces"])) for key in panels}
     if path.is_relative_to(DATA_FOLDER):
         fields["bound_to"] = "default"
     elif "bound_to" in arrays and arrays["bound_to"].dtype.kind == "U" and arrays["bound_to"].size == 1:
@@ -78,12 +82,14 @@ def read_fields(path: Path) -> dict[str, Any]:
 
 def write_fields(path: Path, fields: dict[str, Any]) -> None:
     """Write a garment ``.npz`` that :func:`read_fields` reads back; fields that are None are left out."""
-    tables = ("name", "coarse_edges", "fasteners")
+    tables = ("name", "coarse_edges", "fasteners", "panels")
     arrays = {key: value for key, value in fields.items() if value is not None and key not in tables}
     for level, edges in enumerate(fields.get("coarse_edges") or ()):
         arrays[f"{_LEVEL}{level}"] = edges
     for name, pairs in (fields.get("fasteners") or {}).items():
         arrays[f"{_FASTENER}{name}"] = pairs
+    for name, mask in (fields.get("panels") or {}).items():
+        arrays[f"{_PANEL}{name}"] = mask
     content = io.BytesIO()
     np.savez_compressed(content, **arrays)
     write_atomically(path, content.getvalue())
@@ -163,6 +169,13 @@ def _edge_table(path: Path, key: str, value: Any, what: str = "coarse edges") ->
     if table.ndim != 2 or table.shape[1] != 2:
         raise ValueError(f"{path}: {key} has shape {table.shape}; {what} are pairs of vertices (n, 2)")
     return table
+
+
+def _panel(path: Path, key: str, value: Any, num_faces: int) -> np.ndarray:
+    mask = np.asarray(value)
+    if mask.dtype.kind != "b" or mask.shape != (num_faces,):
+        raise ValueError(f"{path}: {key} is {mask.dtype} {mask.shape}; give one bool a face, ({num_faces},)")
+    return mask
 
 
 def _corner_table(path: Path, key: str, value: Any, fields: dict[str, Any]) -> np.ndarray:

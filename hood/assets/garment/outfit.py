@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import chain, count
 
 import numpy as np
@@ -45,6 +45,7 @@ def join_garments(garments: Sequence[Garment]) -> Garment:
         stiffness=_join_rows(garments, "stiffness", lambda garment: np.ones(len(garment.rest_pos))),
         region=_join_rows(garments, "region", lambda garment: np.zeros(len(garment.rest_pos), dtype=np.int64)),
         fasteners=_join_fasteners(garments, starts),
+        panels=_join_panels(garments),
     )
 
 
@@ -101,9 +102,24 @@ def _join_fasteners(garments: Sequence[Garment], starts: np.ndarray) -> dict[str
     rows: dict[str, np.ndarray] = {}
     for garment, start in zip(garments, starts, strict=True):
         for name, pairs in (garment.fasteners or {}).items():
-            free = (key for key in chain([name], (f"{name}_{k}" for k in count(2))) if key not in rows)
-            rows[next(free)] = pairs + start
+            rows[_free(name, rows)] = pairs + start
     return rows or None
+
+
+def _join_panels(garments: Sequence[Garment]) -> dict[str, np.ndarray] | None:
+    """Panels of all garments, named as :func:`_join_fasteners` names rows."""
+    counts = [len(garment.faces) for garment in garments]
+    panels: dict[str, np.ndarray] = {}
+    for place, garment in enumerate(garments):
+        for name, mask in (garment.panels or {}).items():
+            others = [mask if other == place else np.zeros(size, dtype=bool) for other, size in enumerate(counts)]
+            panels[_free(name, panels)] = np.concatenate(others)
+    return panels or None
+
+
+def _free(name: str, taken: Mapping[str, np.ndarray]) -> str:
+    """``name``, or ``name_2`` and so on where that is taken."""
+    return next(key for key in chain([name], (f"{name}_{k}" for k in count(2))) if key not in taken)
 
 
 def _join_levels(garments: Sequence[Garment], starts: np.ndarray) -> tuple[np.ndarray, ...] | None:

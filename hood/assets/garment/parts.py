@@ -1,4 +1,4 @@
-"""Parts of a garment by name: one of an outfit, sleeves, what is above or below a joint, a painted colour, listed vertices."""
+"""Parts of a garment by name: panels, one of an outfit, sleeves, what is above or below a joint, colours, listed vertices."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from hood.assets.body.body import Body
 from hood.assets.files.library import unknown
+from hood.assets.formats.image import read_texture
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.pins import JOINTS, REGIONS, read_indices
 
@@ -24,19 +25,25 @@ def part_faces(part: str, garment: Garment, body: Body | None) -> np.ndarray:
     most of its corners.
 
     Args:
-        part: the name of a garment of an outfit; ``above_JOINT`` or ``below_JOINT``, by the height of the centre in T-pose, the
-            joint by its own name or that of an opening (:data:`hood.assets.garment.pins.REGIONS`); one of :data:`SLEEVES`; one
-            of :data:`COLOURS`, of the vertices in the mesh file; or the path of a ``.txt`` or ``.json`` list of vertices.
+        part: the name of a panel, which counts before all else; that of a garment of an outfit; ``above_JOINT`` or
+            ``below_JOINT``, by the height of the centre in T-pose, the joint by its own name or that of an opening
+            (:data:`hood.assets.garment.pins.REGIONS`); one of :data:`SLEEVES`; one of :data:`COLOURS`, of the vertices in the
+            mesh file; ``COLOUR@IMAGE``, where the centre of a face lies on that colour of a PNG or JPEG file over the texture
+            coordinates; or the path of a ``.txt`` or ``.json`` list of vertices.
         body: whose joints are meant, in T-pose; None refuses them.
 
     Raises:
         ValueError: the garment has no such part, or no face in it; names what there is.
     """
     side, _, joint = part.partition("_")
-    if part in SLEEVES:
+    if part in (garment.panels or {}):
+        found = np.asarray((garment.panels or {})[part])
+    elif part in SLEEVES:
         found = _sleeves(part, garment, body)
     elif side in ("above", "below") and joint:
         found = _beside(part, side, joint, garment, body)
+    elif "@" in part:
+        found = _imaged(part, garment)
     elif Path(part).suffix.lower() in (".txt", ".json"):
         found = _listed(Path(part).expanduser(), garment)
     elif part in COLOURS:
@@ -51,8 +58,8 @@ def part_faces(part: str, garment: Garment, body: Body | None) -> np.ndarray:
 def _piece(part: str, garment: Garment) -> np.ndarray:
     names = garment.name.split("+")
     if part not in names:
-        known = unknown("part", part, [*names, "above_JOINT", "below_JOINT", *SLEEVES, *COLOURS])
-        raise ValueError(f"garment {garment.name!r}: {known}; or a .txt or .json list of vertices")
+        known = unknown("part", part, [*names, *(garment.panels or {}), "above_JOINT", "below_JOINT", *SLEEVES, *COLOURS])
+        raise ValueError(f"garment {garment.name!r}: {known}; COLOUR@IMAGE, or a .txt or .json list of vertices")
     if garment.piece is None or len(names) == 1:
         return np.ones(len(garment.faces), dtype=bool)
     return np.asarray(garment.piece[garment.faces[:, 0]] == names.index(part))
@@ -103,6 +110,29 @@ def _listed(path: Path, garment: Garment) -> np.ndarray:
     return _of_most_corners(inside, garment)
 
 
+def _imaged(part: str, garment: Garment) -> np.ndarray:
+    """Faces whose centre, in texture coordinates, lies on a pixel of the colour; the image repeats. Garments of an
+    outfit that have no coordinates lie in one point, and are not meant."""
+    colour, _, file = part.partition("@")
+    if colour not in COLOURS:
+        raise ValueError(f"part {part!r}: {unknown('colour', colour, COLOURS)}; give COLOUR@IMAGE, such as red@map.png")
+    if garment.uv is None or garment.uv_faces is None:
+        raise ValueError(
+            f"part {part!r}: garment {garment.name!r} has no texture coordinates, over which the image could lie; "
+            "save it with them, or choose another part"
+        )
+    try:
+        pixels = read_texture(Path(file).expanduser()).pixels()
+    except (ValueError, FileNotFoundError) as error:
+        raise ValueError(f"part {part!r}: {error}") from error
+    height, width = pixels.shape[:2]
+    corners = garment.uv[garment.uv_faces]
+    centre, spread = corners.mean(axis=1), (corners != corners[:, :1]).any(axis=(1, 2))
+    column = np.floor(centre[:, 0] * width).astype(np.int64) % width
+    row = np.floor((1.0 - centre[:, 1]) * height).astype(np.int64) % height
+    return spread & _is_colour(colour, pixels[row, column] / 255.0)
+
+
 def _coloured(colour: str, garment: Garment) -> np.ndarray:
     return _of_most_corners(coloured_vertices(colour, garment), garment)
 
@@ -115,9 +145,13 @@ def coloured_vertices(colour: str, garment: Garment) -> np.ndarray:
     """
     if garment.colours is None:
         raise ValueError(f"part {colour!r}: {garment.name!r} has no vertex colours; paint the part and export colours")
+    return _is_colour(colour, garment.colours)
+
+
+def _is_colour(colour: str, values: np.ndarray) -> np.ndarray:
+    """(N,) bool of colours (N, 3), 0 to 1."""
     own = COLOURS.index(colour)
-    others = np.delete(garment.colours, own, axis=1).max(axis=1)
-    return np.asarray(garment.colours[:, own] - others > _STRENGTH)
+    return np.asarray(values[:, own] - np.delete(values, own, axis=1).max(axis=1) > _STRENGTH)
 
 
 def _of_most_corners(inside: np.ndarray, garment: Garment) -> np.ndarray:

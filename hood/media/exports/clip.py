@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
+from hood.assets.formats.image import Texture
 from hood.dynamics.recorder import RolloutData
 from hood.media.mesh_export import corner_normals
 from hood.media.palette import part_colour
+from hood.media.pieces import pieces_of
 from hood.media.render import BODY_COLOR
 
 #: Farther from the origin than this [m] float32, which most formats hold, is no longer good to 2 µm.
@@ -28,6 +29,7 @@ class Part:
     colour: tuple[float, float, float]  # sRGB, 0 to 1
     uv: np.ndarray | None = None  # (U, 2)
     uv_faces: np.ndarray | None = None  # (F, 3), into uv
+    texture: Texture | None = None
 
     def normals(self, frame: int) -> np.ndarray:
         """Unit normals (V, 3) of one frame; of vertices without a face, or with faces of no area, any."""
@@ -51,13 +53,20 @@ class Clip:
         return len(self.parts[0].pos)
 
 
-def clip_of(data: RolloutData, parts: Sequence[str] = PARTS, num_frames: int | None = None, up: str = "y") -> Clip:
+def clip_of(
+    data: RolloutData,
+    parts: Sequence[str] = PARTS,
+    num_frames: int | None = None,
+    up: str = "y",
+    textures: Mapping[str, Texture] | None = None,
+) -> Clip:
     """A rollout as a clip: the cloth, one part a garment of an outfit, and the body.
 
     Args:
         parts: of :data:`PARTS`; a body without vertices is left out.
         num_frames: the first so many; None: all.
         up: ``y`` as in the rollout, or ``z``: turned by 90° about x.
+        textures: images of garments that have texture coordinates, by the garment's name.
 
     Raises:
         ValueError: nothing is left to export, or a position is not finite.
@@ -68,7 +77,7 @@ def clip_of(data: RolloutData, parts: Sequence[str] = PARTS, num_frames: int | N
         raise ValueError(f"dt is {dt} s; the file does not say how long a frame takes")
     meshes = []
     if "cloth" in parts:
-        meshes += _cloth(data, data.cloth_pos[:count])
+        meshes += _cloth(data, data.cloth_pos[:count], textures or {})
     if "body" in parts and data.body_pos.shape[1]:
         meshes.append(Part("body", data.body_pos[:count], data.body_faces, BODY_COLOR))
     if not meshes:
@@ -85,44 +94,16 @@ def clip_of(data: RolloutData, parts: Sequence[str] = PARTS, num_frames: int | N
     return Clip(turned, 1.0 / dt, _upright(origin, up))
 
 
-def _cloth(data: RolloutData, pos: np.ndarray) -> list[Part]:
+def _cloth(data: RolloutData, pos: np.ndarray, textures: Mapping[str, Texture]) -> list[Part]:
     """One part a garment where the file says which vertex belongs to which."""
-    title = str(data.attributes.get("garment", "cloth"))
-    piece, uv, uv_faces = (data.still.get(name) for name in ("piece", "uv", "uv_faces"))
-    if (
-        uv is None
-        or uv_faces is None
-        or uv.ndim != 2
-        or uv.shape[1] != 2
-        or uv_faces.shape != data.cloth_faces.shape
-        or _outside(uv_faces, len(uv))
-    ):
-        uv = uv_faces = None
-    if piece is None or piece.shape != (pos.shape[1],) or piece.min(initial=0) == piece.max(initial=0):
-        return [Part(_plain(title), pos, data.cloth_faces, part_colour(0), uv, uv_faces)]
-    words, labels, found = title.split("+"), sorted(set(piece.tolist())), list[Part]()
-    for rank, label in enumerate(labels):
-        own = np.flatnonzero(piece == label)
-        number = np.full(len(piece), -1)
-        number[own] = np.arange(len(own))
-        mine = (number[data.cloth_faces] >= 0).all(axis=1)
-        name = _plain(words[rank]) if len(words) == len(labels) else f"cloth_{rank}"
-        name = name if name not in [part.name for part in found] else f"{name}_{rank}"
-        faces, texture = number[data.cloth_faces[mine]], None if uv_faces is None else uv_faces[mine]
-        found.append(Part(name, pos[:, own], faces, part_colour(rank), uv, texture))
+    found = []
+    for rank, piece in enumerate(pieces_of(data)):
+        number = np.full(pos.shape[1], -1)
+        number[piece.vertices] = np.arange(len(piece.vertices))
+        faces, texture = number[data.cloth_faces[piece.faces]], textures.get(piece.name)
+        own = pos[:, piece.vertices]
+        found.append(Part(piece.name, own, faces, part_colour(rank), piece.uv, piece.uv_faces, texture))
     return found
-
-
-def _outside(faces: np.ndarray, count: int) -> bool:
-    return bool(faces.size and not 0 <= faces.min() <= faces.max() < count)
-
-
-def _plain(name: str) -> str:
-    """A name that every format takes: letters, digits and underscores, no digit first."""
-    stem = Path(name).stem if "/" in name or "\\" in name else name
-    plain = "".join(letter if letter.isascii() and letter.isalnum() else "_" for letter in stem)
-    plain = f"cloth_{plain}" if not plain or plain[0].isdigit() else plain
-    return "cloth" if plain == "body" else plain
 
 
 def _upright(pos: np.ndarray, up: str) -> np.ndarray:

@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from hood.assets.formats.image import Texture
 from hood.media.exports.clip import Clip, Part
+from hood.media.pieces import split_seams
 
 #: Larger files [bytes] are refused: browsers and game engines keep all morph targets in memory.
 LARGEST = 256 * 2**20
@@ -19,7 +21,8 @@ _FLOAT, _UNSIGNED = 5126, 5125
 def estimated_size(clip: Clip) -> int:
     """Bytes of the file, about."""
     weights = 4 * clip.num_frames**2 * len(clip.parts)
-    return weights + sum(24 * clip.num_frames * len(_corners(part)[0]) for part in clip.parts)
+    images = sum(len(texture.content) for texture in _images(clip))
+    return images + weights + sum(24 * clip.num_frames * len(_corners(part)[0]) for part in clip.parts)
 
 
 def gltf_bytes(clip: Clip) -> bytes:
@@ -40,10 +43,13 @@ def gltf_bytes(clip: Clip) -> bytes:
     weights = np.eye(clip.num_frames, dtype=np.float32)[:, 1:].reshape(-1)
     shares = file.add(weights, "SCALAR") if clip.num_frames > 1 else None
     nodes, meshes, materials, samplers, channels = [], [], [], list[dict[str, Any]](), list[dict[str, Any]]()
+    images = _images(clip)
     for index, part in enumerate(clip.parts):
         meshes.append(_mesh(file, part, index))
         linear = [*(float(channel) ** 2.2 for channel in part.colour), 1.0]
-        surface = {"baseColorFactor": linear, "metallicFactor": 0.0, "roughnessFactor": 0.9}
+        surface: dict[str, Any] = {"baseColorFactor": linear, "metallicFactor": 0.0, "roughnessFactor": 0.9}
+        if part.texture is not None:
+            surface |= {"baseColorFactor": [1.0] * 4, "baseColorTexture": {"index": images.index(part.texture)}}
         materials.append({"name": part.name, "pbrMetallicRoughness": surface, "doubleSided": part.name != "body"})
         nodes.append({"name": part.name, "mesh": index, "translation": [float(value) for value in clip.origin]})
         if shares is not None:
@@ -56,6 +62,7 @@ def gltf_bytes(clip: Clip) -> bytes:
         "nodes": nodes,
         "meshes": meshes,
         "materials": materials,
+        **_textures(file, images),
         "accessors": file.accessors,
         "bufferViews": file.views,
         "buffers": [{"byteLength": file.length}],
@@ -90,9 +97,26 @@ def _corners(part: Part) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Vertex of every point (N,), faces over points, and texture coordinates (N, 2): a vertex on a seam is several points."""
     if part.uv is None or part.uv_faces is None:
         return np.arange(part.pos.shape[1]), part.faces, None
-    pairs = np.stack([part.faces.reshape(-1), part.uv_faces.reshape(-1)], axis=1)
-    points, number = np.unique(pairs, axis=0, return_inverse=True)
-    return points[:, 0], number.reshape(-1, 3), part.uv[points[:, 1]]
+    vertex, coordinate, faces = split_seams(part.faces, part.uv_faces)
+    return vertex, faces, part.uv[coordinate]
+
+
+def _images(clip: Clip) -> list[Texture]:
+    """Every image once."""
+    return list(dict.fromkeys(part.texture for part in clip.parts if part.texture is not None))
+
+
+def _textures(file: _Buffers, images: list[Texture]) -> dict[str, Any]:
+    """Tables of the document for images that repeat, in their order; nothing without images."""
+    if not images:
+        return {}
+    views = [{"bufferView": file.add_bytes(image.content), "mimeType": image.kind} for image in images]
+    # 10497: repeat; 9729 and 9987: between pixels, and between sizes of the image, linear.
+    return {
+        "images": views,
+        "samplers": [{"wrapS": 10497, "wrapT": 10497, "magFilter": 9729, "minFilter": 9987}],
+        "textures": [{"sampler": 0, "source": place} for place in range(len(images))],
+    }
 
 
 class _Buffers:
@@ -106,18 +130,23 @@ class _Buffers:
 
     def add(self, values: np.ndarray, kind: str, bounds: bool = False) -> int:
         """Number of the accessor of ``values``, float32 or uint32."""
-        content = values.tobytes()
-        self.views.append({"buffer": 0, "byteOffset": self.length, "byteLength": len(content)})
+        view = self.add_bytes(values.tobytes())
         component = _FLOAT if values.dtype == np.float32 else _UNSIGNED
-        accessor: dict[str, Any] = {"bufferView": len(self.views) - 1, "componentType": component, "count": len(values)}
+        accessor: dict[str, Any] = {"bufferView": view, "componentType": component, "count": len(values)}
         accessor["type"] = kind
         if bounds:
             low, high = (np.atleast_1d(edge(values, axis=0)) for edge in (np.min, np.max))
             accessor["min"], accessor["max"] = [float(v) for v in low], [float(v) for v in high]
         self.accessors.append(accessor)
-        self.chunks.append(content)
-        self.length += len(content)
         return len(self.accessors) - 1
+
+    def add_bytes(self, content: bytes) -> int:
+        """Number of the view of ``content``; the next one begins at a multiple of four."""
+        self.views.append({"buffer": 0, "byteOffset": self.length, "byteLength": len(content)})
+        padded = content + b"\0" * (-len(content) % 4)
+        self.chunks.append(padded)
+        self.length += len(padded)
+        return len(self.views) - 1
 
 
 def _packed(document: bytes, binary: bytes) -> bytes:

@@ -12,9 +12,9 @@ from hood.media.mesh_export import obj_faces, obj_points
 
 
 def write_obj_sequence(folder: Path, clip: Clip) -> None:
-    """``NAME_0001.obj`` … of every part, with texture coordinates and normals."""
+    """``NAME_0001.obj`` … of every part, with texture coordinates and normals; an image comes with ``NAME.mtl``."""
     for part in clip.parts:
-        tail = _obj_faces(part)
+        tail = _obj_faces(folder, part)
         for frame in range(clip.num_frames):
             (folder / f"{part.name}_{frame + 1:04d}.obj").write_text(_obj_points(part, frame) + tail, encoding="ascii")
 
@@ -44,17 +44,26 @@ def write_ply_sequence(folder: Path, clip: Clip) -> None:
 
 
 def write_point_cache(folder: Path, clip: Clip) -> None:
-    """``NAME.obj``, the first frame, and ``NAME.pc2``, all frames in float32, of every part."""
+    """``NAME.obj``, the first frame, and ``NAME.pc2``, all frames in float32, of every part; images as with OBJ files."""
     for part in clip.parts:
-        (folder / f"{part.name}.obj").write_text(_obj_points(part, 0) + _obj_faces(part), encoding="ascii")
+        (folder / f"{part.name}.obj").write_text(_obj_points(part, 0) + _obj_faces(folder, part), encoding="ascii")
         # Version, points, first frame, frames from one sample to the next, samples.
         header = struct.pack("<12siiffi", b"POINTCACHE2\0", 1, part.pos.shape[1], 0.0, 1.0, clip.num_frames)
         (folder / f"{part.name}.pc2").write_bytes(header + np.ascontiguousarray(part.pos, "<f4").tobytes())
 
 
 def _obj_points(part: Part, frame: int) -> str:
-    return obj_points(part.name, part.pos[frame], part.normals(frame))
+    lines = obj_points(part.name, part.pos[frame], part.normals(frame))
+    return lines if part.texture is None else f"mtllib {part.name}.mtl\n{lines}"
 
 
-def _obj_faces(part: Part) -> str:
-    return obj_faces(part.faces, part.faces, part.uv, part.uv_faces)
+def _obj_faces(folder: Path, part: Part) -> str:
+    """Lines of a part's faces; of one with an image, that and the material with it are written into ``folder``."""
+    lines = obj_faces(part.faces, part.faces, part.uv, part.uv_faces)
+    if part.texture is None:
+        return lines
+    image = f"{part.name}{part.texture.suffix}"
+    (folder / image).write_bytes(part.texture.content)
+    material = f"newmtl {part.name}\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {image}\n"
+    (folder / f"{part.name}.mtl").write_text(material, encoding="ascii")
+    return f"usemtl {part.name}\n{lines}"

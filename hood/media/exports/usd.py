@@ -1,4 +1,4 @@
-"""USD: one prim a part, positions and normals as time samples."""
+"""USD: one prim a part, positions and normals as time samples, and images beside the file."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ import numpy as np
 from hood.media.exports.clip import Clip, Part
 
 
-def write_usd(path: Path, clip: Clip, up: str) -> None:
+def write_usd(path: Path, clip: Clip, up: str, name: str | None = None) -> None:
     """Write the clip as a stage: metres, one time code a frame from 0 on, ``up`` axis ``y`` or ``z``.
 
     Args:
         path: ends in ``.usd``, ``.usdc`` (binary) or ``.usda`` (text).
+        name: what the file will be called; None: as in ``path``. It names images by :func:`image_name`, which are not written.
 
     Raises:
         OSError: it cannot be written.
@@ -23,12 +24,18 @@ def write_usd(path: Path, clip: Clip, up: str) -> None:
     from pxr import Tf
 
     try:
-        _write(path, clip, up)
+        _write(path, clip, up, Path(name or path.name).stem)
     except Tf.ErrorException as error:
         raise OSError(errno.EIO, "cannot be written; is the folder writable, is there space?", str(path)) from error
 
 
-def _write(path: Path, clip: Clip, up: str) -> None:
+def image_name(stem: str, part: Part) -> str:
+    """Name of the image of a part beside the file ``stem.usd``."""
+    assert part.texture is not None
+    return f"{stem}_{part.name}_texture{part.texture.suffix}"
+
+
+def _write(path: Path, clip: Clip, up: str, name: str) -> None:
     from pxr import Gf, Usd, UsdGeom, Vt
 
     stage = Usd.Stage.CreateNew(str(path))
@@ -44,6 +51,9 @@ def _write(path: Path, clip: Clip, up: str) -> None:
         root.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*map(float, clip.origin)))
     for part in clip.parts:
         _add(UsdGeom.Mesh.Define(stage, f"/rollout/{part.name}"), part, UsdGeom, Vt)
+    for part in clip.parts:
+        if part.texture is not None:
+            _lay_on(stage, clip, part.name, image_name(name, part))
     stage.GetRootLayer().Save()
 
 
@@ -67,3 +77,29 @@ def _add(mesh: Any, part: Part, geom: Any, vt: Any) -> None:
         points.Set(vt.Vec3fArray.FromNumpy(here), frame)
         normals.Set(vt.Vec3fArray.FromNumpy(np.ascontiguousarray(part.normals(frame), np.float32)), frame)
         extent.Set(vt.Vec3fArray.FromNumpy(np.stack([here.min(axis=0), here.max(axis=0)])), frame)
+
+
+def _lay_on(stage: Any, clip: Clip, part: str, image: str) -> None:
+    """Bind a material with the image, which lies beside the stage, to the mesh of a part."""
+    from pxr import Sdf, UsdShade
+
+    folder = "materials"
+    while folder in [other.name for other in clip.parts]:
+        folder += "_"
+    material = UsdShade.Material.Define(stage, f"/rollout/{folder}/{part}")
+    path, kinds = material.GetPath(), Sdf.ValueTypeNames
+    surface, reader, texture = (UsdShade.Shader.Define(stage, path.AppendChild(name)) for name in ("surface", "st", "image"))
+    reader.CreateIdAttr("UsdPrimvarReader_float2")
+    reader.CreateInput("varname", kinds.String).Set("st")
+    texture.CreateIdAttr("UsdUVTexture")
+    texture.CreateInput("file", kinds.Asset).Set(f"./{image}")
+    for axis in ("wrapS", "wrapT"):
+        texture.CreateInput(axis, kinds.Token).Set("repeat")
+    texture.CreateInput("sourceColorSpace", kinds.Token).Set("sRGB")
+    texture.CreateInput("st", kinds.Float2).ConnectToSource(reader.CreateOutput("result", kinds.Float2))
+    surface.CreateIdAttr("UsdPreviewSurface")
+    surface.CreateInput("roughness", kinds.Float).Set(0.9)
+    surface.CreateInput("diffuseColor", kinds.Color3f).ConnectToSource(texture.CreateOutput("rgb", kinds.Float3))
+    material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", kinds.Token))
+    mesh = stage.GetPrimAtPath(f"/rollout/{part}")
+    UsdShade.MaterialBindingAPI.Apply(mesh).Bind(material)

@@ -29,6 +29,19 @@ export async function unpackMesh(packed) {
   return { frames: packed.frames, width, step: packed.step, whole, faces: await unpackIntegers(packed.faces) };
 }
 
+/** What is drawn where garments have images: vertices of the points, faces over points and texture coordinates. */
+export async function unpackMapped(packed) {
+  const [points, faces, steps] = await Promise.all([packed.points, packed.faces, packed.uv].map(unpackIntegers));
+  return { points, faces, uv: Float32Array.from(steps, (value) => value * packed.step), groups: packed.groups };
+}
+
+/** Triples of vertices as those of the points that are drawn: a vertex on a seam of a texture is several points. */
+export function spread(values, points, target) {
+  for (let i = 0; i < points.length; i++) {
+    for (let k = 0; k < 3; k++) target[3 * i + k] = values[3 * points[i] + k];
+  }
+}
+
 /** Positions [m] of a frame into `target`; beyond the last frame those of the last. */
 export function positionsAt(mesh, frame, target) {
   const start = Math.min(frame, mesh.frames - 1) * mesh.width;

@@ -11,16 +11,21 @@ from typing import Any
 
 import numpy as np
 
+from hood.assets.formats.image import Texture
 from hood.dynamics.recorder import RolloutData
 from hood.media.colouring import COLOURINGS, Colouring, colouring_of, colours_at
 from hood.media.film import seconds_per_frame
+from hood.media.moments import shared_moments, wind_of
 from hood.media.palette import outfit_colours
+from hood.media.pieces import pieces_of, split_seams
 from hood.media.viewer.packing import pack_bytes, pack_integers, pack_positions
 
 #: The ramp's last colour, of vertices without a value.
 _UNKNOWN = 255
 #: What the menu calls a colouring, where that is not its name.
 _LABELS = {"rg": "unbalanced force"}
+#: Distance between texture coordinates that a page can hold, and the farthest.
+UV_STEP, _FARTHEST_UV = 2.0**-16, 2.0**14
 _HERE = Path(__file__).parent
 #: Modules by the names under which they are imported.
 _MODULES = {"three": "three.module.min.js", "orbit": "OrbitControls.js", "data": "data.js", "figures": "figures.js"}
@@ -28,8 +33,13 @@ _MODULES = {"three": "three.module.min.js", "orbit": "OrbitControls.js", "data":
 _CHARTED = (("strain_p99", "strain p99"), ("relative_gradient", "rg"), ("ms_total", "ms a frame"))
 
 
-def view_page(rollouts: Sequence[tuple[str, RolloutData]], title: str) -> str:
+def view_page(
+    rollouts: Sequence[tuple[str, RolloutData]], title: str, textures: Sequence[Mapping[str, Texture]] | None = None
+) -> str:
     """The HTML of named rollouts, which loads nothing from anywhere.
+
+    Args:
+        textures: of every rollout the images of its garments, by the names of :func:`hood.media.pieces.pieces_of`.
 
     Raises:
         ValueError: there is none, or their frames are not equally far apart in time.
@@ -45,12 +55,17 @@ def view_page(rollouts: Sequence[tuple[str, RolloutData]], title: str) -> str:
             )
     every = [data for _, data in rollouts]
     painted = {name: _colourings(every, name) for name in COLOURINGS if all(_has(data, name) for data in every)}
+    laid_on = textures or [{}] * len(rollouts)
+    images = list(dict.fromkeys(texture for by in laid_on for texture in by.values()))
     content = {
+        "images": [image.address for image in images],
         "seconds": seconds[0],
+        "moments": [{"frame": frame, "words": words} for frame, words in shared_moments(rollouts)],
         "ramp": np.rint(255.0 * colours_at(np.append(np.linspace(0.0, 1.0, _UNKNOWN), np.nan))).astype(int).tolist(),
         "scales": [_scale(name, by[0]) for name, by in painted.items()],
         "rollouts": [
             _rollout(name, data, {kind: by[at] for kind, by in painted.items()}, every[0] if at else None)
+            | {"mapped": _mapped(data, laid_on[at], images)}
             for at, (name, data) in enumerate(rollouts)
         ],
     }
@@ -83,6 +98,7 @@ def _rollout(name: str, data: RolloutData, painted: Mapping[str, Colouring], fir
     same = first is not None and _same_body(first, data)
     return {
         "name": name,
+        "note": wind_of(data),
         "cloth": cloth,
         "lost": lost,
         "values": {kind: pack_bytes(_places(colouring)) for kind, colouring in painted.items()},
@@ -99,6 +115,39 @@ def _rollout(name: str, data: RolloutData, painted: Mapping[str, Colouring], fir
 def _mesh(pos: np.ndarray, faces: np.ndarray) -> tuple[dict[str, Any], list[int]]:
     packed, lost = pack_positions(pos)
     return packed | {"faces": pack_integers(faces)}, lost
+
+
+def _mapped(data: RolloutData, textures: Mapping[str, Texture], images: Sequence[Texture]) -> dict[str, Any] | None:
+    """What is drawn where garments have images, as JSON; None where none has.
+
+    ``points`` are vertices, those on seams of a texture several times, ``faces`` are over points, ``uv`` in steps of
+    :data:`UV_STEP`; ``groups`` say of how many faces in their order which image is drawn on them, null for none.
+    """
+    if not textures:
+        return None
+    pieces = pieces_of(data)
+    corners = np.zeros_like(data.cloth_faces)
+    table, groups, order, start = [np.zeros((1, 2))], [], [], 1  # coordinate 0 is that of garments without an image
+    for piece in pieces:
+        texture = textures.get(piece.name)
+        order.append(piece.faces)
+        groups.append([len(piece.faces), None if texture is None else images.index(texture)])
+        if texture is not None:
+            assert piece.uv is not None
+            assert piece.uv_faces is not None
+            corners[piece.faces] = piece.uv_faces + start
+            table.append(piece.uv)
+            start += len(piece.uv)
+    chosen = np.concatenate(order)
+    points, coordinate, faces = split_seams(data.cloth_faces[chosen], corners[chosen])
+    uv = np.clip(np.concatenate(table)[coordinate], -_FARTHEST_UV, _FARTHEST_UV)
+    return {
+        "points": pack_integers(points),
+        "faces": pack_integers(faces),
+        "uv": pack_integers(np.rint(uv / UV_STEP)),
+        "step": UV_STEP,
+        "groups": groups,
+    }
 
 
 def _same_body(first: RolloutData, other: RolloutData) -> bool:

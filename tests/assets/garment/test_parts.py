@@ -56,6 +56,62 @@ def test_painted_and_listed_parts_are_the_faces_with_most_corners_there(tmp_path
     np.testing.assert_array_equal(part_faces(str(tmp_path / "left.txt"), tank, None), expected)
 
 
+def test_colours_of_an_image_are_the_faces_whose_centres_lie_there(tmp_path: Path, garments: dict[str, Garment]) -> None:
+    from PIL import Image
+
+    tank, path = garments["tank"], tmp_path / "map.png"
+    assert tank.uv is not None
+    assert tank.uv_faces is not None
+    pixels = np.zeros((40, 30, 3), np.uint8)
+    pixels[:30, :] = [255, 30, 40]  # the upper three quarters
+    pixels[30:, 20:] = [10, 200, 30]
+    pixels[30:, :20] = [250, 200, 60]  # none of the three
+    Image.fromarray(pixels).save(path)
+    u, v = tank.uv[tank.uv_faces].mean(axis=1).T
+    upper = v % 1.0 > 0.25
+    np.testing.assert_array_equal(part_faces(f"red@{path}", tank, None), upper)
+    np.testing.assert_array_equal(part_faces(f"green@{path}", tank, None), ~upper & (u % 1.0 >= 2 / 3))
+    assert 0 < upper.mean() < 1
+    shifted = replace(tank, uv=tank.uv + [2.0, -3.0])
+    np.testing.assert_array_equal(part_faces(f"red@{path}", shifted, None), upper)
+    with pytest.raises(ValueError, match="no face of garment 'tank' is in it"):
+        part_faces(f"blue@{path}", tank, None)
+    bare = replace(garments["skirt"], uv=None, uv_faces=None)
+    with pytest.raises(ValueError, match="garment 'skirt' has no texture coordinates"):
+        part_faces(f"red@{path}", bare, None)
+    Image.new("RGB", (2, 2), (255, 0, 0)).save(path)
+    outfit = join_garments([tank, bare])
+    np.testing.assert_array_equal(part_faces(f"red@{path}", outfit, None), part_faces("tank", outfit, None))
+
+
+def test_images_that_cannot_be_used_are_refused(tmp_path: Path, garments: dict[str, Garment]) -> None:
+    tank, path = garments["tank"], tmp_path / "map.png"
+    for part, said in (
+        (f"red@{path}", "no such file"),
+        (f"rde@{path}", "did you mean 'red'"),
+        (f"@{path}", "give COLOUR@IMAGE"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            part_faces(part, tank, None)
+    path.write_text("no image")
+    with pytest.raises(ValueError, match="neither PNG nor JPEG"):
+        part_faces(f"red@{path}", tank, None)
+
+
+def test_panels_count_before_other_parts(garments: dict[str, Garment], body: Body) -> None:
+    shirt = garments["longsleeve"]
+    front = shirt.rest_pos[shirt.faces, 2].mean(axis=1) > 0
+    panelled = replace(shirt, panels={"front": front, "sleeve_left": ~front})
+    np.testing.assert_array_equal(part_faces("front", panelled, None), front)
+    np.testing.assert_array_equal(part_faces("sleeve_left", panelled, body), ~front)
+    with pytest.raises(ValueError, match="unknown part 'frnt': did you mean 'front'"):
+        part_faces("frnt", panelled, None)
+    outfit = join_garments([panelled, garments["skirt"], replace(garments["tank"], panels={"front": np.arange(1901) < 5})])
+    np.testing.assert_array_equal(part_faces("front", outfit, None)[: len(front)], front)
+    assert part_faces("front", outfit, None).sum() == front.sum()
+    np.testing.assert_array_equal(np.flatnonzero(part_faces("front_2", outfit, None)), len(outfit.faces) - 1901 + np.arange(5))
+
+
 @pytest.mark.parametrize(
     ("part", "message"),
     [

@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import base64
 import io
+import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from hood.assets.formats.image import Texture
 from hood.dynamics.recorder import RolloutData
 from hood.media.camera import Camera
 from hood.media.render import RenderMesh, render_frame
@@ -172,4 +175,53 @@ def test_rollouts_beside_and_over_each_other(data: RolloutData, tmp_path: Path) 
         over = covered(canvas(browser, "canvas"))
         columns = np.flatnonzero(over.any(axis=0))
         assert abs(columns.mean() - half) < 3
+        assert browser.complaints == []
+
+
+def test_events_are_marked_and_lead_to_their_frames(data: RolloutData, tmp_path: Path) -> None:
+    """Of three events close to each other no label covers another, and each begins at its place in the chart."""
+    events = [{"frame": frame, "open": "front_buttons"} for frame in (100, 104, 108)]
+    told = {"dt": 1 / 30, "config": json.dumps({"events": events, "wind": 3})}
+    path = tmp_path / "events.html"
+    path.write_text(view_page([("one", replace(data, attributes=told))], "a tube"), encoding="utf-8")
+    with Browser() as browser:
+        browser.open(path)
+        boxes = np.array(
+            browser.run(
+                "[...document.querySelectorAll('#moments button')].map((one) => { const box = one.getBoundingClientRect();"
+                "return [box.left, box.top, box.right, box.bottom]; })"
+            )
+        )
+        assert len(boxes) == 3
+        assert (boxes[1:, 1] >= boxes[:-1, 3]).all()
+        wide = browser.run("document.getElementById('chart').clientWidth")
+        assert np.allclose(boxes[:, 0], 60 + (wide - 72) * np.array([100, 104, 108]) / (FRAMES - 1), atol=1.0)
+        browser.press(boxes[1, 0] + 8, 0.5 * (boxes[1, 1] + boxes[1, 3]))
+        assert said(browser, "frame").startswith("frame 104 of")
+        assert said(browser, "names") == "onewind 3 m/s"
+        assert browser.complaints == []
+
+
+def test_an_image_lies_on_the_garment(data: RolloutData, tmp_path: Path) -> None:
+    """Half of the tube has a red image and the other half a blue one, side by side in one file; a seam runs where they meet."""
+    from PIL import Image
+
+    content = io.BytesIO()
+    Image.fromarray(np.array([[[255, 0, 0], [0, 0, 255]]], np.uint8).repeat(8, axis=0).repeat(8, axis=1)).save(content, "PNG")
+    right = data.rest_pos[data.cloth_faces][..., 0].mean(axis=1) > 0
+    still = {"uv": np.array([[0.25, 0.5], [0.25, 0.6], [0.75, 0.5], [0.75, 0.6]])}
+    still["uv_faces"] = np.where(right[:, None], [2, 3, 2], [0, 1, 0])
+    texture = Texture(content.getvalue(), "image/png", ".png")
+    path = tmp_path / "image.html"
+    path.write_text(view_page([("one", replace(data, still=still))], "a tube", [{"cloth": texture}]), encoding="utf-8")
+    with Browser() as browser:
+        browser.open(path)
+        shown = scrub(browser, 0)
+        red, blue = (shown[..., one] > 2 * shown[..., other] for one, other in ((0, 2), (2, 0)))
+        left_of, right_of = (np.flatnonzero(half.any(axis=0)).mean() for half in (red, blue))
+        assert min(red.mean(), blue.mean()) > 0.01
+        assert left_of < shown.shape[1] / 2 < right_of
+        choose(browser, "colour", "plain")
+        plain = canvas(browser, "canvas")
+        assert not ((plain[..., 0] > 2 * plain[..., 2]) & covered(plain)).any()
         assert browser.complaints == []

@@ -1,0 +1,85 @@
+"""The garments in a rollout, one by one, with their texture coordinates."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hood.dynamics.recorder import RolloutData
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One garment."""
+
+    name: str  # letters, digits and underscores
+    vertices: np.ndarray  # (P,) their numbers in the rollout
+    faces: np.ndarray  # (N,) their numbers in the rollout
+    uv: np.ndarray | None  # (U, 2); None where the rollout holds none
+    uv_faces: np.ndarray | None  # (N, 3) into uv
+
+    @property
+    def is_mapped(self) -> bool:
+        """Whether its texture coordinates cover an area; in an outfit, garments without any lie in one point."""
+        if self.uv is None or self.uv_faces is None or not len(self.uv_faces):
+            return False
+        corners = self.uv[self.uv_faces].reshape(-1, 2)
+        return bool((corners != corners[0]).any())
+
+
+def pieces_of(data: RolloutData) -> list[Piece]:
+    """The garments of a rollout, in their order; one where the file does not say which vertex belongs to which."""
+    return pieces_by(str(data.attributes.get("garment", "cloth")), data.cloth_pos.shape[1], data.cloth_faces, data.still)
+
+
+def pieces_by(title: str, count: int, faces: np.ndarray, still: Mapping[str, np.ndarray]) -> list[Piece]:
+    """The same by the names of the garments, joined by ``+``, the number of vertices, the faces (F, 3) and what a rollout holds
+    beside them (:data:`hood.dynamics.recorder.STILL`)."""
+    piece, uv, uv_faces = (still.get(name) for name in ("piece", "uv", "uv_faces"))
+    if (
+        uv is None
+        or uv_faces is None
+        or uv.ndim != 2
+        or uv.shape[1] != 2
+        or uv_faces.shape != faces.shape
+        or _outside(uv_faces, len(uv))
+    ):
+        uv = uv_faces = None
+    if piece is None or piece.shape != (count,) or piece.min(initial=0) == piece.max(initial=0):
+        return [Piece(plain_name(title), np.arange(count), np.arange(len(faces)), uv, uv_faces)]
+    words, labels, found = title.split("+"), sorted(set(piece.tolist())), list[Piece]()
+    for rank, label in enumerate(labels):
+        mine = np.flatnonzero((piece[faces] == label).all(axis=1))
+        name = plain_name(words[rank]) if len(words) == len(labels) else f"cloth_{rank}"
+        name = name if name not in [other.name for other in found] else f"{name}_{rank}"
+        found.append(Piece(name, np.flatnonzero(piece == label), mine, uv, None if uv_faces is None else uv_faces[mine]))
+    return found
+
+
+def split_seams(faces: np.ndarray, uv_faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points to draw: a vertex on a seam of the texture is several.
+
+    Args:
+        faces, uv_faces: vertex and texture coordinate of every corner, (F, 3).
+
+    Returns:
+        Vertex (N,) and texture coordinate (N,) of every point, and the faces (F, 3) over points.
+    """
+    pairs = np.stack([faces.reshape(-1), uv_faces.reshape(-1)], axis=1)
+    points, number = np.unique(pairs, axis=0, return_inverse=True)
+    return points[:, 0], points[:, 1], number.reshape(-1, 3)
+
+
+def plain_name(name: str) -> str:
+    """A name that every format takes: letters, digits and underscores, no digit first."""
+    stem = Path(name).stem if "/" in name or "\\" in name else name
+    plain = "".join(letter if letter.isascii() and letter.isalnum() else "_" for letter in stem)
+    plain = f"cloth_{plain}" if not plain or plain[0].isdigit() else plain
+    return "cloth" if plain == "body" else plain
+
+
+def _outside(faces: np.ndarray, count: int) -> bool:
+    return bool(faces.size and not 0 <= faces.min() <= faces.max() < count)
