@@ -27,12 +27,12 @@ def fabric_of(config: DictConfig, garment: Garment, motion: Motion) -> Material:
         ValueError: it names a part that the garment does not have.
     """
     material: Material = build(config.material)
-    parts = checked_fabrics(config)
+    parts, width = checked_fabrics(config), checked_seams(config)
     if not parts:
         return material
     body = motion.body if isinstance(motion, BodyMotion) else None
     pieces = [(part_faces(part, garment, body), fabric) for part, fabric in parts.items()]
-    return patchwork(material, pieces, garment.rest_pos, garment.faces)
+    return patchwork(material, pieces, garment.rest_pos, garment.faces, width)
 
 
 def checked_fabrics(config: DictConfig) -> dict[str, Material]:
@@ -50,6 +50,22 @@ def checked_fabrics(config: DictConfig) -> dict[str, Material]:
             f"fabrics={value}: give fabrics by part, such as fabrics={{below_waistband:silk,above_waistband:denim}}"
         )
     return {str(part): _fabric(str(part), fabric, config) for part, fabric in value.items()}
+
+
+def checked_seams(config: DictConfig) -> float:
+    """``fabrics_seam`` of a config [m].
+
+    Raises:
+        ConfigError: it is no length, or there are no fabrics that it could be between.
+    """
+    width = config.fabrics_seam
+    if isinstance(width, bool) or not isinstance(width, (int, float)) or not 0.0 <= width < float("inf"):
+        raise ConfigError(f"fabrics_seam={width}: give metres (0.03), 0 for a sharp seam")
+    if width > 0.0 and config.fabrics is None:
+        raise ConfigError(
+            f"fabrics_seam={width:g}: is between fabrics; give fabrics={{below_waistband:silk}} too, or leave it out"
+        )
+    return float(width)
 
 
 def _fabric(part: str, given: str | dict[str, Any], config: DictConfig) -> Material:

@@ -18,6 +18,8 @@ from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
+from scipy.sparse import csr_matrix, vstack
+from scipy.sparse.csgraph import dijkstra
 
 from hood.assets.material import FaceField, Material, check_lame, values_of
 from hood.mesh import topology
@@ -123,7 +125,13 @@ class FabricMap:
         return np.broadcast_to(values, (self._counts[place],))
 
 
-def patchwork(material: Material, parts: Sequence[tuple[np.ndarray, Material]], pos: np.ndarray, faces: np.ndarray) -> Material:
+def patchwork(
+    material: Material,
+    parts: Sequence[tuple[np.ndarray, Material]],
+    pos: np.ndarray,
+    faces: np.ndarray,
+    seam_width: float = 0.0,
+) -> Material:
     """A fabric of which some faces are others, each property a field on faces.
 
     Away from the seams every part is what a garment of its own fabric would be. The bend of an edge between two fabrics is the
@@ -134,6 +142,8 @@ def patchwork(material: Material, parts: Sequence[tuple[np.ndarray, Material]], 
         parts: masks (F,) bool and their fabrics; of several that hold a face the last counts.
         pos: (V, 3) m at rest.
         faces: (F, 3).
+        seam_width: m, along the cloth, over which one fabric becomes the other: a face there has the mean of the faces within
+            half of it, the nearer the more. 0: from one face to the next.
     """
     edges = topology.unique_edges(faces)
     corners = pos[faces]
@@ -142,15 +152,50 @@ def patchwork(material: Material, parts: Sequence[tuple[np.ndarray, Material]], 
         [FabricMap(fabric, len(pos), faces, edges, area) for fabric in fabrics]
         for fabrics in ([material], [fabric for _, fabric in parts])
     )
+    label = np.zeros(len(faces), dtype=np.int64)
+    for number, (mask, _) in enumerate(parts):
+        label[mask] = number + 1
+    near, shares = _around_seams(label, corners.mean(axis=1), faces, area, 0.5 * seam_width)
     fields = {}
     for name in Material.names():
         values = whole[0].on_faces(name).copy()
         for (mask, _), own in zip(parts, others, strict=True):
             values[mask] = own.on_faces(name)[mask]
+        values[near] = shares @ values
         fields[name] = FaceField(values)
     return Material(**fields)
 
 
+def _around_seams(
+    label: np.ndarray, centre: np.ndarray, faces: np.ndarray, area: np.ndarray, reach: float
+) -> tuple[np.ndarray, csr_matrix]:
+    """Faces (N,) within ``reach`` [m] along the cloth of a face with another ``label`` (F,), and (N, F) the shares that the
+    faces around have in them; rows sum to 1.
+
+    Args:
+        centre: (F, 3) m of the faces.
+        area: (F,) m².
+    """
+    # Faces that share a vertex: over edges alone ways along the cloth go to and fro, and are half as long again.
+    corner = csr_matrix((np.ones(faces.size), (np.arange(faces.size) // 3, faces.ravel())))
+    first, second = (corner @ corner.T).nonzero()
+    seam = np.unique(first[label[first] != label[second]])
+    if reach <= 0.0 or not len(seam):
+        return np.zeros(0, dtype=np.int64), csr_matrix((0, len(faces)))
+    # A way of length 0 is none in a sparse matrix.
+    length = np.maximum(np.linalg.norm(centre[first] - centre[second], axis=1), 1e-12)
+    graph = csr_matrix((length, (first, second)))
+    near = np.flatnonzero(np.isfinite(dijkstra(graph, indices=seam, limit=reach, min_only=True)))
+    rows, solid = [], np.maximum(area, np.finfo(np.float64).tiny)
+    for some in np.array_split(near, max(len(near) // _FACES_AT_ONCE, 1)):
+        distance = dijkstra(graph, indices=some, limit=reach)
+        weight = np.where(np.isfinite(distance), solid * np.maximum(1.0 - distance / reach, 0.0), 0.0)
+        rows.append(csr_matrix(weight / weight.sum(axis=1, keepdims=True)))
+    return near, vstack(rows).tocsr()
+
+
+#: Rows of distances that are held at a time.
+_FACES_AT_ONCE = 256
 #: What a garment's stiffness multiplies.
 _STIFFENED = ("lame_mu", "lame_lambda")
 _PLURAL = {"vertex": "vertices", "face": "faces", "edge": "edges"}

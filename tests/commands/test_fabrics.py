@@ -51,6 +51,28 @@ def test_what_is_no_table_of_fabrics_is_refused(word: str, message: str) -> None
         checked_fabrics(load_config("rollout", [word]))
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["fabrics={dress:silk}", "fabrics_seam=-0.1"], "fabrics_seam=-0.1: give metres"),
+        (["fabrics={dress:silk}", "fabrics_seam=wide"], "fabrics_seam=wide: give metres"),
+        (["fabrics_seam=0.03"], "fabrics_seam=0.03: is between fabrics; give fabrics="),
+    ],
+)
+def test_what_is_no_width_of_a_seam_is_refused(words: list[str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        make_scene(load_config("rollout", ["num_frames=3", *words]))
+
+
+def test_a_seam_may_be_wide() -> None:
+    words = ["garment=dress", "fabrics={below_waistband:{density:0.6}}", "num_frames=3"]
+    sharp, wide = (make_scene(load_config("rollout", [*words, *more])).cloth for more in ([], ["fabrics_seam=0.2"]))
+    between = (wide.density > wide.density.min() + 1e-3) & (wide.density < wide.density.max() - 1e-3)
+    assert not ((sharp.density > sharp.density.min() + 1e-3) & (sharp.density < sharp.density.max() - 1e-3)).any()
+    assert 0.05 < float(between.float().mean()) < 0.6
+    assert float(wide.mass.sum()) == pytest.approx(float(sharp.mass.sum()), rel=0.02)
+
+
 def test_a_part_may_have_properties_of_its_own() -> None:
     words = ["garment=dress", "fabrics={below_waistband:{friction:3},above_waistband:{material:denim,density:0.3}}"]
     cloth = make_scene(load_config("rollout", [*words, "num_frames=3"])).cloth

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from hood.assets.material import EdgeField, FaceField, Field, Material
+from hood.assets.material import EdgeField, FaceField, Field, Material, values_of
 from hood.dynamics.implicit_euler import implicit_euler
 from hood.losses.bending import Bending
 from hood.losses.potential import default_potential
@@ -230,3 +230,35 @@ def test_of_parts_that_overlap_the_last_counts() -> None:
     masks = np.arange(count) < 9, np.arange(count) < 4
     sewn = patchwork(Material(), [(masks[0], Material(density=0.3)), (masks[1], Material(density=0.4))], *mesh)
     np.testing.assert_allclose(sewn.density.values, [0.4] * 4 + [0.3] * 5 + [0.20022] * (count - 9))
+
+
+def test_a_wide_seam_goes_from_one_fabric_to_the_other() -> None:
+    """A tube: along it the share of the other fabric grows from 0 to 1 over the width; farther away nothing changes."""
+    pos, faces = cylinder(24, 41)
+    axis = int(np.argmax(np.ptp(pos, axis=0)))
+    along = pos[faces].mean(axis=1)[:, axis]
+    along = (along - along.min()) / np.ptp(along)
+    length = float(np.ptp(pos[:, axis]))
+    light, heavy = Material(density=0.1), Material(density=0.3)
+    sharp, wide = (patchwork(light, [(along > 0.5, heavy)], pos, faces, width) for width in (0.0, 0.4 * length))
+    before, after = (values_of(fabric.density)[0] for fabric in (sharp, wide))
+    assert set(before.tolist()) == {0.1, 0.3}
+    far = abs(along - 0.5) > 0.25
+    assert (after[far] == before[far]).all()
+    share = (after - 0.1) / 0.2
+    steps = [share[abs(along - place) < 0.02].mean() for place in (0.36, 0.42, 0.5, 0.58, 0.64)]
+    assert steps == sorted(steps)
+    assert steps[2] == pytest.approx(0.5, abs=0.05)
+    assert 0.0 < steps[0] < 0.1
+    assert 0.9 < steps[-1] < 1.0
+    # It is measured along the cloth: seen across the tube both sides are equal.
+    assert np.ptp(share[abs(along - 0.42) < 0.01]) < 0.05
+
+
+def test_parts_that_do_not_touch_have_no_seam() -> None:
+    """Two sheets one millimetre apart: each keeps its fabric whatever the width."""
+    pos, faces = grid(6, 6)
+    pair = np.concatenate([pos, pos + [0.0, 1e-3, 0.0]]), np.concatenate([faces, faces + len(pos)])
+    other = np.arange(len(pair[1])) >= len(faces)
+    made = patchwork(Material(density=0.1), [(other, Material(density=0.3))], *pair, 1.0)
+    assert values_of(made.density)[0].tolist() == np.where(other, 0.3, 0.1).tolist()
