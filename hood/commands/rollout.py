@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,7 @@ from hood.commands.events import fastening_attributes
 from hood.commands.export import check_formats, export_beside
 from hood.commands.guarding import OFF, GuardStopped, guard_sentences, make_guard, write_alarms
 from hood.commands.notices import heard
+from hood.commands.output_fps import at_output_fps, output_rate, watched_vertices
 from hood.commands.plan_auto import planned, without_accuracy
 from hood.commands.plan_file import plan_mode, plan_path, plan_sentences, rollout_config, summarise_plan
 from hood.commands.refinement import exported
@@ -43,7 +44,7 @@ from hood.config import plain, save_run_record
 from hood.dynamics.captured import network_of
 from hood.dynamics.ease import Ease, measure_ease
 from hood.dynamics.recorder import RolloutWriter, read_rollout, still_of
-from hood.dynamics.rollout import metric_names, simulate
+from hood.dynamics.rollout import Frame, metric_names, simulate
 from hood.dynamics.stepper import Stepper
 from hood.scene.sizing import Sizes
 from hood.training import distributed
@@ -188,6 +189,7 @@ def _finished(config: DictConfig, digest: str, folder: Path) -> dict[str, Any] |
     before.setdefault("accuracy", None)
     before.setdefault("fit", "betas")
     before.setdefault("events", [])
+    before.setdefault("output_fps", None)
     before.setdefault("events_speed", now["events_speed"])
     same = all(before.get(key) == now[key] for key in now if key not in ("resume", "output", "allow_unsound"))
     if not same or not bool(attributes["complete"]) or attributes["checkpoint_sha256"] != digest:
@@ -218,21 +220,25 @@ def _simulate_to_disk(ready: Setup, digest: str, path: Path, asked: DictConfig, 
         "guard": OFF if guard is None else guard.mode,
         **fastening_attributes(scene),
     }
+    rate, watched = output_rate(config), watched_vertices(scene)
     writer = RolloutWriter(
         path,
-        count,
+        count if rate is None else rate.count(count),
         scene.cloth.rest_pos.cpu().numpy(),
         scene.garment.faces,
         scene.motion.faces,
         scene.motion.num_vertices,
         metric_names(potential, stepper, str(config.metrics), str(config.settle), guard is not None),
-        scene.dt,
+        scene.dt if rate is None else 1.0 / rate.fps,
         attributes,
         farthest=float(np.abs(scene.motion.translation).max()),
         fields=exported(config),
         double=solves_in_double(config),
         guarded=guard is not None,
         still=still_of(scene.garment, scene.fastening),
+        rate=rate,
+        num_steps=count,
+        watched=watched,
     )
     frames = simulate(
         stepper,
@@ -247,14 +253,22 @@ def _simulate_to_disk(ready: Setup, digest: str, path: Path, asked: DictConfig, 
         guard=guard,
         afresh=plan_mode(config) == "full",
     )
+
+    def simulated() -> Iterator[Frame]:
+        """The simulated frames, each noted before it is passed on."""
+        for frame in tqdm(frames, total=count, desc=f"rollout {scene.garment.name}", unit="frame", disable=_quiet()):
+            if rate is not None:
+                writer.append_step(frame.world_pos.numpy(), frame.metrics)
+            if scene.sizes != Sizes() and frame.index in (0, count - 1):
+                eases.append(measure_ease(scene, scene.cloth_at(frame.index), frame.state, frame.index))
+            yield frame
+            write_alarms(writer, guard)
+
     try:
         with writer:
-            for frame in tqdm(frames, total=count, desc=f"rollout {scene.garment.name}", unit="frame", disable=_quiet()):
+            for frame in at_output_fps(simulated(), config, scene, count):
                 fields = {name: values.numpy() for name, values in frame.fields.items()}
                 writer.append(frame.world_pos.numpy(), frame.body_pos.numpy(), frame.metrics, fields)
-                write_alarms(writer, guard)
-                if scene.sizes != Sizes() and frame.index in (0, count - 1):
-                    eases.append(measure_ease(scene, scene.cloth_at(frame.index), frame.state, frame.index))
             write_alarms(writer, guard)
             if guard is not None and guard.stopped is not None:
                 raise GuardStopped
