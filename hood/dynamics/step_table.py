@@ -38,8 +38,8 @@ class StepTable:
     """The part of a rollout file, open for writing, that holds :class:`Steps`.
 
     Datasets, a row a simulated frame: ``steps/metrics/NAME (S,)``, ``steps/finite (S,)`` (1, 0, or -1 before it is simulated)
-    and ``steps/pos (S,K,3)`` of ``steps/vertices (K,)``; attributes ``output_fps``, ``simulated_fps``, and ``num_steps`` done of
-    ``steps_planned``. A frame is counted after its values are written.
+    and ``steps/pos (S,K,3)`` of ``steps/vertices (K,)``; attributes ``output_fps``, ``simulated_fps``, and of
+    ``steps_planned`` frames ``num_steps`` done. A frame is counted after its values are written.
     """
 
     def __init__(
