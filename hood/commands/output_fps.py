@@ -18,6 +18,7 @@ from hood.dynamics.output_frames import output_frames
 from hood.dynamics.output_rate import OutputRate
 from hood.dynamics.recorder import RolloutData
 from hood.dynamics.rollout import Frame
+from hood.dynamics.step_table import StepPlan
 from hood.scene.jumps import find_jumps
 from hood.scene.load_motion import load_motion
 from hood.scene.scene import Scene
@@ -55,7 +56,13 @@ def at_output_fps(frames: Iterable[Frame], config: DictConfig, scene: Scene, cou
     yield from output_frames(frames, rate, jumps, None if rate.whole else _posed(config, scene, rate.count(count)))
 
 
-def watched_vertices(scene: Scene) -> list[int]:
+def planned_steps(config: DictConfig, scene: Scene, count: int) -> StepPlan | None:
+    """What a file keeps of ``count`` simulated frames where it stores others; None where it does not."""
+    rate = output_rate(config)
+    return None if rate is None else StepPlan(rate, count, _watched(scene))
+
+
+def _watched(scene: Scene) -> list[int]:
     """Vertices whose every simulated position a report on events needs: those that are fastened, held or let go."""
     found: set[int] = set()
     if scene.fastening is not None:

@@ -18,7 +18,7 @@ from tqdm import tqdm
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.folder_lock import occupy
 from hood.commands.automatic import advice
-from hood.commands.batch import Job, find_jobs, share
+from hood.commands.batch import Job, find_jobs, finished, share
 from hood.commands.cautions import warn
 from hood.commands.cloth_contact import why_not
 from hood.commands.common import (
@@ -32,7 +32,7 @@ from hood.commands.events import fastening_attributes
 from hood.commands.export import check_formats, export_beside
 from hood.commands.guarding import OFF, GuardStopped, guard_sentences, make_guard, write_alarms
 from hood.commands.notices import heard
-from hood.commands.output_fps import at_output_fps, output_rate, watched_vertices
+from hood.commands.output_fps import at_output_fps, planned_steps
 from hood.commands.plan_auto import planned, without_accuracy
 from hood.commands.plan_file import plan_mode, plan_path, plan_sentences, rollout_config, summarise_plan
 from hood.commands.refinement import exported
@@ -153,7 +153,7 @@ def _run_all(config: DictConfig, jobs: list[Job], output: Path) -> int:
     def work(job: Job) -> tuple[dict[str, Any], bool]:
         one = OmegaConf.merge(config, {"sequence": job.sequence, "output": str(job.folder)})
         assert isinstance(one, DictConfig)
-        done = _finished(one, digest, job.folder) if bool(config.resume) else None
+        done = finished(one, digest, job.folder) if bool(config.resume) else None
         return (done, False) if done is not None else _run_one(one, stepper, digest, advise=False)
 
     outcome = share(jobs, work)
@@ -171,30 +171,6 @@ def _run_all(config: DictConfig, jobs: list[Job], output: Path) -> int:
     if any("error" in row for row in outcome.rows.values()):
         return 2
     return exit_code(outcome.rows.values(), bool(config.allow_unsound))
-
-
-def _finished(config: DictConfig, digest: str, folder: Path) -> dict[str, Any] | None:
-    """The summary of a rollout that was finished with the same settings and weights; None where there is none."""
-    try:
-        summary: dict[str, Any] = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-        with h5py.File(folder / "rollout.h5", "r") as file:
-            attributes = dict(file.attrs)
-        before = json.loads(attributes["asked"])
-    except (OSError, ValueError, KeyError):
-        return None
-    now = plain(config)
-    before.setdefault("stepping", now["stepping"])  # rollouts from before there were options are known by their word
-    before.setdefault("formats", [])
-    before["plan"] = before.get("plan") or now["plan"]
-    before.setdefault("accuracy", None)
-    before.setdefault("fit", "betas")
-    before.setdefault("events", [])
-    before.setdefault("output_fps", None)
-    before.setdefault("events_speed", now["events_speed"])
-    same = all(before.get(key) == now[key] for key in now if key not in ("resume", "output", "allow_unsound"))
-    if not same or not bool(attributes["complete"]) or attributes["checkpoint_sha256"] != digest:
-        return None
-    return summary if "sound" in summary else summarise(folder / "rollout.h5")
 
 
 def _simulate_to_disk(ready: Setup, digest: str, path: Path, asked: DictConfig, eases: list[Ease | None]) -> bool:
@@ -220,25 +196,23 @@ def _simulate_to_disk(ready: Setup, digest: str, path: Path, asked: DictConfig, 
         "guard": OFF if guard is None else guard.mode,
         **fastening_attributes(scene),
     }
-    rate, watched = output_rate(config), watched_vertices(scene)
+    steps = planned_steps(config, scene, count)
     writer = RolloutWriter(
         path,
-        count if rate is None else rate.count(count),
+        count if steps is None else steps.rate.count(count),
         scene.cloth.rest_pos.cpu().numpy(),
         scene.garment.faces,
         scene.motion.faces,
         scene.motion.num_vertices,
         metric_names(potential, stepper, str(config.metrics), str(config.settle), guard is not None),
-        scene.dt if rate is None else 1.0 / rate.fps,
+        scene.dt if steps is None else 1.0 / steps.rate.fps,
         attributes,
         farthest=float(np.abs(scene.motion.translation).max()),
         fields=exported(config),
         double=solves_in_double(config),
         guarded=guard is not None,
         still=still_of(scene.garment, scene.fastening),
-        rate=rate,
-        num_steps=count,
-        watched=watched,
+        steps=steps,
     )
     frames = simulate(
         stepper,
@@ -257,7 +231,7 @@ def _simulate_to_disk(ready: Setup, digest: str, path: Path, asked: DictConfig, 
     def simulated() -> Iterator[Frame]:
         """The simulated frames, each noted before it is passed on."""
         for frame in tqdm(frames, total=count, desc=f"rollout {scene.garment.name}", unit="frame", disable=_quiet()):
-            if rate is not None:
+            if steps is not None:
                 writer.append_step(frame.world_pos.numpy(), frame.metrics)
             if scene.sizes != Sizes() and frame.index in (0, count - 1):
                 eases.append(measure_ease(scene, scene.cloth_at(frame.index), frame.state, frame.index))

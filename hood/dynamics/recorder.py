@@ -17,8 +17,7 @@ import numpy as np
 
 from hood.assets.files.h5_links import own_dataset, own_group
 from hood.assets.garment.garment import Garment
-from hood.dynamics.output_rate import OutputRate
-from hood.dynamics.step_table import Steps, StepTable, read_steps, step_paths, still_step_paths
+from hood.dynamics.step_table import StepPlan, Steps, StepTable, read_steps, step_paths, still_step_paths
 from hood.scene.fastening import Fastening
 
 #: World coordinates beyond this [m] are written in float64: float32 resolves only 8 µm there.
@@ -82,9 +81,8 @@ class RolloutWriter:
     on network disks. A reader opens the file anew for later frames.
     On a normal close after fewer frames, the file is cut to the frames done.
 
-    With a ``rate`` the stored frames are not the simulated ones, of which there are ``num_steps``: these have tables of their
-    own (:class:`hood.dynamics.step_table.StepTable`), with the positions of the vertices ``watched``. Alarms count simulated
-    frames.
+    With ``steps`` the stored frames are not the simulated ones: these have tables of their own
+    (:class:`hood.dynamics.step_table.StepTable`), and alarms count them.
     """
 
     def __init__(
@@ -103,13 +101,10 @@ class RolloutWriter:
         double: bool = False,
         guarded: bool = False,
         still: Mapping[str, np.ndarray] | None = None,
-        rate: OutputRate | None = None,
-        num_steps: int = 0,
-        watched: Sequence[int] = (),
+        steps: StepPlan | None = None,
     ) -> None:
         self.path = path
         self.frames_done = self.alarms_done = 0
-        self._steps: StepTable | None = None
         # Windows does not rename a file that is open.
         self._draft = path if sys.platform == "win32" else path.with_name(path.name + ".partial")
         try:
@@ -122,11 +117,7 @@ class RolloutWriter:
             cloth, body = (num_frames, len(cloth_rest_pos), 3), (num_frames, num_body_vertices, 3)
             for name, shape, kind in (("cloth/pos", cloth, cloth_real), ("body/pos", body, real)):
                 self._file.create_dataset(name, shape, dtype=kind, fillvalue=np.nan)
-            for name in fields:
-                by_vertex = (num_frames, len(cloth_rest_pos))
-                self._file.create_dataset(f"cloth/{name}", by_vertex, dtype=np.float32, fillvalue=np.nan)
-            for name in metric_names:
-                self._file.create_dataset(f"metrics/{name}", (num_frames,), dtype=np.float64, fillvalue=np.nan)
+            _lay_out_values(self._file, cloth[:2], fields, metric_names)
             self._file["cloth/faces"] = np.asarray(cloth_faces, dtype=np.int32)
             self._file["cloth/rest_pos"] = np.asarray(cloth_rest_pos, dtype=np.float64 if double else np.float32)
             self._file["body/faces"] = np.asarray(body_faces, dtype=np.int32)
@@ -134,11 +125,10 @@ class RolloutWriter:
                 self._file.create_dataset(f"cloth/{name}", data=np.asarray(values, dtype=STILL[name]))
             self._file["time"] = np.arange(num_frames) * dt
             own = {"dt": dt, "num_frames": 0, "num_planned": num_frames, "complete": False}
-            if rate is not None:
-                self._steps = StepTable(self._file, num_steps, rate, np.asarray(watched, dtype=np.int64), metric_names)
+            self._steps = None if steps is None else StepTable(self._file, steps, metric_names)
             if guarded:
                 own["num_alarms"] = 0
-                _lay_out_alarms(self._file, _ALARMS * (num_frames if rate is None else num_steps))
+                _lay_out_alarms(self._file, _ALARMS * (num_frames if steps is None else steps.count))
             for key, value in {**own, **attributes}.items():
                 self._file.attrs[key] = value if np.isscalar(value) or isinstance(value, np.ndarray) else json.dumps(value)
             self._touch_all()
@@ -369,6 +359,14 @@ def _still_paths(file: h5py.File) -> list[str]:
 def _alarm_paths(file: h5py.File) -> list[str]:
     known = own_group(file, "guard") or ()
     return [f"guard/{name}" for name in ALARM_COLUMNS if name in known]
+
+
+def _lay_out_values(file: h5py.File, shape: tuple[int, int], fields: Sequence[str], metric_names: Sequence[str]) -> None:
+    """Tables of values of every vertex and of every frame; ``shape`` is (T, V)."""
+    for name in fields:
+        file.create_dataset(f"cloth/{name}", shape, dtype=np.float32, fillvalue=np.nan)
+    for name in metric_names:
+        file.create_dataset(f"metrics/{name}", shape[:1], dtype=np.float64, fillvalue=np.nan)
 
 
 def _lay_out_alarms(file: h5py.File, rows: int) -> None:

@@ -34,6 +34,15 @@ class Steps:
         return self.pos[:, np.searchsorted(self.vertices, vertices)]
 
 
+@dataclass(frozen=True)
+class StepPlan:
+    """Simulated frames of a rollout that stores others: ``count`` at most, of whose positions those of ``watched`` are kept."""
+
+    rate: OutputRate
+    count: int
+    watched: Sequence[int] = ()  # vertices in ascending order
+
+
 class StepTable:
     """The part of a rollout file, open for writing, that holds :class:`Steps`.
 
@@ -42,11 +51,9 @@ class StepTable:
     ``steps_planned`` frames ``num_steps`` done. A frame is counted after its values are written.
     """
 
-    def __init__(
-        self, file: h5py.File, count: int, rate: OutputRate, vertices: np.ndarray, metric_names: Sequence[str]
-    ) -> None:
-        self._file, self.done = file, 0
-        self._vertices = np.asarray(vertices, dtype=np.int64)
+    def __init__(self, file: h5py.File, plan: StepPlan, metric_names: Sequence[str]) -> None:
+        self._file, self.done, count, rate = file, 0, plan.count, plan.rate
+        self._vertices = np.asarray(plan.watched, dtype=np.int64)
         file.create_group(_METRICS)
         for name in metric_names:
             file.create_dataset(f"{_METRICS}/{name}", (count,), dtype=np.float64, fillvalue=np.nan)

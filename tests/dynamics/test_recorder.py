@@ -14,6 +14,7 @@ import pytest
 
 from hood.dynamics.output_rate import OutputRate
 from hood.dynamics.recorder import RolloutData, RolloutWriter, read_rollout
+from hood.dynamics.step_table import StepPlan
 
 NAMES = ("strain_p99", "energy_total")
 FACES = np.array([[0, 1, 2], [1, 3, 2]])
@@ -258,10 +259,10 @@ def test_a_file_takes_its_name_when_it_is_laid_out(tmp_path: Path) -> None:
 def write_steps(path: Path, num_steps: int = 7) -> None:
     """Frames at 24 of 120 a second; ``num_steps`` of eleven are simulated before an interrupt, all without."""
     attributes = {"garment": "rag"}
-    rate, planned = OutputRate(24.0, 120.0), 11
+    planned = 11
     target = RolloutWriter(
-        path, 3, np.eye(4, 3), FACES, FACES[:1], 3, NAMES, 1 / 24, attributes, guarded=True, rate=rate, num_steps=planned,
-        watched=[1, 3],
+        path, 3, np.eye(4, 3), FACES, FACES[:1], 3, NAMES, 1 / 24, attributes, guarded=True,
+        steps=StepPlan(OutputRate(24.0, 120.0), planned, [1, 3]),
     )  # fmt: skip
     with target:
         for index in range(num_steps):
