@@ -117,6 +117,7 @@ def finished(config: DictConfig, digest: str, folder: Path) -> dict[str, Any] | 
     before.setdefault("fit", "betas")
     before.setdefault("events", [])
     before.setdefault("output_fps", None)
+    before.setdefault("refine_mesh", 0)
     before.setdefault("events_speed", now["events_speed"])
     same = all(before.get(key) == now[key] for key in now if key not in ("resume", "output", "allow_unsound"))
     if not same or not bool(attributes["complete"]) or attributes["checkpoint_sha256"] != digest:

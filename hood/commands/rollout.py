@@ -35,6 +35,7 @@ from hood.commands.notices import heard
 from hood.commands.output_fps import at_output_fps, planned_steps
 from hood.commands.plan_auto import planned, without_accuracy
 from hood.commands.plan_file import plan_mode, plan_path, plan_sentences, rollout_config, summarise_plan
+from hood.commands.refine_mesh import finer_mesh, on_finer_mesh, refined_still
 from hood.commands.refinement import exported
 from hood.commands.resizing import describe_ease, summarise_ease
 from hood.commands.setup import Setup, check_config, make_stepper, set_up, solves_in_double
@@ -90,10 +91,10 @@ def _keep_plan(config: DictConfig, folder: Path) -> None:
         write_atomically(here, path.read_bytes())
 
 
-def _first_positions(path: Path) -> np.ndarray:
-    """Frame 0 of a rollout file, (V, 3) float64 [m], world."""
+def _first_positions(path: Path, count: int) -> np.ndarray:
+    """Where the ``count`` simulated vertices of a rollout file are in frame 0, (V, 3) float64 [m], world."""
     with h5py.File(path, "r") as file:
-        return np.asarray(file["cloth/pos"][0], dtype=np.float64)
+        return np.asarray(file["cloth/pos"][0, :count], dtype=np.float64)
 
 
 def _run_heard(
@@ -127,7 +128,7 @@ def _run_there(ready: Setup, asked: DictConfig, digest: str, warned: list[str], 
     _tell(describe_ease(summary))
     _tell(plan_sentences(summary))
     if advise:
-        _tell(advice(config, scene, summary, _first_positions(folder / "rollout.h5")))
+        _tell(advice(config, scene, summary, _first_positions(folder / "rollout.h5", scene.cloth.num_vertices)))
     simulator = network_of(stepper)
     try:
         if not interrupted:
@@ -196,12 +197,14 @@ def _simulate_to_disk(ready: Setup, digest: str, path: Path, asked: DictConfig, 
         "guard": OFF if guard is None else guard.mode,
         **fastening_attributes(scene),
     }
-    steps = planned_steps(config, scene, count)
+    steps, finer = planned_steps(config, scene, count), finer_mesh(config, scene)
+    if finer is not None:
+        attributes |= {"refine_mesh": int(config.refine_mesh), "simulated_vertices": finer.num_coarse}
     writer = RolloutWriter(
         path,
         count if steps is None else steps.rate.count(count),
-        scene.cloth.rest_pos.cpu().numpy(),
-        scene.garment.faces,
+        scene.cloth.rest_pos.cpu().numpy() if finer is None else finer.rest_pos,
+        scene.garment.faces if finer is None else finer.faces,
         scene.motion.faces,
         scene.motion.num_vertices,
         metric_names(potential, stepper, str(config.metrics), str(config.settle), guard is not None),
@@ -211,7 +214,7 @@ def _simulate_to_disk(ready: Setup, digest: str, path: Path, asked: DictConfig, 
         fields=exported(config),
         double=solves_in_double(config),
         guarded=guard is not None,
-        still=still_of(scene.garment, scene.fastening),
+        still=refined_still(still_of(scene.garment, scene.fastening), finer, scene.garment.faces),
         steps=steps,
     )
     frames = simulate(
@@ -240,7 +243,7 @@ def _simulate_to_disk(ready: Setup, digest: str, path: Path, asked: DictConfig, 
 
     try:
         with writer:
-            for frame in at_output_fps(simulated(), config, scene, count):
+            for frame in on_finer_mesh(at_output_fps(simulated(), config, scene, count), finer, scene):
                 fields = {name: values.numpy() for name, values in frame.fields.items()}
                 writer.append(frame.world_pos.numpy(), frame.body_pos.numpy(), frame.metrics, fields)
             write_alarms(writer, guard)

@@ -14,6 +14,7 @@ from hood.commands.cloth_contact import describe_cloth_contact, summarise_cloth_
 from hood.commands.event_report import describe_fasteners, summarise_fasteners
 from hood.commands.guarding import summarise_guard
 from hood.commands.output_fps import describe_rate, summarise_rate
+from hood.commands.refine_mesh import describe_mesh, summarise_mesh
 from hood.commands.refinement import describe_refinement, summarise_refinement
 from hood.commands.surface_report import cut_at_worst, describe_surface, summarise_surface
 from hood.commands.verdict import describe_verdict, describe_worst, summarise_verdict
@@ -36,7 +37,8 @@ def summarise(path: Path) -> dict[str, Any]:
         "num_frames": len(data.time),
         "complete": bool(data.attributes["complete"]),
         "garment": data.attributes["garment"],
-        "num_vertices": int(data.cloth_pos.shape[1]),
+        "num_vertices": int(data.cloth_pos.shape[1]) if data.refined is None else data.refined.num_coarse,
+        **summarise_mesh(data),
         "dt": float(data.attributes["dt"]),
         **summarise_rate(data),
         "first_nonfinite_frame": None if finite.all() else int(np.argmin(finite)),
@@ -77,6 +79,7 @@ def describe(summary: dict[str, Any]) -> str:
             f"{summary['garment']}: {summary['num_frames']} frames, "
             + ("all finite" if first is None else f"first non-finite frame {first}"),
             *describe_rate(summary),
+            *describe_mesh(summary),
             f"strain p50 {_percent(summary['strain_p50'])} p99 {_worst_strain(summary)}, {_penetration(summary)}",
             "ms per frame (median): " + ", ".join(f"{name} {value or 0.0:.1f}" for name, value in times.items()),
             *_describe_start(summary.get("settled")),

@@ -42,6 +42,7 @@ STILL = {
     "fastened": np.int32,
     "fastened_row": np.int32,
     "fastened_length": np.float64,
+    "simulated_faces": np.int32,
 }
 
 
@@ -230,6 +231,15 @@ class RolloutWriter:
 
 
 @dataclass(frozen=True)
+class Refined:
+    """The simulated mesh of a rollout that stores a finer one (:class:`hood.mesh.subdivision.Subdivision`)."""
+
+    times: int  # that every face was cut into four
+    num_coarse: int  # simulated vertices, the first of those stored
+    faces: np.ndarray  # (F, 3) between them
+
+
+@dataclass(frozen=True)
 class RolloutData:
     """A rollout read back; arrays hold the frames done."""
 
@@ -245,6 +255,14 @@ class RolloutData:
     alarms: list[dict[str, Any]] = field(default_factory=list)  # of a guard, with the names of ALARM_COLUMNS
     still: dict[str, np.ndarray] = field(default_factory=dict)  # of the cloth, by the names of STILL
     steps: Steps | None = None  # all simulated frames, where those stored have a rate of their own (``output_fps``)
+
+    @property
+    def refined(self) -> Refined | None:
+        """The simulated mesh where the stored one is finer; None where it is the same."""
+        faces = self.still.get("simulated_faces")
+        if faces is None:
+            return None
+        return Refined(int(self.attributes["refine_mesh"]), int(self.attributes["simulated_vertices"]), faces)
 
     @property
     def step_metrics(self) -> dict[str, np.ndarray]:
