@@ -311,6 +311,7 @@ def read_rollout(path: Path | str) -> RolloutData:
     try:
         with h5py.File(path, "r") as file:
             _check_extents(file, path.stat().st_size)
+            _check_refined(file)
             done = _frames_there(file)
             return RolloutData(
                 cloth_pos=file["cloth/pos"][:done],
@@ -356,6 +357,19 @@ def _check_extents(file: h5py.File, num_bytes: int) -> None:
         table = own_dataset(file, name)
         if not table.shape or table.size * table.dtype.itemsize > num_bytes:
             raise ValueError(f"{name} claims the shape {table.shape}, the file has {num_bytes} bytes")
+
+
+def _check_refined(file: h5py.File) -> None:
+    """Raise ValueError where the stored mesh cannot be the simulated one, refined."""
+    if "cloth/simulated_faces" not in _still_paths(file):
+        return
+    times, count = int(file.attrs["refine_mesh"]), int(file.attrs["simulated_vertices"])
+    faces, finer = file["cloth/simulated_faces"][:], file["cloth/faces"]
+    fits = faces.ndim == 2 and faces.shape[1] == 3 and 1 <= times <= 8 and len(faces) * 4**times == len(finer)
+    if not (fits and count <= len(file["cloth/rest_pos"]) and 0 <= faces.min(initial=0) <= faces.max(initial=0) < count):
+        raise ValueError(
+            f"cloth/faces {finer.shape} are not {faces.shape} simulated faces of {count} vertices, refined {times} times"
+        )
 
 
 def _field_paths(file: h5py.File) -> list[str]:

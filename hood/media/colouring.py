@@ -128,6 +128,8 @@ def vertex_strain(data: RolloutData) -> np.ndarray:
     if refined is not None:
         count, faces = refined.num_coarse, np.asarray(refined.faces, dtype=np.int64)
         finer = Subdivision(faces, data.rest_pos[:count], refined.times)
+        if not np.array_equal(finer.faces, data.cloth_faces):
+            raise ValueError("cloth/faces are not cloth/simulated_faces, refined; simulate it again with hood rollout")
         coarse = replace(data, cloth_pos=data.cloth_pos[:, :count], cloth_faces=faces, rest_pos=data.rest_pos[:count], still={})
         return finer.spread(vertex_strain(coarse).T).T
     faces = np.asarray(data.cloth_faces, dtype=np.int64)
