@@ -305,6 +305,8 @@ def inspect_rollout(name: str) -> Finding:
             key: str(data.attributes[key]) for key in ("garment", "sequence", "checkpoint", "stepper") if key in data.attributes
         },
     }
+    if data.refined is not None:
+        finding.facts["simulated cloth vertices"] = data.refined.num_coarse
     output = summarise_rate(data).get("output")
     if output is not None:
         finding.facts["simulated frames"] = f"{output['simulated_frames']} at {output['simulated_fps']:g} fps"

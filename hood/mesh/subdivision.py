@@ -68,7 +68,7 @@ class Subdivision:
         """Texture coordinates (U, 2) and their faces (F, 3) for the finer faces: every piece of texture keeps its edges."""
         for _ in self._levels:
             edges = unique_edges(uv_faces)
-            uv_faces = _quartered(uv_faces, edges, len(uv))
+            uv_faces = quartered(uv_faces, edges, len(uv))
             uv = np.concatenate([uv, uv[edges].mean(axis=1, dtype=uv.dtype)])
         return uv, uv_faces
 
@@ -112,10 +112,10 @@ def _level(faces: np.ndarray, rest_pos: np.ndarray) -> _Level:
     rims = np.flatnonzero(np.bincount(every, minlength=len(edges)) != 2)
     rows, columns = faces.reshape(-1), np.arange(faces.size)
     corners = sparse.csr_matrix((np.ones(faces.size), (rows, columns)), shape=(count, faces.size))
-    return _Level(faces, edges, _quartered(faces, edges, count), corners, rims, _beyond(edges[rims], rest_pos))
+    return _Level(faces, edges, quartered(faces, edges, count), corners, rims, _beyond(edges[rims], rest_pos))
 
 
-def _quartered(faces: np.ndarray, edges: np.ndarray, count: int) -> np.ndarray:
+def quartered(faces: np.ndarray, edges: np.ndarray, count: int) -> np.ndarray:
     """(4F, 3): faces between the ``count`` vertices and the new ones, which follow them in the order of ``edges``."""
     a, b, c = faces.T
     ab, bc, ca = (count + edge_index(edges, np.stack(pair, axis=1)) for pair in ((a, b), (b, c), (c, a)))

@@ -15,6 +15,7 @@ import torch
 import hood
 from hood.assets.garment.binding import signed_distances
 from hood.cli import main
+from hood.commands.findings import inspect_rollout
 from hood.dynamics.recorder import RolloutData, read_rollout
 from hood.dynamics.refined_frames import refined_frames
 from hood.dynamics.rollout import Frame
@@ -66,6 +67,7 @@ def test_a_dress_is_stored_finer_and_measured_as_it_was_simulated(levels: int, c
         data.cloth_pos.shape[1],
         count,
     )
+    assert inspect_rollout("run/rollout.h5").facts["simulated cloth vertices"] == count
     assert "no wrinkle that the simulated mesh has not" in summary["refined_mesh"]["what"]
     assert f"refined from {count}: a smooth surface" in capsys.readouterr().out
     for cloth, body in zip(data.cloth_pos, data.body_pos, strict=True):
