@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from tqdm import tqdm
 
 from hood.assets.files.library import locate
@@ -20,8 +21,10 @@ from hood.assets.garment.garment import Garment
 from hood.assets.material import Material
 from hood.commands.common import read_model
 from hood.commands.guarding import GuardStopped, make_guard
+from hood.commands.output_fps import at_output_fps, output_rate
 from hood.commands.plan_auto import planned
 from hood.commands.plan_file import plan_mode, plan_path, rollout_config
+from hood.commands.refine_mesh import finer_mesh, on_finer_mesh
 from hood.commands.setup import Setup, check_config, make_stepper, set_up
 from hood.commands.words import overrides
 from hood.config import ConfigError, load_config
@@ -44,7 +47,8 @@ class Simulation:
         scene: the cloth, the body and its motion (:class:`hood.scene.scene.Scene`).
         stepper: what takes the steps, refinement included (:class:`hood.dynamics.stepper.Stepper`).
         potential: the energies that it moves by (:class:`hood.Potential`).
-        num_frames: how many frames there will be: no more than the motion has.
+        num_frames: how many frames there will be: no more than the motion has, and with ``output_fps`` those at that rate.
+        faces: (F, 3) of the frames' ``world_pos``: those of the garment, or with ``refine_mesh`` of the finer mesh.
         notes: what was chosen and why, one sentence each (kernels, refinement, start).
     """
 
@@ -54,7 +58,11 @@ class Simulation:
         self.scene: Scene = ready.scene
         self.stepper: Stepper = ready.stepper
         self.potential: Potential = ready.potential
-        self.num_frames = min(int(ready.config.num_frames), ready.scene.num_frames)
+        self._simulated = min(int(ready.config.num_frames), ready.scene.num_frames)
+        rate = output_rate(ready.config)
+        self._finer = finer_mesh(ready.config, ready.scene)
+        self.faces: np.ndarray = ready.scene.garment.faces if self._finer is None else self._finer.faces
+        self.num_frames = self._simulated if rate is None else rate.count(self._simulated)
         self.notes = notes
 
     def __len__(self) -> int:
@@ -67,7 +75,7 @@ class Simulation:
             self.stepper,
             self.scene,
             self.potential,
-            self.num_frames,
+            self._simulated,
             int(config.relaxing_steps),
             metrics=str(config.metrics),
             fields=tuple(config.export),
@@ -76,7 +84,8 @@ class Simulation:
             guard=guard,
             afresh=plan_mode(config) == "full",
         )
-        yield from tqdm(steps, total=self.num_frames, unit="frame", disable=not self._progress)
+        seen = tqdm(steps, total=self._simulated, unit="frame", disable=not self._progress)
+        yield from on_finer_mesh(at_output_fps(seen, config, self.scene, self._simulated), self._finer, self.scene)
         if guard is not None and guard.stopped is not None:
             raise GuardStopped(f"guard=strict: the simulation ends before frame {guard.stopped.frame}, which cannot be trusted")
 
@@ -99,7 +108,8 @@ def simulate(
         stepper: ``network``, ``newton``, ``refine``, ``auto`` or another option of ``hood rollout``, or an own stepper.
         progress: whether a progress bar is shown.
         keys: all keys of ``hood rollout --help`` that concern the simulation: ``body``, ``checkpoint``, ``num_frames``,
-            ``fps`` [1/s], ``betas``, ``refine``, ``device``, … A dictionary stands for a group: ``solver={"target_rg": 1e-3}``.
+            ``fps`` and ``output_fps`` [1/s], ``betas``, ``refine``, ``device``, … A dictionary stands for a group:
+            ``solver={"target_rg": 1e-3}``.
 
     Returns:
         The :class:`Simulation`. A frame's ``world_pos`` is (V, 3) m, its ``body_pos`` (W, 3) m, both float64.

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import h5py
+from omegaconf import DictConfig
+
 from hood.assets.motion.collection import motions_in
 from hood.assets.motion.motion_files import find_motions
-from hood.config import ConfigError
+from hood.commands.summary import summarise
+from hood.config import ConfigError, plain
 from hood.training import distributed
 
 #: A disk in this state refuses the next file too.
@@ -93,3 +98,30 @@ def share(jobs: Sequence[Job], work: Callable[[Job], tuple[dict[str, Any], bool]
         any(part.interrupted for part in parts),
         next((part.hopeless for part in parts if part.hopeless is not None), None),
     )
+
+
+def finished(config: DictConfig, digest: str, folder: Path) -> dict[str, Any] | None:
+    """The summary of a rollout that was finished with the same settings and weights; None where there is none."""
+    try:
+        summary: dict[str, Any] = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        with h5py.File(folder / "rollout.h5", "r") as file:
+            attributes = dict(file.attrs)
+        before = json.loads(attributes["asked"])
+    except (OSError, ValueError, KeyError):
+        return None
+    now = plain(config)
+    before.setdefault("stepping", now["stepping"])  # rollouts from before there were options are known by their word
+    before.setdefault("formats", [])
+    before["plan"] = before.get("plan") or now["plan"]
+    before.setdefault("accuracy", None)
+    before.setdefault("fit", "betas")
+    before.setdefault("texture", None)
+    before.setdefault("fabrics_seam", 0.0)
+    before.setdefault("events", [])
+    before.setdefault("output_fps", None)
+    before.setdefault("refine_mesh", 0)
+    before.setdefault("events_speed", now["events_speed"])
+    same = all(before.get(key) == now[key] for key in now if key not in ("resume", "output", "allow_unsound"))
+    if not same or not bool(attributes["complete"]) or attributes["checkpoint_sha256"] != digest:
+        return None
+    return summary if "sound" in summary else summarise(folder / "rollout.h5")

@@ -25,14 +25,14 @@ def summarise_fasteners(data: RolloutData) -> dict[str, Any]:
         return {}
     known = json.loads(data.attributes["fastening"])
     pairs, row, length = (data.still[name] for name in ("fastened", "fastened_row", "fastened_length"))
-    apart = np.linalg.norm(data.cloth_pos[:, pairs[:, 0]] - data.cloth_pos[:, pairs[:, 1]], axis=2)
+    apart = np.linalg.norm(data.step_pos(pairs[:, 0]) - data.step_pos(pairs[:, 1]), axis=2)
     off = np.abs(apart - length)
     rows = {}
     for number, name in enumerate(known["names"]):
         events = [(frame, closes) for frame, event, closes in known["events"] if event == name]
         if name in known["closed_at_first"]:
             events.insert(0, (-1, True))
-        rows[name] = _row(off[:, row == number], events, data.time)
+        rows[name] = _row(off[:, row == number], events, data.step_time)
     return {"fasteners": rows}
 
 
@@ -93,31 +93,33 @@ def summarise_held(scene: Scene, data: RolloutData) -> dict[str, Any]:
     frame in which all are within a millimetre of where the skinned garment has them. Nothing of scenes without such events."""
     if scene.holding is None:
         return {}
-    rows, last = [], len(data.time) - 1
+    time = data.step_time
+    rows, last = [], len(time) - 1
     for place, grasp in enumerate(scene.holding.grasps):
         if grasp.frame >= last:
             break
         row: dict[str, Any] = {
             "action": "attach" if grasp.holds else "detach",
             "frame": grasp.frame,
-            "time": float(data.time[grasp.frame]),
+            "time": float(time[grasp.frame]),
             "vertices": int(grasp.vertices.sum()),
         }
         if grasp.holds:
             end = next((later.frame for later in scene.holding.grasps[place + 1 :] if not later.holds), last)
-            chosen = grasp.vertices.cpu().numpy()
-            within = (f for f in range(grasp.frame + 1, min(end, last) + 1) if _off(scene, data, f, chosen) <= CLOSED)
+            chosen = np.flatnonzero(grasp.vertices.cpu().numpy())
+            pos = data.step_pos(chosen)
+            within = (f for f in range(grasp.frame + 1, min(end, last) + 1) if _off(scene, pos[f], f, chosen) <= CLOSED)
             first = next(within, None)
-            row |= {"within_frame": first, "within_time": None if first is None else float(data.time[first])}
+            row |= {"within_frame": first, "within_time": None if first is None else float(time[first])}
         rows.append(row)
     return {"held": rows}
 
 
-def _off(scene: Scene, data: RolloutData, frame: int, chosen: np.ndarray) -> float:
-    """How far [m] chosen vertices (V,) are from where the skinned garment has them, at most."""
+def _off(scene: Scene, pos: np.ndarray, frame: int, chosen: np.ndarray) -> float:
+    """How far [m] chosen vertices (K,), at ``pos`` (K, 3), are from where the skinned garment has them, at most."""
     origin = scene.motion.translation[frame]
     there = scene.motion.skinned(scene.garment, frame, origin).cpu().double().numpy() + origin
-    return float(np.linalg.norm(data.cloth_pos[frame][chosen] - there[chosen], axis=1).max())
+    return float(np.linalg.norm(pos - there[chosen], axis=1).max())
 
 
 def describe_held(summary: Mapping[str, Any]) -> list[str]:

@@ -30,6 +30,7 @@ from hood.commands.beside_mesh import place_beside_mesh
 from hood.commands.common import read_model
 from hood.commands.describe_place import describe_place
 from hood.commands.guarding import summarise_guard
+from hood.commands.output_fps import summarise_rate
 from hood.commands.placing import explain_unplaced, find_place, unit_alone
 from hood.dynamics import ranges
 from hood.dynamics.recorder import read_rollout
@@ -305,9 +306,15 @@ def inspect_rollout(name: str) -> Finding:
             key: str(data.attributes[key]) for key in ("garment", "sequence", "checkpoint", "stepper") if key in data.attributes
         },
     }
+    if data.refined is not None:
+        finding.facts["simulated cloth vertices"] = data.refined.num_coarse
+    output = summarise_rate(data).get("output")
+    if output is not None:
+        finding.facts["simulated frames"] = f"{output['simulated_frames']} at {output['simulated_fps']:g} fps"
+        finding.facts["stored at"] = f"{output['fps']:g} fps, {output['interpolated_frames']} frames interpolated"
     verdict = judge_rollout(data)
     finding.facts["sound"] = verdict.sound
-    worst = worst_frame(data.metrics.get("strain_p99", np.zeros(0)))
+    worst = worst_frame(data.step_metrics.get("strain_p99", np.zeros(0)))
     if worst is not None:
         finding.facts["worst strain p99"] = f"{worst[0]:.1%} in frame {worst[1]}"
     if not verdict.sound:

@@ -94,7 +94,7 @@ def summarise_guard(data: RolloutData) -> dict[str, Any]:
     mode = str(data.attributes.get("guard", OFF))
     if mode == OFF:
         return {}
-    rows, count = data.alarms, len(data.cloth_pos)
+    rows, count = data.alarms, len(data.step_finite)
     kinds = {kind: sum(row["repair"] == kind for row in rows) for kind in (REFINED, SOLVED, LEFT)}
     return {
         "guard": {

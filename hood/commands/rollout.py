@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from tqdm import tqdm
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.folder_lock import occupy
 from hood.commands.automatic import advice
-from hood.commands.batch import Job, find_jobs, share
+from hood.commands.batch import Job, find_jobs, finished, share
 from hood.commands.cautions import warn
 from hood.commands.cloth_contact import why_not
 from hood.commands.common import (
@@ -32,8 +32,10 @@ from hood.commands.events import fastening_attributes
 from hood.commands.export import check_outputs, export_beside
 from hood.commands.guarding import OFF, GuardStopped, guard_sentences, make_guard, write_alarms
 from hood.commands.notices import heard
+from hood.commands.output_fps import at_output_fps, planned_steps
 from hood.commands.plan_auto import planned, without_accuracy
 from hood.commands.plan_file import plan_mode, plan_path, plan_sentences, rollout_config, summarise_plan
+from hood.commands.refine_mesh import finer_mesh, on_finer_mesh, refined_still
 from hood.commands.refinement import exported
 from hood.commands.resizing import describe_ease, summarise_ease
 from hood.commands.setup import Setup, check_config, make_stepper, set_up, solves_in_double
@@ -44,7 +46,7 @@ from hood.config import plain, save_run_record
 from hood.dynamics.captured import network_of
 from hood.dynamics.ease import Ease, measure_ease
 from hood.dynamics.recorder import RolloutWriter, read_rollout, still_of
-from hood.dynamics.rollout import metric_names, simulate
+from hood.dynamics.rollout import Frame, metric_names, simulate
 from hood.dynamics.stepper import Stepper
 from hood.scene.sizing import Sizes
 from hood.training import distributed
@@ -90,10 +92,10 @@ def _keep_plan(config: DictConfig, folder: Path) -> None:
         write_atomically(here, path.read_bytes())
 
 
-def _first_positions(path: Path) -> np.ndarray:
-    """Frame 0 of a rollout file, (V, 3) float64 [m], world."""
+def _first_positions(path: Path, count: int) -> np.ndarray:
+    """Where the ``count`` simulated vertices of a rollout file are in frame 0, (V, 3) float64 [m], world."""
     with h5py.File(path, "r") as file:
-        return np.asarray(file["cloth/pos"][0], dtype=np.float64)
+        return np.asarray(file["cloth/pos"][0, :count], dtype=np.float64)
 
 
 def _run_heard(
@@ -128,7 +130,7 @@ def _run_there(ready: Setup, asked: DictConfig, digest: str, warned: list[str], 
     _tell(describe_ease(summary))
     _tell(plan_sentences(summary))
     if advise:
-        _tell(advice(config, scene, summary, _first_positions(folder / "rollout.h5")))
+        _tell(advice(config, scene, summary, _first_positions(folder / "rollout.h5", scene.cloth.num_vertices)))
     simulator = network_of(stepper)
     try:
         if not interrupted:
@@ -154,7 +156,7 @@ def _run_all(config: DictConfig, jobs: list[Job], output: Path) -> int:
     def work(job: Job) -> tuple[dict[str, Any], bool]:
         one = OmegaConf.merge(config, {"sequence": job.sequence, "output": str(job.folder)})
         assert isinstance(one, DictConfig)
-        done = _finished(one, digest, job.folder) if bool(config.resume) else None
+        done = finished(one, digest, job.folder) if bool(config.resume) else None
         return (done, False) if done is not None else _run_one(one, stepper, digest, advise=False)
 
     outcome = share(jobs, work)
@@ -172,30 +174,6 @@ def _run_all(config: DictConfig, jobs: list[Job], output: Path) -> int:
     if any("error" in row for row in outcome.rows.values()):
         return 2
     return exit_code(outcome.rows.values(), bool(config.allow_unsound))
-
-
-def _finished(config: DictConfig, digest: str, folder: Path) -> dict[str, Any] | None:
-    """The summary of a rollout that was finished with the same settings and weights; None where there is none."""
-    try:
-        summary: dict[str, Any] = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-        with h5py.File(folder / "rollout.h5", "r") as file:
-            attributes = dict(file.attrs)
-        before = json.loads(attributes["asked"])
-    except (OSError, ValueError, KeyError):
-        return None
-    now = plain(config)
-    before.setdefault("stepping", now["stepping"])  # rollouts from before there were options are known by their word
-    before.setdefault("formats", [])
-    before["plan"] = before.get("plan") or now["plan"]
-    before.setdefault("accuracy", None)
-    before.setdefault("fit", "betas")
-    before.setdefault("texture", None)
-    before.setdefault("events", [])
-    before.setdefault("events_speed", now["events_speed"])
-    same = all(before.get(key) == now[key] for key in now if key not in ("resume", "output", "allow_unsound"))
-    if not same or not bool(attributes["complete"]) or attributes["checkpoint_sha256"] != digest:
-        return None
-    return summary if "sound" in summary else summarise(folder / "rollout.h5")
 
 
 def _simulate_to_disk(ready: Setup, digest: str, path: Path, asked: DictConfig, eases: list[Ease | None]) -> bool:
@@ -221,21 +199,25 @@ def _simulate_to_disk(ready: Setup, digest: str, path: Path, asked: DictConfig, 
         "guard": OFF if guard is None else guard.mode,
         **fastening_attributes(scene),
     }
+    steps, finer = planned_steps(config, scene, count), finer_mesh(config, scene)
+    if finer is not None:
+        attributes |= {"refine_mesh": int(config.refine_mesh), "simulated_vertices": finer.num_coarse}
     writer = RolloutWriter(
         path,
-        count,
-        scene.cloth.rest_pos.cpu().numpy(),
-        scene.garment.faces,
+        count if steps is None else steps.rate.count(count),
+        scene.cloth.rest_pos.cpu().numpy() if finer is None else finer.rest_pos,
+        scene.garment.faces if finer is None else finer.faces,
         scene.motion.faces,
         scene.motion.num_vertices,
         metric_names(potential, stepper, str(config.metrics), str(config.settle), guard is not None),
-        scene.dt,
+        scene.dt if steps is None else 1.0 / steps.rate.fps,
         attributes,
         farthest=float(np.abs(scene.motion.translation).max()),
         fields=exported(config),
         double=solves_in_double(config),
         guarded=guard is not None,
-        still=still_of(scene.garment, scene.fastening),
+        still=refined_still(still_of(scene.garment, scene.fastening), finer, scene.garment.faces),
+        steps=steps,
     )
     frames = simulate(
         stepper,
@@ -250,14 +232,22 @@ def _simulate_to_disk(ready: Setup, digest: str, path: Path, asked: DictConfig, 
         guard=guard,
         afresh=plan_mode(config) == "full",
     )
+
+    def simulated() -> Iterator[Frame]:
+        """The simulated frames, each noted before it is passed on."""
+        for frame in tqdm(frames, total=count, desc=f"rollout {scene.garment.name}", unit="frame", disable=_quiet()):
+            if steps is not None:
+                writer.append_step(frame.world_pos.numpy(), frame.metrics)
+            if scene.sizes != Sizes() and frame.index in (0, count - 1):
+                eases.append(measure_ease(scene, scene.cloth_at(frame.index), frame.state, frame.index))
+            yield frame
+            write_alarms(writer, guard)
+
     try:
         with writer:
-            for frame in tqdm(frames, total=count, desc=f"rollout {scene.garment.name}", unit="frame", disable=_quiet()):
+            for frame in on_finer_mesh(at_output_fps(simulated(), config, scene, count), finer, scene):
                 fields = {name: values.numpy() for name, values in frame.fields.items()}
                 writer.append(frame.world_pos.numpy(), frame.body_pos.numpy(), frame.metrics, fields)
-                write_alarms(writer, guard)
-                if scene.sizes != Sizes() and frame.index in (0, count - 1):
-                    eases.append(measure_ease(scene, scene.cloth_at(frame.index), frame.state, frame.index))
             write_alarms(writer, guard)
             if guard is not None and guard.stopped is not None:
                 raise GuardStopped

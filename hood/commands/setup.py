@@ -20,7 +20,9 @@ from hood.commands.fabrics import checked_fabrics, fabric_of
 from hood.commands.garments import heed, layer_order, names_of, read_outfit
 from hood.commands.guarding import check_guard
 from hood.commands.motion import check_motion_options, make_motion
+from hood.commands.output_fps import check_output_fps
 from hood.commands.plan_file import plan_path, read_watch
+from hood.commands.refine_mesh import check_refine_mesh
 from hood.commands.refinement import AUTO, check_refinement, chosen, refined
 from hood.commands.resizing import checked_sizes, cut_to_size
 from hood.commands.steppers import PLAIN, make_network, make_solver, option_of
@@ -170,5 +172,7 @@ def _check_numbers(config: DictConfig) -> None:
             raise ConfigError(f"{key}={config[key]}: must be at least {least}")
     thinning(config)
     check_motion_options(config)
+    check_output_fps(config)
+    check_refine_mesh(config)
     if not 0.0 <= float(config.gravity) <= 1000.0:
         raise ConfigError(f"gravity={config.gravity}: give m/s², downwards, 0 to 1000")

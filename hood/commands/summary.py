@@ -13,6 +13,8 @@ import numpy as np
 from hood.commands.cloth_contact import describe_cloth_contact, summarise_cloth_contact
 from hood.commands.event_report import describe_fasteners, summarise_fasteners
 from hood.commands.guarding import summarise_guard
+from hood.commands.output_fps import describe_rate, summarise_rate
+from hood.commands.refine_mesh import describe_mesh, summarise_mesh
 from hood.commands.refinement import describe_refinement, summarise_refinement
 from hood.commands.surface_report import cut_at_worst, describe_surface, summarise_surface
 from hood.commands.verdict import describe_verdict, describe_worst, summarise_verdict
@@ -23,8 +25,8 @@ from hood.solver.reasons import MET, count_reasons, name_counts
 def summarise(path: Path) -> dict[str, Any]:
     """Summary of a rollout file: strain, penetration, surface, times, first non-finite frame; None if not measured."""
     data = read_rollout(path)
-    finite = np.isfinite(data.cloth_pos).all(axis=(1, 2))
-    metrics = defaultdict(lambda: np.full(len(finite), np.nan), data.metrics)
+    finite = data.step_finite
+    metrics = defaultdict(lambda: np.full(len(finite), np.nan), data.step_metrics)
     times = {name[3:]: _quantiles(metrics[name][2:]) for name in sorted(metrics) if name.startswith("ms_")}
     converged = metrics.get("solver_converged")
     solver: dict[str, Any] = {}
@@ -32,11 +34,13 @@ def summarise(path: Path) -> dict[str, Any]:
         solver["solver_steps_not_converged"] = int((converged == 0).sum())
         solver["solver_steps_ended"] = count_reasons(metrics["solver_reason"])
     return {
-        "num_frames": int(len(finite)),
+        "num_frames": len(data.time),
         "complete": bool(data.attributes["complete"]),
         "garment": data.attributes["garment"],
-        "num_vertices": int(data.cloth_pos.shape[1]),
+        "num_vertices": int(data.cloth_pos.shape[1]) if data.refined is None else data.refined.num_coarse,
+        **summarise_mesh(data),
         "dt": float(data.attributes["dt"]),
+        **summarise_rate(data),
         "first_nonfinite_frame": None if finite.all() else int(np.argmin(finite)),
         "first_frame": {
             key: _at(metrics[key], 0) for key in ("strain_p50", "strain_p99", "penetration_count", "penetration_depth")
@@ -49,16 +53,16 @@ def summarise(path: Path) -> dict[str, Any]:
         "penetration_share_max": _largest(metrics["penetration_share"]),
         "penetration_count_max": _largest(metrics["penetration_count"]),
         "penetration_depth_max_m": _largest(metrics["penetration_depth"]),
-        "surface": summarise_surface(data.metrics, _stride(data.attributes)),
+        "surface": summarise_surface(data.step_metrics, _stride(data.attributes)),
         "potential_mean_J": _mean(metrics["energy_total"]),
         "potential_inertial_guess_mean_J": _mean(metrics["energy_inertial_guess"]),
         "relative_gradient_median": _median(metrics["relative_gradient"]),
         "ms_per_frame": times,
         **solver,
         **summarise_cloth_contact(
-            json.loads(data.attributes["config"]), data.metrics, str(data.attributes.get("cloth_contact_off", ""))
+            json.loads(data.attributes["config"]), data.step_metrics, str(data.attributes.get("cloth_contact_off", ""))
         ),
-        **summarise_refinement(json.loads(data.attributes["config"]), data.metrics),
+        **summarise_refinement(json.loads(data.attributes["config"]), data.step_metrics),
         **summarise_fasteners(data),
         **summarise_guard(data),
         **summarise_verdict(data),
@@ -74,6 +78,8 @@ def describe(summary: dict[str, Any]) -> str:
         [
             f"{summary['garment']}: {summary['num_frames']} frames, "
             + ("all finite" if first is None else f"first non-finite frame {first}"),
+            *describe_rate(summary),
+            *describe_mesh(summary),
             f"strain p50 {_percent(summary['strain_p50'])} p99 {_worst_strain(summary)}, {_penetration(summary)}",
             "ms per frame (median): " + ", ".join(f"{name} {value or 0.0:.1f}" for name, value in times.items()),
             *_describe_start(summary.get("settled")),

@@ -17,7 +17,7 @@ _WORST = ("strain_p99", "relative_gradient")
 def summarise_verdict(data: RolloutData) -> dict[str, Any]:
     """Entries ``sound`` (None: not known), ``unsound_reasons`` (what is missing, where not known) and ``worst_frames``."""
     verdict = judge_rollout(data)
-    worst = {name: worst_frame(data.metrics[name]) for name in _WORST if name in data.metrics}
+    worst = {name: worst_frame(data.step_metrics[name]) for name in _WORST if name in data.step_metrics}
     return {
         "sound": verdict.sound,
         "unsound_reasons": list(verdict.reasons),

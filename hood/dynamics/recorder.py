@@ -17,6 +17,7 @@ import numpy as np
 
 from hood.assets.files.h5_links import own_dataset, own_group
 from hood.assets.garment.garment import Garment
+from hood.dynamics.step_table import StepPlan, Steps, StepTable, read_steps, step_paths, still_step_paths
 from hood.scene.fastening import Fastening
 
 #: World coordinates beyond this [m] are written in float64: float32 resolves only 8 µm there.
@@ -41,6 +42,7 @@ STILL = {
     "fastened": np.int32,
     "fastened_row": np.int32,
     "fastened_length": np.float64,
+    "simulated_faces": np.int32,
 }
 
 
@@ -79,6 +81,9 @@ class RolloutWriter:
     leaves one. HDF5's own mode for this (SWMR) would forbid the attributes, need a repair after a kill, and it does not hold
     on network disks. A reader opens the file anew for later frames.
     On a normal close after fewer frames, the file is cut to the frames done.
+
+    With ``steps`` the stored frames are not the simulated ones: these have tables of their own
+    (:class:`hood.dynamics.step_table.StepTable`), and alarms count them.
     """
 
     def __init__(
@@ -97,6 +102,7 @@ class RolloutWriter:
         double: bool = False,
         guarded: bool = False,
         still: Mapping[str, np.ndarray] | None = None,
+        steps: StepPlan | None = None,
     ) -> None:
         self.path = path
         self.frames_done = self.alarms_done = 0
@@ -112,11 +118,7 @@ class RolloutWriter:
             cloth, body = (num_frames, len(cloth_rest_pos), 3), (num_frames, num_body_vertices, 3)
             for name, shape, kind in (("cloth/pos", cloth, cloth_real), ("body/pos", body, real)):
                 self._file.create_dataset(name, shape, dtype=kind, fillvalue=np.nan)
-            for name in fields:
-                by_vertex = (num_frames, len(cloth_rest_pos))
-                self._file.create_dataset(f"cloth/{name}", by_vertex, dtype=np.float32, fillvalue=np.nan)
-            for name in metric_names:
-                self._file.create_dataset(f"metrics/{name}", (num_frames,), dtype=np.float64, fillvalue=np.nan)
+            _lay_out_values(self._file, cloth[:2], fields, metric_names)
             self._file["cloth/faces"] = np.asarray(cloth_faces, dtype=np.int32)
             self._file["cloth/rest_pos"] = np.asarray(cloth_rest_pos, dtype=np.float64 if double else np.float32)
             self._file["body/faces"] = np.asarray(body_faces, dtype=np.int32)
@@ -124,9 +126,10 @@ class RolloutWriter:
                 self._file.create_dataset(f"cloth/{name}", data=np.asarray(values, dtype=STILL[name]))
             self._file["time"] = np.arange(num_frames) * dt
             own = {"dt": dt, "num_frames": 0, "num_planned": num_frames, "complete": False}
+            self._steps = None if steps is None else StepTable(self._file, steps, metric_names)
             if guarded:
                 own["num_alarms"] = 0
-                _lay_out_alarms(self._file, _ALARMS * num_frames)
+                _lay_out_alarms(self._file, _ALARMS * (num_frames if steps is None else steps.count))
             for key, value in {**own, **attributes}.items():
                 self._file.attrs[key] = value if np.isscalar(value) or isinstance(value, np.ndarray) else json.dumps(value)
             self._touch_all()
@@ -159,6 +162,12 @@ class RolloutWriter:
         self._file.attrs.modify("num_frames", self.frames_done)
         self._file.flush()
 
+    def append_step(self, cloth_pos: np.ndarray, metrics: Mapping[str, float]) -> None:
+        """Write what is known of one simulated frame where stored frames have a rate of their own: from world positions (V, 3)
+        [m] and its metrics."""
+        assert self._steps is not None
+        self._steps.append(cloth_pos, metrics)
+
     def append_alarms(self, alarms: Sequence[Mapping[str, Any]]) -> None:
         """Write further alarms, each with the names of :data:`ALARM_COLUMNS`."""
         for alarm in alarms:
@@ -177,7 +186,7 @@ class RolloutWriter:
         self._file.attrs.modify("complete", complete)
         self._file.close()
         if self.frames_done < total:
-            _truncate(self.path, self.frames_done)
+            _truncate(self.path, self.frames_done, None if self._steps is None else self._steps.done)
 
     def discard(self) -> None:
         """Close and delete the file: nothing half-written stays behind."""
@@ -205,7 +214,8 @@ class RolloutWriter:
 
     def _touch_all(self) -> None:
         # HDF5 lays contiguous data out at the first write; one row is enough to allocate and fill everything.
-        for name in ("cloth/pos", "body/pos", *_field_paths(self._file), *_metric_paths(self._file), *_alarm_paths(self._file)):
+        tables = (*_field_paths(self._file), *_metric_paths(self._file), *_alarm_paths(self._file), *step_paths(self._file))
+        for name in ("cloth/pos", "body/pos", *tables):
             self._file[name][-1] = self._file[name].fillvalue
 
     def __enter__(self) -> RolloutWriter:
@@ -218,6 +228,15 @@ class RolloutWriter:
                 raise _plain_error(error, self.path) from error
         else:
             self.close(complete=error is None)
+
+
+@dataclass(frozen=True)
+class Refined:
+    """The simulated mesh of a rollout that stores a finer one (:class:`hood.mesh.subdivision.Subdivision`)."""
+
+    times: int  # that every face was cut into four
+    num_coarse: int  # simulated vertices, the first of those stored
+    faces: np.ndarray  # (F, 3) between them
 
 
 @dataclass(frozen=True)
@@ -235,6 +254,34 @@ class RolloutData:
     fields: dict[str, np.ndarray] = field(default_factory=dict)  # (T, V) by name, such as rg
     alarms: list[dict[str, Any]] = field(default_factory=list)  # of a guard, with the names of ALARM_COLUMNS
     still: dict[str, np.ndarray] = field(default_factory=dict)  # of the cloth, by the names of STILL
+    steps: Steps | None = None  # all simulated frames, where those stored have a rate of their own (``output_fps``)
+
+    @property
+    def refined(self) -> Refined | None:
+        """The simulated mesh where the stored one is finer; None where it is the same."""
+        faces = self.still.get("simulated_faces")
+        if faces is None:
+            return None
+        return Refined(int(self.attributes["refine_mesh"]), int(self.attributes["simulated_vertices"]), faces)
+
+    @property
+    def step_metrics(self) -> dict[str, np.ndarray]:
+        """(S,) by name: of every simulated frame, stored or not."""
+        return self.metrics if self.steps is None else self.steps.metrics
+
+    @property
+    def step_finite(self) -> np.ndarray:
+        """(S,) bool: simulated frames whose positions are all finite."""
+        return np.isfinite(self.cloth_pos).all(axis=(1, 2)) if self.steps is None else self.steps.finite
+
+    @property
+    def step_time(self) -> np.ndarray:
+        """(S,) s: moments of the simulated frames."""
+        return self.time if self.steps is None else self.steps.time
+
+    def step_pos(self, vertices: np.ndarray) -> np.ndarray:
+        """(S, N, 3) m: where vertices (N,) that events fasten or hold are in every simulated frame."""
+        return self.cloth_pos[:, vertices] if self.steps is None else self.steps.pos_of(vertices)
 
 
 def read_rollout(path: Path | str) -> RolloutData:
@@ -264,6 +311,7 @@ def read_rollout(path: Path | str) -> RolloutData:
     try:
         with h5py.File(path, "r") as file:
             _check_extents(file, path.stat().st_size)
+            _check_refined(file)
             done = _frames_there(file)
             return RolloutData(
                 cloth_pos=file["cloth/pos"][:done],
@@ -277,6 +325,7 @@ def read_rollout(path: Path | str) -> RolloutData:
                 fields={name.removeprefix("cloth/"): file[name][:done] for name in _field_paths(file)},
                 alarms=_read_alarms(file),
                 still={name.removeprefix("cloth/"): file[name][:] for name in _still_paths(file)},
+                steps=read_steps(file, len(file["cloth/rest_pos"])),
             )
     except FileNotFoundError:
         raise
@@ -303,10 +352,24 @@ def _is_there(file: h5py.File, index: int) -> bool:
 def _check_extents(file: h5py.File, num_bytes: int) -> None:
     """Rollouts are stored as they are: a table that claims more than the file holds would be read as empty memory."""
     names = ("cloth/pos", "cloth/faces", "cloth/rest_pos", "body/pos", "body/faces", "time")
-    for name in (*names, *_field_paths(file), *_metric_paths(file), *_alarm_paths(file), *_still_paths(file)):
+    by_frame = (*_field_paths(file), *_metric_paths(file), *step_paths(file))
+    for name in (*names, *by_frame, *_alarm_paths(file), *_still_paths(file), *still_step_paths(file)):
         table = own_dataset(file, name)
         if not table.shape or table.size * table.dtype.itemsize > num_bytes:
             raise ValueError(f"{name} claims the shape {table.shape}, the file has {num_bytes} bytes")
+
+
+def _check_refined(file: h5py.File) -> None:
+    """Raise ValueError where the stored mesh cannot be the simulated one, refined."""
+    if "cloth/simulated_faces" not in _still_paths(file):
+        return
+    times, count = int(file.attrs["refine_mesh"]), int(file.attrs["simulated_vertices"])
+    faces, finer = file["cloth/simulated_faces"][:], file["cloth/faces"]
+    fits = faces.ndim == 2 and faces.shape[1] == 3 and 1 <= times <= 8 and len(faces) * 4**times == len(finer)
+    if not (fits and count <= len(file["cloth/rest_pos"]) and 0 <= faces.min(initial=0) <= faces.max(initial=0) < count):
+        raise ValueError(
+            f"cloth/faces {finer.shape} are not {faces.shape} simulated faces of {count} vertices, refined {times} times"
+        )
 
 
 def _field_paths(file: h5py.File) -> list[str]:
@@ -330,6 +393,14 @@ def _alarm_paths(file: h5py.File) -> list[str]:
     return [f"guard/{name}" for name in ALARM_COLUMNS if name in known]
 
 
+def _lay_out_values(file: h5py.File, shape: tuple[int, int], fields: Sequence[str], metric_names: Sequence[str]) -> None:
+    """Tables of values of every vertex and of every frame; ``shape`` is (T, V)."""
+    for name in fields:
+        file.create_dataset(f"cloth/{name}", shape, dtype=np.float32, fillvalue=np.nan)
+    for name in metric_names:
+        file.create_dataset(f"metrics/{name}", shape[:1], dtype=np.float64, fillvalue=np.nan)
+
+
 def _lay_out_alarms(file: h5py.File, rows: int) -> None:
     for name, kind in ALARM_COLUMNS.items():
         fill = {"i": -1, "f": np.nan, "S": b""}[kind.kind]
@@ -348,8 +419,9 @@ def _read_alarms(file: h5py.File) -> list[dict[str, Any]]:
             )
     columns = {path.removeprefix("guard/"): file[path][: int(file.attrs["num_alarms"])] for path in paths}
     for frame in columns["frame"].tolist():
-        if not 0 <= frame <= int(file.attrs["num_planned"]):
-            raise ValueError(f"guard/frame holds {frame}, there are {file.attrs['num_planned']} frames")
+        planned = int(file.attrs.get("steps_planned", file.attrs["num_planned"]))
+        if not 0 <= frame <= planned:
+            raise ValueError(f"guard/frame holds {frame}, there are {planned} frames")
     plain = {name: _words(values) if values.dtype.kind == "S" else values.tolist() for name, values in columns.items()}
     return [dict(zip(plain, row, strict=True)) for row in zip(*plain.values(), strict=True)]
 
@@ -364,18 +436,20 @@ def _plain_error(error: OSError, path: Path) -> OSError:
     return OSError(number, os.strerror(number), str(path))
 
 
-def _truncate(path: Path, num_frames: int) -> None:
-    """Rewrite the file with its first ``num_frames`` frames."""
+def _truncate(path: Path, num_frames: int, num_steps: int | None = None) -> None:
+    """Rewrite the file with its first ``num_frames`` frames, of ``num_steps`` simulated ones where these have tables."""
     temporary = path.with_name(path.name + ".partial")
     try:
         with h5py.File(path, "r") as source, h5py.File(temporary, "w") as target:
             for key, value in source.attrs.items():
                 target.attrs[key] = value
             per_frame = {"cloth/pos", "body/pos", "time", *_field_paths(source), *_metric_paths(source)}
-            for name in ("cloth/faces", "cloth/rest_pos", "body/faces", *_still_paths(source)):
+            for name in ("cloth/faces", "cloth/rest_pos", "body/faces", *_still_paths(source), *still_step_paths(source)):
                 target[name] = source[name][:]
             for name in per_frame:
                 target[name] = source[name][:num_frames]
+            for name in step_paths(source):
+                target[name] = source[name][:num_steps]
             for name in _alarm_paths(source):
                 target[name] = source[name][:]
         os.replace(temporary, path)

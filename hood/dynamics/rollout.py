@@ -62,6 +62,7 @@ class Frame:
     body_pos: Tensor  # (W, 3) m float64
     metrics: dict[str, float]
     fields: dict[str, Tensor] = field(default_factory=dict)  # (V,) by name, of the step that led here; NaN in frame 0
+    simulated: bool = True  # False: between two simulated frames, see :mod:`hood.dynamics.output_frames`
 
 
 #: What is measured of a frame besides its time and what the stepper reports: strain, penetration, cut surface and energies,

@@ -55,13 +55,17 @@ class _Cause:
 
 
 def judge_rollout(data: RolloutData) -> Verdict:
-    """:func:`judge` for a rollout that was read back; strain that was not measured is computed from the positions."""
-    finite = np.isfinite(data.cloth_pos).all(axis=(1, 2))
-    metrics = {name: values for name, values in data.metrics.items() if values.shape == finite.shape}
+    """:func:`judge` for the simulated frames of a rollout that was read back; strain that was not measured is computed from the
+    positions, where these are stored."""
+    finite = data.step_finite
+    metrics = {name: values for name, values in data.step_metrics.items() if values.shape == finite.shape}
     strain = metrics.get("strain_p99")
-    if strain is None:
-        strain = _strain_p99(data, finite)
-    return judge(finite, strain, metrics)
+    if strain is not None or data.steps is None:
+        return judge(finite, _strain_p99(data, finite) if strain is None else strain, metrics)
+    verdict = judge(finite, np.zeros(len(finite)), metrics)
+    if not verdict.sound:
+        return verdict
+    return Verdict(None, ("the strain of simulated frames that are not stored was not measured; metrics=strain measures it",))
 
 
 def judge(finite: np.ndarray, strain_p99: np.ndarray, metrics: Mapping[str, np.ndarray]) -> Verdict:
@@ -174,7 +178,8 @@ def _sentence(cause: _Cause, judged: np.ndarray, few: bool) -> str:
 
 def _strain_p99(data: RolloutData, finite: np.ndarray) -> np.ndarray:
     """(T,) 99th percentile of the absolute edge strain, NaN in frames that are not finite."""
-    start, end = unique_edges(data.cloth_faces.astype(np.int64)).T
+    faces = data.cloth_faces if data.refined is None else data.refined.faces
+    start, end = unique_edges(faces.astype(np.int64)).T
     strain = np.full(len(finite), np.nan)
     if len(start) == 0:
         return np.where(finite, 0.0, strain)

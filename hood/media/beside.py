@@ -166,6 +166,7 @@ def _first_frames(data: RolloutData, count: int) -> RolloutData:
         metrics={name: values[:count] for name, values in data.metrics.items()},
         attributes=data.attributes,
         fields={name: values[:count] for name, values in data.fields.items()},
+        still={name: values for name, values in data.still.items() if name == "simulated_faces"},
     )
 
 

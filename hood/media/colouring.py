@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from hood.dynamics.recorder import RolloutData
 from hood.mesh.proximity import search_surface
+from hood.mesh.subdivision import Subdivision
 
 Picture = NDArray[np.uint8]
 
@@ -121,7 +122,16 @@ def _residual(data: RolloutData) -> np.ndarray:
 
 
 def vertex_strain(data: RolloutData) -> np.ndarray:
-    """(T, V) largest absolute relative length change of the edges at every vertex; NaN where a frame is not finite."""
+    """(T, V) largest absolute relative length change of the edges at every vertex, where the stored mesh is finer those of the
+    simulated one; NaN where a frame is not finite."""
+    refined = data.refined
+    if refined is not None:
+        count, faces = refined.num_coarse, np.asarray(refined.faces, dtype=np.int64)
+        finer = Subdivision(faces, data.rest_pos[:count], refined.times)
+        if not np.array_equal(finer.faces, data.cloth_faces):
+            raise ValueError("cloth/faces are not cloth/simulated_faces, refined; simulate it again with hood rollout")
+        coarse = replace(data, cloth_pos=data.cloth_pos[:, :count], cloth_faces=faces, rest_pos=data.rest_pos[:count], still={})
+        return finer.spread(vertex_strain(coarse).T).T
     faces = np.asarray(data.cloth_faces, dtype=np.int64)
     edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
     rest = np.linalg.norm(data.rest_pos[edges[:, 0]] - data.rest_pos[edges[:, 1]], axis=1)

@@ -12,7 +12,9 @@ import h5py
 import numpy as np
 import pytest
 
+from hood.dynamics.output_rate import OutputRate
 from hood.dynamics.recorder import RolloutData, RolloutWriter, read_rollout
+from hood.dynamics.step_table import StepPlan
 
 NAMES = ("strain_p99", "energy_total")
 FACES = np.array([[0, 1, 2], [1, 3, 2]])
@@ -252,3 +254,69 @@ def test_a_file_takes_its_name_when_it_is_laid_out(tmp_path: Path) -> None:
         assert old.attrs["num_frames"] == 5
         check(read_rollout(path), 1)
     assert [file.name for file in tmp_path.iterdir()] == ["r.h5"]
+
+
+def write_steps(path: Path, num_steps: int = 7) -> None:
+    """Frames at 24 of 120 a second; ``num_steps`` of eleven are simulated before an interrupt, all without."""
+    attributes = {"garment": "rag"}
+    planned = 11
+    target = RolloutWriter(
+        path, 3, np.eye(4, 3), FACES, FACES[:1], 3, NAMES, 1 / 24, attributes, guarded=True,
+        steps=StepPlan(OutputRate(24.0, 120.0), planned, [1, 3]),
+    )  # fmt: skip
+    with target:
+        for index in range(num_steps):
+            pos, body, metrics = frame(index)
+            target.append_step(pos if index != 4 else pos * np.nan, metrics)
+            if index % 5 == 0:
+                target.append(pos, body, metrics)
+        alarm = {"frame": 6, "cause": "strain", "value": 1.0, "limit": 0.5, "repair": "none", "iterations": 0}
+        target.append_alarms([{**alarm, "rg_before": np.nan, "rg_after": np.nan}])
+        if num_steps < planned:
+            raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("num_steps", [7, 11])
+def test_simulated_frames_that_are_not_stored_have_rows_of_their_own(tmp_path: Path, num_steps: int) -> None:
+    path = tmp_path / "r.h5"
+    if num_steps < 11:
+        with pytest.raises(KeyboardInterrupt):
+            write_steps(path, num_steps)
+    else:
+        write_steps(path, num_steps)
+    data = read_rollout(path)
+    assert data.cloth_pos[:, 0, 0].tolist() == [0.25, 5.25, 10.25][: 1 + (num_steps - 1) // 5]
+    assert data.time.tolist() == [index / 24 for index in range(len(data.cloth_pos))]
+    assert data.metrics["energy_total"][1:].tolist() == [5.0, 10.0][: len(data.time) - 1]
+    assert bool(data.attributes["complete"]) == (num_steps == 11)
+    np.testing.assert_allclose(data.step_metrics["strain_p99"], 0.1 * np.arange(num_steps))
+    assert data.step_finite.tolist() == [index != 4 for index in range(num_steps)]
+    assert data.step_time.tolist() == [index / 120 for index in range(num_steps)]
+    assert data.step_pos(np.array([3, 1]))[5].tolist() == [[5.25] * 3] * 2
+    assert data.alarms[0]["frame"] == 6
+    assert (data.attributes["output_fps"], data.attributes["simulated_fps"]) == (24.0, 120.0)
+
+
+@pytest.mark.parametrize(
+    "name, table, said",
+    [
+        ("steps/vertices", np.array([1, 4]), "does not name vertices"),
+        ("steps/vertices", np.array([3, 1]), "does not name vertices"),
+        ("steps/metrics/strain_p99", np.zeros(3), "does not fit 11 simulated frames"),
+        ("steps/pos", np.zeros((11, 2, 2)), "does not fit 11 simulated frames"),
+    ],
+)
+def test_tables_of_simulated_frames_that_do_not_belong_together_are_refused(
+    tmp_path: Path, name: str, table: np.ndarray, said: str
+) -> None:
+    path = tmp_path / "r.h5"
+    write_steps(path, 11)
+    with h5py.File(path, "r+") as file:
+        del file[name]
+        file[name] = table
+    with pytest.raises(ValueError, match=f"not a rollout file .*{said}"):
+        read_rollout(path)
+    with h5py.File(path, "r+") as file:
+        file.attrs["output_fps"] = 0.0
+    with pytest.raises(ValueError, match="output_fps is 0"):
+        read_rollout(path)

@@ -11,6 +11,7 @@ from hood.assets.body.load import load_body
 from hood.assets.garment.garment import Garment
 from hood.mesh.isotropic import isotropic
 from hood.mesh.local_edits import closest
+from hood.mesh.subdivision import quartered
 from hood.mesh.topology import unique_edges
 
 Array = np.ndarray
@@ -91,14 +92,8 @@ def _remesh(garment: Garment, count: float, rng: np.random.Generator) -> Garment
 def _subdivide(garment: Garment, times: float, rng: np.random.Generator) -> Garment:
     """Every face into four, so many times."""
     for _ in range(int(times)):
-        faces, edges = garment.faces, unique_edges(garment.faces)
-        number = {(int(a), int(b)): len(garment.rest_pos) + row for row, (a, b) in enumerate(np.sort(edges, axis=1))}
-        a, b, c = faces.T
-        ab, bc, ca = (
-            np.array([number[min(s, e), max(s, e)] for s, e in zip(start.tolist(), end.tolist(), strict=True)])
-            for start, end in ((a, b), (b, c), (c, a))
-        )
-        finer = np.concatenate([np.stack(face, axis=1) for face in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
+        edges = unique_edges(garment.faces)
+        finer = quartered(garment.faces, edges, len(garment.rest_pos))
         garment = _grown(garment, edges, np.full((len(edges), 2), 0.5), finer)
     return garment
 
