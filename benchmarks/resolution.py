@@ -4,8 +4,8 @@
     python benchmarks/resolution.py edges --sizes 300 48k --output outputs/resolution
 
 The dress of 300 vertices is that of 1,000, triangulated anew; in that of 48,000 every face of the one of 12,000 is four. Each
-is evaluated by ``hood evaluate`` in walk_proud and dance_mixed, 24 frames and four states each (6 frames and two states at
-48,000), on states of the model's own rollouts.
+is evaluated by ``hood evaluate`` in walk_proud and dance_mixed, 24 frames and four states each, on states of the model's own
+rollouts.
 """
 
 from __future__ import annotations
@@ -45,13 +45,12 @@ def garment_of(size: str, folder: Path) -> str:
 
 def evaluate(models: list[str], size: str, folder: Path) -> list[dict[str, Any]]:
     """Rows of ``hood evaluate``, one for each model."""
-    frames, states = (6, 2) if size == "48k" else (24, 4)
     settings = {
         "models": f"[{','.join(models)}]",
         "garments": f"[{garment_of(size, folder)}]",
         "sequences": "[walk_proud,dance_mixed]",
-        "num_frames": frames,
-        "gap_states": states,
+        "num_frames": 24,
+        "gap_states": 4,
         "gap_iterations": 100,
         "output": folder / size,
     }
