@@ -93,7 +93,10 @@ def test_a_motion_that_cannot_be_used_stops_no_other(motions: Path, capsys: pyte
     [
         (ROLLOUT, "motions/list.txt, line 2: unknown sequence 'walk_prud': did you mean 'walk_proud'?"),
         (["evaluate", "models=[guess]", "garments=[tank]"], "line 2: unknown sequence 'walk_prud': did you mean 'walk_proud'?"),
-        (["evaluate", "models=[guess]", "sequences=[plie,walk_prud]"], "sequences[1]: unknown sequence 'walk_prud': did you mean"),
+        (
+            ["evaluate", "models=[guess]", "sequences=[plie,walk_prud]"],
+            "sequences[1]: unknown sequence 'walk_prud': did you mean",
+        ),
         (["tradeoff", "sequences=[plie,walk_prud]"], "sequences[1]: unknown sequence 'walk_prud': did you mean 'walk_proud'?"),
         (["tradeoff"], "motions/list.txt, line 2: unknown sequence 'walk_prud': did you mean 'walk_proud'?"),
         (["train", "model=small"], "motions/list.txt, line 2: unknown sequence 'walk_prud': did you mean 'walk_proud'?"),

@@ -73,7 +73,11 @@ def test_lists_that_say_nothing_are_named(tmp_path: Path, name: str, text: str, 
         ("a.txt", "GONE/zzz.npz", r"a\.txt, line 1: .*GONE/zzz\.npz: no such file; check the path"),
         ("a.txt", "plie\nBML", r"a\.txt, line 2: .*BML: a folder"),
         ("a.json", '["plie", "pliee"]', r"a\.json, list\[1\]: unknown sequence 'pliee': did you mean 'plie'\?"),
-        ("a.json", '{"train": ["walk_prud"]}', r"a\.json, train\[0\]: unknown sequence 'walk_prud': did you mean 'walk_proud'\?"),
+        (
+            "a.json",
+            '{"train": ["walk_prud"]}',
+            r"a\.json, train\[0\]: unknown sequence 'walk_prud': did you mean 'walk_proud'\?",
+        ),
     ],
 )
 def test_a_list_with_a_misspelt_name_is_refused_with_its_place(folder: Path, name: str, text: str, words: str) -> None:
