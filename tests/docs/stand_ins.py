@@ -16,7 +16,9 @@ from workshop import Workshop, write_obj
 
 from hood.assets.garment.garment import Garment, load_garment, save_garment
 from hood.cli import main
+from hood.dynamics.recorder import RolloutWriter
 from hood.evaluation.envelope_prose import BEGIN, END
+from hood.testing import cylinder, sphere
 
 sys.path.insert(0, str(ROOT / "tests" / "dynamics"))
 from reference_oracle import make_state
@@ -40,6 +42,7 @@ class Desk:
         self.go = go
         self.makers: list[tuple[str, Callable[[str, Sequence[str]], Path]]] = [
             (r"(outputs/(?!plan/)\w+|(.*/)?rollout\.h5)", self.rollout),
+            (r"long\.h5", self.long_rollout),
             (r"outputs/plan/plan\.json", self.plan),
             (r"([\w/]+/)?\w+\.safetensors", self.model),
             (r"postcvpr\.pth", self.published),
@@ -81,6 +84,19 @@ class Desk:
 
         made = self._once("rollout", make) / "made"
         return made / "rollout.h5" if name.endswith(".h5") else made
+
+    def long_rollout(self, name: str, words: Sequence[str]) -> Path:
+        """Ninety frames of a tube about a ball."""
+
+        def make(folder: Path) -> None:
+            (pos, faces), (ball, ball_faces) = cylinder(12, 3, 0.3, 0.5), sphere(1, 0.25)
+            with RolloutWriter(
+                folder / "long.h5", 90, pos, faces, ball_faces, len(ball), (), 1 / 30, {"garment": "tube"}
+            ) as out:
+                for _ in range(90):
+                    out.append(pos, ball, {}, {})
+
+        return self._once("long", make) / "long.h5"
 
     def plan(self, name: str, words: Sequence[str]) -> Path:
         def make(folder: Path) -> None:
