@@ -1,4 +1,4 @@
-"""Every command line of the README and the docs: its command, keys, values and names exist. None is run."""
+"""Every command line of the README and the docs: its command, keys, values and names exist. test_commands_run.py runs them."""
 
 from __future__ import annotations
 
