@@ -242,7 +242,7 @@ def test_a_command_does_what_it_promises(
 
 def test_most_lines_do_not_wait_and_every_row_of_the_tables_finds_one() -> None:
     texts = [" ".join(chosen(line)) for _, line in LINES]
-    assert sum(not is_slow(line) for _, line in LINES) > 0.8 * len(LINES)
+    assert sum(not is_slow(line) for _, line in LINES) > 0.75 * len(LINES)
     for pattern in [*(row.pattern for row in SHORT), *(pattern for pattern, _ in SLOW)]:
         assert any(re.search(pattern, text) for text in texts), pattern
     for pattern in CHOICES:

@@ -68,7 +68,7 @@ RUN = (
         r"newton",
         (r"surface\.py[\w ]*?(?= --|$)", "surface.py tank"),
     ),
-    Run(r"waves\.py", "--garments tshirt --states 1 --frames 4", r"\d"),
+    Run(r"waves\.py", "--garments tshirt --states 1 --frames 4", r"\d", slow=True),
 )
 #: Lines that are not run, and why; what they call has tests elsewhere.
 NOT_RUN = {
