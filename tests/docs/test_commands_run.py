@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
-from pages import EXTENDING, EXTENDING_HAS_A_TEST, command_lines, of_hood, words_of
+from pages import EXTENDING, EXTENDING_HAS_A_TEST, ROOT, command_lines, of_hood, words_of
 from stand_ins import BRIEF, Desk
 
 from hood.assets.files.library import locate
@@ -20,7 +20,10 @@ from hood.commands.rollouts_beside import Ended
 from hood.commands.tradeoff import chosen_models, make_grid
 from hood.config import load_config
 
+#: What ``make`` runs of them.
+RECIPES = re.findall(r"^\t\$\(BIN\)/(hood .*)$", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
 LINES = [(page, line) for page, line in command_lines() if of_hood(line) and not (page == EXTENDING and EXTENDING_HAS_A_TEST)]
+LINES += [("Makefile", line) for line in RECIPES]
 #: What makes a rollout short.
 TWO_FRAMES = ("num_frames=2", "video=none", "sheet=false")
 
@@ -248,3 +251,4 @@ def test_most_lines_do_not_wait_and_every_row_of_the_tables_finds_one() -> None:
     for pattern in CHOICES:
         assert any(re.search(pattern, line) for _, line in LINES), pattern
     assert {*EXIT_CODES} <= {*texts}
+    assert len(RECIPES) == 2

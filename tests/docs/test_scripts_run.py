@@ -50,14 +50,18 @@ RUN = (
     Run(r"frame\.py", "--sizes 300 --models fine15 --precision fp32 --frames 3", r"\| fine15 \| torch \| fp32 \|"),
     Run(r"fuzz\.py", "--count 3", r"\| all \| 3 \|", slow=True),
     Run(r"guard\.py", "--garments tank --motions plie --steppers newton --frames 3", r"alarms 0, repairs 0 of 2"),
-    Run(r"half\.py", "--garments tank --frames 12", r"\d", (r"A B", "A.safetensors B.safetensors")),
-    Run(r"heads\.py (errors|projective)", "--garments tshirt --states 1 --frames 4 --solves 1 --kernels torch", r"\d"),
+    Run(r"half\.py", "--garments tank --frames 12", r"\| tank \|", (r"A B", "A.safetensors B.safetensors")),
+    Run(
+        r"heads\.py (errors|projective)",
+        "--garments tshirt --states 1 --frames 4 --solves 1 --kernels torch",
+        r"\(tshirt\)|γ +\d",
+    ),
     Run(r"layer_scenes\.py", "--scenes folding_strip --rates 30 --seconds 0.1", r"folding_strip +1/30"),
     Run(r"layers\.py", "--frames 2", r"tank\+skirt", (r"$", " tank+skirt@plie"), slow=True),
     Run(r"losses\.py", "--sides 9 --share 9 --repetitions 1", r"Share of the energies"),
     Run(r"network\.py", "--sizes 300 --models fine15 --rounds 1 --no-memory --forward-only", r"fine15", slow=True),
     Run(r"precision\.py", "", r"\| met \|"),
-    Run(r"record_ranges\.py", "", "", (r"FILE KEY=VALUE …", "FILE.safetensors model=small model.latent_dim=8")),
+    Run(r"record_ranges\.py", "", r"trained on fps", (r"FILE KEY=VALUE …", "FILE.safetensors model=small model.latent_dim=8")),
     Run(r"scaling\.py report", "", r"γ median"),
     Run(r"cut_pieces\.py", "", r"skirt_front\.npz: 4719 vertices"),
     Run(r"solver\.py", "--sides 9 --frames 2", r"one local sweep, 81 vertices"),
@@ -68,7 +72,7 @@ RUN = (
         r"newton",
         (r"surface\.py[\w ]*?(?= --|$)", "surface.py tank"),
     ),
-    Run(r"waves\.py", "--garments tshirt --states 1 --frames 4", r"\d", slow=True),
+    Run(r"waves\.py", "--garments tshirt --states 1 --frames 4", r"tshirt", slow=True),
 )
 #: Lines that are not run, and why; what they call has tests elsewhere.
 NOT_RUN = {
