@@ -37,7 +37,7 @@ class Short(NamedTuple):
 
 
 SHORT = (
-    Short("^rollout", TWO_FRAMES, "a step has all parts of the model; pictures have tests of their own"),
+    Short("^rollout", TWO_FRAMES, "a step has all parts of the model; pictures and later events have tests of their own"),
     Short("^rollout.*=dress_12k", ("garment=dress",), "another resolution of the same garment"),
     Short("^rollout.*=dress_4k", ("garment=dress",), "another resolution of the same garment"),
     Short("^train", BRIEF, "one update with one scene; the networks are as large as the lines'"),
