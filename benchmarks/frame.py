@@ -114,7 +114,7 @@ def time_frame(simulator: Simulator, scene: Scene, prepared: object, frame: int)
     with watch.aside("metrics"):
         known = POTENTIAL.prepare(problem)
         strain_metrics(scene.cloth, state.pos)
-        penetration_metrics(known.contact, scene.cloth.num_vertices)
+        penetration_metrics(known.contact, scene.cloth)
         StepFigures(POTENTIAL, known, prediction.next_pos, prediction.acc).metrics()
     times |= {"feedback": Timed.spent, "network": times["network"] - Timed.spent}
     return {**times, "metrics": watch.spent_aside("metrics")}, prediction.next_pos

@@ -69,8 +69,8 @@ def medians(work: Mapping[str, Callable[[], object]], repetitions: int) -> dict[
 
 def time_terms(side: int, repetitions: int) -> dict[str, float]:
     """CPU times [ms] of value and gradient, term by term and together, and of the search."""
-    problem, _ = wrapped_sheet(side)
     potential = default_potential()
+    problem = potential.prepare(wrapped_sheet(side)[0])
     acc = _noise(side * side, 1.0)
     next_pos = problem.state.pos + DT * problem.state.vel + DT**2 * acc
 
@@ -89,6 +89,7 @@ def time_training(side: int, repetitions: int) -> tuple[dict[str, float], int]:
     problem, rest_pos = wrapped_sheet(side)
     simulator = build_simulator(schedule="ours", latent_dim=128).train()
     prepared, potential = simulator.prepare(problem.cloth, rest_pos), default_potential()
+    problem = potential.prepare(problem)
     optimizer = torch.optim.Adam(simulator.parameters(), lr=5e-5)
     parts: dict[str, list[float]] = {"features and network": [], "energies": [], "backward and update": []}
     for _ in range(repetitions + 1):

@@ -59,19 +59,26 @@ def load_config(name: str, overrides: Sequence[str] = ()) -> DictConfig:
     Raises:
         ConfigError: misspelt key, group option or type; Hydra's own complaints in one line.
     """
-    plugins = [f"hydra.searchpath=[{','.join(_quoted(f'file://{folder}') for folder in config_folders())}]"]
-    with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
+    folders = tuple(str(folder) for folder in config_folders())
+    return copy.deepcopy(_loaded(CONFIG_FOLDER, folders, name, tuple(overrides)))
+
+
+@lru_cache(maxsize=8)
+def _loaded(folder: Path, plugins_of: tuple[str, ...], name: str, overrides: tuple[str, ...]) -> DictConfig:
+    """A config that is copied and never changed: a command asks for that of its words several times."""
+    plugins = [f"hydra.searchpath=[{','.join(_quoted(f'file://{path}') for path in plugins_of)}]"]
+    with initialize_config_dir(str(folder), version_base="1.3"):
         try:
-            defaults = _composed(CONFIG_FOLDER, name, tuple(plugins))
+            defaults = _composed(folder, name, tuple(plugins))
             chosen = [_check_override(name, text, defaults) for text in overrides]
-            overrides = _last_of_groups(chosen)
+            words = _last_of_groups(chosen)
             # The groups may bring keys of their own, so keys are checked against the composition with all groups chosen.
-            groups = [text for text, override in chosen if _is_group(override) and text in overrides]
-            known = _composed(CONFIG_FOLDER, name, (*plugins, *groups))
+            groups = [text for text, override in chosen if _is_group(override) and text in words]
+            known = _composed(folder, name, (*plugins, *groups))
             for _, override in chosen:
                 if not _is_group(override):
                     _check_key(override, known)
-            config = compose(name, plugins + list(overrides))
+            config = compose(name, plugins + words)
             _check_sources(config)
             OmegaConf.resolve(config)
         except ConfigError:

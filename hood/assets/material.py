@@ -28,7 +28,10 @@ Field = float | np.ndarray | FaceField | EdgeField
 #: Properties that make a fabric differ along warp and weft, in the order of ``Cloth.weave``.
 WEAVE = ("warp", "weft", "shear")
 
-#: Ranges of the paper [SI]; the features are normalised by them, training samples inside them.
+#: Units of the properties that have one, as they are shown to people.
+UNITS = {"density": "kg/m²", "lame_mu": "Pa", "lame_lambda": "Pa", "bending_stiffness": "J", "thickness": "m"}
+
+#: Ranges of the paper [SI, see :data:`UNITS`]; the features are normalised by them, training samples inside them.
 RANGES: dict[str, tuple[float, float]] = {
     "density": (0.0434, 0.7),
     "lame_mu": (15909.0, 63636.0),
@@ -82,7 +85,8 @@ class Material:
             index = first_bad(np.isfinite(values) & ok(values))
             if index is not None:
                 where = "" if values.ndim == 0 else f" at {place} {index}"
-                raise ValueError(f"material {name!r} is {values.flat[index]}{where}; it must be finite and {rule}")
+                unit = f" {UNITS[name]}" if name in UNITS else ""
+                raise ValueError(f"material {name!r} is {values.flat[index]}{where}; it must be finite and {rule}{unit}")
         (lame_mu, place), (lame_lambda, other) = values_of(self.lame_mu), values_of(self.lame_lambda)
         if place == other or "" in (place, other):
             check_lame(lame_mu, lame_lambda, place or other)

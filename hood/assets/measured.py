@@ -13,7 +13,7 @@ The units of KES-F (Kawabata, "The Standardization and Analysis of Hand Evaluati
 | | WT gf·cm/cm² and linearity LT | EMT = 100 · 2 WT / (500 LT) % |
 
 How they become the isotropic fabric of :class:`hood.losses.stretching.Stretching` and :class:`hood.losses.bending.Bending`, h
-being the thickness of that fabric:
+being the thickness [m] of that fabric, μ and λ [Pa] its Lamé parameters and k [J] its ``bending_stiffness``:
 
     h μ = G,    ν = Y / (2 G) - 1, cut to 0 … 0.5,    λ = 2 μ ν / (1 - ν),    k = 4 B
 

@@ -7,12 +7,14 @@ import json
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from glob import has_magic
 from pathlib import Path
 from typing import Any
 
 import h5py
 from omegaconf import DictConfig
 
+from hood.assets.files.library import locate
 from hood.assets.motion.collection import motions_in
 from hood.assets.motion.motion_files import find_motions
 from hood.commands.summary import summarise
@@ -51,6 +53,21 @@ def expand_sequences(entries: Sequence[str]) -> list[str]:
         folder = Path(entry).expanduser()
         found.update(dict.fromkeys(map(str, motions_in(folder)) if folder.is_dir() else find_motions([entry])))
     return list(found)
+
+
+def require_motions(key: str, entries: Sequence[str]) -> None:
+    """Refuse names of motions that are not there, before any of them is used; lists and globs are looked through elsewhere.
+
+    Raises:
+        FileNotFoundError: names the key, the index and the nearest name.
+    """
+    for index, entry in enumerate(entries):
+        if has_magic(entry) or Path(entry).suffix in (".txt", ".json") or Path(entry).expanduser().is_dir():
+            continue
+        try:
+            locate("motions", entry)
+        except FileNotFoundError as error:
+            raise FileNotFoundError(f"{key}[{index}]: {error}") from error
 
 
 def find_jobs(entry: str, output: Path) -> list[Job] | None:

@@ -19,7 +19,7 @@ from hood.assets.files.library import motion_split
 from hood.assets.garment.garment import Garment, load_garment
 from hood.assets.motion.load import load_sequence
 from hood.assets.motion.sequence import PoseSequence
-from hood.commands.batch import expand_sequences
+from hood.commands.batch import expand_sequences, require_motions
 from hood.commands.candidates import digest, distinct, make_candidate
 from hood.commands.cautions import evaluation_cautions, warn
 from hood.commands.common import (
@@ -225,7 +225,9 @@ def make_plan(config: DictConfig) -> Plan:
     titles = [candidate.name for candidate in candidates]
     if len(set(titles)) < len(titles):
         raise ConfigError(f"models={plain(config.models)}: names must differ, these are {', '.join(titles)}; rename a file")
-    motions = expand_sequences([str(name) for name in config.sequences]) or motion_split()["validation"]
+    sequences = [str(name) for name in config.sequences]
+    require_motions("sequences", sequences)
+    motions = expand_sequences(sequences) or motion_split()["validation"]
     garments = [load_garment(str(name)) for name in config.garments]
     names = [garment.name for garment in garments]
     if len(set(names)) < len(names):

@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from hood.assets.files.atomic import write_atomically
-from hood.assets.material import RANGES
+from hood.assets.material import RANGES, UNITS
 from hood.assets.motion.motion_files import MotionFiles
 from hood.commands.common import require_device
 from hood.commands.train import make_trainer
@@ -207,7 +207,8 @@ def describe_training(plan: Mapping[str, Any]) -> str:
     lines += [f"{row['part']:<20}{row['ms']:>9.1f}{100 * row['share']:>7.0f}%" for row in plan["rows"]]
     small = [f"{name} ({one['share']:.1g})" for name, one in plan["terms"].items() if not one["teaches"]]
     fabrics = [
-        f"{name} {', '.join(f'{low:.3g}–{high:.3g}' for low, high in bands)}" for name, bands in drawn["fabrics_never"].items()
+        f"{name} {', '.join(f'{low:.3g}–{high:.3g}' for low, high in bands)} {UNITS.get(name, '')}".rstrip()
+        for name, bands in drawn["fabrics_never"].items()
     ]
     never = {
         f"terms whose force is never more than {_SMALL:g} of the residual": small,

@@ -8,7 +8,7 @@ import torch
 from omegaconf import DictConfig
 
 from hood.assets.files.library import locate
-from hood.commands.batch import expand_sequences
+from hood.commands.batch import expand_sequences, require_motions
 from hood.commands.common import UNTRAINED, require_device, require_distinct, require_package
 from hood.commands.garments import shape_coefficients
 from hood.commands.steppers import find_option
@@ -40,12 +40,12 @@ def check_config(config: DictConfig, sizes: Sequence[str]) -> None:
         require_distinct(key, given)
     for precision in config.precisions:
         check_precision(str(precision), torch.device(str(config.device)))
-    motions = expand_sequences([str(name) for name in config.sequences])
+    sequences = [str(name) for name in config.sequences]
+    require_motions("sequences", sequences)
+    motions = expand_sequences(sequences)
     if not motions:
         raise ConfigError("sequences=[]: give motions")
     require_distinct("sequences", motions)
-    for motion in motions:
-        locate("motions", motion)
     for size in sizes:
         _check_size(config, size)
 

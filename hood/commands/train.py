@@ -132,7 +132,8 @@ def make_trainer(config: DictConfig) -> Trainer:
         earlier = _start_from(simulator, str(config.weights), fps)
         settings = replace(settings, statistics_iterations=0)  # they come with the weights
     simulator.to(str(config.device))
-    names = find_motions(list(config.data.sequences) or motion_split()["train"])
+    leave_out = str(config.data.unusable) == "skip"
+    names = find_motions(list(config.data.sequences) or motion_split()["train"], check=not leave_out)
     sampler = SceneSampler(
         body=load_body(str(config.data.body)),
         garments=[load_garment(str(name)) for name in config.data.garments],

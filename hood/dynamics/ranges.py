@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from hood.assets.garment.garment import Garment
-from hood.assets.material import RANGES, WEAVE, Material, values_of
+from hood.assets.material import RANGES, UNITS, WEAVE, Material, values_of
 from hood.assets.motion.motion_files import MotionFiles
 from hood.losses.potential import Potential
 from hood.losses.problem import STANDARD_GRAVITY
@@ -194,7 +194,8 @@ def _extent(values: Tensor) -> Span:
 def _range(name: str, span: Span) -> str:
     forms: dict[str, Callable[[float], str]] = {"vertices": "{:,.0f}".format, "edge_length": lambda m: f"{1e3 * m:.3g}"}
     low, high = map(forms.get(name, "{:.5g}".format), span)
-    return (low if low == high else f"{low} to {high}") + (" mm" if name == "edge_length" else "")
+    unit = "mm" if name == "edge_length" else UNITS.get(name.removeprefix("material."), "")
+    return f"{low if low == high else f'{low} to {high}'} {unit}".rstrip()
 
 
 def _number(value: Any) -> str:

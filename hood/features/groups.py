@@ -178,7 +178,7 @@ class NodeMaterial(NodeGroup):
 
 
 def unit_fabric(fabric: Tensor, log_lambda: bool = False) -> Tensor:
-    """(N, 3) lame_mu, lame_lambda, bending_stiffness → (N, 3) bending, μ, λ over their training ranges.
+    """(N, 3) lame_mu [Pa], lame_lambda [Pa], bending_stiffness [J] → (N, 3) bending, μ, λ over their training ranges.
 
     (log v − log min)/(log max − log min) for bending and μ, λ linear, not clamped to [0, 1].
     Values below a thousandth of a range's start are raised to it before a logarithm: bending may be 0.

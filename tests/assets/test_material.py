@@ -42,7 +42,7 @@ def test_a_bad_entry_of_a_field_is_named() -> None:
         Material(density=field)
     with pytest.raises(ValueError, match="material 'thickness' is -1.0 at face 6; it must be finite and > 0"):
         Material(thickness=FaceField(field))
-    with pytest.raises(ValueError, match="material 'bending_stiffness' is -1.0 at edge 6; it must be finite and >= 0"):
+    with pytest.raises(ValueError, match="material 'bending_stiffness' is -1.0 at edge 6; it must be finite and >= 0 J"):
         Material(bending_stiffness=EdgeField(field))
     with pytest.raises(ValueError, match="material 'density' is -1.0; it must be finite and > 0"):
         Material(density=-1.0)

@@ -88,6 +88,35 @@ def test_a_motion_that_cannot_be_used_stops_no_other(motions: Path, capsys: pyte
     assert "b.npz" in errors[0]
 
 
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (ROLLOUT, "motions/list.txt, line 2: unknown sequence 'walk_prud': did you mean 'walk_proud'?"),
+        (["evaluate", "models=[guess]", "garments=[tank]"], "line 2: unknown sequence 'walk_prud': did you mean 'walk_proud'?"),
+        (
+            ["evaluate", "models=[guess]", "sequences=[plie,walk_prud]"],
+            "sequences[1]: unknown sequence 'walk_prud': did you mean",
+        ),
+        (["tradeoff", "sequences=[plie,walk_prud]"], "sequences[1]: unknown sequence 'walk_prud': did you mean 'walk_proud'?"),
+        (["tradeoff"], "motions/list.txt, line 2: unknown sequence 'walk_prud': did you mean 'walk_proud'?"),
+        (["train", "model=small"], "motions/list.txt, line 2: unknown sequence 'walk_prud': did you mean 'walk_proud'?"),
+    ],
+)
+def test_a_misspelt_motion_is_refused_before_any_work(
+    words: list[str], told: str, motions: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (motions / "list.txt").write_text("a.npz\nwalk_prud\ndeep/c.npz\n")
+    key = {"rollout": "sequence=", "train": "data.sequences="}.get(words[0], "sequences=")
+    value = "motions/list.txt" if words[0] == "rollout" else "[motions/list.txt]"
+    given = [] if "sequences[1]" in told else [f"{key}{value}"]
+    assert main([*words, *given, "output=out"]) == 2
+    said = capsys.readouterr()
+    assert said.err.count("\n") == 1
+    assert told in said.err
+    assert not list((motions.parent / "out").rglob("*.h5"))
+    assert not list((motions.parent / "out").rglob("*.jsonl"))
+
+
 def test_an_interrupted_batch_goes_on_where_it_stopped(
     motions: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

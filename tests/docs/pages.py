@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 import textwrap
 from pathlib import Path
 from typing import NamedTuple
@@ -61,3 +62,15 @@ def command_lines() -> list[tuple[str, str]]:
         lines += [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", prose_of(page))]
         found += [(page.name, line) for line in lines if _COMMAND.match(line)]
     return sorted(set(found))
+
+
+def of_hood(line: str) -> bool:
+    """Whether the line runs a command of ``hood``, by its name or by a script that does the same."""
+    return re.search(r"\bhood [a-z]|-m hood\.cli|scripts/(rollout|train|evaluate)", line) is not None
+
+
+def words_of(line: str) -> list[str]:
+    """The command and its words, without what starts it (python -m hood.cli, torchrun …) and what a page leaves open."""
+    bare = re.sub(r"^.*?(\bhood |-m hood\.cli |scripts/(?=rollout|train|evaluate))", "", line, count=1)
+    words = shlex.split(bare, comments=True)
+    return [words[0].removesuffix(".py"), *(word for word in words[1:] if "…" not in word)]

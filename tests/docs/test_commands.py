@@ -1,4 +1,4 @@
-"""Every command line of the README and the docs: its command, keys, values and names exist. None is run."""
+"""Every command line of the README and the docs: its command, keys, values and names exist. test_commands_run.py runs them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 from omegaconf import DictConfig
-from pages import CARDS, EXTENDING, EXTENDING_HAS_A_TEST, PAGES, ROOT, command_lines, prose_of
+from pages import CARDS, EXTENDING, EXTENDING_HAS_A_TEST, PAGES, ROOT, command_lines, of_hood, prose_of, words_of
 
 from hood.assets.files.library import names
 from hood.cli import COMMANDS
@@ -27,16 +27,9 @@ OWN = ("losses=windy", "material=felt")
 #: Keys that take embedded names, and of what.
 NAMED = {"garment": "garments", "sequence": "motions", "checkpoint": "weights", "body": "body"}
 LINES = command_lines()
-HOOD = [(page, line) for page, line in LINES if re.search(r"\bhood [a-z]|-m hood\.cli|scripts/(rollout|train|evaluate)", line)]
+HOOD = [(page, line) for page, line in LINES if of_hood(line)]
 PYTHON = [(page, line) for page, line in LINES if line.startswith("python ") and (page, line) not in HOOD]
 MAKE = [(page, line) for page, line in LINES if line.startswith("make ")]
-
-
-def words_of(line: str) -> list[str]:
-    """The command and its words, without what starts it (python -m hood.cli, torchrun …)."""
-    bare = re.sub(r"^.*?(\bhood |-m hood\.cli |scripts/(?=rollout|train|evaluate))", "", line, count=1)
-    words = shlex.split(bare, comments=True)
-    return [words[0].removesuffix(".py"), *(word for word in words[1:] if "…" not in word)]
 
 
 def check_names(config: DictConfig) -> None:

@@ -164,3 +164,15 @@ def test_the_shipped_files_say_what_they_were_trained_for(name: str, garments: d
 
 def test_unknown_ranges_are_called_so() -> None:
     assert describe(None) == {"trained on": "unknown, the file does not say"}
+
+
+def test_ranges_of_fabrics_have_their_units() -> None:
+    trained = Conditions({f"material.{name}": span for name, span in RANGES.items()} | {"material.friction": (1.0, 1.0)}, {})
+    told = describe(trained)
+    assert told["trained on material.bending_stiffness"] == "6.3708e-08 to 0.001314 J"
+    assert told["trained on material.lame_mu"] == "15909 to 63636 Pa"
+    assert told["trained on material.density"] == "0.0434 to 0.7 kg/m²"
+    assert told["trained on material.friction"] == "1"
+    assert outside(trained, Conditions({"material.bending_stiffness": (0.5, 0.5)}, {})) == [
+        "material.bending_stiffness=0.5 J (trained on 6.3708e-08 to 0.001314 J)"
+    ]

@@ -72,13 +72,17 @@ def _in_table(path: Path) -> list[Path]:
     names = [row[column] for row in rows]
     if any(not name for name in names):
         raise ValueError(f"{path}: row {next(i for i, name in enumerate(names) if not name) + 2} names no motion in {column!r}")
-    return [_beside(path.parent, str(name)) for name in names]
+    return [_beside(path, row, str(name)) for row, name in enumerate(names, start=2)]
 
 
-def _beside(folder: Path, name: str) -> Path:
+def _beside(table: Path, row: int, name: str) -> Path:
     """File of a table's entry: beside the table, with or without its suffix, or an embedded motion."""
     for suffix in ("", *motion_suffixes()):
-        file = folder / (name + suffix)
+        file = table.parent / (name + suffix)
         if file.is_file():
             return file
-    return locate("motions", name)
+    try:
+        return locate("motions", name)
+    except (ValueError, OSError) as error:
+        kind = FileNotFoundError if isinstance(error, FileNotFoundError) else ValueError
+        raise kind(f"{table}, row {row}: {error}") from error

@@ -17,7 +17,7 @@ from typing import IO, Any, overload
 
 import numpy as np
 
-from hood.assets.files.library import DATA_FOLDER
+from hood.assets.files.library import DATA_FOLDER, locate, names, nearest
 from hood.assets.motion.recording import motion_suffixes
 from hood.assets.motion.sequence import PoseSequence
 
@@ -26,20 +26,24 @@ PARTS = ("train", "validation")
 _LISTS = (".json", ".txt")
 
 
-def find_motions(entries: Iterable[str], part: str = "train") -> list[str]:
+def find_motions(entries: Iterable[str], part: str = "train", check: bool = True) -> list[str]:
     """Names and files that ``entries`` stand for, in their order, globs sorted, nothing twice.
 
     An entry is the name of an embedded motion, a file, a glob (``amass/**/*_poses.npz``), or a list of such entries: a text
     file with one entry a line (``#`` starts a comment), a JSON list, or a JSON split
     ``{"train": […], "validation": […]}`` of which ``part`` is taken. Relative paths in a list start from its folder.
 
+    Args:
+        check: refuse a list with a name that stands for nothing; False where that is left out later.
+
     Raises:
-        FileNotFoundError: a list that does not exist.
+        FileNotFoundError: a list that does not exist; an entry of a list that is neither a file nor an embedded name: names the
+            list, the line (or the index) and the nearest name.
         ValueError: a glob without a match, a list that cannot be read or lacks the part; names the file.
     """
     found: dict[str, None] = {}
     for entry in map(str, entries):
-        found.update(dict.fromkeys(_expand(entry, part)))
+        found.update(dict.fromkeys(_expand(entry, part, check)))
     return list(found)
 
 
@@ -140,28 +144,58 @@ def motion_lengths(motions: Sequence[PoseSequence]) -> np.ndarray:
     return motions.lengths if isinstance(motions, MotionFiles) else np.array([motion.num_frames for motion in motions])
 
 
-def _expand(entry: str, part: str, folder: Path | None = None) -> list[str]:
+def _expand(entry: str, part: str, check: bool) -> list[str]:
     path = Path(entry).expanduser()
-    if path.suffix in _LISTS and folder is None:
-        return [name for line in _entries(path, part) for name in _expand(line, part, path.parent)]
-    based = path if folder is None else folder / path
+    if path.suffix not in _LISTS:
+        return _matches(path) if has_magic(entry) else [_no_folder(path, entry)]
+    found: list[str] = []
+    for place, text in _entries(path, part):
+        try:
+            found += _listed(text, path.parent, check)
+        except (ValueError, OSError) as error:
+            kind = FileNotFoundError if isinstance(error, FileNotFoundError) else ValueError
+            raise kind(f"{path}, {place}: {error}") from error
+    return found
+
+
+def _listed(entry: str, folder: Path, check: bool) -> list[str]:
+    """What an entry of a list in ``folder`` stands for; with ``check`` all of it is there."""
+    path = Path(entry).expanduser()
+    based = folder / path
     if has_magic(entry):
-        files = sorted(file for file in glob(str(based), recursive=True) if Path(file).is_file())
-        if not files:
-            raise ValueError(f"no file matches {str(based)!r}; ** stands for any folders, e.g. 'amass/**/*_poses.npz'")
-        return files
-    if based.is_dir():
-        raise ValueError(f"{based}: a folder; write which files in it, e.g. '{based}/**/*_poses.npz'")
-    # Not found beside the list: an embedded name, or an error that whoever reads it words best.
-    return [str(based) if folder is not None and (based.is_file() or path.suffix in motion_suffixes()) else entry]
+        return _matches(based)
+    _no_folder(based, entry)
+    is_path = path.suffix in motion_suffixes()
+    if based.is_file() or (is_path and not check):
+        return [str(based)]
+    if is_path:
+        beside = based.parent.iterdir() if based.parent.is_dir() else ()
+        near = nearest(based.name, [*(file.name for file in beside if file.suffix == path.suffix), *names("motions")])
+        raise FileNotFoundError(f"{based}: no such file; " + (f"did you mean {near!r}?" if near else "check the path"))
+    if check:
+        locate("motions", entry)
+    return [entry]
 
 
-def _entries(path: Path, part: str) -> list[str]:
-    """Entries of a list file."""
+def _matches(path: Path) -> list[str]:
+    files = sorted(file for file in glob(str(path), recursive=True) if Path(file).is_file())
+    if not files:
+        raise ValueError(f"no file matches {str(path)!r}; ** stands for any folders, e.g. 'amass/**/*_poses.npz'")
+    return files
+
+
+def _no_folder(path: Path, entry: str) -> str:
+    if path.is_dir():
+        raise ValueError(f"{path}: a folder; write which files in it, e.g. '{path}/**/*_poses.npz'")
+    return entry
+
+
+def _entries(path: Path, part: str) -> list[tuple[str, str]]:
+    """Entries of a list file, each behind its place there."""
     text = path.read_text(encoding="utf-8")
     if path.suffix == ".txt":
-        entries = [line.split("#")[0].strip() for line in text.splitlines()]
-        return [entry for entry in entries if entry]
+        lines = [line.split("#")[0].strip() for line in text.splitlines()]
+        return [(f"line {number}", line) for number, line in enumerate(lines, start=1) if line]
     try:
         content = json.loads(text)
     except ValueError as error:
@@ -169,10 +203,12 @@ def _entries(path: Path, part: str) -> list[str]:
     if isinstance(content, dict):
         if part not in content:
             raise ValueError(f"{path}: has no {part!r} (found {sorted(content)}); a split holds {' and '.join(PARTS)}")
-        content = content[part]
+        content, name = content[part], part
+    else:
+        name = "list"
     if not isinstance(content, list) or not all(isinstance(entry, str) for entry in content):
         raise ValueError(f"{path}: must hold a list of names, files or globs, or one for each of {' and '.join(PARTS)}")
-    return content
+    return [(f"{name}[{index}]", entry) for index, entry in enumerate(content)]
 
 
 # ---- frames by header ------------------------------------------------------------------------------------------------

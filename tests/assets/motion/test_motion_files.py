@@ -65,6 +65,36 @@ def test_lists_that_say_nothing_are_named(tmp_path: Path, name: str, text: str, 
         find_motions([str(tmp_path / name)], "validation")
 
 
+@pytest.mark.parametrize(
+    "name, text, words",
+    [
+        ("a.txt", "plie\n\nwalk_prud  # fast\n", r"a\.txt, line 3: unknown sequence 'walk_prud': did you mean 'walk_proud'\?"),
+        ("a.txt", "BML/a_pose.npz", r"a\.txt, line 1: .*BML/a_pose\.npz: no such file; did you mean 'a_poses\.npz'\?"),
+        ("a.txt", "GONE/zzz.npz", r"a\.txt, line 1: .*GONE/zzz\.npz: no such file; check the path"),
+        ("a.txt", "plie\nBML", r"a\.txt, line 2: .*BML: a folder"),
+        ("a.json", '["plie", "pliee"]', r"a\.json, list\[1\]: unknown sequence 'pliee': did you mean 'plie'\?"),
+        (
+            "a.json",
+            '{"train": ["walk_prud"]}',
+            r"a\.json, train\[0\]: unknown sequence 'walk_prud': did you mean 'walk_proud'\?",
+        ),
+    ],
+)
+def test_a_list_with_a_misspelt_name_is_refused_with_its_place(folder: Path, name: str, text: str, words: str) -> None:
+    (folder / name).write_text(text)
+    with pytest.raises((ValueError, FileNotFoundError), match=words):
+        find_motions([str(folder / name)])
+
+
+def test_lists_are_not_checked_where_missing_motions_are_left_out(folder: Path) -> None:
+    (folder / "a.txt").write_text("plie\nwalk_prud\nGONE/zzz.npz\n")
+    found = find_motions([str(folder / "a.txt")], check=False)
+    assert found == ["plie", "walk_prud", f"{folder}/GONE/zzz.npz"]
+    files = MotionFiles(found, LOAD, 30.0, skip=True)
+    assert files.names == ["plie"]
+    assert ["walk_prud" in files.skipped[0], "zzz.npz" in files.skipped[1]] == [True, True]
+
+
 def test_globs_without_a_match_folders_and_missing_files_are_named(folder: Path) -> None:
     with pytest.raises(ValueError, match=r"no file matches .*\*\* stands for any folders"):
         find_motions([f"{folder}/**/*_stagei.npz"])

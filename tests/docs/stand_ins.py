@@ -1,0 +1,210 @@
+"""The files that readers bring to the command lines of the pages, small, made when a command first names them."""
+
+from __future__ import annotations
+
+import re
+import runpy
+import shutil
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from pages import ROOT, blocks
+from workshop import Workshop, write_obj
+
+from hood.assets.garment.garment import Garment, load_garment, save_garment
+from hood.cli import main
+from hood.dynamics.recorder import RolloutWriter
+from hood.evaluation.envelope_prose import BEGIN, END
+from hood.testing import cylinder, sphere
+
+sys.path.insert(0, str(ROOT / "tests" / "dynamics"))
+from reference_oracle import make_state
+
+#: What makes a training short; the model and its weights are as large as the line's.
+BRIEF = (
+    "trainer.iterations=1", "trainer.batch_size=1", "trainer.statistics_iterations=0", "trainer.horizon.start=1",
+    "trainer.workers=0", "trainer.log_every=1",
+)  # fmt: skip
+#: Words that say what a network is.
+_OF_A_MODEL = re.compile(r"(experiment|model[\w.]*)=")
+
+
+class Desk:
+    """Makes files once, each kind in a folder of its own, and lays copies of those that a command names where it runs."""
+
+    def __init__(self, folder: Path, go: Callable[[Path], None]) -> None:
+        self.folder = folder
+        self.workshop = Workshop(folder / "workshop")
+        self.workshop.folder.mkdir()
+        self.go = go
+        self.makers: list[tuple[str, Callable[[str, Sequence[str]], Path]]] = [
+            (r"(outputs/(?!plan/)\w+|(.*/)?rollout\.h5)", self.rollout),
+            (r"long\.h5", self.long_rollout),
+            (r"outputs/plan/plan\.json", self.plan),
+            (r"([\w/]+/)?\w+\.safetensors", self.model),
+            (r"postcvpr\.pth", self.published),
+            (r"(my_)?shirt\.obj", self.shirt),
+            (r"shirt\.npz", self.bound_shirt),
+            (r"coat\.(obj|ply)|left\.txt|right\.txt", self.coat),
+            (r"(my_)?walk\.npz|my_amass_file\.npz|amass/.*", self.recording),
+            (r"hero\.glb", self.hero),
+            (r"pieces/.*\.npz", self.piece),
+            (r"skirt\.obj|twirl\.npz|skirt_prepared\.npz", self.of_tutorial),
+            (r"docs/stability\.md", self.page),
+        ]
+
+    def lay(self, words: Sequence[str], where: Path) -> None:
+        """Copies of the files that the words name, under those names, into the folder ``where``."""
+        given = [word for word in words[1:] if not word.startswith("output=")]
+        for name in dict.fromkeys(re.findall(r"[\w.*/-]+", " ".join(given))):
+            for pattern, make in self.makers:
+                if re.fullmatch(pattern, name):
+                    made, target = make(name, words), where / _without_stars(name)
+                    target.parent.mkdir(parents=True, exist_ok=True)
+                    (shutil.copytree if made.is_dir() else shutil.copy)(made, target)
+
+    def _once(self, name: str, make: Callable[[Path], None]) -> Path:
+        """The folder ``name`` with what ``make`` writes into it."""
+        folder = self.folder / re.sub(r"[^\w.]+", "_", name)
+        if not folder.exists():
+            folder.mkdir()
+            before = Path.cwd()
+            self.go(folder)
+            make(folder)
+            self.go(before)
+        return folder
+
+    def rollout(self, name: str, words: Sequence[str]) -> Path:
+        def make(folder: Path) -> None:
+            drawn = ["num_frames=12", "video=none", "sheet=false", "export=[rg]"]
+            assert main(["rollout", "garment=dress", "stepper=guess", *drawn, "allow_unsound=true", "output=made"]) == 0
+
+        made = self._once("rollout", make) / "made"
+        return made / "rollout.h5" if name.endswith(".h5") else made
+
+    def long_rollout(self, name: str, words: Sequence[str]) -> Path:
+        """Ninety frames of a tube about a ball."""
+
+        def make(folder: Path) -> None:
+            (pos, faces), (ball, ball_faces) = cylinder(12, 3, 0.3, 0.5), sphere(1, 0.25)
+            with RolloutWriter(
+                folder / "long.h5", 90, pos, faces, ball_faces, len(ball), (), 1 / 30, {"garment": "tube"}
+            ) as out:
+                for _ in range(90):
+                    out.append(pos, ball, {}, {})
+
+        return self._once("long", make) / "long.h5"
+
+    def plan(self, name: str, words: Sequence[str]) -> Path:
+        def make(folder: Path) -> None:
+            short = ["windows=1", "frames=1", "parts=[friction]", "num_frames=12", "output=made"]
+            assert main(["plan", "garment=tank", "stepper=newton", *short]) == 0
+
+        return self._once("plan", make) / "made" / "plan.json"
+
+    def model(self, name: str, words: Sequence[str]) -> Path:
+        """What a training of the words' model wrote after an update; that of another command is the smallest."""
+        chosen = [word for word in words if words[0] == "train" and _OF_A_MODEL.match(word)]
+        chosen = chosen or ["model=small", "model.latent_dim=8"]
+
+        def make(folder: Path) -> None:
+            assert main(["train", *chosen, *BRIEF, "data.garments=[tank]", "data.sequences=[plie]", "output=made"]) == 0
+
+        return self._once("model " + " ".join(chosen), make) / "made" / "model.safetensors"
+
+    def published(self, name: str, words: Sequence[str]) -> Path:
+        def make(folder: Path) -> None:
+            torch.save({"training_module": make_state("postcvpr", 4)}, folder / "postcvpr.pth")
+
+        return self._once("published", make) / "postcvpr.pth"
+
+    def shirt(self, name: str, words: Sequence[str]) -> Path:
+        """Around the T-pose, in centimetres where the words say so; or as the glTF body wears it in its first frame."""
+        if "hero.glb" in " ".join(words):
+            return Path(self.workshop.garment("tshirt", "posed"))
+        unit = 0.01 if "scale=0.01" in words else 1.0
+
+        def make(folder: Path) -> None:
+            shirt = load_garment("tshirt")
+            write_obj(folder / "shirt.obj", shirt.worn_pos / unit, shirt.faces)
+
+        return self._once(f"shirt {unit}", make) / "shirt.obj"
+
+    def bound_shirt(self, name: str, words: Sequence[str]) -> Path:
+        return self._once("bound", lambda folder: save_garment(folder / "shirt.npz", load_garment("tshirt"))) / "shirt.npz"
+
+    def coat(self, name: str, words: Sequence[str]) -> Path:
+        return self._once("coat", _write_coat) / name
+
+    def recording(self, name: str, words: Sequence[str]) -> Path:
+        """The layout of AMASS; a folder of two where one is asked for."""
+        file = Path(self.workshop.motion("amass_smplh"))
+        if name.endswith(".npz"):
+            return file
+
+        def make(folder: Path) -> None:
+            for subject in ("01", "02"):
+                shutil.copy(file, folder / f"{subject}_poses.npz")
+
+        return self._once("amass", make)
+
+    def hero(self, name: str, words: Sequence[str]) -> Path:
+        return Path(self.workshop.body("gltf_skin"))
+
+    def piece(self, name: str, words: Sequence[str]) -> Path:
+        def make(folder: Path) -> None:
+            for piece in runpy.run_path(str(ROOT / "scripts" / "cut_pieces.py"))["pieces"]():
+                save_garment(folder / f"{piece.name}.npz", piece)
+
+        return self._once("pieces", make) / Path(name).name
+
+    def of_tutorial(self, name: str, words: Sequence[str]) -> Path:
+        """The two files that the tutorial's Python writes, half as fine, and what its third command makes of the skirt."""
+
+        def make(folder: Path) -> None:
+            python = next(block.text for block in blocks(ROOT / "docs" / "tutorial.md") if block.language == "python")
+            coarse = python.replace("around, down = 80, 52", "around, down = 56, 36")
+            assert coarse != python
+            exec(compile(coarse, "own_files.py", "exec"), {})
+            assert main(["prepare", "garment=skirt.obj", "scale=0.01", "pins=waistband"]) == 0
+
+        return self._once("tutorial", make) / name
+
+    def page(self, name: str, words: Sequence[str]) -> Path:
+        return self._once("page", lambda folder: _write_page(folder / "stability.md")) / "stability.md"
+
+
+def _without_stars(name: str) -> str:
+    return name.replace("**/*", "01/01")
+
+
+def _write_page(path: Path) -> None:
+    path.write_text(f"before\n\n{BEGIN}\n{END}\n\nafter\n", encoding="utf-8")
+
+
+def _write_coat(folder: Path) -> None:
+    """A jacket as a reader has it: without fasteners, its edges painted in the PLY and listed in two texts."""
+    jacket = load_garment("jacket")
+    assert jacket.fasteners is not None
+    pairs = jacket.fasteners["front_zip"]
+    write_obj(folder / "coat.obj", jacket.worn_pos, jacket.faces)
+    for side, name in enumerate(("left", "right")):
+        (folder / f"{name}.txt").write_text(" ".join(map(str, pairs[:, side])), encoding="utf-8")
+    colours = np.full((len(jacket.rest_pos), 3), 200)
+    colours[pairs[:, 0]], colours[pairs[:, 1]] = (255, 0, 0), (0, 255, 0)
+    _write_ply(folder / "coat.ply", jacket, colours)
+
+
+def _write_ply(path: Path, garment: Garment, colours: np.ndarray) -> None:
+    fields = [*(f"property float {axis}" for axis in "xyz"), *(f"property uchar {name}" for name in ("red", "green", "blue"))]
+    head = ["ply", "format ascii 1.0", f"element vertex {len(colours)}", *fields]
+    head += [f"element face {len(garment.faces)}", "property list uchar int vertex_indices", "end_header"]
+    rows = [
+        f"{x:.7f} {y:.7f} {z:.7f} {r} {g} {b}"
+        for (x, y, z), (r, g, b) in zip(garment.worn_pos.tolist(), colours.tolist(), strict=True)
+    ]
+    rows += [f"3 {a} {b} {c}" for a, b, c in garment.faces.tolist()]
+    path.write_text("\n".join([*head, *rows]) + "\n", encoding="utf-8")

@@ -1,0 +1,176 @@
+"""The scripts and benchmarks of the README and the docs are run, cut short; others are listed, each with the reason."""
+
+from __future__ import annotations
+
+import os
+import re
+import runpy
+import shlex
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+from pages import ROOT, command_lines, of_hood
+from stand_ins import Desk
+
+from hood.cli import ENVIRONMENT
+
+LINES = [(page, line) for page, line in command_lines() if not of_hood(line)]
+
+
+class Run(NamedTuple):
+    """How lines with a pattern are cut short: parts of the line are replaced, words put behind it."""
+
+    pattern: str
+    words: str
+    says: str  # a pattern that the script prints
+    swap: tuple[str, str] = ("", "")
+    slow: bool = False
+
+
+RUN = (
+    Run(r"accuracy\.py", "", r"every vertex 0\.1 mm off"),
+    Run(r"batches\.py", "--garments tank --counts 1 --models quickstart --kernels torch --repeats 1", r"\| quickstart \|"),
+    Run(r"beyond_training\.py", "--parts gravity --frames 2", r"newton: 10 g: \d", slow=True),
+    Run(r"convergence\.py garment", "--sizes 1k --fps 30 --methods newton", r"1k +30 +newton", slow=True),
+    Run(r"convergence\.py strip", "", r"\(0\.\d+\)"),
+    Run(r"distance\.py", "--garments tank --frames 2", r"tank", slow=True),
+    Run(r"engine\.py$", "--iterations 1 --frames 2", r"2 of 2", (r"$", " tank")),
+    Run(
+        r"engine\.py --frame",
+        "--iterations 1 --frames 3 --motions plie",
+        r"\ball +1 ",
+        (r"tshirt trousers dress skirt", "tank"),
+    ),
+    Run(r"events_picture\.py", "", "", (r"rollout\.h5 docs/images/", "long.h5 ")),
+    Run(r"extremes\.py", "--side 9 --frames 1", r"\| × 100 \| × 0\.1 \|"),
+    Run(r"fabrics\.py", "", r"below_waistband"),
+    Run(r"frame\.py", "--sizes 300 --models fine15 --precision fp32 --frames 3", r"\| fine15 \| torch \| fp32 \|"),
+    Run(r"fuzz\.py", "--count 3", r"\| all \| 3 \|", slow=True),
+    Run(r"guard\.py", "--garments tank --motions plie --steppers newton --frames 3", r"alarms 0, repairs 0 of 2"),
+    Run(r"half\.py", "--garments tank --frames 12", r"\| tank \|", (r"A B", "A.safetensors B.safetensors")),
+    Run(
+        r"heads\.py (errors|projective)",
+        "--garments tshirt --states 1 --frames 4 --solves 1 --kernels torch",
+        r"\(tshirt\)|γ +\d",
+    ),
+    Run(r"layer_scenes\.py", "--scenes folding_strip --rates 30 --seconds 0.1", r"folding_strip +1/30"),
+    Run(r"layers\.py", "--frames 2", r"tank\+skirt", (r"$", " tank+skirt@plie"), slow=True),
+    Run(r"losses\.py", "--sides 9 --share 9 --repetitions 1", r"Share of the energies"),
+    Run(r"network\.py", "--sizes 300 --models fine15 --rounds 1 --no-memory --forward-only", r"fine15", slow=True),
+    Run(r"precision\.py", "", r"\| met \|"),
+    Run(r"record_ranges\.py", "", r"trained on fps", (r"FILE KEY=VALUE …", "FILE.safetensors model=small model.latent_dim=8")),
+    Run(r"scaling\.py report", "", r"γ median"),
+    Run(r"cut_pieces\.py", "", r"skirt_front\.npz: 4719 vertices"),
+    Run(r"solver\.py", "--sides 9 --frames 2", r"one local sweep, 81 vertices"),
+    Run(r"starts\.py", "--models quickstart --states 1 --kernels torch", r"lower of quickstart", slow=True),
+    Run(
+        r"surface\.py",
+        "--steppers newton --motions plie --frames 3",
+        r"newton",
+        (r"surface\.py[\w ]*?(?= --|$)", "surface.py tank"),
+    ),
+    Run(r"waves\.py", "--garments tshirt --states 1 --frames 4", r"tshirt", slow=True),
+)
+#: Lines that are not run, and why; what they call has tests elsewhere.
+NOT_RUN = {
+    r"build_assets\.py": "writes the data of the package anew, with packages from PyPI; tests/tools/assets tests that",
+    r"gallery\.py": "21 rollouts of 60 frames at 4,000 vertices",
+    r"gpu\.py": "needs a CUDA device",
+    r"heads\.py (controls|models)": "reads networks that benchmarks/recipes.py trains in hours",
+    r"kills\.py": "starts and kills trainings for minutes; tests/training/test_kills.py does so once",
+    r"minima\.py": "a hundred minimisations to the end, minutes",
+    r"order\.py": "trains three networks for half an hour, or minimises hundreds of steps to the end",
+    r"peers\.py": "needs the simulators of others from PyPI",
+    r"ranks\.py": "trains in several processes, minutes",
+    r"recipes\.py": "trains networks, hours",
+    r"reproduce\.py": "measures points of a chart of hood tradeoff again, hours",
+    r"resolution\.py": "evaluates a dress in resolutions up to 12,000 vertices, minutes each",
+    r"/training\.py": "times updates of several models, a minute for one update of each",
+    r"viewer\.py": "needs headless Chromium",
+    r"^make ": "makes an environment from PyPI; continuous integration runs make test and make docs",
+}
+
+
+def row_of(line: str) -> Run | None:
+    bare = line.partition("#")[0].strip()
+    return next((row for row in RUN if re.search(row.pattern, bare)), None)
+
+
+def as_parameter(page: str, line: str) -> Any:
+    row = row_of(line)
+    return pytest.param(line, id=f"{page}: {line}", marks=[pytest.mark.slow] if row and row.slow else [])
+
+
+def shortened(line: str, row: Run) -> list[str]:
+    bare = line.partition("#")[0].strip()
+    return [*shlex.split(re.sub(*row.swap, bare, count=1) if row.swap[0] else bare)[1:], *shlex.split(row.words)]
+
+
+def exit_code(script: Path) -> object:
+    try:
+        runpy.run_path(str(script), run_name="__main__")
+    except SystemExit as ended:
+        return ended.code or 0
+    return 0
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory: pytest.TempPathFactory) -> Desk:
+    return Desk(tmp_path_factory.mktemp("desk"), os.chdir)
+
+
+@pytest.fixture(scope="module")
+def done() -> set[tuple[str, ...]]:
+    """The words of what was run."""
+    return set()
+
+
+@pytest.fixture
+def tidy(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Modules that scripts import from beside them are forgotten again."""
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    before = {*sys.modules}
+    yield
+    for name in {*sys.modules} - before:
+        if str(getattr(sys.modules[name], "__file__", None) or "").startswith((f"{ROOT}/benchmarks", f"{ROOT}/scripts")):
+            del sys.modules[name]
+
+
+@pytest.mark.parametrize("line", [as_parameter(page, line) for page, line in LINES if row_of(line)])
+def test_a_script_runs(
+    line: str, desk: Desk, done: set[tuple[str, ...]], tidy: None, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    row = row_of(line)
+    assert row is not None
+    words = shortened(line, row)
+    if tuple(words) in done:
+        return
+    monkeypatch.chdir(tmp_path)
+    desk.lay(words, tmp_path)
+    script = ROOT / words[0]
+    for key, value in ENVIRONMENT.items():  # without these scripts begin again in a new process, in the place of this one
+        monkeypatch.setenv(key, value)
+    monkeypatch.setattr(sys, "argv", words)
+    monkeypatch.setattr(sys, "path", [str(script.parent), *sys.path])
+    capsys.readouterr()
+    assert exit_code(script) == 0
+    told = capsys.readouterr().out
+    assert re.search(row.says, told), told
+    if "events_picture" in line:
+        assert (tmp_path / "events.png").stat().st_size
+    if "cut_pieces" in line:
+        assert {path.name for path in (tmp_path / "pieces").iterdir()} >= {"dress_side.npz", "skirt_front.npz"}
+    done.add(tuple(words))
+
+
+def test_every_line_is_run_or_is_listed_with_a_reason() -> None:
+    for page, line in LINES:
+        bare = line.partition("#")[0].strip()
+        found = [row.pattern for row in RUN if re.search(row.pattern, bare)] + [at for at in NOT_RUN if re.search(at, bare)]
+        assert len(found) == 1, f"{page}: {line}: {found}"
+    for pattern in [*(row.pattern for row in RUN), *NOT_RUN]:
+        assert any(re.search(pattern, line.partition("#")[0].strip()) for _, line in LINES), pattern
