@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from pages import ROOT, blocks
+from PIL import Image
 from workshop import Workshop, write_obj
 
 from hood.assets.garment.garment import Garment, load_garment, save_garment
@@ -54,6 +55,7 @@ class Desk:
             (r"pieces/.*\.npz", self.piece),
             (r"skirt\.obj|twirl\.npz|skirt_prepared\.npz", self.of_tutorial),
             (r"docs/stability\.md", self.page),
+            (r"(outputs/patterns/)?(plaid|bands|map)\.(png|jpg)", self.picture),
         ]
 
     def lay(self, words: Sequence[str], where: Path) -> None:
@@ -126,12 +128,28 @@ class Desk:
         if "hero.glb" in " ".join(words):
             return Path(self.workshop.garment("tshirt", "posed"))
         unit = 0.01 if "scale=0.01" in words else 1.0
+        panels = ("sleeve_left", "collar") if "collar" in " ".join(words) else ()
 
         def make(folder: Path) -> None:
             shirt = load_garment("tshirt")
             write_obj(folder / "shirt.obj", shirt.worn_pos / unit, shirt.faces)
+            if panels:
+                head, *faces = (folder / "shirt.obj").read_text(encoding="utf-8").partition("\nf ")
+                rows = "".join(faces).strip().splitlines()
+                groups = [f"g {name}\n{row}" for name, row in zip(panels, rows, strict=False)]
+                (folder / "shirt.obj").write_text("\n".join([head, *groups, "g body", *rows[len(groups) :]]), encoding="utf-8")
 
-        return self._once(f"shirt {unit}", make) / "shirt.obj"
+        return self._once(f"shirt {unit} {' '.join(panels)}", make) / "shirt.obj"
+
+    def picture(self, name: str, words: Sequence[str]) -> Path:
+        """Red on the left, blue on the right."""
+
+        def make(folder: Path) -> None:
+            colours = np.zeros((8, 8, 3), dtype=np.uint8)
+            colours[:, :4, 0] = colours[:, 4:, 2] = 255
+            Image.fromarray(colours).save(folder / Path(name).name)
+
+        return self._once(f"picture {Path(name).name}", make) / Path(name).name
 
     def bound_shirt(self, name: str, words: Sequence[str]) -> Path:
         return self._once("bound", lambda folder: save_garment(folder / "shirt.npz", load_garment("tshirt"))) / "shirt.npz"

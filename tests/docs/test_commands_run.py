@@ -52,7 +52,7 @@ SHORT = (
     Short(
         "^tradeoff",
         (
-            "models=[untrained:small]", "precisions=[fp32]", "newton=false", "dial=none", "sequences=[plie]", "turns=1",
+            "models=[untrained:small]", "precisions=[fp32]", "newton=false", "refined=none", "sequences=[plie]", "turns=1",
             "garments_1k=[tank]", "refine_1k=[0]", "guess_1k=[]", "frames_1k=4", "states_1k=1",
             *(f"{key}_{size}=[]" for size in ("4k", "12k") for key in ("garments", "models", "refine", "guess")),
             *(f"{key}_{size}=4" for size in ("4k", "12k") for key in ("frames", "states")), "shapes_12k=[[]]",
