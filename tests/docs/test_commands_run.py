@@ -38,7 +38,7 @@ class Short(NamedTuple):
 
 SHORT = (
     Short("^rollout", TWO_FRAMES, "a step has all parts of the model; pictures and later events have tests of their own"),
-    Short("^rollout(?!.*formats=).*texture=", ("formats=[glb]",), "an image is for pictures and exports; pictures are not drawn"),
+    Short("^rollout(?!.*formats=).*texture=", ("formats=[glb]",), "an image is for pictures and exports; none are drawn"),
     Short("^rollout.*=dress_12k", ("garment=dress",), "another resolution of the same garment"),
     Short("^rollout.*=dress_4k", ("garment=dress",), "another resolution of the same garment"),
     Short("^train", BRIEF, "one update with one scene; the networks are as large as the lines'"),
