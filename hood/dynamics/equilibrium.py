@@ -28,6 +28,8 @@ _SHORTEST, _LONGEST, _STRIDE = 1.0 / 30.0, 1.0, 0.04
 _REST = 1e-3
 #: Steps at most: the default garments need half of them, and what creeps goes on creeping.
 _MOST_STEPS = 30
+#: Times that cloth is held farther off at the end, where it rests in the skin.
+_HELD_OFF = 4
 #: A part of a garment that has no pins and has moved so far [m] on average is not worn any more.
 _LOST = 0.3
 #: Accuracy of the steps on the way, and of the longest: the way leads to the same place, whatever is left over on it.
@@ -78,8 +80,9 @@ def find_equilibrium(
     Pseudo-transient continuation: implicit steps of growing dt on a body that stands still, each from rest, so that nothing
     swings; contact and friction are those of ``potential`` at the start of each step. Friction of the potential creeps below
     its slip speed (:class:`hood.losses.friction.LaggedFriction`), so that cloth on a slope never stands quite still: at rest
-    is what moves by less than a millimetre in a second. A garment that does not come to rest is warned about and is kept
-    where it is then; of one that has come off the body, the start is kept. There is no equilibrium :func:`without_hold`.
+    is what moves by less than a millimetre in a second. Where triangles then lie in the skin, their corners are held farther
+    off (:mod:`hood.scene.held_off`). A garment that does not come to rest is warned about and is kept where it is then; of one
+    that has come off the body, the start is kept. There is no equilibrium :func:`without_hold`.
 
     The CPU does it, whatever the device.
 
@@ -96,6 +99,8 @@ def find_equilibrium(
     parts = _Parts(cloth)
     *_, (count, pos, speed) = _steps(potential, problem, parts, most_steps or _MOST_STEPS)
     lost = parts.lost(pos - start.pos)
+    if not lost and most_steps is None and math.isfinite(speed):
+        pos = _out_of_skin(potential, problem, pos)
     rest = Rest((start.pos if lost else pos).to(state.pos), count, time.perf_counter() - began, speed, lost)
     if not rest.reached and most_steps is None:
         _warn(scene, rest)
@@ -121,6 +126,24 @@ def _steps(potential: Potential, problem: StepProblem, parts: _Parts, most_steps
         growth = _STRIDE / max(float(moved.max()), 1e-9)
         dt = min(max(dt * min(max(growth, 0.5), 2.0), _SHORTEST), _LONGEST)
         problem = replace(problem, state=replace(here, pos=pos))
+
+
+def _out_of_skin(potential: Potential, problem: StepProblem, pos: Tensor) -> Tensor:
+    """Positions (V, 3) at rest with cloth held farther off where too many of its triangles lie in the skin; ``pos`` itself
+    where they do not, or where that is not finite."""
+    rested = replace(problem.state, pos=pos)
+    problem = replace(problem, state=rested, step=replace(problem.step, dt=torch.full_like(problem.step.dt, _LONGEST)))
+    problem = potential.prepare(problem)
+    for _ in range(_HELD_OFF):
+        again = problem.with_held_off(pos)
+        if again is problem:
+            break
+        problem = again
+        found, report = minimize(potential, problem, pos, _FINE)
+        if NOT_FINITE in report.reason:
+            break
+        pos = found
+    return pos
 
 
 class _Parts:
