@@ -19,9 +19,9 @@ import torch
 from omegaconf import DictConfig
 
 from hood.assets.body.model_file import read_model
+from hood.assets.files.index_list import read_indices
 from hood.assets.formats.mesh_file import read_mesh_file
 from hood.assets.garment.garment import load_garment
-from hood.assets.garment.pins import read_indices
 from hood.assets.motion.animated_mesh import load_mesh_sequence
 from hood.assets.motion.poses import read_pose
 from hood.assets.motion.recording import read_recording

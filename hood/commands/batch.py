@@ -134,6 +134,7 @@ def finished(config: DictConfig, digest: str, folder: Path) -> dict[str, Any] | 
     before.setdefault("fit", "betas")
     before.setdefault("texture", None)
     before.setdefault("fabrics_seam", 0.0)
+    before.setdefault("body_friction", None)
     before.setdefault("events", [])
     before.setdefault("output_fps", None)
     before.setdefault("refine_mesh", 0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 
 from hood.dynamics.captured import network_of
 from hood.dynamics.ranges import Conditions, different, outside, scene_conditions
@@ -20,6 +21,10 @@ def scene_cautions(stepper: Stepper, scene: Scene, potential: Potential, name: s
     betas = scene.motion.betas if isinstance(scene.motion, BodyMotion) else None
     gravity = float(stepper.gravity.norm())
     asked = scene_conditions(scene.garment, scene.cloth, scene.dt, potential, betas, gravity, scene.sizes)
+    if scene.grip is not None:
+        low, high = asked.spans["material.friction"]
+        on_body = {"material.friction": (low * float(scene.grip.min()), high * float(scene.grip.max()))}
+        asked = replace(asked, spans={**asked.spans, **on_body})
     way_out = "stepper=newton needs no weights" + ("" if _is_refined(stepper) else ", refine=10 corrects every step")
     sentences = []
     strange = strange_values(stepper, {scene.garment.name: asked})

@@ -13,12 +13,13 @@ import numpy as np
 from hood.assets.body.body import Body
 from hood.assets.body.load import load_body
 from hood.assets.files.folder_lock import is_occupied
+from hood.assets.files.index_list import read_indices
 from hood.assets.files.library import locate
 from hood.assets.formats.mesh_file import mesh_suffixes, read_mesh_file
 from hood.assets.garment.binding import posed_body
 from hood.assets.garment.fit_search import Asked
 from hood.assets.garment.garment import Garment, garment_of_mesh, load_garment, locate_garment
-from hood.assets.garment.pins import opening_names, read_indices
+from hood.assets.garment.pins import opening_names
 from hood.assets.garment.placement import surrounds
 from hood.assets.garment.suspicions import suspect_kind, suspect_sides
 from hood.assets.garment.units import UNITS, size_ratio, used

@@ -139,6 +139,17 @@ _FABRIC: tuple[tuple[Part, Callable[[DictConfig], bool]], ...] = (
         _given("fabrics"),
     ),
     (
+        Part(
+            "friction of body parts",
+            "parts of the body grip or slide",
+            ("body_friction=null",),
+            "friction",
+            watched=False,
+            refitted=True,
+        ),
+        _given("body_friction"),
+    ),
+    (
         Part("warp and weft", "threads stretch less than they shear", _MEASURED, watched=False, refitted=True),
         lambda config: config.material.get("woven") is True,
     ),

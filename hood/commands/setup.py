@@ -12,6 +12,7 @@ from omegaconf import DictConfig
 from hood.assets.garment.garment import Garment
 from hood.assets.material import Material
 from hood.commands.automatic import Choice, choose
+from hood.commands.body_friction import with_body_friction
 from hood.commands.cautions import scene_cautions, warn
 from hood.commands.cloth_contact import acts, check_cloth_contact, potential_of, tell_if_off
 from hood.commands.common import require_device, thinning
@@ -128,6 +129,7 @@ def make_scene(config: DictConfig, garment: Garment | None = None, material: Mat
     garment = cut_to_size(config, garment, motion)
     fabric = fabric_of(config, garment, motion) if material is None else material
     scene = with_events(replace(dress(garment, motion, fabric, checked_sizes(config)), layers=order), config)
+    scene = with_body_friction(scene, config)
     found = misplacement(scene)
     if found is not None and found.grave:
         raise ValueError(

@@ -82,6 +82,8 @@ def _scene() -> Iterator[Cell]:
         yield Cell("gravity", f"{g:g} g", (f"gravity={g * _G:g}",))
     for coefficient in (0.0, 0.1, 1.0, 10.0):
         yield Cell("friction", f"{coefficient:g}", (f"losses.terms.friction.coefficient={coefficient:g}",))
+    for factor in (0.0, 20.0):
+        yield Cell("friction", f"×{factor:g} on the legs", (f"body_friction={{below_pelvis:{factor:g}}}",))
 
 
 def _motions() -> Iterator[Cell]:

@@ -12,6 +12,12 @@ from hood.scene.contact_points import PointContact
 from hood.scene.reach import vertex_reach
 
 
+def gripped(problem: StepProblem, face: Tensor, force: Tensor) -> Tensor:
+    """Forces (N,) [N] times how much the body's faces (N,) that they act on grip; themselves where all grip alike."""
+    grip = None if problem.step.obstacle is None else problem.step.obstacle.grip
+    return force if grip is None else force * grip.to(force)[face.clamp_min(0)]
+
+
 class LaggedFriction:
     """Friction energy [J], the sum over vertices of μ_f φ N f(‖u_T‖); subclasses say what the normal force N is.
 
@@ -20,7 +26,7 @@ class LaggedFriction:
     12 and 13) with e = ``slip_speed`` · dt: quadratic-cubic below a slip of e, equal to ‖u_T‖ above. The force
     is at most μ_f φ N and reaches it at ``slip_speed``; below, contacts creep.
 
-    φ → ``cloth.friction`` (V,), what the fabric makes of the coefficient.
+    φ → ``cloth.friction`` (V,), what the fabric makes of the coefficient, times ``obstacle.grip`` (G,) of the body's face.
 
     Args:
         coefficient: μ_f.
@@ -48,7 +54,7 @@ class LaggedFriction:
 
     def greatest(self, problem: StepProblem, contact: Contact) -> Tensor:
         """Greatest forces of friction [N], μ_f φ N, shape (V,)."""
-        return self.coefficient * problem.cloth.friction * self.normal_force(problem, contact)
+        return self.coefficient * problem.cloth.friction * gripped(problem, contact.face, self.normal_force(problem, contact))
 
     def contacts(self, problem: StepProblem) -> tuple[Contact, ...]:
         """The contacts of the vertices that the term acts at; none without a body."""
@@ -129,7 +135,7 @@ class Friction(LaggedFriction):
     def greatest_at(self, problem: StepProblem, points: PointContact) -> Tensor:
         """Greatest forces of friction [N] (N,) at the points, φ as the weighted vertices have it."""
         factor = 1.0 + (problem.cloth.friction - 1.0)[points.vertices].mul(points.weights).sum(dim=1)
-        return self.coefficient * factor * self.point_force(problem, points)
+        return self.coefficient * factor * gripped(problem, points.face, self.point_force(problem, points))
 
     def point_force(self, problem: StepProblem, points: PointContact) -> Tensor:
         """Lagged normal forces [N] (N,) at the points."""

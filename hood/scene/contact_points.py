@@ -50,6 +50,7 @@ class PointContact:
     point: Tensor  # (N, 3) m, the body point at t
     next_point: Tensor  # (N, 3) m, the same material point at t + 1
     next_normal: Tensor  # (N, 3) outward unit normal there at t + 1
+    face: Tensor  # (N,) of the body, there
 
     def at(self, values: Tensor) -> Tensor:
         """``values`` (V, 3) of vertices at the points, (N, 3)."""
@@ -113,7 +114,7 @@ def _match_midpoints(place: str, middles: _Midpoints, pos: Tensor, obstacle: Obs
     rows = (match.dist.abs() <= _CAP).nonzero().squeeze(1)
     middles = middles.take(rows)
     weights = pos.new_tensor([0.5, 0.5, 0.0]).expand(len(rows), 3)
-    found = (values[rows] for values in (match.dist, match.point, match.next_point, match.next_normal))
+    found = (values[rows] for values in (match.dist, match.point, match.next_point, match.next_normal, match.face))
     return PointContact(place, middles.vertices, weights, middles.scene, middles.share, *found)
 
 
@@ -139,7 +140,8 @@ def _match_skin(place: str, cloth: Cloth, pos: Tensor, obstacle: Obstacle, conta
     of_skin = vertex_masses(obstacle.pos, obstacle.faces, 1.0)[rows[kept]]
     # A floor's vertex stands for more than the cloth that meets it.
     share = (of_skin / of_cloth).clamp(max=1.0)
-    found = (values[kept] for values in (across, then, later, next_normal))
+    one_of = incidence.around[incidence.first[rows]]
+    found = (values[kept] for values in (across, then, later, next_normal, one_of))
     return PointContact(place, vertices, weights, obstacle.vertex_scene[rows[kept]], share, *found)
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from hood.losses.collision import Collision
 from hood.losses.elements import library
-from hood.losses.friction import Friction
+from hood.losses.friction import Friction, gripped
 from hood.losses.problem import StepProblem
 from hood.native.structures import COUNT, POINTER, REAL, fields
 from hood.scene.contact import Contact
@@ -40,7 +40,7 @@ class ContactPass:
     """The contact of a step as C++ reads it; made by :func:`contact_pass`."""
 
     def __init__(self, lib: ctypes.CDLL, problem: StepProblem, contact: Contact) -> None:
-        self._lib, self._problem = lib, problem
+        self._lib, self._problem, self._face = lib, problem, contact.face
         cloth, state = problem.cloth, problem.state
         self._values = _Contact(count=len(state.pos))
         given = {name: getattr(contact, name) for name in ("dist", "point", "next_point", "next_normal")}
@@ -67,6 +67,7 @@ class ContactPass:
         numbers = (REAL(value) for value in (term.weight, term.coefficient, term.slip_speed))
         self._lib.elements_grip(*self._given(term), *numbers, *_addresses(found))
         found[2].mul_(self._problem.cloth.friction)
+        found[2] = gripped(self._problem, self._face, found[2])
         return found
 
     def _given(self, term: Collision | Friction) -> tuple[object, object]:

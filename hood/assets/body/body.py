@@ -11,6 +11,11 @@ from torch import Tensor
 from hood.assets.body.skinning import axis_angle_to_matrix, joint_transforms, linear_blend_skinning
 from hood.assets.motion.sequence import NUM_BODY_JOINTS, PoseSequence
 
+#: Joints that skeletons of the SMPL family share, in their order.
+JOINTS = (
+    "pelvis left_hip right_hip spine1 left_knee right_knee spine2 left_ankle right_ankle spine3 left_foot right_foot neck "
+    "left_collar right_collar head left_shoulder right_shoulder left_elbow right_elbow left_wrist right_wrist"
+).split()
 #: Joints 20 and 21 of every skeleton of the family; what hangs below them is hand and fingers.
 _WRISTS = (20, 21)
 #: Where the fingers (15 joints a side, left first) start in a skeleton of that many joints: SMPL-H, and SMPL-X, whose jaw

@@ -11,10 +11,10 @@ import numpy as np
 from scipy import sparse
 from scipy.spatial import cKDTree
 
+from hood.assets.files.index_list import read_indices
 from hood.assets.files.library import unknown
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.parts import COLOURS, coloured_vertices
-from hood.assets.garment.pins import read_indices
 from hood.mesh import topology
 
 #: Distance [m] that the two sides of a row have at least: layers of cloth are kept 3 mm apart.

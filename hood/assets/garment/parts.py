@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from hood.assets.body.body import Body
+from hood.assets.body.body import JOINTS, Body
+from hood.assets.files.index_list import read_indices
 from hood.assets.files.library import unknown
 from hood.assets.formats.image import read_texture
 from hood.assets.garment.garment import Garment
-from hood.assets.garment.pins import JOINTS, REGIONS, read_indices
+from hood.assets.garment.pins import REGIONS
 
 #: Colours of vertices that are names of parts.
 COLOURS = ("red", "green", "blue")

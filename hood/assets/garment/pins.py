@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from hood.assets.body.body import Body
+from hood.assets.body.body import JOINTS, Body
+from hood.assets.files.index_list import read_indices
 from hood.assets.files.library import unknown
 from hood.assets.garment.garment import Garment
 from hood.mesh import topology
@@ -27,18 +27,12 @@ REGIONS = {
 }
 #: What a vertex of a garment can be marked as: plain cloth, where panels meet, or the opening whose edge it lies on.
 MARKS = ("cloth", "seam", *REGIONS)
-#: Joints that skeletons of the SMPL family share, in their order.
-JOINTS = (
-    "pelvis left_hip right_hip spine1 left_knee right_knee spine2 left_ankle right_ankle spine3 left_foot right_foot neck "
-    "left_collar right_collar head left_shoulder right_shoulder left_elbow right_elbow left_wrist right_wrist"
-).split()
 PAINTED = "painted"
 #: A vertex is painted where red exceeds the other colours by this much of the full scale.
 _REDNESS = 0.5
 _LIST_SUFFIXES = (".txt", ".json")
 #: An opening farther from its joint than this [m] is none of that region.
 _REGION_REACH = 0.45
-_LIST_LIMIT = 64 << 20
 #: Heights of openings that an error names.
 _MOST_HEIGHTS = 6
 #: The two that one joint does not tell apart.
@@ -152,31 +146,6 @@ def _on_side(region: str, centres: np.ndarray, joints: np.ndarray) -> np.ndarray
     """(L,) bool: whether an opening is on the side of the hips where ``region`` is; all are for most regions."""
     above = centres[:, 1] > joints[JOINTS.index("left_hip"), 1]
     return {"waistband": above, "hem": ~above}.get(region, np.ones(len(centres), dtype=bool))
-
-
-def read_indices(path: Path) -> np.ndarray:
-    """Vertex numbers from a text file (any white space or commas between, # starts a comment) or a JSON list.
-
-    Raises:
-        ValueError: something else than whole numbers; names the file.
-    """
-    if path.stat().st_size > _LIST_LIMIT:
-        raise ValueError(f"{path}: {path.stat().st_size} bytes are no list of vertices")
-    text = path.read_text(encoding="utf-8", errors="replace")
-    try:
-        if path.suffix.lower() == ".json":
-            values = json.loads(text)
-        else:
-            values = [int(word) for line in text.splitlines() for word in line.split("#")[0].replace(",", " ").split()]
-    except (ValueError, RecursionError):
-        values = None
-    if not isinstance(values, list) or not all(
-        isinstance(v, int) and not isinstance(v, bool) and abs(v) < 2**62 for v in values
-    ):
-        raise ValueError(
-            f"{path}: not a list of vertex numbers; write whole numbers, as in 12 13 14 (.txt) or [12, 13] (.json)"
-        )
-    return np.array(values, dtype=np.int64)
 
 
 def _painted(garment: Garment) -> np.ndarray:

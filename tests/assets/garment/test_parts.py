@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hood.assets.body.body import Body
+from hood.assets.body.body import JOINTS, Body
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.outfit import join_garments
 from hood.assets.garment.parts import part_faces
-from hood.assets.garment.pins import JOINTS
 
 
 def test_above_and_below_a_joint_are_the_whole(garments: dict[str, Garment], body: Body) -> None:

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from hood.assets.body.body import Body
+from hood.assets.files.index_list import read_indices
 from hood.assets.garment.garment import Garment
-from hood.assets.garment.pins import opening_names, pin_mask, read_indices
+from hood.assets.garment.pins import opening_names, pin_mask
 from hood.mesh import topology
 
 
