@@ -149,7 +149,7 @@ def test_inspect_prints_the_ranges(tmp_path: Path, quickstart: Simulator, capsys
     assert main(["inspect", str(locate("weights", "quickstart"))]) == 0
     shown = capsys.readouterr().out
     known = f"garment vertices: {vertices(quickstart)}"
-    for line in ("fps: 30", "betas: -2 to 2", known, "material.lame_mu: 15909 to 63636"):
+    for line in ("fps: 30", "betas: -2 to 2", known, "material.lame_mu: 15909 to 63636 Pa"):
         assert f"  trained on {line}\n" in shown
     torch.manual_seed(0)
     save_simulator(tmp_path / "old.safetensors", build_simulator("paper", "acceleration", "1x(mesh)", latent_dim=8))

@@ -55,7 +55,7 @@ def test_what_is_no_table_of_fabrics_is_refused(word: str, message: str) -> None
     ("words", "message"),
     [
         (["fabrics={dress:silk}", "fabrics_seam=-0.1"], "fabrics_seam=-0.1: give metres"),
-        (["fabrics={dress:silk}", "fabrics_seam=wide"], "fabrics_seam=wide: give metres"),
+        (["fabrics={dress:silk}", "fabrics_seam=wide"], "fabrics_seam=wide: give a number"),
         (["fabrics_seam=0.03"], "fabrics_seam=0.03: is between fabrics; give fabrics="),
     ],
 )
