@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from jogging import WORDS, jog
 
 import hood
 from hood.assets.extremes.files import write_motion
@@ -21,8 +21,7 @@ from hood.media.film import seconds_per_frame
 from hood.scene.load_motion import MotionOptions, load_motion
 from hood.testing import grid
 
-ROLLOUT = ["rollout", "garment=tank", "sequence=jog", "start=1.0", "stepper=newton", "cloth_contact=off", "video=none",
-           "sheet=false", "settle=paper"]  # fmt: skip
+ROLLOUT = ["rollout", *WORDS, "garment=tank"]
 
 
 @pytest.fixture(autouse=True)
@@ -31,8 +30,7 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def rollout(*words: str, output: str = "run") -> tuple[RolloutData, dict[str, Any]]:
-    assert main([*ROLLOUT, f"output={output}", *words]) == 0
-    return read_rollout(Path(output) / "rollout.h5"), json.loads((Path(output) / "summary.json").read_text())
+    return jog("garment=tank", *words, output=output)
 
 
 def measured(summary: dict[str, Any]) -> dict[str, Any]:

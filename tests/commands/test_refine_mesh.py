@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from jogging import WORDS, jog
 
 import hood
 from hood.assets.garment.binding import signed_distances
@@ -28,8 +28,7 @@ from hood.mesh.topology import unique_edges
 from hood.scene.state import State
 from hood.testing import cylinder, grid
 
-ROLLOUT = ["rollout", "garment=dress", "sequence=jog", "start=1.0", "stepper=newton", "cloth_contact=off", "video=none",
-           "sheet=false", "settle=paper", "num_frames=5"]  # fmt: skip
+ROLLOUT = ["rollout", *WORDS, "garment=dress", "num_frames=5"]
 OTHER = ("refined_mesh", "ms_per_frame", "warnings", "settled", "cloth_contact", "output", "num_frames", "dt")
 
 
@@ -39,8 +38,7 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def rollout(*words: str, output: str = "run") -> tuple[RolloutData, dict[str, Any]]:
-    assert main([*ROLLOUT, f"output={output}", *words]) == 0
-    return read_rollout(Path(output) / "rollout.h5"), json.loads((Path(output) / "summary.json").read_text())
+    return jog("garment=dress", "num_frames=5", *words, output=output)
 
 
 @pytest.mark.parametrize("levels", [1, 2])
