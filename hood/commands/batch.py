@@ -18,7 +18,7 @@ from hood.assets.files.library import locate
 from hood.assets.motion.collection import motions_in
 from hood.assets.motion.motion_files import find_motions
 from hood.commands.summary import summarise
-from hood.config import ConfigError, plain
+from hood.config import ConfigError, load_config, plain
 from hood.training import distributed
 
 #: A disk in this state refuses the next file too.
@@ -127,18 +127,10 @@ def finished(config: DictConfig, digest: str, folder: Path) -> dict[str, Any] | 
     except (OSError, ValueError, KeyError):
         return None
     now = plain(config)
-    before.setdefault("stepping", now["stepping"])  # rollouts from before there were options are known by their word
-    before.setdefault("formats", [])
     before["plan"] = before.get("plan") or now["plan"]
-    before.setdefault("accuracy", None)
-    before.setdefault("fit", "betas")
-    before.setdefault("texture", None)
-    before.setdefault("fabrics_seam", 0.0)
-    before.setdefault("body_friction", None)
-    before.setdefault("events", [])
-    before.setdefault("output_fps", None)
-    before.setdefault("refine_mesh", 0)
-    before.setdefault("events_speed", now["events_speed"])
+    before.setdefault("stepping", now["stepping"])  # rollouts from before there were options are known by their word
+    # What had no key yet was what its default says now.
+    before = {**plain(load_config("rollout")), **before}
     same = all(before.get(key) == now[key] for key in now if key not in ("resume", "output", "allow_unsound"))
     if not same or not bool(attributes["complete"]) or attributes["checkpoint_sha256"] != digest:
         return None

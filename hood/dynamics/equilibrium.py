@@ -18,6 +18,7 @@ from hood.scene.batch import to_device
 from hood.scene.cloth import Cloth
 from hood.scene.scene import Scene
 from hood.scene.state import Attachments, State, StepInput
+from hood.solver.held_off import minimize_held_off
 from hood.solver.newton import NewtonSettings, minimize
 from hood.solver.reasons import NOT_FINITE
 
@@ -28,8 +29,6 @@ _SHORTEST, _LONGEST, _STRIDE = 1.0 / 30.0, 1.0, 0.04
 _REST = 1e-3
 #: Steps at most: the default garments need half of them, and what creeps goes on creeping.
 _MOST_STEPS = 30
-#: Times that cloth is held farther off at the end, where it rests in the skin.
-_HELD_OFF = 4
 #: A part of a garment that has no pins and has moved so far [m] on average is not worn any more.
 _LOST = 0.3
 #: Accuracy of the steps on the way, and of the longest: the way leads to the same place, whatever is left over on it.
@@ -133,17 +132,8 @@ def _out_of_skin(potential: Potential, problem: StepProblem, pos: Tensor) -> Ten
     where they do not, or where that is not finite."""
     rested = replace(problem.state, pos=pos)
     problem = replace(problem, state=rested, step=replace(problem.step, dt=torch.full_like(problem.step.dt, _LONGEST)))
-    problem = potential.prepare(problem)
-    for _ in range(_HELD_OFF):
-        again = problem.with_held_off(pos)
-        if again is problem:
-            break
-        problem = again
-        found, report = minimize(potential, problem, pos, _FINE)
-        if NOT_FINITE in report.reason:
-            break
-        pos = found
-    return pos
+    _, found, reports = minimize_held_off(potential, potential.prepare(problem), pos, _FINE)
+    return pos if any(NOT_FINITE in report.reason for report in reports) else found
 
 
 class _Parts:

@@ -14,11 +14,9 @@ from hood.dynamics.stopwatch import Stopwatch, timed
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
 from hood.scene.cloth import Cloth
+from hood.solver.held_off import MOST_AGAIN, minimize_held_off
 from hood.solver.newton import NewtonSettings, minimize
 from hood.solver.reasons import reason_number
-
-#: So often is a step taken again that has led into skin which its contact did not show.
-MOST_AGAIN = 3
 
 
 class Stepper(Protocol):
@@ -110,13 +108,10 @@ class NewtonStepper:
                 problem = again
                 pos, report = minimize(self.potential, problem, pos, self.settings)
                 iterations += report.iterations
-            for _ in range(MOST_AGAIN if self._holds_off else 0):
-                again = problem.with_held_off(pos)
-                if again is problem:
-                    break
-                problem = again
-                pos, report = minimize(self.potential, problem, pos, self.settings)
-                iterations += report.iterations
+            if self._holds_off:
+                problem, pos, more = minimize_held_off(self.potential, problem, pos, self.settings)
+                iterations += sum(one.iterations for one in more)
+                report = more[-1] if more else report
         reached = {
             "solver_iterations": float(iterations),
             "solver_converged": float(bool(report.converged.all())),

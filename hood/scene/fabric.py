@@ -176,12 +176,15 @@ def _around_seams(
         centre: (F, 3) m of the faces.
         area: (F,) m².
     """
+    nothing = np.zeros(0, dtype=np.int64), csr_matrix((0, len(faces)))
+    if reach <= 0.0:
+        return nothing
     # Faces that share a vertex: over edges alone ways along the cloth go to and fro, and are half as long again.
     corner = csr_matrix((np.ones(faces.size), (np.arange(faces.size) // 3, faces.ravel())))
     first, second = (corner @ corner.T).nonzero()
     seam = np.unique(first[label[first] != label[second]])
-    if reach <= 0.0 or not len(seam):
-        return np.zeros(0, dtype=np.int64), csr_matrix((0, len(faces)))
+    if not len(seam):
+        return nothing
     # A way of length 0 is none in a sparse matrix.
     length = np.maximum(np.linalg.norm(centre[first] - centre[second], axis=1), 1e-12)
     graph = csr_matrix((length, (first, second)))

@@ -28,9 +28,9 @@ def body_part(part: str, faces: np.ndarray, num_vertices: int, body: Body | None
     if Path(part).suffix.lower() in (".txt", ".json"):
         found = _listed(Path(part).expanduser(), faces, num_vertices)
     elif side in ("above", "below") and joint:
-        name = _joint(part, joint, body)
-        height = name[0].v_template[faces].mean(axis=1)[:, 1]
-        level = name[0].shaped(np.zeros(0))[1][name[1], 1]
+        of, number = _joint(part, joint, body)
+        height = of.v_template[faces].mean(axis=1)[:, 1]
+        level = of.shaped(np.zeros(0))[1][number, 1]
         found = height > level if side == "above" else height <= level
     else:
         of, number = _joint(part, part, body)
@@ -42,6 +42,7 @@ def body_part(part: str, faces: np.ndarray, num_vertices: int, body: Body | None
 
 
 def _joint(part: str, name: str, body: Body | None) -> tuple[Body, int]:
+    """The body, and the number of its joint ``name``."""
     if body is None:
         raise ValueError(f"part {part!r}: this body has no joints; give a .txt or .json list of its vertices")
     if name not in JOINTS:
