@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +17,16 @@ _ACTIONS = ("open", "close", "detach", "attach")
 def moments_of(data: RolloutData) -> list[tuple[int, str]]:
     """Frames whose steps are the first with an event, and what that does: ``(30, "open front_buttons")``, by frame.
 
+    Events count simulated frames; where others are stored (``output_fps``) it is the first stored one that is no earlier.
     Events that no step shows are left out. Rollouts made otherwise than by ``hood rollout`` have none.
     """
     found, dt = [], float(data.attributes.get("dt", 0.0))
+    rate = None if data.steps is None else data.steps.rate
+    step = dt if rate is None else 1.0 / rate.simulated_fps
     for event in (_settings(data).get("events") or []) if dt > 0 else []:
         action = next(action for action in _ACTIONS if action in event)
-        frame = int(event["frame"]) if "frame" in event else first_step(float(event["time"]), dt)
+        frame = int(event["frame"]) if "frame" in event else first_step(float(event["time"]), step)
+        frame = frame if rate is None else ceil(frame / rate.stride)
         if frame < len(data.time) - 1:
             found.append((frame, f"{action} {_names(event[action])}"))
     return sorted(found, key=lambda moment: moment[0])

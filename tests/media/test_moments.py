@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from hood.dynamics.output_rate import OutputRate
 from hood.dynamics.recorder import RolloutData
+from hood.dynamics.step_table import Steps
 from hood.media.moments import moments_of, shared_moments, wind_of
 
 
@@ -35,6 +38,21 @@ def test_events_by_their_frames_in_words() -> None:
         (5, "attach hem.txt"),
         (6, "detach vertex 3"),
     ]
+
+
+def test_events_count_simulated_frames_where_others_are_stored() -> None:
+    """Stored ten times a second, simulated forty times."""
+    early = [{"time": 0.25, "close": "zip"}, {"frame": 8, "open": "zip"}]
+    events = [*early, {"frame": 17, "close": "hood"}, {"frame": 39, "open": "x"}]
+        {"time": 0.25, "close": "zip"},
+        {"frame": 8, "open": "zip"},
+        {"frame": 17, "close": "hood"},
+        {"frame": 39, "open": "x"},
+    ]
+    usual = rollout(events=events)
+    none = np.zeros(0, dtype=np.int64)
+    steps = Steps(OutputRate(10.0, 40.0), np.ones(37, dtype=bool), {}, none, np.zeros((37, 0, 3)))
+    assert moments_of(replace(usual, steps=steps)) == [(2, "open zip"), (3, "close zip"), (5, "close hood")]
 
 
 def test_moments_of_several_rollouts() -> None:
