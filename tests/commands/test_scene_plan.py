@@ -256,6 +256,12 @@ def test_what_is_no_plan_is_refused(content: str | None, said: str, tmp_path: Pa
     assert not (tmp_path / "out").exists()
 
 
+def test_what_is_shown_and_exported_is_free_beside_a_plan(written: Path, tmp_path: Path) -> None:
+    words = [f"plan={written}", "num_frames=2", *QUIET, "formats=[glb]", f"output={tmp_path}"]
+    assert main(["rollout", *words]) == 0
+    assert (tmp_path / "rollout.glb").exists()
+
+
 def test_words_that_the_plan_was_not_made_for_are_refused(written: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for word, made_for in (("garment=skirt", "garment=tank"), ("material=denim", "the default of material")):
         assert main(["rollout", f"plan={written}", word]) == 2

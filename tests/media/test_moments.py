@@ -44,11 +44,6 @@ def test_events_count_simulated_frames_where_others_are_stored() -> None:
     """Stored ten times a second, simulated forty times."""
     early = [{"time": 0.25, "close": "zip"}, {"frame": 8, "open": "zip"}]
     events = [*early, {"frame": 17, "close": "hood"}, {"frame": 39, "open": "x"}]
-        {"time": 0.25, "close": "zip"},
-        {"frame": 8, "open": "zip"},
-        {"frame": 17, "close": "hood"},
-        {"frame": 39, "open": "x"},
-    ]
     usual = rollout(events=events)
     none = np.zeros(0, dtype=np.int64)
     steps = Steps(OutputRate(10.0, 40.0), np.ones(37, dtype=bool), {}, none, np.zeros((37, 0, 3)))
