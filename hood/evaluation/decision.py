@@ -16,7 +16,7 @@ from hood.evaluation.leaving_out import Effect
 LEAST_SAVING = 0.03
 #: A part whose error is so many times what is accepted is not looked at in further windows.
 HOPELESS = 10.0
-#: How far below what is accepted a part has to be that is priced in every frame.
+#: How far below what is accepted a part's γ has to be: windows are few, and other frames go beyond them.
 HEADROOM = 10.0
 #: Quantile over the windows that γ is judged by.
 QUANTILE = 0.95
@@ -95,8 +95,9 @@ def why_kept(
         return f"it costs no time that can be measured ({100 * saving:+.0f}% of a frame)"
     if name in stay:
         return f"{tolerance.say(error)} without it here, but {stay[name]}"
-    if name in priced and tolerance.unit == "gamma" and error * HEADROOM > tolerance.value:
-        return f"without it {tolerance.say(error)}, so near to the limit that it would come back often"
+    if tolerance.unit == "gamma" and error * HEADROOM > tolerance.value:
+        elsewhere = "it would come back often" if name in priced else "other frames would be beyond it"
+        return f"without it {tolerance.say(error)}, so near to the limit that {elsewhere}"
     return ""
 
 
@@ -119,8 +120,9 @@ def decide(
         absent: parts that nothing in the scene uses, with the reason.
         rivals: parts of which at most one can be left out.
         stay: parts that are never left out, and why.
-        priced: parts that come back where they are worth more than is accepted; by γ, they are left out only where they are
-            worth :data:`HEADROOM` times less, since a step that is taken twice costs more than any part saves.
+        priced: parts that come back where they are worth more than is accepted. By γ, parts are left out only where they are
+            worth :data:`HEADROOM` times less: of these since a step that is taken twice costs more than any part saves, of the
+            others since nothing brings them back.
         measure_together: the full model's and the combination's effect, measured side by side.
     """
     full = effects[""]

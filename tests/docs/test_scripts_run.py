@@ -69,6 +69,7 @@ RUN = (
     ),
     Run(r"refined_mesh\.py", "", r"tank", (r"refined_mesh\.py.*", "refined_mesh.py --garments tank tank_4k --frames 4")),
     Run(r"textures_picture\.py", "", "", (r"outputs/patterns docs/images/", "patterns ")),
+    Run(r"benchmarks/plan\.py", "--scenes tank_plie --frames 6 --accuracy none", r"same bits in 1 of 1"),
     Run(r"precision\.py", "", r"\| met \|"),
     Run(r"record_ranges\.py", "", r"trained on fps", (r"FILE KEY=VALUE …", "FILE.safetensors model=small model.latent_dim=8")),
     Run(r"scaling\.py report", "", r"γ median"),

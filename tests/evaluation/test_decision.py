@@ -42,7 +42,7 @@ def test_a_combination_that_misses_the_tolerance_loses_its_worst_part() -> None:
         asked.append(tuple(names))
         return FULL, effect(0.02 if len(names) > 1 else 0.003, 7.0)
 
-    effects = {"": FULL, "a": effect(0.009, 9.0), "b": effect(0.003, 9.0)}
+    effects = {"": FULL, "a": effect(9e-4, 9.0), "b": effect(3e-4, 9.0)}
     found = decide(effects, {}, [], Tolerance(0.01, "gamma"), together)
     assert asked == [("a", "b"), ("b",)]
     assert found.left_out == ("b",)
@@ -106,10 +106,11 @@ def test_a_part_saves_against_the_same_windows() -> None:
     assert Effect([0.0, 0.0], [0.0, 0.0], [3.0, 4.0]).saving(full) == pytest.approx(1.0 - (0.75 + 0.4) / 2)
 
 
-def test_what_is_priced_in_every_frame_needs_headroom() -> None:
+@pytest.mark.parametrize(("priced", "why"), [({"a", "b"}, "come back often"), (set(), "other frames")])
+def test_what_is_left_out_by_gamma_has_headroom(priced: set[str], why: str) -> None:
     effects = {"": FULL, "a": effect(5e-3, 6.0), "b": effect(5e-4, 6.0)}
-    found = decide(effects, {}, [], Tolerance(0.01, "gamma"), lambda names: (FULL, effects["b"]), priced={"a", "b"})
+    found = decide(effects, {}, [], Tolerance(0.01, "gamma"), lambda names: (FULL, effects["b"]), priced=priced)
     assert found.left_out == ("b",)
-    assert "come back often" in found.verdicts["a"].reason
-    by_length = decide(effects, {}, [], Tolerance(100.0, "mm"), lambda names: (FULL, effects["b"]), priced={"a", "b"})
+    assert why in found.verdicts["a"].reason
+    by_length = decide(effects, {}, [], Tolerance(100.0, "mm"), lambda names: (FULL, effects["b"]), priced=priced)
     assert by_length.left_out == ("a", "b")
