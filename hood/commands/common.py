@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import cache
 from pathlib import Path
@@ -154,17 +154,18 @@ def read_model(path: Path, fps: float) -> Simulator:
     return simulator
 
 
-def require_same_model(path: Path, held: Simulator, asked: Simulator, way_out: str) -> None:
-    """Refuse weights of another model than the one ``asked`` for, and name the settings that differ.
+def require_same_model(path: Path, held: Simulator, asked: Simulator, way_out: str, free: Collection[str] = ()) -> None:
+    """Refuse weights of another model than the one ``asked`` for, and name the settings that differ; those ``free`` may.
 
     Raises:
         ConfigError: see above; ends with ``way_out``.
     """
     theirs, ours = held.config, asked.config
-    different = sorted(key for key in {*theirs, *ours} if key not in theirs or key not in ours or theirs[key] != ours[key])
+    keys = {*theirs, *ours} - {*free}
+    different = sorted(key for key in keys if key not in theirs or key not in ours or theirs[key] != ours[key])
     if different:
-        keys = ", ".join(f"{key}={theirs.get(key, 'its default')}" for key in different)
-        raise ConfigError(f"{path}: holds a model of {keys}, not the model asked for; {way_out}")
+        named = ", ".join(f"{key}={theirs.get(key, 'its default')}" for key in different)
+        raise ConfigError(f"{path}: holds a model of {named}, not the model asked for; {way_out}")
 
 
 def weigh(stepper: Stepper, config: DictConfig) -> None:

@@ -286,7 +286,7 @@ def inspect_checkpoint(name: str) -> Finding:
         "message-passing steps": len(simulator.schedule),
         **{
             key: simulator.config[key]
-            for key in ("features", "output", "latent_dim", "layer_radius")
+            for key in ("features", "output", "latent_dim", "layer_radius", "coarse_edge")
             if key in simulator.config
         },
         **ranges.describe(simulator.trained_for),

@@ -12,6 +12,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from hood.assets.files.library import locate, names
 from hood.dynamics.checkpoint import read_header
+from hood.graph.hierarchy import num_passed_over
 from hood.nn.schedule import edge_set_names, parse_schedule, radius
 from hood.scene.cloth import Cloth
 
@@ -27,14 +28,14 @@ def reach_facts(cloth: Cloth, dt: float) -> dict[str, Any]:
     the radius suffices.
     """
     speed = wave_speed(cloth)
-    influence, wide = _FELT * speed * dt / mean_edge(cloth), diameter(cloth)
+    influence, wide = _FELT * speed * dt / cloth.mean_edge, diameter(cloth)
     needed = min(influence, float(wide))
     return {
         "wave_speed": speed,
         "influence_edges": influence,
         "diameter_edges": wide,
         "needed_edges": needed,
-        "models": [one | {"suffices": one["radius"] >= needed} for one in _shipped()],
+        "models": [one | {"suffices": one["radius"] >= needed} for one in _shipped(cloth.mean_edge)],
     }
 
 
@@ -45,11 +46,6 @@ def wave_speed(cloth: Cloth) -> float:
         stiffness = stiffness * cloth.weave[:, :2].amax(dim=1)
     density = cloth.mass.sum() / cloth.rest_area.sum()
     return float((torch.as_tensor(stiffness).double().mean() / density.double()).sqrt())
-
-
-def mean_edge(cloth: Cloth) -> float:
-    """Mean length [m] of the edges at rest."""
-    return float((cloth.rest_pos[cloth.edges[:, 0]] - cloth.rest_pos[cloth.edges[:, 1]]).norm(dim=1).mean())
 
 
 def diameter(cloth: Cloth) -> int:
@@ -68,12 +64,13 @@ def diameter(cloth: Cloth) -> int:
     return int(widest)
 
 
-def _shipped() -> list[dict[str, Any]]:
-    """Name, radius in edges and number of coarse levels of every shipped network."""
+def _shipped(edge: float) -> list[dict[str, Any]]:
+    """Name, radius in edges and number of coarse levels of every shipped network, on a mesh of this mean edge [m]."""
     found = []
     for name in names("weights"):
-        schedule = parse_schedule(str(json.loads(read_header(locate("weights", name))["model"])["schedule"]))
-        found.append({"name": name, "radius": radius(schedule), "levels": len(edge_set_names(schedule)) - 1})
+        model = json.loads(read_header(locate("weights", name))["model"])
+        schedule, passed_over = parse_schedule(str(model["schedule"])), num_passed_over(edge, model.get("coarse_edge"))
+        found.append({"name": name, "radius": radius(schedule, passed_over), "levels": len(edge_set_names(schedule)) - 1})
     return sorted(found, key=lambda one: (one["radius"], one["name"]))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from hood.commands.cloth_contact import acts, why_not
 from hood.commands.plan_choices import levels_of
-from hood.commands.plan_reach import mean_edge, reach_facts
+from hood.commands.plan_reach import reach_facts
 from hood.commands.setup import Setup
 from hood.dynamics.captured import network_of
 from hood.evaluation.leaving_out import Begun, Effect
@@ -23,7 +23,7 @@ def facts(ready: Setup) -> dict[str, Any]:
     levels = list(levels_of(garment))
     return {
         "vertices": cloth.num_vertices,
-        "edge_mm": 1e3 * mean_edge(cloth),
+        "edge_mm": 1e3 * cloth.mean_edge,
         **reach_facts(cloth, ready.scene.dt),
         "network": None if network is None else str(ready.config.checkpoint),
         "levels": None if network is None else network.num_coarse,

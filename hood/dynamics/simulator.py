@@ -24,7 +24,7 @@ from hood.features.inputs import EdgeRows, Inputs
 from hood.features.sets import SETS, SetSettings, build_features, split_name
 from hood.graph.builder import Graph, StaticGraph, build_graph, build_static
 from hood.graph.cache import template_hierarchy
-from hood.graph.hierarchy import Hierarchy, concatenate_hierarchies
+from hood.graph.hierarchy import Hierarchy, concatenate_hierarchies, num_passed_over
 from hood.losses.potential import Potential, default_potential
 from hood.losses.problem import StepProblem
 from hood.mesh.nearest import Nearest
@@ -89,10 +89,11 @@ class Simulator(nn.Module):
         rules: FrameRules | None = None,
         embedded_levels: int = 1,
         layer_radius: float | None = None,
+        coarse_edge: float | None = None,
     ) -> None:
         super().__init__()
         self.features, self.network, self.output = features, network, output
-        self.body_radius, self.layer_radius = body_radius, layer_radius
+        self.body_radius, self.layer_radius, self.coarse_edge = body_radius, layer_radius, coarse_edge
         self.rules = rules or FrameRules()
         self._embedded_levels = embedded_levels
         self.config = config
@@ -146,6 +147,10 @@ class Simulator(nn.Module):
         """Coarse levels of the hierarchy that the model needs: those it works on and those its level feature tells apart."""
         return max(num_coarse_levels(self.schedule), self._embedded_levels - 1)
 
+    def levels_passed_over(self, cloth: Cloth) -> int:
+        """Levels of a garment that are finer than ``coarse_edge``."""
+        return num_passed_over(cloth.mean_edge, self.coarse_edge)
+
     @property
     def uses_statistics(self) -> bool:
         """Whether normalisers must see data before training starts."""
@@ -167,7 +172,8 @@ class Simulator(nn.Module):
         A ``hierarchy`` that came with the garment (:func:`hood.graph.given.given_hierarchy`) is used as it is.
         """
         if hierarchy is None:
-            hierarchy = template_hierarchy(cloth.num_vertices, cloth.edges.cpu().numpy(), rest_pos, self.num_coarse)
+            edges, passed_over = cloth.edges.cpu().numpy(), self.levels_passed_over(cloth)
+            hierarchy = template_hierarchy(cloth.num_vertices, edges, rest_pos, self.num_coarse, passed_over)
         return Prepared(hierarchy, build_static(cloth, hierarchy, self.network.edge_set_names))
 
     def concatenate(self, cloth: Cloth, prepared: Sequence[Prepared], vertex_counts: Sequence[int]) -> Prepared:
@@ -322,6 +328,7 @@ def build_simulator(
     layer_radius: float | None = None,
     network: str = MULTILEVEL,
     output_options: Mapping[str, Any] | None = None,
+    coarse_edge: float | None = None,
 ) -> Simulator:
     """A simulator from plain arguments.
 
@@ -357,12 +364,14 @@ def build_simulator(
             (:func:`hood.scene.near_cloth.find_near_cloth`); None: the model has none.
         network: ``multilevel``, or the name of a plugin's.
         output_options: further arguments of the output's class, plain values by name.
+        coarse_edge: length [m] that edges of the first coarse level have at least, on average: finer levels are passed over,
+            so that messages reach as far on fine meshes as on coarse ones; None: no level is.
 
     Raises:
         ValueError: values that do not fit together, or a name that nothing has; names the key.
     """
     config = {name: value for name, value in locals().items() if name not in _CONVENTIONS or value != _CONVENTIONS[name]}
-    for name in ("latent_dim", "body_radius", "output_scale", "late_scale", "layer_radius"):
+    for name in ("latent_dim", "body_radius", "output_scale", "late_scale", "layer_radius", "coarse_edge"):
         if name in config and not config[name] > 0:
             raise ValueError(f"model.{name} is {config[name]!r}; it must be > 0")
     head, net = output_class(output), network_class(network)
@@ -391,7 +400,7 @@ def build_simulator(
     built = net(
         *widths, latent_dim, schedule, head.width, aggregation, output_init, coarse_encoders, head.look_widths, head.edge_width
     )
-    return Simulator(feature_set, built, made, body_radius, config, rules, num_levels, layer_radius)
+    return Simulator(feature_set, built, made, body_radius, config, rules, num_levels, layer_radius, coarse_edge)
 
 
 #: Arguments of :func:`build_simulator` that are written down only where they differ from its defaults: files of models that
@@ -412,6 +421,7 @@ _CONVENTIONS: dict[str, Any] = {
         "layer_radius",
         "network",
         "output_options",
+        "coarse_edge",
     )
 }
 

@@ -30,40 +30,45 @@ MAX_ENTRIES = 200
 #: Garments whose hierarchies a process keeps; 0.2 MB each at 1k vertices, 2 MB at 12k.
 MAX_TEMPLATES = 128
 
-_TEMPLATES: OrderedDict[tuple[int, int], tuple[np.ndarray, np.ndarray, Hierarchy]] = OrderedDict()
+_TEMPLATES: OrderedDict[tuple[int, int, int], tuple[np.ndarray, np.ndarray, Hierarchy]] = OrderedDict()
 
 
-def template_hierarchy(num_vertices: int, edges: np.ndarray, rest_pos: np.ndarray, num_coarse: int) -> Hierarchy:
+def template_hierarchy(
+    num_vertices: int, edges: np.ndarray, rest_pos: np.ndarray, num_coarse: int, passed_over: int = 0
+) -> Hierarchy:
     """The same as :func:`cached_hierarchy`, kept in memory per array ``rest_pos``: training meets the same garments
     thousands of times. Of more than :data:`MAX_TEMPLATES` garments those met last are kept."""
-    key = (id(rest_pos), num_coarse)
+    key = (id(rest_pos), num_coarse, passed_over)
     entry = _TEMPLATES.pop(key, None)
     # Holding the array keeps its id from being reused; other faces may still share it.
     if entry is None or entry[0] is not rest_pos or not np.array_equal(entry[1], edges):
-        entry = (rest_pos, edges.copy(), cached_hierarchy(num_vertices, edges, rest_pos, num_coarse))
+        entry = (rest_pos, edges.copy(), cached_hierarchy(num_vertices, edges, rest_pos, num_coarse, passed_over))
     _TEMPLATES[key] = entry
     while len(_TEMPLATES) > MAX_TEMPLATES:
         _TEMPLATES.popitem(last=False)
     return entry[2]
 
 
-def cached_hierarchy(num_vertices: int, edges: np.ndarray, rest_pos: np.ndarray, num_coarse: int) -> Hierarchy:
+def cached_hierarchy(
+    num_vertices: int, edges: np.ndarray, rest_pos: np.ndarray, num_coarse: int, passed_over: int = 0
+) -> Hierarchy:
     """What :func:`hood.graph.hierarchy.build_hierarchy` returns for the same arguments, from disk where it is known."""
     folder = cache_folder()
     if folder is None or num_vertices < MIN_VERTICES or num_coarse < 1:
-        return build_hierarchy(num_vertices, edges, rest_pos, num_coarse)
-    path = folder / "hierarchy" / f"{_digest(num_vertices, edges, rest_pos, num_coarse)}.npz"
+        return build_hierarchy(num_vertices, edges, rest_pos, num_coarse, passed_over)
+    path = folder / "hierarchy" / f"{_digest(num_vertices, edges, rest_pos, num_coarse, passed_over)}.npz"
     known = _read(path, num_vertices, num_coarse)
     if known is not None:
         return known
-    built = build_hierarchy(num_vertices, edges, rest_pos, num_coarse)
+    built = build_hierarchy(num_vertices, edges, rest_pos, num_coarse, passed_over)
     _write(path, built)
     return built
 
 
-def _digest(num_vertices: int, edges: np.ndarray, rest_pos: np.ndarray, num_coarse: int) -> str:
+def _digest(num_vertices: int, edges: np.ndarray, rest_pos: np.ndarray, num_coarse: int, passed_over: int = 0) -> str:
     rest_pos = np.ascontiguousarray(rest_pos)
-    digest = hashlib.sha256(f"{VERSION} {num_vertices} {num_coarse} {rest_pos.dtype} {rest_pos.shape}".encode())
+    levels = f"{num_coarse} after {passed_over}" if passed_over else f"{num_coarse}"
+    digest = hashlib.sha256(f"{VERSION} {num_vertices} {levels} {rest_pos.dtype} {rest_pos.shape}".encode())
     digest.update(np.ascontiguousarray(edges, dtype=np.int64).tobytes())
     digest.update(rest_pos.tobytes())
     return digest.hexdigest()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -27,7 +28,21 @@ class Hierarchy:
         return self.node_level.shape[0]
 
 
-def build_hierarchy(num_vertices: int, edges: np.ndarray, rest_pos: np.ndarray, num_coarse: int) -> Hierarchy:
+def num_passed_over(mean_edge: float, coarse_edge: float | None) -> int:
+    """Levels of a mesh that the first coarse one leaves out, so that its edges are about ``coarse_edge`` [m] long or longer.
+
+    Args:
+        mean_edge: m, mean edge of the mesh at rest; a level's edges are about twice as long as those of the one before.
+        coarse_edge: None: no level is left out.
+    """
+    if coarse_edge is None or not mean_edge > 0.0:
+        return 0
+    return max(math.ceil(math.log2(coarse_edge / (2.0 * mean_edge)) - 1e-6), 0)
+
+
+def build_hierarchy(
+    num_vertices: int, edges: np.ndarray, rest_pos: np.ndarray, num_coarse: int, passed_over: int = 0
+) -> Hierarchy:
     """Coarse levels of a mesh graph.
 
     The root of a component is one of its centres (least eccentricity, exact) and serves all levels. Ties between
@@ -40,6 +55,8 @@ def build_hierarchy(num_vertices: int, edges: np.ndarray, rest_pos: np.ndarray, 
         edges: (E, 2) undirected mesh edges.
         rest_pos: (V, 3) rest positions, read for their order alone.
         num_coarse: number of coarse levels, ≥ 0.
+        passed_over: levels between the mesh and the first coarse one that are made and left out (:func:`num_passed_over`):
+            an edge of c_k then spans up to 2^(k + 1 + passed_over) mesh hops.
     """
     edges, rest_pos = np.asarray(edges, dtype=np.int64).reshape(-1, 2), np.asarray(rest_pos)
     _check(num_vertices, edges, rest_pos, num_coarse)
@@ -50,6 +67,8 @@ def build_hierarchy(num_vertices: int, edges: np.ndarray, rest_pos: np.ndarray, 
     graph = coarsen.adjacency(num_vertices, rank[edges])
     roots = coarsen.centres(graph) if num_coarse and graph.nnz else np.zeros(0, dtype=np.int64)
     level_edges, node_level = [], np.zeros(num_vertices, dtype=np.int64)
+    for _ in range(passed_over if num_coarse else 0):
+        graph = coarsen.coarsen(graph, roots)
     for level in range(1, num_coarse + 1):
         graph = coarsen.coarsen(graph, roots)
         level_edges.append(_edge_list(graph, order))

@@ -70,9 +70,13 @@ def finest_level(step: Step) -> int:
     return min(set_level(name) for name in step)
 
 
-def radius(schedule: Sequence[Step]) -> int:
-    """Propagation radius in mesh edges: the sum over the steps of the longest edge processed (paper, Table 1)."""
-    return sum(max(2 ** set_level(name) for name in step) for step in schedule)
+def radius(schedule: Sequence[Step], passed_over: int = 0) -> int:
+    """Propagation radius in mesh edges: the sum over the steps of the longest edge processed (paper, Table 1).
+
+    Where levels are passed over (:func:`hood.graph.hierarchy.num_passed_over`), coarse edges are so many times twice as long.
+    """
+    levels = [max(map(set_level, step)) for step in schedule]
+    return sum(2 ** (level + passed_over) if level else 1 for level in levels)
 
 
 def _parse_sets(text: str, source: str) -> Step:

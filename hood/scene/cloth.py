@@ -90,6 +90,11 @@ class Cloth:
         """Squares [m²] (E,) of the rest lengths of the edges."""
         return self.edge_sq(self.rest_pos)
 
+    @cached_property
+    def mean_edge(self) -> float:
+        """Mean length [m] of the edges at rest; 0 without edges."""
+        return float(self.rest_edge_sq.double().sqrt().mean()) if len(self.edges) else 0.0
+
     def edge_sq(self, pos: Tensor) -> Tensor:
         """Squares [m²] (E,) of the lengths of the edges at ``pos`` (V, 3) [m]."""
         start, end = self.edges.unbind(dim=1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from hood.assets.material import Material
-from hood.commands.plan_reach import diameter, mean_edge, reach_facts, reach_sentence, wave_speed
+from hood.commands.plan_reach import diameter, reach_facts, reach_sentence, wave_speed
+from hood.graph.hierarchy import num_passed_over
 from hood.scene.cloth import Cloth, build_cloth
 from hood.scene.scene import Scene
 from hood.testing import grid
@@ -54,7 +57,16 @@ def test_schedules_that_reach_so_far_are_named() -> None:
     assert "ours (48)" in far
 
 
+def test_where_fine_levels_are_passed_over_schedules_reach_farther(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = {"schedule": "ours", "coarse_edge": 0.04}
+    monkeypatch.setattr("hood.commands.plan_reach.read_header", lambda path: {"model": json.dumps(model)})
+    cloth = sheet(65)  # edges of 19 mm: coarse ones would have 38
+    assert num_passed_over(cloth.mean_edge, 0.04) == 1
+    assert {one["radius"] for one in reach_facts(cloth, 1 / 30)["models"]} == {96}
+    assert {one["radius"] for one in reach_facts(sheet(11), 1 / 30)["models"]} == {48}
+
+
 def test_edges_are_means_at_rest() -> None:
     cloth = sheet(3)
     lengths = (cloth.rest_pos[cloth.edges[:, 0]] - cloth.rest_pos[cloth.edges[:, 1]]).norm(dim=1)
-    assert mean_edge(cloth) == pytest.approx(float(torch.mean(lengths)))
+    assert cloth.mean_edge == pytest.approx(float(torch.mean(lengths)))

@@ -96,6 +96,11 @@ def test_training_from_given_weights(tmp_path: Path) -> None:
     assert "parameter_gradient_norm" not in trainer(*model).update()
 
 
+def test_given_weights_may_go_on_with_other_levels() -> None:
+    begun = trainer("model=edges", "model.schedule=ours", "model.latent_dim=48", "model.coarse_edge=0.04", "weights=edges")
+    assert begun.simulator.config["coarse_edge"] == 0.04
+
+
 def test_weights_of_another_model_are_refused(tmp_path: Path) -> None:
     with pytest.raises(
         ConfigError,

@@ -15,6 +15,7 @@ from hood.assets.garment.garment import Garment
 from hood.assets.material import Material
 from hood.assets.motion.sequence import PoseSequence, turn_world
 from hood.dynamics.simulator import build_simulator
+from hood.graph.hierarchy import build_hierarchy
 from hood.losses.problem import StepProblem
 from hood.scene.cloth import build_cloth, concatenate_cloths
 from hood.scene.scene import Scene, build_scene
@@ -193,6 +194,7 @@ def test_garments_that_share_their_vertices_do_not_share_a_graph() -> None:
         ({"latent_dim": 0}, ("model.latent_dim", "> 0")),
         ({"body_radius": -0.1}, ("model.body_radius", "> 0")),
         ({"output_scale": 0.0}, ("model.output_scale", "> 0")),
+        ({"coarse_edge": 0.0}, ("model.coarse_edge", "> 0")),
         ({"normalizer_decay": 1.5}, ("decay", "1.5")),
     ],
 )
@@ -210,3 +212,19 @@ def test_a_clone_is_equal_and_independent(tank_scene: Scene) -> None:
     with torch.no_grad():
         next(clone.parameters()).add_(1.0)
     assert not torch.equal(next(clone.parameters()), next(simulator.parameters()))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_levels_finer_than_the_coarse_edge_are_passed_over(kind: str, tank_scene: Scene) -> None:
+    cloth, rest_pos = tank_scene.cloth, tank_scene.garment.rest_pos
+    usual, wide = make(kind), make(kind, coarse_edge=3.0 * cloth.mean_edge)
+    assert "coarse_edge" not in usual.config
+    (taken,) = wide.prepare(cloth, rest_pos).hierarchy.coarse_edges
+    (second,) = build_hierarchy(cloth.num_vertices, cloth.edges.numpy(), rest_pos, 1, passed_over=1).coarse_edges
+    assert torch.equal(taken, second)
+    assert len(taken) < len(usual.prepare(cloth, rest_pos).hierarchy.coarse_edges[0])
+    (_, one), (_, other) = take(usual, tank_scene), take(wide, tank_scene)
+    assert torch.isfinite(other.pos).all()
+    assert not torch.equal(one.pos, other.pos)
+    # Meshes whose edges are long enough keep all levels.
+    assert torch.equal(take(make(kind, coarse_edge=2.0 * cloth.mean_edge), tank_scene)[1].pos, one.pos)

@@ -37,8 +37,8 @@ def builds(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return calls
 
 
-def get(pos: np.ndarray = POS, edges: np.ndarray = EDGES, num_coarse: int = 2) -> Hierarchy:
-    return cached_hierarchy(len(pos), edges, pos, num_coarse)
+def get(pos: np.ndarray = POS, edges: np.ndarray = EDGES, num_coarse: int = 2, passed_over: int = 0) -> Hierarchy:
+    return cached_hierarchy(len(pos), edges, pos, num_coarse, passed_over)
 
 
 def assert_same(a: Hierarchy, b: Hierarchy) -> None:
@@ -63,11 +63,12 @@ def test_entries_depend_on_all_that_the_result_depends_on(
     moved[0] += 5.0
     get()
     get(num_coarse=3)
+    get(passed_over=1)
     get(pos=moved)
     get(edges=EDGES[1:])
     monkeypatch.setattr(cache, "VERSION", cache.VERSION + 1)
     get()
-    assert len(builds) == 5
+    assert len(builds) == 6
 
 
 @pytest.mark.parametrize("damage", ["empty", "text", "cut", "wrong length", "outside"])

@@ -6,7 +6,7 @@ import torch
 from scipy.sparse import csgraph
 
 from hood.graph import coarsen
-from hood.graph.hierarchy import build_hierarchy, concatenate_hierarchies
+from hood.graph.hierarchy import build_hierarchy, concatenate_hierarchies, num_passed_over
 from hood.mesh.topology import unique_edges
 from hood.testing import cylinder, grid, strip
 
@@ -47,6 +47,24 @@ def test_levels_are_nested_and_span_two_to_the_level(mesh):
         assert torch.equal(built.node_level >= level, torch.isin(torch.arange(len(hops)), edges))
         assert csgraph.connected_components(coarsen.adjacency(len(hops), edges.numpy()))[0] == len(hops) - len(nodes) + 1
         inside = nodes
+
+
+@pytest.mark.parametrize("passed", [1, 2])
+def test_levels_that_are_passed_over_are_those_between(passed):
+    mesh = grid(30, 25)
+    edges = unique_edges(mesh[1])
+    found, whole = build_hierarchy(len(mesh[0]), edges, mesh[0], 2, passed), levels(mesh, 2 + passed)
+    assert all(torch.equal(*pair) for pair in zip(found.coarse_edges, whole.coarse_edges[passed:], strict=True))
+    assert torch.equal(found.node_level, (whole.node_level - passed).clamp_min(0))
+    assert not build_hierarchy(len(mesh[0]), edges, mesh[0], 0, passed).coarse_edges
+
+
+@pytest.mark.parametrize(
+    "edge, coarse, passed",
+    [(0.03, 0.04, 0), (0.02, 0.04, 0), (0.0199, 0.04, 1), (0.01, 0.04, 1), (0.005, 0.04, 2), (0.005, None, 0), (0.0, 0.04, 0)],
+)
+def test_coarse_edges_are_as_long_as_asked_for(edge, coarse, passed):
+    assert num_passed_over(edge, coarse) == passed
 
 
 def test_edges_are_listed_once_in_order():

@@ -20,6 +20,10 @@ def test_radius_of_table_one(name, steps, expected):
     assert radius(schedule) == expected
 
 
+def test_coarse_edges_are_longer_where_levels_are_passed_over():
+    assert [radius(parse_schedule("2x(mesh) 3x(mesh+coarse0) (coarse1)"), passed) for passed in (0, 1, 2)] == [12, 22, 42]
+
+
 def test_text_is_read_with_or_without_counts_and_spaces():
     assert parse_schedule("(mesh) 2 x (coarse2 + mesh)") == (("mesh",), ("coarse2", "mesh"), ("coarse2", "mesh"))
 
