@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from hood.assets.garment.alterations import join_short_edges
 from hood.assets.garment.garment import Garment, load_garment
 from hood.assets.garment.outfit import join_garments
 from hood.assets.garment.pins import pin_mask
@@ -47,6 +48,7 @@ def read_outfit(given: Any, motion: Motion, triangulate: bool = False, pins: Any
         garments = [given]
     else:
         garments = [load_garment(name, triangulate=triangulate) for name in names_of(given)]
+    garments = [without_short_edges(garment) for garment in garments]
     for garment in garments:
         if not garment.bound:
             heed(garment.name, suspect_seams(garment.rest_pos, garment.faces))
@@ -64,6 +66,18 @@ def read_outfit(given: Any, motion: Motion, triangulate: bool = False, pins: Any
         return outfit
     body = motion.body if isinstance(motion, BodyMotion) else None
     return replace(outfit, pinned=pin_mask(checked_pins(pins), outfit, body))
+
+
+def without_short_edges(garment: Garment) -> Garment:
+    """The garment as it is simulated: vertices that almost coincide with a neighbour are one with it; a warning says so."""
+    joined, count = join_short_edges(garment)
+    if count:
+        warnings.warn(
+            f"garment {garment.name!r}: {count} vertices lie within a thousandth of an edge of a neighbour; faces take the "
+            "neighbour, and those vertices are left out of the simulation",
+            stacklevel=2,
+        )
+    return joined
 
 
 def layer_order(given: Any, names: Sequence[str]) -> tuple[int, ...] | None:

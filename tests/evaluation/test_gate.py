@@ -11,14 +11,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from battery import CRITERIA, METHODS, Battery, chosen
+from battery import METHODS, Battery, chosen
 
 from hood.assets.body.body import Body
 from hood.assets.garment.garment import Garment
 from hood.assets.motion.sequence import PoseSequence
 from hood.dynamics.rollout import simulate
 from hood.dynamics.stepper import NewtonStepper
-from hood.evaluation.envelope import CLASSES, DEGRADED, SILENT, SOUND, judge
+from hood.evaluation.envelope import CLASSES, SILENT, SOUND
 from hood.losses.potential import default_potential
 from hood.scene.scene import build_scene
 from hood.solver.newton import NewtonSettings
@@ -60,11 +60,11 @@ def test_a_network_on_a_spinning_body_is_repaired(battery: Battery) -> None:
     assert battery.judged(cell, "quickstart", "repair").kind == SOUND
 
 
-def test_near_duplicates_are_told(battery: Battery) -> None:
-    """A network alone tears single vertices off; the solver, which takes seconds a step there, is not asked."""
+@pytest.mark.parametrize("method", METHODS)
+def test_near_duplicates_are_taken_as_one(method: str, battery: Battery) -> None:
+    """Edges of 1 µm: a network alone tore the vertices off, the solver missed every step."""
     (cell,) = chosen(["duplicates-20"])
-    judged = judge(cell, battery.run(cell, "quickstart", "report"), None, True, CRITERIA)
-    assert judged.kind in (SOUND, DEGRADED)
+    assert battery.judged(cell, method).kind == SOUND
 
 
 def test_the_shirt_meets_its_target_from_step_17_to_18(body: Body, garments: dict[str, Garment], walk: PoseSequence) -> None:

@@ -18,6 +18,8 @@ from hood.mesh import repair, topology
 _FARTHEST = 0.35
 #: With more of its vertices inside the body it does not surround it.
 _MOST_INSIDE = 0.5
+#: Edges shorter than this share of the median edge join their ends.
+SHORT = 1e-3
 
 
 @dataclass
@@ -192,6 +194,33 @@ def piece_of(garment: Garment, kept: np.ndarray) -> Garment:
     used[left.faces] = True
     number = np.where(used, np.cumsum(used) - 1, -1)
     return _keep_vertices(left, number[left.faces], np.flatnonzero(used), number)
+
+
+def join_short_edges(garment: Garment) -> tuple[Garment, int]:
+    """Faces whose corners lie almost in one place take one vertex for them, the first; and how many vertices are left over.
+
+    An edge of less than :data:`SHORT` of the median one has no direction that float32 knows, and a stiffness that no step
+    resolves. Vertices keep their numbers; those left over are of no face. Edges of no length are a fault of the file, which
+    is refused where cloth is made of it.
+    """
+    edges = topology.unique_edges(garment.faces)
+    lengths = _lengths(garment.rest_pos, edges)
+    short = edges[(lengths > 0.0) & (lengths < SHORT * np.median(lengths))] if len(edges) else edges
+    if not len(short):
+        return garment, 0
+    place = topology.connected_components(len(garment.rest_pos), short)
+    first = np.full(len(garment.rest_pos), len(garment.rest_pos))
+    np.minimum.at(first, place, np.arange(len(place)))
+    taken = first[place]
+    left_over = int((taken != np.arange(len(taken))).sum())
+    pinned = garment.pinned.copy()
+    np.logical_or.at(pinned, taken, garment.pinned)
+    faces = taken[garment.faces]
+    whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    pairs = {name: taken[row] for name, row in (garment.fasteners or {}).items()}
+    fasteners = {name: row[row[:, 0] != row[:, 1]] for name, row in pairs.items()} or None
+    joined = _keep_faces(replace(garment, faces=faces), whole)
+    return replace(joined, pinned=pinned, fasteners=fasteners, coarse_edges=None), left_over
 
 
 _PER_VERTEX = (

@@ -1,0 +1,76 @@
+"""Vertices that almost coincide with a neighbour: taken as one, without new numbers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hood
+from hood.assets.extremes.garments import FAULTS
+from hood.assets.garment.alterations import join_short_edges
+from hood.assets.garment.garment import Garment, load_garment, save_garment
+
+
+@pytest.fixture(scope="module")
+def tank() -> Garment:
+    return load_garment("tank")
+
+
+@pytest.fixture(scope="module")
+def doubled(tank: Garment) -> Garment:
+    """With twenty further vertices 1 µm from one of the others."""
+    return FAULTS["duplicates"](tank, 20.0, np.random.default_rng(0))
+
+
+def as_sets(faces: np.ndarray) -> set[frozenset[int]]:
+    return {frozenset(face) for face in faces.tolist()}
+
+
+def test_faces_take_the_neighbour_and_vertices_keep_their_numbers(tank: Garment, doubled: Garment) -> None:
+    joined, count = join_short_edges(doubled)
+    assert count == 20
+    assert np.array_equal(joined.rest_pos, doubled.rest_pos)
+    assert as_sets(joined.faces) == as_sets(tank.faces)
+    assert len(joined.faces) == len(tank.faces)
+    assert join_short_edges(joined) == (joined, 0)
+
+
+def test_a_garment_without_them_is_the_same_object(tank: Garment) -> None:
+    assert join_short_edges(tank)[0] is tank
+
+
+def test_edges_of_no_length_are_not_hidden(tank: Garment) -> None:
+    pos = tank.rest_pos.copy()
+    one, other = tank.faces[0, :2]
+    pos[one] = pos[other]
+    assert join_short_edges(replace(tank, rest_pos=pos))[1] == 0
+
+
+def test_what_a_vertex_is_goes_over_to_the_one_that_is_taken(doubled: Garment) -> None:
+    last = len(doubled.rest_pos) - 1
+    near = int(np.linalg.norm(doubled.rest_pos[: last - 19] - doubled.rest_pos[last], axis=1).argmin())
+    pinned = np.zeros(len(doubled.rest_pos), dtype=bool)
+    pinned[last] = True
+    panels = {"front": np.arange(len(doubled.faces)) % 2 == 0}
+    pairs = {"zip": np.array([[last, 5], [last, near]])}
+    joined, _ = join_short_edges(replace(doubled, pinned=pinned, panels=panels, fasteners=pairs))
+    assert joined.pinned[near]
+    assert joined.panels is not None
+    assert len(joined.panels["front"]) == len(joined.faces)
+    assert joined.fasteners is not None
+    assert joined.fasteners["zip"].tolist() == [[near, 5]]
+
+
+def test_the_solver_meets_its_target_with_them(tmp_path: Path, doubled: Garment) -> None:
+    save_garment(tmp_path / "doubled.npz", doubled)
+    with pytest.warns(UserWarning, match="'doubled': 20 vertices lie within a thousandth of an edge of a neighbour"):
+        simulation = hood.simulate(tmp_path / "doubled.npz", "plie", stepper="newton", num_frames=6, metrics="strain")
+    frames = list(simulation)
+    usual = list(hood.simulate("tank", "plie", stepper="newton", num_frames=6, metrics="strain"))
+    assert all(frame.metrics["solver_converged"] == 1.0 for frame in frames[1:])
+    assert frames[-1].metrics["strain_p99"] == pytest.approx(usual[-1].metrics["strain_p99"], abs=5e-3)
+    there, here = (np.asarray(rolled[-1].world_pos)[: len(doubled.rest_pos) - 20] for rolled in (frames, usual))
+    assert np.median(np.linalg.norm(there - here, axis=1)) < 1e-3
