@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from hood.assets.garment.alterations import join_short_edges
+from hood.assets.garment.alterations import join_short_edges, part_open_seams
 from hood.assets.garment.garment import Garment, load_garment
 from hood.assets.garment.outfit import join_garments
 from hood.assets.garment.pins import pin_mask
@@ -48,10 +48,10 @@ def read_outfit(given: Any, motion: Motion, triangulate: bool = False, pins: Any
         garments = [given]
     else:
         garments = [load_garment(name, triangulate=triangulate) for name in names_of(given)]
-    garments = [without_short_edges(garment) for garment in garments]
     for garment in garments:
         if not garment.bound:
             heed(garment.name, suspect_seams(garment.rest_pos, garment.faces))
+    garments = [with_seams_apart(without_short_edges(garment)) for garment in garments]
     pins = plain(pins)
     if pins is not None:  # what is held differs in how it follows the body
         garments = [replace(garment, pinned=np.zeros_like(garment.pinned)) for garment in garments]
@@ -78,6 +78,19 @@ def without_short_edges(garment: Garment) -> Garment:
             stacklevel=2,
         )
     return joined
+
+
+def with_seams_apart(garment: Garment) -> Garment:
+    """The garment as it is simulated: open edges that lie on each other are a little apart. A warning says so of garments that
+    are bound to a body; of others :func:`read_outfit` has said it."""
+    parted, count = part_open_seams(garment)
+    if count and garment.bound:
+        warnings.warn(
+            f"garment {garment.name!r}: {count} vertices lie on others along open seams, which hold nothing together; they are "
+            "drawn back by 0.1 mm, hood prepare garment=… sews them",
+            stacklevel=2,
+        )
+    return parted
 
 
 def layer_order(given: Any, names: Sequence[str]) -> tuple[int, ...] | None:

@@ -18,6 +18,8 @@ from hood.mesh import repair, topology
 _FARTHEST = 0.35
 #: With more of its vertices inside the body it does not surround it.
 _MOST_INSIDE = 0.5
+#: How far [m] an open edge that lies on another one is drawn back, but by no more than a share of its faces' height.
+OPENING, _MOST_OPENED = 1e-4, 0.05
 #: Edges shorter than this share of the median edge join their ends.
 SHORT = 1e-3
 
@@ -221,6 +223,31 @@ def join_short_edges(garment: Garment) -> tuple[Garment, int]:
     fasteners = {name: row[row[:, 0] != row[:, 1]] for name, row in pairs.items()} or None
     joined = _keep_faces(replace(garment, faces=faces), whole)
     return replace(joined, pinned=pinned, fasteners=fasteners, coarse_edges=None), left_over
+
+
+def part_open_seams(garment: Garment) -> tuple[Garment, int]:
+    """Vertices that lie on those of another edge of the cloth are drawn back from it by :data:`OPENING`; how many are.
+
+    Cloth that is kept apart needs a distance to begin with. The rest shape and the worn one are changed alike. What is held
+    together by fasteners stays.
+    """
+    seen = repair.weld(garment.rest_pos, garment.faces, repair.weld_tolerance(garment.rest_pos, garment.faces))
+    doubled = np.bincount(seen.vertex_map)[seen.vertex_map] > 1
+    doubled[[vertex for pairs in (garment.fasteners or {}).values() for vertex in pairs.reshape(-1)]] = False
+    rows = np.flatnonzero(doubled)
+    if not len(rows):
+        return garment, 0
+    start, end = np.concatenate([edges := topology.unique_edges(garment.faces), edges[:, ::-1]]).T
+    shapes = {key: getattr(garment, key) for key in ("rest_pos", "skin_pos") if getattr(garment, key) is not None}
+    for key, pos in shapes.items():
+        inwards = np.zeros_like(pos)
+        np.add.at(inwards, start, pos[end] - pos[start])
+        inwards = inwards[rows] / np.bincount(start, minlength=len(pos))[rows, None]
+        length = np.linalg.norm(inwards, axis=1, keepdims=True)
+        moved = pos.copy()
+        moved[rows] += inwards * np.minimum(OPENING / np.where(length > 0, length, 1.0), _MOST_OPENED)
+        shapes[key] = moved
+    return replace(garment, **shapes), len(rows)
 
 
 _PER_VERTEX = (

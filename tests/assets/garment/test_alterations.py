@@ -1,4 +1,4 @@
-"""Vertices that almost coincide with a neighbour: taken as one, without new numbers."""
+"""What is done to a mesh before it is simulated: vertices that almost coincide with a neighbour, open seams."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 import hood
 from hood.assets.extremes.garments import FAULTS
-from hood.assets.garment.alterations import join_short_edges
+from hood.assets.files.library import names
+from hood.assets.garment.alterations import OPENING, join_short_edges, part_open_seams
 from hood.assets.garment.garment import Garment, load_garment, save_garment
 
 
@@ -74,3 +76,55 @@ def test_the_solver_meets_its_target_with_them(tmp_path: Path, doubled: Garment)
     assert frames[-1].metrics["strain_p99"] == pytest.approx(usual[-1].metrics["strain_p99"], abs=5e-3)
     there, here = (np.asarray(rolled[-1].world_pos)[: len(doubled.rest_pos) - 20] for rolled in (frames, usual))
     assert np.median(np.linalg.norm(there - here, axis=1)) < 1e-3
+
+
+@pytest.fixture(scope="module")
+def torn(tank: Garment) -> Garment:
+    """In two bands whose edges lie on each other."""
+    return FAULTS["components"](tank, 2.0, np.random.default_rng(0))
+
+
+def doubled_pairs(garment: Garment) -> np.ndarray:
+    return cKDTree(garment.rest_pos).query_pairs(1e-6, output_type="ndarray")
+
+
+def test_open_seams_are_drawn_back_within_the_cloth(torn: Garment) -> None:
+    pairs = doubled_pairs(torn)
+    assert len(pairs) > 20
+    parted, count = part_open_seams(torn)
+    assert count == len(np.unique(pairs))
+    moved = np.linalg.norm(parted.rest_pos - torn.rest_pos, axis=1)
+    assert np.array_equal(np.flatnonzero(moved), np.unique(pairs))
+    assert moved.max() <= 1.001 * OPENING
+    gaps = np.linalg.norm(parted.rest_pos[pairs[:, 0]] - parted.rest_pos[pairs[:, 1]], axis=1)
+    assert gaps.min() > 0.5 * OPENING  # a jagged edge is not drawn back straight
+    assert part_open_seams(parted)[0] is parted
+
+
+@pytest.mark.parametrize("name", names("garments"))
+def test_embedded_garments_are_left_alone(name: str) -> None:
+    garment = load_garment(name)
+    assert join_short_edges(garment)[0] is garment
+    assert part_open_seams(garment)[0] is garment
+
+
+def test_what_fasteners_hold_together_stays(torn: Garment) -> None:
+    assert part_open_seams(replace(torn, fasteners={"zip": doubled_pairs(torn)}))[1] == 0
+
+
+def test_the_worn_shape_changes_with_the_rest_shape(torn: Garment) -> None:
+    turned = torn.rest_pos @ np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+    parted, _ = part_open_seams(replace(torn, skin_pos=turned))
+    assert parted.skin_pos is not None
+    moves = np.linalg.norm(parted.rest_pos - torn.rest_pos, axis=1), np.linalg.norm(parted.skin_pos - turned, axis=1)
+    np.testing.assert_allclose(*moves, atol=1e-7)
+
+
+@pytest.mark.usefixtures("compiled_layers")
+def test_the_solver_meets_its_target_on_torn_cloth(tmp_path: Path, torn: Garment) -> None:
+    save_garment(tmp_path / "torn.npz", torn)
+    with pytest.warns(UserWarning, match="vertices lie on others along open seams.*hood prepare"):
+        simulation = hood.simulate(tmp_path / "torn.npz", "plie", stepper="newton", num_frames=6, metrics="strain")
+    rows = [frame.metrics for frame in simulation]
+    assert all(row["solver_converged"] == 1.0 for row in rows[1:])
+    assert max(row["strain_p99"] for row in rows) < 0.25
