@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from hood.assets.garment.alterations import join_short_edges, part_open_seams
+from hood.assets.garment.alterations import join_short_edges, part_open_seams, turn_flat_faces
 from hood.assets.garment.garment import Garment, load_garment
 from hood.assets.garment.outfit import join_garments
 from hood.assets.garment.pins import pin_mask
@@ -51,7 +51,7 @@ def read_outfit(given: Any, motion: Motion, triangulate: bool = False, pins: Any
     for garment in garments:
         if not garment.bound:
             heed(garment.name, suspect_seams(garment.rest_pos, garment.faces))
-    garments = [with_seams_apart(without_short_edges(garment)) for garment in garments]
+    garments = [with_seams_apart(without_flat_faces(without_short_edges(garment))) for garment in garments]
     pins = plain(pins)
     if pins is not None:  # what is held differs in how it follows the body
         garments = [replace(garment, pinned=np.zeros_like(garment.pinned)) for garment in garments]
@@ -78,6 +78,18 @@ def without_short_edges(garment: Garment) -> Garment:
             stacklevel=2,
         )
     return joined
+
+
+def without_flat_faces(garment: Garment) -> Garment:
+    """The garment as it is simulated: no corner of a face lies on its opposite edge; a warning says so."""
+    turned, count = turn_flat_faces(garment)
+    if count:
+        warnings.warn(
+            f"garment {garment.name!r}: {count} faces are lower than a thousandth of their length; they are divided anew "
+            "with their neighbours",
+            stacklevel=2,
+        )
+    return turned
 
 
 def with_seams_apart(garment: Garment) -> Garment:

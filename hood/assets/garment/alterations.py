@@ -13,6 +13,7 @@ from hood.assets.garment.garment import Garment
 from hood.assets.garment.placement import Placement
 from hood.assets.garment.suspicions import suspect_sides
 from hood.mesh import repair, topology
+from hood.mesh.caps import turn_caps
 
 #: A garment whose middle vertex is farther from the skin than this [m] was made for another place or body.
 _FARTHEST = 0.35
@@ -223,6 +224,20 @@ def join_short_edges(garment: Garment) -> tuple[Garment, int]:
     fasteners = {name: row[row[:, 0] != row[:, 1]] for name, row in pairs.items()} or None
     joined = _keep_faces(replace(garment, faces=faces), whole)
     return replace(joined, pinned=pinned, fasteners=fasteners, coarse_edges=None), left_over
+
+
+def turn_flat_faces(garment: Garment) -> tuple[Garment, int]:
+    """Faces a corner of which lies on the opposite edge are divided anew with the face behind it; and how many there were.
+
+    Their stiffness across is without bounds. Vertices keep their numbers.
+    """
+    corners, parent, count = turn_caps(garment.rest_pos, garment.faces)
+    if not count:
+        return garment, 0
+    face, corner = corners[..., 0], corners[..., 1]
+    tables = {key: getattr(garment, key)[face, corner] for key in _PER_FACE if getattr(garment, key) is not None}
+    panels = {name: mask[parent] for name, mask in (garment.panels or {}).items()} or None
+    return replace(garment, **tables, panels=panels, coarse_edges=None), count
 
 
 def part_open_seams(garment: Garment) -> tuple[Garment, int]:
