@@ -33,7 +33,7 @@ from hood.commands.common import (
 )
 from hood.commands.conditions import conditions
 from hood.commands.evaluation_files import report_spectrum, report_table
-from hood.commands.garments import shape_coefficients
+from hood.commands.garments import as_simulated, shape_coefficients
 from hood.config import ConfigError, build, load_config, plain, require_choice, save_run_record
 from hood.dynamics.kept_frames import KeptFrames
 from hood.dynamics.ranges import Conditions, scene_conditions
@@ -228,7 +228,7 @@ def make_plan(config: DictConfig) -> Plan:
     sequences = [str(name) for name in config.sequences]
     require_motions("sequences", sequences)
     motions = expand_sequences(sequences) or motion_split()["validation"]
-    garments = [load_garment(str(name)) for name in config.garments]
+    garments = [as_simulated(load_garment(str(name))) for name in config.garments]
     names = [garment.name for garment in garments]
     if len(set(names)) < len(names):
         raise ConfigError(f"garments={plain(config.garments)}: names must differ, these are {', '.join(names)}")

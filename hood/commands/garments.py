@@ -51,7 +51,7 @@ def read_outfit(given: Any, motion: Motion, triangulate: bool = False, pins: Any
     for garment in garments:
         if not garment.bound:
             heed(garment.name, suspect_seams(garment.rest_pos, garment.faces))
-    garments = [with_seams_apart(without_flat_faces(without_short_edges(garment))) for garment in garments]
+    garments = [as_simulated(garment) for garment in garments]
     pins = plain(pins)
     if pins is not None:  # what is held differs in how it follows the body
         garments = [replace(garment, pinned=np.zeros_like(garment.pinned)) for garment in garments]
@@ -68,8 +68,14 @@ def read_outfit(given: Any, motion: Motion, triangulate: bool = False, pins: Any
     return replace(outfit, pinned=pin_mask(checked_pins(pins), outfit, body))
 
 
+def as_simulated(garment: Garment) -> Garment:
+    """The garment without what no step can resolve: short edges, flat faces, open seams that lie on each other. Vertices keep
+    their numbers; warnings say what was done."""
+    return with_seams_apart(without_flat_faces(without_short_edges(garment)))
+
+
 def without_short_edges(garment: Garment) -> Garment:
-    """The garment as it is simulated: vertices that almost coincide with a neighbour are one with it; a warning says so."""
+    """Vertices that almost coincide with a neighbour are one with it; a warning says so."""
     joined, count = join_short_edges(garment)
     if count:
         warnings.warn(
@@ -81,7 +87,7 @@ def without_short_edges(garment: Garment) -> Garment:
 
 
 def without_flat_faces(garment: Garment) -> Garment:
-    """The garment as it is simulated: no corner of a face lies on its opposite edge; a warning says so."""
+    """No corner of a face lies on its opposite edge; a warning says so."""
     turned, count = turn_flat_faces(garment)
     if count:
         warnings.warn(
@@ -93,8 +99,8 @@ def without_flat_faces(garment: Garment) -> Garment:
 
 
 def with_seams_apart(garment: Garment) -> Garment:
-    """The garment as it is simulated: open edges that lie on each other are a little apart. A warning says so of garments that
-    are bound to a body; of others :func:`read_outfit` has said it."""
+    """Open edges that lie on each other are a little apart. A warning says so of garments that are bound to a body; of others
+    :func:`read_outfit` has said it."""
     parted, count = part_open_seams(garment)
     if count and garment.bound:
         warnings.warn(

@@ -30,6 +30,7 @@ from hood.commands.common import (
     tell_choice,
     together,
 )
+from hood.commands.garments import as_simulated
 from hood.commands.motion import check_rate
 from hood.config import ConfigError, build, load_config, plain, require_choice, save_run_record, shown
 from hood.dynamics.checkpoint import read_header
@@ -136,7 +137,7 @@ def make_trainer(config: DictConfig) -> Trainer:
     names = find_motions(list(config.data.sequences) or motion_split()["train"], check=not leave_out)
     sampler = SceneSampler(
         body=load_body(str(config.data.body)),
-        garments=[load_garment(str(name)) for name in config.data.garments],
+        garments=[as_simulated(load_garment(str(name))) for name in config.data.garments],
         sequences=_open_motions(config, names, fps, settings.horizon.maximum + 3),
         **_sampling(config),
         device=str(config.device),

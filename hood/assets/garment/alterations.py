@@ -252,7 +252,8 @@ def part_open_seams(garment: Garment) -> tuple[Garment, int]:
     rows = np.flatnonzero(doubled)
     if not len(rows):
         return garment, 0
-    start, end = np.concatenate([edges := topology.unique_edges(garment.faces), edges[:, ::-1]]).T
+    edges = topology.unique_edges(garment.faces)
+    start, end = np.concatenate([edges, edges[:, ::-1]]).T
     shapes = {key: getattr(garment, key) for key in ("rest_pos", "skin_pos") if getattr(garment, key) is not None}
     for key, pos in shapes.items():
         inwards = np.zeros_like(pos)
