@@ -160,7 +160,7 @@ _FABRIC: tuple[tuple[Part, Callable[[DictConfig], bool]], ...] = (
 )
 _ACCURACY: tuple[tuple[Part, Callable[[DictConfig], bool]], ...] = (
     (Part("last iterations", "forces balanced to 3%", ("solver.target_rg=0.03",), rivals="steps"), _target(0.03)),
-    (Part("later iterations", "forces balanced to 10%", ("solver.target_rg=0.1",), rivals="steps"), _target(0.1)),
+    (Part("later iterations", "forces balanced to 5%", ("solver.target_rg=0.05",), rivals="steps"), _target(0.05)),
 )
 
 
