@@ -372,8 +372,8 @@ def build_simulator(
     """
     config = {name: value for name, value in locals().items() if name not in _CONVENTIONS or value != _CONVENTIONS[name]}
     for name in ("latent_dim", "body_radius", "output_scale", "late_scale", "layer_radius", "coarse_edge"):
-        if name in config and not config[name] > 0:
-            raise ValueError(f"model.{name} is {config[name]!r}; it must be > 0")
+        if name in config and not (isinstance(config[name], (int, float)) and config[name] > 0):
+            raise ValueError(f"model.{name} is {config[name]!r}; it must be a number > 0")
     head, net = output_class(output), network_class(network)
     told, _ = split_name(features)
     if told in SETS and told not in head.feature_sets:

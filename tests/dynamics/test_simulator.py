@@ -195,6 +195,7 @@ def test_garments_that_share_their_vertices_do_not_share_a_graph() -> None:
         ({"body_radius": -0.1}, ("model.body_radius", "> 0")),
         ({"output_scale": 0.0}, ("model.output_scale", "> 0")),
         ({"coarse_edge": 0.0}, ("model.coarse_edge", "> 0")),
+        ({"coarse_edge": "wide"}, ("model.coarse_edge is 'wide'", "a number")),
         ({"normalizer_decay": 1.5}, ("decay", "1.5")),
     ],
 )
