@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from hood.assets.garment.alterations import join_short_edges, part_open_seams, turn_flat_faces
+from hood.assets.garment.alterations import OPENING, SHORT, join_short_edges, part_open_seams, turn_flat_faces
 from hood.assets.garment.garment import Garment, load_garment
 from hood.assets.garment.outfit import join_garments
 from hood.assets.garment.pins import pin_mask
 from hood.assets.garment.suspicions import Suspicion, suspect_kind, suspect_seams
 from hood.assets.garment.units import require_metres, used
 from hood.config import ConfigError, plain
+from hood.mesh.caps import FLAT
 from hood.scene.motion import BodyMotion, Motion
 
 
@@ -70,44 +71,25 @@ def read_outfit(given: Any, motion: Motion, triangulate: bool = False, pins: Any
 
 def as_simulated(garment: Garment) -> Garment:
     """The garment without what no step can resolve: short edges, flat faces, open seams that lie on each other. Vertices keep
-    their numbers; warnings say what was done."""
-    return with_seams_apart(without_flat_faces(without_short_edges(garment)))
-
-
-def without_short_edges(garment: Garment) -> Garment:
-    """Vertices that almost coincide with a neighbour are one with it; a warning says so."""
-    joined, count = join_short_edges(garment)
-    if count:
-        warnings.warn(
-            f"garment {garment.name!r}: {count} vertices lie within a thousandth of an edge of a neighbour; faces take the "
-            "neighbour, and those vertices are left out of the simulation",
-            stacklevel=2,
-        )
-    return joined
-
-
-def without_flat_faces(garment: Garment) -> Garment:
-    """No corner of a face lies on its opposite edge; a warning says so."""
-    turned, count = turn_flat_faces(garment)
-    if count:
-        warnings.warn(
-            f"garment {garment.name!r}: {count} faces are lower than a thousandth of their length; they are divided anew "
-            "with their neighbours",
-            stacklevel=2,
-        )
-    return turned
-
-
-def with_seams_apart(garment: Garment) -> Garment:
-    """Open edges that lie on each other are a little apart. A warning says so of garments that are bound to a body; of others
-    :func:`read_outfit` has said it."""
-    parted, count = part_open_seams(garment)
-    if count and garment.bound:
-        warnings.warn(
-            f"garment {garment.name!r}: {count} vertices lie on others along open seams, which hold nothing together; they are "
-            "drawn back by 0.1 mm, hood prepare garment=… sews them",
-            stacklevel=2,
-        )
+    their numbers. Warnings say what was done; of seams of garments that are not bound :func:`suspect_seams` does."""
+    joined, near = join_short_edges(garment)
+    turned, flat = turn_flat_faces(joined)
+    parted, doubled = part_open_seams(turned)
+    for count, what in (
+        (
+            near,
+            f"vertices lie within {SHORT:g} of an edge's length of a neighbour; faces take the neighbour, and those vertices "
+            "are left out of the simulation",
+        ),
+        (flat, f"faces are lower than {FLAT:g} of their length; they are divided anew with their neighbours"),
+        (
+            doubled if garment.bound else 0,
+            f"vertices lie on others along open seams, which hold nothing together; they are drawn back by "
+            f"{1e3 * OPENING:g} mm, hood prepare garment=… sews them",
+        ),
+    ):
+        if count:
+            warnings.warn(f"garment {garment.name!r}: {count} {what}", stacklevel=2)
     return parted
 
 

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
+from hood.mesh.defects import aspects
+
 #: Faces lower than this share of their longest edge are caps.
 FLAT = 1e-3
 
 
 def find_caps(pos: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(F,) bool: faces (F, 3) of ``pos`` (V, 3) whose height is less than :data:`FLAT` of their longest edge, but not 0."""
-    corners = pos[faces]
-    longest = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2).max(axis=1, initial=0.0)
-    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    return np.asarray((area > 0.0) & (2.0 * area < FLAT * longest**2))
+    found = aspects(pos, faces)
+    return np.asarray(np.isfinite(found) & (found * FLAT > 1.0))
 
 
 def turn_caps(pos: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:

@@ -53,7 +53,7 @@ def find_defects(pos: np.ndarray, faces: np.ndarray) -> Defects:
         isolated_vertices=int(alone.sum()),
         flipped_faces=int(repair.flipped_faces(sound).sum()),
         unwelded_vertices=len(pos) - len(welded.kept),
-        slivers=int((_aspects(pos, sound) > SLIVER_ASPECT).sum()),
+        slivers=int((aspects(pos, sound) > SLIVER_ASPECT).sum()),
         edge_length=(float(length.min()), float(np.median(length)), float(length.max())) if len(length) else (0.0, 0.0, 0.0),
     )
 
@@ -63,9 +63,10 @@ def _faces_per_edge(faces: np.ndarray) -> np.ndarray:
     return np.unique(half, axis=0, return_counts=True)[1]
 
 
-def _aspects(pos: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Longest edge over height (F,) of faces with an area."""
+def aspects(pos: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Longest edge over height (F,) of the faces (F, 3) of ``pos`` (V, 3); not finite where they have no area."""
     corners = pos[faces]
     longest_sq = ((corners - corners[:, [1, 2, 0]]) ** 2).sum(axis=2).max(axis=1, initial=0.0)
     area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    return np.asarray(0.5 * longest_sq / area)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(0.5 * longest_sq / area)

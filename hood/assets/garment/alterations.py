@@ -19,7 +19,7 @@ from hood.mesh.caps import turn_caps
 _FARTHEST = 0.35
 #: With more of its vertices inside the body it does not surround it.
 _MOST_INSIDE = 0.5
-#: How far [m] an open edge that lies on another one is drawn back, but by no more than a share of its faces' height.
+#: How far [m] an open edge that lies on another one is drawn back, but by no more than a share of the way to its neighbours.
 OPENING, _MOST_OPENED = 1e-4, 0.05
 #: Edges shorter than this share of the median edge join their ends.
 SHORT = 1e-3
@@ -211,11 +211,8 @@ def join_short_edges(garment: Garment) -> tuple[Garment, int]:
     short = edges[(lengths > 0.0) & (lengths < SHORT * np.median(lengths))] if len(edges) else edges
     if not len(short):
         return garment, 0
-    place = topology.connected_components(len(garment.rest_pos), short)
-    first = np.full(len(garment.rest_pos), len(garment.rest_pos))
-    np.minimum.at(first, place, np.arange(len(place)))
-    taken = first[place]
-    left_over = int((taken != np.arange(len(taken))).sum())
+    merged = repair.merge(len(garment.rest_pos), short)
+    taken = merged.kept[merged.vertex_map]
     pinned = garment.pinned.copy()
     np.logical_or.at(pinned, taken, garment.pinned)
     faces = taken[garment.faces]
@@ -223,7 +220,7 @@ def join_short_edges(garment: Garment) -> tuple[Garment, int]:
     pairs = {name: taken[row] for name, row in (garment.fasteners or {}).items()}
     fasteners = {name: row[row[:, 0] != row[:, 1]] for name, row in pairs.items()} or None
     joined = _keep_faces(replace(garment, faces=faces), whole)
-    return replace(joined, pinned=pinned, fasteners=fasteners, coarse_edges=None), left_over
+    return replace(joined, pinned=pinned, fasteners=fasteners, coarse_edges=None), len(taken) - len(merged.kept)
 
 
 def turn_flat_faces(garment: Garment) -> tuple[Garment, int]:

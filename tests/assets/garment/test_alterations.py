@@ -68,7 +68,7 @@ def test_what_a_vertex_is_goes_over_to_the_one_that_is_taken(doubled: Garment) -
 
 def test_the_solver_meets_its_target_with_them(tmp_path: Path, doubled: Garment) -> None:
     save_garment(tmp_path / "doubled.npz", doubled)
-    with pytest.warns(UserWarning, match="'doubled': 20 vertices lie within a thousandth of an edge of a neighbour"):
+    with pytest.warns(UserWarning, match="'doubled': 20 vertices lie within 0.001 of an edge's length of a neighbour"):
         simulation = hood.simulate(tmp_path / "doubled.npz", "plie", stepper="newton", num_frames=6, metrics="strain")
     frames = list(simulation)
     usual = list(hood.simulate("tank", "plie", stepper="newton", num_frames=6, metrics="strain"))
@@ -142,7 +142,7 @@ def test_the_solver_meets_its_target_on_slivers(tmp_path: Path, tank: Garment) -
     assert len(turned.panels["front"]) == len(turned.faces) == len(slivers.faces) - 1  # one of them is at the hem
     assert np.array_equal(turned.rest_pos, slivers.rest_pos)
     save_garment(tmp_path / "slivers.npz", slivers)
-    with pytest.warns(UserWarning, match="10 faces are lower than a thousandth of their length"):
+    with pytest.warns(UserWarning, match="10 faces are lower than 0.001 of their length"):
         simulation = hood.simulate(tmp_path / "slivers.npz", "plie", stepper="newton", num_frames=6, metrics="strain")
     rows = [frame.metrics for frame in simulation]
     assert all(row["solver_converged"] == 1.0 for row in rows[1:])
