@@ -154,7 +154,13 @@ def entry(argv: Sequence[str] | None = None) -> None:
         from hood.native import ahead
 
         ahead.start()
-    sys.exit(main(arguments))
+    try:
+        code = main(arguments)
+        sys.stdout.flush()
+    except BrokenPipeError:  # who reads, such as head, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 130
+    sys.exit(code)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from hood.dynamics.recorder import read_rollout
 from hood.media.film import Film
 
 _WIDTH, _HEIGHT = 260, 340  # pixels of one frame
-_FRAMES = (30, 45, 65, 80, 89)  # closed, open, open, closing, closed
+_FRAMES = (30, 45, 65, 80, 91)  # closed, open, open, closing, closed
 
 
 def draw(rollout: Path, picture: Path) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -223,6 +225,13 @@ def test_usage_and_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert all(command in usage for command in ("train", "rollout", "evaluate", "tradeoff", "envelope", "compare"))
     assert main(["--version"]) == 0
     assert capsys.readouterr().out.strip() == f"hood {__version__}"
+
+
+@pytest.mark.parametrize("arguments", ["--help", "sizes --help"])
+def test_a_reader_that_has_seen_enough_is_no_error(arguments: str) -> None:
+    command = f"{sys.executable} -m hood.cli {arguments} | true; exit ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=120, check=False)
+    assert (done.returncode, done.stderr) == (130, "")
 
 
 def test_traceback_on_demand(monkeypatch: pytest.MonkeyPatch) -> None:

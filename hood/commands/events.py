@@ -53,7 +53,7 @@ def checked_events(config: DictConfig) -> tuple[Asked, ...]:
         raise ConfigError(f"events={given}: give a list, {_FORM}")
     speed = config.events_speed
     if isinstance(speed, bool) or not isinstance(speed, (int, float)) or not 0.0 < speed < math.inf:
-        raise ConfigError(f"events_speed={speed}: give a speed > 0 in m/s, such as 0.3")
+        raise ConfigError(f"events_speed={speed}: give a speed > 0 in m/s, such as 0.25")
     asked = tuple(_asked(index, event) for index, event in enumerate(given))
     held = next((one for one in asked if one.action in VERTICES), None)
     if held is not None and str(config.step) != "plain":

@@ -13,7 +13,7 @@ from torch import Tensor
 from hood.scene.state import Attachments
 
 #: Speed [m/s] at which the two sides of a pair that is closed come together.
-SPEED = 0.3
+SPEED = 0.25
 #: A pair is closed when its distance is within this [m] of the one that it is held at.
 CLOSED = 1e-3
 
