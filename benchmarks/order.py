@@ -127,6 +127,8 @@ def report(updates: int, output: Path, figure: Path | None) -> None:
     """Print what is there of the runs, and draw it."""
     known = read_exact(output)
     rows = [row for row in read_rows(output, updates) if "newton" in known.get(row["scene"], {})]
+    if not rows:
+        sys.exit(f"{output} holds no runs of {updates} updates beside exact steps; first: order.py train, then order.py exact")
     results = Results(FAMILY, SCHEDULES, rows, known)
     write_csv(output / "order.csv", results)
     print(exact_table(results), table(results), comparisons(results), sep="\n\n")

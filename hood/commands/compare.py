@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import random
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,9 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from hood.assets.files.atomic import write_atomically
+from hood.assets.formats.image import Texture
 from hood.commands.common import held_folder, output_folder, require_package, split_words, thinning
+from hood.commands.textures import lay_on, read_textures
 from hood.config import ConfigError, require_choice
 from hood.dynamics.recorder import RolloutData, read_rollout
 
@@ -36,6 +38,7 @@ class _Entry:
     path: Path
     name: str
     data: RolloutData
+    textures: Mapping[str, Texture] = field(default_factory=dict)
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -49,9 +52,16 @@ def run(arguments: Sequence[str]) -> int:
     thinning(config)
     if str(config.video) == "none" and not bool(config.sheet):
         raise ConfigError("video=none and sheet=false leave nothing to draw; leave one of them out")
+    if config.texture is not None and str(config.colour) != "fabric":
+        raise ConfigError(
+            f"colour={config.colour}: hides texture={config.texture}; add colour=fabric, or leave the texture out"
+        )
+    textures = read_textures(config)
     output_folder(config)
     require_package("PIL", "Pillow", "pictures", "hood compare")
     entries = _read(files, config)
+    laid_on = lay_on(textures, [entry.data for entry in entries])
+    entries = [replace(entry, textures=images) for entry, images in zip(entries, laid_on, strict=True)]
     if bool(config.blind):
         entries = _shuffled(entries, int(config.seed))
     with held_folder(config) as folder:
@@ -132,7 +142,10 @@ def _draw(entries: Sequence[_Entry], config: DictConfig, folder: Path) -> None:
 
     blind, colour = bool(config.blind), str(config.colour)
     rows = [{"title": _letter(i) if blind else e.name, **_facts(e)} for i, e in enumerate(entries)]
-    panels = [Panel(e.data, str(r["title"]), "" if blind else _note(r)) for e, r in zip(entries, rows, strict=True)]
+    panels = [
+        Panel(entry.data, str(row["title"]), "" if blind else _note(row), entry.textures)
+        for entry, row in zip(entries, rows, strict=True)
+    ]
     height = int(config.height)
     view = SideBySide(panels, "none" if colour == "fabric" else colour, round(height / 1.4), height, thinning(config))
     written = []

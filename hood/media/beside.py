@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hood.assets.formats.image import Texture
 from hood.dynamics.recorder import RolloutData
 from hood.media.film import Film, seconds_per_frame, sheet_frames
 from hood.media.video import VideoWriter
@@ -25,11 +26,13 @@ _SAME_DT = 1e-6  # relative
 
 @dataclass(frozen=True)
 class Panel:
-    """One of the rollouts and what is written above it."""
+    """One of the rollouts, what is written above it, and the images on its garments in their own colours (as in
+    :class:`hood.media.film.Film`)."""
 
     data: RolloutData
     title: str
     note: str = ""
+    textures: Mapping[str, Texture] = field(default_factory=dict)
 
 
 class SideBySide:
@@ -56,8 +59,16 @@ class SideBySide:
         self._size = max(12, height // 30)
         every = [panel.data for panel in panels]
         self._films = [
-            Film(data, width, height, colour=colour, beside=every[:index] + every[index + 1 :], thinner=thinner)
-            for index, data in enumerate(every)
+            Film(
+                panel.data,
+                width,
+                height,
+                colour=colour,
+                beside=every[:index] + every[index + 1 :],
+                thinner=thinner,
+                textures=panel.textures,
+            )
+            for index, panel in enumerate(panels)
         ]
 
     @property
@@ -166,7 +177,7 @@ def _first_frames(data: RolloutData, count: int) -> RolloutData:
         metrics={name: values[:count] for name, values in data.metrics.items()},
         attributes=data.attributes,
         fields={name: values[:count] for name, values in data.fields.items()},
-        still={name: values for name, values in data.still.items() if name == "simulated_faces"},
+        still=data.still,
     )
 
 

@@ -26,7 +26,14 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def record(
-    path: str, sides: int = 12, wider: float = 0.1, frames: int = 2, rg: bool = True, shift: float = 0.0, dt: float = 1 / 30
+    path: str,
+    sides: int = 12,
+    wider: float = 0.1,
+    frames: int = 2,
+    rg: bool = True,
+    shift: float = 0.0,
+    dt: float = 1 / 30,
+    still: dict[str, np.ndarray] | None = None,
 ) -> str:
     """A rollout of a tube of ``sides`` sides about a ball, on disk."""
     file = Path(path)
@@ -35,7 +42,8 @@ def record(
     ball, ball_faces = sphere(1, 0.25)
     fields = ("rg",) if rg else ()
     names = METRICS if rg else ()
-    with RolloutWriter(file, frames, pos, faces, ball_faces, len(ball), names, dt, {"garment": "tube"}, fields=fields) as out:
+    told = {"garment": "tube"}
+    with RolloutWriter(file, frames, pos, faces, ball_faces, len(ball), names, dt, told, fields=fields, still=still) as out:
         for index in range(frames):
             step = {"strain_p99": wider * index} | ({"relative_gradient": 0.25, "ms_total": 40.0} if index else {})
             values = {"rg": np.full(len(pos), 0.5 if index else np.nan)}
@@ -62,6 +70,30 @@ def test_two_rollouts_become_a_sheet_a_film_and_a_key(capsys: pytest.CaptureFixt
     assert right["strain_p99"] == pytest.approx(0.1)
     assert right["relative_gradient"] == 0.25
     assert "fine: rg 0.25, p99 strain 10.0%, 40 ms a frame\n" in capsys.readouterr().out
+
+
+def test_an_image_lies_on_all_garments(capsys: pytest.CaptureFixture[str]) -> None:
+    from PIL import Image
+
+    Image.new("RGB", (4, 4), (220, 20, 20)).save("red.png")
+    for name, sides in (("coarse", 12), ("fine", 24)):
+        pos, faces = cylinder(sides, 3, 0.3, 0.5)
+        record(f"{name}/rollout.h5", sides=sides, still={"uv": pos[:, :2].astype(np.float32), "uv_faces": faces})
+    words = ["compare", "coarse", "fine", "video=none", "height=140"]
+    assert main([*words, "colour=fabric", "texture=red.png", "output=red"]) == 0
+    assert main([*words, "colour=fabric", "output=plain"]) == 0
+    shares = []
+    for folder in ("red", "plain"):
+        picture = np.asarray(Image.open(f"{folder}/contact_sheet.png").convert("RGB")).astype(int)
+        rows = np.array_split(picture[..., 0] - picture[..., 1:].max(axis=2) > 60, 2)
+        shares.append([float(row.mean()) for row in rows])
+    assert min(shares[0]) > 0.05
+    assert max(shares[1]) < 0.01
+    assert main([*words, "texture=red.png", "output=none"]) == 2
+    assert "colour=strain: hides texture=red.png" in capsys.readouterr().err
+    assert main([*words, "colour=fabric", "texture={shirt:red.png}", "output=none"]) == 2
+    assert "texture: unknown garment 'shirt'" in capsys.readouterr().err
+    assert not Path("none").exists()
 
 
 def test_a_blind_comparison_gives_nothing_away(capsys: pytest.CaptureFixture[str]) -> None:

@@ -93,9 +93,9 @@ class Desk:
         def make(folder: Path) -> None:
             (pos, faces), (ball, ball_faces) = cylinder(12, 3, 0.3, 0.5), sphere(1, 0.25)
             with RolloutWriter(
-                folder / "long.h5", 90, pos, faces, ball_faces, len(ball), (), 1 / 30, {"garment": "tube"}
+                folder / "long.h5", 92, pos, faces, ball_faces, len(ball), (), 1 / 30, {"garment": "tube"}
             ) as out:
-                for _ in range(90):
+                for _ in range(92):
                     out.append(pos, ball, {}, {})
 
         return self._once("long", make) / "long.h5"
