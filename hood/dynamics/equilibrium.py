@@ -132,8 +132,7 @@ def _out_of_skin(potential: Potential, problem: StepProblem, pos: Tensor) -> Ten
     where they do not, or where that is not finite."""
     rested = replace(problem.state, pos=pos)
     problem = replace(problem, state=rested, step=replace(problem.step, dt=torch.full_like(problem.step.dt, _LONGEST)))
-    _, found, reports = minimize_held_off(potential, potential.prepare(problem), pos, _FINE)
-    return pos if any(NOT_FINITE in report.reason for report in reports) else found
+    return minimize_held_off(potential, potential.prepare(problem), pos, _FINE).pos
 
 
 class _Parts:

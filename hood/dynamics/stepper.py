@@ -109,9 +109,9 @@ class NewtonStepper:
                 pos, report = minimize(self.potential, problem, pos, self.settings)
                 iterations += report.iterations
             if self._holds_off:
-                problem, pos, more = minimize_held_off(self.potential, problem, pos, self.settings)
-                iterations += sum(one.iterations for one in more)
-                report = more[-1] if more else report
+                held = minimize_held_off(self.potential, problem, pos, self.settings, report)
+                problem, pos, report = held.problem, held.pos, held.report or report
+                iterations += held.iterations
         reached = {
             "solver_iterations": float(iterations),
             "solver_converged": float(bool(report.converged.all())),

@@ -11,7 +11,7 @@ from hood.scene.cloth import Cloth
 from hood.scene.contact import Contact, Fold, find_contact
 from hood.scene.contact_points import PointContact, find_point_contact
 from hood.scene.entered import find_entered, signed_distance
-from hood.scene.held_off import hold_off
+from hood.scene.held_off import hold_off, num_in_skin
 from hood.scene.landing import find_other_skin
 from hood.scene.layer_sides import LayerPairs, find_sides
 from hood.scene.layers import SceneLayers, find_layers, late_targets
@@ -91,14 +91,21 @@ class StepProblem:
         fold = find_entered(next_pos, self.state.pos, self.cloth, obstacle, self.contacts)
         return self if fold is None else replace(self, fold=fold)
 
-    def with_held_off(self, next_pos: Tensor) -> StepProblem:
+    def with_held_off(self, next_pos: Tensor, scenes: Tensor | None = None) -> StepProblem:
         """The problem with cloth held farther off where its solution ``next_pos`` (V, 3) [m] has left too many triangles in the
-        skin; itself where it has not."""
+        skin; itself where it has not, or not in the ``scenes`` (B,) bool where that may be done."""
         obstacle = self.step.obstacle
         if obstacle is None or self.contact is None or not len(obstacle.faces) or not len(next_pos):
             return self
-        contact = hold_off(next_pos, self.cloth, obstacle, self.contact)
+        contact = hold_off(next_pos, self.cloth, obstacle, self.contact, scenes)
         return self if contact is None else replace(self, contact=contact)
+
+    def num_in_skin(self, next_pos: Tensor) -> Tensor:
+        """Number (B,) int64 of the triangles of every scene that are in the skin at ``next_pos`` (V, 3) [m]."""
+        obstacle = self.step.obstacle
+        if obstacle is None:
+            return torch.zeros(self.num_scenes, dtype=torch.int64, device=next_pos.device)
+        return num_in_skin(next_pos, self.cloth, obstacle)
 
     def with_points(self, place: str) -> StepProblem:
         """The problem with its contact, also at points inside edges and faces (a ``place`` of

@@ -26,35 +26,53 @@ from hood.scene.state import Obstacle
 ALLOWED = 0.005
 #: Corners of a triangle in the skin are held off by so much more [m], by twice as much where that was not enough, and by no
 #: more than that in all.
-RISE, MOST = 3e-3, 24e-3
+RISE, MOST = 3e-3, 48e-3
 
 
-def hold_off(next_pos: Tensor, cloth: Cloth, obstacle: Obstacle, contact: Contact) -> Contact | None:
+def hold_off(
+    next_pos: Tensor, cloth: Cloth, obstacle: Obstacle, contact: Contact, scenes: Tensor | None = None
+) -> Contact | None:
     """The contact of a step that holds the triangles farther off that its solution ``next_pos`` (V, 3) [m] has left in the
-    skin; None where these are few, or cannot be held farther off."""
+    skin; None where these are few, or cannot be held farther off.
+
+    Args:
+        scenes: (B,) bool, where that may be done; None for everywhere.
+    """
     before = torch.zeros_like(contact.dist) if contact.raised is None else contact.raised
     rows = torch.zeros_like(contact.valid)
     for cut in _cut_faces(next_pos, cloth, obstacle):
         rows[cut.reshape(-1)] = True
     after = (2.0 * before + RISE).clamp_max(MOST)
     rows &= contact.valid & cloth.free & (before + 0.5 * RISE < MOST)
+    if scenes is not None:
+        rows &= scenes[cloth.vertex_scene]
     return replace(contact, raised=torch.where(rows, after, before)) if bool(rows.any()) else None
+
+
+def num_in_skin(next_pos: Tensor, cloth: Cloth, obstacle: Obstacle) -> Tensor:
+    """Number (B,) int64 of the triangles of every scene that are in the skin at ``next_pos`` (V, 3) [m]."""
+    return torch.tensor([len(cut) for _, cut in _cut(next_pos, cloth, obstacle)], device=next_pos.device)
 
 
 def _cut_faces(next_pos: Tensor, cloth: Cloth, obstacle: Obstacle) -> list[Tensor]:
     """Corners (N, 3) of the triangles in the skin, of every scene that has more than :data:`ALLOWED`."""
+    if not bool(torch.isfinite(next_pos).all()):
+        return []
+    found = _cut(next_pos, cloth, obstacle)
+    return [faces[torch.as_tensor(cut, device=faces.device)] for faces, cut in found if len(cut) > ALLOWED * len(faces)]
+
+
+def _cut(next_pos: Tensor, cloth: Cloth, obstacle: Obstacle) -> list[tuple[Tensor, np.ndarray]]:
+    """Faces (F, 3) of the cloth of every scene, and the numbers of those in the skin."""
     found = []
     pos, skin = next_pos.double().cpu().numpy(), obstacle.next_pos.double().cpu().numpy()
-    if not np.isfinite(pos).all():
-        return []
     for faces, body in _by_scene(cloth, obstacle):
-        if not len(faces) or not len(body):
-            continue
-        both = _ordered(faces, pos), _ordered(body, skin)
-        given = None if both[0] is None or both[1] is None else (both[0], both[1])
-        cut = np.unique(crossings(pos, faces.cpu().numpy(), skin, body.cpu().numpy(), given).pairs[:, 0])
-        if len(cut) > ALLOWED * len(faces):
-            found.append(faces[torch.as_tensor(cut, device=faces.device)])
+        cut = np.empty(0, dtype=np.int64)
+        if len(faces) and len(body):
+            both = _ordered(faces, pos), _ordered(body, skin)
+            given = None if both[0] is None or both[1] is None else (both[0], both[1])
+            cut = np.unique(crossings(pos, faces.cpu().numpy(), skin, body.cpu().numpy(), given).pairs[:, 0])
+        found.append((faces, cut))
     return found
 
 
