@@ -16,6 +16,8 @@ from hood.solver.newton import NewtonSettings, Report, minimize
 MOST_AGAIN = 3
 #: So often is one taken again with cloth held farther off: by 3, 9, 21 and 45 mm.
 MOST_RAISED = 4
+#: That ends where so many minima of a scene have been missed.
+MOST_MISSES = 2
 
 
 class HeldOff(NamedTuple):
@@ -33,32 +35,36 @@ def minimize_held_off(
     """The problem with cloth held off as far as it took, and its minimum; the problem and ``pos`` themselves where these leave
     no more triangles in the skin than are allowed.
 
-    Of the minima that are found on the way, that with the fewest triangles in the skin counts, scene by scene. A scene whose
-    minimum is missed once is held off no farther, and what was missed is not taken: cloth that is caught between skin and
-    skin finds no balance farther off.
+    Of the minima that are found on the way, that with the fewest triangles in the skin counts, scene by scene. What missed
+    its minimum is not taken, and a scene that missed two is held off no farther: cloth that is caught between skin and skin
+    finds no balance farther off.
 
     Args:
         problem: prepared by ``potential``.
         pos: (V, 3) m, its minimum.
-        report: of that minimum; None where it is known to be one.
+        report: of ``pos``, which may have missed the minimum; None where it is known to be one.
     """
     best, least, spent = HeldOff(problem, pos, report, 0), None, 0
-    going = torch.ones(problem.num_scenes, dtype=torch.bool, device=pos.device)
+    misses = torch.zeros(problem.num_scenes, dtype=torch.int64, device=pos.device)
     if report is not None:
-        going &= report.converged.to(going.device)
-    for _ in range(MOST_RAISED if bool(going.any()) else 0):
-        again = problem.with_held_off(pos, going)
+        misses += ~report.converged.to(misses.device)
+    unsolved = misses > 0
+    for _ in range(MOST_RAISED):
+        again = problem.with_held_off(pos, misses < MOST_MISSES)
         if again is problem:
             break
         least = problem.num_in_skin(pos) if least is None else least
         problem = again
         pos, found = minimize(potential, problem, pos, settings)
+        pos = torch.where(torch.isfinite(pos), pos, best.pos)  # what is no number is missed, and no place to go on from
         spent += found.iterations
-        going &= found.converged.to(going.device)
-        if not bool(going.any()):
+        met = found.converged.to(misses.device) & (misses < MOST_MISSES)
+        misses += ~met
+        if bool((misses >= MOST_MISSES).all()):
             break
         count = problem.num_in_skin(pos)
-        better = going & (count < least)
+        better = met & (unsolved | (count < least))
+        unsolved = unsolved & ~better
         least = torch.where(better, count, least)
         best = _by_scene(better, HeldOff(problem, pos, found, 0), best)
     return best._replace(iterations=spent)

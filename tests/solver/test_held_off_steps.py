@@ -71,15 +71,19 @@ def test_the_minimum_with_the_fewest_triangles_in_the_skin_counts(monkeypatch: p
     assert kept.iterations == held_off.MOST_RAISED * report.iterations
 
 
-def test_what_misses_its_target_is_not_taken_and_not_tried_again() -> None:
+def test_what_misses_its_target_is_not_taken_and_tried_once_more() -> None:
     problem = on_balls(-0.002)
     pos, report = solved(problem)
     short = NewtonSettings(max_iterations=1, target_rg=1e-12)
     missed = minimize_held_off(default_potential(), problem, pos, short, report)
-    assert (missed.problem, missed.report, missed.iterations) == (problem, report, 1)
+    assert (missed.problem, missed.report, missed.iterations) == (problem, report, held_off.MOST_MISSES)
     assert torch.equal(missed.pos, pos)
-    unsolved = replace(report, converged=torch.tensor([False]))
-    assert minimize_held_off(default_potential(), problem, pos, NewtonSettings(), unsolved) == (problem, pos, unsolved, 0)
+    start = problem.state.pos
+    _, unsolved = minimize(default_potential(), problem, start, short)
+    mended = minimize_held_off(default_potential(), problem, start, NewtonSettings(), unsolved)
+    assert mended.report is not None
+    assert bool(mended.report.converged.all())
+    assert int(problem.num_in_skin(mended.pos)) == 0
 
 
 def test_a_batch_gives_what_its_members_give_alone() -> None:
