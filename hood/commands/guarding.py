@@ -30,7 +30,7 @@ from hood.dynamics.guard import (
 )
 from hood.dynamics.recorder import RolloutData, RolloutWriter
 from hood.dynamics.soundness import name_frames
-from hood.dynamics.step_repair import LEFT, REFINED, SOLVED
+from hood.dynamics.step_repair import LEFT, NOT_TRIED, REFINED, SOLVED
 from hood.dynamics.stepper import Stepper
 from hood.losses.potential import Potential
 
@@ -46,7 +46,7 @@ _TEXTS = {
     f"every {CHECK_EVERY}th step and in those more strained than before; refine=5 or stepper=newton keeps nearer to it)",
     TURN: "the body turns by {value:.0f} degrees in a step, beyond {limit:.0f} (less with a higher fps=…)",
     SPEED: "the body moves by {value:.2g} m in a step, beyond {limit:.2g} (less with a higher fps=…)",
-    CUT: "the skin cuts {value:.1%} of the cloth's triangles at worst, beyond {limit:.0%}",
+    CUT: "the skin cuts {value:.1%} of the cloth's triangles at worst, beyond {limit:.1%}",
 }
 
 
@@ -145,7 +145,7 @@ def _named(alarms: Sequence[Alarm]) -> str:
 
 
 def _outcome(mode: str, alarms: Sequence[Alarm]) -> list[str]:
-    steps = [alarm for alarm in alarms if alarm.cause in MENDED]
+    steps = [alarm for alarm in alarms if alarm.cause in MENDED or alarm.repair != NOT_TRIED]
     if not steps:
         return []
     if mode != REPAIR:

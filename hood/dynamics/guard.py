@@ -20,7 +20,9 @@ Of every step the gravest of these causes is told, and of the surface what is me
   (:mod:`hood.scene.entered`); a solver has tried that already.
 - *turn*, *speed*: the body turns by more than 15 degrees as one, or its fastest vertex moves by more than 0.3 m. A jump over
   which the cloth was carried is none.
-- *cut*: the skin cuts more than 2% of the cloth's triangles, in frames where that is measured.
+- *cut*: the skin cuts more than 2% of the cloth's triangles, in frames where that is measured. ``repair`` looks at every step
+  of a network and of a refinement: where more than 0.5% are in the skin, their corners are held farther off
+  (:mod:`hood.scene.held_off`), as the solver does by itself.
 
 The limits come from the validation list: seven garments of 1,000 vertices on walk_proud, dance_mixed, plie and
 twist_and_bend, 60 frames each (``python benchmarks/guard.py``; quickstart 1,475 steps, quickstart+5 1,357, newton 1,652, ours
@@ -68,7 +70,9 @@ from hood.dynamics.stepper import Stepper
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
 from hood.mesh.rigid import turned
+from hood.scene.held_off import ALLOWED
 from hood.scene.state import Obstacle
+from hood.solver.held_off import minimize_held_off
 from hood.solver.newton import NewtonSettings, minimize
 from hood.solver.step_figures import StepFigures
 
@@ -164,6 +168,12 @@ class Guard:
             problem: prepared for the potential.
             figures: of the step, where somebody has made them.
         """
+        prediction = self._see(frame, problem, prediction, figures)
+        # A solver holds its steps off by itself.
+        mends = self.mode == "repair" and self._target is None
+        return self._out_of_skin(frame, problem, prediction) if mends else prediction
+
+    def _see(self, frame: int, problem: StepProblem, prediction: Prediction, figures: StepFigures | None) -> Prediction:
         now = step_quality(self._potential, problem, prediction, figures, typical=self._alone)
         moved = _motion_alarm(frame, problem.step.obstacle)
         depth = problem.next_depth(prediction.next_pos) if now.finite else math.nan
@@ -193,6 +203,29 @@ class Guard:
         done = replace(alarm, repair=repaired.kind, iterations=repaired.iterations)
         self.alarms.append(replace(done, rg_before=repaired.before.residual, rg_after=repaired.after.residual))
         return given if repaired.kind == LEFT else self._told(repaired)
+
+    def _out_of_skin(self, frame: int, problem: StepProblem, prediction: Prediction) -> Prediction:
+        """The step with its cloth held farther off where it leaves too many triangles in the skin (:mod:`hood.scene.held_off`);
+        itself where it does not, or where that does not help."""
+        pos = prediction.next_pos
+        if prediction.entered is not None:
+            problem = replace(problem, fold=prediction.entered)
+        if not bool(torch.isfinite(pos).all()) or problem.with_held_off(pos) is problem:
+            return prediction
+        share = int(problem.num_in_skin(pos)) / len(problem.cloth.faces)
+        alarm = Alarm(frame, CUT, share, ALLOWED)
+        settings = replace(self._settings, max_iterations=self._most, budget_ms=None)
+        held = minimize_held_off(self._potential, problem, pos, settings)
+        if held.report is None:
+            self.alarms.append(replace(alarm, repair=LEFT, iterations=held.iterations))
+            return prediction
+        before = step_quality(self._potential, held.problem, replace(prediction, residual=math.nan))
+        taken = replace(prediction, next_pos=held.pos, acc=held.report.acc, residual=math.nan, held_off=held.problem.contact)
+        after = step_quality(self._potential, held.problem, taken)
+        done = RepairedStep(taken, REFINED, held.iterations, before, after)
+        told = replace(alarm, repair=REFINED, iterations=held.iterations)
+        self.alarms.append(replace(told, rg_before=before.residual, rg_after=after.residual))
+        return self._told(done)
 
     def see_surface(self, frame: int, row: Mapping[str, float]) -> None:
         """Look at what was measured of the cloth's surface in a frame."""

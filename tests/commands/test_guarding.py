@@ -122,7 +122,7 @@ def test_the_sentence_names_frames_values_and_limits() -> None:
     ]
     assert guard_sentence("repair", alarms, 11) == (
         "guard: 3 of 10 steps: forces out of balance, 120 times the weight at worst, beyond 50, in frames 3–4; the skin cuts "
-        "3.1% of the cloth's triangles at worst, beyond 2%, in frame 4; the body turns by 24 degrees in a step, beyond 15 "
+        "3.1% of the cloth's triangles at worst, beyond 2.0%, in frame 4; the body turns by 24 degrees in a step, beyond 15 "
         "(less with a higher fps=…), in frame 6; 1 of 2 steps repaired"
     )
     assert guard_sentence("report", [], 11) == ""

@@ -41,6 +41,7 @@ from hood.dynamics.stopwatch import Stopwatch
 from hood.losses.potential import default_potential
 from hood.losses.problem import StepProblem
 from hood.scene.contact import find_contact
+from hood.scene.held_off import ALLOWED
 from hood.scene.scene import Scene, build_scene
 from hood.solver.newton import NewtonSettings
 
@@ -283,6 +284,38 @@ def test_cut_cloth_is_told_where_it_is_measured() -> None:
     for row in ({}, {"cut_face_share": math.nan}, {"cut_face_share": 0.01}, {"cut_face_share": 0.5}):
         guard.see_surface(7, row)
     assert [(alarm.frame, alarm.cause, alarm.value) for alarm in guard.alarms] == [(7, CUT, 0.5)]
+
+
+def drawn_in(pos: torch.Tensor) -> torch.Tensor:
+    """All of it 8 mm backwards: triangles of its front are in the skin, and no vertex is as deep as a guard minds."""
+    return pos - torch.tensor([0.0, 0.0, 0.008]).to(pos)
+
+
+def in_skin(problem: StepProblem, pos: torch.Tensor) -> float:
+    return int(problem.num_in_skin(pos)) / len(problem.cloth.faces)
+
+
+def test_triangles_in_the_skin_are_taken_out_by_a_repair_alone(scene: Scene) -> None:
+    problem, sound = one_step(scene)
+    cut = replace(sound, next_pos=drawn_in(sound.next_pos), residual=1.0)
+    share = in_skin(problem, cut.next_pos)
+    assert in_skin(problem, sound.next_pos) <= ALLOWED < share
+    told = Guard("report", guess(12), POTENTIAL)
+    assert told.see(1, problem, cut) is cut
+    assert told.alarms == []
+    guard = Guard("repair", guess(12), POTENTIAL)
+    better = guard.see(1, problem, cut)
+    (alarm,) = guard.alarms
+    assert (alarm.frame, alarm.cause, alarm.repair) == (1, CUT, REFINED)
+    assert (alarm.value, alarm.limit) == (pytest.approx(share), ALLOWED)
+    assert alarm.rg_after < alarm.rg_before
+    assert better.held_off is not None
+    assert in_skin(problem, better.next_pos) <= ALLOWED
+    hasty = Guard("repair", guess(12), POTENTIAL, most=1)
+    assert hasty.see(1, problem, cut) is cut
+    assert [(alarm.cause, alarm.repair) for alarm in hasty.alarms] == [(CUT, LEFT)]
+    solver = Guard("repair", newton(), POTENTIAL)
+    assert solver.see(1, problem, replace(cut, residual=0.0)).next_pos is cut.next_pos
 
 
 def test_the_limit_follows_the_level_of_the_rollout(scene: Scene) -> None:
