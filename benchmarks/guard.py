@@ -3,6 +3,7 @@
     python benchmarks/guard.py                    # quickstart, quickstart+5 and newton on the validation list
     python benchmarks/guard.py --steppers ours --garments dress tshirt --motions walk_proud --frames 30
     python benchmarks/guard.py --cost             # also its time: rollouts with and without it, by turns
+    python benchmarks/guard.py --mode repair      # with guard=repair, which also looks for triangles in the skin
 
 Rollouts as of ``hood rollout`` with ``metrics=none`` and ``guard=report``. A line per rollout: median, 99.5th percentile and
 maximum of the relative gradient, of the typical vertex's force (of networks alone), of the strain p99, of the body's turn
@@ -27,7 +28,7 @@ from hood.assets.motion.load import load_sequence
 from hood.dynamics.guard import MENDED, Guard, body_motion
 from hood.dynamics.rollout import simulate
 from hood.dynamics.simulator import Prediction
-from hood.dynamics.step_repair import step_quality
+from hood.dynamics.step_repair import NOT_TRIED, step_quality
 from hood.dynamics.stepper import Stepper
 from hood.losses.layers import LayerBarrier
 from hood.losses.potential import Potential, default_potential
@@ -41,8 +42,8 @@ COLUMNS = ("rg", "typical", "strain", "turn", "way")
 class Watched(Guard):
     """A guard that keeps what it looks at."""
 
-    def __init__(self, stepper: Stepper, potential: Potential, alone: bool) -> None:
-        super().__init__("report", stepper, potential)
+    def __init__(self, mode: str, stepper: Stepper, potential: Potential, alone: bool) -> None:
+        super().__init__(mode, stepper, potential)
         self.rows: list[list[float]] = []
         self._typical = alone
 
@@ -52,16 +53,16 @@ class Watched(Guard):
         return super().see(frame, problem, prediction, figures)
 
 
-def times(stepper: Stepper, scene: Scene, potential: Potential, frames: int, guarded: bool) -> np.ndarray:
-    """Milliseconds of the frames of a rollout."""
-    guard = Guard("report", stepper, potential) if guarded else None
+def times(stepper: Stepper, scene: Scene, potential: Potential, frames: int, mode: str | None) -> np.ndarray:
+    """Milliseconds of the frames of a rollout with a guard of this mode; None for none."""
+    guard = None if mode is None else Guard(mode, stepper, potential)
     rolled = simulate(stepper, scene, potential, frames, metrics="none", settle="equilibrium", guard=guard)
     return np.array([frame.metrics["ms_total"] for frame in rolled if frame.index > 1])
 
 
-def cost(stepper: Stepper, scene: Scene, potential: Potential, frames: int, rounds: int = 4) -> float:
+def cost(mode: str, stepper: Stepper, scene: Scene, potential: Potential, frames: int, rounds: int = 4) -> float:
     """Time of a frame with a guard over that without: the median over frames of the least over rounds that take turns."""
-    both = [[times(stepper, scene, potential, frames, guarded) for guarded in (False, True)] for _ in range(rounds)]
+    both = [[times(stepper, scene, potential, frames, one) for one in (None, mode)] for _ in range(rounds)]
     without, with_it = (np.min([one[index] for one in both], axis=0) for index in (0, 1))
     return float(np.median(with_it / without))
 
@@ -83,6 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--steppers", nargs="+", default=["quickstart", "quickstart+5", "newton"])
     parser.add_argument("--frames", type=int, default=60)
     parser.add_argument("--kernels", default="torch", choices=KERNELS, help="of the network")
+    parser.add_argument("--mode", default="report", choices=("report", "repair"), help="repair also looks at the skin")
     parser.add_argument("--cost", action="store_true", help="also the time")
     chosen = parser.parse_args(arguments)
     torch.set_num_threads(1)
@@ -94,13 +96,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
             for garment in chosen.garments:
                 real = torch.float64 if solves(name) else torch.float32
                 scene = build_scene(load_garment(garment), body, load_sequence(motion, 30.0), dtype=real)
-                guard = Watched(stepper, potential, alone=not solves(name))
+                guard = Watched(chosen.mode, stepper, potential, alone=not solves(name))
                 for _ in simulate(stepper, scene, potential, chosen.frames, metrics="none", settle="equilibrium", guard=guard):
                     pass
                 rows = np.array(guard.rows)
-                found = np.array([sum(alarm.cause in MENDED for alarm in guard.alarms), len(guard.alarms)])
+                mended = [alarm for alarm in guard.alarms if alarm.cause in MENDED or alarm.repair != NOT_TRIED]
+                found = np.array([len(mended), len(guard.alarms)])
                 kept, counts = [*kept, rows], counts + found
-                ratio = f", time ×{cost(stepper, scene, potential, chosen.frames):.3f}" if chosen.cost else ""
+                ratio = f", time ×{cost(chosen.mode, stepper, scene, potential, chosen.frames):.3f}" if chosen.cost else ""
                 print(line(f"{name} {garment} {motion}", rows, *found) + ratio, flush=True)
         print(line(f"all {name}", np.concatenate(kept), *counts), flush=True)
 
