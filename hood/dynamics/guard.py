@@ -63,6 +63,7 @@ from hood.dynamics.step_repair import (
     Limits,
     RepairedStep,
     StepQuality,
+    is_better,
     repair_step,
     step_quality,
 )
@@ -206,7 +207,7 @@ class Guard:
 
     def _out_of_skin(self, frame: int, problem: StepProblem, prediction: Prediction) -> Prediction:
         """The step with its cloth held farther off where it leaves too many triangles in the skin (:mod:`hood.scene.held_off`);
-        itself where it does not, or where that does not help."""
+        itself where it does not, or where that does not help or strains it."""
         pos = prediction.next_pos
         if prediction.entered is not None:
             problem = replace(problem, fold=prediction.entered)
@@ -216,15 +217,19 @@ class Guard:
         alarm = Alarm(frame, CUT, share, ALLOWED)
         settings = replace(self._settings, max_iterations=self._most, budget_ms=None)
         held = minimize_held_off(self._potential, problem, pos, settings)
-        if held.report is None:
+        done = None
+        if held.report is not None:
+            before = step_quality(self._potential, held.problem, replace(prediction, residual=math.nan))
+            taken = replace(
+                prediction, next_pos=held.pos, acc=held.report.acc, residual=math.nan, held_off=held.problem.contact
+            )
+            after = step_quality(self._potential, held.problem, taken)
+            done = RepairedStep(taken, REFINED, held.iterations, before, after) if is_better(after, before) else None
+        if done is None:
             self.alarms.append(replace(alarm, repair=LEFT, iterations=held.iterations))
             return prediction
-        before = step_quality(self._potential, held.problem, replace(prediction, residual=math.nan))
-        taken = replace(prediction, next_pos=held.pos, acc=held.report.acc, residual=math.nan, held_off=held.problem.contact)
-        after = step_quality(self._potential, held.problem, taken)
-        done = RepairedStep(taken, REFINED, held.iterations, before, after)
         told = replace(alarm, repair=REFINED, iterations=held.iterations)
-        self.alarms.append(replace(told, rg_before=before.residual, rg_after=after.residual))
+        self.alarms.append(replace(told, rg_before=done.before.residual, rg_after=done.after.residual))
         return self._told(done)
 
     def see_surface(self, frame: int, row: Mapping[str, float]) -> None:

@@ -114,14 +114,15 @@ def repair_step(
         tries.append((kind, taken, step_quality(potential, problem, taken)))
         if tries[-1][2].within(limits):
             break
-    better = [one for one in tries if _is_better(one[2], before)]
+    better = [one for one in tries if is_better(one[2], before)]
     if not better:
         return RepairedStep(prediction, LEFT, spent, before, before)
     kind, taken, after = min(better, key=lambda one: (not one[2].within(limits), one[2].residual))
     return RepairedStep(taken, kind, spent, before, after)
 
 
-def _is_better(now: StepQuality, before: StepQuality) -> bool:
+def is_better(now: StepQuality, before: StepQuality) -> bool:
+    """Whether a repaired step is to be kept: forces are nearer to balance, and it is hardly more strained."""
     if not before.finite:
         return now.finite
     more = max(_MORE_STRAIN, _SHARE_MORE * before.strain)
