@@ -224,7 +224,9 @@ class Guard:
                 prediction, next_pos=held.pos, acc=held.report.acc, residual=math.nan, held_off=held.problem.contact
             )
             after = step_quality(self._potential, held.problem, taken)
-            done = RepairedStep(taken, REFINED, held.iterations, before, after) if is_better(after, before) else None
+            # Cloth held farther off is strained the more: within the ordinary that is no loss.
+            good = is_better(after, replace(before, strain=max(before.strain, STRAIN_LIMIT)))
+            done = RepairedStep(taken, REFINED, held.iterations, before, after) if good else None
         if done is None:
             self.alarms.append(replace(alarm, repair=LEFT, iterations=held.iterations))
             return prediction

@@ -33,7 +33,8 @@ ALARM_COLUMNS = {
     "rg_before": np.dtype(np.float64),
     "rg_after": np.dtype(np.float64),
 }
-_ALARMS = 2
+#: Alarms of a frame at most: of the step, of triangles in the skin that were taken out, and of the surface that is measured.
+_ALARMS = 3
 #: What a file may hold of the cloth beside its mesh, the same in all frames, with the types in the file.
 STILL = {
     "uv": np.float32,

@@ -276,6 +276,17 @@ def write_steps(path: Path, num_steps: int = 7) -> None:
             raise KeyboardInterrupt
 
 
+def test_three_alarms_of_every_frame_have_room(tmp_path: Path) -> None:
+    """Of the step, of triangles in the skin that were taken out, and of the surface that is measured."""
+    path = tmp_path / "r.h5"
+    alarm = {"value": 1.0, "limit": 0.5, "repair": "", "iterations": 0, "rg_before": np.nan, "rg_after": np.nan}
+    with RolloutWriter(path, 2, np.eye(4, 3), FACES, FACES[:1], 3, NAMES, 0.5, {"garment": "rag"}, guarded=True) as target:
+        append(target, 2)
+        for index in range(2):
+            target.append_alarms([{**alarm, "frame": index, "cause": cause} for cause in ("force", "cut", "cut")])
+    assert [row["cause"] for row in read_rollout(path).alarms] == 2 * ["force", "cut", "cut"]
+
+
 @pytest.mark.parametrize("num_steps", [7, 11])
 def test_simulated_frames_that_are_not_stored_have_rows_of_their_own(tmp_path: Path, num_steps: int) -> None:
     path = tmp_path / "r.h5"
