@@ -25,7 +25,7 @@ from hood.assets.body.load import load_body
 from hood.assets.files.library import motion_split
 from hood.assets.garment.garment import load_garment
 from hood.assets.motion.load import load_sequence
-from hood.dynamics.guard import MENDED, Guard, body_motion
+from hood.dynamics.guard import MENDED, Guard
 from hood.dynamics.rollout import simulate
 from hood.dynamics.simulator import Prediction
 from hood.dynamics.step_repair import NOT_TRIED, step_quality
@@ -34,6 +34,7 @@ from hood.losses.layers import LayerBarrier
 from hood.losses.potential import Potential, default_potential
 from hood.losses.problem import StepProblem
 from hood.nn.compiled import KERNELS
+from hood.scene.jumps import moved_in_step
 from hood.scene.scene import Scene, build_scene
 
 COLUMNS = ("rg", "typical", "strain", "turn", "way")
@@ -49,7 +50,7 @@ class Watched(Guard):
 
     def see(self, frame: int, problem: StepProblem, prediction: Prediction, figures: Any = None) -> Prediction:
         found = step_quality(self._potential, problem, prediction, figures, typical=self._typical)
-        self.rows.append([found.residual, found.typical, found.strain, *body_motion(problem.step.obstacle)])
+        self.rows.append([found.residual, found.typical, found.strain, *moved_in_step(problem.step.obstacle)])
         return super().see(frame, problem, prediction, figures)
 
 

@@ -20,9 +20,8 @@ Of every step the gravest of these causes is told, and of the surface what is me
   (:mod:`hood.scene.entered`); a solver has tried that already.
 - *turn*, *speed*: the body turns by more than 15 degrees as one, or its fastest vertex moves by more than 0.3 m. A jump over
   which the cloth was carried is none.
-- *cut*: the skin cuts more than 2% of the cloth's triangles, in frames where that is measured. ``repair`` looks at every step
-  of a network and of a refinement: where more than 0.5% are in the skin, their corners are held farther off
-  (:mod:`hood.scene.held_off`), as the solver does by itself.
+- *cut*: the skin cuts more than 2% of the cloth's triangles, where that is measured. Of a network or a refinement ``repair``
+  looks at every step, and holds cloth farther off (:mod:`hood.scene.held_off`) where more than 0.5% are in the skin.
 
 The limits come from the validation list: seven garments of 1,000 vertices on walk_proud, dance_mixed, plie and
 twist_and_bend, 60 frames each (``python benchmarks/guard.py``; quickstart 1,475 steps, quickstart+5 1,357, newton 1,652, ours
@@ -49,7 +48,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from statistics import median
 
-import numpy as np
 import torch
 
 from hood.dynamics.refine import RefinedStepper
@@ -63,17 +61,16 @@ from hood.dynamics.step_repair import (
     Limits,
     RepairedStep,
     StepQuality,
-    is_better,
+    out_of_skin,
     repair_step,
     step_quality,
 )
 from hood.dynamics.stepper import Stepper
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
-from hood.mesh.rigid import turned
 from hood.scene.held_off import ALLOWED
+from hood.scene.jumps import moved_in_step
 from hood.scene.state import Obstacle
-from hood.solver.held_off import minimize_held_off
 from hood.solver.newton import NewtonSettings, minimize
 from hood.solver.step_figures import StepFigures
 
@@ -110,8 +107,6 @@ CHECK_EVERY, _CHECK_ITERATIONS, CHECK_LIMIT = 20, 10, 0.03
 CHECK_GROWTH = 1.1
 #: Relative gradient that a step is repaired to where the stepper has no target of its own.
 _GOAL = 1e-2
-#: Of the body's vertices one in so many tells how it moves.
-_SPARSE = 16
 
 
 @dataclass(frozen=True)
@@ -170,8 +165,7 @@ class Guard:
             figures: of the step, where somebody has made them.
         """
         prediction = self._see(frame, problem, prediction, figures)
-        # A solver holds its steps off by itself.
-        mends = self.mode == "repair" and self._target is None
+        mends = self.mode == "repair" and self._target is None  # a solver holds its steps off by itself
         return self._out_of_skin(frame, problem, prediction) if mends else prediction
 
     def _see(self, frame: int, problem: StepProblem, prediction: Prediction, figures: StepFigures | None) -> Prediction:
@@ -206,31 +200,13 @@ class Guard:
         return given if repaired.kind == LEFT else self._told(repaired)
 
     def _out_of_skin(self, frame: int, problem: StepProblem, prediction: Prediction) -> Prediction:
-        """The step with its cloth held farther off where it leaves too many triangles in the skin (:mod:`hood.scene.held_off`);
-        itself where it does not, or where that does not help or strains it."""
-        pos = prediction.next_pos
-        if prediction.entered is not None:
-            problem = replace(problem, fold=prediction.entered)
-        if not bool(torch.isfinite(pos).all()) or problem.with_held_off(pos) is problem:
-            return prediction
-        share = int(problem.num_in_skin(pos)) / len(problem.cloth.faces)
-        alarm = Alarm(frame, CUT, share, ALLOWED)
+        """The step without too many triangles in the skin; itself where it has few, or where nothing better is found."""
         settings = replace(self._settings, max_iterations=self._most, budget_ms=None)
-        held = minimize_held_off(self._potential, problem, pos, settings)
-        done = None
-        if held.report is not None:
-            before = step_quality(self._potential, held.problem, replace(prediction, residual=math.nan))
-            taken = replace(
-                prediction, next_pos=held.pos, acc=held.report.acc, residual=math.nan, held_off=held.problem.contact
-            )
-            after = step_quality(self._potential, held.problem, taken)
-            # Cloth held farther off is strained the more: within the ordinary that is no loss.
-            good = is_better(after, replace(before, strain=max(before.strain, STRAIN_LIMIT)))
-            done = RepairedStep(taken, REFINED, held.iterations, before, after) if good else None
+        done = out_of_skin(self._potential, problem, prediction, STRAIN_LIMIT, settings)
         if done is None:
-            self.alarms.append(replace(alarm, repair=LEFT, iterations=held.iterations))
             return prediction
-        told = replace(alarm, repair=REFINED, iterations=held.iterations)
+        share = int(problem.num_in_skin(prediction.next_pos)) / len(problem.cloth.faces)
+        told = Alarm(frame, CUT, share, ALLOWED, done.kind, done.iterations)
         self.alarms.append(replace(told, rg_before=done.before.residual, rg_after=done.after.residual))
         return self._told(done)
 
@@ -316,17 +292,9 @@ def _own_settings(stepper: Stepper) -> NewtonSettings | None:
     return settings
 
 
-def body_motion(obstacle: Obstacle | None) -> tuple[float, float]:
-    """Degrees that the body turns as one in a step, and the way [m] of its fastest vertex, of one in 16; 0 without a body."""
-    if obstacle is None or not len(obstacle.pos):
-        return 0.0, 0.0
-    start, end = (pos[::_SPARSE].cpu().numpy().astype(np.float64) for pos in (obstacle.pos, obstacle.next_pos))
-    return turned(start, end), float(np.sqrt(np.square(end - start).sum(axis=1).max()))
-
-
 def _motion_alarm(frame: int, obstacle: Obstacle | None) -> Alarm | None:
     """Where the body turns or moves too far in a step; a jump over which the cloth was carried is none."""
-    turn, way = body_motion(obstacle)
+    turn, way = moved_in_step(obstacle)
     if turn > TURN_LIMIT:
         return Alarm(frame, TURN, turn, TURN_LIMIT)
     return Alarm(frame, SPEED, way, SPEED_LIMIT) if way > SPEED_LIMIT else None

@@ -12,6 +12,7 @@ from hood.dynamics.measure import strain_metrics, vertex_residual
 from hood.dynamics.simulator import Prediction
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
+from hood.solver.held_off import minimize_held_off
 from hood.solver.newton import NewtonSettings, minimize
 from hood.solver.step_figures import StepFigures
 
@@ -114,15 +115,36 @@ def repair_step(
         tries.append((kind, taken, step_quality(potential, problem, taken)))
         if tries[-1][2].within(limits):
             break
-    better = [one for one in tries if is_better(one[2], before)]
+    better = [one for one in tries if _is_better(one[2], before)]
     if not better:
         return RepairedStep(prediction, LEFT, spent, before, before)
     kind, taken, after = min(better, key=lambda one: (not one[2].within(limits), one[2].residual))
     return RepairedStep(taken, kind, spent, before, after)
 
 
-def is_better(now: StepQuality, before: StepQuality) -> bool:
-    """Whether a repaired step is to be kept: forces are nearer to balance, and it is hardly more strained."""
+@torch.no_grad()
+def out_of_skin(
+    potential: Potential, problem: StepProblem, prediction: Prediction, strain: float, settings: NewtonSettings
+) -> RepairedStep | None:
+    """The step with its cloth held farther off where it leaves too many triangles in the skin (:mod:`hood.scene.held_off`);
+    left as it was where that does not help or strains it beyond ``strain`` (99th percentile); None where it leaves few."""
+    pos = prediction.next_pos
+    if prediction.entered is not None:
+        problem = replace(problem, fold=prediction.entered)
+    if not bool(torch.isfinite(pos).all()) or problem.with_held_off(pos) is problem:
+        return None
+    held = minimize_held_off(potential, problem, pos, settings)
+    before = step_quality(potential, held.problem, replace(prediction, residual=math.nan))
+    if held.report is not None:
+        taken = replace(prediction, next_pos=held.pos, acc=held.report.acc, residual=math.nan, held_off=held.problem.contact)
+        after = step_quality(potential, held.problem, taken)
+        # Cloth held farther off is strained the more: within the ordinary that is no loss.
+        if _is_better(after, replace(before, strain=max(before.strain, strain))):
+            return RepairedStep(taken, REFINED, held.iterations, before, after)
+    return RepairedStep(prediction, LEFT, held.iterations, before, before)
+
+
+def _is_better(now: StepQuality, before: StepQuality) -> bool:
     if not before.finite:
         return now.finite
     more = max(_MORE_STRAIN, _SHARE_MORE * before.strain)
