@@ -84,6 +84,7 @@ def swung(dt: float, seconds: float, angle: float, start: Tensor) -> Tensor:
 
 
 def errors_of(angle: float, start: Tensor) -> None:
+    """Table of the errors of the strip from ``start`` (V, 3) [m], by rate and time, with the order between neighbours."""
     rates = (15, 30, 60, 120, 240, 480, 960, 1920, 3840)
     print(f"{'after':10}" + "".join(f"{f'{rate} fps':>16}" for rate in rates))
     for seconds in (0.1, 0.2, 0.4):

@@ -25,10 +25,10 @@ from hood.assets.body.load import load_body
 from hood.assets.files.library import motion_split
 from hood.assets.garment.garment import load_garment
 from hood.assets.motion.load import load_sequence
-from hood.dynamics.guard import MENDED, Guard
+from hood.dynamics.guard import Guard
 from hood.dynamics.rollout import simulate
 from hood.dynamics.simulator import Prediction
-from hood.dynamics.step_repair import NOT_TRIED, step_quality
+from hood.dynamics.step_repair import step_quality
 from hood.dynamics.stepper import Stepper
 from hood.losses.layers import LayerBarrier
 from hood.losses.potential import Potential, default_potential
@@ -101,8 +101,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 for _ in simulate(stepper, scene, potential, chosen.frames, metrics="none", settle="equilibrium", guard=guard):
                     pass
                 rows = np.array(guard.rows)
-                mended = [alarm for alarm in guard.alarms if alarm.cause in MENDED or alarm.repair != NOT_TRIED]
-                found = np.array([len(mended), len(guard.alarms)])
+                found = np.array([sum(alarm.mendable for alarm in guard.alarms), len(guard.alarms)])
                 kept, counts = [*kept, rows], counts + found
                 ratio = f", time ×{cost(chosen.mode, stepper, scene, potential, chosen.frames):.3f}" if chosen.cost else ""
                 print(line(f"{name} {garment} {motion}", rows, *found) + ratio, flush=True)

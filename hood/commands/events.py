@@ -14,7 +14,7 @@ from torch import Tensor
 from hood.assets.files.library import unknown
 from hood.assets.garment.pins import pin_mask
 from hood.config import ConfigError, plain
-from hood.scene.fastening import Event, first_step
+from hood.scene.fastening import SPEED, Event, first_step
 from hood.scene.holding import Grasp, Holding
 from hood.scene.motion import BodyMotion
 from hood.scene.scene import Scene
@@ -53,7 +53,7 @@ def checked_events(config: DictConfig) -> tuple[Asked, ...]:
         raise ConfigError(f"events={given}: give a list, {_FORM}")
     speed = config.events_speed
     if isinstance(speed, bool) or not isinstance(speed, (int, float)) or not 0.0 < speed < math.inf:
-        raise ConfigError(f"events_speed={speed}: give a speed > 0 in m/s, such as 0.25")
+        raise ConfigError(f"events_speed={speed}: give a speed > 0 in m/s, such as {SPEED:g}")
     asked = tuple(_asked(index, event) for index, event in enumerate(given))
     held = next((one for one in asked if one.action in VERTICES), None)
     if held is not None and str(config.step) != "plain":

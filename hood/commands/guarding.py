@@ -12,25 +12,11 @@ import numpy as np
 from omegaconf import DictConfig
 
 from hood.config import ConfigError, build, require_choice
-from hood.dynamics.guard import (
-    CHECK,
-    CHECK_EVERY,
-    CUT,
-    FINITE,
-    FORCE,
-    INSIDE,
-    MENDED,
-    MODES,
-    SPEED,
-    STRAIN,
-    TARGET,
-    TURN,
-    Alarm,
-    Guard,
-)
+from hood.dynamics.alarms import CHECK, CUT, FINITE, FORCE, INSIDE, SPEED, STRAIN, TARGET, TURN, Alarm
+from hood.dynamics.guard import CHECK_EVERY, MODES, Guard
 from hood.dynamics.recorder import RolloutData, RolloutWriter
 from hood.dynamics.soundness import name_frames
-from hood.dynamics.step_repair import LEFT, NOT_TRIED, REFINED, SOLVED
+from hood.dynamics.step_repair import LEFT, REFINED, SOLVED
 from hood.dynamics.stepper import Stepper
 from hood.losses.potential import Potential
 
@@ -145,7 +131,7 @@ def _named(alarms: Sequence[Alarm]) -> str:
 
 
 def _outcome(mode: str, alarms: Sequence[Alarm]) -> list[str]:
-    steps = [alarm for alarm in alarms if alarm.cause in MENDED or alarm.repair != NOT_TRIED]
+    steps = [alarm for alarm in alarms if alarm.mendable]
     if not steps:
         return []
     if mode != REPAIR:

@@ -45,18 +45,18 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from statistics import median
 
 import torch
 
+from hood.dynamics.alarms import CHECK, CUT, FINITE, FORCE, INSIDE, SPEED, STRAIN, TARGET, TURN, Alarm
 from hood.dynamics.refine import RefinedStepper
 from hood.dynamics.simulator import Prediction
 from hood.dynamics.soundness import Criteria
 from hood.dynamics.step_repair import (
     ENOUGH,
     LEFT,
-    NOT_TRIED,
     REFINED,
     Limits,
     RepairedStep,
@@ -76,12 +76,6 @@ from hood.solver.step_figures import StepFigures
 
 #: What a guard does about an alarm: writes it down, mends the step, or ends the rollout; ``off`` is no guard.
 MODES = ("report", "repair", "strict", "off")
-#: Causes, as they stand in a rollout file; of a step the gravest is told, in this order.
-FINITE, TARGET, STRAIN, FORCE, CHECK = "not finite", "target", "strain", "force", "check"
-INSIDE, TURN, SPEED, CUT = "inside", "turn", "speed", "cut"
-CAUSES = (FINITE, TARGET, STRAIN, FORCE, INSIDE, CHECK, TURN, SPEED, CUT)
-#: Those that a repair of the step can help.
-MENDED = (FINITE, TARGET, STRAIN, FORCE, INSIDE, CHECK)
 
 STRAIN_LIMIT, CUT_LIMIT = Criteria.strain, 0.02
 #: Depth of a vertex in the body [m].
@@ -107,20 +101,6 @@ CHECK_EVERY, _CHECK_ITERATIONS, CHECK_LIMIT = 20, 10, 0.03
 CHECK_GROWTH = 1.1
 #: Relative gradient that a step is repaired to where the stepper has no target of its own.
 _GOAL = 1e-2
-
-
-@dataclass(frozen=True)
-class Alarm:
-    """A limit that a frame is beyond, and what was done about it."""
-
-    frame: int
-    cause: str  # of CAUSES
-    value: float
-    limit: float
-    repair: str = NOT_TRIED  # of hood.dynamics.step_repair
-    iterations: int = 0  # of all tries
-    rg_before: float = math.nan
-    rg_after: float = math.nan
 
 
 class Guard:

@@ -72,7 +72,7 @@ class RolloutWriter:
     not resolve.
 
     With ``guarded`` there are the alarms of a guard, one a row: ``guard/frame``, ``guard/cause`` and ``guard/repair`` (words of
-    :data:`hood.dynamics.guard.CAUSES` and :mod:`hood.dynamics.step_repair`), ``guard/value`` and ``guard/limit`` (of the
+    :data:`hood.dynamics.alarms.CAUSES` and :mod:`hood.dynamics.step_repair`), ``guard/value`` and ``guard/limit`` (of the
     cause: share of strain or of cut triangles, relative gradient, degrees, m), ``guard/iterations``, ``guard/rg_before``
     and ``guard/rg_after``. The attribute ``num_alarms`` counts them; rows beyond it are empty, with the frame -1.
 

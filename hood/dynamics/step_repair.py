@@ -131,9 +131,9 @@ def out_of_skin(
     pos = prediction.next_pos
     if prediction.entered is not None:
         problem = replace(problem, fold=prediction.entered)
-    if not bool(torch.isfinite(pos).all()) or problem.with_held_off(pos) is problem:
-        return None
     held = minimize_held_off(potential, problem, pos, settings)
+    if not held.rounds:
+        return None
     before = step_quality(potential, held.problem, replace(prediction, residual=math.nan))
     if held.report is not None:
         taken = replace(prediction, next_pos=held.pos, acc=held.report.acc, residual=math.nan, held_off=held.problem.contact)

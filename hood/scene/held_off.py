@@ -26,7 +26,7 @@ from hood.scene.state import Obstacle
 ALLOWED = 0.005
 #: Corners of a triangle in the skin are held off by so much more [m], by twice as much where that was not enough, and by no
 #: more than that in all.
-RISE, MOST = 3e-3, 48e-3
+RISE, MOST = 3e-3, 45e-3
 
 
 def hold_off(

@@ -26,7 +26,8 @@ class HeldOff(NamedTuple):
     problem: StepProblem
     pos: Tensor  # (V, 3) m, its minimum
     report: Report | None  # of that minimum; what was given where nothing is held off
-    iterations: int  # that were spent on it
+    rounds: int  # so often it was taken again; 0 where few triangles are in the skin, or nothing can be held off
+    iterations: int  # that were spent on that
 
 
 def minimize_held_off(
@@ -44,7 +45,7 @@ def minimize_held_off(
         pos: (V, 3) m, its minimum.
         report: of ``pos``, which may have missed the minimum; None where it is known to be one.
     """
-    best, least, spent = HeldOff(problem, pos, report, 0), None, 0
+    best, least, rounds, spent = HeldOff(problem, pos, report, 0, 0), None, 0, 0
     misses = torch.zeros(problem.num_scenes, dtype=torch.int64, device=pos.device)
     if report is not None:
         misses += ~report.converged.to(misses.device)
@@ -57,7 +58,7 @@ def minimize_held_off(
         problem = again
         pos, found = minimize(potential, problem, pos, settings)
         pos = torch.where(torch.isfinite(pos), pos, best.pos)  # what is no number is missed, and no place to go on from
-        spent += found.iterations
+        rounds, spent = rounds + 1, spent + found.iterations
         met = found.converged.to(misses.device) & (misses < MOST_MISSES)
         misses += ~met
         if bool((misses >= MOST_MISSES).all()):
@@ -66,8 +67,8 @@ def minimize_held_off(
         better = met & (unsolved | (count < least))
         unsolved = unsolved & ~better
         least = torch.where(better, count, least)
-        best = _by_scene(better, HeldOff(problem, pos, found, 0), best)
-    return best._replace(iterations=spent)
+        best = _by_scene(better, HeldOff(problem, pos, found, 0, 0), best)
+    return best._replace(rounds=rounds, iterations=spent)
 
 
 def _by_scene(better: Tensor, new: HeldOff, old: HeldOff) -> HeldOff:
@@ -85,7 +86,7 @@ def _by_scene(better: Tensor, new: HeldOff, old: HeldOff) -> HeldOff:
     contact = replace(held, raised=torch.where(rows, held.raised, before))
     pos = torch.where(rows.unsqueeze(1), new.pos, old.pos)
     report = new.report if old.report is None or new.report is None else _merged(better, rows, new.report, old.report)
-    return HeldOff(replace(new.problem, contact=contact), pos, report, 0)
+    return HeldOff(replace(new.problem, contact=contact), pos, report, 0, 0)
 
 
 def _merged(better: Tensor, rows: Tensor, new: Report, old: Report) -> Report:

@@ -15,6 +15,7 @@ from hood.commands.event_report import describe_fasteners, describe_held
 from hood.commands.events import Asked, checked_events
 from hood.config import ConfigError, load_config
 from hood.dynamics.recorder import RolloutData, read_rollout
+from hood.scene.fastening import SPEED
 from hood.testing import grid
 
 ROLLOUT = ["rollout", "garment=flag.npz", "body=none", "sequence=none", "stepper=newton", "cloth_contact=off", "video=none",
@@ -195,3 +196,7 @@ def test_garments_without_fasteners_say_what_to_do(capsys: pytest.CaptureFixture
         "events[0]: garment 'tank' has nothing that opens or closes; wear shirt or jacket, or name pairs of your garment's"
     )
     assert message in capsys.readouterr().err
+
+
+def test_the_speed_is_one_from_the_command_line_and_from_python() -> None:
+    assert load_config("rollout").events_speed == SPEED

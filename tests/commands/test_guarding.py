@@ -13,7 +13,7 @@ from belt import write_belt, write_walk
 
 from hood.cli import main
 from hood.commands.guarding import guard_sentence
-from hood.dynamics.guard import CUT, FORCE, TURN, Alarm
+from hood.dynamics.alarms import CUT, FORCE, TURN, Alarm
 from hood.dynamics.recorder import read_rollout
 from hood.dynamics.step_repair import LEFT, REFINED
 

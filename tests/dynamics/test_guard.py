@@ -14,23 +14,8 @@ import torch
 from hood.assets.body.body import Body
 from hood.assets.garment.garment import Garment
 from hood.assets.motion.sequence import PoseSequence
-from hood.dynamics.guard import (
-    CHECK,
-    CHECK_EVERY,
-    CHECK_GROWTH,
-    CHECK_LIMIT,
-    CUT,
-    DEPTH_LIMIT,
-    FINITE,
-    FORCE,
-    INSIDE,
-    SPEED,
-    STRAIN,
-    STRAIN_LIMIT,
-    TARGET,
-    TURN,
-    Guard,
-)
+from hood.dynamics.alarms import CHECK, CUT, FINITE, FORCE, INSIDE, SPEED, STRAIN, TARGET, TURN
+from hood.dynamics.guard import CHECK_EVERY, CHECK_GROWTH, CHECK_LIMIT, DEPTH_LIMIT, STRAIN_LIMIT, Guard
 from hood.dynamics.refine import GuessStepper, RefinedStepper
 from hood.dynamics.rollout import Frame, metric_names, simulate
 from hood.dynamics.simulator import Prediction

@@ -17,7 +17,7 @@ from hood.commands.notices import heard
 from hood.commands.refinement import refined
 from hood.commands.setup import make_scene, make_stepper
 from hood.config import load_config
-from hood.dynamics.guard import CUT
+from hood.dynamics.alarms import CUT
 from hood.dynamics.rollout import simulate
 from hood.dynamics.soundness import Criteria
 from hood.dynamics.soundness import judge as judge_soundness

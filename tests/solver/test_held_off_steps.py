@@ -44,7 +44,7 @@ def test_a_step_with_few_triangles_in_the_skin_is_left_as_it_is() -> None:
     problem = on_balls(0.1)
     pos, report = solved(problem)
     kept = minimize_held_off(default_potential(), problem, pos, NewtonSettings(), report)
-    assert kept == (problem, pos, report, 0)
+    assert kept == (problem, pos, report, 0, 0)
 
 
 def test_the_minimum_with_the_fewest_triangles_in_the_skin_counts(monkeypatch: pytest.MonkeyPatch) -> None:
