@@ -166,18 +166,34 @@ class Guard:
             # A step that met the solver's target is as good as the solver can make it.
             self.alarms.append(alarm)
             return prediction
-        given = prediction
-        if depth > DEPTH_LIMIT:
-            problem = problem.with_entered(prediction.next_pos)
-            prediction = replace(prediction, residual=math.nan, entered=problem.fold)
-            now = step_quality(self._potential, problem, prediction, typical=self._alone)
-        limits = Limits(ENOUGH if self._target is None else self._target, self._strain_limit)
-        repaired = repair_step(self._potential, problem, prediction, now, limits, self._settings, self._most)
+        repaired = self._mended(problem, prediction, now, depth)
         if alarm.cause == STRAIN:
             self._allow(repaired)
         done = replace(alarm, repair=repaired.kind, iterations=repaired.iterations)
         self.alarms.append(replace(done, rg_before=repaired.before.residual, rg_after=repaired.after.residual))
-        return given if repaired.kind == LEFT else self._told(repaired)
+        return prediction if repaired.kind == LEFT else self._told(repaired)
+
+    def _mended(self, problem: StepProblem, given: Prediction, now: StepQuality, depth: float) -> RepairedStep:
+        """The step repaired, with contact where it has got into skin that it did not know of; once more where the repair got
+        deeper into such skin; left as it was where that does not help either."""
+        limits = Limits(ENOUGH if self._target is None else self._target, self._strain_limit)
+        allowed, reached, spent = max(depth, DEPTH_LIMIT), depth, 0
+        prediction, inside = given, given.next_pos
+        for tried in (False, True):
+            if reached > DEPTH_LIMIT:
+                known, problem = problem, problem.with_entered(inside)
+                if tried and problem is known:
+                    break
+                prediction = replace(given, residual=math.nan, entered=problem.fold)
+                now = step_quality(self._potential, problem, prediction, typical=self._alone)
+                # Cloth taken out of the body is strained the more: within the limit that is no loss.
+                now = replace(now, strain=max(now.strain, self._strain_limit))
+            repaired = repair_step(self._potential, problem, prediction, now, limits, self._settings, self._most)
+            inside, spent = repaired.prediction.next_pos, spent + repaired.iterations
+            reached = problem.next_depth(inside)
+            if repaired.kind == LEFT or not reached > allowed:
+                return replace(repaired, iterations=spent)
+        return RepairedStep(given, LEFT, spent, now, now)
 
     def _out_of_skin(self, frame: int, problem: StepProblem, prediction: Prediction) -> Prediction:
         """The step without too many triangles in the skin; itself where it has few, or where nothing better is found."""
@@ -185,6 +201,9 @@ class Guard:
         done = out_of_skin(self._potential, problem, prediction, STRAIN_LIMIT, settings)
         if done is None:
             return prediction
+        depth = problem.next_depth(done.prediction.next_pos)
+        if depth > max(DEPTH_LIMIT, problem.next_depth(prediction.next_pos)):
+            done = RepairedStep(prediction, LEFT, done.iterations, done.before, done.before)
         share = int(problem.num_in_skin(prediction.next_pos)) / len(problem.cloth.faces)
         told = Alarm(frame, CUT, share, ALLOWED, done.kind, done.iterations)
         self.alarms.append(replace(told, rg_before=done.before.residual, rg_after=done.after.residual))

@@ -80,7 +80,7 @@ class StepProblem:
         if obstacle is None or not len(obstacle.faces) or not len(next_pos):
             return 0.0
         dist = signed_distance(next_pos, cloth.vertex_scene, obstacle.next_pos, obstacle)
-        return float(torch.where(cloth.free, -dist, 0.0).clamp_min(0.0).max())
+        return max(-float(torch.where(cloth.free, dist, 0.0).min()), 0.0)
 
     def with_entered(self, next_pos: Tensor) -> StepProblem:
         """The problem with contact where its solution ``next_pos`` (V, 3) [m] lies in skin that it did not know of; itself

@@ -208,6 +208,13 @@ class SurfaceTree:
     def find(self, points: np.ndarray, vertices: Tensor) -> dict[str, np.ndarray]:
         """Those of them that do not depend on where the surface goes. A step ends where the next one begins: the same points
         on the same surface are not searched for again."""
+        return {name: values.copy() for name, values in self._found(points, vertices).items()}
+
+    def distances(self, points: np.ndarray, vertices: Tensor) -> np.ndarray:
+        """Signed distances (N,) alone."""
+        return self._found(points, vertices)["dist"].copy()
+
+    def _found(self, points: np.ndarray, vertices: Tensor) -> dict[str, np.ndarray]:
         count = len(points)
         self._share(num_parts(count, _POINTS))
         self._fit(vertices)
@@ -223,7 +230,7 @@ class SurfaceTree:
                 self._near[count] = found["vertex"]
                 if len(self._near) > _SIZES:
                     del self._near[next(iter(self._near))]
-        return {name: values.copy() for name, values in self._last[1].items()}
+        return self._last[1]
 
     def folds(
         self,
@@ -304,14 +311,27 @@ def distance(
         return None
     given, scene = _double(points), _only_scene(face_scene)
     if scene is not None and scene == _only_scene(point_scene):
-        dist = _tree_of(faces, None, face_scene, incidence, vertices).find(given, vertices)["dist"]
+        dist = _tree_of(faces, None, face_scene, incidence, vertices).distances(given, vertices)
         return torch.from_numpy(dist).to(points.dtype)
     dist = np.full(len(points), np.inf)
     for scene in point_scene.unique().tolist():
         rows = (point_scene == scene).numpy().nonzero()[0]
         if bool((face_scene == scene).any()):
-            dist[rows] = _tree_of(faces, scene, face_scene, incidence, vertices).find(given[rows], vertices)["dist"]
+            dist[rows] = _tree_of(faces, scene, face_scene, incidence, vertices).distances(given[rows], vertices)
     return torch.from_numpy(dist).to(points.dtype)
+
+
+def moved(start: np.ndarray, end: np.ndarray) -> tuple[float, float] | None:
+    """What :func:`hood.mesh.rigid.moved` says of points (N, 3), in one pass; None without a compiler.
+
+    The turn is the eigenvector of Horn's matrix (1987), not the singular vectors of Kabsch's: the same rotation.
+    """
+    lib = library()
+    if lib is None:
+        return None
+    both, found = [np.ascontiguousarray(points, np.float64) for points in (start, end)], np.empty(2)
+    lib.surface_moved(COUNT(len(start)), *(POINTER(array.ctypes.data) for array in (*both, found)))
+    return float(np.degrees(found[0])), float(found[1])
 
 
 @torch.no_grad()

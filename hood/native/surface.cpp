@@ -834,9 +834,65 @@ void fit_boxes(Tree& tree) {
         }
 }
 
+// The turn [rad] that takes points nearest to others about their middle, from sums Σ s eᵀ (3, 3): Horn's matrix, whose eigenvector
+// of the largest eigenvalue is its quaternion, by Jacobi's rotations.
+double turn_of(const double (&s)[3][3]) {
+    double n[4][4] = {}, q[4][4] = {};
+    n[0][0] = s[0][0] + s[1][1] + s[2][2];
+    for (int a = 0; a < 3; ++a) {
+        const int b = (a + 1) % 3, c = (a + 2) % 3;
+        n[0][a + 1] = n[a + 1][0] = s[b][c] - s[c][b];
+        n[a + 1][a + 1] = s[a][a] - s[b][b] - s[c][c];
+        n[a + 1][b + 1] = n[b + 1][a + 1] = s[a][b] + s[b][a];
+    }
+    for (int i = 0; i < 4; ++i) q[i][i] = 1.0;
+    for (int sweep = 0; sweep < 16; ++sweep) {
+        double off = 0.0, on = 0.0;
+        for (int i = 0; i < 4; ++i)
+            for (int j = 0; j < 4; ++j) (i == j ? on : off) += n[i][j] * n[i][j];
+        if (!(off > EPS * EPS * on)) break;
+        for (int i = 0; i < 3; ++i)
+            for (int j = i + 1; j < 4; ++j) {
+                const double angle = 0.5 * std::atan2(2.0 * n[i][j], n[i][i] - n[j][j]);
+                const double c = std::cos(angle), d = std::sin(angle);
+                for (int k = 0; k < 4; ++k) {
+                    const double u = n[k][i], v = n[k][j], x = q[k][i], y = q[k][j];
+                    n[k][i] = c * u + d * v, n[k][j] = c * v - d * u;
+                    q[k][i] = c * x + d * y, q[k][j] = c * y - d * x;
+                }
+                for (int k = 0; k < 4; ++k) {
+                    const double u = n[i][k], v = n[j][k];
+                    n[i][k] = c * u + d * v, n[j][k] = c * v - d * u;
+                }
+            }
+    }
+    int most = 0;
+    for (int i = 1; i < 4; ++i)
+        if (n[i][i] > n[most][most]) most = i;
+    const double x = q[1][most], y = q[2][most], z = q[3][most];
+    return 2.0 * std::atan2(std::sqrt(x * x + y * y + z * z), std::abs(q[0][most]));
+}
+
 }  // namespace
 
 extern "C" {
+
+// How points (N, 3) move as one: the turn about their middle [rad], and the longest way of one of them.
+void surface_moved(int64_t count, const double* start, const double* end, double* found) {
+    double from[3] = {}, to[3] = {}, sums[3][3] = {}, way_sq = 0.0;
+    for (int64_t i = 0; i < count; ++i) {
+        double sq = 0.0;
+        for (int k = 0; k < 3; ++k) {
+            const double s = start[3 * i + k], e = end[3 * i + k];
+            from[k] += s / (double)count, to[k] += e / (double)count, sq += (e - s) * (e - s);
+        }
+        way_sq = sq > way_sq ? sq : way_sq;
+    }
+    for (int64_t i = 0; i < count; ++i)
+        for (int a = 0; a < 3; ++a)
+            for (int b = 0; b < 3; ++b) sums[a][b] += (start[3 * i + a] - from[a]) * (end[3 * i + b] - to[b]);
+    found[0] = turn_of(sums), found[1] = std::sqrt(way_sq);
+}
 
 // Everything that depends on the topology alone, from centres (G, 3) of the faces; ``order`` holds those in the tree.
 void surface_build(Tree* tree, const double* centre) {

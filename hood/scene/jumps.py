@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hood.mesh.rigid import best_turn, turned
+from hood.mesh.rigid import best_turn, moved
 from hood.scene.motion import Motion
 from hood.scene.scene import Scene, local_origin
 from hood.scene.state import Attachments, Obstacle, State, StepInput
@@ -89,17 +89,16 @@ def carried(scene: Scene, frame: int, state: State, attachments: Attachments | N
         return torch.as_tensor((given - middle) @ turn.T + goal + (end - origin)).to(like)
 
     velocity = torch.as_tensor(state.vel.cpu().double().numpy() @ turn.T).to(like)
-    moved = State(along(state.pos, state.origin[0].numpy()), velocity, torch.as_tensor(origin).unsqueeze(0))
-    step = scene.step_input(frame, moved, attachments=attachments, jumping=True)
+    taken = State(along(state.pos, state.origin[0].numpy()), velocity, torch.as_tensor(origin).unsqueeze(0))
+    step = scene.step_input(frame, taken, attachments=attachments, jumping=True)
     assert step.obstacle is not None  # nothing jumps without a body
     earlier = motion.surface(max(frame - 1, 0), start)
     now = along(torch.as_tensor(before), start)
-    return moved, replace(step, obstacle=replace(step.obstacle, pos=now, prev_pos=along(earlier, start)))
+    return taken, replace(step, obstacle=replace(step.obstacle, pos=now, prev_pos=along(earlier, start)))
 
 
 def moved_in_step(obstacle: Obstacle | None) -> tuple[float, float]:
     """Degrees that the body turns as one in a step, and the way [m] of its fastest vertex, of one in 16; 0 without a body."""
     if obstacle is None or not len(obstacle.pos):
         return 0.0, 0.0
-    start, end = (pos[::_SPARSE].cpu().numpy().astype(np.float64) for pos in (obstacle.pos, obstacle.next_pos))
-    return turned(start, end), float(np.sqrt(np.square(end - start).sum(axis=1).max()))
+    return moved(*(pos[::_SPARSE].cpu().numpy().astype(np.float64) for pos in (obstacle.pos, obstacle.next_pos)))

@@ -14,12 +14,23 @@ import torch
 from hood.assets.body.body import Body
 from hood.assets.garment.garment import Garment
 from hood.assets.motion.sequence import PoseSequence
+from hood.dynamics import guard as guard_module
 from hood.dynamics.alarms import CHECK, CUT, FINITE, FORCE, INSIDE, SPEED, STRAIN, TARGET, TURN
 from hood.dynamics.guard import CHECK_EVERY, CHECK_GROWTH, CHECK_LIMIT, DEPTH_LIMIT, STRAIN_LIMIT, Guard
 from hood.dynamics.refine import GuessStepper, RefinedStepper
 from hood.dynamics.rollout import Frame, metric_names, simulate
 from hood.dynamics.simulator import Prediction
-from hood.dynamics.step_repair import LEFT, NOT_TRIED, REFINED, SOLVED, Limits, StepQuality, repair_step, step_quality
+from hood.dynamics.step_repair import (
+    LEFT,
+    NOT_TRIED,
+    REFINED,
+    SOLVED,
+    Limits,
+    RepairedStep,
+    StepQuality,
+    repair_step,
+    step_quality,
+)
 from hood.dynamics.stepper import NewtonStepper, Stepper
 from hood.dynamics.stopping import Count
 from hood.dynamics.stopwatch import Stopwatch
@@ -262,6 +273,31 @@ def test_cloth_inside_the_body_is_told_and_taken_out(scene: Scene) -> None:
     later = replace(obstacle, pos=obstacle.next_pos)
     depth = -find_contact(better.next_pos, problem.cloth.vertex_scene, later).dist
     assert float(depth.max()) < 3e-3
+
+
+@pytest.mark.parametrize("always", [False, True])
+def test_a_repair_that_leads_deeper_into_the_body_is_not_taken(
+    always: bool, scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem, sound = one_step(scene)
+    wild = replace(sound, next_pos=sound.next_pos * 1.3, residual=80.0)  # strained, in front of the body
+    assert not problem.next_depth(wild.next_pos) > DEPTH_LIMIT
+    calls = []
+
+    def into_the_body(*given: Any) -> RepairedStep:
+        calls.append(given[1])
+        found = repair_step(*given)
+        pos = pushed_in(sound.next_pos) if always or len(calls) == 1 else found.prediction.next_pos
+        return replace(found, kind=REFINED, prediction=replace(found.prediction, next_pos=pos))
+
+    monkeypatch.setattr(guard_module, "repair_step", into_the_body)
+    monkeypatch.setattr(StepProblem, "with_entered", lambda known, pos: replace(known))
+    guard = Guard("repair", guess(3), POTENTIAL, SETTINGS)
+    kept = guard.see(1, problem, wild)
+    assert [one is problem for one in calls] == [True, False]  # the second try knows of the skin
+    assert not problem.next_depth(kept.next_pos) > DEPTH_LIMIT
+    assert (kept is wild) == always
+    assert guard.alarms[0].repair == (LEFT if always else REFINED)
 
 
 def test_cut_cloth_is_told_where_it_is_measured() -> None:
