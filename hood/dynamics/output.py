@@ -25,7 +25,7 @@ _SMOOTHING_ROUNDS = 16
 #: A body this far away [m] has a quarter of the say over a vertex's base motion.
 _REACH = 0.03
 #: Cloth may be pressed this deep [m] into the contact zone: 3 w p² is then some seventy times a vertex's weight.
-_DEEPEST = 3e-4
+DEEPEST = 3e-4
 #: Local steps are shortened to this [m]: far from a minimum they mean little.
 _LONGEST_STEP = 5e-3
 
@@ -171,8 +171,12 @@ class VelocityBaseOutput(Output):
         contact = problem.contact
         if contact is None:
             return pos
-        depth = (self.clearance - _DEEPEST - contact.next_dist(pos)).clamp_min(0.0) * contact.valid
+        depth = (self.least_distance(problem, contact) - contact.next_dist(pos)).clamp_min(0.0) * contact.valid
         return pos + depth.unsqueeze(1) * contact.next_normal
+
+    def least_distance(self, problem: StepProblem, contact: Contact) -> Tensor | float:
+        """Distance [m] from the body that vertices, all or each of them (V,), are left at least."""
+        return self.clearance - DEEPEST
 
 
 class LocalStepOutput(VelocityBaseOutput):
@@ -224,7 +228,7 @@ class LocalStepOutput(VelocityBaseOutput):
         scale, gain = (self.scale, 0.0) if index == 0 else (self.late_scale, self.gain)
         pos, body = torch.empty_like(last), planes_of(contact)
         tables = (None if table is None else table.contiguous() for table in (raw, step, before, last))
-        limits = (scale, gain, _LONGEST_STEP, self.clearance - _DEEPEST)
+        limits = (scale, gain, _LONGEST_STEP, self.clearance - DEEPEST)
         native.call("take", body, *tables, free, fixed.contiguous(), len(pos), *limits, pos)
         return pos
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from scipy.spatial.transform import Rotation
 from small_simulators import make
@@ -18,6 +19,7 @@ from hood.dynamics.network_step import Held
 from hood.graph.builder import MESH, Graph, build_graph, build_static
 from hood.graph.hierarchy import build_hierarchy
 from hood.losses.problem import StepProblem
+from hood.scene.reach import sag
 from hood.scene.scene import Scene
 from hood.scene.state import Attachments
 
@@ -135,6 +137,20 @@ def test_vertices_near_the_body_are_anchored_and_others_follow_inertia() -> None
         assert float(more.weight.min()) >= 0
 
 
+def test_the_body_holds_a_fine_mesh_no_tighter_than_a_coarse_one() -> None:
+    """An anchor's strength goes with the area that its vertex stands for: a sheet of edges is as stiff in both."""
+    found = []
+    for rounds in (2, 3, 4):
+        problem = ball_problem(STILL, np.zeros(3), gap=2e-3, rounds=rounds)
+        output, cloth = EdgeOutput(), problem.cloth
+        weight, firm = output.weights(problem, problem.state.pos, torch.zeros(cloth.num_vertices, 2).double())
+        assert firm is not None
+        held = weight - 0.1 * cloth.mass * 30**2
+        found.append([float(part.sum()) for part in (held, firm.weight, output.held_back(problem, problem.state.pos))])
+    for coarse, fine in zip(found, found[1:], strict=False):
+        assert fine == pytest.approx(coarse, rel=0.05)
+
+
 def test_cloth_is_taken_out_of_the_body() -> None:
     problem = ball_problem(STILL, np.zeros(3))
     raw, edge_raw = draw(problem, 0.0)
@@ -143,6 +159,20 @@ def test_cloth_is_taken_out_of_the_body() -> None:
     raw[:, :3] = -2.0 * contact.next_normal  # a centimetre into it
     found = positions(problem, raw, edge_raw)
     assert float(contact.next_dist(found).min()) > 1.69e-3
+
+
+@pytest.mark.parametrize(("rounds", "share"), [(1, 1.0), (5, 0.45)])
+def test_vertices_of_fine_meshes_are_pressed_less_deep(rounds: int, share: float) -> None:
+    """Measured from where contact sets in, which is farther off the body for long edges."""
+    problem, output = ball_problem(STILL, np.zeros(3), rounds=rounds), EdgeOutput()
+    cloth, contact = problem.cloth, problem.contact
+    assert contact is not None
+    found = output.outside(problem, 0.9 * problem.state.pos)
+    onset = output.clearance + sag(cloth, contact, problem.state.pos)
+    edge = cloth.edge_length_sq.sqrt().clamp_max(17e-3)
+    depth = onset - contact.next_dist(found)
+    torch.testing.assert_close(depth, 3e-4 * edge / 17e-3, rtol=1e-6, atol=1e-12)
+    assert float(depth.mean()) == pytest.approx(3e-4 * share, rel=0.2)
 
 
 def test_a_model_file_names_its_output(tmp_path: Path, tank_scene: Scene) -> None:

@@ -20,10 +20,10 @@ from hood.testing import sphere
 RADIUS = 0.2
 
 
-def ball_problem(turn: np.ndarray, move: np.ndarray, gap: float = 4e-3, vel: float = 0.0) -> StepProblem:
-    """A spherical cloth around a ball that makes a rigid motion."""
+def ball_problem(turn: np.ndarray, move: np.ndarray, gap: float = 4e-3, vel: float = 0.0, rounds: int = 2) -> StepProblem:
+    """A spherical cloth, an icosahedron divided in ``rounds``, around a ball that makes a rigid motion."""
     pos, faces = sphere(3, RADIUS)
-    cloth_pos, cloth_faces = sphere(2, RADIUS + gap)
+    cloth_pos, cloth_faces = sphere(rounds, RADIUS + gap)
     cloth = build_cloth(cloth_pos, cloth_faces, Material(), dtype=torch.float64)
     now = torch.as_tensor(pos)
     after = torch.as_tensor(pos @ turn.T + move)
