@@ -3,7 +3,8 @@
     python scripts/cut_pieces.py outputs/pieces
 
 Writes ``dress_side.npz``, ``dress_side_right.npz`` and ``skirt_front.npz``: bands of the meshes of 12,000 vertices from top to
-bottom, held at their upper rims. Long waves cross as many edges in them as in the whole garment.
+bottom, held at their upper rims. Long waves cross as many edges in them as in the whole garment. ``dress_front_fine.npz``,
+``dress_back_fine.npz`` and ``skirt_front_fine.npz`` are narrower ones with every face cut into four, edges of 5 mm.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hood.assets.extremes.garments import FAULTS
 from hood.assets.garment.alterations import piece_of
 from hood.assets.garment.garment import Garment, load_garment, save_garment
 
@@ -21,6 +23,13 @@ from hood.assets.garment.garment import Garment, load_garment, save_garment
 _SHARE, _HEIGHTS = 0.42, 40
 #: Held are vertices this far [m] below the top: of the dress at the shoulder, of the skirt at its waistband.
 _SHOULDER, _WAIST = 0.05, 0.02
+#: Fine bands: garment, depth [m] of what is held at least, and the angles [rad] about the vertical axis between which they lie,
+#: 0 in front.
+_FINE = {
+    "dress_front_fine": ("dress_12k", _SHOULDER, 0.05, 0.62),
+    "dress_back_fine": ("dress_12k", _SHOULDER, -3.0, -2.45),
+    "skirt_front_fine": ("skirt_12k", 3.7e-3, -0.4, 0.2),
+}
 
 
 def beyond(centres: np.ndarray, sign: float) -> np.ndarray:
@@ -50,12 +59,23 @@ def pieces() -> list[Garment]:
     return [*found, held("skirt_front", piece, piece.worn_pos[:, 1].max(), _WAIST)]
 
 
+def fine_pieces() -> list[Garment]:
+    found = []
+    for name, (garment, depth, least, most) in _FINE.items():
+        whole = FAULTS["subdivide"](load_garment(garment), 1.0, np.random.default_rng(0))
+        centres = whole.worn_pos[whole.faces].mean(axis=1)
+        angle = np.arctan2(centres[:, 0], centres[:, 2])
+        piece = piece_of(whole, (angle > least) & (angle < most))
+        found.append(held(name, piece, piece.worn_pos[:, 1].max(), depth))
+    return found
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     folder = parser.parse_args().folder
     folder.mkdir(parents=True, exist_ok=True)
-    for piece in pieces():
+    for piece in [*pieces(), *fine_pieces()]:
         save_garment(folder / f"{piece.name}.npz", piece)
         print(f"{folder / piece.name}.npz: {len(piece.rest_pos)} vertices, {int(piece.pinned.sum())} held")
 

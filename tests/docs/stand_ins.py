@@ -174,7 +174,8 @@ class Desk:
 
     def piece(self, name: str, words: Sequence[str]) -> Path:
         def make(folder: Path) -> None:
-            for piece in runpy.run_path(str(ROOT / "scripts" / "cut_pieces.py"))["pieces"]():
+            script = runpy.run_path(str(ROOT / "scripts" / "cut_pieces.py"))
+            for piece in [*script["pieces"](), *script["fine_pieces"]()]:
                 save_garment(folder / f"{piece.name}.npz", piece)
 
         return self._once("pieces", make) / Path(name).name

@@ -73,7 +73,7 @@ RUN = (
     Run(r"precision\.py", "", r"\| met \|"),
     Run(r"record_ranges\.py", "", r"trained on fps", (r"FILE KEY=VALUE …", "FILE.safetensors model=small model.latent_dim=8")),
     Run(r"scaling\.py report", "", r"γ median"),
-    Run(r"cut_pieces\.py", "", r"skirt_front\.npz: 4719 vertices"),
+    Run(r"cut_pieces\.py", "", r"skirt_front\.npz: 4719 vertices(.|\n)*skirt_front_fine\.npz: 4519 vertices"),
     Run(r"solver\.py", "--sides 9 --frames 2", r"one local sweep, 81 vertices"),
     Run(r"starts\.py", "--models quickstart --states 1 --kernels torch", r"lower of quickstart", slow=True),
     Run(
@@ -173,7 +173,11 @@ def test_a_script_runs(
     if "events_picture" in line:
         assert (tmp_path / "events.png").stat().st_size
     if "cut_pieces" in line:
-        assert {path.name for path in (tmp_path / "pieces").iterdir()} >= {"dress_side.npz", "skirt_front.npz"}
+        assert {path.name for path in (tmp_path / "pieces").iterdir()} >= {
+            "dress_side.npz",
+            "skirt_front.npz",
+            "dress_back_fine.npz",
+        }
     done.add(tuple(words))
 
 
