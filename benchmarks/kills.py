@@ -132,7 +132,7 @@ def children(pid: int) -> Iterator[int]:
 
 def results(folder: Path) -> list[Path]:
     """Files that the command has left and that are to open; event files of tensorboard are named by the second."""
-    files = sorted(path for path in folder.rglob("*") if path.is_file() and path.suffix != PARTIAL)
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and PARTIAL not in path.name)
     return [path for path in files if path.parent.name != "tensorboard"]
 
 
@@ -239,7 +239,7 @@ def judge(case: Case, kills: int, rng: random.Random, counts: Counter[str], scra
             continue
         found = {path.relative_to(folder): fingerprint(path) for path in results(folder)}
         wrong += [f"turn {turn}: {name} {verb}" for name, verb in differences(expected, found)]
-        wrong += [f"turn {turn}: {path} was left" for path in folder.rglob(f"*{PARTIAL}")]
+        wrong += [f"turn {turn}: {path} was left" for path in folder.rglob(f"*{PARTIAL}*")]
     return wrong
 
 

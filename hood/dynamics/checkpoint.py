@@ -14,7 +14,7 @@ from torch import Tensor
 
 from hood import plugins
 from hood.assets.files.atomic import write_atomically
-from hood.assets.files.library import first_line
+from hood.assets.files.guarded import first_line
 from hood.dynamics.parts import plugins_of
 from hood.dynamics.ranges import Conditions
 from hood.dynamics.simulator import Simulator, build_simulator

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hood.assets.files.atomic import write_atomically
+
 logger = logging.getLogger(__name__)
 Picture = NDArray[np.uint8]
 
@@ -26,9 +28,9 @@ def save_png(path: str | Path, image: Picture) -> Path:
         raise ImportError(f"PNG files {_PICTURES_HINT}") from error
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = _partial(path)
-    Image.fromarray(np.ascontiguousarray(image)).save(partial, format="PNG")
-    os.replace(partial, path)
+    packed = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(image)).save(packed, format="PNG")
+    write_atomically(path, packed.getvalue())
     return path
 
 
@@ -133,7 +135,8 @@ class VideoWriter:
 
 
 def _partial(path: Path) -> Path:
-    return path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+    """Always the same: what a process that was killed left under it is written over by the next."""
+    return path.with_name(f".{path.stem}.partial{path.suffix}")
 
 
 def _find_ffmpeg() -> Any:

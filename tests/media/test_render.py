@@ -242,3 +242,26 @@ def test_video_writer_refuses_bad_input(tmp_path: Path) -> None:
         shoot(tmp_path / "film.gif", [frames()[0], frames(height=20)[0]])
     with pytest.raises(ValueError, match="no frames"):
         shoot(tmp_path / "film.gif", [])
+
+
+@needs_pillow
+def test_what_a_killed_process_left_is_gone_after_the_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    picture = np.zeros((16, 16, 3), np.uint8)
+
+    def killed(*names: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as dying:
+        dying.setattr(Path, "unlink", lambda path, missing_ok=False: None)
+        dying.setattr("os.replace", killed)
+        with pytest.raises(KeyboardInterrupt):
+            save_png(tmp_path / "a.png", picture)
+        with pytest.raises(KeyboardInterrupt), VideoWriter(tmp_path / "a.mp4", fps=30.0) as writer:
+            writer.append(picture)
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left
+    assert not left & {"a.png", "a.mp4", "a.gif"}
+    save_png(tmp_path / "a.png", picture)
+    with VideoWriter(tmp_path / "a.mp4", fps=30.0) as writer:
+        writer.append(picture)
+    assert {path.name for path in tmp_path.iterdir()} == {"a.png", writer.path.name}

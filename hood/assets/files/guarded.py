@@ -13,6 +13,16 @@ class Refused(pickle.UnpicklingError):
     """A name or a value that is not read; the message starts with it."""
 
 
+#: Characters of another library's message that are passed on; some quote the file.
+_REASON = 300
+
+
+def first_line(error: Exception) -> str:
+    """What an error says, in one line that is not too long."""
+    said = str(error).splitlines()[0] if str(error) else type(error).__name__
+    return said if len(said) <= _REASON else f"{said[:_REASON]} …"
+
+
 def check_size(path: str | Path, size_limit: int) -> Path:
     """The path of an existing file that is not larger than ``size_limit`` [bytes]."""
     path = Path(path).expanduser()
@@ -31,8 +41,7 @@ def guarded(path: Path, what: str, read: Callable[[], Any]) -> Any:
     except (MemoryError, RecursionError) as error:
         raise ValueError(unreadable(path, what, f"{type(error).__name__} while reading it")) from error
     except Exception as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ValueError(unreadable(path, what, reason)) from error
+        raise ValueError(unreadable(path, what, first_line(error))) from error
 
 
 def unreadable(path: str | Path, what: str, reason: str) -> str:

@@ -13,7 +13,7 @@ from typing import IO
 import numpy as np
 
 from hood.assets.files.foreign_formats import require_readable
-from hood.assets.files.guarded import unreadable
+from hood.assets.files.guarded import first_line, unreadable
 
 DATA_FOLDER = Path(__file__).resolve().parents[2] / "data"
 #: Content beyond this size [bytes] is not read into memory.
@@ -107,11 +107,6 @@ def read_arrays(path: Path, required: Iterable[str], what: str, size_limit: int 
     if missing:
         raise ValueError(f"{path}: not a {what} file: key {missing[0]!r} is missing (found {sorted(arrays)[:8]})")
     return arrays
-
-
-def first_line(error: Exception) -> str:
-    """What an error says, in one line."""
-    return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
 def _members(archive: zipfile.ZipFile, required: set[str], size_limit: int) -> dict[str, np.ndarray]:

@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 
+from hood.assets.files.guarded import first_line
 from hood.assets.files.h5_links import own_dataset
-from hood.assets.files.library import SIZE_LIMIT, first_line, read_arrays
+from hood.assets.files.library import SIZE_LIMIT, read_arrays
 from hood.assets.formats.mesh_file import read_mesh
 from hood.assets.pickles.unpickle import load_pickle
 
