@@ -4,7 +4,7 @@
 
 Writes ``dress_side.npz``, ``dress_side_right.npz`` and ``skirt_front.npz``: bands of the meshes of 12,000 vertices from top to
 bottom, held at their upper rims. Long waves cross as many edges in them as in the whole garment. ``dress_front_fine.npz``,
-``dress_back_fine.npz`` and ``skirt_front_fine.npz`` are narrower ones with every face cut into four, edges of 5 mm.
+``dress_back_fine.npz`` and ``skirt_front_fine.npz`` are narrower ones with every face cut into four, edges of 4 to 5 mm.
 """
 
 from __future__ import annotations

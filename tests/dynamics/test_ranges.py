@@ -158,7 +158,7 @@ def test_the_shipped_files_say_what_they_were_trained_for(name: str, garments: d
     for garment in garments.values():
         cloth = build_cloth(garment.rest_pos, garment.faces, Material())
         assert outside(trained, scene_conditions(garment, cloth, 1 / 30, default_potential(), np.zeros(10))) == []
-    expected = {"quickstart": "11.7 to 39.6 mm", "edges": "7.14 to 39.6 mm"}.get(name, "22.2 to 39.7 mm")
+    expected = {"quickstart": "11.7 to 39.6 mm", "edges": "3.57 to 39.6 mm"}.get(name, "22.2 to 39.7 mm")
     assert describe(trained)["trained on garment mean edge"] == expected
 
 
