@@ -102,10 +102,8 @@ class EdgeOutput(VelocityBaseOutput):
         inertia = _INERTIA * cloth.mass / problem.vertex_dt.squeeze(1) ** 2
         if contact is None:
             return inertia, None
-        near, (towards, along) = (
-            self.nearness(problem, start) * _area(cloth),
-            torch.exp(raw.clamp(-_RANGE, _RANGE)).unbind(dim=1),
-        )
+        near = self.nearness(problem, start) * _area(cloth)
+        towards, along = torch.exp(raw.clamp(-_RANGE, _RANGE)).unbind(dim=1)
         least = _ALONG * torch.minimum(along, towards * (_TOWARDS / _ALONG))
         return inertia + near * least, Firm(near * (_TOWARDS * towards - least), contact.next_normal)
 
@@ -118,6 +116,7 @@ class EdgeOutput(VelocityBaseOutput):
         return (1.0 - gap / _NEAR).clamp(0.0, 1.0) * contact.valid
 
     def base(self, problem: StepProblem) -> Tensor:
+        """Taken out of the body as the result is."""
         return self.outside(problem, super().base(problem))
 
     def least_distance(self, problem: StepProblem, contact: Contact) -> Tensor:
