@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from hood.dynamics.step_repair import NOT_TRIED
+from hood.dynamics.step_repair import NOT_TRIED, RepairedStep
 
 #: Causes, as they stand in a rollout file; of a step the gravest is told, in this order.
 FINITE, TARGET, STRAIN, FORCE, CHECK = "not finite", "target", "strain", "force", "check"
@@ -32,3 +32,8 @@ class Alarm:
     def mendable(self) -> bool:
         """Whether a repair can help, or has been tried."""
         return self.cause in _MENDED or self.repair != NOT_TRIED
+
+    def repaired(self, done: RepairedStep) -> Alarm:
+        """With what was done about it."""
+        before, after = done.before.residual, done.after.residual
+        return replace(self, repair=done.kind, iterations=done.iterations, rg_before=before, rg_after=after)

@@ -102,7 +102,7 @@ class EdgeOutput(VelocityBaseOutput):
         inertia = _INERTIA * cloth.mass / problem.vertex_dt.squeeze(1) ** 2
         if contact is None:
             return inertia, None
-        near = self.nearness(problem, start) * _area(cloth)
+        near = self.held_area(problem, start)
         towards, along = torch.exp(raw.clamp(-_RANGE, _RANGE)).unbind(dim=1)
         least = _ALONG * torch.minimum(along, towards * (_TOWARDS / _ALONG))
         return inertia + near * least, Firm(near * (_TOWARDS * towards - least), contact.next_normal)
@@ -126,7 +126,11 @@ class EdgeOutput(VelocityBaseOutput):
         return self.clearance + sag(cloth, contact, problem.state.pos) - DEEPEST * _area(cloth).clamp_max(1.0).sqrt()
 
     def held_back(self, problem: StepProblem, base: Tensor) -> Tensor:
-        return _VIEW * self.nearness(problem, base) * _area(problem.cloth)
+        return _VIEW * self.held_area(problem, base)
+
+    def held_area(self, problem: StepProblem, pos: Tensor) -> Tensor:
+        """Part of :func:`_area` (V,) by which the body holds vertices at ``pos`` (V, 3) [m], all of it where they touch it."""
+        return self.nearness(problem, pos) * _area(problem.cloth)
 
 
 def _area(cloth: Cloth) -> Tensor:

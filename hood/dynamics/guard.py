@@ -169,8 +169,7 @@ class Guard:
         repaired = self._mended(problem, prediction, now, depth)
         if alarm.cause == STRAIN:
             self._allow(repaired)
-        done = replace(alarm, repair=repaired.kind, iterations=repaired.iterations)
-        self.alarms.append(replace(done, rg_before=repaired.before.residual, rg_after=repaired.after.residual))
+        self.alarms.append(alarm.repaired(repaired))
         return prediction if repaired.kind == LEFT else self._told(repaired)
 
     def _mended(self, problem: StepProblem, given: Prediction, now: StepQuality, depth: float) -> RepairedStep:
@@ -205,8 +204,7 @@ class Guard:
         if depth > max(DEPTH_LIMIT, problem.next_depth(prediction.next_pos)):
             done = RepairedStep(prediction, LEFT, done.iterations, done.before, done.before)
         share = int(problem.num_in_skin(prediction.next_pos)) / len(problem.cloth.faces)
-        told = Alarm(frame, CUT, share, ALLOWED, done.kind, done.iterations)
-        self.alarms.append(replace(told, rg_before=done.before.residual, rg_after=done.after.residual))
+        self.alarms.append(Alarm(frame, CUT, share, ALLOWED).repaired(done))
         return self._told(done)
 
     def see_surface(self, frame: int, row: Mapping[str, float]) -> None:
@@ -253,8 +251,7 @@ class Guard:
         kind = REFINED if after.residual < now.residual else LEFT
         taken = prediction if kind == LEFT else Prediction(pos, report.acc, prediction.metrics)
         repaired = RepairedStep(taken, kind, report.iterations, now, after if kind == REFINED else now)
-        done = replace(alarm, repair=kind, iterations=repaired.iterations)
-        return replace(done, rg_before=repaired.before.residual, rg_after=repaired.after.residual), self._told(repaired)
+        return alarm.repaired(repaired), self._told(repaired)
 
     def _force(self, now: StepQuality) -> float:
         return now.typical if self._alone else now.residual

@@ -208,13 +208,14 @@ class SurfaceTree:
     def find(self, points: np.ndarray, vertices: Tensor) -> dict[str, np.ndarray]:
         """Those of them that do not depend on where the surface goes. A step ends where the next one begins: the same points
         on the same surface are not searched for again."""
-        return {name: values.copy() for name, values in self._found(points, vertices).items()}
+        return {name: values.copy() for name, values in self._closest(points, vertices).items()}
 
     def distances(self, points: np.ndarray, vertices: Tensor) -> np.ndarray:
         """Signed distances (N,) alone."""
-        return self._found(points, vertices)["dist"].copy()
+        return self._closest(points, vertices)["dist"].copy()
 
-    def _found(self, points: np.ndarray, vertices: Tensor) -> dict[str, np.ndarray]:
+    def _closest(self, points: np.ndarray, vertices: Tensor) -> dict[str, np.ndarray]:
+        """The arrays that are remembered themselves: not to be written to."""
         count = len(points)
         self._share(num_parts(count, _POINTS))
         self._fit(vertices)
