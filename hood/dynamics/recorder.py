@@ -17,6 +17,7 @@ import numpy as np
 
 from hood.assets.files.h5_links import own_dataset, own_group
 from hood.assets.garment.garment import Garment
+from hood.dynamics.row_writer import RowWriter
 from hood.dynamics.step_table import StepPlan, Steps, StepTable, read_steps, step_paths, still_step_paths
 from hood.scene.fastening import Fastening
 
@@ -134,6 +135,8 @@ class RolloutWriter:
             for key, value in {**own, **attributes}.items():
                 self._file.attrs[key] = value if np.isscalar(value) or isinstance(value, np.ndarray) else json.dumps(value)
             self._touch_all()
+            by_frame = ("cloth/pos", "body/pos", *_field_paths(self._file), *_metric_paths(self._file))
+            self._rows = {name: RowWriter(self._file[name]) for name in by_frame}
             self._file.flush()
             self._take_name()
         except OSError as error:
@@ -151,13 +154,13 @@ class RolloutWriter:
         fields: Mapping[str, np.ndarray] | None = None,
     ) -> None:
         """Write one frame: world positions (V, 3) and (W, 3) [m], its metrics and its fields (V,)."""
-        frame = self.frames_done
-        self._file["cloth/pos"][frame] = cloth_pos
-        self._file["body/pos"][frame] = body_pos
+        frame, rows = self.frames_done, self._rows
+        rows["cloth/pos"].write(frame, cloth_pos)
+        rows["body/pos"].write(frame, body_pos)
         for name, value in metrics.items():
-            self._file[f"metrics/{name}"][frame] = value
+            rows[f"metrics/{name}"].write(frame, value)
         for name, values in (fields or {}).items():
-            self._file[f"cloth/{name}"][frame] = values
+            rows[f"cloth/{name}"].write(frame, values)
         self._file.flush()  # the frame before its count, for those who read meanwhile
         self.frames_done += 1
         self._file.attrs.modify("num_frames", self.frames_done)

@@ -10,6 +10,7 @@ import numpy as np
 
 from hood.assets.files.h5_links import own_dataset, own_group
 from hood.dynamics.output_rate import OutputRate
+from hood.dynamics.row_writer import RowWriter
 
 _METRICS, _FINITE, _VERTICES, _POS = "steps/metrics", "steps/finite", "steps/vertices", "steps/pos"
 
@@ -62,14 +63,15 @@ class StepTable:
         file.create_dataset(_POS, (count, len(self._vertices), 3), dtype=np.float64, fillvalue=np.nan)
         own = {"output_fps": rate.fps, "simulated_fps": rate.simulated_fps, "num_steps": 0, "steps_planned": count}
         file.attrs.update(own)
+        self._rows = {name: RowWriter(file[name]) for name in step_paths(file)}
 
     def append(self, cloth_pos: np.ndarray, metrics: Mapping[str, float]) -> None:
         """Write one simulated frame: positions (V, 3) [m], world, and its metrics."""
         for name, value in metrics.items():
-            self._file[f"{_METRICS}/{name}"][self.done] = value
+            self._rows[f"{_METRICS}/{name}"].write(self.done, value)
         if len(self._vertices):
-            self._file[_POS][self.done] = cloth_pos[self._vertices]
-        self._file[_FINITE][self.done] = bool(np.isfinite(cloth_pos).all())
+            self._rows[_POS].write(self.done, cloth_pos[self._vertices])
+        self._rows[_FINITE].write(self.done, np.isfinite(cloth_pos).all())
         self._file.flush()
         self.done += 1
         self._file.attrs.modify("num_steps", self.done)

@@ -31,7 +31,7 @@ def choose_windows(motion: Motion, num_frames: int, count: int, length: int) -> 
     """
     last = num_frames - 1 - length
     if last < 0:
-        raise ValueError(f"the motion has {num_frames} frames, a window takes {length + 1}; give fewer frames=…")
+        raise ValueError(f"{num_frames} frames are too few for a window of {length + 1}")
     frames = np.unique(np.linspace(0, last, min(last + 1, _MOST_POSES)).round().astype(int))
     if motion.num_vertices == 0 or len(frames) < 4:
         even = np.linspace(0, last, min(count, last + 1)).round().astype(int)

@@ -91,6 +91,14 @@ def test_what_does_not_fit_is_told_in_a_line(
     assert told.count("\n") == 1
 
 
+def test_too_few_frames_to_plan_are_told_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["rollout", *WORDS[:3], *QUIET, "num_frames=3", "accuracy=0.01", f"output={tmp_path / 'out'}"]) == 2
+    said = capsys.readouterr().err
+    assert "a plan: 3 frames are too few for a window of 7; give more frames (num_frames" in said
+    assert "no accuracy=" in said
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_plan_is_not_of_objects() -> None:
     with pytest.raises(ValueError, match="accuracy=0.01: a plan names garment"):
         hood.simulate(hood.load_garment("tank"), accuracy=0.01)

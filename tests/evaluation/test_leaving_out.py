@@ -75,7 +75,7 @@ def test_windows_begin_at_the_start_and_do_not_overlap(tank_scene: Scene) -> Non
     firsts = sorted(window.first for window in found)
     assert all(second - first >= 1 for first, second in zip(firsts, firsts[1:], strict=False))
     assert firsts[-1] + 2 <= count - 1
-    with pytest.raises(ValueError, match="fewer frames"):
+    with pytest.raises(ValueError, match="too few for a window of"):
         choose_windows(tank_scene.motion, count, 1, count)
 
 
