@@ -40,7 +40,10 @@ def write_section(path: Path, rows: Rows, models: Sequence[str]) -> None:
 
 
 def section(rows: Rows, models: Sequence[str]) -> str:
-    """Shares of the classes, ranges of the factors, and every cell that is not sound, in Markdown."""
+    """Shares of the classes, ranges of the factors, and every cell that is not sound, in Markdown.
+
+    The cells of a method that is not sound in the nominal scene are counted, not listed: they are most of the map.
+    """
     parts = [_origin(rows, models), _shares(rows, models), _ranges(rows, models), _worse(rows, models)]
     return "\n\n".join(parts)
 
@@ -105,11 +108,20 @@ def _runs(sound: Sequence[bool]) -> Iterator[list[int]]:
 
 
 def _worse(rows: Rows, models: Sequence[str]) -> str:
+    nominal = {row["model"]: row for row in rows if row["factor"] == NOMINAL and row["class"] not in (SOUND, REFUSED)}
     lines = ["Settings that are not sound, with the methods and the cause:", ""]
     for (factor, value, garment), group in groupby(rows, key=lambda row: (row["factor"], row["value"], row["garment"])):
-        bad = [row for row in group if row["class"] not in (SOUND, REFUSED)]
+        bad = [row for row in group if row["class"] not in (SOUND, REFUSED) and row["model"] not in nominal]
         if bad:
-            causes = "; ".join(f"{row['model']}: {row['class']}, {row['reasons'].replace('; ', ', ')}" for row in bad)
             name = f"{factor} {value}" + ("" if factor in (NOMINAL, "garment", "input") else f" ({garment})")
-            lines.append(f"- **{name}** {causes}")
+            lines.append(f"- **{name}** " + "; ".join(f"{row['model']}: {_cause(row)}" for row in bad))
+    for model in (model for model in models if model in nominal):
+        count = sum(row["model"] == model and row["class"] not in (SOUND, REFUSED) for row in rows)
+        lines.append(
+            f"- **{model}** is not sound in the nominal scene: {_cause(nominal[model])}. The page has its {count} settings"
+        )
     return "\n".join(lines) if len(lines) > 2 else "Every setting is sound for every method."
+
+
+def _cause(row: Mapping[str, Any]) -> str:
+    return f"{row['class']}, {row['reasons'].replace('; ', ', ')}"

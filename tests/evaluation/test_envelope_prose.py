@@ -58,6 +58,18 @@ def test_the_section_replaces_what_was_between_the_marks(tmp_path: Path) -> None
     assert "input" not in text.replace("bad input", "")
 
 
+def test_methods_that_fail_in_the_nominal_scene_are_counted_alone() -> None:
+    good, bad = ({"model": model, "weights": "none"} for model in ("newton", "ours"))
+    found = [row | good for row in rows("nominal", {"all": SOUND}) + rows("spin", {"1": SOUND, "2": SILENT})]
+    found += [row | bad for row in rows("nominal", {"all": DEGRADED}) + rows("spin", {"1": SOUND, "2": DEGRADED})]
+    text = section(sorted(found, key=lambda row: (row["factor"], row["value"])), ["newton", "ours"])
+    assert "- **spin 2 (dress)** newton: silent, too far at 2\n" in text
+    assert text.endswith(
+        "- **ours** is not sound in the nominal scene: degraded and said, too far at all. The page has its 2 settings"
+    )
+    assert text.count("ours:") == 0
+
+
 def test_a_map_without_a_fault_says_so_and_marks_are_needed(tmp_path: Path) -> None:
     assert "Every setting is sound for every method." in section(rows("spin", {"1": SOUND}), ["newton"])
     path = tmp_path / "page.md"
