@@ -28,15 +28,15 @@ _LOOKS = {
     REFUSED: ("#c3c8cf", "– ", "bad input, refused in one sentence; in no share"),
 }
 _STYLE = """
-.map td { padding: 0; } .map th { position: sticky; left: 0; } .map tbody + tbody { border-top: 2px solid #999; }
-.map td a { display: block; padding: .2em .6em; color: #222; text-decoration: none; min-width: 5.5em; }
+td { white-space: normal; } .map td { padding: 0; } .map tbody th { white-space: normal; max-width: 15em; } .map tbody + tbody { border-top: 2px solid #999; }
+.map td a { display: block; padding: .2em .6em; color: #222; text-decoration: none; min-width: 4em; }
 .map td a:hover { outline: 2px solid #222; }
 .cell { display: none; position: fixed; top: 0; right: 0; bottom: 0; width: min(760px, 92vw); overflow-y: auto; z-index: 2;
   background: #fff; border-left: 3px solid #555; padding: 0 1.4em 2em; box-shadow: -6px 0 24px #0004; box-sizing: border-box; }
 .cell:target { display: block; } .cell h2 { margin-top: 1em; }
 .cell img { max-width: 100%; } .cell svg { width: 100%; height: auto; }
 .cell code { white-space: pre-wrap; overflow-wrap: anywhere; background: #f3f3f3; display: block; padding: .6em; }
-.cell td { white-space: normal; } .close { float: right; margin-top: 1.2em; } .sign { padding: .1em .6em; }
+.close { float: right; margin-top: 1.2em; } .sign { padding: .1em .6em; }
 """ + "\n".join(f".k{index} {{ background: {_LOOKS[kind][0]}; }}" for index, kind in enumerate(CLASSES))
 
 
