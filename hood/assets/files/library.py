@@ -77,7 +77,7 @@ def unknown(what: str, given: str, known: Iterable[str]) -> str:
 
 def nearest(given: str, known: Iterable[str]) -> str | None:
     """The known name that a misspelt one is likeliest to mean; None where none is near."""
-    return next(iter(difflib.get_close_matches(given, list(known), n=1, cutoff=0.5)), None)
+    return next(iter(difflib.get_close_matches(given, list(known), n=1, cutoff=0.6)), None)
 
 
 def motion_split() -> dict[str, list[str]]:
