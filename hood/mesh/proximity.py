@@ -207,7 +207,11 @@ def build_fans(vertices: Tensor, incidence: Incidence) -> Fans:
     edges = vertices.new_empty(rows, 6, slots)
     for i, corner in enumerate((incidence.following.reshape(-1), incidence.preceding.reshape(-1))):
         for k, axis in enumerate(axes):
-            torch.sub(axis.index_select(0, corner).view(rows, slots), axis.unsqueeze(1), out=edges[:, 3 * i + k])
+            there, here, place = axis.index_select(0, corner).view(rows, slots), axis.unsqueeze(1), edges[:, 3 * i + k]
+            if type(vertices) is Tensor:
+                torch.sub(there, here, out=place)
+            else:  # a compiler takes no result with gaps
+                place.copy_(there - here)
     u = edges[:, :3].unbind(dim=1)
     return Fans(edges, _sum_products(u, u))
 

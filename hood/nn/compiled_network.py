@@ -223,7 +223,8 @@ class Inference:
         sets, rows = [part.edges for part in chosen], [part.rows for part in chosen]
         self._subsets = (_Edges * len(sets))(*(_pointers(*pair) for pair in zip(sets, rows, strict=True)))
         self._kept: list[Any] = [*sets, *rows]
-        memory = torch.empty(4, len(self.nodes), self._width)
+        # A set of a fixed graph names its spare node once for every place that is not taken: it can have more rows than nodes.
+        memory = torch.empty(4, max(len(self.nodes), *(len(part.nodes) for part in sets)), self._width)
         self._memory = _Memory(*(part.data_ptr() for part in memory))
         self._kept.append(memory)
 

@@ -63,7 +63,8 @@ def _growth(cloth: Cloth, pos: Tensor) -> Tensor | None:
     """What the square of an edge at a vertex has grown by beyond :data:`COVERED`, at most, (V,) [m²]; None where none has, on
     a CPU (elsewhere the host would wait for the answer)."""
     growth = cloth.edge_sq(pos) - COVERED * cloth.rest_edge_sq
-    if growth.device.type == "cpu" and not growth.requires_grad and not bool((growth > 0.0).any()):
+    traced = type(growth) is not Tensor  # has no values to ask for
+    if growth.device.type == "cpu" and not traced and not growth.requires_grad and not bool((growth > 0.0).any()):
         return None
     return cloth.largest_of_edges(growth.clamp_min(0.0))
 

@@ -5,6 +5,7 @@ import torch
 
 from hood.dynamics.captured import CapturedSimulator
 from hood.dynamics.simulator import build_simulator
+from hood.graph.fixed import Capacity
 from hood.losses.problem import StepProblem
 from hood.nn.compiled import check_kernels
 from hood.scene.scene import Scene
@@ -39,6 +40,21 @@ def test_steps_of_any_shape_are_those_of_the_plain_network(kernels: str, skirt_s
             found = stepper.predict(problem, prepared).acc
             assert not torch.equal(found, plain)
             assert float((found - plain).norm()) < 1e-5 * float(plain.norm())
+
+
+def test_a_fixed_set_may_have_more_rows_than_there_are_nodes(skirt_scene: Scene) -> None:
+    """Its spare node stands once for every place that is not taken, and places are as many as cloth vertices and one."""
+    torch.manual_seed(0)
+    simulator = build_simulator(schedule="2x(mesh+coarse0)", latent_dim=64).eval()
+    state = skirt_scene.start(0)
+    prepared = simulator.prepare(skirt_scene.cloth, skirt_scene.garment.rest_pos)
+    problem = StepProblem(skirt_scene.cloth, state, skirt_scene.step_input(0, state), gravity=simulator.gravity)
+    everywhere = Capacity(4000, skirt_scene.cloth.num_vertices + 1)
+    with torch.no_grad():
+        plain = simulator.predict(problem, prepared).acc
+        simulator.network.use_kernels("fused")
+        found = CapturedSimulator(simulator, "fixed", everywhere).predict(problem, prepared).acc
+    assert float((found - plain).abs().max()) < 1e-5 * float(plain.abs().max())
 
 
 def test_steps_that_are_traced_are_refused() -> None:

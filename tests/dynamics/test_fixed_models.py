@@ -133,6 +133,20 @@ def test_every_kind_of_model_has_such_a_step(kind: str, name: str, request: pyte
     assert_no_data(simulator, scene, cases[0])
 
 
+@pytest.mark.parametrize("kind", ["local", "base"])
+def test_a_compiler_takes_it_on_a_cpu(kind: str, tank_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the compiler's front; contact by curvature asks stretched cloth for values elsewhere, and fans are written with
+    gaps."""
+    compiled = torch.compile
+    monkeypatch.setattr(torch, "compile", lambda f, **options: compiled(f, backend="aot_eager", **options))
+    simulator, problem = make(kind), problem_of(tank_scene, 3)
+    prepared = simulator.prepare(tank_scene.cloth, tank_scene.garment.rest_pos)
+    with native.in_torch(), torch.no_grad():
+        expected = simulator.predict(problem, prepared).next_pos
+    found = CapturedSimulator(simulator, "compiled").predict(problem, prepared).next_pos
+    assert error(found, expected, problem) < 5e-4
+
+
 def test_a_rollout_hands_its_potential_over(tank_scene: Scene) -> None:
     """Another potential is another plan, as is another gravity."""
     simulator, problem = make("local"), problem_of(tank_scene, 3)
