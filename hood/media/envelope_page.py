@@ -28,7 +28,8 @@ _LOOKS = {
     REFUSED: ("#c3c8cf", "– ", "bad input, refused in one sentence; in no share"),
 }
 _STYLE = """
-td { white-space: normal; } .map td { padding: 0; } .map tbody th { white-space: normal; max-width: 15em; } .map tbody + tbody { border-top: 2px solid #999; }
+td { white-space: normal; } .map td { padding: 0; }
+.map tbody th { white-space: normal; max-width: 15em; } .map tbody + tbody { border-top: 2px solid #999; }
 .map td a { display: block; padding: .2em .6em; color: #222; text-decoration: none; min-width: 4em; }
 .map td a:hover { outline: 2px solid #222; }
 .cell { display: none; position: fixed; top: 0; right: 0; bottom: 0; width: min(760px, 92vw); overflow-y: auto; z-index: 2;

@@ -21,6 +21,8 @@ class Horizon:
 
     def __post_init__(self) -> None:
         _require_least("horizon", self, every=0, maximum=1, start=1)
+        if self.start > self.maximum:
+            raise ValueError(f"trainer.horizon.start is {self.start}, maximum {self.maximum}; a start is at most the maximum")
 
     def __call__(self, iteration: int) -> int:
         return min(self.start + iteration // max(self.every, 1), self.maximum)
@@ -39,6 +41,7 @@ class StepDecay:
 
     def __post_init__(self) -> None:
         _require_least("schedule", self, every=1, floor=0)
+        _require_share(self.floor)
 
     def __call__(self, iteration: int, num_iterations: int) -> float:
         return 0.5 ** (iteration // self.every) + self.floor
@@ -57,6 +60,7 @@ class WarmupCosine:
 
     def __post_init__(self) -> None:
         _require_least("schedule", self, warmup=0, floor=0)
+        _require_share(self.floor)
 
     def __call__(self, iteration: int, num_iterations: int) -> float:
         if iteration < self.warmup:
@@ -133,6 +137,11 @@ def _require_least(part: str, settings: object, **least: int) -> None:
         value = getattr(settings, name)
         if not value >= lowest:
             raise ValueError(f"trainer.{part}.{name} is {value}; it must be at least {lowest}")
+
+
+def _require_share(floor: float) -> None:
+    if not floor <= 1:
+        raise ValueError(f"trainer.schedule.floor is {floor}; it is a share of the learning rate, at most 1")
 
 
 def scaled_count(name: str, count: int, factor: float) -> int:

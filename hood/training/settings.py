@@ -66,7 +66,7 @@ class TrainerSettings:
         for name in ("iterations", "batch_size", "checkpoint_every", "log_every", "max_skipped"):
             if getattr(self, name) < 1:
                 raise ValueError(f"trainer.{name} is {getattr(self, name)}; it must be at least 1")
-        for name in ("validate_every", "max_rollbacks"):
+        for name in ("validate_every", "max_rollbacks", "statistics_iterations"):
             if getattr(self, name) < 0:
                 raise ValueError(f"trainer.{name} is {getattr(self, name)}; it must be at least 0")
         object.__setattr__(self, "keep_at", tuple(self.keep_at))  # a list in a config

@@ -70,6 +70,11 @@ class Trainer:
         earlier: int = 0,
     ) -> None:
         settings = settings.compressed()
+        if settings.iterations <= settings.statistics_iterations and simulator.uses_statistics:
+            raise ValueError(
+                f"trainer.iterations={settings.iterations}: the first {settings.statistics_iterations} only collect "
+                "statistics, so nothing would be trained; give more, or fewer trainer.statistics_iterations=…"
+            )
         shown = for_networks(potential)
         simulator.use_potential(shown)
         simulator.trained_for = training_conditions(sampler, settings.collision.apply(shown, settings.iterations))

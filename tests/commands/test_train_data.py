@@ -79,7 +79,7 @@ def test_buckets_by_size() -> None:
 
 def test_training_from_given_weights(tmp_path: Path) -> None:
     model = ["model=small", "model.features=paper", "model.output=acceleration", "model.latent_dim=8"]
-    first = trainer(*model, f"output={tmp_path}/first", "trainer.iterations=3", "seed=1")
+    first = trainer(*model, f"output={tmp_path}/first", "trainer.iterations=3", "trainer.statistics_iterations=2", "seed=1")
     first.run()
     given = f"weights={tmp_path}/first/model.safetensors"
     second = trainer(*model, given, f"output={tmp_path}/second", "seed=2")

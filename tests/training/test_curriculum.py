@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -99,6 +100,20 @@ def test_time_scale_leaves_rates_sample_counts_and_the_rest() -> None:
 def test_time_scales_that_leave_no_training_are_refused(factor: float, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         replace(PAPER, time_scale=factor)
+
+
+@pytest.mark.parametrize(
+    "make, words",
+    [
+        (lambda: Horizon(start=8, maximum=2), "trainer.horizon.start is 8, maximum 2"),
+        (lambda: WarmupCosine(floor=2), "trainer.schedule.floor is 2; it is a share"),
+        (lambda: StepDecay(floor=1.5), "trainer.schedule.floor is 1.5; it is a share"),
+        (lambda: TrainerSettings(statistics_iterations=-2), "trainer.statistics_iterations is -2; it must be at least 0"),
+    ],
+)
+def test_settings_that_contradict_themselves_are_refused(make: Callable[[], object], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        make()
 
 
 def test_the_configs_hold_the_papers_numbers() -> None:

@@ -225,6 +225,13 @@ def test_the_paper_model_collects_statistics_first(tmp_path: Path, sampler: Scen
     assert not all(torch.equal(value, before[name]) for name, value in trainer.simulator.named_parameters())
 
 
+def test_a_run_that_would_only_collect_statistics_is_refused(tmp_path: Path, sampler: SceneSampler) -> None:
+    short = replace(SETTINGS, iterations=4)
+    with pytest.raises(ValueError, match=r"trainer.iterations=4: the first 4 only collect statistics"):
+        make(tmp_path, sampler, PAPER, short)
+    make(tmp_path, sampler, PHYSICAL, short)  # has none to collect
+
+
 def test_averaged_weights(tmp_path: Path, sampler: SceneSampler) -> None:
     trainer = make(tmp_path, sampler)
     for _ in range(3):
