@@ -143,6 +143,12 @@ def _check_format(form: str, key: str, asked: str) -> None:
         raise ConfigError(f'{asked}: writing needs usd-core (pip install "hood[usd]"); glb, pc2, obj and ply need nothing more')
 
 
+def exports_beside(source: Path) -> list[Path]:
+    """What :func:`export_beside` has written beside a rollout, in any format, and images that belong to it."""
+    made = [_beside(source, form) for form in FORMATS]
+    return [*(path for path in made if path.exists()), *source.parent.glob(f"{source.stem}_*_texture.*")]
+
+
 def _beside(source: Path, form: str) -> Path:
     return source.with_suffix(f".{form}") if form in _SUFFIXES else source.with_name(f"{source.stem}_{form}")
 
@@ -168,7 +174,7 @@ def _write(target: Path, form: str, clip: Clip, up: str, replace: bool = False) 
         write_atomically(target, gltf_bytes(clip))
         return
     draft = target.with_name(f".partial.{target.name}")  # USD tells the format by the suffix
-    _remove(draft)
+    remove_whole(draft)
     try:
         if form == "usd":
             write_usd(draft, clip, up, target.name)
@@ -179,18 +185,19 @@ def _write(target: Path, form: str, clip: Clip, up: str, replace: bool = False) 
             draft.mkdir()
             _FOLDERS[form](draft, clip)
             if replace:
-                _remove(target)
+                remove_whole(target)
             elif target.is_dir():
                 target.rmdir()  # empty
         draft.replace(target)
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(target)) from error
     finally:
-        _remove(draft)
+        remove_whole(draft)
 
 
-def _remove(path: Path) -> None:
-    if path.is_dir():
+def remove_whole(path: Path) -> None:
+    """Remove a file, or a folder with what is in it; of a link the link alone."""
+    if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)

@@ -44,7 +44,8 @@ def chosen(config: Mapping[Any, Any]) -> tuple[str, float] | None:
     if not given:
         return None
     value = config[given[0]]
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
+    whole = given[0] != "refine" or (isinstance(value, (int, float)) and float(value).is_integer())
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not whole:
         what = "a whole number of iterations, or auto" if given[0] == "refine" else "a number"
         raise ConfigError(f"{given[0]}={shown(value)}: give {what}")
     return given[0], float(value)

@@ -27,6 +27,7 @@ from hood.commands.common import (
     thinning,
     together,
 )
+from hood.commands.earlier_files import remove_earlier
 from hood.commands.event_report import describe_held, summarise_held
 from hood.commands.events import fastening_attributes
 from hood.commands.export import check_outputs, export_beside
@@ -112,7 +113,7 @@ def _run_there(ready: Setup, asked: DictConfig, digest: str, warned: list[str], 
     """The rollout in its folder, which is there and held."""
     config, scene, stepper = ready.config, ready.scene, ready.stepper
     folder = output_folder(config)
-    (folder / "summary.json").unlink(missing_ok=True)  # its presence says that everything is there
+    remove_earlier(folder, config)
     save_run_record(folder, config, int(config.seed))
     eases: list[Ease | None] = []
     interrupted = _simulate_to_disk(ready, digest, folder / "rollout.h5", asked, eases)

@@ -27,7 +27,10 @@ def summarise(path: Path) -> dict[str, Any]:
     data = read_rollout(path)
     finite = data.step_finite
     metrics = defaultdict(lambda: np.full(len(finite), np.nan), data.step_metrics)
-    times = {name[3:]: _quantiles(metrics[name][2:]) for name in sorted(metrics) if name.startswith("ms_")}
+    # The first step makes tables as well: it counts only where there is no other.
+    times = {
+        name[3:]: _quantiles(metrics[name][2 if len(finite) > 2 else 1 :]) for name in sorted(metrics) if name.startswith("ms_")
+    }
     converged = metrics.get("solver_converged")
     solver: dict[str, Any] = {}
     if converged is not None:
@@ -73,7 +76,6 @@ def describe(summary: dict[str, Any]) -> str:
     """The summary in a few lines: frames, strain, vertices inside the body, times, how far steps were taken, the cut surface
     with its warnings, the verdict."""
     first = summary["first_nonfinite_frame"]
-    times = {name: value["median"] for name, value in summary["ms_per_frame"].items()}
     return "\n".join(
         [
             f"{summary['garment']}: {summary['num_frames']} frames, "
@@ -81,7 +83,7 @@ def describe(summary: dict[str, Any]) -> str:
             *describe_rate(summary),
             *describe_mesh(summary),
             f"strain p50 {_percent(summary['strain_p50'])} p99 {_worst_strain(summary)}, {_penetration(summary)}",
-            "ms per frame (median): " + ", ".join(f"{name} {value or 0.0:.1f}" for name, value in times.items()),
+            *_describe_times(summary["ms_per_frame"]),
             *_describe_start(summary.get("settled")),
             *describe_refinement(summary),
             *describe_surface(summary["surface"]),
@@ -125,6 +127,11 @@ def _settled(metrics: Mapping[str, np.ndarray]) -> dict[str, Any] | None:
         "speed_m_per_s": _at(metrics["settle_speed"], 0),
         "reached": bool(metrics["settle_reached"][0]),
     }
+
+
+def _describe_times(times: Mapping[str, Mapping[str, float | None]]) -> list[str]:
+    known = [f"{name} {value['median']:.1f}" for name, value in times.items() if value["median"] is not None]
+    return [f"ms per frame (median): {', '.join(known)}"] if known else []
 
 
 def _describe_start(settled: Mapping[str, Any] | None) -> list[str]:

@@ -147,25 +147,26 @@ def _write(folder: Path, reached: Sequence[Reached], failures: Sequence[Failure]
     rejected = overstretched(reached)
     left_out = [(failure.point, failure.reason, str(failure.log)) for failure in failures]
     study = Study(list(reached), rejected, left_out, list(absent))
-    _write_tables(folder, reached)
+    tables = [folder / "points.csv", *_write_tables(folder, reached)]
     page = write_page(study, folder)
     print(_front_text(reached, rejected))
     if study.warning:
         print(f"\n{study.warning}")
-    print(f"\n{study.sentence}\n\npage in {page}, tables in {folder / 'points.csv'} and {folder / 'refine_table.json'}")
+    print(f"\n{study.sentence}\n\npage in {page}, tables in {', '.join(map(str, tables))}")
 
 
-def _write_tables(folder: Path, reached: Sequence[Reached]) -> None:
-    """``points.csv`` and ``points.json``, and the tables for ``refine_table``: ``refine_table.json`` is that of the checkpoint
-    that ``hood rollout`` takes by default, or of the first series where that was not measured."""
+def _write_tables(folder: Path, reached: Sequence[Reached]) -> list[Path]:
+    """``points.csv`` and ``points.json``, and the tables for ``refine_table``, whose paths are returned: of every series, and
+    ``refine_table.json`` of the checkpoint that ``hood rollout`` takes by default, where that was measured."""
     rows = [item.row() for item in reached]
     write_rows(rows, list(rows[0]), folder, "points")
-    tables = refinement_tables(reached)
-    for name, table in tables.items():
-        write_atomically(folder / f"refine_table_{name.replace('/', '-').replace(':', '-')}.json", _json(table))
-    if tables:
-        default = f"{load_config('rollout').checkpoint}_fp32"
-        write_atomically(folder / "refine_table.json", _json(tables.get(default, next(iter(tables.values())))))
+    default, written = f"{load_config('rollout').checkpoint}_fp32", []
+    for name, table in refinement_tables(reached).items():
+        named = folder / f"refine_table_{name.replace('/', '-').replace(':', '-')}.json"
+        for path in (folder / "refine_table.json", named) if name == default else (named,):
+            write_atomically(path, _json(table))
+            written.append(path)
+    return written
 
 
 def _json(table: Any) -> bytes:

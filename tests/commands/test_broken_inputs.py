@@ -39,6 +39,7 @@ BROKEN: dict[str, tuple[list[str], tuple[str, ...], Callable[[], object] | None]
     "unit of the body": (["rollout", "body_scale=0"], ("body_scale=0: give a number above 0, such as body_scale=0.01",), None),
     "rate of the file": (["rollout", "file_fps=fast"], ("file_fps=fast: give a number, such as file_fps=120",), None),
     "iterations": (["rollout", "refine=many"], ("refine=many: give a whole number of iterations, or auto",), None),
+    "parts of an iteration": (["rollout", "refine=2.5"], ("refine=2.5: give a whole number of iterations, or auto",), None),
     "exported values": (["rollout", "export=[strain]"], ("export=[strain]", "give some of [rg]"), None),
     "energy that another one needs": (
         ["rollout", "losses.terms.collision=null"],

@@ -245,9 +245,11 @@ def test_the_command_writes_page_tables_and_charts(capsys: pytest.CaptureFixture
     assert [row["gap"] for row in rows if row["model"] == "newton"] == [-1e-7]
     assert Path("chart/front_1k.png").stat().st_size > 10_000
     assert Path("chart/cost_1k.png").stat().st_size > 5_000
-    table = json.loads(Path("chart/refine_table.json").read_text())["rows"]
+    table = json.loads(Path("chart/refine_table_untrained-small_fp32.json").read_text())["rows"]
     assert [(row["refine"], row["ms"]) for row in table] == [(0, 102.5), (2, 122.5)]
     assert Path("chart/refine_table_guess_fp32.json").exists()
+    assert not Path("chart/refine_table.json").exists()  # of the default checkpoint, which was not measured
+    assert "refine_table_guess_fp32.json" in printed
 
 
 @pytest.mark.usefixtures("undrawn")
