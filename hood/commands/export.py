@@ -135,7 +135,7 @@ def _checked(config: DictConfig) -> tuple[str, str, list[str]]:
 
 
 def _check_format(form: str, key: str, asked: str) -> None:
-    if form == "abc":
+    if form.lower() in ("abc", "alembic"):
         raise ConfigError(f"{asked}: no maintained package writes Alembic; take {key}=usd, which the same programs read")
     if form not in FORMATS:
         raise ConfigError(f"{asked}: choose {' or '.join(FORMATS)}")

@@ -322,15 +322,20 @@ def start_state(stepper: Stepper, scene: Scene, potential: Potential, relaxing_s
         state = scene.start(frame, relaxed=False, thorough=True)
     except NotWornError as refusal:
         return _led_in(stepper, scene, potential, relaxing_steps, frame, refusal)
+    put_on = _longest(scene, state.pos)
     if has_layers(potential):
         state = _taken_apart(scene, state, frame)
     stretched = _longest(scene, state.pos)
     if stretched > _TORN:
-        warnings.warn(
-            f"garment {scene.garment.name!r} starts with edges stretched by up to {stretched:.0%} in frame {frame} of "
-            f"{scene.motion.name!r}: let the body move there from a standing pose (blend_in=1), or start elsewhere (start=…)",
-            stacklevel=2,
+        starts = f"garment {scene.garment.name!r} starts with edges stretched by up to {stretched:.0%}"
+        why = (
+            f"in frame {frame} of {scene.motion.name!r}: let the body move there from a standing pose (blend_in=1), or start "
+            "elsewhere (start=…)"
+            if put_on > _TORN
+            else f"since its garments were taken apart, {put_on:.0%} before: they lie deep in each other; give another order "
+            "(layers=[…]), or one that is cut wider (size=…)"
         )
+        warnings.warn(f"{starts} {why}", stacklevel=2)
     prepared = prepare_stepper(stepper, scene)
     velocity = scene.start_velocity(frame)
     if stepper.relaxing is Relaxing.RESTART and relaxing_steps > 0:
@@ -354,6 +359,13 @@ def start_state(stepper: Stepper, scene: Scene, potential: Potential, relaxing_s
 def _taken_apart(scene: Scene, state: State, frame: int) -> State:
     """The start with its garments apart; a warning says in which order they are worn where that was guessed."""
     state, found = scene.taken_apart(state, frame)
+    if found is not None and found.lifted:
+        assert scene.outfit is not None
+        order = ", ".join(scene.outfit.names[garment] for garment in found.order)
+        warnings.warn(
+            f"outfit: garments lie in the same place at the start and were taken 3 mm apart; from the body outwards: {order}",
+            stacklevel=3,
+        )
     if found is not None and (found.before or found.turned):
         assert scene.outfit is not None
         names = scene.outfit.names

@@ -19,6 +19,7 @@ from torch import Tensor
 from hood.mesh.crossing import self_crossings
 from hood.mesh.topology import boundary_loops
 from hood.scene.cloth import Cloth
+from hood.scene.coincident import lifted
 from hood.scene.contact import match_surface
 from hood.scene.start import LazySearch, Momentum, descend, free_stretch, leave, push_out
 from hood.scene.state import Obstacle
@@ -63,6 +64,7 @@ class Separation:
     stretch: float  # largest relative lengthening of an edge
     turned: tuple[tuple[int, int], ...] = ()  # garments over others, which lay under them against the order that was given
     seconds: float = 0.0  # of computing
+    lifted: bool = False  # whether garments lay in the same place
 
 
 class Outfit(NamedTuple):
@@ -124,11 +126,12 @@ def separate(
         TangledError: triangles of two garments still cross, or a garment is not over another one that ``order`` has it over.
     """
     began = time.perf_counter()
+    given, pos = pos, _lifted(outfit, pos, obstacle, order)
     before = len(crossing_pairs(outfit, pos))
     turned = () if order is None else _against(outfit, pos, obstacle, tuple(order))
     if before == 0 and not turned:
         chosen = tuple(order) if order is not None else likely_orders(outfit, pos, obstacle)[0]
-        return Separation(pos, chosen, 0, 0, _longest(outfit, pos))
+        return Separation(pos, chosen, 0, 0, _longest(outfit, pos), lifted=pos is not given)
     orders = [tuple(order)] if order is not None else likely_orders(outfit, pos, obstacle)[:_TRIED]
     best: Separation | None = None
     for tried, inner_share in product(orders, _SHARES):
@@ -142,7 +145,17 @@ def separate(
     assert best is not None
     if best.after:
         raise TangledError(_refusal(outfit, best, obstacle))
-    return replace(best, seconds=time.perf_counter() - began)
+    return replace(best, seconds=time.perf_counter() - began, lifted=pos is not given)
+
+
+def _lifted(outfit: Outfit, pos: Tensor, obstacle: Obstacle | None, order: Sequence[int] | None) -> Tensor:
+    """Garments that lie in the same place one over the other, in the order given or in that of the outfit."""
+    inwards = tuple(range(len(outfit.names))) if order is None else tuple(order)
+    outside = torch.zeros_like(pos)
+    for sheet in _sheets(outfit, pos, obstacle):
+        own = match_surface(pos[sheet.vertices], torch.zeros(len(sheet.vertices), dtype=torch.long), sheet.obstacle(pos))
+        outside[sheet.vertices] = own.normal
+    return lifted(pos, outfit.piece, inwards, outside, outfit.cloth.free, _GAP)
 
 
 def _against(outfit: Outfit, pos: Tensor, obstacle: Obstacle | None, order: tuple[int, ...]) -> tuple[tuple[int, int], ...]:

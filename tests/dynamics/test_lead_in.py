@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from imitations import write_seated
 
 from hood.assets.body.body import Body
@@ -20,8 +21,10 @@ from hood.dynamics.refine import GuessStepper, RefinedStepper
 from hood.dynamics.rollout import simulate
 from hood.dynamics.simulator import Prediction
 from hood.dynamics.stopping import Count
+from hood.losses.layers import LayerBarrier
 from hood.losses.potential import default_potential
-from hood.scene.scene import LEAD_IN, NotWornError, build_scene
+from hood.scene.scene import LEAD_IN, NotWornError, Scene, build_scene
+from hood.scene.state import State
 
 POTENTIAL = default_potential()
 
@@ -77,6 +80,19 @@ def test_a_start_with_long_edges_is_told(
     told = r"'tshirt' starts with edges stretched by up to \d+% in frame 0 of 'seated': .* standing pose \(blend_in=1\)"
     with pytest.warns(UserWarning, match=told):
         next(simulate(stepper(), scene, POTENTIAL, 2, metrics="none"))
+
+
+def test_edges_stretched_by_taking_garments_apart_are_not_put_down_to_the_pose(
+    monkeypatch: pytest.MonkeyPatch, tank_scene: Scene
+) -> None:
+    def pulled(scene: Scene, state: State, frame: int) -> State:
+        return State(state.pos * torch.tensor([1.0, 1.6, 1.0]), state.vel, state.origin)
+
+    monkeypatch.setattr("hood.dynamics.rollout._taken_apart", pulled)
+    potential = default_potential().with_terms(layers=LayerBarrier())
+    told = r"stretched by up to \d+% since its garments were taken apart, \d+% before: .*layers="
+    with pytest.warns(UserWarning, match=told):
+        next(simulate(RefinedStepper(GuessStepper(potential), potential, Count(1)), tank_scene, potential, 2, metrics="none"))
 
 
 def test_what_the_t_pose_does_not_help_is_refused(

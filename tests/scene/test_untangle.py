@@ -102,6 +102,26 @@ def test_garments_apart_stay_as_they_are():
     assert found.pos is pos
 
 
+@pytest.mark.parametrize("order", [None, (1, 0)])
+def test_garments_in_the_same_place_are_laid_over_each_other(order):
+    outfit, pos = tubes(0.2, 0.23)
+    pos[outfit.piece == 1] = pos[outfit.piece == 0]
+    assert len(crossing_pairs(outfit, pos)) == 0  # so nothing else would tell them apart
+    found = separate(outfit, pos, trunk(0.19), CLEARANCE, order)
+    assert found.lifted
+    assert found.order == (order or (0, 1))
+    assert heights(outfit, found.pos, *reversed(found.order)) == pytest.approx(3e-3, abs=3e-4)
+    inner = torch.as_tensor(outfit.piece == found.order[0])
+    assert torch.equal(found.pos[inner], pos[inner])
+
+
+def test_garments_that_share_a_seam_stay_where_they_are():
+    outfit, pos = tubes(0.2, 0.23)
+    ring = np.flatnonzero(outfit.piece == 0)[:24]
+    pos[np.flatnonzero(outfit.piece == 1)[:24]] = pos[ring]
+    assert not separate(outfit, pos, trunk(0.19), CLEARANCE).lifted
+
+
 @pytest.mark.parametrize("outer", [0.206, 0.23])
 def test_a_garment_wholly_under_another_is_taken_over_it(outer):
     outfit, pos = tubes(0.2, outer)
