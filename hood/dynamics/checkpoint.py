@@ -45,7 +45,27 @@ def save_simulator(path: Path, simulator: Simulator, metadata: Mapping[str, str]
     needed = plugins_of(simulator.config)
     known |= {_PLUGINS: json.dumps(needed)} if needed else {}
     header = {"format": _FORMAT, "model": json.dumps(simulator.config), **known, **(metadata or {})}
-    write_atomically(path, save(tensors, header))
+    write_atomically(path, _in_order(save(tensors, header)))
+
+
+def _in_order(content: bytes) -> bytes:
+    """A safetensors file with the entries of its metadata in order: the library writes them in another one each time, and the
+    same weights would have another digest."""
+    header, tensors = _parts(content)
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    return _whole(header, tensors)
+
+
+def _parts(content: bytes) -> tuple[dict[str, Any], bytes]:
+    """Header and tensors of a safetensors file."""
+    begin = 8 + int.from_bytes(content[:8], "little")
+    return json.loads(content[8:begin]), content[begin:]
+
+
+def _whole(header: Mapping[str, Any], tensors: bytes) -> bytes:
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)  # the format's alignment
+    return len(text).to_bytes(8, "little") + text + tensors
 
 
 def record_ranges(path: Path, trained_for: Conditions) -> None:
@@ -55,13 +75,9 @@ def record_ranges(path: Path, trained_for: Conditions) -> None:
         ValueError: not a file written by :func:`save_simulator`.
     """
     _read_file(path)
-    content = path.read_bytes()
-    begin = 8 + int.from_bytes(content[:8], "little")  # of the tensors, after the size of the header and the header
-    header = json.loads(content[8:begin])
+    header, tensors = _parts(path.read_bytes())
     header["__metadata__"][_RANGES] = trained_for.to_json()
-    text = json.dumps(header, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 8)  # the format's alignment
-    write_atomically(path, len(text).to_bytes(8, "little") + text + content[begin:])
+    write_atomically(path, _whole(header, tensors))
 
 
 def read_header(path: Path) -> dict[str, str]:

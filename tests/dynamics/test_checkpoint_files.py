@@ -43,6 +43,16 @@ def test_half_precision_file(tmp_path: Path, tank_scene: Scene) -> None:
     assert float((take(loaded, tank_scene)[1].pos - take(simulator, tank_scene)[1].pos).abs().max()) < 1e-4
 
 
+def test_the_same_weights_are_the_same_bytes(tmp_path: Path) -> None:
+    simulator, told = make("physical"), {name: name for name in ("iteration", "seed", "garments", "budget", "commit")}
+    files = [tmp_path / f"{number}.safetensors" for number in range(4)]
+    for path in files:
+        save_simulator(path, simulator, told)
+    assert len({path.read_bytes() for path in files}) == 1
+    begin = 8 + int.from_bytes(files[0].read_bytes()[:8], "little")
+    assert begin % 8 == 0
+
+
 def damaged(path: Path, case: str) -> Path:
     simulator = make("physical")
     save_simulator(path, simulator)
