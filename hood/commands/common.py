@@ -15,7 +15,7 @@ import torch
 from omegaconf import DictConfig
 
 from hood.assets.files.folder_lock import occupy
-from hood.config import ConfigError, load_config, plain, read_record, require_choice
+from hood.config import ConfigError, load_config, plain, read_record, require_choice, shown
 from hood.dynamics.checkpoint import load_simulator
 from hood.dynamics.reference import SUFFIXES, load_reference_checkpoint
 from hood.dynamics.simulator import Simulator
@@ -212,15 +212,27 @@ def require_same_config(config: DictConfig, folder: Path, free: Sequence[str], f
         return
     before = read_record(record)
 
-    def that_matters(value: Any) -> Any:
-        value = plain(value)
-        return {key: item for key, item in value.items() if key not in free_below} if isinstance(value, dict) else value
-
     for key in map(str, config):
-        if key not in free and that_matters(before.get(key)) != that_matters(config[key]):
+        if key in free:
+            continue
+        there, here = plain(before.get(key)), plain(config[key])
+        if isinstance(there, dict) and isinstance(here, dict):
+            there, here = ({name: item for name, item in side.items() if name not in free_below} for side in (there, here))
+        if there != here:
+            name, there, here = _difference(key, there, here)
             raise ConfigError(
-                f"{record}: {key} differs from this command's; resume with the same settings or use another output"
+                f"{record}: {name} is {shown(there)} there, {shown(here)} in this command; resume with the same settings or "
+                "use another output"
             )
+
+
+def _difference(name: str, there: Any, here: Any) -> tuple[str, Any, Any]:
+    """The first place in two values of a config that is not the same in both: its name, and what is there."""
+    if isinstance(there, dict) and isinstance(here, dict):
+        for key in dict.fromkeys([*there, *here]):
+            if there.get(key) != here.get(key):
+                return _difference(f"{name}.{key}", there.get(key), here.get(key))
+    return name, there, here
 
 
 def require_device(config: DictConfig) -> None:

@@ -214,6 +214,8 @@ def _is_resumed(config: DictConfig, folder: Path, checkpoint: Path) -> bool:
         return True
     if bool(config.resume) and any(folder.glob("*.safetensors")):
         raise ConfigError(f"{folder}: nothing to resume, checkpoint.pt is missing")
+    if bool(config.resume):
+        print(f"resume=true: no training in {folder} yet, this one begins", flush=True)
     return False
 
 
