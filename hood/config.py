@@ -14,7 +14,6 @@ from typing import Any
 
 import yaml
 from hydra import compose, initialize_config_dir
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from hydra.utils import get_object, instantiate
@@ -24,6 +23,7 @@ from omegaconf.errors import OmegaConfBaseException
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.guarded import check_size
 from hood.assets.files.library import unknown
+from hood.overrides import decoded, decoded_text, is_coded, parse, quoted, readable
 from hood.plugins import config_folders, packages
 
 _PACKAGE = Path(__file__).resolve().parent
@@ -66,7 +66,7 @@ def load_config(name: str, overrides: Sequence[str] = ()) -> DictConfig:
 @lru_cache(maxsize=8)
 def _loaded(folder: Path, plugins_of: tuple[str, ...], name: str, overrides: tuple[str, ...]) -> DictConfig:
     """A config that is copied and never changed: a command asks for that of its words several times."""
-    plugins = [f"hydra.searchpath=[{','.join(_quoted(f'file://{path}') for path in plugins_of)}]"]
+    plugins = [f"hydra.searchpath=[{','.join(quoted(f'file://{path}') for path in plugins_of)}]"]
     with initialize_config_dir(str(folder), version_base="1.3"):
         try:
             defaults = _composed(folder, name, tuple(plugins))
@@ -79,12 +79,13 @@ def _loaded(folder: Path, plugins_of: tuple[str, ...], name: str, overrides: tup
                 if not _is_group(override):
                     _check_key(override, known)
             config = compose(name, plugins + words)
+            _decode_keys(config, [override for text, override in chosen if is_coded(text)])
             _check_sources(config)
             OmegaConf.resolve(config)
         except ConfigError:
             raise
         except (HydraException, OmegaConfBaseException) as error:
-            raise ConfigError(f"configuration: {_one_line(error)}") from error
+            raise ConfigError(f"configuration: {decoded_text(_one_line(error))}") from error
     OmegaConf.set_struct(config, True)
     _check_types(name, known, config, "")
     return config
@@ -208,10 +209,10 @@ def with_words(config: DictConfig, words: Sequence[str]) -> DictConfig:
     """
     changed = copy.deepcopy(config)
     for word in words:
-        said = OverridesParser.create().parse_override(word)
+        _, said = _read_word(word, config)
         if OmegaConf.select(config, said.key_or_group, default=_ABSENT) is _ABSENT:
             raise ConfigError(f"{word}: no such key")
-        OmegaConf.update(changed, said.key_or_group, said.value(), merge=False)
+        OmegaConf.update(changed, said.key_or_group, decoded(said.value()), merge=False)
     return changed
 
 
@@ -240,19 +241,41 @@ def _check_override(name: str, text: str, defaults: DictConfig) -> tuple[str, Ov
         raise ConfigError(f"{text!r}: keys have no dashes; write {word}, hood {name} --help lists the keys")
     if "=" not in text and not text.startswith("~"):
         raise ConfigError(f"argument {text!r} is not of the form key=value; keys of {name}: {', '.join(defaults)}")
-    try:
-        override = OverridesParser.create().parse_override(text)
-    except HydraException as error:
-        raise ConfigError(
-            f"cannot read {text[:_REASON]!r}: close every bracket, and put a value that holds one of = , [ ] {{ }} or a space "
-            f"into two pairs of quotes, key=\"'value'\""
-        ) from error
+    text, override = _read_word(text, defaults)
     key = override.get_key_element().lstrip("+~").split("@")[0]
     if _is_group(override) and override.value() is None and defaults.get(key) is not None:
         raise ConfigError(f"{key}=null: cannot be left out; give one of {', '.join(options(key))}")
     if _is_group(override) and override.value() is not None and str(override.value()) not in options(key):
         raise ConfigError(unknown(f"option of {key}", str(override.value()), options(key)))
     return text, override
+
+
+def _read_word(text: str, defaults: DictConfig) -> tuple[str, Override]:
+    """A word in the form that Hydra reads, see :func:`hood.overrides.readable`, and what it says."""
+    try:
+        text = readable(text, _takes_several(text.partition("=")[0], defaults)) if "=" in text else text
+        return text, parse(text)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    except HydraException as error:
+        raise ConfigError(f"cannot read {text[:_REASON]!r}: write key=value") from error
+
+
+def _takes_several(key: str, defaults: DictConfig) -> bool:
+    """Whether a key may be given a list: what is null may, unless it is where a command writes."""
+    try:
+        value = OmegaConf.select(defaults, key)
+    except OmegaConfBaseException:
+        value = None
+    return key != _FOLDER and (value is None or key in _ONE_OR_MORE or isinstance(value, ListConfig))
+
+
+def _decode_keys(config: DictConfig, chosen: Sequence[Override]) -> None:
+    """Give tables the keys that :func:`hood.overrides.coded` wrote otherwise."""
+    for override in chosen:
+        value = OmegaConf.select(config, override.key_or_group)
+        if isinstance(value, (DictConfig, ListConfig)):
+            OmegaConf.update(config, override.key_or_group, decoded(OmegaConf.to_container(value)), merge=False)
 
 
 def _last_of_groups(chosen: Sequence[tuple[str, Override]]) -> list[str]:
@@ -376,10 +399,6 @@ def _is_own(target: str) -> bool:
 def _allowed() -> tuple[str, ...]:
     """Beginnings of the names of classes that configs may name."""
     return (*_TARGETS, *(f"{name}." for name in packages()))
-
-
-def _quoted(text: str) -> str:
-    return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
 
 
 def _one_line(error: BaseException) -> str:

@@ -39,6 +39,7 @@ from hood.dynamics.soundness import judge_rollout, worst_frame
 from hood.mesh.defects import Defects, find_defects
 from hood.mesh.quality import check_triangles
 from hood.mesh.topology import boundary_loops
+from hood.overrides import plain_word
 from hood.scene.load_motion import NO_MOTION, MotionOptions, load_motion
 from hood.scene.mesh_motion import MeshMotion
 
@@ -67,7 +68,7 @@ class Finding:
         """The command that repairs a garment; None where nothing needs repair, or no command can."""
         if self.refused or not self.repairs:
             return None
-        words = [f"garment={self.file}", *self.wearer, *filter(None, dict.fromkeys(self.repairs))]
+        words = [plain_word("garment", self.file), *self.wearer, *filter(None, dict.fromkeys(self.repairs))]
         return " ".join(["hood prepare", *map(shlex.quote, words)])
 
     def problem(self, what: str, fix: str, repair: str | None = None) -> None:

@@ -21,6 +21,7 @@ from hood.commands.garments import read_outfit, shape_coefficients
 from hood.commands.motion import check_motion_options, motion_options
 from hood.commands.notices import heard
 from hood.config import ConfigError, load_config, plain, require_choice
+from hood.overrides import plain_word
 from hood.scene.fitting import fit_figures, misplacement
 from hood.scene.load_motion import NO_MOTION, MotionOptions, load_motion
 from hood.scene.mesh_motion import MeshMotion
@@ -127,11 +128,11 @@ def _wearer(body: str, config: DictConfig) -> list[str]:
     """The words of ``hood prepare`` for the body that a garment is looked at beside; none for the default."""
     if body_kind(body) == "model":
         betas = [] if config.betas is None else [f"betas={plain(config.betas)}".replace(" ", "")]
-        return [f"body={body}"] * (body != "default") + betas
+        return [plain_word("body", body)] * (body != "default") + betas
     if body_kind(body) == NO_BODY:
         return []
     scale = [] if config.body_scale is None else [f"body_scale={config.body_scale:g}"]
-    return [f"body={body}", *scale, *([f"body_up={config.up}"] if str(config.up) != "auto" else [])]
+    return [plain_word("body", body), *scale, *([f"body_up={config.up}"] if str(config.up) != "auto" else [])]
 
 
 def _fit(found: list[Finding], body: str, config: DictConfig) -> dict[str, Any] | None:

@@ -27,6 +27,7 @@ from hood.evaluation.decision import QUANTILE, Tolerance
 from hood.evaluation.elsewhere import Apart
 from hood.evaluation.leaving_out import Begun, Effect
 from hood.media.plan_page import Difference
+from hood.overrides import plain_word
 
 #: Words of these keys belong to a training, and to no rollout.
 _TRAINING_GROUPS = ("experiment", "trainer", "data")
@@ -51,7 +52,9 @@ def run(overrides: Sequence[str]) -> int:
     print(reach_sentence(plan["facts"]))
     print(page)
     print(f"measured in {plan['cpu_seconds']:.1f} s of the processor")
-    print(f"plan in {folder / 'plan.json'}; roll out by it: hood rollout plan={folder / 'plan.json'} output=outputs/mine")
+    file = str(folder / "plan.json")
+    again = shlex.join(["hood", "rollout", plain_word("plan", file), "output=outputs/mine"])
+    print(f"plan in {file}; roll out by it: {again}")
     watched = "" if plan["watch"] is None else " (what is left out does not come back where it matters; by the plan it does)"
     print(f"the same in words{watched}: {plan['command']}")
     return 0

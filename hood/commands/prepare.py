@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -46,6 +47,7 @@ from hood.commands.prepare_mesh import prepare_for_mesh
 from hood.config import ConfigError, load_config, plain, require_choice, shown
 from hood.media.mesh_export import write_obj
 from hood.mesh.quality import check_triangles
+from hood.overrides import plain_word
 from hood.scene.fitting import FitFigures, fit_figures
 from hood.scene.scene import build_scene
 from hood.scene.wear import STRETCHED, Worn, put_on
@@ -308,7 +310,8 @@ def _text(report: dict[str, Any]) -> str:
         )
         if start["stretch_max"] > _STRETCH_LIMIT or start["depth_max"] > _DEPTH_LIMIT:
             lines.append("  that is far from rest: check that pose, scale and body are those the garment was made for")
-    lines.append(f"written to {report['output']}; run it with: hood rollout garment={report['output']}")
+    run = shlex.join(["hood", "rollout", plain_word("garment", report["output"])])
+    lines.append(f"written to {report['output']}; run it with: {run}")
     return "\n".join(lines)
 
 

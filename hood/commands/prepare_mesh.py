@@ -7,6 +7,7 @@ same body take it. Its rest lengths are those of its file.
 from __future__ import annotations
 
 import json
+import shlex
 import warnings
 from collections.abc import Callable
 from dataclasses import asdict, replace
@@ -29,6 +30,7 @@ from hood.commands.garments import checked_pins, heed
 from hood.commands.placing import AUTO, asked_keys, explain_size, find_place_on_mesh, keep_place
 from hood.config import ConfigError, plain
 from hood.mesh.quality import check_triangles
+from hood.overrides import plain_word
 from hood.scene.fitting import FitFigures, fit_figures
 from hood.scene.load_motion import NO_MOTION, MotionOptions, load_motion
 from hood.scene.mesh_motion import MeshMotion
@@ -148,11 +150,12 @@ def _text(report: dict[str, Any], body: str) -> str:
         lines += [f"  {change['text']}" for change in part["changes"]] or ["  nothing to repair"]
         lines.append(f"  now {part['result']}")
     start = report["starts"]["first frame"]
+    run = shlex.join(["hood", "rollout", plain_word("garment", report["output"]), plain_word("body", body)])
     return "\n".join(
         [
             *lines,
             f"start in the first frame of {body}: edges stretched by at most {100 * start['stretch_max']:.1f}%, "
             f"deepest vertex {1e3 * start['depth_max']:.1f} mm",
-            f"written to {report['output']}; run it with: hood rollout garment={report['output']} body={body}",
+            f"written to {report['output']}; run it with: {run}",
         ]
     )

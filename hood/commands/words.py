@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from hood.config import TABLES, ConfigError
+from hood.overrides import coded, quoted
 
 #: Strings that Hydra reads as they are; all others are quoted.
 _BARE = re.compile(r"[A-Za-z_][A-Za-z0-9_./+-]*")
 _WORDS = ("null", "true", "false", "nan", "inf")
-#: What Hydra reads as a key of a table, without quotes.
-_KEY = re.compile(r"[A-Za-z0-9_./+-]+")
+#: Keys of tables: names of parts in any alphabet, and of files.
+_KEY = re.compile(r"[\w./+@-]+")
 
 
 def overrides(keys: Mapping[str, Any], group: str = "") -> list[str]:
@@ -50,12 +52,12 @@ def _word(value: Any, key: str) -> str:
         text = str(value)
         if _BARE.fullmatch(text) and text.lower() not in _WORDS:
             return text
-        return "'" + re.sub(r"(\\+)(?=')|(\\+)$", lambda found: 2 * found[0], text).replace("'", "\\'") + "'"
+        return quoted(text)
     raise ConfigError(f"{key}={value!r}: give a number, a word, a path, a list or a table of them, or None")
 
 
 def _key(name: Any, key: str) -> str:
     text = str(name)
-    if not _KEY.fullmatch(text):
-        raise ConfigError(f"{key}: {text!r} cannot be a key of a table; use letters, digits and _ . / + -")
-    return text
+    if not _KEY.fullmatch(unicodedata.normalize("NFC", text)):
+        raise ConfigError(f"{key}: {text!r} cannot be a key of a table; use letters, digits and _ . / + @ -")
+    return coded(text)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from hood import api
 from hood.assets.garment.garment import Garment, load_garment
+from hood.assets.garment.parts import part_faces
 from hood.cli import main
 from hood.commands.fabrics import fabric_named
 from hood.commands.setup import make_scene
@@ -51,6 +54,41 @@ def test_panels_go_from_the_file_into_the_scene(front: np.ndarray, capsys: pytes
     density = make_scene(load_config("rollout", words)).cloth.density.numpy()
     np.testing.assert_allclose(density[panels["front"]], fabric_named("silk").density, rtol=1e-6)
     np.testing.assert_allclose(density[panels["back"]], fabric_named("denim").density, rtol=1e-6)
+
+
+def test_panels_are_known_by_the_name_in_the_file_and_by_the_listed_one(
+    front: np.ndarray, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("Jäckchen.obj").write_text(Path("top.obj").read_text().replace("o front", "o Schößchen"), encoding="utf-8")
+    assert main(["prepare", "garment=Jäckchen.obj", "output=Jäckchen.npz"]) == 0
+    assert "panels: Schoesschen (" in capsys.readouterr().out
+    main(["inspect", "Jäckchen.npz"])
+    assert "panels: Schoesschen (" in capsys.readouterr().out
+    silk, base = fabric_named("silk").density, fabric_named("default").density
+    before = np.arange(len(front)) < front.sum()
+    for words in (
+        ["fabrics={Schößchen:silk}"],
+        ["fabrics={Schoesschen:silk}"],
+        api.overrides({"fabrics": {"Schößchen": "silk"}}),
+    ):
+        config = load_config("rollout", ["garment=Jäckchen.npz", *words, "num_frames=2"])
+        np.testing.assert_allclose(make_scene(config).cloth.density.numpy(), np.where(before, silk, base), rtol=1e-6)
+    longer = load_config("rollout", ["garment=Jäckchen.npz", "size={Schößchen:1.1}", "num_frames=2"])
+    assert make_scene(longer).cloth.rest_area.sum() > make_scene(config).cloth.rest_area.sum()
+    whole = load_config("rollout", ["garment=[Jäckchen.npz,skirt]", "fabrics={Jäckchen:silk}", "num_frames=2"])
+    density = make_scene(whole).cloth.density.numpy()
+    np.testing.assert_allclose(density[: len(front)], silk, rtol=1e-6)
+    np.testing.assert_allclose(density[len(front) :], base, rtol=1e-6)
+
+
+def test_a_file_that_keeps_other_names_is_asked_by_both(garments: dict[str, Garment]) -> None:
+    tank = garments["tank"]
+    first = np.arange(len(tank.faces)) < 9
+    garment = replace(tank, panels={"Schößchen": first, "front left": ~first})
+    for name in ("Schößchen", "Schoesschen", "Scho\u0308ßchen"):
+        np.testing.assert_array_equal(part_faces(name, garment, None), first)
+    for name in ("front left", "front_left"):
+        np.testing.assert_array_equal(part_faces(name, garment, None), ~first)
 
 
 def test_a_misspelt_panel_is_named(front: np.ndarray, capsys: pytest.CaptureFixture[str]) -> None:

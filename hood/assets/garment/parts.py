@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from hood.assets.body.body import JOINTS, Body
+from hood.assets.files.folded import meant
 from hood.assets.files.index_list import read_indices
 from hood.assets.files.library import unknown
 from hood.assets.formats.image import read_texture
@@ -26,19 +27,21 @@ def part_faces(part: str, garment: Garment, body: Body | None) -> np.ndarray:
     most of its corners.
 
     Args:
-        part: the name of a panel, which counts before all else; that of a garment of an outfit; ``above_JOINT`` or
-            ``below_JOINT``, by the height of the centre in T-pose, the joint by its own name or that of an opening
-            (:data:`hood.assets.garment.pins.REGIONS`); one of :data:`SLEEVES`; one of :data:`COLOURS`, of the vertices in the
-            mesh file; ``COLOUR@IMAGE``, where the centre of a face lies on that colour of a PNG or JPEG file over the texture
-            coordinates; or the path of a ``.txt`` or ``.json`` list of vertices.
+        part: the name of a panel, as its file has it or folded (:mod:`hood.assets.files.folded`), which counts before all else;
+            likewise that of a garment of an outfit; ``above_JOINT`` or ``below_JOINT``, by the height of the centre in T-pose,
+            the joint by its own name or that of an opening (:data:`hood.assets.garment.pins.REGIONS`); one of
+            :data:`SLEEVES`; one of :data:`COLOURS`, of the vertices in the mesh file; ``COLOUR@IMAGE``, where the centre of a
+            face lies on that colour of a PNG or JPEG file over the texture coordinates; or the path of a ``.txt`` or ``.json``
+            list of vertices.
         body: whose joints are meant, in T-pose; None refuses them.
 
     Raises:
         ValueError: the garment has no such part, or no face in it; names what there is.
     """
     side, _, joint = part.partition("_")
-    if part in (garment.panels or {}):
-        found = np.asarray((garment.panels or {})[part])
+    panel = meant(part, garment.panels or {})
+    if garment.panels is not None and panel is not None:
+        found = np.asarray(garment.panels[panel])
     elif part in SLEEVES:
         found = _sleeves(part, garment, body)
     elif side in ("above", "below") and joint:
@@ -58,12 +61,13 @@ def part_faces(part: str, garment: Garment, body: Body | None) -> np.ndarray:
 
 def _piece(part: str, garment: Garment) -> np.ndarray:
     names = garment.name.split("+")
-    if part not in names:
+    piece = meant(part, names)
+    if piece is None:
         known = unknown("part", part, [*names, *(garment.panels or {}), "above_JOINT", "below_JOINT", *SLEEVES, *COLOURS])
         raise ValueError(f"garment {garment.name!r}: {known}; COLOUR@IMAGE, or a .txt or .json list of vertices")
     if garment.piece is None or len(names) == 1:
         return np.ones(len(garment.faces), dtype=bool)
-    return np.asarray(garment.piece[garment.faces[:, 0]] == names.index(part))
+    return np.asarray(garment.piece[garment.faces[:, 0]] == names.index(piece))
 
 
 def _beside(part: str, side: str, joint: str, garment: Garment, body: Body | None) -> np.ndarray:

@@ -46,6 +46,17 @@ def test_names_of_polygons_are_panels(tmp_path: Path) -> None:
     np.testing.assert_array_equal(mesh.faces[0:2].max(axis=0) < 6, True)
 
 
+def test_names_of_panels_are_folded(tmp_path: Path) -> None:
+    given = "Schößchen", "Übertritt", "Schoesschen", "ns:front", "Shirt.001", "Scho\u0308\u00dfchen", "左袖", "pièce (2)", "§"
+    text = "".join(f"usemtl {name}\nf 1 2 6\n" for name in given)
+    panels = read_mesh_file(write(tmp_path, POINTS + text)).panels
+    assert panels is not None
+    assert {name: np.flatnonzero(mask).tolist() for name, mask in panels.items()} == {
+        "Schoesschen_2": [0], "Uebertritt": [1], "Schoesschen": [2], "ns_front": [3], "Shirt.001": [4], "Schoesschen_3": [5],
+        "u5de6u8896": [6], "piece_2": [7], "_": [8],
+    }  # fmt: skip
+
+
 @pytest.mark.parametrize("names", ["", "o shirt\n", "o shirt\ng default\nusemtl None\n", "g off\n"])
 def test_a_name_of_all_faces_is_no_panel(tmp_path: Path, names: str) -> None:
     text = POINTS + names + "f 1 2 6\nf 2 7 6\n"
