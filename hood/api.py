@@ -131,7 +131,7 @@ def simulate(
         named["garment"] = garment
     if isinstance(material, str):
         named["material"] = material
-    if isinstance(stepper, str):
+    if stepper is None or isinstance(stepper, str):
         named["stepper"] = stepper
     key = "accuracy" if named.get("accuracy") is not None else "plan" if plan_path(named) is not None else None
     if key is not None and (isinstance(garment, Garment) or isinstance(material, Material) or not isinstance(stepper, str)):

@@ -159,6 +159,16 @@ def test_values_and_groups_reach_the_config() -> None:
         api.overrides({"seed": {1, 2}})
 
 
+def test_no_stepper_is_refused_by_name() -> None:
+    with pytest.raises(ConfigError, match="stepper=null: cannot be left out; give one of auto, guess"):
+        hood.simulate("tank", "plie", num_frames=2, stepper=None)  # type: ignore[arg-type]
+
+
+def test_numbers_and_arrays_of_numpy_and_torch_are_numbers_and_lists() -> None:
+    given = {"num_frames": np.int64(3), "gravity": np.float32(9.5), "betas": np.array([1.0, 0.5]), "pins": torch.tensor([1, 4])}
+    assert api.overrides(given) == ["num_frames=3", "gravity=9.5", "betas=[1.0,0.5]", "pins=[1,4]"]
+
+
 def test_tables_reach_the_config() -> None:
     words = api.overrides({"size": {"sleeves": 1.2}, "fabrics": {"above_waistband": {"material": "silk", "friction": 2}}})
     assert words == ["size={sleeves:1.2}", "fabrics={above_waistband:{material:silk,friction:2}}"]

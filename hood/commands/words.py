@@ -22,7 +22,8 @@ def overrides(keys: Mapping[str, Any], group: str = "") -> list[str]:
     """Python values as the ``key=value`` words of a command.
 
     Args:
-        keys: by name; None is ``null``. A dictionary is a group of keys, of :data:`hood.config.TABLES` and in lists a table.
+        keys: by name; None is ``null``, numbers and arrays of NumPy and torch are numbers and lists. A dictionary is a group
+            of keys, of :data:`hood.config.TABLES` and in lists a table.
         group: what stands before every key, with a dot.
 
     Raises:
@@ -38,6 +39,8 @@ def overrides(keys: Mapping[str, Any], group: str = "") -> list[str]:
 
 
 def _word(value: Any, key: str) -> str:
+    if hasattr(value, "tolist"):  # of NumPy or torch
+        value = value.tolist()
     if value is None:
         return "null"
     if isinstance(value, bool):

@@ -280,7 +280,7 @@ def test_the_page_names_what_failed_and_what_is_not_measured_yet(capsys: pytest.
 def test_other_settings_want_another_folder(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(COMMAND) == 0
     assert main([*COMMAND, "frames_1k=50"]) == 2
-    assert "frames_1k differs" in capsys.readouterr().err
+    assert "frames_1k is 24 there, 50 in this command" in capsys.readouterr().err
 
 
 REFUSED = {
