@@ -78,6 +78,7 @@ def _loaded(folder: Path, plugins_of: tuple[str, ...], name: str, overrides: tup
             for _, override in chosen:
                 if not _is_group(override):
                     _check_key(override, known)
+                    _check_brackets(name, override, known)
             config = compose(name, plugins + words)
             _decode_keys(config, [override for text, override in chosen if is_coded(text)])
             _check_sources(config)
@@ -276,6 +277,14 @@ def _decode_keys(config: DictConfig, chosen: Sequence[Override]) -> None:
         value = OmegaConf.select(config, override.key_or_group)
         if isinstance(value, (DictConfig, ListConfig)):
             OmegaConf.update(config, override.key_or_group, decoded(OmegaConf.to_container(value)), merge=False)
+
+
+def _check_brackets(name: str, override: Override, known: DictConfig) -> None:
+    """Refuse a table where a list is wanted; Hydra would not say so."""
+    key, value = override.key_or_group, override.value()
+    before = OmegaConf.select(known, key, default=None)
+    if isinstance(before, ListConfig) and isinstance(value, dict):
+        raise ConfigError(_wrong_kind(name, key, before, decoded(value)))
 
 
 def _last_of_groups(chosen: Sequence[tuple[str, Override]]) -> list[str]:

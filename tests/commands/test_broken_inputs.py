@@ -40,6 +40,12 @@ BROKEN: dict[str, tuple[list[str], tuple[str, ...], Callable[[], object] | None]
     "rate of the file": (["rollout", "file_fps=fast"], ("file_fps=fast: give a number, such as file_fps=120",), None),
     "iterations": (["rollout", "refine=many"], ("refine=many: give a whole number of iterations, or auto",), None),
     "parts of an iteration": (["rollout", "refine=2.5"], ("refine=2.5: give a whole number of iterations, or auto",), None),
+    "an event without its list": (
+        ["rollout", "events={time: 1.0, open: front_buttons}"],
+        ("events={time:1,open:front_buttons}: give a list in brackets",),
+        None,
+    ),
+    "formats in braces": (["rollout", "formats={a:1}"], ("formats={a:1}: give a list in brackets", "formats=[]"), None),
     "exported values": (["rollout", "export=[strain]"], ("export=[strain]", "give some of [rg]"), None),
     "energy that another one needs": (
         ["rollout", "losses.terms.collision=null"],
