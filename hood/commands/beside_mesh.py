@@ -9,11 +9,12 @@ import numpy as np
 from hood.assets.garment.binding import signed_distances
 from hood.assets.garment.fit_search import Asked
 from hood.assets.garment.garment import Garment
+from hood.assets.garment.in_place import way_there
 from hood.assets.garment.suspicions import suspect_place, suspect_sides
 from hood.assets.garment.units import UNITS, find_scale, size_ratio, used
 from hood.commands.describe_place import describe_place
 from hood.commands.placing import find_place_on_mesh
-from hood.scene.mesh_motion import MeshMotion
+from hood.scene.mesh_motion import MeshMotion, wearable
 
 if TYPE_CHECKING:
     from hood.commands.findings import Finding
@@ -51,9 +52,11 @@ def place_beside_mesh(finding: Finding, garment: Garment, motion: MeshMotion) ->
     inside = finding.facts["vertices inside the body"] = int((dist < 0).sum())
     misplaced = suspect_place(pos, garment.faces, surface, motion.faces)
     for suspicion in misplaced:
-        gap = np.round((surface.max(axis=0) + surface.min(axis=0) - pos.max(axis=0) - pos.min(axis=0)) / 2, 2)
-        centred = f"offset={gap.tolist()}".replace(" ", "")
-        finding.problem(f"it {suspicion.what}", f"move it to where it is worn; {centred} puts it into the body's middle")
+        way = np.round(way_there(pos, garment.faces, surface, motion.faces), 2) + 0.0
+        offset = f"offset={way.tolist()}".replace(" ", "")
+        moved = found is None and bool(way.any()) and not wearable(garment)  # of a sheet prepare changes nothing else
+        fix = f"move it to where it is worn; {offset} brings it to the body"
+        finding.problem(f"it {suspicion.what}", fix, offset if moved else None)
     finding.refused = any(suspicion.grave for suspicion in misplaced)
     for suspicion in [] if misplaced else suspect_sides(pos, garment.faces, surface, motion.faces):
         finding.problem(f"it {suspicion.what}", "prepare turns it", "")

@@ -11,8 +11,9 @@ from hood.assets.body.body import Body
 from hood.assets.garment.binding import posed_body
 from hood.assets.garment.fit_search import Asked, Wearer, find_placement
 from hood.assets.garment.garment import Garment
-from hood.assets.garment.in_place import lies_in_place
+from hood.assets.garment.in_place import lies_in_place, way_there
 from hood.assets.motion.poses import arms_down
+from hood.testing import grid
 
 Mesh = tuple[np.ndarray, np.ndarray]
 
@@ -112,3 +113,16 @@ def test_what_lies_in_place(body: Body, garments: dict[str, Garment]) -> None:
     for garment in garments.values():
         if garment.bound:
             assert lies_in_place(garment.tpose(np.zeros(10)), garment.faces, surface, body.faces), garment.name
+
+
+def test_the_way_to_the_body(body: Body) -> None:
+    """A cape comes back from the side as it hung; a flat sheet lies down on the head."""
+    surface = posed_body(body, arms_down(0.0), 0, np.zeros(10)).surface
+    pos, faces = cape()
+    np.testing.assert_allclose(way_there(pos + [3.0, 0, 0], faces, surface, body.faces), [-3.0, 0, 0], atol=0.01)
+    mesh = grid(32, 32)
+    flat = mesh[0] - mesh[0].mean(axis=0)
+    flat = flat[:, np.argsort(-np.ptp(flat, axis=0))][:, [0, 2, 1]]
+    there = flat + [2.0, 0.8, 0] + way_there(flat + [2.0, 0.8, 0], mesh[1], surface, body.faces)
+    assert 0.01 < there[:, 1].min() - surface[:, 1].max() < 0.03
+    assert np.abs(there.mean(axis=0)[[0, 2]]).max() < 0.1
