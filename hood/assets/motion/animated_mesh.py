@@ -31,6 +31,9 @@ ANIMATED_SUFFIXES = (".npz", ".pkl", CACHE_SUFFIX, *_H5_SUFFIXES, *_GLTF_SUFFIXE
 _DEFAULT_FPS = 30.0
 #: A body larger than this [m] is in other units.
 _LARGEST = 30.0
+#: A body stands along z where it is so many times longer than along y, and no plane: at least this share as thick, and not
+#: filled like a box, [share of its box]. A vehicle [m] may be so long.
+_LONGER, _THICK, _FILLED, _PERSON = 2.5, 0.1, 0.4, 4.0
 
 
 def body_kind(name: str | Path) -> str:
@@ -70,7 +73,7 @@ def load_mesh_sequence(
     whose animation is evaluated at ``fps`` itself; OBJ, PLY, OFF or STL for one that stands still.
 
     Args:
-        up: axis that points up in the file: "y", "z", or "auto", y.
+        up: axis that points up in the file: "y", "z", or "auto", y, with a warning where the first frame seems to stand along z.
         start, stop: part to keep, in seconds or in frames of the file ("120f").
         loop: times the motion is played; it must end as it began.
         file_fps: frame rate of the file, whatever it says itself; 30 where neither does.
@@ -92,6 +95,8 @@ def load_mesh_sequence(
     sequence = MeshSequence(path.stem, verts, faces, rate, _bones(path, content), content.rest, content.weights)
     sequence = turn_mesh(sequence, 1.0 if scale is None else float(scale), up)
     _check_size(path, sequence, scale)
+    if up == "auto":
+        _check_bearing(path, sequence)
     sequence = resample_mesh(trim_mesh(sequence, start, stop), fps)
     sequence = replace(sequence, faces=_sewn(path, sequence))
     return replace(loop_mesh(sequence, loop), faces=_outward(path, sequence))
@@ -194,6 +199,25 @@ def _check_size(path: Path, sequence: MeshSequence, scale: float | None) -> None
         )
 
 
+def _check_bearing(path: Path, sequence: MeshSequence) -> None:
+    """Warn of a mesh that lies along z in its first frame, as a body does that stands in a file with z up."""
+    points = sequence.verts[0].astype(np.float64)
+    box = np.ptp(points, axis=0)
+    long = _LONGER * box[1] < box[2] <= _PERSON and box[1] > _THICK * box[2]
+    if long and abs(_volume(points, sequence.faces)) < _FILLED * box.prod():
+        warnings.warn(
+            f"{path}: the body seems to stand along z (it is {box[2]:.2f} m long there, {box[1]:.2f} m along y), but y is taken "
+            "as up; pass up=z (body_up=z in hood prepare) if it stands, up=y (body_up=y) if it lies",
+            stacklevel=3,
+        )
+
+
+def _volume(points: np.ndarray, faces: np.ndarray) -> float:
+    """Signed volume [m³] of a closed mesh (W, 3), (G, 3): below zero where its faces look inwards."""
+    a, b, c = (points[faces[:, corner]] - points.mean(axis=0) for corner in range(3))
+    return float(np.einsum("fi,fi->", a, np.cross(b, c))) / 6.0
+
+
 def _sewn(path: Path, sequence: MeshSequence) -> np.ndarray:
     """The faces, with vertices that seams double joined: inside and outside need a closed body."""
     before = len(topology.boundary_loops(sequence.faces))
@@ -217,10 +241,8 @@ def _sewn(path: Path, sequence: MeshSequence) -> np.ndarray:
 def _outward(path: Path, sequence: MeshSequence) -> np.ndarray:
     """The faces, turned over where a closed mesh is inside out: cloth would be drawn into it."""
     faces, points = sequence.faces, sequence.verts[0].astype(np.float64)
-    a, b, c = (points[faces[:, corner]] - points.mean(axis=0) for corner in range(3))
-    volume = float(np.einsum("fi,fi->", a, np.cross(b, c)))
     closed = 2 * len(topology.unique_edges(faces)) == 3 * len(faces)
-    if volume >= 0 or not closed:
+    if not closed or _volume(points, faces) >= 0:
         return faces
     warnings.warn(f"{path}: the faces of the mesh look inwards; they are turned over", stacklevel=3)
     return np.ascontiguousarray(faces[:, ::-1])
