@@ -340,3 +340,30 @@ def test_other_meshes_say_nothing_of_their_axis(tmp_path: Path, body: Body, case
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         load_mesh_sequence(tmp_path / "body.obj")
+
+
+@pytest.mark.parametrize("unit", [0.01, 0.001])
+def test_the_unit_that_makes_a_person_is_named(tmp_path: Path, body: Body, unit: float) -> None:
+    write_obj(tmp_path / "body.obj", body.v_template / unit, body.faces)
+    advice = rf"pass body_scale={unit:g}, which makes it 1\.72 m \(body_scale=1 takes it as it is\)"
+    with pytest.raises(ValueError, match=advice):
+        load_mesh_sequence(tmp_path / "body.obj")
+    wrong = 10 * unit
+    with pytest.warns(UserWarning, match=rf"17\.2 m large with body_scale={wrong:g}; {advice}"):
+        load_mesh_sequence(tmp_path / "body.obj", scale=wrong)
+    with pytest.warns(UserWarning, match=rf"0\.172 m large with body_scale={unit / 10:g}; {advice}"):
+        load_mesh_sequence(tmp_path / "body.obj", scale=unit / 10)
+    with pytest.raises(ValueError, match=f"body_scale={50 * unit:g} is not its unit, {advice}"):
+        load_mesh_sequence(tmp_path / "body.obj", scale=50 * unit)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for scale in (unit, 1.0):  # 1: as it is, whatever that is
+            assert np.ptp(load_mesh_sequence(tmp_path / "body.obj", scale=scale).verts) == pytest.approx(
+                1.719 * scale / unit, 1e-3
+            )
+
+
+def test_a_unit_that_shrinks_a_mesh_in_metres_is_told(tmp_path: Path, body: Body) -> None:
+    write_obj(tmp_path / "body.obj", body.v_template, body.faces)
+    with pytest.warns(UserWarning, match=r"0\.0172 m large with body_scale=0\.01; pass body_scale=1, which makes it 1\.72 m$"):
+        load_mesh_sequence(tmp_path / "body.obj", scale=0.01)
