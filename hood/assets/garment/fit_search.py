@@ -19,7 +19,7 @@ from hood.assets.garment.fit_size import Size, find_size
 from hood.assets.garment.in_place import lies_in_place
 from hood.assets.garment.placement import UP_AXES, Placement, Surrounding, surrounds
 from hood.assets.garment.skin_field import WIDTH, Field, Skin, misfit, settle, sleeve_misfit
-from hood.assets.garment.units import possible, size_ratio, used
+from hood.assets.garment.units import find_scale, possible, size_ratio, used
 
 #: Angles [degrees] of the arms around which all translations are tried, the steps of the finer search, and the greatest.
 ARM_ANGLES = (0.0, 30.0, 60.0)
@@ -227,12 +227,14 @@ class _Search:
         return self._judged(placement)
 
     def as_it_is(self, best: _Candidate) -> _Candidate | None:
-        """The garment as its file has it, but for what is asked; None where it cannot be in metres.
+        """The garment as its file has it, but for what is asked; None where it cannot be in metres. One that is larger than
+        usual can where it lies around the body.
 
         The angle of its arms is looked for from the T-pose, and from that of ``best`` where that is close.
         """
         asked = self.asked
-        if asked.scale is None and 1.0 not in self.scales:
+        usual = asked.scale is not None or 1.0 in self.scales
+        if not usual and find_scale(used(self.pos, self.faces), self.body) != 1.0:
             return None
         offset = np.zeros(3) if asked.offset is None else asked.offset
         start = Placement(asked.scale or 1.0, asked.up or "y", asked.turn or 0.0, offset, self.wearer.angles[0])
@@ -240,7 +242,7 @@ class _Search:
         stay = search.with_angle(search._judged(start))
         if best.misfit <= CLOSE and best.placement.angle != stay.placement.angle:
             stay = min(stay, search._judged(replace(start, angle=best.placement.angle)), key=lambda c: c.misfit)
-        return stay
+        return stay if usual or self._worn(stay) else None
 
     def decided(self, ranked: list[_Candidate], stay: _Candidate | None) -> Found:
         """The best candidate, or the file as it is; and whether that can be trusted."""

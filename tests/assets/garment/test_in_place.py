@@ -90,6 +90,26 @@ def test_with_its_unit_alone_a_close_garment_stays_too(wearer: Wearer, garments:
     assert find_placement(wide, garments["tshirt"].faces, wearer, Asked(scale=1.0)).placement.keys()[3] == "offset=[0,0,0]"
 
 
+def poncho() -> Mesh:
+    """A flat cone around the neck, 1.8 m wide, which is larger than garments usually are."""
+
+    def at(down: np.ndarray, along: np.ndarray) -> list[np.ndarray]:
+        radius, angle = 0.1 + 0.75 * down, 2 * np.pi * along
+        return [1.05 * radius * np.cos(angle), 0.66 - 0.1 * down, radius * np.sin(angle) - 0.02]
+
+    pos, faces = sheet(20, 40, at)
+    last = np.arange(len(pos)) % 41 == 40  # the seam: its last column is its first
+    return pos, np.where(last[faces], faces - 40, faces)
+
+
+def test_what_is_wider_than_usual_is_in_metres_where_it_lies_around_the_body(wearer: Wearer) -> None:
+    pos, faces = poncho()
+    found = find_placement(pos, faces, wearer)
+    assert found.refusal is None
+    assert found.placement.keys() == ["scale=1", "up=y", "turn=0", "offset=[0,0,0]"]
+    assert find_placement(pos + [3.0, 0, 0], faces, wearer).refusal is not None
+
+
 @pytest.mark.parametrize("shift", [(0.2, 0.2, 0.0), (0.0, 0.9, 0.0), (0.0, 0.05, -0.05)])
 def test_a_loose_skirt_beside_its_place_is_brought_back(
     wearer: Wearer, garments: dict[str, Garment], shift: tuple[float, float, float]
