@@ -25,10 +25,11 @@ def place_beside_mesh(finding: Finding, garment: Garment, motion: MeshMotion) ->
     nearer: what ``hood prepare`` finds for itself. Where it finds no place, the garment is looked at where it is."""
     surfaces = [motion.points(0)] + ([] if motion.sequence.rest is None else [motion.sequence.rest])
     pos = garment.worn_pos
-    finding.facts["size in body heights"] = float(f"{size_ratio(used(pos, garment.faces), surfaces[0]):.3g}")
+    ratio = size_ratio(used(pos, garment.faces), surfaces[0])
     found = find_place_on_mesh(garment, motion, Asked())
     if found is not None and (found.refusal is None or found.resized is not None):
         finding.facts |= {
+            "size in body heights": float(f"{found.placement.scale * ratio:.3g}"),
             "units": UNITS.get(found.placement.scale, "unknown"),
             "misfit on the body, 0 to 1": round(found.misfit, 3),
         }
@@ -36,7 +37,9 @@ def place_beside_mesh(finding: Finding, garment: Garment, motion: MeshMotion) ->
         pos = (found.placement if found.resized is None else found.resized.placement).apply(pos)
     else:
         factor = find_scale(used(pos, garment.faces), surfaces[0])
-        finding.facts["units"] = "unknown" if factor is None else UNITS[factor]
+        guess = "" if found is None else "by its size alone: "
+        finding.facts[f"{guess}size in body heights"] = float(f"{(factor or 1.0) * ratio:.3g}")
+        finding.facts[f"{guess}units"] = "unknown" if factor is None else UNITS[factor]
         if factor is None:
             finding.problem("its size fits no unit", "give scale=FACTOR, metres per unit")
             finding.refused = True
