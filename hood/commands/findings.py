@@ -25,7 +25,7 @@ from hood.assets.garment.suspicions import suspect_kind, suspect_sides
 from hood.assets.garment.units import UNITS, size_ratio, used
 from hood.assets.motion.poses import arms_down
 from hood.assets.motion.recording import read_recording
-from hood.assets.motion.up_axis import bearing_notice
+from hood.assets.motion.up_axis import bearing_notice, find_bearing
 from hood.assets.pickles.unpickle import load_pickle
 from hood.commands.beside_mesh import place_beside_mesh
 from hood.commands.common import read_model
@@ -189,10 +189,14 @@ def _place_beside(finding: Finding, garment: Garment, body: Body, betas: np.ndar
     found = find_place(garment, body, betas, Asked(), None)
     placement = found.placement if found.resized is None else found.resized.placement
     unsure = found.resized is None and found.refusal is not None
+    ratio = size_ratio(used(garment.rest_pos, garment.faces), body.shaped(betas)[0])
+    unit = {
+        "size in body heights": float(f"{found.placement.scale * ratio:.3g}"),
+        "units": UNITS.get(found.placement.scale, "unknown"),
+    }
     place = {"up axis": placement.up, "turned by [degrees]": placement.turn, "arms below the T-pose [degrees]": placement.angle}
     finding.facts |= {
-        "size in body heights": float(f"{size_ratio(used(garment.rest_pos, garment.faces), body.shaped(betas)[0]):.3g}"),
-        "units": UNITS.get(found.placement.scale, "unknown"),
+        **({f"closest place, not sure: {what}": value for what, value in unit.items()} if unsure else unit),
         "times its size it fits about alike": "its shape does not say"
         if found.sizes is None
         else np.round(found.sizes, 2).tolist(),
@@ -201,9 +205,9 @@ def _place_beside(finding: Finding, garment: Garment, body: Body, betas: np.ndar
         "misfit of the next place, beyond": round(found.margin, 3),
     }
     if unsure:
-        unit = unit_alone(garment, body, betas)
-        finding.refused = unit is None
-        finding.problem(f"no place on {body.name!r} is sure: {found.refusal}", f"prepare: {explain_unplaced(unit)}", unit)
+        key = unit_alone(garment, body, betas)
+        finding.refused = key is None
+        finding.problem(f"no place on {body.name!r} is sure: {found.refusal}", f"prepare: {explain_unplaced(key)}", key)
         return
     describe_place(finding, found, body.name)
     posed = posed_body(body, arms_down(placement.angle), 0, betas)
@@ -238,7 +242,7 @@ def inspect_motion(name: str) -> Finding:
     """A motion of joint rotations."""
     recording = read_recording(locate("motions", name))
     finding = Finding(name, "motion")
-    axis, notice = bearing_notice(Path(name), recording)
+    (axis, notice), bearing = bearing_notice(Path(name), recording), find_bearing(recording)
     speed = np.linalg.norm(np.diff(recording.transl, axis=0), axis=1) * recording.fps
     finding.facts = {
         "frames": len(recording.poses),
@@ -248,7 +252,8 @@ def inspect_motion(name: str) -> Finding:
         "gender": recording.gender,
         "shape coefficients": len(recording.betas),
         "up axis by its layout": recording.up,
-        "up axis by its poses": axis,
+        "up axis by its poses": bearing.axis if bearing.sure else f"not sure: {bearing.axis} if it stands, {axis} if it lies",
+        "up axis taken": axis,
         "greatest root speed [m/s]": round(float(speed.max(initial=0.0)), 2),
         "fingers": recording.fingers is not None,
     }

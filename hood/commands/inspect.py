@@ -148,12 +148,12 @@ def _fit(found: list[Finding], body: str, config: DictConfig) -> dict[str, Any] 
         with heard(aloud=False):  # what single files are warned about stands with them
             performed = load_motion(body, motion, _options(config))
             scene = dress(read_outfit(garments, performed, triangulate=True), performed)
-        misplaced = misplacement(scene)
+        misplaced = misplacement(scene, on_meshes=True)
         skinned, start = fit_figures(scene, settled=False), fit_figures(scene)
     except (ValueError, OSError) as error:
         return {**names, "fits": False, "reason": " ".join(str(error).split())}
     if misplaced is not None:
-        return {**names, "fits": False, "reason": f"the garment {misplaced.what}"}
+        return {**names, "fits": False, "starts": not misplaced.grave, "reason": f"the garment {misplaced.what}"}
     surface = performed.surface(0, performed.translation[0])
     height = float(surface[:, 1].max() - surface[:, 1].min()) if len(surface) else 0.0
     fits = start.stretch_max <= _STRETCH_LIMIT and start.depth_max <= _DEPTH_LIMIT
@@ -199,7 +199,7 @@ def _fit_lines(fit: dict[str, Any]) -> list[str]:
     frame = "its first frame" if fit["motion"] == NO_MOTION else f"the first frame of {fit['motion']}"
     head = f"{' + '.join(fit['garments'])} on {fit['body']} in {frame}:"
     if "reason" in fit:
-        return [head, f"  ! does not start: {fit['reason']}"]
+        return [head, f"  ! {'they do not fit' if fit.get('starts') else 'does not start'}: {fit['reason']}"]
     skinned, start = fit["skinned"], fit["start"]
     return [
         head,

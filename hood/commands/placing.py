@@ -9,7 +9,7 @@ from omegaconf import DictConfig
 
 from hood.assets.body.body import Body
 from hood.assets.garment.binding import PosedBody, posed_body
-from hood.assets.garment.fit_search import Asked, Found, Resized, Wearer, find_placement
+from hood.assets.garment.fit_search import CLOSE, Asked, Found, Resized, Wearer, find_placement
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.placement import UP_AXES, Placement
 from hood.assets.garment.units import find_scale, possible, size_ratio, used
@@ -87,9 +87,13 @@ def find_place_on_mesh(garment: Garment, motion: MeshMotion, asked: Asked) -> Fo
     best: Found | None = None
     for surface in surfaces:
         found = find_placement(garment.worn_pos, garment.faces, _statue(surface, motion.faces), asked)
-        known = best is not None and (found.refusal is not None, found.misfit) >= (best.refusal is not None, best.misfit)
-        best = best if known else found
+        best = found if best is None or _rank(found) < _rank(best) else best
     return best
+
+
+def _rank(found: Found) -> tuple[bool, bool, float]:
+    """What lies around one surface where it is stays there, unless it fits another closely."""
+    return found.refusal is not None, not found.worn and found.misfit > CLOSE, found.misfit
 
 
 def _statue(surface: np.ndarray, faces: np.ndarray) -> Wearer:

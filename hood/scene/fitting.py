@@ -46,10 +46,11 @@ def fit_figures(scene: Scene, frame: int = 0, settled: bool = True) -> FitFigure
     )
 
 
-def misplacement(scene: Scene, frame: int = 0) -> Suspicion | None:
+def misplacement(scene: Scene, frame: int = 0, on_meshes: bool = False) -> Suspicion | None:
     """Why the garment is not worn where ``frame`` puts it, not yet settled; None: it is, or there is no body.
 
-    Of sheets far from a mesh that mesh warns itself, see :meth:`hood.scene.mesh_motion.MeshMotion.dressed`.
+    Of sheets far from a mesh that mesh warns itself, see :meth:`hood.scene.mesh_motion.MeshMotion.dressed`: with ``on_meshes``
+    alone they are told here too.
     """
     origin = scene.motion.translation[frame]
     surface = scene.motion.surface(frame, origin).double().cpu().numpy()
@@ -57,7 +58,7 @@ def misplacement(scene: Scene, frame: int = 0) -> Suspicion | None:
         return None
     pos = scene.motion.skinned(scene.garment, frame, origin).double().cpu().numpy()
     found = suspect_place(pos, scene.garment.faces, surface, scene.motion.faces)
-    return next((one for one in found if one.grave or isinstance(scene.motion, BodyMotion)), None)
+    return next((one for one in found if one.grave or on_meshes or isinstance(scene.motion, BodyMotion)), None)
 
 
 def doubts(scene: Scene, frame: int = 0) -> list[tuple[str, Suspicion]]:

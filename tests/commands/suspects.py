@@ -14,6 +14,7 @@ from hood.assets.garment.garment import Garment
 from hood.assets.motion.recording import read_recording
 from hood.assets.motion.sequence import Z_UP_TO_Y_UP
 from hood.mesh import topology
+from hood.testing import grid
 
 #: How far the floor lies below the middle of the default body [m]: characters of other programs stand on y = 0.
 _FLOOR = 0.9
@@ -45,6 +46,18 @@ def pattern_pieces(path: Path, garment: Garment) -> Path:
 def body_as_garment(path: Path, body: Body) -> Path:
     """The closed body itself."""
     return write_obj(path, body.v_template, body.faces)
+
+
+def lying_body(path: Path, body: Body) -> Path:
+    """The closed body as a program with z up writes it: with y up it lies on its back."""
+    return write_obj(path, body.v_template[:, [0, 2, 1]] * [1.0, -1.0, 1.0], body.faces)
+
+
+def towel(path: Path) -> Path:
+    """A sheet of a square metre, 30 cm above the origin."""
+    pos, faces = grid(20, 20)
+    flat = pos - pos.mean(axis=0)
+    return write_obj(path, flat[:, np.argsort(-np.ptp(flat, axis=0))][:, [0, 2, 1]] + [0.0, 0.3, 0.0], faces)
 
 
 def torn_body(path: Path, body: Body, num_parts: int = 410) -> Path:

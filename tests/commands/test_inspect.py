@@ -218,3 +218,41 @@ def test_bindings_of_a_garment_are_told(capsys: pytest.CaptureFixture[str], garm
     dress, tank = (finding["facts"]["stiffer than the fabric"] for finding in report["files"])
     assert dress == f"{int((garments['dress'].stiffness > 1).sum())} vertices, 2 times"
     assert tank is None
+
+
+def test_what_is_not_sure_is_said_to_be(capsys: pytest.CaptureFixture[str], garments: dict[str, Garment]) -> None:
+    """The unit of a garment that fits nowhere for sure is a guess like the rest of its place."""
+    tank = garments["tank"]
+    write_obj(Path("flat.obj"), tank.rest_pos * [1.0, 1.0, 0.001], tank.faces)
+    _, report = inspect(capsys, "flat.obj", "tank")
+    facts = report["files"][0]["facts"]
+    assert "no place on 'default' is sure" in " ".join(entry["problem"] for entry in report["files"][0]["problems"])
+    assert not {"units", "size in body heights", "up axis"} & set(facts)
+    assert {"closest place, not sure: units", "closest place, not sure: size in body heights"} <= set(facts)
+
+
+def test_the_size_of_a_garment_is_told_in_the_unit_found(
+    capsys: pytest.CaptureFixture[str], garments: dict[str, Garment]
+) -> None:
+    tank, sizes = garments["tank"], []
+    for unit in (1.0, 0.01):
+        write_obj(Path("tank.obj"), tank.tpose(np.zeros(10)) / unit, tank.faces)
+        sizes.append(inspect(capsys, "tank.obj")[1]["files"][0]["facts"]["size in body heights"])
+    assert sizes[0] == sizes[1] == pytest.approx(0.4, abs=0.15)
+
+
+@pytest.mark.parametrize(("height", "told"), [(0.0, "not sure: y if it stands, z if it lies"), (0.9, "y")])
+def test_the_axis_of_a_motion_does_not_contradict_its_notice(
+    capsys: pytest.CaptureFixture[str], height: float, told: str
+) -> None:
+    """A motion in the layout of AMASS whose root stands along y, on the floor of its layout or at a standing height."""
+    np.savez(
+        "y_up.npz", poses=np.zeros((10, 156)), trans=np.tile([0.0, height, 0.0], (10, 1)), betas=np.zeros(16), gender="neutral",
+        mocap_framerate=25,
+    )  # fmt: skip
+    code, report = inspect(capsys, "y_up.npz")
+    facts, (problem,) = report["files"][0]["facts"], report["files"][0]["problems"]
+    assert code == 1
+    assert facts["up axis by its poses"] == told
+    assert facts["up axis taken"] == ("y" if told == "y" else "z")
+    assert "its body stands along y" in problem["problem"]

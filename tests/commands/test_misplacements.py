@@ -267,6 +267,50 @@ def test_the_command_for_a_mesh_body(capsys: pytest.CaptureFixture[str], body: B
     assert np.linalg.norm(load_garment("g.npz").rest_pos - pos - aside, axis=1).mean() < NEAR
 
 
+def cape() -> tuple[np.ndarray, np.ndarray]:
+    """A half ring of cloth (V, 3) behind the back, from the shoulders to the knees, and its faces: a sheet."""
+    rows = columns = 20
+    down, along = np.divmod(np.arange((rows + 1) * (columns + 1)), columns + 1)
+    angle, down = np.pi * (1 + along / columns), down / rows
+    places = [(0.2 + 0.15 * down) * np.cos(angle), 0.6 - 0.95 * down, (0.13 + 0.18 * down) * np.sin(angle) - 0.03]
+    first = np.flatnonzero((along < columns) & (np.arange(len(along)) < rows * (columns + 1)))
+    corners = first[:, None] + [0, 1, columns + 2, columns + 1]
+    return np.stack(places, axis=1), np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
+
+
+def test_a_sheet_far_from_a_mesh_body_does_not_fit_until_it_is_moved(capsys: pytest.CaptureFixture[str], body: Body) -> None:
+    """The printed command carries the way; without it prepare warns as a rollout does."""
+    write_obj(Path("hero.obj"), body.v_template, body.faces)
+    pos, faces = cape()
+    write_obj(Path("cape.obj"), pos + [3.0, 0, 0], faces)
+    assert main(["inspect", "hero.obj", "cape.obj", "body=hero.obj"]) == 1
+    said = capsys.readouterr().out
+    assert "! they do not fit: the garment is away from the body: its middle vertex is 2." in said
+    assert "  they fit" not in said
+    main(["inspect", "hero.obj", "cape.obj", "body=hero.obj", "--json"])
+    report = json.loads(capsys.readouterr().out)
+    assert not report["fit"]["fits"]
+    assert main(["prepare", "garment=cape.obj", "body=hero.obj", "output=still.npz"]) == 0
+    assert "warning: garment 'cape' is away from the body" in capsys.readouterr().err
+    command = shlex.split(report["files"][1]["command"])
+    assert [word for word in command if word.startswith("offset=")] == ["offset=[-3.0,0.0,0.0]"]
+    assert main([*command[1:], "output=back.npz"]) == 0
+    assert capsys.readouterr().err == ""
+    assert main(["inspect", "hero.obj", "back.npz", "body=hero.obj"]) == 0
+    assert "  they fit" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["default", "hero.obj"])
+def test_a_cape_behind_the_back_stays_there(capsys: pytest.CaptureFixture[str], body: Body, name: str) -> None:
+    """It lies around the body: neither turned nor moved, whichever body it is."""
+    write_obj(Path("hero.obj"), body.v_template, body.faces)
+    pos, faces = cape()
+    write_obj(Path("cape.obj"), pos, faces)
+    assert main(["prepare", "garment=cape.obj", f"body={name}", "output=cape.npz"]) == 0
+    assert "turned" not in capsys.readouterr().out
+    np.testing.assert_allclose(load_garment("cape.npz").rest_pos, pos, atol=1e-4)
+
+
 def test_the_command_names_the_body(capsys: pytest.CaptureFixture[str], body: Body) -> None:
     """A garment that is measured against another body is prepared for that one."""
     other = replace(body, v_template=body.shaped(np.array([2.0]))[0])

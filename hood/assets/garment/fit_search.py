@@ -16,9 +16,10 @@ from typing import NamedTuple
 import numpy as np
 
 from hood.assets.garment.fit_size import Size, find_size
+from hood.assets.garment.in_place import lies_in_place
 from hood.assets.garment.placement import UP_AXES, Placement, Surrounding, surrounds
 from hood.assets.garment.skin_field import WIDTH, Field, Skin, misfit, settle, sleeve_misfit
-from hood.assets.garment.units import possible, size_ratio, used
+from hood.assets.garment.units import find_scale, possible, size_ratio, used
 
 #: Angles [degrees] of the arms around which all translations are tried, the steps of the finer search, and the greatest.
 ARM_ANGLES = (0.0, 30.0, 60.0)
@@ -36,13 +37,15 @@ _PEAKS, _USUAL, _ODD, _REFINED = 2, 12, 3, 4
 #: A garment that is too small passes through the body where it belongs: it is looked for larger as well, in so many places.
 _LARGER, _LARGER_PLACES = 1.09, 2
 #: A garment that lies so close in its place, for the clearance of its cut, or is there of its own size as far as its shape
-#: tells, is looked for nowhere else.
+#: tells, is looked for nowhere else; nor is one that lies around the body where its file has it.
 _SURE, _OWN_SIZE = 0.25, 0.03
 #: A coordinate of the offset smaller than this [m] is within the accuracy of the search: it stays 0.
 _ACCURACY = 0.01
-#: A file that is at most this much worse as it is, stays as it is; so does one that fits nowhere but lies around the body with
-#: at most this share of its vertices inside.
-_STAY, _STAY_INSIDE = 0.02, 0.02
+#: A file that is at most this much worse as it is, stays as it is.
+_STAY = 0.02
+#: A file that lies around the body leaves its place only for one where it fits as closely as this: a loose garment fits about
+#: alike in many places, a cape before the face too.
+CLOSE = 0.4
 #: Beyond this misfit a garment fits nowhere; a different placement within this margin makes the answer ambiguous.
 _LIMIT, _MARGIN = 0.78, 0.015
 #: Placements whose points lie nearer than this [m] are the same one.
@@ -79,6 +82,7 @@ class Found(NamedTuple):
     refusal: str | None = None  # why the placement is not to be trusted
     sizes: tuple[float, float] | None = None  # factors that fit about alike; None: its shape says nothing, or scale was given
     resized: Resized | None = None  # never taken unasked: a looser cut is no larger unit
+    worn: bool = False  # it lies around the body where its file has it, and stays there
 
 
 _NOWHERE = Placement(1.0, "y", 0.0, np.zeros(3))
@@ -121,7 +125,8 @@ class Wearer:
 def find_placement(pos: np.ndarray, faces: np.ndarray, wearer: Wearer, asked: Asked | None = None) -> Found:
     """The placement of the garment ``pos`` (V, 3), in units of its file, with ``faces`` (F, 3), on ``wearer``.
 
-    A file that fits as it is, stays as it is. Where no answer can be trusted, ``refusal`` says why.
+    A file that fits as it is, stays as it is. So does one that lies around the body, unless it fits closely elsewhere; with
+    its unit alone asked for, it stays there in any case. Where no answer can be trusted, ``refusal`` says why.
     """
     search = _Search(pos, faces, wearer, asked or Asked())
     if len(search.many) == 0:
@@ -132,7 +137,7 @@ def find_placement(pos: np.ndarray, faces: np.ndarray, wearer: Wearer, asked: As
     candidates = _distinct([search.settled(start) for start in search.starts()], search.many)
     candidates = [search.with_angle(candidate) for candidate in candidates[:_REFINED]]
     ranked = _distinct([search.polished(candidate) for candidate in candidates], search.many)
-    return search.with_size(search.decided(ranked, search.as_it_is()), ranked)
+    return search.with_size(search.decided(ranked, search.as_it_is(ranked[0])), ranked)
 
 
 class _Candidate(NamedTuple):
@@ -221,15 +226,23 @@ class _Search:
             placement = replace(placement, offset=np.where(np.abs(placement.offset) < _ACCURACY, 0.0, placement.offset))
         return self._judged(placement)
 
-    def as_it_is(self) -> _Candidate | None:
-        """The garment as its file has it, but for what is asked; None where it cannot be in metres."""
+    def as_it_is(self, best: _Candidate) -> _Candidate | None:
+        """The garment as its file has it, but for what is asked; None where it cannot be in metres. One that is larger than
+        usual can where it lies around the body.
+
+        The angle of its arms is looked for from the T-pose, and from that of ``best`` where that is close.
+        """
         asked = self.asked
-        if asked.scale is None and 1.0 not in self.scales:
+        usual = asked.scale is not None or 1.0 in self.scales
+        if not usual and find_scale(used(self.pos, self.faces), self.body) != 1.0:
             return None
         offset = np.zeros(3) if asked.offset is None else asked.offset
         start = Placement(asked.scale or 1.0, asked.up or "y", asked.turn or 0.0, offset, self.wearer.angles[0])
         search = _Search(self.pos, self.faces, self.wearer, Asked(start.scale, start.up, start.turn, offset))
-        return search.with_angle(search._judged(start))
+        stay = search.with_angle(search._judged(start))
+        if best.misfit <= CLOSE and best.placement.angle != stay.placement.angle:
+            stay = min(stay, search._judged(replace(start, angle=best.placement.angle)), key=lambda c: c.misfit)
+        return stay if usual or self._worn(stay) else None
 
     def decided(self, ranked: list[_Candidate], stay: _Candidate | None) -> Found:
         """The best candidate, or the file as it is; and whether that can be trusted."""
@@ -240,9 +253,17 @@ class _Search:
         rival = min(rivals, key=lambda c: c.misfit, default=None)
         found = Found(best.placement, best.misfit, 1.0 - best.misfit if rival is None else rival.misfit - best.misfit)
         refusal = self._doubt(best, rival, best is stay)
-        if refusal is not None and stay is not None and self._worn(stay):
-            return Found(stay.placement, stay.misfit, 0.0)
+        if stay is not None and (best is stay or refusal is not None or self._may_stay(best)) and self._worn(stay):
+            margin = found.margin if best is stay else 0.0
+            return Found(stay.placement, stay.misfit, margin, worn=True)
         return found._replace(refusal=refusal)
+
+    def _may_stay(self, best: _Candidate) -> bool:
+        """Whether a garment that lies around the body stays there, though it fits better at ``best``: that is not close, or
+        the unit of the file is all that is asked for."""
+        asked = self.asked
+        unit_alone = asked.scale is not None and asked.up is None and asked.turn is None and asked.offset is None
+        return unit_alone or best.misfit > CLOSE
 
     def with_size(self, found: Found, ranked: list[_Candidate]) -> Found:
         """``found`` with the sizes that fit, and the place in another size where that explains the garment clearly better."""
@@ -251,7 +272,8 @@ class _Search:
             return found
         here = best = self._judged(found.placement)
         own = size = self._size(best)
-        sure = size.misfit <= _SURE or (size.alike is not None and abs(size.factor - 1.0) <= _OWN_SIZE)
+        own_size = size.alike is not None and abs(size.factor - 1.0) <= _OWN_SIZE
+        sure = found.worn or own_size or size.misfit <= _SURE
         others = [] if sure else [*ranked, *self._larger()]
         for other in others:
             if other.odd <= here.odd and not _same(other, here, self.many, _SAME):
@@ -310,8 +332,8 @@ class _Search:
 
     def _worn(self, stay: _Candidate) -> bool:
         """Whether the file as it is lies around the body: nothing then asks for another place."""
-        around = self._surrounding(stay)
-        return around.problem is None and around.inside <= _STAY_INSIDE
+        surface = self.wearer.skin(stay.placement.angle).surface
+        return lies_in_place(stay.placement.apply(self.pos), self.faces, surface, self.wearer.faces)
 
     def _surrounding(self, candidate: _Candidate) -> Surrounding:
         points = candidate.placement.apply(used(self.pos, self.faces))

@@ -29,8 +29,13 @@ _H5_SUFFIXES = (".h5", ".hdf5")
 #: What can be given as a moving or still mesh, besides a folder of OBJ or PLY files.
 ANIMATED_SUFFIXES = (".npz", ".pkl", CACHE_SUFFIX, *_H5_SUFFIXES, *_GLTF_SUFFIXES, *_STILL_SUFFIXES)
 _DEFAULT_FPS = 30.0
-#: A body larger than this [m] is in other units.
-_LARGEST = 30.0
+#: A body larger than this [m] is in other units. Of these [m per unit] that is named which brings it nearest to a person [m].
+_LARGEST, _UNITS, _USUAL = 30.0, (1.0, 0.01, 0.001), 1.7
+#: Sizes [m] of bodies, from dolls to horses: who names a unit that gives another one is told.
+_PERSONS = (0.25, 4.0)
+#: A body stands along z where it is so many times longer than along y, and no plane: at least this share as thick, and not
+#: filled like a box [share of it].
+_LONGER, _THICK, _FILLED = 2.5, 0.1, 0.4
 
 
 def body_kind(name: str | Path) -> str:
@@ -70,11 +75,12 @@ def load_mesh_sequence(
     whose animation is evaluated at ``fps`` itself; OBJ, PLY, OFF or STL for one that stands still.
 
     Args:
-        up: axis that points up in the file: "y", "z", or "auto", y.
+        up: axis that points up in the file: "y", "z", or "auto", y, with a warning where it seems to be z.
         start, stop: part to keep, in seconds or in frames of the file ("120f").
         loop: times the motion is played; it must end as it began.
         file_fps: frame rate of the file, whatever it says itself; 30 where neither does.
-        scale: metres per unit of the file; None: 1, refused where the mesh would be larger than 30 m.
+        scale: metres per unit of the file; None: 1. Refused where the mesh is larger than 30 m then; a given one is warned of
+            where it makes no person. 1 takes the mesh as it is.
         animation, parts: of glTF, see :func:`hood.assets.formats.gltf_animation.read_gltf_animation`.
 
     Raises:
@@ -92,6 +98,8 @@ def load_mesh_sequence(
     sequence = MeshSequence(path.stem, verts, faces, rate, _bones(path, content), content.rest, content.weights)
     sequence = turn_mesh(sequence, 1.0 if scale is None else float(scale), up)
     _check_size(path, sequence, scale)
+    if up == "auto":
+        _check_bearing(path, sequence)
     sequence = resample_mesh(trim_mesh(sequence, start, stop), fps)
     sequence = replace(sequence, faces=_sewn(path, sequence))
     return replace(loop_mesh(sequence, loop), faces=_outward(path, sequence))
@@ -186,12 +194,36 @@ def _check_size(path: Path, sequence: MeshSequence, scale: float | None) -> None
     extent = float(np.ptp(sequence.verts[0], axis=0).max())
     if extent <= 0:
         raise ValueError(f"{path}: all vertices of its first frame are at one point; it is no surface")
-    if scale is None and extent > _LARGEST:
-        factor = 0.01 if extent <= 100 * _LARGEST else 0.001
-        raise ValueError(
-            f"{path}: the mesh is {extent:.4g} m large; its unit is not the metre, pass body_scale={factor:g} "
-            "(body_scale=1 takes it as it is)"
+    if scale == 1.0:
+        return
+    given = 1.0 if scale is None else float(scale)
+    factor = min(_UNITS, key=lambda unit: abs(np.log(unit * extent / given / _USUAL)))
+    fix = f"pass body_scale={factor:g}, which makes it {factor * extent / given:.3g} m"
+    fix += "" if factor == 1.0 else " (body_scale=1 takes it as it is)"
+    if extent > _LARGEST:
+        unit = "its unit is not the metre" if scale is None else f"body_scale={scale:g} is not its unit"
+        raise ValueError(f"{path}: the mesh is {extent:.4g} m large; {unit}, {fix}")
+    if scale is not None and not _PERSONS[0] <= extent <= _PERSONS[1] and factor != scale:
+        warnings.warn(f"{path}: the mesh is {extent:.3g} m large with body_scale={scale:g}; {fix}", stacklevel=3)
+
+
+def _check_bearing(path: Path, sequence: MeshSequence) -> None:
+    """Warn of a mesh that lies along z in its first frame, as a body does that stands in a file with z up."""
+    points = sequence.verts[0].astype(np.float64)
+    box = np.ptp(points, axis=0)
+    long = _LONGER * box[1] < box[2] <= _PERSONS[1] and box[1] > _THICK * box[2]
+    if long and abs(_volume(points, sequence.faces)) < _FILLED * box.prod():
+        warnings.warn(
+            f"{path}: the body seems to stand along z (it is {box[2]:.2f} m long there, {box[1]:.2f} m along y), but y is "
+            "taken as up; pass up=z (body_up=z in hood prepare) if it stands, up=y (body_up=y) if it lies",
+            stacklevel=3,
         )
+
+
+def _volume(points: np.ndarray, faces: np.ndarray) -> float:
+    """Signed volume [m³] of a closed mesh (W, 3), (G, 3): below zero where its faces look inwards."""
+    a, b, c = (points[faces[:, corner]] - points.mean(axis=0) for corner in range(3))
+    return float(np.einsum("fi,fi->", a, np.cross(b, c))) / 6.0
 
 
 def _sewn(path: Path, sequence: MeshSequence) -> np.ndarray:
@@ -217,10 +249,8 @@ def _sewn(path: Path, sequence: MeshSequence) -> np.ndarray:
 def _outward(path: Path, sequence: MeshSequence) -> np.ndarray:
     """The faces, turned over where a closed mesh is inside out: cloth would be drawn into it."""
     faces, points = sequence.faces, sequence.verts[0].astype(np.float64)
-    a, b, c = (points[faces[:, corner]] - points.mean(axis=0) for corner in range(3))
-    volume = float(np.einsum("fi,fi->", a, np.cross(b, c)))
     closed = 2 * len(topology.unique_edges(faces)) == 3 * len(faces)
-    if volume >= 0 or not closed:
+    if not closed or _volume(points, faces) >= 0:
         return faces
     warnings.warn(f"{path}: the faces of the mesh look inwards; they are turned over", stacklevel=3)
     return np.ascontiguousarray(faces[:, ::-1])

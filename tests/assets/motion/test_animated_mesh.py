@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import struct
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,9 +12,10 @@ import h5py
 import numpy as np
 import pytest
 
+from hood.assets.body.body import Body
 from hood.assets.motion.animated_mesh import body_kind, load_mesh_sequence
 from hood.assets.motion.mesh_sequence import MeshSequence, resample_mesh
-from hood.testing import sphere
+from hood.testing import box, sphere
 
 POINTS, FACES = sphere(1, 0.5)
 COUNT = 7
@@ -304,3 +306,63 @@ def test_kinds_of_bodies(tmp_path: Path, body_file: Path) -> None:
     (tmp_path / "SMPL_MALE.pkl").write_bytes(pickle.dumps({"v_template": np.zeros((3, 3)), "vertsy": 1}, 2))
     assert body_kind(tmp_path / "models") == body_kind(tmp_path / "SMPL_MALE.pkl") == "model"
     assert body_kind(tmp_path / "hero.glb") == "mesh"
+
+
+def lying(body: Body) -> np.ndarray:
+    """(W, 3) m: the body in its T-pose, which stands along z."""
+    return body.v_template[:, [0, 2, 1]] * [1.0, -1.0, 1.0]
+
+
+def test_a_body_that_seems_to_stand_along_z_is_told(tmp_path: Path, body: Body) -> None:
+    """It is usable as it is: who says up=y hears nothing, and up=z turns it."""
+    write_obj(tmp_path / "body.obj", 100.0 * lying(body), body.faces)
+    with pytest.warns(UserWarning, match=r"seems to stand along z .*1\.7\d m.*; pass up=z \(body_up=z in hood prepare\)"):
+        found = load_mesh_sequence(tmp_path / "body.obj", scale=0.01)
+    np.testing.assert_allclose(found.verts[0], lying(body), atol=1e-9)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        given = [load_mesh_sequence(tmp_path / "body.obj", scale=0.01, up=up) for up in ("y", "z")]
+    np.testing.assert_array_equal(given[0].verts, found.verts)
+    np.testing.assert_allclose(given[1].verts[0], body.v_template, atol=1e-9)
+
+
+@pytest.mark.parametrize("case", ["standing", "thick", "plane", "car", "box"])
+def test_other_meshes_say_nothing_of_their_axis(tmp_path: Path, body: Body, case: str) -> None:
+    boxed, box_faces = box()
+    pos, faces = {
+        "standing": (body.v_template, body.faces),
+        "thick": (lying(body) * [1.0, 2.5, 1.0], body.faces),
+        "plane": (lying(body) * [1.0, 0.3, 1.0], body.faces),
+        "car": (2.7 * lying(body), body.faces),
+        "box": (boxed * [1.0, 0.5, 2.0], box_faces),
+    }[case]
+    write_obj(tmp_path / "body.obj", pos, faces)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_mesh_sequence(tmp_path / "body.obj")
+
+
+@pytest.mark.parametrize("unit", [0.01, 0.001])
+def test_the_unit_that_makes_a_person_is_named(tmp_path: Path, body: Body, unit: float) -> None:
+    write_obj(tmp_path / "body.obj", body.v_template / unit, body.faces)
+    advice = rf"pass body_scale={unit:g}, which makes it 1\.72 m \(body_scale=1 takes it as it is\)"
+    with pytest.raises(ValueError, match=advice):
+        load_mesh_sequence(tmp_path / "body.obj")
+    wrong = 10 * unit
+    with pytest.warns(UserWarning, match=rf"17\.2 m large with body_scale={wrong:g}; {advice}"):
+        load_mesh_sequence(tmp_path / "body.obj", scale=wrong)
+    with pytest.warns(UserWarning, match=rf"0\.172 m large with body_scale={unit / 10:g}; {advice}"):
+        load_mesh_sequence(tmp_path / "body.obj", scale=unit / 10)
+    with pytest.raises(ValueError, match=f"body_scale={50 * unit:g} is not its unit, {advice}"):
+        load_mesh_sequence(tmp_path / "body.obj", scale=50 * unit)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for scale in (unit, 1.0):  # 1: as it is, whatever that is
+            found = load_mesh_sequence(tmp_path / "body.obj", scale=scale)
+            np.testing.assert_allclose(found.verts[0], body.v_template * scale / unit, rtol=1e-9)
+
+
+def test_a_unit_that_shrinks_a_mesh_in_metres_is_told(tmp_path: Path, body: Body) -> None:
+    write_obj(tmp_path / "body.obj", body.v_template, body.faces)
+    with pytest.warns(UserWarning, match=r"0\.0172 m large with body_scale=0\.01; pass body_scale=1, which makes it 1\.72 m$"):
+        load_mesh_sequence(tmp_path / "body.obj", scale=0.01)
