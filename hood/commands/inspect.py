@@ -57,7 +57,7 @@ def _split(arguments: Sequence[str]) -> tuple[list[str], DictConfig]:
     """Files and the config: a word ``key=value`` is an override unless there is such a file, every other word a file."""
     words = ["format=json" if word == "--json" else word for word in arguments]
     overrides = [word for word in words if re.match(r"[a-z_.]+=", word) and not Path(word).exists()]
-    files = [word for word in words if word not in overrides]
+    files = [_of_folder(word) for word in words if word not in overrides]
     config = load_config("inspect", overrides)
     if any(word.startswith("-") for word in files):
         raise ConfigError(
@@ -66,6 +66,12 @@ def _split(arguments: Sequence[str]) -> tuple[list[str], DictConfig]:
     if not files:
         raise ConfigError("no file is given: hood inspect shirt.obj walk.npz")
     return files, config
+
+
+def _of_folder(word: str) -> str:
+    """The file of a rollout's folder, which the commands that take rollouts take as well; else the word."""
+    file = Path(word).expanduser() / "rollout.h5"
+    return str(file) if file.is_file() else word
 
 
 def _identify(name: str, body: str) -> Finding:

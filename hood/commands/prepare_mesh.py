@@ -63,7 +63,7 @@ def prepare_for_mesh(config: DictConfig, names: list[str], target: Path, read: C
     prepare_folder(target.parent)
     save_garment(target, outfit)
     report = _report(names, fittings, outfit, figures, target)
-    print(json.dumps(report, indent=1) if str(config.format) == "json" else _text(report, str(config.body)))
+    print(json.dumps(report, indent=1) if str(config.format) == "json" else _text(report, config))
     return 0
 
 
@@ -143,14 +143,17 @@ def _report(names: list[str], fittings: list[Fitting], outfit: Garment, figures:
     }
 
 
-def _text(report: dict[str, Any], body: str) -> str:
-    lines = []
+def _text(report: dict[str, Any], config: DictConfig) -> str:
+    body, lines = str(config.body), []
     for part in report["garments"]:
         lines.append(f"{part['file']}:")
         lines += [f"  {change['text']}" for change in part["changes"]] or ["  nothing to repair"]
         lines.append(f"  now {part['result']}")
     start = report["starts"]["first frame"]
-    run = shlex.join(["hood", "rollout", plain_word("garment", report["output"]), plain_word("body", body)])
+    words = [plain_word("garment", report["output"]), plain_word("body", body)]
+    words += [] if config.body_scale is None else [f"body_scale={config.body_scale:g}"]
+    words += [] if str(config.body_up) == "auto" else [f"up={config.body_up}"]
+    run = shlex.join(["hood", "rollout", *words])
     return "\n".join(
         [
             *lines,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from pathlib import Path
 
+import numpy as np
 import pytest
 from workshop import write_obj
 
@@ -54,3 +55,27 @@ def test_the_rollout_on_a_mesh_runs(
     command, *words = printed(capsys.readouterr().out.splitlines()[-1], "run it with: ")
     config = load_config(command, words)
     assert (config.garment, config.body) == ("Röckchen_prepared.npz", name)
+
+
+def test_the_rollout_on_a_mesh_has_its_unit_and_axis(
+    garments: dict[str, Garment], body: Body, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The body is in centimetres, with z up."""
+    write_obj(Path("body.obj"), 100.0 * body.v_template @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), body.faces)
+    write_obj(Path("tank.obj"), garments["tank"].worn_pos, garments["tank"].faces)
+    assert main(["prepare", "garment=tank.obj", "body=body.obj", "body_scale=0.01", "body_up=z"]) == 0
+    command, *words = printed(capsys.readouterr().out.splitlines()[-1], "run it with: ")
+    config = load_config(command, words)
+    assert (config.body_scale, config.up) == (0.01, "z")
+    quiet = ["stepper=guess", "refine=0", "num_frames=1", "video=none", "sheet=false", "metrics=none", "sequence=none"]
+    assert main([command, *words, *quiet]) in (0, 3)
+
+
+def test_a_folder_of_a_rollout_is_inspected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    quiet = ["stepper=guess", "refine=0", "num_frames=2", "video=none", "sheet=false"]
+    assert main(["rollout", "garment=tank", "sequence=plie", *quiet, "output=shot"]) in (0, 3)
+    main(["inspect", "shot/rollout.h5"])
+    of_file = capsys.readouterr().out.split("shot/rollout.h5", 1)[1]
+    main(["inspect", "shot"])
+    assert capsys.readouterr().out.split("shot/rollout.h5", 1)[1] == of_file
+    assert "rollout" in of_file
