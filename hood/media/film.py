@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +20,7 @@ from hood.media.pieces import pieces_of
 from hood.media.prints import Print, pixels_of
 from hood.media.render import BODY_COLOR, Camera, RenderMesh, captioned, contact_sheet, render_frame
 from hood.media.video import VideoWriter, save_png
+from hood.native.threads import MOST_PARTS, num_parts
 
 _SHEET_FRAMES = 12
 #: Where the body is to be drawn thinner, it is where cloth is this near [m].
@@ -105,7 +108,7 @@ class Film:
     def sheet(self, count: int = _SHEET_FRAMES, columns: int = 6) -> np.ndarray:
         """Contact sheet of ``count`` evenly spaced frames."""
         chosen = sheet_frames(len(self.data.cloth_pos), count)
-        return contact_sheet([self.frame(i) for i in chosen], columns, [f"{self.data.time[i]:.2f} s" for i in chosen])
+        return contact_sheet(list(drawn(self, chosen)), columns, [f"{self.data.time[i]:.2f} s" for i in chosen])
 
 
 def sheet_frames(num_frames: int, count: int = _SHEET_FRAMES) -> list[int]:
@@ -141,9 +144,25 @@ def write_video(
     step = seconds_per_frame(data)
     chosen: Sequence[int] | Iterable[int] = range(0, len(data.cloth_pos), stride) if frames is None else frames
     with VideoWriter(path, fps=1.0 / (step * stride)) as writer:
-        for index in chosen:
-            writer.append(film.frame(index))
+        for picture in drawn(film, chosen):
+            writer.append(picture)
     return writer.path
+
+
+def drawn(film: Film, frames: Iterable[int]) -> Iterator[np.ndarray]:
+    """Pictures (H, W, 3) uint8 of frames, in their order; drawn some frames ahead, by as many threads as torch has."""
+    threads = num_parts(MOST_PARTS, 1)
+    if threads == 1:
+        yield from map(film.frame, frames)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        ahead: deque[Future[np.ndarray]] = deque()
+        for index in frames:
+            ahead.append(pool.submit(film.frame, index))
+            if len(ahead) > threads:
+                yield ahead.popleft().result()
+        while ahead:
+            yield ahead.popleft().result()
 
 
 def _prints(data: RolloutData, textures: Mapping[str, Texture]) -> list[Print]:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from hood.dynamics.recorder import RolloutData
-from hood.media.film import Film
+from hood.media.film import Film, drawn
 from hood.testing import cylinder, sphere
 
 pytest.importorskip("PIL")
@@ -63,3 +65,31 @@ def test_the_camera_frames_the_garment() -> None:
     lost[2] = np.nan
     near, wild = film._camera, Film(replace(still, cloth_pos=lost), 160, 224)._camera
     assert np.linalg.norm(np.subtract(wild.position, wild.target)) < 4 * np.linalg.norm(np.subtract(near.position, near.target))
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_frames_that_are_drawn_ahead_are_the_same_and_in_order(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = ball_in_a_tube()
+    turned = np.stack([data.cloth_pos[0] + [0.02 * number, 0.0, 0.0] for number in range(7)])
+    film = Film(replace(data, cloth_pos=turned, body_pos=np.repeat(data.body_pos, 7, axis=0), time=np.arange(7) / 30), 96, 128)
+    expected = [film.frame(index) for index in (6, 0, 3, 3, 1)]
+    used = set()
+
+    def seen(index: int) -> np.ndarray:
+        used.add(threading.get_ident())
+        time.sleep(0.02)  # so that one thread cannot do it all
+        return Film.frame(film, index)
+
+    monkeypatch.setattr("hood.media.film.num_parts", lambda count, least: threads)
+    monkeypatch.setattr(film, "frame", seen)
+    found = list(drawn(film, iter((6, 0, 3, 3, 1))))
+    assert all(np.array_equal(a, b) for a, b in zip(found, expected, strict=True))
+    assert len(used) == threads
+    assert (threading.get_ident() in used) == (threads == 1)
+
+
+def test_a_frame_that_cannot_be_drawn_ends_the_film(monkeypatch: pytest.MonkeyPatch) -> None:
+    film = Film(ball_in_a_tube(), 96, 128)
+    monkeypatch.setattr("hood.media.film.num_parts", lambda count, least: 2)
+    with pytest.raises(IndexError):
+        list(drawn(film, [0, 99]))
