@@ -155,7 +155,7 @@ class _Probe:
         try:
             return choose_windows(self.ready.scene.motion, count, self.asked.windows, LEAD + self.asked.frames + 1)
         except ValueError as error:
-            fix = "give more frames (num_frames, or a longer motion), shorter windows (frames=… of hood plan), or no accuracy=…"
+            fix = "give more frames (num_frames, or a longer motion), fewer frames=… of hood plan, or no accuracy=…"
             raise ConfigError(f"a plan: {error}; {fix}") from error
 
     def _why_absent(self, part: Part) -> str:

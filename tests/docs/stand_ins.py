@@ -47,7 +47,7 @@ class Desk:
             (r"outputs/plan/plan\.json", self.plan),
             (r"([\w/]+/)?\w+\.safetensors", self.model),
             (r"postcvpr\.pth", self.published),
-            (r"(my_)?shirt\.obj", self.shirt),
+            (r"(my_)?shirt\.obj|cape \(1\)\.obj|Röckchen\.obj", self.shirt),
             (r"shirt\.npz", self.bound_shirt),
             (r"coat\.(obj|ply)|left\.txt|right\.txt", self.coat),
             (r"(my_)?walk\.npz|my_amass_file\.npz|amass/.*", self.recording),
@@ -61,7 +61,8 @@ class Desk:
     def lay(self, words: Sequence[str], where: Path) -> None:
         """Copies of the files that the words name, under those names, into the folder ``where``."""
         given = [word for word in words[1:] if not word.startswith("output=")]
-        for name in dict.fromkeys(re.findall(r"[\w.*/-]+", " ".join(given))):
+        values = [word.partition("=")[2] for word in given]
+        for name in dict.fromkeys([*re.findall(r"[\w.*/-]+", " ".join(given)), *values]):
             for pattern, make in self.makers:
                 if re.fullmatch(pattern, name):
                     made, target = make(name, words), where / _without_stars(name)

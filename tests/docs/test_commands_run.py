@@ -78,7 +78,6 @@ CHOICES = {
     r"garment=(NAME|…)": "garment=tank",
     r"sequence=MOTION": "sequence=plie",
     r"weights=NAME": "weights=quickstart model=passes",
-    r"document=FILE": "document=docs/stability.md",
     r"inspect FILE$": "inspect my_shirt.obj",
     r"checkpoint=…": "checkpoint=A/model.safetensors",
     r"budget_ms=…": "budget_ms=50",

@@ -190,7 +190,7 @@ def test_a_package_of_the_same_names_is_told_apart(installed: Path, tmp_path: Pa
     [
         (["model=small", "model.output=my_cloth.bounded.Bounded"], "model.output is 'my_cloth.bounded.Bounded'; choose"),
         (["model=small", "model.features=physical+os"], "no installed package has a group 'os' (known: speed)"),
-        (["model=ours", "model.output=bounded"], None),
+        (["model=ours", "model.output=bounded", "trainer.statistics_iterations=0"], None),
         (["model=bounded", "model.features=local"], "this output needs model.features=paper or model.features=physical"),
         (["model=bounded", "model.schedule='1x(mesh) | 1x(mesh)'"], "several passes"),
     ],
