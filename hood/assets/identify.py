@@ -9,7 +9,7 @@ from pathlib import Path
 import h5py
 
 from hood.assets.files.foreign_formats import require_readable
-from hood.assets.files.guarded import guarded
+from hood.assets.files.guarded import guarded, listed
 from hood.assets.files.h5_links import own_group
 from hood.assets.files.library import names, nearest
 from hood.assets.formats.gltf import read_gltf
@@ -83,7 +83,7 @@ def _kind_of_keys(path: Path, keys: Collection[str]) -> str:
     for kind, alternatives in _KEYS.items():
         if any(needed <= set(keys) for needed in alternatives):
             return kind
-    raise ValueError(f"{path}: no garment, body, motion or mesh has the keys {', '.join(sorted(keys)[:8]) or '(none)'}")
+    raise ValueError(f"{path}: no garment, body, motion or mesh has the keys {listed(sorted(keys))}")
 
 
 def _archive_keys(path: Path) -> list[str]:

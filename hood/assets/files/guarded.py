@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +15,22 @@ class Refused(pickle.UnpicklingError):
 
 #: Characters of another library's message that are passed on; some quote the file.
 _REASON = 300
+#: And of a name that a file holds.
+_NAME = 40
 
 
 def first_line(error: Exception) -> str:
     """What an error says, in one line that is not too long."""
     said = str(error).splitlines()[0] if str(error) else type(error).__name__
     return said if len(said) <= _REASON else f"{said[:_REASON]} …"
+
+
+def listed(names: Iterable[str], most: int = 8) -> str:
+    """Names out of a file in one line that can be printed, whatever a damaged file holds: at most so many, each cut off."""
+    every = list(names)
+    shown = ["".join(c if c.isprintable() else "?" for c in name[: _NAME + 1]) for name in every[:most]]
+    cut = [name if len(name) <= _NAME else f"{name[:_NAME]}…" for name in shown]
+    return (", ".join(cut) + (" …" if len(every) > most else "")) or "(none)"
 
 
 def check_size(path: str | Path, size_limit: int) -> Path:

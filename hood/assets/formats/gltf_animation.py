@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hood.assets.files.guarded import Refused, guarded
+from hood.assets.files.guarded import Refused, guarded, listed
 from hood.assets.files.library import SIZE_LIMIT
 from hood.assets.formats.gltf import Gltf, read_gltf
 from hood.assets.formats.gltf_player import Player
@@ -144,7 +144,7 @@ def _meshes(gltf: Gltf, player: Player, parts: Sequence[str]) -> Iterator[_Mesh]
                 yield _primitive(gltf, node, spec, primitive)
     missing = set(parts) - names
     if missing:
-        raise Refused(f"no part {sorted(missing)[0]!r}; it has {', '.join(sorted(names)[:12])}")
+        raise Refused(f"no part {sorted(missing)[0]!r}; it has {listed(sorted(names), 12)}")
 
 
 def _outward(mesh: _Mesh, player: Player, times: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from hood.assets.files.guarded import listed
 from hood.assets.files.library import unknown
 from hood.assets.garment.garment_arrays import check_rows, normalised
 from hood.assets.pickles.unpickle import load_pickle
@@ -38,9 +39,9 @@ def read_reference_garment(path: Path, name: str | None) -> dict[str, Any]:
         return _fields(str(path), path.stem, content)
     entries = {str(key): value for key, value in content.items() if isinstance(value, Mapping) and "faces" in value}
     if not entries:
-        raise ValueError(f"{path}: not a garment file: no 'rest_pos' or 'vertices' with 'faces' (found {_found(content)})")
+        raise ValueError(f"{path}: not a garment file: no 'rest_pos' or 'vertices' with 'faces' (found {_keys(content)})")
     if name is None and len(entries) > 1:
-        raise ValueError(f"{path}: holds {len(entries)} garments; choose one, {path.name}:{min(entries)} ({_found(entries)})")
+        raise ValueError(f"{path}: holds {len(entries)} garments; choose one, {path.name}:{min(entries)} ({_keys(entries)})")
     chosen = next(iter(entries)) if name is None else name
     if chosen not in entries:
         raise ValueError(f"{path}: {unknown('garment', chosen, sorted(entries))}")
@@ -54,9 +55,8 @@ def garment_names(content: Any) -> list[str]:
     return sorted(str(key) for key, value in content.items() if isinstance(value, Mapping) and "faces" in value)
 
 
-def _found(content: Mapping[Any, Any]) -> str:
-    keys = sorted(map(str, content))
-    return ", ".join(keys[:8]) + (" …" if len(keys) > 8 else "")
+def _keys(content: Mapping[Any, Any]) -> str:
+    return listed(sorted(map(str, content)))
 
 
 def _fields(where: str, name: str, entry: Mapping[str, Any]) -> dict[str, Any]:
