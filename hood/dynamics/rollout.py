@@ -363,7 +363,8 @@ def _taken_apart(scene: Scene, state: State, frame: int) -> State:
         assert scene.outfit is not None
         order = ", ".join(scene.outfit.names[garment] for garment in found.order)
         warnings.warn(
-            f"outfit: garments lie in the same place at the start and were taken 3 mm apart; from the body outwards: {order}",
+            "outfit: garments lie in the same place at the start and were laid over each other; from the body outwards: "
+            f"{order}",
             stacklevel=3,
         )
     if found is not None and (found.before or found.turned):

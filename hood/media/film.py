@@ -20,7 +20,7 @@ from hood.media.pieces import pieces_of
 from hood.media.prints import Print, pixels_of
 from hood.media.render import BODY_COLOR, Camera, RenderMesh, captioned, contact_sheet, render_frame
 from hood.media.video import VideoWriter, save_png
-from hood.native.threads import MOST_PARTS, num_parts
+from hood.native.threads import num_parts
 
 _SHEET_FRAMES = 12
 #: Where the body is to be drawn thinner, it is where cloth is this near [m].
@@ -33,6 +33,8 @@ _MARGIN = 1.18
 _ENDS = 0.4
 #: Cloth farther than this [m] from the body's box does not widen the picture: it blew up.
 _ASTRAY = 0.6
+#: Frames that are drawn at once at most; each takes some 30 MB.
+_THREADS = 8
 _SMOOTHING = 15  # frames over which the camera averages the walker's path
 
 
@@ -150,8 +152,9 @@ def write_video(
 
 
 def drawn(film: Film, frames: Iterable[int]) -> Iterator[np.ndarray]:
-    """Pictures (H, W, 3) uint8 of frames, in their order; drawn some frames ahead, by as many threads as torch has."""
-    threads = num_parts(MOST_PARTS, 1)
+    """Pictures (H, W, 3) uint8 of frames, in their order; drawn some frames ahead, by as many threads as torch has, up to
+    :data:`_THREADS`."""
+    threads = num_parts(_THREADS, 1)
     if threads == 1:
         yield from map(film.frame, frames)
         return

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 from torch import Tensor
 
 #: Vertices nearer than this [m] are in the same place, and garments where that is more than this share of one's vertices.
@@ -13,26 +12,18 @@ from torch import Tensor
 _SAME, _SHARE = 1e-5, 0.5
 
 
-def lifted(pos: Tensor, piece: np.ndarray, order: Sequence[int], outside: Tensor, free: Tensor, gap: float) -> Tensor:
-    """Positions (V, 3) [m] with outer garments moved out by ``gap`` [m] where they lie in an inner one; ``pos`` itself where
-    none does.
+def layers_below(pos: Tensor, piece: np.ndarray, order: Sequence[int]) -> np.ndarray:
+    """On how many garments that lie in the same place each vertex of ``pos`` (V, 3) [m] comes to lie, (V,); 0 where on none.
 
     Args:
         piece: (V,) garment of a vertex.
         order: garments from the body outwards.
-        outside: (V, 3) unit normals, away from the body.
-        free: (V,) bool; the others stay.
     """
     place = np.round(pos.detach().double().cpu().numpy() / _SAME).astype(np.int64)
-    _, number = np.unique(place, axis=0, return_inverse=True)
-    number, above = number.reshape(-1), np.zeros(len(piece))
+    number = np.unique(place, axis=0, return_inverse=True)[1].reshape(-1)
+    below = np.zeros(len(piece), np.int64)
     for rank, outer in enumerate(order):
         rows = np.flatnonzero(piece == outer)
-        for inner in order[:rank]:
-            same = np.isin(number[rows], number[piece == inner])
-            if same.mean() > _SHARE:
-                above[rows] += 1.0
-    if not above.any():
-        return pos
-    way = torch.as_tensor(gap * above).to(pos) * free.to(pos)
-    return pos + way.unsqueeze(1) * outside.to(pos)
+        same = (np.isin(number[rows], number[piece == inner]).mean() > _SHARE for inner in order[:rank])
+        below[rows] = sum(map(bool, same))
+    return below

@@ -19,7 +19,7 @@ from torch import Tensor
 from hood.mesh.crossing import self_crossings
 from hood.mesh.topology import boundary_loops
 from hood.scene.cloth import Cloth
-from hood.scene.coincident import lifted
+from hood.scene.coincident import layers_below
 from hood.scene.contact import match_surface
 from hood.scene.start import LazySearch, Momentum, descend, free_stretch, leave, push_out
 from hood.scene.state import Obstacle
@@ -150,12 +150,14 @@ def separate(
 
 def _lifted(outfit: Outfit, pos: Tensor, obstacle: Obstacle | None, order: Sequence[int] | None) -> Tensor:
     """Garments that lie in the same place one over the other, in the order given or in that of the outfit."""
-    inwards = tuple(range(len(outfit.names))) if order is None else tuple(order)
+    below = layers_below(pos, outfit.piece, range(len(outfit.names)) if order is None else order)
+    if not below.any():
+        return pos
     outside = torch.zeros_like(pos)
     for sheet in _sheets(outfit, pos, obstacle):
         own = match_surface(pos[sheet.vertices], torch.zeros(len(sheet.vertices), dtype=torch.long), sheet.obstacle(pos))
         outside[sheet.vertices] = own.normal
-    return lifted(pos, outfit.piece, inwards, outside, outfit.cloth.free, _GAP)
+    return pos + (_GAP * torch.as_tensor(below).to(pos) * outfit.cloth.free.to(pos)).unsqueeze(1) * outside
 
 
 def _against(outfit: Outfit, pos: Tensor, obstacle: Obstacle | None, order: tuple[int, ...]) -> tuple[tuple[int, int], ...]:
