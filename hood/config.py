@@ -79,7 +79,7 @@ def _loaded(folder: Path, plugins_of: tuple[str, ...], name: str, overrides: tup
                 if not _is_group(override):
                     _check_key(override, known)
                     _check_brackets(name, override, known)
-            config = compose(name, plugins + words)
+            config = copy.deepcopy(known) if words == groups else compose(name, plugins + words)
             _decode_keys(config, [override for text, override in chosen if is_coded(text)])
             _check_sources(config)
             OmegaConf.resolve(config)

@@ -9,9 +9,9 @@ import numpy as np
 from omegaconf import DictConfig
 
 from hood.commands.cloth_contact import potential_of
+from hood.commands.losses import losses_of
 from hood.commands.refinement import AUTO, other_refinement_keys, refined
 from hood.commands.steppers import make_solver, option_of, with_stepper
-from hood.config import build
 from hood.dynamics.captured import network_of
 from hood.dynamics.ranges import scene_conditions
 from hood.dynamics.rollout import simulate
@@ -72,7 +72,7 @@ def advice(config: DictConfig, scene: Scene, summary: dict[str, Any], start: np.
     reached, target = summary["relative_gradient_median"], float(config.solver.target_rg)
     if str(config.stepper) != "network" or int(summary["num_frames"]) < _LEAST_FRAMES or not total.get("median"):
         return []
-    alone = _ms(solver(config), replace(scene, start_pos=start), build(config.losses))
+    alone = _ms(solver(config), replace(scene, start_pos=start), losses_of(config))
     if alone is None or alone >= total["median"] or (reached is not None and reached <= target):
         return []
     here = "" if reached is None else f", {reached:.2g} with the network"
@@ -106,7 +106,7 @@ def _iterations(config: DictConfig, stepper: Stepper, scene: Scene, choice: Choi
 
 def _compare(config: DictConfig, stepper: Stepper, scene: Scene, choice: Choice) -> None:
     """The solver where a frame of it takes less time than one of the network; both are measured."""
-    potential, size, scene = build(config.losses), scene.cloth.num_vertices, _put_on(scene)
+    potential, size, scene = losses_of(config), scene.cloth.num_vertices, _put_on(scene)
     with_network = _ms(refined(stepper, choice.settle(config), size), scene, potential)
     alone = _ms(solver(config), scene, potential)
     if with_network is None or alone is None:

@@ -12,6 +12,7 @@ from omegaconf import DictConfig
 from hood.assets.files.library import locate
 from hood.commands.common import UNTRAINED
 from hood.commands.conditions import training_note
+from hood.commands.losses import losses_of
 from hood.commands.steppers import ALWAYS, NEVER, find_option, make_network, make_solver
 from hood.config import ConfigError, build, load_config, options
 from hood.dynamics.captured import network_of
@@ -32,7 +33,7 @@ def make_candidate(name: str, config: DictConfig) -> Candidate:
         if option is not None and option.refinement == ALWAYS:
             raise ConfigError(f"models: {name!r} takes its steps by refinement alone; give {name}+5, or another number")
         return inner
-    potential, settings = build(config.losses), build(config.solver)
+    potential, settings = losses_of(config), build(config.solver)
     stepper = RefinedStepper(inner.stepper, potential, Count(iterations), str(config.refine_method), settings)
     return Candidate(f"{inner.name}+{iterations}", inner.weights, stepper, inner.training)
 
@@ -55,7 +56,7 @@ def split_refinement(name: str) -> tuple[str, int | None]:
 def _unrefined_candidate(name: str, config: DictConfig) -> Candidate:
     option = find_option(name)
     if option is not None:
-        return Candidate(name, "none", make_solver(option, config, build(config.losses)))
+        return Candidate(name, "none", make_solver(option, config, losses_of(config)))
     prefix = UNTRAINED + ":"
     if name.startswith(prefix):
         model = name[len(prefix) :]

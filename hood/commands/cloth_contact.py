@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
+from hood.commands.losses import losses_of
 from hood.commands.refinement import chosen
 from hood.commands.steppers import MAY, option_of
-from hood.config import ConfigError, build, plain, require_choice
+from hood.config import ConfigError, plain, require_choice
 from hood.dynamics.measure import LAYER_METRICS
 from hood.losses.collision import Collision
 from hood.losses.layer_friction import LayerFriction
@@ -37,7 +38,7 @@ def check_cloth_contact(config: DictConfig) -> None:
 def potential_of(config: DictConfig) -> Potential:
     """The potential of the config's losses, with a barrier and friction between layers of cloth where ``cloth_contact`` and the
     rest of the settled config ask for them."""
-    potential: Potential = build(config.losses)
+    potential: Potential = losses_of(config)
     if str(config.cloth_contact) == "off" or _why_not(config, potential):
         return potential
     potential = potential.with_terms(layers=LayerBarrier(between=str(config.cloth_contact) == "layers"))
@@ -98,7 +99,7 @@ def _hindrance(config: DictConfig, potential: Potential | None = None) -> str:
         return f"step={config.step} has fixed shapes, which contact of cloth with cloth has not; use step=plain"
     if str(config.cloth_contact) == "auto" and str(config.device) != "cpu":
         return "its search is done on the CPU, between steps on another device; cloth_contact=on does so"
-    terms = (potential or build(config.losses)).terms.values()
+    terms = (potential or losses_of(config)).terms.values()
     collision = [term for term in terms if isinstance(term, Collision)]
     if str(config.cloth_contact) == "auto" and not any(type(term) is Collision for term in collision):
         return "losses=… are those of published code, which has none; cloth_contact=on adds it"

@@ -104,8 +104,8 @@ def make_plan(words: list[str], own: DictConfig, evidence: bool = True) -> tuple
     asked = Asked(tolerance, budget, [str(name) for name in own.parts], int(own.windows), int(own.frames), evidence=evidence)
     found = probe(ready, asked)
     plan = _record(ready, [*words, *_settled_words(config, ready)], asked, found)
-    shown = differences(ready, found.begun, found.effects, asked.frames)
-    plan |= {"asked": words, "facts": facts(ready), "seconds": time.perf_counter() - began}
+    shown = differences(ready, found.begun, found.effects, asked.frames) if evidence else []
+    plan |= {"asked": words, "facts": facts(ready) if evidence else {}, "seconds": time.perf_counter() - began}
     return plan | {"cpu_seconds": time.process_time() - spent}, shown
 
 

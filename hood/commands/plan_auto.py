@@ -13,7 +13,7 @@ from hood.commands.common import output_folder
 from hood.commands.plan import make_plan
 from hood.commands.plan_file import FREE, plan_path, read_plan, write_plan
 from hood.commands.plan_table import sentence
-from hood.config import ConfigError, load_config
+from hood.config import ConfigError, load_config, with_words
 from hood.native.build import processor
 from hood.native.cache import cache_folder
 
@@ -41,7 +41,7 @@ def planned(overrides: Sequence[str]) -> list[str]:
         raise ConfigError(f"accuracy={config.accuracy}: belongs to plan=auto, not to plan={config.plan}; drop one of the two")
     rest = [word for word in overrides if _key(word) not in ("accuracy", "plan")]
     words = [word for word in rest if _key(word) not in FREE or _key(word) == "num_frames"]
-    own = load_config("plan", [f"accuracy={config.accuracy}"])
+    own = with_words(load_config("plan"), [f"accuracy={config.accuracy}"])
     cache = cache_folder()
     path = (output_folder(config) if cache is None else cache / "plans") / f"plan-{_digest(words, str(config.accuracy))}.json"
     if path.is_file():

@@ -9,8 +9,9 @@ from omegaconf import DictConfig
 
 from hood.assets.files.library import unknown
 from hood.commands.cloth_contact import acts
+from hood.commands.losses import losses_of
 from hood.commands.refinement import chosen, other_refinement_keys
-from hood.config import ConfigError, build
+from hood.config import ConfigError
 from hood.losses.collision import Collision
 
 
@@ -61,7 +62,7 @@ def _folds(config: DictConfig) -> bool:
 
 
 def _collision(config: DictConfig, key: str, value: str) -> bool:
-    term = build(config.losses).terms.get("collision")
+    term = losses_of(config).terms.get("collision")
     return isinstance(term, Collision) and getattr(term, key, None) == value
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
+from hood.commands.losses import losses_of
 from hood.commands.steppers import ALWAYS, NEVER, option_of
 from hood.config import ConfigError, build, plain, require_choice, shown
 from hood.dynamics.refine import METHODS, RefinedStepper
@@ -134,7 +135,7 @@ def refined(stepper: Stepper, config: DictConfig, num_vertices: int, potential: 
     goal = make_goal(config, num_vertices)
     if goal is None:
         return stepper
-    potential = build(config.losses) if potential is None else potential
+    potential = losses_of(config) if potential is None else potential
     return RefinedStepper(stepper, potential, goal, str(config.refine_method), build(config.solver))
 
 

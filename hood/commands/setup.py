@@ -20,6 +20,7 @@ from hood.commands.events import checked_events, with_events
 from hood.commands.fabrics import checked_fabrics, fabric_of
 from hood.commands.garments import heed, layer_order, names_of, read_outfit
 from hood.commands.guarding import check_guard
+from hood.commands.losses import losses_of
 from hood.commands.motion import check_motion_options, make_motion
 from hood.commands.output_fps import check_output_fps
 from hood.commands.plan_file import plan_path, read_watch
@@ -27,7 +28,7 @@ from hood.commands.refine_mesh import check_refine_mesh
 from hood.commands.refinement import AUTO, check_refinement, chosen, refined
 from hood.commands.resizing import checked_sizes, cut_to_size
 from hood.commands.steppers import PLAIN, make_network, make_solver, option_of
-from hood.config import ConfigError, build, load_config, require_choice
+from hood.config import ConfigError, load_config, require_choice
 from hood.dynamics.captured import MODES, network_of
 from hood.dynamics.rollout import METRIC_CHOICES, SETTLE_CHOICES, own_start
 from hood.dynamics.stepper import Stepper
@@ -101,7 +102,7 @@ def set_up(
     stepper = refined(stepper, settled, scene.cloth.num_vertices, potential_of(settled))
     _check_start(settled, stepper, scene, tell)
     tell_if_off(settled, 1 if scene.outfit is None else len(scene.outfit.names))
-    warn(scene_cautions(stepper, scene, build(settled.losses), str(settled.checkpoint)))
+    warn(scene_cautions(stepper, scene, losses_of(settled), str(settled.checkpoint)))
     potential = potential_of(settled)
     path = plan_path(config)
     if path is not None:

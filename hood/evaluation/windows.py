@@ -55,10 +55,6 @@ def choose_windows(motion: Motion, num_frames: int, count: int, length: int) -> 
 
 def _course(motion: Motion, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Speed [m/s] and mean distance from the centre [m] of the body's vertices in ``frames``."""
-    speed, spread = np.zeros(len(frames)), np.zeros(len(frames))
-    for index, frame in enumerate(frames):
-        origin = np.asarray(motion.translation[frame], dtype=np.float64)
-        here, there = (motion.surface(at, origin).cpu().numpy()[::_VERTEX_STRIDE] for at in (int(frame), int(frame) + 1))
-        speed[index] = np.sqrt(((there - here) ** 2).sum(axis=1).mean()) * motion.fps
-        spread[index] = np.linalg.norm(here - here.mean(axis=0), axis=1).mean()
-    return speed, spread
+    here, there = (motion.some_points(at, _VERTEX_STRIDE) for at in (frames, frames + 1))
+    speed = np.sqrt(((there - here) ** 2).sum(axis=2).mean(axis=1)) * motion.fps
+    return speed, np.linalg.norm(here - here.mean(axis=1, keepdims=True), axis=2).mean(axis=1)

@@ -51,6 +51,11 @@ class LayerBarrier:
             raise ValueError("step problem: layers not searched for yet; pass the problem through Potential.prepare once")
         return True
 
+    def rests(self, problem: StepProblem) -> bool:
+        """Whether no pair is within its reach at x_t."""
+        near = (len(scene.near_at_start(problem.state.pos).corners) for scene in problem.layers)
+        return bool(problem.layers) and not any(near)
+
     def __call__(self, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> Tensor:
         """Energy [J] (B,) at ``next_pos`` (V, 3)."""
         return torch.stack([self._scene(scene, next_pos) for scene in problem.layers])

@@ -29,6 +29,10 @@ class SceneLayers:
         """This scene's rows of ``values`` (V, 3), float64."""
         return values[self.first : self.last].detach().cpu().double().numpy()
 
+    def near_at_start(self, pos: Tensor) -> Contacts:
+        """What is within its reach where the step begins, at ``pos`` (V, 3) m."""
+        return self.layers.contacts(self.of(pos)) if self.at_start is None else self.at_start
+
 
 def find_layers(
     cloth: Cloth, pos: Tensor, ahead: Tensor, reach: float, pressure: float, between: bool

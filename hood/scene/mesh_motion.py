@@ -81,6 +81,10 @@ class MeshMotion:
         """(W, 3) m, relative to ``origin``: subtracted in float64, so that nothing is lost far from the world's."""
         return torch.as_tensor(self.points(frame) - origin).to(self.device, self.dtype)
 
+    def some_points(self, frames: np.ndarray, stride: int) -> np.ndarray:
+        """(N, W′, 3) m, float64, in the world: every ``stride``-th vertex in ``frames`` (N,)."""
+        return np.stack([self.points(int(frame))[::stride] for frame in frames])
+
     def obstacle(self, frame: int, origin: np.ndarray, static: bool = False) -> Obstacle:
         """The body around the step ``frame`` → ``frame + 1``; ``static`` freezes it at ``frame`` (relaxing step)."""
         now = self.surface(frame, origin)
@@ -191,6 +195,10 @@ class NoBody:
     def surface(self, frame: int, origin: np.ndarray) -> Tensor:
         """(0, 3)."""
         return torch.zeros(0, 3, dtype=self.dtype, device=self.device)
+
+    def some_points(self, frames: np.ndarray, stride: int) -> np.ndarray:
+        """(N, 0, 3)."""
+        return np.zeros((len(frames), 0, 3))
 
     def obstacle(self, frame: int, origin: np.ndarray, static: bool = False) -> None:
         """None."""

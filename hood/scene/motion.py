@@ -67,6 +67,10 @@ class Motion(Protocol):
         """(W, 3) m."""
         ...
 
+    def some_points(self, frames: np.ndarray, stride: int) -> np.ndarray:
+        """(N, W′, 3) m, float64, in the world: every ``stride``-th vertex in ``frames`` (N,); nothing of it is kept."""
+        ...
+
     def obstacle(self, frame: int, origin: np.ndarray, static: bool = False) -> Obstacle | None:
         """The body around the step ``frame`` → ``frame + 1``, frozen at ``frame`` when ``static``; None without a body."""
         ...
@@ -179,6 +183,11 @@ class BodyMotion:
         surface = (self.local_surface(frame) + shift).to(self.dtype)
         self._placed[frame] = key, surface
         return surface
+
+    def some_points(self, frames: np.ndarray, stride: int) -> np.ndarray:
+        """(N, W′, 3) m, float64, in the world: every ``stride``-th vertex in ``frames`` (N,)."""
+        posed = self.body.some_points(self.sequence.at(frames), self.betas, stride)
+        return posed.numpy() + self.translation[frames][:, None]
 
     def obstacle(self, frame: int, origin: np.ndarray, static: bool = False) -> Obstacle:
         """The body around the step ``frame`` → ``frame + 1``; ``static`` freezes it at ``frame`` (relaxing step)."""

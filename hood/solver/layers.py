@@ -108,12 +108,7 @@ def eased(layers: tuple[SceneLayers, ...], now: Tensor, there: Tensor) -> Tensor
 
 def touching(layers: tuple[SceneLayers, ...], pos: Tensor) -> bool:
     """Whether any cloth is near or through cloth at ``pos`` (V, 3), where the step begins."""
-    return any(scene.layers.crossed > 0 or _near_at_start(scene, pos) for scene in layers)
-
-
-def _near_at_start(scene: SceneLayers, pos: Tensor) -> bool:
-    found = scene.layers.contacts(scene.of(pos)) if scene.at_start is None else scene.at_start
-    return len(found.corners) > 0
+    return any(scene.layers.crossed > 0 or len(scene.near_at_start(pos).corners) > 0 for scene in layers)
 
 
 def free_way(layers: tuple[SceneLayers, ...], now: Tensor, there: Tensor) -> bool:

@@ -143,3 +143,16 @@ def test_potential_without_its_layers() -> None:
     assert has_layers(both)
     assert not has_layers(without_layers(both))
     assert list(without_layers(both).terms) == list(plain.terms)
+
+
+@pytest.mark.parametrize(("gap", "rests"), [(0.0015, False), (0.02, True)])
+def test_layers_pull_where_they_are_near(gap: float, rests: bool) -> None:
+    """Where none is, the term is not asked: what it would add is nothing."""
+    near, term = _two_sheets(gap), LayerBarrier()
+    prepared = term.prepare(near)
+    assert term.rests(prepared) == rests
+    _, gradient = _alone(term, prepared, near.state.pos)
+    assert bool((gradient == 0.0).all()) == rests
+    with pytest.raises(ValueError, match="layers not searched for yet"):
+        Potential({"layers": term}).energies(near, near.state.pos)
+    assert not term.rests(near)

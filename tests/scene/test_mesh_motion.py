@@ -55,6 +55,9 @@ def test_the_same_obstacle_as_the_parametric_body(dtype: torch.dtype, body: Body
             gap = float((getattr(first, name) - getattr(second, name)).abs().max())
             assert gap <= (0 if dtype == torch.float32 else 1e-12), name
         assert torch.equal(first.faces, second.faces)
+    frames = np.array([4, 0])
+    np.testing.assert_allclose(motion.some_points(frames, 50), mesh.some_points(frames, 50), rtol=0, atol=1e-12)
+    assert NoBody(6, 30.0, dtype, torch.device("cpu")).some_points(frames, 50).shape == (2, 0, 3)
 
 
 def test_garments_turn_with_what_is_next_to_them() -> None:

@@ -98,3 +98,13 @@ def test_a_body_that_is_gone_leaves_nothing_behind(body: Body, walk: PoseSequenc
         del other
         gc.collect()
         assert set(module._TENSORS) <= before
+
+
+def test_some_points_are_those_of_the_surface(body: Body, walk: PoseSequence) -> None:
+    """In the world, of frames in any order, and nothing is posed or kept for them."""
+    motion = body_motion(body, walk.window(0, 40), np.linspace(-1, 1, 10), torch.float64)
+    frames = np.array([33, 2, 17])
+    found = motion.some_points(frames, 100)
+    assert not motion.posed
+    whole = [motion.surface(int(frame), np.zeros(3)).numpy()[::100] for frame in frames]
+    np.testing.assert_allclose(found, whole, rtol=0, atol=1e-12)

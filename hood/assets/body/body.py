@@ -94,3 +94,8 @@ class Body:
         """Posed vertices (T, W, 3) [m] relative to :meth:`translation`."""
         rest = torch.as_tensor(self.shaped(betas)[0]).to(dtype)
         return linear_blend_skinning(rest, torch.as_tensor(self.weights).to(dtype), self.transforms(sequence, betas, dtype))
+
+    def some_points(self, sequence: PoseSequence, betas: np.ndarray, stride: int) -> Tensor:
+        """Every ``stride``-th vertex of :meth:`surface` alone, (T, W′, 3) [m] in float64."""
+        rest, weights = (torch.as_tensor(values[::stride]) for values in (self.shaped(betas)[0], self.weights))
+        return linear_blend_skinning(rest, weights, self.transforms(sequence, betas, torch.float64))

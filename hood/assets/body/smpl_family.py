@@ -43,6 +43,10 @@ class SmplFamilyBody(Body):
                 shape, rotations, template[None], shapedirs, posedirs, regressor, parents, weights, pose2rot=False
             )[0]  # fmt: skip
 
+    def some_points(self, sequence: PoseSequence, betas: np.ndarray, stride: int) -> Tensor:
+        """Every ``stride``-th vertex of :meth:`surface`, (T, W′, 3) [m] in float64."""
+        return self.surface(sequence, betas, torch.float64)[:, ::stride]
+
     def _tensors_in(self, dtype: torch.dtype) -> tuple[Tensor, ...]:
         # Each precision is rounded from float64 by itself: a module turned to float32 and back has lost its digits.
         if dtype not in self._tensors:

@@ -42,6 +42,11 @@ class PoseSequence:
         fingers = None if self.fingers is None else self.fingers[start:stop]
         return replace(self, poses=self.poses[start:stop], transl=self.transl[start:stop], fingers=fingers)
 
+    def at(self, frames: np.ndarray) -> PoseSequence:
+        """The frames with these numbers (N,)."""
+        fingers = None if self.fingers is None else self.fingers[frames]
+        return replace(self, poses=self.poses[frames], transl=self.transl[frames], fingers=fingers)
+
 
 def resample(sequence: PoseSequence, fps: float) -> PoseSequence:
     """The motion at another frame rate: rotations by slerp, translations linearly; time stamps k / fps, no drift."""
