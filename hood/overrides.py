@@ -18,6 +18,8 @@ _SHOWN = 300
 _QUOTED = re.compile(r"'(?:[^'\\]|\\.)*'|\"(?:[^\"\\]|\\.)*\"", re.DOTALL)
 _BRACKETS = {"[": "]", "{": "}", "(": ")"}
 _NUMBER = re.compile(r"[+-]?(\d[\d_]*\.?\d*|\.\d+)([eE][+-]?\d+)?|nan|inf|null|true|false", re.IGNORECASE)
+#: Keys of names: 2024_01 is a folder there, not a number.
+_NAMES = ("output", "garment", "sequence", "body", "checkpoint", "texture")
 #: What the grammar does not read in the key of a table, and how it is written there instead.
 _FOREIGN, _CODE = re.compile(r"[^A-Za-z0-9_ /\-.+*@?|]"), re.compile(r"\$u(10[0-9a-f]{4}|[0-9a-f]{1,5})\$")
 
@@ -45,6 +47,8 @@ def readable(text: str, several: bool) -> str:
     """
     key, _, value = text.partition("=")
     kind = _kind(text)
+    if key in _NAMES and _is_other_number(text):
+        return f"{key}={quoted(value)}"
     if kind not in (None, ValueType.SIMPLE_CHOICE_SWEEP):
         return text
     if _kind(f"{key}=0") is None:
@@ -112,6 +116,15 @@ def _kind(text: str) -> ValueType | None:
     except HydraException:
         return None
     return override.value_type or ValueType.ELEMENT
+
+
+def _is_other_number(text: str) -> bool:
+    """Whether Hydra reads the value as a number that is written in another way: 007, 1_000, 1e3."""
+    try:
+        value = parse(text).value()
+    except HydraException:
+        return False
+    return type(value) in (int, float) and str(value) != text.partition("=")[2].strip()
 
 
 def _is_list(value: str, several: bool) -> bool:

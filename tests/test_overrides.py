@@ -13,6 +13,7 @@ from hood.overrides import plain_word
 NAMES = (
     "Röckchen.obj", "tänzer.glb", "out/möbel", "karo ö.png", "cape (1).obj", "cape#2.obj", "cape&b.obj", "cape,v2.obj",
     "cape's.obj", "a=b.obj", "C:cape.obj", "裙子.obj", "é!.obj", "cape [2].obj", '5" hem.obj', "\udce4.obj",
+    "2024_01", "007", "1e3",
 )  # fmt: skip
 
 

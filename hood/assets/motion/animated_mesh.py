@@ -33,6 +33,9 @@ _DEFAULT_FPS = 30.0
 _LARGEST, _UNITS, _USUAL = 30.0, (1.0, 0.01, 0.001), 1.7
 #: Sizes [m] of bodies, from dolls to horses: who names a unit that gives another one is told.
 _PERSONS = (0.25, 4.0)
+#: Units [m] of which persons of 4 to 30 m are, feet and decimetres; they are at least so tall, of their largest extent, and at
+#: most so deep.
+_LARGE_UNITS, _TALL, _FLAT = (0.3048, 0.1), 0.8, 0.4
 #: A body stands along z where it is so many times longer than along y, and no plane: at least this share as thick, and not
 #: filled like a box [share of it].
 _LONGER, _THICK, _FILLED = 2.5, 0.1, 0.4
@@ -203,8 +206,17 @@ def _check_size(path: Path, sequence: MeshSequence, scale: float | None) -> None
     if extent > _LARGEST:
         unit = "its unit is not the metre" if scale is None else f"body_scale={scale:g} is not its unit"
         raise ValueError(f"{path}: the mesh is {extent:.4g} m large; {unit}, {fix}")
+    if scale is None and extent > _PERSONS[1] and _is_upright(np.ptp(sequence.verts[0], axis=0)):
+        factor = min(_LARGE_UNITS, key=lambda unit: abs(np.log(unit * extent / _USUAL)))
+        fix = f"pass body_scale={factor:g}, which makes it {factor * extent:.3g} m (body_scale=1 takes it as it is)"
+        warnings.warn(f"{path}: the body is {extent:.3g} m tall, its unit seems not to be the metre; {fix}", stacklevel=3)
     if scale is not None and not _PERSONS[0] <= extent <= _PERSONS[1] and factor != scale:
         warnings.warn(f"{path}: the mesh is {extent:.3g} m large with body_scale={scale:g}; {fix}", stacklevel=3)
+
+
+def _is_upright(box: np.ndarray) -> bool:
+    """Whether a box (3,) has the shape of a standing person's, arms down or held out: high along y, and not deep."""
+    return bool(box[1] >= _TALL * box.max() and box.min() <= _FLAT * box.max())
 
 
 def _check_bearing(path: Path, sequence: MeshSequence) -> None:

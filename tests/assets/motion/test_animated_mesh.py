@@ -366,3 +366,17 @@ def test_a_unit_that_shrinks_a_mesh_in_metres_is_told(tmp_path: Path, body: Body
     write_obj(tmp_path / "body.obj", body.v_template, body.faces)
     with pytest.warns(UserWarning, match=r"0\.0172 m large with body_scale=0\.01; pass body_scale=1, which makes it 1\.72 m$"):
         load_mesh_sequence(tmp_path / "body.obj", scale=0.01)
+
+
+@pytest.mark.parametrize("unit", [0.3048, 0.1])
+def test_a_person_of_4_to_30_metres_is_told(tmp_path: Path, body: Body, unit: float) -> None:
+    """In feet or decimetres. A hall and a floor of that size are taken as they are, and so is who says so."""
+    write_obj(tmp_path / "body.obj", body.v_template / unit, body.faces)
+    with pytest.warns(UserWarning, match=rf"seems not to be the metre; pass body_scale={unit:g}, which makes it 1\.72 m"):
+        load_mesh_sequence(tmp_path / "body.obj")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_mesh_sequence(tmp_path / "body.obj", scale=1.0)
+        for stretch in ([3.0, 1.0, 3.0], [6.0, 0.05, 6.0]):
+            write_obj(tmp_path / "hall.obj", 2.7 * body.v_template * stretch, body.faces)
+            load_mesh_sequence(tmp_path / "hall.obj")
