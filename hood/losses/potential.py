@@ -58,6 +58,11 @@ def _prepares(kind: type) -> bool:
     return issubclass(kind, PreparedTerm)
 
 
+@cache
+def _may_rest(kind: type) -> bool:
+    return issubclass(kind, RestingTerm)
+
+
 #: What a pull leaves out, see :meth:`Potential.with_pull`.
 _NOT_PULLING = (Inertia, Gravity, Collision, LaggedFriction, LayerFriction)
 
@@ -179,7 +184,9 @@ def keeps_both_sides(potential: Potential) -> bool:
 
 
 def _pulls(term: Term, problem: StepProblem) -> bool:
-    return not isinstance(term, _NOT_PULLING) and not (isinstance(term, RestingTerm) and term.rests(problem))
+    if isinstance(term, _NOT_PULLING):
+        return False
+    return not (_may_rest(type(term)) and cast(RestingTerm, term).rests(problem))
 
 
 def _asks_for_pull(term: Term, problem: StepProblem) -> bool:
