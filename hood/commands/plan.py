@@ -14,6 +14,7 @@ from omegaconf import DictConfig
 
 from hood.assets.files.library import locate
 from hood.commands.common import held_folder, output_folder
+from hood.commands.plan_content import content_digest
 from hood.commands.plan_file import write_plan
 from hood.commands.plan_probe import HOLD, Asked, Probed, probe
 from hood.commands.plan_reach import reach_sentence
@@ -25,12 +26,14 @@ from hood.dynamics.captured import network_of
 from hood.evaluation.combining import Combination
 from hood.evaluation.decision import QUANTILE, Tolerance
 from hood.evaluation.elsewhere import Apart
-from hood.evaluation.leaving_out import Begun, Effect
+from hood.evaluation.leaving_out import LEAD, Begun, Effect
 from hood.media.plan_page import Difference
 from hood.overrides import plain_word
 
 #: Words of these keys belong to a training, and to no rollout.
 _TRAINING_GROUPS = ("experiment", "trainer", "data")
+#: Steps of a window by default, where γ of single steps decides, and where lengths do.
+_BRIEF, _LONG = 3, 30
 #: Keys of ``hood plan`` that the plan of a training has, beside its folder.
 _TRAINING_KEYS = ("updates", "scenes")
 
@@ -101,7 +104,8 @@ def make_plan(words: list[str], own: DictConfig, evidence: bool = True) -> tuple
     config, tolerance, budget = _check(words, own)
     began, spent = time.perf_counter(), time.process_time()
     ready = set_up(config, make_stepper(config)[0])
-    asked = Asked(tolerance, budget, [str(name) for name in own.parts], int(own.windows), int(own.frames), evidence=evidence)
+    frames = _frames(own, tolerance, budget, min(int(ready.config.num_frames), ready.scene.num_frames))
+    asked = Asked(tolerance, budget, [str(name) for name in own.parts], int(own.windows), frames, evidence=evidence)
     found = probe(ready, asked)
     plan = _record(ready, [*words, *_settled_words(config, ready)], asked, found)
     shown = differences(ready, found.begun, found.effects, asked.frames) if evidence else []
@@ -114,12 +118,24 @@ def _check(words: list[str], own: DictConfig) -> tuple[DictConfig, Tolerance, fl
     config = load_config("rollout", words)
     check_config(config)
     for key, least, most in (("windows", 1, 5), ("frames", 1, 300)):
-        if isinstance(own[key], bool) or not least <= int(own[key]) <= most:
+        if own[key] is None and key == "frames":
+            continue
+        if isinstance(own[key], bool) or not isinstance(own[key], int) or not least <= own[key] <= most:
             raise ConfigError(f"{key}={own[key]}: give a whole number from {least} to {most}")
     budget = own.budget_ms
     if budget is not None and (isinstance(budget, bool) or not isinstance(budget, (int, float)) or not 0 < budget < math.inf):
         raise ConfigError(f"budget_ms={budget}: give milliseconds of a frame, above 0 (budget_ms=10)")
     return config, _tolerance(own), None if budget is None else float(budget)
+
+
+def _frames(own: DictConfig, tolerance: Tolerance, budget: float | None, num_frames: int) -> int:
+    """Steps of a window: those that are asked for, else a few where single steps are judged by γ, and a second of them where
+    lengths are, as far as the motion goes."""
+    if own.frames is not None:
+        return int(own.frames)
+    if tolerance.unit == "gamma" and budget is None:
+        return _BRIEF
+    return max(min(_LONG, num_frames - LEAD - 2), 1)
 
 
 def _split(overrides: Sequence[str]) -> tuple[DictConfig, list[str]]:
@@ -167,6 +183,7 @@ def _record(ready: Setup, words: list[str], asked: Asked, found: Probed) -> dict
         together = _numbers(found.together, full) | {"error": tolerance.error(found.together, full)}
     return {
         "words": words,
+        "content": content_digest(words),
         "chosen": found.words,
         "command": command_line(words, found.words),
         "accuracy": {"value": tolerance.value, "unit": tolerance.unit},
@@ -174,7 +191,7 @@ def _record(ready: Setup, words: list[str], asked: Asked, found: Probed) -> dict
         "windows": [{"first": one.window.first, "measured_from": one.frame, "reason": one.window.reason} for one in begun],
         "frames": asked.frames,
         "full": _numbers(full, full),
-        "times": _times(begun),
+        "times": _times(begun, full.median_ms),
         "windows_without_minimum": full.exact.count(False),
         "rows": rows,
         "together": together,
@@ -184,11 +201,13 @@ def _record(ready: Setup, words: list[str], asked: Asked, found: Probed) -> dict
     }
 
 
-def _times(begun: Sequence[Begun]) -> dict[str, float]:
-    """Milliseconds of the parts of a frame of the full model, the medians of the windows; the longest first."""
-    names = [name for name in begun[0].times if name not in ("total", "metrics")]
+def _times(begun: Sequence[Begun], frame_ms: float) -> dict[str, float]:
+    """Milliseconds of the parts of a frame of the full model, the longest first: their shares, the medians of the windows, of
+    ``frame_ms``, which may be of another clock."""
+    names = [name for name in begun[0].times if name not in ("total", "metrics", "layers")]  # layers are a part of the solver
     found = {name: float(np.median([one.times[name] for one in begun])) for name in names}
-    return dict(sorted(found.items(), key=lambda pair: -pair[1]))
+    whole = sum(found.values())
+    return {name: ms / whole * frame_ms for name, ms in sorted(found.items(), key=lambda pair: -pair[1]) if whole > 0.0}
 
 
 def _combined(found: Probed) -> dict[str, Any]:

@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Sequence
-from pathlib import Path
 
 from hood import __version__
-from hood.assets.files.library import locate
 from hood.commands.common import output_folder
 from hood.commands.plan import make_plan
+from hood.commands.plan_content import content_digest
 from hood.commands.plan_file import FREE, plan_path, read_plan, write_plan
 from hood.commands.plan_table import sentence
 from hood.config import ConfigError, load_config, with_words
 from hood.native.build import processor
 from hood.native.cache import cache_folder
-
-#: Words of these keys name files whose content decides.
-_FILES = ("garment", "sequence", "body", "checkpoint", "pins", "refine_table")
 
 
 def without_accuracy(overrides: Sequence[str]) -> list[str]:
@@ -62,25 +57,5 @@ def _key(word: str) -> str:
 
 def _digest(words: Sequence[str], accuracy: str) -> str:
     """Of everything that a plan depends on, the processor that its times are of among it."""
-    said = hashlib.sha256("\0".join([__version__, processor(), accuracy, *sorted(words)]).encode())
-    config = load_config("rollout", words)
-    for key in _FILES:
-        for name in config[key] if isinstance(config[key], Sequence) and not isinstance(config[key], str) else [config[key]]:
-            said.update(f"\0{key}".encode())
-            for path in _files_of(key, str(name)):
-                said.update(path.read_bytes())
-    return said.hexdigest()[:24]
-
-
-def _files_of(key: str, name: str) -> list[Path]:
-    """The files that a value names; none where it is something else."""
-    path = Path(name).expanduser()
-    if path.is_dir():
-        return sorted(Path(folder) / file for folder, _, files in os.walk(path) for file in files)
-    if path.is_file():
-        return [path]
-    kind = {"garment": "garments", "sequence": "motions", "body": "body", "checkpoint": "weights"}.get(key)
-    try:
-        return [] if kind is None else [locate(kind, name)]
-    except (ValueError, FileNotFoundError):
-        return []
+    said = [__version__, processor(), accuracy, *sorted(words), content_digest(words)]
+    return hashlib.sha256("\0".join(said).encode()).hexdigest()[:24]

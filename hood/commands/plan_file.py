@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import json
+import shlex
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +17,7 @@ from omegaconf import DictConfig
 
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.guarded import check_size
+from hood.commands.plan_content import content_digest
 from hood.config import ConfigError, load_config
 from hood.dynamics.soundness import name_frames
 from hood.dynamics.watched import PLAN_METRICS
@@ -57,7 +60,7 @@ def rollout_config(overrides: Sequence[str]) -> DictConfig:
         raise ConfigError(f"accuracy={config.accuracy}: belongs to plan=auto; a plan has its own, drop accuracy=…")
     if path is None:
         return config
-    words = _read_words(path)
+    words = _checked_words(path)
     said = {word.partition("=")[0]: word for word in words}  # what was chosen stands for what was asked for
     for word in overrides:
         key, _, value = word.partition("=")
@@ -66,7 +69,10 @@ def rollout_config(overrides: Sequence[str]) -> DictConfig:
         made = said.get(key, f"the default of {key}")
         raise ConfigError(f"{key}={value}: {path} was made for {made}; drop {key}=…, or make a plan with hood plan {word}")
     given = {word.partition("=")[0] for word in overrides}
-    return load_config("rollout", [*(word for key, word in said.items() if key not in given), *overrides])
+    try:
+        return load_config("rollout", [*(word for key, word in said.items() if key not in given), *overrides])
+    except ConfigError as error:  # what stands beside the plan has been read before
+        raise ConfigError(f"plan={path}: {error}; make the plan again") from error
 
 
 @dataclass(frozen=True)
@@ -104,8 +110,23 @@ def write_plan(path: Path, plan: Mapping[str, Any]) -> None:
     write_atomically(path, json.dumps({"format": FORMAT, **plan}, indent=1, allow_nan=False).encode())
 
 
-def _read_words(path: Path) -> list[str]:
+def _checked_words(path: Path) -> list[str]:
+    """All words of a plan. A warning says where these, or files that they name, are not those that it was made for.
+
+    Raises:
+        ConfigError: words that are none, and those of :func:`read_plan`.
+    """
     plan = read_plan(path)
+    try:
+        content = content_digest(plan["words"])
+    except ConfigError as error:
+        raise ConfigError(f"plan={path}: {error}; make the plan again") from error
+    if plan.get("content", content) != content:
+        warnings.warn(
+            f"plan={path}: its words, or the files that they name, are not those that it was made for; make it again: "
+            f"{shlex.join(['hood', 'plan', *plan['words'], 'output=…'])}",
+            stacklevel=2,
+        )
     return [*plan["words"], *plan["chosen"]]
 
 
@@ -134,8 +155,16 @@ def read_plan(path: Path) -> dict[str, Any]:
 def summarise_plan(path: Path, config: Mapping[Any, Any]) -> dict[str, Any]:
     """What ``summary.json`` says of a rollout's plan, and of what was left out where that was watched."""
     file_of = plan_path(config)
-    found = {"mode": plan_mode(config)} | ({} if file_of is None else {"file": str(file_of)})
-    return {"plan": found | _watched(path)}
+    found: dict[str, Any] = {"mode": plan_mode(config)} | ({} if file_of is None else {"file": str(file_of)})
+    missed = None if file_of is None or not file_of.is_file() else _missed_budget(read_plan(file_of))
+    return {"plan": found | ({} if missed is None else {"missed_budget_ms": missed}) | _watched(path)}
+
+
+def _missed_budget(plan: Mapping[str, Any]) -> float | None:
+    """The time [ms] that a plan was asked for and found nothing for; None where it did."""
+    found = plan.get("combination")
+    missed = isinstance(found, dict) and found.get("fits") is False
+    return float(plan["budget_ms"]) if missed and isinstance(plan.get("budget_ms"), (int, float)) else None
 
 
 def _watched(path: Path) -> dict[str, Any]:
@@ -151,8 +180,16 @@ def _watched(path: Path) -> dict[str, Any]:
 def plan_sentences(summary: Mapping[str, Any]) -> list[str]:
     """A line on where the full model came back; nothing without a watch."""
     found = summary.get("plan")
-    if not found or "limit" not in found:
+    if not found:
         return []
+    lines = _watch_sentences(found) if "limit" in found else []
+    if "missed_budget_ms" in found:
+        missed = f"{found['missed_budget_ms']:g} ms a frame"
+        lines.insert(0, f"plan: it was asked for {missed}, and nothing that was measured took as little; this is the nearest")
+    return lines
+
+
+def _watch_sentences(found: Mapping[str, Any]) -> list[str]:
     if not found["frames_by_full_model"]:
         worst = f"{found['price_max']:.2g} of γ at most, {found['limit']:.2g} was accepted"
         return [f"plan: what was left out was worth {worst}"]

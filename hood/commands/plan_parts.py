@@ -187,7 +187,7 @@ def _steppers(config: DictConfig) -> list[Part]:
         for count in _FROM_GUESS:
             ways.append((f"{count} iterations", "from the inertial guess", ("stepper=refine", f"refine={count}")))
         for count in _FROM_NETWORK:
-            name = "network" if count == 0 else f"network, {count} iterations"
+            name = "network" if count == 0 else f"network with {count} iterations"
             purpose = f"steps of {config.checkpoint}" + (", refined" if count else "")
             ways.append((name, purpose, ("stepper=network", f"refine={count}")))
     elif asked == "network":
@@ -204,7 +204,7 @@ def choose_parts(config: DictConfig, names: list[str], steppers: bool = False, o
     Raises:
         ConfigError: a part that this rollout does not have.
     """
-    there = {part.name: part for part in parts_of(config, True)}
+    there, names = {part.name: part for part in parts_of(config, True)}, list(dict.fromkeys(names))
     for name in names:
         if name not in there and name not in others:
             raise ConfigError(unknown("part", name, [*there, *others]))

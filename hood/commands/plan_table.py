@@ -14,7 +14,8 @@ def describe(plan: Mapping[str, Any]) -> str:
     """The table and one paragraph."""
     where = ", ".join(f"{one['measured_from']} ({one['reason']})" for one in plan["windows"])
     lines = [
-        f"measured from frames {where}; {plan['frames']} steps each; the full model takes {plan['full']['ms']:.1f} ms a frame, "
+        f"measured from frames {where}; {plan['frames']} steps each; the full model takes {plan['full']['ms']:.1f} ms of the "
+        f"processor a frame, "
         f"γ {short(plan['full']['gamma_p95'])}",
         "",
         f"{'row':<20}{'force/weight':>13}{'γ without':>11}{'p95':>10}{'mm p50':>9}{'p95':>8}{'ms':>8}{'saved':>8}  decision",
@@ -67,13 +68,13 @@ def _found(plan: Mapping[str, Any]) -> str:
     without = {row["part"] for row in plan["rows"] if row["decision"] == "left out"}
     names = [f"without {name}" if name in without else name for name in found["names"]]
     figures = f"{found['ms']:.1f} ms a frame instead of {found['full_ms']:.1f}, {short(found['mm'])} mm from the full model"
-    figures += f" (95th percentile; {short(found['mm_p50'])} in the median)"
+    figures += f" after {plan['frames']} frames (95th percentile; {short(found['mm_p50'])} in the median)"
     whole = " Run against the full model as a whole:" if names else ""
     chosen = f"{', '.join(names)}.{whole} {figures}." if names else f"the full model, {found['ms']:.1f} ms a frame."
     if not found["fits"]:
         return f"Nothing takes {budget:g} ms a frame or less; the nearest is {chosen}"
     if budget is None:
-        return f"Chosen as the cheapest within {_asked(limit)}: {chosen}"
+        return f"Chosen as the cheapest within {_asked(limit)} after {plan['frames']} frames: {chosen}"
     text = f"Chosen as the nearest to the full model within {budget:g} ms a frame: {chosen}"
     if limit["unit"] == "mm" and found["mm"] > limit["value"]:
         text += f" This misses {_asked(limit)}, which nothing meets in that time."

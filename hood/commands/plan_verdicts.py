@@ -12,8 +12,9 @@ from hood.evaluation.leaving_out import Effect
 
 #: A part that is worth more than this γ is no simplification: without it accelerations are wrong by 1 g.
 BROKEN = 1.0
-#: Why what would do is not chosen, and why another mesh or time step is not chosen by γ.
-_OTHERWISE = "what is chosen does it better"
+#: Why what would do is not chosen, where something else is and where the full model is.
+_OTHERWISE, _NOTHING = "what is chosen does it better", "no combination that was run as a whole did"
+#: Why another mesh or time step is not chosen by γ.
 _IN_MM = "another mesh or step has no γ: accuracy=5mm or budget_ms=… decides on it"
 
 
@@ -43,7 +44,7 @@ def of_parts(
             verdict = Verdict("kept", f"without it γ = {Tolerance(BROKEN, 'gamma').error(effect, full):.2g} more")
         else:
             reason = why_kept(part.name, effect, full, of_mm, stay, ())
-            verdict = Verdict("kept", reason or f"{far} without it; {_OTHERWISE}")
+            verdict = Verdict("kept", reason or f"{far} without it; {_why_else(names)}")
         found[part.name] = with_it(verdict) if part.instead else verdict
     return found
 
@@ -57,7 +58,11 @@ def of_choice(one: Choice, apart: Apart, full_ms: float, names: Collection[str] 
     said = f"{far}, {100 * (1 - share):.0f}% of the time saved"
     if names is None:
         return Verdict("compared", f"{said}; {_IN_MM}")
-    return Verdict("taken", said) if one.name in names else Verdict("not taken", f"{said}; {_OTHERWISE}")
+    return Verdict("taken", said) if one.name in names else Verdict("not taken", f"{said}; {_why_else(names)}")
+
+
+def _why_else(names: Collection[str]) -> str:
+    return _OTHERWISE if names else _NOTHING
 
 
 def with_it(verdict: Verdict) -> Verdict:

@@ -7,6 +7,8 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from hood.evaluation.decision import LEAST_SAVING
+
 #: Combinations that are run against the full model at most; each costs two windows.
 MOST_TRIED = 4
 
@@ -72,7 +74,7 @@ def combinations(options: Sequence[Option], full_ms: float) -> list[Combination]
 def cheapest(known: Sequence[Combination], limit_mm: float, measure: Callable[[tuple[str, ...]], Combination]) -> Search:
     """The cheapest combination that is at most ``limit_mm`` from the full model, by what is expected of them, and measured.
 
-    The full model, which is always among them, meets every limit.
+    The full model, which is always among them, meets every limit. What is run as a whole has to save as much as a part has to.
     """
     full = known[0]
     order = sorted((one for one in known if one.mm <= limit_mm and one.ms <= full.ms), key=lambda one: (one.ms, one.mm))
@@ -81,7 +83,7 @@ def cheapest(known: Sequence[Combination], limit_mm: float, measure: Callable[[t
         if not expected.names or len(tried) == MOST_TRIED:
             break
         tried.append(measure(expected.names))
-        if tried[-1].mm <= limit_mm and tried[-1].ms < full.ms:
+        if tried[-1].mm <= limit_mm and tried[-1].ms <= (1.0 - LEAST_SAVING) * full.ms:
             return Search(tried[-1], True, tuple(tried))
     return Search(full, True, tuple(tried))
 
@@ -106,7 +108,7 @@ def most_accurate(known: Sequence[Combination], budget_ms: float, measure: Calla
         tried.append(measure(expected.names))
         if tried[-1].ms <= budget_ms:
             return Search(tried[-1], True, tuple(tried))
-        if not fitting:
+        if not fitting and tried[-1].ms < full.ms:
             break
         slower = max(slower, tried[-1].ms / expected.ms)
     return Search(min([full, *tried], key=lambda one: one.ms), False, tuple(tried))

@@ -48,7 +48,13 @@ def test_ways_to_take_the_steps_exclude_each_other() -> None:
     config = load_config("rollout", ["stepper=newton", "refine=0"])
     ways = [part for part in parts_of(config, True) if part.instead]
     assert {part.rivals for part in ways} == {"steps"}
-    assert {part.name for part in ways} == {"8 iterations", "4 iterations", "2 iterations", "network", "network, 5 iterations"}
+    assert {part.name for part in ways} == {
+        "8 iterations",
+        "4 iterations",
+        "2 iterations",
+        "network",
+        "network with 5 iterations",
+    }
     assert not any(part.instead for part in parts_of(config))
     for part in ways:
         settled = settled_with(part.words, config)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import html
 import json
 import shlex
+import shutil
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +15,10 @@ import numpy as np
 import pytest
 
 import hood
+from hood.assets.files.library import locate
 from hood.cli import main
 from hood.commands.plan_file import rollout_config
+from hood.config import ConfigError
 from hood.evaluation.leaving_out import Effect
 
 WORDS = ["garment=tank", "sequence=plie", "stepper=newton", "num_frames=24"]
@@ -151,6 +155,8 @@ def test_where_nothing_is_fast_enough_the_nearest_is_named(
     assert main([*command[1:], *short, f"output={tmp_path / 'pasted'}"]) == 0
     assert main(["rollout", f"plan={tmp_path / 'plan' / 'plan.json'}", *short, f"output={tmp_path / 'by_plan'}"]) == 0
     assert np.array_equal(positions(tmp_path / "pasted"), positions(tmp_path / "by_plan"))
+    assert "plan: it was asked for 0.001 ms a frame, and nothing that was measured" in capsys.readouterr().out
+    assert read(tmp_path / "by_plan" / "summary.json")["plan"]["missed_budget_ms"] == 0.001
 
 
 def test_a_length_is_met_by_what_was_run_as_a_whole(tmp_path: Path) -> None:
@@ -163,6 +169,54 @@ def test_a_length_is_met_by_what_was_run_as_a_whole(tmp_path: Path) -> None:
     assert len(found["names"]) <= 1  # one way to take the steps
     assert all(row["decision"] == ("taken" if name in found["names"] else "not taken") for name, row in rows.items())
     assert rows["4 iterations"]["mm"] < rows["2 iterations"]["mm"]
+
+
+def test_a_length_is_of_a_second_unless_frames_are_given(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As far as the motion goes: 24 frames leave room for 20 steps behind the two that begin a window."""
+    for accuracy, frames in (("1mm", 20), ("0.01", 3)):
+        words = ["parts=[later iterations]", "windows=1", f"accuracy={accuracy}", f"output={tmp_path}"]
+        assert main(["plan", *WORDS, *words]) == 0
+        assert read(tmp_path / "plan.json")["frames"] == frames
+        told = capsys.readouterr().out
+        assert f"; {frames} steps each; the full model takes" in told
+        assert ("after 20 frames" in told) == (accuracy == "1mm")
+
+
+def test_times_of_the_page_are_those_of_the_table(made: Path) -> None:
+    """Shares of a frame are measured by another clock."""
+    plan = read(made)
+    assert sum(plan["times"].values()) == pytest.approx(plan["full"]["ms"])
+    assert "solver" in plan["times"]
+
+
+def test_a_name_given_twice_is_one_row(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plan", *WORDS, "parts=[bending,bending]", "windows=1", "frames=1", f"output={tmp_path}"]) == 0
+    assert [row["part"] for row in read(tmp_path / "plan.json")["rows"]] == ["bending"]
+    assert "bending, bending" not in capsys.readouterr().out
+
+
+def test_a_plan_knows_what_it_was_made_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The words and the content of files; a plan from before that was kept has nothing to compare."""
+    monkeypatch.chdir(tmp_path)
+    garment = Path("own.npz")
+    shutil.copy(locate("garments", "tank"), garment)
+    words = ["garment=own.npz", *WORDS[1:]]
+    assert main(["plan", *words, "parts=[later iterations]", "windows=1", "frames=1", "output=plan"]) == 0
+    path = Path("plan/plan.json")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rollout_config([f"plan={path}"])
+    shutil.copy(locate("garments", "skirt"), garment)
+    with pytest.warns(UserWarning, match=r"plan=plan/plan\.json: its words, or the files that they name, are not those"):
+        rollout_config([f"plan={path}"])
+    shutil.copy(locate("garments", "tank"), garment)
+    plan = read(path)
+    path.write_text(json.dumps(plan | {"words": [*plan["words"], "fps=40"]}))
+    with pytest.warns(UserWarning, match="make it again: hood plan garment=own.npz"):
+        rollout_config([f"plan={path}"])
+    path.write_text(json.dumps(plan | {"words": [*plan["words"], "frobnicate=1"]}))
+    with pytest.raises(ConfigError, match=r"plan=plan/plan\.json: unknown key 'frobnicate'.*; make the plan again"):
+        rollout_config([f"plan={path}"])
 
 
 def test_what_a_plan_chose_stands_for_what_was_asked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

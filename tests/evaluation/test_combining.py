@@ -42,6 +42,12 @@ def test_what_is_measured_decides_not_what_was_expected() -> None:
     assert [one.names for one in found.tried] == [("coarse", "rough"), ("coarse",), ("limp", "rough")]
 
 
+def test_what_hardly_saves_time_as_a_whole_is_not_taken() -> None:
+    found = cheapest(KNOWN, 5.0, lambda names: Combination(names, 0.1, 98.0))
+    assert (found.chosen, found.fits) == (KNOWN[0], True)
+    assert len(found.tried) == MOST_TRIED
+
+
 def test_of_those_in_time_the_most_accurate_is_chosen() -> None:
     assert most_accurate(KNOWN, 95.0, as_expected()).chosen.names == ("rough",)
     assert most_accurate(KNOWN, 30.0, as_expected()).chosen.names == ("coarse",)
