@@ -18,11 +18,11 @@ def describe(plan: Mapping[str, Any]) -> str:
         f"processor a frame, "
         f"γ {short(plan['full']['gamma_p95'])}",
         "",
-        f"{'row':<20}{'force/weight':>13}{'γ without':>11}{'p95':>10}{'mm p50':>9}{'p95':>8}{'ms':>8}{'saved':>8}  decision",
+        f"{'row':<26}{'force/weight':>13}{'γ without':>11}{'p95':>10}{'mm p50':>9}{'p95':>8}{'ms':>8}{'saved':>8}  decision",
     ]
     for row in plan["rows"]:
         numbers = "".join(f"{_cell(row, key):>{width}}" for key, width in _COLUMNS)
-        lines.append(f"{row['part']:<20}{numbers}  {row['decision']}: {row['reason']}")
+        lines.append(f"{row['part']:<26}{numbers}  {row['decision']}: {row['reason']}")
     missed = plan["windows_without_minimum"]
     if missed:
         lines.append(f"γ is a lower bound in {missed} of {len(plan['windows'])} windows: the exact step was not reached there")
