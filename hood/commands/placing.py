@@ -116,7 +116,9 @@ def unit_alone(garment: Garment, body: Body, betas: np.ndarray) -> str | None:
     if len(units) != 1 or units[0] == 1.0:
         return None
     found = find_place(garment, body, betas, Asked(scale=units[0]), None)
-    return found.placement.keys()[0] if found.refusal is None and found.resized is None else None
+    place = found.placement
+    stays = place.up == "y" and place.turn == 0 and not place.offset.any()
+    return place.keys()[0] if stays and found.refusal is None and found.resized is None else None
 
 
 def explain_unplaced(unit: str | None) -> str:

@@ -17,11 +17,12 @@ from workshop import write_obj
 from hood.assets.body.body import Body
 from hood.assets.body.load import load_body
 from hood.assets.garment.binding import posed_body
-from hood.assets.garment.fit_search import Asked
+from hood.assets.garment.fit_search import Asked, Found
 from hood.assets.garment.garment import Garment, load_garment
 from hood.assets.garment.placement import Placement
 from hood.assets.motion.poses import arms_down
 from hood.cli import main
+from hood.commands import placing
 from hood.commands.placing import find_place
 
 GARMENTS = ("tshirt", "trousers", "dress", "tank", "longsleeve", "skirt")
@@ -149,6 +150,10 @@ FEW = {
     "top in inches, z up, seen from the side, arms down": Case("longsleeve", "floor", 0.0254, "z", 90.0, 45.0),
     "skirt in decimetres, back to front": Case("skirt", "centre", 0.1, "y", 180.0),
     "trousers of a tall body, 10 cm too high": Case("trousers", (0.0, -0.1, 0.0), shape=(0, 2.0)),
+    "dress with hanging arms, z up": Case("dress", (0.0, 0.0, 3.0), up="z", turn=90.0, angle=70.0, shape=(1, 2.0)),
+    "tank of a heavy body in millimetres, arms down": Case("tank", (0.0, -3.0, 0.0), 0.001, angle=45.0, shape=(1, -2.0)),
+    "skirt of another body in inches": Case("skirt", "centre", 0.0254, turn=180.0, shape=(2, 2.0)),
+    "skirt as loose elsewhere, in centimetres": Case("skirt", unit=0.01, turn=90.0, shape=(4, -2.0)),
 }
 
 
@@ -169,12 +174,43 @@ SIZES = {
     "tank too large by 8%, in centimetres, 3 m away": Case("tank", (3.0, 0.0, 0.0), 0.01, factor=1.08),
     "trousers too small by 8%, z up": Case("trousers", "floor", up="z", factor=0.92),
     "shorts too small by 8%, back to front": Case("shorts", "centre", turn=180.0, factor=0.92),
+    "shorts too small by 8%, where they belong": Case("shorts", unit=0.001, angle=30.0, shape=(2, 2.0), factor=0.92),
+    "tank too small by 8%, in inches": Case("tank", "floor", 0.0254, "z", 90.0, 30.0, (2, 2.0), 0.92),
+    "dress too large by 8%, in inches, 3 m away": Case("dress", (0.0, 0.0, 3.0), 0.0254, "z", 90.0, 45.0, factor=1.08),
 }
 
 
 @pytest.mark.parametrize("name", SIZES)
 def test_another_size_comes_back_too(capsys: pytest.CaptureFixture[str], name: str) -> None:
     assert bring_back(SIZES[name], capsys)[0] == "right"
+
+
+def test_sleeves_tell_no_size(capsys: pytest.CaptureFixture[str]) -> None:
+    """Room over the chest and a size less are alike: a long-sleeved top keeps its size, which is among those that fit.
+
+    One that fits in no size near its own is too small.
+    """
+    assert bring_back(Case("longsleeve", "floor", up="z", turn=270.0, shape=(1, 2.0), factor=1.07), capsys)[0] == "told"
+    small = Case("longsleeve", "centre", 0.0254, angle=30.0, shape=(1, -2.0), factor=0.92)
+    assert bring_back(small, capsys)[0] == "refused"
+    assert main(["prepare", "garment=g.obj", *small.words, "output=small.npz"]) == 2
+    assert "it is too small: it fits at 1.0" in capsys.readouterr().err
+
+
+def test_a_loose_skirt_is_no_quarter_of_its_size(capsys: pytest.CaptureFixture[str]) -> None:
+    """In decimetres it fits the trunk loosely, in inches closely around an arm: neither is sure."""
+    assert bring_back(Case("skirt", unit=0.1, turn=270.0, shape=(4, -2.0), factor=1.07), capsys)[0] == "refused"
+
+
+def test_the_unit_alone_is_named_only_where_the_garment_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A place that the search finds elsewhere once it knows the unit is not the file's."""
+    garment, body = load_garment("tank"), _default()
+    file = replace(garment, rest_pos=1000.0 * garment.rest_pos)
+    offsets = {"scale=0.001": np.zeros(3), None: np.array([0.0, 0.3, 0.0])}
+    for key, offset in offsets.items():
+        found = Found(Placement(0.001, "y", 0.0, offset), 0.7, 0.1)
+        monkeypatch.setattr(placing, "find_place", lambda *words, found=found: found)
+        assert placing.unit_alone(file, body, np.zeros(10)) == key
 
 
 def test_prepare_resizes_nothing_unasked(capsys: pytest.CaptureFixture[str]) -> None:

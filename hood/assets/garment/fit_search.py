@@ -30,10 +30,13 @@ _ANGLE_GAIN, _LEAST_ANGLE = 0.03, 7.5
 #: moves so far [m] when the arms are lowered by so many degrees: no shoulders, and no hands, which hang beside skirts.
 _SLEEVES, _SLEEVE_REACH = 0.03, 0.1
 _UPPER_ARM, _LOWERED = (0.05, 0.22), 45.0
-#: Samples of the garment: for the search, and for the decision.
-_FEW, _MANY = 200, 600
-#: Peaks of one orientation and pose; candidates that are settled, of usual and of other size; those whose angle is searched.
-_PEAKS, _USUAL, _ODD, _REFINED = 2, 12, 3, 4
+#: Arms halfway down [degrees]: without sleeves nothing tells their angle, but shoulders sink by 1 cm as arms are lowered.
+_HALFWAY = 30.0
+#: Samples of the garment: for the search, for the decision, and for the size.
+_FEW, _MANY, _MOST = 200, 600, 1200
+#: Peaks of one orientation and pose; candidates that are settled, of usual size for each unit and of other size; those whose
+#: angle is searched, beside the best of each unit.
+_PEAKS, _USUAL, _ODD, _REFINED = 4, 20, 3, 4
 #: A garment that is too small passes through the body where it belongs: it is looked for larger as well, in so many places.
 _LARGER, _LARGER_PLACES = 1.09, 2
 #: A garment that lies so close in its place, for the clearance of its cut, or is there of its own size as far as its shape
@@ -135,8 +138,11 @@ def find_placement(pos: np.ndarray, faces: np.ndarray, wearer: Wearer, asked: As
         what = f"it is {search.ratio:.3g} times the body's height, which fits no unit; give scale=FACTOR, metres per unit"
         return Found(_NOWHERE, 1.0, 0.0, what)
     candidates = _distinct([search.settled(start) for start in search.starts()], search.many)
-    candidates = [search.with_angle(candidate) for candidate in candidates[:_REFINED]]
+    bests = [next((c for c in candidates if c.placement.scale == scale), None) for scale in search.scales]
+    chosen = [c for i, c in enumerate(candidates) if i < _REFINED or any(c is best for best in bests)]
+    candidates = [search.with_angle(candidate) for candidate in chosen]
     ranked = _distinct([search.polished(candidate) for candidate in candidates], search.many)
+    ranked = _distinct([*ranked, *search.turned(ranked[0])], search.many)
     return search.with_size(search.decided(ranked, search.as_it_is(ranked[0])), ranked)
 
 
@@ -144,6 +150,7 @@ class _Candidate(NamedTuple):
     odd: bool  # by its size or its side
     misfit: float
     placement: Placement
+    sleeved: bool = True  # as far as is known
 
 
 @dataclass
@@ -156,7 +163,7 @@ class _Search:
     asked: Asked
 
     def __post_init__(self) -> None:
-        self.few, self.many = (_samples(self.pos, self.faces, count) for count in (_FEW, _MANY))
+        self.few, self.many, self.most = (_samples(self.pos, self.faces, count) for count in (_FEW, _MANY, _MOST))
         self.body = self.wearer.skin(self.wearer.angles[0]).surface
         self.ratio = size_ratio(used(self.pos, self.faces), self.body)
         usable = possible(used(self.pos, self.faces), self.body)
@@ -171,9 +178,11 @@ class _Search:
             start = Placement(scale, up, turn, np.zeros(3), angle)
             found += [(value, replace(start, offset=offset)) for value, offset in self._places(start)]
         found.sort(key=lambda item: -item[0])
-        usual = [placement for _, placement in found if not self._odd(placement)]
+        usual = []
+        for scale in self.scales:  # small garments fit in more places, and would leave the others none
+            usual += [placement for _, placement in found if placement.scale == scale and not self._odd(placement)][:_USUAL]
         odd = [placement for _, placement in found if self._odd(placement)]
-        return usual[:_USUAL] + odd[:_ODD]
+        return usual + odd[:_ODD]
 
     def settled(self, start: Placement) -> _Candidate:
         """``start`` moved to where it fits best."""
@@ -186,7 +195,7 @@ class _Search:
         placement = start.placement
         sleeves = self._on_arms(placement)
         if sleeves.mean() < _SLEEVES:
-            return self._judged(self._at_angle(placement, 0.0))
+            return self._judged(self._at_angle(placement, 0.0))._replace(sleeved=False)
         for steps in _ANGLE_STEPS:  # what is near the arms is chosen again where they are known better
             placement = self._best_angle(placement, sleeves, steps)
             again = self._on_arms(placement)
@@ -220,11 +229,24 @@ class _Search:
         return np.asarray(self.wearer.upper_arms[measured.sample] & (np.abs(measured.dist) < _SLEEVE_REACH))
 
     def polished(self, start: _Candidate) -> _Candidate:
-        """``start`` by all samples; coordinates within the accuracy of the search are 0."""
-        placement = self._moved(start.placement, self.many, (WIDTH,), 12)
+        """``start`` by all samples, without sleeves around arms halfway down; coordinates within the accuracy are 0."""
+        angle = start.placement.angle
+        around = start.placement if start.sleeved else replace(start.placement, angle=_HALFWAY)
+        placement = replace(self._moved(around, self.many, (WIDTH,), 12), angle=angle)
         if self.asked.offset is None:
             placement = replace(placement, offset=np.where(np.abs(placement.offset) < _ACCURACY, 0.0, placement.offset))
         return self._judged(placement)
+
+    def turned(self, best: _Candidate) -> list[_Candidate]:
+        """``best`` turned about the middle of the garment to its other sides: one that is round has no front."""
+        if self.asked.turn is not None or self.asked.offset is not None:
+            return []
+        middle, found = best.placement.apply(self.many).mean(axis=0), []
+        for quarter in (90.0, 180.0, 270.0):
+            start = replace(best.placement, turn=(best.placement.turn + quarter) % 360.0)
+            start = replace(start, offset=start.offset + middle - start.apply(self.many).mean(axis=0))
+            found.append(self.polished(best._replace(placement=self._at_angle(start, start.angle))))
+        return found
 
     def as_it_is(self, best: _Candidate) -> _Candidate | None:
         """The garment as its file has it, but for what is asked; None where it cannot be in metres. One that is larger than
@@ -252,7 +274,7 @@ class _Search:
         rivals = [c for c in ranked[1:] if c.odd <= best.odd and not _same(c, best, self.many, _SAME)]
         rival = min(rivals, key=lambda c: c.misfit, default=None)
         found = Found(best.placement, best.misfit, 1.0 - best.misfit if rival is None else rival.misfit - best.misfit)
-        refusal = self._doubt(best, rival, best is stay)
+        refusal = self._doubt(best, rival, best is stay) or self._too_small(best, ranked)
         if stay is not None and (best is stay or refusal is not None or self._may_stay(best)) and self._worn(stay):
             margin = found.margin if best is stay else 0.0
             return Found(stay.placement, stay.misfit, margin, worn=True)
@@ -267,26 +289,50 @@ class _Search:
 
     def with_size(self, found: Found, ranked: list[_Candidate]) -> Found:
         """``found`` with the sizes that fit, and the place in another size where that explains the garment clearly better."""
-        ambiguous = found.refusal is not None and found.margin < _MARGIN
-        if self.asked.scale is not None or ambiguous:
+        if self.asked.scale is not None:
             return found
+        ambiguous = found.refusal is not None and found.margin < _MARGIN
         here = best = self._judged(found.placement)
-        own = size = self._size(best)
+        own = size = self._size(best, self.many)
         own_size = size.alike is not None and abs(size.factor - 1.0) <= _OWN_SIZE
-        sure = found.worn or own_size or size.misfit <= _SURE
+        sure = not ambiguous and (found.worn or own_size or size.misfit <= _SURE)
         others = [] if sure else [*ranked, *self._larger()]
-        for other in others:
-            if other.odd <= here.odd and not _same(other, here, self.many, _SAME):
-                other_size = self._size(other)
-                if other_size.alike is not None and other_size.misfit < size.misfit - _MARGIN:
-                    best, size = other, other_size
+        others = [c for c in others if c.odd <= here.odd and not _same(c, here, self.many, _SAME)]
+        sizes = [(c, self._size(c, self.many)) for c in others]
+        for other, other_size in sizes:
+            if other_size.alike is not None and other_size.misfit < size.misfit - _MARGIN * (best is here):
+                best, size = other, other_size
+        if ambiguous and self._rivalled(best, size, sizes):
+            return found
+        own, size = self._size(here, self.most), self._size(best, self.most)
         found = found._replace(sizes=size.alike)
         if best is not here:
             unit = min(self.scales, key=lambda scale: abs(np.log(scale / best.placement.scale)))
             size = size.of(best.placement.scale / unit, own)
             refusal = f"it fits more closely elsewhere, at {size.factor:.3g} times its size"
             found = found._replace(refusal=refusal, sizes=size.alike, placement=replace(found.placement, scale=unit))
-        return found._replace(resized=self._resized(best.placement, found.placement.scale, size)) if size.clear else found
+        if not size.clear:
+            return found
+        if self._on_arms(best.placement).mean() < _SLEEVES:
+            return found._replace(resized=self._resized(best.placement, found.placement.scale, size))
+        # Sleeved tops have more room over the chest, which looks like a size too large: see hood.assets.garment.fit_size.
+        if size.factor < 1.0 or size.alike is None:
+            return found
+        least, greatest = size.alike
+        small = f"it is too small: it fits at {least:.2f} to {greatest:.2f} times its size, and sleeves tell no closer which"
+        return found._replace(refusal=found.refusal or small)
+
+    def _rivalled(self, best: _Candidate, size: Size, others: list[tuple[_Candidate, Size]]) -> bool:
+        """Whether one of ``others``, in its size, is elsewhere and about as close as ``best`` in its ``size``."""
+        place = self._in_size(best.placement, size)
+        close = [self._in_size(c.placement, s) for c, s in others if s.misfit < size.misfit + _MARGIN]
+        return any(_apart(place, other, self.many) >= 3 * _SAME for other in close)
+
+    def _in_size(self, placement: Placement, size: Size) -> Placement:
+        """``placement`` with the garment in ``size``, about the middle of its trunk."""
+        _, middle = self._trunk(placement, self.many)
+        offset = size.factor * placement.offset + (1.0 - size.factor) * middle + size.offset
+        return replace(placement, scale=size.factor * placement.scale, offset=offset)
 
     def _larger(self) -> list[_Candidate]:
         """The best places of the garment if it is larger than its file has it."""
@@ -294,13 +340,13 @@ class _Search:
         search.scales = [_LARGER * scale for scale in self.scales]
         return _distinct([search.settled(start) for start in search.starts()], search.many)[:_LARGER_PLACES]
 
-    def _size(self, candidate: _Candidate) -> Size:
-        points, _ = self._trunk(candidate.placement)
+    def _size(self, candidate: _Candidate, samples: np.ndarray) -> Size:
+        points, _ = self._trunk(candidate.placement, samples)
         return find_size(points, self.wearer.skin(candidate.placement.angle))
 
-    def _trunk(self, placement: Placement) -> tuple[np.ndarray, np.ndarray]:
-        """Samples (N, 3) [m] of the garment off the arms, whose sleeves are wider than trunks; and their middle (3,)."""
-        points, skin = placement.apply(self.many), self.wearer.skin(placement.angle)
+    def _trunk(self, placement: Placement, samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """``samples`` (N, 3) on the body [m] and off its arms, whose sleeves are wider than trunks; and their middle (3,)."""
+        points, skin = placement.apply(samples), self.wearer.skin(placement.angle)
         trunk = points[~self.wearer.arms[skin.measure(points).sample]]
         points = trunk if len(trunk) >= _FEW else points
         return points, points.mean(axis=0)
@@ -309,7 +355,7 @@ class _Search:
         """The place in the size that explains the garment clearly better; None where it does not surround the body there."""
         scale = float(f"{unit * size.factor:.3g}")
         if self.asked.offset is None:
-            factor, (_, middle) = scale / start.scale, self._trunk(start)
+            factor, (_, middle) = scale / start.scale, self._trunk(start, self.most)
             start = replace(start, offset=factor * start.offset + (1.0 - factor) * middle + size.offset)
         search = _Search(self.pos, self.faces, self.wearer, replace(self.asked, scale=scale))
         best = search.polished(search.with_angle(search._judged(replace(start, scale=scale))))
@@ -329,6 +375,14 @@ class _Search:
                 f"two places fit alike ({one}, misfit {best.misfit:.3f}; {other}, misfit {rival.misfit:.3f}); give one of them"
             )
         return None
+
+    def _too_small(self, best: _Candidate, ranked: list[_Candidate]) -> str | None:
+        """Why an odd answer does not count: in a larger unit the garment fits with a wider cut."""
+        larger = [c for c in ranked if best.odd and not c.odd and c.placement.scale > best.placement.scale]
+        if self.asked.offset is not None or all(self._size(c, self.many).misfit > _LIMIT for c in larger):
+            return None
+        one, other = (f"scale={c.placement.scale:g}" for c in (best, larger[0]))
+        return f"it fits a small part of the body ({one}), and loosely around the trunk ({other}); give one of them"
 
     def _worn(self, stay: _Candidate) -> bool:
         """Whether the file as it is lies around the body: nothing then asks for another place."""
@@ -378,7 +432,12 @@ def _rank(candidate: _Candidate) -> tuple[bool, bool, float]:
 
 def _same(one: _Candidate, other: _Candidate, points: np.ndarray, within: float) -> bool:
     """Whether the same points lie within so many metres of each other on average."""
-    return float(np.linalg.norm(one.placement.apply(points) - other.placement.apply(points), axis=1).mean()) < within
+    return _apart(one.placement, other.placement, points) < within
+
+
+def _apart(one: Placement, other: Placement, points: np.ndarray) -> float:
+    """Mean distance [m] of the same points at two placements."""
+    return float(np.linalg.norm(one.apply(points) - other.apply(points), axis=1).mean())
 
 
 def _samples(pos: np.ndarray, faces: np.ndarray, count: int) -> np.ndarray:

@@ -20,10 +20,10 @@ def wearer(body: Body) -> Wearer:
     return Wearer(lambda angle: posed_body(body, arms_down(angle), 0, np.zeros(10)).surface, body.faces)
 
 
-def worn(garment: Garment, body: Body, angle: float) -> np.ndarray:
+def worn(garment: Garment, body: Body, angle: float, betas: np.ndarray = np.zeros(10)) -> np.ndarray:  # noqa: B008
     assert garment.lbs_weights is not None
-    points = np.concatenate([garment.tpose(np.zeros(10)), np.ones((len(garment.tpose(np.zeros(10))), 1))], axis=1)
-    transforms = posed_body(body, arms_down(angle), 0, np.zeros(10)).transforms
+    points = np.concatenate([garment.tpose(betas), np.ones((len(garment.rest_pos), 1))], axis=1)
+    transforms = posed_body(body, arms_down(angle), 0, betas).transforms
     return np.asarray(np.einsum("vj,jab,vb->va", garment.lbs_weights, transforms, points))
 
 
@@ -47,6 +47,22 @@ def test_the_misfit_is_least_where_a_garment_belongs(wearer: Wearer, garments: d
         assert misfit(skin.measure(points + 0.04 * shift)) > here + 0.01
     start = np.array([0.02, -0.015, 0.01])
     assert np.abs(start + settle(points + start, skin, WIDTH, 15)).max() < 0.01
+
+
+@pytest.mark.parametrize("name", ["tank", "dress", "trousers", "skirt"])
+@pytest.mark.parametrize("shape", [(0, 2.0), (1, 2.0), (4, -2.0)])
+def test_the_place_is_right_on_bodies_of_other_shapes(
+    body: Body, garments: dict[str, Garment], name: str, shape: tuple[int, float]
+) -> None:
+    """Whatever the cut, and however low the arms hang that no sleeve tells of."""
+    betas = np.eye(10)[shape[0]] * shape[1]
+    other = Wearer(lambda angle: posed_body(body, arms_down(angle), 0, betas).surface, body.faces)
+    for angle in (0.0, 70.0):
+        pos = worn(garments[name], body, angle, betas)
+        found = find_placement(pos, garments[name].faces, other, Asked(1.0, "y", 0.0))
+        moved = find_placement(pos - [3.0, 2.0, 0.0], garments[name].faces, other, Asked(1.0, "y", 0.0))
+        assert not found.placement.offset.any()
+        assert np.linalg.norm(moved.placement.offset - [3.0, 2.0, 0.0]) < 0.01
 
 
 def test_correlation_finds_the_place_from_anywhere(wearer: Wearer, garments: dict[str, Garment]) -> None:
