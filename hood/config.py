@@ -360,9 +360,12 @@ def _check_sources(config: DictConfig) -> None:
         sources = re.findall(rf"\$\{{{re.escape(_OPTIONAL)}(\w+)\.", str(values))
         source = next((source for source in sources if terms.get(source) is None), None)
         if source is not None:
+            # A training takes the weight of contact from its own keys.
+            ramp = "trainer.collision.start=0 trainer.collision.end=0"
+            no_weight = ramp if "trainer" in config else f"{_OPTIONAL}{source}.weight=0"
             raise ConfigError(
                 f"{_OPTIONAL}{source}=null: {_OPTIONAL}{holder} takes values from it; add {_OPTIONAL}{holder}=null as well, "
-                f"or give {_OPTIONAL}{source}.weight=0 instead"
+                f"or give {no_weight} instead"
             )
 
 

@@ -219,6 +219,24 @@ def test_help_lists_keys_groups_and_names(command: str, capsys: pytest.CaptureFi
     assert max(len(line) for line in text.splitlines()) <= 120
 
 
+@pytest.mark.parametrize("command", ["train", "rollout", "evaluate", "tradeoff", "envelope"])
+def test_names_stand_behind_keys_of_the_command(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    from omegaconf import OmegaConf
+
+    from hood.config import CONFIG_FOLDER, load_config
+
+    assert main([command, "--help"]) == 0
+    text, config = capsys.readouterr().out, load_config(command)
+    part = text.split("these keys take files as well\n")[1].split("\n\n")[0]
+    keys = [line.split("=")[0].strip() for line in part.splitlines() if "=" in line]
+    assert len(keys) >= 3
+    for key in keys:
+        assert OmegaConf.select(config, key, default="absent") != "absent", key
+    if command == "train":
+        assert keys == ["data.garments", "data.sequences", "data.body", "weights"]
+        assert f"keys of model.*, losses.* stand in the files of the options:\n  {CONFIG_FOLDER}/GROUP/" in text
+
+
 def test_usage_and_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([]) == 0
     usage = capsys.readouterr().out

@@ -15,6 +15,17 @@ from hood.training.curriculum import WarmupCosine
 from hood.training.settings import TrainerSettings
 
 
+def test_contact_without_weight_is_named_by_the_keys_of_the_command() -> None:
+    for name, keys in (
+        ("rollout", "losses.terms.collision.weight=0"),
+        ("train", "trainer.collision.start=0 trainer.collision.end=0"),
+    ):
+        with pytest.raises(ConfigError, match=f"or give {keys} instead"):
+            load_config(name, ["losses.terms.collision=null"])
+        load_config(name, keys.split())
+        load_config(name, ["losses.terms.collision=null", "losses.terms.friction=null"])
+
+
 def test_defaults_of_every_command_load() -> None:
     for name in ("train", "rollout", "evaluate", "tradeoff"):
         assert load_config(name).device == "cpu"

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from hood.assets.files.atomic import write_atomically
-from hood.evaluation.report import COLUMNS, describe, format_table
+from hood.evaluation.report import columns, describe, format_table
 from hood.evaluation.rows import write_rows
 from hood.evaluation.spectrum import COLUMNS as SPECTRUM_COLUMNS
 from hood.evaluation.spectrum import bar_panels, format_spectrum
@@ -18,7 +18,7 @@ def report_table(rows: Sequence[Mapping[str, Any]], about: Conditions, folder: P
     """Print the table; write it as ``table.csv``, ``table.json`` and, beside the paper's, ``table1.md``."""
     print(format_table(rows))
     print(f"\n{describe(rows)}")
-    csv_path, json_path = write_rows(rows, COLUMNS, folder, "table")
+    csv_path, json_path = write_rows(rows, columns(rows), folder, "table")
     page_path = folder / "table1.md"
     write_atomically(page_path, page(rows, about).encode())
     print(f"tables in {csv_path}, {json_path} and, beside the paper's, {page_path}")

@@ -7,6 +7,8 @@ import textwrap
 from collections.abc import Iterator
 from typing import Any
 
+from omegaconf import DictConfig, OmegaConf
+
 from hood.assets.files import library
 from hood.commands.exit_codes import exit_code_lines
 from hood.config import CONFIG_FOLDER, headings, load_config, notes, options, plain, shown
@@ -75,6 +77,14 @@ _EXAMPLES = {
 _BEFORE_KEYS = {**dict.fromkeys(("inspect", "compare", "view", "export"), "FILE ... "), "fabric": "[NAME ...] "}
 
 
+#: Keys that take an embedded name of a kind, or a file; a command has one of each, or none.
+_NAMED = {
+    "garments": ("garment", "garments", "garments_4k", "data.garments"),
+    "motions": ("sequence", "sequences", "data.sequences"),
+    "body": ("body", "data.body"),
+    "weights": ("checkpoint", "models", "weights"),
+}
+_ABSENT = object()
 #: Groups whose keys a command's help lists one by one, those of the chosen option.
 _LISTED = {"train": {"data": "default", "trainer": "fast"}, "rollout": {"material": "default", "solver": "newton"}}
 
@@ -106,12 +116,26 @@ def describe(name: str) -> str:
         lines += ["", f"keys of {group}={option}, which can be changed one by one"]
         within = notes(f"{group}/{option}")
         lines += [_row(f"{group}.{key}", value, within.get(key, "")) for key, value in _leaves(plain(config[group]))]
+    lines += _elsewhere(config, [group for group in groups if group not in _LISTED.get(name, {})])
     if groups or name in ("tradeoff", "envelope"):
-        lines += ["", "embedded names; these keys take files as well"]
-        for kind, label in (("garments", "garment"), ("motions", "sequence"), ("body", "body"), ("weights", "checkpoint")):
-            lines.append(textwrap.fill(f"  {label + '=':<14}{' '.join(library.names(kind))}", 118, subsequent_indent=" " * 16))
+        lines += _names(config)
     lines += ["", "examples:", *(f"  {example}" for example in _EXAMPLES[name]), "", *exit_code_lines()]
     return "\n".join(lines)
+
+
+def _elsewhere(config: DictConfig, groups: list[str]) -> list[str]:
+    """Where the keys stand of groups that are not listed."""
+    keys = ", ".join(f"{group}.*" for group in groups if isinstance(config.get(group), DictConfig))
+    return ["", f"keys of {keys} stand in the files of the options:", f"  {CONFIG_FOLDER}/GROUP/OPTION.yaml"] if keys else []
+
+
+def _names(config: DictConfig) -> list[str]:
+    """The embedded names, each kind with the command's key for it."""
+    lines = ["", "embedded names; these keys take files as well"]
+    for kind, keys in _NAMED.items():
+        for key in [key for key in keys if OmegaConf.select(config, key, default=_ABSENT) is not _ABSENT][:1]:
+            lines.append(textwrap.fill(f"  {key + '=':<16}{' '.join(library.names(kind))}", 118, subsequent_indent=" " * 18))
+    return lines
 
 
 def _row(key: str, value: object, note: str) -> str:

@@ -109,6 +109,10 @@ def _run(config: DictConfig, trainer: Trainer, folder: Path) -> int:
                 file=sys.stderr,
             )
         raise
+    if trainer.skipped:
+        why, tried = trainer.why_skipped(), trainer.skipped + trainer.made
+        if main:
+            print(f"hood: {trainer.skipped} of {tried} updates were skipped, the last one{why}", file=sys.stderr)
     if main:
         print(f"weights in {folder / 'model.safetensors'}, checkpoint in {trainer.checkpoint_path}")
     if not finished:
@@ -127,6 +131,8 @@ def make_trainer(config: DictConfig) -> Trainer:
     torch.manual_seed(int(config.seed))
     simulator: Simulator = build(config.model)
     settings: TrainerSettings = build(config.trainer)
+    potential: Potential = build(config.losses)
+    settings.collision.require_its_weight(potential)
     fps = float(config.data.fps)
     earlier = 0
     if config.weights is not None:
@@ -142,9 +148,8 @@ def make_trainer(config: DictConfig) -> Trainer:
         **_sampling(config),
         device=str(config.device),
     )
-    potential = build(config.losses)
     folder = output_folder(config)
-    watch = _make_watch(config, sampler, potential, folder) if settings.validate_every else None
+    watch = _make_watch(config, sampler, settings.collision.at_end(potential), folder) if settings.validate_every else None
     return Trainer(simulator, potential, sampler, settings, folder, int(config.seed), watch, earlier)
 
 

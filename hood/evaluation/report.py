@@ -6,37 +6,35 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from hood.evaluation.gap import AGREEMENT
-from hood.evaluation.table import ALL, FAILURE_STRAIN, INTERVALS
+from hood.evaluation.table import ALL, FAILURE_STRAIN, INTERVALS, TERMS, other_terms
 
 _NAMES = ("model", "weights", "garment")
 _MAIN = ("steps", "radius", "ms", "ms_p99", "fps", "L_total", "gradient_norm", "rg")
 _GAP = ("gap", "gap_p95", "unconverged", "disagree")
-_TERMS = ("L_guess", "L_stretching", "L_bending", "L_inertia", "L_gravity", "L_collision", "L_friction")
+_TERMS = ("L_guess", *(f"L_{name}" for name in TERMS))
 _STATE = ("strain_p99", "penetration", "penetration_worst", "drift")
 _SURFACE = ("cut_faces", "cut_faces_worst", "crossings")
 _FAILURE = ("failed_at", "failed", "frames_to_failure")
 _ENDS = tuple(f"{column}_{end}" for column in INTERVALS for end in ("low", "high"))
-COLUMNS = (
-    *_NAMES,
-    *_MAIN,
-    *_GAP,
-    *_TERMS,
-    *_STATE,
-    *_SURFACE,
-    *_FAILURE,
-    "rollouts",
-    "frames",
-    "gap_states",
-    "gap_spread",
-    *_ENDS,
-)
-#: Columns of the printed tables; all in one would be wider than a screen.
-_PRINTED = ((*_NAMES, *_MAIN, *_GAP, "failed"), (*_NAMES, *_TERMS), (*_NAMES, *_STATE, *_SURFACE))
+#: Characters of a line at most.
+_WIDTH = 160
+
+
+def columns(rows: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
+    """The columns of the rows' files: the same ones for all rows, and one for every other energy that acts in some of them."""
+    counts = ("rollouts", "frames", "gap_states", "gap_spread")
+    return (*_NAMES, *_MAIN, *_GAP, *_TERMS, *_others(rows), *_STATE, *_SURFACE, *_FAILURE, *counts, *_ENDS)
 
 
 def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The rows as three fixed-width tables: cost and accuracy, energies, state of the cloth."""
-    return "\n\n".join(_fixed_width(rows, columns) for columns in _PRINTED)
+    """The rows as fixed-width tables: cost and accuracy, energies, state of the cloth; all in one would be wider than a
+    screen."""
+    others = _others(rows)
+    energies = [_fixed_width(rows, (*_NAMES, *_TERMS, *others))]
+    if energies[0].index("\n") > _WIDTH:
+        energies = [_fixed_width(rows, (*_NAMES, *some)) for some in (_TERMS, others)]
+    first, last = (*_NAMES, *_MAIN, *_GAP, "failed"), (*_NAMES, *_STATE, *_SURFACE)
+    return "\n\n".join((_fixed_width(rows, first), *energies, _fixed_width(rows, last)))
 
 
 def describe(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -66,6 +64,10 @@ def describe(rows: Sequence[Mapping[str, Any]]) -> str:
     if any(row["weights"] == "untrained" for row in rows):
         lines.append("untrained: random weights; steps, radius and times of these rows mean something, their accuracy does not")
     return "\n".join(lines)
+
+
+def _others(rows: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
+    return tuple(f"L_{name}" for name in other_terms(rows))
 
 
 def _fixed_width(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> str:

@@ -36,6 +36,9 @@ _STATISTICS: dict[str, tuple[str, Callable[[np.ndarray], float]]] = {
     "strain_p99": ("strain_p99", np.median),
 }
 INTERVALS = tuple(_STATISTICS)
+#: Energies that every row has, in their order; and how metrics of frames name an energy.
+TERMS = ("stretching", "bending", "inertia", "gravity", "collision", "friction")
+_SUMS, _ENERGY = (*TERMS, "total"), "energy_"
 
 #: Told what is being done and how many rollouts are done.
 Progress = Callable[[str, int], None]
@@ -97,7 +100,8 @@ def evaluate(
     Means over the frames that a candidate's own rollouts reach before the first non-finite one; ``failed_at`` is the
     earliest such frame (None: never). Of the ``rollouts``, ``failed`` is the share that failed, as non-finite or by
     :data:`FAILURE_STRAIN`, and ``frames_to_failure`` the median of the frames where they did, rollouts that lasted counted as
-    later than all (None: less than half failed). ``steps`` and ``radius`` are None without a network. ``L_guess`` is the
+    later than all (None: less than half failed). ``steps`` and ``radius`` are None without a network. ``L_NAME`` is the energy
+    of every term that acts in the row, those of :data:`TERMS` in any case, ``L_total`` their sum, ``L_guess`` the
     potential of the inertial guess on the same states. ``gradient_norm`` [N] is the mean over vertices of ‖∂L/∂x_v‖₂, averaged
     over frames; ``rg`` and ``strain_p99`` are medians over frames; ``penetration`` is the mean share of vertices deeper than
     2 mm, ``penetration_worst`` that of the worst frame; ``cut_faces`` is the mean share of the cloth's triangles that the
@@ -147,6 +151,13 @@ def candidate_rows(candidate: Candidate, parts: Mapping[str, Sequence[Measured]]
         {**shared, "garment": name, **_row(sum(part, start=Measured())), **_intervals(part)}
         for name, part in {**parts, ALL: whole}.items()
     ]
+
+
+def other_terms(rows: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
+    """Energies that act in some of the rows beside :data:`TERMS`, own ones among them: their columns are ``L_NAME``."""
+    known = {f"L_{name}" for name in (*_SUMS, "guess", "total_low", "total_high")}
+    columns = (key for row in rows for key in row if key.startswith("L_") and key not in known)
+    return tuple(dict.fromkeys(column.removeprefix("L_") for column in columns))
 
 
 def _tell(progress: Progress, done: int, text: str) -> None:
@@ -202,9 +213,10 @@ def _row(measured: Measured) -> dict[str, Any]:
         "ms_p99": float(np.quantile(times, 0.99)),
         "fps": float(1e3 / np.median(times)),
     }
-    for name in ("stretching", "bending", "inertia", "gravity", "collision", "friction", "total"):
-        row[f"L_{name}"] = _mean(frames, f"energy_{name}")
-    row["L_guess"] = _mean(frames, "energy_inertial_guess")
+    others = (key.removeprefix(_ENERGY) for frame in frames for key in frame if key.startswith(_ENERGY))
+    for name in dict.fromkeys((*_SUMS, *others)):
+        row[f"L_{name}"] = _mean(frames, f"{_ENERGY}{name}")
+    row["L_guess"] = row.pop("L_inertial_guess", 0.0)
     row["gradient_norm"] = _mean(frames, "gradient_norm")
     row["penetration"] = _mean(frames, "penetration_share")
     row["penetration_worst"] = max(frame.get("penetration_share", 0.0) for frame in frames)

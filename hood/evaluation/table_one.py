@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any, NamedTuple
 
-from hood.evaluation.table import ALL, FAILURE_STRAIN, INTERVALS
+from hood.evaluation.table import ALL, FAILURE_STRAIN, INTERVALS, TERMS, other_terms
 
 Row = Mapping[str, Any]
 
@@ -38,9 +38,8 @@ _COLUMNS = (
     ("gradient_norm", "gradient norm [N]"),
     ("gap", "γ median"), ("gap_p95", "γ p95"), ("rg", "rg"), ("strain_p99", "strain p99"),
 )  # fmt: skip
+#: Behind the energies.
 _MORE = (
-    ("model", "model"), ("garment", "garment"), ("L_stretching", "stretching"), ("L_bending", "bending"),
-    ("L_inertia", "inertia"), ("L_gravity", "gravity"), ("L_collision", "collision"), ("L_friction", "friction"),
     ("L_guess", "L_total of the inertial guess"), ("penetration", "penetrating"), ("penetration_worst", "worst frame"),
     ("cut_faces", "triangles cut by the skin"), ("cut_faces_worst", "worst frame"), ("crossings", "crossing pairs"),
     ("drift", "drift [m]"), ("failed", "failed rollouts"), ("frames_to_failure", "frames to failure"),
@@ -92,12 +91,18 @@ def page(rows: Sequence[Row], about: Conditions) -> str:
         "# Cost, reach and accuracy",
         f"Measured with\n\n```\n{about.command}\n```\n\non {about.machine}.",
         f"## Measured\n\n{_table(rows, _COLUMNS)}\n\n{_legend()}",
-        f"## Terms of the loss [J] and state of the cloth\n\n{_table(rows, _MORE)}",
+        f"## Terms of the loss [J] and state of the cloth\n\n{_table(rows, (*_energies(rows), *_MORE))}",
         f"## Beside the paper\n\n{_beside(rows)}",
         f"## What the paper claims, and what was found\n\n{_check_table(checks(rows))}",
         f"## What differs from the paper\n\n{_differences(rows, about)}",
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def _energies(rows: Sequence[Row]) -> list[tuple[str, str]]:
+    """Columns of the energies, with their titles."""
+    terms = [(f"L_{name}", name.replace("_", " ")) for name in (*TERMS, *other_terms(rows))]
+    return [("model", "model"), ("garment", "garment"), *terms]
 
 
 def _groups(rows: Sequence[Row]) -> list[str]:

@@ -184,9 +184,8 @@ def keeps_both_sides(potential: Potential) -> bool:
 
 
 def _pulls(term: Term, problem: StepProblem) -> bool:
-    if isinstance(term, _NOT_PULLING):
-        return False
-    return not (_may_rest(type(term)) and cast(RestingTerm, term).rests(problem))
+    rests = _may_rest(type(term)) and cast(RestingTerm, term).rests(problem)
+    return not (rests or isinstance(term, _NOT_PULLING))
 
 
 def _asks_for_pull(term: Term, problem: StepProblem) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from dataclasses import dataclass, replace
 
@@ -126,9 +127,36 @@ class CollisionRamp:
 
     def apply(self, potential: Potential, iteration: int) -> Potential:
         """The potential with this iteration's weight in collision and friction."""
-        weight = self(iteration)
-        names = [name for name in ("collision", "friction") if name in potential.terms]
-        return potential.with_terms(**{name: potential.terms[name].with_weight(weight) for name in names})  # type: ignore[attr-defined]
+        return _with_weight(potential, self(iteration))
+
+    def at_end(self, potential: Potential) -> Potential:
+        """The potential with the weight to which the ramp leads."""
+        return _with_weight(potential, self.end)
+
+    def require_its_weight(self, potential: Potential) -> None:
+        """Raise ValueError where a term has a weight of its own, which the ramp would overwrite unsaid."""
+        for name in _weighted(potential):
+            term = potential.terms[name]
+            given = getattr(term, "weight", None)
+            usual = inspect.signature(type(term)).parameters.get("weight")
+            if given is None or given == self.end or (usual is not None and given == usual.default):
+                continue
+            key, level = f"losses.terms.{name}.weight={given:.9g}", self.start == self.end
+            fix = f"trainer.collision.end={given:.9g}" + f" and trainer.collision.start={given:.9g}" * level
+            rise = "" if level else f" (it rises from trainer.collision.start={self.start:.9g})"
+            raise ValueError(
+                f"{key}: a training takes this weight from trainer.collision.end={self.end:.9g}; give {fix} instead{rise}"
+            )
+
+
+def _weighted(potential: Potential) -> list[str]:
+    """Terms that have the weight of contact; a term of another package under these names may have none."""
+    return [name for name in ("collision", "friction") if hasattr(potential.terms.get(name), "with_weight")]
+
+
+def _with_weight(potential: Potential, weight: float) -> Potential:
+    changed = {name: potential.terms[name].with_weight(weight) for name in _weighted(potential)}  # type: ignore[attr-defined]
+    return potential.with_terms(**changed)
 
 
 def _require_least(part: str, settings: object, **least: int) -> None:

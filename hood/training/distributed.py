@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 from collections.abc import Callable, Mapping
 from datetime import timedelta
@@ -10,6 +11,7 @@ from typing import Any, TypeVar
 import torch
 import torch.distributed as dist
 from torch import Tensor
+from torch.nn.parallel import DistributedDataParallel
 
 Result = TypeVar("Result")
 
@@ -93,6 +95,13 @@ def mean(report: Mapping[str, float]) -> dict[str, float]:
     reports = gather(dict(report))
     names = dict.fromkeys(name for part in reports for name in part)
     return {name: sum(part.get(name, 0.0) for part in reports) / len(reports) for name in names}
+
+
+def averaging(module: torch.nn.Module) -> DistributedDataParallel:
+    """The module with gradients that are means over the processes; its buffers are left alone from then on."""
+    known = inspect.signature(DistributedDataParallel).parameters
+    key = "forward_sync_buffers" if "forward_sync_buffers" in known else "broadcast_buffers"  # torch before 2.13
+    return DistributedDataParallel(module, **{key: False})  # type: ignore[arg-type]
 
 
 def all_reduce_sum(value: Tensor) -> Tensor:

@@ -12,7 +12,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.parallel import DistributedDataParallel
 
 from hood.assets.files.atomic import write_atomically
 from hood.dynamics.checkpoint import save_simulator
@@ -39,6 +38,7 @@ from hood.training.loss import relative_loss
 from hood.training.metrics_log import MetricsLog, Window
 from hood.training.optimiser import make_optimizer
 from hood.training.settings import TrainerSettings
+from hood.training.skipped import Skipped, made_behind, told
 from hood.training.slots import Slots
 from hood.training.watch import Watch
 
@@ -75,6 +75,7 @@ class Trainer:
                 f"trainer.iterations={settings.iterations}: the first {settings.statistics_iterations} only collect "
                 "statistics, so nothing would be trained; give more, or fewer trainer.statistics_iterations=…"
             )
+        settings.collision.require_its_weight(potential)
         shown = for_networks(potential)
         simulator.use_potential(shown)
         simulator.trained_for = training_conditions(sampler, settings.collision.apply(shown, settings.iterations))
@@ -95,7 +96,7 @@ class Trainer:
         self.model: torch.nn.Module = simulator
         if ranks > 1:
             # Statistics are kept equal by their own sums; scenes are drawn by slot, so only other draws need a generator each.
-            self.model = DistributedDataParallel(simulator, broadcast_buffers=False)
+            self.model = distributed.averaging(simulator)
             torch.manual_seed(seed + 7919 * rank)
             for module in simulator.modules():
                 if isinstance(module, RunningNormalizer):
@@ -103,12 +104,11 @@ class Trainer:
         self.optimizer = make_optimizer(settings.optimizer, simulator, settings.learning_rate)
         self.iteration = 0
         self.earlier = earlier
-        self.skipped = 0
         self.rollbacks = 0
         self.best = math.inf
         self.stopwatch: Stopwatch | None = None  # told where an update's time goes
         self.observe: Observer | None = None
-        self._skipped_in_row = 0
+        self._skips = Skipped()
         self._rollbacks_in_row = 0
         self._failed_at = -1
         self._saved_at = -1
@@ -120,12 +120,26 @@ class Trainer:
     def checkpoint_path(self) -> Path:
         return self.folder / "checkpoint.pt"
 
+    @property
+    def skipped(self) -> int:
+        """Updates without a finite loss and gradient so far."""
+        return self._skips.count
+
+    @property
+    def made(self) -> int:
+        """Updates that were made and not rolled back."""
+        return self._skips.made
+
+    def why_skipped(self) -> str:
+        """Why the last of them was, in brackets; all processes must ask."""
+        return told(distributed.gather(self._skips.reason))
+
     def run(self, progress: Progress | None = None, should_stop: Callable[[], bool] = lambda: False) -> bool:
         """Train up to ``settings.iterations``; True when finished, False when ``should_stop`` ended it early.
 
         Raises:
             OSError: a file could not be written; what was written before is intact.
-            ValueError: training does not stay finite.
+            ValueError: training does not stay finite, or no update at all was made.
         """
         settings = self.settings
         with ExitStack() as stack:
@@ -139,7 +153,7 @@ class Trainer:
                 last = self.iteration == settings.iterations
                 # In the middle of a streak of skipped updates the weights are not known to be good.
                 keeping = self.iteration in settings.keep_at
-                saving = last or ((keeping or self.iteration % settings.checkpoint_every == 0) and not self._skipped_in_row)
+                saving = last or ((keeping or self.iteration % settings.checkpoint_every == 0) and not self._skips.in_row)
                 if self._is_lost(saving):
                     self._roll_back()
                     clock = Clock(self.iteration)
@@ -160,7 +174,13 @@ class Trainer:
                     distributed.on_main(self._keep)
             if self.iteration != self._saved_at and not self._is_lost(True):
                 self.save()
-        return self.iteration >= settings.iterations
+        finished = self.iteration >= settings.iterations
+        if finished and not self._skips.made:
+            raise ValueError(
+                f"nothing was trained: {self.skipped} of {self.skipped} updates were skipped{self.why_skipped()}; "
+                f"{self.folder / 'model.safetensors'} holds the weights that it began with"
+            )
+        return finished
 
     def update(self) -> dict[str, float]:
         """One step of every slot and one optimiser update; returns what was measured."""
@@ -201,7 +221,7 @@ class Trainer:
             if self.model is not simulator:
                 # A share without body edges leaves their networks out; all processes must reduce the same parameters.
                 surrogate = surrogate + 0.0 * sum(p.sum() for p in simulator.parameters())
-            report |= self._optimise(surrogate, math.isfinite(report["total"]))
+            report |= self._optimise(surrogate, {name: report[name] for name in energies})
         with timed(clock, "scenes"):
             self.slots.advance(prediction.next_pos, simulator.next_velocity(problem, prediction))
         self.iteration += 1
@@ -227,8 +247,7 @@ class Trainer:
             "iteration": self.iteration,
             "earlier": self.earlier,
             "seed": self.seed,
-            "skipped": self.skipped,
-            "skipped_in_row": self._skipped_in_row,
+            **self._skips.state_dict(),
             "rollbacks": [self.rollbacks, self._rollbacks_in_row, self._failed_at],
             "best": self.best,
             "simulator": self.simulator.state_dict(),
@@ -270,7 +289,7 @@ class Trainer:
         self.slots.load_state_dict(state["slots"])
         self.best = float(state["best"])
         self.earlier = int(state["earlier"])
-        self.skipped, self._skipped_in_row = int(state["skipped"]), int(state["skipped_in_row"])
+        self._skips.load_state_dict(state)
         self.rollbacks, self._rollbacks_in_row, self._failed_at = state["rollbacks"]
         if len(state["rng"]) == distributed.world_size():
             set_generator_states(state["rng"][distributed.rank()], self._device)
@@ -307,12 +326,13 @@ class Trainer:
             mean.copy_(state["average"][name])
         self.optimizer.load_state_dict(state["optimizer"])
         self.iteration = int(state["iteration"])
+        self._skips.made = made_behind(state)
 
     def _is_lost(self, look: bool) -> bool:
         """Whether training cannot go on from here; ``look`` at the weights also while losses are finite."""
-        if self._skipped_in_row >= self.settings.max_skipped:
+        if self._skips.in_row >= self.settings.max_skipped:
             return True
-        if not look and not self._skipped_in_row:
+        if not look and not self._skips.in_row:
             return False
         values = (*self.simulator.state_dict().values(), *self._average.values())
         return not all(bool(torch.isfinite(value).all()) for value in values if value.is_floating_point())
@@ -323,7 +343,7 @@ class Trainer:
         if self._rollbacks_in_row >= self.settings.max_rollbacks:
             raise ValueError(
                 f"training does not stay finite: {self.skipped} updates skipped, {self._rollbacks_in_row} times back to a "
-                f"checkpoint without getting past iteration {self._failed_at}; start again with a lower "
+                f"checkpoint without getting past iteration {self._failed_at}{self.why_skipped()}; start again with a lower "
                 f"trainer.learning_rate ({self.checkpoint_path} holds the last finite weights)"
             )
         path = self.checkpoint_path if self._rollbacks_in_row == 0 else previous(self.checkpoint_path)
@@ -332,7 +352,7 @@ class Trainer:
         self.slots.restart()
         self.optimizer.zero_grad(set_to_none=True)
         self._window = Window()
-        self._skipped_in_row = 0
+        self._skips.in_row = 0
         self.rollbacks, self._rollbacks_in_row = self.rollbacks + 1, self._rollbacks_in_row + 1
         self._failed_at = max(failed, self._failed_at)
         if distributed.rank() == 0:
@@ -373,8 +393,8 @@ class Trainer:
         unit = 1.0 if self.settings.signal == "potential" else scale(problem)
         return self._damping(residual) / (unit * problem.num_scenes)
 
-    def _optimise(self, surrogate: Tensor, finite: bool) -> dict[str, float]:
-        settings = self.settings
+    def _optimise(self, surrogate: Tensor, energies: Mapping[str, float]) -> dict[str, float]:
+        settings, finite = self.settings, math.isfinite(sum(energies.values()))
         factor = settings.schedule(self.iteration, settings.iterations)
         for group in self.optimizer.param_groups:
             group["lr"] = settings.learning_rate * factor
@@ -384,12 +404,11 @@ class Trainer:
         with timed(self.stopwatch, "optimiser"):
             norm = float(torch.nn.utils.clip_grad_norm_(self.simulator.parameters(), settings.clip_norm))
             if distributed.any_rank(not (finite and math.isfinite(norm))):
-                self.skipped += 1
-                self._skipped_in_row += 1
+                self._skips.skip(self.iteration + 1, energies, norm)
             else:
                 self.optimizer.step()
                 self._update_average()
-                self._skipped_in_row = 0
+                self._skips.make()
         return {
             "parameter_gradient_norm": norm,
             "learning_rate": settings.learning_rate * factor,

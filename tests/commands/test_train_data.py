@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
+from torch import Tensor
 
 from hood.assets.material import Material
 from hood.assets.motion.motion_files import MotionFiles
+from hood.cli import main
 from hood.commands.train import make_trainer
 from hood.config import ConfigError, load_config
 from hood.dynamics.checkpoint import read_header
+from hood.losses.gravity import Gravity
+from hood.losses.problem import StepProblem
 from hood.training.trainer import Trainer
 
 SMALL = ["model.latent_dim=8", "data.garments=[tank]"]
@@ -60,6 +65,54 @@ def test_motions_shorter_than_a_rollout(tmp_path: Path, capsys: pytest.CaptureFi
 def test_time_scale_reaches_the_trainer() -> None:
     settings = trainer("trainer=paper", "trainer.time_scale=0.02").settings
     assert (settings.iterations, settings.horizon.every, settings.collision.end_iteration) == (3000, 100, 3000)
+
+
+def test_a_weight_of_contact_is_given_to_the_ramp(tmp_path: Path) -> None:
+    """Refused before a file is read; validation is judged by the potential to which the ramp leads."""
+    for key in ("losses.terms.collision.weight=1e6", "losses.terms.friction.weight=1e6"):
+        with pytest.raises(ValueError, match=r"weight=1000000: .* give trainer\.collision\.end=1000000"):
+            trainer(key, "data.garments=[nowhere.obj]")
+    made = trainer("trainer=paper", "trainer.collision.end=1e6", "trainer.validate_every=10")
+    assert made.watch is not None
+    terms = made.watch.validation.potential.terms
+    assert (terms["collision"].weight, terms["friction"].weight) == (1e6, 1e6)
+    assert made.simulator.trained_for.potential["collision"]["weight"] == 1e6
+
+
+def test_contact_without_weight_trains() -> None:
+    report = trainer("trainer.collision.start=0", "trainer.collision.end=0", "trainer.workers=0").update()
+    assert report["collision"] == 0.0
+
+
+def test_a_training_without_an_update_ends_with_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [
+        *SMALL, "model.schedule='1x(mesh)'", "model.features=paper", "trainer.iterations=2", "trainer.statistics_iterations=1",
+        "trainer.batch_size=1", "trainer.workers=0",
+    ]  # fmt: skip
+    energies, broken = Gravity.__call__, [1, 2]
+
+    def fail(term: Gravity, problem: StepProblem, pos: Tensor, acc: Tensor) -> Tensor:
+        count[0] += 1
+        return energies(term, problem, pos, acc) * (math.nan if count[0] in broken else 1.0)
+
+    monkeypatch.setattr(Gravity, "__call__", fail)
+    for output, wrong, code, said in (
+        (
+            "none",
+            (1, 2),
+            2,
+            "hood: error: nothing was trained: 1 of 1 updates were skipped (iteration 2: energy gravity is nan)",
+        ),
+        ("some", (2,), 0, "hood: 1 of 2 updates were skipped, the last one (iteration 2: energy gravity is nan)"),
+    ):
+        broken[:], count = wrong, [0]
+        more = ["trainer.iterations=3"] if code == 0 else []
+        assert main(["train", *words, *more, f"output={tmp_path / output}"]) == code
+        heard = capsys.readouterr()
+        assert said in heard.err
+        assert ("weights in" in heard.out) == (code == 0)
 
 
 def test_one_fabric_for_every_scene() -> None:

@@ -9,15 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
+from hood.config import build, load_config
 from hood.dynamics.rollout import simulate
 from hood.dynamics.simulator import build_simulator
 from hood.dynamics.stepper import NewtonStepper
-from hood.evaluation.report import COLUMNS, describe, format_table
+from hood.evaluation.report import columns, describe, format_table
 from hood.evaluation.rows import write_rows
-from hood.evaluation.table import ALL, Candidate, GapSettings, evaluate
+from hood.evaluation.table import ALL, TERMS, Candidate, GapSettings, evaluate, other_terms
+from hood.evaluation.table_one import Conditions, page
 from hood.evaluation.validation import Validation
 from hood.losses.potential import default_potential
+from hood.losses.problem import StepProblem
 from hood.scene.scene import Scene
 from hood.solver.newton import NewtonSettings
 
@@ -55,7 +59,7 @@ def test_one_row_per_model_and_garment_and_one_over_all(rows: list[dict]) -> Non
     assert {row["steps"] for row in rows if row["model"] == "base"} == {1}
     assert {row["radius"] for row in rows if row["model"] == "wild"} == {2}
     for row in rows:
-        assert set(row) <= set(COLUMNS)
+        assert set(row) <= set(columns(rows))
 
 
 def test_numbers_are_the_means_of_the_rollout(rows: list[dict], candidates: list[Candidate], tank_scene: Scene) -> None:
@@ -151,16 +155,49 @@ def test_text_and_files(rows: list[dict], solver_rows: list[dict], tmp_path: Pat
     assert "untrained: random weights" in describe(rows)
     assert "untrained" not in describe(solver_rows)
     assert "did not converge" not in describe(rows)
-    csv_path, json_path = write_rows(rows, COLUMNS, tmp_path, "table")
+    csv_path, json_path = write_rows(rows, columns(rows), tmp_path, "table")
     with open(csv_path, newline="") as file:
         table = list(csv.DictReader(file))
-    assert list(table[0]) == list(COLUMNS)
+    assert list(table[0]) == list(columns(rows))
     assert [line["model"] for line in table] == [row["model"] for row in rows]
     assert float(table[0]["L_total"]) == pytest.approx(rows[0]["L_total"])
     assert table[0]["failed_at"] == table[0]["gap"] == ""
     assert float(table[-1]["gap"]) == pytest.approx(solver_rows[-1]["gap"])
     assert json.loads(json_path.read_text()) == rows
     assert sorted(path.name for path in tmp_path.iterdir()) == ["table.csv", "table.json"]
+
+
+def test_other_energies_have_columns_and_all_add_up(candidates: list[Candidate], tank_scene: Scene, rows: list[dict]) -> None:
+    """Air and damping, and a term of another package; what does not act has none."""
+
+    class Wind:
+        def applies(self, problem: StepProblem) -> bool:
+            return True
+
+        def __call__(self, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> Tensor:
+            return problem.sum_vertices(-2.0 * problem.cloth.mass * next_pos[:, 0])
+
+    words = ["losses.terms.air.velocity=3", "losses.terms.stretch_damping.time=0.01"]
+    potential = build(load_config("evaluate", words).losses).with_terms(a_long_wind=Wind())
+    found = evaluate(candidates[:1], {"tank": [tank_scene]}, potential, FRAMES, GapSettings(states=0))
+    assert other_terms(rows) == ()
+    assert set(other_terms(found)) == {"air", "stretch_damping", "a_long_wind"}
+    for row in found:
+        assert row["L_air"] != 0.0
+        parts = sum(row[f"L_{name}"] for name in (*TERMS, *other_terms(found)))
+        assert parts == pytest.approx(row["L_total"], rel=1e-5)
+        assert set(row) <= set(columns(found))
+    text = format_table(found)
+    assert max(map(len, text.splitlines())) <= 160
+    assert [text.count(f"L_{name}") for name in other_terms(found)] == [1, 1, 1]
+    page_of = page(found, Conditions("hood evaluate", "A Processor", "default", ["walk"], 1, FRAMES, 30.0))
+    assert "| friction | air | stretch damping | a long wind |" in page_of
+
+
+def test_many_energies_are_a_table_of_their_own(rows: list[dict]) -> None:
+    few, many = ([row | {f"L_energy_{i}": 0.25 for i in range(count)} for row in rows] for count in (1, 6))
+    assert [len(format_table(some).split("\n\n")) for some in (rows, few, many)] == [3, 3, 4]
+    assert max(map(len, format_table(many).splitlines())) <= 160
 
 
 def test_validation_summarises_own_rollouts(candidates: list[Candidate], tank_scene: Scene, skirt_scene: Scene) -> None:

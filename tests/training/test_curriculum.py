@@ -8,7 +8,9 @@ from dataclasses import replace
 import pytest
 
 from hood.config import build, load_config
-from hood.losses.potential import default_potential
+from hood.losses.friction import Friction
+from hood.losses.gravity import Gravity
+from hood.losses.potential import default_potential, reference_potential
 from hood.training.curriculum import CollisionRamp, Horizon, InverseRoot, StepDecay, WarmupCosine
 from hood.training.settings import TrainerSettings
 
@@ -59,6 +61,34 @@ def test_the_weight_reaches_collision_and_friction_and_nothing_else() -> None:
         assert potential.terms[name].weight == 5e5
     for name in ("stretching", "bending", "inertia", "gravity"):
         assert applied.terms[name] is potential.terms[name]
+
+
+def test_a_weight_that_the_ramp_would_overwrite_is_refused() -> None:
+    level, rising = CollisionRamp(5e5, 5e5), CollisionRamp(5e3, 5e5, 50, 150)
+    for ramp in (level, rising):
+        ramp.require_its_weight(default_potential())
+        ramp.require_its_weight(reference_potential())
+    CollisionRamp(1e6, 1e6).require_its_weight(default_potential(1e6))
+    CollisionRamp(1e6, 1e6).require_its_weight(default_potential())
+    with pytest.raises(ValueError, match=r"^losses\.terms\.collision\.weight=1000000: a training takes") as error:
+        level.require_its_weight(default_potential(1e6))
+    assert "give trainer.collision.end=1000000 and trainer.collision.start=1000000 instead" in str(error.value)
+    with pytest.raises(
+        ValueError, match=r"collision\.weight=0: .*give trainer\.collision\.end=0 instead \(it rises from .*5000\)"
+    ):
+        rising.require_its_weight(default_potential(0.0))
+    other = default_potential().with_terms(friction=Friction(weight=2e5))
+    with pytest.raises(ValueError, match=r"losses\.terms\.friction\.weight=200000"):
+        level.require_its_weight(other)
+
+
+def test_a_contact_of_another_package_keeps_its_own_weight() -> None:
+    potential = default_potential().with_terms(collision=Gravity())
+    ramp = CollisionRamp(1e3, 1e3)
+    ramp.require_its_weight(potential)
+    applied = ramp.apply(potential, 0)
+    assert applied.terms["collision"] is potential.terms["collision"]
+    assert applied.terms["friction"].weight == 1e3
 
 
 PAPER = TrainerSettings()

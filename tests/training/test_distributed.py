@@ -27,6 +27,25 @@ def test_energies_that_a_process_lacks_count_as_nothing(monkeypatch: pytest.Monk
     assert distributed.mean({"total": 1.0, "collision": 4.0}) == {"total": 2.0, "collision": 2.0, "friction": 0.5}
 
 
+def test_buffers_are_left_alone_by_the_key_that_torch_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    """2.13 has a new one, and warns about the former at length."""
+
+    class Former:
+        def __init__(self, module: torch.nn.Module, broadcast_buffers: bool = True) -> None:
+            self.given = "broadcast_buffers", broadcast_buffers
+
+    class Present:
+        def __init__(
+            self, module: torch.nn.Module, broadcast_buffers: object = None, forward_sync_buffers: object = None
+        ) -> None:
+            assert broadcast_buffers is None
+            self.given = "forward_sync_buffers", forward_sync_buffers
+
+    for kind, key in ((Former, "broadcast_buffers"), (Present, "forward_sync_buffers")):
+        monkeypatch.setattr(distributed, "DistributedDataParallel", kind)
+        assert distributed.averaging(torch.nn.Identity()).given == (key, False)
+
+
 def moments(rows: Tensor) -> Tensor:
     return torch.cat([torch.tensor([float(len(rows))]).double(), rows.double().sum(0), rows.double().square().sum(0)])
 

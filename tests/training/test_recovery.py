@@ -6,6 +6,7 @@ import errno
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,7 @@ from hood.scene.dataset import SceneSampler
 from hood.training.checkpoint import load_checkpoint, previous
 from hood.training.curriculum import CollisionRamp, Horizon, WarmupCosine
 from hood.training.settings import TrainerSettings
+from hood.training.skipped import Skipped, told
 from hood.training.trainer import Trainer
 
 SETTINGS = TrainerSettings(
@@ -171,6 +173,37 @@ def test_training_that_never_stays_finite_ends_with_one_sentence(tmp_path: Path,
     back = [record["iteration"] for record in lines(tmp_path) if "rolled_back_from" in record]
     assert back == [3]  # the line of the first return, to 6, was cut off by the second
     assert load_checkpoint(trainer.checkpoint_path)["iteration"] == 6
+
+
+def test_training_that_makes_no_update_is_no_success(tmp_path: Path, sampler: SceneSampler) -> None:
+    """Fewer updates than lead back to a checkpoint; nor is it one when it is resumed."""
+    settings, why = replace(SETTINGS, iterations=2), "energy fault is nan"
+    trainer = make(tmp_path, sampler, Fault(lambda call: True, loss=math.nan), settings)
+    start = weights(trainer)
+    with pytest.raises(ValueError, match=rf"2 of 2 updates were skipped \(iteration 2: {why}\); .*model\.safetensors"):
+        trainer.run()
+    assert torch.equal(weights(trainer), start)
+    again = make(tmp_path, sampler, settings=settings)
+    again.resume(again.checkpoint_path)
+    with pytest.raises(ValueError, match=rf"2 of 2 updates were skipped \(iteration 2: {why}\)"):
+        again.run()
+
+
+def test_the_reason_is_the_energy_or_else_the_gradient() -> None:
+    skips = Skipped()
+    skips.skip(3, {"inertia": 1.0, "wind": math.inf}, math.nan)
+    assert skips.reason == "iteration 3: energy wind is inf"
+    skips.skip(4, {"inertia": 1.0}, math.inf)
+    assert skips.reason == "iteration 4: the length of the gradient is inf"
+    skips.skip(5, {"inertia": 1.0}, 1.0)  # another process saw it
+    assert told([skips.reason, "iteration 5: energy wind is nan"]) == " (iteration 5: energy wind is nan)"
+    assert (skips.count, skips.in_row, skips.made, told([""])) == (3, 3, 0, "")
+
+
+def test_one_update_that_is_made_is_a_training(tmp_path: Path, sampler: SceneSampler) -> None:
+    trainer = make(tmp_path, sampler, Fault(lambda call: call == 1, loss=math.nan), replace(SETTINGS, iterations=2))
+    assert trainer.run()
+    assert trainer.why_skipped() == " (iteration 1: energy fault is nan)"
 
 
 def test_a_streak_goes_on_over_a_resume(tmp_path: Path, sampler: SceneSampler) -> None:
