@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 from hood.losses.potential import Potential
+from hood.losses.term import Term, WeightedTerm, named
 
 
 @dataclass(frozen=True)
@@ -125,10 +126,23 @@ class CollisionRamp:
         return replace(self, begin_iteration=begin, end_iteration=end)
 
     def apply(self, potential: Potential, iteration: int) -> Potential:
-        """The potential with this iteration's weight in collision and friction."""
-        weight = self(iteration)
-        names = [name for name in ("collision", "friction") if name in potential.terms]
-        return potential.with_terms(**{name: potential.terms[name].with_weight(weight) for name in names})  # type: ignore[attr-defined]
+        """The potential with this iteration's weight in collision and friction.
+
+        Raises:
+            ValueError: such a term cannot be given a weight.
+        """
+        weight, ramped = self(iteration), dict[str, Term]()
+        for name in ("collision", "friction"):
+            term = potential.terms.get(name)
+            if term is None:
+                continue
+            if not isinstance(term, WeightedTerm):
+                raise ValueError(
+                    f"{named(name, term)}: training ramps the weight of this term, which has no method with_weight; add one "
+                    "that returns the term with another weight, or the term itself, or give the term another name"
+                )
+            ramped[name] = term.with_weight(weight)
+        return potential.with_terms(**ramped)
 
 
 def _require_least(part: str, settings: object, **least: int) -> None:
