@@ -10,9 +10,13 @@ from hood.dynamics.captured import network_of
 from hood.dynamics.ranges import Conditions, different, outside, scene_conditions
 from hood.dynamics.refine import RefinedStepper
 from hood.dynamics.stepper import Stepper
+from hood.losses.layer_sides import LayerSides
+from hood.losses.layers import LAYER_TERMS
 from hood.losses.potential import Potential, default_potential
+from hood.losses.term import named
 from hood.scene.motion import BodyMotion
 from hood.scene.scene import Scene
+from hood.solver.forces import CLOSED_FORM
 
 
 def scene_cautions(stepper: Stepper, scene: Scene, potential: Potential, name: str) -> list[str]:
@@ -87,6 +91,17 @@ def unseen_potential(stepper: Stepper, asked: Conditions) -> str:
         return ""
     measured = "what is measured and how steps are refined, not what is predicted"
     return f"{', '.join(texts)} changes only {measured if _is_refined(stepper) else 'what is measured, not the motion'}"
+
+
+def known_by_slope(stepper: Stepper, potential: Potential) -> list[str]:
+    """One sentence on energies whose curvature the solver does not know, where it takes or refines the steps; else none."""
+    if network_of(stepper) is not None and not _is_refined(stepper):
+        return []
+    known = (*CLOSED_FORM, *LAYER_TERMS, LayerSides)
+    names = [named(name, term) for name, term in potential.terms.items() if type(term) not in known]
+    if not names:
+        return []
+    return [f"{', '.join(names)}: the solver knows the slope alone, not how stiff it is; stiff terms take many iterations"]
 
 
 def warn(sentences: Iterable[str]) -> None:

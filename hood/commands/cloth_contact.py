@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,14 +14,18 @@ from hood.commands.refinement import chosen
 from hood.commands.steppers import MAY, option_of
 from hood.config import ConfigError, plain, require_choice
 from hood.dynamics.measure import LAYER_METRICS
-from hood.losses.collision import Collision
+from hood.losses.collision import CentroidCollision, Collision
+from hood.losses.friction import CodedFriction, LaggedFriction, WeightFriction
 from hood.losses.layer_friction import LayerFriction
 from hood.losses.layers import LayerBarrier
 from hood.losses.potential import Potential
+from hood.losses.term import Term
 from hood.mesh import layers
 from hood.native.build import BuildError
 
 CHOICES = ("auto", "on", "off", "layers")
+#: Contact of the published code, which has none of cloth with cloth. A subclass is somebody's own.
+PUBLISHED = (CentroidCollision, WeightFriction, CodedFriction)
 
 
 def check_cloth_contact(config: DictConfig) -> None:
@@ -100,14 +104,20 @@ def _hindrance(config: DictConfig, potential: Potential | None = None) -> str:
     if str(config.cloth_contact) == "auto" and str(config.device) != "cpu":
         return "its search is done on the CPU, between steps on another device; cloth_contact=on does so"
     terms = (potential or losses_of(config)).terms.values()
-    collision = [term for term in terms if isinstance(term, Collision)]
-    if str(config.cloth_contact) == "auto" and not any(type(term) is Collision for term in collision):
+    if str(config.cloth_contact) == "auto" and _are_published(terms):
         return "losses=… are those of published code, which has none; cloth_contact=on adds it"
     try:
         layers.library()
     except BuildError as error:
         return str(error)
     return ""
+
+
+def _are_published(terms: Iterable[Term]) -> bool:
+    """Whether contact with the body is that of published code, and no other."""
+    kinds = [type(term) for term in terms if isinstance(term, (Collision, LaggedFriction))]
+    others = [kind for kind in kinds if issubclass(kind, Collision) and kind not in PUBLISHED]
+    return not others and any(kind in PUBLISHED for kind in kinds)
 
 
 def _rough(config: DictConfig) -> bool:

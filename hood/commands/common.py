@@ -20,7 +20,7 @@ from hood.dynamics.checkpoint import load_simulator
 from hood.dynamics.reference import SUFFIXES, load_reference_checkpoint
 from hood.dynamics.simulator import Simulator
 from hood.dynamics.stepper import Stepper
-from hood.nn.choice import AUTO, Choice, choose_kernels
+from hood.nn.choice import AUTO, Choice, choose_for
 from hood.nn.compiled import check_kernels
 from hood.nn.precision import check_precision
 from hood.training import distributed
@@ -187,7 +187,7 @@ def use_arithmetic(simulator: Simulator, config: DictConfig, traced: bool = Fals
     if kernels == AUTO and traced:
         kernels = "torch"
     if kernels == AUTO:
-        choice = choose_kernels(precision, network.latent_dim, device)
+        choice = choose_for(network, precision, device)
         tell_choice(choice)
         kernels = choice.kernels
     check_kernels(kernels, precision, network.latent_dim, device)

@@ -13,7 +13,7 @@ from hood.assets.garment.garment import Garment
 from hood.assets.material import Material
 from hood.commands.automatic import Choice, choose
 from hood.commands.body_friction import with_body_friction
-from hood.commands.cautions import scene_cautions, warn
+from hood.commands.cautions import known_by_slope, scene_cautions, warn
 from hood.commands.cloth_contact import acts, check_cloth_contact, potential_of, tell_if_off
 from hood.commands.common import require_device, thinning
 from hood.commands.events import checked_events, with_events
@@ -103,6 +103,8 @@ def set_up(
     _check_start(settled, stepper, scene, tell)
     tell_if_off(settled, 1 if scene.outfit is None else len(scene.outfit.names))
     warn(scene_cautions(stepper, scene, losses_of(settled), str(settled.checkpoint)))
+    for sentence in known_by_slope(stepper, losses_of(settled)):
+        tell(sentence)
     potential = potential_of(settled)
     path = plan_path(config)
     if path is not None:

@@ -10,8 +10,9 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from hood.losses.potential import Potential, PreparedTerm
+from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem, free_flight
+from hood.losses.term import PreparedTerm
 from hood.losses.wind import Wind
 from hood.mesh.proximity import Incidence, build_incidence
 from hood.scene.contact import Fold, find_contact, find_fixed_contact, find_fixed_fold

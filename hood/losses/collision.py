@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -15,6 +16,7 @@ from hood.scene.reach import REACHES, vertex_reach
 
 #: Which skin a vertex between two parts of the body is kept off: of the nearest alone, or of both.
 SIDES = ("both", "nearest")
+Weighted = TypeVar("Weighted")
 
 
 def checked_contact(term: str, contact: str, reach: str, sides: str) -> tuple[str, str, str]:
@@ -28,6 +30,19 @@ def checked_contact(term: str, contact: str, reach: str, sides: str) -> tuple[st
         if value not in choices:
             raise ValueError(f"{term}: {key} is {value!r}; choose {', '.join(choices)}")
     return contact, reach, sides
+
+
+def weighted(term: Weighted, weight: float) -> Weighted:
+    """A copy of a term, whatever its class, with another ``weight``.
+
+    Raises:
+        ValueError: it is negative.
+    """
+    if weight < 0:
+        raise ValueError(f"{type(term).__name__}: weight is {weight}; give weight >= 0")
+    found: Any = copy(term)
+    found.weight = weight
+    return cast("Weighted", found)
 
 
 class Planes(NamedTuple):
@@ -80,9 +95,9 @@ class Collision:
         self.epsilon = epsilon
         self.contact, self.reach, self.sides = checked_contact("collision", contact, reach, sides)
 
-    def with_weight(self, weight: float) -> Collision:
-        """The same term with another weight, for a ramp during training."""
-        return type(self)(weight, self.epsilon, self.contact, self.reach, self.sides)
+    def with_weight(self, weight: float) -> Self:
+        """The same term with another weight, for a ramp during training; subclasses see to what they derive from it."""
+        return weighted(self, weight)
 
     def prepare(self, problem: StepProblem) -> StepProblem:
         """The problem with its contact searched for, once per step."""
@@ -139,10 +154,6 @@ class CentroidCollision(Collision):
     def __init__(self, weight: float = 5e5, epsilon: float = 2e-3, lagged: bool = False) -> None:
         super().__init__(weight, epsilon, reach="constant", sides="nearest")
         self.lagged = lagged
-
-    def with_weight(self, weight: float) -> CentroidCollision:
-        """The same term with another weight, for a ramp during training."""
-        return type(self)(weight, self.epsilon, self.lagged)
 
     def prepare(self, problem: StepProblem) -> StepProblem:
         """The problem with the centroid search done, once per step."""

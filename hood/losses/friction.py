@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Self
+
 import torch
 from torch import Tensor
 
-from hood.losses.collision import checked_contact, contacts_of, lagged_contact, with_lagged_centroids, with_places
+from hood.losses.collision import checked_contact, contacts_of, lagged_contact, weighted, with_lagged_centroids, with_places
 from hood.losses.problem import StepProblem, sum_per_scene
 from hood.scene.contact import Contact, LaggedContact
 from hood.scene.contact_points import PointContact
@@ -110,9 +112,9 @@ class Friction(LaggedFriction):
         self.epsilon = epsilon
         self.contact, self.reach, self.sides = checked_contact("friction", contact, reach, sides)
 
-    def with_weight(self, weight: float) -> Friction:
-        """The same term with another collision weight, for a ramp during training."""
-        return Friction(self.coefficient, self.slip_speed, weight, self.epsilon, self.contact, self.reach, self.sides)
+    def with_weight(self, weight: float) -> Self:
+        """The same term with another collision weight, for a ramp during training; subclasses see to what they derive."""
+        return weighted(self, weight)
 
     def prepare(self, problem: StepProblem) -> StepProblem:
         """The problem with its contact searched for, once per step, if there is friction."""
@@ -185,7 +187,7 @@ class WeightFriction(LaggedFriction):
             raise ValueError(f"friction: radius is {radius}; give radius > 0")
         self.radius = radius
 
-    def with_weight(self, weight: float) -> WeightFriction:
+    def with_weight(self, weight: float) -> Self:
         """The term itself: the weight of a collision term plays no role in it."""
         return self
 
@@ -219,7 +221,7 @@ class CodedFriction(LaggedFriction):
             raise ValueError(f"friction: radius is {radius}; give radius > 0")
         self.radius = radius
 
-    def with_weight(self, weight: float) -> CodedFriction:
+    def with_weight(self, weight: float) -> Self:
         """The term itself: the weight of a collision term plays no role in it."""
         return self
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
-from typing import Any, Protocol, cast, runtime_checkable
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -20,36 +20,8 @@ from hood.losses.inertia import Inertia
 from hood.losses.layer_friction import LayerFriction
 from hood.losses.problem import STANDARD_GRAVITY, StepProblem, sum_per_scene
 from hood.losses.stretching import Stretching
-
-
-class Term(Protocol):
-    """An energy. A new one is a class with these two methods and an entry in the potential's ``terms``."""
-
-    def applies(self, problem: StepProblem) -> bool:
-        """Whether the energy can be anything but a constant zero for this problem."""
-        ...
-
-    def __call__(self, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> Tensor:
-        """Energy [J] (B,) at ``next_pos`` (V, 3) [m], reached with acceleration ``acc`` (V, 3) [m/s²]."""
-        ...
-
-
-@runtime_checkable
-class PreparedTerm(Protocol):
-    """A term that needs to know more about a step than every step tells."""
-
-    def prepare(self, problem: StepProblem) -> StepProblem:
-        """The problem with what the term needs; itself when it is there already."""
-        ...
-
-
-@runtime_checkable
-class RestingTerm(Protocol):
-    """A term whose force is often zero where a step begins, which is sooner asked than computed."""
-
-    def rests(self, problem: StepProblem) -> bool:
-        """Whether it has no force at x_t."""
-        ...
+from hood.losses.term import PreparedTerm, RestingTerm, checked
+from hood.losses.term import Term as Term
 
 
 @cache
@@ -143,12 +115,13 @@ class Potential:
             acc: (V, 3) m/s²; by default computed from ``next_pos``, with the precision that allows.
 
         Raises:
-            ValueError: when ``next_pos`` is in half precision.
+            ValueError: when ``next_pos`` is in half precision, or a term returns something else than (B,).
         """
         if next_pos.dtype in (torch.float16, torch.bfloat16):
             raise ValueError(f"energies cannot be computed in {next_pos.dtype}; give positions in float32 or float64")
         acc = problem.acceleration(next_pos) if acc is None else acc
-        return {name: term(problem, next_pos, acc) for name, term in self.active(problem).items()}
+        active, count = self.active(problem), problem.num_scenes
+        return {name: checked(name, term, term(problem, next_pos, acc), count) for name, term in active.items()}
 
     def total(self, problem: StepProblem, next_pos: Tensor, acc: Tensor | None = None) -> Tensor:
         """Potential Φ [J] per scene (B,)."""

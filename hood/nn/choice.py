@@ -66,6 +66,13 @@ def choose_kernels(precision: str, width: int, device: torch.device, training: b
     return choice
 
 
+def choose_for(network: MeshGraphNet, precision: str, device: torch.device, training: bool = False) -> Choice:
+    """The same for a network, which may have parts of an own class."""
+    choice = choose_kernels(precision, network.latent_dim, device, training)
+    part = network.own_part() if choice.kernels == "fused" else ""
+    return Choice("torch", f"{part} is computed as its class says") if part else choice
+
+
 def _measure(precision: str, width: int, training: bool) -> Choice:
     """Time every form that works here."""
     forms, refusals = ["torch"], []

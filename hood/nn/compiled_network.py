@@ -102,12 +102,16 @@ def check_width(width: int) -> None:
 
 def weights_for(network: MeshGraphNet, nodes: Tensor) -> Packed | None:
     """The network's weights, packed, if outputs for node features ``nodes`` can be had this way: float32 on a CPU, without a
-    gradient. The network is one that :func:`check_width` lets pass."""
+    gradient. The network is one that :func:`check_width` lets pass; one with parts of an own class has none."""
     if torch.is_grad_enabled() or torch.compiler.is_compiling():
         return None
     if type(nodes) is not Tensor or nodes.device.type != "cpu" or nodes.dtype != torch.float32:
         return None
     known = _PACKED.get(network)
+    if known is None or any(table.get(name) is not child for table, name, child in known.children):
+        known = None
+        if network.own_part():
+            return None
     parameters = _parameters(network) if known is None else [table[name] for table, name in known.slots]
     state = [(p.data_ptr(), p._version) for p in parameters if p.dtype == torch.float32 and not p.is_inference()]
     if len(state) < len(parameters):
@@ -133,6 +137,8 @@ class Packed:
     def __init__(self, network: MeshGraphNet, state: list[tuple[int, int]]) -> None:
         self._lib, self._kept = library(), list[Any]()
         self.state, self.slots = state, _slots(network)  # what changes with the weights, and where they are
+        tables = [module._modules for module in network.modules()]
+        self.children = [(table, name, child) for table in tables for name, child in table.items()]
         self.node_encoder = self.perceptron(network.node_encoder)
         names = (*network.edge_set_names, *network.world_sets)
         self.edge_encoders = {name: self.perceptron(network.edge_encoder(name)) for name in names}

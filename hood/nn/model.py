@@ -17,6 +17,7 @@ from hood.nn.dense import pad_rows
 from hood.nn.edge_decoder import EdgeDecoder
 from hood.nn.message_passing import ProcessorStep
 from hood.nn.mlp import MLP
+from hood.nn.own_parts import own_part
 from hood.nn.precision import PRECISIONS as PRECISIONS
 from hood.nn.precision import check_precision, products
 from hood.nn.schedule import edge_set_names, finest_level, parse_passes, parse_schedule
@@ -24,6 +25,13 @@ from hood.nn.schedule import edge_set_names, finest_level, parse_passes, parse_s
 #: Between two passes: the index of the one that ended and its raw output (V, out_width) in, what its prediction looks like
 #: out: columns of the cloth nodes, and of the edge sets that the next pass works on.
 Look = Callable[[int, Tensor], tuple[Tensor, Mapping[str, Tensor]]]
+#: What a network consists of.
+_PARTS: Mapping[str, type[nn.Module]] = {
+    **dict.fromkeys(("node_encoder", "edge_encoders", "decoder", "late_decoders", "node_looks"), MLP),
+    "steps": ProcessorStep,
+    "edge_looks": nn.Linear,
+    "edge_decoder": EdgeDecoder,
+}
 
 
 class MeshGraphNet(nn.Module):
@@ -118,16 +126,24 @@ class MeshGraphNet(nn.Module):
     def use_kernels(self, name: str) -> None:
         """``torch`` computes by torch's operations, ``compiled`` by kernels that are compiled here, once per user: the same
         function, faster, on a CPU with AVX-512 and a C++ compiler. ``fused`` takes every pass of an inference in one call, on
-        any CPU with a compiler; gradients go by torch's operations.
+        any CPU with a compiler; gradients go by torch's operations. Parts of an own class are computed by torch's operations
+        and their own, with ``compiled`` beside the others; ``fused`` knows no such network.
 
         Raises:
-            ValueError: no such choice, or it does not work here.
+            ValueError: no such choice, or it does not work here, or not for this network.
         """
         check_kernels(name, self.precision, self.latent_dim)
+        part = self.own_part() if name == "fused" else ""
+        if part:
+            raise ValueError(f"kernels=fused compute hood's own network alone, not one with {part}; use kernels=torch")
         self.kernels = name
         for module in self.modules():
             if isinstance(module, MLP):
-                module.compiled = name == "compiled"
+                module.compiled = name == "compiled" and type(module) is MLP
+
+    def own_part(self) -> str:
+        """The part, or the network, that is not of hood's own class, in words; empty where there is none."""
+        return own_part(self, MeshGraphNet, _PARTS)
 
     def use_checkpointing(self, on: bool) -> None:
         """Whether training keeps only the latents between processor steps and computes a step again for its gradient.
@@ -197,9 +213,10 @@ class MeshGraphNet(nn.Module):
         self, step: ProcessorStep, sets: tuple[str, ...], graph: Graph, nodes: Tensor, edges: Mapping[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Latents after one processor step on the edge sets ``sets``."""
-        overwrite = not torch.is_grad_enabled()
+        inferring = not torch.is_grad_enabled()
+        overwrite = inferring and type(self) is MeshGraphNet and type(step) is ProcessorStep  # others may read them again
         subsets = {name: graph.subset(name, finest_level(sets)) for name in (*sets, *self.world_sets)}
-        if self.checkpointing and not overwrite:
+        if self.checkpointing and not inferring:
             taken: tuple[Tensor, dict[str, Tensor]] = checkpoint(
                 step, nodes, edges, subsets, use_reentrant=False, preserve_rng_state=False
             )

@@ -5,8 +5,10 @@ from __future__ import annotations
 import inspect
 import math
 from dataclasses import dataclass, replace
+from typing import cast
 
 from hood.losses.potential import Potential
+from hood.losses.term import Term, WeightedTerm, named
 
 
 @dataclass(frozen=True)
@@ -126,7 +128,11 @@ class CollisionRamp:
         return replace(self, begin_iteration=begin, end_iteration=end)
 
     def apply(self, potential: Potential, iteration: int) -> Potential:
-        """The potential with this iteration's weight in collision and friction."""
+        """The potential with this iteration's weight in collision and friction.
+
+        Raises:
+            ValueError: such a term cannot be given a weight.
+        """
         return _with_weight(potential, self(iteration))
 
     def at_end(self, potential: Potential) -> Potential:
@@ -135,8 +141,7 @@ class CollisionRamp:
 
     def require_its_weight(self, potential: Potential) -> None:
         """Raise ValueError where a term has a weight of its own, which the ramp would overwrite unsaid."""
-        for name in _weighted(potential):
-            term = potential.terms[name]
+        for name, term in _weighted(potential).items():
             given = getattr(term, "weight", None)
             usual = inspect.signature(type(term)).parameters.get("weight")
             if given is None or given == self.end or (usual is not None and given == usual.default):
@@ -149,13 +154,28 @@ class CollisionRamp:
             )
 
 
-def _weighted(potential: Potential) -> list[str]:
-    """Terms that have the weight of contact; a term of another package under these names may have none."""
-    return [name for name in ("collision", "friction") if hasattr(potential.terms.get(name), "with_weight")]
+def _weighted(potential: Potential) -> dict[str, WeightedTerm]:
+    """Terms that have the weight of contact.
+
+    Raises:
+        ValueError: a term under these names cannot be given one.
+    """
+    found: dict[str, WeightedTerm] = {}
+    for name in ("collision", "friction"):
+        term = potential.terms.get(name)
+        if term is None:
+            continue
+        if not isinstance(term, WeightedTerm):
+            raise ValueError(
+                f"{named(name, term)}: training ramps the weight of this term, which has no method with_weight; add one "
+                "that returns the term with another weight, or the term itself, or give the term another name"
+            )
+        found[name] = term
+    return found
 
 
 def _with_weight(potential: Potential, weight: float) -> Potential:
-    changed = {name: potential.terms[name].with_weight(weight) for name in _weighted(potential)}  # type: ignore[attr-defined]
+    changed = {name: cast(Term, term.with_weight(weight)) for name, term in _weighted(potential).items()}
     return potential.with_terms(**changed)
 
 

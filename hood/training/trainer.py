@@ -22,7 +22,7 @@ from hood.features.normalizer import RunningNormalizer
 from hood.losses.layers import for_networks
 from hood.losses.potential import Potential, relative_gradient, scale
 from hood.losses.problem import StepProblem
-from hood.nn.choice import AUTO, Choice, choose_kernels
+from hood.nn.choice import AUTO, Choice, choose_for
 from hood.scene.dataset import SceneSampler
 from hood.training import distributed
 from hood.training.checkpoint import (
@@ -84,8 +84,7 @@ class Trainer:
         simulator.network.use_precision(settings.precision)
         self.choice: Choice | None = None  # of kernels, where that was left open
         if settings.kernels == AUTO:
-            width = simulator.network.latent_dim
-            self.choice = choose_kernels(settings.precision, width, simulator.gravity.device, training=True)
+            self.choice = choose_for(simulator.network, settings.precision, simulator.gravity.device, training=True)
         simulator.network.use_kernels(settings.kernels if self.choice is None else self.choice.kernels)
         simulator.network.use_checkpointing(settings.activation_checkpointing)
         ranks, rank = distributed.world_size(), distributed.rank()

@@ -16,16 +16,23 @@ from hood.assets.garment.garment import load_garment
 from hood.assets.material import Material
 from hood.assets.motion.sequence import PoseSequence
 from hood.cli import main
-from hood.commands.cautions import evaluation_cautions, scene_cautions
+from hood.commands import setup
+from hood.commands.cautions import evaluation_cautions, known_by_slope, scene_cautions
 from hood.commands.common import weigh
+from hood.commands.losses import losses_of
 from hood.commands.setup import make_stepper
 from hood.config import load_config
 from hood.dynamics.checkpoint import load_simulator, save_simulator
 from hood.dynamics.ranges import Conditions, scene_conditions
 from hood.dynamics.refine import GuessStepper, RefinedStepper
 from hood.dynamics.simulator import Simulator, build_simulator
+from hood.dynamics.stepper import NewtonStepper
 from hood.dynamics.stopping import Count
-from hood.losses.potential import default_potential
+from hood.losses.collision import Collision
+from hood.losses.layer_friction import LayerFriction
+from hood.losses.layer_sides import LayerSides
+from hood.losses.layers import LayerBarrier
+from hood.losses.potential import coded_potential, default_potential
 from hood.scene.scene import Scene, build_scene
 from hood.solver.newton import NewtonSettings
 
@@ -49,6 +56,32 @@ def refined(stepper: Simulator) -> RefinedStepper:
 
 def test_nothing_is_said_of_what_was_trained(quickstart: Simulator, tank_scene: Scene) -> None:
     assert scene_cautions(quickstart, tank_scene, DEFAULT, "quickstart") == []
+
+
+class OwnCollision(Collision):
+    """Contact that somebody has written."""
+
+
+def test_terms_that_the_solver_knows_by_their_slope_are_named_where_it_works(quickstart: Simulator) -> None:
+    own = DEFAULT.with_terms(collision=OwnCollision())
+    (sentence,) = known_by_slope(refined(quickstart), own)
+    assert "\n" not in sentence
+    assert sentence.startswith("losses.terms.collision (test_cautions.OwnCollision): the solver knows the slope alone")
+    assert "take many iterations" in sentence
+    assert known_by_slope(NewtonStepper(own, NewtonSettings()), own) == [sentence]
+    assert known_by_slope(quickstart, own) == []
+    layered = DEFAULT.with_terms(layers=LayerBarrier(), layer_friction=LayerFriction(), sides=LayerSides())
+    for potential in (DEFAULT, coded_potential(), layered, losses_of(load_config("rollout", []))):
+        assert known_by_slope(refined(quickstart), potential) == []
+
+
+def test_a_rollout_says_so_when_it_begins(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before any step is taken."""
+    own, said = DEFAULT.with_terms(collision=OwnCollision()), list[str]()
+    monkeypatch.setattr(setup, "losses_of", lambda config: own)
+    config = load_config("rollout", ["stepper=newton", "garment=tank", "sequence=walk_proud", "num_frames=2"])
+    setup.set_up(config, make_stepper(config)[0], tell=said.append)
+    assert sum("the solver knows the slope alone" in sentence for sentence in said) == 1
 
 
 def vertices(simulator: Simulator) -> str:

@@ -12,8 +12,12 @@ import pytest
 from belt import write_belt, write_walk
 
 from hood.cli import main
-from hood.commands.cloth_contact import describe_cloth_contact, summarise_cloth_contact
+from hood.commands.cloth_contact import _why_not, describe_cloth_contact, summarise_cloth_contact
+from hood.config import load_config
 from hood.dynamics.measure import LAYER_METRICS
+from hood.losses.collision import Collision
+from hood.losses.friction import CodedFriction, WeightFriction
+from hood.losses.potential import Potential, coded_potential, default_potential, reference_potential
 
 COMMAND = ["rollout", "stepper=newton", "sequence=walk.npz", "num_frames=4", "video=none", "sheet=false"]
 
@@ -86,6 +90,31 @@ def test_auto_that_cannot_act_says_why(more: list[str], reason: str, said: str, 
     out = capsys.readouterr().out
     assert said in out
     assert ("cloth_contact" in out) == bool(said)  # a network alone is not expected to
+
+
+class OwnCollision(Collision):
+    """Contact that somebody has written."""
+
+
+@pytest.mark.usefixtures("compiled_layers")
+def test_only_losses_of_published_code_have_no_contact_of_cloth_by_themselves() -> None:
+    config, default = load_config("rollout", ["stepper=newton"]), default_potential()
+    without = Potential({name: term for name, term in default.terms.items() if name not in ("collision", "friction")})
+    for potential in (default, without, default.with_terms(collision=OwnCollision()), without.with_terms(other=OwnCollision())):
+        assert _why_not(config, potential) == ""
+    assert _why_not(config, default.with_terms(friction=WeightFriction())) == ""
+    published = reference_potential(), coded_potential(), without.with_terms(friction=CodedFriction())
+    for potential in published:
+        assert "are those of published code" in _why_not(config, potential)
+    assert _why_not(config, reference_potential().with_terms(collision=OwnCollision())) == ""
+
+
+@pytest.mark.usefixtures("compiled_layers")
+def test_layers_are_kept_apart_without_contact_with_the_body() -> None:
+    write_belt(Path("belt.obj"))
+    found, pos = _run("garment=belt.obj", "metrics=strain", "losses.terms.collision=null", "losses.terms.friction=null")
+    assert found["cloth_contact"]["used"] == "on"
+    assert np.isfinite(pos).all()
 
 
 def test_garments_that_nothing_keeps_apart_are_warned_about(capsys: pytest.CaptureFixture[str]) -> None:

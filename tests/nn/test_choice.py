@@ -5,9 +5,11 @@ import json
 import pytest
 import torch
 
+from hood.graph.builder import BODY, MESH
 from hood.native.build import BuildError
 from hood.nn import choice
-from hood.nn.choice import choose_kernels, time_forms
+from hood.nn.choice import choose_for, choose_kernels, time_forms
+from hood.nn.model import MeshGraphNet
 
 CPU = torch.device("cpu")
 
@@ -45,6 +47,20 @@ def test_the_fastest_form_is_taken_and_kept(folder, monkeypatch):
     assert choose_kernels("fp32", 128, CPU).kernels == "torch"
     assert asked == [(["torch", "compiled", "fused"], "fp32", 64, False)]
     assert len(list(folder.iterdir())) == 4
+
+
+def test_a_network_with_parts_of_an_own_class_is_computed_by_torch(folder, monkeypatch):
+    class Own(MeshGraphNet):
+        """A network that somebody has written."""
+
+    times(monkeypatch, torch=3.0, compiled=2.0, fused=1.0)
+    known, own = (kind(4, {MESH: 4, BODY: 4}, 16, "1x(mesh)") for kind in (MeshGraphNet, Own))
+    assert choose_for(known, "fp32", CPU).kernels == "fused"
+    found = choose_for(own, "fp32", CPU)
+    assert found.kernels == "torch"
+    assert "Own is computed as its class says" in str(found)
+    times(monkeypatch, torch=2.0, compiled=1.0)
+    assert choose_for(own, "fp32", CPU, training=True).kernels == "compiled"  # the same function, of every part that it knows
 
 
 def test_gradients_of_the_fused_form_are_those_of_torch(folder, monkeypatch):

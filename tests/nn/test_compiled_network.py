@@ -10,6 +10,9 @@ from torch import Tensor
 from hood.native.build import BuildError
 from hood.nn import compiled_network
 from hood.nn.compiled import check_kernels
+from hood.nn.edge_decoder import EdgeDecoder
+from hood.nn.message_passing import ProcessorStep
+from hood.nn.mlp import MLP
 from hood.nn.model import MeshGraphNet
 from hood.testing import grid
 
@@ -151,6 +154,116 @@ def test_a_network_of_fused_kernels_infers_so_and_learns_by_torch():
     assert torch.equal(network(*arguments), plain)
     with torch.no_grad():
         assert torch.equal(network(*arguments), evaluate(network, case, compiled=True))
+
+
+class HalvedNet(MeshGraphNet):
+    """Half of what the network says."""
+
+    def forward(self, *arguments, **named):
+        return 0.5 * super().forward(*arguments, **named)
+
+
+class SlowNet(MeshGraphNet):
+    """Latents that change a tenth as much, nodes and edges alike."""
+
+    def _take(self, step, sets, graph, nodes, edges):
+        new, changed = super()._take(step, sets, graph, nodes, edges)
+        return nodes + 0.1 * (new - nodes), {name: edges[name] + 0.1 * (changed[name] - edges[name]) for name in edges}
+
+
+class GatedStep(ProcessorStep):
+    """The same in the step itself."""
+
+    def forward(self, nodes, edges, subsets, overwrite=False):
+        new, changed = super().forward(nodes, edges, subsets, overwrite)
+        return nodes + 0.1 * (new - nodes), {name: edges[name] + 0.1 * (changed[name] - edges[name]) for name in edges}
+
+
+class Loud(MLP):
+    """Twice what a perceptron says."""
+
+    def forward(self, x, dtype=None):
+        return 2.0 * super().forward(x, dtype)
+
+
+class OwnDecoder(EdgeDecoder):
+    """Edges that say nothing."""
+
+    def forward(self, nodes, latent, edges):
+        return 0.0 * super().forward(nodes, latent, edges)
+
+
+def with_part(place: str, part: torch.nn.Module) -> MeshGraphNet:
+    network = make(SHORT, edge_out_width=2)
+    network.set_submodule(place, part)
+    return network
+
+
+def hooked() -> MeshGraphNet:
+    network = make(SHORT)
+    network.decoder.register_forward_hook(lambda module, given, out: 3.0 * out)
+    return network
+
+
+def patched() -> MeshGraphNet:
+    network = make(SHORT)
+    network.steps[1].node_mlp.tail = lambda hidden, residual=None: residual
+    return network
+
+
+OWN = {
+    "HalvedNet": lambda: HalvedNet(5, WIDTHS, 48, SHORT),
+    "SlowNet": lambda: SlowNet(5, WIDTHS, 48, SHORT),
+    "steps, .*GatedStep": lambda: with_part("steps.2", GatedStep(make(SHORT).steps[2].sets, 48)),
+    "node_encoder, .*Loud": lambda: with_part("node_encoder", Loud(5, 48, 48)),
+    "edge_encoders, .*Loud": lambda: with_part("edge_encoders.body", Loud(3, 48, 48)),
+    "decoder, .*Loud": lambda: with_part("decoder", Loud(48, 48, 3, norm=False)),
+    "edge_decoder, .*OwnDecoder": lambda: with_part("edge_decoder", OwnDecoder(48, 2)),
+    "decoder, hood.nn.mlp.MLP": hooked,
+    "steps, hood.nn.mlp.MLP": patched,
+}
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", OWN)
+def test_networks_with_parts_of_an_own_class_compute_without_a_gradient_what_they_learn_with_one(name):
+    network, case = OWN[name](), single(make_case(make_graph(grid(6, 6))))
+    arguments = (case.graph, case.nodes, case.edges)
+    learned = network(*arguments)
+    with pytest.raises(ValueError, match=rf"kernels=fused compute .*{name}.*; use kernels=torch"):
+        network.use_kernels("fused")
+    forms = ["torch"]
+    try:
+        check_kernels("compiled", "fp32", 48)
+        forms.append("compiled")
+    except ValueError:
+        pass
+    for form in forms:
+        network.use_kernels(form)
+        with torch.no_grad():
+            torch.testing.assert_close(network(*arguments), learned, rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(network(*arguments), learned, rtol=1e-4, atol=1e-5)
+
+
+@needs_compiler
+def test_a_part_that_is_replaced_later_is_not_passed_over():
+    network, case = make(SHORT), make_case(make_graph(grid(6, 6)))
+    assert difference(network, case) < 3e-6
+    assert not network.own_part()
+    network.decoder = MLP(48, 48, 3, norm=False)
+    assert difference(network, case) < 3e-6
+    network.decoder = Loud(48, 48, 3, norm=False)
+    network.kernels, case = "fused", single(case)
+    with torch.no_grad():
+        assert compiled_network.weights_for(network, case.nodes) is None
+        found = network(case.graph, case.nodes, case.edges)
+    torch.testing.assert_close(found, network(case.graph, case.nodes, case.edges), rtol=1e-4, atol=1e-5)
+
+
+@needs_compiler
+def test_passes_and_edge_outputs_are_parts_of_hoods_own_network():
+    assert not make(PASSES, look_widths=(5, 1), out_width=5).own_part()
+    assert not make(SHORT, edge_out_width=2).own_part()
 
 
 @needs_compiler

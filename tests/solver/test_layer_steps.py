@@ -10,9 +10,10 @@ import torch
 from layer_scenes import folding_strip, sheet_over_bar, sheets_on_sphere, stack
 
 from hood.dynamics.implicit_euler import EulerStep, implicit_euler
+from hood.losses.collision import Collision
 from hood.losses.layer_friction import LayerFriction
 from hood.losses.layers import LayerBarrier
-from hood.losses.potential import default_potential
+from hood.losses.potential import Potential, default_potential
 from hood.losses.problem import StepProblem
 from hood.mesh.crossing import self_crossings
 from hood.scene.cloth import concatenate_cloths
@@ -35,10 +36,12 @@ SMALL = {
 RATES = {240: 96, 60: 24, 30: 12, 15: 6}
 
 
-def _march_clean(problem: StepProblem, steps: int, settings: NewtonSettings | None = None) -> tuple[int, int]:
+def _march_clean(
+    problem: StepProblem, steps: int, settings: NewtonSettings | None = None, potential: Potential = POTENTIAL
+) -> tuple[int, int]:
     """Pairs of features in reach, and steps that missed the accuracy; nothing may ever cross."""
     faces, touched, missed = problem.cloth.faces.numpy(), 0, 0
-    for now in implicit_euler(POTENTIAL, problem, steps, settings):
+    for now in implicit_euler(potential, problem, steps, settings):
         pos = now.state.pos.numpy()
         layers = now.problem.layers[0].layers
         touched += len(layers.contacts(pos).corners)
@@ -60,6 +63,16 @@ def test_clean_cloth_stays_clean(name: str, rate: int) -> None:
 def test_clean_cloth_stays_clean_in_torch(name: str) -> None:
     touched, missed = _march_clean(SMALL[name](1 / 30), 8, NewtonSettings(engine="torch"))
     assert missed == 0
+    assert touched > 0
+
+
+class OwnCollision(Collision):
+    """Contact that somebody has written, whose slope alone the solver knows."""
+
+
+def test_clean_cloth_stays_clean_on_a_body_with_contact_of_an_own_class() -> None:
+    potential = POTENTIAL.with_terms(collision=OwnCollision())
+    touched, _ = _march_clean(SMALL["stack"](1 / 30), 3, NewtonSettings(max_iterations=10), potential)
     assert touched > 0
 
 

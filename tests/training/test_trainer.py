@@ -26,7 +26,6 @@ from hood.losses.layers import for_networks
 from hood.losses.potential import Potential, default_potential
 from hood.nn.choice import Choice
 from hood.scene.dataset import SceneSampler, Window
-from hood.training import trainer as trainer_module
 from hood.training.curriculum import CollisionRamp, Horizon, InverseRoot, WarmupCosine
 from hood.training.settings import TrainerSettings
 from hood.training.trainer import Trainer
@@ -273,7 +272,7 @@ def test_kernels_are_those_that_train_fastest_here(
         assert (precision, width, device.type, training) == ("bf16", 8, "cpu", True)
         return Choice("torch", "measured")
 
-    monkeypatch.setattr(trainer_module, "choose_kernels", choose)
+    monkeypatch.setattr("hood.nn.choice.choose_kernels", choose)
     trainer = make(tmp_path, sampler, settings=replace(SETTINGS, kernels="auto", precision="bf16"))
     assert str(trainer.choice) == "kernels=auto: torch (measured)"
     assert trainer.simulator.network.kernels == "torch"
