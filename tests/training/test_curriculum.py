@@ -82,13 +82,21 @@ def test_a_weight_that_the_ramp_would_overwrite_is_refused() -> None:
         level.require_its_weight(other)
 
 
-def test_a_contact_of_another_package_keeps_its_own_weight() -> None:
-    potential = default_potential().with_terms(collision=Gravity())
-    ramp = CollisionRamp(1e3, 1e3)
+class Steady(Gravity):
+    """A contact of another package whose weight is its own."""
+
+    def with_weight(self, weight: float) -> Steady:
+        return self
+
+
+def test_a_contact_of_another_package_keeps_its_own_weight_if_it_says_so() -> None:
+    potential, ramp = default_potential().with_terms(collision=Steady()), CollisionRamp(1e3, 1e3)
     ramp.require_its_weight(potential)
     applied = ramp.apply(potential, 0)
     assert applied.terms["collision"] is potential.terms["collision"]
-    assert applied.terms["friction"].weight == 1e3
+    assert applied.terms["friction"].weight == 1e3  # type: ignore[attr-defined]
+    with pytest.raises(ValueError, match=r"losses\.terms\.collision \(hood\.losses\.gravity\.Gravity\).*no method with_weight"):
+        ramp.require_its_weight(potential.with_terms(collision=Gravity()))
 
 
 PAPER = TrainerSettings()
