@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 
 from hood.commands.losses import losses_of
 from hood.commands.steppers import ALWAYS, NEVER, option_of
-from hood.config import ConfigError, build, plain, require_choice, shown
+from hood.config import ConfigError, brief, build, plain, require_choice
 from hood.dynamics.refine import METHODS, RefinedStepper
 from hood.dynamics.refine_table import costs_from_table, floor_from_table
 from hood.dynamics.rollout import FIELD_CHOICES
@@ -48,7 +48,7 @@ def chosen(config: Mapping[Any, Any]) -> tuple[str, float] | None:
     whole = given[0] != "refine" or (isinstance(value, (int, float)) and float(value).is_integer())
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not whole:
         what = "a whole number of iterations, or auto" if given[0] == "refine" else "a number"
-        raise ConfigError(f"{given[0]}={shown(value)}: give {what}")
+        raise ConfigError(f"{given[0]}={brief(value)}: give {what}")
     return given[0], float(value)
 
 
@@ -98,7 +98,9 @@ def exported(config: DictConfig) -> tuple[str, ...]:
     names = [str(name) for name in plain(config.export)]
     for name in names:
         if name not in FIELD_CHOICES:
-            raise ConfigError(f"export={shown(config.export)}: unknown {name!r}; give some of [{','.join(FIELD_CHOICES)}]")
+            raise ConfigError(
+                f"export={brief(config.export)}: unknown {name[:100]!r}; give some of [{','.join(FIELD_CHOICES)}]"
+            )
     drawn = str(config.colour)
     return tuple(dict.fromkeys([*names, *([drawn] if drawn in FIELD_CHOICES else [])]))
 

@@ -312,6 +312,8 @@ def read_rollout(path: Path | str) -> RolloutData:
         (3, 1016, 3)
     """
     path = Path(path)
+    if path.is_dir():
+        raise ValueError(f"{path}: a folder; give the rollout.h5 in it")
     try:
         with h5py.File(path, "r") as file:
             _check_extents(file, path.stat().st_size)
@@ -331,8 +333,8 @@ def read_rollout(path: Path | str) -> RolloutData:
                 still={name.removeprefix("cloth/"): file[name][:] for name in _still_paths(file)},
                 steps=read_steps(file, len(file["cloth/rest_pos"])),
             )
-    except FileNotFoundError:
-        raise
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"{path}: no such file; give the rollout.h5 that hood rollout writes") from error
     except Exception as error:  # damaged files make h5py raise nearly anything
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ValueError(f"{path}: not a rollout file ({reason}); make one with hood rollout") from error

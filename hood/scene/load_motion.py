@@ -17,6 +17,8 @@ from hood.scene.motion import Motion, body_motion
 
 #: A sequence that says so: meshes perform their own, and without a body there is none.
 NO_MOTION = "none"
+#: Characters of a value that a message repeats at most.
+_SHOWN = 100
 
 
 @dataclass(frozen=True)
@@ -92,6 +94,8 @@ def _betas(given: Sequence[float] | None, recorded: np.ndarray) -> np.ndarray:
     betas = np.zeros(max(len(recorded), 10))
     values = np.asarray(given, dtype=np.float64).reshape(-1)
     if len(values) > len(betas) or not np.isfinite(values).all():
-        raise ValueError(f"betas={list(given)}: give at most {len(betas)} finite shape coefficients, e.g. [1.5, 0, -1]")
+        raise ValueError(
+            f"betas={str(list(given))[:_SHOWN]}: give at most {len(betas)} finite shape coefficients, e.g. [1.5, 0, -1]"
+        )
     betas[: len(values)] = values
     return betas
