@@ -77,7 +77,8 @@ class RolloutWriter:
     With ``guarded`` there are the alarms of a guard, one a row: ``guard/frame``, ``guard/cause`` and ``guard/repair`` (words of
     :data:`hood.dynamics.alarms.CAUSES` and :mod:`hood.dynamics.step_repair`), ``guard/value`` and ``guard/limit`` (of the
     cause: share of strain or of cut triangles, relative gradient, degrees, m), ``guard/iterations``, ``guard/rg_before``
-    and ``guard/rg_after``; of a step also ``guard/strain``, ``guard/force`` and ``guard/depth``. The attribute ``num_alarms`` counts them; rows beyond it are empty, with the frame -1.
+    and ``guard/rg_after``; of a step also ``guard/strain``, ``guard/force`` and ``guard/depth``. The attribute ``num_alarms``
+    counts them; rows beyond it are empty, with the frame -1.
 
     All datasets are laid out, filled with NaN, before the file takes its name: a full disk shows at once, and later writes
     never touch the file's structure. A frame is counted in ``num_frames`` after its values are written. So whoever opens the
