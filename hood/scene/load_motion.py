@@ -112,7 +112,7 @@ def _doubt(betas: np.ndarray) -> None:
     if abs(value) > _MEANT:
         hint = f"; if a point is missing, give {value / 10:g}" if abs(value) / 10 <= _MEANT else ""
         warnings.warn(
-            f"betas[{index}]={value:g} is beyond what body models are made for, {-_MEANT:g} to {_MEANT:g}: the body is hardly a "
-            f"person's, and garments may not fit it{hint}",
+            f"betas[{index}]={value:g} is beyond what body models are made for, {-_MEANT:g} to {_MEANT:g}: the body is hardly "
+            f"a person's, and garments may not fit it{hint}",
             stacklevel=2,
         )
