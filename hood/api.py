@@ -9,7 +9,7 @@ import contextlib
 import inspect
 import io
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 from hood.assets.files.library import locate
 from hood.assets.garment.garment import Garment
+from hood.assets.garment.own_garment import checked_garment
 from hood.assets.material import Material
 from hood.commands.common import read_model
 from hood.commands.guarding import GuardStopped, make_guard
@@ -31,7 +32,7 @@ from hood.config import ConfigError, load_config
 from hood.dynamics import rollout as frames
 from hood.dynamics.rollout import Frame
 from hood.dynamics.simulator import Simulator
-from hood.dynamics.stepper import Stepper
+from hood.dynamics.stepper import Stepper, require_stepper
 from hood.losses.potential import Potential
 from hood.scene.scene import Scene
 
@@ -94,7 +95,7 @@ def simulate(
     garment: str | Path | list[str] | Garment = "dress",
     sequence: str | Path = "walk_proud",
     *,
-    material: str | Material | None = None,
+    material: str | Material | Mapping[str, Any] | None = None,
     stepper: str | Stepper = "network",
     progress: bool = False,
     **keys: Any,
@@ -104,7 +105,7 @@ def simulate(
     Args:
         garment: a name, a file, a list of them for an outfit, or a :class:`hood.Garment`.
         sequence: a name or a file of a motion.
-        material: a name (``denim``), or a :class:`hood.Material`. None: the default fabric.
+        material: a name (``denim``), a :class:`hood.Material`, or a dictionary of properties. None: the default fabric.
         stepper: ``network``, ``newton``, ``refine``, ``auto`` or another option of ``hood rollout``, or an own stepper.
         progress: whether a progress bar is shown.
         keys: all keys of ``hood rollout --help`` that concern the simulation: ``body``, ``checkpoint``, ``num_frames``,
@@ -129,10 +130,16 @@ def simulate(
     named: dict[str, Any] = {"sequence": sequence, **keys}
     if not isinstance(garment, Garment):
         named["garment"] = garment
-    if isinstance(material, str):
+    else:
+        garment = checked_garment(garment)
+    if isinstance(material, (str, Mapping)):
         named["material"] = material
+    elif material is not None and not isinstance(material, Material):
+        raise ConfigError(f"material is of type {type(material).__name__}; give a name, such as denim, or a hood.Material")
     if stepper is None or isinstance(stepper, str):
         named["stepper"] = stepper
+    else:
+        require_stepper(stepper)
     key = "accuracy" if named.get("accuracy") is not None else "plan" if plan_path(named) is not None else None
     if key is not None and (isinstance(garment, Garment) or isinstance(material, Material) or not isinstance(stepper, str)):
         raise ConfigError(f"{key}={named[key]}: a plan names garment, material and stepper; leave them out")

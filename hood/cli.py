@@ -82,6 +82,8 @@ def _run(name: str, overrides: Sequence[str]) -> int:
     except KeyboardInterrupt:
         print("hood: interrupted", file=sys.stderr)
         return 130
+    except BrokenPipeError:  # see entry()
+        raise
     except (ValueError, OSError, ImportError) as error:
         if os.environ.get("HOOD_TRACEBACK"):
             raise

@@ -43,6 +43,8 @@ _ABSENT = object()
 _KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text", ListConfig: "a list in brackets"}
 #: Characters of a comment that is repeated in a message; a longer one is read in --help.
 _SHORT_NOTE = 160
+#: Characters of a value that a message repeats at most.
+_BRIEF = 100
 #: Bytes of a run's record at most, levels of its nesting, and characters of a reason why it is none.
 _RECORD_LIMIT, _DEEPEST, _REASON = 1 << 20, 32, 300
 #: What configs may name; and classes of plugins (:mod:`hood.plugins`).
@@ -183,6 +185,12 @@ def shown(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def brief(value: Any) -> str:
+    """A value as :func:`shown`, cut where it is long."""
+    text = shown(value)
+    return text if len(text) <= _BRIEF else f"{text[:_BRIEF]}…"
 
 
 def options(group: str) -> list[str]:
@@ -350,7 +358,7 @@ def _wrong_kind(name: str, key: str, before: Any, after: Any) -> str:
     usual = f"such as {key}={shown(before)}" if shown(before) not in ("", "[]") else f"the default is {key}={shown(before)}"
     note = notes(name).get(key, "")
     note = f"hood {name} --help says of {key}: {note}" if 0 < len(note) <= _SHORT_NOTE else f"see hood {name} --help"
-    return f"{key}={shown(after)[:_REASON]}: give {kind}, {usual}; {note}"
+    return f"{key}={brief(after)}: give {kind}, {usual}; {note}"
 
 
 def _check_sources(config: DictConfig) -> None:

@@ -17,6 +17,7 @@ import torch
 
 import hood
 from hood import api
+from hood.assets.garment.own_garment import checked_garment
 from hood.commands.guarding import GuardStopped
 from hood.config import ConfigError, load_config, plain
 from hood.dynamics.stepper import NewtonStepper
@@ -131,6 +132,85 @@ def test_a_strict_guard_ends_the_simulation_and_says_where() -> None:
 def test_what_cannot_be_used_is_told_with_its_name(keys: dict, error: type[Exception], said: str) -> None:
     with pytest.raises(error, match=said):
         hood.simulate(**keys)
+
+
+def own_garment(**changed: object) -> hood.Garment:
+    tank = hood.load_garment("tank")
+    fields = {"rest_pos": tank.rest_pos, "faces": tank.faces, "pinned": np.zeros(len(tank.rest_pos), bool)}
+    return hood.Garment("mine", **(fields | changed))  # type: ignore[arg-type]
+
+
+def with_value(array: np.ndarray, place: tuple[int, ...], value: float) -> np.ndarray:
+    changed = array.copy()
+    changed[place] = value
+    return changed
+
+
+BROKEN = {
+    "nan": (lambda tank: {"rest_pos": with_value(tank.rest_pos, (7, 0), np.nan)}, "vertex 7 is .*; positions must be finite"),
+    "beyond": (lambda tank: {"faces": with_value(tank.faces, (3, 1), 9999)}, "face 3 .*9999.*from 0 to 1015"),
+    "negative": (lambda tank: {"faces": with_value(tank.faces, (3, 1), -1)}, "face 3 .*-1.*from 0 to 1015"),
+    "float": (lambda tank: {"faces": tank.faces.astype(float)}, "must be integer"),
+    "no faces": (lambda tank: {"faces": []}, "mesh is empty"),
+    "quads": (lambda tank: {"faces": np.zeros((5, 4), int)}, "4 corners each; split them"),
+    "ragged": (lambda tank: {"faces": [[0, 1, 2], [0, 1, 2, 3]]}, "differ in length.*split polygons"),
+    "none": (lambda tank: {"faces": None}, "faces is None; give"),
+    "text": (lambda tank: {"rest_pos": "here"}, "type str; give an array"),
+    "flat": (lambda tank: {"rest_pos": tank.rest_pos[:, :2]}, r"give \(num_vertices, 3\)"),
+    "pins": (lambda tank: {"pinned": [True, False]}, "2 rows for 1016 vertices"),
+    "weights": (lambda tank: {"lbs_weights": np.ones((3, 24))}, "lbs_weights has 3 rows"),
+    "levels": (lambda tank: {"coarse_edges": ([[0, 5000]],)}, "coarse edge 0 of level 0"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_own_garments_are_checked_like_files(case: str) -> None:
+    change, said = BROKEN[case]
+    broken = own_garment(**change(hood.load_garment("tank")))
+    with pytest.raises(ValueError, match=f"^garment 'mine': .*{said}"):
+        hood.simulate(broken, "plie", stepper="newton", num_frames=2)
+    with pytest.raises(ValueError, match=said):
+        hood.build_scene(broken, hood.load_body(), hood.load_sequence("plie"))
+
+
+def test_own_garments_of_lists_and_tensors_are_those_of_arrays() -> None:
+    tank = own_garment()
+    lists = own_garment(**{key: getattr(tank, key).tolist() for key in ("rest_pos", "faces", "pinned")})
+    tensors = own_garment(**{key: torch.as_tensor(getattr(tank, key)) for key in ("rest_pos", "faces", "pinned")})
+    assert all(checked_garment(garment) is garment for garment in (tank, hood.load_garment("tank"), hood.load_garment("shirt")))
+    for garment in (lists, tensors):
+        for key in ("rest_pos", "faces", "pinned"):
+            now, want = getattr(checked_garment(garment), key), getattr(tank, key)
+            assert now.dtype == want.dtype
+            assert np.array_equal(now, want)
+
+
+def test_arguments_of_another_kind_are_refused_in_a_sentence() -> None:
+    tank, body, plie = hood.load_garment("tank"), hood.load_body(), hood.load_sequence("plie")
+    cases = [
+        (lambda: hood.simulate("tank", stepper=object()), "type object, which has no gravity.*Stepper"),
+        (lambda: hood.simulate("tank", plie), "sequence is given by a name .*type PoseSequence"),
+        (lambda: hood.simulate("tank", np.zeros((9, 24, 3))), r"sequence is given by .*array \(9, 24, 3\)"),
+        (lambda: hood.simulate("tank", body=body), "body is given by a name .*type Body"),
+        (lambda: hood.simulate([tank, tank]), "garment is given by .*list of an object of type Garment"),
+        (lambda: hood.simulate("tank", sequence=np.zeros((99, 3)).tolist()), "sequence=.*…: give one text"),
+        (lambda: hood.simulate("tank", pins=np.zeros(999)), "pins=.*…: give vertex numbers"),
+        (lambda: hood.simulate("tank", betas=np.zeros(999)), "betas=.*: give at most 10"),
+        (lambda: hood.simulate("tank", plan={}), "plan={}: give text, such as plan=auto"),
+        (lambda: hood.simulate("tank", material=np.zeros(3)), "material is of type ndarray; give a name"),
+        (lambda: hood.build_scene("tank", body, plie), "garment is of type str; give a hood.Garment"),
+        (lambda: hood.build_scene(tank, "default", plie), "takes a hood.Body, .* not str"),
+        (lambda: hood.build_scene(tank, body, "plie"), "takes a hood.PoseSequence, .* not str"),
+        (lambda: hood.build_scene(tank, body, plie, "denim"), "takes a hood.Material.* not str"),
+        (lambda: hood.load_garment(tank), "garment is given by its name or file, not as Garment"),
+        (lambda: hood.read_rollout("."), "a folder; give the rollout.h5 in it"),
+    ]
+    for call, said in cases:
+        with pytest.raises(ValueError, match=said) as refused:
+            call()
+        assert len(str(refused.value)) < 400, said
+    with pytest.raises(FileNotFoundError, match=r"^nope.h5: no such file; give the rollout.h5"):
+        hood.read_rollout("nope.h5")
 
 
 ODD = (

@@ -245,9 +245,9 @@ def test_usage_and_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out.strip() == f"hood {__version__}"
 
 
-@pytest.mark.parametrize("arguments", ["--help", "sizes --help"])
+@pytest.mark.parametrize("arguments", ["--help", "sizes --help", "inspect tank skirt"])
 def test_a_reader_that_has_seen_enough_is_no_error(arguments: str) -> None:
-    command = f"{sys.executable} -m hood.cli {arguments} | true; exit ${{PIPESTATUS[0]}}"
+    command = f"PYTHONUNBUFFERED=1 {sys.executable} -m hood.cli {arguments} | true; exit ${{PIPESTATUS[0]}}"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=120, check=False)
     assert (done.returncode, done.stderr) == (130, "")
 

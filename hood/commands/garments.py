@@ -16,9 +16,12 @@ from hood.assets.garment.outfit import join_garments
 from hood.assets.garment.pins import pin_mask
 from hood.assets.garment.suspicions import Suspicion, suspect_kind, suspect_seams
 from hood.assets.garment.units import require_metres, used
-from hood.config import ConfigError, plain
+from hood.config import ConfigError, brief, plain
 from hood.mesh.caps import FLAT
 from hood.scene.motion import BodyMotion, Motion
+
+#: Characters of a value that a message repeats at most.
+_SHOWN = 100
 
 
 def names_of(given: Any, key: str = "garment") -> list[str]:
@@ -30,7 +33,7 @@ def names_of(given: Any, key: str = "garment") -> list[str]:
     value = plain(given)
     names = value if isinstance(value, list) else [value]
     if not names or not all(isinstance(name, (str, int, float)) and not isinstance(name, bool) for name in names):
-        raise ConfigError(f"{key}={value}: give a name, a file, or several, {key}=[shirt.obj,trousers]")
+        raise ConfigError(f"{key}={brief(value)}: give a name, a file, or several, {key}=[shirt.obj,trousers]")
     return [str(name) for name in names]
 
 
@@ -137,7 +140,9 @@ def checked_pins(pins: Any) -> str | int | Sequence[str | int]:
         return pins
     if isinstance(pins, list) and all(isinstance(pin, (str, int)) and not isinstance(pin, bool) for pin in pins):
         return pins
-    raise ConfigError(f"pins={pins}: give vertex numbers, regions or lists, such as pins=[waistband,12,13] or pins=held.txt")
+    raise ConfigError(
+        f"pins={brief(pins)}: give vertex numbers, regions or lists, such as pins=[waistband,12,13] or pins=held.txt"
+    )
 
 
 def shape_coefficients(given: Any, key: str = "betas") -> np.ndarray:
@@ -149,5 +154,5 @@ def shape_coefficients(given: Any, key: str = "betas") -> np.ndarray:
     values = plain(given)
     numbers = isinstance(values, list) and all(isinstance(b, (int, float)) and np.isfinite(b) for b in values)
     if not numbers or len(values) > 10:
-        raise ConfigError(f"{key}={values}: give at most 10 finite shape coefficients, e.g. [1.5,0,-1]")
+        raise ConfigError(f"{key}={str(values)[:_SHOWN]}: give at most 10 finite shape coefficients, e.g. [1.5,0,-1]")
     return np.array([*values, *[0.0] * (10 - len(values))], dtype=np.float64)

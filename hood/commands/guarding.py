@@ -34,6 +34,8 @@ _TEXTS = {
     SPEED: "the body moves by {value:.2g} m in a step, beyond {limit:.2g} (less with a higher fps=…)",
     CUT: "the skin cuts {value:.1%} of the cloth's triangles at worst, beyond {limit:.1%}",
 }
+#: Where an alarm of another cause has what its step comes to.
+_MEASURED = {STRAIN: "strain", FORCE: "force", INSIDE: "depth"}
 
 
 class GuardStopped(Exception):
@@ -111,23 +113,24 @@ def guard_sentence(mode: str, alarms: Sequence[Alarm], num_frames: int) -> str:
             "it are kept"
         )
     causes = list(dict.fromkeys(alarm.cause for alarm in alarms))
-    parts = [_named([alarm for alarm in alarms if alarm.cause == cause]) for cause in causes]
+    parts = [_named([alarm for alarm in alarms if alarm.cause == cause], alarms) for cause in causes]
     frames = len({alarm.frame for alarm in alarms})
     return f"guard: {frames} of {num_frames - 1} steps: {'; '.join([*parts, *_outcome(mode, alarms)])}"
 
 
-def _part(alarms: Sequence[Alarm]) -> str:
-    """What was so, of one cause."""
+def _part(alarms: Sequence[Alarm], all_alarms: Sequence[Alarm] = ()) -> str:
+    """What was so, of one cause; the worst of ``all_alarms``, also of steps of which something graver is told."""
     text = _TEXTS.get(alarms[0].cause, "{value:.3g}, beyond {limit:.3g}")
     worst = max(alarms, key=lambda alarm: -math.inf if math.isnan(alarm.value) else alarm.value)
-    return text.format(value=worst.value, limit=worst.limit)
+    measured = [getattr(alarm, _MEASURED[worst.cause]) for alarm in all_alarms] if worst.cause in _MEASURED else []
+    return text.format(value=max([worst.value, *(value for value in measured if value > worst.value)]), limit=worst.limit)
 
 
-def _named(alarms: Sequence[Alarm]) -> str:
+def _named(alarms: Sequence[Alarm], all_alarms: Sequence[Alarm]) -> str:
     """The same with its frames."""
     chosen = np.zeros(1 + max(alarm.frame for alarm in alarms), dtype=bool)
     chosen[[alarm.frame for alarm in alarms]] = True
-    return f"{_part(alarms)}, in {name_frames(chosen)}"
+    return f"{_part(alarms, all_alarms)}, in {name_frames(chosen)}"
 
 
 def _outcome(mode: str, alarms: Sequence[Alarm]) -> list[str]:

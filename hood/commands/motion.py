@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from hood.assets.files.library import names
 from hood.assets.motion.animated_mesh import body_kind
 from hood.assets.motion.load import HANDS
-from hood.config import ConfigError, plain, require_choice, shown
+from hood.config import ConfigError, brief, plain, require_choice, shown
 from hood.scene.load_motion import NO_MOTION, MotionOptions, load_motion
 from hood.scene.motion import Motion
 
@@ -102,12 +102,12 @@ def _betas(given: Any) -> Any:
         return None
     # bool is an int, and no coefficient.
     if not isinstance(given, list) or not all(isinstance(b, (int, float)) and not isinstance(b, bool) for b in given):
-        raise ConfigError(f"betas={given}: give at most 10 finite shape coefficients, e.g. betas=[1.5,0,-1]")
+        raise ConfigError(f"betas={brief(given)}: give at most 10 finite shape coefficients, e.g. betas=[1.5,0,-1]")
     return given
 
 
 def _names(config: DictConfig, key: str) -> list[str]:
     given = plain(config[key])
     if not isinstance(given, list):
-        raise ConfigError(f"{key}={given}: give a list of names, e.g. {key}=[Body]")
+        raise ConfigError(f"{key}={brief(given)}: give a list of names, e.g. {key}=[Body]")
     return [str(name) for name in given]

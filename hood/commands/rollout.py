@@ -158,7 +158,7 @@ def _run_all(config: DictConfig, jobs: list[Job], output: Path) -> int:
         one = OmegaConf.merge(config, {"sequence": job.sequence, "output": str(job.folder)})
         assert isinstance(one, DictConfig)
         done = finished(one, digest, job.folder) if bool(config.resume) else None
-        return (done, False) if done is not None else _run_one(one, stepper, digest, advise=False)
+        return (done | {"skipped": True}, False) if done is not None else _run_one(one, stepper, digest, advise=False)
 
     outcome = share(jobs, work)
     if distributed.rank() == 0:

@@ -100,20 +100,23 @@ def describe_all(rows: Mapping[str, Mapping[str, Any]], total: int) -> str:
     lines = []
     for name, row in rows.items():
         if "error" in row:
-            lines.append(f"{name}: {row['error']}")
+            lines.append(row["error"] if row["error"].startswith(f"{name}:") else f"{name}: {row['error']}")
             continue
         first = row["first_nonfinite_frame"]
         state = f"{row['num_frames']} frames, " + ("all finite" if first is None else f"first non-finite frame {first}")
         lines.append(
             f"{name}: {state}, strain p99 {_worst_strain(row)}, "
             f"{_percent(row['penetration_share_mean'])} of the vertices inside the body, {cut_at_worst(row.get('surface'))}"
+            + ("; finished before, skipped" if row.get("skipped") else "")
             + (f"; UNSOUND: {row['unsound_reasons'][0]}" if row["sound"] is False else "")
         )
     failed = sum("error" in row for row in rows.values())
     unsound = sum(row.get("sound") is False for row in rows.values())
+    skipped = sum(bool(row.get("skipped")) for row in rows.values())
     parts = [f"{len(rows) - failed} of {total} motions simulated"]
     parts += [f"{count} {what}" for count, what in ((failed, "failed"), (unsound, "unsound")) if count]
-    return "\n".join([*lines, ", ".join(parts)])
+    before = f"; {skipped} of them finished before and skipped now" if skipped else ""
+    return "\n".join([*lines, ", ".join(parts) + before])
 
 
 def _settled(metrics: Mapping[str, np.ndarray]) -> dict[str, Any] | None:

@@ -27,6 +27,10 @@ class Alarm:
     iterations: int = 0  # of all tries
     rg_before: float = math.nan
     rg_after: float = math.nan
+    # of a step all that was measured, whichever of it is the gravest; NaN where it was not
+    strain: float = math.nan  # 99th percentile of the edge strain
+    force: float = math.nan  # as of the cause FORCE
+    depth: float = math.nan  # in the body [m]
 
     @property
     def mendable(self) -> bool:

@@ -153,6 +153,9 @@ class Guard:
         moved = _motion_alarm(frame, problem.step.obstacle)
         depth = problem.next_depth(prediction.next_pos) if now.finite else math.nan
         alarm = self._step_alarm(frame, prediction, now, depth, wary=moved is not None)
+        if alarm is not None:
+            wild = self._alone and now.residual > WILD
+            alarm = replace(alarm, strain=now.strain, force=now.residual if wild else self._force(now), depth=depth)
         if alarm is None and self._alone and self._is_due(frame, now.strain):
             checked, prediction = self._check(frame, problem, prediction, now)
             if checked is not None:

@@ -34,6 +34,8 @@ ALARM_COLUMNS = {
     "rg_before": np.dtype(np.float64),
     "rg_after": np.dtype(np.float64),
 }
+#: What files of later versions say beside it of a step; NaN in rows of earlier ones.
+STEP_COLUMNS = {name: np.dtype(np.float64) for name in ("strain", "force", "depth")}
 #: Alarms of a frame at most: of the step, of triangles in the skin that were taken out, and of the surface that is measured.
 _ALARMS = 3
 #: What a file may hold of the cloth beside its mesh, the same in all frames, with the types in the file.
@@ -75,7 +77,8 @@ class RolloutWriter:
     With ``guarded`` there are the alarms of a guard, one a row: ``guard/frame``, ``guard/cause`` and ``guard/repair`` (words of
     :data:`hood.dynamics.alarms.CAUSES` and :mod:`hood.dynamics.step_repair`), ``guard/value`` and ``guard/limit`` (of the
     cause: share of strain or of cut triangles, relative gradient, degrees, m), ``guard/iterations``, ``guard/rg_before``
-    and ``guard/rg_after``. The attribute ``num_alarms`` counts them; rows beyond it are empty, with the frame -1.
+    and ``guard/rg_after``; of a step also ``guard/strain``, ``guard/force`` and ``guard/depth``. The attribute ``num_alarms``
+    counts them; rows beyond it are empty, with the frame -1.
 
     All datasets are laid out, filled with NaN, before the file takes its name: a full disk shows at once, and later writes
     never touch the file's structure. A frame is counted in ``num_frames`` after its values are written. So whoever opens the
@@ -178,6 +181,8 @@ class RolloutWriter:
             for name, kind in ALARM_COLUMNS.items():
                 value = alarm[name]
                 self._file[f"guard/{name}"][self.alarms_done] = value.encode() if kind.kind == "S" else value
+            for name in STEP_COLUMNS:
+                self._file[f"guard/{name}"][self.alarms_done] = alarm.get(name, np.nan)
             self.alarms_done += 1
         if alarms:
             self._file.flush()
@@ -312,6 +317,8 @@ def read_rollout(path: Path | str) -> RolloutData:
         (3, 1016, 3)
     """
     path = Path(path)
+    if path.is_dir():
+        raise ValueError(f"{path}: a folder; give the rollout.h5 in it")
     try:
         with h5py.File(path, "r") as file:
             _check_extents(file, path.stat().st_size)
@@ -331,8 +338,8 @@ def read_rollout(path: Path | str) -> RolloutData:
                 still={name.removeprefix("cloth/"): file[name][:] for name in _still_paths(file)},
                 steps=read_steps(file, len(file["cloth/rest_pos"])),
             )
-    except FileNotFoundError:
-        raise
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"{path}: no such file; give the rollout.h5 that hood rollout writes") from error
     except Exception as error:  # damaged files make h5py raise nearly anything
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ValueError(f"{path}: not a rollout file ({reason}); make one with hood rollout") from error
@@ -394,7 +401,7 @@ def _still_paths(file: h5py.File) -> list[str]:
 
 def _alarm_paths(file: h5py.File) -> list[str]:
     known = own_group(file, "guard") or ()
-    return [f"guard/{name}" for name in ALARM_COLUMNS if name in known]
+    return [f"guard/{name}" for name in (*ALARM_COLUMNS, *STEP_COLUMNS) if name in known]
 
 
 def _lay_out_values(file: h5py.File, shape: tuple[int, int], fields: Sequence[str], metric_names: Sequence[str]) -> None:
@@ -406,16 +413,18 @@ def _lay_out_values(file: h5py.File, shape: tuple[int, int], fields: Sequence[st
 
 
 def _lay_out_alarms(file: h5py.File, rows: int) -> None:
-    for name, kind in ALARM_COLUMNS.items():
+    for name, kind in (ALARM_COLUMNS | STEP_COLUMNS).items():
         fill = {"i": -1, "f": np.nan, "S": b""}[kind.kind]
         file.create_dataset(f"guard/{name}", (rows,), dtype=kind, fillvalue=np.array(fill, dtype=kind))
 
 
 def _read_alarms(file: h5py.File) -> list[dict[str, Any]]:
     paths = _alarm_paths(file)
-    if len(paths) < len(ALARM_COLUMNS):
+    if any(f"guard/{name}" not in paths for name in ALARM_COLUMNS):
         return []
-    for name, kind in ALARM_COLUMNS.items():
+    for name, kind in (ALARM_COLUMNS | STEP_COLUMNS).items():
+        if f"guard/{name}" not in paths:
+            continue
         table = file[f"guard/{name}"]
         if table.ndim != 1 or table.dtype.kind != kind.kind:
             raise ValueError(

@@ -328,14 +328,7 @@ def start_state(stepper: Stepper, scene: Scene, potential: Potential, relaxing_s
     stretched = _longest(scene, state.pos)
     if stretched > _TORN:
         starts = f"garment {scene.garment.name!r} starts with edges stretched by up to {stretched:.0%}"
-        why = (
-            f"in frame {frame} of {scene.motion.name!r}: let the body move there from a standing pose (blend_in=1), or start "
-            "elsewhere (start=…)"
-            if put_on > _TORN
-            else f"since its garments were taken apart, {put_on:.0%} before: they lie deep in each other; give another order "
-            "(layers=[…]), or one that is cut wider (size=…)"
-        )
-        warnings.warn(f"{starts} {why}", stacklevel=2)
+        warnings.warn(f"{starts} {_why_stretched(scene, frame, put_on)}", stacklevel=2)
     prepared = prepare_stepper(stepper, scene)
     velocity = scene.start_velocity(frame)
     if stepper.relaxing is Relaxing.RESTART and relaxing_steps > 0:
@@ -354,6 +347,26 @@ def start_state(stepper: Stepper, scene: Scene, potential: Potential, relaxing_s
         if lower and bool(torch.isfinite(pos).all()) and _longest(scene, pos) <= max(_STRETCH, _longest(scene, state.pos)):
             state = State(pos, state.vel, state.origin)
     return State(state.pos, velocity, state.origin)
+
+
+def _why_stretched(scene: Scene, frame: int, put_on: float) -> str:
+    """What stretched the edges of a start beyond :data:`_TORN`, which were stretched by ``put_on`` before anything was taken
+    apart, and what helps."""
+    if put_on > _TORN:
+        return (
+            f"in frame {frame} of {scene.motion.name!r}: let the body move there from a standing pose (blend_in=1), or start "
+            "elsewhere (start=…)"
+        )
+    if scene.outfit is not None:
+        return (
+            f"since its garments were taken apart, {put_on:.0%} before: they lie deep in each other; give another order "
+            "(layers=[…]), or one that is cut wider (size=…)"
+        )
+    return (
+        f"since it was smoothed where it passes through itself, {put_on:.0%} before: put on this body in frame {frame} of "
+        f"{scene.motion.name!r}, its parts lie in each other; give another shape (betas=…), a standing pose (blend_in=1), or a "
+        "garment that is made for this body"
+    )
 
 
 def _taken_apart(scene: Scene, state: State, frame: int) -> State:

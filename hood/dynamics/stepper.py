@@ -56,6 +56,20 @@ class Stepper(Protocol):
         ...
 
 
+#: What every stepper has.
+_PARTS = ("gravity", "config", "times", "metrics", "relaxing", "prepare", "search", "predict", "next_velocity")
+
+
+def require_stepper(given: object) -> None:
+    """Raise ValueError where an own stepper lacks an attribute or a method of :class:`Stepper`; names them."""
+    missing = [name for name in _PARTS if not hasattr(given, name)]
+    if missing:
+        raise ValueError(
+            f"stepper is of type {type(given).__name__}, which has no {', '.join(missing)}; give an option of hood rollout, or "
+            "an object with what hood.dynamics.stepper.Stepper lists"
+        )
+
+
 class NewtonStepper:
     """Implicit Euler by projected Newton on the same potential that trains the networks; no weights.
 

@@ -34,12 +34,14 @@ class Tolerance:
         """``0.01`` is of γ, ``5mm`` a distance.
 
         Raises:
-            ValueError: neither.
+            ValueError: neither; a γ above 1, which is a distance without its unit.
         """
         match = re.fullmatch(r"([0-9.]+(?:e-?[0-9]+)?)\s*(mm)?", str(text).strip())
         value = float(match.group(1)) if match and match.group(1).count(".") < 2 and match.group(1) != "." else 0.0
         if match is None or not 0.0 < value < math.inf:
             raise ValueError(f"accuracy={text}: give a γ above 0 (0.01), or a distance (5mm)")
+        if match.group(2) is None and value > 1.0:  # γ = 1 is the weight itself
+            raise ValueError(f"accuracy={text}: give accuracy=0.01 (a γ) or accuracy={text}mm (a distance)")
         return cls(value, "mm" if match.group(2) else "gamma")
 
     @property

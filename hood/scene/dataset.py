@@ -23,7 +23,7 @@ from hood.scene.batch import to_device
 from hood.scene.cloth import Cloth
 from hood.scene.fastening import fastening_of
 from hood.scene.motion import BodyMotion, body_motion
-from hood.scene.scene import Scene, build_scene
+from hood.scene.scene import Scene, dress
 
 #: Draws before a set of motions that cannot be read is given up.
 _MAX_UNREADABLE = 100
@@ -115,8 +115,8 @@ class SceneSampler:
         size = float(rng.uniform(self.size_low, self.size_high))
         material = self.material or sample_material(rng, template.rest_pos, self.piecewise_fraction)
         mirrored = self.mirror and rng.random() < 0.5
-        body, dress = self._assets(index, mirrored)
-        scene = build_scene(dress, body, window, material, betas, size)
+        body, worn = self._assets(index, mirrored)
+        scene = dress(worn, body_motion(body, window, betas), material, size)
         return Window(scene, min(start, 1), index, mirrored)
 
     def pack(self, window: Window) -> dict[str, Any]:

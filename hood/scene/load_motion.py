@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,10 @@ from hood.scene.motion import Motion, body_motion
 
 #: A sequence that says so: meshes perform their own, and without a body there is none.
 NO_MOTION = "none"
+#: Characters of a value that a message repeats at most.
+_SHOWN = 100
+#: Shape coefficients are standard deviations; body models say nothing of what lies this far out.
+_MEANT = 5.0
 
 
 @dataclass(frozen=True)
@@ -92,6 +97,22 @@ def _betas(given: Sequence[float] | None, recorded: np.ndarray) -> np.ndarray:
     betas = np.zeros(max(len(recorded), 10))
     values = np.asarray(given, dtype=np.float64).reshape(-1)
     if len(values) > len(betas) or not np.isfinite(values).all():
-        raise ValueError(f"betas={list(given)}: give at most {len(betas)} finite shape coefficients, e.g. [1.5, 0, -1]")
+        raise ValueError(
+            f"betas={str(list(given))[:_SHOWN]}: give at most {len(betas)} finite shape coefficients, e.g. [1.5, 0, -1]"
+        )
     betas[: len(values)] = values
+    _doubt(betas)
     return betas
+
+
+def _doubt(betas: np.ndarray) -> None:
+    """Warn about the largest coefficient that no body model is made for."""
+    index = int(np.abs(betas).argmax())
+    value = float(betas[index])
+    if abs(value) > _MEANT:
+        hint = f"; if a point is missing, give {value / 10:g}" if abs(value) / 10 <= _MEANT else ""
+        warnings.warn(
+            f"betas[{index}]={value:g} is beyond what body models are made for, {-_MEANT:g} to {_MEANT:g}: the body is hardly "
+            f"a person's, and garments may not fit it{hint}",
+            stacklevel=2,
+        )

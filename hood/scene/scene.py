@@ -10,6 +10,7 @@ from torch import Tensor
 
 from hood.assets.body.body import Body
 from hood.assets.garment.garment import Garment
+from hood.assets.garment.own_garment import checked_garment
 from hood.assets.material import Material
 from hood.assets.motion.sequence import PoseSequence
 from hood.scene.batch import to_device
@@ -236,7 +237,8 @@ def build_scene(
         device: ``cpu`` or ``cuda``.
 
     Raises:
-        ValueError: the garment cannot follow the body, or is not on it in the motion's first frame.
+        ValueError: an argument of another type, a garment of arrays that cannot be simulated, or one that cannot follow the
+            body or is not on it in the motion's first frame.
 
     Examples:
         >>> import hood
@@ -247,6 +249,12 @@ def build_scene(
         >>> tuple(state.pos.shape)
         (1016, 3)
     """
+    garment = checked_garment(garment)
+    for kind, given, loaded in ((Body, body, "hood.load_body()"), (PoseSequence, sequence, "hood.load_sequence('plie')")):
+        if not isinstance(given, kind):
+            raise ValueError(f"build_scene takes a hood.{kind.__name__}, such as {loaded}, not {type(given).__name__}")
+    if material is not None and not isinstance(material, Material):
+        raise ValueError(f"build_scene takes a hood.Material, or None for the default fabric, not {type(material).__name__}")
     betas = np.zeros(10) if betas is None else np.asarray(betas, dtype=np.float64)
     return dress(garment, body_motion(body, sequence, betas, dtype, device), material, size)
 

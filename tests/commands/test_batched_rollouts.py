@@ -86,6 +86,8 @@ def test_a_motion_that_cannot_be_used_stops_no_other(motions: Path, capsys: pyte
     errors = [row["error"] for row in rows.values() if "error" in row]
     assert len(errors) == 1
     assert "b.npz" in errors[0]
+    (line,) = [line for line in printed.splitlines() if "b.npz" in line]
+    assert line.count("b.npz") == 1
 
 
 @pytest.mark.parametrize(
@@ -136,7 +138,11 @@ def test_an_interrupted_batch_goes_on_where_it_stopped(
     assert set(before) == {"a", "b"}
     monkeypatch.undo()
     monkeypatch.chdir(motions.parent)
+    capsys.readouterr()
     assert main([*ROLLOUT, "resume=true"]) == 0
+    printed = capsys.readouterr().out
+    assert "3 of 3 motions simulated; 1 of them finished before and skipped now\n" in printed
+    assert printed.count("; finished before, skipped") == 1
     after = times(out)
     assert after["a"] == before["a"]
     assert after["b"] > before["b"]

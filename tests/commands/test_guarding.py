@@ -13,7 +13,7 @@ from belt import write_belt, write_walk
 
 from hood.cli import main
 from hood.commands.guarding import guard_sentence
-from hood.dynamics.alarms import CUT, FORCE, TURN, Alarm
+from hood.dynamics.alarms import CUT, FORCE, INSIDE, STRAIN, TURN, Alarm
 from hood.dynamics.recorder import read_rollout
 from hood.dynamics.step_repair import LEFT, REFINED
 
@@ -126,6 +126,19 @@ def test_the_sentence_names_frames_values_and_limits() -> None:
         "(less with a higher fps=…), in frame 6; 1 of 2 steps repaired"
     )
     assert guard_sentence("report", [], 11) == ""
+
+
+def test_the_worst_is_that_of_all_steps_whatever_else_is_told_of_them() -> None:
+    alarms = [
+        Alarm(3, FORCE, 75.1, 50.0, strain=0.1, force=75.1, depth=0.02),
+        Alarm(4, STRAIN, 0.9, 0.25, strain=0.9, force=3.9e6, depth=0.001),
+        Alarm(5, INSIDE, 0.012, 0.01, strain=0.1, force=1.0, depth=0.012),
+    ]
+    said = guard_sentence("report", alarms, 11)
+    assert "forces out of balance, 3.9e+06 times the weight at worst, beyond 50, in frame 3" in said
+    assert "strain p99 beyond 25%, 90% at worst, in frame 4" in said
+    assert "a vertex 0.02 m inside the body at worst" in said
+    assert "75.1 times" in guard_sentence("strict", alarms, 11)
 
 
 def test_alarms_of_a_damaged_file_are_refused() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hood.cli import main
-from hood.commands.refinement import summarise_refinement
+from hood.commands.refinement import describe_refinement, summarise_refinement
 from hood.dynamics.recorder import read_rollout
 
 UNTRAINED = ["checkpoint=untrained", "model=small", "model.latent_dim=4", "model.schedule='1x(mesh)'"]
@@ -98,3 +98,22 @@ def test_a_budget_counts_whole_frames() -> None:
     assert entry["ms_p95"] == pytest.approx(109.0)
     assert entry["iterations_max"] == 4
     assert summarise_refinement({"refine": 0}, metrics) == {}
+
+
+@pytest.mark.parametrize(
+    ("iterations", "refining", "told"),
+    [
+        ([0, 0, 0], [0.1, 0.1, 0.1], "in 3 of 3 frames, which are not refined at all and take 10.0 ms; about budget_ms=16 has"),
+        ([0, 0, 2], [0.1, 0.1, 8.0], "in 2 of 3 frames, which are not refined at all and take 10.0 ms; about budget_ms=16 has"),
+        ([0, 1, 2], [0.1, 3.0, 8.0], None),
+    ],
+)
+def test_a_budget_that_is_used_up_before_an_iteration_is_told(iterations: list, refining: list, told: str | None) -> None:
+    config = {"budget_ms": 3.0, "refine": 0, "refine_method": "newton"}
+    metrics = {
+        "refine_iterations": np.array([np.nan, *iterations]), "refine_rg": np.full(4, np.nan),
+        "ms_total": np.array([np.nan, 10.0, 10.0, 10.0]), "ms_refine": np.array([np.nan, *refining]),
+    }  # fmt: skip
+    lines = describe_refinement(summarise_refinement(config, metrics))
+    assert len(lines) == (1 if told is None else 2)
+    assert told is None or f"budget_ms=3 is used up before the first iteration {told} room for one" in lines[1]

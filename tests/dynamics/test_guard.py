@@ -128,6 +128,10 @@ def test_a_bad_step_is_told_and_mended(spoil: Any, cause: str, scene: Scene) -> 
     told = frames(Spoilt(3, spoil), scene, report)
     assert same(told, frames(Spoilt(3, spoil), scene, None))
     assert (report.alarms[0].frame, report.alarms[0].cause, report.alarms[0].repair) == (3, cause, NOT_TRIED)
+    if spoil is stretched:  # told is the gravest, the others are known
+        assert report.alarms[0].strain == report.alarms[0].value
+        assert report.alarms[0].force > 0
+        assert report.alarms[0].depth >= 0
     repair = Guard("repair", Spoilt(3, spoil), POTENTIAL)
     repaired = frames(Spoilt(3, spoil), scene, repair)
     assert [alarm.frame for alarm in repair.alarms] == [3]

@@ -82,17 +82,27 @@ def test_a_start_with_long_edges_is_told(
         next(simulate(stepper(), scene, POTENTIAL, 2, metrics="none"))
 
 
-def test_edges_stretched_by_taking_garments_apart_are_not_put_down_to_the_pose(
-    monkeypatch: pytest.MonkeyPatch, tank_scene: Scene
+@pytest.mark.parametrize(
+    ("pieces", "why"),
+    [
+        (2, r"its garments were taken apart, \d+% before: .*layers="),
+        (1, r"it was smoothed where it passes through itself, .*betas="),
+    ],
+)
+def test_edges_stretched_by_taking_cloth_apart_are_not_put_down_to_the_pose(
+    monkeypatch: pytest.MonkeyPatch, tank_scene: Scene, pieces: int, why: str
 ) -> None:
+    """Garments are taken apart from each other, a single one from itself."""
+
     def pulled(scene: Scene, state: State, frame: int) -> State:
         return State(state.pos * torch.tensor([1.0, 1.6, 1.0]), state.vel, state.origin)
 
     monkeypatch.setattr("hood.dynamics.rollout._taken_apart", pulled)
     potential = default_potential().with_terms(layers=LayerBarrier())
-    told = r"stretched by up to \d+% since its garments were taken apart, \d+% before: .*layers="
-    with pytest.warns(UserWarning, match=told):
-        next(simulate(RefinedStepper(GuessStepper(potential), potential, Count(1)), tank_scene, potential, 2, metrics="none"))
+    piece = np.arange(tank_scene.cloth.num_vertices) % pieces
+    scene = replace(tank_scene, garment=replace(tank_scene.garment, piece=piece))
+    with pytest.warns(UserWarning, match=rf"stretched by up to \d+% since {why}"):
+        next(simulate(RefinedStepper(GuessStepper(potential), potential, Count(1)), scene, potential, 2, metrics="none"))
 
 
 def test_what_the_t_pose_does_not_help_is_refused(

@@ -26,6 +26,13 @@ def test_other_tolerances_are_refused(text: str) -> None:
         Tolerance.read(text)
 
 
+def test_a_distance_without_its_unit_is_asked_for() -> None:
+    for text in ("5", "1.5"):
+        with pytest.raises(ValueError, match=rf"^accuracy={text}: give accuracy=0.01 .*or accuracy={text}mm"):
+            Tolerance.read(text)
+    assert Tolerance.read("1") == Tolerance(1.0, "gamma")
+
+
 def test_parts_are_left_out_that_pass_and_save_time() -> None:
     effects = {"": FULL, "cheap": effect(1e-4, 8.0), "needed": effect(0.5, 5.0), "free": effect(1e-4, 9.9)}
     found = decide(effects, {"none": "no body"}, [], Tolerance(0.01, "gamma"), lambda names: (FULL, effect(1e-4, 8.0)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +55,16 @@ def test_options_of_motions(tmp_path: Path) -> None:
     # Seconds 1 to 2 of the file's 90 frames (cut to its end at 45 fps) are 15 at 15 fps, two plays share a frame, and a
     # second of standing comes first.
     assert motion.num_frames == 15 + 2 * 15 - 1
+
+
+def test_shapes_beyond_those_of_people_are_doubted() -> None:
+    with pytest.warns(UserWarning, match=r"^betas\[1\]=15 is beyond .*-5 to 5.*if a point is missing, give 1.5$"):
+        load_motion("default", "walk_proud", MotionOptions(betas=[0.0, 15.0]))
+    with pytest.warns(UserWarning, match=r"^betas\[0\]=-100 is beyond .*may not fit it$"):
+        load_motion("default", "walk_proud", MotionOptions(betas=[-100.0]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_motion("default", "walk_proud", MotionOptions(betas=[5.0, -5.0]))
 
 
 @pytest.mark.parametrize("betas", [[np.nan], list(range(11))])

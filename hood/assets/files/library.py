@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import json
 import math
+import os
 import zipfile
 from collections.abc import Iterable
 from pathlib import Path
@@ -48,6 +49,7 @@ def locate(kind: str, name: str | Path, folders: bool = False) -> Path:
         FileNotFoundError: neither an embedded name nor an existing file; the message lists the nearest names.
         ValueError: a file of another program's format; names the way out.
     """
+    require_name(kind, name)
     embedded = DATA_FOLDER / kind / f"{name}{_SUFFIX[kind]}"
     if embedded.is_file():
         return embedded
@@ -60,6 +62,12 @@ def locate(kind: str, name: str | Path, folders: bool = False) -> Path:
     if path.suffix or len(path.parts) > 1:
         raise FileNotFoundError(f"{path}: no such file (embedded {kind}: {', '.join(names(kind)) or 'none'})")
     raise FileNotFoundError(unknown(_LABEL[kind], str(name), names(kind)) + "; or give the path of a file")
+
+
+def require_name(kind: str, name: object) -> None:
+    """Raise ValueError where something else than a name or a file is given, such as what was read from one already."""
+    if not isinstance(name, (str, os.PathLike)):
+        raise ValueError(f"a {_LABEL[kind]} is given by its name or file, not as {type(name).__name__}")
 
 
 def unknown_suffix(path: Path, what: str) -> str:

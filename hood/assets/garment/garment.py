@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hood.assets.files.library import locate, unknown_suffix
+from hood.assets.files.library import locate, require_name, unknown_suffix
 from hood.assets.formats.mesh_file import MeshFile, mesh_suffixes, read_mesh_file
 from hood.assets.garment.garment_arrays import read_fields, write_fields
 from hood.assets.garment.reference_garments import read_reference_garment
@@ -106,7 +106,7 @@ def load_garment(name: str | Path, triangulate: bool = False) -> Garment:
         known = ", ".join((*GARMENT_SUFFIXES, *mesh_suffixes()))
         raise ValueError(f"{path}: {unknown_suffix(path, 'garment')}; give one of {known}")
     check_triangles(garment.rest_pos, garment.faces, str(path))
-    _check_levels(garment, path)
+    check_levels(garment, str(path))
     return garment
 
 
@@ -124,15 +124,17 @@ def save_garment(path: Path, garment: Garment) -> None:
 
 def locate_garment(name: str | Path) -> tuple[Path, str | None]:
     """File of a garment, and which of its entries is meant (``garments_dict.pkl:dress``)."""
+    require_name("garments", name)
     head, colon, entry = str(name).rpartition(":")
     if colon and head.lower().endswith(".pkl"):
         return locate("garments", head), entry
     return locate("garments", name), None
 
 
-def _check_levels(garment: Garment, path: Path) -> None:
+def check_levels(garment: Garment, where: str) -> None:
+    """Raise ValueError where an edge of a coarse level has a vertex that the garment does not have."""
     for level, edges in enumerate(garment.coarse_edges or ()):
         outside = (edges < 0) | (edges >= len(garment.rest_pos))
         if outside.any():
             row = int(np.argmax(outside.any(axis=1)))
-            raise ValueError(f"{path}: coarse edge {row} of level {level} is {edges[row].tolist()}; there is no such vertex")
+            raise ValueError(f"{where}: coarse edge {row} of level {level} is {edges[row].tolist()}; there is no such vertex")

@@ -40,39 +40,7 @@ def read_fields(path: Path) -> dict[str, Any]:
     """
     check_size(path, _SIZE_LIMIT)
     arrays = read_arrays(path, ("rest_pos", "faces"), "garment")
-    fields: dict[str, Any] = {
-        "rest_pos": _reals(path, "rest_pos", arrays["rest_pos"]),
-        "faces": _indices(path, "faces", arrays["faces"]),
-    }
-    if fields["rest_pos"].ndim != 2 or fields["rest_pos"].shape[1] != 3:
-        raise ValueError(f"{path}: rest_pos has shape {fields['rest_pos'].shape}; give (num_vertices, 3)")
-    num_vertices = len(fields["rest_pos"])
-    for key in _ROWS:
-        if key in arrays:
-            fields[key] = _reals(path, key, arrays[key])
-            check_rows(str(path), key, fields[key], num_vertices)
-    fields["pinned"] = fields.get("pinned", np.zeros(num_vertices)).astype(bool)
-    _check_stiffness(path, fields.get("stiffness"))
-    for key in ("piece", "region"):
-        if key in fields:
-            fields[key] = fields[key].astype(np.int64)
-    if "lbs_weights" in fields:
-        fields["lbs_weights"] = normalised(str(path), fields["lbs_weights"])
-    if "uv" in arrays and "uv_faces" in arrays:
-        fields["uv"] = _finite(path, "uv", _reals(path, "uv", arrays["uv"]))
-    for key in _CORNERS:
-        if key in arrays and (key != "uv_faces" or "uv" in fields):
-            fields[key] = _corner_table(path, key, arrays[key], fields)
-    levels = sorted((key for key in arrays if key.startswith(_LEVEL)), key=lambda key: (len(key), key))
-    if levels:
-        fields["coarse_edges"] = tuple(_edge_table(path, key, arrays[key]) for key in levels)
-    rows = sorted(key for key in arrays if key.startswith(_FASTENER))
-    if rows:
-        fields["fasteners"] = {key[len(_FASTENER) :]: _edge_table(path, key, arrays[key], "fasteners") for key in rows}
-        check_fasteners(str(path), fields["fasteners"], num_vertices)
-    panels = [key for key in arrays if key.startswith(_PANEL)]
-    if panels:
-        fields["panels"] = {key[len(_PANEL) :]: _panel(path, key, arrays[key], len(fields["faces"])) for key in panels}
+    fields = checked_fields(str(path), arrays)
     if path.is_relative_to(DATA_FOLDER):
         fields["bound_to"] = "default"
     elif "bound_to" in arrays and arrays["bound_to"].dtype.kind == "U" and arrays["bound_to"].size == 1:
@@ -80,8 +48,50 @@ def read_fields(path: Path) -> dict[str, Any]:
     return fields
 
 
-def write_fields(path: Path, fields: dict[str, Any]) -> None:
-    """Write a garment ``.npz`` that :func:`read_fields` reads back; fields that are None are left out."""
+def checked_fields(where: str, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Arguments of a garment from its arrays by the names that they have in a file, see :func:`as_arrays`.
+
+    Raises:
+        ValueError: a field that does not fit the others; names ``where``, the field and its first bad row.
+    """
+    fields: dict[str, Any] = {
+        "rest_pos": _reals(where, "rest_pos", arrays["rest_pos"]),
+        "faces": _indices(where, "faces", arrays["faces"]),
+    }
+    if fields["rest_pos"].ndim != 2 or fields["rest_pos"].shape[1] != 3:
+        raise ValueError(f"{where}: rest_pos has shape {fields['rest_pos'].shape}; give (num_vertices, 3)")
+    num_vertices = len(fields["rest_pos"])
+    for key in _ROWS:
+        if key in arrays:
+            fields[key] = _reals(where, key, arrays[key])
+            check_rows(where, key, fields[key], num_vertices)
+    fields["pinned"] = fields.get("pinned", np.zeros(num_vertices)).astype(bool)
+    _check_stiffness(where, fields.get("stiffness"))
+    for key in ("piece", "region"):
+        if key in fields:
+            fields[key] = fields[key].astype(np.int64)
+    if "lbs_weights" in fields:
+        fields["lbs_weights"] = normalised(where, fields["lbs_weights"])
+    if "uv" in arrays and "uv_faces" in arrays:
+        fields["uv"] = _finite(where, "uv", _reals(where, "uv", arrays["uv"]))
+    for key in _CORNERS:
+        if key in arrays and (key != "uv_faces" or "uv" in fields):
+            fields[key] = _corner_table(where, key, arrays[key], fields)
+    levels = sorted((key for key in arrays if key.startswith(_LEVEL)), key=lambda key: (len(key), key))
+    if levels:
+        fields["coarse_edges"] = tuple(_edge_table(where, key, arrays[key]) for key in levels)
+    rows = sorted(key for key in arrays if key.startswith(_FASTENER))
+    if rows:
+        fields["fasteners"] = {key[len(_FASTENER) :]: _edge_table(where, key, arrays[key], "fasteners") for key in rows}
+        check_fasteners(where, fields["fasteners"], num_vertices)
+    panels = [key for key in arrays if key.startswith(_PANEL)]
+    if panels:
+        fields["panels"] = {key[len(_PANEL) :]: _panel(where, key, arrays[key], len(fields["faces"])) for key in panels}
+    return fields
+
+
+def as_arrays(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields of a garment by the names that they have in a file; those that are None and the name are left out."""
     tables = ("name", "coarse_edges", "fasteners", "panels")
     arrays = {key: value for key, value in fields.items() if value is not None and key not in tables}
     for level, edges in enumerate(fields.get("coarse_edges") or ()):
@@ -90,8 +100,13 @@ def write_fields(path: Path, fields: dict[str, Any]) -> None:
         arrays[f"{_FASTENER}{name}"] = pairs
     for name, mask in (fields.get("panels") or {}).items():
         arrays[f"{_PANEL}{name}"] = mask
+    return arrays
+
+
+def write_fields(path: Path, fields: dict[str, Any]) -> None:
+    """Write a garment ``.npz`` that :func:`read_fields` reads back; fields that are None are left out."""
     content = io.BytesIO()
-    np.savez_compressed(content, **arrays)
+    np.savez_compressed(content, **as_arrays(fields))
     write_atomically(path, content.getvalue())
 
 
@@ -123,18 +138,18 @@ def check_fasteners(where: str, fasteners: Mapping[str, np.ndarray], num_vertice
             )
 
 
-def _finite(path: Path, key: str, value: np.ndarray) -> np.ndarray:
+def _finite(where: str, key: str, value: np.ndarray) -> np.ndarray:
     if not np.isfinite(value).all():
         row = int(np.argwhere(~np.isfinite(value))[0][0])
-        raise ValueError(f"{path}: {key} has row {row}, which is not finite; repair it, or leave {key} out")
+        raise ValueError(f"{where}: {key} has row {row}, which is not finite; repair it, or leave {key} out")
     return value
 
 
-def _check_stiffness(path: Path, stiffness: np.ndarray | None) -> None:
+def _check_stiffness(where: str, stiffness: np.ndarray | None) -> None:
     if stiffness is not None and not (stiffness > 0).all():
         vertex = int(np.argmin(stiffness > 0))
         raise ValueError(
-            f"{path}: stiffness of vertex {vertex} is {stiffness[vertex]}; give a factor above 0, 1 for plain cloth"
+            f"{where}: stiffness of vertex {vertex} is {stiffness[vertex]}; give a factor above 0, 1 for plain cloth"
         )
 
 
@@ -150,37 +165,37 @@ def normalised(where: str, weights: np.ndarray) -> np.ndarray:
     return np.asarray(weights / total)
 
 
-def _reals(path: Path, key: str, value: Any) -> np.ndarray:
+def _reals(where: str, key: str, value: Any) -> np.ndarray:
     array = np.asarray(value)
     if array.dtype.kind not in "biuf":
-        raise ValueError(f"{path}: {key} is {array.dtype}; it must hold numbers")
+        raise ValueError(f"{where}: {key} is {array.dtype}; it must hold numbers")
     return array.astype(np.float64)
 
 
-def _indices(path: Path, key: str, value: Any) -> np.ndarray:
+def _indices(where: str, key: str, value: Any) -> np.ndarray:
     array = np.asarray(value)
-    if not np.issubdtype(array.dtype, np.integer):
-        raise ValueError(f"{path}: {key} are {array.dtype}; they must be integer vertex indices")
+    if array.size and not np.issubdtype(array.dtype, np.integer):
+        raise ValueError(f"{where}: {key} are {array.dtype}; they must be integer vertex indices")
     return array.astype(np.int64)
 
 
-def _edge_table(path: Path, key: str, value: Any, what: str = "coarse edges") -> np.ndarray:
-    table = _indices(path, key, value)
+def _edge_table(where: str, key: str, value: Any, what: str = "coarse edges") -> np.ndarray:
+    table = _indices(where, key, value)
     if table.ndim != 2 or table.shape[1] != 2:
-        raise ValueError(f"{path}: {key} has shape {table.shape}; {what} are pairs of vertices (n, 2)")
+        raise ValueError(f"{where}: {key} has shape {table.shape}; {what} are pairs of vertices (n, 2)")
     return table
 
 
-def _panel(path: Path, key: str, value: Any, num_faces: int) -> np.ndarray:
+def _panel(where: str, key: str, value: Any, num_faces: int) -> np.ndarray:
     mask = np.asarray(value)
     if mask.dtype.kind != "b" or mask.shape != (num_faces,):
-        raise ValueError(f"{path}: {key} is {mask.dtype} {mask.shape}; give one bool a face, ({num_faces},)")
+        raise ValueError(f"{where}: {key} is {mask.dtype} {mask.shape}; give one bool a face, ({num_faces},)")
     return mask
 
 
-def _corner_table(path: Path, key: str, value: Any, fields: dict[str, Any]) -> np.ndarray:
-    table = _indices(path, key, value)
+def _corner_table(where: str, key: str, value: Any, fields: dict[str, Any]) -> np.ndarray:
+    table = _indices(where, key, value)
     size = len(fields["uv"]) if key == "uv_faces" else table.max(initial=0) + 1
     if table.shape != fields["faces"].shape or (table < 0).any() or (table >= size).any():
-        raise ValueError(f"{path}: {key} does not fit faces and uv; give one index per corner, or leave it out")
+        raise ValueError(f"{where}: {key} does not fit faces and uv; give one index per corner, or leave it out")
     return table
