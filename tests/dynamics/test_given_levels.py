@@ -31,6 +31,10 @@ def test_levels_of_the_garment_are_used(garments: dict[str, Garment], body: Body
 
 
 def test_levels_of_another_garment_are_refused(garments: dict[str, Garment], body: Body, walk: PoseSequence) -> None:
-    scene = build_scene(replace(garments["tank"], coarse_edges=(np.array([[0, 99999]]),)), body, walk.window(0, 3))
+    """Where the garment is given, and where a scene has one in the place of its own."""
+    other = replace(garments["tank"], coarse_edges=(np.array([[0, 99999]]),))
+    with pytest.raises(ValueError, match=r"garment 'tank': coarse edge 0 of level 0 is \[0, 99999\]"):
+        build_scene(other, body, walk.window(0, 3))
+    scene = replace(build_scene(garments["tank"], body, walk.window(0, 3)), garment=other)
     with pytest.raises(ValueError, match="99999"):
         prepare_stepper(build_simulator(schedule="1x(mesh+coarse0)", latent_dim=2), scene)
