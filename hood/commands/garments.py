@@ -20,9 +20,6 @@ from hood.config import ConfigError, brief, plain
 from hood.mesh.caps import FLAT
 from hood.scene.motion import BodyMotion, Motion
 
-#: Characters of a value that a message repeats at most.
-_SHOWN = 100
-
 
 def names_of(given: Any, key: str = "garment") -> list[str]:
     """Names in a config value that is one name or a list of them.
@@ -154,5 +151,5 @@ def shape_coefficients(given: Any, key: str = "betas") -> np.ndarray:
     values = plain(given)
     numbers = isinstance(values, list) and all(isinstance(b, (int, float)) and np.isfinite(b) for b in values)
     if not numbers or len(values) > 10:
-        raise ConfigError(f"{key}={str(values)[:_SHOWN]}: give at most 10 finite shape coefficients, e.g. [1.5,0,-1]")
+        raise ConfigError(f"{key}={brief(values)}: give at most 10 finite shape coefficients, e.g. [1.5,0,-1]")
     return np.array([*values, *[0.0] * (10 - len(values))], dtype=np.float64)

@@ -12,7 +12,7 @@ from hood.config import load_config
 
 #: Words of these keys name files whose content decides.
 _FILES = ("garment", "sequence", "body", "checkpoint", "pins", "refine_table")
-#: Of larger files [bytes], and of those in folders, the size alone is looked at.
+#: Of larger files [bytes] the size alone is looked at.
 _LARGE = 1 << 26
 
 
@@ -36,8 +36,9 @@ def _content_of(key: str, name: str) -> Iterator[bytes]:
     """Of the files that a value names; nothing where it is something else."""
     path = Path(name).expanduser()
     if path.is_dir():
-        for folder, _, files in sorted(os.walk(path)):
-            yield from (f"{file} {(Path(folder) / file).stat().st_size}".encode() for file in sorted(files))
+        for file in sorted(Path(folder) / name for folder, _, files in os.walk(path) for name in files):
+            yield str(file.relative_to(path)).encode()
+            yield _content(file)
         return
     kind = {"garment": "garments", "sequence": "motions", "body": "body", "checkpoint": "weights"}.get(key)
     try:
@@ -45,4 +46,9 @@ def _content_of(key: str, name: str) -> Iterator[bytes]:
     except (ValueError, FileNotFoundError):
         return
     if found is not None:
-        yield found.read_bytes() if found.stat().st_size <= _LARGE else str(found.stat().st_size).encode()
+        yield _content(found)
+
+
+def _content(path: Path) -> bytes:
+    size = path.stat().st_size
+    return path.read_bytes() if size <= _LARGE else str(size).encode()

@@ -102,7 +102,7 @@ def exported(config: DictConfig) -> tuple[str, ...]:
     for name in names:
         if name not in FIELD_CHOICES:
             raise ConfigError(
-                f"export={brief(config.export)}: unknown {name[:100]!r}; give some of [{','.join(FIELD_CHOICES)}]"
+                f"export={brief(config.export)}: unknown {brief(name)!r}; give some of [{','.join(FIELD_CHOICES)}]"
             )
     drawn = str(config.colour)
     return tuple(dict.fromkeys([*names, *([drawn] if drawn in FIELD_CHOICES else [])]))
