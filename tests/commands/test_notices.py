@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from hood import cli
+from hood.assets.files.doubt import Doubt
 from hood.commands.notices import heard
 
 
@@ -38,3 +39,16 @@ def test_every_command_is_heard(capsys: pytest.CaptureFixture[str], monkeypatch:
     monkeypatch.setattr(cli, "_command", lambda name: command)
     assert cli.main(["inspect"]) == 0
     assert capsys.readouterr().err == "hood: warning: it fell\n"
+
+
+def test_doubts_are_warnings_that_a_script_can_read(capsys: pytest.CaptureFixture[str]) -> None:
+    with heard() as all_said, heard() as said:
+        doubt = Doubt("frame_rate", "walk.npz: no frame rate, 30 taken; file_fps=… gives it", value=30.0, unit="fps")
+        warnings.warn(doubt, stacklevel=1)
+        warnings.warn("plain", stacklevel=1)
+    assert all_said == said == ["walk.npz: no frame rate, 30 taken; file_fps=… gives it", "plain"]
+    for one in (all_said, said):
+        assert [doubt.as_dict() for doubt in one.doubts] == [
+            {"kind": "frame_rate", "sentence": said[0], "frames": [], "value": 30.0, "unit": "fps"}
+        ]
+    assert capsys.readouterr().err.count("no frame rate") == 1

@@ -1,0 +1,44 @@
+"""Doubts: what a command goes on with although it may be wrong, as a warning that a script can read."""
+
+from __future__ import annotations
+
+from typing import Any
+
+#: What a doubt can be about; these words stand in ``summary.json`` and stay.
+KINDS = (
+    "frame_rate",  # assumed, no file gives it
+    "units",  # guessed from the size
+    "layout",  # how the numbers of a motion are arranged was guessed
+    "orientation",  # the body is head down, or which way is up is not sure
+    "floor",  # the body is far below or above its own floor
+    "speed",  # the body moves faster than people do
+    "jump",  # the body jumps from one frame to the next
+    "body_overlap",  # parts of the body lie in each other
+    "shape",  # the body is no person's
+    "fabric",  # no cloth is like that
+    "garment",  # what the garment's file holds was guessed
+    "worn",  # it cannot be told whether the garment stays on
+)
+
+
+class Doubt(UserWarning):
+    """A warning of one sentence, ``what is so; the way out``, that is also told in ``doubts`` of ``summary.json``.
+
+    Args:
+        kind: one of :data:`KINDS`.
+        sentence: what may be wrong, with its numbers, and after a semicolon what settles it: a key, a command.
+        frames: of the rollout or file that it is about; empty for all.
+        value: the number behind it, in ``unit``.
+    """
+
+    def __init__(
+        self, kind: str, sentence: str, frames: tuple[int, ...] = (), value: float | None = None, unit: str = ""
+    ) -> None:
+        assert kind in KINDS, kind
+        super().__init__(sentence)
+        self.kind, self.frames, self.value, self.unit = kind, frames, value, unit
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON: ``kind``, ``sentence``, ``frames``, ``value``, ``unit``."""
+        frames = [int(frame) for frame in self.frames]
+        return {"kind": self.kind, "sentence": str(self), "frames": frames, "value": self.value, "unit": self.unit}
