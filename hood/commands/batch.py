@@ -131,7 +131,7 @@ def finished(config: DictConfig, digest: str, folder: Path) -> dict[str, Any] | 
     before.setdefault("stepping", now["stepping"])  # rollouts from before there were options are known by their word
     # What had no key yet was what its default says now.
     before = {**plain(load_config("rollout")), **before}
-    same = all(before.get(key) == now[key] for key in now if key not in ("resume", "output", "allow_unsound"))
+    same = all(before.get(key) == now[key] for key in now if key not in ("resume", "output", "allow_unsound", "doubts"))
     if not same or not bool(attributes["complete"]) or attributes["checkpoint_sha256"] != digest:
         return None
-    return summary if "sound" in summary else summarise(folder / "rollout.h5")
+    return summary if {"sound", "doubts"} <= set(summary) else summarise(folder / "rollout.h5")

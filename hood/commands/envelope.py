@@ -16,7 +16,7 @@ from hood.commands.envelope_report import report
 from hood.commands.envelope_tasks import Task, command_of, make_tasks, read_record, weights_of, write_inputs
 from hood.commands.rollouts_beside import Ended, interruptible, run_beside
 from hood.config import ConfigError, load_config, save_run_record, shown
-from hood.dynamics.soundness import Criteria
+from hood.evaluation.envelope import Criteria
 from hood.evaluation.envelope_prose import require_marks
 from hood.training import distributed
 

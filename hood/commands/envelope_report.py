@@ -16,9 +16,9 @@ from omegaconf import DictConfig
 from hood.commands.envelope_tasks import REFERENCE, Task, read_record, weights_of
 from hood.commands.surface_report import surface_warnings
 from hood.dynamics.recorder import read_rollout
-from hood.dynamics.soundness import Criteria
+from hood.dynamics.verdict.rule import judge_rollout
 from hood.evaluation.cells import NOMINAL
-from hood.evaluation.envelope import Run, judge, shares, table, usual_of
+from hood.evaluation.envelope import Criteria, Run, judge, shares, table, usual_of
 from hood.evaluation.envelope_figures import FIGURES, at_same_times, figures
 from hood.evaluation.envelope_prose import write_section
 from hood.evaluation.grid import NEWTON
@@ -89,7 +89,8 @@ def read_found(task: Task, folder: Path) -> Found:
         return Found(Run(code, error, late=code < 0 and bool(error)))
     surface = summary.get("surface")
     warnings = (*summary.get("warnings", ()), *(() if surface is None else surface_warnings(surface)))
-    unsound = tuple(summary.get("unsound_reasons", ())) if summary.get("sound") is False else ()
+    verdict = judge_rollout(data)  # of today's rule, whenever the rollout was made
+    unsound = verdict.sentences if verdict.sound is False else ()
     finite = np.isfinite(data.cloth_pos).all(axis=(1, 2))
     run = Run(code, error, warnings, unsound, {**data.metrics, "finite": finite})
     return Found(run, data.cloth_pos, float(data.attributes["dt"]))

@@ -9,7 +9,8 @@ EXIT_CODES = {
     0: "done",
     1: "inspect: something needs repair",
     2: "an error, told in one line",
-    UNSOUND: "rollout: a result is unsound, or guard=strict ended it; see sound, unsound_reasons and guard in summary.json",
+    UNSOUND: "rollout: a result is unsound, or guard=strict ended it, or doubts=refuse and it has doubts; see sound, reasons, "
+    "doubts and guard in summary.json",
     130: "interrupted",
 }
 

@@ -35,7 +35,8 @@ from hood.commands.output_fps import summarise_rate
 from hood.commands.placing import explain_unplaced, find_place, unit_alone
 from hood.dynamics import ranges
 from hood.dynamics.recorder import read_rollout
-from hood.dynamics.soundness import judge_rollout, worst_frame
+from hood.dynamics.verdict.frames import worst_frame
+from hood.dynamics.verdict.rule import judge_rollout
 from hood.mesh.defects import Defects, find_defects
 from hood.mesh.quality import check_triangles
 from hood.mesh.topology import boundary_loops
@@ -326,7 +327,11 @@ def inspect_rollout(name: str) -> Finding:
         finding.facts["worst strain p99"] = f"{worst[0]:.1%} in frame {worst[1]}"
     if not verdict.sound:
         state = "not judged" if verdict.sound is None else "unsound"
-        finding.problem(f"{state}: {'; '.join(verdict.reasons)}", _SIMULATE_AGAIN)
+        finding.problem(f"{state}: {'; '.join(verdict.sentences)}", _SIMULATE_AGAIN)
+    for doubt in verdict.doubts:
+        what, _, fix = str(doubt["sentence"]).rpartition("; ")
+        finding.problem(f"doubt: {what or fix}", fix if what else "")
+    finding.facts |= {"not counted": list(verdict.notes)} if verdict.notes else {}
     guarded = summarise_guard(data).get("guard", {})
     if guarded.get("sentence"):
         finding.facts["guard"] = guarded["sentence"].removeprefix("guard: ")

@@ -15,9 +15,9 @@ from hood.config import ConfigError, build, require_choice
 from hood.dynamics.alarms import CHECK, CUT, FINITE, FORCE, INSIDE, SPEED, STRAIN, TARGET, TURN, Alarm
 from hood.dynamics.guard import CHECK_EVERY, MODES, Guard
 from hood.dynamics.recorder import RolloutData, RolloutWriter
-from hood.dynamics.soundness import name_frames
 from hood.dynamics.step_repair import LEFT, REFINED, SOLVED
 from hood.dynamics.stepper import Stepper
+from hood.dynamics.verdict.frames import name_frames
 from hood.losses.potential import Potential
 
 OFF, REPAIR, STRICT = "off", "repair", "strict"

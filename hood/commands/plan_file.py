@@ -19,7 +19,7 @@ from hood.assets.files.atomic import write_atomically
 from hood.assets.files.guarded import check_size
 from hood.commands.plan_content import content_digest
 from hood.config import ConfigError, load_config
-from hood.dynamics.soundness import name_frames
+from hood.dynamics.verdict.frames import name_frames
 from hood.dynamics.watched import PLAN_METRICS
 
 FORMAT = "hood-plan/1"

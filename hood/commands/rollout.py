@@ -16,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from hood.assets.files.atomic import write_atomically
+from hood.assets.files.doubt import Doubt
 from hood.assets.files.folder_lock import occupy
 from hood.commands.automatic import advice
 from hood.commands.batch import Job, find_jobs, finished, share
@@ -32,7 +33,7 @@ from hood.commands.event_report import describe_held, summarise_held
 from hood.commands.events import fastening_attributes
 from hood.commands.export import check_outputs, export_beside
 from hood.commands.guarding import OFF, GuardStopped, guard_sentences, make_guard, write_alarms
-from hood.commands.notices import heard
+from hood.commands.notices import Heard, heard
 from hood.commands.output_fps import at_output_fps, planned_steps
 from hood.commands.plan_auto import planned, without_accuracy
 from hood.commands.plan_file import plan_mode, plan_path, plan_sentences, rollout_config, summarise_plan
@@ -71,7 +72,7 @@ def _run(config: DictConfig) -> int:
     if distributed.rank() != 0:
         return 0
     summary, interrupted = _run_one(config, *make_stepper(config))
-    return 130 if interrupted else exit_code([summary], bool(config.allow_unsound))
+    return 130 if interrupted else exit_code([summary], bool(config.allow_unsound), str(config.doubts))
 
 
 def _run_one(config: DictConfig, stepper: Stepper, digest: str, advise: bool = True) -> tuple[dict[str, Any], bool]:
@@ -99,9 +100,7 @@ def _first_positions(path: Path, count: int) -> np.ndarray:
         return np.asarray(file["cloth/pos"][0, :count], dtype=np.float64)
 
 
-def _run_heard(
-    config: DictConfig, stepper: Stepper, digest: str, warned: list[str], advise: bool
-) -> tuple[dict[str, Any], bool]:
+def _run_heard(config: DictConfig, stepper: Stepper, digest: str, warned: Heard, advise: bool) -> tuple[dict[str, Any], bool]:
     """The rollout of one motion; ``warned`` is what has been warned about when the summary is written."""
     ready = set_up(config, stepper)
     check_worn(read_textures(config), ready.scene.garment)
@@ -109,14 +108,14 @@ def _run_heard(
         return _run_there(ready, config, digest, warned, advise)
 
 
-def _run_there(ready: Setup, asked: DictConfig, digest: str, warned: list[str], advise: bool) -> tuple[dict[str, Any], bool]:
+def _run_there(ready: Setup, asked: DictConfig, digest: str, warned: Heard, advise: bool) -> tuple[dict[str, Any], bool]:
     """The rollout in its folder, which is there and held."""
     config, scene, stepper = ready.config, ready.scene, ready.stepper
     folder = output_folder(config)
     remove_earlier(folder, config)
     save_run_record(folder, config, int(config.seed))
     eases: list[Ease | None] = []
-    interrupted = _simulate_to_disk(ready, digest, folder / "rollout.h5", asked, eases)
+    interrupted = _simulate_to_disk(ready, digest, folder / "rollout.h5", asked, eases, warned.doubts)
     summary = summarise(folder / "rollout.h5")
     if eases:
         summary |= summarise_ease(eases[0], eases[-1])
@@ -174,12 +173,15 @@ def _run_all(config: DictConfig, jobs: list[Job], output: Path) -> int:
         return 130
     if any("error" in row for row in outcome.rows.values()):
         return 2
-    return exit_code(outcome.rows.values(), bool(config.allow_unsound))
+    return exit_code(outcome.rows.values(), bool(config.allow_unsound), str(config.doubts))
 
 
-def _simulate_to_disk(ready: Setup, digest: str, path: Path, asked: DictConfig, eases: list[Ease | None]) -> bool:
-    """Stream the rollout into ``path``; True when the user interrupted it. ``asked`` is the config with ``auto`` in it. Where a
-    size was asked for, how the garment sat is added to ``eases``, at the beginning and the end."""
+def _simulate_to_disk(
+    ready: Setup, digest: str, path: Path, asked: DictConfig, eases: list[Ease | None], doubts: Sequence[Doubt]
+) -> bool:
+    """Stream the rollout into ``path``; True when the user interrupted it. ``asked`` is the config with ``auto`` in it,
+    ``doubts`` those about its inputs. Where a size was asked for, how the garment sat is added to ``eases``, at the beginning
+    and the end."""
     config, scene, stepper, potential = ready.config, ready.scene, ready.stepper, ready.potential
     guard = make_guard(config, stepper, potential)
     count = min(int(config.num_frames), scene.num_frames)
@@ -198,6 +200,7 @@ def _simulate_to_disk(ready: Setup, digest: str, path: Path, asked: DictConfig, 
         "surface_stride": int(config.surface_stride),
         "cloth_contact_off": why_not(config),
         "guard": OFF if guard is None else guard.mode,
+        "doubts": [doubt.as_dict() for doubt in doubts],
         **fastening_attributes(scene),
     }
     steps, finer = planned_steps(config, scene, count), finer_mesh(config, scene)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,10 +29,13 @@ from hood.commands.refine_mesh import check_refine_mesh
 from hood.commands.refinement import AUTO, check_refinement, chosen, refined
 from hood.commands.resizing import checked_sizes, cut_to_size
 from hood.commands.steppers import PLAIN, make_network, make_solver, option_of
+from hood.commands.verdict import DOUBTS
 from hood.config import ConfigError, load_config, require_choice
 from hood.dynamics.captured import MODES, network_of
 from hood.dynamics.rollout import METRIC_CHOICES, SETTLE_CHOICES, own_start
 from hood.dynamics.stepper import Stepper
+from hood.dynamics.verdict.body import doubt_body
+from hood.dynamics.verdict.fabric import doubt_fabric
 from hood.dynamics.watched import WatchedStepper
 from hood.losses.potential import Potential
 from hood.nn.compiled import KERNELS
@@ -58,6 +62,7 @@ def check_config(config: DictConfig) -> None:
     require_choice(config, "video", ("mp4", "gif", "none"))
     require_choice(config, "metrics", METRIC_CHOICES)
     require_choice(config, "settle", SETTLE_CHOICES)
+    require_choice(config, "doubts", DOUBTS)
     _check_numbers(config)
     checked_fabrics(config)
     checked_sizes(config)
@@ -102,6 +107,8 @@ def set_up(
     stepper = refined(stepper, settled, scene.cloth.num_vertices, potential_of(settled))
     _check_start(settled, stepper, scene, tell)
     tell_if_off(settled, 1 if scene.outfit is None else len(scene.outfit.names))
+    for doubt in (*doubt_body(scene.motion, int(settled.num_frames)), *doubt_fabric(scene.cloth, scene.garment.name)):
+        warnings.warn(doubt, stacklevel=2)
     warn(scene_cautions(stepper, scene, losses_of(settled), str(settled.checkpoint)))
     for sentence in known_by_slope(stepper, losses_of(settled)):
         tell(sentence)

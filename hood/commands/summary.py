@@ -59,6 +59,7 @@ def summarise(path: Path) -> dict[str, Any]:
         "surface": summarise_surface(data.step_metrics, _stride(data.attributes)),
         "potential_mean_J": _mean(metrics["energy_total"]),
         "potential_inertial_guess_mean_J": _mean(metrics["energy_inertial_guess"]),
+        "distance_p99_median_m": _median(metrics["distance_p99"]),
         "relative_gradient_median": _median(metrics["relative_gradient"]),
         "ms_per_frame": times,
         **solver,
@@ -109,12 +110,14 @@ def describe_all(rows: Mapping[str, Mapping[str, Any]], total: int) -> str:
             f"{_percent(row['penetration_share_mean'])} of the vertices inside the body, {cut_at_worst(row.get('surface'))}"
             + ("; finished before, skipped" if row.get("skipped") else "")
             + (f"; UNSOUND: {row['unsound_reasons'][0]}" if row["sound"] is False else "")
+            + (f"; doubt: {row['doubts'][0]['sentence']}" if row.get("doubts") else "")
         )
     failed = sum("error" in row for row in rows.values())
     unsound = sum(row.get("sound") is False for row in rows.values())
+    doubtful = sum(bool(row.get("doubts")) for row in rows.values())
     skipped = sum(bool(row.get("skipped")) for row in rows.values())
     parts = [f"{len(rows) - failed} of {total} motions simulated"]
-    parts += [f"{count} {what}" for count, what in ((failed, "failed"), (unsound, "unsound")) if count]
+    parts += [f"{count} {what}" for count, what in ((failed, "failed"), (unsound, "unsound"), (doubtful, "doubtful")) if count]
     before = f"; {skipped} of them finished before and skipped now" if skipped else ""
     return "\n".join([*lines, ", ".join(parts) + before])
 

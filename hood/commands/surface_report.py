@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from hood.dynamics.soundness import Criteria
+from hood.limits import CUT_UNSOUND
 
 #: A frame with a larger share of cut triangles is warned about.
-WORST_CUT = Criteria().cut_share
+WORST_CUT = CUT_UNSOUND.value
 
 
 def summarise_surface(metrics: Mapping[str, np.ndarray], stride: int | None) -> dict[str, Any] | None:

@@ -53,7 +53,6 @@ import torch
 from hood.dynamics.alarms import CHECK, CUT, FINITE, FORCE, INSIDE, SPEED, STRAIN, TARGET, TURN, Alarm
 from hood.dynamics.refine import RefinedStepper
 from hood.dynamics.simulator import Prediction
-from hood.dynamics.soundness import Criteria
 from hood.dynamics.step_repair import (
     ENOUGH,
     LEFT,
@@ -66,6 +65,7 @@ from hood.dynamics.step_repair import (
     step_quality,
 )
 from hood.dynamics.stepper import Stepper
+from hood.limits import CUT_ALARM, INSIDE_ALARM, STRAIN_ALARM, STRAIN_RATIO
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
 from hood.scene.held_off import ALLOWED
@@ -77,9 +77,9 @@ from hood.solver.step_figures import StepFigures
 #: What a guard does about an alarm: writes it down, mends the step, or ends the rollout; ``off`` is no guard.
 MODES = ("report", "repair", "strict", "off")
 
-STRAIN_LIMIT, CUT_LIMIT = Criteria.strain, 0.02
+STRAIN_LIMIT, CUT_LIMIT = STRAIN_ALARM.value, CUT_ALARM.value
 #: Depth of a vertex in the body [m].
-DEPTH_LIMIT = Criteria.depth
+DEPTH_LIMIT = INSIDE_ALARM.value
 #: A body that turns by more degrees, or moves by more metres, in a step.
 TURN_LIMIT, SPEED_LIMIT = 15.0, 0.3
 #: Unbalanced force: of a network's typical vertex, or of the whole cloth where a solver or a refinement took the step.
@@ -93,7 +93,7 @@ _WARY = 0.3
 #: The force limit is at least so many times the median of the last calm steps, once there are some.
 FORCE_FACTOR, _WINDOW, _LEAST = 5.0, 30, 10
 #: The strain limit is at least so many times the strain of the last step that was solved for its strain.
-_STRAIN_RATIO = Criteria.strain_ratio
+_STRAIN_RATIO = STRAIN_RATIO.value
 #: Of a network alone every so many steps are held against a solver that goes on from there so many iterations; their strains
 #: may differ by so much.
 CHECK_EVERY, _CHECK_ITERATIONS, CHECK_LIMIT = 20, 10, 0.03

@@ -8,7 +8,8 @@ from html import escape
 
 import numpy as np
 
-from hood.dynamics.soundness import Criteria
+from hood.evaluation.envelope import Criteria
+from hood.limits import CUT_UNSOUND
 
 #: Pixels of a panel, of the gap between two and around them, and points of a curve at most.
 _WIDTH, _HEIGHT, _GAP, _EDGE, _POINTS = 320, 120, 56, 30, 120
@@ -30,7 +31,7 @@ def curve_svg(curve: Curve, solver: Curve | None, name: str, criteria: Criteria)
     """
     panels = (
         ("strain p99", "strain_p99", criteria.strain),
-        ("share of triangles cut by the skin", "cut_face_share", criteria.cut_share),
+        ("share of triangles cut by the skin", "cut_face_share", CUT_UNSOUND.value),
     )
     width, height = 2 * _WIDTH + _GAP + 2 * _EDGE, _HEIGHT + 2 * _EDGE
     parts = []

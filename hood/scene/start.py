@@ -5,13 +5,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from hood.limits import STRAIN_START
 from hood.scene.cloth import Cloth
 from hood.scene.contact import Contact, find_contact
 from hood.scene.reach import sag
 from hood.scene.state import Obstacle
 
 #: Edges may start this much longer or shorter than at rest; beyond it they are projected back.
-_STRAIN_LIMIT = 0.04
+_STRAIN_LIMIT = STRAIN_START.value
 _SEARCH_EVERY = 10
 #: A thorough start goes on while a free edge is stretched by more than the first, for at most so many iterations. Meanwhile
 #: cloth may be compressed by as much as the second: it buckles later, and gives way.

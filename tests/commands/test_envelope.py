@@ -15,8 +15,8 @@ from hood.commands import envelope, envelope_tasks
 from hood.commands.envelope_tasks import REFERENCE, Task, command_of, make_tasks, write_inputs
 from hood.commands.rollouts_beside import Ended, run_beside
 from hood.config import ConfigError, load_config
-from hood.dynamics.soundness import Criteria
 from hood.evaluation.cells import NOMINAL, Cell, cells
+from hood.evaluation.envelope import Criteria
 
 NO_TIME = Cell("input", "no time", ("fps=0",), bad_input="fps")
 

@@ -19,7 +19,7 @@ from hood.commands.findings import inspect_rollout
 from hood.dynamics.recorder import RolloutData, read_rollout
 from hood.dynamics.refined_frames import refined_frames
 from hood.dynamics.rollout import Frame
-from hood.dynamics.soundness import judge_rollout
+from hood.dynamics.verdict.rule import judge_rollout
 from hood.media.colouring import colouring_of, vertex_strain
 from hood.media.exports.clip import clip_of
 from hood.mesh.crossing import self_crossings

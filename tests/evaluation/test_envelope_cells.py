@@ -10,7 +10,6 @@ import pytest
 
 from hood.assets.extremes.garments import FAULTS
 from hood.assets.extremes.motions import MOTIONS
-from hood.dynamics.soundness import Criteria
 from hood.evaluation.cells import NOMINAL, ORDERED, Cell, cells
 from hood.evaluation.envelope import (
     DEGRADED,
@@ -18,6 +17,7 @@ from hood.evaluation.envelope import (
     REFUSED,
     SILENT,
     SOUND,
+    Criteria,
     Run,
     form,
     judge,

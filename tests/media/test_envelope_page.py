@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from hood.dynamics.recorder import RolloutWriter
-from hood.dynamics.soundness import Criteria
-from hood.evaluation.envelope import CLASSES, REFUSED, SILENT, SOUND, Judged
+from hood.evaluation.envelope import CLASSES, REFUSED, SILENT, SOUND, Criteria, Judged
 from hood.evaluation.envelope_figures import FIGURES
 from hood.media.envelope_curve import Curve, curve_svg
 from hood.media.envelope_page import View, write_page

@@ -18,6 +18,7 @@ KINDS = (
     "fabric",  # no cloth is like that
     "garment",  # what the garment's file holds was guessed
     "worn",  # it cannot be told whether the garment stays on
+    "guard",  # the guard of a rollout saw something that was not mended
 )
 
 

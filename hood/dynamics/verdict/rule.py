@@ -1,0 +1,133 @@
+"""The rule: whether a rollout can be trusted. One for what makes rollouts and for what reads them.
+
+A rollout is unsound
+
+- with a frame that is not finite;
+- with a part of the garment that has come off (:mod:`hood.dynamics.verdict.worn`);
+- with bad frames among more than 2% of those after the fifth. A frame is bad where the cloth is torn, its step ended too far
+  from the minimum, the skin comes through the cloth, or cloth through cloth. What is measured in every n-th frame stands for
+  those up to the next; of five frames or fewer all after the start must be bad.
+
+The numbers are those of :mod:`hood.limits`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hood.dynamics.recorder import RolloutData
+from hood.dynamics.verdict.cause import Cause
+from hood.dynamics.verdict.causes import causes_of, strain_of
+from hood.dynamics.verdict.frames import name_frames, runs_of, worst_frame
+from hood.dynamics.verdict.solved import unknown_steps
+from hood.dynamics.verdict.surface import drawn
+from hood.dynamics.verdict.unworn import worn_causes
+from hood.limits import SETTLING, TOLERATED
+
+
+@dataclass(frozen=True)
+class Reason:
+    """Why a rollout is unsound."""
+
+    kind: str  # a stable word, see :data:`hood.dynamics.verdict.causes.KINDS`
+    sentence: str
+    frames: tuple[tuple[int, int], ...] = ()  # runs of bad frames, first and last
+    value: float | None = None  # the worst
+    frame: int | None = None  # where that is
+    limit: float | None = None
+    unit: str = ""
+    part: int | None = None  # of the garment, from 1
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {**self.__dict__, "frames": [list(run) for run in self.frames]}
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Sound, unsound, or, with None, not known."""
+
+    sound: bool | None
+    reasons: tuple[Reason, ...] = ()  # why unsound, or what is missing
+    doubts: tuple[dict[str, Any], ...] = ()  # :meth:`hood.assets.files.doubt.Doubt.as_dict`
+    notes: tuple[str, ...] = ()  # what was seen and does not count, and why
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """The reasons in words."""
+        return tuple(reason.sentence for reason in self.reasons)
+
+
+def judge_rollout(data: RolloutData) -> Verdict:
+    """The verdict on the simulated frames of a rollout that was read back."""
+    finite = data.step_finite
+    if len(finite) == 0:
+        return Verdict(None, (Reason("empty", "it holds no frame"),))
+    seen = drawn(data)
+    off, found = worn_causes(data, seen), causes_of(data, seen)
+    reasons = [] if finite.all() else [_not_finite(finite)]
+    reasons += [_reason(cause, np.ones(len(finite), dtype=bool), "frames") for cause in off.causes]
+    judged = _judged(len(finite))
+    bad = np.any([cause.spread for cause in found.causes], axis=0) & judged if found.causes else np.zeros_like(judged)
+    few = len(finite) <= SETTLING.value
+    if bad.sum() > (judged.sum() - 1 if few else TOLERATED.value * judged.sum()):
+        among = "frames" if few else "frames after the fifth"
+        reasons += [_reason(cause, judged, among) for cause in found.causes if (cause.bad & judged).any()]
+    doubts = (*stored_doubts(data), *(doubt.as_dict() for doubt in (*off.doubts, *found.doubts)))
+    notes = (*off.notes, *found.notes)
+    if reasons:
+        return Verdict(False, tuple(reasons), doubts, notes)
+    missing = _missing(data, judged)
+    return Verdict(None if missing else True, missing, doubts, notes)
+
+
+def stored_doubts(data: RolloutData) -> tuple[dict[str, Any], ...]:
+    """Doubts about the inputs that the rollout was made from, as its file holds them; files from before hold none."""
+    text = data.attributes.get("doubts")
+    return () if text is None else tuple(json.loads(str(text)))
+
+
+def _judged(count: int) -> np.ndarray:
+    """(S,) bool: the frames after the fifth; of few all after the start, or the start alone."""
+    first = int(SETTLING.value) if count > SETTLING.value else min(1, count - 1)
+    return np.arange(count) >= first
+
+
+def _not_finite(finite: np.ndarray) -> Reason:
+    text = f"{(~finite).sum()} of {len(finite)} frames are not finite: {name_frames(~finite)}"
+    return Reason("not_finite", text, tuple(runs_of(~finite)))
+
+
+def _reason(cause: Cause, judged: np.ndarray, among: str) -> Reason:
+    which = cause.bad & judged
+    worst = None if cause.values is None else worst_frame(np.where(which, cause.values, np.nan))
+    counted = judged if cause.measured is None else judged & cause.measured
+    text = f"{cause.text} in {which.sum()} of {counted.sum()} {among}: {name_frames(which)}"
+    if cause.whole:
+        text = cause.text
+    elif worst is not None:
+        text = f"{text}, worst {cause.shown(worst[0])} in frame {worst[1]}"
+    value, frame = (None, None) if worst is None else worst
+    return Reason(cause.kind, text, tuple(runs_of(which)), value, frame, cause.limit, cause.unit, cause.part)
+
+
+def _missing(data: RolloutData, judged: np.ndarray) -> tuple[Reason, ...]:
+    """What has to be known before a rollout is called sound, and is not."""
+    if strain_of(data) is None:
+        text = "the strain of simulated frames that are not stored was not measured; metrics=strain measures it"
+        return (Reason("strain", text),)
+    unknown = unknown_steps(data.step_metrics, judged)
+    if unknown is None:
+        return ()
+    text = f"how far the steps to {name_frames(unknown)} ended from their minimum was not measured, so it cannot be judged"
+    return (Reason("distance", f"{text}; metrics=all measures it", tuple(runs_of(unknown))),)
+
+
+def sentences(reasons: Sequence[dict[str, Any]]) -> list[str]:
+    """Of reasons or doubts as JSON holds them."""
+    return [str(one["sentence"]) for one in reasons]

@@ -1,0 +1,119 @@
+"""Parts of a garment that have come off the body, in words."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+
+from hood.assets.files.doubt import Doubt
+from hood.dynamics.recorder import RolloutData
+from hood.dynamics.verdict.cause import Cause, Found
+from hood.dynamics.verdict.surface import Drawn
+from hood.dynamics.verdict.worn import Wear, measure_wear
+from hood.limits import AWAY_UNSOUND, SLIPPED_UNSOUND, TOLERATED
+
+#: Stored frames that are looked at, at most.
+_LOOKED_AT = 60
+
+
+def worn_causes(data: RolloutData, seen: Drawn) -> Found:
+    """Every part of the garment that has left its place on the body, by frames. Nothing without a body, with ``worn=false``,
+    and from the first event on that lets go of held cloth."""
+    config = _config(data)
+    if config.get("worn", True) is False or not len(seen.body_faces) or not len(seen.faces):
+        return Found()
+    last = _detached(config, data, len(seen.cloth))
+    notes = _note_on_events(seen, last)
+    finite = np.isfinite(seen.cloth[:last]).all(axis=(1, 2))
+    usable = np.flatnonzero(finite)
+    if not len(usable) or usable[0] != 0:
+        return Found(notes=notes)
+    chosen = usable[np.unique(np.linspace(0, len(usable) - 1, min(len(usable), _LOOKED_AT)).astype(np.int64))]
+    wear = measure_wear(seen.cloth, seen.faces, seen.body, seen.body_faces, chosen.tolist())
+    if wear is None:
+        return Found(notes=notes)
+    found = Found(notes=notes)
+    for part in range(len(wear.num_vertices)):
+        found += _of_part(data, seen, wear, part)
+    return found
+
+
+def _of_part(data: RolloutData, seen: Drawn, wear: Wear, part: int) -> Found:
+    away, slipped = wear.away[:, part], wear.slipped[:, part]
+    if not np.isfinite(away).any():
+        return Found(doubts=[_not_worn_at_first(data, wear, part)])
+    off = (away > AWAY_UNSOUND.value) | (np.nan_to_num(slipped) > SLIPPED_UNSOUND.value)
+    # What has come off stays off; a film does not show a moment.
+    if not (off[-1] or off.mean() > TOLERATED.value and off.sum() > 1):
+        return Found()
+    first = int(np.argmax(off))
+    count, frames = len(data.step_finite), seen.step[wear.frames]
+    bad = np.zeros(count, dtype=bool)
+    for place in np.flatnonzero(off).tolist():
+        until = frames[place + 1] if place + 1 < len(frames) else count
+        bad[frames[place] : until] = True
+    values = np.full(count, np.nan)
+    values[frames] = np.fmax(away, slipped)
+    by_rim = away[first] <= AWAY_UNSOUND.value
+    way, limit = (slipped, SLIPPED_UNSOUND) if by_rim else (away, AWAY_UNSOUND)
+    how = "its openings have slipped along the body" if by_rim else "it is away from where it was on the body"
+    text = (
+        f"{name_part(data, wear, part)} has come off: from frame {frames[first]} on {how}, by "
+        f"{np.nanmax(way):.2f} m at worst (beyond {limit.value:.2f})"
+    )
+    return Found([Cause("not_worn", text, bad, values, limit.value, limit.unit, ".2f", part=part + 1, whole=True)])
+
+
+def _not_worn_at_first(data: RolloutData, wear: Wear, part: int) -> Doubt:
+    text = (
+        f"{name_part(data, wear, part)} is not worn in frame 0, it is {100 * wear.gap[part]:.0f} cm from the body or hardly "
+        "touches it, so nobody can tell whether it stays on; worn=false says that it need not"
+    )
+    return Doubt("worn", text, (0,), float(wear.gap[part]), "m")
+
+
+def name_part(data: RolloutData, wear: Wear, part: int) -> str:
+    """A part in words: the garment, or its number, vertices and the lowest of them."""
+    garment = str(data.attributes.get("garment", "garment"))
+    if len(wear.num_vertices) == 1:
+        return repr(garment)
+    piece, names = data.still.get("piece"), garment.split("+")
+    if piece is not None and len(names) == len(wear.num_vertices) and len(np.unique(piece)) == len(names):
+        return repr(names[int(piece[wear.first_vertex[part]])])
+    return (
+        f"part {part + 1} of {len(wear.num_vertices)} of {garment!r} ({wear.num_vertices[part]} vertices, the lowest is "
+        f"{wear.first_vertex[part]})"
+    )
+
+
+def _note_on_events(seen: Drawn, last: int) -> list[str]:
+    if last >= len(seen.cloth):
+        return []
+    return [f"whether the garment stays on is not judged from frame {seen.step[last]} on, where an event lets go of it"]
+
+
+def _detached(config: dict[str, Any], data: RolloutData, count: int) -> int:
+    """The first stored frame at which an event lets go of held cloth; ``count`` where none does."""
+    events = config.get("events") or []
+    moments = [_moment(event, data) for event in events if isinstance(event, dict) and "detach" in event]
+    if not moments:
+        return count
+    return int(np.searchsorted(data.time, min(moments) - 1e-9))
+
+
+def _moment(event: dict[str, Any], data: RolloutData) -> float:
+    if "time" in event:
+        return float(event["time"])
+    times, frame = data.step_time, int(event["frame"])
+    return float(times[frame]) if frame < len(times) else np.inf
+
+
+def _config(data: RolloutData) -> dict[str, Any]:
+    """The settings that the rollout was made with; files from before may lack them."""
+    try:
+        found = json.loads(str(data.attributes.get("config", "{}")))
+    except ValueError:
+        return {}
+    return found if isinstance(found, dict) else {}

@@ -1,0 +1,92 @@
+"""Whether a viewer can see a place: from one of many sides nothing of cloth and body lies before it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+#: Sides that are looked from: degrees around the vertical, and above the horizon. Nobody looks from under the floor.
+_AROUND, _ABOVE = np.arange(0.0, 360.0, 30.0), (-15.0, 15.0, 45.0)
+#: Width [m] of what is looked through, and how far [m] a place may lie behind the foremost surface there.
+_CELL, _BEHIND = 0.008, 0.012
+#: Surfaces are sampled a little finer than that.
+_SPACING = 0.006
+_MOST_PARTS = 24
+
+
+def visible(places: np.ndarray, surfaces: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """Which of ``places`` (N, 3) [m] can be seen, (N,) bool.
+
+    Args:
+        surfaces: positions (V, 3) [m] and faces (F, 3) of all that can hide them.
+    """
+    seen = np.zeros(len(places), dtype=bool)
+    if not len(places):
+        return seen
+    points = np.concatenate([sampled(pos, faces) for pos, faces in surfaces]).T.copy()
+    for towards in _directions():
+        right, up = _across(towards)
+        seen |= _foremost(places.T, points, (right, up, towards))
+    return seen
+
+
+def _foremost(places: np.ndarray, points: np.ndarray, axes: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
+    """Which places (3, N) are not behind a point (3, M), seen along the third of the ``axes``."""
+    right, up, towards = axes
+    across, height = _along(right, places), _along(up, places)
+    left, low = across.min() - _CELL, height.min() - _CELL
+    width = int(np.ceil((height.max() + _CELL - low) / _CELL)) + 1
+    x = _along(right, points)
+    points = points[:, (x >= left) & (x <= across.max() + _CELL)]
+    y = _along(up, points)
+    points = points[:, (y >= low) & (y <= height.max() + _CELL)]
+    cells = [
+        np.floor((u - left) / _CELL).astype(np.int64) * width + np.floor((v - low) / _CELL).astype(np.int64)
+        for u, v in ((across, height), (_along(right, points), _along(up, points)))
+    ]
+    front = np.full(int(cells[0].max()) + 1, -np.inf)
+    within = cells[1] < len(front)
+    np.maximum.at(front, cells[1][within], _along(towards, points)[within])
+    return np.asarray(_along(towards, places) >= front[cells[0]] - _BEHIND)
+
+
+def _along(axis: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Coordinates (N,) of points (3, N); written out, as a product of matrices so narrow is slow in some libraries."""
+    return np.asarray(axis[0] * points[0] + axis[1] * points[1] + axis[2] * points[2])
+
+
+def sampled(pos: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Points (M, 3) of a surface, no farther than some millimetres from each other."""
+    corners = pos[faces]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    parts = np.clip(np.ceil(longest / _SPACING), 1, _MOST_PARTS).astype(np.int64)
+    clouds = [pos]
+    for count in np.unique(parts):
+        weights = _grid(int(count))
+        clouds.append(np.einsum("wk,fkx->fwx", weights, corners[parts == count]).reshape(-1, 3))
+    return np.concatenate(clouds)
+
+
+def _grid(parts: int) -> np.ndarray:
+    """Barycentric weights (W, 3) of the middles of a triangle's ``parts``² pieces."""
+    rows = []
+    for i in range(parts):
+        for j in range(parts - i):
+            rows.append((i + 1 / 3, j + 1 / 3))
+            if i + j < parts - 1:
+                rows.append((i + 2 / 3, j + 2 / 3))
+    first, second = np.array(rows).T / parts
+    return np.stack([first, second, 1.0 - first - second], axis=1)
+
+
+def _directions() -> np.ndarray:
+    """Unit vectors (D, 3) towards the viewer, y up."""
+    around, above = (values.ravel() for values in np.meshgrid(np.radians(_AROUND), np.radians(_ABOVE)))
+    return np.stack([np.cos(above) * np.sin(around), np.sin(above), np.cos(above) * np.cos(around)], axis=1)
+
+
+def _across(towards: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    right = np.cross([0.0, 1.0, 0.0], towards)
+    right /= np.linalg.norm(right)
+    return right, np.cross(towards, right)

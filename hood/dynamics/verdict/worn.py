@@ -1,0 +1,215 @@
+"""Whether a garment stays where it was worn: each of its parts against the region of the body that it started on.
+
+Two lengths say so, of every part that is worn in frame 0:
+
+- *away*: how much farther its vertices are from their region of the body than they were from the body in frame 0, the median
+  over the vertices that touched it there;
+- *slipped*: the same for the vertices of an opening that lies around a limb, the median over such openings (of two the lesser:
+  one of them holds the garment); an opening with no limb in it any more counts as a metre.
+
+The region of a vertex are the points of the body within 15 cm, along the skin, of its nearest one in frame 0. Swinging hems,
+open jackets and crossed arms stay near their regions; trousers around the ankles do not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
+
+from hood.mesh.topology import boundary_loops, connected_components, unique_edges
+
+#: A vertex nearer than this [m] to the body touches it; the region of a vertex reaches so far [m] along the skin.
+TOUCHES, _REGION = 0.03, 0.15
+#: An opening lies around a limb where so many edges of the body go through it and this share of its vertices touches the body.
+_THROUGH, _TIGHT = 6, 0.6
+#: Shorter openings [m] are buttonholes and slits.
+_LEAST_OPENING = 0.12
+#: A part of which fewer vertices touch the body, and no limb goes through any opening, is not worn.
+_LEAST_TOUCHING = 0.05
+#: Vertices of a part that are looked at, at most: their median is what is asked for.
+_MOST_LOOKED_AT = 300
+#: What an opening that has lost its limb has slipped by [m].
+_LOST = 1.0
+#: Bodies with longer edges [m] get points between their vertices.
+_COARSE = 0.04
+
+
+@dataclass(frozen=True)
+class Wear:
+    """How far every part has got from where it was worn. NaN: the part is not worn in frame 0, or has no such opening."""
+
+    frames: np.ndarray  # (S,) that were looked at
+    away: np.ndarray  # (S, P) m
+    slipped: np.ndarray  # (S, P) m
+    num_vertices: np.ndarray  # (P,) of each part
+    first_vertex: np.ndarray  # (P,) the lowest of each part
+    gap: np.ndarray  # (P,) m, between part and body in frame 0
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Vertices of a part that are followed, with the points of the body around each."""
+
+    vertices: np.ndarray  # (N,)
+    region: np.ndarray  # (N, K) points of the body, the first repeated
+    start: np.ndarray  # (N,) m, from the body in frame 0
+    is_opening: bool = False
+
+    def away(self, pos: np.ndarray, body: np.ndarray) -> float:
+        """Median over its vertices of how much farther from their regions than in frame 0 they are [m]."""
+        dist_sq = ((pos[self.vertices][:, None] - body[self.region]) ** 2).sum(axis=2).min(axis=1)
+        return float(np.median(np.sqrt(dist_sq) - self.start))
+
+
+class WearMeter:
+    """Measures frames of a garment that is worn by a body in the first of them.
+
+    Args:
+        pos: (V, 3) m, the cloth in frame 0.
+        faces: (F, 3) of the cloth.
+        body_pos: (W, 3) m, in frame 0.
+        body_faces: (G, 3); at least one.
+    """
+
+    def __init__(self, pos: np.ndarray, faces: np.ndarray, body_pos: np.ndarray, body_faces: np.ndarray) -> None:
+        self._body_edges = unique_edges(body_faces)
+        self._between = _edges_to_split(body_pos, self._body_edges)
+        body = self._points(body_pos)
+        used = np.unique(faces)
+        part = connected_components(len(pos), unique_edges(faces))
+        numbers, part_of_used = np.unique(part[used], return_inverse=True)
+        self._near = cKDTree(body[self._known(body_faces, len(body))])
+        dist, nearest = self._near.query(pos)
+        nearest = self._known(body_faces, len(body))[nearest]
+        loops = [loop for loop in boundary_loops(faces) if _length(pos[loop]) >= _LEAST_OPENING]
+        through = [num_through(pos[loop], body_pos, self._body_edges) for loop in loops]
+        self.num_vertices = np.bincount(part_of_used, minlength=len(numbers))
+        members = [used[part_of_used == number] for number in range(len(numbers))]
+        self.first_vertex = np.array([rows.min() for rows in members], dtype=np.int64)
+        self.gap = np.array([dist[rows].min() for rows in members])
+        chosen = []
+        for number, rows in zip(numbers, members, strict=True):
+            own = [(loop, count) for loop, count in zip(loops, through, strict=True) if part[loop[0]] == number]
+            chosen.append(_to_follow(rows, dist, own))
+        regions = _Regions(body, self._body_edges, self._between)
+        self._groups = [
+            [_Group(rows, regions.around(nearest[rows]), dist[rows], opening) for rows, opening in groups] for groups in chosen
+        ]
+
+    def __call__(self, pos: np.ndarray, body_pos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """``away`` (P,) and ``slipped`` (P,) [m] of one frame, see :class:`Wear`."""
+        body = self._points(body_pos)
+        away, slipped = np.full(len(self._groups), np.nan), np.full(len(self._groups), np.nan)
+        for number, groups in enumerate(self._groups):
+            rims = [self._slipped(group, pos, body, body_pos) for group in groups if group.is_opening]
+            if groups:
+                away[number] = groups[0].away(pos, body)
+            if rims:
+                slipped[number] = sorted(rims)[(len(rims) - 1) // 2]
+        return away, slipped
+
+    def _slipped(self, rim: _Group, pos: np.ndarray, body: np.ndarray, body_pos: np.ndarray) -> float:
+        if num_through(pos[rim.vertices], body_pos, self._body_edges) == 0:
+            return _LOST
+        return rim.away(pos, body)
+
+    def _points(self, body_pos: np.ndarray) -> np.ndarray:
+        """Vertices of the body, and the middles of its edges where it is coarse."""
+        if not len(self._between):
+            return body_pos
+        return np.concatenate([body_pos, body_pos[self._between].mean(axis=1)])
+
+    def _known(self, body_faces: np.ndarray, count: int) -> np.ndarray:
+        """Points that belong to a face: others are no skin."""
+        corners = np.unique(body_faces)
+        return np.concatenate([corners, np.arange(count - len(self._between), count)])
+
+
+def measure_wear(
+    pos: np.ndarray, faces: np.ndarray, body_pos: np.ndarray, body_faces: np.ndarray, frames: Sequence[int]
+) -> Wear | None:
+    """:class:`Wear` of a rollout (T, V, 3), (T, W, 3) [m] in ``frames``; None without a body, cloth, or a finite frame 0."""
+    if not len(body_faces) or not len(faces) or not (np.isfinite(pos[0]).all() and np.isfinite(body_pos[0]).all()):
+        return None
+    meter = WearMeter(pos[0].astype(np.float64), faces, body_pos[0].astype(np.float64), body_faces)
+    rows = [meter(pos[frame].astype(np.float64), body_pos[frame].astype(np.float64)) for frame in frames]
+    away, slipped = (np.array([row[which] for row in rows]) for which in range(2))
+    return Wear(np.asarray(frames), away, slipped, meter.num_vertices, meter.first_vertex, meter.gap)
+
+
+def num_through(rim: np.ndarray, body_pos: np.ndarray, body_edges: np.ndarray) -> int:
+    """How many edges of the body go through the fan of triangles between an opening (N, 3) [m] and its middle."""
+    start, end = body_pos[body_edges[:, 0]], body_pos[body_edges[:, 1]]
+    near = (np.minimum(start, end) <= rim.max(axis=0)).all(axis=1) & (np.maximum(start, end) >= rim.min(axis=0)).all(axis=1)
+    start, way = start[near], (end - start)[near]
+    if not len(start):
+        return 0
+    middle = rim.mean(axis=0)
+    first, second = rim - middle, np.roll(rim, -1, axis=0) - middle  # sides of the triangles, (N, 3)
+    normal = np.cross(first, second)
+    slope = way @ normal.T  # (E, N)
+    from_middle = start - middle
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = -(from_middle @ normal.T) / slope
+        crossed = np.cross(way, from_middle)
+        u = (crossed @ second.T) / slope
+        v = -(crossed @ first.T) / slope
+        hit = (along >= 0.0) & (along <= 1.0) & (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0)
+    return int(hit.any(axis=1).sum())
+
+
+def _to_follow(rows: np.ndarray, dist: np.ndarray, openings: list[tuple[np.ndarray, int]]) -> list[tuple[np.ndarray, bool]]:
+    """Of a part the vertices that touch the body, and its openings around a limb; nothing where it is not worn."""
+    touching = rows[dist[rows] < TOUCHES]
+    if len(touching) < _LEAST_TOUCHING * len(rows) and not any(count >= _THROUGH for _, count in openings):
+        return []
+    if not len(touching):
+        touching = rows[np.argsort(dist[rows], kind="stable")[: max(1, len(rows) // 10)]]
+    rims = [loop for loop, count in openings if count >= _THROUGH and (dist[loop] < TOUCHES).mean() >= _TIGHT]
+    return [(_some(touching), False), *((loop, True) for loop in rims)]
+
+
+def _some(rows: np.ndarray) -> np.ndarray:
+    return rows[:: -(-len(rows) // _MOST_LOOKED_AT)]
+
+
+class _Regions:
+    """Points of the body by distance along the skin."""
+
+    def __init__(self, body: np.ndarray, edges: np.ndarray, between: np.ndarray) -> None:
+        count, middles = len(body), np.arange(len(body) - len(between), len(body))
+        links = np.concatenate([edges, *(np.stack([middles, between[:, side]], axis=1) for side in range(2))])
+        lengths = np.linalg.norm(body[links[:, 0]] - body[links[:, 1]], axis=1).clip(1e-9)
+        self._graph = coo_matrix((lengths, (links[:, 0], links[:, 1])), shape=(count, count)).tocsr()
+
+    def around(self, points: np.ndarray) -> np.ndarray:
+        """(N, K): the points within 15 cm of each of ``points`` (N,), filled up with itself."""
+        own, which = np.unique(points, return_inverse=True)
+        found = [np.flatnonzero(np.isfinite(row)) for row in self._far(own)]
+        most = max((len(row) for row in found), default=1)
+        table = np.repeat(own[:, None], most, axis=1)
+        for row, near in zip(table, found, strict=True):
+            row[: len(near)] = near
+        return table[which]
+
+    def _far(self, points: np.ndarray, at_once: int = 64) -> list[np.ndarray]:
+        """Distances (W,) from each of ``points``, infinite beyond the region."""
+        rows: list[np.ndarray] = []
+        for first in range(0, len(points), at_once):
+            rows += list(dijkstra(self._graph, directed=False, indices=points[first : first + at_once], limit=_REGION))
+        return rows
+
+
+def _edges_to_split(body_pos: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """(B, 2): edges that get a point in their middle."""
+    length = np.linalg.norm(body_pos[edges[:, 0]] - body_pos[edges[:, 1]], axis=1)
+    return edges[length > _COARSE]
+
+
+def _length(rim: np.ndarray) -> float:
+    return float(np.linalg.norm(rim - np.roll(rim, 1, axis=0), axis=1).sum())

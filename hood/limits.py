@@ -1,0 +1,76 @@
+"""Limits that decide what is said of a result: each with its unit, the module that it belongs to and the reason for its value.
+
+Everything that calls a rollout unsound, doubts an input or raises an alarm takes its number from here. Limits of one quantity
+stand beside each other, so that it is seen why they differ.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Limit(NamedTuple):
+    """A number beyond which something is said."""
+
+    value: float
+    unit: str
+    owner: str  # module that applies it
+    reason: str
+
+
+class Range(NamedTuple):
+    """Least and most of what is known of a quantity."""
+
+    least: float
+    most: float
+    unit: str
+    owner: str
+    reason: str
+
+
+_RULE, _GUARD, _BODY = "hood.dynamics.verdict.rule", "hood.dynamics.guard", "hood.dynamics.verdict.body"
+
+#: Of the frames that are judged this share may be bad.
+TOLERATED = Limit(0.02, "share of frames", _RULE, "one frame in fifty is not seen in a film")
+#: Frames at the beginning that may settle; they are judged only where there are no others.
+SETTLING = Limit(5, "frames", _RULE, "a start by relaxing steps swings for a sixth of a second")
+
+#: Strain, the 99th percentile over the edges. What is torn is unsound; what no ordinary fabric does makes the guard look at the
+#: step; what would snap back makes the start be smoothed.
+STRAIN_UNSOUND = Limit(0.5, "share of the length", _RULE, "soft, heavy and tight cloth reaches 40%, torn cloth 80%")
+STRAIN_ALARM = Limit(0.25, "share of the length", _GUARD, "seven garments on four motions reach 19%")
+STRAIN_RATIO = Limit(1.5, "times the solver's strain", _GUARD, "soft, heavy and tight cloth is strained so by the solver, too")
+STRAIN_START = Limit(0.04, "share of the length", "hood.scene.start", "more would show as a jerk in frame 1")
+
+#: How far the 99th percentile of the vertices still had to go to the minimum of their step.
+DISTANCE_UNSOUND = Limit(0.02, "m", _RULE, "a viewer sees 2 cm")
+#: Where no distance was measured: the unbalanced force over the weight.
+GRADIENT_UNSOUND = Limit(100.0, "times the weight", _RULE, "a coarse stand-in, wrong both ways by a factor of ten")
+
+#: Skin through cloth, apart from folds of the skin.
+CUT_UNSOUND = Limit(0.01, "share of the cloth's triangles", _RULE, "pictures show ten of a thousand triangles")
+CUT_ALARM = Limit(0.02, "share of the cloth's triangles", _GUARD, "the worst of 28 ordinary rollouts is 1.4%")
+DEPTH_UNSOUND = Limit(0.01, "m", _RULE, "skin that sticks out so far is seen from every side")
+#: Cloth that is under the skin as a whole cuts nothing.
+INSIDE_UNSOUND = Limit(0.05, "share of the vertices", _RULE, "2 mm deep in the body; ordinary rollouts have less than 1%")
+INSIDE_ALARM = Limit(0.01, "m", _GUARD, "contact pushes out from 10 mm, from deeper it may push through the limb")
+#: Cloth through cloth beyond that of the start, along which pairs of triangles are counted, where a viewer can see it; and what
+#: the start may have, as a share of the triangles.
+CROSSINGS_UNSOUND = Limit(0.12, "m", _RULE, "about the width of a hand")
+CROSSINGS_OF_START = Limit(0.02, "share of the triangles", _RULE, "collars and pockets that pass through the cloth they lie on")
+
+#: Worn, see hood.dynamics.verdict.worn.
+AWAY_UNSOUND = Limit(0.20, "m", "hood.dynamics.verdict.worn", "43 rollouts: worn at most 0.11, come off at least 0.28")
+SLIPPED_UNSOUND = Limit(0.10, "m", "hood.dynamics.verdict.worn", "43 rollouts: worn at most 0.07, come off at least 0.21")
+
+#: The body.
+HEAD_DOWN = Limit(0.5, "share of frames", _BODY, "cartwheels are shorter, and handstands stand on the hands")
+FLOOR_OFF = Limit(0.3, "m", _BODY, "soles and recorded floors differ by less")
+BODY_SPEED = Limit(12.0, "m/s", _BODY, "the fastest sprint is 12.4 m/s, captured motions reach 3")
+BODY_OVERLAP = Limit(0.03, "share of the body's triangles", _BODY, "a deep squat has 2.3%, arms in the trunk 3.6%")
+
+#: Fabrics.
+_FABRIC = "hood.dynamics.verdict.fabric"
+DENSITY_KNOWN = Range(0.005, 5.0, "kg/m²", _FABRIC, "silk gauze to lead aprons")
+SHEAR_KNOWN = Range(0.1, 1e6, "N/m", _FABRIC, "nets to sailcloth")
+BENDING_KNOWN = Range(0.0, 0.1, "N·m", _FABRIC, "threads to saddle leather")

@@ -1,0 +1,159 @@
+"""Skin through cloth and cloth through cloth: what counts, what the start had, what nobody sees."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from stored import frames, stored, tube
+
+from hood.dynamics.recorder import RolloutData
+from hood.dynamics.verdict.rule import judge_rollout
+from hood.dynamics.verdict.surface import drawn, surface_metrics
+from hood.dynamics.verdict.visible import sampled, visible
+
+COUNT = 31
+
+
+def sheet(centre: tuple[float, float, float], across: int, size: float = 0.4, cells: int = 8) -> tuple[np.ndarray, np.ndarray]:
+    """A square of cloth at ``centre`` [m], at right angles to the axis ``across``."""
+    ticks = np.linspace(-size / 2, size / 2, cells + 1)
+    plane = np.stack(np.meshgrid(ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 2)
+    pos = np.insert(plane, across, 0.0, axis=1) + np.array(centre)
+    corner = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).ravel()
+    faces = [
+        np.stack([corner, corner + 1, corner + cells + 2], 1),
+        np.stack([corner, corner + cells + 2, corner + cells + 1], 1),
+    ]
+    return pos, np.concatenate(faces)
+
+
+def crossed(apart: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Two sheets, one through the middle of the other, or so far beside it."""
+    one, faces = sheet((0.0, 1.0, 0.0), 2)
+    other, _ = sheet((0.003 + apart, 1.013, 0.007), 0)
+    return np.concatenate([one, other]), np.concatenate([faces, faces + len(one)])
+
+
+def measured(**metrics: np.ndarray) -> RolloutData:
+    """A rollout that has measured its surface: nothing, but for what is given."""
+    names = ("cut_face_share", "cut_edge_share", "skin_depth", "self_crossings", "garment_crossings", "cut_in_folds")
+    return stored(COUNT, {"strain_p99": frames(COUNT), **{name: frames(COUNT, 0.0) for name in names}, **metrics})
+
+
+def test_skin_through_cloth_counts_beyond_one_percent() -> None:
+    assert judge_rollout(measured(cut_face_share=frames(COUNT, 0.009))).sound
+    (reason,) = judge_rollout(measured(cut_face_share=frames(COUNT, 0.02))).reasons
+    assert (reason.kind, reason.value, reason.limit) == ("skin_through_cloth", 0.02, 0.01)
+
+
+def test_skin_that_sticks_out_counts_by_its_height() -> None:
+    few = {"cut_face_share": frames(COUNT, 0.005)}
+    assert judge_rollout(measured(**few, skin_depth=frames(COUNT, 0.008))).sound
+    (reason,) = judge_rollout(measured(**few, skin_depth=frames(COUNT, 0.012))).reasons
+    assert reason.kind == "skin_depth"
+    assert "worst 12 mm in frame 5" in reason.sentence
+
+
+def test_folds_of_the_skin_are_told_and_do_not_count() -> None:
+    verdict = judge_rollout(measured(cut_face_share=frames(COUNT, 0.02), cut_in_folds=frames(COUNT, 0.015)))
+    assert verdict.sound
+    (note,) = verdict.notes
+    assert "2.0%" not in note
+    assert note.startswith("the skin cuts up to 1.5% of the cloth's triangles where it passes through itself")
+
+
+def test_cloth_inside_the_body_cuts_nothing_and_counts() -> None:
+    (reason,) = judge_rollout(measured(penetration_share=frames(COUNT, 0.3))).reasons
+    assert reason.kind == "inside_body"
+
+
+def test_cloth_through_cloth_counts_for_every_stepper() -> None:
+    """Measured here from the positions alone: the file has no metrics of the surface."""
+    apart, faces = crossed(0.5)
+    through, _ = crossed()
+    cloth = np.repeat(apart[None], COUNT, axis=0)
+    assert judge_rollout(stored(COUNT, cloth=cloth, faces=faces)).sound
+    cloth[10:] = through
+    data = stored(COUNT, {"strain_p99": frames(COUNT)}, cloth=cloth, faces=faces)
+    (reason,) = judge_rollout(data).reasons
+    assert reason.kind == "cloth_through_cloth"
+    assert reason.unit == "pairs of triangles"
+    pieces = {"piece": np.repeat([0, 1], len(apart) // 2)}
+    (reason,) = judge_rollout(stored(COUNT, {"strain_p99": frames(COUNT)}, cloth=cloth, faces=faces, still=pieces)).reasons
+    assert reason.kind == "garments_through_each_other"
+
+
+def test_a_few_pairs_of_the_start_are_doubtful_and_many_are_wrong() -> None:
+    through, faces = crossed()
+    few = stored(
+        COUNT,
+        {"strain_p99": frames(COUNT)},
+        cloth=np.concatenate([through, FAR]),
+        faces=np.concatenate([faces, padding(len(through))]),
+    )
+    verdict = judge_rollout(few)
+    assert verdict.sound
+    (doubt,) = verdict.doubts
+    assert (doubt["kind"], doubt["frames"], doubt["unit"]) == ("garment", [0], "pairs of triangles")
+    (reason,) = judge_rollout(stored(COUNT, {"strain_p99": frames(COUNT)}, cloth=through, faces=faces)).reasons
+    assert "already in frame 0, and more than 2% of the triangles still do" in reason.sentence
+
+
+#: A triangle far from all else, and faces that cross nothing: it, over and over.
+FAR = np.array([[5.0, 0, 0], [5.1, 0, 0], [5.0, 0.1, 0]])
+
+
+def padding(count: int) -> np.ndarray:
+    return np.repeat([[count, count + 1, count + 2]], 4000, axis=0)
+
+
+def test_what_no_viewer_sees_is_told_and_does_not_count() -> None:
+    """The crossing sheets are inside a closed room."""
+    apart, faces = crossed(0.25)
+    through, _ = crossed()
+    walls, wall_faces = room()
+    cloth = np.repeat(apart[None], COUNT, axis=0)
+    cloth[10:] = through
+    hidden = stored(COUNT, {"strain_p99": frames(COUNT)}, cloth=cloth, faces=faces, body=walls,
+                    body_faces=wall_faces.astype(np.int32), config={"worn": False})  # fmt: skip
+    verdict = judge_rollout(hidden)
+    assert verdict.sound
+    assert any("of which no viewer sees more than 0" in note for note in verdict.notes)
+    seen = stored(COUNT, {"strain_p99": frames(COUNT)}, cloth=cloth, faces=faces, body=walls + 3.0,
+                  body_faces=wall_faces.astype(np.int32), config={"worn": False})  # fmt: skip
+    assert judge_rollout(seen).sound is False
+
+
+def room() -> tuple[np.ndarray, np.ndarray]:
+    """A box of a metre around the sheets."""
+    parts = [sheet(tuple(np.array([0.0, 1.0, 0.0]) + 0.5 * way * np.eye(3)[axis]), axis, 1.0)  # type: ignore[arg-type]
+             for axis in range(3) for way in (-1, 1)]  # fmt: skip
+    count = len(parts[0][0])
+    return np.concatenate([pos for pos, _ in parts]), np.concatenate(
+        [part[1] + count * number for number, part in enumerate(parts)]
+    )
+
+
+def test_metrics_of_the_rollout_come_before_own_ones() -> None:
+    data = measured(cut_face_share=np.where(np.arange(COUNT) % 5 == 0, 0.002, np.nan))
+    assert surface_metrics(data, drawn(data))["cut_face_share"][5] == 0.002
+
+
+def test_places_are_seen_where_nothing_lies_before_them() -> None:
+    body, faces = tube(0.2, 0.0, 1.0)
+    places = np.array([[0.0, 0.5, 0.201], [0.0, 0.5, 0.0], [0.19, 0.5, 0.0], [0.0, 3.0, 0.0]])
+    lids = [sheet((0.0, y, 0.0), 1, 0.5) for y in (0.0, 1.0)]
+    assert visible(places, [(body, faces), *lids]).tolist() == [True, False, True, True]
+    below_the_rim = np.array([[0.0, 0.95, 0.0]])
+    assert visible(below_the_rim, [(body, faces)]).all()  # from above, through the open end
+    assert not visible(below_the_rim, [(body, faces), *lids]).any()
+    assert visible(np.zeros((0, 3)), [(body, faces)]).shape == (0,)
+
+
+def test_surfaces_are_sampled_without_holes() -> None:
+    pos, faces = sheet((0.0, 0.0, 0.0), 2, 0.1, 1)
+    points = sampled(pos, faces)
+    grid = np.stack(np.meshgrid(np.linspace(-0.049, 0.049, 40), np.linspace(-0.049, 0.049, 40)), axis=-1).reshape(-1, 2)
+    gap = np.sqrt(((grid[:, None] - points[None, :, :2]) ** 2).sum(axis=2)).min(axis=1)
+    assert gap.max() < 0.006
+    assert points[:, 2] == pytest.approx(0.0)
