@@ -28,6 +28,7 @@ from hood.dynamics.simulator import Prediction
 from hood.dynamics.stepper import Stepper
 from hood.dynamics.stopwatch import Stopwatch
 from hood.dynamics.surface import SURFACE_METRICS, SURFACE_STRIDE, SurfaceMeter
+from hood.dynamics.verdict.distance import DISTANCE_METRICS, distance_metrics
 from hood.graph.given import given_hierarchy
 from hood.losses.layers import for_networks, has_layers
 from hood.losses.potential import Potential
@@ -89,7 +90,7 @@ def metric_names(
         "e0",
     )
     measured = {
-        "all": (*STRAIN_METRICS, *PENETRATION_METRICS, *SURFACE_METRICS, *energies),
+        "all": (*STRAIN_METRICS, *PENETRATION_METRICS, *SURFACE_METRICS, *DISTANCE_METRICS, *energies),
         "strain": STRAIN_METRICS,
         "none": (),
     }
@@ -137,7 +138,8 @@ def simulate(
     ``metrics`` is one of :data:`METRIC_CHOICES`. What only they need to know, contact included, is no part of the step and
     changes nothing about it; its time is ``ms_metrics``, which ``ms_total`` leaves out as it does the caller's work. The same
     holds for ``fields``, names of :data:`FIELD_CHOICES`. The metrics of :class:`hood.dynamics.surface.SurfaceMeter` belong to
-    every ``surface_stride``-th frame, the first and the last; other frames lack them.
+    every ``surface_stride``-th frame, the first and the last; other frames lack them. So do those of
+    :func:`hood.dynamics.verdict.distance.distance_metrics`, which frame 0 lacks too: no step led there.
 
     A network that looks at a potential looks at ``potential``; a solver keeps its own.
 
@@ -203,7 +205,7 @@ def simulate(
         with watch.aside("metrics"):
             known = potential.prepare(problem) if problem is not None and wants_potential else problem
             row = {**_state_metrics(scene, here, state, body_frame, known, metrics), **stepped}
-            if meter is not None and (index % surface_stride == 0 or index + 1 == count):
+            if meter is not None and _is_measured(index, count, surface_stride):
                 row |= _surface_now(meter, scene, state, body_frame)
         row["ms_metrics"] = watch.spent_aside("metrics")
         if guard is not None and index > 0:
@@ -240,9 +242,16 @@ def simulate(
                 known_fields = {name: vertex_residual(known, figures.gradient).float().cpu() for name in fields}
                 if metrics == "all":
                     stepped |= figures.metrics()
+                    if _is_measured(index + 1, count, surface_stride):
+                        stepped |= distance_metrics(potential, known, prediction.next_pos)
         if observe is not None:
             with watch.aside("caller"):
                 observe(index + 1, known, prediction)
+
+
+def _is_measured(index: int, count: int, stride: int) -> bool:
+    """Whether a frame of ``count`` is one in which what takes longer is measured."""
+    return index % stride == 0 or index + 1 == count
 
 
 def _jumps_within(scene: Scene, start_frame: int, count: int) -> dict[int, Jump]:

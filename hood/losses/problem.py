@@ -147,6 +147,11 @@ class StepProblem:
         known = (replace(scene, at_start=scene.layers.contacts(scene.of(pos))) for scene in self.layers)
         return replace(self, layers=tuple(known))
 
+    def with_ways_from(self, pos: Tensor) -> StepProblem:
+        """The problem with layers that cloth is kept apart by from ``pos`` (V, 3) on, wherever the step began: for what goes on
+        from there. Cloth that passes through cloth at ``pos`` is left alone. Itself where nobody searched for layers."""
+        return replace(self, layers=tuple(scene.begun_at(pos) for scene in self.layers)) if self.layers else self
+
     def points_at(self, place: str) -> PointContact | None:
         """Contact at the points of a place; None at ``vertices`` and without a body.
 

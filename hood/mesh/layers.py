@@ -224,6 +224,10 @@ class Layers:
         self._held, self.between = held, between
         self.forced = 0  # pairs of features that held vertices drive through each other
 
+    def begun_at(self, pos: np.ndarray) -> Layers:
+        """The layers of a step that begins at ``pos`` (V, 3); these here do not change."""
+        return Layers(self.mesh, pos, self._held, self.pressure, self.between)
+
     @property
     def crossed(self) -> int:
         """Pairs of faces that pass through each other where the step begins."""

@@ -33,6 +33,10 @@ class SceneLayers:
         """What is within its reach where the step begins, at ``pos`` (V, 3) m."""
         return self.layers.contacts(self.of(pos)) if self.at_start is None else self.at_start
 
+    def begun_at(self, pos: Tensor) -> SceneLayers:
+        """The same with ways that begin at ``pos`` (V, 3) m; what was near what where the step begins is still known."""
+        return SceneLayers(self.layers.begun_at(self.of(pos)), self.first, self.last, self.at_start, self.pins)
+
 
 def find_layers(
     cloth: Cloth, pos: Tensor, ahead: Tensor, reach: float, pressure: float, between: bool
