@@ -71,7 +71,7 @@ def test_whole_ratios_store_simulated_frames_bit_by_bit(capsys: pytest.CaptureFi
 
 @pytest.mark.parametrize("fps", [24, 50])
 def test_other_ratios_interpolate_and_measure_what_was_simulated(fps: int) -> None:
-    words = ("fps=30", "num_frames=13", "metrics=strain", "guard=off")
+    words = ("fps=30", "num_frames=13", "metrics=all", "guard=off")
     every, usual = rollout(*words, output="every")
     data, summary = rollout(*words, f"output_fps={fps}")
     count, common = {24: 10, 50: 21}[fps], {24: (4, 5), 50: (5, 3)}[fps]

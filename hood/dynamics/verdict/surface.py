@@ -16,6 +16,8 @@ from hood.mesh.topology import unique_edges
 
 #: Frames that are measured where the rollout has not, and in which places are looked at from all sides, at most.
 _MEASURED, _LOOKED_AT = 12, 4
+#: Moments nearer [s] than this are the same.
+_SAME = 1e-6
 
 
 @dataclass(frozen=True)
@@ -58,17 +60,19 @@ def drawn(data: RolloutData) -> Drawn:
 
 def surface_metrics(data: RolloutData, seen: Drawn) -> dict[str, np.ndarray]:
     """:data:`hood.dynamics.surface.SURFACE_METRICS` (S,) of the simulated frames, NaN where not measured; of a rollout that
-    measured none a dozen of its stored frames are."""
+    measured none a dozen of its stored frames are, of those that were simulated."""
     found = {name: data.step_metrics[name] for name in SURFACE_METRICS if name in data.step_metrics}
     if "cut_face_share" in found and np.isfinite(found["cut_face_share"]).any():
         return found
     count = len(data.step_finite)
     table = {name: np.full(count, np.nan) for name in SURFACE_METRICS}
-    if not len(seen.cloth) or not len(seen.faces):
+    simulated = np.flatnonzero(np.abs(data.step_time[seen.step] - data.time) < _SAME)
+    if not len(simulated) or not len(seen.faces):
         return table
     garment = Garment("", seen.rest_pos, seen.faces, np.zeros(len(seen.rest_pos), dtype=bool), piece=seen.piece)
     meter = SurfaceMeter(garment, seen.body_faces)
-    for frame in np.unique(np.linspace(0, len(seen.cloth) - 1, _MEASURED).astype(np.int64)).tolist():
+    places = np.unique(np.linspace(0, len(simulated) - 1, _MEASURED).astype(np.int64))
+    for frame in simulated[places].tolist():
         for name, value in meter(seen.cloth[frame], seen.body[frame]).items():
             table[name][seen.step[frame]] = value
     return table
