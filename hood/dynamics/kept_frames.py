@@ -1,4 +1,4 @@
-"""The frames of a rollout kept in memory, to be drawn when it is over."""
+"""The frames of a rollout kept in memory, to be judged and drawn when it is over."""
 
 from __future__ import annotations
 
@@ -15,17 +15,20 @@ class KeptFrames:
     def __init__(self) -> None:
         self.cloth: list[np.ndarray] = []
         self.body: list[np.ndarray] = []
+        self.metrics: list[dict[str, float]] = []
         self.scene: Scene | None = None
 
     def see(self, scene: Scene, frame: Frame) -> None:
         """Keep ``frame``."""
         self.scene = scene
         self.cloth.append(frame.world_pos.numpy())
-        self.body.append(frame.body_pos.numpy())
+        self.body.append(frame.body_pos.numpy().astype(np.float32))
+        self.metrics.append(frame.metrics)
 
     def data(self) -> RolloutData:
-        """The frames as a rollout without metrics; at least one must have been shown."""
+        """The frames as a rollout that was read back; at least one must have been shown."""
         assert self.scene is not None
+        names = {name for row in self.metrics for name in row}
         return RolloutData(
             cloth_pos=np.stack(self.cloth),
             cloth_faces=self.scene.garment.faces,
@@ -33,6 +36,6 @@ class KeptFrames:
             body_pos=np.stack(self.body),
             body_faces=self.scene.motion.faces,
             time=np.arange(len(self.cloth)) * self.scene.dt,
-            metrics={},
-            attributes={},
+            metrics={name: np.array([row.get(name, np.nan) for row in self.metrics]) for name in sorted(names)},
+            attributes={"garment": self.scene.garment.name},
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import partial
@@ -10,8 +11,10 @@ from typing import Any
 import numpy as np
 
 from hood.dynamics.captured import network_of
+from hood.dynamics.kept_frames import KeptFrames
 from hood.dynamics.rollout import Frame, simulate
 from hood.dynamics.stepper import Stepper
+from hood.dynamics.verdict.rule import judge_rollout
 from hood.evaluation.bootstrap import pooled_interval
 from hood.evaluation.gap import AGREEMENT, REFERENCE, gap
 from hood.evaluation.radius import measured_radius
@@ -81,6 +84,9 @@ class Measured:
     drifts: list[float] = field(default_factory=list)  # [m] to the side, on a body that stands still
     ends: list[int | None] = field(default_factory=list)  # of every rollout: first frame failed, see FAILURE_STRAIN; None: none
 
+    kinds: list[list[str]] = field(
+        default_factory=list
+    )  # of every rollout: why it is unsound, by the rule; []: sound, or not known
     spectra: list[dict[str, Any]] = field(default_factory=list)  # of the states of gaps, see error_spectrum
 
     def __add__(self, other: Measured) -> Measured:
@@ -97,18 +103,19 @@ def evaluate(
 ) -> list[dict[str, Any]]:
     """Rows of the table: one per candidate and garment, and one per candidate over all garments.
 
-    Means over the frames that a candidate's own rollouts reach before the first non-finite one; ``failed_at`` is the
-    earliest such frame (None: never). Of the ``rollouts``, ``failed`` is the share that failed, as non-finite or by
+    Means over the frames that a candidate's own rollouts reach before the first non-finite one; ``failed_at`` is the earliest
+    such frame (None: never). ``sound`` is the share of rollouts that :mod:`hood.dynamics.verdict` calls so, ``unsound_for``
+    what the others were called unsound for, and how many; ``distance`` [m] the median over frames of the 99th percentile of the
+    distance to the minimum of a step. Of the ``rollouts``, ``failed`` is the share that failed, as non-finite or by
     :data:`FAILURE_STRAIN`, and ``frames_to_failure`` the median of the frames where they did, rollouts that lasted counted as
     later than all (None: less than half failed). ``steps`` and ``radius`` are None without a network. ``L_NAME`` is the energy
-    of every term that acts in the row, those of :data:`TERMS` in any case, ``L_total`` their sum, ``L_guess`` the
-    potential of the inertial guess on the same states. ``gradient_norm`` [N] is the mean over vertices of ‖∂L/∂x_v‖₂, averaged
-    over frames; ``rg`` and ``strain_p99`` are medians over frames; ``penetration`` is the mean share of vertices deeper than
-    2 mm, ``penetration_worst`` that of the worst frame; ``cut_faces`` is the mean share of the cloth's triangles that the
-    body cuts, ``cut_faces_worst`` that of the worst frame, ``crossings`` the mean number of pairs of cloth triangles that pass
-    through each other, all three of the frames where they are measured; ``drift`` [m] is the largest of those measured (None:
-    none was). Of
-    the states whose gap is computed (``gap_states`` of them): ``gap`` is the median, ``gap_p95`` the 95th percentile,
+    of every term that acts in the row, those of :data:`TERMS` in any case, ``L_total`` their sum, ``L_guess`` the potential of
+    the inertial guess on the same states. ``gradient_norm`` [N] is the mean over vertices of ‖∂L/∂x_v‖₂, averaged over frames;
+    ``rg`` and ``strain_p99`` are medians over frames; ``penetration`` is the mean share of vertices deeper than 2 mm,
+    ``penetration_worst`` that of the worst frame; ``cut_faces`` is the mean share of the cloth's triangles that the body cuts,
+    ``cut_faces_worst`` that of the worst frame, ``crossings`` the mean number of pairs of cloth triangles that pass through
+    each other, all three of the frames where they are measured; ``drift`` [m] is the largest of those measured (None: none
+    was). Of the states whose gap is computed (``gap_states`` of them): ``gap`` is the median, ``gap_p95`` the 95th percentile,
     ``unconverged`` the share whose reference missed its accuracy and ``disagree`` the share where minimisations ended in
     different minima, ``gap_spread`` [e0] the 95th percentile of how far these are apart. Columns of :data:`INTERVALS` have 95%
     intervals over rollouts, ``NAME_low`` and ``NAME_high``, from two rollouts on.
@@ -136,9 +143,17 @@ def measure(
     see: See | None = None,
 ) -> Measured:
     """One rollout of a candidate; ``tell`` hears what is being done, ``see`` is shown every frame."""
-    measured = Measured()
-    for text in _run(candidate.stepper, scene, potential, num_frames, gaps or GapSettings(), measured, see):
+    measured, kept = Measured(), KeptFrames()
+
+    def seen(frame: Frame) -> None:
+        kept.see(scene, frame)
+        if see is not None:
+            see(frame)
+
+    for text in _run(candidate.stepper, scene, potential, num_frames, gaps or GapSettings(), measured, seen):
         tell(f"{candidate.name} {scene.garment.name} {scene.motion.name} {text}")
+    verdict = judge_rollout(kept.data())
+    measured.kinds.append([reason.kind for reason in verdict.reasons] if verdict.sound is False else [])
     return measured
 
 
@@ -172,14 +187,13 @@ def _reach(stepper: Stepper) -> dict[str, int | None]:
 
 
 def _run(
-    stepper: Stepper, scene: Scene, potential: Potential, num_frames: int, gaps: GapSettings, into: Measured, see: See | None
+    stepper: Stepper, scene: Scene, potential: Potential, num_frames: int, gaps: GapSettings, into: Measured, see: See
 ) -> Iterator[str]:
     """One rollout, added to ``into``; yields what is being done."""
     count, end = min(num_frames, scene.num_frames), None
     sample = StepSample(range(_WARMUP + 1, count), gaps.states)
     for frame in simulate(stepper, scene, potential, count, observe=sample if gaps.states else None):
-        if see is not None:
-            see(frame)
+        see(frame)
         yield f"frame {frame.index + 1}/{count}"
         strain = frame.metrics["strain_p99"]
         if end is None and not strain <= FAILURE_STRAIN:
@@ -202,7 +216,7 @@ def _run(
 def _row(measured: Measured) -> dict[str, Any]:
     frames, failures = measured.frames, measured.failures
     row: dict[str, Any] = {"frames": len(frames), "failed_at": min(failures) if failures else None}
-    row |= _failure_columns(measured.ends) | _gap_columns(measured.gaps)
+    row |= _failure_columns(measured.ends) | _verdict_columns(measured.kinds) | _gap_columns(measured.gaps)
     if measured.drifts:
         row["drift"] = max(measured.drifts)
     if not frames:
@@ -222,6 +236,8 @@ def _row(measured: Measured) -> dict[str, Any]:
     row["penetration_worst"] = max(frame.get("penetration_share", 0.0) for frame in frames)
     row |= _surface_columns(frames)
     row["strain_p99"] = float(np.median([frame["strain_p99"] for frame in frames]))
+    distance = [frame["distance_p99"] for frame in frames if np.isfinite(frame.get("distance_p99", np.nan))]
+    row["distance"] = float(np.median(distance)) if distance else None
     row["rg"] = float(np.median([frame["relative_gradient"] for frame in frames]))
     return row
 
@@ -247,6 +263,17 @@ def _failure_columns(ends: Sequence[int | None]) -> dict[str, Any]:
         "rollouts": len(ends),
         "failed": float(np.mean(np.isfinite(frames))),
         "frames_to_failure": int(median) if np.isfinite(median) else None,
+    }
+
+
+def _verdict_columns(kinds: Sequence[Sequence[str]]) -> dict[str, Any]:
+    """The share of rollouts that the rule calls sound, and what the others are called for; nothing of earlier logs."""
+    if not kinds:
+        return {}
+    counts = Counter(kind for one in kinds for kind in dict.fromkeys(one))
+    return {
+        "sound": sum(not one for one in kinds) / len(kinds),
+        "unsound_for": ", ".join(f"{k} {n}" for k, n in counts.most_common()),
     }
 
 
