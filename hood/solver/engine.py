@@ -383,6 +383,11 @@ class SceneEngine:
         """Write positions and accelerations (V, 3) of this scene's vertices into arrays of the whole cloth."""
         self._lib.newton_state(self._address, pos.ctypes.data_as(POINTER), acc.ctypes.data_as(POINTER))
 
+    def read_direction(self, direction: np.ndarray) -> None:
+        """Write the last Newton step (V, 3) [m] of this scene's free vertices into an array of the whole cloth."""
+        count = self.values.num_rows
+        direction[self.tables.vertex[:count]] = self.array("direction")[:count, :3]
+
     def alone(self, pos: int, force: int, step: int) -> None:
         """Write force [N] and local step [m] of this scene's free vertices at positions: addresses of tables (V, 3) of the
         whole cloth, in float32."""
@@ -538,3 +543,10 @@ class EngineSystem:
         for engine in self._engines:
             engine.read(pos, acc)
         return torch.from_numpy(pos), torch.from_numpy(acc)
+
+    def direction(self) -> Tensor:
+        """(V, 3) m: the last Newton step, before contact and the line search took less of it."""
+        direction = np.zeros_like(self._step.fixed)
+        for engine in self._engines:
+            engine.read_direction(direction)
+        return torch.from_numpy(direction)

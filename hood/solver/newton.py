@@ -114,12 +114,12 @@ def minimize(
     layers = layers_of(potential, work)
     if layers and proceed is None and not touching(layers, work.state.pos):
         # Most cloth meets none: the step is taken without, and that is the step where it turns out to have met none.
-        system = _system(without_layers(potential), work, plan, settings)
+        system = system_of(without_layers(potential), work, plan, settings)
         system.begin(start)
         pos, report = run(system, work.state.pos, settings, began, proceed)
         if free_way(layers, work.state.pos, pos):
             return rounded(problem, pos), replace(report, acc=report.acc.to(problem.state.pos.dtype))
-    system = _system(potential, work, plan, settings)
+    system = system_of(potential, work, plan, settings)
     system.begin(start)
     pos, report = run(system, work.state.pos, settings, began, proceed)
     return rounded(problem, pos), replace(report, acc=report.acc.to(problem.state.pos.dtype))
@@ -131,7 +131,7 @@ def first_guess(potential: Potential, problem: StepProblem, settings: NewtonSett
     problem's type; see :func:`hood.solver.iterate.first_iterate`."""
     problem = potential.prepare(problem)
     work = in_double(problem)
-    system = _system(potential, work, plan_for(work), settings or NewtonSettings())
+    system = system_of(potential, work, plan_for(work), settings or NewtonSettings())
     system.begin(None)
     pos, acc = system.state()
     return rounded(problem, pos), acc.to(problem.state.pos.dtype)
@@ -143,7 +143,7 @@ def plan_ahead(potential: Potential, problem: StepProblem, settings: NewtonSetti
     plan = plan_for(problem)
     if "ahead" not in plan.cache:
         plan.cache["ahead"] = True
-        _system(potential, in_double(potential.prepare(problem)), plan, settings or NewtonSettings())
+        system_of(potential, in_double(potential.prepare(problem)), plan, settings or NewtonSettings())
 
 
 class System(Protocol):
@@ -205,15 +205,21 @@ class TorchSystem:
         searching = torch.tensor(active, device=now.phi.device)
         direction, inverse = self.directions(model, now.phi.new_tensor(residual), searching)
         slope = self.problem.sum_vertices((model.gradient * direction).sum(1))
-        path = Path(self.unknowns, now, direction, inverse, self.plan.vertices)
+        path, self._direction = Path(self.unknowns, now, direction, inverse, self.plan.vertices), direction
         self._now, moved = backtrack(self.unknowns, path, now, slope, searching)
         return [bool(value) for value in moved.tolist()]
 
     def state(self) -> tuple[Tensor, Tensor]:
         return self._now.pos, self._now.acc
 
+    def direction(self) -> Tensor:
+        """(V, 3) m: the last Newton step, before contact and the line search took less of it."""
+        return self._direction
 
-def _system(potential: Potential, problem: StepProblem, plan: SolverPlan, settings: NewtonSettings) -> System:
+
+def system_of(
+    potential: Potential, problem: StepProblem, plan: SolverPlan, settings: NewtonSettings
+) -> TorchSystem | engine.EngineSystem:
     """The fastest form of the solver that does what ``settings`` ask for.
 
     Raises:

@@ -56,7 +56,7 @@ def test_a_minimum_has_no_way_to_go(dtype: torch.dtype) -> None:
     assert 0.0 <= found["distance_p99"] <= found["distance_max"] < 1e-6
 
 
-@pytest.mark.parametrize("offset", [1e-4, 0.05])
+@pytest.mark.parametrize("offset", [2e-4, 0.05])
 def test_the_way_of_a_quadratic_potential_is_known(offset: float) -> None:
     """Inertia and weight alone: every vertex has to go back what it was moved, however far."""
     potential = POTENTIAL.only({name: POTENTIAL.terms[name] for name in ("inertia", "gravity")})
@@ -66,8 +66,8 @@ def test_the_way_of_a_quadratic_potential_is_known(offset: float) -> None:
     pos[40, 0] += 2.0 * offset
     true = float((pos[:, 0] - problem.state.pos[:, 0]).quantile(0.99))
     found = distance_metrics(potential, problem, pos)
-    assert true <= found["distance_p99"] <= 1.5 * true
-    assert 3.0 * offset <= found["distance_max"] <= 4.5 * offset
+    assert found["distance_p99"] == pytest.approx(true, rel=0.05)
+    assert found["distance_max"] == pytest.approx(3.0 * offset, rel=0.05)
 
 
 def test_the_estimate_is_within_a_factor_of_two_for_a_sheet_that_was_pulled() -> None:
@@ -86,7 +86,7 @@ def test_vertices_that_are_held_do_not_count() -> None:
     pos, _ = minimize(POTENTIAL, problem, settings=TIGHT)
     pos[80, 1] -= 0.02
     found = distance_metrics(POTENTIAL, problem, pos)
-    assert 0.01 < found["distance_p99"] == found["distance_max"] < 0.04
+    assert found["distance_p99"] == found["distance_max"] == pytest.approx(0.02, rel=0.5)
     everything = POTENTIAL.prepare(sheet(held=81))
     assert distance_metrics(POTENTIAL, everything, everything.state.pos) == dict.fromkeys(DISTANCE_METRICS, 0.0)
 
@@ -97,14 +97,29 @@ def test_layers_are_kept_apart_from_where_the_step_ended() -> None:
     problem = LAYERED.prepare(closing_sheets())
     pos, report = minimize(LAYERED, problem, settings=replace(TIGHT, target_rg=1e-5))
     assert bool(report.converged.all())
-    layers = problem.layers[0].layers
-    work, known = layers.work, layers.mesh.apart
+    known = problem.layers[0].layers.mesh.apart
     assert distance_metrics(LAYERED, problem, pos)["distance_max"] < 1e-5
-    assert layers.work == work
-    assert layers.mesh.apart is known
+    assert problem.layers[0].layers.mesh.apart is known
     upper = torch.arange(len(pos)).unsqueeze(1) >= len(pos) // 2
     higher = torch.where(upper, pos + pos.new_tensor([0.0, 0.03, 0.0]), pos)
-    assert 0.02 < distance_metrics(LAYERED, problem, higher)["distance_p99"] < 0.06
+    assert 0.03 < distance_metrics(LAYERED, problem, higher)["distance_p99"] < 0.09
+
+
+class _Deceptive:
+    """A potential whose slope leads nowhere: its force pulls sideways, its energy does not know of that."""
+
+    def applies(self, problem: StepProblem) -> bool:
+        return True
+
+    def __call__(self, problem: StepProblem, next_pos: torch.Tensor, acc: torch.Tensor) -> torch.Tensor:
+        return problem.sum_vertices(next_pos[:, 0] - next_pos[:, 0].detach())
+
+
+def test_a_way_that_the_search_does_not_find_is_left() -> None:
+    potential, problem = POTENTIAL.with_terms(odd=_Deceptive()), POTENTIAL.prepare(sheet())
+    pos, _ = minimize(POTENTIAL, problem, settings=TIGHT)
+    assert torch.equal(minimize(potential, problem, pos, TIGHT)[0], pos)
+    assert distance_metrics(potential, problem, pos)["distance_p99"] > 1e-3
 
 
 def test_nothing_is_known_of_steps_that_are_not_finite_and_of_potentials_for_training() -> None:
