@@ -51,13 +51,14 @@ GRADIENT_UNSOUND = Limit(100.0, "times the weight", _RULE, "a coarse stand-in, w
 CUT_UNSOUND = Limit(0.01, "share of the cloth's triangles", _RULE, "pictures show ten of a thousand triangles")
 CUT_ALARM = Limit(0.02, "share of the cloth's triangles", _GUARD, "the worst of 28 ordinary rollouts is 1.4%")
 DEPTH_UNSOUND = Limit(0.01, "m", _RULE, "skin that sticks out so far is seen from every side")
+SPOTS_UNSOUND = Limit(0.0015, "share of the cloth's triangles", _RULE, "three of two thousand: smaller spots are not seen")
+SPOTS_HEIGHT = Limit(0.003, "m", _RULE, "lower spots flicker, higher ones stay")
+SPOTS_LASTING = Limit(0.25, "share of frames", _RULE, "spots that come and go are not seen")
 #: Cloth that is under the skin as a whole cuts nothing.
 INSIDE_UNSOUND = Limit(0.05, "share of the vertices", _RULE, "2 mm deep in the body; ordinary rollouts have less than 1%")
 INSIDE_ALARM = Limit(0.01, "m", _GUARD, "contact pushes out from 10 mm, from deeper it may push through the limb")
-#: Cloth through cloth beyond that of the start, along which pairs of triangles are counted, where a viewer can see it; and what
-#: the start may have, as a share of the triangles.
-CROSSINGS_UNSOUND = Limit(0.12, "m", _RULE, "about the width of a hand")
-CROSSINGS_OF_START = Limit(0.02, "share of the triangles", _RULE, "collars and pockets that pass through the cloth they lie on")
+#: Cloth through cloth where a viewer can see it: the length along which pairs of triangles are counted.
+CROSSINGS_UNSOUND = Limit(0.25, "m", _RULE, "the length of a hand; shorter ones look like a fold")
 
 #: Worn, see hood.dynamics.verdict.worn.
 AWAY_UNSOUND = Limit(0.20, "m", "hood.dynamics.verdict.worn", "43 rollouts: worn at most 0.11, come off at least 0.28")

@@ -4,9 +4,9 @@ A rollout is unsound
 
 - with a frame that is not finite;
 - with a part of the garment that has come off (:mod:`hood.dynamics.verdict.worn`);
-- with bad frames among more than 2% of those after the fifth. A frame is bad where the cloth is torn, its step ended too far
-  from the minimum, the skin comes through the cloth, or cloth through cloth. What is measured in every n-th frame stands for
-  those up to the next; of five frames or fewer all after the start must be bad.
+- with bad frames among more than 2% of all, or of those after the fifth where frame 0 was not at rest. A frame is bad where
+  the cloth is torn, its step ended too far from the minimum, the skin comes through the cloth, or cloth through cloth. What is
+  measured in every n-th frame stands for those up to the next; of five frames or fewer all after the start must be bad.
 
 The numbers are those of :mod:`hood.limits`.
 """
@@ -72,11 +72,11 @@ def judge_rollout(data: RolloutData) -> Verdict:
     off, found = worn_causes(data, seen), causes_of(data, seen)
     reasons = [] if finite.all() else [_not_finite(finite)]
     reasons += [_reason(cause, np.ones(len(finite), dtype=bool), "frames") for cause in off.causes]
-    judged = _judged(len(finite))
+    judged = _judged(len(finite), _settled(data))
     bad = np.any([cause.spread for cause in found.causes], axis=0) & judged if found.causes else np.zeros_like(judged)
     few = len(finite) <= SETTLING.value
+    among = "frames" if few or judged.all() else "frames after the fifth"
     if bad.sum() > (judged.sum() - 1 if few else TOLERATED.value * judged.sum()):
-        among = "frames" if few else "frames after the fifth"
         reasons += [_reason(cause, judged, among) for cause in found.causes if (cause.bad & judged).any()]
     doubts = (*stored_doubts(data), *(doubt.as_dict() for doubt in (*off.doubts, *found.doubts)))
     notes = (*off.notes, *found.notes)
@@ -92,9 +92,16 @@ def stored_doubts(data: RolloutData) -> tuple[dict[str, Any], ...]:
     return () if text is None else tuple(json.loads(str(text)))
 
 
-def _judged(count: int) -> np.ndarray:
-    """(S,) bool: the frames after the fifth; of few all after the start, or the start alone."""
-    first = int(SETTLING.value) if count > SETTLING.value else min(1, count - 1)
+def _settled(data: RolloutData) -> bool:
+    """Whether frame 0 was at rest."""
+    reached = data.step_metrics.get("settle_reached")
+    return reached is not None and len(reached) > 0 and bool(reached[0] == 1)
+
+
+def _judged(count: int, settled: bool) -> np.ndarray:
+    """(S,) bool: all frames where the start was at rest, else those after the fifth; of few all after the start."""
+    few = count <= SETTLING.value
+    first = min(1, count - 1) if few else 0 if settled else int(SETTLING.value)
     return np.arange(count) >= first
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -105,14 +104,10 @@ def _seen_at(seen: Drawn, frame: int) -> tuple[int, int]:
     return int(visible(places, [(pos, seen.faces), (body, seen.body_faces)]).sum()), len(pairs)
 
 
-def beyond_start(values: np.ndarray) -> np.ndarray:
-    """``values`` (S,) less that of frame 0, where it was measured; never less than 0."""
-    first = values[0] if len(values) and np.isfinite(values[0]) else 0.0
-    return np.maximum(values - first, 0.0)
-
-
-def apart_from_folds(metrics: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Share (S,) of the cloth's triangles that the skin cuts where it does not pass through itself."""
-    folds = metrics.get("cut_in_folds")
-    share = metrics["cut_face_share"]
-    return share if folds is None else share - folds
+def spread_over(values: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """``values`` (S,) with those that are NaN taken from the nearest known one, in ``measured`` frames; 0 elsewhere."""
+    known = np.flatnonzero(np.isfinite(values))
+    if not len(known):
+        return np.zeros(len(values))
+    nearest = known[np.abs(np.arange(len(values))[:, None] - known[None]).argmin(axis=1)]
+    return np.where(measured, values[nearest], 0.0)

@@ -3,7 +3,8 @@
 Two lengths say so, of every part that is worn in frame 0:
 
 - *away*: how much farther its vertices are from their region of the body than they were from the body in frame 0, the median
-  over the vertices that touched it there;
+  over the vertices that touched it there, and over the nearest of them for a part without an opening around a limb: a cape
+  that is blown out hangs by its collar;
 - *slipped*: the same for the vertices of an opening that lies around a limb, the median over such openings (of two the lesser:
   one of them holds the garment); an opening with no limb in it any more counts as a metre.
 
@@ -31,6 +32,8 @@ _THROUGH, _TIGHT = 6, 0.6
 _LEAST_OPENING = 0.12
 #: A part of which fewer vertices touch the body, and no limb goes through any opening, is not worn.
 _LEAST_TOUCHING = 0.05
+#: A part without an opening around a limb hangs by this share of what touches the body.
+_HANGS = 0.02
 #: Vertices of a part that are looked at, at most: their median is what is asked for.
 _MOST_LOOKED_AT = 300
 #: What an opening that has lost its limb has slipped by [m].
@@ -59,11 +62,12 @@ class _Group:
     region: np.ndarray  # (N, K) points of the body, the first repeated
     start: np.ndarray  # (N,) m, from the body in frame 0
     is_opening: bool = False
+    share: float = 0.5  # of the vertices that are nearer than what is told
 
     def away(self, pos: np.ndarray, body: np.ndarray) -> float:
-        """Median over its vertices of how much farther from their regions than in frame 0 they are [m]."""
+        """How much farther from their regions than in frame 0 its vertices are [m], at their ``share``."""
         dist_sq = ((pos[self.vertices][:, None] - body[self.region]) ** 2).sum(axis=2).min(axis=1)
-        return float(np.median(np.sqrt(dist_sq) - self.start))
+        return float(np.quantile(np.sqrt(dist_sq) - self.start, self.share))
 
 
 class WearMeter:
@@ -98,7 +102,11 @@ class WearMeter:
             chosen.append(_to_follow(rows, dist, own))
         regions = _Regions(body, self._body_edges, self._between)
         self._groups = [
-            [_Group(rows, regions.around(nearest[rows]), dist[rows], opening) for rows, opening in groups] for groups in chosen
+            [
+                _Group(rows, regions.around(nearest[rows]), dist[rows], opening, 0.5 if len(groups) > 1 else _HANGS)
+                for rows, opening in groups
+            ]
+            for groups in chosen
         ]
 
     def __call__(self, pos: np.ndarray, body_pos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,129 @@
+"""Skin that comes through the cloth where a viewer sees it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from hood.dynamics.surface import in_folds
+from hood.dynamics.verdict.cause import Cause, Found
+from hood.dynamics.verdict.frames import name_frames
+from hood.dynamics.verdict.surface import Drawn, spread_over
+from hood.dynamics.verdict.visible import sampled, visible
+from hood.limits import CUT_UNSOUND, DEPTH_UNSOUND, INSIDE_UNSOUND, SPOTS_HEIGHT, SPOTS_LASTING, SPOTS_UNSOUND
+from hood.mesh.crossing import crossings
+from hood.mesh.skin import Sheet
+from hood.mesh.topology import connected_components, unique_edges
+
+#: Frames that are looked at from all sides, at most.
+_LOOKED_AT = 8
+
+
+def skin_causes(metrics: Mapping[str, np.ndarray], inside: Mapping[str, np.ndarray], seen: Drawn) -> Found:
+    """Skin through cloth.
+
+    A frame is bad where the skin that a viewer sees cuts more than 1% of the cloth's triangles, or sticks out by more than a
+    centimetre. Spots of some millimetres are seen where they stay: they count if more than a quarter of the frames have them.
+    Triangles caught in a fold of the skin do not count, and spots at the rim of the cloth look like its edge.
+
+    Args:
+        metrics: of the surface, (S,) each.
+        inside: of the rollout, of which ``penetration_share`` says how many vertices are inside the body.
+    """
+    share, depth = metrics["cut_face_share"], metrics["skin_depth"]
+    measured = np.isfinite(share)
+    shown, spots, poked = (spread_over(values, measured) for values in _seen(share, seen))
+    depth = np.where(measured, np.fmax(depth, poked), np.nan)
+    height = np.nan_to_num(depth)
+    cut, deep = shown > CUT_UNSOUND.value, (height > DEPTH_UNSOUND.value) & (shown > SPOTS_UNSOUND.value)
+    lasting = measured & (spots > SPOTS_UNSOUND.value) & (height > SPOTS_HEIGHT.value)
+    if lasting.sum() <= SPOTS_LASTING.value * measured.sum():
+        lasting = np.zeros_like(lasting)
+    causes = [
+        Cause("skin_through_cloth", f"the skin is seen through more than {cut_text()} of the cloth's triangles", cut & measured,
+              shown, CUT_UNSOUND.value, CUT_UNSOUND.unit, ".1%", measured=measured),
+        Cause("skin_depth", f"skin sticks out of the cloth by more than {1e3 * DEPTH_UNSOUND.value:g} mm", deep & measured,
+              depth, DEPTH_UNSOUND.value, "m", ".0f", 1e3, " mm", measured),
+        Cause("skin_depth", f"spots of skin stick out by more than {1e3 * SPOTS_HEIGHT.value:g} mm, and stay,", lasting,
+              depth, SPOTS_HEIGHT.value, "m", ".0f", 1e3, " mm", measured),
+    ]  # fmt: skip
+    return Found(causes, notes=_notes(metrics, share, shown)) + inside_causes(inside)
+
+
+def cut_text() -> str:
+    return f"{CUT_UNSOUND.value:.0%}"
+
+
+def inside_causes(metrics: Mapping[str, np.ndarray]) -> Found:
+    """Cloth inside the body, as far as a rollout measured it: it cuts nothing there."""
+    share = metrics.get("penetration_share")
+    if share is None:
+        return Found()
+    text, limit = f"more than {INSIDE_UNSOUND.value:.0%} of the cloth's vertices are inside the body", INSIDE_UNSOUND
+    bad = np.nan_to_num(share) > limit.value
+    return Found([Cause("inside_body", text, bad, share, limit.value, limit.unit, ".0%", measured=np.isfinite(share))])
+
+
+def _seen(share: np.ndarray, seen: Drawn) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Shares (S,) of the cloth's triangles through which skin is seen, of those that are not at its rim, and how far the body
+    goes through them [m]; NaN in frames that were not looked at, 0 in those whose skin cuts hardly anything."""
+    shown, spots, poked = (np.where(share <= SPOTS_UNSOUND.value, 0.0, np.nan) for _ in range(3))
+    stored = {int(step): frame for frame, step in enumerate(seen.step)}
+    over = [step for step in np.flatnonzero(np.nan_to_num(share) > SPOTS_UNSOUND.value).tolist() if step in stored]
+    for place in np.unique(np.linspace(0, max(len(over) - 1, 0), min(len(over), _LOOKED_AT)).astype(np.int64)).tolist():
+        step = over[place]
+        shown[step], spots[step], poked[step] = _seen_at(seen, stored[step])
+    return shown, spots, poked
+
+
+def _seen_at(seen: Drawn, frame: int) -> tuple[float, float, float]:
+    pos, body = seen.cloth[frame].astype(np.float64), seen.body[frame].astype(np.float64)
+    cut = crossings(pos, seen.faces, body, seen.body_faces)
+    pairs = cut.pairs
+    pairs = pairs[~in_folds(pairs[:, 1], body, seen.body_faces)]
+    faces = np.unique(pairs[:, 0])
+    found = faces[visible(pos[seen.faces[faces]].mean(axis=1), [(pos, seen.faces), (body, seen.body_faces)])]
+    rim = np.zeros(len(pos), dtype=bool)
+    sheet = Sheet.of(seen.faces)
+    rim[: len(sheet.on_rim)] = sheet.on_rim
+    inner = ~rim[seen.faces[found]].any(axis=1)
+    through = way_through(pos, seen.faces, body, seen.body_faces, cut.second_edges) if len(found) else 0.0
+    return len(found) / len(seen.faces), int(inner.sum()) / len(seen.faces), through
+
+
+def way_through(cloth: np.ndarray, faces: np.ndarray, body: np.ndarray, body_faces: np.ndarray, cut: np.ndarray) -> float:
+    """How far [m] a body (W, 3) goes through the middle of a cloth (V, 3), (F, 3): the greatest distance to the cloth of what is
+    cut off from the rest of the body where edges of it pass through the cloth; 0 where nothing is cut off.
+
+    Args:
+        cut: (K, 3) the ends of these edges, ascending, and the face.
+    """
+    edges, count = unique_edges(body_faces), len(body)
+    kept = edges[~np.isin(edges @ [count, 1], cut[:, :2] @ [count, 1])]
+    whole, piece = (connected_components(count, some) for some in (edges, kept))
+    beyond = np.zeros(count, dtype=bool)
+    for part in np.unique(whole[cut[:, 0]]):
+        pieces = np.where(whole == part, piece, -1)
+        beyond |= (pieces >= 0) & (pieces != np.bincount(pieces[pieces >= 0]).argmax())
+    return float(cKDTree(sampled(cloth, faces)).query(body[beyond])[0].max()) if beyond.any() else 0.0
+
+
+def _notes(metrics: Mapping[str, np.ndarray], share: np.ndarray, shown: np.ndarray) -> list[str]:
+    """What was cut and does not count."""
+    folds = metrics.get("cut_in_folds", np.zeros_like(share))
+    caught = np.nan_to_num(folds) > CUT_UNSOUND.value
+    notes = []
+    if caught.any():
+        notes.append(
+            f"the skin cuts up to {np.nanmax(folds):.1%} of the cloth's triangles where it passes through itself, in "
+            f"{name_frames(caught)}: cloth cannot be outside both sides of such a fold, and this does not count"
+        )
+    hidden = np.nan_to_num(share - folds) > CUT_UNSOUND.value
+    if hidden.any() and not (shown[hidden] > CUT_UNSOUND.value).any():
+        notes.append(
+            f"the skin cuts up to {np.nanmax((share - folds)[hidden]):.1%} of the cloth's triangles in {name_frames(hidden)}, "
+            "where no viewer sees it: this does not count"
+        )
+    return notes
