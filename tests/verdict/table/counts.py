@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 Array = np.ndarray
 
@@ -11,8 +12,9 @@ def inside(points: Array, pos: Array, faces: Array) -> Array:
     """Which points (N, 3) lie in a closed surface: its winding number, from solid angles (van Oosterom and Strackee, 1983)."""
     corners = pos[faces]
     found = np.zeros(len(points))
-    for first in range(0, len(points), 64):
-        some = slice(first, first + 64)
+    maybe = _behind(points, pos, faces)
+    for first in range(0, len(maybe), 64):
+        some = maybe[first : first + 64]
         a, b, c = (corners[None, :, corner] - points[some, None] for corner in range(3))
         la, lb, lc = (np.linalg.norm(edge, axis=2) for edge in (a, b, c))
         above = np.einsum("nfi,nfi->nf", a, np.cross(b, c))
@@ -54,6 +56,18 @@ def parts(count: int, faces: Array) -> Array:
         if np.array_equal(lower, own):
             return np.unique(own, return_inverse=True)[1]
         own = lower
+
+
+def _behind(points: Array, pos: Array, faces: Array) -> Array:
+    """Rows of the points that do not lie clearly ahead of the three vertices nearest to them."""
+    normal = np.zeros_like(pos)
+    corners = pos[faces]
+    for corner in range(3):
+        np.add.at(normal, faces[:, corner], np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    _, near = cKDTree(pos).query(points, 3)
+    ahead = np.einsum("nki,nki->nk", points[:, None] - pos[near], normal[near])
+    return np.flatnonzero(ahead.min(axis=1) < 2e-3)
 
 
 def _boxes(first: Array, second: Array) -> Array:
