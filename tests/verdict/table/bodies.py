@@ -69,6 +69,20 @@ def ball(speed: float, height: float = 0.5, radius: float = 0.2, count: int = 16
     return make
 
 
+def spear(speed: float, height: float = 0.5, count: int = 12) -> Maker:
+    """A spindle of 1 m, 8 cm thick, that rises through a height at ``speed`` [m/s]."""
+
+    def make(folder: Path) -> Path:
+        pos, faces = sphere(3, 1.0)
+        rise = height - 0.7 + np.arange(count) * speed / _FPS
+        np.savez(
+            folder / "spear.npz", verts=pos * [0.04, 0.5, 0.04] + rise[:, None, None] * [0.0, 1.0, 0.0], faces=faces, fps=_FPS
+        )
+        return folder / "spear.npz"
+
+    return make
+
+
 def _window(name: str, first: int, count: int) -> PoseSequence:
     return load_sequence(name).window(first, first + count)
 

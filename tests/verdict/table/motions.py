@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +41,7 @@ def flip(seconds: float = 0.8, about: str = "x", height: float = 0.6) -> Maker:
         poses, trans = (np.repeat(rows[:1], calm + count, axis=0) for rows in _recorded("stand_sway"))
         share = np.concatenate([np.zeros(calm), np.linspace(0.0, 1.0, count)])
         eased = share * share * (3.0 - 2.0 * share)
-        poses = _turned(poses, Rotation.from_euler(about, 360.0 * eased, degrees=True))
+        poses = _turned(poses, Rotation.from_euler(about, 360.0 * eased[:, None], degrees=True))
         return _write(folder / f"flip_{about}.npz", poses, trans + 4 * height * (share - share**2)[:, None] * [0, 0, 1.0])
 
     return make
@@ -116,7 +117,7 @@ def turned_rows(first: int, last: int, name: str = "walk_proud", start: int = 60
     def make(folder: Path) -> Path:
         poses, trans = (rows[start : start + 120] for rows in _recorded(name))
         half = np.where((np.arange(len(poses)) >= first) & (np.arange(len(poses)) < last), 180.0, 0.0)
-        return _write(folder / "turned.npz", _turned(poses, Rotation.from_euler("z", half, degrees=True)), trans)
+        return _write(folder / "turned.npz", _turned(poses, Rotation.from_euler("z", half[:, None], degrees=True)), trans)
 
     return make
 
@@ -126,6 +127,20 @@ def without_rate(name: str = "walk_proud", start: int = 60) -> Maker:
 
     def make(folder: Path) -> Path:
         return _write(folder / "no_rate.npz", *(rows[start:] for rows in _recorded(name)), mocap_framerate=None)
+
+    return make
+
+
+def pose_pickle(name: str = "walk_proud", start: int = 60, every: int = 1) -> Maker:
+    """A pickle of joint rotations, y up, that says nothing of frames per second; it has one of ``every`` recorded rows."""
+
+    def make(folder: Path) -> Path:
+        poses, trans = (rows[start::every] for rows in _recorded(name))
+        upright = _turned(poses, _TO_Y)
+        fields = {"global_orient": upright[:, :3], "body_pose": np.pad(upright[:, 3:66], ((0, 0), (0, 6)))}
+        fields |= {"transl": _TO_Y.apply(trans), "betas": np.zeros((len(poses), 10))}
+        (folder / "poses.pkl").write_bytes(pickle.dumps(fields, 2))
+        return folder / "poses.pkl"
 
     return make
 

@@ -30,6 +30,8 @@ Array = np.ndarray
 VIEWS = {"front": 8.0, "back": 188.0, "side": 98.0}
 _SIZE = (310, 400)
 _SKIN = (0.86, 0.72, 0.60)
+#: Stretch beyond which nothing else is counted: every triangle meets every other.
+_TORN = 8.0
 _CLOTH = np.array([[0.16, 0.38, 0.72], [0.75, 0.22, 0.20], [0.20, 0.58, 0.28], [0.60, 0.30, 0.66], [0.85, 0.60, 0.12]])
 
 
@@ -89,7 +91,10 @@ def _chosen(cloth: Array, rest: Array, faces: Array) -> list[int]:
 
 def _words(frame: int, cloth: Array, rest: Array, faces: Array, body: Array, body_faces: Array) -> str:
     long = counts.stretch(cloth, rest, faces)
-    words = f"{frame}: stretch {np.quantile(long, 0.99):.2f} {long.max():.2f}\nself {len(counts.crossings(cloth, faces))}"
+    words = f"{frame}: stretch {np.quantile(long, 0.99):.2f} {long.max():.2f}"
+    if np.quantile(long, 0.99) > _TORN:
+        return words
+    words += f"\nself {len(counts.crossings(cloth, faces))}"
     if not len(body):
         return words
     cut = np.unique(counts.crossings(cloth, faces, body, body_faces)[:, 0])

@@ -1,7 +1,17 @@
-"""The table of labelled rollouts: all scenes by name, and the fast ones."""
+"""The table of labelled rollouts: its scenes and labels by name, the fast ones, and inputs that are refused.
+
+A label says what a person saw in the pictures of :mod:`tests.verdict.table.pictures`, before any rule judged the rollout:
+
+- ``label``: right, a supervisor would take the shot, or broken. Faults that no view shows are right.
+- ``margin``: clear, or near, where two people might differ.
+- ``why``: what was seen. ``since``: first frame in which it shows; ``part``: where. Both null for what is right.
+- ``doubts``: what a person would want to be told about the input, in the words of :data:`hood.assets.files.doubt.KINDS`.
+- ``seen``: when, and from where.
+"""
 
 from __future__ import annotations
 
+from tests.verdict.table import motions
 from tests.verdict.table.scene import Scene
 from tests.verdict.table.scenes_garments import LOOSE, OUTFITS, PARTS, SIZES
 from tests.verdict.table.scenes_poses import HARD, OTHER_BODIES, SHAPES, WRONG_MOTIONS
@@ -10,3 +20,13 @@ from tests.verdict.table.scenes_steppers import FABRICS, RATES, STEPPERS
 _ALL = [*STEPPERS, *FABRICS, *RATES, *HARD, *OTHER_BODIES, *SHAPES, *WRONG_MOTIONS, *SIZES, *PARTS, *LOOSE, *OUTFITS]
 SCENES: dict[str, Scene] = {scene.name: scene for scene in _ALL}
 assert len(SCENES) == len(_ALL), "two scenes of one name"
+
+# LABELS: dict[str, dict[str, Any]] = json.loads((Path(__file__).parent / "labels.json").read_text(encoding="utf-8"))
+
+#: Inputs of the kinds of the table that the command refuses, with one sentence; no rollout, no label.
+REFUSED: dict[str, Scene] = {
+    scene.name: scene for scene in (Scene("tank_npz_no_rate", "refused", "newton", "tank", motions.without_rate(), 20),)
+}
+
+#: The cheapest of many kinds, half of them broken.
+FAST: tuple[str, ...] = ()

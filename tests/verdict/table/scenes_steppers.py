@@ -59,7 +59,7 @@ FABRICS = [
     Scene("skirt_leather", "stiff fabric", "newton", "skirt", "walk_brisk", 24, ("start=1", "material=nappa_leather")),
     Scene("shorts_felt", "stiff fabric", "newton", "shorts", "kicks", 24, ("start=1", "material=wool_felt")),
     Scene("dress_canvas_refined", "stiff fabric", "guess+5", "dress", "dance_slow", 24, ("start=1", "material=cotton_canvas")),
-    Scene("shirt_two_fabrics", "several fabrics", "newton", "dress", "walk_brisk", 24,
+    Scene("dress_two_fabrics", "several fabrics", "newton", "dress", "walk_brisk", 24,
           ("start=1", "fabrics={below_waistband:silk}", "material=denim")),
     Scene("dress_like_gum", "over-stretched", "newton", "dress", "jumps", 30,
           ("start=1", "material.lame_mu=250", "material.lame_lambda=400")),
