@@ -11,7 +11,11 @@ A label says what a person saw in the pictures of :mod:`tests.verdict.table.pict
 
 from __future__ import annotations
 
-from tests.verdict.table import motions
+import json
+from pathlib import Path
+from typing import Any
+
+from tests.verdict.table import garments, motions
 from tests.verdict.table.scene import Scene
 from tests.verdict.table.scenes_garments import LOOSE, OUTFITS, PARTS, SIZES
 from tests.verdict.table.scenes_poses import HARD, OTHER_BODIES, SHAPES, WRONG_MOTIONS
@@ -21,11 +25,20 @@ _ALL = [*STEPPERS, *FABRICS, *RATES, *HARD, *OTHER_BODIES, *SHAPES, *WRONG_MOTIO
 SCENES: dict[str, Scene] = {scene.name: scene for scene in _ALL}
 assert len(SCENES) == len(_ALL), "two scenes of one name"
 
-# LABELS: dict[str, dict[str, Any]] = json.loads((Path(__file__).parent / "labels.json").read_text(encoding="utf-8"))
+LABELS: dict[str, dict[str, Any]] = json.loads((Path(__file__).parent / "labels.json").read_text(encoding="utf-8"))
 
 #: Inputs of the kinds of the table that the command refuses, with one sentence; no rollout, no label.
 REFUSED: dict[str, Scene] = {
-    scene.name: scene for scene in (Scene("tank_npz_no_rate", "refused", "newton", "tank", motions.without_rate(), 20),)
+    scene.name: scene
+    for scene in (
+        Scene("tank_npz_no_rate", "refused", "newton", "tank", motions.without_rate(), 20),
+        Scene("skirt_tangled", "refused", "newton", garments.tangled("skirt", -0.45, -0.15), frames=16, keys=("start=1",)),
+        Scene("tank_upside_down", "refused", "newton", garments.upside_down("tank"), frames=20, keys=("start=1",)),
+        Scene("shorts_on_chest", "refused", "newton", garments.plain("shorts", (0, 0.42, 0)), frames=20, keys=("start=1",)),
+        Scene("tshirt_too_low", "refused", "newton", garments.plain("tshirt", (0, -0.45, 0)), frames=20, keys=("start=1",)),
+        Scene("tank_inside_body", "refused", "newton", garments.shrunk_inside("tank"), frames=16, keys=("start=1",)),
+        Scene("skirt_beside", "refused", "newton", garments.plain("skirt", (2.0, 0, 0)), frames=16, keys=("start=1",)),
+    )
 }
 
 #: The cheapest of many kinds, half of them broken.
