@@ -24,6 +24,7 @@ def test_every_scene_has_a_label_and_every_label_a_scene() -> None:
         assert label["why"], name
         broken = label["label"] == "broken"
         assert (label["since"] is not None) == broken == bool(label["part"]), name
+        assert label["cause"] in (("cloth", "input") if broken else (None,)), name
         if broken:
             assert 0 <= label["since"] < SCENES[name].frames, name
 
@@ -33,7 +34,7 @@ def test_the_table_is_as_wide_as_it_says() -> None:
     assert len({scene.kind for scene in SCENES.values()}) >= 38
     assert {scene.stepper for scene in SCENES.values()} == set(STEPPERS)
     share = Counter(label["label"] for label in LABELS.values())
-    assert min(share.values()) > 0.35 * len(LABELS)
+    assert min(share.values()) > 0.3 * len(LABELS)
 
 
 def test_the_fast_scenes_are_of_many_kinds_and_half_of_them_broken() -> None:
@@ -51,16 +52,14 @@ def test_points_in_a_ball_are_found() -> None:
 
 
 def test_crossing_pairs_of_two_squares_are_those_along_the_line_of_both() -> None:
-    pos, faces = grid(9, 9, 1.0)
-    upright = (pos - pos.mean(axis=0))[:, [0, 2, 1]] + pos.mean(axis=0) + [0.013, 0.0, 0.017]
-    pairs = counts.crossings(pos, faces, upright, faces)
-    assert len(pairs)
-    height = pos.mean(axis=0)
-    across = np.flatnonzero([abs(pos[face][:, 2] - height[2] - 0.017).min() < 0.13 for face in faces])
-    assert set(pairs[:, 0]) <= set(across)
-    together = np.concatenate([pos, upright]), np.concatenate([faces, faces + len(pos)])
-    assert len(counts.crossings(*together)) == len(pairs)
-    assert len(counts.crossings(pos, faces)) == 0
+    flat, faces = grid(9, 9, 1.0)
+    across, along = 0.517, flat[:, 2][faces]
+    upright = (flat - flat.mean(axis=0))[:, [0, 2, 1]] + [flat[:, 0].mean() + 0.013, 0.05, across]
+    pairs = counts.crossings(flat, faces, upright, faces)
+    assert set(pairs[:, 0]) == set(np.flatnonzero((along.min(axis=1) < across) & (along.max(axis=1) > across)))
+    both = np.concatenate([flat, upright]), np.concatenate([faces, faces + len(flat)])
+    assert len(counts.crossings(*both)) == len(pairs)
+    assert len(counts.crossings(flat, faces)) == 0
 
 
 def test_parts_and_stretch_of_two_sheets() -> None:
@@ -82,7 +81,6 @@ def test_a_scene_runs_and_its_sheet_shows_the_cloth(tmp_path: Path) -> None:
 
 
 def test_a_refused_scene_says_why(tmp_path: Path) -> None:
-    name = sorted(REFUSED)[0]
-    words = run_unread(REFUSED[name], tmp_path)
-    assert words.startswith("hood: error:")
-    assert run(REFUSED[name], tmp_path) == ({}, 2)
+    scene = REFUSED["tank_npz_no_rate"]
+    assert "mocap_framerate" in run_unread(scene, tmp_path)
+    assert run(scene, tmp_path) == ({}, 2)

@@ -78,6 +78,17 @@ FABRICS = [
     Scene("tshirt_10_network", "network out of range", "quickstart", "tshirt", "jog", 16, ("start=1", "fps=10")),
 ]  # fmt: skip
 
+#: Contact that gives way, or acts at vertices alone and on the skin itself.
+SOFT_CONTACT = [
+    Scene("tank_soft_contact", "skin through cloth", "newton", "tank", "walk_brisk", 16,
+          ("start=1", "losses.terms.collision.weight=20")),
+    Scene("trousers_no_contact", "skin through cloth", "newton", "trousers", "squats", 20,
+          ("start=1", "losses.terms.collision.weight=1")),
+    Scene("longsleeve_constant_reach", "skin through cloth", "newton", "longsleeve", "walk_brisk", 16,
+          ("start=1", "losses.terms.collision.reach=constant")),
+    Scene("tshirt_reference_losses", "skin through cloth", "guess+5", "tshirt", "jog", 16, ("start=1", "losses=reference")),
+]  # fmt: skip
+
 RATES = [
     Scene("dress_15", "15 frames a second", "newton", "dress", "walk_brisk", 20, ("start=1", "fps=15")),
     Scene("trousers_15_jog", "15 frames a second", "quickstart+5", "trousers", "jog", 16, ("start=1", "fps=15")),
