@@ -41,10 +41,12 @@ PARTS = [
     Scene("dress_slit_low", "slit garment", "newton", made.slit("dress", -0.1), "walk_brisk", 24, WALK),
     Scene("tank_skirt_one_file", "two in one file", "newton", made.both("tank", "skirt"), frames=16, keys=WALK,
           needs="the file is one garment of two parts"),
-    Scene("tshirt_twice", "tangled start", "newton", made.twice("tshirt"), frames=16, keys=WALK),
+    Scene("tshirt_twice", "tangled start", "newton", made.twice("tshirt"), frames=16, keys=WALK,
+          needs="two parts 1 cm apart stay two; a loader that takes them for one doubled layer makes it right"),
     Scene("dress_tangled_network", "tangled start", "quickstart", made.tangled("dress", -0.40, -0.10), frames=16, keys=WALK),
     Scene("skirt_upside_down", "on the wrong way", "newton", made.upside_down("skirt"), frames=24, keys=WALK),
-    Scene("tank_beside", "wrong limb", "newton", made.plain("tank", (0.10, 0, 0)), frames=10, keys=WALK),
+    Scene("tank_beside", "wrong limb", "newton", made.plain("tank", (0.10, 0, 0)), frames=10, keys=WALK,
+          needs="the file is put on where it lies"),
 ]  # fmt: skip
 
 LOOSE = [
