@@ -4,11 +4,12 @@
     python -m tests.verdict.table.pictures dress_handstand skirt_spin output=outputs/table
     python -m tests.verdict.table.pictures dress_handstand output=outputs/table again=true close=0.4
 
-A sheet has a column a frame: the first, a third, two thirds, the one whose edges are stretched most, and the last. Its rows
-are the views. The body is light, every connected part of the cloth has a colour of its own, faces seen from inside are darker.
-Above each column stand counts of :mod:`tests.verdict.table.counts`: stretch of the edges (99th percentile, most), pairs of
-triangles through each other, cloth vertices in the body, triangles that the skin cuts. What the command says about its rollout
-is not shown: labels are given without it. ``close=0.4`` draws what lies within 0.4 m of the middle of the cloth.
+A sheet has a column a frame: the first, a third, two thirds, the one whose edges are stretched most, of every fourth the one that
+the skin cuts most, and the last. Its rows are the views. The body is light, every connected part of the cloth has a colour of
+its own, faces seen from inside are darker. Above each column stand counts of :mod:`tests.verdict.table.counts`: stretch of the
+edges (99th percentile, most), pairs of triangles through each other, cloth vertices in the body, triangles that the skin cuts.
+What the command says about its rollout is not shown: labels are given without it. ``close=0.4`` draws what lies within 0.4 m
+of the middle of the cloth.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ def sheet(path: Path, close: float = 0.0) -> Array:
     colours = _CLOTH[counts.parts(len(rest), faces) % len(_CLOTH)]
     cells: dict[str, list[Array]] = {view: [] for view in VIEWS}
     labels = []
-    frames = _chosen(cloth, rest, faces)
+    frames = _chosen(cloth, rest, faces, body, body_faces)
     for frame in frames:
         labels.append(_words(frame, cloth[frame], rest, faces, body[frame], body_faces))
         for view, azimuth in VIEWS.items():
@@ -81,12 +82,19 @@ def sheet(path: Path, close: float = 0.0) -> Array:
     return contact_sheet(images, len(frames), [*labels, *[""] * (len(images) - len(labels))])
 
 
-def _chosen(cloth: Array, rest: Array, faces: Array) -> list[int]:
-    """First, a third, two thirds and last, and the one whose edges are stretched most."""
+def _chosen(cloth: Array, rest: Array, faces: Array, body: Array, body_faces: Array) -> list[int]:
+    """First, a third, two thirds and last, the most stretched one, and of every fourth the one that the skin cuts most."""
     fine = [frame for frame in range(len(cloth)) if np.isfinite(cloth[frame]).all()]
-    worst = max(fine, key=lambda frame: float(np.quantile(counts.stretch(cloth[frame], rest, faces), 0.99)))
+    stretch = [float(np.quantile(counts.stretch(cloth[frame], rest, faces), 0.99)) for frame in fine]
     last = fine[-1]
-    return sorted({0, last // 3, 2 * last // 3, worst, last})
+    chosen = {0, last // 3, 2 * last // 3, fine[int(np.argmax(stretch))], last}
+    if body.shape[1] and max(stretch) < _TORN:
+        chosen.add(max(fine[2::4], key=lambda frame: _num_cut(cloth[frame], faces, body[frame], body_faces), default=0))
+    return sorted(chosen)
+
+
+def _num_cut(cloth: Array, faces: Array, body: Array, body_faces: Array) -> int:
+    return len(np.unique(counts.crossings(cloth, faces, body, body_faces)[:, 0]))
 
 
 def _words(frame: int, cloth: Array, rest: Array, faces: Array, body: Array, body_faces: Array) -> str:
@@ -97,9 +105,8 @@ def _words(frame: int, cloth: Array, rest: Array, faces: Array, body: Array, bod
     words += f"\nself {len(counts.crossings(cloth, faces))}"
     if not len(body):
         return words
-    cut = np.unique(counts.crossings(cloth, faces, body, body_faces)[:, 0])
-    deep = counts.inside(cloth, body, body_faces).mean()
-    return words + f" in {deep:.1%} cut {len(cut) / len(faces):.1%}"
+    cut = _num_cut(cloth, faces, body, body_faces) / len(faces)
+    return words + f" in {counts.inside(cloth, body, body_faces).mean():.1%} cut {cut:.1%}"
 
 
 def _cell(cloth: Array, faces: Array, colours: Array, body: Array, body_faces: Array, azimuth: float, close: float) -> Array:
