@@ -4,12 +4,12 @@
     python -m tests.verdict.table.pictures dress_handstand skirt_spin output=outputs/table
     python -m tests.verdict.table.pictures dress_handstand output=outputs/table again=true close=0.4
 
-A sheet has a column a frame: the first, a third, two thirds, the one whose edges are stretched most, of every fourth the one that
-the skin cuts most, and the last. Its rows are the views. The body is light, every connected part of the cloth has a colour of
-its own, faces seen from inside are darker. Above each column stand counts of :mod:`tests.verdict.table.counts`: stretch of the
-edges (99th percentile, most), pairs of triangles through each other, cloth vertices in the body, triangles that the skin cuts.
-What the command says about its rollout is not shown: labels are given without it. ``close=0.4`` draws what lies within 0.4 m
-of the middle of the cloth.
+A sheet has a column a frame: the first, a third, two thirds, the one whose edges are stretched most, of every fourth the
+one that the skin cuts most, and the last. Its rows are the views. The body is light, every connected part of the cloth has
+a colour of its own, faces seen from inside are darker. Above each column stand counts of :mod:`tests.verdict.table.counts`:
+stretch of the edges (99th percentile, most), pairs of triangles through each other, cloth vertices in the body, triangles
+that the skin cuts. What the command says about its rollout is not shown: labels are given without it. ``close=0.4`` draws
+what lies within 0.4 m of the middle of the cloth.
 """
 
 from __future__ import annotations
