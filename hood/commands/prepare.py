@@ -28,7 +28,7 @@ from hood.assets.garment.units import UNITS
 from hood.assets.motion.animated_mesh import body_kind
 from hood.assets.motion.load import load_sequence
 from hood.assets.motion.poses import POSE_SUFFIXES, arms_down, read_pose
-from hood.assets.motion.sequence import PoseSequence
+from hood.assets.motion.sequence import UP_AXES, PoseSequence
 from hood.commands.common import prepare_folder
 from hood.commands.fastening import fasten_as_asked, give_room
 from hood.commands.garments import checked_pins, heed, names_of, shape_coefficients
@@ -75,7 +75,7 @@ def run(overrides: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     config = load_config("prepare", overrides)
     require_choice(config, "format", ("text", "json"))
-    require_choice(config, "body_up", ("auto", "y", "z"))
+    require_choice(config, "body_up", ("auto", *UP_AXES))
     check_rate(config)
     if int(config.frame) < 0:
         raise ConfigError(f"frame={config.frame}: must be at least 0, frames count from 0")

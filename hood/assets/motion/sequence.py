@@ -8,11 +8,29 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from hood.assets.motion.recording import NUM_BODY_JOINTS
+from hood.assets.motion.rotation_vectors import from_vectors
 
-__all__ = ["NUM_BODY_JOINTS", "Z_UP_TO_Y_UP", "PoseSequence", "resample", "turn_world"]
+__all__ = ["NUM_BODY_JOINTS", "UP_AXES", "Z_UP_TO_Y_UP", "PoseSequence", "require_up", "resample", "still", "turn_world"]
 
-#: z-up (AMASS) to y-up: (x, y, z) → (x, z, -y).
-Z_UP_TO_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+#: The turn (3, 3) that makes y of an axis which points up in a file, by the axis. Row 1 is the axis itself; z (AMASS) goes
+#: (x, y, z) → (x, z, -y), and -y, of cameras, (x, -y, -z).
+UP_AXES = {
+    "y": np.eye(3),
+    "z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
+    "x": np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+    "-y": np.diag([1.0, -1.0, -1.0]),
+    "-z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+    "-x": np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+}
+Z_UP_TO_Y_UP = UP_AXES["z"]
+#: Seconds for which a single pose is held where nobody says how long.
+_HELD = 5.0
+
+
+def require_up(up: str) -> None:
+    """Raise ValueError unless ``up`` is an axis of :data:`UP_AXES` or "auto"."""
+    if up not in (*UP_AXES, "auto"):
+        raise ValueError(f"up={up}: give z (AMASS), y, x, -y (cameras), -z, -x or auto, the axis that points up in the file")
 
 
 @dataclass(frozen=True)
@@ -48,6 +66,12 @@ class PoseSequence:
         return replace(self, poses=self.poses[frames], transl=self.transl[frames], fingers=fingers)
 
 
+def still(sequence: PoseSequence, fps: float, num_frames: int | None = None) -> PoseSequence:
+    """A single pose held at ``fps`` for ``num_frames``, at least two; None: five seconds."""
+    count = max(round(_HELD * fps) + 1 if num_frames is None else num_frames, 2)
+    return replace(sequence.at(np.zeros(count, dtype=np.int64)), fps=fps)
+
+
 def resample(sequence: PoseSequence, fps: float) -> PoseSequence:
     """The motion at another frame rate: rotations by slerp, translations linearly; time stamps k / fps, no drift."""
     if abs(sequence.fps - fps) < 1e-9:
@@ -76,7 +100,7 @@ def time_stamps(name: str, num_frames: int, fps: float, new_fps: float) -> tuple
 def turn_world(sequence: PoseSequence, rotation: np.ndarray) -> PoseSequence:
     """The motion in a turned world: root orientation and translation by ``rotation`` (3, 3)."""
     poses = sequence.poses.copy()
-    poses[:, 0] = (Rotation.from_matrix(rotation) * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
+    poses[:, 0] = (Rotation.from_matrix(rotation) * from_vectors(poses[:, 0])).as_rotvec()
     transl = sequence.transl @ rotation.T
     return replace(sequence, poses=poses, transl=transl, world_rotation=rotation @ sequence.world_rotation)
 
@@ -86,5 +110,5 @@ def _slerp(poses: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndar
     result = np.zeros((len(target), *poses.shape[1:]))
     for joint in range(poses.shape[1]):
         if np.any(poses[:, joint]):
-            result[:, joint] = Slerp(source, Rotation.from_rotvec(poses[:, joint]))(target).as_rotvec()
+            result[:, joint] = Slerp(source, from_vectors(poses[:, joint]))(target).as_rotvec()
     return result

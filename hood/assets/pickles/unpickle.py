@@ -57,8 +57,10 @@ class RestrictedUnpickler(pickle._Unpickler):  # type: ignore[name-defined,misc]
         pickle.BYTEARRAY8[0]: _load_bytearray,
     }
 
-    def __init__(self, file: BinaryIO | io.BytesIO) -> None:
-        super().__init__(_Bounded(file), encoding="latin1")
+    def __init__(self, file: BinaryIO | io.BytesIO | Bounded) -> None:
+        #: The file, from where it is now; what stands behind the pickle can be read from it.
+        self.bounded = file if isinstance(file, Bounded) else Bounded(file)
+        super().__init__(self.bounded, encoding="latin1")
 
     def find_class(self, module: str, name: str) -> Any:
         """The stand-in for ``module.name``.
@@ -78,7 +80,7 @@ class RestrictedUnpickler(pickle._Unpickler):  # type: ignore[name-defined,misc]
         )
 
 
-class _Bounded:
+class Bounded:
     """A file that is never asked for more than it holds."""
 
     def __init__(self, file: BinaryIO | io.BytesIO) -> None:

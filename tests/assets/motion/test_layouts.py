@@ -1,0 +1,39 @@
+"""Published layouts: every one is the same walk, and says what it is; what is not read is answered in one sentence."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from variants import GENERATORS
+from walks import walk
+from writers import write
+
+from hood.assets.files.doubt import Doubt
+from hood.assets.motion.load import load_sequence
+from hood.assets.motion.recording import read_recording
+from hood.assets.motion.up_axis import bearing_notice
+
+
+@pytest.mark.parametrize("name", GENERATORS)
+def test_every_layout_is_the_same_walk(name: str, tmp_path: Path) -> None:
+    file = GENERATORS[name]
+    path = write(tmp_path / f"m{file.suffix}", file.make())
+    found = read_recording(path, **file.keys)
+    assert (found.layout, found.fps, found.fps_assumed, found.family) == (file.layout, file.fps, file.assumed, file.family)
+    assert (len(found.people), found.unit) == (file.people, "m")
+    assert bearing_notice(path, found)[0] == file.up
+    if file.betas:
+        np.testing.assert_allclose(found.betas[:10], walk().betas, atol=1e-6)
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        sequence = load_sequence(path, file.fps, **file.keys)
+    kinds = {said.message.kind for said in heard if isinstance(said.message, Doubt)}
+    assert kinds == {*file.doubts, *(("frame_rate",) if file.assumed else ())}
+    before_camera = [0.0, 0.0, -30.0] if name == "4DHumans" else [0.0, 0.0, 0.0]
+    np.testing.assert_allclose(sequence.transl, walk().transl + before_camera, atol=1e-6)
+    own, wanted = (Rotation.from_rotvec(poses[:, :22].reshape(-1, 3)) for poses in (sequence.poses, walk().poses))
+    assert (own.inv() * wanted).magnitude().max() < 1e-6
