@@ -10,7 +10,7 @@ import numpy as np
 
 from hood.assets.files.guarded import listed
 from hood.assets.motion.layouts.content import Unread
-from hood.assets.motion.layouts.people import Person
+from hood.assets.motion.layouts.people import Person, find_people
 from hood.assets.motion.layouts.table import squeezed
 from hood.assets.motion.skeleton import PARENTS
 
@@ -39,7 +39,7 @@ def unknown(path: Path, content: Any) -> str:
         return f"{path}: holds a body model, not a motion; pass body={path}"
     if "verts" in keys or "vertices" in keys:
         return f"{path}: holds a mesh, not joint rotations; a moving mesh is a body: pass body={path}"
-    if {"rh", "th"} & set(keys):
+    if {"rh", "th"} <= set(keys):
         return (
             f"{path}: an EasyMocap or ZJU-MoCap layout (Rh, Th), which turns about the origin and not about the pelvis, is "
             "not read; write global_orient=Rh, body_pose=poses[:, 3:], transl=Th + (R(Rh) - 1) @ J0, J0 the pelvis at rest"
@@ -55,6 +55,18 @@ def unknown(path: Path, content: Any) -> str:
         f"{path}: not an AMASS motion: neither 'poses' nor 'root_orient' and 'pose_body' inside "
         f"(found {found}); or give 'body_pose', 'global_orient' and 'transl'"
     )
+
+
+def is_of_motion(content: Any) -> bool:
+    """Whether content is a motion, or something that is given for one: joint positions, tables of features."""
+    if isinstance(content, list):
+        return bool(find_people(content)) or (len(content) > 0 and is_of_motion(content[0]))
+    if not isinstance(content, Mapping):
+        return isinstance(content, np.ndarray)
+    if _are_weights(content):
+        return False
+    keys = {squeezed(key) for key in content}
+    return bool(find_people(content)) or {"rh", "th"} <= keys or any(_is_positions(squeezed(k), v) for k, v in content.items())
 
 
 def unplaced(path: Path, person: Person) -> str:
