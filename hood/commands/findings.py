@@ -246,6 +246,7 @@ def inspect_moving_mesh(name: str, options: MotionOptions) -> Finding:
         "vertices": mesh.verts.shape[1],
         "triangles": len(mesh.faces),
         f"frames at {mesh.fps:g} fps": mesh.num_frames,
+        "frame rate of the file": "assumed" if mesh.fps_assumed else None,
         "size": np.round(np.ptp(mesh.verts[0], axis=0), 3).tolist(),
         "components": defects.num_components,
         "openings": defects.openings,

@@ -15,7 +15,7 @@ from hood.assets import identify as kinds
 from hood.assets.body.body import Body
 from hood.assets.body.load import load_body
 from hood.assets.motion.animated_mesh import NO_BODY, body_kind
-from hood.assets.motion.sequence import UP_AXES
+from hood.assets.motion.axes import UP_AXES
 from hood.commands import findings
 from hood.commands.findings import Finding
 from hood.commands.garments import read_outfit, shape_coefficients

@@ -26,9 +26,10 @@ from hood.assets.garment.pins import pin_mask, pin_numbers
 from hood.assets.garment.suspicions import suspect_kind
 from hood.assets.garment.units import UNITS
 from hood.assets.motion.animated_mesh import body_kind
+from hood.assets.motion.axes import UP_AXES
 from hood.assets.motion.load import load_sequence
 from hood.assets.motion.poses import POSE_SUFFIXES, arms_down, read_pose
-from hood.assets.motion.sequence import UP_AXES, PoseSequence
+from hood.assets.motion.sequence import PoseSequence
 from hood.commands.common import prepare_folder
 from hood.commands.fastening import fasten_as_asked, give_room
 from hood.commands.garments import checked_pins, heed, names_of, shape_coefficients

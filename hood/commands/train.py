@@ -18,9 +18,9 @@ from hood.assets.body.load import load_body
 from hood.assets.files.library import locate, motion_split, unknown
 from hood.assets.garment.garment import load_garment
 from hood.assets.material import Material
+from hood.assets.motion.axes import UP_AXES
 from hood.assets.motion.load import load_sequence
 from hood.assets.motion.motion_files import MotionFiles, find_motions
-from hood.assets.motion.sequence import UP_AXES
 from hood.commands.common import (
     held_folder,
     output_folder,

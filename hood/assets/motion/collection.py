@@ -22,9 +22,9 @@ def expand_sequences(patterns: str | Path | Iterable[str | Path], part: str = "t
     """Motion files that ``patterns`` stand for: in their order, folders and globs sorted, nothing twice.
 
     A pattern is the name of an embedded motion; a file; a folder, whose motions are all ``.npz`` and ``.pkl`` files in it and
-    below, or all ``.npy`` and ``.pt`` where there are none of these, but not the shapes that AMASS keeps beside them; a glob (``amass/**/*_poses.npz``); a list, see
-    :func:`hood.assets.motion.motion_files.find_motions`; or a ``.csv`` table with a column ``id`` (or file, path, sequence,
-    name; else its first), whose entries start from its folder and may leave the suffix out.
+    below (all ``.npy`` and ``.pt`` where there are none of these), but not the shapes that AMASS keeps beside them; a glob
+    (``amass/**/*_poses.npz``); a list, see :func:`hood.assets.motion.motion_files.find_motions`; or a ``.csv`` table with a
+    column ``id`` (or file, path, sequence, name; else its first), whose entries start from its folder, with or without suffix.
 
     Args:
         part: of a JSON split, "train" or "validation".

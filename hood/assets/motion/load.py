@@ -9,8 +9,9 @@ import numpy as np
 
 from hood.assets.files.library import locate
 from hood.assets.motion import sequence_edit as edit
+from hood.assets.motion.axes import UP_AXES, require_up
 from hood.assets.motion.recording import NUM_BODY_JOINTS, Recording, read_recording
-from hood.assets.motion.sequence import UP_AXES, PoseSequence, require_up, resample, still, turn_world
+from hood.assets.motion.sequence import PoseSequence, resample, still, turn_world
 from hood.assets.motion.up_axis import bearing_notice, head_down_doubt
 
 HANDS = ("flat", "file")

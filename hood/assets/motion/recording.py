@@ -47,6 +47,7 @@ class Recording:
     people: tuple[str, ...] = ("0",)  # everyone in the file
     person: str = "0"  # who of them this is
     unit: str = "m"  # of the translation in the file
+    unit_sure: bool = True  # tested by the body, or given
     fps_assumed: bool = False  # the file does not say a frame rate
     rotations: str | None = None  # how joint rotations were read that are no axis-angle vectors
     notes: tuple[UserWarning, ...] = ()  # what whoever uses it is to be told, doubts among them
@@ -87,10 +88,11 @@ def read_recording(
         family=_family(chosen, track.turns),
         up=chosen.layout.up,
         layout=chosen.layout.name,
-        camera=chosen.layout.camera or track.transl_key == chosen.keys.get("camtrans"),
+        camera=chosen.layout.camera,
         people=tuple(each.name for each in people),
         person=chosen.name,
         unit=unit.name,
+        unit_sure=unit.sure,
         fps_assumed=isinstance(rate_doubt, Doubt) and file_fps is None and "assumed" in str(rate_doubt),
         rotations=track.way,
         notes=tuple(note for note in notes if note is not None),

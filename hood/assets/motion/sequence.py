@@ -7,30 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from hood.assets.motion.axes import Z_UP_TO_Y_UP
 from hood.assets.motion.recording import NUM_BODY_JOINTS
 from hood.assets.motion.rotation_vectors import from_vectors
 
-__all__ = ["NUM_BODY_JOINTS", "UP_AXES", "Z_UP_TO_Y_UP", "PoseSequence", "require_up", "resample", "still", "turn_world"]
+__all__ = ["NUM_BODY_JOINTS", "Z_UP_TO_Y_UP", "PoseSequence", "resample", "still", "turn_world"]
 
-#: The turn (3, 3) that makes y of an axis which points up in a file, by the axis. Row 1 is the axis itself; z (AMASS) goes
-#: (x, y, z) → (x, z, -y), and -y, of cameras, (x, -y, -z).
-UP_AXES = {
-    "y": np.eye(3),
-    "z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
-    "x": np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
-    "-y": np.diag([1.0, -1.0, -1.0]),
-    "-z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
-    "-x": np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
-}
-Z_UP_TO_Y_UP = UP_AXES["z"]
 #: Seconds for which a single pose is held where nobody says how long.
 _HELD = 5.0
-
-
-def require_up(up: str) -> None:
-    """Raise ValueError unless ``up`` is an axis of :data:`UP_AXES` or "auto"."""
-    if up not in (*UP_AXES, "auto"):
-        raise ValueError(f"up={up}: give z (AMASS), y, x, -y (cameras), -z, -x or auto, the axis that points up in the file")
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hood.assets.files.doubt import Doubt
+from hood.assets.motion.axes import UP_AXES
 from hood.assets.motion.skeleton import FEET, joints_about_pelvis, some_frames
 
 #: Metres by unit.
@@ -28,6 +29,7 @@ class Unit(NamedTuple):
 
     name: str
     note: UserWarning | None = None
+    sure: bool = True  # by the user's word, or tested
 
     @property
     def metres(self) -> float:
@@ -51,8 +53,10 @@ def find_unit(path: Path, key: str, poses: np.ndarray, transl: np.ndarray, fps: 
     speeds = _feet_speeds(poses, transl, fps)
     by_steps, by_floor = _by_steps(speeds), _by_floor(poses, transl)
     found = by_steps or by_floor
-    if found == "m" or (found is None and not _is_suspect(speeds, transl, fps)):
+    if found == "m":
         return Unit("m")
+    if found is None and not _is_suspect(speeds, transl, fps):
+        return Unit("m", sure=_stands_on_floor(poses, transl, up))
     if found is not None:
         why = "its feet stand still only so" if by_steps else "its feet are on the floor only so"
         said = f"{path}: {key} is in {_WORDS[found]}, {why}; it is taken so (trans_unit=m takes it as metres)"
@@ -63,7 +67,7 @@ def find_unit(path: Path, key: str, poses: np.ndarray, transl: np.ndarray, fps: 
         f"{path}: {key} may not be in metres (the body moves at {fastest:.3g} m/s, {far:.3g} m far), and is taken so; "
         "trans_unit=cm or mm converts it, trans_unit=m says that it is right"
     )
-    return Unit("m", Doubt("units", said, value=fastest, unit="m/s"))
+    return Unit("m", Doubt("units", said, value=fastest, unit="m/s"), sure=False)
 
 
 def _feet_speeds(poses: np.ndarray, transl: np.ndarray, fps: float) -> dict[str, float]:
@@ -101,6 +105,14 @@ def _by_floor(poses: np.ndarray, transl: np.ndarray) -> str | None:
             continue
         found |= {name for name, value in low.items() if np.quantile(np.abs(value), 0.8) < _NEAR_FLOOR}
     return found.pop() if len(found) == 1 else None
+
+
+def _stands_on_floor(poses: np.ndarray, transl: np.ndarray, up: str) -> bool:
+    """Whether the lowest joint is near a floor at 0 with a translation in metres that lifts the pelvis."""
+    axis = UP_AXES[up][1]
+    height = transl @ axis
+    low = height + (joints_about_pelvis(poses) @ axis).min(axis=1)
+    return bool(np.median(np.abs(low)) < _NEAR_FLOOR < np.median(height))
 
 
 def _is_suspect(speeds: dict[str, float], transl: np.ndarray, fps: float) -> bool:

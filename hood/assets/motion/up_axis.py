@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from hood.assets.files.doubt import Doubt
+from hood.assets.motion.axes import UP_AXES
 from hood.assets.motion.recording import Recording
-from hood.assets.motion.sequence import UP_AXES
 from hood.assets.motion.skeleton import joints_about_pelvis, some_frames, upright
 
 #: The head is over the feet along an axis where the unit vector between them has this component there, and a body stands

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from hood.assets.files.library import locate
+from hood.assets.motion.axes import UP_AXES, require_up
 from hood.assets.motion.layouts.people import SeveralPeopleError
 from hood.assets.motion.recording import Recording, read_recording
-from hood.assets.motion.sequence import UP_AXES, require_up
 from hood.assets.motion.up_axis import bearing_notice, find_bearing, head_down_doubt
 from hood.commands.findings import Finding
 from hood.scene.load_motion import MotionOptions
@@ -40,9 +40,7 @@ def inspect_motion(name: str, options: MotionOptions) -> Finding:
     for note in (*recording.notes, *([] if notice is None else [notice])):
         _add(finding, path, note)
     if float(np.quantile(_root_speed(recording), 0.99)) > _FASTEST:
-        finding.problem(
-            "the root moves faster than 20 m/s", "trans may be in another unit or the frame rate wrong: trans_unit=cm"
-        )
+        finding.problem("the root moves faster than 20 m/s", "its unit or frame rate may be wrong: trans_unit=cm or file_fps=…")
     return finding
 
 
@@ -58,6 +56,8 @@ def _facts(recording: Recording, axis: str, options: MotionOptions) -> dict[str,
     bearing, speed = find_bearing(recording), _root_speed(recording)
     count = len(recording.poses)
     rate = f"{recording.fps:g}, assumed" if recording.fps_assumed else recording.fps
+    unit = recording.unit + ("" if recording.unit_sure else ", assumed")
+    unit += "" if options.trans_unit == "auto" else ", as given"
     tested = bearing.axis if bearing.sure else f"not sure: {bearing.axis} if it stands, {recording.up} if not"
     return {
         "frames": count,
@@ -71,7 +71,7 @@ def _facts(recording: Recording, axis: str, options: MotionOptions) -> dict[str,
         "rotations": recording.rotations or "axis-angle vectors",
         "gender": recording.gender,
         "shape coefficients": len(recording.betas),
-        "unit of the translation": recording.unit if options.trans_unit == "auto" else f"{recording.unit}, as given",
+        "unit of the translation": unit,
         "seen from a camera": recording.camera,
         "up axis by its layout": recording.up,
         "up axis by its poses": tested,

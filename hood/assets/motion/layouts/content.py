@@ -16,7 +16,7 @@ from hood.assets.files.library import SIZE_LIMIT, npy_header, read_arrays
 from hood.assets.pickles.content import load_content, unpickle
 from hood.assets.pickles.torch_file import load_torch
 
-ARCHIVES, ARRAYS, PICKLES, TENSORS = (".npz",), (".npy",), (".pkl", ".pickle", ".joblib"), (".pt", ".pth")
+ARCHIVES, ARRAYS, PICKLES, TENSORS = (".npz",), (".npy",), (".pkl", ".pickle", ".pk", ".p", ".joblib"), (".pt", ".pth")
 MOTION_SUFFIXES = (*ARCHIVES, *PICKLES, *ARRAYS, *TENSORS)
 #: Readers of other formats, see :mod:`hood.plugins`: a path in; the arrays of one of the layouts out, by key.
 PLUGINS = "motions"

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from hood.assets.files.frame_rates import squeezed
 from hood.assets.files.guarded import listed
 from hood.assets.motion.layouts.content import Unread
 from hood.assets.motion.layouts.people import Person, find_people
-from hood.assets.motion.layouts.table import squeezed
 from hood.assets.motion.skeleton import PARENTS
 
 #: Bones keep their length: it varies by less than this share where triples are places of joints.

@@ -2,26 +2,16 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from hood.assets.files.doubt import Doubt
-from hood.assets.motion.layouts.table import Layout, squeezed
+from hood.assets.files.frame_rates import parse_rate, rates_in
+from hood.assets.motion.layouts.table import Layout
 
 #: Rates [1/s] that are taken from a file.
 _SLOWEST, _FASTEST = 0.1, 1e5
-_WHOSE = (
-    "mocap|motion|video|source|src|original|orig|capture|captured|recorded|recording|sequence|seq|data|camera|cam|smpl|pose"
-)
-_RATE_KEY = re.compile(rf"({_WHOSE})?(framerate|fps|frequency|freq|samplingrate|samplerate|framespersecond)(hz|fps)?")
-_TIME_KEY = re.compile(rf"({_WHOSE})?(frametime|framedt|timestep|dt)(s|sec|seconds)?")
-#: Dicts within each other that are looked into.
-_DEEPEST = 4
-_SAID = re.compile(r"([0-9.eE+-]+)\s*(?:/\s*([0-9.]+))?\s*(?:fps|hz|1/s|frames per second)?", re.IGNORECASE)
 
 
 def frame_rate(
@@ -54,37 +44,6 @@ def frame_rate(
     return layout.fps, Doubt("frame_rate", said, value=layout.fps, unit="fps")
 
 
-def rates_in(source: Mapping[str, Any], depth: int = 0) -> Iterator[tuple[str, Any]]:
-    """Keys and values that say a frame rate, those of AMASS first; the inverse of those that say a time."""
-    for key in sorted(source, key=lambda key: not squeezed(key).startswith("mocap")):
-        short, value = squeezed(key), source[key]
-        if value is None:
-            continue
-        if _RATE_KEY.fullmatch(short):
-            yield key, value
-        elif _TIME_KEY.fullmatch(short) and np.size(value) == 1:
-            yield key, _inverse(value)
-    if depth < _DEEPEST:
-        for value in source.values():
-            if isinstance(value, Mapping):
-                yield from rates_in(value, depth + 1)
-
-
-def parse_rate(value: Any) -> float:
-    """The number that a rate stands for: ``120``, ``[120.]``, ``"29.97"``, ``b"120 fps"``, ``"30000/1001"``; NaN for others."""
-    item = np.asarray(value).reshape(-1)
-    if len(item) != 1:
-        return float("nan")
-    if item.dtype.kind in "iuf":
-        return float(item[0])
-    text = item[0].decode("latin-1") if isinstance(item[0], bytes) else str(item[0])
-    match = _SAID.fullmatch(text.strip().strip("'\""))
-    try:
-        return float(match[1]) / float(match[2] or 1) if match else float("nan")
-    except (ValueError, ZeroDivisionError):
-        return float("nan")
-
-
 def _rate(path: Path, key: str, value: Any) -> float:
     rate = parse_rate(value)
     if not _SLOWEST <= rate <= _FASTEST:
@@ -93,11 +52,6 @@ def _rate(path: Path, key: str, value: Any) -> float:
             "second (0.1 to 100000; file_fps=… overrides it)"
         )
     return rate
-
-
-def _inverse(value: Any) -> float:
-    seconds = parse_rate(value)
-    return 1.0 / seconds if seconds > 0 else float("nan")
 
 
 def _reason(layout: Layout) -> str:

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from hood.assets.motion.layouts.table import find_layout, squeezed
+from hood.assets.files.frame_rates import squeezed
+from hood.assets.motion.layouts.table import find_layout
 
 #: Names of frames: those of pictures, and numbers behind such a word.
 _FRAME_NAME = re.compile(r".*\.(jpe?g|png|bmp|webp)$|(frame|image|img)[_ -]?\d+$", re.IGNORECASE)

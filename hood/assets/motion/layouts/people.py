@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from hood.assets.files.frame_rates import squeezed
 from hood.assets.files.guarded import listed
-from hood.assets.motion.layouts.table import LAYOUTS, Layout, counts_of, find_layout, squeezed
+from hood.assets.motion.layouts.table import LAYOUTS, Layout, counts_of, find_layout
 
 #: Numbers of one rotation in all representations, as in :mod:`hood.assets.motion.layouts.rotations`.
 _PER = (3, 4, 6, 9)

@@ -74,7 +74,7 @@ def read_track(path: Path, person: Person) -> Track:
 def translation_key(person: Person) -> str | None:
     """The squeezed key of a person's translation."""
     keys = (*person.layout.transl, *WORLD_TRANSL, *CAMERA_TRANSL)
-    return next((key for key in keys if person.fields.get(key) is not None), None)
+    return next((key for key in keys if isinstance(person.fields.get(key), (np.ndarray, list))), None)
 
 
 def numbers(path: Path, key: str, value: Any) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -49,11 +48,6 @@ class Layout:
         return marked and placed and all(key in keys for key in self.poses)
 
 
-def squeezed(key: str) -> str:
-    """A key in lower case, letters and digits alone: ``mocap_frameRate`` and ``MocapFramerate`` are one."""
-    return re.sub(r"[^a-z0-9]", "", key.lower())
-
-
 def counts_of(key: str) -> tuple[tuple[int, ...], int]:
     """How many joints a squeezed key of rotations may hold, and from which on."""
     return _COUNTS.get(key, (WHOLE, 0))
@@ -79,7 +73,11 @@ LAYOUTS = (
     Layout("TRAM", ("predrotmat",), CAMERA_TRANSL, camera=True, up="-y", family="smpl"),
     Layout("Motion-X", ("rootorient", "posebody"), above="motionx", family="smplx"),
     Layout("MDM", ("thetas",), ("roottranslation",), fps=20.0, family="smpl"),
-    Layout("fullpose (SMPL-X)", ("fullpose",), fps=None, up="z"),
+    Layout("GRAB", ("fullpose",), above="params", fps=None, up="z"),
+    Layout("SMPL-X stage ii", ("fullpose",), marks=("stageiidebugdetails", "markerslatent"), fps=None, up="z"),
+    Layout("fullpose", ("fullpose",), fps=None, up="z"),
+    Layout("PHC", ("poseaa",), ("trans", "transorig", "roottransoffset"), up="z"),
+    Layout("HybrIK", ("predthetas",), ("transl", *CAMERA_TRANSL), camera=True, up="-y", family="smpl"),
     Layout("AMASS", ("poses",), fps=None, up="z"),
     Layout("AMASS", ("rootorient", "posebody"), fps=None, up="z"),
     Layout("body_pose", ("globalorient", "bodypose")),
