@@ -69,9 +69,12 @@ def find_bearing(recording: Recording) -> Bearing:
     if own is not None and other is not None:
         if other.fails and own.holds:
             return Bearing(recording.up, True)
+        # A body that hangs by its feet is still there as well, and does not walk; nor does one that lies and swings an arm.
         if own.fails and other.holds and (other.apart > _WALKS or _is_custom(axis, recording.up)):
             return Bearing(axis, True)
-    return _by_heights(recording, axis)
+        if other.fails:
+            return Bearing(axis, False)
+    return _by_heights(recording, axis, own is None or own.holds)
 
 
 def bearing_notice(path: Path, recording: Recording) -> tuple[str, UserWarning | None]:
@@ -134,15 +137,19 @@ def _carried(recording: Recording, axis: str) -> Carried | None:
     return Carried(float(still.mean()), float(on_floor.mean()), apart)
 
 
-def _by_heights(recording: Recording, axis: str) -> Bearing:
-    """By the heights over a floor at 0, for a body that moves too little to tell: along ``axis``, not that of its layout."""
+def _by_heights(recording: Recording, axis: str, rests: bool) -> Bearing:
+    """By the heights over a floor at 0, for a body that moves too little to tell: along ``axis``, not that of its layout.
+
+    Args:
+        rests: what is lowest along the axis of the layout is still.
+    """
     height, along = (float(np.median(recording.transl @ _vector(name))) for name in (recording.up, axis))
+    stands = _STANDING[0] < along < _STANDING[1]
     if _is_custom(axis, recording.up):
-        return Bearing(axis, _STANDING[0] < along < _STANDING[1])
-    # No program has such an axis up: what looks so lies, hangs or does a handstand, or a camera saw it.
-    sideways = axis.lstrip("-") not in (recording.up.lstrip("-"), "y", "z")
-    lies = _LYING[0] < height < _LYING[1]
-    return Bearing(recording.up, True) if lies and sideways else Bearing(axis, False)
+        return Bearing(axis, stands)
+    # No program has x up: what looks so lies, unless it is nowhere near a floor. What is upside down may do a handstand.
+    lies = rests and _LYING[0] < height < _LYING[1] and not stands
+    return Bearing(recording.up, True) if lies and axis.lstrip("-") == "x" else Bearing(axis, False)
 
 
 def _is_custom(axis: str, up: str) -> bool:
