@@ -42,10 +42,10 @@ def upright(joints: np.ndarray) -> np.ndarray:
     return along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
 
 
-def some_frames(num_frames: int, fps: float, most: int = 400) -> tuple[np.ndarray, int]:
-    """Up to ``most`` frames spread over a motion, and how many frames later to look again: about 0.08 s, so that a speed is
-    more than noise. None of a single frame."""
-    step = min(max(round(_SPAN * fps), 1), max(num_frames - 1, 0))
+def some_frames(num_frames: int, fps: float, span: float = _SPAN, most: int = 400) -> tuple[np.ndarray, int]:
+    """Up to ``most`` frames spread over a motion, and how many frames later to look again: about ``span`` [s], so that a speed
+    is more than noise. None of a single frame."""
+    step = min(max(round(span * fps), 1), max(num_frames - 1, 0))
     if step == 0:
         return np.zeros(0, np.int64), 0
     return np.unique(np.linspace(0, num_frames - 1 - step, most).astype(np.int64)), step

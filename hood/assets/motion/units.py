@@ -15,13 +15,15 @@ from hood.assets.motion.skeleton import FEET, joints_about_pelvis, some_frames
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _WORDS = {"m": "metres", "cm": "centimetres", "mm": "millimetres"}
 #: Planted feet are slower by this factor in the right unit than in every other, where they move at all [m/s] there.
-_SLOWER, _MOVES = 0.4, 0.05
+_SLOWER, _MOVES = 0.4, 0.005
+#: Times [s] over which speeds are taken: a runner's foot is planted for the first, and estimates are noisy over it.
+_SPANS = (0.08, 0.25)
 #: The lowest joint is so near to a floor at 0 [m]: pelvis and soles of other bodies lie elsewhere by as much.
 _NEAR_FLOOR = 0.35
 #: And so far above in metres [m] that no floor is meant: a translation of that height is in another unit.
 _FAR = 20.0
-#: A person's root moves no faster [m/s], and the feet of nobody who stands or walks are so fast all the time.
-_FASTEST, _FAST_FEET = 15.0, 1.0
+#: A person's root moves no faster [m/s]; and a planted foot slides no faster, where it would stand still in another unit.
+_FASTEST, _FAST_FEET = 15.0, 0.15
 
 
 class Unit(NamedTuple):
@@ -50,9 +52,9 @@ def find_unit(path: Path, key: str, poses: np.ndarray, transl: np.ndarray, fps: 
         if given not in UNITS:
             raise ValueError(f"trans_unit={given}: give {', '.join(UNITS)} or auto, the unit of the translation in the file")
         return Unit(given)
-    speeds = _feet_speeds(poses, transl, fps)
-    by_steps, by_floor = _by_steps(speeds), _by_floor(poses, transl)
-    found = by_steps or by_floor
+    spans = [_feet_speeds(poses, transl, fps, span) for span in _SPANS]
+    by_steps = next(filter(None, map(_by_steps, spans)), None)
+    speeds, found = spans[0], by_steps or _by_floor(poses, transl)
     if found == "m":
         return Unit("m")
     if found is None and not _is_suspect(speeds, transl, fps):
@@ -70,9 +72,9 @@ def find_unit(path: Path, key: str, poses: np.ndarray, transl: np.ndarray, fps: 
     return Unit("m", Doubt("units", said, value=fastest, unit="m/s"), sure=False)
 
 
-def _feet_speeds(poses: np.ndarray, transl: np.ndarray, fps: float) -> dict[str, float]:
-    """Median speed [m/s] of the slower foot, by unit of the translation; empty for a single frame."""
-    first, step = some_frames(len(poses), fps)
+def _feet_speeds(poses: np.ndarray, transl: np.ndarray, fps: float, span: float) -> dict[str, float]:
+    """Median speed [m/s] of the slower foot, by unit of the translation, and without any ("none"); empty for a single frame."""
+    first, step = some_frames(len(poses), fps, span)
     if not len(first):
         return {}
     change = joints_about_pelvis(poses[first + step])[:, FEET] - joints_about_pelvis(poses[first])[:, FEET]
@@ -80,15 +82,16 @@ def _feet_speeds(poses: np.ndarray, transl: np.ndarray, fps: float) -> dict[str,
     seconds = step / fps
     return {
         name: float(np.median(np.linalg.norm(change + metres * shift, axis=2).min(axis=1))) / seconds
-        for name, metres in UNITS.items()
+        for name, metres in {**UNITS, "none": 0.0}.items()
     }
 
 
 def _by_steps(speeds: dict[str, float]) -> str | None:
-    """The unit in which the planted foot is still, where it moves in all others."""
+    """The unit in which the planted foot is still, where it moves in all others and if the body were not moved at all: feet
+    of somebody who is carried are still in the smallest unit, and tell nothing."""
     if not speeds:
         return None
-    best = min(speeds, key=lambda name: speeds[name])
+    best = min(UNITS, key=lambda name: speeds[name])
     others = [speed for name, speed in speeds.items() if name != best]
     return best if all(speed > _MOVES and speeds[best] < _SLOWER * speed for speed in others) else None
 

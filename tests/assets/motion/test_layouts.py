@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refused import REFUSALS
 from scipy.spatial.transform import Rotation
 from variants import GENERATORS
 from walks import walk
@@ -37,3 +38,14 @@ def test_every_layout_is_the_same_walk(name: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(sequence.transl, walk().transl + before_camera, atol=1e-6)
     own, wanted = (Rotation.from_rotvec(poses[:, :22].reshape(-1, 3)) for poses in (sequence.poses, walk().poses))
     assert (own.inv() * wanted).magnitude().max() < 1e-6
+
+
+@pytest.mark.parametrize("name", REFUSALS)
+def test_what_is_not_read_is_answered_in_one_sentence(name: str, tmp_path: Path) -> None:
+    refusal = REFUSALS[name]
+    path = write(tmp_path / f"m{refusal.suffix}", refusal.make())
+    with pytest.raises(ValueError, match=refusal.words) as error:
+        read_recording(path, **refusal.keys)
+    assert str(error.value).startswith(f"{path}: ")
+    assert "\n" not in str(error.value)
+    assert len(str(error.value).removeprefix(str(path))) < 300

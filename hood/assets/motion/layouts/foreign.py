@@ -40,9 +40,11 @@ def unknown(path: Path, content: Any) -> str:
     if "verts" in keys or "vertices" in keys:
         return f"{path}: holds a mesh, not joint rotations; a moving mesh is a body: pass body={path}"
     if {"rh", "th"} <= set(keys):
+        return _about_origin(path)
+    if {"motion", "lengths"} <= set(keys):
         return (
-            f"{path}: an EasyMocap or ZJU-MoCap layout (Rh, Th), which turns about the origin and not about the pelvis, is "
-            "not read; write global_orient=Rh, body_pose=poses[:, 3:], transl=Th + (R(Rh) - 1) @ J0, J0 the pelvis at rest"
+            f"{path}: the results of MDM are joint positions, which are not read; its visualize.render_mesh writes a file "
+            "…_smpl_params.npy for each, which is"
         )
     inner = next((value for key, value in content.items() if _is_positions(squeezed(key), value)), None)
     if inner is not None:
@@ -71,6 +73,8 @@ def is_of_motion(content: Any) -> bool:
 
 def unplaced(path: Path, person: Person) -> str:
     """The sentence for poses without a translation."""
+    if {"rh", "th"} <= set(person.keys):
+        return _about_origin(path)
     head = f"{path}: not an AMASS motion: key 'trans' is missing"
     if {"predcam", "origcam", "cam"} & set(person.keys):
         return (
@@ -78,6 +82,13 @@ def unplaced(path: Path, person: Person) -> str:
             "(N, 3) [m], zeros to stay in place, and save both in one file"
         )
     return f"{head} (found {listed(sorted(person.keys.values()))}); add trans (N, 3) in metres, zeros to stay in place"
+
+
+def _about_origin(path: Path) -> str:
+    return (
+        f"{path}: the layout of EasyMocap and ZJU-MoCap (Rh, Th), which turns about the origin, not the pelvis, is not read; "
+        "write global_orient=Rh, body_pose=poses[:, 3:] and transl=Th + (R(Rh) - 1) @ J0, J0 the pelvis at rest"
+    )
 
 
 def _bare(array: np.ndarray) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from hood.assets.files.doubt import Doubt
+from hood.assets.motion.layouts.content import Unread
 from hood.assets.motion.layouts.foreign import unknown, unplaced
 from hood.assets.motion.layouts.frames import gather_frames
 from hood.assets.motion.layouts.people import Person, find_people
@@ -83,6 +84,8 @@ def numbers(path: Path, key: str, value: Any) -> np.ndarray:
     Raises:
         ValueError: no numbers, or rows of several lengths; names file and key.
     """
+    if isinstance(value, Unread):
+        raise ValueError(f"{path}: {key} {value.reason}")
     try:
         array = np.asarray(value)
     except ValueError as error:
