@@ -18,8 +18,8 @@ from hood.assets.motion.load import load_sequence
 from hood.assets.motion.recording import read_recording
 
 KEYS = (
-    "mocap_framerate", "mocap_frame_rate", "mocapFrameRate", "framerate", "frameRate", "frame_rate", "FrameRate", "fps", "FPS", "mocap_fps",
-    "mocap_frame_rate_hz", "video_fps", "source_fps", "sampling_rate", "capture_frequency", "frames_per_second",
+    "mocap_framerate", "mocap_frame_rate", "mocapFrameRate", "framerate", "frameRate", "frame_rate", "FrameRate", "fps", "FPS",
+    "mocap_fps", "mocap_frame_rate_hz", "video_fps", "source_fps", "sampling_rate", "capture_frequency", "frames_per_second",
 )  # fmt: skip
 
 
@@ -33,7 +33,8 @@ def test_a_rate_is_read_under_every_key(key: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "value",
-    [50, 50.0, np.array(50), np.array([50.0]), np.array([[50]]), "50", b"50", "50.0 fps", "50 Hz", np.array("50"), np.array(b"50"), [50]],
+    [50, 50.0, np.array(50), np.array([50.0]), np.array([[50]]), "50", b"50", "50.0 fps", "50 Hz", np.array("50"),
+     np.array(b"50"), [50]],
 )  # fmt: skip
 def test_a_rate_is_read_in_every_form(value: Any, tmp_path: Path) -> None:
     assert read_recording(write(tmp_path / "m.pkl", split(fps=value))).fps == 50.0
