@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from parameters import amass, split
-from published import aist, emdb, gvhmr, wham
-from writers import write
+from motion_kinds.parameters import amass, split
+from motion_kinds.published import aist, emdb, gvhmr, wham
+from motion_kinds.writers import write
 
 from hood.assets.files.doubt import Doubt
 from hood.assets.files.frame_rates import parse_rate

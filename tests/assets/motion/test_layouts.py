@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from refused import REFUSALS
+from motion_kinds.refused import REFUSALS
+from motion_kinds.variants import GENERATORS
+from motion_kinds.walks import walk
+from motion_kinds.writers import write
 from scipy.spatial.transform import Rotation
-from variants import GENERATORS
-from walks import walk
-from writers import write
 
 from hood.assets.files.doubt import Doubt
 from hood.assets.motion.load import load_sequence

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from parameters import amass
-from walks import world
-from writers import write
+from motion_kinds.parameters import amass
+from motion_kinds.walks import world
+from motion_kinds.writers import write
 
 from hood.assets.files.doubt import Doubt
 from hood.assets.files.library import locate, names

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
-from walks import COUNT, matrices, walk, world
+
+from motion_kinds.walks import COUNT, matrices, walk, world
 
 
 def amass(columns: int = 156, **more: Any) -> dict[str, Any]:

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from walks import COUNT, Walk, matrices, walk, world
+
+from motion_kinds.walks import COUNT, Walk, matrices, walk, world
 
 
 def aist() -> dict[str, Any]:

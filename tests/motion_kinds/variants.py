@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from parameters import (
+
+from motion_kinds.parameters import (
     amass,
     camera_space,
     of_kind,
@@ -21,7 +22,7 @@ from parameters import (
     split,
     split_matrices,
 )
-from published import (
+from motion_kinds.published import (
     aist,
     bedlam,
     emdb,
@@ -41,7 +42,7 @@ from published import (
     tram,
     wham,
 )
-from walks import COUNT, matrices, world
+from motion_kinds.walks import COUNT, matrices, world
 
 
 @dataclass(frozen=True)

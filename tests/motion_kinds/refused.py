@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from parameters import amass, posed, split
-from published import phalp, romp, slahmr, threedpw, wham
 from scipy.spatial.transform import Rotation
-from walks import COUNT, walk, world
 
 from hood.assets.motion.skeleton import joints_about_pelvis
+from motion_kinds.parameters import amass, posed, split
+from motion_kinds.published import phalp, romp, slahmr, threedpw, wham
+from motion_kinds.walks import COUNT, walk, world
 
 
 @dataclass(frozen=True)
