@@ -21,7 +21,7 @@ def write(path: Path, content: Any) -> Path:
     elif path.name.endswith(".pt"):
         torch.save(content, path)
     elif path.name.endswith((".jl.pkl", ".jlz.pkl")):
-        raw = _joblib_bytes(content)
+        raw = joblib_bytes(content)
         path.write_bytes(zlib.compress(raw) if ".jlz" in path.name else raw)
     else:
         path.write_bytes(pickle.dumps(content, 2 if path.name.endswith(".py2.pkl") else 4))
@@ -66,7 +66,8 @@ class _JoblibPickler(pickle._Pickler):  # type: ignore[name-defined,misc]
     dispatch = {**pickle._Pickler.dispatch, type: save_global}  # type: ignore[attr-defined]
 
 
-def _joblib_bytes(content: Any) -> bytes:
+def joblib_bytes(content: Any) -> bytes:
+    """What ``joblib.dump`` writes."""
     buffer = io.BytesIO()
     _JoblibPickler(buffer).dump(content)
     return buffer.getvalue()

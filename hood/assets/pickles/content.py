@@ -5,9 +5,12 @@ Like every pickle here they are read by :class:`hood.assets.pickles.unpickle.Res
 
 from __future__ import annotations
 
+import bz2
 import io
+import lzma
 import pickle
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO, ClassVar
 
@@ -18,7 +21,14 @@ from hood.assets.pickles.unpickle import SIZE_LIMIT, Bounded
 
 #: Packages whose objects lie beside the arrays as settings; their content is not kept.
 _BESIDES = ("omegaconf", "pathlib", "typing", "datetime", "easydict", "yacs", "munch")
-_COMPRESSED = (b"\x78", b"\x1f\x8b")  # zlib and gzip, as joblib writes with compress=True
+#: First bytes of files that are compressed as a whole, as joblib writes them with ``compress``, and what unpacks them.
+_COMPRESSED: dict[bytes, Callable[[], Any]] = {
+    b"\x78": lambda: zlib.decompressobj(wbits=15),
+    b"\x1f\x8b": lambda: zlib.decompressobj(wbits=31),
+    b"BZh": bz2.BZ2Decompressor,
+    b"\xfd7zXZ": lzma.LZMADecompressor,
+    b"]\x00\x00": lzma.LZMADecompressor,
+}
 
 
 def load_content(path: str | Path, size_limit: int = SIZE_LIMIT) -> Any:
@@ -74,12 +84,12 @@ class _ContentUnpickler(TorchUnpickler):
         state = record.state
         if not isinstance(state, dict) or not {"shape", "order", "dtype"} <= set(state):
             raise Refused("an array of joblib without its shape; the file is damaged")
-        if state.get("numpy_array_alignment_bytes") is not None:
-            self.bounded.read(self.bounded.read(1)[0])
         dtype = resolve(state["dtype"])
         if dtype.hasobject:
             record.array = unpickle(self.bounded)
         else:
+            if state.get("numpy_array_alignment_bytes") is not None:
+                self.bounded.read(self.bounded.read(1)[0])
             record.array = read_raw_array(self.bounded.read, dtype, state["shape"], str(state["order"]))
 
 
@@ -92,12 +102,13 @@ def _tensor_bytes(content: Any) -> Any:
 
 def _unpacked(file: BinaryIO, size_limit: int) -> BinaryIO | io.BytesIO:
     """The file, unpacked where it is compressed as a whole."""
-    head = file.read(2)
+    head = file.read(5)
     file.seek(0)
-    if not head.startswith(_COMPRESSED):
+    make = next((make for start, make in _COMPRESSED.items() if head.startswith(start)), None)
+    if make is None:
         return file
-    unpacker = zlib.decompressobj(wbits=47)
+    unpacker = make()
     content = unpacker.decompress(file.read(), size_limit)
-    if unpacker.unconsumed_tail:
-        raise Refused(f"unpacks to more than {size_limit} bytes")
+    if not unpacker.eof:
+        raise Refused(f"is cut off, or unpacks to more than {size_limit} bytes")
     return io.BytesIO(content)

@@ -155,7 +155,8 @@ def read_raw_array(read: Callable[[int], bytes], dtype: np.dtype, shape: Any, or
     sizes = tuple(int(n) for n in shape)
     if any(n < 0 for n in sizes):
         raise Refused(f"an array of shape {sizes}; the file is damaged")
-    flat = np.frombuffer(read(math.prod(sizes) * dtype.itemsize), dtype=dtype).copy()
+    raw = np.frombuffer(read(math.prod(sizes) * dtype.itemsize), dtype=dtype)
+    flat = raw.astype(dtype.newbyteorder("="), copy=True)
     return flat.reshape(sizes, order="F" if order == "F" else "C")
 
 
