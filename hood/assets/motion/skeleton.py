@@ -42,6 +42,11 @@ def upright(joints: np.ndarray) -> np.ndarray:
     return along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
 
 
+def spread(num_frames: int, most: int = 1000) -> np.ndarray:
+    """Up to ``most`` frames, evenly over a motion: what most of them show is what most of its frames show."""
+    return np.unique(np.linspace(0, num_frames - 1, min(most, num_frames)).round().astype(np.int64))
+
+
 def some_frames(num_frames: int, fps: float, span: float = _SPAN, most: int = 400) -> tuple[np.ndarray, int]:
     """Up to ``most`` frames spread over a motion, and how many frames later to look again: about ``span`` [s], so that a speed
     is more than noise. None of a single frame."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from hood.assets.files.doubt import Doubt
 from hood.assets.motion.axes import UP_AXES
-from hood.assets.motion.skeleton import FEET, joints_about_pelvis, some_frames
+from hood.assets.motion.skeleton import FEET, joints_about_pelvis, some_frames, spread
 
 #: Metres by unit.
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
@@ -98,7 +98,7 @@ def _by_steps(speeds: dict[str, float]) -> str | None:
 
 def _by_floor(poses: np.ndarray, transl: np.ndarray) -> str | None:
     """The unit that puts the lowest joint on a floor at 0, along whichever axis it is, where metres put it far from there."""
-    chosen = np.unique(np.linspace(0, len(poses) - 1, 100).astype(int))
+    chosen = spread(len(poses), 100)
     joints = joints_about_pelvis(poses[chosen])
     found = set()
     for column in range(3):
@@ -112,9 +112,9 @@ def _by_floor(poses: np.ndarray, transl: np.ndarray) -> str | None:
 
 def _stands_on_floor(poses: np.ndarray, transl: np.ndarray, up: str) -> bool:
     """Whether the lowest joint is near a floor at 0 with a translation in metres that lifts the pelvis."""
-    axis = UP_AXES[up][1]
-    height = transl @ axis
-    low = height + (joints_about_pelvis(poses) @ axis).min(axis=1)
+    axis, chosen = UP_AXES[up][1], spread(len(poses), 100)
+    height = transl[chosen] @ axis
+    low = height + (joints_about_pelvis(poses[chosen]) @ axis).min(axis=1)
     return bool(np.median(np.abs(low)) < _NEAR_FLOOR < np.median(height))
 
 

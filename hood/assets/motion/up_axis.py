@@ -10,7 +10,7 @@ import numpy as np
 from hood.assets.files.doubt import Doubt
 from hood.assets.motion.axes import UP_AXES
 from hood.assets.motion.recording import Recording
-from hood.assets.motion.skeleton import joints_about_pelvis, some_frames, upright
+from hood.assets.motion.skeleton import joints_about_pelvis, some_frames, spread, upright
 
 #: The head is over the feet along an axis where the unit vector between them has this component there, and a body stands
 #: along an axis where that is so in this share of the frames; along that of its layout in the second share.
@@ -56,7 +56,7 @@ class Carried(NamedTuple):
 
 def find_bearing(recording: Recording) -> Bearing:
     """The axis along which the body stands; that of the layout where the skeleton does not tell."""
-    along = upright(joints_about_pelvis(recording.poses))
+    along = _uprights(recording)
     shares = {axis: float((along @ _vector(axis) > _ALONG).mean()) for axis in UP_AXES}
     if shares[recording.up] >= _OFTEN:
         return Bearing(recording.up, True)
@@ -103,8 +103,8 @@ def bearing_notice(path: Path, recording: Recording) -> tuple[str, UserWarning |
 
 def head_down_doubt(path: Path, recording: Recording, axis: str) -> Doubt | None:
     """The doubt about a body that is head down in most frames with ``axis`` up."""
-    height = upright(joints_about_pelvis(recording.poses)) @ _vector(axis)
-    down = np.flatnonzero(height < _HEAD_DOWN)
+    height = _uprights(recording) @ _vector(axis)
+    down = spread(len(recording.poses))[height < _HEAD_DOWN]
     if len(down) <= len(height) / 2:
         return None
     share = len(down) / len(height)
@@ -114,6 +114,11 @@ def head_down_doubt(path: Path, recording: Recording, axis: str) -> Doubt | None
         f"up={axis} says that it is right"
     )
     return Doubt("orientation", said, tuple(map(int, down[:100])), share, "")
+
+
+def _uprights(recording: Recording) -> np.ndarray:
+    """(N, 3): unit vectors from the feet to the head, in frames spread over the motion."""
+    return upright(joints_about_pelvis(recording.poses[spread(len(recording.poses))]))
 
 
 def _vector(axis: str) -> np.ndarray:
@@ -161,7 +166,7 @@ def _camera_doubt(path: Path, recording: Recording) -> Doubt | None:
     """Cameras are not level: what is up in their picture is not exactly against gravity."""
     if not recording.camera:
         return None
-    lean = upright(joints_about_pelvis(recording.poses)).mean(axis=0) @ _vector(recording.up)
+    lean = _uprights(recording).mean(axis=0) @ _vector(recording.up)
     degrees = float(np.degrees(np.arccos(np.clip(lean, -1.0, 1.0))))
     said = (
         f"{path}: its body is seen from a camera ({recording.layout} files), up is taken from the picture, and it leans "
