@@ -85,7 +85,7 @@ BROKEN: dict[str, tuple[list[str], tuple[str, ...], Callable[[], object] | None]
     ),
     "motion without frames": (
         ["rollout", "stepper=newton", "sequence=m.npz"],
-        ("m.npz: the sequence has 0 frame(s)", "at least 2"),
+        ("m.npz: poses has no frames", "at least one"),
         lambda: motion("m.npz", frames=0),
     ),
     "no motions": (["rollout", "sequence=."], ("no motions", "give a folder that holds such files"), None),
@@ -162,7 +162,7 @@ BROKEN: dict[str, tuple[list[str], tuple[str, ...], Callable[[], object] | None]
     "prepared body's axis": (["prepare", "garment=tank", "body_up=w"], ("body_up 'w'", "known are auto, y, z"), None),
     "prepared body's unit": (["prepare", "garment=tank", "body_scale=cm"], ("body_scale=cm: give metres per unit",), None),
     "inspected rate": (["inspect", "dress", "fps=0"], ("fps=0: give the simulation's frames per second",), None),
-    "inspected axis": (["inspect", "dress", "up=x"], ("up 'x'", "known are auto, y, z"), None),
+    "inspected axis": (["inspect", "dress", "up=w"], ("up 'w'", "known are auto, y, z"), None),
     "size of a word": (["sizes", "sizes={S:small}"], ("sizes: S is small; give what size of hood rollout takes",), None),
     "no sizes": (["sizes", "sizes={}"], ("sizes={}: give names and factors",), None),
     "one body": (["sizes", "shapes=[1]"], ("shapes=[1]: give lists of shape coefficients",), None),

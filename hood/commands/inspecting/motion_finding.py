@@ -58,7 +58,8 @@ def _facts(recording: Recording, axis: str, options: MotionOptions) -> dict[str,
     rate = f"{recording.fps:g}, assumed" if recording.fps_assumed else recording.fps
     unit = recording.unit + ("" if recording.unit_sure else ", assumed")
     unit += "" if options.trans_unit == "auto" else ", as given"
-    tested = bearing.axis if bearing.sure else f"not sure: {bearing.axis} if it stands, {recording.up} if not"
+    otherwise = "is head down" if bearing.axis.lstrip("-") == recording.up.lstrip("-") else "lies"
+    tested = bearing.axis if bearing.sure else f"not sure: {bearing.axis} if it stands, {recording.up} if it {otherwise}"
     return {
         "frames": count,
         "frames per second": rate,

@@ -152,7 +152,7 @@ Damage = Callable[[dict], None]
 REFUSED: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "not finite pose": (lambda a: a["poses"].__setitem__((5, 7), np.nan), ("poses", "frame 5")),
     "not finite translation": (lambda a: a["trans"].__setitem__((3, 0), np.inf), ("trans", "frame 3")),
-    "no frames": (lambda a: a.update(poses=a["poses"][:0], trans=a["trans"][:0]), ("poses", "(N, 66)")),
+    "no frames": (lambda a: a.update(poses=a["poses"][:0], trans=a["trans"][:0]), ("poses has no frames", "at least one")),
     "lengths differ": (lambda a: a.update(trans=a["trans"][:-1]), ("agree",)),
     "no translation": (lambda a: a.pop("trans"), ("'trans'",)),
     "no poses": (lambda a: a.pop("poses"), ("not an AMASS motion",)),

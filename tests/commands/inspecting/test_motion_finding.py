@@ -83,5 +83,5 @@ def test_what_cannot_be_tested_is_assumed(tmp_path: Path, capsys: pytest.Capture
     still = {"poses": np.tile(world("-y").flat()[:1], (60, 1)), "trans": np.tile([0.0, 7.0, 9.0], (60, 1))}
     _, found = told(capsys, str(write(tmp_path / "m.npz", amass(72, **still))))
     assert found["facts"]["unit of the translation"] == "m, assumed"
-    assert found["facts"]["up axis by its poses"] == "not sure: -y if it stands, z if not"
+    assert found["facts"]["up axis by its poses"] == "not sure: -y if it stands, z if it lies"
     assert "up=-y" in found["problems"][0]["fix"]

@@ -71,8 +71,23 @@ def plain(item: Any, depth: int = 0) -> Any:
     if isinstance(item, Mapping):
         return {_text(key): plain(value, depth + 1) for key, value in item.items()}
     if isinstance(item, (list, tuple)):
-        return [plain(entry, depth + 1) for entry in item]
+        table = _table(item)
+        return table if table is not None else [plain(entry, depth + 1) for entry in item]
     return item
+
+
+def _table(item: Any) -> np.ndarray | None:
+    """Lists of numbers, or of such lists of one length, as an array; None for others."""
+    first = item
+    while isinstance(first, (list, tuple)) and first:
+        first = first[0]
+    if not isinstance(first, (int, float)):
+        return None
+    try:
+        found = np.asarray(item)
+    except ValueError:  # rows of several lengths
+        return None
+    return found if found.dtype.kind in "iuf" else None
 
 
 def _text(key: Any) -> str:

@@ -17,23 +17,26 @@ _FRAME_NAME = re.compile(r".*\.(jpe?g|png|bmp|webp)$|(frame|image|img)[_ -]?\d+$
 _IDS = ("tid", "trackids", "trackedids", "trackid", "id", "personid", "subjectid")
 #: Keys of the dicts that hold the pose of each person of a frame.
 _POSES = ("smpl", "smplparams", "predsmplparams", "params")
+#: Containers within each other that are looked into.
+_DEEPEST = 4
 #: Numbers of a whole pose, in one row, of axis-angle vectors or matrices, of joints that the layouts have.
 _ROW = (63, 66, 69, 72, 156, 165, 189, 207, 198, 216)
 
 
-def gather_frames(path: Path, content: Any) -> Any:
-    """``content`` as a dict of people, each with tables of one row a frame, where it has one entry a frame; else as it is.
+def gather_frames(path: Path, content: Any, depth: int = 0) -> Any:
+    """``content`` with a dict of people, each with tables of one row a frame, for whatever in it has one entry a frame.
 
     People are told apart by the number that trackers give them; ``frame_ids`` say in which frames each is seen.
 
     Raises:
         ValueError: several people in a frame and no such numbers; names the file.
     """
-    if isinstance(content, Mapping) and len(content) == 1:  # {"results": …}
-        (key, inner), *_ = content.items()
-        return {key: gather_frames(path, inner)} if isinstance(inner, (Mapping, list)) else content
     entries = _entries(content)
     if entries is None:
+        if depth < _DEEPEST and isinstance(content, Mapping):
+            return {key: gather_frames(path, value, depth + 1) for key, value in content.items()}
+        if depth < _DEEPEST and isinstance(content, list) and len(content) == 1:
+            return [gather_frames(path, content[0], depth + 1)]
         return content
     people: dict[str, list[dict[str, Any]]] = {}
     for frame, entry in enumerate(entries):
@@ -52,9 +55,10 @@ def gather_frames(path: Path, content: Any) -> Any:
 def _entries(content: Any) -> list[Any] | None:
     """What stands for each frame; None where the content is not arranged so."""
     if isinstance(content, Mapping) and len(content) > 1:
+        pictures = [key for key in content if _FRAME_NAME.fullmatch(key) and isinstance(content[key], (Mapping, list))]
+        if len(pictures) > 1:
+            return [content[key] for key in sorted(pictures, key=_numbers)]
         values = [content[key] for key in sorted(content, key=_numbers)]
-        if all(_FRAME_NAME.fullmatch(key) for key in content):
-            return values
         return values if all(key.isdigit() and _is_row(content[key]) for key in content) else None
     if isinstance(content, list) and len(content) > 1 and all(_is_row(entry) for entry in content):
         return content

@@ -52,7 +52,7 @@ def find_people(content: Any) -> list[Person]:
     of_best = [person for person in found if LAYOUTS.index(person.layout) == best]
     # Hands and objects beside a body may have the keys of a pose; their shapes are none.
     plausible = [person for person in of_best if _is_pose(person)] or of_best
-    people = [each for person in plausible for each in _apart(person)]
+    people = [each for person in _named(plausible) for each in _apart(person)]
     if len({person.name for person in people}) < len(people):
         return [replace(person, name=str(index)) for index, person in enumerate(people)]
     return people
@@ -88,7 +88,7 @@ def _walk(item: Any, above: str, trail: tuple[str, ...], around: tuple[Mapping[s
         layout = find_layout(keys, above)
         if layout is not None:
             fields = {key: item[written] for key, written in keys.items()}
-            yield Person(_name(trail), layout, fields, keys, around)
+            yield Person("/".join(trail), layout, fields, keys, around)
             return
         for key, value in item.items():
             yield from _walk(value, squeezed(key), (*trail, key), (item, *around))
@@ -97,9 +97,13 @@ def _walk(item: Any, above: str, trail: tuple[str, ...], around: tuple[Mapping[s
             yield from _walk(value, "", (*trail, str(index)), around)
 
 
-def _name(trail: tuple[str, ...]) -> str:
-    """The part of a place in a file that tells people apart: a number if there is one."""
-    return next((key for key in reversed(trail) if key.isdigit()), trail[-1] if trail else "0")
+def _named(people: list[Person]) -> list[Person]:
+    """People by the part of their places in the file that tells them apart; one alone is 0."""
+    trails = [person.name.split("/") for person in people]
+    first = next((i for i, keys in enumerate(zip(*trails, strict=False)) if len(set(keys)) > 1), 0)
+    last = next((i for i, keys in enumerate(zip(*map(reversed, trails), strict=False)) if len(set(keys)) > 1), 0)
+    names = ["/".join(trail[first : len(trail) - last]) if len(people) > 1 else "0" for trail in trails]
+    return [replace(person, name=name) for person, name in zip(people, names, strict=True)]
 
 
 def _is_pose(person: Person) -> bool:

@@ -23,6 +23,8 @@ _MOTION_X_PARTS = {"root_orient": (0, 3), "pose_body": (3, 66), "pose_hand": (66
                    "trans": (309, 312), "betas": (312, 322)}  # fmt: skip
 #: Keys that say in which frames of a video a person is seen.
 FRAME_IDS = ("frameids", "frameid", "frame", "frames", "reorganizeidx")
+#: Dicts within each other that are looked into.
+_DEEPEST = 4
 #: More frames than this come out of no recording that lacks some.
 _MOST_FRAMES = 1_000_000
 
@@ -44,12 +46,19 @@ def people_in(path: Path, content: Any) -> list[Person]:
     Raises:
         ValueError: there is nobody; says what the file holds, and what to write instead.
     """
-    if isinstance(content, np.ndarray) and content.ndim == 2 and content.shape[1] == _MOTION_X and content.dtype.kind == "f":
-        content = {"motionx": {key: content[:, slice(*columns)] for key, columns in _MOTION_X_PARTS.items()}}
-    people = find_people(gather_frames(path, content))
+    people = find_people(gather_frames(path, _with_motion_x(content)))
     if not people:
         raise ValueError(unknown(path, content))
     return people
+
+
+def _with_motion_x(content: Any, depth: int = 0) -> Any:
+    """``content`` with the tables of Motion-X in it as dicts."""
+    if isinstance(content, np.ndarray) and content.ndim == 2 and content.shape[1] == _MOTION_X and content.dtype.kind == "f":
+        return {"motionx": {key: content[:, slice(*columns)] for key, columns in _MOTION_X_PARTS.items()}}
+    if isinstance(content, dict) and depth < _DEEPEST:
+        return {key: _with_motion_x(value, depth + 1) for key, value in content.items()}
+    return content
 
 
 def read_track(path: Path, person: Person) -> Track:

@@ -43,6 +43,8 @@ def as_turns(path: Path, key: str, array: np.ndarray, counts: Sequence[int], fir
     Raises:
         ValueError: an array that is none of the shapes; names file, key and shapes.
     """
+    if array.size == 0:
+        raise ValueError(f"{path}: {key} has no frames (its shape is {array.shape}); give at least one")
     for count in counts:
         for per in KINDS:
             found = _split(array, count, per)
