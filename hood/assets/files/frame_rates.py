@@ -23,6 +23,14 @@ def squeezed(key: str) -> str:
     return re.sub(r"[^a-z0-9]", "", key.lower())
 
 
+def flat(value: Any) -> np.ndarray:
+    """(M,): whatever a value holds, as an array of one axis; empty where its rows have several lengths."""
+    try:
+        return np.asarray(value).reshape(-1)
+    except ValueError:
+        return np.zeros(0)
+
+
 def rates_in(source: Mapping[str, Any], depth: int = 0) -> Iterator[tuple[str, Any]]:
     """Keys and values that say a frame rate, those of AMASS first; the inverse of those that say a time."""
     for key in sorted(source, key=lambda key: not squeezed(key).startswith("mocap")):
@@ -31,7 +39,7 @@ def rates_in(source: Mapping[str, Any], depth: int = 0) -> Iterator[tuple[str, A
             continue
         if _RATE_KEY.fullmatch(short):
             yield key, value
-        elif _TIME_KEY.fullmatch(short) and np.size(value) == 1:
+        elif _TIME_KEY.fullmatch(short) and len(flat(value)) == 1:
             yield key, _inverse(value)
     if depth < _DEEPEST:
         for value in source.values():
@@ -41,7 +49,7 @@ def rates_in(source: Mapping[str, Any], depth: int = 0) -> Iterator[tuple[str, A
 
 def parse_rate(value: Any) -> float:
     """The number that a rate stands for: ``120``, ``[120.]``, ``"29.97"``, ``b"120 fps"``, ``"30000/1001"``; NaN for others."""
-    item = np.asarray(value).reshape(-1)
+    item = flat(value)
     if len(item) != 1:
         return float("nan")
     if item.dtype.kind in "iuf":

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from hood.assets.files.doubt import Doubt
+from hood.assets.files.frame_rates import flat
 from hood.assets.motion.layouts.content import MOTION_SUFFIXES, motion_suffixes, read_content
 from hood.assets.motion.layouts.frame_rate import frame_rate
 from hood.assets.motion.layouts.people import Person, choose
@@ -145,7 +146,7 @@ def _word(value: Any) -> str:
     """Text in lower case of a value that holds one word, as text, bytes or the text of bytes; else empty."""
     if value is None:
         return ""
-    item = np.asarray(value).reshape(-1)
+    item = flat(value)
     if len(item) != 1:
         return ""
     text = item[0].decode("latin-1") if isinstance(item[0], bytes) else str(item[0])

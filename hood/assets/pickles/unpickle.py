@@ -74,8 +74,9 @@ class RestrictedUnpickler(pickle._Unpickler):  # type: ignore[name-defined,misc]
             return found
         if module.split(".")[0] in self.inert:
             return opaque(f"{module}.{name}")
+        shown = "".join(letter if letter.isprintable() else "?" for letter in f"{module}.{name}"[:200])
         raise Refused(
-            f"names {module}.{name}, which is not read: only numbers, text, containers, arrays and sparse matrices are "
+            f"names {shown}, which is not read: only numbers, text, containers, arrays and sparse matrices are "
             "(a file that needs it may be harmful; convert it where it was made)"
         )
 

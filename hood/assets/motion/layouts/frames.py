@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hood.assets.files.frame_rates import squeezed
+from hood.assets.files.frame_rates import flat, squeezed
 from hood.assets.motion.layouts.table import find_layout
 
 #: Names of frames: those of pictures, and numbers behind such a word.
@@ -79,7 +79,7 @@ def _is_row(entry: Any) -> bool:
         return False
     try:
         return all(np.asarray(entry[keys[key]], dtype=float).size in (3, 4, 6, 9, *_ROW) for key in layout.poses)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError):  # no numbers, or rows of several lengths
         return False
 
 
@@ -103,7 +103,7 @@ def _rows(entry: Any) -> list[dict[str, Any]]:
     rows = []
     for index in range(count):
         own = {key: value[index] for key, value in fields.items() if _length(value) == count}
-        if poses is not None:
+        if poses is not None and isinstance(poses[index], Mapping):
             own |= {squeezed(key): value for key, value in poses[index].items()}
         rows.append(_named(own))
     return rows
@@ -111,13 +111,14 @@ def _rows(entry: Any) -> list[dict[str, Any]]:
 
 def _named(row: dict[str, Any]) -> dict[str, Any]:
     name = next((row[key] for key in _IDS if key in row), None)
-    if name is not None and np.size(name) == 1:
-        row["person"] = int(np.asarray(name).reshape(-1)[0])
+    number = flat(name)
+    if name is not None and len(number) == 1 and number.dtype.kind in "iu":
+        row["person"] = int(number[0])
     return row
 
 
 def _length(value: Any) -> int:
-    return len(value) if isinstance(value, (list, np.ndarray)) and np.ndim(value) != 0 else -1
+    return len(value) if isinstance(value, list) or (isinstance(value, np.ndarray) and value.ndim) else -1
 
 
 def _stacked(rows: list[dict[str, Any]]) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hood.assets.files.frame_rates import squeezed
+from hood.assets.files.frame_rates import flat, squeezed
 from hood.assets.files.guarded import listed
 from hood.assets.motion.layouts.table import LAYOUTS, Layout, counts_of, find_layout
 
@@ -112,7 +112,7 @@ def _is_pose(person: Person) -> bool:
         value = person.fields[key]
         first = value[0] if isinstance(value, list) and value else value
         sizes = {count * per for count in counts for per in _PER}
-        shape = np.shape(first) if isinstance(first, (np.ndarray, list)) else ()
+        shape = first.shape if isinstance(first, np.ndarray) else ()
         if not any(int(np.prod(shape[axis:])) in sizes for axis in range(len(shape))):
             return False
     return True
@@ -156,7 +156,7 @@ def _entries_a_person(person: Person) -> int | None:
     sizes = {count * per for count in counts for per in _PER}
     if isinstance(value, list):
         # A list of tables is one of people, a list of rows one of frames.
-        many = [entry for entry in value if np.ndim(entry) >= 2 and np.size(entry) not in sizes]
+        many = [entry for entry in value if isinstance(entry, np.ndarray) and entry.ndim >= 2 and entry.size not in sizes]
         return len(value) if many and len(many) == len(value) else None
     if not isinstance(value, np.ndarray) or value.ndim < 3 or len(value) < 2:
         return None
@@ -170,15 +170,15 @@ def _groups(person: Person) -> dict[str, np.ndarray]:
     if "imgname" in person.fields:
         return _by_picture(person)
     key = next((key for key in person.layout.ids if key in person.fields), None)
-    ids = np.asarray(person.fields[key]).reshape(-1) if key is not None else np.zeros(0)
+    ids = flat(person.fields[key]) if key is not None else np.zeros(0)
     if len(ids) != _length(person.fields[person.layout.poses[0]]):
         return {}
     return {str(name): np.flatnonzero(ids == name) for name in np.unique(ids)}
 
 
 def _by_picture(person: Person) -> dict[str, np.ndarray]:
-    pictures = [str(_text(name)) for name in np.asarray(person.fields["imgname"]).reshape(-1)]
-    subjects = [str(_text(name)) for name in np.asarray(person.fields.get("sub", [""] * len(pictures))).reshape(-1)]
+    pictures = [str(_text(name)) for name in flat(person.fields["imgname"])]
+    subjects = [str(_text(name)) for name in flat(person.fields.get("sub", [""] * len(pictures)))]
     if len(subjects) != len(pictures):
         return {}
     names = ["/".join(filter(None, (str(Path(picture).parent), sub))) for picture, sub in zip(pictures, subjects, strict=True)]

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from hood.assets.files.doubt import Doubt
+from hood.assets.files.frame_rates import flat
 from hood.assets.motion.layouts.content import Unread
 from hood.assets.motion.layouts.foreign import unknown, unplaced
 from hood.assets.motion.layouts.frames import gather_frames
@@ -54,6 +55,8 @@ def people_in(path: Path, content: Any) -> list[Person]:
 
 def _with_motion_x(content: Any, depth: int = 0) -> Any:
     """``content`` with the tables of Motion-X in it as dicts."""
+    if isinstance(content, np.ndarray) and content.ndim == 3 and len(content) == 1:
+        content = content[0]
     if isinstance(content, np.ndarray) and content.ndim == 2 and content.shape[1] == _MOTION_X and content.dtype.kind == "f":
         return {"motionx": {key: content[:, slice(*columns)] for key, columns in _MOTION_X_PARTS.items()}}
     if isinstance(content, dict) and depth < _DEEPEST:
@@ -160,7 +163,7 @@ def _hands(path: Path, person: Person, num_frames: int) -> np.ndarray | None:
 def _filled(path: Path, person: Person, track: Track) -> Track:
     """The track with a frame for every number between the first and the last at which the person is seen."""
     key = next((key for key in FRAME_IDS if key in person.fields), None)
-    seen = np.asarray(person.fields[key]).reshape(-1) if key is not None else np.zeros(0)
+    seen = flat(person.fields[key]) if key is not None else np.zeros(0)
     if len(seen) != len(track.turns) or len(seen) < 2 or seen.dtype.kind not in "iuf" or not (np.diff(seen) > 0).all():
         return track
     count = int(seen[-1] - seen[0]) + 1

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from hood.assets.files.doubt import Doubt
+from hood.assets.motion.layouts.read import numbers
 
 _KEYS = ("betas", "shape", "smplbetas", "smplshape", "predshape", "predbetas", "shapes")
 #: Rows within this of the first are the same shape, written with less precision.
@@ -28,14 +29,11 @@ def subject_shape(path: Path, fields: Mapping[str, Any], keys: Mapping[str, str]
     if key is None:
         return np.zeros(10), None
     name = keys[key]
-    table = np.asarray(fields[key])
-    if table.dtype.kind not in "iuf":
-        raise ValueError(f"{path}: {name} holds {table.dtype} values; it must hold numbers")
-    table = table.astype(np.float64)
-    table = (
-        table.reshape(-1, table.shape[-1]) if table.ndim > 2 or (table.ndim == 2 and table.shape[-1] > 1) else table.reshape(-1)
-    )
-    if table.size == 0 or np.ndim(fields[key]) == 0 or not (np.abs(table) <= _LARGEST).all():
+    table = np.asarray(numbers(path, name, fields[key]))
+    scalar = table.ndim == 0
+    rows = table.ndim > 2 or (table.ndim == 2 and table.shape[-1] > 1)
+    table = table.reshape(-1, table.shape[-1]) if rows else table.reshape(-1)
+    if table.size == 0 or scalar or not (np.abs(table) <= _LARGEST).all():
         raise ValueError(f"{path}: {name} has shape {table.shape} or absurd values; give (S,) finite shape coefficients")
     if table.ndim == 1:
         return table, None
