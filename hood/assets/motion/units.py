@@ -24,6 +24,8 @@ _NEAR_FLOOR = 0.35
 _FAR = 20.0
 #: A person's root moves no faster [m/s]; and a planted foot slides no faster, where it would stand still in another unit.
 _FASTEST, _FAST_FEET = 15.0, 0.15
+#: Share of the steps that count: recordings that are cut jump in some.
+_MOSTLY = 0.9
 
 
 class Unit(NamedTuple):
@@ -63,7 +65,7 @@ def find_unit(path: Path, key: str, poses: np.ndarray, transl: np.ndarray, fps: 
         why = "its feet stand still only so" if by_steps else "its feet are on the floor only so"
         said = f"{path}: {key} is in {_WORDS[found]}, {why}; it is taken so (trans_unit=m takes it as metres)"
         return Unit(found, UserWarning(said))
-    fastest = float(np.quantile(_root_speed(transl, fps), 0.99)) if len(transl) > 1 else 0.0
+    fastest = float(np.quantile(_root_speed(transl, fps), _MOSTLY)) if len(transl) > 1 else 0.0
     far = np.ptp(transl, axis=0).max()
     said = (
         f"{path}: {key} may not be in metres (the body moves at {fastest:.3g} m/s, {far:.3g} m far), and is taken so; "
@@ -122,7 +124,7 @@ def _is_suspect(speeds: dict[str, float], transl: np.ndarray, fps: float) -> boo
     """Whether metres are hardly right: the body flies, or its feet are fast although they would not be in another unit."""
     if not speeds:
         return float(np.abs(transl).max()) > 50.0 * _FAR
-    flies = float(np.quantile(_root_speed(transl, fps), 0.99)) > _FASTEST
+    flies = float(np.quantile(_root_speed(transl, fps), _MOSTLY)) > _FASTEST
     return flies or (speeds["m"] > _FAST_FEET and speeds["cm"] < _SLOWER * speeds["m"])
 
 

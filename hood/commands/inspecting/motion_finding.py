@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from hood.assets.files.doubt import Doubt
 from hood.assets.files.library import locate
 from hood.assets.motion.axes import UP_AXES, require_up
 from hood.assets.motion.layouts.people import SeveralPeopleError
@@ -39,7 +40,8 @@ def inspect_motion(name: str, options: MotionOptions) -> Finding:
     finding.facts = _facts(recording, axis, options)
     for note in (*recording.notes, *([] if notice is None else [notice])):
         _add(finding, path, note)
-    if float(np.quantile(_root_speed(recording), 0.99)) > _FASTEST:
+    doubted = any(isinstance(note, Doubt) and note.kind == "units" for note in recording.notes)
+    if not doubted and float(np.quantile(_root_speed(recording), 0.99)) > _FASTEST:
         finding.problem("the root moves faster than 20 m/s", "its unit or frame rate may be wrong: trans_unit=cm or file_fps=…")
     return finding
 
