@@ -85,19 +85,17 @@ def bearing_notice(path: Path, recording: Recording) -> tuple[str, UserWarning |
     if found.axis == own and found.sure:
         return own, _camera_doubt(path, recording)
     if found.axis == own:
-        said = (
-            f"{path}: the body neither stands along an axis nor rests on a floor; {own} is taken as up, up={_others(own)} else"
-        )
-        return own, Doubt("orientation", said)
+        said = f"{path}: the body neither stands along an axis nor rests on a floor, and {own} is taken as up"
+        return own, Doubt("orientation", f"{said}; up={_others(own)} gives another axis")
     what = f"{path}: its body stands along {found.axis}, though {own} is up in files with its keys"
     if found.sure:
         return found.axis, UserWarning(
             f"{what}; it is taken as {found.axis} up (up={found.axis} says so, up={own} {_turns(found.axis, own)})"
         )
     if found.axis.lstrip("-") == own.lstrip("-"):
-        said = f"{what}, or it is head down; pass up={found.axis} if it stands, up={own} if it hangs or does a handstand"
+        said = f"{what}, or it is head down, and {own} is taken; pass up={found.axis} if it stands, up={own} if it is"
     else:
-        said = f"{what}, or it lies on the floor; pass up={found.axis} if it stands, up={own} if it lies"
+        said = f"{what}, or it lies on the floor, and {own} is taken; pass up={found.axis} if it stands, up={own} if it lies"
     return own, Doubt("orientation", said)
 
 

@@ -46,8 +46,7 @@ def unknown(path: Path, content: Any) -> str:
             f"{path}: the results of MDM are joint positions, which are not read; its visualize.render_mesh writes a file "
             "…_smpl_params.npy for each, which is"
         )
-    inner = next((value for key, value in content.items() if _is_positions(squeezed(key), value)), None)
-    if inner is not None:
+    if any(_is_positions(squeezed(key), value) for key, value in _tables(content)):
         return f"{path}: {_NO_BODY}"
     unread = next((f"{key} {value.reason}" for key, value in content.items() if isinstance(value, Unread)), None)
     found = listed(sorted(content))
@@ -68,7 +67,11 @@ def is_of_motion(content: Any) -> bool:
     if _are_weights(content):
         return False
     keys = {squeezed(key) for key in content}
-    return bool(find_people(content)) or {"rh", "th"} <= keys or any(_is_positions(squeezed(k), v) for k, v in content.items())
+    return (
+        bool(find_people(content))
+        or {"rh", "th"} <= keys
+        or any(_is_positions(squeezed(key), v) for key, v in _tables(content))
+    )
 
 
 def unplaced(path: Path, person: Person) -> str:

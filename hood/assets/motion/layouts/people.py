@@ -11,6 +11,7 @@ import numpy as np
 
 from hood.assets.files.frame_rates import flat, squeezed
 from hood.assets.files.guarded import listed
+from hood.assets.motion.layouts.content import Unread
 from hood.assets.motion.layouts.table import LAYOUTS, Layout, counts_of, find_layout
 
 #: Numbers of one rotation in all representations, as in :mod:`hood.assets.motion.layouts.rotations`.
@@ -86,7 +87,7 @@ def _walk(item: Any, above: str, trail: tuple[str, ...], around: tuple[Mapping[s
         for key in item:
             keys.setdefault(squeezed(key), key)
         layout = find_layout(keys, above)
-        if layout is not None:
+        if layout is not None and all(isinstance(item[keys[key]], (np.ndarray, list, Unread)) for key in layout.poses):
             fields = {key: item[written] for key, written in keys.items()}
             yield Person("/".join(trail), layout, fields, keys, around)
             return
