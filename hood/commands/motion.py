@@ -23,7 +23,7 @@ _WORDS = {
     "hands": HANDS,
     "blend_from": ("t", "a"),
     "gender": ("neutral", "male", "female"),
-    "trans_unit": ("auto", *UNITS),
+    "trans_unit": (*UNITS, "auto"),
 }
 
 
@@ -87,7 +87,7 @@ def motion_options(config: DictConfig) -> MotionOptions:
         blend_from=str(config.blend_from),
         hands=str(config.hands),
         person=None if config.person is None else str(config.person),
-        trans_unit=str(config.trans_unit),
+        trans_unit=str(config.trans_unit or "auto"),
         scale=_optional(config, "body_scale"),
         animation=config.animation,
         parts=_names(config, "body_parts"),

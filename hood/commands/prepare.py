@@ -235,7 +235,8 @@ def _named_pose(given: str, config: DictConfig) -> tuple[PoseSequence, int]:
     path, frame = locate("motions", given), int(config.frame)
     if path.suffix.lower() in POSE_SUFFIXES:
         return read_pose(path), 0
-    sequence = load_sequence(given, fps=float(config.fps))
+    person = None if config.person is None else str(config.person)
+    sequence = load_sequence(given, fps=float(config.fps), person=person)
     if not 0 <= frame < sequence.num_frames:
         raise ConfigError(f"frame={frame}: {given} has {sequence.num_frames} frames at {float(config.fps):g} fps")
     return sequence, frame

@@ -201,7 +201,7 @@ def _reading(config: DictConfig) -> dict[str, Any]:
     return {
         "up": str(config.data.up),
         "person": None if person is None else str(person),
-        "trans_unit": str(config.data.trans_unit),
+        "trans_unit": str(config.data.trans_unit or "auto"),
         "file_fps": None if rate is None else float(rate),
     }
 
