@@ -216,3 +216,20 @@ def mdm() -> Any:
         "length": COUNT, "motion": np.zeros((25, 6, COUNT)),
     }  # fmt: skip
     return np.array(content, dtype=object)
+
+
+def hybrik() -> dict[str, Any]:
+    own = world("-y")
+    return {
+        "pred_thetas": matrices(own.poses).reshape(COUNT, 216), "transl": own.transl,
+        "pred_betas": np.tile(own.betas, (COUNT, 1)), "pred_phi": np.zeros((COUNT, 23, 2)), "pred_uvd": np.zeros((COUNT, 29, 3)), "bbox": np.zeros((COUNT, 4)),
+    }  # fmt: skip
+
+
+def phc(count: int = 1) -> dict[str, Any]:
+    own = world("z")
+    motion = {
+        "pose_aa": own.flat(), "trans_orig": own.transl, "root_trans_offset": own.transl, "beta": own.betas,
+        "gender": "neutral", "pose_quat_global": np.zeros((COUNT, 24, 4)), "fps": 30,
+    }  # fmt: skip
+    return {f"0-KIT_3_walk_{index}_poses": motion for index in range(count)}

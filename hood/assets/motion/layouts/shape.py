@@ -11,7 +11,7 @@ import numpy as np
 from hood.assets.files.doubt import Doubt
 from hood.assets.motion.layouts.read import numbers
 
-_KEYS = ("betas", "shape", "smplbetas", "smplshape", "predshape", "predbetas", "shapes")
+_KEYS = ("betas", "shape", "smplbetas", "smplshape", "predshape", "predbetas", "shapes", "beta", "smplbeta")
 #: Rows within this of the first are the same shape, written with less precision.
 _SAME = 1e-3
 #: Estimates of one person differ by less than this from frame to frame: standard deviation of the coefficient that varies most.
