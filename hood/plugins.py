@@ -28,7 +28,9 @@ GROUP = "hood.plugins"
 READERS = ("meshes", "motions")
 KINDS = ("features", "outputs", "networks", *READERS)
 #: Suffixes that mean something already.
-TAKEN = frozenset("npz pkl obj ply off stl glb gltf txt json csv h5 hdf5 safetensors pth pt ckpt".split())
+TAKEN = frozenset(
+    "npz npy pkl pickle pk p joblib obj ply off stl glb gltf txt json csv h5 hdf5 safetensors pth pt ckpt".split()
+)
 
 
 @cache

@@ -83,7 +83,7 @@ ERRORS: dict[str, tuple[list[str], tuple[str, ...], Prepare]] = {
     "no frames": (["rollout", *UNTRAINED, "num_frames=0"], ("num_frames=0",), lambda: None),
     "negative seed": (["rollout", *UNTRAINED, "seed=-1"], ("seed=-1",), lambda: None),
     "frame rate": (["rollout", *UNTRAINED, "fps=0"], ("fps",), lambda: None),
-    "up axis": (["rollout", *UNTRAINED, "up=x"], ("up", "x"), lambda: None),
+    "up axis": (["rollout", *UNTRAINED, "up=w"], ("up", "w"), lambda: None),
     "betas": (["rollout", *UNTRAINED, "betas=[.nan]"], ("betas",), lambda: None),
     "text betas": (["rollout", *UNTRAINED, "betas=[a]"], ("betas",), lambda: None),
     "untrained without model": (["rollout", "checkpoint=untrained"], ("model=small",), lambda: None),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import zipfile
 from collections.abc import Collection
 from pathlib import Path
+from typing import Any
 
 import h5py
 
@@ -17,12 +18,14 @@ from hood.assets.formats.mesh_file import mesh_suffixes
 from hood.assets.formats.point_cache import CACHE_SUFFIX
 from hood.assets.garment.reference_garments import garment_names
 from hood.assets.motion.animated_mesh import body_kind
-from hood.assets.motion.recording import MOTION_SUFFIXES, motion_suffixes
-from hood.assets.pickles.unpickle import load_pickle
+from hood.assets.motion.layouts.content import PICKLES, TENSORS, plain, read_content
+from hood.assets.motion.layouts.foreign import is_of_motion
+from hood.assets.motion.recording import motion_suffixes
+from hood.assets.pickles.content import load_content
 
 GARMENT, BODY, MOTION, MOVING_MESH = "garment", "body model", "motion", "moving mesh"
 CHECKPOINT, ROLLOUT, REFERENCE_ROLLOUT, VERTEX_LIST = "checkpoint", "rollout", "rollout of the reference", "vertex list"
-_CHECKPOINTS = (".safetensors", ".pth", ".pt", ".ckpt")
+_CHECKPOINTS = (".safetensors", ".ckpt")
 _EMBEDDED = {"garments": GARMENT, "motions": MOTION, "body": BODY, "weights": CHECKPOINT}
 _KEYS = {
     GARMENT: ({"rest_pos", "faces"}, {"vertices", "faces", "coarse_edges"}),
@@ -60,29 +63,46 @@ def identify(name: str) -> str:
         return MOVING_MESH
     if suffix in mesh_suffixes():
         return GARMENT
-    if suffix in motion_suffixes() and suffix not in MOTION_SUFFIXES:
-        return MOTION
     if suffix in _CHECKPOINTS:
         return CHECKPOINT
+    if suffix in TENSORS:
+        return MOTION if _is_torch_motion(path) else CHECKPOINT
     if suffix in (".txt", ".json"):
         return VERTEX_LIST
     if suffix in (".h5", ".hdf5"):
         return guarded(path, "HDF5 file", lambda: _h5_kind(path))
     if suffix == ".npz":
-        return _kind_of_keys(path, guarded(path, "NumPy archive", lambda: _archive_keys(path)))
-    if suffix == ".pkl":
-        content = load_pickle(path)
+        keys = guarded(path, "NumPy archive", lambda: _archive_keys(path))
+        return _kind_of_keys(keys) or _kind_of_content(path, read_content(path), keys)
+    if suffix in PICKLES:
+        content = load_content(path)
         if garment_names(content):
             return GARMENT
-        return _kind_of_keys(path, [str(key) for key in content] if isinstance(content, dict) else [])
+        keys = [str(key) for key in content] if isinstance(content, dict) else []
+        return _kind_of_keys(keys) or _kind_of_content(path, plain(content), keys)
+    if suffix in motion_suffixes():
+        return MOTION
     kind = f"unknown file type {path.suffix!r}" if path.suffix else "its name has no ending, such as .obj or .npz"
     raise ValueError(f"{path}: {kind}; convert or rename it, docs/files.md lists what is read")
 
 
-def _kind_of_keys(path: Path, keys: Collection[str]) -> str:
-    for kind, alternatives in _KEYS.items():
-        if any(needed <= set(keys) for needed in alternatives):
-            return kind
+def _kind_of_keys(keys: Collection[str]) -> str | None:
+    fitting = (kind for kind, alternatives in _KEYS.items() if any(needed <= set(keys) for needed in alternatives))
+    return next(fitting, None)
+
+
+def _is_torch_motion(path: Path) -> bool:
+    """Whether a file of torch holds a motion; what cannot be read is left to the reader of checkpoints."""
+    try:
+        return is_of_motion(read_content(path))
+    except ValueError:
+        return False
+
+
+def _kind_of_content(path: Path, content: Any, keys: Collection[str]) -> str:
+    """A motion may stand deeper in a file, or under keys of other layouts."""
+    if is_of_motion(content):
+        return MOTION
     raise ValueError(f"{path}: no garment, body, motion or mesh has the keys {listed(sorted(keys))}")
 
 

@@ -217,7 +217,11 @@ def require_same_config(config: DictConfig, folder: Path, free: Sequence[str], f
             continue
         there, here = plain(before.get(key)), plain(config[key])
         if isinstance(there, dict) and isinstance(here, dict):
-            there, here = ({name: item for name, item in side.items() if name not in free_below} for side in (there, here))
+            # A key that is newer than the record is null where nobody asks for anything.
+            there, here = (
+                {name: item for name, item in side.items() if name not in free_below and item is not None}
+                for side in (there, here)
+            )
         if there != here:
             name, there, here = _difference(key, there, here)
             raise ConfigError(

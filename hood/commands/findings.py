@@ -24,8 +24,6 @@ from hood.assets.garment.placement import surrounds
 from hood.assets.garment.suspicions import suspect_kind, suspect_sides
 from hood.assets.garment.units import UNITS, size_ratio, used
 from hood.assets.motion.poses import arms_down
-from hood.assets.motion.recording import read_recording
-from hood.assets.motion.up_axis import bearing_notice, find_bearing
 from hood.assets.pickles.unpickle import load_pickle
 from hood.commands.beside_mesh import place_beside_mesh
 from hood.commands.common import read_model
@@ -239,33 +237,6 @@ def inspect_body(name: str) -> Finding:
     return finding
 
 
-def inspect_motion(name: str) -> Finding:
-    """A motion of joint rotations."""
-    recording = read_recording(locate("motions", name))
-    finding = Finding(name, "motion")
-    (axis, notice), bearing = bearing_notice(Path(name), recording), find_bearing(recording)
-    speed = np.linalg.norm(np.diff(recording.transl, axis=0), axis=1) * recording.fps
-    finding.facts = {
-        "frames": len(recording.poses),
-        "frames per second": recording.fps,
-        "seconds": round((len(recording.poses) - 1) / recording.fps, 3),
-        "layout": recording.family,
-        "gender": recording.gender,
-        "shape coefficients": len(recording.betas),
-        "up axis by its layout": recording.up,
-        "up axis by its poses": bearing.axis if bearing.sure else f"not sure: {bearing.axis} if it stands, {axis} if it lies",
-        "up axis taken": axis,
-        "greatest root speed [m/s]": round(float(speed.max(initial=0.0)), 2),
-        "fingers": recording.fingers is not None,
-    }
-    if notice is not None:
-        what, _, fix = notice.removeprefix(f"{name}: ").partition("; ")
-        finding.problem(what, fix)
-    if float(np.quantile(speed, 0.99)) > 20.0:
-        finding.problem("the root moves faster than 20 m/s", "trans may be in centimetres: divide it by 100")
-    return finding
-
-
 def inspect_moving_mesh(name: str, options: MotionOptions) -> Finding:
     """A mesh that moves, or stands, as a body; what is repaired or wrong there is warned about by its reader."""
     motion = load_motion(name, NO_MOTION, options)
@@ -276,6 +247,7 @@ def inspect_moving_mesh(name: str, options: MotionOptions) -> Finding:
         "vertices": mesh.verts.shape[1],
         "triangles": len(mesh.faces),
         f"frames at {mesh.fps:g} fps": mesh.num_frames,
+        "frame rate of the file": "assumed" if mesh.fps_assumed else None,
         "size": np.round(np.ptp(mesh.verts[0], axis=0), 3).tolist(),
         "components": defects.num_components,
         "openings": defects.openings,

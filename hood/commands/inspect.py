@@ -15,9 +15,11 @@ from hood.assets import identify as kinds
 from hood.assets.body.body import Body
 from hood.assets.body.load import load_body
 from hood.assets.motion.animated_mesh import NO_BODY, body_kind
+from hood.assets.motion.axes import UP_AXES
 from hood.commands import findings
 from hood.commands.findings import Finding
 from hood.commands.garments import read_outfit, shape_coefficients
+from hood.commands.inspecting.motion_finding import inspect_motion
 from hood.commands.motion import check_motion_options, motion_options
 from hood.commands.notices import heard
 from hood.config import ConfigError, load_config, plain, require_choice
@@ -39,7 +41,7 @@ def run(arguments: Sequence[str]) -> int:
     """Run the command; returns the exit code: 0 where nothing needs repair, 1 where something does."""
     files, config = _split(arguments)
     require_choice(config, "format", ("text", "json"))
-    require_choice(config, "up", ("auto", "y", "z"))
+    require_choice(config, "up", ("auto", *UP_AXES))
     check_motion_options(config)
     known = [_identify(name, str(config.body)) for name in files]
     beside = next((finding.file for finding in known if finding.kind in _BODIES), str(config.body))
@@ -104,11 +106,12 @@ def _read(name: str, kind: str, beside: str, config: DictConfig) -> Finding:
         return findings.inspect_garment(name, _body(beside, config), _wearer(beside, config), betas)
     if kind == kinds.MOVING_MESH:
         return findings.inspect_moving_mesh(name, _options(config))
+    if kind == kinds.MOTION:
+        return inspect_motion(name, _options(config))
     if kind == kinds.REFERENCE_ROLLOUT:
         return findings.inspect_pickle(name, kind)
     readers = {
         kinds.BODY: findings.inspect_body,
-        kinds.MOTION: findings.inspect_motion,
         kinds.CHECKPOINT: findings.inspect_checkpoint,
         kinds.ROLLOUT: findings.inspect_rollout,
         kinds.VERTEX_LIST: findings.inspect_list,

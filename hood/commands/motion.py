@@ -11,6 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from hood.assets.files.library import names
 from hood.assets.motion.animated_mesh import body_kind
 from hood.assets.motion.load import HANDS
+from hood.assets.motion.units import UNITS
 from hood.config import ConfigError, brief, plain, require_choice, shown
 from hood.scene.load_motion import NO_MOTION, MotionOptions, load_motion
 from hood.scene.motion import Motion
@@ -18,7 +19,12 @@ from hood.scene.motion import Motion
 #: Values of the keys that take numbers.
 _SUCH_AS = {"fps": 30, "file_fps": 120, "blend_in": 1, "body_scale": 0.01}
 #: Keys of one word and their words; a null is the file's own.
-_WORDS = {"hands": HANDS, "blend_from": ("t", "a"), "gender": ("neutral", "male", "female")}
+_WORDS = {
+    "hands": HANDS,
+    "blend_from": ("t", "a"),
+    "gender": ("neutral", "male", "female"),
+    "trans_unit": (*UNITS, "auto"),
+}
 
 
 def check_motion_options(config: DictConfig) -> None:
@@ -80,6 +86,8 @@ def motion_options(config: DictConfig) -> MotionOptions:
         blend_in=_number(config, "blend_in"),
         blend_from=str(config.blend_from),
         hands=str(config.hands),
+        person=None if config.person is None else str(config.person),
+        trans_unit=str(config.trans_unit or "auto"),
         scale=_optional(config, "body_scale"),
         animation=config.animation,
         parts=_names(config, "body_parts"),

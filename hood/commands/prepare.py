@@ -26,6 +26,7 @@ from hood.assets.garment.pins import pin_mask, pin_numbers
 from hood.assets.garment.suspicions import suspect_kind
 from hood.assets.garment.units import UNITS
 from hood.assets.motion.animated_mesh import body_kind
+from hood.assets.motion.axes import UP_AXES
 from hood.assets.motion.load import load_sequence
 from hood.assets.motion.poses import POSE_SUFFIXES, arms_down, read_pose
 from hood.assets.motion.sequence import PoseSequence
@@ -75,7 +76,7 @@ def run(overrides: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     config = load_config("prepare", overrides)
     require_choice(config, "format", ("text", "json"))
-    require_choice(config, "body_up", ("auto", "y", "z"))
+    require_choice(config, "body_up", ("auto", *UP_AXES))
     check_rate(config)
     if int(config.frame) < 0:
         raise ConfigError(f"frame={config.frame}: must be at least 0, frames count from 0")
@@ -234,7 +235,8 @@ def _named_pose(given: str, config: DictConfig) -> tuple[PoseSequence, int]:
     path, frame = locate("motions", given), int(config.frame)
     if path.suffix.lower() in POSE_SUFFIXES:
         return read_pose(path), 0
-    sequence = load_sequence(given, fps=float(config.fps))
+    person = None if config.person is None else str(config.person)
+    sequence = load_sequence(given, fps=float(config.fps), person=person)
     if not 0 <= frame < sequence.num_frames:
         raise ConfigError(f"frame={frame}: {given} has {sequence.num_frames} frames at {float(config.fps):g} fps")
     return sequence, frame

@@ -18,6 +18,7 @@ from hood.assets.body.load import load_body
 from hood.assets.files.library import locate, motion_split, unknown
 from hood.assets.garment.garment import load_garment
 from hood.assets.material import Material
+from hood.assets.motion.axes import UP_AXES
 from hood.assets.motion.load import load_sequence
 from hood.assets.motion.motion_files import MotionFiles, find_motions
 from hood.commands.common import (
@@ -74,7 +75,7 @@ def _check_values(config: DictConfig) -> None:
         if int(OmegaConf.select(config, key)) < least:
             raise ConfigError(f"{key}={OmegaConf.select(config, key)}: must be at least {least}")
     require_choice(config, "data.unusable", ("refuse", "skip"))
-    require_choice(config, "data.up", ("auto", "y", "z"))
+    require_choice(config, "data.up", ("auto", *UP_AXES))
     check_rate(config, "data.fps")
     if not len(config.data.garments):
         raise ConfigError("data.garments=[]: give at least one, such as data.garments=[dress]")
@@ -187,16 +188,27 @@ def _sampling(config: DictConfig) -> dict[str, Any]:
 
 def _open_motions(config: DictConfig, names: list[str], fps: float, min_frames: int) -> MotionFiles:
     """The training motions, read when they are drawn."""
-    load = partial(load_sequence, fps=fps, up=str(config.data.up))
+    load = partial(load_sequence, fps=fps, **_reading(config))
     motions = MotionFiles(names, load, fps, min_frames, str(config.data.unusable) == "skip")
     if motions.skipped and distributed.rank() == 0:
         print(f"hood: {len(motions.skipped)} of {len(names)} motions skipped, first: {motions.skipped[0]}", file=sys.stderr)
     return motions
 
 
+def _reading(config: DictConfig) -> dict[str, Any]:
+    """The keys of ``data`` that say how motion files are read, for :func:`hood.assets.motion.load.load_sequence`."""
+    person, rate = config.data.person, config.data.file_fps
+    return {
+        "up": str(config.data.up),
+        "person": None if person is None else str(person),
+        "trans_unit": str(config.data.trans_unit or "auto"),
+        "file_fps": None if rate is None else float(rate),
+    }
+
+
 def _make_watch(config: DictConfig, sampler: SceneSampler, potential: Potential, folder: Path) -> Watch:
     names = find_motions(list(config.data.validation_sequences) or motion_split()["validation"], "validation")
-    motions = [load_sequence(str(name), float(config.data.fps), str(config.data.up)) for name in names]
+    motions = [load_sequence(str(name), float(config.data.fps), **_reading(config)) for name in names]
     validation = Validation(
         sampler.body,
         sampler.garments,

@@ -34,8 +34,10 @@ class MotionOptions:
     stop: float | str | None = None
     loop: int = 1
     file_fps: float | None = None
-    num_frames: int = 150  # for bodies that do not move
+    num_frames: int = 150  # for bodies that do not move, and for a single pose
     # parametric bodies
+    person: int | str | None = None  # who of several people in the motion's file
+    trans_unit: str = "auto"
     betas: Sequence[float] | None = (
         None  # None: the recorded subject's where the body is the model that recorded it, else zeros
     )
@@ -86,6 +88,7 @@ def load_motion(
     poses = load_sequence(
         sequence, options.fps, options.up, start=options.start, stop=options.stop, loop=options.loop,
         blend_in=options.blend_in, blend_from=options.blend_from, hands=options.hands, file_fps=options.file_fps,
+        person=options.person, trans_unit=options.trans_unit, num_frames=options.num_frames,
     )  # fmt: skip
     model = load_body(body, options.gender or poses.gender)
     return body_motion(model, poses, _betas(options.betas, model.subject_betas(poses)), dtype, device)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from omegaconf import open_dict
 
 from hood.cli import main
 from hood.commands.common import require_same_config
@@ -31,6 +32,17 @@ def test_the_setting_that_differs_is_named_with_both_values(given: str, words: s
     require_same_config(load_config("train", [*TINY, "trainer.log_every=7"]), tmp_path, (), ("log_every",))
     with pytest.raises(ConfigError, match=words):
         require_same_config(load_config("train", [*TINY, given]), tmp_path, ())
+
+
+def test_a_run_that_was_begun_before_a_key_was_there_goes_on(tmp_path: Path) -> None:
+    earlier = load_config("train", TINY)
+    with open_dict(earlier):
+        for key in ("person", "trans_unit", "file_fps"):
+            earlier.data.pop(key)
+    save_run_record(tmp_path, earlier, 0)
+    require_same_config(load_config("train", TINY), tmp_path, ())
+    with pytest.raises(ConfigError, match=r"data\.trans_unit is null there, cm in this command"):
+        require_same_config(load_config("train", [*TINY, "data.trans_unit=cm"]), tmp_path, ())
 
 
 def test_a_training_that_has_nothing_to_resume_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

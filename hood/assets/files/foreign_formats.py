@@ -8,7 +8,7 @@ from hood import plugins
 
 _SCENES = {
     ".usd": "USD", ".usda": "USD", ".usdc": "USD", ".usdz": "USD", ".fbx": "FBX", ".dae": "COLLADA", ".blend": "Blender",
-    ".max": "3ds Max", ".mb": "Maya", ".ma": "Maya", ".abc": "Alembic", ".bvh": "BVH",
+    ".max": "3ds Max", ".mb": "Maya", ".ma": "Maya", ".abc": "Alembic", ".bvh": "BVH", ".c3d": "C3D", ".trc": "TRC",
 }  # fmt: skip
 #: How each kind of asset gets out of a scene file.
 _WAY_OUT = {
@@ -21,6 +21,9 @@ _WAY_OUT = {
 }
 #: Plugins' readers of the kind, see :mod:`hood.plugins`.
 _READERS = {"garments": ("meshes",), "motions": ("motions",), "body": (), "file": ("meshes", "motions")}
+#: Files of markers, which are no skeleton yet.
+_MARKERS = (".c3d", ".trc")
+_FITTED = "fit SMPL to its markers (MoSh++, SOMA) and give the .npz that comes out"
 _BVH_BODY = (
     "retarget it to SMPL (AMASS .npz), or animate a character with it in Blender and export that as GLB: body={stem}.glb"
 )
@@ -35,5 +38,5 @@ def require_readable(path: Path, kind: str) -> None:
     suffix = path.suffix.lower()
     if suffix not in _SCENES or kind not in _WAY_OUT or any(suffix[1:] in plugins.names(group) for group in _READERS[kind]):
         return
-    way = _BVH_BODY if suffix == ".bvh" and kind != "garments" else _WAY_OUT[kind]
+    way = _FITTED if suffix in _MARKERS else _BVH_BODY if suffix == ".bvh" and kind != "garments" else _WAY_OUT[kind]
     raise ValueError(f"{path}: {_SCENES[suffix]} files are not read; {way.format(stem=path.stem)}")

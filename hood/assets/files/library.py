@@ -7,9 +7,9 @@ import json
 import math
 import os
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 
@@ -95,8 +95,17 @@ def motion_split() -> dict[str, list[str]]:
     return split
 
 
-def read_arrays(path: Path, required: Iterable[str], what: str, size_limit: int = SIZE_LIMIT) -> dict:
+def read_arrays(
+    path: Path,
+    required: Iterable[str],
+    what: str,
+    size_limit: int = SIZE_LIMIT,
+    objects: Callable[[IO[bytes]], Any] | None = None,
+) -> dict:
     """Arrays of an ``.npz`` file, never unpickled; members that would need it (strings of old files) are passed over.
+
+    Args:
+        objects: reads such a member instead, from behind its header.
 
     Raises:
         FileNotFoundError: no such file.
@@ -106,7 +115,7 @@ def read_arrays(path: Path, required: Iterable[str], what: str, size_limit: int 
     required = list(required)
     try:
         with zipfile.ZipFile(path) as archive:
-            arrays = _members(archive, set(required), size_limit)
+            arrays = _members(archive, set(required), size_limit, objects)
     except FileNotFoundError:
         raise
     except Exception as error:
@@ -117,18 +126,22 @@ def read_arrays(path: Path, required: Iterable[str], what: str, size_limit: int 
     return arrays
 
 
-def _members(archive: zipfile.ZipFile, required: set[str], size_limit: int) -> dict[str, np.ndarray]:
+def _members(
+    archive: zipfile.ZipFile, required: set[str], size_limit: int, objects: Callable[[IO[bytes]], Any] | None
+) -> dict[str, Any]:
     entries = [info for info in archive.infolist() if info.filename.endswith(".npy")]
     total = sum(info.file_size for info in entries)
     if total > size_limit:
         raise ValueError(f"unpacks to {total} bytes, the limit is {size_limit}")
-    arrays = {}
+    arrays: dict[str, Any] = {}
     for info in entries:
         key = info.filename.removesuffix(".npy")
         with archive.open(info) as file:
-            shape, dtype = _npy_header(file)
+            shape, dtype = npy_header(file)
+            if dtype.hasobject and objects is not None:
+                arrays[key] = objects(file)
         if dtype.hasobject:
-            if key in required:
+            if key in required and objects is None:
                 raise ValueError(f"key {key!r} holds Python objects, which are not read; save it as a plain array")
             continue
         # Memory is taken before the content is read: a header may promise what the file does not hold.
@@ -139,7 +152,12 @@ def _members(archive: zipfile.ZipFile, required: set[str], size_limit: int) -> d
     return arrays
 
 
-def _npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
+def npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
+    """Shape and kind of the array behind a ``.npy`` header; ``file`` is left behind the header.
+
+    Raises:
+        ValueError: no such header, or a negative shape.
+    """
     version = np.lib.format.read_magic(file)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, _, dtype = read(file)

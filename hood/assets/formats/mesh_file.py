@@ -51,6 +51,8 @@ class MeshFile:
     num_polygons: int = 0  # faces of four and more corners that were split
     num_joined: int = 0  # vertices that the format had doubled
     notes: tuple[str, ...] = ()  # what was not kept
+    corners: np.ndarray | None = None  # (N,) vertex of every corner, polygon after polygon, before any was split
+    counts: np.ndarray | None = None  # (P,) corners of every polygon
 
 
 def mesh_suffixes() -> tuple[str, ...]:
@@ -132,6 +134,8 @@ def _finish(raw: RawMesh, split_polygons: bool, join: bool) -> MeshFile:
     polygon = np.repeat(np.arange(len(raw.counts)), raw.counts)[rows[:, 0]]
     return MeshFile(
         pos=raw.pos[kept],
+        corners=vertex_map[raw.corners],
+        counts=raw.counts,
         faces=faces,
         uv=raw.uv if uv_faces is not None else None,
         uv_faces=uv_faces,

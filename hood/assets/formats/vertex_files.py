@@ -11,19 +11,19 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 
+from hood.assets.files.frame_rates import rates_in
 from hood.assets.files.guarded import first_line
 from hood.assets.files.h5_links import own_dataset
 from hood.assets.files.library import SIZE_LIMIT, read_arrays
-from hood.assets.formats.mesh_file import read_mesh
+from hood.assets.formats.mesh_file import MeshFile, read_mesh_file
 from hood.assets.pickles.unpickle import load_pickle
 
 #: Names of the tables; the last pair is the body of a ``rollout.h5``.
 VERTEX_KEYS = ("verts", "vertices", "body/pos")
 FACE_KEYS = ("faces", "f", "body/faces")
 FOLDER_SUFFIXES = (".obj", ".ply")
-_RATE_KEYS = ("fps", "frame_rate", "mocap_framerate", "mocap_frame_rate")
 #: An HDF5 file may be stored compressed; what it unpacks to is limited, not its size.
-_OTHER_KEYS = ("transforms", *_RATE_KEYS)
+_OTHER_KEYS = ("transforms",)
 
 
 class VertexFile(NamedTuple):
@@ -69,7 +69,8 @@ def read_vertex_h5(path: Path) -> VertexFile:
             found: dict[str, Any] = {
                 key: _dataset(file, key) for key in (*VERTEX_KEYS, *FACE_KEYS, *_OTHER_KEYS) if key in file
             }
-            found.update({key: file.attrs[key] for key in _RATE_KEYS if key in file.attrs})
+            said = next(rates_in({key: _small(file, key) for key in file} | dict(file.attrs)), None)
+            found |= {} if said is None else {"fps": said[1]}
             if "body/pos" in found and "dt" in file.attrs:
                 found["fps"] = 1.0 / float(file.attrs["dt"])
                 found["body/pos"] = found["body/pos"][: int(file.attrs.get("num_frames", len(found["body/pos"])))]
@@ -81,7 +82,7 @@ def read_vertex_h5(path: Path) -> VertexFile:
 
 
 def read_mesh_folder(folder: Path) -> VertexFile:
-    """A folder of OBJ or PLY files, one a frame, in the order of the numbers in their names; polygons are triangulated.
+    """A folder of OBJ or PLY files, one a frame, in the order of the numbers in their names; polygons are split once.
 
     Raises:
         ValueError: no such files, both kinds, or a frame with other vertices or faces than the first; names the file.
@@ -93,21 +94,29 @@ def read_mesh_folder(folder: Path) -> VertexFile:
         raise ValueError(f"{folder}: holds OBJ and PLY files; keep one kind")
     if sum(path.stat().st_size for path in files) > 4 * SIZE_LIMIT:
         raise ValueError(f"{folder}: more than {4 * SIZE_LIMIT} bytes of meshes; save them as one .npz (verts, faces)")
-    first, faces = read_mesh(files[0], True)
+    mesh = read_mesh_file(files[0], True)
+    first, faces = mesh.pos, mesh.faces
     if first.nbytes * len(files) > SIZE_LIMIT:
         raise ValueError(f"{folder}: {len(files)} frames of {len(first)} vertices are more than {SIZE_LIMIT} bytes; give fewer")
     verts = np.empty((len(files), *first.shape))
     verts[0] = first
     for frame, path in enumerate(files[1:], start=1):
-        pos, own = read_mesh(path, True)
+        own = read_mesh_file(path, True)
+        pos = own.pos
         if pos.shape != first.shape:
             raise ValueError(
                 f"{path}: {len(pos)} vertices, {files[0].name} has {len(first)}; every frame must be the same mesh"
             )
-        if not np.array_equal(own, faces):
+        # Polygons are split by their shape, and that changes: the split of the first frame is that of all.
+        if not _same_polygons(own, mesh):
             raise ValueError(f"{path}: its faces are not those of {files[0].name}; every frame must be the same mesh")
         verts[frame] = pos
     return VertexFile(verts, faces)
+
+
+def _same_polygons(one: MeshFile, other: MeshFile) -> bool:
+    pairs = ((one.corners, other.corners), (one.counts, other.counts))
+    return all(a is not None and b is not None and np.array_equal(a, b) for a, b in pairs)
 
 
 def _pick(path: Path, fields: Mapping[Any, Any]) -> VertexFile:
@@ -117,8 +126,16 @@ def _pick(path: Path, fields: Mapping[Any, Any]) -> VertexFile:
         missing = "verts" if verts is None else "faces"
         found = sorted(str(key) for key in fields)[:8]
         raise ValueError(f"{path}: not a mesh sequence: key {missing!r} is missing (found {found})")
-    rate = next((fields[key] for key in _RATE_KEYS if key in fields), None)
+    _, rate = next(rates_in({str(key): value for key, value in fields.items()}), (None, None))
     return VertexFile(verts, faces, rate, fields.get("transforms"))
+
+
+def _small(file: h5py.File, key: str) -> Any:
+    """A dataset of one value; None for what is larger, and for groups and links."""
+    place = file.get(key, getlink=True)
+    if not isinstance(place, h5py.HardLink) or not isinstance(file[key], h5py.Dataset) or file[key].size != 1:
+        return None
+    return file[key][()]
 
 
 def _dataset(file: h5py.File, key: str) -> np.ndarray:

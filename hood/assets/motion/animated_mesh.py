@@ -12,12 +12,15 @@ from typing import Any
 
 import numpy as np
 
+from hood.assets.files.doubt import Doubt
+from hood.assets.files.frame_rates import parse_rate
 from hood.assets.files.library import DATA_FOLDER
 from hood.assets.formats import vertex_files
 from hood.assets.formats.gltf_animation import read_gltf_animation
 from hood.assets.formats.mesh_file import read_mesh
 from hood.assets.formats.point_cache import CACHE_SUFFIX, caches, read_point_cache
 from hood.assets.formats.vertex_files import FACE_KEYS, FOLDER_SUFFIXES, VERTEX_KEYS, VertexFile
+from hood.assets.motion.axes import require_up
 from hood.assets.motion.mesh_sequence import MeshSequence, loop_mesh, resample_mesh, trim_mesh, turn_mesh
 from hood.mesh import topology
 from hood.mesh.repair import sew_moving
@@ -78,10 +81,10 @@ def load_mesh_sequence(
     whose animation is evaluated at ``fps`` itself; OBJ, PLY, OFF or STL for one that stands still.
 
     Args:
-        up: axis that points up in the file: "y", "z", or "auto", y, with a warning where it seems to be z.
+        up: axis that points up in the file: "y", "z", "x", "-y", "-z", "-x", or "auto", y, with a doubt where it seems to be z.
         start, stop: part to keep, in seconds or in frames of the file ("120f").
         loop: times the motion is played; it must end as it began.
-        file_fps: frame rate of the file, whatever it says itself; 30 where neither does.
+        file_fps: frame rate of the file, whatever it says itself; 30, with a doubt, where neither does.
         scale: metres per unit of the file; None: 1. Refused where the mesh is larger than 30 m then; a given one is warned of
             where it makes no person. 1 takes the mesh as it is.
         animation, parts: of glTF, see :func:`hood.assets.formats.gltf_animation.read_gltf_animation`.
@@ -93,12 +96,17 @@ def load_mesh_sequence(
     path = Path(path).expanduser()
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder")
-    if up not in ("y", "z", "auto"):
-        raise ValueError(f"up={up}: give y, z or auto, the axis that points up in the file")
+    require_up(up)
     content = _read(path, fps, animation, parts)
-    rate = _rate(path, content.fps if file_fps is None else file_fps)
+    said = content.fps if file_fps is None else file_fps
+    rate = _rate(path, said)
     verts, faces = _checked(path, content.verts, content.faces)
-    sequence = MeshSequence(path.stem, verts, faces, rate, _bones(path, content), content.rest, content.weights)
+    assumed = said is None and len(verts) > 1
+    if assumed:
+        sentence = f"{path}: says no frame rate, {rate:g} fps are assumed; file_fps=… gives the right one"
+        warnings.warn(Doubt("frame_rate", sentence, value=rate, unit="fps"), stacklevel=2)
+    bones = _bones(path, content)
+    sequence = MeshSequence(path.stem, verts, faces, rate, bones, content.rest, content.weights, fps_assumed=assumed)
     sequence = turn_mesh(sequence, 1.0 if scale is None else float(scale), up)
     _check_size(path, sequence, scale)
     if up == "auto":
@@ -184,9 +192,8 @@ def _bones(path: Path, content: VertexFile) -> np.ndarray | None:
 def _rate(path: Path, value: Any) -> float:
     if value is None:
         return _DEFAULT_FPS
-    flat = np.asarray(value).reshape(-1)
-    rate = float(flat[0]) if len(flat) == 1 and flat.dtype.kind in "iuf" else np.nan
-    if not np.isfinite(rate) or not 0.1 <= rate <= 1e5:
+    rate = parse_rate(value)
+    if not 0.1 <= rate <= 1e5:
         raise ValueError(
             f"{path}: its frame rate is {' '.join(str(value).split())[:40]}; give file_fps, 0.1 to 100000 frames a second"
         )
@@ -209,9 +216,11 @@ def _check_size(path: Path, sequence: MeshSequence, scale: float | None) -> None
     if scale is None and extent > _PERSONS[1] and _is_upright(np.ptp(sequence.verts[0], axis=0)):
         factor = min(_LARGE_UNITS, key=lambda unit: abs(np.log(unit * extent / _USUAL)))
         fix = f"pass body_scale={factor:g}, which makes it {factor * extent:.3g} m (body_scale=1 takes it as it is)"
-        warnings.warn(f"{path}: the body is {extent:.3g} m tall, its unit seems not to be the metre; {fix}", stacklevel=3)
+        sentence = f"{path}: the body is {extent:.3g} m tall, its unit seems not to be the metre; {fix}"
+        warnings.warn(Doubt("units", sentence, value=extent, unit="m"), stacklevel=3)
     if scale is not None and not _PERSONS[0] <= extent <= _PERSONS[1] and factor != scale:
-        warnings.warn(f"{path}: the mesh is {extent:.3g} m large with body_scale={scale:g}; {fix}", stacklevel=3)
+        sentence = f"{path}: the mesh is {extent:.3g} m large with body_scale={scale:g}; {fix}"
+        warnings.warn(Doubt("units", sentence, value=extent, unit="m"), stacklevel=3)
 
 
 def _is_upright(box: np.ndarray) -> bool:
@@ -225,11 +234,11 @@ def _check_bearing(path: Path, sequence: MeshSequence) -> None:
     box = np.ptp(points, axis=0)
     long = _LONGER * box[1] < box[2] <= _PERSONS[1] and box[1] > _THICK * box[2]
     if long and abs(_volume(points, sequence.faces)) < _FILLED * box.prod():
-        warnings.warn(
+        sentence = (
             f"{path}: the body seems to stand along z (it is {box[2]:.2f} m long there, {box[1]:.2f} m along y), but y is "
-            "taken as up; pass up=z (body_up=z in hood prepare) if it stands, up=y (body_up=y) if it lies",
-            stacklevel=3,
+            "taken as up; pass up=z (body_up=z in hood prepare) if it stands, up=y (body_up=y) if it lies"
         )
+        warnings.warn(Doubt("orientation", sentence), stacklevel=3)
 
 
 def _volume(points: np.ndarray, faces: np.ndarray) -> float:

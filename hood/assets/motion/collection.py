@@ -7,11 +7,13 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from hood.assets.files.library import locate
+from hood.assets.motion.layouts.content import ARRAYS, TENSORS
 from hood.assets.motion.motion_files import find_motions
 from hood.assets.motion.recording import motion_suffixes
 
 #: What lies beside the motions in AMASS folders: subjects' shapes, stages of the fit.
 _BESIDES = ("shape", "neutral_stagei", "female_stagei", "male_stagei")
+_OFTEN_OTHERS = (*ARRAYS, *TENSORS)
 #: Columns of a table that may name the motion.
 _NAME_COLUMNS = ("id", "file", "path", "sequence", "name")
 
@@ -20,9 +22,9 @@ def expand_sequences(patterns: str | Path | Iterable[str | Path], part: str = "t
     """Motion files that ``patterns`` stand for: in their order, folders and globs sorted, nothing twice.
 
     A pattern is the name of an embedded motion; a file; a folder, whose motions are all ``.npz`` and ``.pkl`` files in it and
-    below, but not the shapes that AMASS keeps beside them; a glob (``amass/**/*_poses.npz``); a list, see
-    :func:`hood.assets.motion.motion_files.find_motions`; or a ``.csv`` table with a column ``id`` (or file, path, sequence,
-    name; else its first), whose entries start from its folder and may leave the suffix out.
+    below (all ``.npy`` and ``.pt`` where there are none of these), but not the shapes that AMASS keeps beside them; a glob
+    (``amass/**/*_poses.npz``); a list, see :func:`hood.assets.motion.motion_files.find_motions`; or a ``.csv`` table with a
+    column ``id`` (or file, path, sequence, name; else its first), whose entries start from its folder, with or without suffix.
 
     Args:
         part: of a JSON split, "train" or "validation".
@@ -51,8 +53,10 @@ def motions_in(folder: Path) -> list[Path]:
         ValueError: there are none.
     """
     suffixes = motion_suffixes()
-    files = (path for path in folder.rglob("*") if path.suffix in suffixes and path.is_file())
-    found = sorted(path for path in files if path.stem not in _BESIDES and not path.name.startswith("."))
+    files = (path for path in folder.rglob("*") if path.suffix.lower() in suffixes and path.is_file())
+    every = sorted(path for path in files if path.stem not in _BESIDES and not path.name.startswith("."))
+    # Arrays and files of torch are motions in few folders, and lie beside them in many: statistics, weights.
+    found = [path for path in every if path.suffix.lower() not in _OFTEN_OTHERS] or every
     if not found:
         raise ValueError(f"{folder}: no motions ({', '.join(suffixes)}) in it or below; give a folder that holds such files")
     return found

@@ -9,9 +9,10 @@ import numpy as np
 
 from hood.assets.files.library import locate
 from hood.assets.motion import sequence_edit as edit
+from hood.assets.motion.axes import UP_AXES, require_up
 from hood.assets.motion.recording import NUM_BODY_JOINTS, Recording, read_recording
-from hood.assets.motion.sequence import Z_UP_TO_Y_UP, PoseSequence, resample, turn_world
-from hood.assets.motion.up_axis import bearing_notice
+from hood.assets.motion.sequence import PoseSequence, resample, still, turn_world
+from hood.assets.motion.up_axis import bearing_notice, head_down_doubt
 
 HANDS = ("flat", "file")
 
@@ -28,14 +29,17 @@ def load_sequence(
     blend_from: str = "t",
     hands: str = "flat",
     file_fps: float | None = None,
+    person: int | str | None = None,
+    trans_unit: str = "auto",
+    num_frames: int | None = None,
 ) -> PoseSequence:
     """A motion by its embedded name or from a file, as it is to be performed.
 
     Args:
-        name: an embedded name, an AMASS ``.npz`` of any layout, or a ``.pkl`` with joint rotations.
+        name: an embedded name, or a motion file of any layout (:func:`hood.assets.motion.recording.read_recording`).
         fps: frames per second of the result; rotations are interpolated by slerp, translations linearly.
-        up: axis of the file's world that points up: "z", "y", or "auto", along which the body stands; z for AMASS layouts and
-            y for the others where that is open.
+        up: axis of the file's world that points up: "y", "z", "x", "-y", "-z", "-x", or "auto", along which the body stands;
+            where that is open z for AMASS layouts, -y for cameras and y for the others, with a doubt.
         start: first moment of the file to keep, in seconds, or in frames of the file as "120f"; None: its beginning.
         stop: last moment to keep, likewise; None: its end.
         loop: times the motion is played; each play goes on from where the last one ended.
@@ -43,6 +47,9 @@ def load_sequence(
         blend_from: that pose, "t" or "a".
         hands: "flat", or "file" for the fingers (SMPL-H, SMPL-X) or hands (SMPL) that the file holds.
         file_fps: frame rate of the file, whatever it says itself.
+        person: who of several people in the file, by name or place; one of several is never taken unasked.
+        trans_unit: unit of the file's translation, "m", "cm" or "mm"; "auto": found from steps and heights.
+        num_frames: for how many frames a file with a single pose is held; None: five seconds.
 
     Returns:
         The :class:`PoseSequence`, with ``poses`` (T, 24, 3) rad, ``transl`` (T, 3) m, y up.
@@ -58,35 +65,38 @@ def load_sequence(
         ((121, 24, 3), 60)
     """
     path = locate("motions", name)
-    if up not in ("y", "z", "auto"):
-        raise ValueError(f"up={up}: give z (AMASS), y or auto, the axis that points up in the file")
+    require_up(up)
     if hands not in HANDS:
         raise ValueError(f"hands={hands}: give flat, or file for fingers as recorded")
-    recording = read_recording(path, file_fps)
+    recording = read_recording(path, file_fps, person, trans_unit)
+    for note in recording.notes:
+        warnings.warn(note, stacklevel=2)
+    axis = _up_axis(path, recording) if up == "auto" else up
+    sequence = _sequence(path.stem, recording, hands)
+    if sequence.num_frames == 1:
+        sequence = still(sequence, fps, num_frames)
+    else:
+        sequence = resample(edit.trim(sequence, start, stop), fps)
+    if axis != "y":
+        sequence = turn_world(sequence, UP_AXES[axis])
+    return edit.blend_in(edit.loop(sequence, loop), blend_in, blend_from)
+
+
+def _sequence(name: str, recording: Recording, hands: str) -> PoseSequence:
+    """The recording in the world of its file, with hands as recorded or flat."""
     poses, fingers = recording.poses, recording.fingers
     if hands == "flat":
         poses, fingers = poses.copy(), None
         poses[:, NUM_BODY_JOINTS:] = 0.0
-    sequence = PoseSequence(
-        path.stem,
-        poses,
-        recording.transl,
-        recording.fps,
-        recording.betas,
-        np.eye(3),
-        fingers,
-        recording.gender,
-        recording.family,
+    return PoseSequence(
+        name, poses, recording.transl, recording.fps, recording.betas, np.eye(3), fingers, recording.gender, recording.family
     )
-    sequence = resample(edit.trim(sequence, start, stop), fps)
-    if (_up_axis(path, recording) if up == "auto" else up) == "z":
-        sequence = turn_world(sequence, Z_UP_TO_Y_UP)
-    return edit.blend_in(edit.loop(sequence, loop), blend_in, blend_from)
 
 
 def _up_axis(path: Path, recording: Recording) -> str:
-    """The axis along which the body stands; a warning where it is not that of the layout."""
+    """The axis along which the body stands; a warning where it is not that of the layout, a doubt where that is not sure."""
     axis, notice = bearing_notice(path, recording)
+    notice = notice or head_down_doubt(path, recording, axis)
     if notice is not None:
         warnings.warn(notice, stacklevel=3)
     return axis

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hood.assets.files.library import SIZE_LIMIT
-from hood.assets.motion.sequence import Z_UP_TO_Y_UP, time_stamps
+from hood.assets.motion.axes import UP_AXES
+from hood.assets.motion.sequence import time_stamps
 from hood.assets.motion.sequence_edit import frame_at
 
 #: First and last frame of a motion that can be repeated may differ by this share of its size.
@@ -30,6 +31,7 @@ class MeshSequence:
     transforms: np.ndarray | None = None  # (T, J, 3, 4) float64
     rest: np.ndarray | None = None  # (W, 3) m, float64
     weights: np.ndarray | None = None  # (W, J)
+    fps_assumed: bool = False  # the file does not say a frame rate
 
     @property
     def num_frames(self) -> int:
@@ -61,16 +63,16 @@ def resample_mesh(sequence: MeshSequence, fps: float) -> MeshSequence:
 
 
 def turn_mesh(sequence: MeshSequence, scale: float, up: str) -> MeshSequence:
-    """The motion scaled by ``scale`` [m per unit], and turned y up where ``up`` is "z".
+    """The motion scaled by ``scale`` [m per unit] and turned so that ``up``, an axis of :data:`UP_AXES` or "auto" for y, is y.
 
     Raises:
         ValueError: ``scale`` is not a positive number.
     """
     if not np.isfinite(scale) or scale <= 0:
         raise ValueError(f"body_scale={scale}: give metres per unit of the file, more than zero")
-    if scale == 1.0 and up != "z":
+    turn = UP_AXES["y" if up == "auto" else up]
+    if scale == 1.0 and np.array_equal(turn, np.eye(3)):
         return sequence
-    turn = Z_UP_TO_Y_UP if up == "z" else np.eye(3)
     # Column by column: a product with a matrix would take the memory of a second sequence in float64.
     verts = np.empty_like(sequence.verts)
     for row in range(3):

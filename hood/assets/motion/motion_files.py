@@ -17,7 +17,10 @@ from typing import IO, Any, overload
 
 import numpy as np
 
+from hood.assets.files.frame_rates import squeezed
 from hood.assets.files.library import DATA_FOLDER, locate, names, nearest
+from hood.assets.motion.layouts.read import FRAME_IDS
+from hood.assets.motion.layouts.table import WHOLE
 from hood.assets.motion.recording import motion_suffixes
 from hood.assets.motion.sequence import PoseSequence
 
@@ -215,13 +218,14 @@ def _entries(path: Path, part: str) -> list[tuple[str, str]]:
 
 _POSES = ("poses", "root_orient")
 _RATES = ("mocap_framerate", "mocap_frame_rate")
+_WIDTHS = (3, *(3 * count for count in WHOLE))
 
 
 def _num_frames(name: str, fps: float) -> int | None:
     """Frames at ``fps`` of an AMASS archive, by its headers; None where they do not tell."""
     path = DATA_FOLDER / "motions" / f"{name}.npz"
     path = path if path.is_file() else Path(name).expanduser()
-    if path.suffix != ".npz":
+    if path.suffix.lower() != ".npz":
         return None
     try:
         with zipfile.ZipFile(path) as archive:
@@ -230,8 +234,13 @@ def _num_frames(name: str, fps: float) -> int | None:
             rate = next((key for key in _RATES if f"{key}.npy" in members), None)
             if poses is None or rate is None:
                 return None
+            if {squeezed(name.removesuffix(".npy")) for name in members} & set(FRAME_IDS):
+                return None
             with archive.open(f"{poses}.npy") as file:
                 shape = _shape(file)
+            # A pose alone, and tables of several people, have other axes than frames and numbers.
+            if not (len(shape) == 2 and shape[1] in _WIDTHS) and not (len(shape) == 3 and shape[1] in WHOLE and shape[2] == 3):
+                return None
             with archive.open(f"{rate}.npy") as file:
                 value = np.lib.format.read_array(file, allow_pickle=False)
         frames = int(np.floor((shape[0] - 1) * fps / float(value.reshape(-1)[0]) + 1e-9)) + 1

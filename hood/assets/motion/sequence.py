@@ -7,12 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from hood.assets.motion.axes import Z_UP_TO_Y_UP
 from hood.assets.motion.recording import NUM_BODY_JOINTS
+from hood.assets.motion.rotation_vectors import from_vectors
 
-__all__ = ["NUM_BODY_JOINTS", "Z_UP_TO_Y_UP", "PoseSequence", "resample", "turn_world"]
+__all__ = ["NUM_BODY_JOINTS", "Z_UP_TO_Y_UP", "PoseSequence", "resample", "still", "turn_world"]
 
-#: z-up (AMASS) to y-up: (x, y, z) → (x, z, -y).
-Z_UP_TO_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+#: Seconds for which a single pose is held where nobody says how long.
+_HELD = 5.0
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,12 @@ class PoseSequence:
         return replace(self, poses=self.poses[frames], transl=self.transl[frames], fingers=fingers)
 
 
+def still(sequence: PoseSequence, fps: float, num_frames: int | None = None) -> PoseSequence:
+    """A single pose held at ``fps`` for ``num_frames``, at least two; None: five seconds."""
+    count = max(round(_HELD * fps) + 1 if num_frames is None else num_frames, 2)
+    return replace(sequence.at(np.zeros(count, dtype=np.int64)), fps=fps)
+
+
 def resample(sequence: PoseSequence, fps: float) -> PoseSequence:
     """The motion at another frame rate: rotations by slerp, translations linearly; time stamps k / fps, no drift."""
     if abs(sequence.fps - fps) < 1e-9:
@@ -76,7 +84,7 @@ def time_stamps(name: str, num_frames: int, fps: float, new_fps: float) -> tuple
 def turn_world(sequence: PoseSequence, rotation: np.ndarray) -> PoseSequence:
     """The motion in a turned world: root orientation and translation by ``rotation`` (3, 3)."""
     poses = sequence.poses.copy()
-    poses[:, 0] = (Rotation.from_matrix(rotation) * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
+    poses[:, 0] = (Rotation.from_matrix(rotation) * from_vectors(poses[:, 0])).as_rotvec()
     transl = sequence.transl @ rotation.T
     return replace(sequence, poses=poses, transl=transl, world_rotation=rotation @ sequence.world_rotation)
 
@@ -86,5 +94,5 @@ def _slerp(poses: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndar
     result = np.zeros((len(target), *poses.shape[1:]))
     for joint in range(poses.shape[1]):
         if np.any(poses[:, joint]):
-            result[:, joint] = Slerp(source, Rotation.from_rotvec(poses[:, joint]))(target).as_rotvec()
+            result[:, joint] = Slerp(source, from_vectors(poses[:, joint]))(target).as_rotvec()
     return result

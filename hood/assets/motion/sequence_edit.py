@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hood.assets.motion.rotation_vectors import from_vectors
 from hood.assets.motion.sequence import PoseSequence
 
 _UP = np.array([0.0, 1.0, 0.0])
@@ -91,14 +92,14 @@ def loop(sequence: PoseSequence, plays: int) -> PoseSequence:
         return sequence
     closed = _closed(sequence)
     first, last = closed.poses[0, 0], closed.poses[-1, 0]
-    turn = Rotation.from_rotvec((_heading(last) - _heading(first)) * _UP)
+    turn = from_vectors((_heading(last) - _heading(first)) * _UP)
     parts, heading, place = [], Rotation.identity(), closed.transl[0]
     for play in range(plays):
         source = sequence if play == plays - 1 else closed
         transl = place + heading.apply(source.transl - source.transl[0])
         transl[:, 1] = source.transl[:, 1]
         poses = source.poses.copy()
-        poses[:, 0] = (heading * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
+        poses[:, 0] = (heading * from_vectors(poses[:, 0])).as_rotvec()
         part = replace(source, poses=poses, transl=transl)
         parts.append(part if play == 0 else part.window(1, part.num_frames))  # its first frame is the last one before it
         heading, place = heading * turn, transl[-1]
@@ -136,7 +137,7 @@ def _closed(sequence: PoseSequence) -> PoseSequence:
     weight = _smooth(np.arange(1, count + 1) / count)
     target = sequence.poses[:1].copy()
     turn = _heading(sequence.poses[-1, 0]) - _heading(target[0, 0])
-    target[0, 0] = (Rotation.from_rotvec(turn * _UP) * Rotation.from_rotvec(target[0, 0])).as_rotvec()
+    target[0, 0] = (from_vectors(turn * _UP) * from_vectors(target[0, 0])).as_rotvec()
     poses, transl = sequence.poses.copy(), sequence.transl.copy()
     poses[-count:] = _between(poses[-count:], target, weight)
     transl[-count:, 1] += weight * (transl[0, 1] - transl[-count:, 1])
@@ -149,7 +150,7 @@ def _closed(sequence: PoseSequence) -> PoseSequence:
 
 def _heading(root: np.ndarray) -> float:
     """Angle [rad] about the vertical axis of where a root orientation faces; z forward has none."""
-    ahead = Rotation.from_rotvec(root).apply([0.0, 0.0, 1.0])
+    ahead = from_vectors(root).apply([0.0, 0.0, 1.0])
     return float(np.arctan2(ahead[0], ahead[2]))
 
 
@@ -159,10 +160,10 @@ def _smooth(share: np.ndarray) -> np.ndarray:
 
 def _between(start: np.ndarray, end: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Slerp from (T, J, 3) towards (T or 1, J, 3) by ``weight`` (T,), along the short arcs."""
-    first = Rotation.from_rotvec(start.reshape(-1, 3))
-    last = Rotation.from_rotvec(np.broadcast_to(end, start.shape).reshape(-1, 3))
+    first = from_vectors(start.reshape(-1, 3))
+    last = from_vectors(np.broadcast_to(end, start.shape).reshape(-1, 3))
     step = (first.inv() * last).as_rotvec() * np.repeat(weight, start.shape[1])[:, None]
-    return (first * Rotation.from_rotvec(step)).as_rotvec().reshape(start.shape)
+    return (first * from_vectors(step)).as_rotvec().reshape(start.shape)
 
 
 def _join(parts: list[PoseSequence]) -> PoseSequence:

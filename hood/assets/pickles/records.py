@@ -150,6 +150,16 @@ def _array(content: Any, dtype: Any, shape: Any, order: str = "C", seen: dict[in
     return flat.reshape(tuple(int(n) for n in shape), order="F" if order == "F" else "C")
 
 
+def read_raw_array(read: Callable[[int], bytes], dtype: np.dtype, shape: Any, order: str) -> np.ndarray:
+    """The array of ``shape`` whose numbers ``read`` gives next, column by column where ``order`` is "F"."""
+    sizes = tuple(int(n) for n in shape)
+    if any(n < 0 for n in sizes):
+        raise Refused(f"an array of shape {sizes}; the file is damaged")
+    raw = np.frombuffer(read(math.prod(sizes) * dtype.itemsize), dtype=dtype)
+    flat = raw.astype(dtype.newbyteorder("="), copy=True)
+    return flat.reshape(sizes, order="F" if order == "F" else "C")
+
+
 def _scalar(dtype: Any, content: Any = b"") -> Any:
     return _array(content, dtype, ())[()]
 

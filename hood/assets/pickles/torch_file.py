@@ -19,7 +19,7 @@ from torch import Tensor
 
 from hood.assets.files.guarded import Refused, check_size, guarded
 from hood.assets.pickles.records import Function, resolve
-from hood.assets.pickles.unpickle import SIZE_LIMIT, RestrictedUnpickler
+from hood.assets.pickles.unpickle import SIZE_LIMIT, Bounded, RestrictedUnpickler
 
 #: Packages whose objects checkpoints carry beside the weights: configurations, and the classes they describe. Only their
 #: names are kept; none of them is imported.
@@ -58,10 +58,12 @@ class _StorageType:
         raise Refused("sets the state of a storage type; the file is damaged or harmful")
 
 
-class _TorchUnpickler(RestrictedUnpickler):
-    inert = _INERT
+class TorchUnpickler(RestrictedUnpickler):
+    """Unpickler of tensors; ``storage`` gives the flat tensor of a storage that the pickle refers to."""
 
-    def __init__(self, file: BinaryIO | io.BytesIO, storage: Callable[..., Tensor] | None = None) -> None:
+    inert: tuple[str, ...] = _INERT
+
+    def __init__(self, file: BinaryIO | io.BytesIO | Bounded, storage: Callable[..., Tensor] | None = None) -> None:
         super().__init__(file)
         self._storage = storage
 
@@ -105,7 +107,7 @@ _FUNCTIONS: dict[tuple[str, str], Any] = {
 
 
 def _read(file: BinaryIO, size_limit: int) -> Any:
-    read = _read_zip if zipfile.is_zipfile(file) else _read_stream
+    read = _read_zip if zipfile.is_zipfile(file) else read_torch_stream
     file.seek(0)
     return read(file, size_limit)
 
@@ -127,19 +129,22 @@ def _read_zip(file: BinaryIO, size_limit: int) -> Any:
                 loaded[key] = _flat(bytearray(archive.read(f"{root}data/{key}")), dtype, count)
             return loaded[key]
 
-        return _TorchUnpickler(io.BytesIO(archive.read(root + "data.pkl")), storage).load()
+        return TorchUnpickler(io.BytesIO(archive.read(root + "data.pkl")), storage).load()
 
 
-def _read_stream(file: BinaryIO, size_limit: int) -> Any:
-    """The older format: magic number, version, platform, object, storage keys, storages; contents come last."""
-    if _TorchUnpickler(file).load() != _MAGIC:
+def read_torch_stream(file: BinaryIO | io.BytesIO, size_limit: int) -> Any:
+    """The older format, of at most ``size_limit`` bytes: magic number, version, platform, object, storage keys, storages;
+    contents come last."""
+    if TorchUnpickler(file).load() != _MAGIC:
         raise Refused("not written by torch.save")
-    _TorchUnpickler(file).load()
-    if not _TorchUnpickler(file).load().get("little_endian", True):
+    TorchUnpickler(file).load()
+    if not TorchUnpickler(file).load().get("little_endian", True):
         raise Refused("tensors in big-endian order; save the file again on this machine")
     buffers: dict[str, tuple[bytearray, Tensor]] = {}
     total = 0
-    size_limit = min(size_limit, os.fstat(file.fileno()).st_size)  # no storage is larger than the file it is in
+    place = file.tell()
+    size_limit = min(size_limit, file.seek(0, os.SEEK_END))  # no storage is larger than the file it is in
+    file.seek(place)
 
     def storage(dtype: torch.dtype, key: Any, location: Any, count: int, view: Any = None) -> Tensor:
         nonlocal total
@@ -152,11 +157,11 @@ def _read_stream(file: BinaryIO, size_limit: int) -> Any:
         flat = buffers[key][1]
         return flat if view is None else flat[view[1] : view[1] + view[2]]
 
-    content = _TorchUnpickler(file, storage).load()
-    for key in _TorchUnpickler(file).load():
+    content = TorchUnpickler(file, storage).load()
+    for key in TorchUnpickler(file).load():
         buffer, flat = buffers[key]
         (count,) = struct.unpack("<q", file.read(8))
-        if count != len(flat) or file.readinto(buffer) != len(buffer):  # type: ignore[attr-defined]
+        if count != len(flat) or file.readinto(buffer) != len(buffer):  # type: ignore[union-attr]
             raise Refused(f"storage {key} is cut off; copy the file again")
     return content
 

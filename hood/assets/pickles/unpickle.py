@@ -57,8 +57,10 @@ class RestrictedUnpickler(pickle._Unpickler):  # type: ignore[name-defined,misc]
         pickle.BYTEARRAY8[0]: _load_bytearray,
     }
 
-    def __init__(self, file: BinaryIO | io.BytesIO) -> None:
-        super().__init__(_Bounded(file), encoding="latin1")
+    def __init__(self, file: BinaryIO | io.BytesIO | Bounded) -> None:
+        #: The file, from where it is now; what stands behind the pickle can be read from it.
+        self.bounded = file if isinstance(file, Bounded) else Bounded(file)
+        super().__init__(self.bounded, encoding="latin1")
 
     def find_class(self, module: str, name: str) -> Any:
         """The stand-in for ``module.name``.
@@ -72,13 +74,14 @@ class RestrictedUnpickler(pickle._Unpickler):  # type: ignore[name-defined,misc]
             return found
         if module.split(".")[0] in self.inert:
             return opaque(f"{module}.{name}")
+        shown = "".join(letter if letter.isprintable() else "?" for letter in f"{module}.{name}"[:200])
         raise Refused(
-            f"names {module}.{name}, which is not read: only numbers, text, containers, arrays and sparse matrices are "
+            f"names {shown}, which is not read: only numbers, text, containers, arrays and sparse matrices are "
             "(a file that needs it may be harmful; convert it where it was made)"
         )
 
 
-class _Bounded:
+class Bounded:
     """A file that is never asked for more than it holds."""
 
     def __init__(self, file: BinaryIO | io.BytesIO) -> None:

@@ -23,3 +23,12 @@ def test_each_names_the_way_out(tmp_path: Path, suffix: str) -> None:
             locate(kind, path)
     with pytest.raises(ValueError, match=r"files are not read; .*GLB"):
         identify(str(path))
+
+
+@pytest.mark.parametrize("suffix", ["c3d", "trc"])
+def test_markers_are_to_be_fitted(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"walk.{suffix}"
+    path.write_bytes(b"content")
+    for read in (lambda: locate("motions", path), lambda: identify(str(path))):
+        with pytest.raises(ValueError, match=rf"walk\.{suffix}: .* files are not read; fit SMPL to its markers"):
+            read()

@@ -13,7 +13,10 @@ import numpy as np
 import pytest
 
 from hood.assets.body.body import Body
+from hood.assets.files.doubt import Doubt
+from hood.assets.formats.mesh_file import read_mesh
 from hood.assets.motion.animated_mesh import body_kind, load_mesh_sequence
+from hood.assets.motion.axes import UP_AXES
 from hood.assets.motion.mesh_sequence import MeshSequence, resample_mesh
 from hood.testing import box, sphere
 
@@ -380,3 +383,57 @@ def test_a_person_of_4_to_30_metres_is_told(tmp_path: Path, body: Body, unit: fl
         for stretch in ([3.0, 1.0, 3.0], [6.0, 0.05, 6.0]):
             write_obj(tmp_path / "hall.obj", 2.7 * body.v_template * stretch, body.faces)
             load_mesh_sequence(tmp_path / "hall.obj")
+
+
+# ---- what a file does not say -------------------------------------------------------------------------------------------
+
+
+def test_an_assumed_frame_rate_is_a_doubt(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", verts=moving(), faces=FACES)
+    with pytest.warns(Doubt, match="says no frame rate, 30 fps are assumed; file_fps=") as heard:
+        found = load_mesh_sequence(tmp_path / "a.npz", 30.0)
+    assert found.fps_assumed
+    assert [said.message.kind for said in heard if isinstance(said.message, Doubt)] == ["frame_rate"]
+    for name, more in (("still", {"verts": moving()[0]}), ("said", {"frameRate": "30"}), ("listed", {"mocap_fps": [30.0]})):
+        np.savez(tmp_path / f"{name}.npz", **({"verts": moving(), "faces": FACES} | more))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Doubt)
+            assert not load_mesh_sequence(tmp_path / f"{name}.npz", 30.0).fps_assumed
+
+
+@pytest.mark.parametrize("up", UP_AXES)
+def test_a_mesh_is_turned_from_every_axis(up: str, tmp_path: Path) -> None:
+    turn = UP_AXES[up]
+    np.savez(tmp_path / "a.npz", verts=moving() @ turn, faces=FACES, fps=30.0)
+    np.testing.assert_allclose(load_mesh_sequence(tmp_path / "a.npz", 30.0, up).verts, moving(), atol=1e-12)
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3))
+    assert np.linalg.det(turn) == pytest.approx(1.0)
+
+
+def quads(folder: Path, heights: list[float], order: tuple[int, ...] = (1, 2, 3, 4)) -> Path:
+    """A cube of quads in numbered OBJ files; one corner is lifted by ``heights``, so that its quads are best cut otherwise."""
+    folder.mkdir(exist_ok=True)
+    corners = np.array(list(np.ndindex(2, 2, 2)), dtype=float)
+    faces = [order, (5, 7, 8, 6), (1, 5, 6, 2), (3, 4, 8, 7), (1, 3, 7, 5), (2, 6, 8, 4)]
+    for frame, height in enumerate(heights):
+        points = corners.copy()
+        points[7] += [0.0, height, 0.6 * height]
+        lines = [f"v {x} {y} {z}" for x, y, z in points] + ["f " + " ".join(map(str, face)) for face in faces]
+        (folder / f"frame_{frame}.obj").write_text("\n".join(lines))
+    return folder
+
+
+def test_quads_are_split_as_in_the_first_frame(tmp_path: Path) -> None:
+    folder = quads(tmp_path / "q", [0.0, 0.5, -0.5, 1.0], (1, 2, 4, 3))
+    splits = [read_mesh(folder / f"frame_{frame}.obj", True)[1].tolist() for frame in range(4)]
+    assert splits[0] != splits[1]  # each by itself is cut otherwise
+    found = load_mesh_sequence(folder, 30.0, file_fps=30.0)
+    assert (found.num_frames, found.faces.shape) == (4, (12, 3))
+    np.testing.assert_allclose(found.verts[3, 7], [1.0, 2.0, 1.6])
+
+
+def test_other_quads_are_still_refused(tmp_path: Path) -> None:
+    folder = quads(tmp_path / "q", [0.0, 0.0], (1, 2, 4, 3))
+    (quads(tmp_path / "r", [0.0], (1, 3, 4, 2)) / "frame_0.obj").rename(folder / "frame_1.obj")
+    with pytest.raises(ValueError, match=r"frame_1\.obj: its faces are not those of frame_0\.obj"):
+        load_mesh_sequence(folder, 30.0)

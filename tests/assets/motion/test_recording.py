@@ -155,7 +155,9 @@ def test_other_contents_say_what_they_are(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="body model"):
         read_recording(write(tmp_path / "m.npz", {"v_template": np.zeros((2, 3))}))
     with pytest.raises(ValueError, match="holds a list"):
-        read_recording(write(tmp_path / "m.pkl", [1]))
+        read_recording(write(tmp_path / "m.pkl", ["a"]))
+    with pytest.raises(ValueError, match="holds a str"):
+        read_recording(write(tmp_path / "m.pkl", "a"))
     with pytest.raises(ValueError, match="unknown motion format '.bvh'"):
         read_recording(tmp_path / "m.bvh")
 

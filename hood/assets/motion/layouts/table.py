@@ -1,0 +1,96 @@
+"""The published layouts by their keys: what each holds, its custom of the up axis, and the frame rate of its recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+#: Numbers of joints of a whole skeleton: without hands, SMPL, SMPL-H, SMPL-X.
+WHOLE = (22, 24, 52, 55)
+_ROOT, _BODY = (1,), (21, 23)
+#: The joints that a key of rotations holds: how many, from which on.
+_COUNTS: dict[str, tuple[tuple[int, ...], int]] = {
+    "rootorient": (_ROOT, 0), "globalorient": (_ROOT, 0), "posesroot": (_ROOT, 0), "worldglobalrots": (_ROOT, 0),
+    "posebody": (_BODY, 1), "bodypose": (_BODY, 1), "posesbody": (_BODY, 1),
+}  # fmt: skip
+#: Keys of a translation in the world, and of one in front of a camera.
+WORLD_TRANSL = (
+    "trans", "transl", "translation", "smpltrans", "smpltransl", "transworld", "worldtrans", "roottrans", "roottranslation",
+)  # fmt: skip
+CAMERA_TRANSL = ("predtrans", "predcamt", "camt", "camtrans", "transcam", "cameratranslation", "camera", "cameratransl")
+#: A frame rate of recordings from video, where their layout says none.
+_VIDEO = 30.0
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How a published file is told by its keys; keys are in lower case, without signs.
+
+    ``fps`` is the rate that recordings of the layout are known to have where no file says it; None: a file must say it.
+    """
+
+    name: str
+    poses: tuple[str, ...]  # keys of the joint rotations, in the order of the joints
+    transl: tuple[str, ...] = WORLD_TRANSL  # keys that may hold the translation, the first counts
+    marks: tuple[str, ...] = ()  # keys of which one must be there as well
+    above: str = ""  # key of the dict that the layout stands in
+    fps: float | None = _VIDEO
+    up: str = "y"
+    camera: bool = False  # as seen from a camera, which need not be level
+    family: str | None = None  # None: by the number of joints
+    scaling: str = ""  # key of the number by which its translation is larger than metres
+    ids: tuple[str, ...] = field(default=())  # keys of the person that each row is of
+
+    def fits(self, keys: Mapping[str, str], above: str) -> bool:
+        """Whether a dict with these keys under the key ``above`` is of this layout."""
+        marked = not self.marks or any(mark in keys for mark in self.marks)
+        placed = not self.above or self.above == above
+        return marked and placed and all(key in keys for key in self.poses)
+
+
+def counts_of(key: str) -> tuple[tuple[int, ...], int]:
+    """How many joints a squeezed key of rotations may hold, and from which on."""
+    return _COUNTS.get(key, (WHOLE, 0))
+
+
+_TRACKS = ("trackids", "trackedids", "tid", "subjectids")
+#: In the order in which they are tried: those told by special keys before those whose keys others have as well.
+LAYOUTS = (
+    Layout("AIST++", ("smplposes",), ("smpltrans",), ("smplscaling",), fps=60.0, family="smpl", scaling="smplscaling"),
+    Layout("3DPW", ("poses",), marks=("poses60hz", "vtemplateclothed", "camposevalid", "camposes"), family="smpl"),
+    Layout("EMDB", ("posesroot", "posesbody"), family="smpl"),
+    Layout("BEDLAM labels", ("poseworld",), ("transworld",), marks=("imgname",), family="smplx"),
+    Layout("BEDLAM labels", ("posecam",), ("transcam",), marks=("imgname",), camera=True, up="-y", family="smplx"),
+    Layout("WHAM", ("poseworld",), ("transworld",), family="smpl"),
+    Layout("GVHMR", ("globalorient", "bodypose"), above="smplparamsglobal", family="smplx"),
+    Layout("GVHMR, in its camera", ("globalorient", "bodypose"), above="smplparamsincam", camera=True, up="-y", family="smplx"),
+    Layout(
+        "SLAHMR", ("rootorient", "posebody"), marks=("trackmask", "floorplane", "worldscale", "latentpose", "camr"),
+        camera=True, up="-y", family="smplh",
+    ),
+    Layout("TRACE", ("worldglobalrots", "smplthetas"), ("worldtrans",), family="smpl", up="-y", camera=True, ids=_TRACKS),
+    Layout("ROMP", ("smplthetas",), CAMERA_TRANSL, camera=True, up="-y", family="smpl", ids=_TRACKS),
+    Layout("TRAM", ("predrotmat",), CAMERA_TRANSL, camera=True, up="-y", family="smpl"),
+    Layout("Motion-X", ("rootorient", "posebody"), above="motionx", family="smplx"),
+    Layout("MDM", ("thetas",), ("roottranslation",), fps=20.0, family="smpl"),
+    Layout("GRAB", ("fullpose",), above="params", fps=None, up="z"),
+    Layout("SMPL-X stage ii", ("fullpose",), marks=("stageiidebugdetails", "markerslatent"), fps=None, up="z"),
+    Layout("fullpose", ("fullpose",), fps=None, up="z"),
+    Layout("PHC", ("poseaa",), ("trans", "transorig", "roottransoffset"), up="z"),
+    Layout("HybrIK", ("predthetas",), ("transl", *CAMERA_TRANSL), camera=True, up="-y", family="smpl"),
+    Layout("AMASS", ("poses",), fps=None, up="z"),
+    Layout("AMASS", ("rootorient", "posebody"), fps=None, up="z"),
+    Layout("body_pose", ("globalorient", "bodypose")),
+    Layout("pose and translation", ("pose",)),
+    Layout("image estimator", ("globalorient", "bodypose"), CAMERA_TRANSL, CAMERA_TRANSL, camera=True, up="-y"),
+    Layout("image estimator", ("pose",), CAMERA_TRANSL, CAMERA_TRANSL, camera=True, up="-y"),
+    Layout("SMPL poses", ("smplposes",)),
+    Layout("SMPL poses", ("smplpose",)),
+    Layout("SMPL poses", ("thetas",)),
+)  # fmt: skip
+
+
+def find_layout(keys: Mapping[str, str], above: str = "") -> Layout | None:
+    """The layout of a dict with the squeezed ``keys``; one whose translation is there goes before one where it is not."""
+    fitting = [layout for layout in LAYOUTS if layout.fits(keys, above)]
+    return next((layout for layout in fitting if any(key in keys for key in layout.transl)), next(iter(fitting), None))

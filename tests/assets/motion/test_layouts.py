@@ -1,0 +1,104 @@
+"""Published layouts: every one is the same walk, and says what it is; what is not read is answered in one sentence."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from motion_kinds.parameters import split
+from motion_kinds.published import motion_x, wham
+from motion_kinds.refused import REFUSALS
+from motion_kinds.siblings import SIBLINGS, opened
+from motion_kinds.variants import GENERATORS
+from motion_kinds.walks import walk, world
+from motion_kinds.writers import write
+from scipy.spatial.transform import Rotation
+
+from hood.assets.files.doubt import Doubt
+from hood.assets.motion.load import load_sequence
+from hood.assets.motion.recording import read_recording
+from hood.assets.motion.up_axis import bearing_notice
+
+
+@pytest.mark.parametrize("name", GENERATORS)
+def test_every_layout_is_the_same_walk(name: str, tmp_path: Path) -> None:
+    file = GENERATORS[name]
+    path = write(tmp_path / f"m{file.suffix}", file.make())
+    found = read_recording(path, **file.keys)
+    assert (found.layout, found.fps, found.fps_assumed, found.family) == (file.layout, file.fps, file.assumed, file.family)
+    assert (len(found.people), found.unit) == (file.people, "m")
+    assert bearing_notice(path, found)[0] == file.up
+    if file.betas:
+        np.testing.assert_allclose(found.betas[:10], walk().betas, atol=1e-6)
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        sequence = load_sequence(path, file.fps, **file.keys)
+    kinds = {said.message.kind for said in heard if isinstance(said.message, Doubt)}
+    assert kinds == {*file.doubts, *(("frame_rate",) if file.assumed else ())}
+    before_camera = [0.0, 0.0, -30.0] if name == "4DHumans" else [0.0, 0.0, 0.0]
+    np.testing.assert_allclose(sequence.transl, walk().transl + before_camera, atol=1e-6)
+    own, wanted = (Rotation.from_rotvec(poses[:, :22].reshape(-1, 3)) for poses in (sequence.poses, walk().poses))
+    assert (own.inv() * wanted).magnitude().max() < 1e-6
+
+
+#: One of every way in which layouts arrange their tables.
+OTHERWISE = (
+    "AIST++", "3DPW, second of two", "EMDB", "GVHMR", "PHALP, two tracks", "ROMP", "Motion-X", "GRAB", "quaternions, w first",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("way", SIBLINGS)
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_the_same_content_is_read_however_it_is_written(way: str, tmp_path: Path) -> None:
+    suffix, change = SIBLINGS[way]
+    for name in (
+        "AIST++",
+        "3DPW, second of two",
+        "EMDB",
+        "GVHMR",
+        "PHALP, two tracks",
+        "ROMP",
+        "Motion-X",
+        "GRAB",
+        "quaternions, w first",
+    ):
+        file = GENERATORS[name]
+        path = write(tmp_path / f"m{suffix}", change(opened(file.make())))
+        sequence = load_sequence(path, file.fps, **file.keys)
+        assert np.abs(sequence.transl - walk().transl).max() < 2e-6, name
+        own, wanted = (Rotation.from_rotvec(poses[:, :22].reshape(-1, 3)) for poses in (sequence.poses, walk().poses))
+        assert (own.inv() * wanted).magnitude().max() < 2e-6, name
+
+
+def test_frames_in_which_nobody_was_seen_are_filled_and_doubted(tmp_path: Path) -> None:
+    seen = np.r_[0:20, 25:60]
+    people = wham()
+    people[0] = {key: value[seen] for key, value in people[0].items()}
+    found = read_recording(write(tmp_path / "m.pkl", people))
+    np.testing.assert_allclose(found.transl[seen], walk().transl[seen], atol=1e-12)
+    assert np.abs(found.transl[20:25] - walk().transl[20:25]).max() < 0.03
+    doubt = next(note for note in found.notes if isinstance(note, Doubt) and note.kind == "jump")
+    assert (doubt.frames, doubt.value) == ((20, 21, 22, 23, 24), 5.0)
+
+
+def test_fingers_stand_beside_the_body(tmp_path: Path) -> None:
+    own = world()
+    hands = {f"{side}_hand_pose": own.fingers[:, rows] for side, rows in (("left", slice(15)), ("right", slice(15, 30)))}
+    found = read_recording(write(tmp_path / "m.pkl", split(**hands, fps=30)))
+    np.testing.assert_array_equal(found.fingers, own.fingers)
+    np.testing.assert_array_equal(read_recording(write(tmp_path / "m.npy", motion_x())).fingers, own.fingers)
+    coefficients = {f"{side}_hand_pose": np.zeros((60, 12)) for side in ("left", "right")}
+    assert read_recording(write(tmp_path / "m.pkl", split(**coefficients, fps=30))).fingers is None
+
+
+@pytest.mark.parametrize("name", REFUSALS)
+def test_what_is_not_read_is_answered_in_one_sentence(name: str, tmp_path: Path) -> None:
+    refusal = REFUSALS[name]
+    path = write(tmp_path / f"m{refusal.suffix}", refusal.make())
+    with pytest.raises(ValueError, match=refusal.words) as error:
+        read_recording(path, **refusal.keys)
+    assert str(error.value).startswith(f"{path}: ")
+    assert "\n" not in str(error.value)
+    assert len(str(error.value).removeprefix(str(path))) < 300
