@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 
 from hood.assets.files.folded import folded_names
+from hood.assets.files.text import read_text
 from hood.assets.formats.raw_mesh import RawMesh, Unreadable, unit_colours
 
 #: Lines that name the polygons after them, and names that programs write for none.
 _NAMED, _NAMELESS = ("o", "g", "usemtl"), ("", "default", "off", "None", "(null)")
+_NEW_LINE = re.compile(r"\r\n|\n|\r")
 #: A garment has not so many panels: the names mean something else, such as single faces.
 MOST_PANELS = 256
 
@@ -25,26 +28,26 @@ def read_obj(path: Path) -> RawMesh:
     corners: list[tuple[int, int, int]] = []
     counts: list[int] = []
     names = _Names()
-    with open(path, encoding="utf-8", errors="replace") as file:
-        for number, line in enumerate(file, start=1):
-            words = line.split("#")[0].split()
-            if not words:
-                continue
-            try:
-                if words[0] in tables:
-                    tables[words[0]].append([float(word) for word in words[1:8]])
-                elif words[0] == "f":
-                    sizes = [len(tables[key]) for key in ("v", "vt", "vn")]
-                    corners.extend(_corner(word, sizes) for word in words[1:])
-                    counts.append(len(words) - 1)
-                    names.add_polygon()
-                elif words[0] in _NAMED:
-                    names.change(words[0], words[1:])
-            except ValueError:
-                raise Unreadable(
-                    f"line {number} is not readable ({line.strip()[:60]!r}); behind {words[0]} stand numbers alone, repair or "
-                    f"remove the line"
-                ) from None
+    # Not splitlines(), which also splits at signs that a name may hold.
+    for number, line in enumerate(_NEW_LINE.split(read_text(path)), start=1):
+        words = line.split("#")[0].split()
+        if not words:
+            continue
+        try:
+            if words[0] in tables:
+                tables[words[0]].append([float(word) for word in words[1:8]])
+            elif words[0] == "f":
+                sizes = [len(tables[key]) for key in ("v", "vt", "vn")]
+                corners.extend(_corner(word, sizes) for word in words[1:])
+                counts.append(len(words) - 1)
+                names.add_polygon()
+            elif words[0] in _NAMED:
+                names.change(words[0], words[1:])
+        except ValueError:
+            raise Unreadable(
+                f"line {number} is not readable ({line.strip()[:60]!r}); behind {words[0]} stand numbers alone, repair or "
+                f"remove the line"
+            ) from None
     pos, colours = _positions(tables["v"])
     table = np.array(corners, dtype=np.int64).reshape(-1, 3)
     mesh = RawMesh(pos, table[:, 0], np.array(counts, dtype=np.int64), colours)

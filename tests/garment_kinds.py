@@ -1,0 +1,260 @@
+"""Garment files that are not one tidy sheet: panels, shells, buttons, several garments, encodings; all of embedded garments.
+
+Every maker of :data:`KINDS` writes one file into a folder and returns its path; ``SENTENCES`` has a few words of what hood says
+of it. Positions are those of :func:`clean`, where the file shows the same cloth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from imitations import GltfWriter
+
+from hood.assets.body.load import load_body
+from hood.assets.garment.garment import load_garment
+from hood.mesh import topology
+
+Mesh = tuple[np.ndarray, np.ndarray]  # (V, 3) m, (F, 3)
+
+
+@cache
+def clean(name: str = "tank") -> Mesh:
+    """An embedded garment as the default body wears it in its T-pose."""
+    garment = load_garment(name)
+    return garment.tpose(np.zeros(10)), garment.faces
+
+
+def avatar() -> Mesh:
+    body = load_body()
+    return body.v_template, body.faces
+
+
+def normals(pos: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(V, 3) unit normals, faces by their areas."""
+    corners = pos[faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    total = np.zeros_like(pos)
+    np.add.at(total, faces.reshape(-1), np.repeat(across, 3, axis=0))
+    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
+
+
+def joined(*meshes: Mesh) -> Mesh:
+    starts = np.cumsum([0, *(len(pos) for pos, _ in meshes[:-1])])
+    faces = [faces + start for (_, faces), start in zip(meshes, starts, strict=True)]
+    return np.concatenate([pos for pos, _ in meshes]), np.concatenate(faces)
+
+
+def part(mesh: Mesh, kept: np.ndarray) -> Mesh:
+    """The faces ``kept`` (F,) with vertices of their own."""
+    pos, faces = mesh
+    used, corners = np.unique(faces[kept], return_inverse=True)
+    return pos[used], corners.reshape(-1, 3)
+
+
+# ---- what is done to a mesh ---------------------------------------------------------------------------------------------
+
+
+def quarters(mesh: Mesh, gap: float) -> list[Mesh]:
+    """Four panels, front and back, left and right, moved apart so that their rims are ``gap`` [m] from each other."""
+    pos, faces = mesh
+    centre = pos[faces].mean(axis=1)
+    middle = pos.mean(axis=0)
+    panels = []
+    for front in (True, False):
+        for left in (True, False):
+            kept = ((centre[:, 2] > middle[2]) == front) & ((centre[:, 0] > middle[0]) == left)
+            own, table = part(mesh, kept)
+            shift = 0.5 * gap * np.array([1.0 if left else -1.0, 0.0, 1.0 if front else -1.0])
+            panels.append((own + shift, table))
+    return panels
+
+
+def halves(mesh: Mesh, gap: float) -> list[Mesh]:
+    """Front and back, ``gap`` [m] from each other."""
+    pos, faces = mesh
+    ahead = pos[faces].mean(axis=1)[:, 2] > pos[:, 2].mean()
+    shift = np.array([0.0, 0.0, 0.5 * gap])
+    return [(part(mesh, ahead)[0] + shift, part(mesh, ahead)[1]), (part(mesh, ~ahead)[0] - shift, part(mesh, ~ahead)[1])]
+
+
+def refined(mesh: Mesh) -> Mesh:
+    """Every face cut into four: rims of another spacing."""
+    pos, faces = mesh
+    edges = topology.unique_edges(faces)
+    a, b, c = faces.T
+    ab, bc, ca = (len(pos) + topology.edge_index(edges, np.stack(pair, axis=1)) for pair in ((a, b), (b, c), (c, a)))
+    table = [np.stack(face, axis=1) for face in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+    return np.concatenate([pos, pos[edges].mean(axis=1)]), np.concatenate(table)
+
+
+def shell(mesh: Mesh, thickness: float, rims: bool = True, share: float = 0.0) -> Mesh:
+    """A closed surface of two layers: the given one, and one ``thickness`` [m] inside of it; ``share`` of it is outside."""
+    pos, faces = mesh
+    normal = normals(pos, faces)
+    outer, inner = pos + share * thickness * normal, pos - (1.0 - share) * thickness * normal
+    count = len(pos)
+    tables = [faces, faces[:, ::-1] + count]
+    if rims:
+        half = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+        key = np.sort(half, axis=1) @ [count, 1]
+        number, back, times = np.unique(key, return_inverse=True, return_counts=True)
+        del number
+        a, b = half[times[back] == 1].T
+        tables += [np.stack([b, a, a + count], axis=1), np.stack([b, a + count, b + count], axis=1)]
+    return np.concatenate([outer, inner]), np.concatenate(tables)
+
+
+def doubled(mesh: Mesh, turned: bool = True) -> Mesh:
+    """Every face twice, the second time with vertices of its own."""
+    pos, faces = mesh
+    return joined(mesh, (pos.copy(), faces[:, ::-1] if turned else faces))
+
+
+def button(middle: np.ndarray, normal: np.ndarray, radius: float = 0.008, height: float = 0.003, sides: int = 12) -> Mesh:
+    """A closed disc on the cloth at ``middle`` (3,) [m], half a millimetre off it along ``normal`` (3,)."""
+    normal = normal / np.linalg.norm(normal)
+    first = np.cross(normal, [0.3, 0.9, 0.2])
+    first /= np.linalg.norm(first)
+    second = np.cross(normal, first)
+    turn = 2 * np.pi * np.arange(sides) / sides
+    ring = radius * (np.cos(turn)[:, None] * first + np.sin(turn)[:, None] * second) + middle + 5e-4 * normal
+    pos = np.concatenate([ring, ring + height * normal, [ring.mean(axis=0), ring.mean(axis=0) + height * normal]])
+    here, after, low, high = np.arange(sides), (np.arange(sides) + 1) % sides, 2 * sides, 2 * sides + 1
+    table = [
+        (here, after, after + sides), (here, after + sides, here + sides),
+        (after, here, np.full(sides, low)), (here + sides, after + sides, np.full(sides, high)),
+    ]  # fmt: skip
+    return pos, np.concatenate([np.stack(face, axis=1) for face in table])
+
+
+def eyelet(middle: np.ndarray, normal: np.ndarray, radius: float = 0.006, thick: float = 0.0015, sides: int = 12) -> Mesh:
+    """A closed ring (torus) on the cloth."""
+    normal = normal / np.linalg.norm(normal)
+    first = np.cross(normal, [0.3, 0.9, 0.2])
+    first /= np.linalg.norm(first)
+    second = np.cross(normal, first)
+    u, v = np.meshgrid(2 * np.pi * np.arange(sides) / sides, 2 * np.pi * np.arange(6) / 6, indexing="ij")
+    around = np.cos(u)[..., None] * first + np.sin(u)[..., None] * second
+    pos = middle + 2 * thick * normal + (radius + thick * np.cos(v))[..., None] * around + thick * np.sin(v)[..., None] * normal
+    i, j = np.meshgrid(np.arange(sides), np.arange(6), indexing="ij")
+    at = lambda a, b: (a % sides) * 6 + b % 6  # noqa: E731
+    faces = [
+        np.stack([at(i, j), at(i + 1, j), at(i + 1, j + 1)], axis=2),
+        np.stack([at(i, j), at(i + 1, j + 1), at(i, j + 1)], axis=2),
+    ]
+    return pos.reshape(-1, 3), np.concatenate([table.reshape(-1, 3) for table in faces])
+
+
+def front_places(mesh: Mesh, count: int = 4) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Places and normals down the middle of the front."""
+    pos, faces = mesh
+    normal = normals(pos, faces)
+    ahead = (pos[:, 2] > pos[:, 2].mean()) & (np.abs(pos[:, 0] - pos[:, 0].mean()) < 0.04)
+    rows = np.flatnonzero(ahead)
+    heights = np.linspace(pos[rows, 1].min(), pos[rows, 1].max(), count + 2)[1:-1]
+    chosen = [rows[np.argmin(np.abs(pos[rows, 1] - height))] for height in heights]
+    return [(pos[row], normal[row] if normal[row, 2] > 0 else -normal[row]) for row in chosen]
+
+
+def patch(mesh: Mesh, size: float = 0.09, off: float = 2e-3) -> Mesh:
+    """A pocket: a sheet of its own on the cloth, ``off`` [m] over it."""
+    pos, faces = mesh
+    normal = normals(pos, faces)
+    middle = front_places(mesh, 3)[1][0]
+    kept = np.linalg.norm(pos[faces].mean(axis=1) - middle, axis=1) < size / 2
+    own, table = part((pos + off * normal, faces), kept)
+    return own, table
+
+
+def lining(mesh: Mesh, depth: float, below: float) -> Mesh:
+    """A real layer: ``depth`` [m] inside the part of the garment that is over the height ``below`` (share of its own)."""
+    pos, faces = mesh
+    inner = pos - depth * normals(pos, faces)
+    limit = pos[:, 1].min() + below * np.ptp(pos[:, 1])
+    return part((inner, faces), pos[faces].mean(axis=1)[:, 1] > limit)
+
+
+def sewn_lining(mesh: Mesh, depth: float = 3e-3, below: float = 0.6) -> Mesh:
+    """A lining whose rim is sewn to the garment: edges of three faces, folded at the top."""
+    pos, faces = mesh
+    normal = normals(pos, faces)
+    limit = pos[:, 1].min() + below * np.ptp(pos[:, 1])
+    kept = pos[faces].mean(axis=1)[:, 1] > limit
+    used = np.unique(faces[kept])
+    half = np.sort(faces[kept][:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    edges, times = np.unique(half, axis=0, return_counts=True)
+    rim = np.unique(edges[times == 1])
+    own = np.setdiff1d(used, rim)
+    number = np.arange(len(pos))
+    number[own] = len(pos) + np.arange(len(own))
+    return np.concatenate([pos, pos[own] - depth * normal[own]]), np.concatenate([faces, number[faces[kept]]])
+
+
+def cape() -> Mesh:
+    """A sheet on the shoulders and the back."""
+    pos, faces = clean("dress")
+    centre = pos[faces].mean(axis=1)
+    kept = (centre[:, 2] < -0.01) & (centre[:, 1] > pos[:, 1].min() + 0.3)
+    return part((pos + 0.02 * normals(pos, faces), faces), kept)
+
+
+# ---- files --------------------------------------------------------------------------------------------------------------
+
+
+def obj_text(objects: Sequence[tuple[str, Mesh]], word: str = "o") -> str:
+    """Objects, groups or materials (``word`` o, g, usemtl) of an OBJ file; an empty name writes none."""
+    lines, start = [], 1
+    for name, (pos, faces) in objects:
+        lines += [f"{word} {name}"] * bool(name)
+        lines += [f"v {x:.9f} {y:.9f} {z:.9f}" for x, y, z in pos.tolist()]
+        lines += [f"f {a} {b} {c}" for a, b, c in (faces + start).tolist()]
+        start += len(pos)
+    return "\n".join(lines) + "\n"
+
+
+def write_objects(path: Path, objects: Sequence[tuple[str, Mesh]], word: str = "o", encoding: str = "utf-8") -> Path:
+    path.write_bytes(obj_text(objects, word).encode(encoding))
+    return path
+
+
+def write_mesh(path: Path, mesh: Mesh) -> Path:
+    return write_objects(path, [("", mesh)])
+
+
+def ply_text(mesh: Mesh) -> str:
+    pos, faces = mesh
+    head = ["ply", "format ascii 1.0", f"element vertex {len(pos)}", *(f"property double {axis}" for axis in "xyz")]
+    head += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
+    rows = [f"{x:.9f} {y:.9f} {z:.9f}" for x, y, z in pos.tolist()] + [f"3 {a} {b} {c}" for a, b, c in faces.tolist()]
+    return "\n".join([*head, *rows]) + "\n"
+
+
+def off_text(mesh: Mesh) -> str:
+    pos, faces = mesh
+    rows = [f"{x:.9f} {y:.9f} {z:.9f}" for x, y, z in pos.tolist()] + [f"3 {a} {b} {c}" for a, b, c in faces.tolist()]
+    return "\n".join(["OFF", f"{len(pos)} {len(faces)} 0", *rows]) + "\n"
+
+
+def stl_text(mesh: Mesh) -> str:
+    pos, faces = mesh
+    rows = ["solid tank"]
+    for corners in pos[faces]:
+        rows += ["facet normal 0 0 1", "outer loop", *(f"vertex {x:.9f} {y:.9f} {z:.9f}" for x, y, z in corners.tolist())]
+        rows += ["endloop", "endfacet"]
+    return "\n".join([*rows, "endsolid"]) + "\n"
+
+
+def write_glb(path: Path, objects: Sequence[tuple[str, Mesh]]) -> Path:
+    """A glTF scene with one node a mesh."""
+    writer = GltfWriter()
+    meshes, nodes = [], []
+    for name, (pos, faces) in objects:
+        attributes = {"POSITION": writer.table(pos.astype(np.float32))}
+        indices = writer.table(faces.astype(np.uint32).reshape(-1))
+        meshes.append({"primitives": [{"attributes": attributes, "indices": indices}]})
+        nodes.append({"mesh": len(meshes) - 1, "name": name})
+    writer.document |= {"meshes": meshes, "nodes": nodes}
+    return writer.write(path)
