@@ -22,7 +22,7 @@ def fasten_as_asked(fitting: Fitting, config: DictConfig) -> np.ndarray:
         ValueError: a row that the garment cannot have; names it.
     """
     fitting.garment, pairs = fasten(fitting.garment, _rows(config))
-    return pairs
+    return fitting.in_file(pairs)
 
 
 def give_room(fitting: Fitting, pairs: np.ndarray) -> None:

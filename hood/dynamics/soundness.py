@@ -178,7 +178,7 @@ def _sentence(cause: _Cause, judged: np.ndarray, few: bool) -> str:
 
 def _strain_p99(data: RolloutData, finite: np.ndarray) -> np.ndarray:
     """(T,) 99th percentile of the absolute edge strain, NaN in frames that are not finite."""
-    faces = data.cloth_faces if data.refined is None else data.refined.faces
+    faces = data.cloth_faces[: len(data.cloth_faces) - data.riding[1]] if data.refined is None else data.refined.faces
     start, end = unique_edges(faces.astype(np.int64)).T
     strain = np.full(len(finite), np.nan)
     if len(start) == 0:

@@ -7,15 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from hood.assets.files.folded import folded_names
 from hood.assets.files.text import read_text
-from hood.assets.formats.raw_mesh import RawMesh, Unreadable, unit_colours
+from hood.assets.formats.raw_mesh import RawMesh, Unreadable, named_polygons, unit_colours
 
 #: Lines that name the polygons after them, and names that programs write for none.
 _NAMED, _NAMELESS = ("o", "g", "usemtl"), ("", "default", "off", "None", "(null)")
 _NEW_LINE = re.compile(r"\r\n|\n|\r")
-#: A garment has not so many panels: the names mean something else, such as single faces.
-MOST_PANELS = 256
 
 
 def read_obj(path: Path) -> RawMesh:
@@ -80,17 +77,8 @@ class _Names:
         self._of_polygons.append(self._place)
 
     def panels(self) -> tuple[dict[str, np.ndarray] | None, list[str]]:
-        """(P,) bool of every name that some polygons have and others do not, folded (:func:`folded_names`); None without any.
-        And what was not kept."""
-        combinations, used = list(self._places), sorted(set(self._of_polygons))
-        shared = set(combinations[used[0]]).intersection(*(combinations[at] for at in used)) if used else set()
-        names = list(dict.fromkeys(name for at in used for name in combinations[at] if name not in shared))
-        if len(names) > MOST_PANELS:
-            return None, [f"{len(names)} names of objects, groups and materials are more than {MOST_PANELS}; none is kept"]
-        of_polygons = np.array(self._of_polygons, dtype=np.int64)
-        known = {name: np.array([name in combination for combination in combinations]) for name in names}
-        short = folded_names(known)
-        return {short[name]: mask[of_polygons] for name, mask in known.items()} or None, []
+        """See :func:`named_polygons`."""
+        return named_polygons(list(self._places), np.array(self._of_polygons, dtype=np.int64))
 
 
 def _corner(word: str, sizes: list[int]) -> tuple[int, int, int]:

@@ -12,6 +12,7 @@ from hood.assets.formats.mesh_file import MeshFile, mesh_suffixes, read_mesh_fil
 from hood.assets.garment.garment_arrays import read_fields, write_fields
 from hood.assets.garment.reference_garments import read_reference_garment
 from hood.mesh.quality import check_triangles
+from hood.mesh.riders import Riders
 
 #: What can be given as a garment, besides embedded names and mesh files.
 GARMENT_SUFFIXES = (".npz", ".pkl")
@@ -46,6 +47,9 @@ class Garment:
         None  # (P, 2) each: pairs of vertices that a seam, buttons or a zipper hold together
     )
     panels: dict[str, np.ndarray] | None = None  # (F,) bool each: faces that the mesh file gives a name, as its pattern pieces
+    thickness: np.ndarray | None = None  # (V,) m, of the cloth as its file shows it; 0: not known. The fabric has its own
+    riders: Riders | None = None  # buttons and the like, which ride on the cloth
+    file_numbers: np.ndarray | None = None  # (V of the file,) present number of each of its vertices, -1: gone; None: as there
 
     @property
     def bound(self) -> bool:
@@ -66,6 +70,19 @@ class Garment:
     def tpose(self, betas: np.ndarray) -> np.ndarray:
         """Garment (V, 3) [m] in T-pose on the body of shape ``betas``: what skinning poses."""
         return self.worn_pos + self._offset(betas)
+
+    def numbers_of(self, vertices: np.ndarray, where: str) -> np.ndarray:
+        """Present numbers of vertices (n,) that somebody names by their numbers in the file; those that are gone are left out.
+
+        Raises:
+            ValueError: a number that no vertex of the file has; ``where`` says who names it.
+        """
+        count = len(self.rest_pos) if self.file_numbers is None else len(self.file_numbers)
+        outside = (vertices < 0) | (vertices >= count)
+        if outside.any():
+            raise ValueError(f"{where}: vertex {int(vertices[np.argmax(outside)])} of {count}; they are numbered from 0")
+        present = vertices if self.file_numbers is None else self.file_numbers[vertices]
+        return np.asarray(present[present >= 0])
 
     def _offset(self, betas: np.ndarray) -> np.ndarray:
         assert self.shapedirs is not None, "bind the garment first"

@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from hood.assets.garment.openings import find_openings
 from hood.assets.garment.placement import inward_share, surrounds
 from hood.mesh import repair, topology
+from hood.mesh.parts import rim_length
 
 #: A part is flat where its least extent is below this share of its greatest.
 _FLAT = 0.01
@@ -21,6 +22,7 @@ _TORN = 0.5
 #: A closed mesh as large as this share of a body's height and as thick as that share is a body. Clothes with two sides are
 #: thinner: twice volume over area is 0.006 body heights for 1 cm, a body has 0.04.
 _BODY_SIZE, _BODY_THICKNESS = 0.8, 0.02
+_SMALL_RIM = 0.1
 #: A mesh nearer than this [body heights] to this share of the body's vertices, head, hands and feet included, is the body.
 _ON_SKIN, _ALL_SKIN = 0.006, 0.95
 #: Metres per unit of the files that bodies come in.
@@ -72,14 +74,23 @@ def suspect_kind(pos: np.ndarray, faces: np.ndarray, surface: np.ndarray) -> lis
     pos, size = factor * pos, factor * size
     if size < _BODY_SIZE * height:
         return []
-    closed = 2 * len(topology.unique_edges(faces)) == 3 * len(faces)
+    why = body_of(pos, faces, surface, height)
+    return [] if why is None else [Suspicion(why, "pass it as body=…, and a garment with openings as garment=…", True)]
+
+
+def body_of(pos: np.ndarray, faces: np.ndarray, surface: np.ndarray, height: float) -> str | None:
+    """Why a mesh (V, 3) [m], (F, 3) as large as a person of that ``height`` [m] is a body, in words that follow "it"; None: it
+    is none. ``surface`` (W, 3) [m] is the body that garments are measured against."""
+    size = float(np.ptp(pos[np.unique(faces)], axis=0).max())
+    if size < _BODY_SIZE * height:
+        return None
+    # Eyes and mouths may be open; the openings of a garment are longer.
+    closed = all(rim_length(pos, loop) < _SMALL_RIM * height for loop in topology.boundary_loops(faces))
     if closed and _thickness(pos, faces) > _BODY_THICKNESS * height:
-        what = f"is a closed solid {size:.2f} m large, which is a body, not a garment"
-    elif float((cKDTree(pos).query(surface, distance_upper_bound=_ON_SKIN * height)[0] < np.inf).mean()) > _ALL_SKIN:
-        what = "lies on the skin of the whole body, head, hands and feet included: it is the body, not a garment"
-    else:
-        return []
-    return [Suspicion(what, "pass it as body=…, and a garment with openings as garment=…", True)]
+        return f"is a closed solid {size:.2f} m large, which is a body, not a garment"
+    if float((cKDTree(pos).query(surface, distance_upper_bound=_ON_SKIN * height)[0] < np.inf).mean()) > _ALL_SKIN:
+        return "lies on the skin of the whole body, head, hands and feet included: it is the body, not a garment"
+    return None
 
 
 def suspect_place(pos: np.ndarray, faces: np.ndarray, surface: np.ndarray, body_faces: np.ndarray) -> list[Suspicion]:

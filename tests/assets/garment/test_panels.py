@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hood.assets.formats.mesh_file import read_mesh_file
-from hood.assets.formats.obj import MOST_PANELS
+from hood.assets.formats.raw_mesh import MOST_PANELS
 from hood.assets.garment import alterations
 from hood.assets.garment.garment import Garment, load_garment, save_garment
 

@@ -1,0 +1,72 @@
+"""Garments from files, brought to cloth of one layer that hangs together; what was done is warned about."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from hood.assets.files.doubt import Doubt
+from hood.assets.formats.mesh_file import mesh_suffixes, read_mesh_file
+from hood.assets.garment.alterations import Change, start_fitting
+from hood.assets.garment.contents.sort_out import choose, mend
+from hood.assets.garment.contents.wanted import Wanted
+from hood.assets.garment.garment import Garment, garment_of_mesh, load_garment, locate_garment
+from hood.assets.garment.suspicions import suspect_seams
+from hood.mesh import repair
+from hood.mesh.quality import check_triangles
+
+#: Changes that somebody asked for.
+_ASKED = ("objects",)
+
+
+def read_garment(name: str, wanted: Wanted, surface: np.ndarray, triangulate: bool) -> Garment:
+    """The garment ``name``; one of a mesh file as ``wanted`` says, with ``file_numbers`` where its vertices have other numbers.
+
+    Args:
+        surface: (W, 3) m, the body that it is measured against.
+        triangulate: split polygons instead of refusing them.
+
+    Raises:
+        ValueError: a file that cannot be read or simulated.
+    """
+    path, _ = locate_garment(name)
+    if path.suffix.lower() not in mesh_suffixes():
+        garment = load_garment(name, triangulate=triangulate)
+        if garment.bound and not wanted.objects:
+            return garment
+    else:
+        garment = garment_of_mesh(path, read_mesh_file(path, triangulate))
+        twice = repair.duplicate_faces(garment.faces)
+        check_triangles(garment.rest_pos, garment.faces[~twice], str(path))
+    _refuse_soup(garment)
+    fitting = start_fitting(garment)
+    choose(fitting, wanted, surface)
+    mend(fitting, wanted, surface)
+    check_triangles(fitting.garment.rest_pos, fitting.garment.faces, str(path))
+    tell(path.stem, fitting.changes)
+    return fitting.garment
+
+
+def _refuse_soup(garment: Garment) -> None:
+    for suspicion in suspect_seams(garment.rest_pos, garment.faces):
+        if suspicion.grave:
+            raise ValueError(f"garment {garment.name!r} {suspicion.sentence}")
+
+
+def tell(name: str, changes: Sequence[Change]) -> None:
+    """Warn about what was done to the garment ``name``: guesses as doubts, with the key that settles them."""
+    for change in changes:
+        if change.what in _ASKED:
+            continue
+        if change.fix:
+            warnings.warn(Doubt("garment", f"garment {name!r}: {change.text}; {change.fix}", value=change.count), stacklevel=2)
+        else:
+            warnings.warn(f"garment {name!r}: {change.text}", stacklevel=2)
+
+
+def said(change: Mapping[str, Any]) -> str:
+    """A change, as a dict, in one sentence."""
+    return "; ".join(filter(None, (change["text"], change["fix"])))
