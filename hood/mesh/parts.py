@@ -19,6 +19,7 @@ class Part(NamedTuple):
     area: float  # in squares of the mesh's unit
     low: np.ndarray  # (3,) of its box
     high: np.ndarray  # (3,)
+    num_edges: int
 
     @property
     def extent(self) -> float:
@@ -28,6 +29,12 @@ class Part(NamedTuple):
     @property
     def closed(self) -> bool:
         return not self.rims
+
+    @property
+    def can_be_put_on(self) -> bool:
+        """Whether something can be in it, as in a tube: not in a sheet, nor in a ball. Euler's characteristic V − E + F is 1 and
+        2 for these, and less for all else, also where a lining that is sewn to the rims leaves none open."""
+        return len(self.vertices) - self.num_edges + len(self.faces) <= 0
 
 
 def part_labels(num_vertices: int, faces: np.ndarray) -> np.ndarray:
@@ -52,11 +59,23 @@ def find_parts(pos: np.ndarray, faces: np.ndarray) -> list[Part]:
     for loop in topology.boundary_loops(faces):
         rims.setdefault(int(label[loop[0]]), []).append(loop)
     by_vertex, by_face = _rows(label), _rows(of_faces)
+    edges = np.bincount(label[topology.unique_edges(faces)[:, 0]], minlength=1)
     found = []
     for number, vertices in by_vertex.items():
         rows, box = by_face[number], pos[vertices]
         loops = tuple(rims.get(number, ()))
-        found.append(Part(number + 1, vertices, rows, loops, float(areas[rows].sum()), box.min(axis=0), box.max(axis=0)))
+        found.append(
+            Part(
+                number + 1,
+                vertices,
+                rows,
+                loops,
+                float(areas[rows].sum()),
+                box.min(axis=0),
+                box.max(axis=0),
+                int(edges[number]),
+            )
+        )
     return found
 
 
