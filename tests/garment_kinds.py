@@ -1,12 +1,13 @@
 """Garment files that are not one tidy sheet: panels, shells, buttons, several garments, encodings; all of embedded garments.
 
-Every maker of :data:`KINDS` writes one file into a folder and returns its path; ``SENTENCES`` has a few words of what hood says
-of it. Positions are those of :func:`clean`, where the file shows the same cloth.
+Every kind of :data:`KINDS` is written into a folder by :meth:`Kind.write`; it knows the words that hood says of it, and the
+cloth that it shows.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -190,7 +191,10 @@ def sewn_lining(mesh: Mesh, depth: float = 3e-3, below: float = 0.6) -> Mesh:
     own = np.setdiff1d(used, rim)
     number = np.arange(len(pos))
     number[own] = len(pos) + np.arange(len(own))
-    return np.concatenate([pos, pos[own] - depth * normal[own]]), np.concatenate([faces, number[faces[kept]]])
+    inner = number[faces[kept]]
+    return np.concatenate([pos, pos[own] - depth * normal[own]]), np.concatenate(
+        [faces, inner[(inner >= len(pos)).any(axis=1)]]
+    )
 
 
 def cape() -> Mesh:
@@ -258,3 +262,174 @@ def write_glb(path: Path, objects: Sequence[tuple[str, Mesh]]) -> Path:
         nodes.append({"mesh": len(meshes) - 1, "name": name})
     writer.document |= {"meshes": meshes, "nodes": nodes}
     return writer.write(path)
+
+
+# ---- the kinds ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of file."""
+
+    write: Callable[[Path], Path]  # into a folder
+    says: str  # words of the one sentence about it; "": nothing is said
+    shows: Callable[[], Mesh] | None = None  # the cloth, where it is the same as in a clean file
+    riders: int = 0  # groups of what rides on it
+    pieces: int = 1  # garments
+    thickness: float = 0.0  # m
+    tolerance: float = 1e-6  # m, of the positions
+
+
+def _obj(name: str, mesh: Callable[[], Mesh], scale: float = 1.0) -> Callable[[Path], Path]:
+    def write(folder: Path) -> Path:
+        pos, faces = mesh()
+        return write_mesh(folder / f"{name}.obj", (scale * pos, faces))
+
+    return write
+
+
+def _objects(name: str, word: str, *objects: tuple[str, Callable[[], Mesh]]) -> Callable[[Path], Path]:
+    return lambda folder: write_objects(folder / f"{name}.obj", [(own, mesh()) for own, mesh in objects], word)
+
+
+def _glb(name: str, *objects: tuple[str, Callable[[], Mesh]]) -> Callable[[Path], Path]:
+    return lambda folder: write_glb(folder / f"{name}.glb", [(own, mesh()) for own, mesh in objects])
+
+
+def _text(name: str, make: Callable[[Mesh], str], encoding: str) -> Callable[[Path], Path]:
+    def write(folder: Path) -> Path:
+        (folder / name).write_bytes(make(clean("tank")).encode(encoding))
+        return folder / name
+
+    return write
+
+
+def _tank() -> Mesh:
+    return clean("tank")
+
+
+def _skirt() -> Mesh:
+    return clean("skirt")
+
+
+def _with(things: Callable[[Mesh], list[Mesh]]) -> Callable[[], Mesh]:
+    return lambda: joined(clean("tank"), *things(clean("tank")))
+
+
+def _buttons(mesh: Mesh) -> list[Mesh]:
+    return [button(*place) for place in front_places(mesh)]
+
+
+def _eyelets(mesh: Mesh) -> list[Mesh]:
+    return [eyelet(*place) for place in front_places(mesh)]
+
+
+def _buckle(mesh: Mesh) -> list[Mesh]:
+    """A frame and its pin, which touch."""
+    middle, normal = front_places(mesh, 3)[1]
+    return [eyelet(middle, normal, radius=0.02, thick=0.002), button(middle + 0.002 * normal, normal, 0.019, 0.002)]
+
+
+def _far_bead(mesh: Mesh) -> list[Mesh]:
+    return [button(np.array([0.0, 0.3, 0.9]), np.array([0.0, 0.0, 1.0]))]
+
+
+def _thick_quarters() -> Mesh:
+    return joined(*(shell(panel, 1e-3) for panel in quarters(clean("tank"), 2e-3)))
+
+
+def _uneven_halves() -> Mesh:
+    front, back = halves(clean("tank"), 2e-3)
+    return joined(refined(front), back)
+
+
+def _dense_lining() -> Mesh:
+    pos, faces = clean("tank")
+    return joined((pos, faces), refined((pos - 3e-3 * normals(pos, faces), faces)))
+
+
+def _torn_strips() -> Mesh:
+    """A shell whose rim strips have vertices of their own."""
+    pos, faces = shell(clean("tank"), 2e-3)
+    count = 2 * len(clean("tank")[1])
+    return joined(part((pos, faces), np.arange(len(faces)) < count), part((pos, faces), np.arange(len(faces)) >= count))
+
+
+KINDS: dict[str, Kind] = {
+    "panels touching": Kind(_obj("panels0", lambda: joined(*quarters(_tank(), 0.0))), "vertices on seams"),
+    **{
+        f"panels {1e3 * gap:g} mm apart": Kind(
+            _obj(f"panels{k}", lambda gap=gap: joined(*quarters(_tank(), gap))), "rims of 4 pieces lie along each other"
+        )
+        for k, gap in enumerate((5e-4, 1.5e-3, 3e-3, 5e-3), start=1)
+    },
+    "panels in centimetres": Kind(
+        _obj("panels_cm", lambda: joined(*quarters(_tank(), 3e-3)), 100.0), "rims of 4 pieces lie along each other"
+    ),
+    "front and back": Kind(_obj("halves", lambda: joined(*halves(_tank(), 4e-3))), "rims of 2 pieces lie along each other"),
+    "panels of other edges": Kind(_obj("uneven", _uneven_halves), "rims of 2 pieces lie along each other"),
+    **{
+        f"shell of {1e3 * thick:g} mm": Kind(
+            _obj(f"shell{k}", lambda thick=thick: shell(_tank(), thick)), "cloth with its thickness", _tank, thickness=thick
+        )
+        for k, thick in enumerate((5e-4, 2e-3, 5e-3))
+    },
+    "shell around the cloth": Kind(
+        _obj("shell_middle", lambda: shell(_tank(), 2e-3, share=0.5)), "cloth with its thickness", thickness=2e-3
+    ),
+    "shell of an open jacket": Kind(
+        _obj("shell_jacket", lambda: shell(clean("jacket"), 5e-3)), "cloth with its thickness", lambda: clean("jacket"),
+        thickness=5e-3,
+    ),
+    "shell without rims": Kind(
+        _obj("shell_open", lambda: shell(_tank(), 2e-3, rims=False)), "cloth with its thickness", _tank, thickness=2e-3
+    ),
+    "shell with torn rims": Kind(_obj("shell_torn", _torn_strips), "cloth with its thickness", _tank, thickness=2e-3),
+    "shells of panels": Kind(_obj("shell_panels", _thick_quarters), "cloth with its thickness", thickness=1e-3),
+    "doubled faces": Kind(_obj("doubled", lambda: doubled(_tank())), "lie on others", _tank),
+    "doubled faces, same winding": Kind(_obj("doubled_same", lambda: doubled(_tank(), False)), "lie on others", _tank),
+    "doubled faces in glTF": Kind(_glb("doubled", ("tank", lambda: doubled(_tank()))), "duplicate faces", _tank),
+    "buttons": Kind(_obj("buttons", _with(_buttons)), "4 closed parts on the cloth", _tank, riders=4),
+    "eyelets": Kind(_obj("eyelets", _with(_eyelets)), "4 closed parts on the cloth", _tank, riders=4),
+    "a buckle of two parts": Kind(_obj("buckle", _with(_buckle)), "2 closed parts on the cloth", _tank, riders=1),
+    "buttons in millimetres": Kind(_obj("buttons_mm", _with(_buttons), 1000.0), "4 closed parts on the cloth", riders=4),
+    "a bead beside it": Kind(_obj("bead", _with(_far_bead)), "on no cloth", _tank),
+    "a pocket": Kind(_obj("pocket", _with(lambda mesh: [patch(mesh)])), "1 sheet on the cloth", _tank, riders=-1),
+    "two garments": Kind(
+        _obj("two", lambda: joined(_tank(), _skirt())), "2 garments, part_1", lambda: joined(_tank(), _skirt()), pieces=2
+    ),
+    **{
+        f"two garments by {word}": Kind(
+            _objects(f"two_{word}", word, ("tank", _tank), ("skirt", _skirt)),
+            "2 garments, tank (1016 vertices), skirt (994 vertices)",
+            lambda: joined(_tank(), _skirt()),
+            pieces=2,
+        )
+        for word in ("o", "g", "usemtl")
+    },
+    "two garments in glTF": Kind(
+        _glb("two", ("tank", _tank), ("skirt", _skirt)), "2 garments, tank", lambda: joined(_tank(), _skirt()), pieces=2
+    ),
+    "an avatar beside it": Kind(
+        _objects("avatar", "o", ("Avatar", avatar), ("tank", _tank)), "a body beside the garment, 'Avatar'", _tank
+    ),
+    "an avatar without names": Kind(
+        _obj("unnamed", lambda: joined(avatar(), _tank())), "a body beside the garment, 'part_1'", _tank
+    ),
+    "an avatar in glTF": Kind(
+        _glb("avatar", ("tank", _tank), ("Avatar", avatar)), "a body beside the garment, 'Avatar'", _tank
+    ),
+    "a lining of a part": Kind(
+        _obj("lining", lambda: joined(_tank(), lining(_tank(), 3e-3, 0.5))), "2 garments",
+        lambda: joined(_tank(), lining(_tank(), 3e-3, 0.5)), pieces=2,
+    ),
+    "a whole lining of another mesh": Kind(_obj("dense", _dense_lining), "2 garments", _dense_lining, pieces=2),
+    "a lining sewn in": Kind(_obj("sewn", lambda: sewn_lining(_tank())), "", lambda: sewn_lining(_tank())),
+    "a cape": Kind(_obj("cape", cape), "", cape),
+    "a byte-order mark": Kind(_text("mark.obj", lambda mesh: obj_text([("", mesh)]), "utf-8-sig"), "", _tank),
+    "UTF-16": Kind(_text("wide.obj", lambda mesh: obj_text([("", mesh)]), "utf-16"), "", _tank),
+    "Latin-1 names": Kind(_text("latin.obj", lambda mesh: obj_text([("Kleid_für_Jörg", mesh)]), "latin-1"), "", _tank),
+    "a marked PLY": Kind(_text("mark.ply", ply_text, "utf-8-sig"), "", _tank),
+    "a marked OFF": Kind(_text("mark.off", off_text, "utf-8-sig"), "", _tank),
+    "a marked STL": Kind(_text("mark.stl", stl_text, "utf-8-sig"), "", _tank),
+}  # fmt: skip

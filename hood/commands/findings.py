@@ -16,7 +16,10 @@ from hood.assets.files.folder_lock import is_occupied
 from hood.assets.files.index_list import read_indices
 from hood.assets.files.library import locate
 from hood.assets.formats.mesh_file import mesh_suffixes, read_mesh_file
+from hood.assets.garment.alterations import start_fitting
 from hood.assets.garment.binding import posed_body
+from hood.assets.garment.contents.sort_out import choose, mend
+from hood.assets.garment.contents.wanted import Wanted
 from hood.assets.garment.fit_search import Asked
 from hood.assets.garment.garment import Garment, garment_of_mesh, load_garment, locate_garment
 from hood.assets.garment.pins import opening_names
@@ -29,6 +32,7 @@ from hood.assets.motion.up_axis import bearing_notice, find_bearing
 from hood.assets.pickles.unpickle import load_pickle
 from hood.commands.beside_mesh import place_beside_mesh
 from hood.commands.common import read_model
+from hood.commands.contents.report import describe_made, describe_objects, problems_of
 from hood.commands.describe_place import describe_place
 from hood.commands.guarding import summarise_guard
 from hood.commands.output_fps import summarise_rate
@@ -84,10 +88,16 @@ def unreadable(name: str, kind: str, error: Exception) -> Finding:
     return Finding(name, kind, problems=[(sentence.removeprefix(f"{name}: "), "")])
 
 
-def inspect_garment(name: str, body: Body | MeshMotion, wearer: Sequence[str], betas: np.ndarray | None = None) -> Finding:
+def inspect_garment(
+    name: str,
+    body: Body | MeshMotion,
+    wearer: Sequence[str],
+    betas: np.ndarray | None = None,
+    wanted: Wanted | None = None,
+) -> Finding:
     """A garment file beside ``body``: a model of shape ``betas`` in its T-pose, or a mesh in its first frame.
 
-    ``wearer`` are the words of prepare that name this body.
+    ``wearer`` are the words of prepare that name this body, ``wanted`` is what is asked of a file of several things.
     """
     finding = Finding(name, "garment", wearer=list(wearer))
     path, _ = locate_garment(name)
@@ -107,6 +117,7 @@ def inspect_garment(name: str, body: Body | MeshMotion, wearer: Sequence[str], b
     finding.facts |= _garment_facts(garment)
     defects = find_defects(garment.rest_pos, garment.faces)
     _describe_defects(finding, defects)
+    garment = _made(finding, garment, body, wanted or Wanted())
     if _is_suspect(finding, garment, body):
         return finding
     if isinstance(body, MeshMotion):
@@ -116,6 +127,21 @@ def inspect_garment(name: str, body: Body | MeshMotion, wearer: Sequence[str], b
     else:
         _place_beside(finding, garment, body, np.zeros(10) if betas is None else betas)
     return finding
+
+
+def _made(finding: Finding, garment: Garment, body: Body | MeshMotion, wanted: Wanted) -> Garment:
+    """What a rollout makes of the file, told; the garment itself where it is one sheet."""
+    if garment.bound:
+        return garment
+    surface = body.points(0) if isinstance(body, MeshMotion) else body.v_template
+    finding.facts |= describe_objects(garment, surface)
+    fitting = start_fitting(garment)
+    choose(fitting, wanted, surface)
+    mend(fitting, wanted, surface)
+    for what, fix in problems_of(finding.file, fitting.changes):
+        finding.problem(what, fix, "")
+    finding.facts |= describe_made(fitting.garment)
+    return fitting.garment
 
 
 def _stiffer(garment: Garment) -> str | None:

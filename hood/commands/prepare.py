@@ -301,7 +301,7 @@ def _text(report: dict[str, Any]) -> str:
     lines = []
     for part in report["garments"]:
         lines.append(f"{part['file']}:")
-        lines += [f"  {said(change)}" for change in part["changes"]] or ["  nothing to repair"]
+        lines += [f"  {said(change, part['file'])}" for change in part["changes"]] or ["  nothing to repair"]
         lines += _length_lines(part)
         lines.append(f"  now {part['result']}")
     if report["num_pinned"]:

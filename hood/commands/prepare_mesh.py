@@ -154,7 +154,7 @@ def _text(report: dict[str, Any], config: DictConfig) -> str:
     body, lines = str(config.body), []
     for part in report["garments"]:
         lines.append(f"{part['file']}:")
-        lines += [f"  {said(change)}" for change in part["changes"]] or ["  nothing to repair"]
+        lines += [f"  {said(change, part['file'])}" for change in part["changes"]] or ["  nothing to repair"]
         lines.append(f"  now {part['result']}")
     start = report["starts"]["first frame"]
     words = [plain_word("garment", report["output"]), plain_word("body", body)]

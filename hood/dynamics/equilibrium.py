@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from hood.assets.files.progress import Progress
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
 from hood.mesh.parts import find_parts
@@ -31,6 +32,8 @@ _SHORTEST, _LONGEST, _STRIDE = 1.0 / 30.0, 1.0, 0.04
 _REST = 1e-3
 #: Steps at most: the default garments need half of them, and what creeps goes on creeping.
 _MOST_STEPS = 30
+#: Cloth of more vertices than this gets fewer, but for so many.
+_MANY, _FEWEST = 10_000, 12
 #: A part of a garment that has no pins and has moved so far [m] on average is not worn any more.
 _LOST = 0.3
 #: Parts that a message names.
@@ -108,7 +111,7 @@ def find_equilibrium(
     given = ~worn & cloth.free & bool(worn.any())
     problem = StepProblem(cloth, replace(start, vel=torch.zeros_like(start.vel)), step, gravity=gravity.to(start.pos))
     way = _Way(_kept(problem, given, start.pos), start.pos)
-    count, speed = way.settle(potential, most_steps or _MOST_STEPS)
+    count, speed = way.settle(potential, most_steps or _most_steps(cloth.num_vertices))
     pos = way.pos
     if way.parts.moving and most_steps is None and math.isfinite(speed):
         pos = _out_of_skin(potential, way.problem, pos)
@@ -116,6 +119,11 @@ def find_equilibrium(
     if not rest.reached and most_steps is None:
         _warn(scene, rest)
     return rest
+
+
+def _most_steps(num_vertices: int) -> int:
+    """Steps that settling may take: of much cloth fewer, which take longer each."""
+    return min(_MOST_STEPS, max(_FEWEST, _MOST_STEPS * _MANY // max(num_vertices, 1)))
 
 
 class _Way:
@@ -128,7 +136,7 @@ class _Way:
 
     def settle(self, potential: Potential, most_steps: int) -> tuple[int, float]:
         """Number of steps taken, and the speed [m/s] in the last, until the cloth is at rest, lost, or out of steps."""
-        dt, speed = _SHORTEST, math.inf
+        dt, speed, progress = _SHORTEST, math.inf, Progress("settling the cloth")
         for count in range(1, most_steps + 1):
             here, longest = self.problem.state, dt >= _LONGEST
             step = replace(self.problem.step, dt=torch.full_like(self.problem.step.dt, dt))
@@ -138,6 +146,7 @@ class _Way:
             moved = (pos - here.pos).norm(dim=1)
             speed = float(self.parts.means(moved).max()) / dt
             self._go_on(pos)
+            progress.tell(f"step {count} of at most {most_steps}, it moves by {1e3 * speed:.1f} mm a second")
             if not self.parts.moving or (longest and speed <= _REST / _LONGEST):
                 return count, speed
             growth = _STRIDE / max(float(moved[self.parts.free].max()), 1e-9)

@@ -51,10 +51,15 @@ def _fan(face: int, on_edges: list[np.ndarray], at: np.ndarray, count: int) -> n
             side.append({k})
     triangles = []
     while len(polygon) > 3:
-        ear = next(n for n in range(len(polygon)) if not side[n - 1] & side[n] & side[(n + 1) % len(side)])
+        ear = next(n for n in range(len(polygon)) if _is_ear(side, n))
         triangles.append([polygon[ear - 1], polygon[ear], polygon[(ear + 1) % len(polygon)]])
         del polygon[ear], side[ear]
     return np.array([*triangles, polygon], dtype=np.int64)
+
+
+def _is_ear(side: list[set[int]], n: int) -> bool:
+    """Whether a corner of a polygon and its neighbours lie on no one side of the triangle, nor what is left without it."""
+    return not (side[n - 1] & side[n] & side[(n + 1) % len(side)] or set.intersection(*side[:n], *side[n + 1 :]))
 
 
 def along(cut: Cut, values: np.ndarray) -> np.ndarray:

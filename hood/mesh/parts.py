@@ -32,8 +32,8 @@ class Part(NamedTuple):
 
     @property
     def can_be_put_on(self) -> bool:
-        """Whether something can be in it, as in a tube: not in a sheet, nor in a ball. Euler's characteristic V − E + F is 1 and
-        2 for these, and less for all else, also where a lining that is sewn to the rims leaves none open."""
+        """Whether something can be in it, as in a tube: not in a sheet, nor in a ball. Euler's V − E + F is 1 and 2 for
+        these, and less for all else, also where a lining that is sewn to the rims leaves none open."""
         return len(self.vertices) - self.num_edges + len(self.faces) <= 0
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from hood.assets.files.doubt import Doubt
 from hood.assets.formats.mesh_file import mesh_suffixes, read_mesh_file
 from hood.assets.garment.alterations import Change, start_fitting
 from hood.assets.garment.contents.sort_out import choose, mend
-from hood.assets.garment.contents.wanted import Wanted
+from hood.assets.garment.contents.wanted import FILE, Wanted
 from hood.assets.garment.garment import Garment, garment_of_mesh, load_garment, locate_garment
 from hood.assets.garment.suspicions import suspect_seams
 from hood.mesh import repair
@@ -46,7 +47,7 @@ def read_garment(name: str, wanted: Wanted, surface: np.ndarray, triangulate: bo
     choose(fitting, wanted, surface)
     mend(fitting, wanted, surface)
     check_triangles(fitting.garment.rest_pos, fitting.garment.faces, str(path))
-    tell(path.stem, fitting.changes)
+    tell(path, fitting.changes)
     return fitting.garment
 
 
@@ -56,17 +57,19 @@ def _refuse_soup(garment: Garment) -> None:
             raise ValueError(f"garment {garment.name!r} {suspicion.sentence}")
 
 
-def tell(name: str, changes: Sequence[Change]) -> None:
-    """Warn about what was done to the garment ``name``: guesses as doubts, with the key that settles them."""
+def tell(path: Path, changes: Sequence[Change]) -> None:
+    """Warn about what was done to the garment of a file: guesses as doubts, with the key that settles them."""
+    name = path.stem
     for change in changes:
         if change.what in _ASKED:
             continue
         if change.fix:
-            warnings.warn(Doubt("garment", f"garment {name!r}: {change.text}; {change.fix}", value=change.count), stacklevel=2)
+            fix = change.fix.replace(FILE, str(path))
+            warnings.warn(Doubt("garment", f"garment {name!r}: {change.text}; {fix}", value=change.count), stacklevel=2)
         else:
             warnings.warn(f"garment {name!r}: {change.text}", stacklevel=2)
 
 
-def said(change: Mapping[str, Any]) -> str:
-    """A change, as a dict, in one sentence."""
-    return "; ".join(filter(None, (change["text"], change["fix"])))
+def said(change: Mapping[str, Any], file: str) -> str:
+    """A change of the garment of ``file``, as a dict, in one sentence."""
+    return "; ".join(filter(None, (change["text"], change["fix"].replace(FILE, file))))

@@ -8,6 +8,7 @@ import numpy as np
 
 from hood.assets.files.folded import meant
 from hood.assets.files.guarded import listed
+from hood.assets.formats.objects import parts_by_name
 from hood.assets.garment.alterations import Fitting, drop_faces
 from hood.assets.garment.binding import signed_distances
 from hood.assets.garment.garment import Garment
@@ -15,8 +16,6 @@ from hood.assets.garment.suspicions import body_of
 from hood.mesh.parts import Part, find_parts, part_labels, rim_length
 from hood.mesh.shells import find_shell
 
-#: Names of parts that the file gives none.
-PART = "part_"
 #: An object has at most so much [share] of its faces elsewhere than in the parts that it is made of.
 _WHOLE = 0.99
 #: Cloth is at most so thick [m], things on it are at most so large [m], and openings that something can be put on by are at
@@ -42,7 +41,7 @@ def items_of(garment: Garment, scale: float, surface: np.ndarray) -> list[Item]:
         scale: metres per unit of the file.
         surface: (W, 3) m, the body that garments are measured against.
     """
-    named = dict(garment.panels or {}) or _by_parts(garment)
+    named = dict(garment.panels or {}) or parts_by_name(len(garment.rest_pos), garment.faces)
     items = []
     for name, mask in named.items():
         used = np.unique(garment.faces[mask])
@@ -87,12 +86,12 @@ def choose_objects(fitting: Fitting, names: tuple[str, ...]) -> None:
     if not names:
         return
     garment = fitting.garment
-    known = {**_by_parts(garment), **(garment.panels or {})}
+    known = {**parts_by_name(len(garment.rest_pos), garment.faces), **(garment.panels or {})}
     kept = np.zeros(len(garment.faces), dtype=bool)
     for name in names:
         found = meant(name, known)
         if found is None:
-            there = listed([*(garment.panels or {}), *_by_parts(garment)])
+            there = listed([*(garment.panels or {}), *parts_by_name(len(garment.rest_pos), garment.faces)])
             raise ValueError(
                 f"{garment.name}: objects={name}: no object, group, material or part of that name; there are {there}"
             )
@@ -137,7 +136,7 @@ def _candidates(garment: Garment) -> dict[str, np.ndarray]:
         rows = np.isin(label, np.unique(label[mask]))
         if mask.sum() >= _WHOLE * rows.sum() and not rows.all():
             found[name] = rows
-    parts = _by_parts(garment)
+    parts = parts_by_name(len(garment.rest_pos), garment.faces)
     return found or (parts if len(parts) > 1 else {})
 
 
@@ -148,9 +147,3 @@ def _is_body(pos: np.ndarray, faces: np.ndarray, surface: np.ndarray, height: fl
     largest = max(find_parts(pos, faces), key=lambda part: part.area)
     used, corners = np.unique(faces[largest.faces], return_inverse=True)
     return body_of(pos[used], corners.reshape(-1, 3), surface, height) is not None
-
-
-def _by_parts(garment: Garment) -> dict[str, np.ndarray]:
-    """(F,) bool of every connected part, named by number from 1."""
-    label = part_labels(len(garment.rest_pos), garment.faces)[garment.faces[:, 0]]
-    return {f"{PART}{number + 1}": label == number for number in range(int(label.max(initial=-1)) + 1)}

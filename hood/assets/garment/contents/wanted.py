@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 #: Choices for cloth that has its thickness in the file, and for buttons and the like.
 SHELLS, SMALL_PARTS = ("auto", "keep"), ("ride", "leave_out", "simulate")
+#: What stands for the file's name in a sentence of one who does not know it.
+FILE = "FILE"
 #: Rims of pattern pieces within this [m] are sewn: 5 mm, and what curves add to it.
 SEAM = 6e-3
 
