@@ -108,6 +108,69 @@ def shell(mesh: Mesh, thickness: float, rims: bool = True, share: float = 0.0) -
     return np.concatenate([outer, inner]), np.concatenate(tables)
 
 
+def bevelled(mesh: Mesh, thickness: float) -> Mesh:
+    """A closed shell whose rims are not upright but drawn out to an edge half way between the layers."""
+    pos, faces = mesh
+    normal, count = normals(pos, faces), len(pos)
+    half = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    _, back, times = np.unique(np.sort(half, axis=1) @ [count, 1], return_inverse=True, return_counts=True)
+    a, b = half[times[back] == 1].T
+    rim = np.unique([a, b])
+    around, number = np.zeros_like(pos), np.zeros(count)
+    for start, end in (half.T, half[:, ::-1].T):
+        np.add.at(around, start, pos[end])
+        np.add.at(number, start, 1)
+    out = pos[rim] - around[rim] / number[rim, None]
+    out /= np.linalg.norm(out, axis=1, keepdims=True)
+    own = np.full(count, -1)
+    own[rim] = 2 * count + np.arange(len(rim))
+    tables = [faces, faces[:, ::-1] + count]
+    tables += [np.stack(face, axis=1) for face in ((b, a, own[a]), (b, own[a], own[b]))]
+    tables += [np.stack(face, axis=1) for face in ((own[b], own[a], a + count), (own[b], a + count, b + count))]
+    edge = pos[rim] + 0.5 * thickness * (out - normal[rim])
+    return np.concatenate([pos, pos - thickness * normal, edge]), np.concatenate(tables)
+
+
+def folded_hem(mesh: Mesh, height: float = 0.05, off: float = 3e-3) -> Mesh:
+    """The lowest rim goes on outside and up again, as a cuff that is folded."""
+    pos, faces = mesh
+    normal, rows = normals(pos, faces), 3
+    hem = min(topology.boundary_loops(faces), key=lambda loop: float(pos[loop, 1].mean()))
+    rings = [hem]
+    added = []
+    for row in range(1, rows + 1):
+        rings.append(len(pos) + (row - 1) * len(hem) + np.arange(len(hem)))
+        added.append(pos[hem] + 2 * off * normal[hem] + [0.0, row * height / rows, 0.0])
+    tables = []
+    for low, high in zip(rings, rings[1:], strict=False):
+        after, above = np.roll(low, -1), np.roll(high, -1)
+        tables += [np.stack([low, after, above], axis=1), np.stack([low, above, high], axis=1)]
+    return np.concatenate([pos, *added]), np.concatenate([faces, *tables])
+
+
+def belt(mesh: Mesh, height: float = 0.15, thick: float = 4e-3) -> Mesh:
+    """A closed cord around the waist."""
+    pos, _ = mesh
+    near = pos[np.abs(pos[:, 1] - height) < 0.02]
+    middle = near.mean(axis=0)
+    turns, radii = np.arctan2(*(near - middle)[:, [2, 0]].T), np.hypot(*(near - middle)[:, [0, 2]].T)
+    i, j = np.meshgrid(np.arange(48), np.arange(6), indexing="ij")
+    turn, around = 2 * np.pi * i / 48, 2 * np.pi * j / 6
+    out = (
+        np.interp(turn, turns[np.argsort(turns)], radii[np.argsort(turns)], period=2 * np.pi)
+        + 1.5 * thick
+        + thick * np.cos(around)
+    )
+    ring = np.stack([middle[0] + out * np.cos(turn), height + thick * np.sin(around), middle[2] + out * np.sin(turn)], axis=2)
+    return ring.reshape(-1, 3), _torus_faces(48, 6)
+
+
+def _torus_faces(first: int, second: int) -> np.ndarray:
+    i, j = np.meshgrid(np.arange(first), np.arange(second), indexing="ij")
+    a, b, c, d = (((i + k) % first) * second + (j + m) % second for k, m in ((0, 0), (1, 0), (1, 1), (0, 1)))
+    return np.concatenate([np.stack(face, axis=2).reshape(-1, 3) for face in ((a, b, c), (a, c, d))])
+
+
 def doubled(mesh: Mesh, turned: bool = True) -> Mesh:
     """Every face twice, the second time with vertices of its own."""
     pos, faces = mesh
@@ -140,13 +203,7 @@ def eyelet(middle: np.ndarray, normal: np.ndarray, radius: float = 0.006, thick:
     u, v = np.meshgrid(2 * np.pi * np.arange(sides) / sides, 2 * np.pi * np.arange(6) / 6, indexing="ij")
     around = np.cos(u)[..., None] * first + np.sin(u)[..., None] * second
     pos = middle + 2 * thick * normal + (radius + thick * np.cos(v))[..., None] * around + thick * np.sin(v)[..., None] * normal
-    i, j = np.meshgrid(np.arange(sides), np.arange(6), indexing="ij")
-    at = lambda a, b: (a % sides) * 6 + b % 6  # noqa: E731
-    faces = [
-        np.stack([at(i, j), at(i + 1, j), at(i + 1, j + 1)], axis=2),
-        np.stack([at(i, j), at(i + 1, j + 1), at(i, j + 1)], axis=2),
-    ]
-    return pos.reshape(-1, 3), np.concatenate([table.reshape(-1, 3) for table in faces])
+    return pos.reshape(-1, 3), _torus_faces(sides, 6)
 
 
 def front_places(mesh: Mesh, count: int = 4) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -330,6 +387,16 @@ def _buckle(mesh: Mesh) -> list[Mesh]:
     return [eyelet(middle, normal, radius=0.02, thick=0.002), button(middle + 0.002 * normal, normal, 0.019, 0.002)]
 
 
+def _teeth(mesh: Mesh) -> list[Mesh]:
+    """Discs that touch each other, in a row of 20 cm."""
+    pos, faces = mesh
+    middle, normal = front_places(mesh, 3)[1]
+    places = [middle + [0.0, shift, 0.0] for shift in np.linspace(-0.1, 0.1, 40)]
+    front = pos[pos[:, 2] > pos[:, 2].mean()]
+    depth = [front[np.argmin(np.linalg.norm(front[:, :2] - place[:2], axis=1)), 2] for place in places]
+    return [button(np.array([*place[:2], z + 2e-3]), normal, 2.6e-3, 2e-3) for place, z in zip(places, depth, strict=True)]
+
+
 def _far_bead(mesh: Mesh) -> list[Mesh]:
     return [button(np.array([0.0, 0.3, 0.9]), np.array([0.0, 0.0, 1.0]))]
 
@@ -385,6 +452,9 @@ KINDS: dict[str, Kind] = {
         _obj("shell_open", lambda: shell(_tank(), 2e-3, rims=False)), "cloth with its thickness", _tank, thickness=2e-3
     ),
     "shell with torn rims": Kind(_obj("shell_torn", _torn_strips), "cloth with its thickness", _tank, thickness=2e-3),
+    "shell with bevelled rims": Kind(
+        _obj("bevel", lambda: bevelled(_tank(), 3e-3)), "cloth with its thickness", _tank, thickness=3e-3
+    ),
     "shells of panels": Kind(_obj("shell_panels", _thick_quarters), "cloth with its thickness", thickness=1e-3),
     "doubled faces": Kind(_obj("doubled", lambda: doubled(_tank())), "lie on others", _tank),
     "doubled faces, same winding": Kind(_obj("doubled_same", lambda: doubled(_tank(), False)), "lie on others", _tank),
@@ -393,6 +463,8 @@ KINDS: dict[str, Kind] = {
     "eyelets": Kind(_obj("eyelets", _with(_eyelets)), "4 closed parts on the cloth", _tank, riders=4),
     "a buckle of two parts": Kind(_obj("buckle", _with(_buckle)), "2 closed parts on the cloth", _tank, riders=1),
     "buttons in millimetres": Kind(_obj("buttons_mm", _with(_buttons), 1000.0), "4 closed parts on the cloth", riders=4),
+    "teeth of a zipper": Kind(_obj("zipper", _with(_teeth)), "40 closed parts on the cloth", _tank, riders=40),
+    "a belt": Kind(_obj("belt", _with(lambda mesh: [belt(mesh)])), "1 long closed part on the cloth", _tank, riders=-1),
     "a bead beside it": Kind(_obj("bead", _with(_far_bead)), "on no cloth", _tank),
     "a pocket": Kind(_obj("pocket", _with(lambda mesh: [patch(mesh)])), "1 sheet on the cloth", _tank, riders=-1),
     "two garments": Kind(
@@ -424,6 +496,13 @@ KINDS: dict[str, Kind] = {
         lambda: joined(_tank(), lining(_tank(), 3e-3, 0.5)), pieces=2,
     ),
     "a whole lining of another mesh": Kind(_obj("dense", _dense_lining), "2 garments", _dense_lining, pieces=2),
+    "a folded hem": Kind(_obj("folded", lambda: folded_hem(_skirt())), "", lambda: folded_hem(_skirt())),
+    "an avatar in centimetres": Kind(
+        lambda folder: write_objects(
+            folder / "cm.obj", [(name, (100.0 * mesh[0], mesh[1])) for name, mesh in (("Avatar", avatar()), ("tank", _tank()))]
+        ),
+        "a body beside the garment, 'Avatar'",
+    ),
     "a lining sewn in": Kind(_obj("sewn", lambda: sewn_lining(_tank())), "", lambda: sewn_lining(_tank())),
     "a cape": Kind(_obj("cape", cape), "", cape),
     "a byte-order mark": Kind(_text("mark.obj", lambda mesh: obj_text([("", mesh)]), "utf-8-sig"), "", _tank),

@@ -36,6 +36,8 @@ _MOST_STEPS = 30
 _MANY, _FEWEST = 10_000, 12
 #: A part of a garment that has no pins and has moved so far [m] on average is not worn any more.
 _LOST = 0.3
+#: Parts that come off make the others begin again, with so many times the steps at most.
+_AGAIN = 3
 #: Parts that a message names.
 _TOLD = 3
 #: Accuracy of the steps on the way, and of the longest: the way leads to the same place, whatever is left over on it.
@@ -127,17 +129,25 @@ def _most_steps(num_vertices: int) -> int:
 
 
 class _Way:
-    """The cloth on its way to rest, from ``start`` (V, 3) on; parts that come off the body go back there and stay."""
+    """The cloth on its way to rest, from ``start`` (V, 3) on. Where parts come off the body, all go back there, and the others
+    begin again without these: cloth that has settled over a part that is put back would be through it."""
 
     def __init__(self, problem: StepProblem, start: Tensor) -> None:
-        self.problem, self.start, self.pos = problem, start, problem.state.pos
+        self.problem, self.start = problem, start
         self.parts = _Parts(problem.cloth)
         self.lost: tuple[int, ...] = ()
+
+    @property
+    def pos(self) -> Tensor:
+        """(V, 3) m, where the cloth is."""
+        return self.problem.state.pos
 
     def settle(self, potential: Potential, most_steps: int) -> tuple[int, float]:
         """Number of steps taken, and the speed [m/s] in the last, until the cloth is at rest, lost, or out of steps."""
         dt, speed, progress = _SHORTEST, math.inf, Progress("settling the cloth")
-        for count in range(1, most_steps + 1):
+        count, last = 0, most_steps
+        while count < last:
+            count += 1
             here, longest = self.problem.state, dt >= _LONGEST
             step = replace(self.problem.step, dt=torch.full_like(self.problem.step.dt, dt))
             pos, report = minimize(potential, replace(self.problem, step=step), here.pos, _FINE if longest else _ROUGH)
@@ -145,24 +155,26 @@ class _Way:
                 return count, math.inf
             moved = (pos - here.pos).norm(dim=1)
             speed = float(self.parts.means(moved).max()) / dt
-            self._go_on(pos)
-            progress.tell(f"step {count} of at most {most_steps}, it moves by {1e3 * speed:.1f} mm a second")
+            self.problem = replace(self.problem, state=replace(here, pos=pos))
+            progress.tell(f"step {count} of at most {last}, it moves by {1e3 * speed:.1f} mm a second")
+            if self._lose(self.parts.lost(pos - self.start)):
+                dt, last = _SHORTEST, min(last + count, _AGAIN * most_steps)
             if not self.parts.moving or (longest and speed <= _REST / _LONGEST):
                 return count, speed
             growth = _STRIDE / max(float(moved[self.parts.free].max()), 1e-9)
             dt = min(max(dt * min(max(growth, 0.5), 2.0), _SHORTEST), _LONGEST)
-        return most_steps, speed
+        return count, speed
 
-    def _go_on(self, pos: Tensor) -> None:
-        """Take the step to ``pos`` (V, 3), without the parts that are lost by it."""
-        gone = self.parts.lost(pos - self.start)
-        self.problem = replace(self.problem, state=replace(self.problem.state, pos=pos))
-        if len(gone):
-            back = torch.isin(self.parts.of_vertices, gone)
-            self.problem = _kept(self.problem, back & self.problem.cloth.free, self.start)
-            self.lost = tuple(sorted({*self.lost, *gone.tolist()}))
-            self.parts = _Parts(self.problem.cloth)
-        self.pos = self.problem.state.pos
+    def _lose(self, gone: Tensor) -> bool:
+        """Go back to the start and hold the parts ``gone`` (n,) there; whether there are any."""
+        if not len(gone):
+            return False
+        held = torch.isin(self.parts.of_vertices, gone) & self.problem.cloth.free
+        begun = replace(self.problem, state=replace(self.problem.state, pos=self.start))
+        self.problem = _kept(begun, held, self.start)
+        self.lost = tuple(sorted({*self.lost, *gone.tolist()}))
+        self.parts = _Parts(self.problem.cloth)
+        return True
 
 
 def _kept(problem: StepProblem, rows: Tensor, start: Tensor) -> StepProblem:

@@ -12,8 +12,8 @@ from scipy.spatial import cKDTree
 
 from hood.mesh import repair, topology
 
-#: Two faces lie along each other where the cosine between them is at least this.
-_ALONG = 0.5
+#: Two faces lie along each other where the cosine between their normals, one turned over, is at least this.
+_ALONG = 0.8
 #: Of the area so much lies along other cloth at about one distance, from half of it to one and a half.
 _MOST, _SPREAD = 0.75, 0.5
 #: The two layers have so much of that area, and at least so many times each other's.
@@ -22,6 +22,9 @@ _BOTH, _ALIKE = 0.95, 0.6
 _TOUCHING = 1e-6
 #: Cosine between the normals of two faces with a sharp edge between them: a rim is upright on its layers.
 _SHARP = 0.3
+#: What is narrower at the end of a layer than so many times the thickness, and lies askew [cosine], is of a rounded rim; looked
+#: for so often.
+_NARROW, _SAME_PLANE, _TRIMS = 0.8, 0.96, 4
 #: Rays and faces that are looked at at once.
 _AT_ONCE = 2_000_000
 
@@ -57,7 +60,7 @@ def find_shell(pos: np.ndarray, faces: np.ndarray, thickest: float) -> Shell | N
     if size[first] + size[second] < _BOTH * area[layer].sum() or size[second] < _ALIKE * size[first]:
         return None
     side = _grown(faces, np.where(layer & (label == first), 0, np.where(layer & (label == second), 1, -1)))
-    one, other = (np.flatnonzero(side == which) for which in (0, 1))
+    one, other = (_trimmed(pos, faces, normal, np.flatnonzero(side == which), usual) for which in (0, 1))
     outer, inner = (one, other) if area[one].sum() >= area[other].sum() else (other, one)
     return Shell(outer, inner, usual)
 
@@ -179,6 +182,26 @@ def _grown(faces: np.ndarray, side: np.ndarray) -> np.ndarray:
         beside[label[one[rows]], side[other[rows]]] = True
     alone = beside.sum(axis=1) == 1
     return np.where(left & alone[label], beside[label].argmax(axis=1), side)
+
+
+def _trimmed(pos: np.ndarray, faces: np.ndarray, normal: np.ndarray, rows: np.ndarray, thickness: float) -> np.ndarray:
+    """Rows of a layer without what its rounded rim has left on it: narrow faces at its end, askew to their neighbours."""
+    for _ in range(_TRIMS):
+        half = faces[rows][:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+        _, back, times = np.unique(np.sort(half, axis=1) @ [len(pos), 1], return_inverse=True, return_counts=True)
+        ends = (times[back] == 1).reshape(-1, 3)
+        length = np.linalg.norm(pos[half[:, 1]] - pos[half[:, 0]], axis=1).reshape(-1, 3)
+        area = _normals(pos, faces[rows])[1]
+        height = 2.0 * area / length.max(axis=1).clip(1e-30)
+        askew = ends.all(axis=1)
+        first, second = topology.hinges(faces[rows]).faces.T
+        apart = (normal[rows[first]] * normal[rows[second]]).sum(axis=1) < _SAME_PLANE
+        askew[np.concatenate([first[apart], second[apart]])] = True
+        gone = ends.any(axis=1) & askew & (height < _NARROW * thickness)
+        if not gone.any():
+            break
+        rows = rows[~gone]
+    return rows
 
 
 def _matched(pos: np.ndarray, faces: np.ndarray, others: np.ndarray, farthest: float) -> np.ndarray | None:

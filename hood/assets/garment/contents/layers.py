@@ -50,11 +50,10 @@ def to_one_layer(fitting: Fitting, scale: float) -> None:
     own = garment.thickness
     drop_faces(fitting, ~dropped, thickness=thickness / scale if own is None else np.maximum(own, thickness / scale))
     apart = [value for _, _, value in found]
-    fitting.guess(
-        "layers", int(dropped.sum()),
-        f"the file shows cloth with its thickness, two layers {_range(apart)} apart; the outer layer is simulated", _KEEP,
-        thickness=max(apart),
-    )  # fmt: skip
+    text = f"cloth with its thickness, two layers {_range(apart)} apart; the outer layer is simulated"
+    if max(apart) * 1e6 < 1.0:
+        text = "cloth with two sides, two layers in one place; one is simulated"
+    fitting.guess("layers", int(dropped.sum()), f"the file shows {text}", _KEEP, thickness=max(apart))
 
 
 def _range(thick: list[float]) -> str:

@@ -13,11 +13,14 @@ from hood.assets.garment.alterations import Fitting, drop_faces
 from hood.assets.garment.binding import signed_distances
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.suspicions import body_of
+from hood.assets.garment.units import UNITS
 from hood.mesh.parts import Part, find_parts, part_labels, rim_length
 from hood.mesh.shells import find_shell
 
 #: An object has at most so much [share] of its faces elsewhere than in the parts that it is made of.
 _WHOLE = 0.99
+#: A body is at least so large [share] beside all that the file holds.
+_LARGE = 0.5
 #: Cloth is at most so thick [m], things on it are at most so large [m], and openings that something can be put on by are at
 #: least so long [m].
 THICKEST, SMALL, OPENING = 0.012, 0.06, 0.12
@@ -101,10 +104,10 @@ def choose_objects(fitting: Fitting, names: tuple[str, ...]) -> None:
     fitting.note("objects", count, f"objects={','.join(names)}: {count} faces of other objects are left out")
 
 
-def leave_body_out(fitting: Fitting, scale: float, surface: np.ndarray) -> None:
-    """Leave out a body that the file holds beside the garment, and what lies inside of that, such as eyes."""
+def leave_body_out(fitting: Fitting, surface: np.ndarray) -> None:
+    """Leave out a body that the file holds beside the garment, in any unit, and what lies inside of that, such as eyes."""
     garment = fitting.garment
-    pos, height = scale * garment.rest_pos, float(np.ptp(surface, axis=0).max())
+    pos, height = garment.rest_pos, float(np.ptp(surface, axis=0).max())
     bodies = [
         (name, mask) for name, mask in _candidates(garment).items() if _is_body(pos, garment.faces[mask], surface, height)
     ]
@@ -141,9 +144,11 @@ def _candidates(garment: Garment) -> dict[str, np.ndarray]:
 
 
 def _is_body(pos: np.ndarray, faces: np.ndarray, surface: np.ndarray, height: float) -> bool:
-    """Whether a mesh is a body, eyes and teeth of its own aside."""
-    if float(np.ptp(pos[faces].reshape(-1, 3), axis=0).max()) < 0.5 * height:
+    """Whether a mesh is a body in some unit, eyes and teeth of its own aside."""
+    size = float(np.ptp(pos[faces].reshape(-1, 3), axis=0).max())
+    unit = min(UNITS, key=lambda unit: abs(np.log(max(unit * size, 1e-12) / height)))  # a body is as large as a body
+    if not 0.5 * height < unit * size < 2.0 * height or size < _LARGE * float(np.ptp(pos, axis=0).max()):
         return False
     largest = max(find_parts(pos, faces), key=lambda part: part.area)
     used, corners = np.unique(faces[largest.faces], return_inverse=True)
-    return body_of(pos[used], corners.reshape(-1, 3), surface, height) is not None
+    return body_of(unit * pos[used], corners.reshape(-1, 3), surface, height) is not None

@@ -15,13 +15,13 @@ from hood.mesh.parts import Part, find_parts
 from hood.mesh.proximity import SurfaceHit, search_surface
 from hood.mesh.riders import Riders, clusters, join_riders, rigid_anchors
 
-#: A small thing is on the cloth if it is no farther off than this [m], a large solid one than half of it, and things no farther
-#: apart than the last are one.
-_ON, _ONE = 0.015, 0.002
-#: A solid thing may be so large [m] and ride.
-_LARGE = 0.4
-#: A sheet lies on cloth with so much [share] of its vertices within this [m], and is at most such a share of its area.
-_LYING, _NEAR, _SHARE = 0.9, 0.008, 0.15
+#: A thing is on the cloth if it is no farther off than this [m]; things no farther apart than the second are one, which is no
+#: larger than the third; larger ones, such as belts, bend with the cloth.
+_ON, _ONE, _RIGID = 0.015, 0.002, 0.1
+#: What bends with the cloth has so much [share] of its vertices within this [m] of it; a pocket lies closer.
+_LYING, _AROUND, _NEAR = 0.9, 0.03, 0.008
+#: Of the area of the largest cloth a solid thing or a pocket has at most this share.
+_SHARE = 0.15
 #: Things in words: so many are named by their places.
 _NAMED = 3
 
@@ -31,9 +31,14 @@ class _Kinds:
     """The parts of a file by what becomes of them."""
 
     cloth: list[Part]
-    rigid: list[Part]  # closed ones
+    rigid: list[Part]  # closed ones, small
+    bent: list[Part]  # closed ones that are long: belts, cords
     sheets: list[Part]  # pockets, labels
     off: list[Part]  # closed ones that lie on no cloth
+
+    @property
+    def riding(self) -> list[Part]:
+        return [*self.rigid, *self.bent, *self.sheets]
 
 
 def let_ride(fitting: Fitting, wanted: Wanted, scale: float) -> None:
@@ -43,14 +48,11 @@ def let_ride(fitting: Fitting, wanted: Wanted, scale: float) -> None:
     garment = fitting.garment
     pos, faces = scale * garment.rest_pos, garment.faces
     kinds = _sorted(pos, faces)
-    taken = [*kinds.rigid, *kinds.sheets]
-    if not taken and not kinds.off:
+    if not kinds.riding and not kinds.off:
         return
-    riders = None
-    if wanted.small_parts == "ride" and taken:
-        riders = _riders(garment, kinds, scale)
+    riders = _riders(garment, kinds, scale) if wanted.small_parts == "ride" and kinds.riding else garment.riders
     kept = np.ones(len(faces), dtype=bool)
-    for part in [*taken, *kinds.off]:
+    for part in [*kinds.riding, *kinds.off]:
         kept[part.faces] = False
     fitting.garment = replace(garment, riders=riders)
     _note(fitting, kinds, wanted, pos)
@@ -60,21 +62,22 @@ def let_ride(fitting: Fitting, wanted: Wanted, scale: float) -> None:
 def _sorted(pos: np.ndarray, faces: np.ndarray) -> _Kinds:
     """The parts, by size, openings and what they lie on."""
     parts = find_parts(pos, faces)
-    closed = [part for part in parts if part.closed and part.extent <= _LARGE]
-    cloth = [part for part in parts if not (part.closed and part.extent <= _LARGE)]
+    largest = max((part.area for part in parts if not part.closed), default=0.0)
+    closed = [part for part in parts if part.closed and (part.extent <= SMALL or part.area <= _SHARE * largest)]
+    few = [part for part in parts if not part.closed and part.area <= _SHARE * largest and num_openings(pos, part) < 2]
+    cloth = [part for part in parts if not any(part is one for one in (*closed, *few))]
     if not cloth or len(parts) == 1:
-        return _Kinds(parts, [], [], [])
-    largest = max(part.area for part in cloth)
-    few = [part for part in cloth if part.area < _SHARE * largest and num_openings(pos, part) < 2]
-    cloth = [part for part in cloth if not any(part is one for one in few)]
-    on: list[Part] = []
-    off: list[Part] = []
+        return _Kinds(parts, [], [], [], [])
+    found = _Kinds(cloth, [], [], [], [])
     for part, dist in zip(closed, _distances(pos, faces, cloth, closed), strict=True):
-        (on if dist.min() <= (_ON if part.extent <= SMALL else 0.5 * _ON) else off).append(part)
-    sheets: list[Part] = []
+        bends = part.extent > _RIGID and float((dist <= _AROUND).mean()) >= _LYING
+        lies = part.extent <= _RIGID and dist.min() <= _ON
+        (found.bent if bends else found.rigid if lies else found.off).append(part)
+    loose: list[Part] = []
     for part, dist in zip(few, _distances(pos, faces, cloth, few), strict=True):
-        (sheets if (dist <= _NEAR).mean() >= _LYING else cloth).append(part)
-    return _Kinds(cloth, on, sheets, off)
+        (found.sheets if (dist <= _NEAR).mean() >= _LYING else loose).append(part)
+    cloth.extend(loose)
+    return found
 
 
 def _distances(pos: np.ndarray, faces: np.ndarray, cloth: list[Part], parts: list[Part]) -> list[np.ndarray]:
@@ -98,22 +101,32 @@ def _riders(garment: Garment, kinds: _Kinds, scale: float) -> Riders | None:
     pos = scale * garment.rest_pos
     table = np.concatenate([part.faces for part in kinds.cloth])
     found: list[Riders | None] = [garment.riders]
-    label = clusters([pos[part.vertices] for part in kinds.rigid], _ONE) if kinds.rigid else np.zeros(0, np.int64)
-    for number in np.unique(label):
-        members = [part for part, own in zip(kinds.rigid, label, strict=True) if own == number]
+    for members in _things(pos, kinds.rigid):
         hits = [_below(pos, garment.faces, kinds.cloth, part.vertices) for part in members]
         nearest = min(hits, key=lambda hit: float(hit.dist.abs().min()))
         corners = garment.faces[table[int(nearest.face[int(nearest.dist.abs().argmin())])]]
-        own = next(part for part in kinds.cloth if np.isin(corners[0], part.vertices))
+        rows = next(part.vertices for part in kinds.cloth if np.isin(corners[0], part.vertices))
         vertices = np.concatenate([part.vertices for part in members])
-        rows = own.vertices
         anchors = rows[rigid_anchors(pos[vertices], pos[rows], np.searchsorted(rows, corners))]
         found.append(_group(garment, members, anchors, np.zeros(len(anchors), np.int64), np.zeros(len(vertices), np.int64)))
-    for part in kinds.sheets:
+    for part in (*kinds.bent, *kinds.sheets):
         corners = garment.faces[table[_below(pos, garment.faces, kinds.cloth, part.vertices).face.numpy()]]
         each = np.arange(len(part.vertices))
         found.append(_group(garment, [part], corners.reshape(-1), np.repeat(each, 3), each))
     return join_riders(found, [0] * len(found), [0] * len(found))
+
+
+def _things(pos: np.ndarray, parts: list[Part]) -> list[list[Part]]:
+    """Parts that touch are one thing, as a buckle and its pin; the teeth of a zipper, which all touch, are not."""
+    if not parts:
+        return []
+    label = clusters([pos[part.vertices] for part in parts], _ONE)
+    things = [[part for part, own in zip(parts, label, strict=True) if own == number] for number in np.unique(label)]
+    split: list[list[Part]] = []
+    for thing in things:
+        box = np.max([part.high for part in thing], axis=0) - np.min([part.low for part in thing], axis=0)
+        split += [thing] if box.max() <= _RIGID else [[part] for part in thing]
+    return split
 
 
 def _group(garment: Garment, parts: list[Part], anchors: np.ndarray, of_anchor: np.ndarray, of_rider: np.ndarray) -> Riders:
@@ -138,6 +151,10 @@ def _note(fitting: Fitting, kinds: _Kinds, wanted: Wanted, pos: np.ndarray) -> N
         other = "small_parts=leave_out leaves them out" if rides else "small_parts=ride keeps them"
         how = kept if rides else f"{'are' if many else 'is'} left out"
         fitting.guess("riding", len(kinds.rigid), f"{what} {how}", f"{other}, small_parts=simulate takes them for cloth")
+    if kinds.bent:
+        what = f"{_count(kinds.bent, 'long closed part')} on the cloth, as belts and cords are ({_places(kinds.bent)})"
+        how = "moved with it, outside the simulation" if rides else "left out"
+        fitting.guess("riding_bent", len(kinds.bent), f"{what}: {how}", "small_parts=simulate takes them for cloth")
     if kinds.sheets:
         count = _count(kinds.sheets, "sheet")
         what = f"{count} on the cloth, sewn to nothing, as pockets and labels are ({_places(kinds.sheets)})"

@@ -35,7 +35,7 @@ def choose(fitting: Fitting, wanted: Wanted, surface: np.ndarray) -> None:
     if _is_made(garment):
         return
     if not wanted.objects:
-        leave_body_out(fitting, metres_per_unit(garment.rest_pos, garment.faces, surface), surface)
+        leave_body_out(fitting, surface)
     _drop_duplicates(fitting)
     if wanted.shells == "auto":
         drop_copies(fitting)
