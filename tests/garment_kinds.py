@@ -353,6 +353,27 @@ def _glb(name: str, *objects: tuple[str, Callable[[], Mesh]]) -> Callable[[Path]
     return lambda folder: write_glb(folder / f"{name}.glb", [(own, mesh()) for own, mesh in objects])
 
 
+def _stitched(gap: float) -> Callable[[Path], Path]:
+    """Front and back, joined by lines between the vertices that belong together, as sewing threads of modelling programs."""
+
+    def write(folder: Path) -> Path:
+        (front, faces), (back, table) = halves(clean("tank"), gap)
+        half = lambda own: own[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)  # noqa: E731
+        rims = []
+        for own in (faces, table):
+            edges, times = np.unique(np.sort(half(own), axis=1), axis=0, return_counts=True)
+            rims.append(np.unique(edges[times == 1]))
+        shift = np.array([0.0, 0.0, gap])
+        dist = np.linalg.norm(front[rims[0]][:, None] - shift - back[rims[1]][None], axis=2)
+        pairs = [(rims[0][k], rims[1][n]) for k, n in enumerate(dist.argmin(axis=1)) if dist[k, n] < 1e-9]
+        text = obj_text([("", joined((front, faces), (back, table)))])
+        lines = [f"l {a + 1} {b + 1 + len(front)}" for a, b in pairs]
+        (folder / f"stitched{gap}.obj").write_text(text + "\n".join(lines) + "\n")
+        return folder / f"stitched{gap}.obj"
+
+    return write
+
+
 def _text(name: str, make: Callable[[Mesh], str], encoding: str) -> Callable[[Path], Path]:
     def write(folder: Path) -> Path:
         (folder / name).write_bytes(make(clean("tank")).encode(encoding))
@@ -434,6 +455,8 @@ KINDS: dict[str, Kind] = {
         _obj("panels_cm", lambda: joined(*quarters(_tank(), 3e-3)), 100.0), "rims of 4 pieces lie along each other"
     ),
     "front and back": Kind(_obj("halves", lambda: joined(*halves(_tank(), 4e-3))), "rims of 2 pieces lie along each other"),
+    "stitched panels": Kind(_stitched(0.016), "pairs of vertices that the file stitches"),
+    "stitches that are open": Kind(_stitched(0.1), "stitches are longer than 20 mm", pieces=2),
     "panels of other edges": Kind(_obj("uneven", _uneven_halves), "rims of 2 pieces lie along each other"),
     **{
         f"shell of {1e3 * thick:g} mm": Kind(

@@ -16,7 +16,7 @@ from hood.assets.files.folder_lock import is_occupied
 from hood.assets.files.index_list import read_indices
 from hood.assets.files.library import locate
 from hood.assets.formats.mesh_file import mesh_suffixes, read_mesh_file
-from hood.assets.garment.alterations import start_fitting
+from hood.assets.garment.alterations import Fitting, start_fitting
 from hood.assets.garment.binding import posed_body
 from hood.assets.garment.contents.sort_out import choose, mend
 from hood.assets.garment.contents.wanted import Wanted
@@ -99,11 +99,11 @@ def inspect_garment(
 
     ``wearer`` are the words of prepare that name this body, ``wanted`` is what is asked of a file of several things.
     """
-    finding = Finding(name, "garment", wearer=list(wearer))
+    finding, stitches = Finding(name, "garment", wearer=list(wearer)), None
     path, _ = locate_garment(name)
     if path.suffix.lower() in mesh_suffixes():
         mesh = read_mesh_file(path, split_polygons=True)
-        garment = garment_of_mesh(path, mesh)
+        garment, stitches = garment_of_mesh(path, mesh), mesh.stitches
         finding.kind = "garment mesh"
         if mesh.num_polygons:
             finding.problem(f"{mesh.num_polygons} faces have more than three corners", "triangulate=true, or prepare", "")
@@ -117,7 +117,7 @@ def inspect_garment(
     finding.facts |= _garment_facts(garment)
     defects = find_defects(garment.rest_pos, garment.faces)
     _describe_defects(finding, defects)
-    garment = _made(finding, garment, body, wanted or Wanted())
+    garment = _made(finding, start_fitting(garment, stitches), body, wanted or Wanted())
     if _is_suspect(finding, garment, body):
         return finding
     if isinstance(body, MeshMotion):
@@ -129,13 +129,13 @@ def inspect_garment(
     return finding
 
 
-def _made(finding: Finding, garment: Garment, body: Body | MeshMotion, wanted: Wanted) -> Garment:
+def _made(finding: Finding, fitting: Fitting, body: Body | MeshMotion, wanted: Wanted) -> Garment:
     """What a rollout makes of the file, told; the garment itself where it is one sheet."""
+    garment = fitting.garment
     if garment.bound:
         return garment
     surface = body.points(0) if isinstance(body, MeshMotion) else body.v_template
     finding.facts |= describe_objects(garment, surface)
-    fitting = start_fitting(garment)
     choose(fitting, wanted, surface)
     mend(fitting, wanted, surface)
     for what, fix in problems_of(finding.file, fitting.changes):

@@ -189,7 +189,7 @@ def _read(name: str) -> Fitting:
     bad = ~np.isfinite(garment.rest_pos).all(axis=1)
     if bad.any() or len(garment.faces) == 0:
         check_triangles(garment.rest_pos, garment.faces, str(path))
-    fitting = alterations.start_fitting(garment)
+    fitting = alterations.start_fitting(garment, mesh.stitches)
     fitting.note("split_polygons", mesh.num_polygons, f"split {mesh.num_polygons} polygons into triangles")
     fitting.note("joined", mesh.num_joined, f"joined {mesh.num_joined} vertices that {path.suffix[1:].upper()} files double")
     for note in mesh.notes:

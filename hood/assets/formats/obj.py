@@ -16,7 +16,8 @@ _NEW_LINE = re.compile(r"\r\n|\n|\r")
 
 
 def read_obj(path: Path) -> RawMesh:
-    """The polygons of all objects and groups of the file, whose names become panels; lines and points are passed over.
+    """The polygons of all objects and groups of the file, whose names become panels; lines become stitches, points are passed
+    over.
 
     Raises:
         Unreadable: a line that is not numbers, or an index out of range.
@@ -24,6 +25,7 @@ def read_obj(path: Path) -> RawMesh:
     tables: dict[str, list[list[float]]] = {"v": [], "vt": [], "vn": []}
     corners: list[tuple[int, int, int]] = []
     counts: list[int] = []
+    stitches: list[tuple[int, int]] = []
     names = _Names()
     # Not splitlines(), which also splits at signs that a name may hold.
     for number, line in enumerate(_NEW_LINE.split(read_text(path)), start=1):
@@ -38,6 +40,9 @@ def read_obj(path: Path) -> RawMesh:
                 corners.extend(_corner(word, sizes) for word in words[1:])
                 counts.append(len(words) - 1)
                 names.add_polygon()
+            elif words[0] == "l":
+                ends = [_corner(word, [len(tables["v"]), len(tables["vt"]), 0])[0] for word in words[1:]]
+                stitches.extend(zip(ends, ends[1:], strict=False))
             elif words[0] in _NAMED:
                 names.change(words[0], words[1:])
         except ValueError:
@@ -48,6 +53,7 @@ def read_obj(path: Path) -> RawMesh:
     pos, colours = _positions(tables["v"])
     table = np.array(corners, dtype=np.int64).reshape(-1, 3)
     mesh = RawMesh(pos, table[:, 0], np.array(counts, dtype=np.int64), colours)
+    mesh.stitches = np.array(stitches, dtype=np.int64).reshape(-1, 2) if stitches else None
     mesh.panels, notes = names.panels()
     mesh.notes.extend(notes)
     if tables["vt"] and (table[:, 1] >= 0).any():

@@ -49,7 +49,10 @@ def read_ply(path: Path) -> RawMesh:
     for name in ("vertex", "face"):
         if name not in columns:
             raise Unreadable(f"PLY without the element {name!r}")
-    return _mesh(columns["vertex"], columns["face"])
+    mesh = _mesh(columns["vertex"], columns["face"])
+    ends = _scalars(columns.get("edge", {}), ("vertex1", "vertex2"))
+    mesh.stitches = None if ends is None or not len(ends) else ends.astype(np.int64)
+    return mesh
 
 
 def _as_ascii(content: bytes) -> bytes:

@@ -34,6 +34,7 @@ class RawMesh:
     normals: np.ndarray | None = None  # (M, 3)
     normal_corners: np.ndarray | None = None  # (N,)
     panels: dict[str, np.ndarray] | None = None  # (P,) bool each: the polygons of a name
+    stitches: np.ndarray | None = None  # (S, 2) vertices that lines join: sewing threads of some programs
     notes: list[str] = field(default_factory=list)
 
 

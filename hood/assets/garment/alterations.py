@@ -33,6 +33,7 @@ class Fitting:
     file: Garment  # as it was read
     vertex_map: np.ndarray  # (V of the file,) present number of each vertex of the file; -1: removed
     changes: list[Change] = field(default_factory=list)
+    stitches: np.ndarray | None = None  # (S, 2) vertices of the file that its lines join
 
     def note(self, what: str, count: int, text: str, **details: Any) -> None:
         """Record a change of ``count`` things; nothing is recorded for none."""
@@ -68,9 +69,9 @@ class Change:
     fix: str = ""  # of a guess: what to do where it is wrong
 
 
-def start_fitting(garment: Garment) -> Fitting:
-    """A fitting of a garment as it was read."""
-    return Fitting(garment, garment, np.arange(len(garment.rest_pos)))
+def start_fitting(garment: Garment, stitches: np.ndarray | None = None) -> Fitting:
+    """A fitting of a garment as it was read, with the pairs (S, 2) of vertices that lines of its file join."""
+    return Fitting(garment, garment, np.arange(len(garment.rest_pos)), stitches=stitches)
 
 
 def place(fitting: Fitting, placement: Placement) -> None:

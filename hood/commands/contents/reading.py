@@ -34,16 +34,18 @@ def read_garment(name: str, wanted: Wanted, surface: np.ndarray, triangulate: bo
         ValueError: a file that cannot be read or simulated.
     """
     path, _ = locate_garment(name)
+    stitches = None
     if path.suffix.lower() not in mesh_suffixes():
         garment = load_garment(name, triangulate=triangulate)
         if garment.bound and not wanted.objects:
             return garment
     else:
-        garment = garment_of_mesh(path, read_mesh_file(path, triangulate))
+        mesh = read_mesh_file(path, triangulate)
+        garment, stitches = garment_of_mesh(path, mesh), mesh.stitches
         twice = repair.duplicate_faces(garment.faces)
         check_triangles(garment.rest_pos, garment.faces[~twice], str(path))
     _refuse_soup(garment)
-    fitting = start_fitting(garment)
+    fitting = start_fitting(garment, stitches)
     choose(fitting, wanted, surface)
     mend(fitting, wanted, surface)
     check_triangles(fitting.garment.rest_pos, fitting.garment.faces, str(path))

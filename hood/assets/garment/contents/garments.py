@@ -45,10 +45,14 @@ def tell_apart(fitting: Fitting, scale: float) -> None:
         piece[part.vertices] = large.index(name) if name in large else 0
     fitting.garment = replace(garment, name="+".join(large), piece=np.maximum(piece, 0))
     counts = ", ".join(f"{name} ({int((piece == number).sum())} vertices)" for number, name in enumerate(large))
-    fitting.guess(
-        "garments", len(large), f"the file holds {len(large)} garments, {counts}; they are worn as an outfit",
-        "objects=[…] chooses, layers=[…] orders them from the body outwards", names=large,
-    )  # fmt: skip
+    worn = {name for part, name in zip(parts, names, strict=True) if part.can_be_put_on}
+    if worn >= set(large):
+        what = f"the file holds {len(large)} garments, {counts}; they are worn as an outfit"
+        fix = "objects=[…] chooses, layers=[…] orders them from the body outwards"
+    else:
+        what = f"the file holds {len(large)} parts that hang together by nothing, {counts}; each is simulated by itself"
+        fix = "objects=[…] chooses, weld=0.01 sews rims up to 1 cm apart, pins=… hold what would fall"
+    fitting.guess("garments", len(large), what, fix, names=large)
 
 
 def _names(garment: Garment, parts: list[Part]) -> list[str]:

@@ -9,12 +9,13 @@ import numpy as np
 
 from hood.assets.garment.alterations import Fitting, keep_vertices
 from hood.assets.garment.contents.objects import num_openings
-from hood.assets.garment.contents.wanted import SEAM, Wanted
+from hood.assets.garment.contents.wanted import SEAM, THREAD, Wanted
 from hood.assets.garment.garment import Garment
 from hood.mesh import repair
 from hood.mesh.cut_edges import Cut, along, along_corners, cut_edges
 from hood.mesh.parts import Part, find_parts, part_labels
 from hood.mesh.seams import Facing, Rims, Seam, find_facing, find_rims
+from hood.mesh.topology import unique_edges
 
 
 def sew_panels(fitting: Fitting, wanted: Wanted, scale: float, open_edges: np.ndarray) -> None:
@@ -27,6 +28,28 @@ def sew_panels(fitting: Fitting, wanted: Wanted, scale: float, open_edges: np.nd
     for _ in range(2):  # what was sewn to its neighbours may then be sewn to itself
         if not _sew_once(fitting, gap, wanted.gap is not None, scale, open_edges):
             break
+
+
+def sew_stitches(fitting: Fitting, scale: float) -> None:
+    """Make one vertex, in the middle, of two on rims that a line of the file joins; lines along the mesh mean nothing."""
+    if fitting.stitches is None:
+        return
+    garment, ends = fitting.garment, fitting.vertex_map[fitting.stitches]
+    ends = ends[(ends >= 0).all(axis=1) & (ends[:, 0] != ends[:, 1])]
+    rims, known = find_rims(garment.faces).vertices, unique_edges(garment.faces)
+    key = np.array([len(garment.rest_pos), 1])
+    ends = ends[np.isin(ends, rims).all(axis=1) & ~np.isin(np.sort(ends, axis=1) @ key, known @ key)]
+    apart = scale * np.linalg.norm(garment.rest_pos[ends[:, 0]] - garment.rest_pos[ends[:, 1]], axis=1)
+    near = apart <= THREAD
+    if near.any():
+        _make_one(fitting, garment, ends[near])
+        fitting.note("stitches", int(near.sum()), f"sewed {int(near.sum())} pairs of vertices that the file stitches")
+    if not near.all():
+        fitting.guess(
+            "open_stitches", int((~near).sum()),
+            f"{int((~near).sum())} stitches are longer than {1e3 * THREAD:g} mm, one {apart.max():.2f} m, and are left open",
+            "drape the garment where it was made, until they are closed",
+        )  # fmt: skip
 
 
 def _sew_once(fitting: Fitting, gap: float, asked: bool, scale: float, open_edges: np.ndarray) -> bool:
@@ -83,7 +106,12 @@ def _close(fitting: Fitting, facing: Facing, rims: Rims) -> None:
     cut = cut_edges(garment.faces, count, rims.face[facing.cut[:, 1]], rims.corner[facing.cut[:, 1]], facing.at)
     garment = _with_cut(garment, cut)
     new = count + np.arange(len(facing.cut))
-    merged = repair.merge(len(garment.rest_pos), np.concatenate([facing.pairs, np.stack([facing.cut[:, 0], new], axis=1)]))
+    _make_one(fitting, garment, np.concatenate([facing.pairs, np.stack([facing.cut[:, 0], new], axis=1)]))
+
+
+def _make_one(fitting: Fitting, garment: Garment, pairs: np.ndarray) -> None:
+    """``garment`` with vertices that ``pairs`` (N, 2) join as one, in the middle of them."""
+    merged = repair.merge(len(garment.rest_pos), pairs)
     number = np.bincount(merged.vertex_map)
     middle = np.zeros((len(merged.kept), 3))
     np.add.at(middle, merged.vertex_map, garment.rest_pos)

@@ -10,7 +10,7 @@ from hood.assets.garment.alterations import Fitting, drop_faces, sew
 from hood.assets.garment.contents.garments import tell_apart
 from hood.assets.garment.contents.layers import drop_copies, to_one_layer
 from hood.assets.garment.contents.objects import choose_objects, leave_body_out
-from hood.assets.garment.contents.panels import sew_panels
+from hood.assets.garment.contents.panels import sew_panels, sew_stitches
 from hood.assets.garment.contents.small_parts import let_ride
 from hood.assets.garment.contents.wanted import Wanted
 from hood.assets.garment.garment import Garment
@@ -59,6 +59,7 @@ def mend(fitting: Fitting, wanted: Wanted, surface: np.ndarray | None, open_edge
     sides = np.zeros(0, dtype=np.int64) if open_edges is None else open_edges
     if wanted.sew:
         sew(fitting, None, fitting.at_present(sides))
+        sew_stitches(fitting, scale)
         _drop_collapsed(fitting)
     if wanted.shells == "auto":
         to_one_layer(fitting, scale)

@@ -10,6 +10,8 @@ SHELLS, SMALL_PARTS = ("auto", "keep"), ("ride", "leave_out", "simulate")
 FILE = "FILE"
 #: Rims of pattern pieces within this [m] are sewn: 5 mm, and what curves add to it.
 SEAM = 6e-3
+#: Stitches of a file are closed up to this length [m]: longer ones are of pieces that were never draped.
+THREAD = 0.02
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,8 @@ from hood.mesh.repair import duplicate_faces
 
 
 def sorted_out(path: Path, wanted: Wanted | None = None) -> Fitting:
-    fitting, wanted, surface = start_fitting(read(path)), wanted or Wanted(), load_body().v_template
+    mesh, wanted, surface = read_mesh_file(path, split_polygons=True), wanted or Wanted(), load_body().v_template
+    fitting = start_fitting(garment_of_mesh(path, mesh), mesh.stitches)
     choose(fitting, wanted, surface)
     mend(fitting, wanted, surface)
     return fitting
