@@ -190,12 +190,22 @@ def likely_orders(outfit: Outfit, pos: Tensor, obstacle: Obstacle | None) -> lis
             outside[over, under] += float((height > 0).sum() - (height < 0).sum())
             held = [bool(outfit.cloth.pinned[sheets[garment].vertices].any()) for garment in (under, over)]
             outside[over, under] += _HELD * len(height) * (held[0] - held[1])
-    if count > _PERMUTED:  # their orders are too many: the one by how many lie under each
-        return [tuple(np.argsort((outside - outside.T).sum(axis=1), kind="stable").tolist())]
+    if count > _PERMUTED:
+        return [_from_inside(np.maximum(outside - outside.T, 0.0))]
     return sorted(
         permutations(range(count)),
         key=lambda order: -sum(outside[over, under] - outside[under, over] for under, over in combinations(order, 2)),
     )
+
+
+def _from_inside(over: np.ndarray) -> tuple[int, ...]:
+    """An order of many garments, where all orders are too many to compare: next comes the one that lies least over those that are
+    left, by how much (C, C) each lies over each."""
+    left, order = list(range(len(over))), []
+    while left:
+        order.append(min(left, key=lambda one: float(over[one, left].sum())))
+        left.remove(order[-1])
+    return tuple(order)
 
 
 class _Match(NamedTuple):

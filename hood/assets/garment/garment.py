@@ -114,7 +114,7 @@ def load_garment(name: str | Path, triangulate: bool = False) -> Garment:
     path, entry = locate_garment(name)
     suffix = path.suffix.lower()
     if suffix == ".npz":
-        garment = Garment(path.stem, **read_fields(path))
+        garment = Garment(**{"name": path.stem, **read_fields(path)})
     elif suffix == ".pkl":
         garment = Garment(**read_reference_garment(path, entry))
     elif suffix in mesh_suffixes():

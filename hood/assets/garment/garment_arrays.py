@@ -32,13 +32,15 @@ _LEVEL = "coarse_edges_"
 _FASTENER = "fastener_"
 _PANEL = "panel_"
 _RIDER = "rider_"
+_NAMES = "piece_names"
 #: Tables of riders and their columns; 0: none.
 _RIDERS = {"pos": 3, "faces": 3, "group": 0, "anchors": 0, "anchor_group": 0}
 _SIZE_LIMIT = 2 << 30
 
 
 def read_fields(path: Path) -> dict[str, Any]:
-    """Arguments of :class:`hood.assets.garment.garment.Garment` from a garment ``.npz``.
+    """Arguments of :class:`hood.assets.garment.garment.Garment` from a garment ``.npz``; the name only where the file has names
+    for the garments of an outfit.
 
     Raises:
         ValueError: a field that does not fit the others; names the file, the field and its first bad row.
@@ -50,6 +52,14 @@ def read_fields(path: Path) -> dict[str, Any]:
         fields["bound_to"] = "default"
     elif "bound_to" in arrays and arrays["bound_to"].dtype.kind == "U" and arrays["bound_to"].size == 1:
         fields["bound_to"] = str(arrays["bound_to"].reshape(-1)[0])
+    names = arrays.get(_NAMES)
+    if (
+        names is not None
+        and names.dtype.kind == "U"
+        and "piece" in fields
+        and len(names) == fields["piece"].max(initial=-1) + 1
+    ):
+        fields["name"] = "+".join(names.tolist())
     return fields
 
 
@@ -114,8 +124,11 @@ def as_arrays(fields: Mapping[str, Any]) -> dict[str, Any]:
 
 def write_fields(path: Path, fields: dict[str, Any]) -> None:
     """Write a garment ``.npz`` that :func:`read_fields` reads back; fields that are None are left out."""
-    content = io.BytesIO()
-    np.savez_compressed(content, **as_arrays(fields))
+    content, arrays = io.BytesIO(), as_arrays(fields)
+    names, piece = str(fields["name"]).split("+"), fields.get("piece")
+    if piece is not None and len(names) == piece.max(initial=-1) + 1:
+        arrays[_NAMES] = np.array(names)
+    np.savez_compressed(content, **arrays)
     write_atomically(path, content.getvalue())
 
 
