@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
-from hood.assets.garment.alterations import Fitting
+from hood.assets.garment.contents.fitting import Fitting
 from hood.assets.garment.fasteners import ROOM, fasten, with_room
 from hood.commands.garments import names_of
 from hood.config import ConfigError, plain

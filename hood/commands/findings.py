@@ -16,8 +16,8 @@ from hood.assets.files.folder_lock import is_occupied
 from hood.assets.files.index_list import read_indices
 from hood.assets.files.library import locate
 from hood.assets.formats.mesh_file import mesh_suffixes, read_mesh_file
-from hood.assets.garment.alterations import Fitting, start_fitting
 from hood.assets.garment.binding import posed_body
+from hood.assets.garment.contents.fitting import Fitting, start_fitting
 from hood.assets.garment.contents.sort_out import choose, mend
 from hood.assets.garment.contents.wanted import Wanted
 from hood.assets.garment.fit_search import Asked
@@ -32,6 +32,7 @@ from hood.assets.motion.up_axis import bearing_notice, find_bearing
 from hood.assets.pickles.unpickle import load_pickle
 from hood.commands.beside_mesh import place_beside_mesh
 from hood.commands.common import read_model
+from hood.commands.contents.reading import meant_by
 from hood.commands.contents.report import describe_made, describe_objects, problems_of
 from hood.commands.describe_place import describe_place
 from hood.commands.guarding import summarise_guard
@@ -100,7 +101,7 @@ def inspect_garment(
     ``wearer`` are the words of prepare that name this body, ``wanted`` is what is asked of a file of several things.
     """
     finding, stitches = Finding(name, "garment", wearer=list(wearer)), None
-    path, _ = locate_garment(name)
+    path, entry = locate_garment(name)
     if path.suffix.lower() in mesh_suffixes():
         mesh = read_mesh_file(path, split_polygons=True)
         garment, stitches = garment_of_mesh(path, mesh), mesh.stitches
@@ -117,7 +118,7 @@ def inspect_garment(
     finding.facts |= _garment_facts(garment)
     defects = find_defects(garment.rest_pos, garment.faces)
     _describe_defects(finding, defects)
-    garment = _made(finding, start_fitting(garment, stitches), body, wanted or Wanted())
+    garment = _made(finding, start_fitting(garment, stitches), body, meant_by(entry, path, wanted or Wanted()))
     if _is_suspect(finding, garment, body):
         return finding
     if isinstance(body, MeshMotion):
@@ -204,9 +205,10 @@ def _describe_defects(finding: Finding, defects: Defects) -> None:
     if defects.slivers:
         finding.problem(f"{defects.slivers} faces are slivers, stiff and inaccurate", "remesh the garment where it was made")
     if defects.non_manifold_edges:
+        first = ", ".join("–".join(map(str, edge)) for edge in defects.crowded_edges)
         finding.problem(
-            f"{defects.non_manifold_edges} edges have three or more faces",
-            "legal (a sewn-in layer); separate the layers if they are none",
+            f"{defects.non_manifold_edges} edges have three or more faces, such as those of the vertices {first}",
+            "legal (a sewn-in layer); separate the layers there if they are none",
         )
 
 

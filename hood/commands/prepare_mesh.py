@@ -18,15 +18,15 @@ import numpy as np
 from omegaconf import DictConfig
 
 from hood.assets.garment import alterations
-from hood.assets.garment.alterations import Fitting
 from hood.assets.garment.binding import push_out, signed_distances
+from hood.assets.garment.contents.fitting import Fitting
 from hood.assets.garment.contents.sort_out import choose, mend
-from hood.assets.garment.garment import Garment, save_garment
+from hood.assets.garment.garment import Garment, locate_garment, save_garment
 from hood.assets.garment.outfit import join_garments
 from hood.assets.garment.pins import pin_mask, pin_numbers
 from hood.assets.garment.suspicions import suspect_kind, suspect_place, suspect_seams
 from hood.commands.common import prepare_folder
-from hood.commands.contents.reading import said
+from hood.commands.contents.reading import meant_by, said
 from hood.commands.contents.wanted import wanted_of
 from hood.commands.fastening import fasten_as_asked, give_room
 from hood.commands.garments import checked_pins, heed
@@ -74,7 +74,8 @@ def _fit(fitting: Fitting, name: str, config: DictConfig, motion: MeshMotion) ->
     """One garment on the mesh: in metres, where it fits, sewn, clean, outside the skin; where it fits nowhere, auto leaves it
     where it is, for the unit."""
     garment, surface, clearance = fitting.garment, motion.points(0), float(config.clearance)
-    wanted = wanted_of(config)
+    path, entry = locate_garment(name)
+    wanted = meant_by(entry, path, wanted_of(config))
     choose(fitting, wanted, surface)
     garment = fitting.garment
     heed(garment.name, suspect_kind(garment.rest_pos, garment.faces, surface))

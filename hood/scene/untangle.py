@@ -199,8 +199,8 @@ def likely_orders(outfit: Outfit, pos: Tensor, obstacle: Obstacle | None) -> lis
 
 
 def _from_inside(over: np.ndarray) -> tuple[int, ...]:
-    """An order of many garments, where all orders are too many to compare: next comes the one that lies least over those that are
-    left, by how much (C, C) each lies over each."""
+    """An order of many garments, where all orders are too many to compare: next comes the one that lies least over those left,
+    by how much (C, C) each lies over each."""
     left, order = list(range(len(over))), []
     while left:
         order.append(min(left, key=lambda one: float(over[one, left].sum())))

@@ -31,8 +31,8 @@ def parts_by_name(num_vertices: int, faces: np.ndarray) -> dict[str, np.ndarray]
     return {f"{PART}{number + 1}": label == number for number in range(int(label.max(initial=-1)) + 1)}
 
 
-def read_object(path: Path, mesh: MeshFile, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) and triangles (F, 3) of one object, group, material or part of a file.
+def object_alone(path: Path, mesh: MeshFile, name: str) -> MeshFile:
+    """One object, group, material or part of a file, by itself: its vertices and triangles.
 
     Raises:
         ValueError: there is none of that name; says which there are.
@@ -42,4 +42,4 @@ def read_object(path: Path, mesh: MeshFile, name: str) -> tuple[np.ndarray, np.n
     if found is None:
         raise ValueError(f"{path}: no object, group, material or part {name!r}; there are {listed(reversed(list(known)))}")
     used, corners = np.unique(mesh.faces[known[found]], return_inverse=True)
-    return mesh.pos[used], corners.reshape(-1, 3)
+    return MeshFile(mesh.pos[used], corners.reshape(-1, 3))

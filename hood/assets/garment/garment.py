@@ -9,6 +9,7 @@ import numpy as np
 
 from hood.assets.files.library import locate, require_name, unknown_suffix
 from hood.assets.formats.mesh_file import MeshFile, mesh_suffixes, read_mesh_file
+from hood.assets.formats.objects import object_alone, split_object
 from hood.assets.garment.garment_arrays import read_fields, write_fields
 from hood.assets.garment.reference_garments import read_reference_garment
 from hood.mesh.quality import check_triangles
@@ -95,7 +96,8 @@ def load_garment(name: str | Path, triangulate: bool = False) -> Garment:
 
     Args:
         name: an embedded name, a garment ``.npz``, a mesh file (OBJ, PLY, STL, GLB, OFF) in metres around the body's T-pose,
-            or a ``.pkl`` of the reference implementation (``garments_dict.pkl:name`` chooses one of several).
+            or a ``.pkl`` of the reference implementation. A name behind the file's chooses one of several
+            (``garments_dict.pkl:dress``, ``scene.obj:tank``; of a mesh file without its texture).
         triangulate: split faces of four and more corners instead of refusing them.
 
     Returns:
@@ -118,7 +120,8 @@ def load_garment(name: str | Path, triangulate: bool = False) -> Garment:
     elif suffix == ".pkl":
         garment = Garment(**read_reference_garment(path, entry))
     elif suffix in mesh_suffixes():
-        garment = garment_of_mesh(path, read_mesh_file(path, triangulate))
+        mesh = read_mesh_file(path, triangulate)
+        garment = garment_of_mesh(path, mesh if entry is None else object_alone(path, mesh, entry))
     else:
         known = ", ".join((*GARMENT_SUFFIXES, *mesh_suffixes()))
         raise ValueError(f"{path}: {unknown_suffix(path, 'garment')}; give one of {known}")
@@ -140,12 +143,13 @@ def save_garment(path: Path, garment: Garment) -> None:
 
 
 def locate_garment(name: str | Path) -> tuple[Path, str | None]:
-    """File of a garment, and which of its entries is meant (``garments_dict.pkl:dress``)."""
+    """File of a garment, and which of its entries is meant (``garments_dict.pkl:dress``, ``scene.obj:tank``)."""
     require_name("garments", name)
     head, colon, entry = str(name).rpartition(":")
     if colon and head.lower().endswith(".pkl"):
         return locate("garments", head), entry
-    return locate("garments", name), None
+    path, entry_of_mesh = split_object(name)
+    return (locate("garments", name), None) if entry_of_mesh is None else (locate("garments", str(path)), entry_of_mesh)
 
 
 def check_levels(garment: Garment, where: str) -> None:

@@ -16,7 +16,7 @@ from hood.assets.files.library import DATA_FOLDER
 from hood.assets.formats import vertex_files
 from hood.assets.formats.gltf_animation import read_gltf_animation
 from hood.assets.formats.mesh_file import read_mesh_file
-from hood.assets.formats.objects import read_object, split_object
+from hood.assets.formats.objects import object_alone, split_object
 from hood.assets.formats.point_cache import CACHE_SUFFIX, caches, read_point_cache
 from hood.assets.formats.vertex_files import FACE_KEYS, FOLDER_SUFFIXES, VERTEX_KEYS, VertexFile
 from hood.assets.motion.mesh_sequence import MeshSequence, loop_mesh, resample_mesh, trim_mesh, turn_mesh
@@ -122,7 +122,8 @@ def _read(path: Path, fps: float, animation: int | str, parts: Sequence[str], en
         return VertexFile(scene.verts, scene.faces, fps, scene.transforms, scene.rest if skinned else None, scene.weights)
     if suffix in _STILL_SUFFIXES:
         mesh = read_mesh_file(path, True)
-        return VertexFile(mesh.pos, mesh.faces) if entry is None else VertexFile(*read_object(path, mesh, entry))
+        mesh = mesh if entry is None else object_alone(path, mesh, entry)
+        return VertexFile(mesh.pos, mesh.faces)
     readers = {".npz": vertex_files.read_vertex_archive, ".pkl": vertex_files.read_vertex_pickle}
     readers |= dict.fromkeys(_H5_SUFFIXES, vertex_files.read_vertex_h5)
     if suffix not in readers:

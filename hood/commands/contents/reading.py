@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 
 from hood.assets.files.doubt import Doubt
 from hood.assets.formats.mesh_file import mesh_suffixes, read_mesh_file
-from hood.assets.garment.alterations import Change, start_fitting
+from hood.assets.garment.contents.fitting import Change, start_fitting
 from hood.assets.garment.contents.sort_out import choose, mend
 from hood.assets.garment.contents.wanted import FILE, Wanted
 from hood.assets.garment.garment import Garment, garment_of_mesh, load_garment, locate_garment
@@ -33,8 +34,8 @@ def read_garment(name: str, wanted: Wanted, surface: np.ndarray, triangulate: bo
     Raises:
         ValueError: a file that cannot be read or simulated.
     """
-    path, _ = locate_garment(name)
-    stitches = None
+    path, entry = locate_garment(name)
+    stitches, wanted = None, meant_by(entry, path, wanted)
     if path.suffix.lower() not in mesh_suffixes():
         garment = load_garment(name, triangulate=triangulate)
         if garment.bound and not wanted.objects:
@@ -51,6 +52,12 @@ def read_garment(name: str, wanted: Wanted, surface: np.ndarray, triangulate: bo
     check_triangles(fitting.garment.rest_pos, fitting.garment.faces, str(path))
     tell(path, fitting.changes)
     return fitting.garment
+
+
+def meant_by(entry: str | None, path: Path, wanted: Wanted) -> Wanted:
+    """What is asked of a file, one object of which may stand behind its name."""
+    of_mesh = entry is not None and path.suffix.lower() in mesh_suffixes()
+    return replace(wanted, objects=(str(entry),)) if of_mesh else wanted
 
 
 def _refuse_soup(garment: Garment) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hood.assets.garment.alterations import Change
+from hood.assets.garment.contents.fitting import Change
 from hood.assets.garment.contents.objects import Item, items_of, num_openings
 from hood.assets.garment.contents.sort_out import metres_per_unit
 from hood.assets.garment.contents.wanted import FILE

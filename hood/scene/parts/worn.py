@@ -44,3 +44,15 @@ def name_part(scene: Scene, part: Part, num_parts: int) -> str:
     outfit = scene.outfit
     of = "" if outfit is None else f" of {outfit.names[int(outfit.piece[part.vertices[0]])]!r}"
     return f"part {part.number}{of} ({len(part.vertices)} vertices from {int(part.vertices[0])} on, at {middle} m)"
+
+
+def worst_part(scene: Scene, pos: np.ndarray) -> str:
+    """The part with the longest stretched edge at ``pos`` (V, 3), in words for a message; "" where there is one alone."""
+    parts = find_parts(scene.garment.rest_pos, scene.garment.faces)
+    edges = scene.cloth.edges.cpu().numpy()
+    if len(parts) == 1 or not len(edges):
+        return ""
+    rest = scene.cloth.rest_pos.double().cpu().numpy()
+    now, before = (np.linalg.norm(table[edges[:, 0]] - table[edges[:, 1]], axis=1) for table in (pos, rest))
+    vertex = edges[int(np.argmax(now / np.maximum(before, 1e-12))), 0]
+    return next(name_part(scene, part, len(parts)) for part in parts if vertex in part.vertices)

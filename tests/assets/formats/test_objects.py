@@ -9,7 +9,8 @@ import pytest
 from garment_kinds import ply_text, write_glb, write_objects
 
 from hood.assets.formats.mesh_file import read_mesh_file
-from hood.assets.formats.objects import parts_by_name, read_object, split_object
+from hood.assets.formats.objects import object_alone, parts_by_name, split_object
+from hood.assets.garment.garment import load_garment
 from hood.assets.motion.animated_mesh import body_kind, load_mesh_sequence
 from hood.testing import cylinder, grid
 
@@ -31,11 +32,12 @@ def test_a_name_behind_a_file_is_that_of_an_object(tmp_path: Path) -> None:
     assert body_kind(f"{path}:tube") == "mesh"
     mesh = read_mesh_file(path)
     for name in ("Röckchen", "Roeckchen", "part_1"):
-        pos, faces = read_object(path, mesh, name)
-        np.testing.assert_allclose(pos, _SHEET[0])
-        assert np.array_equal(faces, _SHEET[1])
+        alone = object_alone(path, mesh, name)
+        np.testing.assert_allclose(alone.pos, _SHEET[0])
+        assert np.array_equal(alone.faces, _SHEET[1])
+    np.testing.assert_allclose(load_garment(f"{path}:tube").rest_pos, _TUBE[0], atol=1e-9)
     with pytest.raises(ValueError, match="no object, group, material or part 'hat'; there are "):
-        read_object(path, mesh, "hat")
+        object_alone(path, mesh, "hat")
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".glb"])

@@ -134,17 +134,16 @@ def test_pins_of_panels_are_those_of_the_file() -> None:
     assert np.ptp(heights) < 5e-3
 
 
-@pytest.mark.parametrize("name", ["two garments by o", "two garments in glTF"])
-def test_two_garments_of_a_file_are_an_outfit(name: str, tmp_path: Path) -> None:
+def test_two_garments_of_a_file_are_an_outfit(tmp_path: Path) -> None:
     """Taken apart before frame 0, as two files are, and in the order that is asked for."""
-    path = KINDS[name].write(tmp_path)
+    path = KINDS["two garments by o"].write(tmp_path)
     data, said, doubts = run(path, "layers=[skirt,tank]")
     assert data.attributes["garment"] == "tank+skirt"
     assert "holds 2 garments" in str(doubts[0])
     assert any("from the body outwards: skirt, tank" in sentence for sentence in said)
     assert set(data.still["piece"].tolist()) == {0, 1}
-    alone = run(path, "objects=[skirt]")[0]
-    assert len(alone.rest_pos) == len(clean("skirt")[0])
+    for words in ((path, "objects=[skirt]"), (f"{path}:skirt",)):
+        assert len(run(*words, "settle=paper", "num_frames=1")[0].rest_pos) == len(clean("skirt")[0])
 
 
 def test_an_avatar_of_the_file_can_be_the_body(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

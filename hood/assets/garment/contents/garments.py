@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from hood.assets.formats.objects import PART
-from hood.assets.garment.alterations import Fitting
+from hood.assets.garment.contents.fitting import Fitting
 from hood.assets.garment.garment import Garment
 from hood.mesh.parts import Part, find_parts
 

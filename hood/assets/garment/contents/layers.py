@@ -6,7 +6,8 @@ from itertools import combinations
 
 import numpy as np
 
-from hood.assets.garment.alterations import Fitting, drop_faces
+from hood.assets.garment.alterations import drop_faces
+from hood.assets.garment.contents.fitting import Fitting
 from hood.assets.garment.contents.objects import SMALL, THICKEST
 from hood.mesh.parts import Part, find_parts
 from hood.mesh.shells import find_shell, paired_sheet, same_sheet

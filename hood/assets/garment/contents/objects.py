@@ -9,8 +9,9 @@ import numpy as np
 from hood.assets.files.folded import meant
 from hood.assets.files.guarded import listed
 from hood.assets.formats.objects import parts_by_name
-from hood.assets.garment.alterations import Fitting, drop_faces
+from hood.assets.garment.alterations import drop_faces
 from hood.assets.garment.binding import signed_distances
+from hood.assets.garment.contents.fitting import Fitting
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.suspicions import body_of
 from hood.assets.garment.units import UNITS

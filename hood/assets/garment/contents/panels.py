@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from hood.assets.garment.alterations import Fitting, keep_vertices
+from hood.assets.garment.alterations import keep_vertices
+from hood.assets.garment.contents.fitting import Fitting
 from hood.assets.garment.contents.objects import num_openings
 from hood.assets.garment.contents.wanted import SEAM, THREAD, Wanted
 from hood.assets.garment.garment import Garment

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from hood.assets.garment.alterations import Fitting, drop_faces
+from hood.assets.garment.alterations import drop_faces
+from hood.assets.garment.contents.fitting import Fitting
 from hood.assets.garment.contents.objects import SMALL, num_openings
 from hood.assets.garment.contents.wanted import Wanted
 from hood.assets.garment.garment import Garment

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from hood.assets.garment.alterations import Fitting, drop_faces, sew
+from hood.assets.garment.alterations import drop_faces, sew
+from hood.assets.garment.contents.fitting import Fitting
 from hood.assets.garment.contents.garments import tell_apart
 from hood.assets.garment.contents.layers import drop_copies, to_one_layer
 from hood.assets.garment.contents.objects import choose_objects, leave_body_out

@@ -25,7 +25,7 @@ from scipy.spatial import cKDTree
 
 from hood.assets.body.load import load_body
 from hood.assets.formats.mesh_file import read_mesh_file
-from hood.assets.garment.alterations import Fitting, start_fitting
+from hood.assets.garment.contents.fitting import Fitting, start_fitting
 from hood.assets.garment.contents.objects import items_of
 from hood.assets.garment.contents.sort_out import choose, mend, metres_per_unit
 from hood.assets.garment.contents.wanted import Wanted

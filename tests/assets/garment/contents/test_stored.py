@@ -11,7 +11,7 @@ from garment_kinds import KINDS
 
 from hood.assets.body.load import load_body
 from hood.assets.formats.mesh_file import read_mesh_file
-from hood.assets.garment.alterations import start_fitting
+from hood.assets.garment.contents.fitting import start_fitting
 from hood.assets.garment.contents.sort_out import mend
 from hood.assets.garment.contents.wanted import Wanted
 from hood.assets.garment.garment import Garment, garment_of_mesh, load_garment, save_garment
