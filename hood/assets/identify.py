@@ -15,6 +15,7 @@ from hood.assets.files.h5_links import own_group
 from hood.assets.files.library import names, nearest
 from hood.assets.formats.gltf import read_gltf
 from hood.assets.formats.mesh_file import mesh_suffixes
+from hood.assets.formats.objects import split_object
 from hood.assets.formats.point_cache import CACHE_SUFFIX
 from hood.assets.garment.reference_garments import garment_names
 from hood.assets.motion.animated_mesh import body_kind
@@ -47,7 +48,7 @@ def identify(name: str) -> str:
         if name in names(folder):
             return kind
     head, colon, _ = name.rpartition(":")
-    path = Path(head if colon and head.lower().endswith(".pkl") else name).expanduser()
+    path = Path(head).expanduser() if colon and head.lower().endswith(".pkl") else split_object(name)[0]
     if not path.exists():
         near = nearest(name, [known for folder in _EMBEDDED for known in names(folder)])
         hint = f"; did you mean {near}?" if near else ""

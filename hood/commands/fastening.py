@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
-from hood.assets.garment.alterations import Fitting
+from hood.assets.garment.contents.fitting import Fitting
 from hood.assets.garment.fasteners import ROOM, fasten, with_room
 from hood.commands.garments import names_of
 from hood.config import ConfigError, plain
@@ -22,7 +22,7 @@ def fasten_as_asked(fitting: Fitting, config: DictConfig) -> np.ndarray:
         ValueError: a row that the garment cannot have; names it.
     """
     fitting.garment, pairs = fasten(fitting.garment, _rows(config))
-    return pairs
+    return fitting.in_file(pairs)
 
 
 def give_room(fitting: Fitting, pairs: np.ndarray) -> None:

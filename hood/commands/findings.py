@@ -17,6 +17,9 @@ from hood.assets.files.index_list import read_indices
 from hood.assets.files.library import locate
 from hood.assets.formats.mesh_file import mesh_suffixes, read_mesh_file
 from hood.assets.garment.binding import posed_body
+from hood.assets.garment.contents.fitting import Fitting, start_fitting
+from hood.assets.garment.contents.sort_out import choose, mend
+from hood.assets.garment.contents.wanted import Wanted
 from hood.assets.garment.fit_search import Asked
 from hood.assets.garment.garment import Garment, garment_of_mesh, load_garment, locate_garment
 from hood.assets.garment.pins import opening_names
@@ -27,6 +30,8 @@ from hood.assets.motion.poses import arms_down
 from hood.assets.pickles.unpickle import load_pickle
 from hood.commands.beside_mesh import place_beside_mesh
 from hood.commands.common import read_model
+from hood.commands.contents.reading import meant_by
+from hood.commands.contents.report import describe_made, describe_objects, problems_of
 from hood.commands.describe_place import describe_place
 from hood.commands.guarding import summarise_guard
 from hood.commands.output_fps import summarise_rate
@@ -83,16 +88,22 @@ def unreadable(name: str, kind: str, error: Exception) -> Finding:
     return Finding(name, kind, problems=[(sentence.removeprefix(f"{name}: "), "")])
 
 
-def inspect_garment(name: str, body: Body | MeshMotion, wearer: Sequence[str], betas: np.ndarray | None = None) -> Finding:
+def inspect_garment(
+    name: str,
+    body: Body | MeshMotion,
+    wearer: Sequence[str],
+    betas: np.ndarray | None = None,
+    wanted: Wanted | None = None,
+) -> Finding:
     """A garment file beside ``body``: a model of shape ``betas`` in its T-pose, or a mesh in its first frame.
 
-    ``wearer`` are the words of prepare that name this body.
+    ``wearer`` are the words of prepare that name this body, ``wanted`` is what is asked of a file of several things.
     """
-    finding = Finding(name, "garment", wearer=list(wearer))
-    path, _ = locate_garment(name)
+    finding, stitches = Finding(name, "garment", wearer=list(wearer)), None
+    path, entry = locate_garment(name)
     if path.suffix.lower() in mesh_suffixes():
         mesh = read_mesh_file(path, split_polygons=True)
-        garment = garment_of_mesh(path, mesh)
+        garment, stitches = garment_of_mesh(path, mesh), mesh.stitches
         finding.kind = "garment mesh"
         if mesh.num_polygons:
             finding.problem(f"{mesh.num_polygons} faces have more than three corners", "triangulate=true, or prepare", "")
@@ -106,6 +117,7 @@ def inspect_garment(name: str, body: Body | MeshMotion, wearer: Sequence[str], b
     finding.facts |= _garment_facts(garment)
     defects = find_defects(garment.rest_pos, garment.faces)
     _describe_defects(finding, defects)
+    garment = _made(finding, start_fitting(garment, stitches), body, meant_by(entry, path, wanted or Wanted()))
     if _is_suspect(finding, garment, body):
         return finding
     if isinstance(body, MeshMotion):
@@ -115,6 +127,21 @@ def inspect_garment(name: str, body: Body | MeshMotion, wearer: Sequence[str], b
     else:
         _place_beside(finding, garment, body, np.zeros(10) if betas is None else betas)
     return finding
+
+
+def _made(finding: Finding, fitting: Fitting, body: Body | MeshMotion, wanted: Wanted) -> Garment:
+    """What a rollout makes of the file, told; the garment itself where it is one sheet."""
+    garment = fitting.garment
+    if garment.bound:
+        return garment
+    surface = body.points(0) if isinstance(body, MeshMotion) else body.v_template
+    finding.facts |= describe_objects(garment, surface)
+    choose(fitting, wanted, surface)
+    mend(fitting, wanted, surface)
+    for what, fix in problems_of(finding.file, fitting.changes):
+        finding.problem(what, fix, "")
+    finding.facts |= describe_made(fitting.garment)
+    return fitting.garment
 
 
 def _stiffer(garment: Garment) -> str | None:
@@ -177,9 +204,10 @@ def _describe_defects(finding: Finding, defects: Defects) -> None:
     if defects.slivers:
         finding.problem(f"{defects.slivers} faces are slivers, stiff and inaccurate", "remesh the garment where it was made")
     if defects.non_manifold_edges:
+        first = ", ".join("–".join(map(str, edge)) for edge in defects.crowded_edges)
         finding.problem(
-            f"{defects.non_manifold_edges} edges have three or more faces",
-            "legal (a sewn-in layer); separate the layers if they are none",
+            f"{defects.non_manifold_edges} edges have three or more faces, such as those of the vertices {first}",
+            "legal (a sewn-in layer); separate the layers there if they are none",
         )
 
 

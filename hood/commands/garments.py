@@ -10,12 +10,15 @@ from typing import Any
 
 import numpy as np
 
+from hood.assets.body.load import load_body
 from hood.assets.garment.alterations import OPENING, SHORT, join_short_edges, part_open_seams, turn_flat_faces
-from hood.assets.garment.garment import Garment, load_garment
+from hood.assets.garment.contents.wanted import Wanted
+from hood.assets.garment.garment import Garment
 from hood.assets.garment.outfit import join_garments
 from hood.assets.garment.pins import pin_mask
 from hood.assets.garment.suspicions import Suspicion, suspect_kind, suspect_seams
 from hood.assets.garment.units import require_metres, used
+from hood.commands.contents.reading import read_garment
 from hood.config import ConfigError, brief, plain
 from hood.mesh.caps import FLAT
 from hood.scene.motion import BodyMotion, Motion
@@ -34,13 +37,16 @@ def names_of(given: Any, key: str = "garment") -> list[str]:
     return [str(name) for name in names]
 
 
-def read_outfit(given: Any, motion: Motion, triangulate: bool = False, pins: Any = None) -> Garment:
+def read_outfit(
+    given: Any, motion: Motion, triangulate: bool = False, pins: Any = None, wanted: Wanted | None = None
+) -> Garment:
     """The garment or garments named by a config value, as one garment that can follow ``motion``.
 
     Args:
         given: a name, a file, a list of them, or a garment that is read already.
         triangulate: split polygons of mesh files instead of refusing them.
         pins: what is held instead of the files' own pins, see :func:`hood.assets.garment.pins.pin_mask`; None: the files' own.
+        wanted: what is asked of files that are not one sheet of cloth; None: what is usual.
 
     Raises:
         ValueError: a garment that cannot be read, is not in metres or does not fit, or pins it does not have.
@@ -48,7 +54,8 @@ def read_outfit(given: Any, motion: Motion, triangulate: bool = False, pins: Any
     if isinstance(given, Garment):
         garments = [given]
     else:
-        garments = [load_garment(name, triangulate=triangulate) for name in names_of(given)]
+        beside, wanted = _measured_against(motion), wanted or Wanted()
+        garments = [read_garment(name, wanted, beside, triangulate) for name in names_of(given)]
     for garment in garments:
         if not garment.bound:
             heed(garment.name, suspect_seams(garment.rest_pos, garment.faces))
@@ -67,6 +74,13 @@ def read_outfit(given: Any, motion: Motion, triangulate: bool = False, pins: Any
         return outfit
     body = motion.body if isinstance(motion, BodyMotion) else None
     return replace(outfit, pinned=pin_mask(checked_pins(pins), outfit, body))
+
+
+def _measured_against(motion: Motion) -> np.ndarray:
+    """(W, 3) m: the body that says how large a garment may be; the default one where there is none."""
+    if motion.num_vertices:
+        return motion.surface(0, motion.translation[0]).double().cpu().numpy()
+    return load_body("default").v_template
 
 
 def as_simulated(garment: Garment) -> Garment:

@@ -17,6 +17,7 @@ from hood.assets.body.load import load_body
 from hood.assets.motion.animated_mesh import NO_BODY, body_kind
 from hood.assets.motion.axes import UP_AXES
 from hood.commands import findings
+from hood.commands.contents.wanted import wanted_of
 from hood.commands.findings import Finding
 from hood.commands.garments import read_outfit, shape_coefficients
 from hood.commands.inspecting.motion_finding import inspect_motion
@@ -103,7 +104,7 @@ def _inspect(known: Finding, beside: str, config: DictConfig) -> Finding:
 def _read(name: str, kind: str, beside: str, config: DictConfig) -> Finding:
     if kind == kinds.GARMENT:
         betas = None if config.betas is None else shape_coefficients(config.betas)
-        return findings.inspect_garment(name, _body(beside, config), _wearer(beside, config), betas)
+        return findings.inspect_garment(name, _body(beside, config), _wearer(beside, config), betas, wanted_of(config))
     if kind == kinds.MOVING_MESH:
         return findings.inspect_moving_mesh(name, _options(config))
     if kind == kinds.MOTION:
@@ -156,7 +157,7 @@ def _fit(found: list[Finding], body: str, config: DictConfig) -> dict[str, Any] 
     try:
         with heard(aloud=False):  # what single files are warned about stands with them
             performed = load_motion(body, motion, _options(config))
-            scene = dress(read_outfit(garments, performed, triangulate=True), performed)
+            scene = dress(read_outfit(garments, performed, triangulate=True, wanted=wanted_of(config)), performed)
         misplaced = misplacement(scene, on_meshes=True)
         skinned, start = fit_figures(scene, settled=False), fit_figures(scene)
     except (ValueError, OSError) as error:

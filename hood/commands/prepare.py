@@ -18,8 +18,9 @@ from hood.assets.body.load import load_body
 from hood.assets.files.library import locate
 from hood.assets.formats.mesh_file import mesh_suffixes, read_mesh_file
 from hood.assets.garment import alterations
-from hood.assets.garment.alterations import Fitting
 from hood.assets.garment.binding import PosedBody, bind_garment, posed_body
+from hood.assets.garment.contents.fitting import Fitting, start_fitting
+from hood.assets.garment.contents.sort_out import choose, mend
 from hood.assets.garment.garment import Garment, garment_of_mesh, load_garment, locate_garment, save_garment
 from hood.assets.garment.outfit import join_garments
 from hood.assets.garment.pins import pin_mask, pin_numbers
@@ -31,6 +32,8 @@ from hood.assets.motion.load import load_sequence
 from hood.assets.motion.poses import POSE_SUFFIXES, arms_down, read_pose
 from hood.assets.motion.sequence import PoseSequence
 from hood.commands.common import prepare_folder
+from hood.commands.contents.reading import meant_by, said
+from hood.commands.contents.wanted import wanted_of
 from hood.commands.fastening import fasten_as_asked, give_room
 from hood.commands.garments import checked_pins, heed, names_of, shape_coefficients
 from hood.commands.motion import check_rate
@@ -126,14 +129,17 @@ def _mesh_target(config: DictConfig) -> Path:
 
 def _fit(name: str, config: DictConfig, body: Body, betas: np.ndarray) -> _Fitted:
     """One garment, read, repaired, put on and bound."""
-    fitting = _read(name)
+    path, entry = locate_garment(name)
+    fitting, wanted = _read(name), meant_by(entry, path, wanted_of(config))
+    choose(fitting, wanted, body.v_template)
     if not fitting.garment.bound:
         heed(fitting.garment.name, suspect_kind(fitting.garment.rest_pos, fitting.garment.faces, body.v_template))
     tolerance = None if str(config.weld) == "none" else _number(config, "weld", "auto")
     posed = _place(fitting, config, body, betas)
     sides = fasten_as_asked(fitting, config)
     if str(config.weld) != "none":
-        alterations.sew(fitting, tolerance, sides)
+        alterations.sew(fitting, tolerance, fitting.at_present(sides))
+    mend(fitting, replace(wanted, gap=None), None, sides)
     alterations.clean(fitting)
     check_triangles(fitting.garment.rest_pos, fitting.garment.faces, name)
     alterations.face_out(fitting, body.v_template if posed is None else posed.surface, body.faces)
@@ -145,7 +151,8 @@ def _fit(name: str, config: DictConfig, body: Body, betas: np.ndarray) -> _Fitte
     ratios = alterations.length_ratios(fitting, betas)
     change = np.abs(ratios - 1)
     fitted = _Fitted(fitting, worn, float(change.max(initial=0.0)), float((change > _CHANGED).mean()) if len(change) else 0.0)
-    if fitted.changed_share > _MOST_CHANGED:
+    pulled = any(change.what == "panels" for change in fitting.changes)
+    if fitted.changed_share > _MOST_CHANGED and not pulled:
         raise ValueError(
             f"{name}: welding changes {100 * fitted.changed_share:.1f}% of the rest lengths by more than "
             f"{100 * _CHANGED:.0f}%, the most by {100 * fitted.length_change:.0f}%; give a smaller weld, "
@@ -178,13 +185,13 @@ def _wear(fitting: Fitting, posed: PosedBody, clearance: float, allow_misfit: bo
 def _read(name: str) -> Fitting:
     path, _ = locate_garment(name)
     if path.suffix.lower() not in mesh_suffixes():
-        return alterations.start_fitting(load_garment(name))
+        return start_fitting(load_garment(name))
     mesh = read_mesh_file(path, split_polygons=True)
     garment = garment_of_mesh(path, mesh)
     bad = ~np.isfinite(garment.rest_pos).all(axis=1)
     if bad.any() or len(garment.faces) == 0:
         check_triangles(garment.rest_pos, garment.faces, str(path))
-    fitting = alterations.start_fitting(garment)
+    fitting = start_fitting(garment, mesh.stitches)
     fitting.note("split_polygons", mesh.num_polygons, f"split {mesh.num_polygons} polygons into triangles")
     fitting.note("joined", mesh.num_joined, f"joined {mesh.num_joined} vertices that {path.suffix[1:].upper()} files double")
     for note in mesh.notes:
@@ -297,7 +304,7 @@ def _text(report: dict[str, Any]) -> str:
     lines = []
     for part in report["garments"]:
         lines.append(f"{part['file']}:")
-        lines += [f"  {change['text']}" for change in part["changes"]] or ["  nothing to repair"]
+        lines += [f"  {said(change, part['file'])}" for change in part["changes"]] or ["  nothing to repair"]
         lines += _length_lines(part)
         lines.append(f"  now {part['result']}")
     if report["num_pinned"]:

@@ -18,13 +18,16 @@ import numpy as np
 from omegaconf import DictConfig
 
 from hood.assets.garment import alterations
-from hood.assets.garment.alterations import Fitting
 from hood.assets.garment.binding import push_out, signed_distances
-from hood.assets.garment.garment import Garment, save_garment
+from hood.assets.garment.contents.fitting import Fitting
+from hood.assets.garment.contents.sort_out import choose, mend
+from hood.assets.garment.garment import Garment, locate_garment, save_garment
 from hood.assets.garment.outfit import join_garments
 from hood.assets.garment.pins import pin_mask, pin_numbers
 from hood.assets.garment.suspicions import suspect_kind, suspect_place, suspect_seams
 from hood.commands.common import prepare_folder
+from hood.commands.contents.reading import meant_by, said
+from hood.commands.contents.wanted import wanted_of
 from hood.commands.fastening import fasten_as_asked, give_room
 from hood.commands.garments import checked_pins, heed
 from hood.commands.placing import AUTO, asked_keys, explain_size, find_place_on_mesh, keep_place
@@ -71,6 +74,10 @@ def _fit(fitting: Fitting, name: str, config: DictConfig, motion: MeshMotion) ->
     """One garment on the mesh: in metres, where it fits, sewn, clean, outside the skin; where it fits nowhere, auto leaves it
     where it is, for the unit."""
     garment, surface, clearance = fitting.garment, motion.points(0), float(config.clearance)
+    path, entry = locate_garment(name)
+    wanted = meant_by(entry, path, wanted_of(config))
+    choose(fitting, wanted, surface)
+    garment = fitting.garment
     heed(garment.name, suspect_kind(garment.rest_pos, garment.faces, surface))
     if not clearance >= 0:
         raise ConfigError(f"clearance={config.clearance}: give a number ≥ 0")
@@ -87,7 +94,8 @@ def _fit(fitting: Fitting, name: str, config: DictConfig, motion: MeshMotion) ->
     if str(config.weld) == "none":
         heed(garment.name, suspect_seams(fitting.garment.rest_pos, fitting.garment.faces))
     else:
-        alterations.sew(fitting, None if str(config.weld) == AUTO else float(config.weld), sides)
+        alterations.sew(fitting, None if str(config.weld) == AUTO else float(config.weld), fitting.at_present(sides))
+    mend(fitting, replace(wanted, gap=None), None, sides)
     alterations.clean(fitting)
     check_triangles(fitting.garment.rest_pos, fitting.garment.faces, name)
     # What another body's weights say does not hold here: the place of a garment is where it is worn.
@@ -147,7 +155,7 @@ def _text(report: dict[str, Any], config: DictConfig) -> str:
     body, lines = str(config.body), []
     for part in report["garments"]:
         lines.append(f"{part['file']}:")
-        lines += [f"  {change['text']}" for change in part["changes"]] or ["  nothing to repair"]
+        lines += [f"  {said(change, part['file'])}" for change in part["changes"]] or ["  nothing to repair"]
         lines.append(f"  now {part['result']}")
     start = report["starts"]["first frame"]
     words = [plain_word("garment", report["output"]), plain_word("body", body)]

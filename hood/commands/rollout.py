@@ -50,6 +50,7 @@ from hood.dynamics.ease import Ease, measure_ease
 from hood.dynamics.recorder import RolloutWriter, read_rollout, still_of
 from hood.dynamics.rollout import Frame, metric_names, simulate
 from hood.dynamics.stepper import Stepper
+from hood.dynamics.stored.riding import ridden_faces, ridden_frames, ridden_rest, ridden_still, riding_attributes
 from hood.scene.sizing import Sizes
 from hood.training import distributed
 
@@ -206,11 +207,15 @@ def _simulate_to_disk(
     steps, finer = planned_steps(config, scene, count), finer_mesh(config, scene)
     if finer is not None:
         attributes |= {"refine_mesh": int(config.refine_mesh), "simulated_vertices": finer.num_coarse}
+    garment, riders = scene.garment, scene.garment.riders
+    attributes |= riding_attributes(riders)
+    still = refined_still(still_of(garment, scene.fastening), finer, garment.faces)
+    stored_rest = scene.cloth.rest_pos.cpu().numpy() if finer is None else finer.rest_pos
     writer = RolloutWriter(
         path,
         count if steps is None else steps.rate.count(count),
-        scene.cloth.rest_pos.cpu().numpy() if finer is None else finer.rest_pos,
-        scene.garment.faces if finer is None else finer.faces,
+        ridden_rest(stored_rest, garment),
+        ridden_faces(garment.faces if finer is None else finer.faces, len(stored_rest), riders),
         scene.motion.faces,
         scene.motion.num_vertices,
         metric_names(potential, stepper, str(config.metrics), str(config.settle), guard is not None),
@@ -220,7 +225,7 @@ def _simulate_to_disk(
         fields=exported(config),
         double=solves_in_double(config),
         guarded=guard is not None,
-        still=refined_still(still_of(scene.garment, scene.fastening), finer, scene.garment.faces),
+        still=ridden_still(still, riders),
         steps=steps,
     )
     frames = simulate(
@@ -249,7 +254,8 @@ def _simulate_to_disk(
 
     try:
         with writer:
-            for frame in on_finer_mesh(at_output_fps(simulated(), config, scene, count), finer, scene):
+            shown = on_finer_mesh(at_output_fps(simulated(), config, scene, count), finer, scene)
+            for frame in ridden_frames(shown, garment):
                 fields = {name: values.numpy() for name, values in frame.fields.items()}
                 writer.append(frame.world_pos.numpy(), frame.body_pos.numpy(), frame.metrics, fields)
             write_alarms(writer, guard)

@@ -17,6 +17,7 @@ from hood.commands.body_friction import with_body_friction
 from hood.commands.cautions import known_by_slope, scene_cautions, warn
 from hood.commands.cloth_contact import acts, check_cloth_contact, potential_of, tell_if_off
 from hood.commands.common import require_device, thinning
+from hood.commands.contents.wanted import wanted_of
 from hood.commands.events import checked_events, with_events
 from hood.commands.fabrics import checked_fabrics, fabric_of
 from hood.commands.garments import heed, layer_order, names_of, read_outfit
@@ -70,6 +71,7 @@ def check_config(config: DictConfig) -> None:
     require_choice(config, "kernels", (AUTO, *KERNELS))
     require_choice(config, "precision", (*PRECISIONS, TF32))
     option_of(config)
+    wanted_of(config)
     require_choice(config, "step", (PLAIN, *MODES))
     check_refinement(config)
     check_guard(config)
@@ -134,8 +136,10 @@ def _watched(config: DictConfig, lean: Stepper, scene: Scene, path: Path) -> tup
 def make_scene(config: DictConfig, garment: Garment | None = None, material: Material | None = None) -> Scene:
     """Assets named in the config, put together; ``garment`` and ``material`` stand for those of the config where given."""
     motion = make_motion(config, torch.float64 if solves_in_double(config) else torch.float32)
-    order = layer_order(config.layers, names_of(config.garment)) if garment is None else None
-    garment = read_outfit(config.garment if garment is None else garment, motion, bool(config.triangulate), config.pins)
+    given = config.garment if garment is None else garment
+    ordered = garment is None
+    garment = read_outfit(given, motion, bool(config.triangulate), config.pins, wanted_of(config))
+    order = layer_order(config.layers, _names_in(garment, names_of(config.garment))) if ordered else None
     garment = cut_to_size(config, garment, motion)
     fabric = fabric_of(config, garment, motion) if material is None else material
     scene = with_events(replace(dress(garment, motion, fabric, checked_sizes(config)), layers=order), config)
@@ -150,6 +154,12 @@ def make_scene(config: DictConfig, garment: Garment | None = None, material: Mat
     for name, doubt in doubts(scene):
         heed(name, [doubt])
     return scene
+
+
+def _names_in(garment: Garment, files: list[str]) -> list[str]:
+    """The garments of an outfit by the names of their files; by their own where a file holds several."""
+    count = 1 if garment.piece is None else int(garment.piece.max()) + 1
+    return files if len(files) == count else garment.name.split("+")
 
 
 def solves_in_double(config: DictConfig) -> bool:

@@ -40,7 +40,7 @@ def summarise(path: Path) -> dict[str, Any]:
         "num_frames": len(data.time),
         "complete": bool(data.attributes["complete"]),
         "garment": data.attributes["garment"],
-        "num_vertices": int(data.cloth_pos.shape[1]) if data.refined is None else data.refined.num_coarse,
+        "num_vertices": int(data.cloth_pos.shape[1]) - data.riding[0] if data.refined is None else data.refined.num_coarse,
         **summarise_mesh(data),
         "dt": float(data.attributes["dt"]),
         **summarise_rate(data),

@@ -274,6 +274,11 @@ class RolloutData:
         return Refined(int(self.attributes["refine_mesh"]), int(self.attributes["simulated_vertices"]), faces)
 
     @property
+    def riding(self) -> tuple[int, int]:
+        """How many vertices and faces of the cloth, the last ones, ride on it and are not simulated, as those of buttons."""
+        return int(self.attributes.get("riding_vertices", 0)), int(self.attributes.get("riding_faces", 0))
+
+    @property
     def step_metrics(self) -> dict[str, np.ndarray]:
         """(S,) by name: of every simulated frame, stored or not."""
         return self.metrics if self.steps is None else self.steps.metrics
@@ -322,6 +327,7 @@ def read_rollout(path: Path | str) -> RolloutData:
     try:
         with h5py.File(path, "r") as file:
             _check_extents(file, path.stat().st_size)
+            _check_riding(file)
             _check_refined(file)
             done = _frames_there(file)
             return RolloutData(
@@ -370,13 +376,21 @@ def _check_extents(file: h5py.File, num_bytes: int) -> None:
             raise ValueError(f"{name} claims the shape {table.shape}, the file has {num_bytes} bytes")
 
 
+def _check_riding(file: h5py.File) -> None:
+    """Raise ValueError where more rides on the cloth than there is."""
+    for name, table in (("riding_vertices", "cloth/rest_pos"), ("riding_faces", "cloth/faces")):
+        if not 0 <= int(file.attrs.get(name, 0)) < max(len(file[table]), 1):
+            raise ValueError(f"{name} is {file.attrs[name]}, {table} has {len(file[table])} rows")
+
+
 def _check_refined(file: h5py.File) -> None:
     """Raise ValueError where the stored mesh cannot be the simulated one, refined."""
     if "cloth/simulated_faces" not in _still_paths(file):
         return
     times, count = int(file.attrs["refine_mesh"]), int(file.attrs["simulated_vertices"])
     faces, finer = file["cloth/simulated_faces"][:], file["cloth/faces"]
-    fits = faces.ndim == 2 and faces.shape[1] == 3 and 1 <= times <= 8 and len(faces) * 4**times == len(finer)
+    number = len(finer) - int(file.attrs.get("riding_faces", 0))
+    fits = faces.ndim == 2 and faces.shape[1] == 3 and 1 <= times <= 8 and len(faces) * 4**times == number
     if not (fits and count <= len(file["cloth/rest_pos"]) and 0 <= faces.min(initial=0) <= faces.max(initial=0) < count):
         raise ValueError(
             f"cloth/faces {finer.shape} are not {faces.shape} simulated faces of {count} vertices, refined {times} times"

@@ -37,7 +37,7 @@ from hood.mesh.surface_tree import forget_searches
 from hood.scene.cloth import Cloth
 from hood.scene.contact import Contact, find_contact
 from hood.scene.jumps import Jump, carried, describe_jumps, find_jumps
-from hood.scene.mesh_motion import wearable
+from hood.scene.parts.worn import worn_vertices, worst_part
 from hood.scene.scene import LEAD_IN, RELAXING_DT, NotWornError, Scene, recentre
 from hood.scene.start import free_stretch, push_out
 from hood.scene.state import Attachments, State
@@ -336,7 +336,10 @@ def start_state(stepper: Stepper, scene: Scene, potential: Potential, relaxing_s
         state = _taken_apart(scene, state, frame)
     stretched = _longest(scene, state.pos)
     if stretched > _TORN:
-        starts = f"garment {scene.garment.name!r} starts with edges stretched by up to {stretched:.0%}"
+        part = worst_part(scene, state.pos.double().cpu().numpy())
+        starts = (
+            f"garment {scene.garment.name!r}{f', {part},' if part else ''} starts with edges stretched by up to {stretched:.0%}"
+        )
         warnings.warn(f"{starts} {_why_stretched(scene, frame, put_on)}", stacklevel=2)
     prepared = prepare_stepper(stepper, scene)
     velocity = scene.start_velocity(frame)
@@ -413,7 +416,7 @@ def own_start(stepper: Stepper, scene: Scene, frame: int = 0) -> str | None:
         return "these weights go on from their relaxing step, as they were trained to"
     if scene.start_pos is not None and frame == 0:
         return "the scene gives the start"
-    return None if wearable(scene.garment) else "a sheet starts as it is given"
+    return None if worn_vertices(scene, frame).any() else "a sheet starts as it is given"
 
 
 @torch.no_grad()

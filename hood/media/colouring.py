@@ -128,10 +128,12 @@ def vertex_strain(data: RolloutData) -> np.ndarray:
     if refined is not None:
         count, faces = refined.num_coarse, np.asarray(refined.faces, dtype=np.int64)
         finer = Subdivision(faces, data.rest_pos[:count], refined.times)
-        if not np.array_equal(finer.faces, data.cloth_faces):
+        riders, own_faces = data.riding
+        if not np.array_equal(finer.faces, data.cloth_faces[: len(data.cloth_faces) - own_faces]):
             raise ValueError("cloth/faces are not cloth/simulated_faces, refined; simulate it again with hood rollout")
         coarse = replace(data, cloth_pos=data.cloth_pos[:, :count], cloth_faces=faces, rest_pos=data.rest_pos[:count], still={})
-        return finer.spread(vertex_strain(coarse).T).T
+        spread = finer.spread(vertex_strain(coarse).T).T
+        return np.concatenate([spread, np.zeros((len(spread), riders))], axis=1)
     faces = np.asarray(data.cloth_faces, dtype=np.int64)
     edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
     rest = np.linalg.norm(data.rest_pos[edges[:, 0]] - data.rest_pos[edges[:, 1]], axis=1)

@@ -10,6 +10,8 @@ from hood.mesh import repair, topology
 
 #: Faces with a longest edge beyond this many times their height are slivers.
 SLIVER_ASPECT = 50.0
+#: Edges of three faces that are named.
+_EXAMPLES = 3
 
 
 @dataclass(frozen=True)
@@ -19,6 +21,7 @@ class Defects:
     num_components: int
     openings: tuple[int, ...]  # vertices of each boundary loop, longest first
     non_manifold_edges: int  # with three or more faces
+    crowded_edges: tuple[tuple[int, int], ...]  # the first of them, by their vertices
     broken_faces: int  # a repeated vertex, or no area
     duplicate_faces: int
     isolated_vertices: int
@@ -43,11 +46,12 @@ def find_defects(pos: np.ndarray, faces: np.ndarray) -> Defects:
     component = topology.connected_components(len(pos), edges)
     welded = repair.weld(pos, faces, repair.weld_tolerance(pos, faces))
     broken = repair.broken_faces(pos, faces)
-    sound = faces[~broken]
+    sound, crowded = faces[~broken], _crowded_edges(faces)
     return Defects(
         num_components=len(np.unique(component[~alone])),
         openings=tuple(len(loop) for loop in topology.boundary_loops(faces)),
-        non_manifold_edges=int((_faces_per_edge(faces) > 2).sum()),
+        non_manifold_edges=len(crowded),
+        crowded_edges=tuple((int(a), int(b)) for a, b in crowded[:_EXAMPLES]),
         broken_faces=int(broken.sum()),
         duplicate_faces=int(repair.duplicate_faces(faces).sum()),
         isolated_vertices=int(alone.sum()),
@@ -58,9 +62,11 @@ def find_defects(pos: np.ndarray, faces: np.ndarray) -> Defects:
     )
 
 
-def _faces_per_edge(faces: np.ndarray) -> np.ndarray:
+def _crowded_edges(faces: np.ndarray) -> np.ndarray:
+    """(n, 2) edges of three faces and more."""
     half = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    return np.unique(half, axis=0, return_counts=True)[1]
+    edges, counts = np.unique(half, axis=0, return_counts=True)
+    return np.asarray(edges[counts > 2])
 
 
 def aspects(pos: np.ndarray, faces: np.ndarray) -> np.ndarray:

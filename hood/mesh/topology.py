@@ -26,7 +26,8 @@ class Hinges(NamedTuple):
 def unique_edges(faces: np.ndarray) -> np.ndarray:
     """Undirected edges (E, 2) of ``faces`` (F, 3): each row ascending, rows in lexicographic order."""
     edges = np.sort(_half_edges(faces)[:, :2], axis=1)
-    return np.unique(edges, axis=0)
+    key = int(edges.max(initial=0)) + 1  # one number an edge: sorted much faster than rows
+    return np.stack(np.divmod(np.unique(edges @ np.array([key, 1], dtype=np.int64)), key), axis=1)
 
 
 def edge_index(edges: np.ndarray, pairs: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ from hood.assets.body.skinning import linear_blend_skinning
 from hood.assets.garment.binding import bind_garment
 from hood.assets.garment.garment import Garment
 from hood.assets.motion.mesh_sequence import MeshSequence
-from hood.mesh import topology
+from hood.mesh.parts import find_parts
 from hood.mesh.proximity import search_surface
 from hood.mesh.rigid import best_turn
 from hood.scene.anchors import Anchors, anchors
@@ -250,10 +250,8 @@ def _misfit(pos: np.ndarray, points: np.ndarray, faces: np.ndarray) -> _Misfit:
 
 
 def wearable(garment: Garment) -> bool:
-    """Whether a part of it has openings to put it on by: a sheet has its rim alone."""
-    part = topology.connected_components(len(garment.rest_pos), topology.unique_edges(garment.faces))
-    rims = [int(part[loop[0]]) for loop in topology.boundary_loops(garment.faces)]
-    return len(rims) > len(set(rims))
+    """Whether a part of it can be put on: a sheet cannot (:attr:`hood.mesh.parts.Part.can_be_put_on`)."""
+    return any(part.can_be_put_on for part in find_parts(garment.rest_pos, garment.faces))
 
 
 def _rest_body(sequence: MeshSequence) -> Body:

@@ -18,6 +18,7 @@ from hood.scene.cloth import Cloth, build_cloth
 from hood.scene.fastening import Fastening, fastening_of
 from hood.scene.holding import Holding
 from hood.scene.motion import BodyMotion, Motion, body_motion
+from hood.scene.parts.worn import worst_part
 from hood.scene.sizing import Size, Sizes, resized, sizes_of
 from hood.scene.start import free_stretch, settle
 from hood.scene.state import Attachments, Obstacle, State, StepInput
@@ -137,10 +138,12 @@ class Scene:
             return
         given, now = (float(free_stretch(self.cloth, pos).max()) for pos in (skinned, settled))
         if now - max(given, 0.0) > _TORN:
+            part = worst_part(self, settled.double().cpu().numpy())
             raise NotWornError(
-                f"garment {self.garment.name!r}: passes through {self.motion.name!r} in frame {frame} (taken out of it, edges "
-                f"are stretched by {100 * now:.0f}%); give it as it is worn there, bind it to a body with the pose it was made "
-                "in (hood prepare pose=…), or start from another frame or a standing pose (start=…, blend_in=3)"
+                f"garment {self.garment.name!r}: {part}{' ' * bool(part)}passes through {self.motion.name!r} in frame {frame} "
+                f"(taken out of it, edges are stretched by {100 * now:.0f}%); give it as it is worn there, bind it to a body "
+                "with the pose it was made in (hood prepare pose=…), or start from another frame or a standing pose (start=…, "
+                "blend_in=3)"
             )
 
     def lead_in(self, frame: int) -> Scene | None:

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hood.assets.files.progress import Progress
 from hood.mesh.crossing import self_crossings
 from hood.mesh.topology import boundary_loops
 from hood.scene.cloth import Cloth
@@ -44,6 +45,8 @@ _HELD = 0.2
 _WRONG = 0.75
 #: Orders of the layers that are tried where the likeliest does not come out well.
 _TRIED = 3
+#: Of so many garments all orders are looked at.
+_PERMUTED = 6
 #: What the inner layer takes of a push: nothing, which opens folds of an outer layer, or half, which opens narrow places but
 #: leaves it in folds that the first steps find hard.
 _SHARES = (0.0, 0.5)
@@ -93,8 +96,10 @@ def smooth_out(cloth: Cloth, faces: np.ndarray, pos: Tensor, obstacle: Obstacle 
     start, end = cloth.edges.unbind(dim=1)
     both, other = torch.cat([start, end]), torch.cat([end, start])
     count = torch.zeros_like(pos[:, 0]).index_add(0, both, torch.ones_like(pos[:, 0])[both]).clamp_min(1.0)[:, None]
-    for _ in range(_SMOOTHED):
+    progress = Progress("smoothing places where the garment passes through itself")
+    for turn in range(_SMOOTHED):
         pairs = self_crossings(pos.double().cpu().numpy(), faces)
+        progress.tell(f"round {turn + 1} of at most {_SMOOTHED}, {len(pairs)} pairs of triangles are left")
         if least is None or len(pairs) < least:
             best, least = pos, len(pairs)
         if len(pairs) == 0:
@@ -185,10 +190,22 @@ def likely_orders(outfit: Outfit, pos: Tensor, obstacle: Obstacle | None) -> lis
             outside[over, under] += float((height > 0).sum() - (height < 0).sum())
             held = [bool(outfit.cloth.pinned[sheets[garment].vertices].any()) for garment in (under, over)]
             outside[over, under] += _HELD * len(height) * (held[0] - held[1])
+    if count > _PERMUTED:
+        return [_from_inside(np.maximum(outside - outside.T, 0.0))]
     return sorted(
         permutations(range(count)),
         key=lambda order: -sum(outside[over, under] - outside[under, over] for under, over in combinations(order, 2)),
     )
+
+
+def _from_inside(over: np.ndarray) -> tuple[int, ...]:
+    """An order of many garments, where all orders are too many to compare: next comes the one that lies least over those left,
+    by how much (C, C) each lies over each."""
+    left, order = list(range(len(over))), []
+    while left:
+        order.append(min(left, key=lambda one: float(over[one, left].sum())))
+        left.remove(order[-1])
+    return tuple(order)
 
 
 class _Match(NamedTuple):
@@ -266,7 +283,9 @@ def _take_apart(
     """The garments apart in one order; the best of the rounds. What is not yet as the order has it counts as one crossing."""
     course = _Course(outfit, pos, obstacle, clearance, order)
     best, found, clean = Separation(pos, order, before, before + len(turned), _longest(outfit, pos), turned), 0, 0
+    progress = Progress("taking garments apart")
     for number in range(_ROUNDS):
+        progress.tell(f"round {number + 1} of at most {_ROUNDS}, {best.after} pairs of triangles are left")
         course.round(inner_share, lengths=number > 0, carried=clean > 0)
         ended = push_out(outfit.cloth, course.pos, obstacle, clearance)
         pairs = crossing_pairs(outfit, ended)

@@ -63,6 +63,7 @@ def test_a_garment_from_the_wild_runs(capsys: pytest.CaptureFixture[str], garmen
         "scaled": len(wild.garment.rest_pos) + wild.num_torn,
         "welded": wild.num_torn,
         "pushed_out": wild.num_inside,
+        "garments": 3,
     }
     assert wild.num_inside == pytest.approx(0.05 * len(wild.garment.rest_pos), abs=1)
     garment = load_garment("wild.npz")

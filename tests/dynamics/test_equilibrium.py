@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from garment_kinds import cape, clean, sewn_lining
 from reference_oracle import make_state
 from torch import Tensor
 
@@ -172,9 +173,38 @@ def test_a_garment_that_slides_off_starts_as_it_is_put_on(body: Body, walk: Pose
     scene = build_scene(Garment("hoop", pos, faces, np.zeros(len(pos), dtype=bool)), body, still(walk, 3))
     with pytest.warns(UserWarning, match="'hoop' comes off the body when it settles"):
         rest = settled(scene)
-    assert rest.lost
+    assert rest.lost == (0,)
     assert not rest.reached
     assert torch.equal(rest.pos, scene.start(0, relaxed=False, thorough=True).pos)
+
+
+def test_a_part_that_slides_off_is_put_back_and_the_others_settle(
+    body: Body, walk: PoseSequence, garments: dict[str, Garment]
+) -> None:
+    """Named by its number, its vertices and its place."""
+    pos, faces = cylinder(24, 4, 0.6, 0.2)
+    hoop = Garment("hoop", pos, faces, np.zeros(len(pos), dtype=bool))
+    both = build_scene(join_garments([garments["tank"], hoop]), body, still(walk, 3))
+    count = len(garments["tank"].rest_pos)
+    with pytest.warns(UserWarning, match=rf"part 2 of 'hoop' \(96 vertices from {count} on, at \[.*\] m\) comes off the body"):
+        rest = settled(both)
+    assert rest.lost == (1,)
+    start = both.start(0, relaxed=False, thorough=True).pos
+    assert torch.equal(rest.pos[count:], start[count:])
+    alone = settled(build_scene(garments["tank"], body, still(walk, 3)))
+    torch.testing.assert_close(rest.pos[:count], alone.pos, rtol=0, atol=2e-3)
+    assert not torch.equal(rest.pos[:count], start[:count])
+
+
+def test_a_lining_that_closes_the_rims_makes_no_sheet_of_a_garment(body: Body, walk: PoseSequence) -> None:
+    """Nor is a cape one that lies around the shoulders; a sheet that is to fall on the body is."""
+    scenes = [
+        build_scene(Garment("own", *mesh, np.zeros(len(mesh[0]), dtype=bool)), body, still(walk, 3))
+        for mesh in (sewn_lining(clean("tank")), cape())
+    ]
+    assert [own_start(NewtonStepper(POTENTIAL), scene) for scene in scenes] == [None, None]
+    both = sheet_above(body, walk)
+    assert own_start(NewtonStepper(POTENTIAL), both) == "a sheet starts as it is given"
 
 
 def test_what_has_not_come_to_rest_is_told(band_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from hood.assets.files.text import read_text
+
 _LIST_LIMIT = 64 << 20
 
 
@@ -18,7 +20,7 @@ def read_indices(path: Path) -> np.ndarray:
     """
     if path.stat().st_size > _LIST_LIMIT:
         raise ValueError(f"{path}: {path.stat().st_size} bytes are no list of vertices")
-    text = path.read_text(encoding="utf-8", errors="replace")
+    text = read_text(path)
     try:
         if path.suffix.lower() == ".json":
             values = json.loads(text)

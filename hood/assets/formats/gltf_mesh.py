@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hood.assets.formats.gltf import Gltf, read_gltf
-from hood.assets.formats.raw_mesh import RawMesh, Unreadable, unit_colours
+from hood.assets.formats.raw_mesh import RawMesh, Unreadable, named_polygons, unit_colours
 
 _READ = ("POSITION", "TEXCOORD_0", "NORMAL", "COLOR_0")
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
@@ -25,15 +25,26 @@ def read_glb(path: Path) -> RawMesh:
         ValueError: not a glTF file, a compressed mesh, an index out of range, or no triangles.
     """
     gltf = read_gltf(path)
-    parts = [
-        _primitive(gltf, primitive, transform)
-        for mesh, transform in _placed_meshes(gltf)
-        for primitive in gltf.item("meshes", mesh).get("primitives", [])
-        if primitive.get("mode", _TRIANGLES) in (_TRIANGLES, _STRIP, _FAN)
-    ]
+    parts, names = [], []
+    for mesh, transform, name in _placed_meshes(gltf):
+        for primitive in gltf.item("meshes", mesh).get("primitives", []):
+            if primitive.get("mode", _TRIANGLES) in (_TRIANGLES, _STRIP, _FAN):
+                parts.append(_primitive(gltf, primitive, transform))
+                names.append((name or str(gltf.item("meshes", mesh).get("name", "")), _material(gltf, primitive)))
     if not parts:
         raise Unreadable("the scene has no mesh of triangles")
-    return _join(parts)
+    joined = _join(parts)
+    of_polygons = np.repeat(np.arange(len(parts)), [len(part.counts) for part in parts])
+    joined.panels, notes = named_polygons([tuple(filter(None, own)) for own in names], of_polygons)
+    joined.notes += notes
+    return joined
+
+
+def _material(gltf: Gltf, primitive: dict[str, Any]) -> str:
+    """The name of a primitive's material; "" for none."""
+    if "material" not in primitive:
+        return ""
+    return str(gltf.item("materials", primitive["material"]).get("name", ""))
 
 
 def node_matrix(node: dict[str, Any]) -> np.ndarray:
@@ -48,11 +59,11 @@ def node_matrix(node: dict[str, Any]) -> np.ndarray:
     return matrix
 
 
-def _placed_meshes(gltf: Gltf) -> Iterator[tuple[int, np.ndarray]]:
-    """Mesh number and world transform (4, 4) of every node of the scene that has a mesh; every mesh where there is no scene."""
+def _placed_meshes(gltf: Gltf) -> Iterator[tuple[int, np.ndarray, str]]:
+    """Mesh number, world transform (4, 4) and name of every node that has a mesh; every mesh where there is no scene."""
     nodes = gltf.items("nodes")
     if not nodes:
-        yield from ((mesh, np.eye(4)) for mesh in range(len(gltf.items("meshes"))))
+        yield from ((mesh, np.eye(4), "") for mesh in range(len(gltf.items("meshes"))))
         return
     scene = gltf.item("scenes", gltf.document.get("scene", 0)) if gltf.items("scenes") else {}
     children = {child for node in nodes for child in node.get("children", [])}
@@ -68,7 +79,7 @@ def _placed_meshes(gltf: Gltf) -> Iterator[tuple[int, np.ndarray]]:
         # A skinned mesh ignores the place of its node.
         world = parent @ node_matrix(node)
         if "mesh" in node:
-            yield node["mesh"], np.eye(4) if "skin" in node else world
+            yield node["mesh"], np.eye(4) if "skin" in node else world, str(node.get("name", ""))
         waiting.extend((child, world, depth + 1) for child in reversed(node.get("children", [])))
 
 

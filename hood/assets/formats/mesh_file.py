@@ -48,6 +48,7 @@ class MeshFile:
     normal_faces: np.ndarray | None = None  # (F, 3): corners of one number share a normal; None: smooth everywhere
     colours: np.ndarray | None = None  # (V, 3), 0 to 1
     panels: dict[str, np.ndarray] | None = None  # (F,) bool each: the triangles of an object, group or material, by its name
+    stitches: np.ndarray | None = None  # (S, 2) vertices that lines of the file join
     num_polygons: int = 0  # faces of four and more corners that were split
     num_joined: int = 0  # vertices that the format had doubled
     notes: tuple[str, ...] = ()  # what was not kept
@@ -142,10 +143,19 @@ def _finish(raw: RawMesh, split_polygons: bool, join: bool) -> MeshFile:
         normal_faces=_shared_normals(raw, rows, faces, notes),
         colours=None if raw.colours is None else raw.colours[kept],
         panels=None if raw.panels is None else {name: mask[polygon] for name, mask in raw.panels.items()},
+        stitches=_stitches(raw, vertex_map),
         num_polygons=int((raw.counts > 3).sum()),
         num_joined=len(raw.pos) - len(kept),
         notes=tuple(notes),
     )
+
+
+def _stitches(raw: RawMesh, vertex_map: np.ndarray) -> np.ndarray | None:
+    """Lines between two vertices that there are; others join nothing."""
+    if raw.stitches is None:
+        return None
+    there = ((raw.stitches >= 0) & (raw.stitches < len(raw.pos))).all(axis=1)
+    return vertex_map[raw.stitches[there]]
 
 
 def _check(raw: RawMesh, split_polygons: bool) -> None:

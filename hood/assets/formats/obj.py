@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 
-from hood.assets.files.folded import folded_names
-from hood.assets.formats.raw_mesh import RawMesh, Unreadable, unit_colours
+from hood.assets.files.text import read_text
+from hood.assets.formats.raw_mesh import RawMesh, Unreadable, named_polygons, unit_colours
 
 #: Lines that name the polygons after them, and names that programs write for none.
 _NAMED, _NAMELESS = ("o", "g", "usemtl"), ("", "default", "off", "None", "(null)")
-#: A garment has not so many panels: the names mean something else, such as single faces.
-MOST_PANELS = 256
+_NEW_LINE = re.compile(r"\r\n|\n|\r")
 
 
 def read_obj(path: Path) -> RawMesh:
-    """The polygons of all objects and groups of the file, whose names become panels; lines and points are passed over.
+    """The polygons of all objects and groups of the file, whose names become panels; lines become stitches, points are passed
+    over.
 
     Raises:
         Unreadable: a line that is not numbers, or an index out of range.
@@ -24,30 +25,35 @@ def read_obj(path: Path) -> RawMesh:
     tables: dict[str, list[list[float]]] = {"v": [], "vt": [], "vn": []}
     corners: list[tuple[int, int, int]] = []
     counts: list[int] = []
+    stitches: list[tuple[int, int]] = []
     names = _Names()
-    with open(path, encoding="utf-8", errors="replace") as file:
-        for number, line in enumerate(file, start=1):
-            words = line.split("#")[0].split()
-            if not words:
-                continue
-            try:
-                if words[0] in tables:
-                    tables[words[0]].append([float(word) for word in words[1:8]])
-                elif words[0] == "f":
-                    sizes = [len(tables[key]) for key in ("v", "vt", "vn")]
-                    corners.extend(_corner(word, sizes) for word in words[1:])
-                    counts.append(len(words) - 1)
-                    names.add_polygon()
-                elif words[0] in _NAMED:
-                    names.change(words[0], words[1:])
-            except ValueError:
-                raise Unreadable(
-                    f"line {number} is not readable ({line.strip()[:60]!r}); behind {words[0]} stand numbers alone, repair or "
-                    f"remove the line"
-                ) from None
+    # Not splitlines(), which also splits at signs that a name may hold.
+    for number, line in enumerate(_NEW_LINE.split(read_text(path)), start=1):
+        words = line.split("#")[0].split()
+        if not words:
+            continue
+        try:
+            if words[0] in tables:
+                tables[words[0]].append([float(word) for word in words[1:8]])
+            elif words[0] == "f":
+                sizes = [len(tables[key]) for key in ("v", "vt", "vn")]
+                corners.extend(_corner(word, sizes) for word in words[1:])
+                counts.append(len(words) - 1)
+                names.add_polygon()
+            elif words[0] == "l":
+                ends = [_corner(word, [len(tables["v"]), len(tables["vt"]), 0])[0] for word in words[1:]]
+                stitches.extend(zip(ends, ends[1:], strict=False))
+            elif words[0] in _NAMED:
+                names.change(words[0], words[1:])
+        except ValueError:
+            raise Unreadable(
+                f"line {number} is not readable ({line.strip()[:60]!r}); behind {words[0]} stand numbers alone, repair or "
+                f"remove the line"
+            ) from None
     pos, colours = _positions(tables["v"])
     table = np.array(corners, dtype=np.int64).reshape(-1, 3)
     mesh = RawMesh(pos, table[:, 0], np.array(counts, dtype=np.int64), colours)
+    mesh.stitches = np.array(stitches, dtype=np.int64).reshape(-1, 2) if stitches else None
     mesh.panels, notes = names.panels()
     mesh.notes.extend(notes)
     if tables["vt"] and (table[:, 1] >= 0).any():
@@ -77,17 +83,8 @@ class _Names:
         self._of_polygons.append(self._place)
 
     def panels(self) -> tuple[dict[str, np.ndarray] | None, list[str]]:
-        """(P,) bool of every name that some polygons have and others do not, folded (:func:`folded_names`); None without any.
-        And what was not kept."""
-        combinations, used = list(self._places), sorted(set(self._of_polygons))
-        shared = set(combinations[used[0]]).intersection(*(combinations[at] for at in used)) if used else set()
-        names = list(dict.fromkeys(name for at in used for name in combinations[at] if name not in shared))
-        if len(names) > MOST_PANELS:
-            return None, [f"{len(names)} names of objects, groups and materials are more than {MOST_PANELS}; none is kept"]
-        of_polygons = np.array(self._of_polygons, dtype=np.int64)
-        known = {name: np.array([name in combination for combination in combinations]) for name in names}
-        short = folded_names(known)
-        return {short[name]: mask[of_polygons] for name, mask in known.items()} or None, []
+        """See :func:`named_polygons`."""
+        return named_polygons(list(self._places), np.array(self._of_polygons, dtype=np.int64))
 
 
 def _corner(word: str, sizes: list[int]) -> tuple[int, int, int]:

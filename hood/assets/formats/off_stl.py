@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hood.assets.files.text import decoded, read_text
 from hood.assets.formats.raw_mesh import RawMesh, Unreadable
 
 _STL_HEAD = 84
@@ -18,7 +19,7 @@ def read_off(path: Path) -> RawMesh:
     Raises:
         Unreadable: not an ASCII OFF file, or it ends before the rows it announces.
     """
-    text = path.read_bytes().decode("latin-1")
+    text = read_text(path)
     rows = [words for words in (line.split("#")[0].split() for line in text.splitlines()) if words]
     head = rows[0][0] if rows else ""
     if not head.endswith("OFF") or "BINARY" in rows[0]:
@@ -47,8 +48,9 @@ def read_stl(path: Path) -> RawMesh:
         Unreadable: the file ends before the triangles it announces.
     """
     content = path.read_bytes()
-    if content[:5].lower() == b"solid" and b"facet" in content[:1024]:
-        points = _ascii_corners(content)
+    text = _text_of(content)
+    if text is not None:
+        points = _ascii_corners(text)
     else:
         if len(content) < _STL_HEAD:
             raise Unreadable(f"{len(content)} bytes are less than the head of an STL file")
@@ -60,8 +62,14 @@ def read_stl(path: Path) -> RawMesh:
     return RawMesh(points, np.arange(len(points)), np.full(len(points) // 3, 3, dtype=np.int64))
 
 
-def _ascii_corners(content: bytes) -> np.ndarray:
-    rows = [line.split() for line in content.decode("latin-1").splitlines()]
+def _text_of(content: bytes) -> str | None:
+    """The text of an ASCII file; None of a binary one, whose head may begin with the same word."""
+    head = decoded(content[:4096]).lower()
+    return decoded(content) if head.startswith("solid") and "facet" in head else None
+
+
+def _ascii_corners(text: str) -> np.ndarray:
+    rows = [line.split() for line in text.splitlines()]
     points = [[float(word) for word in row[1:4]] for row in rows if row[:1] == ["vertex"]]
     if len(points) % 3 or any(len(point) != 3 for point in points):
         raise Unreadable(f"STL with {len(points)} corners; every triangle has three of three coordinates")

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from hood.assets.files.text import decoded
 from hood.assets.formats.raw_mesh import RawMesh, Unreadable, unit_colours
 
 _TYPES = {
@@ -39,7 +40,7 @@ def read_ply(path: Path) -> RawMesh:
     Raises:
         Unreadable: a broken head, more rows announced than the file holds, or no vertices or faces.
     """
-    content = path.read_bytes()
+    content = _as_ascii(path.read_bytes())
     order, elements, body = _head(content)
     columns: dict[str, _Columns] = {}
     reader = _Ascii(content[body:]) if order is None else _Binary(content, body, order)
@@ -48,7 +49,18 @@ def read_ply(path: Path) -> RawMesh:
     for name in ("vertex", "face"):
         if name not in columns:
             raise Unreadable(f"PLY without the element {name!r}")
-    return _mesh(columns["vertex"], columns["face"])
+    mesh = _mesh(columns["vertex"], columns["face"])
+    ends = _scalars(columns.get("edge", {}), ("vertex1", "vertex2"))
+    mesh.stitches = None if ends is None or not len(ends) else ends.astype(np.int64)
+    return mesh
+
+
+def _as_ascii(content: bytes) -> bytes:
+    """The file as the format has it, in ASCII: a byte-order mark, and text of two bytes a letter, are other programs' doing."""
+    if content.startswith(b"ply"):
+        return content
+    text = decoded(content)
+    return text.encode("latin-1", errors="replace") if text.startswith("ply") else content
 
 
 def _head(content: bytes) -> tuple[str | None, list[_Element], int]:

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+
+from hood.assets.files.folded import folded_names
+
+#: A garment has not so many panels: the names mean something else, such as single faces.
+MOST_PANELS = 256
 
 
 class Unreadable(ValueError):
@@ -28,6 +34,7 @@ class RawMesh:
     normals: np.ndarray | None = None  # (M, 3)
     normal_corners: np.ndarray | None = None  # (N,)
     panels: dict[str, np.ndarray] | None = None  # (P,) bool each: the polygons of a name
+    stitches: np.ndarray | None = None  # (S, 2) vertices that lines join: sewing threads of some programs
     notes: list[str] = field(default_factory=list)
 
 
@@ -37,3 +44,23 @@ def unit_colours(values: np.ndarray) -> np.ndarray:
     if np.issubdtype(values.dtype, np.integer):
         return real / np.iinfo(values.dtype).max if values.dtype.itemsize <= 2 else real / 255.0
     return real / 255.0 if real.size and np.nanmax(real) > 1.0 else real
+
+
+def named_polygons(
+    combinations: Sequence[tuple[str, ...]], of_polygons: np.ndarray
+) -> tuple[dict[str, np.ndarray] | None, list[str]]:
+    """(P,) bool of every name that some polygons have and others do not, folded (:func:`folded_names`), None without any; and
+    what was not kept.
+
+    Args:
+        combinations: of names that polygons have.
+        of_polygons: (P,) the place among them of each polygon's.
+    """
+    used = np.unique(of_polygons).tolist()
+    shared = set(combinations[used[0]]).intersection(*(combinations[at] for at in used)) if used else set()
+    names = list(dict.fromkeys(name for at in used for name in combinations[at] if name not in shared))
+    if len(names) > MOST_PANELS:
+        return None, [f"{len(names)} names of objects, groups and materials are more than {MOST_PANELS}; none is kept"]
+    known = {name: np.array([name in combination for combination in combinations]) for name in names}
+    short = folded_names(known)
+    return {short[name]: mask[of_polygons] for name, mask in known.items()} or None, []

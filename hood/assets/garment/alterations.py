@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from hood.assets.garment.binding import PosedBody, bind_posed, push_out, signed_distances
+from hood.assets.garment.contents.fitting import Fitting
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.placement import Placement
 from hood.assets.garment.suspicions import suspect_sides
@@ -25,36 +26,6 @@ OPENING, _MOST_OPENED = 1e-4, 0.05
 SHORT = 1e-3
 
 
-@dataclass
-class Fitting:
-    """A garment on its way from a file to a body, with a record of every change."""
-
-    garment: Garment
-    file: Garment  # as it was read
-    vertex_map: np.ndarray  # (V of the file,) present number of each vertex of the file; -1: removed
-    changes: list[Change] = field(default_factory=list)
-
-    def note(self, what: str, count: int, text: str, **details: Any) -> None:
-        """Record a change of ``count`` things; nothing is recorded for none."""
-        if count:
-            self.changes.append(Change(what, count, text, details))
-
-
-@dataclass(frozen=True)
-class Change:
-    """One change: its name for programs, how many things it touched, and a sentence."""
-
-    what: str
-    count: int
-    text: str
-    details: dict[str, Any]
-
-
-def start_fitting(garment: Garment) -> Fitting:
-    """A fitting of a garment as it was read."""
-    return Fitting(garment, garment, np.arange(len(garment.rest_pos)))
-
-
 def place(fitting: Fitting, placement: Placement) -> None:
     """Bring the coordinates of the file to the body: scaled to metres, turned, moved."""
     garment = fitting.garment
@@ -64,6 +35,8 @@ def place(fitting: Fitting, placement: Placement) -> None:
         rest_pos=placement.apply(garment.rest_pos),
         skin_pos=None if skin_pos is None else placement.apply(skin_pos),
         rest_turn=None if rest_turn is None else turn @ rest_turn @ turn.T,
+        riders=None if garment.riders is None else replace(garment.riders, pos=placement.apply(garment.riders.pos)),
+        thickness=None if garment.thickness is None else placement.scale * garment.thickness,
     )
     count, offset = len(garment.rest_pos), np.round(placement.offset, 4).tolist()
     if placement.scale != 1.0:
@@ -87,18 +60,30 @@ def sew(fitting: Fitting, tolerance: float | None, left_out: np.ndarray | None =
     welded = repair.weld(garment.rest_pos, garment.faces, tolerance, open_edges)
     count = len(garment.rest_pos) - len(welded.kept)
     if count:
-        fitting.garment = _keep_vertices(garment, welded.vertex_map[garment.faces], welded.kept, welded.vertex_map)
+        fitting.garment = keep_vertices(garment, welded.vertex_map[garment.faces], welded.kept, welded.vertex_map)
         fitting.vertex_map = np.where(fitting.vertex_map < 0, -1, welded.vertex_map[fitting.vertex_map])
     fitting.note("welded", count, f"welded {count} vertices on seams, within {1e3 * tolerance:.2g} mm", tolerance=tolerance)
+
+
+def drop_faces(fitting: Fitting, kept: np.ndarray, thickness: np.ndarray | None = None) -> None:
+    """Keep the faces ``kept`` (F,) bool, and of the vertices all but those that lose their last face; ``thickness`` (V,) is a
+    new field of the garment where it is given."""
+    garment = fitting.garment if thickness is None else replace(fitting.garment, thickness=thickness)
+    gone = repair.isolated_vertices(len(garment.rest_pos), garment.faces[kept])
+    gone &= ~repair.isolated_vertices(len(garment.rest_pos), garment.faces)
+    number = np.where(gone, -1, np.cumsum(~gone) - 1)
+    left = keep_faces(garment, kept)
+    fitting.garment = keep_vertices(left, number[left.faces], np.flatnonzero(~gone), number) if gone.any() else left
+    fitting.vertex_map = np.where(fitting.vertex_map < 0, -1, number[fitting.vertex_map])
 
 
 def clean(fitting: Fitting) -> None:
     """Remove faces without area, duplicate faces and unused vertices; turn faces over that lie against their neighbours."""
     garment = fitting.garment
     broken = repair.broken_faces(garment.rest_pos, garment.faces)
-    garment = _keep_faces(garment, ~broken)
+    garment = keep_faces(garment, ~broken)
     duplicate = repair.duplicate_faces(garment.faces)
-    garment = _keep_faces(garment, ~duplicate)
+    garment = keep_faces(garment, ~duplicate)
     if len(garment.faces) == 0:
         raise ValueError(f"{garment.name}: no face has an area; nothing is left of the garment")
     flipped = repair.flipped_faces(garment.faces)
@@ -106,7 +91,7 @@ def clean(fitting: Fitting) -> None:
     alone = repair.isolated_vertices(len(garment.rest_pos), garment.faces)
     number = np.where(alone, -1, np.cumsum(~alone) - 1)
     kept = np.flatnonzero(~alone)
-    fitting.garment = _keep_vertices(garment, number[garment.faces], kept, number) if alone.any() else garment
+    fitting.garment = keep_vertices(garment, number[garment.faces], kept, number) if alone.any() else garment
     fitting.vertex_map = np.where(fitting.vertex_map < 0, -1, number[fitting.vertex_map])
     for what, mask, text in (
         ("removed_broken_faces", broken, "removed {} faces without area"),
@@ -192,11 +177,11 @@ def summary(garment: Garment) -> str:
 
 def piece_of(garment: Garment, kept: np.ndarray) -> Garment:
     """The piece of a garment that its faces ``kept`` (F,) bool are, with the vertices that they use; without texture."""
-    left = _keep_faces(replace(garment, uv=None, uv_faces=None, normal_faces=None), kept)
+    left = keep_faces(replace(garment, uv=None, uv_faces=None, normal_faces=None, riders=None), kept)
     used = np.zeros(len(garment.rest_pos), dtype=bool)
     used[left.faces] = True
     number = np.where(used, np.cumsum(used) - 1, -1)
-    return _keep_vertices(left, number[left.faces], np.flatnonzero(used), number)
+    return keep_vertices(left, number[left.faces], np.flatnonzero(used), number)
 
 
 def join_short_edges(garment: Garment) -> tuple[Garment, int]:
@@ -219,7 +204,8 @@ def join_short_edges(garment: Garment) -> tuple[Garment, int]:
     whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
     pairs = {name: taken[row] for name, row in (garment.fasteners or {}).items()}
     fasteners = {name: row[row[:, 0] != row[:, 1]] for name, row in pairs.items()} or None
-    joined = _keep_faces(replace(garment, faces=faces), whole)
+    riders = None if garment.riders is None else garment.riders.renumbered(taken)
+    joined = keep_faces(replace(garment, faces=faces, riders=riders), whole)
     return replace(joined, pinned=pinned, fasteners=fasteners, coarse_edges=None), len(taken) - len(merged.kept)
 
 
@@ -265,20 +251,24 @@ def part_open_seams(garment: Garment) -> tuple[Garment, int]:
 
 _PER_VERTEX = (
     "rest_pos", "pinned", "lbs_weights", "shapedirs", "colours", "skin_pos", "rest_turn", "piece", "region", "stiffness",
+    "thickness",
 )  # fmt: skip
 _PER_FACE = ("faces", "uv_faces", "normal_faces")
 
 
-def _keep_vertices(garment: Garment, faces: np.ndarray, kept: np.ndarray, number: np.ndarray) -> Garment:
+def keep_vertices(garment: Garment, faces: np.ndarray, kept: np.ndarray, number: np.ndarray) -> Garment:
     """The garment with its vertices ``kept`` and ``faces`` in their numbers, where ``number`` (V,) says what became of each,
     -1 if it is gone; its coarse edges are of another mesh now."""
     rows: dict[str, Any] = {key: getattr(garment, key)[kept] for key in _PER_VERTEX if getattr(garment, key) is not None}
     pairs = {name: number[row][(number[row] >= 0).all(axis=1)] for name, row in (garment.fasteners or {}).items()}
     rows["fasteners"] = {name: row for name, row in pairs.items() if len(row)} or None
+    rows["riders"] = None if garment.riders is None else garment.riders.renumbered(number)
+    if garment.file_numbers is not None:
+        rows["file_numbers"] = np.where(garment.file_numbers < 0, -1, number[garment.file_numbers])
     return replace(garment, **rows | {"faces": faces, "coarse_edges": None})
 
 
-def _keep_faces(garment: Garment, kept: np.ndarray) -> Garment:
+def keep_faces(garment: Garment, kept: np.ndarray) -> Garment:
     tables = {k: getattr(garment, k)[kept] for k in _PER_FACE if getattr(garment, k) is not None}
     panels = {name: mask[kept] for name, mask in (garment.panels or {}).items()}
     return replace(garment, **tables, panels={name: mask for name, mask in panels.items() if mask.any()} or None)

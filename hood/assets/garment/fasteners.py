@@ -60,7 +60,7 @@ def _pairs(where: str, given: Mapping[str, Any], garment: Garment) -> np.ndarray
     if len(forms) != 1:
         raise ValueError(f"{where} names its sides in {len(forms)} ways; give {_FIX}")
     if forms[0] == "left":
-        return _listed(where, given, len(garment.rest_pos))
+        return _listed(where, given, garment)
     sides = _painted(where, given["painted"], garment) if forms[0] == "painted" else _in_front(where, given["heights"], garment)
     pairs = _nearest(garment.rest_pos, *sides)
     if len(pairs) == 0:
@@ -68,7 +68,8 @@ def _pairs(where: str, given: Mapping[str, Any], garment: Garment) -> np.ndarray
     return pairs[np.argsort(-garment.rest_pos[pairs[:, 0], 1], kind="stable")]
 
 
-def _listed(where: str, given: Mapping[str, Any], count: int) -> np.ndarray:
+def _listed(where: str, given: Mapping[str, Any], garment: Garment) -> np.ndarray:
+    count = len(garment.rest_pos) if garment.file_numbers is None else len(garment.file_numbers)
     sides = []
     for key in ("left", "right"):
         value = given.get(key)
@@ -82,7 +83,13 @@ def _listed(where: str, given: Mapping[str, Any], count: int) -> np.ndarray:
         if outside.any():
             row = int(np.argmax(outside))
             raise ValueError(f"{where}: {key}[{row}] is vertex {int(numbers[row])} of {count}; they are numbered from 0")
-        sides.append(numbers)
+        present = numbers if garment.file_numbers is None else garment.file_numbers[numbers]
+        if (present < 0).any():
+            row = int(np.argmax(present < 0))
+            raise ValueError(
+                f"{where}: {key}[{row}] is vertex {int(numbers[row])}, which is no part of the garment; give another"
+            )
+        sides.append(present)
     left, right = sides
     if len(left) != len(right) or len(left) == 0:
         raise ValueError(f"{where}: {len(left)} vertices left and {len(right)} right; give as many on both sides, at least one")

@@ -9,9 +9,11 @@ import numpy as np
 
 from hood.assets.files.library import locate, require_name, unknown_suffix
 from hood.assets.formats.mesh_file import MeshFile, mesh_suffixes, read_mesh_file
+from hood.assets.formats.objects import object_alone, split_object
 from hood.assets.garment.garment_arrays import read_fields, write_fields
 from hood.assets.garment.reference_garments import read_reference_garment
 from hood.mesh.quality import check_triangles
+from hood.mesh.riders import Riders
 
 #: What can be given as a garment, besides embedded names and mesh files.
 GARMENT_SUFFIXES = (".npz", ".pkl")
@@ -46,6 +48,9 @@ class Garment:
         None  # (P, 2) each: pairs of vertices that a seam, buttons or a zipper hold together
     )
     panels: dict[str, np.ndarray] | None = None  # (F,) bool each: faces that the mesh file gives a name, as its pattern pieces
+    thickness: np.ndarray | None = None  # (V,) m, of the cloth as its file shows it; 0: not known. The fabric has its own
+    riders: Riders | None = None  # buttons and the like, which ride on the cloth
+    file_numbers: np.ndarray | None = None  # (V of the file,) present number of each of its vertices, -1: gone; None: as there
 
     @property
     def bound(self) -> bool:
@@ -67,6 +72,19 @@ class Garment:
         """Garment (V, 3) [m] in T-pose on the body of shape ``betas``: what skinning poses."""
         return self.worn_pos + self._offset(betas)
 
+    def numbers_of(self, vertices: np.ndarray, where: str) -> np.ndarray:
+        """Present numbers of vertices (n,) that somebody names by their numbers in the file; those that are gone are left out.
+
+        Raises:
+            ValueError: a number that no vertex of the file has; ``where`` says who names it.
+        """
+        count = len(self.rest_pos) if self.file_numbers is None else len(self.file_numbers)
+        outside = (vertices < 0) | (vertices >= count)
+        if outside.any():
+            raise ValueError(f"{where}: vertex {int(vertices[np.argmax(outside)])} of {count}; they are numbered from 0")
+        present = vertices if self.file_numbers is None else self.file_numbers[vertices]
+        return np.asarray(present[present >= 0])
+
     def _offset(self, betas: np.ndarray) -> np.ndarray:
         assert self.shapedirs is not None, "bind the garment first"
         count = min(len(betas), self.shapedirs.shape[2])
@@ -78,7 +96,8 @@ def load_garment(name: str | Path, triangulate: bool = False) -> Garment:
 
     Args:
         name: an embedded name, a garment ``.npz``, a mesh file (OBJ, PLY, STL, GLB, OFF) in metres around the body's T-pose,
-            or a ``.pkl`` of the reference implementation (``garments_dict.pkl:name`` chooses one of several).
+            or a ``.pkl`` of the reference implementation. A name behind the file's chooses one of several
+            (``garments_dict.pkl:dress``, ``scene.obj:tank``; of a mesh file without its texture).
         triangulate: split faces of four and more corners instead of refusing them.
 
     Returns:
@@ -97,11 +116,12 @@ def load_garment(name: str | Path, triangulate: bool = False) -> Garment:
     path, entry = locate_garment(name)
     suffix = path.suffix.lower()
     if suffix == ".npz":
-        garment = Garment(path.stem, **read_fields(path))
+        garment = Garment(**{"name": path.stem, **read_fields(path)})
     elif suffix == ".pkl":
         garment = Garment(**read_reference_garment(path, entry))
     elif suffix in mesh_suffixes():
-        garment = garment_of_mesh(path, read_mesh_file(path, triangulate))
+        mesh = read_mesh_file(path, triangulate)
+        garment = garment_of_mesh(path, mesh if entry is None else object_alone(path, mesh, entry))
     else:
         known = ", ".join((*GARMENT_SUFFIXES, *mesh_suffixes()))
         raise ValueError(f"{path}: {unknown_suffix(path, 'garment')}; give one of {known}")
@@ -123,12 +143,13 @@ def save_garment(path: Path, garment: Garment) -> None:
 
 
 def locate_garment(name: str | Path) -> tuple[Path, str | None]:
-    """File of a garment, and which of its entries is meant (``garments_dict.pkl:dress``)."""
+    """File of a garment, and which of its entries is meant (``garments_dict.pkl:dress``, ``scene.obj:tank``)."""
     require_name("garments", name)
     head, colon, entry = str(name).rpartition(":")
     if colon and head.lower().endswith(".pkl"):
         return locate("garments", head), entry
-    return locate("garments", name), None
+    path, entry_of_mesh = split_object(name)
+    return (locate("garments", name), None) if entry_of_mesh is None else (locate("garments", str(path)), entry_of_mesh)
 
 
 def check_levels(garment: Garment, where: str) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.guarded import check_size
 from hood.assets.files.library import DATA_FOLDER, read_arrays
+from hood.mesh.riders import Riders
 
 #: Per-vertex fields and the shape of a row; None: any size.
 _ROWS: dict[str, tuple[int | None, ...]] = {
@@ -24,16 +25,22 @@ _ROWS: dict[str, tuple[int | None, ...]] = {
     "piece": (),
     "region": (),
     "stiffness": (),
+    "thickness": (),
 }
 _CORNERS = ("uv_faces", "normal_faces")
 _LEVEL = "coarse_edges_"
 _FASTENER = "fastener_"
 _PANEL = "panel_"
+_RIDER = "rider_"
+_NAMES = "piece_names"
+#: Tables of riders and their columns; 0: none.
+_RIDERS = {"pos": 3, "faces": 3, "group": 0, "anchors": 0, "anchor_group": 0}
 _SIZE_LIMIT = 2 << 30
 
 
 def read_fields(path: Path) -> dict[str, Any]:
-    """Arguments of :class:`hood.assets.garment.garment.Garment` from a garment ``.npz``.
+    """Arguments of :class:`hood.assets.garment.garment.Garment` from a garment ``.npz``; the name only where the file has names
+    for the garments of an outfit.
 
     Raises:
         ValueError: a field that does not fit the others; names the file, the field and its first bad row.
@@ -45,6 +52,14 @@ def read_fields(path: Path) -> dict[str, Any]:
         fields["bound_to"] = "default"
     elif "bound_to" in arrays and arrays["bound_to"].dtype.kind == "U" and arrays["bound_to"].size == 1:
         fields["bound_to"] = str(arrays["bound_to"].reshape(-1)[0])
+    names = arrays.get(_NAMES)
+    if (
+        names is not None
+        and names.dtype.kind == "U"
+        and "piece" in fields
+        and len(names) == fields["piece"].max(initial=-1) + 1
+    ):
+        fields["name"] = "+".join(names.tolist())
     return fields
 
 
@@ -84,6 +99,8 @@ def checked_fields(where: str, arrays: Mapping[str, np.ndarray]) -> dict[str, An
     if rows:
         fields["fasteners"] = {key[len(_FASTENER) :]: _edge_table(where, key, arrays[key], "fasteners") for key in rows}
         check_fasteners(where, fields["fasteners"], num_vertices)
+    if f"{_RIDER}pos" in arrays:
+        fields["riders"] = _riders(where, arrays, num_vertices, len(fields.get("uv", ())))
     panels = [key for key in arrays if key.startswith(_PANEL)]
     if panels:
         fields["panels"] = {key[len(_PANEL) :]: _panel(where, key, arrays[key], len(fields["faces"])) for key in panels}
@@ -92,7 +109,7 @@ def checked_fields(where: str, arrays: Mapping[str, np.ndarray]) -> dict[str, An
 
 def as_arrays(fields: Mapping[str, Any]) -> dict[str, Any]:
     """The fields of a garment by the names that they have in a file; those that are None and the name are left out."""
-    tables = ("name", "coarse_edges", "fasteners", "panels")
+    tables = ("name", "coarse_edges", "fasteners", "panels", "riders", "file_numbers")
     arrays = {key: value for key, value in fields.items() if value is not None and key not in tables}
     for level, edges in enumerate(fields.get("coarse_edges") or ()):
         arrays[f"{_LEVEL}{level}"] = edges
@@ -100,13 +117,18 @@ def as_arrays(fields: Mapping[str, Any]) -> dict[str, Any]:
         arrays[f"{_FASTENER}{name}"] = pairs
     for name, mask in (fields.get("panels") or {}).items():
         arrays[f"{_PANEL}{name}"] = mask
+    if fields.get("riders") is not None:
+        arrays |= {f"{_RIDER}{name}": table for name, table in vars(fields["riders"]).items() if table is not None}
     return arrays
 
 
 def write_fields(path: Path, fields: dict[str, Any]) -> None:
     """Write a garment ``.npz`` that :func:`read_fields` reads back; fields that are None are left out."""
-    content = io.BytesIO()
-    np.savez_compressed(content, **as_arrays(fields))
+    content, arrays = io.BytesIO(), as_arrays(fields)
+    names, piece = str(fields["name"]).split("+"), fields.get("piece")
+    if piece is not None and len(names) == piece.max(initial=-1) + 1:
+        arrays[_NAMES] = np.array(names)
+    np.savez_compressed(content, **arrays)
     write_atomically(path, content.getvalue())
 
 
@@ -184,6 +206,39 @@ def _edge_table(where: str, key: str, value: Any, what: str = "coarse edges") ->
     if table.ndim != 2 or table.shape[1] != 2:
         raise ValueError(f"{where}: {key} has shape {table.shape}; {what} are pairs of vertices (n, 2)")
     return table
+
+
+def _riders(where: str, arrays: Mapping[str, np.ndarray], num_vertices: int, num_uv: int) -> Riders:
+    """What rides on the cloth, with every index in range."""
+    tables: dict[str, Any] = {}
+    for name, width in _RIDERS.items():
+        key = f"{_RIDER}{name}"
+        if key not in arrays:
+            raise ValueError(f"{where}: has {_RIDER}pos and no {key}; write both, or leave out all of {_RIDER}…")
+        value = arrays[key]
+        tables[name] = _finite(where, key, _reals(where, key, value)) if name == "pos" else _indices(where, key, value)
+        if tables[name].ndim != (2 if width else 1) or (width and tables[name].shape[1] != width):
+            shape = f"(n, {width})" if width else "(n,)"
+            raise ValueError(f"{where}: {key} has shape {tables[name].shape}; it must be {shape}")
+    if f"{_RIDER}uv_faces" in arrays and num_uv:
+        tables["uv_faces"] = _indices(where, f"{_RIDER}uv_faces", arrays[f"{_RIDER}uv_faces"])
+    _check_riders(where, tables, num_vertices, num_uv)
+    return Riders(**tables)
+
+
+def _check_riders(where: str, tables: Mapping[str, np.ndarray], num_vertices: int, num_uv: int) -> None:
+    count, groups = len(tables["pos"]), int(tables["group"].max(initial=-1)) + 1
+    limits = {"faces": count, "group": count, "anchors": num_vertices, "anchor_group": groups, "uv_faces": num_uv}
+    for name, limit in limits.items():
+        table = tables.get(name, np.zeros(0, dtype=np.int64))
+        if table.min(initial=0) < 0 or table.max(initial=-1) >= limit:
+            raise ValueError(f"{where}: {_RIDER}{name} holds {int(table.max(initial=0))}; give numbers from 0 to {limit - 1}")
+    one_each = len(tables["group"]) == count and len(tables["anchors"]) == len(tables["anchor_group"])
+    textured = "uv_faces" not in tables or tables["uv_faces"].shape == tables["faces"].shape
+    if not (one_each and textured and len(np.unique(tables["anchor_group"])) == groups):
+        raise ValueError(
+            f"{where}: the tables {_RIDER}… do not fit each other; write a group for every rider, and anchors for every group"
+        )
 
 
 def _panel(where: str, key: str, value: Any, num_faces: int) -> np.ndarray:

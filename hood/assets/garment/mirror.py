@@ -87,6 +87,10 @@ def mirror_garment(garment: Garment) -> Garment:
         image["rest_turn"] = _SIDES[:, None] * garment.rest_turn * _SIDES
     if garment.region is not None:
         image["region"] = _OTHER_SIDE[garment.region]
+    if garment.riders is not None:
+        riders = garment.riders
+        uv_faces = None if riders.uv_faces is None else _reversed(riders.uv_faces)
+        image["riders"] = replace(riders, pos=riders.pos * _SIDES, faces=_reversed(riders.faces), uv_faces=uv_faces)
     if garment.bound_to is not None:
         image["bound_to"] = _image_name(garment.bound_to)
     return replace(garment, **image)

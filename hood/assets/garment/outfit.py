@@ -8,6 +8,7 @@ from itertools import chain, count
 import numpy as np
 
 from hood.assets.garment.garment import Garment
+from hood.mesh.riders import join_riders
 
 
 def join_garments(garments: Sequence[Garment]) -> Garment:
@@ -46,6 +47,9 @@ def join_garments(garments: Sequence[Garment]) -> Garment:
         region=_join_rows(garments, "region", lambda garment: np.zeros(len(garment.rest_pos), dtype=np.int64)),
         fasteners=_join_fasteners(garments, starts),
         panels=_join_panels(garments),
+        thickness=_join_rows(garments, "thickness", lambda garment: np.zeros(len(garment.rest_pos))),
+        riders=join_riders([garment.riders for garment in garments], starts.tolist(), _uv_starts(garments)),
+        file_numbers=_join_numbers(garments, starts),
     )
 
 
@@ -74,6 +78,14 @@ def _join_uv(garments: Sequence[Garment]) -> tuple[np.ndarray | None, np.ndarray
         corners.append(table + start)
         start += len(uv)
     return np.concatenate(tables), np.concatenate(corners)
+
+
+def _uv_starts(garments: Sequence[Garment]) -> list[int]:
+    """Where the texture coordinates of each begin in those of all."""
+    if all(garment.uv is None for garment in garments):
+        return [0] * len(garments)
+    counts = [1 if garment.uv is None or garment.uv_faces is None else len(garment.uv) for garment in garments]
+    return np.cumsum([0, *counts[:-1]]).tolist()
 
 
 def _join_normals(garments: Sequence[Garment]) -> np.ndarray | None:
@@ -120,6 +132,14 @@ def _join_panels(garments: Sequence[Garment]) -> dict[str, np.ndarray] | None:
 def _free(name: str, taken: Mapping[str, np.ndarray]) -> str:
     """``name``, or ``name_2`` and so on where that is taken."""
     return next(key for key in chain([name], (f"{name}_{k}" for k in count(2))) if key not in taken)
+
+
+def _join_numbers(garments: Sequence[Garment], starts: np.ndarray) -> np.ndarray | None:
+    """Vertices of all files, one after the other; None where all are as in their files."""
+    if all(garment.file_numbers is None for garment in garments):
+        return None
+    tables = [np.arange(len(g.rest_pos)) if g.file_numbers is None else g.file_numbers for g in garments]
+    return np.concatenate([np.where(table < 0, -1, table + start) for table, start in zip(tables, starts, strict=True)])
 
 
 def _join_levels(garments: Sequence[Garment], starts: np.ndarray) -> tuple[np.ndarray, ...] | None:

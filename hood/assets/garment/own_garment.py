@@ -11,6 +11,7 @@ import numpy as np
 from hood.assets.garment.garment import Garment, check_levels
 from hood.assets.garment.garment_arrays import as_arrays, checked_fields
 from hood.mesh.quality import check_triangles
+from hood.mesh.riders import Riders
 
 #: Weights of a vertex that sum to one within this stay as they are.
 _ROUNDING = 1e-9
@@ -58,6 +59,9 @@ def _same(given: Any, checked: Any) -> bool:
     """Whether a field is what it was checked to be."""
     if isinstance(checked, Mapping):
         return isinstance(given, Mapping) and all(_same(given[key], value) for key, value in checked.items())
+    if isinstance(checked, Riders):
+        tables = {name: table for name, table in vars(checked).items() if table is not None}
+        return isinstance(given, Riders) and all(_same(getattr(given, name), table) for name, table in tables.items())
     if isinstance(checked, tuple):
         return isinstance(given, tuple) and all(map(_same, given, checked))
     if not isinstance(given, np.ndarray) or given.dtype != checked.dtype:

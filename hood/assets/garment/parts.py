@@ -106,12 +106,8 @@ def _joint(part: str, name: str, body: Body | None) -> np.ndarray:
 
 
 def _listed(path: Path, garment: Garment) -> np.ndarray:
-    numbers, count = read_indices(path), len(garment.rest_pos)
-    outside = (numbers < 0) | (numbers >= count)
-    if outside.any():
-        raise ValueError(f"{path}: vertex {int(numbers[np.argmax(outside)])} of {count}; they are numbered from 0")
-    inside = np.zeros(count, dtype=bool)
-    inside[numbers] = True
+    inside = np.zeros(len(garment.rest_pos), dtype=bool)
+    inside[garment.numbers_of(read_indices(path), str(path))] = True
     return _of_most_corners(inside, garment)
 
 

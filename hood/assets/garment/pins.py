@@ -55,10 +55,7 @@ def pin_mask(pins: Pins, garment: Garment, body: Body | None) -> np.ndarray:
     """
     numbers, words = pin_numbers(pins)
     mask = np.zeros(len(garment.rest_pos), dtype=bool)
-    outside = (numbers < 0) | (numbers >= len(mask))
-    if outside.any():
-        raise ValueError(f"pins: vertex {int(numbers[np.argmax(outside)])} of {len(mask)}; they are numbered from 0")
-    mask[numbers] = True
+    mask[garment.numbers_of(numbers, "pins")] = True
     for word in words:
         if word != "none":
             mask[_named(word, garment, body)] = True

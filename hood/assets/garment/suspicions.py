@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from hood.assets.garment.openings import find_openings
 from hood.assets.garment.placement import inward_share, surrounds
 from hood.mesh import repair, topology
+from hood.mesh.parts import find_parts, rim_length
 
 #: A part is flat where its least extent is below this share of its greatest.
 _FLAT = 0.01
@@ -21,12 +22,15 @@ _TORN = 0.5
 #: A closed mesh as large as this share of a body's height and as thick as that share is a body. Clothes with two sides are
 #: thinner: twice volume over area is 0.006 body heights for 1 cm, a body has 0.04.
 _BODY_SIZE, _BODY_THICKNESS = 0.8, 0.02
+_SMALL_RIM = 0.1
 #: A mesh nearer than this [body heights] to this share of the body's vertices, head, hands and feet included, is the body.
 _ON_SKIN, _ALL_SKIN = 0.006, 0.95
 #: Metres per unit of the files that bodies come in.
 _UNITS = (1.0, 0.01, 0.001)
 #: A sheet farther from the skin than this [m] in the middle does not lie on the body at first.
 _FAR = 0.35
+#: What is said of such a sheet; and parts beyond so many are not looked at one by one.
+_FALLS, _PARTS = ", and falls from there", 30
 #: A garment is inside out where the normals of more than this share of its area point to the body; those that are not have
 #: 0 to 0.04 of it, clothes with two sides a half.
 _INSIDE_OUT = 0.75
@@ -72,26 +76,50 @@ def suspect_kind(pos: np.ndarray, faces: np.ndarray, surface: np.ndarray) -> lis
     pos, size = factor * pos, factor * size
     if size < _BODY_SIZE * height:
         return []
-    closed = 2 * len(topology.unique_edges(faces)) == 3 * len(faces)
+    why = body_of(pos, faces, surface, height)
+    return [] if why is None else [Suspicion(why, "pass it as body=…, and a garment with openings as garment=…", True)]
+
+
+def body_of(pos: np.ndarray, faces: np.ndarray, surface: np.ndarray, height: float) -> str | None:
+    """Why a mesh (V, 3) [m], (F, 3) as large as a person of that ``height`` [m] is a body, in words that follow "it"; None: it
+    is none. ``surface`` (W, 3) [m] is the body that garments are measured against."""
+    size = float(np.ptp(pos[np.unique(faces)], axis=0).max())
+    if size < _BODY_SIZE * height:
+        return None
+    # Eyes and mouths may be open; the openings of a garment are longer.
+    closed = all(rim_length(pos, loop) < _SMALL_RIM * height for loop in topology.boundary_loops(faces))
     if closed and _thickness(pos, faces) > _BODY_THICKNESS * height:
-        what = f"is a closed solid {size:.2f} m large, which is a body, not a garment"
-    elif float((cKDTree(pos).query(surface, distance_upper_bound=_ON_SKIN * height)[0] < np.inf).mean()) > _ALL_SKIN:
-        what = "lies on the skin of the whole body, head, hands and feet included: it is the body, not a garment"
-    else:
-        return []
-    return [Suspicion(what, "pass it as body=…, and a garment with openings as garment=…", True)]
+        return f"is a closed solid {size:.2f} m large, which is a body, not a garment"
+    if float((cKDTree(pos).query(surface, distance_upper_bound=_ON_SKIN * height)[0] < np.inf).mean()) > _ALL_SKIN:
+        return "lies on the skin of the whole body, head, hands and feet included: it is the body, not a garment"
+    return None
 
 
 def suspect_place(pos: np.ndarray, faces: np.ndarray, surface: np.ndarray, body_faces: np.ndarray) -> list[Suspicion]:
     """Whether a garment (V, 3) [m] is worn by the body (W, 3) [m] where both are; a sheet may lie anywhere.
 
-    Grave: it surrounds nothing of the body, or half of its openings are empty, as those of a shirt around the knees are.
+    Grave: it surrounds nothing of the body, or half of its openings are empty, as those of a shirt around the knees are. Of
+    several parts, those that are away from the body, or around nothing of it, are told by their numbers.
     """
+    whole = _suspect_whole(pos, faces, surface, body_faces)
+    parts = find_parts(pos, faces)
+    if any(one.grave for one in whole) or len(parts) == 1 or len(parts) > _PARTS:
+        return whole
+    for part in parts:
+        used, corners = np.unique(faces[part.faces], return_inverse=True)
+        found = _suspect_whole(pos[used], corners.reshape(-1, 3), surface, body_faces)
+        if any(one.grave for one in found) or any(one.what.endswith(_FALLS) for one in found):
+            where = f"part {part.number} of {len(parts)}, {len(used)} vertices from {int(used[0])} on,"
+            return [Suspicion(f"has a part that is not worn: {where} {found[0].what}", found[0].fix, False)]
+    return whole
+
+
+def _suspect_whole(pos: np.ndarray, faces: np.ndarray, surface: np.ndarray, body_faces: np.ndarray) -> list[Suspicion]:
     openings = find_openings(pos, faces, surface, body_faces)
     around = surrounds(pos, surface, body_faces)
     fix = "hood inspect says how to place it"
     if openings.num == 0:
-        return [Suspicion(f"{around.problem}, and falls from there", fix, False)] if around.middle > _FAR else []
+        return [Suspicion(f"{around.problem}{_FALLS}", fix, False)] if around.middle > _FAR else []
     if openings.num_empty == openings.num:
         what = f"does not surround the body: none of its {openings.num} openings has a part of the body in it"
         return [Suspicion(f"{what} (half of it is over {around.middle:.2g} m away from the skin)", fix, True)]

@@ -36,8 +36,10 @@ def tailored(garment: Garment, factors: Mapping[str, float], body: Body | None =
     factor = np.ones(len(garment.faces))
     for part, value in factors.items():
         factor[part_faces(part, garment, body)] = value
-    worn = garment.worn_pos
-    return replace(garment, rest_pos=_stretched(garment.rest_pos, garment.faces, factor), skin_pos=worn)
+    rest_pos, riders = _stretched(garment.rest_pos, garment.faces, factor), garment.riders
+    if riders is not None:
+        riders = replace(riders, pos=riders.positions(rest_pos, garment.rest_pos))
+    return replace(garment, rest_pos=rest_pos, skin_pos=garment.worn_pos, riders=riders)
 
 
 def lengths_of(before: Garment, after: Garment, part: str, body: Body | None = None) -> float:

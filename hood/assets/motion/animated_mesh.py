@@ -17,7 +17,8 @@ from hood.assets.files.frame_rates import parse_rate
 from hood.assets.files.library import DATA_FOLDER
 from hood.assets.formats import vertex_files
 from hood.assets.formats.gltf_animation import read_gltf_animation
-from hood.assets.formats.mesh_file import read_mesh
+from hood.assets.formats.mesh_file import read_mesh_file
+from hood.assets.formats.objects import object_alone, split_object
 from hood.assets.formats.point_cache import CACHE_SUFFIX, caches, read_point_cache
 from hood.assets.formats.vertex_files import FACE_KEYS, FOLDER_SUFFIXES, VERTEX_KEYS, VertexFile
 from hood.assets.motion.axes import require_up
@@ -46,7 +47,7 @@ _LONGER, _THICK, _FILLED = 2.5, 0.1, 0.4
 
 def body_kind(name: str | Path) -> str:
     """What is meant by a body: ``"model"`` (embedded or of the SMPL family), ``"mesh"`` (moving or still), ``"none"``."""
-    path = Path(name).expanduser()
+    path, _ = split_object(name)
     if str(name) == NO_BODY:
         return NO_BODY
     if (DATA_FOLDER / "body" / f"{name}.npz").is_file():
@@ -78,7 +79,8 @@ def load_mesh_sequence(
 
     Accepted: a folder of numbered OBJ or PLY files; a PC2 point cache with its OBJ or PLY beside it, or their folder;
     ``.npz``, ``.h5`` or ``.pkl`` with ``verts (N, W, 3)`` and ``faces`` (a ``rollout.h5`` as well); ``.glb`` or ``.gltf``,
-    whose animation is evaluated at ``fps`` itself; OBJ, PLY, OFF or STL for one that stands still.
+    whose animation is evaluated at ``fps`` itself; OBJ, PLY, OFF or STL for one that stands still. A name behind that of a
+    still mesh or of glTF, ``scene.obj:Avatar``, is that of the object, group, material or part (``part_1``) that is the body.
 
     Args:
         up: axis that points up in the file: "y", "z", "x", "-y", "-z", "-x", or "auto", y, with a doubt where it seems to be z.
@@ -93,11 +95,11 @@ def load_mesh_sequence(
         FileNotFoundError: no such file or folder.
         ValueError: unreadable, wrong shapes or indices, not finite, other units; names the file and the fix.
     """
-    path = Path(path).expanduser()
+    path, entry = split_object(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder")
     require_up(up)
-    content = _read(path, fps, animation, parts)
+    content = _read(path, fps, animation, parts, entry)
     said = content.fps if file_fps is None else file_fps
     rate = _rate(path, said)
     verts, faces = _checked(path, content.verts, content.faces)
@@ -116,18 +118,20 @@ def load_mesh_sequence(
     return replace(loop_mesh(sequence, loop), faces=_outward(path, sequence))
 
 
-def _read(path: Path, fps: float, animation: int | str, parts: Sequence[str]) -> VertexFile:
+def _read(path: Path, fps: float, animation: int | str, parts: Sequence[str], entry: str | None) -> VertexFile:
     suffix = path.suffix.lower()
     if suffix == CACHE_SUFFIX or (path.is_dir() and caches(path)):
         return read_point_cache(path)
     if path.is_dir():
         return vertex_files.read_mesh_folder(path)
     if suffix in _GLTF_SUFFIXES:
-        scene = read_gltf_animation(path, fps, animation, parts)
+        scene = read_gltf_animation(path, fps, animation, parts if entry is None else (entry,))
         skinned = scene.transforms is not None
         return VertexFile(scene.verts, scene.faces, fps, scene.transforms, scene.rest if skinned else None, scene.weights)
     if suffix in _STILL_SUFFIXES:
-        return VertexFile(*read_mesh(path, True))
+        mesh = read_mesh_file(path, True)
+        mesh = mesh if entry is None else object_alone(path, mesh, entry)
+        return VertexFile(mesh.pos, mesh.faces)
     readers = {".npz": vertex_files.read_vertex_archive, ".pkl": vertex_files.read_vertex_pickle}
     readers |= dict.fromkeys(_H5_SUFFIXES, vertex_files.read_vertex_h5)
     if suffix not in readers:

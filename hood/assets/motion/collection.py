@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Iterable
 from pathlib import Path
 
 from hood.assets.files.library import locate
+from hood.assets.files.text import read_text
 from hood.assets.motion.layouts.content import ARRAYS, TENSORS
 from hood.assets.motion.motion_files import find_motions
 from hood.assets.motion.recording import motion_suffixes
@@ -66,9 +68,8 @@ def _in_table(path: Path) -> list[Path]:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     try:
-        with open(path, encoding="utf-8", newline="") as file:
-            rows = list(csv.DictReader(file))
-    except (UnicodeDecodeError, csv.Error) as error:
+        rows = list(csv.DictReader(io.StringIO(read_text(path), newline="")))
+    except csv.Error as error:
         raise ValueError(f"{path}: not readable as a table of comma-separated values ({error})") from error
     if not rows:
         raise ValueError(f"{path}: an empty table; give one row per motion below a row of column names")

@@ -19,6 +19,7 @@ import numpy as np
 
 from hood.assets.files.frame_rates import squeezed
 from hood.assets.files.library import DATA_FOLDER, locate, names, nearest
+from hood.assets.files.text import read_text
 from hood.assets.motion.layouts.read import FRAME_IDS
 from hood.assets.motion.layouts.table import WHOLE
 from hood.assets.motion.recording import motion_suffixes
@@ -195,7 +196,7 @@ def _no_folder(path: Path, entry: str) -> str:
 
 def _entries(path: Path, part: str) -> list[tuple[str, str]]:
     """Entries of a list file, each behind its place there."""
-    text = path.read_text(encoding="utf-8")
+    text = read_text(path)
     if path.suffix == ".txt":
         lines = [line.split("#")[0].strip() for line in text.splitlines()]
         return [(f"line {number}", line) for number, line in enumerate(lines, start=1) if line]

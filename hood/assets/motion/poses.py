@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from hood.assets.files.guarded import check_size, guarded
+from hood.assets.files.text import read_text
 from hood.assets.motion.sequence import PoseSequence
 from hood.assets.motion.sequence_edit import standing_pose
 
@@ -53,6 +54,6 @@ def _numbers(path: Path) -> np.ndarray:
     if suffix == ".npy":
         # Mapped, not read: a head that announces more than the file holds is refused before memory is asked for.
         return np.array(np.load(path, mmap_mode="r", allow_pickle=False), dtype=np.float64).reshape(-1)
-    text = path.read_text(encoding="utf-8", errors="replace")
+    text = read_text(path)
     values = json.loads(text) if suffix == ".json" else text.replace(",", " ").split()
     return np.asarray(values, dtype=np.float64).reshape(-1)

@@ -13,7 +13,7 @@ from hood.dynamics.verdict.frames import name_frames
 from hood.dynamics.verdict.guarded import guard_doubts
 from hood.dynamics.verdict.skin import skin_causes
 from hood.dynamics.verdict.solved import solved_causes
-from hood.dynamics.verdict.surface import Drawn, surface_metrics, visible_crossings
+from hood.dynamics.verdict.surface import Drawn, drawn, surface_metrics, visible_crossings
 from hood.dynamics.verdict.torn import strain_causes
 from hood.limits import CROSSINGS_UNSOUND
 from hood.mesh.topology import unique_edges
@@ -40,14 +40,14 @@ def strain_of(data: RolloutData) -> np.ndarray | None:
         return known
     if data.steps is not None:
         return None
-    faces = data.cloth_faces if data.refined is None else data.refined.faces
-    start, end = unique_edges(faces.astype(np.int64)).T
+    seen = drawn(data)
+    start, end = unique_edges(seen.faces).T
     finite, strain = data.step_finite, np.full(len(data.step_finite), np.nan)
     if len(start) == 0:
         return np.where(finite, 0.0, strain)
-    rest = np.linalg.norm(data.rest_pos[end].astype(np.float64) - data.rest_pos[start], axis=1)
+    rest = np.linalg.norm(seen.rest_pos[end] - seen.rest_pos[start], axis=1)
     for frame in np.flatnonzero(finite):
-        pos = data.cloth_pos[frame].astype(np.float64)
+        pos = seen.cloth[frame].astype(np.float64)
         strain[frame] = np.quantile(np.abs(np.linalg.norm(pos[end] - pos[start], axis=1) / rest - 1.0), 0.99)
     return strain
 

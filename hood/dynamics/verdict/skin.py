@@ -94,8 +94,8 @@ def _seen_at(seen: Drawn, frame: int) -> tuple[float, float, float]:
 
 
 def way_through(cloth: np.ndarray, faces: np.ndarray, body: np.ndarray, body_faces: np.ndarray, cut: np.ndarray) -> float:
-    """How far [m] a body (W, 3) goes through the middle of a cloth (V, 3), (F, 3): the greatest distance to the cloth of what is
-    cut off from the rest of the body where edges of it pass through the cloth; 0 where nothing is cut off.
+    """How far [m] a body (W, 3) goes through the middle of a cloth (V, 3), (F, 3): the greatest distance to the cloth of what
+    is cut off from the rest of the body where edges of it pass through the cloth; 0 where nothing is cut off.
 
     Args:
         cut: (K, 3) the ends of these edges, ascending, and the face.

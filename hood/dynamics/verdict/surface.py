@@ -40,7 +40,8 @@ class Drawn:
 
 def drawn(data: RolloutData) -> Drawn:
     """Of a rollout that was read back."""
-    faces, count = data.cloth_faces, data.cloth_pos.shape[1]
+    faces = data.cloth_faces[: len(data.cloth_faces) - data.riding[1]]
+    count = data.cloth_pos.shape[1] - data.riding[0]
     if data.refined is not None:
         faces, count = data.refined.faces, data.refined.num_coarse
     piece = data.still.get("piece")

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hood.assets.garment.alterations import clean, sew, start_fitting
+from hood.assets.garment.alterations import clean, sew
+from hood.assets.garment.contents.fitting import start_fitting
 from hood.assets.garment.fasteners import ROOM, fasten, with_room
 from hood.assets.garment.garment import Garment, load_garment, save_garment
 from hood.assets.garment.mirror import mirror_garment

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from hood.assets.formats.mesh_file import read_mesh_file
-from hood.assets.formats.obj import MOST_PANELS
+from hood.assets.formats.raw_mesh import MOST_PANELS
 from hood.assets.garment import alterations
+from hood.assets.garment.contents.fitting import start_fitting
 from hood.assets.garment.garment import Garment, load_garment, save_garment
 
 POINTS = "".join(f"v {x} {y} 0\n" for y in range(3) for x in range(4))
@@ -79,7 +80,7 @@ def test_panels_stay_with_their_faces_through_repairs(tmp_path: Path) -> None:
         "\n".join([*lines, "g left", "f 1 2 3", "f 1 1 3", "f 1 3 4", "g right", "f 5 7 8", "f 5 6 8", "g gone", "f 7 7 8"])
         + "\n"
     )
-    fitting = alterations.start_fitting(load_unchecked(write(tmp_path, text)))
+    fitting = start_fitting(load_unchecked(write(tmp_path, text)))
     alterations.sew(fitting, 1e-3)
     alterations.clean(fitting)
     panels = fitting.garment.panels

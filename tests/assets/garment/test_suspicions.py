@@ -101,3 +101,14 @@ def test_seams_of_some_vertices_are_no_soup(garments: dict[str, Garment]) -> Non
     (found,) = suspect_seams(soup, np.arange(len(soup)).reshape(-1, 3))
     assert found.grave
     assert f"({len(tank.faces)} parts)" in found.what
+
+
+def test_a_part_beside_the_body_is_told_by_its_number(body: Body, garments: dict[str, Garment]) -> None:
+    """The garment is worn all the same: a rollout goes on."""
+    tank, skirt = (garments[name].tpose(np.zeros(10)) for name in ("tank", "skirt"))
+    pos = np.concatenate([tank, skirt + [2.0, 0.0, 0.0]])
+    faces = np.concatenate([garments["tank"].faces, garments["skirt"].faces + len(tank)])
+    (found,) = suspect_place(pos, faces, body.v_template, body.faces)
+    assert f"part 2 of 2, {len(skirt)} vertices from {len(tank)} on, does not surround the body" in found.what
+    assert not found.grave
+    assert suspect_place(np.concatenate([tank, skirt]), faces, body.v_template, body.faces) == []

@@ -1,0 +1,66 @@
+"""Several garments in one file, as an outfit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from hood.assets.formats.objects import PART
+from hood.assets.garment.contents.fitting import Fitting
+from hood.assets.garment.garment import Garment
+from hood.mesh.parts import Part, find_parts
+
+#: A name is that of a part if it covers so much [share] of the part's faces.
+_COVERED = 0.9
+#: A file of more parts than these is one garment: they are beads, fringes, or loose triangles.
+_MOST = 12
+#: Parts smaller than this share of the largest one are no garments of their own.
+_LEAST = 0.02
+
+
+def tell_apart(fitting: Fitting, scale: float) -> None:
+    """Parts of a file that are left become garments of an outfit, with the names of their objects; parts of one object are one
+    garment."""
+    garment = fitting.garment
+    if garment.piece is not None:
+        return
+    parts = find_parts(scale * garment.rest_pos, garment.faces)
+    if len(parts) < 2:
+        return
+    names = _names(garment, parts)
+    area = {name: sum(part.area for part, own in zip(parts, names, strict=True) if own == name) for name in names}
+    large = [name for name in area if area[name] >= _LEAST * max(area.values())]
+    if len(large) < 2 or len(large) > _MOST:
+        if len(parts) > _MOST:
+            fitting.guess(
+                "parts",
+                len(parts),
+                f"the file has {len(parts)} parts that hang together by nothing",
+                "weld=0.01 sews rims up to 1 cm apart, objects=[…] chooses",
+            )
+        return
+    piece = np.full(len(garment.rest_pos), -1, dtype=np.int64)
+    for part, name in zip(parts, names, strict=True):
+        piece[part.vertices] = large.index(name) if name in large else 0
+    fitting.garment = replace(garment, name="+".join(large), piece=np.maximum(piece, 0))
+    counts = ", ".join(f"{name} ({int((piece == number).sum())} vertices)" for number, name in enumerate(large))
+    worn = {name for part, name in zip(parts, names, strict=True) if part.can_be_put_on}
+    if worn >= set(large):
+        what = f"the file holds {len(large)} garments, {counts}; they are worn as an outfit"
+        fix = "objects=[…] chooses, layers=[…] orders them from the body outwards"
+    else:
+        what = f"the file holds {len(large)} parts that hang together by nothing, {counts}; each is simulated by itself"
+        fix = "objects=[…] chooses, weld=0.01 sews rims up to 1 cm apart, pins=… hold what would fall"
+    fitting.guess("garments", len(large), what, fix, names=large)
+
+
+def _names(garment: Garment, parts: list[Part]) -> list[str]:
+    """A name for every part: that of the first object, group or material that has all of it and not all of the file, else its
+    number."""
+    panels = {name: mask for name, mask in (garment.panels or {}).items() if not mask.all()}
+    names = []
+    for part in parts:
+        own = next((name for name, mask in panels.items() if mask[part.faces].mean() >= _COVERED), None)
+        names.append((own or f"{PART}{part.number}").replace("+", "_"))
+    return names

@@ -1,0 +1,1 @@
+"""What a rollout file holds beside the simulated cloth."""

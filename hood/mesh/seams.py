@@ -1,0 +1,182 @@
+"""Rims that lie along each other, as those of pattern pieces that belong together: which vertices and edges face each other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+#: A seam is at least so long [m] and has so many vertices on either side: corners of two pieces may meet by chance.
+_SHORTEST, _FEWEST = 0.03, 3
+#: A vertex that faces an edge within this share of its length from an end is sewn to that end.
+_NEAR_END = 0.3
+#: Edges are cut no nearer than this share to their ends, and not for what faces an end [share]; and two vertices that are less
+#: apart along a rim than this [m] face each other.
+_LEAST, _AT_END, _SAME = 0.15, 0.05, 1e-9
+#: Vertices of the same rim are no candidates for each other within so many times the gap along it.
+_ALONG = 6.0
+
+
+class Rims(NamedTuple):
+    """The open edges of a mesh."""
+
+    edges: np.ndarray  # (E, 2) vertices
+    face: np.ndarray  # (E,) the one that each is of
+    corner: np.ndarray  # (E,) the edge runs from this corner of the face to the next
+
+    @property
+    def vertices(self) -> np.ndarray:
+        """(n,) ascending."""
+        return np.unique(self.edges)
+
+
+class Seam(NamedTuple):
+    """Two parts whose rims lie along each other, or one with itself."""
+
+    parts: tuple[int, int]
+    length: float  # m
+    gap: float  # m, median distance
+    share: float  # of the shorter of the two whole rims
+
+
+class Facing(NamedTuple):
+    """What is to be sewn."""
+
+    seams: list[Seam]
+    pairs: np.ndarray  # (N, 2) vertices that are to be one
+    cut: np.ndarray  # (M, 2) a vertex that faces the inside of an edge, and the row of that edge among the rims
+    at: np.ndarray  # (M,) where on the edge, 0 to 1
+
+
+def find_rims(faces: np.ndarray) -> Rims:
+    """Edges that belong to exactly one face, in the direction in which that has them."""
+    half = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    _, first, times = np.unique(np.sort(half, axis=1), axis=0, return_index=True, return_counts=True)
+    rows = np.sort(first[times == 1])
+    return Rims(half[rows], rows // 3, rows % 3)
+
+
+def find_facing(
+    pos: np.ndarray, rims: Rims, part: np.ndarray, gap: float, sewn: Callable[[Seam], bool], own: bool = True
+) -> Facing:
+    """Which rims of ``pos`` (V, 3) [m] lie within ``gap`` [m] of each other.
+
+    Args:
+        part: (V,) part that a vertex is of.
+        sewn: whether a seam that was found is to be sewn.
+        own: whether a part may be sewn to itself.
+    """
+    matches = _closest(pos, rims, part, gap, own)
+    seams, kept = _seams(pos, rims, part, matches, sewn)
+    matches = _Matches(*(column[kept] for column in matches))
+    pairs = _mutual(pos, rims, part, matches)
+    done = _keys(pairs.reshape(-1), part[pairs[:, ::-1].reshape(-1)])
+    end = rims.edges[matches.edge, (matches.at > 0.5).astype(np.int64)]
+    left = ~np.isin(_keys(matches.vertex, part[end]), done)
+    near = left & (np.minimum(matches.at, 1.0 - matches.at) < _NEAR_END) & ~np.isin(_keys(end, part[matches.vertex]), done)
+    pairs = np.concatenate([pairs, np.stack([matches.vertex[near], end[near]], axis=1)])
+    cut = left & ~near & (np.minimum(matches.at, 1.0 - matches.at) > _AT_END)
+    rows = np.stack([matches.vertex[cut], matches.edge[cut]], axis=1)
+    return Facing(seams, pairs, rows, np.clip(matches.at[cut], _LEAST, 1.0 - _LEAST))
+
+
+class _Matches(NamedTuple):
+    """The open edge of every part that is nearest to a vertex of a rim."""
+
+    vertex: np.ndarray
+    edge: np.ndarray  # row
+    at: np.ndarray  # place on it, 0 to 1
+    dist: np.ndarray  # m
+
+
+def _closest(pos: np.ndarray, rims: Rims, part: np.ndarray, gap: float, own: bool) -> _Matches:
+    vertices = rims.vertices
+    start, end = pos[rims.edges[:, 0]], pos[rims.edges[:, 1]]
+    length = np.linalg.norm(end - start, axis=1)
+    middles = cKDTree(0.5 * (start + end))
+    found = middles.query_ball_point(pos[vertices], gap + 0.5 * float(length.max(initial=0.0)))
+    row = np.repeat(np.arange(len(vertices)), [len(one) for one in found])
+    edge = np.concatenate([np.zeros(0), *found]).astype(np.int64)
+    point, way = pos[vertices[row]], end[edge] - start[edge]
+    at = np.clip(((point - start[edge]) * way).sum(axis=1) / np.maximum(length[edge] ** 2, 1e-30), 0.0, 1.0)
+    dist = np.linalg.norm(start[edge] + at[:, None] * way - point, axis=1)
+    other = part[rims.edges[edge, 0]] != part[vertices[row]]
+    if own:
+        along = _along(pos, rims, vertices)
+        here, there = along[0][vertices[row]], along[0][rims.edges[edge, 0]]
+        way_between = np.abs(here - there)
+        same_loop = along[1][vertices[row]] == along[1][rims.edges[edge, 0]]
+        around = np.minimum(way_between, along[2][vertices[row]] - way_between)
+        other |= ~same_loop | (around > _ALONG * gap + 2.0 * length[edge])
+    good = other & (dist <= gap)
+    row, edge, at, dist = (column[good] for column in (row, edge, at, dist))
+    key = _keys(row, part[rims.edges[edge, 0]])
+    order = np.lexsort((dist, key))
+    first = order[np.unique(key[order], return_index=True)[1]]
+    return _Matches(vertices[row[first]], edge[first], at[first], dist[first])
+
+
+def _along(pos: np.ndarray, rims: Rims, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """For every vertex of a rim: how far along it is, which loop it is of, and how long that is; (V,) each."""
+    place, loop_of, whole = np.zeros(len(pos)), np.full(len(pos), -1), np.full(len(pos), np.inf)
+    after = dict(zip(rims.edges[:, 0].tolist(), rims.edges[:, 1].tolist(), strict=True))
+    for number, begin in enumerate(vertices.tolist()):
+        if loop_of[begin] >= 0 or begin not in after:
+            continue
+        loop, vertex = [], begin
+        while vertex in after and loop_of[vertex] < 0:
+            loop_of[vertex] = number
+            loop.append(vertex)
+            vertex = after[vertex]
+        steps = np.linalg.norm(pos[loop] - np.roll(pos[loop], -1, axis=0), axis=1)
+        place[loop] = np.concatenate([[0.0], np.cumsum(steps)[:-1]])
+        whole[loop] = steps.sum()
+    return place, loop_of, whole
+
+
+def _seams(
+    pos: np.ndarray, rims: Rims, part: np.ndarray, matches: _Matches, sewn: Callable[[Seam], bool]
+) -> tuple[list[Seam], np.ndarray]:
+    """The seams that are sewn, and which matches (N,) bool are of them."""
+    here, there = part[matches.vertex], part[rims.edges[matches.edge, 0]]
+    key = np.stack([np.minimum(here, there), np.maximum(here, there)], axis=1)
+    start, end = pos[rims.edges[:, 0]], pos[rims.edges[:, 1]]
+    length = np.linalg.norm(end - start, axis=1)
+    share_of_vertex = np.zeros(len(pos))
+    for side in (0, 1):
+        np.add.at(share_of_vertex, rims.edges[:, side], 0.5 * length)
+    whole = np.bincount(part[rims.edges[:, 0]], weights=length, minlength=int(part.max(initial=0)) + 1)
+    kept, seams = np.zeros(len(key), dtype=bool), []
+    for one, other in np.unique(key, axis=0).tolist():
+        rows = (key == (one, other)).all(axis=1)
+        sides = [share_of_vertex[matches.vertex[rows & (here == side)]] for side in {one, other}]
+        run = float(np.mean([side.sum() for side in sides])) / (2.0 if one == other else 1.0)
+        enough = all(len(side) >= _FEWEST for side in sides) and run >= _SHORTEST
+        rim = min(whole[one], whole[other])
+        seam = Seam((one, other), run, float(np.median(matches.dist[rows])), run / max(rim, 1e-12))
+        if enough and sewn(seam):
+            seams.append(seam)
+            kept |= rows
+    return seams, kept
+
+
+def _mutual(pos: np.ndarray, rims: Rims, part: np.ndarray, matches: _Matches) -> np.ndarray:
+    """Pairs (N, 2) of matched vertices each of which is the nearer end of the edge that the other one faces."""
+    end = rims.edges[matches.edge, (matches.at > 0.5).astype(np.int64)]
+    length = np.linalg.norm(pos[rims.edges[matches.edge, 1]] - pos[rims.edges[matches.edge, 0]], axis=1)
+    beside = np.minimum(matches.at, 1.0 - matches.at) * length  # m along the rim between the two
+    faced = {(int(v), int(part[e])): int(e) for v, e in zip(matches.vertex, end, strict=True)}
+    taken: dict[tuple[int, int], tuple[float, int]] = {}  # of several that face one vertex from one part the nearest one
+    for vertex, other, off in zip(matches.vertex.tolist(), end.tolist(), beside.tolist(), strict=True):
+        own = int(part[vertex])
+        if faced.get((other, own)) == vertex or off < _SAME:
+            taken[other, own] = min(taken.get((other, own), (np.inf, -1)), (off, vertex))
+    pairs = {tuple(sorted((vertex, other))) for (other, _), (_, vertex) in taken.items()}
+    return np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
+
+
+def _keys(vertex: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """One number for a vertex and a part."""
+    return vertex.astype(np.int64) * (1 << 20) + part

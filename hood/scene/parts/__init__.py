@@ -1,0 +1,1 @@
+"""The connected parts of a scene's garment."""

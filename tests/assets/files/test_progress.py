@@ -1,0 +1,21 @@
+"""Work that takes long says how far it is, and short work says nothing."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from hood.assets.files.progress import Progress
+
+
+def test_lines_come_after_a_while_and_not_too_often(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    progress = Progress("settling")
+    for second in range(30):
+        now[0] = float(second)
+        progress.tell(f"step {second}")
+    assert capsys.readouterr().err.splitlines() == [f"hood: settling: step {second}" for second in (5, 15, 25)]
