@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 
+from hood.assets.files.extras import install
 from hood.assets.files.folder_lock import occupy
 from hood.config import ConfigError, load_config, plain, read_record, require_choice, shown
 from hood.dynamics.checkpoint import load_simulator
@@ -87,7 +88,7 @@ def output_folder(config: DictConfig) -> Path:
 def require_package(module: str, title: str, extra: str, what: str) -> None:
     """Raise ConfigError unless ``module`` is there, before ``what`` is begun that draws with it."""
     if importlib.util.find_spec(module) is None:
-        raise ConfigError(f'{what}: drawing needs {title} (pip install "hood[{extra}]")')
+        raise ConfigError(f"{what}: drawing needs {title} ({install(extra)})")
 
 
 def require_distinct(key: str, values: Sequence[Any]) -> None:
