@@ -24,7 +24,7 @@ from hood.assets.files.atomic import write_atomically
 from hood.assets.files.guarded import check_size
 from hood.assets.files.library import unknown
 from hood.overrides import decoded, decoded_text, is_coded, parse, quoted, readable
-from hood.plugins import config_folders, packages
+from hood.plugins import config_folders, packages, without_options
 
 _PACKAGE = Path(__file__).resolve().parent
 #: Installed packages carry the configs inside; a clone has them beside the package.
@@ -255,7 +255,8 @@ def _check_override(name: str, text: str, defaults: DictConfig) -> tuple[str, Ov
     if _is_group(override) and override.value() is None and defaults.get(key) is not None:
         raise ConfigError(f"{key}=null: cannot be left out; give one of {', '.join(options(key))}")
     if _is_group(override) and override.value() is not None and str(override.value()) not in options(key):
-        raise ConfigError(unknown(f"option of {key}", str(override.value()), options(key)))
+        lost = without_options()
+        raise ConfigError(unknown(f"option of {key}", str(override.value()), options(key)) + (f"; {lost}" if lost else ""))
     return text, override
 
 
