@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import errno
 import json
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from glob import has_magic
 from pathlib import Path
 from typing import Any
 
-import h5py
 from omegaconf import DictConfig
 
 from hood.assets.files.library import locate
 from hood.assets.motion.collection import motions_in
 from hood.assets.motion.motion_files import find_motions
+from hood.commands.batches.places import attributes_of, is_of, place_motions, refuse_others
+from hood.commands.common import output_folder
 from hood.commands.summary import summarise
-from hood.config import ConfigError, load_config, plain
+from hood.config import ConfigError, brief, load_config, plain
 from hood.training import distributed
 
+#: Keys that change nothing in a rollout; its motion is compared by its file.
+_FREE = ("resume", "output", "root", "allow_unsound", "sequence")
 #: A disk in this state refuses the next file too.
 _HOPELESS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
@@ -70,25 +72,25 @@ def require_motions(key: str, entries: Sequence[str]) -> None:
             raise FileNotFoundError(f"{key}[{index}]: {error}") from error
 
 
-def find_jobs(entry: str, output: Path) -> list[Job] | None:
-    """The jobs of a folder, a glob or a list of motions, folders below ``output`` named as the files; None for one motion.
+def find_jobs(entry: str, output: Path, root: str | None = None) -> list[Job] | None:
+    """The jobs of a folder, a glob or a list of motions, folders below ``output`` named as the files below ``root``, without
+    one below what they have in common; None for one motion.
 
     Raises:
-        ConfigError: two motions would share a folder.
+        ConfigError: two motions would share a folder, or another motion is in one; ``root`` does not hold the motions, or
+            there is one motion only.
     """
     plain_file = Path(entry).expanduser().is_file() and Path(entry).suffix not in (".txt", ".json")
     found = [entry] if plain_file else expand_sequences([entry])
     if found == [entry]:
+        if root is not None:
+            raise ConfigError(f"root={root}: names the folders of many motions, and sequence={entry} is one; drop root")
         return None
-    files = [name for name in found if Path(name).suffix]
-    root = Path(os.path.commonpath([Path(name).absolute().parent for name in files])) if files else Path()
-    jobs = [Job(n, output / (Path(n).absolute().relative_to(root).with_suffix("") if n in files else n)) for n in found]
-    taken: dict[Path, str] = {}
-    for job in jobs:
-        if job.folder in taken:
-            raise ConfigError(f"{taken[job.folder]} and {job.sequence} would both go to {job.folder}; rename one of them")
-        taken[job.folder] = job.sequence
-    return jobs
+    folders, start = place_motions(found, output, root)
+    for name, folder in zip(found, folders, strict=True):
+        refuse_others(folder, name)
+    print(f"{len(found)} motions, their folders in {output} are named from {start} (root)")
+    return [Job(name, folder) for name, folder in zip(found, folders, strict=True)]
 
 
 def share(jobs: Sequence[Job], work: Callable[[Job], tuple[dict[str, Any], bool]]) -> Outcome:
@@ -117,21 +119,59 @@ def share(jobs: Sequence[Job], work: Callable[[Job], tuple[dict[str, Any], bool]
     )
 
 
+def resumed(config: DictConfig, digest: str) -> dict[str, Any] | None:
+    """With ``resume=true`` the summary of the rollout that is in its folder; says where one there was made otherwise."""
+    if not bool(config.resume):
+        return None
+    folder = output_folder(config)
+    done = finished(config, digest, folder)
+    sentence = made_otherwise(config, folder) if done is None else None
+    if sentence is not None:
+        print(sentence)
+    return done
+
+
 def finished(config: DictConfig, digest: str, folder: Path) -> dict[str, Any] | None:
     """The summary of a rollout that was finished with the same settings and weights; None where there is none."""
+    attributes = _complete(folder)
     try:
         summary: dict[str, Any] = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-        with h5py.File(folder / "rollout.h5", "r") as file:
-            attributes = dict(file.attrs)
-        before = json.loads(attributes["asked"])
-    except (OSError, ValueError, KeyError):
+    except (OSError, ValueError):
         return None
+    if attributes is None or attributes["checkpoint_sha256"] != digest or _other_settings(config, attributes):
+        return None
+    return summary if "sound" in summary else summarise(folder / "rollout.h5")
+
+
+def made_otherwise(config: DictConfig, folder: Path) -> str | None:
+    """A sentence where the folder has a whole rollout of the motion with another setting; None where it has none."""
+    attributes = _complete(folder)
+    found = {} if attributes is None else _other_settings(config, attributes)
+    for key, there in found.items():
+        here = f"{key} is {brief(there)} there, {brief(config[key])} in this command"
+        return f"resume=true: {folder} was made with other settings and is made again ({here})"
+    return None
+
+
+def _complete(folder: Path) -> dict[str, Any] | None:
+    """Attributes of the whole rollout in a folder; None where there is none."""
+    attributes = attributes_of(folder)
+    known = attributes is not None and {"asked", "complete", "checkpoint_sha256"} <= {*attributes}
+    return attributes if attributes is not None and known and bool(attributes["complete"]) else None
+
+
+def _other_settings(config: DictConfig, attributes: dict[str, Any]) -> dict[str, Any]:
+    """What a rollout was made with where that is not what ``config`` says, by key."""
+    try:
+        before = json.loads(attributes["asked"])
+    except ValueError:
+        return {"asked": None}
     now = plain(config)
     before["plan"] = before.get("plan") or now["plan"]
     before.setdefault("stepping", now["stepping"])  # rollouts from before there were options are known by their word
     # What had no key yet was what its default says now.
     before = {**plain(load_config("rollout")), **before}
-    same = all(before.get(key) == now[key] for key in now if key not in ("resume", "output", "allow_unsound"))
-    if not same or not bool(attributes["complete"]) or attributes["checkpoint_sha256"] != digest:
-        return None
-    return summary if "sound" in summary else summarise(folder / "rollout.h5")
+    other = {key: before.get(key) for key in now if key not in _FREE and before.get(key) != now[key]}
+    if not is_of(attributes, str(config.sequence)):
+        other["sequence"] = before.get("sequence")
+    return other
