@@ -96,7 +96,7 @@ def simulate(
     sequence: str | Path = "walk_proud",
     *,
     material: str | Material | Mapping[str, Any] | None = None,
-    stepper: str | Stepper = "network",
+    stepper: str | Stepper = "auto",
     progress: bool = False,
     **keys: Any,
 ) -> Simulation:
@@ -106,7 +106,9 @@ def simulate(
         garment: a name, a file, a list of them for an outfit, or a :class:`hood.Garment`.
         sequence: a name or a file of a motion.
         material: a name (``denim``), a :class:`hood.Material`, or a dictionary of properties. None: the default fabric.
-        stepper: ``network``, ``newton``, ``refine``, ``auto`` or another option of ``hood rollout``, or an own stepper.
+        stepper: ``network``, ``newton``, ``refine``, another option of ``hood rollout``, or an own stepper. ``auto``: the
+            network where ``checkpoint``, ``refine`` or another key of it is given; else ``newton`` on a CPU, and on a GPU the
+            faster of the two that is as accurate.
         progress: whether a progress bar is shown.
         keys: all keys of ``hood rollout --help`` that concern the simulation: ``body``, ``checkpoint``, ``num_frames``,
             ``fps`` and ``output_fps`` [1/s], ``betas``, ``refine``, ``device``, … A dictionary stands for a group:
@@ -140,6 +142,7 @@ def simulate(
         named["stepper"] = stepper
     else:
         require_stepper(stepper)
+        named["stepper"] = "network"  # what may be said of a network's steps may be said of these
     key = "accuracy" if named.get("accuracy") is not None else "plan" if plan_path(named) is not None else None
     if key is not None and (isinstance(garment, Garment) or isinstance(material, Material) or not isinstance(stepper, str)):
         raise ConfigError(f"{key}={named[key]}: a plan names garment, material and stepper; leave them out")

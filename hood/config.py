@@ -47,6 +47,10 @@ _SHORT_NOTE = 160
 _BRIEF = 100
 #: Bytes of a run's record at most, levels of its nesting, and characters of a reason why it is none.
 _RECORD_LIMIT, _DEEPEST, _REASON = 1 << 20, 32, 300
+#: Keys of a rollout that say which network takes the steps and how it computes, and how they are refined: who gives one means
+#: the network, unless another stepper is named.
+NETWORK_KEYS = ("checkpoint", "model", "precision", "kernels")
+_REFINING = ("refine", "target_rg", "budget_ms", "max_strain", "refine_method", "refine_most", "refine_table")
 #: What configs may name; and classes of plugins (:mod:`hood.plugins`).
 _TARGETS = ("hood.", "torch.optim.")
 
@@ -62,7 +66,15 @@ def load_config(name: str, overrides: Sequence[str] = ()) -> DictConfig:
         ConfigError: misspelt key, group option or type; Hydra's own complaints in one line.
     """
     folders = tuple(str(folder) for folder in config_folders())
-    return copy.deepcopy(_loaded(CONFIG_FOLDER, folders, name, tuple(overrides)))
+    words = with_network(overrides) if name == "rollout" else tuple(overrides)
+    return copy.deepcopy(_loaded(CONFIG_FOLDER, folders, name, words))
+
+
+def with_network(words: Sequence[str]) -> tuple[str, ...]:
+    """The words of a rollout; ``stepper=network`` among them where it is left to ``auto`` and one is about a network alone."""
+    said = {word.partition("=")[0].lstrip("+"): word.partition("=")[2] for word in words}
+    means = any(key.split(".")[0] in (*NETWORK_KEYS, *_REFINING) for key in said) or said.get("step", "plain") != "plain"
+    return (*words, "stepper=network") if means and said.get("stepper", "auto") == "auto" else tuple(words)
 
 
 @lru_cache(maxsize=8)

@@ -1,28 +1,23 @@
-"""Many motions in one command: which files, which folder for each, whose turn, what is done already."""
+"""Many motions in one command: which files, which folder for each, whose turn."""
 
 from __future__ import annotations
 
 import errno
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from glob import has_magic
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from hood.assets.files.library import locate
 from hood.assets.motion.collection import motions_in
 from hood.assets.motion.motion_files import find_motions
-from hood.commands.batches.places import attributes_of, is_of, place_motions, refuse_others
-from hood.commands.common import output_folder
-from hood.commands.summary import summarise
-from hood.config import ConfigError, brief, load_config, plain
+from hood.commands.batches.places import place_motions, refuse_others
+from hood.config import ConfigError
 from hood.training import distributed
 
-#: Keys that change nothing in a rollout; its motion is compared by its file.
-_FREE = ("resume", "output", "root", "allow_unsound", "sequence")
 #: A disk in this state refuses the next file too.
 _HOPELESS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
@@ -33,6 +28,12 @@ class Job:
 
     sequence: str
     folder: Path
+
+    def of(self, config: DictConfig) -> DictConfig:
+        """The config of its rollout, from that of all."""
+        one = OmegaConf.merge(config, {"sequence": self.sequence, "output": str(self.folder)})
+        assert isinstance(one, DictConfig)
+        return one
 
 
 @dataclass
@@ -117,61 +118,3 @@ def share(jobs: Sequence[Job], work: Callable[[Job], tuple[dict[str, Any], bool]
         any(part.interrupted for part in parts),
         next((part.hopeless for part in parts if part.hopeless is not None), None),
     )
-
-
-def resumed(config: DictConfig, digest: str) -> dict[str, Any] | None:
-    """With ``resume=true`` the summary of the rollout that is in its folder; says where one there was made otherwise."""
-    if not bool(config.resume):
-        return None
-    folder = output_folder(config)
-    done = finished(config, digest, folder)
-    sentence = made_otherwise(config, folder) if done is None else None
-    if sentence is not None:
-        print(sentence)
-    return done
-
-
-def finished(config: DictConfig, digest: str, folder: Path) -> dict[str, Any] | None:
-    """The summary of a rollout that was finished with the same settings and weights; None where there is none."""
-    attributes = _complete(folder)
-    try:
-        summary: dict[str, Any] = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    if attributes is None or attributes["checkpoint_sha256"] != digest or _other_settings(config, attributes):
-        return None
-    return summary if "sound" in summary else summarise(folder / "rollout.h5")
-
-
-def made_otherwise(config: DictConfig, folder: Path) -> str | None:
-    """A sentence where the folder has a whole rollout of the motion with another setting; None where it has none."""
-    attributes = _complete(folder)
-    found = {} if attributes is None else _other_settings(config, attributes)
-    for key, there in found.items():
-        here = f"{key} is {brief(there)} there, {brief(config[key])} in this command"
-        return f"resume=true: {folder} was made with other settings and is made again ({here})"
-    return None
-
-
-def _complete(folder: Path) -> dict[str, Any] | None:
-    """Attributes of the whole rollout in a folder; None where there is none."""
-    attributes = attributes_of(folder)
-    known = attributes is not None and {"asked", "complete", "checkpoint_sha256"} <= {*attributes}
-    return attributes if attributes is not None and known and bool(attributes["complete"]) else None
-
-
-def _other_settings(config: DictConfig, attributes: dict[str, Any]) -> dict[str, Any]:
-    """What a rollout was made with where that is not what ``config`` says, by key."""
-    try:
-        before = json.loads(attributes["asked"])
-    except ValueError:
-        return {"asked": None}
-    now = plain(config)
-    before["plan"] = before.get("plan") or now["plan"]
-    before.setdefault("stepping", now["stepping"])  # rollouts from before there were options are known by their word
-    # What had no key yet was what its default says now.
-    before = {**plain(load_config("rollout")), **before}
-    other = {key: before.get(key) for key in now if key not in _FREE and before.get(key) != now[key]}
-    if not is_of(attributes, str(config.sequence)):
-        other["sequence"] = before.get("sequence")
-    return other

@@ -12,15 +12,17 @@ from typing import Any
 
 import h5py
 import numpy as np
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from tqdm import tqdm
 
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.folder_lock import occupy
 from hood.commands.automatic import advice
-from hood.commands.batch import Job, find_jobs, resumed, share
+from hood.commands.batch import Job, find_jobs, share
+from hood.commands.batches.one_stepper import with_one_stepper
 from hood.commands.batches.overview import write_overview
 from hood.commands.batches.places import motion_attributes, refuse_others
+from hood.commands.batches.resuming import as_begun, resumed
 from hood.commands.cautions import warn
 from hood.commands.cloth_contact import why_not
 from hood.commands.common import output_folder, prepare_folder, thinning, together
@@ -67,6 +69,7 @@ def _run(config: DictConfig) -> int:
         return _run_all(config, jobs, output)
     if distributed.rank() != 0:
         return 0
+    config = as_begun(config, [(str(config.sequence), output)])
     stepper, digest = make_stepper(config)
     summary, interrupted = resumed(config, digest), False
     if summary is None:
@@ -155,12 +158,12 @@ def _run_there(ready: Setup, asked: DictConfig, digest: str, warned: list[str], 
 
 
 def _run_all(config: DictConfig, jobs: list[Job], output: Path) -> int:
-    """Every motion in its folder, and ``summary.json`` over all of them."""
+    """Every motion in its folder, and ``summary.json`` over all of them; one stepper for all."""
+    config = distributed.on_main(lambda: with_one_stepper(config, jobs))
     stepper, digest = make_stepper(config)
 
     def work(job: Job) -> tuple[dict[str, Any], bool]:
-        one = OmegaConf.merge(config, {"sequence": job.sequence, "output": str(job.folder)})
-        assert isinstance(one, DictConfig)
+        one = job.of(config)
         done = resumed(one, digest)
         return (done | {"skipped": True}, False) if done is not None else _run_one(one, stepper, digest, alone=False)
 
