@@ -20,6 +20,7 @@ from hood.assets.files.library import locate
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.own_garment import checked_garment
 from hood.assets.material import Material
+from hood.commands.checks.idle_keys import idle_in_rollout
 from hood.commands.common import read_model
 from hood.commands.guarding import GuardStopped, make_guard
 from hood.commands.output_fps import at_output_fps, output_rate
@@ -154,6 +155,7 @@ def simulate(
     with contextlib.redirect_stdout(told):  # choices are told to whoever reads the notes
         config = rollout_config(planned(overrides(named)))
         check_config(config)
+        notes += idle_in_rollout(overrides(named), config)
         taken = make_stepper(config)[0] if isinstance(stepper, str) else stepper
         ready = set_up(
             config,
@@ -181,6 +183,7 @@ def rollout(**keys: Any) -> dict[str, Any]:
     Examples:
         >>> import hood
         >>> summary = hood.rollout(garment="tank", num_frames=3, video="none", output="outputs/tank")
+        stepper=newton: the solver, the default on a CPU; ...
         tank: 3 frames, all finite
         ...
         >>> summary["num_frames"]
@@ -212,6 +215,7 @@ def export(rollout: str | Path, **keys: Any) -> Path:
     Examples:
         >>> import hood
         >>> _ = hood.rollout(garment="tank", num_frames=3, video="none", output="outputs/tank")
+        stepper=newton: the solver, the default on a CPU; ...
         tank: 3 frames, all finite
         ...
         >>> hood.export("outputs/tank", format="glb").name
@@ -239,7 +243,7 @@ def train(**keys: Any) -> Path:
 
     Examples:
         >>> import hood
-        >>> weights = hood.train(model="small", trainer={"iterations": 1}, output="runs/first")
+        >>> weights = hood.train(model="small", trainer={"iterations": 1, "kernels": "torch"}, output="runs/first")
         432,579 parameters, 7 garments, 22 motions
         ...
         >>> weights.name

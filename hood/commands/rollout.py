@@ -24,6 +24,7 @@ from hood.commands.batches.overview import write_overview
 from hood.commands.batches.places import motion_attributes, refuse_others
 from hood.commands.batches.resuming import as_begun, resumed
 from hood.commands.cautions import warn
+from hood.commands.checks.idle_keys import idle_in_rollout
 from hood.commands.cloth_contact import why_not
 from hood.commands.common import output_folder, prepare_folder, thinning, together
 from hood.commands.earlier_files import remove_earlier
@@ -58,6 +59,8 @@ def run(overrides: Sequence[str]) -> int:
     config = rollout_config(without_accuracy(overrides))
     check_config(config)
     check_outputs(config)
+    if distributed.is_first():
+        _tell(idle_in_rollout(overrides, config))
     return together(lambda: _run(rollout_config(distributed.on_main(lambda: planned(overrides)))))
 
 
