@@ -14,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from hood.assets.files.library import locate
 from hood.assets.motion.collection import motions_in
 from hood.assets.motion.motion_files import find_motions
+from hood.commands.batches.overview import refuse_overview, refuse_rollout
 from hood.commands.batches.places import place_motions, refuse_others
 from hood.config import ConfigError
 from hood.training import distributed
@@ -79,14 +80,16 @@ def find_jobs(entry: str, output: Path, root: str | None = None) -> list[Job] | 
 
     Raises:
         ConfigError: two motions would share a folder, or another motion is in one; ``root`` does not hold the motions, or
-            there is one motion only.
+            there is one motion only; one rollout would meet those of many in ``output``.
     """
     plain_file = Path(entry).expanduser().is_file() and Path(entry).suffix not in (".txt", ".json")
     found = [entry] if plain_file else expand_sequences([entry])
     if found == [entry]:
         if root is not None:
             raise ConfigError(f"root={root}: names the folders of many motions, and sequence={entry} is one; drop root")
+        refuse_overview(output)
         return None
+    refuse_rollout(output)
     folders, start = place_motions(found, output, root)
     for name, folder in zip(found, folders, strict=True):
         refuse_others(folder, name)

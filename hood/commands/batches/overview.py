@@ -9,6 +9,7 @@ from typing import Any
 
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.folder_lock import occupy
+from hood.config import ConfigError
 
 _NAME = "summary.json"
 #: Seconds to wait for another call that writes its rows at this moment.
@@ -42,6 +43,21 @@ def write_overview(output: Path, rows: Mapping[str, dict[str, Any]], folders: Ma
         }
         write_atomically(path, json.dumps(content, indent=1).encode())
     return path
+
+
+def refuse_overview(folder: Path) -> None:
+    """Raise ConfigError where one rollout would write into the folder of many, and replace the summary over all of them."""
+    count = len(_read(folder / _NAME)[0])
+    if count:
+        raise ConfigError(f"output={folder}: holds the rollouts of {count} motions and their summary; give a folder of its own")
+
+
+def refuse_rollout(folder: Path) -> None:
+    """Raise ConfigError where the folder for many motions holds one rollout: its summary would be replaced."""
+    if (folder / "rollout.h5").exists():
+        raise ConfigError(
+            f"output={folder}: holds one rollout, whose summary that of many would replace; choose another output"
+        )
 
 
 def _is_there(output: Path, place: str | None, row: Mapping[str, Any]) -> bool:

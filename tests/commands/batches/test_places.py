@@ -165,3 +165,15 @@ def test_one_motion_that_is_finished_stays(subjects: Path, capsys: pytest.Captur
     told = capsys.readouterr().out
     assert "resume=true: out was made with other settings and is made again (gravity is 9.81 there, 5 in this command)" in told
     assert files(subjects / "out") != before
+
+
+def test_one_rollout_and_those_of_many_do_not_share_a_folder(subjects: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*QUICK, "sequence=01.txt"]) == 0
+    assert main([*QUICK, "sequence=amass/02/walk.npz", "output=one"]) == 0
+    before = {name: files(subjects / name) for name in ("out", "one")}
+    capsys.readouterr()
+    assert main([*QUICK, "sequence=amass/02/walk.npz"]) == 2
+    assert "output=out: holds the rollouts of 2 motions and their summary; give a folder of its own" in capsys.readouterr().err
+    assert main([*QUICK, "sequence=01.txt", "output=one"]) == 2
+    assert "output=one: holds one rollout, whose summary that of many would replace" in capsys.readouterr().err
+    assert {name: files(subjects / name) for name in ("out", "one")} == before
