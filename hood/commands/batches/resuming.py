@@ -12,9 +12,9 @@ from omegaconf import DictConfig, OmegaConf
 from hood.commands.automatic import AUTO
 from hood.commands.batches.places import attributes_of, is_of
 from hood.commands.common import output_folder
-from hood.commands.steppers import with_stepper
+from hood.commands.steppers import GROUP, with_stepper
 from hood.commands.summary import summarise
-from hood.config import brief, load_config, plain
+from hood.config import brief, load_config, options, plain
 
 #: Keys that change nothing in a rollout; its motion is compared by its file.
 _FREE = ("resume", "output", "root", "allow_unsound", "sequence")
@@ -31,7 +31,7 @@ def as_begun(config: DictConfig, motions: Iterable[tuple[str, Path]]) -> DictCon
         return config
     for sequence, folder in motions:
         attributes = _complete(folder)
-        if attributes is None:
+        if attributes is None or str(attributes["stepper"]) not in options(GROUP):  # of a plugin that is gone
             continue
         same = with_stepper(config, str(attributes["stepper"]))
         if not _other_settings(OmegaConf.merge(same, {"sequence": sequence}), attributes):
