@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import importlib.util
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -152,6 +153,7 @@ def entry(argv: Sequence[str] | None = None) -> None:
     """Console entry: the process is set up before torch is loaded, then runs the command and ends with its exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     leave_working_folder()
+    _name_program()
     if sys.platform.startswith("linux"):
         _keep_memory_mapped()
     from hood.native import build
@@ -188,6 +190,14 @@ def leave_working_folder() -> None:
     if home == here and home not in sys.path:
         sys.path.append(home)
         os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [os.environ.get("PYTHONPATH"), home]))
+
+
+def _name_program() -> None:
+    """Tell processes that this one spawns, as trainings do, that it is ``python -m hood``: they would import the script that
+    called us to begin with, and one without a guard would start the command again."""
+    main = sys.modules["__main__"]
+    if getattr(main, "__spec__", None) is None:
+        main.__spec__ = importlib.util.find_spec("hood.__main__")
 
 
 def _keep_memory_mapped() -> None:

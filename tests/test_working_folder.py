@@ -13,7 +13,8 @@ ROOT = Path(__file__).resolve().parents[1]
 #: Modules that hood, its packages or Python import; a namespace that Hydra looks through.
 NAMES = ("yaml", "types", "numpy", "torch", "h5py", "hood", "json", "typing", "random", "hydra_plugins/mine")
 MARK = "import os\nopen(os.environ['MARKS'] + '/' + __name__, 'w').close()\n"
-#: What pip writes as the command; it also notes what is opened or listed below the working folder, but the outputs.
+#: What is installed as the command, without the guard that pip writes; it also notes what is opened or listed below the working
+#: folder, but the outputs.
 COMMAND = """
 import os, sys
 here = os.getcwd()
@@ -27,10 +28,18 @@ sys.addaudithook(note)
 from hood.cli import entry
 sys.exit(entry())
 """
-#: A training of one update whose scenes are made by a process of its own.
+#: Before its last two lines: the processes that make the scenes of a training start at once, and it is told.
+SPAWNING = """
+import hood.training.prefetch as prefetch
+prefetch._WARM_UP = 0
+start = prefetch.SceneFeed._start_pool
+prefetch.SceneFeed._start_pool = lambda feed: print("a pool", file=sys.stderr) or start(feed)
+"""
+#: A training whose scenes are made by a process of its own.
 TRAINING = (
     "train", "model=small", "model.latent_dim=4", "model.schedule='1x(mesh)'", "data.garments=[tank]",
-    "data.sequences=[walk_proud]", "trainer.iterations=2", "trainer.batch_size=1", "trainer.workers=1", "output=out",
+    "data.sequences=[walk_proud]", "trainer.iterations=2", "trainer.batch_size=2", "trainer.workers=1",
+    "trainer.horizon.start=1", "trainer.statistics_iterations=0", "output=out",
 )  # fmt: skip
 ROLLOUT = ("rollout", "garment=tank", "stepper=newton", "num_frames=2", "video=none", "output=out")
 
@@ -50,9 +59,9 @@ def folder(tmp_path: Path) -> Path:
 
 
 def run(folder: Path, *command: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Python with these arguments there, by default with no variable that changes where it looks."""
+    """Python with these arguments there, without a compiler, by default with no variable that changes where it looks."""
     kept = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
-    variables = kept | {"MARKS": str(folder.parent / "marks")} | environment
+    variables = kept | {"MARKS": str(folder.parent / "marks"), "CXX": "no-such-compiler"} | environment
     return subprocess.run([sys.executable, *command], cwd=folder, env=variables, capture_output=True, text=True, timeout=300)
 
 
@@ -60,10 +69,20 @@ def marks(folder: Path) -> dict[str, str]:
     return {path.name: path.read_text() for path in (folder.parent / "marks").iterdir()}
 
 
-@pytest.mark.parametrize("words", [("--version",), ("inspect", "tank"), ROLLOUT, TRAINING], ids=lambda words: words[0])
+@pytest.mark.parametrize("words", [("--version",), ("inspect", "tank"), ROLLOUT], ids=lambda words: words[0])
 def test_no_file_of_the_working_folder_is_run_or_looked_at(words: tuple[str, ...], folder: Path) -> None:
     done = run(folder, str(folder.parent / "bin" / "hood"), *words)
     assert done.returncode == 0, done.stderr
+    assert marks(folder) == {}
+
+
+def test_processes_that_a_training_starts_run_nothing_there_and_not_the_command_again(folder: Path) -> None:
+    command = folder.parent / "bin" / "hood"
+    command.write_text(COMMAND.replace("from hood.cli", f"{SPAWNING}from hood.cli"))
+    done = run(folder, str(command), *TRAINING)
+    assert done.returncode == 0, done.stderr
+    assert "a pool" in done.stderr
+    assert "worker died" not in done.stderr
     assert marks(folder) == {}
 
 

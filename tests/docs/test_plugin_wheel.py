@@ -19,8 +19,8 @@ _BUILDER = re.compile(r"\[build-system\]\n.*?\n\n", re.DOTALL)
 
 
 def python(*words: str | Path, where: Path, path: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """Python with these words in the folder ``where``, with packages from ``path``."""
-    environment = os.environ | ({"PYTHONPATH": str(path)} if path else {})
+    """Python with these words in the folder ``where``, without a compiler, with packages from ``path``."""
+    environment = os.environ | {"CXX": "no-such-compiler"} | ({"PYTHONPATH": str(path)} if path else {})
     return subprocess.run([sys.executable, "-P", *words], cwd=where, env=environment, capture_output=True, text=True)
 
 
