@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 .PHONY: demo test lint slow envelope docs clean
 
 demo: $(VENV)/.demo
-	$(BIN)/hood rollout garment=dress_4k stepper=auto output=outputs/demo
+	$(BIN)/hood rollout garment=dress_4k output=outputs/demo
 	@echo "Look at outputs/demo/contact_sheet.png and outputs/demo/rollout.mp4"
 
 test: lint

@@ -85,7 +85,7 @@ def start(case: Case, folder: Path, again: bool) -> subprocess.Popen[bytes]:
     texts = [text.replace("{out}", str(folder)) for text in given]
     with (folder.parent / "printed").open("ab") as printed:
         return subprocess.Popen(
-            [sys.executable, "-m", "hood.cli", *texts],
+            [sys.executable, "-P", "-m", "hood.cli", *texts],
             stdout=printed,
             stderr=subprocess.STDOUT,
             start_new_session=True,

@@ -171,7 +171,7 @@ def naive_step(case: Case, step: ProcessorStep, nodes: Tensor, edges: dict[str, 
 
 
 def pyg(case: Case) -> Callable[[], Tensor]:
-    """The single-level network as torch_geometric's MetaLayer; needs ``pip install torch_geometric``."""
+    """The single-level network as torch_geometric's MetaLayer; needs ``pip install "hood-cloth[benchmark]"``."""
     from torch_geometric.nn import MetaLayer  # type: ignore[import-not-found]
     from torch_geometric.utils import scatter  # type: ignore[import-not-found]
 

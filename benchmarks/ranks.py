@@ -23,10 +23,10 @@ def measure(ranks: int, batch_size: int, iterations: int, options: list[str]) ->
             "train", f"trainer.batch_size={batch_size}", f"trainer.iterations={iterations}", f"output={folder}/run",
             "trainer.log_every=1", f"trainer.checkpoint_every={iterations}", "trainer.workers=0", *options,
         ]  # fmt: skip
-        launcher = [sys.executable, "-m"]
+        launcher = [sys.executable, "-P", "-m"]
         if ranks > 1:
             launcher += ["torch.distributed.run", "--standalone", "--nproc-per-node", str(ranks), "-m"]
-        environment = os.environ | {"OMP_NUM_THREADS": "1"}
+        environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONSAFEPATH": "1"}
         result = subprocess.run([*launcher, "hood.cli", *arguments], env=environment, capture_output=True, text=True)
         if result.returncode:
             sys.exit(result.stderr[-2000:])

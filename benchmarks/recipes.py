@@ -148,7 +148,10 @@ def hood(arguments: list[str], log: Path) -> tuple[int, float]:
     """Exit code and CPU seconds of one ``hood`` command with one thread; what it prints goes to ``log``."""
     with open(log, "ab") as sink:
         process = subprocess.Popen(
-            [sys.executable, "-m", "hood.cli", *arguments], stdout=sink, stderr=sink, env=os.environ | {"OMP_NUM_THREADS": "1"}
+            [sys.executable, "-P", "-m", "hood.cli", *arguments],
+            stdout=sink,
+            stderr=sink,
+            env=os.environ | {"OMP_NUM_THREADS": "1"},
         )
         _, status, usage = os.wait4(process.pid, 0)
     return os.waitstatus_to_exitcode(status), usage.ru_utime + usage.ru_stime

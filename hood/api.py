@@ -20,6 +20,7 @@ from hood.assets.files.library import locate
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.own_garment import checked_garment
 from hood.assets.material import Material
+from hood.commands.checks.idle_keys import idle_in_rollout
 from hood.commands.common import read_model
 from hood.commands.guarding import GuardStopped, make_guard
 from hood.commands.output_fps import at_output_fps, output_rate
@@ -96,7 +97,7 @@ def simulate(
     sequence: str | Path = "walk_proud",
     *,
     material: str | Material | Mapping[str, Any] | None = None,
-    stepper: str | Stepper = "network",
+    stepper: str | Stepper = "auto",
     progress: bool = False,
     **keys: Any,
 ) -> Simulation:
@@ -106,7 +107,9 @@ def simulate(
         garment: a name, a file, a list of them for an outfit, or a :class:`hood.Garment`.
         sequence: a name or a file of a motion.
         material: a name (``denim``), a :class:`hood.Material`, or a dictionary of properties. None: the default fabric.
-        stepper: ``network``, ``newton``, ``refine``, ``auto`` or another option of ``hood rollout``, or an own stepper.
+        stepper: ``network``, ``newton``, ``refine``, another option of ``hood rollout``, or an own stepper. ``auto``: the
+            network where ``checkpoint``, ``refine`` or another key of it is given; else ``newton`` on a CPU, and on a GPU the
+            faster of the two that is as accurate.
         progress: whether a progress bar is shown.
         keys: all keys of ``hood rollout --help`` that concern the simulation: ``body``, ``checkpoint``, ``num_frames``,
             ``fps`` and ``output_fps`` [1/s], ``betas``, ``refine``, ``device``, … A dictionary stands for a group:
@@ -140,6 +143,7 @@ def simulate(
         named["stepper"] = stepper
     else:
         require_stepper(stepper)
+        named["stepper"] = "network"  # what may be said of a network's steps may be said of these
     key = "accuracy" if named.get("accuracy") is not None else "plan" if plan_path(named) is not None else None
     if key is not None and (isinstance(garment, Garment) or isinstance(material, Material) or not isinstance(stepper, str)):
         raise ConfigError(f"{key}={named[key]}: a plan names garment, material and stepper; leave them out")
@@ -151,6 +155,7 @@ def simulate(
     with contextlib.redirect_stdout(told):  # choices are told to whoever reads the notes
         config = rollout_config(planned(overrides(named)))
         check_config(config)
+        notes += idle_in_rollout(overrides(named), config)
         taken = make_stepper(config)[0] if isinstance(stepper, str) else stepper
         ready = set_up(
             config,
@@ -178,6 +183,7 @@ def rollout(**keys: Any) -> dict[str, Any]:
     Examples:
         >>> import hood
         >>> summary = hood.rollout(garment="tank", num_frames=3, video="none", output="outputs/tank")
+        stepper=newton: the solver, the default on a CPU; ...
         tank: 3 frames, all finite
         ...
         >>> summary["num_frames"]
@@ -209,6 +215,7 @@ def export(rollout: str | Path, **keys: Any) -> Path:
     Examples:
         >>> import hood
         >>> _ = hood.rollout(garment="tank", num_frames=3, video="none", output="outputs/tank")
+        stepper=newton: the solver, the default on a CPU; ...
         tank: 3 frames, all finite
         ...
         >>> hood.export("outputs/tank", format="glb").name
@@ -236,7 +243,7 @@ def train(**keys: Any) -> Path:
 
     Examples:
         >>> import hood
-        >>> weights = hood.train(model="small", trainer={"iterations": 1}, output="runs/first")
+        >>> weights = hood.train(model="small", trainer={"iterations": 1, "kernels": "torch"}, output="runs/first")
         432,579 parameters, 7 garments, 22 motions
         ...
         >>> weights.name

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import ctypes
 import gc
+import importlib.util
 import os
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
+from hood.assets.files.extras import DISTRIBUTION
 from hood.commands.exit_codes import exit_code_lines
 
-# Read by the C library and OpenMP at process start. Cloth steps allocate and free tensors of a few MB many times a frame:
-# keeping them mapped is worth 1.15–1.9×. Waiting threads that spin slow a busy machine down 6× and more. Both figures and the
-# times below are of an AMD server CPU.
+# For the C library and OpenMP. Cloth steps allocate and free tensors of a few MB many times a frame: keeping them mapped is
+# worth 1.15–1.9×. Waiting threads that spin slow a busy machine down 6× and more. Both figures and the times below are of an
+# AMD server CPU.
 ENVIRONMENT = {
     "OMP_WAIT_POLICY": "PASSIVE",
     # One step of a 1k garment takes 45 ms on one thread and 100 ms on two: its operations are too small to share.
@@ -20,6 +24,8 @@ ENVIRONMENT = {
     "MALLOC_TRIM_THRESHOLD_": "1073741824",
     "MALLOC_TOP_PAD_": "67108864",
 }
+#: The numbers that ``mallopt`` of the GNU C library has for them.
+_OF_MALLOPT = {"MALLOC_TRIM_THRESHOLD_": -1, "MALLOC_TOP_PAD_": -2, "MALLOC_MMAP_THRESHOLD_": -3}
 COMMANDS = {
     "rollout": "simulate garments on a moving body: positions, a film, a verdict",
     "view": "write rollouts as one HTML page to turn and play in a browser",
@@ -53,7 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name in ("-V", "--version"):
         from hood import __version__
 
-        print(f"hood {__version__}")
+        print(f"hood {__version__} ({DISTRIBUTION})")
         return 0
     if name not in COMMANDS:
         from hood.assets.files.library import unknown
@@ -144,11 +150,12 @@ def _usage() -> str:
 
 
 def entry(argv: Sequence[str] | None = None) -> None:
-    """Console entry: allocator settings take effect only at process start, so the process replaces itself once."""
+    """Console entry: the process is set up before torch is loaded, then runs the command and ends with its exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
-    if sys.platform.startswith("linux") and not os.environ.get("MALLOC_TOP_PAD_"):
-        os.environ.update({key: os.environ.get(key, value) for key, value in ENVIRONMENT.items()})
-        os.execv(sys.executable, [sys.executable, "-m", "hood.cli", *arguments])
+    leave_working_folder()
+    _name_program()
+    if sys.platform.startswith("linux"):
+        _keep_memory_mapped()
     from hood.native import build
 
     build.announce = lambda sentence: print(f"hood: {sentence}", file=sys.stderr)
@@ -163,6 +170,45 @@ def entry(argv: Sequence[str] | None = None) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 130
     sys.exit(code)
+
+
+def leave_working_folder() -> None:
+    """Import nothing from the folder where the command is called, here and in every Python that is started from here.
+
+    ``python -m`` and ``python -c`` put it first: a file ``yaml.py`` there would be run. ``PYTHONPATH`` stays. Of a clone that
+    is not installed, hood itself is found there still, after everything else.
+    """
+    os.environ["PYTHONSAFEPATH"] = "1"
+    try:
+        here = os.getcwd()
+    except FileNotFoundError:  # it has been removed since
+        here = ""
+    if sys.flags.safe_path or not sys.path or sys.path[0] not in ("", here):
+        return
+    del sys.path[0]
+    home = str(Path(__file__).parents[1])
+    if home == here and home not in sys.path:
+        sys.path.append(home)
+        os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [os.environ.get("PYTHONPATH"), home]))
+
+
+def _name_program() -> None:
+    """Tell processes that this one spawns, as trainings do, that it is ``python -m hood``: they would import the script that
+    called us to begin with, and one without a guard would start the command again."""
+    main = sys.modules["__main__"]
+    if getattr(main, "__spec__", None) is None:
+        main.__spec__ = importlib.util.find_spec("hood.__main__")
+
+
+def _keep_memory_mapped() -> None:
+    """Apply :data:`ENVIRONMENT`, what the user has set before it: to this process now, to those that it starts by their
+    environment. OpenMP reads its part when torch is loaded."""
+    missing = {key: value for key, value in ENVIRONMENT.items() if not os.environ.get(key)}
+    os.environ.update(missing)
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)  # not every C library has it
+    for key, number in _OF_MALLOPT.items():
+        if mallopt is not None and key in missing:
+            mallopt(number, int(missing[key]))
 
 
 if __name__ == "__main__":

@@ -23,8 +23,8 @@ from omegaconf.errors import OmegaConfBaseException
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.guarded import check_size
 from hood.assets.files.library import unknown
-from hood.overrides import decoded, decoded_text, is_coded, parse, quoted, readable
-from hood.plugins import config_folders, packages
+from hood.overrides import decoded, decoded_text, is_coded, loop, parse, quoted, readable
+from hood.plugins import config_folders, packages, without_options
 
 _PACKAGE = Path(__file__).resolve().parent
 #: Installed packages carry the configs inside; a clone has them beside the package.
@@ -47,6 +47,10 @@ _SHORT_NOTE = 160
 _BRIEF = 100
 #: Bytes of a run's record at most, levels of its nesting, and characters of a reason why it is none.
 _RECORD_LIMIT, _DEEPEST, _REASON = 1 << 20, 32, 300
+#: Keys of a rollout that say which network takes the steps and how it computes, and how they are refined: who gives one means
+#: the network, unless another stepper is named.
+NETWORK_KEYS = ("checkpoint", "model", "precision", "kernels")
+_REFINING = ("refine", "target_rg", "budget_ms", "max_strain", "refine_method", "refine_most", "refine_table")
 #: What configs may name; and classes of plugins (:mod:`hood.plugins`).
 _TARGETS = ("hood.", "torch.optim.")
 
@@ -62,7 +66,15 @@ def load_config(name: str, overrides: Sequence[str] = ()) -> DictConfig:
         ConfigError: misspelt key, group option or type; Hydra's own complaints in one line.
     """
     folders = tuple(str(folder) for folder in config_folders())
-    return copy.deepcopy(_loaded(CONFIG_FOLDER, folders, name, tuple(overrides)))
+    words = with_network(overrides) if name == "rollout" else tuple(overrides)
+    return copy.deepcopy(_loaded(CONFIG_FOLDER, folders, name, words))
+
+
+def with_network(words: Sequence[str]) -> tuple[str, ...]:
+    """The words of a rollout; ``stepper=network`` among them where it is left to ``auto`` and one is about a network alone."""
+    said = {word.partition("=")[0].lstrip("+"): word.partition("=")[2] for word in words}
+    means = any(key.split(".")[0] in (*NETWORK_KEYS, *_REFINING) for key in said) or said.get("step", "plain") != "plain"
+    return (*words, "stepper=network") if means and said.get("stepper", "auto") == "auto" else tuple(words)
 
 
 @lru_cache(maxsize=8)
@@ -245,17 +257,23 @@ def save_run_record(folder: Path, config: DictConfig, seed: int) -> None:
 
 
 def _check_override(name: str, text: str, defaults: DictConfig) -> tuple[str, Override]:
+    if text.split("=")[0] in ("-m", "--multirun"):
+        raise ConfigError(f"{text!r}: {loop(name)}")
     if text.startswith("-"):
         word = text.lstrip("-") if "=" in text else "key=value"
         raise ConfigError(f"{text!r}: keys have no dashes; write {word}, hood {name} --help lists the keys")
     if "=" not in text and not text.startswith("~"):
         raise ConfigError(f"argument {text!r} is not of the form key=value; keys of {name}: {', '.join(defaults)}")
-    text, override = _read_word(text, defaults)
+    given, (text, override) = text, _read_word(text, defaults)
     key = override.get_key_element().lstrip("+~").split("@")[0]
+    several = _values_of(key, given, override, defaults)
+    if several:
+        raise ConfigError(f"{given[:_REASON]}: {loop(name, key, several)}")
     if _is_group(override) and override.value() is None and defaults.get(key) is not None:
         raise ConfigError(f"{key}=null: cannot be left out; give one of {', '.join(options(key))}")
     if _is_group(override) and override.value() is not None and str(override.value()) not in options(key):
-        raise ConfigError(unknown(f"option of {key}", str(override.value()), options(key)))
+        lost = without_options()
+        raise ConfigError(unknown(f"option of {key}", str(override.value()), options(key)) + (f"; {lost}" if lost else ""))
     return text, override
 
 
@@ -268,6 +286,19 @@ def _read_word(text: str, defaults: DictConfig) -> tuple[str, Override]:
         raise ConfigError(str(error)) from error
     except HydraException as error:
         raise ConfigError(f"cannot read {text[:_REASON]!r}: write key=value") from error
+
+
+def _values_of(key: str, text: str, override: Override, defaults: DictConfig) -> list[str]:
+    """The values where a word gives several to a key that takes one: what Hydra calls a sweep. Empty where it gives one."""
+    if override.is_sweep_override():
+        return ["…"]
+    given = str(override.value()).split(",")
+    if len(given) < 2 or text.partition("=")[2][:1] in "[{('\"":
+        return []
+    usual = OmegaConf.select(defaults, key, default=None)
+    scalar = isinstance(usual, (bool, int, float))
+    options_of_group = _is_group(override) and all(value in options(key) for value in given)
+    return given if scalar or options_of_group else []
 
 
 def _takes_several(key: str, defaults: DictConfig) -> bool:

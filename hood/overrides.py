@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,8 @@ from hood.assets.files.library import names
 
 #: Characters of a word that a message repeats at most.
 _SHOWN = 300
+#: Values that an example of a loop has at most.
+_SHOWN_VALUES = 3
 _QUOTED = re.compile(r"'(?:[^'\\]|\\.)*'|\"(?:[^\"\\]|\\.)*\"", re.DOTALL)
 _BRACKETS = {"[": "]", "{": "}", "(": ")"}
 _NUMBER = re.compile(r"[+-]?(\d[\d_]*\.?\d*|\.\d+)([eE][+-]?\d+)?|nan|inf|null|true|false", re.IGNORECASE)
@@ -70,6 +73,13 @@ def readable(text: str, several: bool) -> str:
             raise ValueError(_without_brackets(key, value))
         return readable(f"{key}=[{value}]", several)
     return f"{key}={quoted(value)}"
+
+
+def loop(command: str, key: str = "seed", values: Sequence[str] = ("0", "1")) -> str:
+    """The way out for who asks one command for several values of a key."""
+    shown = " ".join(values[:_SHOWN_VALUES])
+    rollouts = f"for x in {shown}; do hood {command} {key}=$x output=outputs/{key.rpartition('.')[2]}_$x; done"
+    return f"a command takes one value of a key, a loop of the shell runs several: {rollouts}"
 
 
 def quoted(text: str) -> str:

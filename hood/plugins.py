@@ -8,8 +8,9 @@ A package registers in its ``pyproject.toml``; nothing else is ever imported or 
     [project.entry-points."hood.features"]
     curvature = "my_cloth:Curvature"
 
-Options lie in its folder ``configs``, in groups as in ours: ``my_cloth/configs/losses/windy.yaml`` is ``losses=windy``. What
-stands in a group of :data:`KINDS` has a name of its own: ``model.features=physical+curvature``.
+Options lie in its folder ``configs``, which its wheel has to hold, in groups as in ours:
+``my_cloth/configs/losses/windy.yaml`` is ``losses=windy``. What stands in a group of :data:`KINDS` has a name of its own:
+``model.features=physical+curvature``.
 """
 
 from __future__ import annotations
@@ -46,16 +47,33 @@ def config_folders() -> tuple[Path, ...]:
     Raises:
         ValueError: a registered package is not there.
     """
-    folders = []
+    return tuple(folder for name in packages() for folder in _config_folders_of(name))
+
+
+def without_options() -> str:
+    """A sentence about the first registered package that has no option, with the way out; empty where each has one.
+
+    A package is registered for its options and their classes; what builds it may leave out files that are not Python.
+    """
     for name in packages():
-        try:
-            spec = importlib.util.find_spec(name)
-        except ImportError:
-            spec = None
-        if spec is None:
-            raise ValueError(f"plugin {name!r}: registered under {GROUP}, but there is no such package; install it again")
-        folders += [Path(place) / "configs" for place in spec.submodule_search_locations or ()]
-    return tuple(folder for folder in folders if folder.is_dir())
+        if not any(folder.glob("*/*.yaml") for folder in _config_folders_of(name)):
+            return (
+                f"the plugin {name!r} is installed without its files configs/GROUP/*.yaml: where setuptools builds it, add "
+                f'[tool.setuptools.package-data] {name} = ["configs/**/*.yaml"] to its pyproject.toml, and install it again'
+            )
+    return ""
+
+
+def _config_folders_of(name: str) -> list[Path]:
+    """The folders ``configs`` of a registered package, as many as there are."""
+    try:
+        spec = importlib.util.find_spec(name)
+    except ImportError:
+        spec = None
+    if spec is None:
+        raise ValueError(f"plugin {name!r}: registered under {GROUP}, but there is no such package; install it again")
+    folders = [Path(place) / "configs" for place in spec.submodule_search_locations or ()]
+    return [folder for folder in folders if folder.is_dir()]
 
 
 def names(kind: str) -> tuple[str, ...]:

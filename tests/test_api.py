@@ -244,6 +244,25 @@ def test_no_stepper_is_refused_by_name() -> None:
         hood.simulate("tank", "plie", num_frames=2, stepper=None)  # type: ignore[arg-type]
 
 
+def test_tensors_with_a_gradient_are_refused_where_it_would_be_dropped() -> None:
+    value, vertices = torch.tensor(3e4, requires_grad=True), torch.ones(1016, requires_grad=True)
+    moved = torch.as_tensor(hood.load_garment("tank").rest_pos).requires_grad_()
+    cases = [
+        ("material.lame_mu", lambda: hood.simulate("tank", material={"lame_mu": value})),
+        ("material", lambda: hood.simulate("tank", material=hood.Material(lame_mu=vertices))),
+        ("material", lambda: hood.Material(lame_mu=hood.FaceField(vertices))),  # type: ignore[arg-type]
+        ("wind", lambda: hood.simulate("tank", wind=[value, 0.0, 0.0])),
+        ("betas", lambda: hood.simulate("tank", betas=vertices[:3])),
+        ("solver.target_rg", lambda: hood.simulate("tank", solver={"target_rg": value})),
+        ("garment 'mine': rest_pos", lambda: hood.simulate(own_garment(rest_pos=moved))),
+    ]
+    for key, call in cases:
+        with pytest.raises(ValueError, match=f"^{key}: its tensor requires a gradient, .*; give value.detach") as told:
+            call()
+        assert "\n" not in str(told.value)
+    assert hood.Material(lame_mu=vertices.detach() * 2e4).lame_mu is not None
+
+
 def test_numbers_and_arrays_of_numpy_and_torch_are_numbers_and_lists() -> None:
     given = {"num_frames": np.int64(3), "gravity": np.float32(9.5), "betas": np.array([1.0, 0.5]), "pins": torch.tensor([1, 4])}
     assert api.overrides(given) == ["num_frames=3", "gravity=9.5", "betas=[1.0,0.5]", "pins=[1,4]"]

@@ -242,7 +242,7 @@ def test_usage_and_version(capsys: pytest.CaptureFixture[str]) -> None:
     usage = capsys.readouterr().out
     assert all(command in usage for command in ("train", "rollout", "evaluate", "tradeoff", "envelope", "compare"))
     assert main(["--version"]) == 0
-    assert capsys.readouterr().out.strip() == f"hood {__version__}"
+    assert capsys.readouterr().out.strip() == f"hood {__version__} (hood-cloth)"
 
 
 @pytest.mark.parametrize("arguments", ["--help", "sizes --help", "inspect tank skirt"])

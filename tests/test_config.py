@@ -188,3 +188,25 @@ def test_words_more_are_those_of_the_command_line():
     assert config == load_config("rollout", ["garment=tank"])
     with pytest.raises(ConfigError, match="gravty=0: no such key"):
         with_words(config, ["gravty=0"])
+
+
+@pytest.mark.parametrize(
+    ("command", "word", "values"),
+    [
+        ("rollout", "--multirun", "seed"),
+        ("train", "-m", "seed"),
+        ("rollout", "seed=0,1", "for x in 0 1; do hood rollout seed=$x output=outputs/seed_$x; done"),
+        ("rollout", "seed=range(3)", "for x in …; do hood rollout seed=$x output"),
+        ("rollout", "num_frames=choice(3,4)", "for x in …; do hood rollout num_frames=$x"),
+        ("rollout", "material=denim,silk", "for x in denim silk; do hood rollout material=$x output=outputs/material_$x; done"),
+        ("train", "trainer.learning_rate=1e-3,1e-4", "for x in 1e-3 1e-4; do hood train trainer.learning_rate=$x "),
+        ("train", "model=ours,small", "for x in ours small; do hood train model=$x"),
+    ],
+)
+def test_several_values_of_a_key_are_refused_with_the_loop(command: str, word: str, values: str) -> None:
+    with pytest.raises(
+        ConfigError, match="a command takes one value of a key, a loop of the shell runs several: for x in"
+    ) as told:
+        load_config(command, [word])
+    assert values in str(told.value)
+    assert "\n" not in str(told.value)

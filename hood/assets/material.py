@@ -6,6 +6,9 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+#: Of a value that is given as a tensor with a gradient.
+NO_GRADIENT = "its tensor requires a gradient, and a simulation passes none back to it; give value.detach()"
+
 
 @dataclass(frozen=True)
 class FaceField:
@@ -95,7 +98,10 @@ class Material:
 def values_of(field: Field) -> tuple[np.ndarray, str]:
     """Values of a property and what they lie on: ``"vertex"``, ``"face"``, ``"edge"``, or ``""`` for one number (shape ())."""
     on = {FaceField: "face", EdgeField: "edge"}.get(type(field), "vertex")
-    values = np.asarray(field.values if isinstance(field, (FaceField, EdgeField)) else field, dtype=np.float64)
+    given = field.values if isinstance(field, (FaceField, EdgeField)) else field
+    if getattr(given, "requires_grad", False):
+        raise ValueError(f"material: {NO_GRADIENT}")
+    values = np.asarray(given, dtype=np.float64)
     return values, on if values.ndim else ""
 
 

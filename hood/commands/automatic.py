@@ -1,9 +1,13 @@
-"""``stepper=auto`` and ``refine=auto``: what they become for a scene on this machine, and sentences that say why."""
+"""``stepper=auto`` and ``refine=auto``: what they become for a scene on this device, and sentences that say why.
+
+On a CPU nothing is measured, so that one command gives one result: the solver takes the steps. A command that gives a key
+of the network, as ``checkpoint`` or ``refine``, has chosen it (:func:`hood.config.with_network`).
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from omegaconf import DictConfig
@@ -52,6 +56,14 @@ class Choice:
         return settled
 
 
+def decided(config: DictConfig) -> tuple[DictConfig, list[str]]:
+    """The config with the stepper that needs no measurement, and why; itself where ``auto`` has to measure, or is not asked."""
+    if str(config.stepper) != AUTO or str(config.device) != "cpu":
+        return config, []
+    why = "stepper=newton: the solver, the default on a CPU; checkpoint=… or refine=… takes a network"
+    return with_stepper(config, "newton"), [why]
+
+
 def choose(config: DictConfig, stepper: Stepper, scene: Scene) -> Choice:
     """What ``auto`` means for this scene, whose steps a network takes (``stepper``) unless the config names a solver."""
     asked = str(config.stepper)
@@ -72,13 +84,13 @@ def advice(config: DictConfig, scene: Scene, summary: dict[str, Any], start: np.
     reached, target = summary["relative_gradient_median"], float(config.solver.target_rg)
     if str(config.stepper) != "network" or int(summary["num_frames"]) < _LEAST_FRAMES or not total.get("median"):
         return []
-    alone = _ms(solver(config), replace(scene, start_pos=start), losses_of(config))
-    if alone is None or alone >= total["median"] or (reached is not None and reached <= target):
+    alone = _measure(solver(config), replace(scene, start_pos=start), losses_of(config), metrics="none")
+    if alone is None or alone.ms >= total["median"] or (reached is not None and reached <= target):
         return []
     here = "" if reached is None else f", {reached:.2g} with the network"
     return [
-        f"the solver alone takes {alone:.0f} ms a frame here, the network {total['median']:.0f}, and leaves less unbalanced "
-        f"force (relative gradient {target:g}{here}): stepper=newton; stepper=auto measures and takes the faster one"
+        f"the solver alone takes {alone.ms:.0f} ms a frame here, the network {total['median']:.0f}, and leaves less unbalanced "
+        f"force (relative gradient {target:g}{here}): stepper=newton"
     ]
 
 
@@ -105,19 +117,21 @@ def _iterations(config: DictConfig, stepper: Stepper, scene: Scene, choice: Choi
 
 
 def _compare(config: DictConfig, stepper: Stepper, scene: Scene, choice: Choice) -> None:
-    """The solver where a frame of it takes less time than one of the network; both are measured."""
+    """The network where a frame of it takes less time than one of the solver and leaves no more force; both are measured."""
     potential, size, scene = losses_of(config), scene.cloth.num_vertices, _put_on(scene)
-    with_network = _ms(refined(stepper, choice.settle(config), size), scene, potential)
-    alone = _ms(solver(config), scene, potential)
-    if with_network is None or alone is None:
-        choice.why.append("stepper=network: the motion is too short to measure which is faster")
-        return
-    choice.ms = {"network": with_network, "newton": alone}
-    if alone < with_network:
+    with_network = _measure(refined(stepper, choice.settle(config), size), scene, potential)
+    alone = _measure(solver(config), scene, potential)
+    accurate = max(float(config.solver.target_rg), 0.0 if alone is None else alone.rg)
+    if with_network is None or alone is None or alone.ms < with_network.ms or not with_network.rg <= accurate:
         choice.stepper, choice.refine = "newton", 0 if config.refine == AUTO else None
         choice.why = []
-    times = f"a frame of the solver takes {alone:.0f} ms here, one of the network {with_network:.0f} ms"
-    choice.why.append(f"stepper={choice.stepper}: {times}")
+    if with_network is None or alone is None:
+        choice.why.append(f"stepper={choice.stepper}: the motion is too short to measure which is faster")
+        return
+    choice.ms = {"network": with_network.ms, "newton": alone.ms}
+    times = f"a frame of the solver takes {alone.ms:.0f} ms here, one of the network {with_network.ms:.0f} ms"
+    forces = f"the relative gradient is {alone.rg:.2g} with the solver, {with_network.rg:.2g} with the network"
+    choice.why.append(f"stepper={choice.stepper}: {times}; {forces}")
 
 
 def _put_on(scene: Scene) -> Scene:
@@ -129,8 +143,16 @@ def _put_on(scene: Scene) -> Scene:
     return replace(scene, start_pos=(start.pos.double().cpu() + start.origin[0]).numpy())
 
 
-def _ms(stepper: Stepper, scene: Scene, potential: Potential) -> float | None:
-    """Milliseconds of a frame, the shortest of a few; None where the motion has too few."""
-    frames = simulate(stepper, scene, potential, _TIMED_FRAMES, metrics="none")
-    times = [frame.metrics["ms_total"] for frame in frames if frame.index > 1]
-    return min(times, default=None)
+class Measured(NamedTuple):
+    """Of a few frames: milliseconds of the shortest, and the median of the unbalanced force [relative gradient]."""
+
+    ms: float
+    rg: float
+
+
+def _measure(stepper: Stepper, scene: Scene, potential: Potential, metrics: str = "all") -> Measured | None:
+    """Of the first frames of a scene; None where the motion has too few. What is measured counts for no time."""
+    frames = simulate(stepper, scene, potential, _TIMED_FRAMES, metrics=metrics)
+    rows = [frame.metrics for frame in frames if frame.index > 1]
+    forces = [row.get("relative_gradient", float("nan")) for row in rows]
+    return Measured(min(row["ms_total"] for row in rows), float(np.median(forces))) if rows else None

@@ -1,24 +1,22 @@
-"""Many motions in one command: which files, which folder for each, whose turn, what is done already."""
+"""Many motions in one command: which files, which folder for each, whose turn."""
 
 from __future__ import annotations
 
 import errno
-import json
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from glob import has_magic
 from pathlib import Path
 from typing import Any
 
-import h5py
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from hood.assets.files.library import locate
 from hood.assets.motion.collection import motions_in
 from hood.assets.motion.motion_files import find_motions
-from hood.commands.summary import summarise
-from hood.config import ConfigError, load_config, plain
+from hood.commands.batches.overview import refuse_overview, refuse_rollout
+from hood.commands.batches.places import place_motions, refuse_others
+from hood.config import ConfigError
 from hood.training import distributed
 
 #: A disk in this state refuses the next file too.
@@ -31,6 +29,12 @@ class Job:
 
     sequence: str
     folder: Path
+
+    def of(self, config: DictConfig) -> DictConfig:
+        """The config of its rollout, from that of all."""
+        one = OmegaConf.merge(config, {"sequence": self.sequence, "output": str(self.folder)})
+        assert isinstance(one, DictConfig)
+        return one
 
 
 @dataclass
@@ -70,25 +74,27 @@ def require_motions(key: str, entries: Sequence[str]) -> None:
             raise FileNotFoundError(f"{key}[{index}]: {error}") from error
 
 
-def find_jobs(entry: str, output: Path) -> list[Job] | None:
-    """The jobs of a folder, a glob or a list of motions, folders below ``output`` named as the files; None for one motion.
+def find_jobs(entry: str, output: Path, root: str | None = None) -> list[Job] | None:
+    """The jobs of a folder, a glob or a list of motions, folders below ``output`` named as the files below ``root``, without
+    one below what they have in common; None for one motion.
 
     Raises:
-        ConfigError: two motions would share a folder.
+        ConfigError: two motions would share a folder, or another motion is in one; ``root`` does not hold the motions, or
+            there is one motion only; one rollout would meet those of many in ``output``.
     """
     plain_file = Path(entry).expanduser().is_file() and Path(entry).suffix not in (".txt", ".json")
     found = [entry] if plain_file else expand_sequences([entry])
     if found == [entry]:
+        if root is not None:
+            raise ConfigError(f"root={root}: names the folders of many motions, and sequence={entry} is one; drop root")
+        refuse_overview(output)
         return None
-    files = [name for name in found if Path(name).suffix]
-    root = Path(os.path.commonpath([Path(name).absolute().parent for name in files])) if files else Path()
-    jobs = [Job(n, output / (Path(n).absolute().relative_to(root).with_suffix("") if n in files else n)) for n in found]
-    taken: dict[Path, str] = {}
-    for job in jobs:
-        if job.folder in taken:
-            raise ConfigError(f"{taken[job.folder]} and {job.sequence} would both go to {job.folder}; rename one of them")
-        taken[job.folder] = job.sequence
-    return jobs
+    refuse_rollout(output)
+    folders, start = place_motions(found, output, root)
+    for name, folder in zip(found, folders, strict=True):
+        refuse_others(folder, name)
+    print(f"{len(found)} motions, their folders in {output} are named from {start} (root)")
+    return [Job(name, folder) for name, folder in zip(found, folders, strict=True)]
 
 
 def share(jobs: Sequence[Job], work: Callable[[Job], tuple[dict[str, Any], bool]]) -> Outcome:
@@ -115,23 +121,3 @@ def share(jobs: Sequence[Job], work: Callable[[Job], tuple[dict[str, Any], bool]
         any(part.interrupted for part in parts),
         next((part.hopeless for part in parts if part.hopeless is not None), None),
     )
-
-
-def finished(config: DictConfig, digest: str, folder: Path) -> dict[str, Any] | None:
-    """The summary of a rollout that was finished with the same settings and weights; None where there is none."""
-    try:
-        summary: dict[str, Any] = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-        with h5py.File(folder / "rollout.h5", "r") as file:
-            attributes = dict(file.attrs)
-        before = json.loads(attributes["asked"])
-    except (OSError, ValueError, KeyError):
-        return None
-    now = plain(config)
-    before["plan"] = before.get("plan") or now["plan"]
-    before.setdefault("stepping", now["stepping"])  # rollouts from before there were options are known by their word
-    # What had no key yet was what its default says now.
-    before = {**plain(load_config("rollout")), **before}
-    same = all(before.get(key) == now[key] for key in now if key not in ("resume", "output", "allow_unsound", "doubts"))
-    if not same or not bool(attributes["complete"]) or attributes["checkpoint_sha256"] != digest:
-        return None
-    return summary if {"sound", "doubts"} <= set(summary) else summarise(folder / "rollout.h5")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import sys
+import warnings
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import cache
@@ -14,6 +15,7 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 
+from hood.assets.files.extras import install
 from hood.assets.files.folder_lock import occupy
 from hood.config import ConfigError, load_config, plain, read_record, require_choice, shown
 from hood.dynamics.checkpoint import load_simulator
@@ -21,7 +23,7 @@ from hood.dynamics.reference import SUFFIXES, load_reference_checkpoint
 from hood.dynamics.simulator import Simulator
 from hood.dynamics.stepper import Stepper
 from hood.nn.choice import AUTO, Choice, choose_for
-from hood.nn.compiled import check_kernels
+from hood.nn.compiled import check_kernels, why_slow
 from hood.nn.precision import check_precision
 from hood.training import distributed
 
@@ -87,7 +89,7 @@ def output_folder(config: DictConfig) -> Path:
 def require_package(module: str, title: str, extra: str, what: str) -> None:
     """Raise ConfigError unless ``module`` is there, before ``what`` is begun that draws with it."""
     if importlib.util.find_spec(module) is None:
-        raise ConfigError(f'{what}: drawing needs {title} (pip install "hood[{extra}]")')
+        raise ConfigError(f"{what}: drawing needs {title} ({install(extra)})")
 
 
 def require_distinct(key: str, values: Sequence[Any]) -> None:
@@ -184,6 +186,7 @@ def use_arithmetic(simulator: Simulator, config: DictConfig, traced: bool = Fals
     precision, kernels, device = str(config.precision), str(config.kernels), torch.device(str(config.device))
     network = simulator.network
     check_precision(precision, device)
+    warn_if_slow("precision", precision, device)
     if kernels == AUTO and traced:
         kernels = "torch"
     if kernels == AUTO:
@@ -193,6 +196,13 @@ def use_arithmetic(simulator: Simulator, config: DictConfig, traced: bool = Fals
     check_kernels(kernels, precision, network.latent_dim, device)
     network.use_precision(precision)
     network.use_kernels(kernels)
+
+
+def warn_if_slow(key: str, precision: str, device: torch.device) -> None:
+    """A warning where a precision that should save time costs some here."""
+    reason = why_slow(precision, device)
+    if reason and distributed.rank() == 0:
+        warnings.warn(f"{key}={precision}: {reason}", stacklevel=2)
 
 
 @cache

@@ -7,11 +7,11 @@ UNSOUND = 3
 #: Where several hold, 130 comes before 2, and 2 before 3.
 EXIT_CODES = {
     0: "done",
-    1: "inspect: something needs repair",
-    2: "an error, told in one line",
+    1: "inspect: something needs repair; tradeoff: points failed, the page is without them",
+    2: "an error, told in one line; rollout: a motion of many could not be used, the others are there",
     UNSOUND: "rollout: a result is unsound, or guard=strict ended it, or doubts=refuse and it has doubts; see sound, reasons, "
     "doubts and guard in summary.json",
-    130: "interrupted",
+    130: "interrupted; what is done is kept",
 }
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from hood.assets.files.atomic import write_atomically
+from hood.assets.files.extras import install
 from hood.assets.formats.image import Texture
 from hood.commands.common import frame_count, split_words
 from hood.commands.compare import read_checked
@@ -140,7 +141,7 @@ def _check_format(form: str, key: str, asked: str) -> None:
     if form not in FORMATS:
         raise ConfigError(f"{asked}: choose {' or '.join(FORMATS)}")
     if form == "usd" and importlib.util.find_spec("pxr") is None:
-        raise ConfigError(f'{asked}: writing needs usd-core (pip install "hood[usd]"); glb, pc2, obj and ply need nothing more')
+        raise ConfigError(f"{asked}: writing needs usd-core ({install('usd')}); glb, pc2, obj and ply need nothing more")
 
 
 def exports_beside(source: Path) -> list[Path]:

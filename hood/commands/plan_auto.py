@@ -57,5 +57,5 @@ def _key(word: str) -> str:
 
 def _digest(words: Sequence[str], accuracy: str) -> str:
     """Of everything that a plan depends on, the processor that its times are of among it."""
-    said = [__version__, processor(), accuracy, content_digest(words)]
+    said = [__version__, processor(), accuracy, str(load_config("rollout", words).stepper), content_digest(words)]
     return hashlib.sha256("\0".join(said).encode()).hexdigest()[:24]

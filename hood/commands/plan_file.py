@@ -102,7 +102,7 @@ def read_watch(path: Path) -> Watch | None:
     numbers = [float(value) for value in values if isinstance(value, (int, float)) and 0.0 < value < float("inf")]
     if len(numbers) != 2:
         raise ConfigError(f"plan={path}: 'watch' must hold limit and hold, both above 0; make the plan again")
-    return Watch(list(plan["words"]), numbers[0], max(int(numbers[1]), 1))
+    return Watch(_with_stepper(plan["words"]), numbers[0], max(int(numbers[1]), 1))
 
 
 def write_plan(path: Path, plan: Mapping[str, Any]) -> None:
@@ -127,7 +127,13 @@ def _checked_words(path: Path) -> list[str]:
             f"{shlex.join(['hood', 'plan', *plan['words'], 'output=…'])}",
             stacklevel=2,
         )
-    return [*plan["words"], *plan["chosen"]]
+    return [*_with_stepper(plan["words"]), *plan["chosen"]]
+
+
+def _with_stepper(words: Sequence[str]) -> list[str]:
+    """The words of a plan. One that names no stepper is of the time when the network was the default."""
+    named = any(word.partition("=")[0] == "stepper" for word in words)
+    return [*([] if named else ["stepper=network"]), *words]
 
 
 def read_plan(path: Path) -> dict[str, Any]:

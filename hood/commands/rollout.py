@@ -12,22 +12,22 @@ from typing import Any
 
 import h5py
 import numpy as np
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from tqdm import tqdm
 
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.doubt import Doubt
 from hood.assets.files.folder_lock import occupy
 from hood.commands.automatic import advice
-from hood.commands.batch import Job, find_jobs, finished, share
+from hood.commands.batch import Job, find_jobs, share
+from hood.commands.batches.one_stepper import with_one_stepper
+from hood.commands.batches.overview import write_overview
+from hood.commands.batches.places import motion_attributes, refuse_others
+from hood.commands.batches.resuming import as_begun, resumed
 from hood.commands.cautions import warn
+from hood.commands.checks.idle_keys import idle_in_rollout
 from hood.commands.cloth_contact import why_not
-from hood.commands.common import (
-    output_folder,
-    prepare_folder,
-    thinning,
-    together,
-)
+from hood.commands.common import output_folder, prepare_folder, thinning, together
 from hood.commands.earlier_files import remove_earlier
 from hood.commands.event_report import describe_held, summarise_held
 from hood.commands.events import fastening_attributes
@@ -57,30 +57,38 @@ from hood.training import distributed
 
 def run(overrides: Sequence[str]) -> int:
     """Run the command; returns the exit code: 130 where the user interrupted it, else 2 where a motion of many could not be
-    used, else 3 where a result is unsound (:mod:`hood.dynamics.soundness`), else 0."""
+    used, else 3 where a result is unsound (:mod:`hood.dynamics.verdict`), else 0."""
     config = rollout_config(without_accuracy(overrides))
     check_config(config)
     check_outputs(config)
+    if distributed.is_first():
+        _tell(idle_in_rollout(overrides, config))
     return together(lambda: _run(rollout_config(distributed.on_main(lambda: planned(overrides)))))
 
 
 def _run(config: DictConfig) -> int:
     """One motion, or each of many in a folder of its own; processes that torchrun started share the many."""
     output = output_folder(config)
-    jobs = distributed.on_main(lambda: find_jobs(str(config.sequence), output))
+    jobs = distributed.on_main(lambda: find_jobs(str(config.sequence), output, config.root))
     if jobs is not None:
         return _run_all(config, jobs, output)
     if distributed.rank() != 0:
         return 0
-    summary, interrupted = _run_one(config, *make_stepper(config))
+    config = as_begun(config, [(str(config.sequence), output)])
+    stepper, digest = make_stepper(config)
+    summary, interrupted = resumed(config, digest), False
+    if summary is None:
+        summary, interrupted = _run_one(config, stepper, digest)
+    else:
+        print(f"resume=true: {output} holds this rollout, finished with the same settings; it stays")
     return 130 if interrupted else exit_code([summary], bool(config.allow_unsound), str(config.doubts))
 
 
-def _run_one(config: DictConfig, stepper: Stepper, digest: str, advise: bool = True) -> tuple[dict[str, Any], bool]:
-    """The rollout of one motion with all its files: the summary, and whether the user interrupted it. Where many are run,
-    none is the place for advice on the stepper."""
+def _run_one(config: DictConfig, stepper: Stepper, digest: str, alone: bool = True) -> tuple[dict[str, Any], bool]:
+    """The rollout of one motion with all its files: the summary, and whether the user interrupted it. Where many are run
+    none may replace another's, and none is the place for advice on the stepper."""
     with heard() as warned:
-        return _run_heard(config, stepper, digest, warned, advise)
+        return _run_heard(config, stepper, digest, warned, alone)
 
 
 def _tell(sentences: Sequence[str]) -> None:
@@ -101,12 +109,14 @@ def _first_positions(path: Path, count: int) -> np.ndarray:
         return np.asarray(file["cloth/pos"][0, :count], dtype=np.float64)
 
 
-def _run_heard(config: DictConfig, stepper: Stepper, digest: str, warned: Heard, advise: bool) -> tuple[dict[str, Any], bool]:
+def _run_heard(config: DictConfig, stepper: Stepper, digest: str, warned: Heard, alone: bool) -> tuple[dict[str, Any], bool]:
     """The rollout of one motion; ``warned`` is what has been warned about when the summary is written."""
     ready = set_up(config, stepper)
     check_worn(read_textures(config), ready.scene.garment)
     with occupy(prepare_folder(output_folder(config))):
-        return _run_there(ready, config, digest, warned, advise)
+        if not alone:
+            refuse_others(output_folder(config), str(config.sequence))
+        return _run_there(ready, config, digest, warned, alone)
 
 
 def _run_there(ready: Setup, asked: DictConfig, digest: str, warned: Heard, advise: bool) -> tuple[dict[str, Any], bool]:
@@ -151,21 +161,20 @@ def _run_there(ready: Setup, asked: DictConfig, digest: str, warned: Heard, advi
 
 
 def _run_all(config: DictConfig, jobs: list[Job], output: Path) -> int:
-    """Every motion in its folder, and ``summary.json`` over all of them."""
+    """Every motion in its folder, and ``summary.json`` over all of them; one stepper for all."""
+    config = distributed.on_main(lambda: with_one_stepper(config, jobs))
     stepper, digest = make_stepper(config)
 
     def work(job: Job) -> tuple[dict[str, Any], bool]:
-        one = OmegaConf.merge(config, {"sequence": job.sequence, "output": str(job.folder)})
-        assert isinstance(one, DictConfig)
-        done = finished(one, digest, job.folder) if bool(config.resume) else None
-        return (done | {"skipped": True}, False) if done is not None else _run_one(one, stepper, digest, advise=False)
+        one = job.of(config)
+        done = resumed(one, digest)
+        return (done | {"skipped": True}, False) if done is not None else _run_one(one, stepper, digest, alone=False)
 
     outcome = share(jobs, work)
     if distributed.rank() == 0:
-        prepare_folder(output)
-        _write_json(output / "summary.json", {"num_motions": len(jobs), "motions": outcome.rows})
+        overview = write_overview(prepare_folder(output), outcome.rows, {job.sequence: job.folder for job in jobs})
         print(describe_all(outcome.rows, len(jobs)))
-        print(f"summary of all in {output / 'summary.json'}")
+        print(f"summary of all in {overview}")
         if len(outcome.rows) < len(jobs):
             print("hood: not all done; the same command with resume=true goes on", file=sys.stderr)
     if outcome.hopeless is not None:
@@ -202,6 +211,7 @@ def _simulate_to_disk(
         "cloth_contact_off": why_not(config),
         "guard": OFF if guard is None else guard.mode,
         "doubts": [doubt.as_dict() for doubt in doubts],
+        **motion_attributes(str(config.sequence)),
         **fastening_attributes(scene),
     }
     steps, finer = planned_steps(config, scene, count), finer_mesh(config, scene)

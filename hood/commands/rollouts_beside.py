@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TypeVar
 
-#: What runs before the arguments of ``hood``.
-PROGRAM = (sys.executable, "-m", "hood.cli")
+#: What runs before the arguments of ``hood``; nothing is imported from the working folder.
+PROGRAM = (sys.executable, "-P", "-m", "hood.cli")
 #: How the line begins that a command fails with.
 _ERROR = "hood: error: "
 #: Seconds that an ended process has to go.

@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 
 from hood.assets.garment.garment import Garment
 from hood.assets.material import Material
-from hood.commands.automatic import Choice, choose
+from hood.commands.automatic import Choice, choose, decided
 from hood.commands.body_friction import with_body_friction
 from hood.commands.cautions import known_by_slope, scene_cautions, warn
 from hood.commands.cloth_contact import acts, check_cloth_contact, potential_of, tell_if_off
@@ -95,8 +95,10 @@ def set_up(
     Raises:
         ConfigError, ValueError, FileNotFoundError: keys, files or assets that cannot be used.
     """
+    config, why = decided(config)
     scene = make_scene(config, garment, material)
     choice = choose(config, stepper, scene)
+    choice.why[:0] = why
     settled = choice.settle(config)
     for sentence in choice.why:
         tell(sentence)
@@ -169,6 +171,7 @@ def solves_in_double(config: DictConfig) -> bool:
 
 def make_stepper(config: DictConfig) -> tuple[Stepper, str]:
     """What takes the steps, before they are refined, and the SHA-256 of its weights (``none`` without a network)."""
+    config, _ = decided(config)
     option, step = option_of(config), str(config.step)
     if option.network:
         return make_network(config, str(config.checkpoint), config.get("model"), step)

@@ -21,6 +21,7 @@ from hood.assets.material import Material
 from hood.assets.motion.axes import UP_AXES
 from hood.assets.motion.load import load_sequence
 from hood.assets.motion.motion_files import MotionFiles, find_motions
+from hood.commands.checks.idle_keys import idle_in_training
 from hood.commands.common import (
     held_folder,
     output_folder,
@@ -30,6 +31,7 @@ from hood.commands.common import (
     require_same_model,
     tell_choice,
     together,
+    warn_if_slow,
 )
 from hood.commands.garments import as_simulated
 from hood.commands.motion import check_rate
@@ -66,6 +68,9 @@ def run(overrides: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     config = load_config("train", overrides)
     require_device(config)
+    if distributed.is_first():
+        for sentence in idle_in_training(overrides, config):
+            print(sentence)
     return together(lambda: _train(config))
 
 
@@ -140,6 +145,7 @@ def make_trainer(config: DictConfig) -> Trainer:
         earlier = _start_from(simulator, str(config.weights), fps)
         settings = replace(settings, statistics_iterations=0)  # they come with the weights
     simulator.to(str(config.device))
+    warn_if_slow("trainer.precision", settings.precision, torch.device(str(config.device)))
     leave_out = str(config.data.unusable) == "skip"
     names = find_motions(list(config.data.sequences) or motion_split()["train"], check=not leave_out)
     sampler = SceneSampler(

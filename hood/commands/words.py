@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from hood.assets.material import NO_GRADIENT
 from hood.config import TABLES, ConfigError
 from hood.overrides import coded, quoted
 
@@ -48,6 +49,8 @@ def overrides(keys: Mapping[str, Any], group: str = "") -> list[str]:
 def _word(value: Any, key: str) -> str:
     if key in _NAMES and not _may_name(value):
         raise ConfigError(f"{key} is given by {_NAMES[key]}, not as {_sort(value)}")
+    if getattr(value, "requires_grad", False):
+        raise ConfigError(f"{key}: {NO_GRADIENT}")
     if hasattr(value, "tolist"):  # of NumPy or torch
         value = value.tolist()
     if value is None:

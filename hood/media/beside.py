@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from hood.assets.files.extras import install
 from hood.assets.formats.image import Texture
 from hood.dynamics.recorder import RolloutData
 from hood.media.film import Film, seconds_per_frame, sheet_frames
@@ -196,7 +197,7 @@ def _write(picture: Picture, lines: Sequence[tuple[str, tuple[int, int, int]]], 
     try:
         from PIL import Image, ImageDraw, ImageFont
     except ImportError as error:
-        raise ImportError("labels on pictures need Pillow: pip install hood[pictures]") from error
+        raise ImportError(f"labels on pictures need Pillow: {install('pictures')}") from error
     canvas = Image.fromarray(picture)
     draw, font = ImageDraw.Draw(canvas), ImageFont.load_default(size)
     for row, (text, ink) in enumerate(lines):

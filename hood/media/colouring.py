@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from hood.assets.files.extras import install
 from hood.dynamics.recorder import RolloutData
 from hood.mesh.proximity import search_surface
 from hood.mesh.subdivision import Subdivision
@@ -51,7 +52,7 @@ class Colouring:
         try:
             from PIL import Image, ImageDraw, ImageFont
         except ImportError as error:
-            raise ImportError("labels on pictures need Pillow: pip install hood[pictures]") from error
+            raise ImportError(f"labels on pictures need Pillow: {install('pictures')}") from error
         height, width = picture.shape[:2]
         size = max(11, height // 40) if size is None else size
         left, right = width // 10, width - width // 10

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hood.assets.files.extras import install
 from hood.media.camera import NEAR, Camera, unit
 from hood.media.drawing import SeenValues, address, library, packed
 from hood.media.hem import FAR, sewn
@@ -117,7 +118,7 @@ def _written(image: Picture, text: str, size: int, place: tuple[int, int], ancho
     try:
         from PIL import Image, ImageDraw, ImageFont
     except ImportError as error:
-        raise ImportError("labels on pictures need Pillow: pip install hood[pictures]") from error
+        raise ImportError(f"labels on pictures need Pillow: {install('pictures')}") from error
     canvas = Image.fromarray(image)
     font = ImageFont.load_default(size)
     ImageDraw.Draw(canvas).text(place, text, fill=(60, 62, 66), font=font, anchor=anchor)

@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hood.assets.files.atomic import write_atomically
+from hood.assets.files.extras import install
 
 logger = logging.getLogger(__name__)
 Picture = NDArray[np.uint8]
 
-_PICTURES_HINT = "need Pillow: pip install hood[pictures]"
+_PICTURES_HINT = f"need Pillow: {install('pictures')}"
 
 
 def save_png(path: str | Path, image: Picture) -> Path:
@@ -53,7 +54,7 @@ class VideoWriter:
         self._ffmpeg: Any = _find_ffmpeg() if path.suffix == ".mp4" else None
         if path.suffix == ".mp4" and self._ffmpeg is None:
             path = path.with_suffix(".gif")
-            logger.warning("imageio-ffmpeg is missing (pip install hood[pictures]): writing %s instead", path)
+            logger.warning("imageio-ffmpeg is missing (%s): writing %s instead", install("pictures"), path)
         path.parent.mkdir(parents=True, exist_ok=True)
         self.path = path
         self.fps = fps

@@ -123,6 +123,15 @@ def library(width: int, half: bool) -> ctypes.CDLL:
         raise ValueError(f"kernels=compiled: {error} or use kernels=torch") from error
 
 
+def why_slow(precision: str, device: torch.device) -> str:
+    """Why a precision is slower than float32 on this processor; empty where it is not, and where that is not known."""
+    abilities = set(processor().split())
+    known = any(word.startswith(("sse", "asimd")) for word in abilities)  # those that every processor lists
+    if precision != "bf16" or device.type != "cpu" or not known or abilities & {"avx512_bf16", "amx_bf16", "bf16"}:
+        return ""
+    return "this processor has no instructions for bfloat16 (AVX512_BF16), and a network is several times slower than in fp32"
+
+
 def _multiplies_bfloat16() -> bool:
     supported = getattr(torch.cpu, "_is_avx512_bf16_supported", None)  # missing in other versions of torch
     return supported is not None and bool(supported())

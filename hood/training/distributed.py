@@ -41,6 +41,11 @@ def rank() -> int:
     return dist.get_rank() if dist.is_initialized() else 0
 
 
+def is_first() -> bool:
+    """Whether this is process 0, also before it has joined the others."""
+    return int(os.environ.get("RANK", "0")) == 0 if not dist.is_initialized() else rank() == 0
+
+
 def world_size() -> int:
     """Number of processes, 1 when alone."""
     return dist.get_world_size() if dist.is_initialized() else 1

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from hood.assets.files.atomic import write_atomically
+from hood.assets.files.extras import install
 
 
 class MetricsLog:
@@ -24,6 +25,8 @@ class MetricsLog:
         self._folder = folder
         self.path = folder / "metrics.jsonl"
         self._open(iteration)
+        if self._board is None:
+            print(f"hood: no TensorBoard events: {_missing()}; all numbers are in {self.path}", file=sys.stderr)
 
     def write(self, iteration: int, values: dict[str, float]) -> None:
         """One record, on disk at once, so that a killed run keeps it; what is not a finite number becomes null."""
@@ -115,6 +118,15 @@ def _lines_up_to(path: Path, iteration: int) -> list[str]:
         except (ValueError, KeyError, TypeError):
             continue  # a line cut by a kill
     return kept
+
+
+def _missing() -> str:
+    """Why there are no events, with the way out."""
+    try:
+        import tensorboard  # noqa: F401
+    except ImportError:
+        return f"it is not installed ({install('tensorboard')})"
+    return "torch cannot use the one that is installed"
 
 
 def _tensorboard(folder: Path, iteration: int) -> Any:

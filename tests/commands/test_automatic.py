@@ -10,9 +10,14 @@ from typing import Any
 import pytest
 import torch
 
+import hood
 from hood.cli import main
 from hood.commands import automatic
-from hood.dynamics.checkpoint import save_simulator
+from hood.commands.automatic import Measured
+from hood.commands.batch import find_jobs
+from hood.commands.batches import one_stepper
+from hood.config import load_config
+from hood.dynamics.checkpoint import load_simulator, save_simulator
 from hood.dynamics.ranges import Conditions, scene_conditions
 from hood.dynamics.refine import RefinedStepper
 from hood.dynamics.simulator import build_simulator
@@ -44,13 +49,17 @@ def summary() -> dict[str, Any]:
     return json.loads(Path("out/summary.json").read_text())
 
 
-def taken(monkeypatch: pytest.MonkeyPatch, **ms: float) -> None:
-    """Times of a frame as measured: of a network, refined or not, and of the solver."""
+#: What is found of the solver.
+SOLVER = Measured(20.0, 0.01)
 
-    def measured(stepper: Any, *_: Any) -> float:
-        return ms["newton"] if stepper.config.get("stepper") == "newton" else ms["network"]
 
-    monkeypatch.setattr(automatic, "_ms", measured)
+def measured(monkeypatch: pytest.MonkeyPatch, network: Measured | None, newton: Measured = SOLVER) -> None:
+    """What is measured: of a network, refined or not, and of the solver."""
+
+    def measure(stepper: Any, *_: Any, **__: Any) -> Measured | None:
+        return newton if stepper.config.get("stepper") == "newton" else network
+
+    monkeypatch.setattr(automatic, "_measure", measure)
 
 
 def test_a_larger_garment_is_not_left_to_the_network(capsys: pytest.CaptureFixture[str], weights: Conditions) -> None:
@@ -75,59 +84,136 @@ def test_what_is_given_wins_and_what_is_known_needs_nothing(key: str, capsys: py
     assert summary().get("refinement", {}).get("asked") == asked
 
 
-def test_auto_takes_the_faster_one(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    taken(monkeypatch, network=90.0, newton=20.0)
-    assert main([*QUICK, "stepper=auto"]) == 0
-    assert "stepper=newton: a frame of the solver takes 20 ms here, one of the network 90 ms" in capsys.readouterr().out
-    found = summary()
-    assert found["choice"] | {"why": 0} == {"stepper": "newton", "refine": 0, "ms": {"network": 90, "newton": 20}, "why": 0}
-    assert "solver_steps_not_converged" in found
-    assert "refinement" not in found
-    taken(monkeypatch, network=9.0, newton=20.0)
-    assert main([*QUICK, "stepper=auto", "checkpoint=known.safetensors"]) == 0
-    assert "stepper=network: a frame of the solver takes 20 ms here, one of the network 9 ms" in capsys.readouterr().out
-    assert "solver_steps_not_converged" not in summary()
-
-
-def test_finished_rollouts_are_known_by_what_was_asked(
+def test_on_a_cpu_the_solver_is_the_default_and_nothing_is_measured(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    taken(monkeypatch, network=90.0, newton=20.0)
-    Path("list.txt").write_text("walk_proud\n")
-    for repeated in (False, True):
-        assert main([*QUICK, "stepper=auto", "sequence=list.txt", "resume=true"]) == 0
-        assert ("stepper=newton:" in capsys.readouterr().out) is not repeated
+    monkeypatch.setattr(automatic, "_measure", lambda *_, **__: pytest.fail("a timing decides"))
+    for words in ([], ["stepper=auto"]):
+        assert main([*(word for word in QUICK if "checkpoint" not in word), *words]) == 0
+        told = capsys.readouterr().out
+        line = "stepper=newton: the solver, the default on a CPU; checkpoint=… or refine=… takes a network"
+        assert told.count(line) == 1
+        assert "kernels=auto" not in told
+        assert summary()["choice"] == {"stepper": "newton", "refine": 0, "ms": {}, "why": [line]}
+        assert "solver_steps_not_converged" in summary()
+    simulation = hood.simulate("tank", num_frames=2)
+    assert simulation.notes == [line]
+    assert isinstance(simulation.stepper, NewtonStepper)
 
 
-def test_times_are_measured_on_the_scene(tank_scene: Scene) -> None:
+@pytest.mark.parametrize(
+    ("words", "stepper"),
+    [
+        (["checkpoint=quickstart"], "network"),
+        (["refine=5"], "network"),
+        (["refine=0"], "network"),
+        (["stepper=auto", "target_rg=0.1"], "network"),
+        (["budget_ms=9"], "network"),
+        (["precision=bf16"], "network"),
+        (["model=small", "model.latent_dim=8"], "network"),
+        (["step=compiled"], "network"),
+        (["step=plain"], "auto"),
+        (["material=denim", "solver.target_rg=0.1"], "auto"),
+        (["stepper=newton", "checkpoint=quickstart"], "newton"),
+        (["stepper=refine", "refine=5"], "refine"),
+    ],
+)
+def test_a_key_of_the_network_keeps_the_network(words: list[str], stepper: str) -> None:
+    config = load_config("rollout", words)
+    assert config.stepper == stepper
+    assert config.stepping == load_config("rollout", [f"stepper={stepper}"]).stepping
+
+
+@pytest.mark.parametrize(
+    ("network", "stepper"),
+    [
+        (Measured(9.0, 0.01), "network"),
+        (Measured(9.0, 0.2), "newton"),  # faster, and less exact
+        (Measured(90.0, 0.001), "newton"),
+        (Measured(9.0, float("nan")), "newton"),
+        (None, "newton"),
+    ],
+)
+def test_elsewhere_the_network_has_to_be_faster_and_as_accurate(
+    network: Measured | None, stepper: str, monkeypatch: pytest.MonkeyPatch, tank_scene: Scene
+) -> None:
+    measured(monkeypatch, network)
+    config = load_config("rollout", ["garment=tank"])  # choose() is asked where the device leaves something to measure
+    choice = automatic.choose(config, build_simulator("paper", "acceleration", "1x(mesh)", latent_dim=8), tank_scene)
+    assert choice.stepper == stepper
+    (why,) = choice.why
+    if network is None:
+        assert why == "stepper=newton: the motion is too short to measure which is faster"
+        return
+    assert f"stepper={stepper}: a frame of the solver takes 20 ms here, one of the network {network.ms:.0f} ms; " in why
+    assert "the relative gradient is 0.01 with the solver, " in why
+    assert choice.settle(config).stepper == stepper
+
+
+def test_what_is_measured_is_of_the_scene(tank_scene: Scene) -> None:
     potential = default_potential()
-    ms = automatic._ms(NewtonStepper(potential), tank_scene, potential)
-    assert ms is not None
-    assert ms > 0
+    found = automatic._measure(NewtonStepper(potential), tank_scene, potential)
+    assert found is not None
+    assert found.ms > 0
+    assert 0 < found.rg < 0.05
+    assert automatic._measure(NewtonStepper(potential), tank_scene, potential, "none")
+
+
+def test_many_motions_have_one_stepper(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("list.txt").write_text("walk_proud\nplie\n")
+    command = [*(word for word in QUICK if "checkpoint" not in word), "sequence=list.txt"]
+    assert main(command) == 0
+    assert capsys.readouterr().out.count("stepper=newton: the solver, the default") == 1
+    assert main([*command, "resume=true"]) == 0
+    assert "2 of them finished before and skipped now" in capsys.readouterr().out
+    asked: list[Any] = []
+    monkeypatch.setattr(one_stepper, "decided", lambda config: (config, []))  # as on a GPU
+    monkeypatch.setattr(one_stepper, "make_stepper", lambda config: (None, ""))
+    monkeypatch.setattr(one_stepper, "choose", lambda *_: asked.append(1) or automatic.Choice("network", why=["measured"]))
+    jobs = find_jobs("list.txt", Path("other"))
+    assert jobs is not None
+    assert one_stepper.with_one_stepper(load_config("rollout", ["garment=tank"]), jobs).stepper == "network"
+    assert capsys.readouterr().out.endswith("measured\n")
+    assert len(asked) == 1
+
+
+def test_what_was_begun_with_the_network_goes_on_with_it(capsys: pytest.CaptureFixture[str]) -> None:
+    """As a batch of a time when the network was the default."""
+    Path("list.txt").write_text("walk_proud\nplie\n")
+    Path("one.txt").write_text("walk_proud\n")
+    usual = [word for word in QUICK if "checkpoint" not in word]
+    assert main([*usual, "sequence=one.txt", "stepper=network"]) == 0
+    capsys.readouterr()
+    assert main([*usual, "sequence=list.txt", "resume=true"]) == 0
+    told = capsys.readouterr().out
+    assert "resume=true: stepper=network, as in out/walk_proud" in told
+    assert "1 of them finished before and skipped now" in told
+    assert json.loads(Path("out/plie/summary.json").read_text())["choice"]["stepper"] == "network"
+    assert main([*usual, "sequence=list.txt", "resume=true", "material=denim"]) == 0
+    told = capsys.readouterr().out
+    assert "stepper=newton: the solver, the default on a CPU" in told
+    assert "out/walk_proud was made with other settings and is made again" in told
 
 
 def test_advice_is_given_where_the_solver_is_faster(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     longer = [*QUICK, "num_frames=10", "refine=0"]
-    taken(monkeypatch, network=0.0, newton=1e-3)
+    measured(monkeypatch, None, Measured(1e-3, 0.01))
     assert main(longer) == 0
     assert "the solver alone takes 0 ms a frame here, the network" in capsys.readouterr().out
-    taken(monkeypatch, network=0.0, newton=1e9)
+    measured(monkeypatch, None, Measured(1e9, 0.01))
     assert main(longer) == 0
     assert "the solver alone" not in capsys.readouterr().out
-    taken(monkeypatch, network=0.0, newton=1e-3)
+    measured(monkeypatch, None, Measured(1e-3, 0.01))
     assert main([*QUICK, "refine=0"]) == 0  # too short to say
     assert "the solver alone" not in capsys.readouterr().out
 
 
-def test_refined_networks_are_measured_as_they_would_run(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_refined_networks_are_measured_as_they_would_run(monkeypatch: pytest.MonkeyPatch, tank_scene: Scene) -> None:
     seen: list[Any] = []
-
-    def measured(stepper: Any, *_: Any) -> float:
-        seen.append(stepper)
-        return 1.0
-
-    monkeypatch.setattr(automatic, "_ms", measured)
-    assert main([*QUICK, "stepper=auto"]) == 0
+    monkeypatch.setattr(automatic, "_measure", lambda stepper, *_, **__: seen.append(stepper))
+    config = load_config("rollout", ["garment=tank"])  # choose() is asked where the device leaves something to measure
+    config.checkpoint = "small.safetensors"
+    automatic.choose(config, load_simulator(Path("small.safetensors")), tank_scene)
     assert isinstance(seen[0], RefinedStepper)

@@ -341,7 +341,7 @@ def test_a_missing_matplotlib_is_told_before_any_work(
     found = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: None if name == "matplotlib" else found(name, *more))
     assert main(COMMAND) == 2
-    assert 'pip install "hood[charts]"' in capsys.readouterr().err
+    assert 'pip install "hood-cloth[charts]"' in capsys.readouterr().err
     assert not Path("chart").exists()
 
 

@@ -50,7 +50,8 @@ class Desk:
             (r"(my_)?shirt\.obj|cape \(1\)\.obj|Röckchen\.obj", self.shirt),
             (r"shirt\.npz", self.bound_shirt),
             (r"coat\.(obj|ply)|left\.txt|right\.txt", self.coat),
-            (r"(my_)?walk\.npz|my_amass_file\.npz|amass/.*", self.recording),
+            (r"(my_)?walk\.npz|my_amass_file\.npz|amass(/.*)?", self.recording),
+            (r"(first|second)\.txt", self.list_of_motions),
             (r"hero\.glb", self.hero),
             (r"pieces/.*\.npz", self.piece),
             (r"skirt\.obj|twirl\.npz|skirt_prepared\.npz", self.of_tutorial),
@@ -69,7 +70,7 @@ class Desk:
                     target.parent.mkdir(parents=True, exist_ok=True)
                     (shutil.copytree if made.is_dir() else shutil.copy)(made, target)
 
-    def _once(self, name: str, make: Callable[[Path], None]) -> Path:
+    def _once(self, name: str, make: Callable[[Path], object]) -> Path:
         """The folder ``name`` with what ``make`` writes into it."""
         folder = self.folder / re.sub(r"[^\w.]+", "_", name)
         if not folder.exists():
@@ -169,6 +170,11 @@ class Desk:
                 shutil.copy(file, folder / f"{subject}_poses.npz")
 
         return self._once("amass", make)
+
+    def list_of_motions(self, name: str, words: Sequence[str]) -> Path:
+        """One of the two recordings in the folder ``amass``."""
+        entry = "amass/01_poses.npz" if name == "first.txt" else "amass/02_poses.npz"
+        return self._once(name, lambda folder: (folder / name).write_text(entry, encoding="utf-8")) / name
 
     def hero(self, name: str, words: Sequence[str]) -> Path:
         return Path(self.workshop.body("gltf_skin"))

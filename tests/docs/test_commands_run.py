@@ -146,7 +146,7 @@ def promised(words: Sequence[str]) -> list[str]:
         folder = output or "outputs/rollout"
         formats = [name for name in ("glb", "usd") if name in value_of(words, "formats", "")]
         names = ["rollout.h5", "summary.json", "config.yaml", *(f"rollout.{name}" for name in formats)]
-        many = "/*" if "sequence=amass" in " ".join(words) else ""
+        many = "/*" if re.search(r"sequence=(amass|\w+\.txt)", " ".join(words)) else ""
         return [f"{folder}{many}/{name}" for name in names]
     if command in ("inspect", "fabric") and not output:
         return []

@@ -7,6 +7,7 @@ import re
 import runpy
 import shlex
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -66,7 +67,8 @@ def write_package(folder: Path, text: str) -> None:
     groups = ""
     for name, language, body in blocks(text):
         if language == "toml":
-            groups += re.sub(r'\[project\.entry-points\."(.+)"\]', r"[\1]", body).replace('"', "") + "\n"
+            for group, points in tomllib.loads(body).get("project", {}).get("entry-points", {}).items():
+                groups += f"[{group}]\n" + "".join(f"{key} = {value}\n" for key, value in points.items())
         elif language in ("python", "yaml"):
             assert name, f"the page does not say where this belongs:\n{body}"
             (folder / name).parent.mkdir(parents=True, exist_ok=True)

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
+
 import pytest
 import torch
 
+from hood.commands.common import warn_if_slow
+from hood.nn import compiled
 from hood.nn.model import MeshGraphNet
 from hood.nn.precision import check_precision, products
 
@@ -45,3 +49,27 @@ def test_a_network_refuses_it_on_a_cpu() -> None:
     network.use_precision("tf32")
     with pytest.raises(ValueError, match="precision=tf32 needs device=cuda"):
         network(None, torch.zeros(1, 3), {})
+
+
+@pytest.mark.parametrize(
+    ("processor", "slow"),
+    [
+        ("Linux x86_64 flags : fpu sse2 avx2 avx512f", True),
+        ("Linux x86_64 flags : fpu sse2 avx2 avx512f avx512_bf16", False),
+        ("Linux x86_64 flags : fpu sse2 amx_bf16 amx_tile", False),
+        ("Linux aarch64 Features : fp asimd bf16", False),
+        ("Linux aarch64 Features : fp asimd", True),
+        ("Darwin arm64 arm", False),  # what it can do is not known
+    ],
+)
+def test_bfloat16_without_instructions_for_it_is_told(processor: str, slow: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiled, "processor", lambda: processor)
+    cpu = torch.device("cpu")
+    assert bool(compiled.why_slow("bf16", cpu)) == slow
+    assert compiled.why_slow("fp32", cpu) == compiled.why_slow("bf16", torch.device("cuda")) == ""
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        warn_if_slow("trainer.precision", "bf16", cpu)
+    assert [str(one.message)[:75] for one in heard] == [
+        "trainer.precision=bf16: this processor has no instructions for bfloat16 (AV"
+    ] * slow

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import sys
 from pathlib import Path
 
 import pytest
@@ -72,6 +73,19 @@ def test_tensorboard_alone_does_not_end_a_run(tmp_path: Path, capsys: pytest.Cap
         log.write(2, {"total": 1.0})
     assert [record["iteration"] for record in read(tmp_path)] == [1, 2]
     assert capsys.readouterr().err.count("no more TensorBoard events") == 1
+
+
+def test_a_run_without_tensorboard_says_so_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("tensorboard", "torch.utils.tensorboard"):
+        monkeypatch.setitem(sys.modules, name, None)  # as where it is not installed
+    with MetricsLog(tmp_path, 0) as log:
+        log.write(1, {"total": 1.0})
+        log.cut(0)
+    told = capsys.readouterr().err
+    way_out = 'it is not installed (pip install "hood-cloth[tensorboard]"); all numbers are in'
+    assert told == f"hood: no TensorBoard events: {way_out} {tmp_path / 'metrics.jsonl'}\n"
 
 
 def test_a_fresh_run_starts_a_fresh_file(tmp_path: Path) -> None:

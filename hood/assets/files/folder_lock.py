@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-#: Attempts to hold a folder, and seconds between them: somebody may just be looking whether it is held.
-_ATTEMPTS, _PAUSE = 5, 0.02
+#: Seconds in which a folder is tried to be held, and between two attempts: somebody may just be looking whether it is held.
+_PATIENCE, _PAUSE = 0.1, 0.02
 
 
 class OccupiedError(ValueError):
@@ -18,17 +18,18 @@ class OccupiedError(ValueError):
 
 
 @contextmanager
-def occupy(folder: Path) -> Iterator[None]:
+def occupy(folder: Path, patience: float = _PATIENCE) -> Iterator[None]:
     """Hold an existing folder for this process. The system gives it back when the process ends, however it ends.
 
-    Where the file system knows no locks of folders (many network disks), nothing is held and nothing refused.
+    Where the file system knows no locks of folders (many network disks), nothing is held and nothing refused. Another process
+    is waited for, for ``patience`` seconds.
 
     Raises:
         OccupiedError: another process holds it.
     """
     descriptor = _open(folder)
     try:
-        if descriptor is not None and not _hold(descriptor):
+        if descriptor is not None and not _hold(descriptor, patience):
             raise OccupiedError(f"{folder}: another run is writing there; wait for its end or choose another output")
         yield
     finally:
@@ -57,12 +58,13 @@ def _open(folder: Path) -> int | None:
         return None
 
 
-def _hold(descriptor: int) -> bool:
-    for _ in range(_ATTEMPTS):
-        if _lock(descriptor, shared=False):
-            return True
+def _hold(descriptor: int, patience: float) -> bool:
+    end = time.monotonic() + patience
+    while not _lock(descriptor, shared=False):
+        if time.monotonic() > end:
+            return False
         time.sleep(_PAUSE)
-    return False
+    return True
 
 
 def _lock(descriptor: int, shared: bool) -> bool:

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from hood.assets.files.extras import install
+
 #: Larger files [bytes] are refused: pages and glTF hold them whole.
 LARGEST = 4_000_000
 #: How a file begins, its kind and the ending of its name.
@@ -39,7 +41,7 @@ class Texture:
         try:
             from PIL import Image
         except ImportError as error:
-            raise ImportError('pixels of images need Pillow: pip install "hood[pictures]"') from error
+            raise ImportError(f"pixels of images need Pillow: {install('pictures')}") from error
         try:
             with Image.open(io.BytesIO(self.content)) as opened:
                 image = opened.convert("RGB")

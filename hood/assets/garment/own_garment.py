@@ -10,6 +10,7 @@ import numpy as np
 
 from hood.assets.garment.garment import Garment, check_levels
 from hood.assets.garment.garment_arrays import as_arrays, checked_fields
+from hood.assets.material import NO_GRADIENT
 from hood.mesh.quality import check_triangles
 from hood.mesh.riders import Riders
 
@@ -44,6 +45,8 @@ def checked_garment(garment: Garment) -> Garment:
 
 
 def _array(where: str, key: str, value: Any) -> np.ndarray:
+    if getattr(value, "requires_grad", False):
+        raise ValueError(f"{where}: {key}: {NO_GRADIENT}")
     value = value.detach().cpu() if hasattr(value, "detach") else value  # a tensor
     try:
         array = np.asarray(value)

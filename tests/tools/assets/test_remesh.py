@@ -69,7 +69,7 @@ def test_diffuse_keeps_constants_and_damps_noise(sheet: tuple[np.ndarray, np.nda
 
 
 def test_missing_build_package_says_how_to_get_it() -> None:
-    with pytest.raises(ImportError, match="pip install"):
+    with pytest.raises(ImportError, match=r"pip install \"hood-cloth\[assets\]\""):
         remesh.require("no_such_package_anywhere")
 
 

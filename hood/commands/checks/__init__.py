@@ -1,0 +1,1 @@
+"""What a command's words say beside each other, before anything is made."""
