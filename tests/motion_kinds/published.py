@@ -222,8 +222,8 @@ def hybrik() -> dict[str, Any]:
     own = world("-y")
     return {
         "pred_thetas": matrices(own.poses).reshape(COUNT, 216), "transl": own.transl,
-        "pred_betas": np.tile(own.betas, (COUNT, 1)), "pred_phi": np.zeros((COUNT, 23, 2)),
-        "pred_uvd": np.zeros((COUNT, 29, 3)), "bbox": np.zeros((COUNT, 4)),
+        "pred_betas": np.tile(own.betas, (COUNT, 1)),
+        "pred_phi": np.zeros((COUNT, 23, 2)), "pred_uvd": np.zeros((COUNT, 29, 3)), "bbox": np.zeros((COUNT, 4)),
     }  # fmt: skip
 
 
