@@ -5,7 +5,7 @@
     python benchmarks/step_distance.py --rows distance.jsonl --picture step_distance.png     # needs hood[charts]
     python benchmarks/step_distance.py --cost                                # its share of a rollout's time
 
-States are steps of rollouts of 25 scenes by seven methods: two networks alone, five iterations after a network and after none,
+States are steps of rollouts of 28 scenes by seven methods: two networks alone, five iterations after a network and after none,
 the solver stopped after three iterations and where it is done, and six sweeps of block descent. Scenes have 1,000 to 25,000
 vertices, 15 to 120 frames a second, fabrics from silk to leather, layers and outfits; none of them gave a constant of the
 estimate. From every state the solver goes on to a relative gradient of 1e-6: how far the vertices have moved by then (99th
@@ -82,6 +82,9 @@ SCENES: dict[str, dict[str, Any]] = {
     "outfit_tshirt_skirt": _scene(["tshirt", "skirt"], "twists"),
     "outfit_tank_trousers_leather": _scene(["tank", "trousers"], "walk_brisk", "nappa_leather"),
     "outfit_longsleeve_skirt_60": _scene(["longsleeve", "skirt"], "bends", fps=60),
+    "tshirt_jog": _scene("tshirt", "jog"),
+    "dress_march_linen": _scene("dress", "walk_march", "linen"),
+    "shorts_twists_leather_60": _scene("shorts", "twists", "nappa_leather", 60),
     "tshirt_4k": _scene("tshirt_4k", "dance_disco"),
     "trousers_4k_canvas": _scene("trousers_4k", "lunges", "cotton_canvas"),
     "dress_4k_60": _scene("dress_4k", "twists", fps=60),

@@ -28,7 +28,7 @@ from hood.dynamics.simulator import Prediction
 from hood.dynamics.stepper import Stepper
 from hood.dynamics.stopwatch import Stopwatch
 from hood.dynamics.surface import SURFACE_METRICS, SURFACE_STRIDE, SurfaceMeter
-from hood.dynamics.verdict.distance import DISTANCE_METRICS, distance_metrics
+from hood.dynamics.verdict.distance import DISTANCE_EVERY, DISTANCE_METRICS, distance_metrics
 from hood.graph.given import given_hierarchy
 from hood.losses.layers import for_networks, has_layers
 from hood.losses.potential import Potential
@@ -138,8 +138,9 @@ def simulate(
     ``metrics`` is one of :data:`METRIC_CHOICES`. What only they need to know, contact included, is no part of the step and
     changes nothing about it; its time is ``ms_metrics``, which ``ms_total`` leaves out as it does the caller's work. The same
     holds for ``fields``, names of :data:`FIELD_CHOICES`. The metrics of :class:`hood.dynamics.surface.SurfaceMeter` belong to
-    every ``surface_stride``-th frame, the first and the last; other frames lack them. So do those of
-    :func:`hood.dynamics.verdict.distance.distance_metrics`, which frame 0 lacks too: no step led there.
+    every ``surface_stride``-th frame, the first and the last; other frames lack them. Those of
+    :func:`hood.dynamics.verdict.distance.distance_metrics` belong to every second of these and to the last; frame 0 lacks them:
+    no step led there.
 
     A network that looks at a potential looks at ``potential``; a solver keeps its own.
 
@@ -242,7 +243,7 @@ def simulate(
                 known_fields = {name: vertex_residual(known, figures.gradient).float().cpu() for name in fields}
                 if metrics == "all":
                     stepped |= figures.metrics()
-                    if _is_measured(index + 1, count, surface_stride):
+                    if _is_measured(index + 1, count, DISTANCE_EVERY * surface_stride):
                         stepped |= distance_metrics(potential, known, prediction.next_pos)
         if observe is not None:
             with watch.aside("caller"):

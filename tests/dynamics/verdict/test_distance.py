@@ -101,8 +101,8 @@ def test_layers_are_kept_apart_from_where_the_step_ended() -> None:
     assert distance_metrics(LAYERED, problem, pos)["distance_max"] < 1e-5
     assert problem.layers[0].layers.mesh.apart is known
     upper = torch.arange(len(pos)).unsqueeze(1) >= len(pos) // 2
-    higher = torch.where(upper, pos + pos.new_tensor([0.0, 0.03, 0.0]), pos)
-    assert 0.03 < distance_metrics(LAYERED, problem, higher)["distance_p99"] < 0.09
+    lifted = torch.where(upper, pos + pos.new_tensor([0.0, 0.01, 0.0]), pos)
+    assert 0.005 < distance_metrics(LAYERED, problem, lifted)["distance_p99"] < 0.02
 
 
 class _Deceptive:
@@ -146,14 +146,14 @@ def stepper_of(kind: str) -> Stepper:
 
 @pytest.mark.usefixtures("compiled_layers")
 @pytest.mark.parametrize("kind", ["network", "newton", "guess", "sweeps"])
-def test_rollouts_measure_at_a_stride_and_last_and_do_not_notice(band_scene: Scene, kind: str) -> None:
+def test_rollouts_measure_at_twice_the_stride_and_last_and_do_not_notice(band_scene: Scene, kind: str) -> None:
     potential = LAYERED if kind in ("newton", "guess") else POTENTIAL
     both = [
         list(simulate(stepper_of(kind), band_scene, potential, 6, relaxing_steps=0, metrics=metrics, surface_stride=2))
         for metrics in ("all", "none")
     ]
     assert set(DISTANCE_METRICS) <= set(metric_names(potential, stepper_of(kind)))
-    assert [set(DISTANCE_METRICS) <= set(frame.metrics) for frame in both[0]] == [False, False, True, False, True, True]
+    assert [set(DISTANCE_METRICS) <= set(frame.metrics) for frame in both[0]] == [False, False, False, False, True, True]
     assert not any("distance_p99" in frame.metrics for frame in both[1])
     assert all(torch.equal(a.world_pos, b.world_pos) for a, b in zip(*both, strict=True))
     way = [frame.metrics["distance_p99"] for frame in both[0] if "distance_p99" in frame.metrics]
