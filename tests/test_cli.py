@@ -403,7 +403,14 @@ def test_a_rollout_without_metrics_holds_times_and_its_start_alone(tmp_path: Pat
     assert "strain p50 n/a p99 n/a, vertices inside the body n/a\n" in capsys.readouterr().out
     names = set(read_rollout(tmp_path / "run" / "rollout.h5").metrics)
     times = {f"ms_{part}" for part in ("search", "features", "network", "rest", "total", "guard", "metrics")}
-    assert names == times | {"settle_steps", "settle_seconds", "settle_speed", "settle_reached"}
+    assert names == times | {
+        "settle_steps",
+        "settle_seconds",
+        "settle_speed",
+        "settle_reached",
+        "settle_away",
+        "settle_slipped",
+    }
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["strain_p50"] is summary["potential_mean_J"] is summary["first_frame"]["strain_p99"] is None
     assert summary["ms_per_frame"]["network"]["median"] > 0

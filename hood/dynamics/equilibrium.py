@@ -50,6 +50,7 @@ class Rest:
 
     Args:
         pos: (V, 3) m, in the frame of the state that it started from.
+        began: (V, 3) m, where it was put on.
         steps: taken.
         seconds: of computing.
         speed: [m/s] at which the cloth still moved in the last step, the mean over its fastest part.
@@ -57,6 +58,7 @@ class Rest:
     """
 
     pos: Tensor
+    began: Tensor
     steps: int
     seconds: float
     speed: float
@@ -117,7 +119,7 @@ def find_equilibrium(
     pos = way.pos
     if way.parts.moving and most_steps is None and math.isfinite(speed):
         pos = _out_of_skin(potential, way.problem, pos)
-    rest = Rest(pos.to(state.pos), count, time.perf_counter() - began, speed, way.lost)
+    rest = Rest(pos.to(state.pos), state.pos, count, time.perf_counter() - began, speed, way.lost)
     if not rest.reached and most_steps is None:
         _warn(scene, rest)
     return rest

@@ -47,12 +47,15 @@ STILL = {
     "fastened_row": np.int32,
     "fastened_length": np.float64,
     "simulated_faces": np.int32,
+    "pinned": np.int32,
 }
 
 
 def still_of(garment: Garment, fastening: Fastening | None = None) -> dict[str, np.ndarray]:
     """What a file holds of the garment and its fasteners beside its mesh, by the names of :data:`STILL`."""
     found = {} if garment.piece is None else {"piece": garment.piece}
+    if garment.pinned.any():
+        found["pinned"] = np.flatnonzero(garment.pinned)
     if fastening is not None:
         pairs = fastening.pairs
         tables = {"fastened": pairs.edges, "fastened_row": fastening.row, "fastened_length": pairs.length}
@@ -67,12 +70,12 @@ class RolloutWriter:
 
     Datasets: ``cloth/pos (T,V,3)``, ``cloth/faces``, ``cloth/rest_pos``, ``body/pos (T,W,3)``, ``body/faces``, ``time (T,)``,
     ``metrics/* (T,)``, of every vertex ``cloth/NAME (T,V)`` for each name in ``fields``, and those of :data:`STILL` that are
-    given: texture coordinates ``cloth/uv (U,2)`` with ``cloth/uv_faces (F,3)``, which garment of an outfit a vertex
-    belongs to, ``cloth/piece (V,)``, and pairs of vertices that are fastened to each other, ``cloth/fastened (A,2)``, with the
-    number of their row and the distance [m] that they are held at; attributes: ``num_frames`` done
-    so far of ``num_planned``, ``complete``, and what is given as ``attributes``. Real numbers are float32, positions far from
-    the origin float64; with ``double`` the cloth's are float64 anyway, for states that meet an accuracy which float32 does
-    not resolve.
+    given: texture coordinates ``cloth/uv (U,2)`` with ``cloth/uv_faces (F,3)``, which garment of an outfit a vertex belongs to,
+    ``cloth/piece (V,)``, which vertices are held, ``cloth/pinned (P,)``, and pairs of vertices that are fastened to each other,
+    ``cloth/fastened (A,2)``, with the number of their row and the distance [m] that they are held at; attributes:
+    ``num_frames`` done so far of ``num_planned``, ``complete``, and what is given as ``attributes``. Real numbers are float32,
+    positions far from the origin float64; with ``double`` the cloth's are float64 anyway, for states that meet an accuracy
+    which float32 does not resolve.
 
     With ``guarded`` there are the alarms of a guard, one a row: ``guard/frame``, ``guard/cause`` and ``guard/repair`` (words of
     :data:`hood.dynamics.alarms.CAUSES` and :mod:`hood.dynamics.step_repair`), ``guard/value`` and ``guard/limit`` (of the

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -29,6 +30,7 @@ from hood.dynamics.stepper import Stepper
 from hood.dynamics.stopwatch import Stopwatch
 from hood.dynamics.surface import SURFACE_METRICS, SURFACE_STRIDE, SurfaceMeter
 from hood.dynamics.verdict.distance import DISTANCE_EVERY, DISTANCE_METRICS, distance_metrics
+from hood.dynamics.verdict.worn import measure_wear
 from hood.graph.given import given_hierarchy
 from hood.losses.layers import for_networks, has_layers
 from hood.losses.potential import Potential
@@ -73,7 +75,7 @@ METRIC_CHOICES = ("all", "strain", "none")
 FIELD_CHOICES = ("rg",)
 #: How frame 0 is made, see :func:`simulate`, and what frame 0 says of an equilibrium.
 SETTLE_CHOICES = ("equilibrium", "paper")
-SETTLE_METRICS = ("settle_steps", "settle_seconds", "settle_speed", "settle_reached")
+SETTLE_METRICS = ("settle_steps", "settle_seconds", "settle_speed", "settle_reached", "settle_away", "settle_slipped")
 
 
 def metric_names(
@@ -125,7 +127,8 @@ def simulate(
     steps (paper, section 3.4), vertices pushed out of the body. Where the stepper restarts from the relaxing step
     (:class:`hood.dynamics.frames.Relaxing`), the last one leads from frame 0 to frame 1 instead. With ``equilibrium`` there
     are no relaxing steps: the solver settles the cloth on the still body (:func:`hood.dynamics.equilibrium.find_equilibrium`),
-    the same way for every stepper, and frame 0 has :data:`SETTLE_METRICS` (number, s, m/s, 0 or 1). What has a start of its
+    the same way for every stepper, and frame 0 has :data:`SETTLE_METRICS` (number, s, m/s, 0 or 1, and how far the part that
+    moved most has come from its place on the body, m, see :mod:`hood.dynamics.verdict.worn`). What has a start of its
     own (:func:`own_start`) keeps ``paper``. Either way frame 0 has the velocity
     of the skinned garment.
 
@@ -178,7 +181,7 @@ def simulate(
     else:
         state = start_state(stepper, scene, potential, relaxing_steps, start_frame)
     relaxing = relaxing_steps > 0 and stepper.relaxing is Relaxing.RESTART
-    stepped = {} if rest is None else _settled(rest)
+    stepped = {} if rest is None else _settled(rest, scene, start_frame, state)
     known_fields = {name: torch.full((scene.cloth.num_vertices,), torch.nan) for name in fields}
     wants_potential = metrics == "all" or bool(fields)
     meter = SurfaceMeter(scene.garment, scene.motion.faces) if metrics == "all" else None
@@ -443,9 +446,21 @@ def rest_state(
     return State(rest.pos, scene.start_velocity(frame), start.origin), rest
 
 
-def _settled(rest: Rest) -> dict[str, float]:
-    values = (float(rest.steps), rest.seconds, rest.speed, float(rest.reached))
+def _settled(rest: Rest, scene: Scene, frame: int, state: State) -> dict[str, float]:
+    """:data:`SETTLE_METRICS` of the ``state`` that was found."""
+    body = scene.motion.surface(frame, state.origin[0].numpy()).double().cpu().numpy()
+    before, after = (pos.double().cpu().numpy()[None] for pos in (rest.began, rest.pos))
+    faces, pinned = scene.garment.faces, np.flatnonzero(scene.garment.pinned)
+    both = (np.concatenate([before, after]), faces, np.stack([body, body]), scene.motion.faces)
+    wear = measure_wear(*both, [1], pinned) if len(body) and np.isfinite(after).all() else None
+    came = (np.nan, np.nan) if wear is None else (_most(wear.away), _most(wear.slipped))
+    values = (float(rest.steps), rest.seconds, rest.speed, float(rest.reached), *came)
     return dict(zip(SETTLE_METRICS, values, strict=True))
+
+
+def _most(lengths: np.ndarray) -> float:
+    """The largest that is known; NaN where none is."""
+    return float(np.fmax.reduce(lengths.reshape(-1), initial=np.nan))
 
 
 def _led_in(

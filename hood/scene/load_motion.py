@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from hood.assets.body.load import load_body
+from hood.assets.files.doubt import Doubt
 from hood.assets.motion.animated_mesh import NO_BODY, body_kind, load_mesh_sequence
 from hood.assets.motion.load import load_sequence
 from hood.scene.mesh_motion import NoBody, mesh_motion
@@ -114,8 +115,8 @@ def _doubt(betas: np.ndarray) -> None:
     value = float(betas[index])
     if abs(value) > _MEANT:
         hint = f"; if a point is missing, give {value / 10:g}" if abs(value) / 10 <= _MEANT else ""
-        warnings.warn(
+        sentence = (
             f"betas[{index}]={value:g} is beyond what body models are made for, {-_MEANT:g} to {_MEANT:g}: the body is hardly "
-            f"a person's, and garments may not fit it{hint}",
-            stacklevel=2,
+            f"a person's, and garments may not fit it{hint}"
         )
+        warnings.warn(Doubt("shape", sentence, value=value, unit="standard deviations"), stacklevel=2)

@@ -41,6 +41,7 @@ def skin_causes(metrics: Mapping[str, np.ndarray], inside: Mapping[str, np.ndarr
     lasting = measured & (spots > SPOTS_UNSOUND.value) & (height > SPOTS_HEIGHT.value)
     if lasting.sum() <= SPOTS_LASTING.value * measured.sum():
         lasting = np.zeros_like(lasting)
+    lasting &= ~deep
     causes = [
         Cause("skin_through_cloth", f"the skin is seen through more than {cut_text()} of the cloth's triangles", cut & measured,
               shown, CUT_UNSOUND.value, CUT_UNSOUND.unit, ".1%", measured=measured),

@@ -30,6 +30,7 @@ class Drawn:
     body_faces: np.ndarray  # (G, 3)
     piece: np.ndarray | None  # (V,) garment of an outfit
     step: np.ndarray  # (T,) the simulated frame of each, or the nearest
+    pinned: np.ndarray  # (P,) vertices that are held, as far as the file says
 
     @property
     def edge_length(self) -> float:
@@ -55,6 +56,7 @@ def drawn(data: RolloutData) -> Drawn:
         np.asarray(data.body_faces, dtype=np.int64),
         None if piece is None else piece[:count],
         step,
+        data.still.get("pinned", np.zeros(0, dtype=np.int64)).astype(np.int64),
     )
 
 

@@ -31,13 +31,29 @@ def worn_causes(data: RolloutData, seen: Drawn) -> Found:
     if not len(usable) or usable[0] != 0:
         return Found(notes=notes)
     chosen = usable[np.unique(np.linspace(0, len(usable) - 1, min(len(usable), _LOOKED_AT)).astype(np.int64))]
-    wear = measure_wear(seen.cloth, seen.faces, seen.body, seen.body_faces, chosen.tolist())
+    wear = measure_wear(seen.cloth, seen.faces, seen.body, seen.body_faces, chosen.tolist(), seen.pinned)
     if wear is None:
         return Found(notes=notes)
-    found = Found(notes=notes)
+    found = Found(_fallen_before(data, len(data.step_finite)), notes=notes)
     for part in range(len(wear.num_vertices)):
         found += _of_part(data, seen, wear, part)
     return found
+
+
+def _fallen_before(data: RolloutData, count: int) -> list[Cause]:
+    """What came off while the start was settled, before frame 0."""
+    rows = [data.step_metrics.get(name) for name in ("settle_away", "settle_slipped")]
+    away, slipped = (np.nan if row is None or not len(row) else float(row[0]) for row in rows)
+    if not (away > AWAY_UNSOUND.value or slipped > SLIPPED_UNSOUND.value):
+        return []
+    limit = AWAY_UNSOUND if away > AWAY_UNSOUND.value else SLIPPED_UNSOUND
+    way = float(np.fmax(away, slipped))
+    text = (
+        f"{str(data.attributes.get('garment', 'garment'))!r} came off when it was settled on the body, before frame 0: it has "
+        f"moved by {way:.2f} m from where it was put on (beyond {limit.value:.2f}); pins=… hold it, a smaller size stays"
+    )
+    bad = np.ones(count, dtype=bool)
+    return [Cause("not_worn", text, bad, np.full(count, way), limit.value, limit.unit, ".2f", whole=True)]
 
 
 def _of_part(data: RolloutData, seen: Drawn, wear: Wear, part: int) -> Found:

@@ -38,6 +38,7 @@ _HANGS = 0.02
 _MOST_LOOKED_AT = 300
 #: What an opening that has lost its limb has slipped by [m].
 _LOST = 1.0
+_NONE = np.zeros(0, dtype=np.int64)
 #: Bodies with longer edges [m] get points between their vertices.
 _COARSE = 0.04
 
@@ -78,9 +79,17 @@ class WearMeter:
         faces: (F, 3) of the cloth.
         body_pos: (W, 3) m, in frame 0.
         body_faces: (G, 3); at least one.
+        pinned: (P,) vertices that are held: they count as touching the body.
     """
 
-    def __init__(self, pos: np.ndarray, faces: np.ndarray, body_pos: np.ndarray, body_faces: np.ndarray) -> None:
+    def __init__(
+        self,
+        pos: np.ndarray,
+        faces: np.ndarray,
+        body_pos: np.ndarray,
+        body_faces: np.ndarray,
+        pinned: np.ndarray = _NONE,
+    ) -> None:
         self._body_edges = unique_edges(body_faces)
         self._between = _edges_to_split(body_pos, self._body_edges)
         body = self._points(body_pos)
@@ -99,7 +108,7 @@ class WearMeter:
         chosen = []
         for number, rows in zip(numbers, members, strict=True):
             own = [(loop, count) for loop, count in zip(loops, through, strict=True) if part[loop[0]] == number]
-            chosen.append(_to_follow(rows, dist, own))
+            chosen.append(_to_follow(rows, dist, own, np.intersect1d(rows, pinned)))
         regions = _Regions(body, self._body_edges, self._between)
         self._groups = [
             [
@@ -139,12 +148,17 @@ class WearMeter:
 
 
 def measure_wear(
-    pos: np.ndarray, faces: np.ndarray, body_pos: np.ndarray, body_faces: np.ndarray, frames: Sequence[int]
+    pos: np.ndarray,
+    faces: np.ndarray,
+    body_pos: np.ndarray,
+    body_faces: np.ndarray,
+    frames: Sequence[int],
+    pinned: np.ndarray = _NONE,
 ) -> Wear | None:
     """:class:`Wear` of a rollout (T, V, 3), (T, W, 3) [m] in ``frames``; None without a body, cloth, or a finite frame 0."""
     if not len(body_faces) or not len(faces) or not (np.isfinite(pos[0]).all() and np.isfinite(body_pos[0]).all()):
         return None
-    meter = WearMeter(pos[0].astype(np.float64), faces, body_pos[0].astype(np.float64), body_faces)
+    meter = WearMeter(pos[0].astype(np.float64), faces, body_pos[0].astype(np.float64), body_faces, pinned)
     rows = [meter(pos[frame].astype(np.float64), body_pos[frame].astype(np.float64)) for frame in frames]
     away, slipped = (np.array([row[which] for row in rows]) for which in range(2))
     return Wear(np.asarray(frames), away, slipped, meter.num_vertices, meter.first_vertex, meter.gap)
@@ -171,15 +185,17 @@ def num_through(rim: np.ndarray, body_pos: np.ndarray, body_edges: np.ndarray) -
     return int(hit.any(axis=1).sum())
 
 
-def _to_follow(rows: np.ndarray, dist: np.ndarray, openings: list[tuple[np.ndarray, int]]) -> list[tuple[np.ndarray, bool]]:
-    """Of a part the vertices that touch the body, and its openings around a limb; nothing where it is not worn."""
-    touching = rows[dist[rows] < TOUCHES]
+def _to_follow(
+    rows: np.ndarray, dist: np.ndarray, openings: list[tuple[np.ndarray, int]], held: np.ndarray
+) -> list[tuple[np.ndarray, bool]]:
+    """Of a part the vertices that touch the body or are held, and its openings around a limb; nothing where it is not worn."""
+    touching = np.union1d(rows[dist[rows] < TOUCHES], held)
     if len(touching) < _LEAST_TOUCHING * len(rows) and not any(count >= _THROUGH for _, count in openings):
         return []
     if not len(touching):
         touching = rows[np.argsort(dist[rows], kind="stable")[: max(1, len(rows) // 10)]]
     rims = [loop for loop, count in openings if count >= _THROUGH and (dist[loop] < TOUCHES).mean() >= _TIGHT]
-    return [(_some(touching), False), *((loop, True) for loop in rims)]
+    return [(np.union1d(_some(touching), held[:_MOST_LOOKED_AT]), False), *((loop, True) for loop in rims)]
 
 
 def _some(rows: np.ndarray) -> np.ndarray:
