@@ -6,10 +6,11 @@
     python benchmarks/step_distance.py --cost                                # its share of a rollout's time
 
 States are steps of rollouts of 28 scenes by seven methods: two networks alone, five iterations after a network and after none,
-the solver stopped after three iterations and where it is done, and six sweeps of block descent. Scenes have 1,000 to 25,000
-vertices, 15 to 120 frames a second, fabrics from silk to leather, layers and outfits; none of them gave a constant of the
-estimate. From every state the solver goes on to a relative gradient of 1e-6: how far the vertices have moved by then (99th
-percentile over those that are free) is the true distance. Another minimum may be nearer: that is the one the solver goes to.
+the solver stopped after three iterations and where it is done, and six sweeps of block descent. Scenes have 1,000 to 12,000
+vertices, 15 to 120 frames a second, fabrics from silk to leather, layers and outfits. None of them gave a constant of the
+estimate; how many iterations it takes was chosen with nine of them in sight. From every state the solver goes on to a relative
+gradient of 1e-6: how far the vertices have moved by then (99th percentile over those that are free) is the true distance.
+Another minimum may be nearer: that is the one the solver goes to.
 
 Printed are, over all states and by method, size, frames a second and fabric: states, the median of the true distance, rank
 correlation, and the shares of the estimates within a factor of 2 and of 4, of the states whose true or estimated distance is at
