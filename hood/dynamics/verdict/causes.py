@@ -26,11 +26,17 @@ def causes_of(data: RolloutData, seen: Drawn) -> Found:
     torn = Found() if strain is None else strain_causes(data.step_finite, strain, seen)
     return (
         torn
-        + solved_causes(metrics)
+        + solved_causes(metrics, _step_of(data))
         + skin_causes(surface, metrics, seen)
         + crossing_causes(seen, surface)
         + guard_doubts(data)
     )
+
+
+def _step_of(data: RolloutData) -> float:
+    """The time step [s] of the simulated frames."""
+    times = data.step_time
+    return float(times[1] - times[0]) if len(times) > 1 else float(data.attributes.get("dt", 1.0))
 
 
 def strain_of(data: RolloutData) -> np.ndarray | None:

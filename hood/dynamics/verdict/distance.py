@@ -13,6 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from hood.limits import DISTANCE_UNSOUND
 from hood.losses.layer_sides import LayerSides
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
@@ -30,6 +31,9 @@ ITERATIONS, CALM, SETTLED = 5, 5e-5, 0.1
 #: The whole way over what the iterations tell of it, and the power of the share of the force that they leave: fitted to 500
 #: states of scenes that ``benchmarks/step_distance.py`` does not have.
 WHOLE, LEFT = 1.3, 0.08
+#: An estimate within this factor of the limit of a verdict is looked at again: up to so many iterations more, until Newton's
+#: step is less than this share of the way.
+NEAR, AGAIN, CLOSE = 2.5, 25, 0.02
 #: So much of Newton's steps counts as gone at least: of a search that gets nowhere, all of the way is left.
 _LEAST = 0.2
 
@@ -48,22 +52,25 @@ def distance_metrics(potential: Potential, problem: StepProblem, next_pos: Tenso
     for_training = any(type(term) is LayerSides for term in potential.terms.values())
     if for_training or not bool(torch.isfinite(next_pos).all()):
         return dict.fromkeys(DISTANCE_METRICS, float("nan"))
-    found = estimate(potential, problem, next_pos)
+    limit = DISTANCE_UNSOUND.value * float(problem.step.dt.max())
+    found = estimate(potential, problem, next_pos, limit)
     for scene in problem.layers:  # what somebody asks of the step after this does not depend on it
         scene.layers.restart()
     return dict(zip(DISTANCE_METRICS, found, strict=True))
 
 
-def estimate(potential: Potential, problem: StepProblem, next_pos: Tensor) -> Distance:
+def estimate(potential: Potential, problem: StepProblem, next_pos: Tensor, limit: float | None = None) -> Distance:
     """How far vertices at ``next_pos`` (V, 3) m are from the minimum that the solver goes to from there.
 
     d is how far they get in up to :data:`ITERATIONS` iterations, p the sum of Newton's steps on the way, taken whole, and r the
     share of the force that is left: the way is √(d p) times 1.3 r^0.08, or times 1 where that is less; d and every step are
-    99th percentiles or largest values. Cloth that passes through cloth has no way to go for that: ``self_crossings`` counts it.
+    99th percentiles or largest values. Near ``limit`` the solver goes on, and the way is how far it gets. Cloth that passes
+    through cloth has no way to go for that: ``self_crossings`` counts it.
 
     Args:
         potential: what the step is measured by.
         problem: prepared by it, with the contact that the step was taken with in the end.
+        limit: of a verdict [m]; None: there is none.
     """
     free = problem.cloth.free
     if not bool(free.any()):
@@ -75,7 +82,21 @@ def estimate(potential: Potential, problem: StepProblem, next_pos: Tensor) -> Di
     steps = _follow(way, free)
     whole = WHOLE if len(steps) == 1 else max(WHOLE * min(way.residual / began, 1.0) ** LEFT, 1.0)
     gone, sums = _sizes(way.pos - next_pos, free), (sum(sizes) for sizes in zip(*steps, strict=True))
-    return Distance(*(whole * math.sqrt(max(d, _LEAST * p) * p) for d, p in zip(gone, sums, strict=True)))
+    found = Distance(*(whole * math.sqrt(max(d, _LEAST * p) * p) for d, p in zip(gone, sums, strict=True)))
+    near = limit is not None and limit / NEAR < found.p99 < limit * NEAR
+    return _looked_at_again(way, next_pos, free) if near else found
+
+
+def _looked_at_again(way: Further, start: Tensor, free: Tensor) -> Distance:
+    """How far the solver gets when it goes on, and its last step, of which some is left."""
+    gone, last = _sizes(way.pos - start, free), Distance(0.0, 0.0)
+    for _ in range(AGAIN):
+        if not (way.residual > 0.0 and way.move()):
+            break
+        gone, last = _sizes(way.pos - start, free), _sizes(way.direction, free)
+        if last.p99 < CLOSE * gone.p99:
+            break
+    return Distance(gone.p99 + last.p99, gone.most + last.most)
 
 
 def _follow(way: Further, free: Tensor) -> list[Distance]:

@@ -11,18 +11,21 @@ from hood.limits import DISTANCE_UNSOUND, GRADIENT_UNSOUND, TOLERATED
 
 #: The metric of :mod:`hood.dynamics.verdict.distance`.
 DISTANCE = "distance_p99"
+#: Single steps beyond the limit are mended by the next ones: so often they are beyond it, or so far, where they count.
+_OFTEN, _FAR = 0.25, 2.0
 
 
-def solved_causes(metrics: Mapping[str, np.ndarray]) -> Found:
-    """Bad steps, of every stepper by the distance [m] where it was measured. Elsewhere a solver is held to its target and, as a
+def solved_causes(metrics: Mapping[str, np.ndarray], dt: float) -> Found:
+    """Bad steps of ``dt`` [s], of every stepper by the distance [m] where it was measured: a step in four beyond the limit, or
+    one beyond twice as much. Elsewhere a solver is held to its target and, as a
     refinement, to the relative gradient; a network alone to nothing: its steps are no minima, and the force says little."""
     distance = metrics.get(DISTANCE)
     if distance is not None and np.isfinite(distance).any():
-        text = f"steps ended more than {1e3 * DISTANCE_UNSOUND.value:g} mm from their minimum (p99 over the vertices)"
-        return Found([
-            Cause("distance", text, np.nan_to_num(distance) > DISTANCE_UNSOUND.value, distance, DISTANCE_UNSOUND.value, "m",
-                  ".0f", 1e3, " mm", np.isfinite(distance)),
-        ])  # fmt: skip
+        limit, measured, way = DISTANCE_UNSOUND.value * dt, np.isfinite(distance), np.nan_to_num(distance)
+        often = (way > limit).sum() > _OFTEN * measured.sum()
+        bad = way > (limit if often else _FAR * limit)
+        text = f"steps ended more than {1e3 * limit:.2g} mm from their minimum (p99 over the vertices)"
+        return Found([Cause("distance", text, bad, distance, limit, "m", ".0f", 1e3, " mm", measured)])
     found, converged, gradient = [], metrics.get("solver_converged"), _gradient(metrics)
     if converged is not None:
         found.append(Cause("solver_target", "the solver missed its target", converged == 0))

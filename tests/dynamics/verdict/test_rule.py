@@ -95,19 +95,28 @@ def test_the_distance_decides_where_it_was_measured() -> None:
     loose = {"relative_gradient": steps(30, 500.0), "solver_converged": steps(30, 0.0)}
     assert refined(distance_p99=measured, **loose).sound
     measured[15] = 0.05
+    assert refined(distance_p99=measured).sound  # one step beyond 30 mm, and not twice as far
+    measured[15] = 0.07
     (reason,) = refined(distance_p99=measured, refine_rg=steps(30, 1e-3)).reasons
-    assert (reason.kind, reason.frames, reason.value, reason.frame) == ("distance", ((15, 15),), 0.05, 15)
-    assert "worst 50 mm in frame 15" in reason.sentence
-    assert refined(distance_p99=measured).sound is False
+    assert (reason.kind, reason.frames, reason.value, reason.frame) == ("distance", ((15, 15),), 0.07, 15)
+    assert "worst 70 mm in frame 15" in reason.sentence
+    assert refined(distance_p99=np.where(np.isfinite(measured), 0.04, np.nan)).sound is False
+
+
+def test_the_limit_of_the_distance_goes_with_the_time_step() -> None:
+    for fps, sound in ((30.0, True), (120.0, False)):
+        data = stored(30, {"strain_p99": frames(30), "distance_p99": steps(30, 0.02)})
+        data.time[:] = np.arange(30) / fps
+        assert judge_rollout(data).sound is sound
 
 
 def test_one_measured_frame_of_many_is_suffered_for_as_long_as_it_stands_for() -> None:
     """Six steps of 305 are 2%."""
     measured = np.where(np.arange(305) % 5 == 0, 0.001, np.nan)
-    measured[100] = 0.05
+    measured[100] = 0.07
     data = {"strain_p99": frames(305), "distance_p99": measured}
     assert judge_rollout(stored(305, data)).sound
-    measured[200] = 0.05
+    measured[200] = 0.07
     assert judge_rollout(stored(305, data)).sound is False
 
 

@@ -68,7 +68,7 @@ def test_skin_through_much_of_the_cloth_counts_in_every_frame() -> None:
 def test_skin_that_sticks_out_far_counts_by_its_height() -> None:
     assert kinds(worn(np.where(np.arange(COUNT) > 20, 0.025, 0.0), 5)) == ["skin_depth"]
     (reason,) = judge_rollout(worn(np.where(np.arange(COUNT) > 20, 0.025, 0.0), 5)).reasons
-    assert reason.value == pytest.approx(0.02, abs=2e-3)
+    assert reason.value == pytest.approx(0.02, abs=3e-3)
 
 
 def test_low_spots_of_skin_count_where_they_stay() -> None:
