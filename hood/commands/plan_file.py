@@ -124,7 +124,7 @@ def _checked_words(path: Path) -> list[str]:
     if plan.get("content", content) != content:
         warnings.warn(
             f"plan={path}: its words, or the files that they name, are not those that it was made for; make it again: "
-            f"{shlex.join(['hood', 'plan', *plan['words'], 'output=…'])}",
+            f"{shlex.join(['hood', 'plan', *_with_stepper(plan['words']), 'output=…'])}",
             stacklevel=2,
         )
     return [*_with_stepper(plan["words"]), *plan["chosen"]]

@@ -17,7 +17,7 @@ import pytest
 import hood
 from hood.assets.files.library import locate
 from hood.cli import main
-from hood.commands.plan_file import rollout_config
+from hood.commands.plan_file import read_watch, rollout_config
 from hood.config import ConfigError
 from hood.evaluation.leaving_out import Effect
 
@@ -349,3 +349,15 @@ def test_without_a_body_its_contact_is_absent(tmp_path: Path) -> None:
     rows = {row["part"]: row for row in read(tmp_path / "plan.json")["rows"]}
     assert rows["friction"]["decision"] == "absent"
     assert rows["bending"]["decision"] in ("kept", "left out")
+
+
+def test_a_plan_that_names_no_stepper_is_of_the_network(tmp_path: Path) -> None:
+    """It was made when the network was the default."""
+    path = tmp_path / "plan.json"
+    watch = {"limit": 0.01, "hold": 3}
+    for chosen, stepper in ((["refine=5"], "network"), ([], "network"), (["stepper=newton", "refine=0"], "newton")):
+        path.write_text(json.dumps({"format": "hood-plan/1", "words": ["garment=tank"], "chosen": chosen, "watch": watch}))
+        assert rollout_config([f"plan={path}"]).stepper == stepper
+        found = read_watch(path)
+        assert found is not None
+        assert found.words == ["stepper=network", "garment=tank"]
