@@ -17,6 +17,7 @@ from imitations import GltfWriter
 from hood.assets.body.load import load_body
 from hood.assets.garment.garment import load_garment
 from hood.mesh import topology
+from hood.mesh.repair import flipped_faces
 
 Mesh = tuple[np.ndarray, np.ndarray]  # (V, 3) m, (F, 3)
 
@@ -145,7 +146,10 @@ def folded_hem(mesh: Mesh, height: float = 0.05, off: float = 3e-3) -> Mesh:
     for low, high in zip(rings, rings[1:], strict=False):
         after, above = np.roll(low, -1), np.roll(high, -1)
         tables += [np.stack([low, after, above], axis=1), np.stack([low, above, high], axis=1)]
-    return np.concatenate([pos, *added]), np.concatenate([faces, *tables])
+    table = np.concatenate([faces, *tables])
+    turned = flipped_faces(table)
+    table[turned] = table[turned][:, ::-1]
+    return np.concatenate([pos, *added]), table
 
 
 def belt(mesh: Mesh, height: float = 0.15, thick: float = 4e-3) -> Mesh:
@@ -475,6 +479,10 @@ KINDS: dict[str, Kind] = {
         _obj("shell_open", lambda: shell(_tank(), 2e-3, rims=False)), "cloth with its thickness", _tank, thickness=2e-3
     ),
     "shell with torn rims": Kind(_obj("shell_torn", _torn_strips), "cloth with its thickness", _tank, thickness=2e-3),
+    "shell of a folded hem": Kind(
+        _obj("fold", lambda: shell(folded_hem(_skirt(), off=4e-3), 1e-3)), "cloth with its thickness",
+        lambda: folded_hem(_skirt(), off=4e-3), thickness=1e-3, tolerance=2e-3,
+    ),
     "shell with bevelled rims": Kind(
         _obj("bevel", lambda: bevelled(_tank(), 3e-3)), "cloth with its thickness", _tank, thickness=3e-3
     ),

@@ -32,6 +32,7 @@ from hood.commands.beside_mesh import place_beside_mesh
 from hood.commands.common import read_model
 from hood.commands.contents.reading import meant_by
 from hood.commands.contents.report import describe_made, describe_objects, problems_of
+from hood.commands.contents.wanted import words_of
 from hood.commands.describe_place import describe_place
 from hood.commands.guarding import summarise_guard
 from hood.commands.output_fps import summarise_rate
@@ -118,6 +119,7 @@ def inspect_garment(
     defects = find_defects(garment.rest_pos, garment.faces)
     _describe_defects(finding, defects)
     garment = _made(finding, start_fitting(garment, stitches), body, meant_by(entry, path, wanted or Wanted()))
+    finding.repairs += words_of(wanted or Wanted())
     if _is_suspect(finding, garment, body):
         return finding
     if isinstance(body, MeshMotion):

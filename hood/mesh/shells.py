@@ -22,6 +22,10 @@ _BOTH, _ALIKE = 0.95, 0.6
 _TOUCHING = 1e-6
 #: Cosine between the normals of two faces with a sharp edge between them: a rim is upright on its layers.
 _SHARP = 0.3
+#: The rim between two layers is at most so many times as wide as they are apart.
+_RIM = 2.5
+#: Two groups of faces that meet in a fold have less than this share of their faces opposite each other.
+_FOLDED = 0.2
 #: What is narrower at the end of a layer than so many times the thickness, and lies askew [cosine], is of a rounded rim; looked
 #: for so often.
 _NARROW, _SAME_PLANE, _TRIMS = 0.8, 0.96, 4
@@ -46,7 +50,7 @@ def find_shell(pos: np.ndarray, faces: np.ndarray, thickest: float) -> Shell | N
     """
     faces = _wound_outwards(pos, faces)
     normal, area = _normals(pos, faces)
-    gap = _gaps(pos, faces, normal, thickest)
+    gap, opposite = _gaps(pos, faces, normal, thickest)
     layer = np.isfinite(gap)
     if area[layer].sum() < _MOST * area.sum():
         return None
@@ -55,6 +59,8 @@ def find_shell(pos: np.ndarray, faces: np.ndarray, thickest: float) -> Shell | N
     if area[layer].sum() < _MOST * area.sum():
         return None
     label = _smooth_groups(faces, normal, layer)
+    rim = (_widths(pos, faces, area, label) <= _RIM * usual)[label]
+    label = _unfolded(faces, layer, rim, label, opposite)
     size = np.bincount(label[layer], weights=area[layer], minlength=2)
     first, second = np.argsort(-size, kind="stable")[:2]
     if size[first] + size[second] < _BOTH * area[layer].sum() or size[second] < _ALIKE * size[first]:
@@ -112,13 +118,13 @@ def _median(values: np.ndarray, weights: np.ndarray) -> float:
     return float(values[order][np.searchsorted(total, 0.5 * total[-1])])
 
 
-def _gaps(pos: np.ndarray, faces: np.ndarray, normal: np.ndarray, farthest: float) -> np.ndarray:
-    """Distance (F,) from the middle of every face, against its normal, to the nearest face that looks the other way; infinite
-    where none is nearer than ``farthest``."""
+def _gaps(pos: np.ndarray, faces: np.ndarray, normal: np.ndarray, farthest: float) -> tuple[np.ndarray, np.ndarray]:
+    """Distance (F,) from the middle of every face, against its normal, to the nearest face that looks the other way, and that
+    face; infinite and -1 where none is nearer than ``farthest``."""
     corners = pos[faces]
     centre = corners.mean(axis=1)
     radius = np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
-    gap = np.full(len(faces), np.inf)
+    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     for ray, face in _near(centre, radius, farthest):
         facing = (normal[ray] * normal[face]).sum(axis=1) <= -_ALONG
         ray, face = ray[facing], face[facing]
@@ -126,8 +132,13 @@ def _gaps(pos: np.ndarray, faces: np.ndarray, normal: np.ndarray, farthest: floa
         way = (normal[face] * (centre[face] - centre[ray])).sum(axis=1) / along
         at = centre[ray] + way[:, None] * normal[ray]
         hit = (-way <= farthest) & (way <= _TOUCHING * farthest) & _inside(at, corners[face], normal[face])
-        np.minimum.at(gap, ray[hit], np.abs(way[hit]))
-    return gap
+        found.append((ray[hit], np.abs(way[hit]), face[hit]))
+    ray, way, face = (np.concatenate(column) for column in zip(*found, strict=True))
+    order = np.lexsort((way, ray))
+    first = order[np.unique(ray[order], return_index=True)[1]]
+    gap, opposite = np.full(len(faces), np.inf), np.full(len(faces), -1, dtype=np.int64)
+    gap[ray[first]], opposite[ray[first]] = way[first], face[first]
+    return gap, opposite
 
 
 def _near(centre: np.ndarray, radius: np.ndarray, farthest: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -160,13 +171,44 @@ def _inside(points: np.ndarray, corners: np.ndarray, normal: np.ndarray) -> np.n
 
 
 def _smooth_groups(faces: np.ndarray, normal: np.ndarray, layer: np.ndarray) -> np.ndarray:
-    """Labels (F,): faces of layers that hang together over edges which are not sharp."""
+    """Labels (F,): faces of layers, and those of none, that hang together over edges which are not sharp."""
     first, second = topology.hinges(faces).faces.T
-    joined = layer[first] & layer[second] & ((normal[first] * normal[second]).sum(axis=1) > _SHARP)
+    joined = (layer[first] == layer[second]) & ((normal[first] * normal[second]).sum(axis=1) > _SHARP)
     ones = np.ones(int(joined.sum()), dtype=bool)
     graph = coo_matrix((ones, (first[joined], second[joined])), shape=(len(faces), len(faces)))
-    label = connected_components(graph, directed=False)[1]
-    return np.unique(label, return_inverse=True)[1]
+    return connected_components(graph, directed=False)[1]
+
+
+def _widths(pos: np.ndarray, faces: np.ndarray, area: np.ndarray, label: np.ndarray) -> np.ndarray:
+    """Width (C,) of every group of faces: twice its area over the length around it."""
+    hinges = topology.hinges(faces)
+    one, other = label[hinges.faces].T
+    length = np.linalg.norm(pos[hinges.vertices[:, 0]] - pos[hinges.vertices[:, 1]], axis=1) * (one != other)
+    count = int(label.max()) + 1
+    around = np.bincount(one, weights=length, minlength=count) + np.bincount(other, weights=length, minlength=count)
+    return 2.0 * np.bincount(label, weights=area, minlength=count) / np.maximum(around, 1e-30)
+
+
+def _unfolded(faces: np.ndarray, layer: np.ndarray, rim: np.ndarray, label: np.ndarray, opposite: np.ndarray) -> np.ndarray:
+    """Labels (F,) with groups joined that meet in the edge of a fold, such as that of a cuff: both have their opposite layers
+    elsewhere, where those that meet in a rim are each other's. Faces of a ``rim`` (F,) join nothing."""
+    count = int(label.max()) + 1
+    own, other = label[layer], label[opposite[layer]]
+    facing, number = np.unique(own * count + other, return_counts=True)
+    size = np.bincount(own, minlength=count)
+    first, second = topology.hinges(faces).faces.T
+    meet = ~rim[first] & ~rim[second] & (label[first] != label[second])
+    pairs = np.unique(np.sort(np.stack([label[first[meet]], label[second[meet]]], axis=1), axis=1), axis=0)
+    opposed = sum(_looked_up(facing, number, a * count + b) / np.maximum(size[a], 1) for a, b in (pairs.T, pairs.T[::-1]))
+    folds = pairs[opposed < _FOLDED]
+    graph = coo_matrix((np.ones(len(folds), bool), (folds[:, 0], folds[:, 1])), shape=(count, count))
+    return connected_components(graph, directed=False)[1][label]
+
+
+def _looked_up(keys: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Values (n,) of ascending keys; 0 where there is none."""
+    place = np.minimum(np.searchsorted(keys, wanted), max(len(keys) - 1, 0))
+    return np.where(keys[place] == wanted, values[place], 0) if len(keys) else np.zeros(len(wanted))
 
 
 def _grown(faces: np.ndarray, side: np.ndarray) -> np.ndarray:

@@ -92,7 +92,7 @@ def smooth_out(cloth: Cloth, faces: np.ndarray, pos: Tensor, obstacle: Obstacle 
 
     A vertex of such a triangle, or beside one, goes half the way to the mean of its neighbours, and out of the body again.
     """
-    best, least = pos, None
+    best, least, found = pos, None, 0
     start, end = cloth.edges.unbind(dim=1)
     both, other = torch.cat([start, end]), torch.cat([end, start])
     count = torch.zeros_like(pos[:, 0]).index_add(0, both, torch.ones_like(pos[:, 0])[both]).clamp_min(1.0)[:, None]
@@ -101,8 +101,8 @@ def smooth_out(cloth: Cloth, faces: np.ndarray, pos: Tensor, obstacle: Obstacle 
         pairs = self_crossings(pos.double().cpu().numpy(), faces)
         progress.tell(f"round {turn + 1} of at most {_SMOOTHED}, {len(pairs)} pairs of triangles are left")
         if least is None or len(pairs) < least:
-            best, least = pos, len(pairs)
-        if len(pairs) == 0:
+            best, least, found = pos, len(pairs), turn
+        if len(pairs) == 0 or turn - found >= _PATIENCE:
             break
         near = torch.zeros_like(cloth.free)
         near[torch.as_tensor(np.unique(faces[pairs.reshape(-1)]))] = True

@@ -31,6 +31,19 @@ def wanted_of(config: DictConfig) -> Wanted:
     )
 
 
+def words_of(wanted: Wanted) -> list[str]:
+    """The words of a command that ask for this; none for what is usual."""
+    usual = Wanted()
+    weld = NONE if not wanted.sew else f"{wanted.gap}"
+    words = {
+        "objects": None if not wanted.objects else f"objects=[{','.join(wanted.objects)}]",
+        "weld": None if (wanted.sew, wanted.gap) == (usual.sew, usual.gap) else f"weld={weld}",
+        "shells": None if wanted.shells == usual.shells else f"shells={wanted.shells}",
+        "small_parts": None if wanted.small_parts == usual.small_parts else f"small_parts={wanted.small_parts}",
+    }
+    return [word for word in words.values() if word is not None]
+
+
 def _names(given: Any) -> list[str]:
     value = plain(given)
     names = value if isinstance(value, list) else [value]

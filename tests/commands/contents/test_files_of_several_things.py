@@ -168,6 +168,8 @@ def test_inspect_lists_what_is_in_a_file(tmp_path: Path, capsys: pytest.CaptureF
     assert found["facts"]["object ring"].endswith("a small thing such as a button")
     assert found["facts"]["riding vertices"] == len(ring[0])
     assert found["command"] == f"hood prepare garment={path}"
+    (found,) = inspect(capsys, str(path), "objects=[tank,ring]", "small_parts=leave_out", "weld=0.002")["files"]
+    assert found["command"] == f"hood prepare garment={path} 'objects=[tank,ring]' weld=0.002 small_parts=leave_out"
 
 
 _FEW = ("panels 3 mm apart", "shell of 2 mm", "buttons", "a pocket", "two garments by o", "an avatar beside it")

@@ -16,6 +16,8 @@ from hood.mesh.shells import find_shell, paired_sheet, same_sheet
 _COPY = 1e-6
 #: Beyond so many parts of one file copies are not looked for: they are buttons and beads.
 _MOST = 200
+#: A closed part of less than this share of the largest one's area is a thing on the cloth.
+_LARGE = 0.15
 _KEEP = "shells=keep simulates what is in the file"
 
 
@@ -46,6 +48,7 @@ def to_one_layer(fitting: Fitting, scale: float) -> None:
         if not dropped[outer].any():
             dropped[others] = True
             thickness[np.unique(faces[outer])] = thick
+    _tell_closed(fitting, parts, dropped)
     if not dropped.any():
         return
     own = garment.thickness
@@ -55,6 +58,17 @@ def to_one_layer(fitting: Fitting, scale: float) -> None:
     if max(apart) * 1e6 < 1.0:
         text = "cloth with two sides, two layers in one place; one is simulated"
     fitting.guess("layers", int(dropped.sum()), f"the file shows {text}", _KEEP, thickness=max(apart))
+
+
+def _tell_closed(fitting: Fitting, parts: list[Part], dropped: np.ndarray) -> None:
+    """Say which large parts are closed and stay so."""
+    largest = max(part.area for part in parts)
+    closed = [part for part in parts if part.closed and part.extent > SMALL and part.area > _LARGE * largest]
+    left = [part for part in closed if not dropped[part.faces].any()]
+    if left:
+        named = ", ".join(f"part {part.number} of {len(part.vertices)} vertices" for part in left[:3])
+        what = f"{named} is closed, and no layers of cloth are found in it; it is simulated as it is"
+        fitting.guess("closed", len(left), what, "export it as one sheet where it was made, or choose others (objects=[…])")
 
 
 def _range(thick: list[float]) -> str:

@@ -172,8 +172,8 @@ def _count(parts: list[Part], noun: str) -> str:
 
 
 def _places(parts: list[Part]) -> str:
-    """Which parts they are and where their middles lie, in units of the file, of the first few."""
-    named = [f"{part_name(part)} at {np.round(0.5 * (part.low + part.high), 2).tolist()}" for part in parts[:_NAMED]]
+    """Which parts they are and where their middles lie [m], of the first few."""
+    named = [f"{part_name(part)} at {np.round(0.5 * (part.low + part.high), 2).tolist()} m" for part in parts[:_NAMED]]
     return ", ".join(named) + (f" and {len(parts) - _NAMED} more" if len(parts) > _NAMED else "")
 
 

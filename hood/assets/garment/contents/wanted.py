@@ -9,7 +9,7 @@ SHELLS, SMALL_PARTS = ("auto", "keep"), ("ride", "leave_out", "simulate")
 #: What stands for the file's name in a sentence of one who does not know it.
 FILE = "FILE"
 #: Rims of pattern pieces within this [m] are sewn: 5 mm, and what curves add to it.
-SEAM = 6e-3
+SEAM = 5.5e-3
 #: Stitches of a file are closed up to this length [m]: longer ones are of pieces that were never draped.
 THREAD = 0.02
 
