@@ -34,11 +34,11 @@ class Jump:
     degrees: float
 
 
-def find_jumps(motion: Motion, fps: float) -> dict[int, Jump]:
-    """Jumps by frame, that of a step being the one where it begins."""
+def find_jumps(motion: Motion, fps: float, faster: float = _FASTER) -> dict[int, Jump]:
+    """Jumps by frame, that of a step being the one where it begins: in which the body is ``faster`` [m/s] than around it."""
     moved = np.diff(np.asarray(motion.translation, dtype=np.float64), axis=0)
     turns = motion.turns()
-    frames = _outliers(moved, fps, _FASTER) | _outliers(turns, fps, _TURNING)
+    frames = _outliers(moved, fps, faster) | _outliers(turns, fps, _TURNING)
     return {
         frame: Jump(float(np.linalg.norm(moved[frame])), float(np.degrees(np.linalg.norm(turns[frame]))))
         for frame in sorted(frames)

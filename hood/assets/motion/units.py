@@ -99,12 +99,15 @@ def _by_steps(speeds: dict[str, float]) -> str | None:
 
 
 def _by_floor(poses: np.ndarray, transl: np.ndarray) -> str | None:
-    """The unit that puts the lowest joint on a floor at 0, along whichever axis it is, where metres put it far from there."""
+    """The unit that puts the feet on a floor at 0, along whichever axis they are mostly the lowest, where metres put them far
+    from there."""
     chosen = spread(len(poses), 100)
     joints = joints_about_pelvis(poses[chosen])
     found = set()
     for column in range(3):
-        height = transl[chosen, column]
+        height, lowest = transl[chosen, column], joints[:, :, column].argmin(axis=1)
+        if np.isin(lowest, FEET).mean() < _MOSTLY:
+            continue
         low = {name: metres * height + joints[:, :, column].min(axis=1) for name, metres in UNITS.items()}
         if abs(float(np.median(low["m"]))) < _FAR:
             continue

@@ -8,7 +8,7 @@ import numpy as np
 
 from hood.assets.files.doubt import Doubt
 from hood.dynamics.verdict.frames import name_frames
-from hood.limits import BODY_OVERLAP, BODY_SPEED, FLOOR_OFF, HEAD_DOWN, TOLERATED
+from hood.limits import BODY_JUMP, BODY_OVERLAP, BODY_SPEED, FLOOR_OFF, HEAD_DOWN, TOLERATED
 from hood.mesh.compiled_crossing import eights
 from hood.mesh.crossing import self_crossings
 from hood.mesh.topology import connected_components, unique_edges
@@ -16,13 +16,15 @@ from hood.scene.jumps import describe_jumps, find_jumps
 from hood.scene.motion import BodyMotion, Motion
 
 #: Frames that are looked at, at most; and of them those in which the body is held against itself.
-_LOOKED_AT, _HELD_AGAINST_ITSELF = 30, 6
+_LOOKED_AT, _HELD_AGAINST_ITSELF = 30, 12
 #: Of the vertices that tell head from soles one in so many is posed.
 _STRIDE = 4
 #: Head and soles: this share of the template's height from its top and from its bottom; hands: of its width from its sides.
 _ENDS = 0.07
 #: Hands that carry the body are the lowest part of it, but for this [m].
 _ON_HANDS = 0.1
+#: A body lies where its head is higher than its soles by less than this share of its height.
+_LIES = 0.35
 #: A part of the mesh with a smaller share of its faces is none of the body's limbs: eyes, teeth, hair.
 _LIMB = 0.2
 
@@ -41,19 +43,23 @@ def doubt_body(motion: Motion, num_frames: int) -> list[Doubt]:
 
 
 def _orientation(motion: BodyMotion, looked: np.ndarray, heights: np.ndarray) -> Iterator[Doubt]:
-    """Head down in most frames, and not on its hands."""
+    """Head down in most frames, and not on its hands; or lying in most, far from the floor."""
     ends = _ends_of(motion.body.v_template[::_STRIDE])
     head, soles, hands = (heights[:, end].mean(axis=1) for end in ends)
-    down = (head < soles) & (hands > heights.min(axis=1) + _ON_HANDS)
-    if down.mean() > HEAD_DOWN.value:
-        yield Doubt(
-            "orientation",
-            f"{motion.name!r}: the body is head down in {down.mean():.0%} of the frames, and not on its hands; if it should "
-            "stand, its file is in the space of a camera: give the axis that points up in it (up=-y turns most of them)",
-            tuple(looked[down].tolist()),
-            float(down.mean()),
-            HEAD_DOWN.unit,
-        )
+    lowest, size = heights.min(axis=1), float(np.ptp(motion.body.v_template[:, 1]))
+    down = (head < soles) & (hands > lowest + _ON_HANDS)
+    lies = (np.abs(head - soles) < _LIES * size) & (np.abs(lowest) > FLOOR_OFF.value)
+    for which, what in ((down, "head down, and not on its hands,"), (lies, "lying in the air")):
+        if which.mean() > HEAD_DOWN.value:
+            yield Doubt(
+                "orientation",
+                f"{motion.name!r}: the body is {what} in {which.mean():.0%} of the frames; if it should stand, another axis "
+                "of its file points up: up=-y for most files in the space of a camera, up=y or up=z for others",
+                tuple(looked[which].tolist()),
+                float(which.mean()),
+                HEAD_DOWN.unit,
+            )
+            return
 
 
 def _floor(motion: BodyMotion, looked: np.ndarray, lowest: np.ndarray) -> Iterator[Doubt]:
@@ -98,10 +104,19 @@ def _speed(motion: Motion, count: int) -> Iterator[Doubt]:
 
 
 def _jump(motion: Motion, count: int) -> Iterator[Doubt]:
-    within = {frame: jump for frame, jump in find_jumps(motion, motion.fps).items() if frame < count - 1}
-    if within:
-        worst = max(jump.metres for jump in within.values())
-        yield Doubt("jump", describe_jumps(motion, within), tuple(sorted(within)), worst, "m")
+    carried = {frame: jump for frame, jump in find_jumps(motion, motion.fps).items() if frame < count - 1}
+    if carried:  # the same sentence as the rollout's
+        worst = max(jump.metres for jump in carried.values())
+        yield Doubt("jump", describe_jumps(motion, carried), tuple(sorted(carried)), worst, "m")
+    found = find_jumps(motion, motion.fps, BODY_JUMP.value)
+    small = {frame: jump for frame, jump in found.items() if frame < count - 1 and frame not in carried}
+    if small:
+        worst = max(jump.metres for jump in small.values())
+        frames = name_frames(_mask(np.array(sorted(small))))
+        what = f"{motion.name!r}: the body is displaced by up to {worst:.2g} m from one frame to the next, after {frames}"
+        yield Doubt(
+            "jump", f"{what}; repair the motion there, or leave it out (start=…, stop=…)", tuple(sorted(small)), worst, "m"
+        )
 
 
 def _overlap(motion: Motion, looked: np.ndarray) -> Iterator[Doubt]:

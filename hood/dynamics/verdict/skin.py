@@ -25,7 +25,7 @@ def skin_causes(metrics: Mapping[str, np.ndarray], inside: Mapping[str, np.ndarr
     """Skin through cloth.
 
     A frame is bad where the skin that a viewer sees cuts more than 1% of the cloth's triangles, or sticks out by more than a
-    centimetre. Spots of some millimetres are seen where they stay: they count if more than a quarter of the frames have them.
+    centimetre. Spots of some millimetres are seen where they stay: they count if more than two frames in five have them.
     Triangles caught in a fold of the skin do not count, and spots at the rim of the cloth look like its edge.
 
     Args:

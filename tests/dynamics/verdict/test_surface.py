@@ -74,8 +74,8 @@ def test_skin_that_sticks_out_far_counts_by_its_height() -> None:
 def test_low_spots_of_skin_count_where_they_stay() -> None:
     assert judge_rollout(worn(np.where(np.arange(COUNT) > 25, 0.0115, 0.0), 5)).sound
     (reason,) = judge_rollout(worn(np.full(COUNT, 0.0115), 5)).reasons
-    assert "spots of skin stick out by more than 3 mm, and stay" in reason.sentence
-    assert judge_rollout(worn(np.full(COUNT, 0.007), 5)).sound  # 2 mm
+    assert "spots of skin stick out by more than 1.5 mm, and stay" in reason.sentence
+    assert judge_rollout(worn(np.full(COUNT, 0.006), 5)).sound  # 1 mm
 
 
 def test_a_body_that_goes_through_a_sheet_counts_by_how_far() -> None:
