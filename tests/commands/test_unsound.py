@@ -85,7 +85,7 @@ def test_what_nobody_measured_is_not_judged(capsys: pytest.CaptureFixture[str]) 
     command = [*CHEAP, "sequence=walk.npz", "refine=0", "budget_ms=0.001"]  # nothing is refined, no gradient computed
     assert main(command) == 0
     assert summary()["sound"] is None
-    assert "\nnot judged: how far the steps to frames 5–6 ended from their minimum was not measured" in capsys.readouterr().out
+    assert "\nnot judged: how far the steps to frames 1–6 ended from their minimum was not measured" in capsys.readouterr().out
 
 
 def test_batches_count_the_unsound(capsys: pytest.CaptureFixture[str]) -> None:
@@ -107,3 +107,33 @@ def test_batches_count_the_unsound(capsys: pytest.CaptureFixture[str]) -> None:
     Path("motions/broken.npz").write_bytes(b"no motion")
     assert main([*command, "resume=true"]) == 2
     assert "2 of 3 motions simulated, 1 failed, 1 unsound" in capsys.readouterr().out
+
+
+def test_doubts_are_told_kept_and_refused_where_that_is_asked(capsys: pytest.CaptureFixture[str]) -> None:
+    """A fabric as stiff as a plate; the result is what it is."""
+    write_walk(Path("walk.npz"), 7)
+    command = [*CHEAP, "sequence=walk.npz", "refine=20", "material.bending_stiffness=0.2"]
+    assert main(command) == 0
+    found, shown = summary(), capsys.readouterr()
+    assert found["sound"] is True
+    (doubt,) = found["doubts"]
+    assert (doubt["kind"], doubt["value"], doubt["unit"], doubt["frames"]) == ("fabric", pytest.approx(0.2), "N·m", [])
+    assert found["warnings"].count(doubt["sentence"]) == 1
+    assert f"doubt: {doubt['sentence']}\nsound, with 1 doubt\n" in shown.out
+    assert main(["inspect", "out/rollout.h5"]) == 1
+    assert "! doubt: garment 'belt': its bending stiffness is 0.2 N·m" in capsys.readouterr().out
+    assert main([*command, "doubts=refuse"]) == 3
+    assert "the rollout is doubtful; exit code 3, as doubts=refuse asks" in capsys.readouterr().err
+    assert main([*command, "doubts=never"]) == 2
+
+
+def test_batches_count_and_refuse_the_doubtful(capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("a", "b"):
+        write_walk(Path("motions") / f"{name}.npz", 7)
+    command = [*CHEAP, "sequence=motions", "num_frames=7", "refine=20", "material.bending_stiffness=0.2"]
+    assert main(command) == 0
+    shown = capsys.readouterr().out
+    assert "2 of 2 motions simulated, 2 doubtful" in shown
+    assert "; doubt: garment 'belt': its bending" in shown
+    # What is finished is judged by the exit code that is asked for now.
+    assert main([*command, "resume=true", "doubts=refuse"]) == 3
