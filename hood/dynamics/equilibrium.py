@@ -245,11 +245,12 @@ def _warn(scene: Scene, rest: Rest) -> None:
     name = f"garment {scene.garment.name!r}"
     if rest.lost:
         which = _named(scene, rest.lost)
-        come, start, are = ("come", "start", "are") if len(rest.lost) > 1 else ("comes", "starts", "is")
-        who = f"{name}: {which} {come}" if which else f"{name} {come}"
-        it = "they" if len(rest.lost) > 1 else "it"
-        when = "when the cloth settles" if which else "when it settles"
-        text = f"{who} off the body {when}: {it} {start} as {it} {are} put on, and will fall"
+        if not which:
+            text = f"{name} comes off the body when it settles: it starts as it is put on, and will fall"
+        elif len(rest.lost) == 1:
+            text = f"{name}: {which} comes off the body when the cloth settles: it starts as it is put on, and will fall"
+        else:
+            text = f"{name}: {which} come off the body when the cloth settles: they start as they are put on, and will fall"
     elif not math.isfinite(rest.speed):
         text = f"{name} is not at rest in frame 0: the potential has no finite value in step {rest.steps} of settling"
     else:

@@ -59,7 +59,13 @@ def find_rims(faces: np.ndarray) -> Rims:
 
 
 def find_facing(
-    pos: np.ndarray, rims: Rims, part: np.ndarray, gap: float, sewn: Callable[[Seam], bool], own: bool = True
+    pos: np.ndarray,
+    rims: Rims,
+    part: np.ndarray,
+    gap: float,
+    sewn: Callable[[Seam], bool],
+    own: bool = True,
+    left_out: np.ndarray | None = None,
 ) -> Facing:
     """Which rims of ``pos`` (V, 3) [m] lie within ``gap`` [m] of each other.
 
@@ -67,8 +73,12 @@ def find_facing(
         part: (V,) part that a vertex is of.
         sewn: whether a seam that was found is to be sewn.
         own: whether a part may be sewn to itself.
+        left_out: vertices (n,) that are sewn to nothing.
     """
     matches = _closest(pos, rims, part, gap, own)
+    if left_out is not None and len(left_out):
+        ends = np.concatenate([matches.vertex[:, None], rims.edges[matches.edge]], axis=1)
+        matches = _Matches(*(column[~np.isin(ends, left_out).any(axis=1)] for column in matches))
     seams, kept = _seams(pos, rims, part, matches, sewn)
     matches = _Matches(*(column[kept] for column in matches))
     pairs = _mutual(pos, rims, part, matches)
@@ -110,7 +120,7 @@ def _closest(pos: np.ndarray, rims: Rims, part: np.ndarray, gap: float, own: boo
         same_loop = along[1][vertices[row]] == along[1][rims.edges[edge, 0]]
         around = np.minimum(way_between, along[2][vertices[row]] - way_between)
         other |= ~same_loop | (around > _ALONG * gap + 2.0 * length[edge])
-    good = other & (dist <= gap)
+    good = other & (dist <= gap) & (rims.edges[edge] != vertices[row][:, None]).all(axis=1)
     row, edge, at, dist = (column[good] for column in (row, edge, at, dist))
     key = _keys(row, part[rims.edges[edge, 0]])
     order = np.lexsort((dist, key))

@@ -9,7 +9,8 @@ import numpy as np
 from hood.assets.formats.objects import PART
 from hood.assets.garment.contents.fitting import Fitting
 from hood.assets.garment.garment import Garment
-from hood.mesh.parts import Part, find_parts
+from hood.mesh.parts import Part, find_parts, part_labels
+from hood.mesh.topology import connected_components
 
 #: A name is that of a part if it covers so much [share] of the part's faces.
 _COVERED = 0.9
@@ -63,4 +64,14 @@ def _names(garment: Garment, parts: list[Part]) -> list[str]:
     for part in parts:
         own = next((name for name, mask in panels.items() if mask[part.faces].mean() >= _COVERED), None)
         names.append((own or f"{PART}{part.number}").replace("+", "_"))
-    return names
+    return _fastened(garment, parts, names)
+
+
+def _fastened(garment: Garment, parts: list[Part], names: list[str]) -> list[str]:
+    """Names of parts, where those that fasteners hold together have one."""
+    rows = list((garment.fasteners or {}).values())
+    if not rows:
+        return names
+    label = part_labels(len(garment.rest_pos), garment.faces)
+    joined = connected_components(len(parts), label[np.concatenate(rows)])
+    return [names[int(np.argmax(joined == own))] for own in joined]

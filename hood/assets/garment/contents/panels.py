@@ -59,12 +59,10 @@ def _sew_once(fitting: Fitting, gap: float, asked: bool, scale: float, open_edge
     parts, label = find_parts(pos, garment.faces), part_labels(len(pos), garment.faces)
     rims = find_rims(garment.faces)
     sides = [fitting.at_present(open_edges), *(row.reshape(-1) for row in (garment.fasteners or {}).values())]
-    keep = ~np.isin(rims.edges, np.concatenate(sides)).any(axis=1)
-    rims = Rims(*(table[keep] for table in rims))
     if len(rims.edges) == 0:
         return False
     pieces = _Pieces(pos, parts, asked)
-    facing = find_facing(pos, rims, label, gap, pieces.are_sewn, own=asked or len(parts) > 1)
+    facing = find_facing(pos, rims, label, gap, pieces.are_sewn, own=asked or len(parts) > 1, left_out=np.concatenate(sides))
     if not len(facing.pairs) and not len(facing.cut):
         return False
     between = {part for seam in facing.seams for part in seam.parts}

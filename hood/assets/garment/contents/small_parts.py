@@ -48,7 +48,8 @@ def let_ride(fitting: Fitting, wanted: Wanted, scale: float) -> None:
         return
     garment = fitting.garment
     pos, faces = scale * garment.rest_pos, garment.faces
-    kinds = _sorted(pos, faces)
+    fastened = [row.reshape(-1) for row in (garment.fasteners or {}).values()]
+    kinds = _sorted(pos, faces, np.concatenate([np.zeros(0, dtype=np.int64), *fastened]))
     if not kinds.riding and not kinds.off:
         return
     riders = _riders(garment, kinds, scale) if wanted.small_parts == "ride" and kinds.riding else garment.riders
@@ -60,12 +61,14 @@ def let_ride(fitting: Fitting, wanted: Wanted, scale: float) -> None:
     drop_faces(fitting, kept)
 
 
-def _sorted(pos: np.ndarray, faces: np.ndarray) -> _Kinds:
-    """The parts, by size, openings and what they lie on."""
+def _sorted(pos: np.ndarray, faces: np.ndarray, fastened: np.ndarray) -> _Kinds:
+    """The parts, by size, openings and what they lie on; what has ``fastened`` vertices (n,) is cloth."""
     parts = find_parts(pos, faces)
+    held = [part for part in parts if np.isin(part.vertices, fastened).any()]
     largest = max((part.area for part in parts if not part.closed), default=0.0)
     closed = [part for part in parts if part.closed and (part.extent <= SMALL or part.area <= _SHARE * largest)]
     few = [part for part in parts if not part.closed and part.area <= _SHARE * largest and num_openings(pos, part) < 2]
+    closed, few = ([part for part in own if not any(part is one for one in held)] for own in (closed, few))
     cloth = [part for part in parts if not any(part is one for one in (*closed, *few))]
     if not cloth or len(parts) == 1:
         return _Kinds(parts, [], [], [], [])
