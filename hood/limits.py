@@ -51,9 +51,9 @@ GRADIENT_UNSOUND = Limit(100.0, "times the weight", _RULE, "a coarse stand-in, w
 CUT_UNSOUND = Limit(0.01, "share of the cloth's triangles", _RULE, "pictures show ten of a thousand triangles")
 CUT_ALARM = Limit(0.02, "share of the cloth's triangles", _GUARD, "the worst of 28 ordinary rollouts is 1.4%")
 DEPTH_UNSOUND = Limit(0.01, "m", _RULE, "skin that sticks out so far is seen from every side")
-SPOTS_UNSOUND = Limit(0.0015, "share of the cloth's triangles", _RULE, "three of two thousand: smaller spots are not seen")
+SPOTS_UNSOUND = Limit(0.002, "share of the cloth's triangles", _RULE, "four of two thousand: smaller spots are not seen")
 SPOTS_HEIGHT = Limit(0.0015, "m", _RULE, "lower spots flicker")
-SPOTS_LASTING = Limit(0.4, "share of frames", _RULE, "spots that come and go are not seen")
+SPOTS_LASTING = Limit(0.45, "share of frames", _RULE, "spots that come and go are not seen")
 #: Cloth that is under the skin as a whole cuts nothing.
 INSIDE_UNSOUND = Limit(0.05, "share of the vertices", _RULE, "2 mm deep in the body; ordinary rollouts have less than 1%")
 INSIDE_ALARM = Limit(0.01, "m", _GUARD, "contact pushes out from 10 mm, from deeper it may push through the limb")

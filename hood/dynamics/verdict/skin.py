@@ -14,19 +14,18 @@ from hood.dynamics.verdict.surface import Drawn, spread_over
 from hood.dynamics.verdict.visible import sampled, visible
 from hood.limits import CUT_UNSOUND, DEPTH_UNSOUND, INSIDE_UNSOUND, SPOTS_HEIGHT, SPOTS_LASTING, SPOTS_UNSOUND
 from hood.mesh.crossing import crossings
-from hood.mesh.skin import Sheet
 from hood.mesh.topology import connected_components, unique_edges
 
-#: Frames that are looked at from all sides, at most.
-_LOOKED_AT = 8
+#: Frames that are looked at from all sides, at most, of those in which a larger share of the cloth's triangles is cut.
+_LOOKED_AT, _HARDLY = 8, 0.001
 
 
 def skin_causes(metrics: Mapping[str, np.ndarray], inside: Mapping[str, np.ndarray], seen: Drawn) -> Found:
     """Skin through cloth.
 
     A frame is bad where the skin that a viewer sees cuts more than 1% of the cloth's triangles, or sticks out by more than a
-    centimetre. Spots of some millimetres are seen where they stay: they count if more than two frames in five have them.
-    Triangles caught in a fold of the skin do not count, and spots at the rim of the cloth look like its edge.
+    centimetre. Spots of some millimetres are seen where they stay: they count if nearly half of the frames have them. Triangles
+    caught in a fold of the skin do not count.
 
     Args:
         metrics: of the surface, (S,) each.
@@ -34,11 +33,11 @@ def skin_causes(metrics: Mapping[str, np.ndarray], inside: Mapping[str, np.ndarr
     """
     share, depth = metrics["cut_face_share"], metrics["skin_depth"]
     measured = np.isfinite(share)
-    shown, spots, poked = (spread_over(values, measured) for values in _seen(share, seen))
+    shown, poked = (spread_over(values, measured) for values in _seen(share, seen))
     depth = np.where(measured, np.fmax(depth, poked), np.nan)
     height = np.nan_to_num(depth)
-    cut, deep = shown > CUT_UNSOUND.value, (height > DEPTH_UNSOUND.value) & (shown > SPOTS_UNSOUND.value)
-    lasting = measured & (spots > SPOTS_UNSOUND.value) & (height > SPOTS_HEIGHT.value)
+    cut, deep = shown > CUT_UNSOUND.value, (height > DEPTH_UNSOUND.value) & (shown > 0)
+    lasting = measured & (shown > SPOTS_UNSOUND.value) & (height > SPOTS_HEIGHT.value)
     if lasting.sum() <= SPOTS_LASTING.value * measured.sum():
         lasting = np.zeros_like(lasting)
     lasting &= ~deep
@@ -67,31 +66,29 @@ def inside_causes(metrics: Mapping[str, np.ndarray]) -> Found:
     return Found([Cause("inside_body", text, bad, share, limit.value, limit.unit, ".0%", measured=np.isfinite(share))])
 
 
-def _seen(share: np.ndarray, seen: Drawn) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Shares (S,) of the cloth's triangles through which skin is seen, of those that are not at its rim, and how far the body
-    goes through them [m]; NaN in frames that were not looked at, 0 in those whose skin cuts hardly anything."""
-    shown, spots, poked = (np.where(share <= SPOTS_UNSOUND.value, 0.0, np.nan) for _ in range(3))
+def _seen(share: np.ndarray, seen: Drawn) -> tuple[np.ndarray, np.ndarray]:
+    """Shares (S,) of the cloth's triangles through which skin is seen, and how far the body goes through them [m].
+
+    NaN in frames that were not looked at, 0 in those whose skin cuts hardly anything.
+    """
+    shown, poked = (np.where(share <= _HARDLY, 0.0, np.nan) for _ in range(2))
     stored = {int(step): frame for frame, step in enumerate(seen.step)}
-    over = [step for step in np.flatnonzero(np.nan_to_num(share) > SPOTS_UNSOUND.value).tolist() if step in stored]
+    over = [step for step in np.flatnonzero(np.nan_to_num(share) > _HARDLY).tolist() if step in stored]
     for place in np.unique(np.linspace(0, max(len(over) - 1, 0), min(len(over), _LOOKED_AT)).astype(np.int64)).tolist():
         step = over[place]
-        shown[step], spots[step], poked[step] = _seen_at(seen, stored[step])
-    return shown, spots, poked
+        shown[step], poked[step] = _seen_at(seen, stored[step])
+    return shown, poked
 
 
-def _seen_at(seen: Drawn, frame: int) -> tuple[float, float, float]:
+def _seen_at(seen: Drawn, frame: int) -> tuple[float, float]:
     pos, body = seen.cloth[frame].astype(np.float64), seen.body[frame].astype(np.float64)
     cut = crossings(pos, seen.faces, body, seen.body_faces)
     pairs = cut.pairs
     pairs = pairs[~in_folds(pairs[:, 1], body, seen.body_faces)]
     faces = np.unique(pairs[:, 0])
     found = faces[visible(pos[seen.faces[faces]].mean(axis=1), [(pos, seen.faces), (body, seen.body_faces)])]
-    rim = np.zeros(len(pos), dtype=bool)
-    sheet = Sheet.of(seen.faces)
-    rim[: len(sheet.on_rim)] = sheet.on_rim
-    inner = ~rim[seen.faces[found]].any(axis=1)
     through = way_through(pos, seen.faces, body, seen.body_faces, cut.second_edges) if len(found) else 0.0
-    return len(found) / len(seen.faces), int(inner.sum()) / len(seen.faces), through
+    return len(found) / len(seen.faces), through
 
 
 def way_through(cloth: np.ndarray, faces: np.ndarray, body: np.ndarray, body_faces: np.ndarray, cut: np.ndarray) -> float:
