@@ -25,7 +25,7 @@ from hood.media.camera import Camera
 from hood.media.render import RenderMesh, contact_sheet, render_frame
 from tests.verdict.table import counts
 from tests.verdict.table.scene import Scene, run_unread
-from tests.verdict.table.scenes import SCENES
+from tests.verdict.table.scenes import REFUSED, SCENES
 
 Array = np.ndarray
 VIEWS = {"front": 8.0, "back": 188.0, "side": 98.0}
@@ -41,7 +41,7 @@ def main(words: list[str]) -> None:
     names = [word for word in words if "=" not in word] or list(SCENES)
     folder = Path(keys.get("output", "outputs/table"))
     for name in names:
-        refused = _made(SCENES[name], folder / name, keys.get("again") == "true")
+        refused = _made({**SCENES, **REFUSED}[name], folder / name, keys.get("again") == "true")
         if refused:
             print(f"{name}: refused: {refused}", flush=True)
             continue

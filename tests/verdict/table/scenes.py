@@ -53,6 +53,7 @@ REFUSED: dict[str, Scene] = {
         Scene("shorts_on_chest", "refused", "newton", garments.plain("shorts", (0, 0.42, 0)), frames=20, keys=("start=1",)),
         Scene("tshirt_too_low", "refused", "newton", garments.plain("tshirt", (0, -0.45, 0)), frames=20, keys=("start=1",)),
         Scene("tank_inside_body", "refused", "newton", garments.shrunk_inside("tank"), frames=16, keys=("start=1",)),
+        Scene("tshirt_sleeves_off", "refused", "newton", garments.sleeves_off(), "walk_brisk", 30, ("start=1",)),
         Scene("skirt_beside", "refused", "newton", garments.plain("skirt", (2.0, 0, 0)), frames=16, keys=("start=1",)),
     )
 }
