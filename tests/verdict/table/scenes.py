@@ -22,6 +22,7 @@ from tests.verdict.table import garments, motions
 from tests.verdict.table.scene import Scene
 from tests.verdict.table.scenes_garments import LOOSE, OUTFITS, PARTS, SIZES
 from tests.verdict.table.scenes_poses import HARD, OTHER_BODIES, SHAPES, WRONG_MOTIONS
+from tests.verdict.table.scenes_second import ALL
 from tests.verdict.table.scenes_steppers import FABRICS, RATES, SOFT_CONTACT, STEPPERS
 
 _ALL = [
@@ -41,7 +42,17 @@ _ALL = [
 SCENES: dict[str, Scene] = {scene.name: scene for scene in _ALL}
 assert len(SCENES) == len(_ALL), "two scenes of one name"
 
-LABELS: dict[str, dict[str, Any]] = json.loads((Path(__file__).parent / "labels.json").read_text(encoding="utf-8"))
+#: The second table: other scenes, labelled apart from the first ones and from every rule.
+SECOND: dict[str, Scene] = {scene.name: scene for scene in ALL}
+assert len(SECOND) == len(ALL), "two scenes of one name"
+assert not set(SECOND) & set(SCENES), "a name of the first table"
+
+
+def _labels(file: str) -> dict[str, dict[str, Any]]:
+    return dict(json.loads((Path(__file__).parent / file).read_text(encoding="utf-8")))
+
+
+LABELS, SECOND_LABELS = _labels("labels.json"), _labels("labels_second.json")
 
 #: Inputs of the kinds of the table that the command refuses, with one sentence; no rollout, no label.
 REFUSED: dict[str, Scene] = {
