@@ -80,16 +80,17 @@ def spiked(name: str, metres: float = 0.6) -> Maker:
 
 
 def hat(radius: float = 0.108, height: float = 0.17, top: float = 0.915) -> Maker:
-    """A cap on the head, open below."""
-
-    def make(folder: Path) -> Path:
-        pos, faces = tube(36, 14, (0.012, 0.012, radius, radius * 1.12), height)
-        share = -pos[:, 1] / height
-        wide = np.sqrt(np.clip(2 * share - share**2, 0, 1)) / np.maximum(share, 0.08)
-        pos = pos * np.stack([wide, np.ones_like(wide), wide], axis=1)
-        return write_obj(folder / "hat.obj", (pos + [0.0, top, 0.055], faces))
-
-    return make
+    """A round cap on the head, open below."""
+    around = 36
+    pos, faces = tube(around, 14, (radius, radius * 1.12, radius, radius * 1.12), height)
+    share = np.maximum(-pos[:, 1] / height, 0.05)
+    wide = np.sqrt(2 * share - share**2)
+    pos = pos * np.stack([wide, np.ones_like(wide), wide], axis=1)
+    middle = len(pos)
+    rim = np.arange(around)
+    crown = np.stack([np.full(around, middle), rim, np.roll(rim, -1)], axis=1)
+    closed = np.concatenate([pos, [[0.0, 0.004, 0.0]]]), np.concatenate([faces, crown])
+    return _file("hat", moved(closed, (0.0, top, 0.055)))
 
 
 def leg_tube(radius: float, top: float, height: float = 0.22, wider: float = 1.0) -> Maker:

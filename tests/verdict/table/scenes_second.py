@@ -5,6 +5,7 @@ from __future__ import annotations
 from tests.verdict.table import takes
 from tests.verdict.table.motions import posed
 from tests.verdict.table.scene import Scene
+from tests.verdict.table.scenes_second_files import ACCESSORIES, CAPTURES, PARTS, THINGS
 from tests.verdict.table.takes import CHEST, ELBOWS, HIPS, KNEES, SHOULDERS, SPINE, bent
 
 WALK = ("start=1.5",)
@@ -139,4 +140,4 @@ FITS = [
     Scene("shirt_betas_minus_7", "unlikely people", "newton", "shirt", "walk_stroll", 12, (*WALK, "betas=[-7]", "fit=none")),
 ]  # fmt: skip
 
-ALL = [*ORDINARY, *POSES, *FABRICS_RATES, *FITS]
+ALL = [*ORDINARY, *POSES, *FABRICS_RATES, *FITS, *PARTS, *ACCESSORIES, *THINGS, *CAPTURES]
