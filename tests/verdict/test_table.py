@@ -4,20 +4,23 @@ from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
 
 from hood.assets.files.doubt import KINDS
 from hood.testing import grid, sphere
 from tests.verdict.table import counts
 from tests.verdict.table.pictures import sheet
 from tests.verdict.table.scene import STEPPERS, Scene, run, run_unread
-from tests.verdict.table.scenes import FAST, LABELS, REFUSED, SCENES
+from tests.verdict.table.scenes import FAST, LABELS, REFUSED, SCENES, SECOND, SECOND_LABELS
 
 
-def test_every_scene_has_a_label_and_every_label_a_scene() -> None:
-    assert set(LABELS) == set(SCENES)
-    for name, label in LABELS.items():
+@pytest.mark.parametrize(("scenes", "labels"), [(SCENES, LABELS), (SECOND, SECOND_LABELS)], ids=["first", "second"])
+def test_every_scene_has_a_label_and_every_label_a_scene(scenes: dict[str, Scene], labels: dict[str, dict[str, Any]]) -> None:
+    assert set(labels) == set(scenes)
+    for name, label in labels.items():
         assert label["label"] in ("right", "broken"), name
         assert label["margin"] in ("clear", "near"), name
         assert set(label["doubts"]) <= set(KINDS), name
@@ -26,7 +29,7 @@ def test_every_scene_has_a_label_and_every_label_a_scene() -> None:
         assert (label["since"] is not None) == broken == bool(label["part"]), name
         assert label["cause"] in (("cloth", "input") if broken else (None,)), name
         if broken:
-            assert 0 <= label["since"] < SCENES[name].frames, name
+            assert 0 <= label["since"] < scenes[name].frames, name
 
 
 def test_the_table_is_as_wide_as_it_says() -> None:
@@ -35,6 +38,15 @@ def test_the_table_is_as_wide_as_it_says() -> None:
     assert {scene.stepper for scene in SCENES.values()} == set(STEPPERS)
     share = Counter(label["label"] for label in LABELS.values())
     assert min(share.values()) > 0.3 * len(LABELS)
+
+
+def test_the_second_table_is_another_one() -> None:
+    assert len(SECOND) >= 180
+    assert len({scene.kind for scene in SECOND.values()}) >= 38
+    assert {scene.stepper for scene in SECOND.values()} == set(STEPPERS)
+    assert not {scene.kind for scene in SECOND.values()} & {scene.kind for scene in SCENES.values()}
+    share = Counter(label["label"] for label in SECOND_LABELS.values())
+    assert min(share.values()) > 0.3 * len(SECOND_LABELS)
 
 
 def test_the_fast_scenes_are_of_many_kinds_and_half_of_them_broken() -> None:

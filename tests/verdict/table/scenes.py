@@ -18,10 +18,11 @@ import json
 from pathlib import Path
 from typing import Any
 
-from tests.verdict.table import garments, motions
+from tests.verdict.table import garments, motions, pieces, things
 from tests.verdict.table.scene import Scene
 from tests.verdict.table.scenes_garments import LOOSE, OUTFITS, PARTS, SIZES
 from tests.verdict.table.scenes_poses import HARD, OTHER_BODIES, SHAPES, WRONG_MOTIONS
+from tests.verdict.table.scenes_second import ALL
 from tests.verdict.table.scenes_steppers import FABRICS, RATES, SOFT_CONTACT, STEPPERS
 
 _ALL = [
@@ -41,8 +42,19 @@ _ALL = [
 SCENES: dict[str, Scene] = {scene.name: scene for scene in _ALL}
 assert len(SCENES) == len(_ALL), "two scenes of one name"
 
-LABELS: dict[str, dict[str, Any]] = json.loads((Path(__file__).parent / "labels.json").read_text(encoding="utf-8"))
+#: The second table: other scenes, labelled apart from the first ones and from every rule.
+SECOND: dict[str, Scene] = {scene.name: scene for scene in ALL}
+assert len(SECOND) == len(ALL), "two scenes of one name"
+assert not set(SECOND) & set(SCENES), "a name of the first table"
 
+
+def _labels(file: str) -> dict[str, dict[str, Any]]:
+    return dict(json.loads((Path(__file__).parent / file).read_text(encoding="utf-8")))
+
+
+LABELS, SECOND_LABELS = _labels("labels.json"), _labels("labels_second.json")
+
+START = ("start=1.5",)
 #: Inputs of the kinds of the table that the command refuses, with one sentence; no rollout, no label.
 REFUSED: dict[str, Scene] = {
     scene.name: scene
@@ -53,6 +65,15 @@ REFUSED: dict[str, Scene] = {
         Scene("shorts_on_chest", "refused", "newton", garments.plain("shorts", (0, 0.42, 0)), frames=20, keys=("start=1",)),
         Scene("tshirt_too_low", "refused", "newton", garments.plain("tshirt", (0, -0.45, 0)), frames=20, keys=("start=1",)),
         Scene("tank_inside_body", "refused", "newton", garments.shrunk_inside("tank"), frames=16, keys=("start=1",)),
+        Scene("tshirt_sleeves_off", "refused", "newton", garments.sleeves_off(), "walk_brisk", 30, ("start=1",)),
+        Scene(
+            "longsleeve_twice", "refused", "newton", garments.twice("longsleeve", (0, 0.004, 0.025)), "walk_curve", 14, START
+        ),
+        Scene("trousers_wrong_leg", "refused", "newton", garments.plain("trousers", (0.17, 0, 0)), "walk_stroll", 12, START),
+        Scene("tank_quarter_turn", "refused", "newton", pieces.turned("tank", 90), "walk_stroll", 12, START),
+        Scene("tank_far_too_small", "refused", "newton", "tank", "walk_stroll", 12, (*START, "size=0.5")),
+        Scene("tshirt_very_low_poly", "refused", "quickstart", garments.plain("tshirt"), "none", 16, (), things.low_poly(0.05)),
+        Scene("tshirt_skirt_jacket", "refused", "newton", "[tshirt,skirt,jacket]", "walk_curve", 12, START),
         Scene("skirt_beside", "refused", "newton", garments.plain("skirt", (2.0, 0, 0)), frames=16, keys=("start=1",)),
     )
 }

@@ -1,0 +1,143 @@
+"""The second table: other clothes, motions, bodies, fabrics, rates and faults than those of the first one."""
+
+from __future__ import annotations
+
+from tests.verdict.table import takes
+from tests.verdict.table.motions import posed
+from tests.verdict.table.scene import Scene
+from tests.verdict.table.scenes_second_files import ACCESSORIES, CAPTURES, PARTS, THINGS
+from tests.verdict.table.takes import CHEST, ELBOWS, HIPS, KNEES, SHOULDERS, SPINE, bent
+
+WALK = ("start=1.5",)
+
+#: Ordinary clothes on ordinary motions, by every stepper.
+ORDINARY = [
+    Scene("longsleeve_curve", "plain walk", "newton", "longsleeve", "walk_curve", 24, WALK),
+    Scene("shirt_march", "plain walk", "newton", "shirt", "walk_march", 24, WALK),
+    Scene("tshirt_back_network", "plain network", "quickstart", "tshirt", "walk_back", 30, WALK),
+    Scene("shorts_march_edges", "plain network", "edges", "shorts", "walk_march", 30, WALK),
+    Scene("skirt_tired_ours", "plain network", "ours", "skirt", "walk_tired", 30, WALK),
+    Scene("longsleeve_circle_fine15", "plain network", "fine15", "longsleeve", "walk_circle", 30, WALK),
+    Scene("shorts_steps_fine48", "plain network", "fine48", "shorts", "side_steps", 30, WALK),
+    Scene("tank_raises_small", "plain network", "small1", "tank", "arm_raises", 30, WALK),
+    Scene("dress_twist_bend_network", "network on hard motion", "quickstart", "dress", "twist_and_bend", 30, ("start=2",)),
+    Scene("longsleeve_bends_ours", "network on hard motion", "ours", "longsleeve", "bends", 30, ("start=2",)),
+    Scene("trousers_squats_edges", "network on hard motion", "edges", "trousers", "squats", 30, WALK),
+    Scene("skirt_kicks_small", "network on hard motion", "small1", "skirt", "kicks", 30, WALK),
+    Scene("trousers_lunges_fine48", "network on hard motion", "fine48", "trousers", "lunges", 30, WALK),
+    Scene("shirt_disco_network", "network on hard motion", "quickstart", "shirt", "dance_disco", 24, ("start=3",)),
+    Scene("jacket_dance_edges", "network on hard motion", "edges", "jacket", "dance_mixed", 24, ("start=3",)),
+    Scene("skirt_march_untrained", "untrained weights", "untrained_small", "skirt", "walk_march", 24, WALK),
+    Scene("tshirt_curve_blocks", "untrained weights", "untrained_blocks", "tshirt", "walk_curve", 24, WALK),
+    Scene("shorts_stroll_global", "untrained weights", "untrained_global", "shorts", "walk_stroll", 24, WALK),
+    Scene("longsleeve_untrained_paper", "untrained weights", "untrained_paper", "longsleeve", "stand_sway", 10),
+    Scene("dress_run_refined", "refined steps", "quickstart+5", "dress", "run_on_spot", 24, WALK),
+    Scene("tshirt_steps_ours5", "refined steps", "ours+5", "tshirt", "side_steps", 24, WALK),
+    Scene("tank_kicks_edges5", "refined steps", "edges+5", "tank", "kicks", 24, WALK),
+    Scene("skirt_lunges_refine1", "few iterations", "quickstart+1", "skirt", "lunges", 30, WALK),
+    Scene("tank_bends_newton1", "few iterations", "newton_1", "tank", "bends", 30, ("start=2",)),
+    Scene("longsleeve_dance_newton1", "few iterations", "newton_1", "longsleeve", "dance_disco", 24, ("start=3",)),
+    Scene("shorts_squats_newton3", "few iterations", "newton_3", "shorts", "squats", 30, WALK),
+    Scene("shorts_run_guess1", "few iterations", "guess+1", "shorts", "run_on_spot", 24, WALK),
+    Scene("longsleeve_bends_direct", "direct method", "newton_direct", "longsleeve", "bends", 20, ("start=2",)),
+    Scene("shorts_jog_guess", "inertial guess", "guess", "shorts", "jog", 12, WALK),
+    Scene("longsleeve_stand_guess", "inertial guess", "guess", "longsleeve", "stand_sway", 20),
+    Scene("skirt_steps_guess5", "inertial guess", "guess+5", "skirt", "side_steps", 24, WALK),
+    Scene("dress_twists_sweeps", "sweeps of vertices", "sweeps+5", "dress", "twists", 20, WALK),
+    Scene("longsleeve_sway_sweeps", "sweeps of vertices", "sweeps+40", "longsleeve", "stand_sway", 16),
+]
+
+#: Hard and right, or nearly.
+POSES = [
+    Scene("longsleeve_upside_down", "handstand again", "newton", "longsleeve", posed("handstand", 180, rate=1.3), 28),
+    Scene("skirt_upside_down_pose", "handstand again", "newton", "skirt", posed("handstand", 170, rate=1.3), 28),
+    Scene("shorts_upside_down", "handstand again", "guess+5", "shorts", posed("handstand", 180, rate=1.3), 28),
+    Scene("longsleeve_crouch", "deep crouch", "quickstart+5", "longsleeve", posed("crouch", 115, rate=1.3), 28),
+    Scene("shirt_crouch", "deep crouch", "newton", "shirt", posed("crouch", 100, rate=1.3), 26),
+    Scene("shorts_split", "wide split", "newton", "shorts", posed("split", 60, rate=1.3), 28),
+    Scene("dress_side_split", "wide split", "quickstart+5", "dress", posed("split", 50, rate=1.3), 28),
+    Scene("tank_high_kick", "high kick", "newton", "tank",
+          bent("kick", {HIPS[0]: (-100, 0, 0), SPINE: (-10, 0, 0)}), 24),
+    Scene("skirt_high_kick", "high kick", "newton", "skirt", bent("kick", {HIPS[1]: (-95, 0, 0)}), 24),
+    Scene("shorts_star", "star jump", "newton", "shorts",
+          bent("star", {HIPS[0]: (0, 0, 35), HIPS[1]: (0, 0, -35), SHOULDERS[0]: (0, 0, 60), SHOULDERS[1]: (0, 0, -60)}, 0.4,
+          up=0.3),
+          20),
+    Scene("tshirt_side_bend", "side bend", "newton", "tshirt", bent("side", {SPINE: (0, 0, 30), CHEST: (0, 0, 25)}), 24),
+    Scene("longsleeve_elbows", "bent elbows", "newton", "longsleeve",
+          bent("elbows", {ELBOWS[0]: (0, -120, 0), ELBOWS[1]: (0, 120, 0)}), 24),
+    Scene("trousers_kneel", "bent knees", "newton", "trousers", bent("kneel", {KNEES[0]: (100, 0, 0), HIPS[0]: (-40, 0, 0)}),
+          24),
+    Scene("dress_bow", "bow", "quickstart+5", "dress",
+          bent("bow", {HIPS[0]: (-75, 0, 0), HIPS[1]: (-75, 0, 0)}, root=(75, 0, 0)), 24),
+    Scene("tank_wheel", "turn over", "newton", "tank", takes.wheel(0.9), 28),
+    Scene("skirt_wheel", "turn over", "newton", "skirt", takes.wheel(0.9, 1.0), 28),
+    Scene("longsleeve_roll", "turn over", "quickstart+5", "longsleeve", takes.wheel(0.9, 1.0, "x", 0.5), 28),
+    Scene("shirt_spin_open", "spinning", "newton", "shirt", posed("spin", 1.2), 30,
+          ("events=[{frame: 3, open: front_buttons}]",)),
+    Scene("dress_spin_two", "spinning", "newton", "dress", posed("spin", 2.0), 26),
+    Scene("dress_on_back", "lying down", "newton", "dress", takes.laid("stand_sway", 0, "x", -90), 16, ("up=z",)),
+    Scene("skirt_on_side", "lying down", "newton", "skirt", takes.laid("stand_sway", 0, "y", 90, 0.3), 16, ("up=z",)),
+    Scene("trousers_stop", "sudden halt", "newton", "trousers", posed("stop", 10.0), 26),
+    Scene("tshirt_drop", "free fall", "quickstart+5", "tshirt", posed("fall", 1.2), 24),
+    Scene("longsleeve_dance_slow", "slow dance", "newton", "longsleeve", "dance_slow", 24, ("start=3",)),
+]  # fmt: skip
+
+FABRICS_RATES = [
+    Scene("tank_15_network", "other rates", "quickstart", "tank", "side_steps", 20, (*WALK, "fps=15")),
+    Scene("longsleeve_50", "other rates", "newton", "longsleeve", "walk_brisk", 30, (*WALK, "fps=50")),
+    Scene("shorts_120", "other rates", "newton", "shorts", "kicks", 30, (*WALK, "fps=120")),
+    Scene("skirt_10", "other rates", "newton", "skirt", "dance_mixed", 14, ("start=2", "fps=10")),
+    Scene("longsleeve_120_network", "other rates", "quickstart", "longsleeve", "jog", 30, (*WALK, "fps=120")),
+    Scene("skirt_4k", "finer clothes", "newton", "skirt_4k", "twists", 8, WALK),
+    Scene("longsleeve_4k_network", "finer clothes", "quickstart", "longsleeve_4k", "walk_brisk", 10, (*WALK, "refine=0")),
+    Scene("tank_12k", "finer clothes", "newton", "tank_12k", "arm_raises", 6, WALK),
+    Scene("longsleeve_knit", "fabrics by name", "newton", "longsleeve", "wave_and_reach", 20, (*WALK, "material=double_knit")),
+    Scene("skirt_crepe", "fabrics by name", "quickstart+5", "skirt", "walk_curve", 20, (*WALK, "material=silk_crepe")),
+    Scene("shirt_nylon", "fabrics by name", "newton", "shirt", "bends", 20, (*WALK, "material=coated_nylon")),
+    Scene("trousers_warp", "unlike directions", "newton", "trousers", "lunges", 20,
+          (*WALK, "material.warp=4", "material.shear=0.3")),
+    Scene("skirt_like_gum", "drawn out", "newton", "skirt", "jumps", 24,
+          (*WALK, "material.lame_mu=150", "material.lame_lambda=250")),
+    Scene("longsleeve_like_gum", "drawn out", "guess+5", "longsleeve", "walk_march", 20,
+          (*WALK, "material.lame_mu=200", "material.lame_lambda=300")),
+    Scene("tank_soft_weft", "drawn out", "newton", "tank", "walk_stroll", 20,
+          (*WALK, "material.warp=0.03", "material.weft=0.03", "material.density=0.5")),
+    Scene("dress_heavy", "heavy cloth", "newton", "dress", "walk_stroll", 20, (*WALK, "material.density=8")),
+    Scene("skirt_light_network", "network beyond its cloth", "quickstart", "skirt", "dance_mixed", 24,
+          ("start=2", "material.density=0.01")),
+    Scene("tshirt_stiff_network", "network beyond its cloth", "quickstart", "tshirt", "kicks", 24,
+          (*WALK, "material.lame_mu=4e5", "material.lame_lambda=6e5", "material.bending_stiffness=2e-3")),
+    Scene("longsleeve_stiff_ours", "network beyond its cloth", "ours", "longsleeve", "jog", 24,
+          (*WALK, "material.lame_mu=3e5", "material.lame_lambda=4e5")),
+    Scene("skirt_without_weight", "floating", "newton", "skirt", "walk_stroll", 24, (*WALK, "gravity=0")),
+    Scene("dress_frozen", "frozen", "newton", "dress", "walk_brisk", 24, (*WALK, "damping=20")),
+    Scene("trousers_slippery", "without friction", "newton", "trousers", "walk_brisk", 28,
+          (*WALK, "material.friction=0", "pins=none", "size=1.1")),
+    Scene("longsleeve_weak_contact", "skin comes through", "newton", "longsleeve", "kicks", 20,
+          (*WALK, "losses.terms.collision.weight=5")),
+    Scene("skirt_weak_contact", "skin comes through", "guess+5", "skirt", "lunges", 20,
+          (*WALK, "losses.terms.collision.weight=15")),
+    Scene("trousers_reference_losses", "skin comes through", "newton", "trousers", "kicks", 20, (*WALK, "losses=reference")),
+    Scene("dress_contact_200", "skin comes through", "newton", "dress", "lunges", 16,
+          (*WALK, "losses.terms.collision.weight=200")),
+]  # fmt: skip
+
+FITS = [
+    Scene("shirt_loose", "sizes", "newton", "shirt", "walk_curve", 20, (*WALK, "size=1.15")),
+    Scene("longsleeve_tight", "sizes", "newton", "longsleeve", "walk_curve", 16, (*WALK, "size=0.9")),
+    Scene("trousers_too_small", "far too small", "newton", "trousers", "walk_stroll", 12, (*WALK, "size=0.7")),
+    Scene("tshirt_huge", "far too large", "newton", "tshirt", "walk_brisk", 28, (*WALK, "size=2")),
+    Scene("shorts_huge", "far too large", "newton", "shorts", "stand_sway", 24, ("size=1.5", "pins=none")),
+    Scene("tank_shrinking", "changing size", "newton", "tank", "stand_sway", 24,
+          ("size=1.1", "size_end=0.85", "size_seconds=0.6")),
+    Scene("tshirt_growing", "changing size", "quickstart+5", "tshirt", "stand_sway", 24, ("size_end=1.3", "size_seconds=0.6")),
+    Scene("skirt_held_aside", "held at one side", "newton", "skirt", "walk_stroll", 24, (*WALK, "pins=[0,1,2]")),
+    Scene("trousers_let_go", "let go", "newton", "trousers", "jumps", 28, (*WALK, "events=[{frame: 4, detach: waistband}]")),
+    Scene("tank_body_slim", "other people", "newton", "tank", "walk_march", 16, (*WALK, "betas=[-2.5,-1]")),
+    Scene("trousers_body_broad", "other people", "quickstart+5", "trousers", "walk_march", 16, (*WALK, "betas=[3,1]")),
+    Scene("longsleeve_betas_9", "unlikely people", "newton", "longsleeve", "walk_stroll", 12, (*WALK, "betas=[0,9]")),
+    Scene("shirt_betas_minus_7", "unlikely people", "newton", "shirt", "walk_stroll", 12, (*WALK, "betas=[-7]", "fit=none")),
+]  # fmt: skip
+
+ALL = [*ORDINARY, *POSES, *FABRICS_RATES, *FITS, *PARTS, *ACCESSORIES, *THINGS, *CAPTURES]
