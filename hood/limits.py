@@ -38,6 +38,7 @@ SETTLING = Limit(5, "frames", _RULE, "a start by relaxing steps swings for a six
 #: Strain, the 99th percentile over the edges. What is torn is unsound; what no ordinary fabric does makes the guard look at the
 #: step; what would snap back makes the start be smoothed.
 STRAIN_UNSOUND = Limit(0.5, "share of the length", _RULE, "soft, heavy and tight cloth reaches 40%, torn cloth 80%")
+STRAIN_TORN = Limit(1.0, "share of the length", _RULE, "torn also where the start still settles: no start has swung so")
 STRAIN_ALARM = Limit(0.25, "share of the length", _GUARD, "seven garments on four motions reach 19%")
 STRAIN_RATIO = Limit(1.5, "times the solver's strain", _GUARD, "soft, heavy and tight cloth is strained so by the solver, too")
 STRAIN_START = Limit(0.04, "share of the length", "hood.scene.start", "more would show as a jerk in frame 1")
@@ -59,10 +60,11 @@ INSIDE_UNSOUND = Limit(0.05, "share of the vertices", _RULE, "2 mm deep in the b
 INSIDE_ALARM = Limit(0.01, "m", _GUARD, "contact pushes out from 10 mm, from deeper it may push through the limb")
 #: Cloth through cloth where a viewer can see it: the length along which pairs of triangles are counted.
 CROSSINGS_UNSOUND = Limit(0.25, "m", _RULE, "the length of a hand; shorter ones look like a fold")
+CROSSINGS_LASTING = Limit(0.25, "share of frames", _RULE, "up to twice that length is not seen if it comes and goes")
 
 #: Worn, see hood.dynamics.verdict.worn.
 AWAY_UNSOUND = Limit(0.20, "m", "hood.dynamics.verdict.worn", "43 rollouts: worn at most 0.11, come off at least 0.28")
-SLIPPED_UNSOUND = Limit(0.10, "m", "hood.dynamics.verdict.worn", "43 rollouts: worn at most 0.07, come off at least 0.21")
+SLIPPED_UNSOUND = Limit(0.15, "m", "hood.dynamics.verdict.worn", "374 rollouts: worn at most 0.14, come off at least 0.15")
 
 #: The body.
 HEAD_DOWN = Limit(0.5, "share of frames", _BODY, "cartwheels are shorter, and handstands stand on the hands")
@@ -75,4 +77,5 @@ BODY_JUMP = Limit(5.0, "m/s", _BODY, "faster than in the steps around; captured 
 _FABRIC = "hood.dynamics.verdict.fabric"
 DENSITY_KNOWN = Range(0.005, 1.2, "kg/m²", _FABRIC, "silk gauze to coats of leather")
 SHEAR_KNOWN = Range(1.0, 1e6, "N/m", _FABRIC, "nets to sailcloth")
+STRETCH_KNOWN = Range(5.0, 1e7, "N/m", _FABRIC, "fishnet to sailcloth")
 BENDING_KNOWN = Range(0.0, 0.1, "N·m", _FABRIC, "threads to saddle leather")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -32,9 +33,11 @@ from hood.dynamics.surface import SURFACE_METRICS, SURFACE_STRIDE, SurfaceMeter
 from hood.dynamics.verdict.distance import DISTANCE_EVERY, DISTANCE_METRICS, distance_metrics
 from hood.dynamics.verdict.worn import measure_wear
 from hood.graph.given import given_hierarchy
+from hood.limits import CUT_UNSOUND
 from hood.losses.layers import for_networks, has_layers
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
+from hood.mesh.crossing import crossings
 from hood.mesh.surface_tree import forget_searches
 from hood.scene.cloth import Cloth
 from hood.scene.contact import Contact, find_contact
@@ -49,6 +52,8 @@ from hood.solver.step_figures import StepFigures
 _STRETCH = 0.1
 #: One with an edge lengthened by more than this is told; measured: at most 0.08 in ordinary poses, 0.18 to 0.69 seated.
 _TORN = 0.3
+#: The way of a relaxing step is looked at so often [m].
+_LOOK = 0.02
 
 AttachmentSchedule = Callable[[int], Attachments | None]
 #: Called after a step with the frame it leads to, what the step had to solve and what came out.
@@ -315,8 +320,8 @@ def prepare_stepper(stepper: Stepper, scene: Scene) -> Any:
 
 @torch.no_grad()
 def start_state(stepper: Stepper, scene: Scene, potential: Potential, relaxing_steps: int, frame: int = 0) -> State:
-    """Settled, relaxed start: the relaxing step is kept only where it lowers the potential of its own problem and leaves no
-    edge stretched by more than a tenth that was not before.
+    """Settled, relaxed start: the relaxing step is kept only where it lowers the potential of its own problem, leaves no edge
+    stretched by more than a tenth that was not before, and takes no cloth through the body to its other side.
 
     Steppers that carry on or restart from it (:class:`hood.dynamics.frames.Relaxing`) get its positions as they are, and the
     velocity of their own rule. Those that restart take the last of the relaxing steps on the way to the next frame: it is not
@@ -360,9 +365,24 @@ def start_state(stepper: Stepper, scene: Scene, potential: Potential, relaxing_s
         pos = push_out(scene.cloth, prediction.next_pos, step.obstacle, scene.clearance)
         problem = potential.prepare(problem)
         lower = bool((potential.total(problem, pos) < potential.total(problem, state.pos)).all())
-        if lower and bool(torch.isfinite(pos).all()) and _longest(scene, pos) <= max(_STRETCH, _longest(scene, state.pos)):
+        kept = lower and bool(torch.isfinite(pos).all()) and _longest(scene, pos) <= max(_STRETCH, _longest(scene, state.pos))
+        if kept and not _passes(scene, frame, state, pos):
             state = State(pos, state.vel, state.origin)
     return State(state.pos, velocity, state.origin)
+
+
+def _passes(scene: Scene, frame: int, state: State, pos: Tensor) -> bool:
+    """Whether the body of ``frame`` cuts the cloth on its straight way from ``state`` to ``pos``, and not where that begins."""
+    body = scene.motion.surface(frame, state.origin[0].numpy()).double().cpu().numpy()
+    start, end = (one.double().cpu().numpy() for one in (state.pos, pos))
+    looks = math.ceil(float(np.linalg.norm(end - start, axis=1).max()) / _LOOK)
+    if not len(scene.motion.faces) or not np.isfinite(body).all():
+        return False
+    for look in range(looks):
+        cut = crossings(start + look / looks * (end - start), scene.garment.faces, body, scene.motion.faces).pairs
+        if len(np.unique(cut[:, 0])) > CUT_UNSOUND.value * len(scene.garment.faces):
+            return look > 0
+    return False
 
 
 def _why_stretched(scene: Scene, frame: int, put_on: float) -> str:

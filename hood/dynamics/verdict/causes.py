@@ -15,7 +15,7 @@ from hood.dynamics.verdict.skin import skin_causes
 from hood.dynamics.verdict.solved import solved_causes
 from hood.dynamics.verdict.surface import Drawn, drawn, surface_metrics, visible_crossings
 from hood.dynamics.verdict.torn import strain_causes
-from hood.limits import CROSSINGS_UNSOUND
+from hood.limits import CROSSINGS_LASTING, CROSSINGS_UNSOUND
 from hood.mesh.topology import unique_edges
 
 
@@ -67,7 +67,7 @@ _CROSSINGS = {
 
 
 def crossing_causes(seen: Drawn, metrics: Mapping[str, np.ndarray]) -> Found:
-    """Cloth through cloth that a viewer sees."""
+    """Cloth through cloth that a viewer sees. What is at most twice the limit for a moment is not seen."""
     found, most = Found(), most_crossings(seen)
     every_pair = sum((np.nan_to_num(metrics[name]) for name in _CROSSINGS), np.zeros(len(metrics["self_crossings"])))
     looked = visible_crossings(seen, every_pair, most)
@@ -78,6 +78,8 @@ def crossing_causes(seen: Drawn, metrics: Mapping[str, np.ndarray]) -> Found:
         first = counts[0] if len(counts) and np.isfinite(counts[0]) else 0.0
         start = f" (frame 0 has {first:.0f} already)" if first > 0 else ""
         bad = (np.nan_to_num(counts) > most) & (not hidden)
+        if bad.sum() < CROSSINGS_LASTING.value * np.isfinite(counts).sum() and np.nan_to_num(counts).max() <= 2 * most:
+            bad = np.zeros_like(bad)
         found += Found([Cause(kind, text + start, bad, counts, most, _PAIRS, ".0f", measured=np.isfinite(counts))])
         if 0 < first <= most:
             found.doubts.append(_of_start(first, what))

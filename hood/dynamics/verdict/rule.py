@@ -4,9 +4,10 @@ A rollout is unsound
 
 - with a frame that is not finite;
 - with a part of the garment that has come off (:mod:`hood.dynamics.verdict.worn`);
-- with bad frames among more than 2% of all, or of those after the fifth where frame 0 was not at rest. A frame is bad where
-  the cloth is torn, its step ended too far from the minimum, the skin comes through the cloth, or cloth through cloth. What is
-  measured in every n-th frame stands for those up to the next; of five frames or fewer all after the start must be bad.
+- with more than one bad frame, and more than 2% of all, or of those after the fifth where frame 0 was not at rest. A frame is
+  bad where the cloth is torn, its step ended too far from the minimum, or skin or cloth come through the cloth.
+  What is measured in every n-th frame stands for those up to the next; of five frames or fewer all after the start must be bad.
+  Cloth that is torn to twice its length is judged in every frame, single ones as well.
 
 The numbers are those of :mod:`hood.limits`.
 """
@@ -27,7 +28,7 @@ from hood.dynamics.verdict.frames import name_frames, runs_of, worst_frame
 from hood.dynamics.verdict.solved import unknown_steps
 from hood.dynamics.verdict.surface import drawn
 from hood.dynamics.verdict.unworn import worn_causes
-from hood.limits import SETTLING, TOLERATED
+from hood.limits import SETTLING, STRAIN_TORN, TOLERATED
 
 
 @dataclass(frozen=True)
@@ -72,11 +73,13 @@ def judge_rollout(data: RolloutData) -> Verdict:
     off, found = worn_causes(data, seen), causes_of(data, seen)
     reasons = [] if finite.all() else [_not_finite(finite)]
     reasons += [_reason(cause, np.ones(len(finite), dtype=bool), "frames") for cause in off.causes]
-    judged = _judged(len(finite), _settled(data))
+    torn = _torn(data)
+    judged = _judged(len(finite), _settled(data)) | torn
     bad = np.any([cause.spread for cause in found.causes], axis=0) & judged if found.causes else np.zeros_like(judged)
     few = len(finite) <= SETTLING.value
-    among = "frames" if few or judged.all() else "frames after the fifth"
-    if bad.sum() > (judged.sum() - 1 if few else TOLERATED.value * judged.sum()):
+    among = "frames" if few or judged[: int(SETTLING.value)].any() else "frames after the fifth"
+    tolerated = judged.sum() - 1 if few else max(TOLERATED.value * judged.sum(), 0 if torn.any() else 1)
+    if bad.sum() > tolerated:
         reasons += [_reason(cause, judged, among) for cause in found.causes if (cause.bad & judged).any()]
     doubts = (*stored_doubts(data), *(doubt.as_dict() for doubt in (*off.doubts, *found.doubts)))
     notes = (*off.notes, *found.notes)
@@ -103,6 +106,14 @@ def _judged(count: int, settled: bool) -> np.ndarray:
     few = count <= SETTLING.value
     first = min(1, count - 1) if few else 0 if settled else int(SETTLING.value)
     return np.arange(count) >= first
+
+
+def _torn(data: RolloutData) -> np.ndarray:
+    """(S,) bool: frames that are judged also where the start still settles."""
+    strain = strain_of(data)
+    if strain is None or len(data.step_finite) <= SETTLING.value:
+        return np.zeros(len(data.step_finite), dtype=bool)
+    return np.asarray(np.nan_to_num(strain) > STRAIN_TORN.value)
 
 
 def _not_finite(finite: np.ndarray) -> Reason:

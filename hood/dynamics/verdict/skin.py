@@ -14,18 +14,21 @@ from hood.dynamics.verdict.surface import Drawn, spread_over
 from hood.dynamics.verdict.visible import sampled, visible
 from hood.limits import CUT_UNSOUND, DEPTH_UNSOUND, INSIDE_UNSOUND, SPOTS_HEIGHT, SPOTS_LASTING, SPOTS_UNSOUND
 from hood.mesh.crossing import crossings
-from hood.mesh.topology import connected_components, unique_edges
+from hood.mesh.topology import connected_components, hinges, unique_edges
 
 #: Frames that are looked at from all sides, at most, of those in which a larger share of the cloth's triangles is cut.
 _LOOKED_AT, _HARDLY = 8, 0.001
+#: Surfaces of people turn by less than this [rad] at an edge; those of furniture by 90 degrees.
+_CORNER = np.deg2rad(60.0)
 
 
 def skin_causes(metrics: Mapping[str, np.ndarray], inside: Mapping[str, np.ndarray], seen: Drawn) -> Found:
     """Skin through cloth.
 
     A frame is bad where the skin that a viewer sees cuts more than 1% of the cloth's triangles, or sticks out by more than a
-    centimetre. Spots of some millimetres are seen where they stay: they count if nearly half of the frames have them. Triangles
-    caught in a fold of the skin do not count.
+    centimetre. Spots of some millimetres are seen where they stay: they count if nearly half of the frames have them, and not
+    where a corner of a thing comes through between the vertices of the cloth. Triangles caught in a fold of the skin do not
+    count.
 
     Args:
         metrics: of the surface, (S,) each.
@@ -33,11 +36,11 @@ def skin_causes(metrics: Mapping[str, np.ndarray], inside: Mapping[str, np.ndarr
     """
     share, depth = metrics["cut_face_share"], metrics["skin_depth"]
     measured = np.isfinite(share)
-    shown, poked = (spread_over(values, measured) for values in _seen(share, seen))
+    shown, spots, poked = (spread_over(values, measured) for values in _seen(share, seen))
     depth = np.where(measured, np.fmax(depth, poked), np.nan)
     height = np.nan_to_num(depth)
     cut, deep = shown > CUT_UNSOUND.value, (height > DEPTH_UNSOUND.value) & (shown > 0)
-    lasting = measured & (shown > SPOTS_UNSOUND.value) & (height > SPOTS_HEIGHT.value)
+    lasting = measured & (spots > SPOTS_UNSOUND.value) & (height > SPOTS_HEIGHT.value)
     if lasting.sum() <= SPOTS_LASTING.value * measured.sum():
         lasting = np.zeros_like(lasting)
     lasting &= ~deep
@@ -66,29 +69,42 @@ def inside_causes(metrics: Mapping[str, np.ndarray]) -> Found:
     return Found([Cause("inside_body", text, bad, share, limit.value, limit.unit, ".0%", measured=np.isfinite(share))])
 
 
-def _seen(share: np.ndarray, seen: Drawn) -> tuple[np.ndarray, np.ndarray]:
-    """Shares (S,) of the cloth's triangles through which skin is seen, and how far the body goes through them [m].
+def _seen(share: np.ndarray, seen: Drawn) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Shares (S,) of the cloth's triangles through which skin is seen, of those apart from corners, and how far the body goes
+    through them [m].
 
     NaN in frames that were not looked at, 0 in those whose skin cuts hardly anything.
     """
-    shown, poked = (np.where(share <= _HARDLY, 0.0, np.nan) for _ in range(2))
+    found = np.where(share <= _HARDLY, 0.0, np.nan)[None].repeat(3, axis=0)
     stored = {int(step): frame for frame, step in enumerate(seen.step)}
     over = [step for step in np.flatnonzero(np.nan_to_num(share) > _HARDLY).tolist() if step in stored]
     for place in np.unique(np.linspace(0, max(len(over) - 1, 0), min(len(over), _LOOKED_AT)).astype(np.int64)).tolist():
-        step = over[place]
-        shown[step], poked[step] = _seen_at(seen, stored[step])
-    return shown, poked
+        found[:, over[place]] = _seen_at(seen, stored[over[place]])
+    return found[0], found[1], found[2]
 
 
-def _seen_at(seen: Drawn, frame: int) -> tuple[float, float]:
+def _seen_at(seen: Drawn, frame: int) -> tuple[float, float, float]:
     pos, body = seen.cloth[frame].astype(np.float64), seen.body[frame].astype(np.float64)
     cut = crossings(pos, seen.faces, body, seen.body_faces)
     pairs = cut.pairs
     pairs = pairs[~in_folds(pairs[:, 1], body, seen.body_faces)]
     faces = np.unique(pairs[:, 0])
     found = faces[visible(pos[seen.faces[faces]].mean(axis=1), [(pos, seen.faces), (body, seen.body_faces)])]
+    round_faces = pairs[~_at_corners(body, seen.body_faces)[pairs[:, 1]], 0]
     through = way_through(pos, seen.faces, body, seen.body_faces, cut.second_edges) if len(found) else 0.0
-    return len(found) / len(seen.faces), through
+    return len(found) / len(seen.faces), int(np.isin(found, round_faces).sum()) / len(seen.faces), through
+
+
+def _at_corners(pos: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(G,) bool: faces of a body that have a vertex on an edge where it turns by more than :data:`_CORNER`."""
+    corners = pos[faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True).clip(1e-30)
+    hinge = hinges(faces)
+    one, other = normal[hinge.faces].swapaxes(0, 1)
+    sharp = np.zeros(len(pos), dtype=bool)
+    sharp[hinge.vertices[(one * other).sum(axis=1) < np.cos(_CORNER), :2]] = True
+    return np.asarray(sharp[faces].any(axis=1))
 
 
 def way_through(cloth: np.ndarray, faces: np.ndarray, body: np.ndarray, body_faces: np.ndarray, cut: np.ndarray) -> float:

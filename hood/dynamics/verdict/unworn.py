@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -35,15 +36,23 @@ def worn_causes(data: RolloutData, seen: Drawn) -> Found:
     if wear is None:
         return Found(notes=notes)
     found = Found(_fallen_before(data, len(data.step_finite)), notes=notes)
+    if len(wear.num_vertices) == 1 and not found.causes:
+        wear = replace(wear, slipped=wear.slipped + np.nan_to_num(max(_before(data)[1], 0.0)))
     for part in range(len(wear.num_vertices)):
         found += _of_part(data, seen, wear, part)
     return found
 
 
-def _fallen_before(data: RolloutData, count: int) -> list[Cause]:
-    """What came off while the start was settled, before frame 0."""
+def _before(data: RolloutData) -> tuple[float, float]:
+    """How far the garment moved away and slipped while the start was settled [m], the worst of its parts; NaN: not known."""
     rows = [data.step_metrics.get(name) for name in ("settle_away", "settle_slipped")]
     away, slipped = (np.nan if row is None or not len(row) else float(row[0]) for row in rows)
+    return away, slipped
+
+
+def _fallen_before(data: RolloutData, count: int) -> list[Cause]:
+    """What came off while the start was settled, before frame 0."""
+    away, slipped = _before(data)
     if not (away > AWAY_UNSOUND.value or slipped > SLIPPED_UNSOUND.value):
         return []
     limit = AWAY_UNSOUND if away > AWAY_UNSOUND.value else SLIPPED_UNSOUND
@@ -74,7 +83,7 @@ def _of_part(data: RolloutData, seen: Drawn, wear: Wear, part: int) -> Found:
     values[frames] = np.fmax(away, slipped)
     by_rim = away[first] <= AWAY_UNSOUND.value
     way, limit = (slipped, SLIPPED_UNSOUND) if by_rim else (away, AWAY_UNSOUND)
-    how = "its openings have slipped along the body" if by_rim else "it is away from where it was on the body"
+    how = "its highest opening has slipped along the body" if by_rim else "it is away from where it was on the body"
     text = (
         f"{name_part(data, wear, part)} has come off: from frame {frames[first]} on {how}, by "
         f"{np.nanmax(way):.2f} m at worst (beyond {limit.value:.2f})"

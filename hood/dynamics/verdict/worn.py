@@ -5,11 +5,11 @@ Two lengths say so, of every part that is worn in frame 0:
 - *away*: how much farther its vertices are from their region of the body than they were from the body in frame 0, the median
   over the vertices that touched it there, and over the nearest of them for a part without an opening around a limb: a cape
   that is blown out hangs by its collar;
-- *slipped*: the same for the vertices of an opening that lies around a limb, the median over such openings (of two the lesser:
-  one of them holds the garment); an opening with no limb in it any more counts as a metre.
+- *slipped*: how far the highest opening around a limb has moved along the body: the way of the middle of the points of the body
+  that are nearest to its vertices, on the body of frame 0. An opening with no limb in it any more counts as a metre.
 
-The region of a vertex are the points of the body within 15 cm, along the skin, of its nearest one in frame 0. Swinging hems,
-open jackets and crossed arms stay near their regions; trousers around the ankles do not.
+The region of a vertex are the points of the body within 15 cm, along the skin, of its nearest one in frame 0; an opening is
+followed for 40 cm. Swinging hems, open jackets and crossed arms stay near their regions; trousers around the ankles do not.
 """
 
 from __future__ import annotations
@@ -24,8 +24,11 @@ from scipy.spatial import cKDTree
 
 from hood.mesh.topology import boundary_loops, connected_components, unique_edges
 
-#: A vertex nearer than this [m] to the body touches it; the region of a vertex reaches so far [m] along the skin.
-TOUCHES, _REGION = 0.03, 0.15
+#: A vertex nearer than this [m] to the body touches it; the region of a vertex reaches so far [m] along the skin, and openings
+#: are followed so far.
+TOUCHES, _REGION, _FOLLOWED = 0.03, 0.15, 0.40
+#: Of an opening so many vertices are followed, at most.
+_OF_OPENING = 60
 #: An opening lies around a limb where so many edges of the body go through it and this share of its vertices touches the body.
 _THROUGH, _TIGHT = 6, 0.6
 #: Shorter openings [m] are buttonholes and slits.
@@ -57,18 +60,33 @@ class Wear:
 
 @dataclass(frozen=True)
 class _Group:
-    """Vertices of a part that are followed, with the points of the body around each."""
+    """Vertices of a part that touch the body, with the points of it around each."""
 
     vertices: np.ndarray  # (N,)
     region: np.ndarray  # (N, K) points of the body, the first repeated
     start: np.ndarray  # (N,) m, from the body in frame 0
-    is_opening: bool = False
-    share: float = 0.5  # of the vertices that are nearer than what is told
+    share: float  # of the vertices that are nearer than what is told
 
     def away(self, pos: np.ndarray, body: np.ndarray) -> float:
         """How much farther from their regions than in frame 0 its vertices are [m], at their ``share``."""
         dist_sq = ((pos[self.vertices][:, None] - body[self.region]) ** 2).sum(axis=2).min(axis=1)
         return float(np.quantile(np.sqrt(dist_sq) - self.start, self.share))
+
+
+@dataclass(frozen=True)
+class _Opening:
+    """An opening around a limb, and where on the body of frame 0 it was."""
+
+    rim: np.ndarray  # (R,) vertices along it
+    vertices: np.ndarray  # (N,) of them, followed
+    region: np.ndarray  # (N, K) points of the body, the first of each nearest in frame 0
+    places: np.ndarray  # (B, 3) m, points of the body in frame 0
+
+    def slipped(self, pos: np.ndarray, body: np.ndarray) -> float:
+        """How far it has moved along the body [m]."""
+        near = ((pos[self.vertices][:, None] - body[self.region]) ** 2).sum(axis=2).argmin(axis=1)
+        now = self.places[self.region[np.arange(len(near)), near]]
+        return float(np.linalg.norm(now.mean(axis=0) - self.places[self.region[:, 0]].mean(axis=0)))
 
 
 class WearMeter:
@@ -110,30 +128,31 @@ class WearMeter:
             own = [(loop, count) for loop, count in zip(loops, through, strict=True) if part[loop[0]] == number]
             chosen.append(_to_follow(rows, dist, own, np.intersect1d(rows, pinned)))
         regions = _Regions(body, self._body_edges, self._between)
-        self._groups = [
-            [
-                _Group(rows, regions.around(nearest[rows]), dist[rows], opening, 0.5 if len(groups) > 1 else _HANGS)
-                for rows, opening in groups
-            ]
-            for groups in chosen
-        ]
+        self._touching: list[_Group | None] = []
+        self._openings: list[_Opening | None] = []
+        for rows, rims in chosen:
+            share = 0.5 if rims else _HANGS
+            self._touching.append(_Group(rows, regions.around(nearest[rows]), dist[rows], share) if len(rows) else None)
+            highest = max(rims, key=lambda rim: float(pos[rim, 1].mean()), default=_NONE)
+            few = _some(highest, _OF_OPENING)
+            followed = _Opening(highest, few, regions.around(nearest[few], _FOLLOWED), body) if len(few) else None
+            self._openings.append(followed)
 
     def __call__(self, pos: np.ndarray, body_pos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """``away`` (P,) and ``slipped`` (P,) [m] of one frame, see :class:`Wear`."""
         body = self._points(body_pos)
-        away, slipped = np.full(len(self._groups), np.nan), np.full(len(self._groups), np.nan)
-        for number, groups in enumerate(self._groups):
-            rims = [self._slipped(group, pos, body, body_pos) for group in groups if group.is_opening]
-            if groups:
-                away[number] = groups[0].away(pos, body)
-            if rims:
-                slipped[number] = sorted(rims)[(len(rims) - 1) // 2]
+        away, slipped = np.full(len(self._touching), np.nan), np.full(len(self._touching), np.nan)
+        for number, (touching, opening) in enumerate(zip(self._touching, self._openings, strict=True)):
+            if touching is not None:
+                away[number] = touching.away(pos, body)
+            if opening is not None:
+                slipped[number] = self._slipped(opening, pos, body, body_pos)
         return away, slipped
 
-    def _slipped(self, rim: _Group, pos: np.ndarray, body: np.ndarray, body_pos: np.ndarray) -> float:
-        if num_through(pos[rim.vertices], body_pos, self._body_edges) == 0:
+    def _slipped(self, opening: _Opening, pos: np.ndarray, body: np.ndarray, body_pos: np.ndarray) -> float:
+        if num_through(pos[opening.rim], body_pos, self._body_edges) == 0:
             return _LOST
-        return rim.away(pos, body)
+        return opening.slipped(pos, body)
 
     def _points(self, body_pos: np.ndarray) -> np.ndarray:
         """Vertices of the body, and the middles of its edges where it is coarse."""
@@ -187,19 +206,19 @@ def num_through(rim: np.ndarray, body_pos: np.ndarray, body_edges: np.ndarray) -
 
 def _to_follow(
     rows: np.ndarray, dist: np.ndarray, openings: list[tuple[np.ndarray, int]], held: np.ndarray
-) -> list[tuple[np.ndarray, bool]]:
+) -> tuple[np.ndarray, list[np.ndarray]]:
     """Of a part the vertices that touch the body or are held, and its openings around a limb; nothing where it is not worn."""
     touching = np.union1d(rows[dist[rows] < TOUCHES], held)
     if len(touching) < _LEAST_TOUCHING * len(rows) and not any(count >= _THROUGH for _, count in openings):
-        return []
+        return _NONE, []
     if not len(touching):
         touching = rows[np.argsort(dist[rows], kind="stable")[: max(1, len(rows) // 10)]]
     rims = [loop for loop, count in openings if count >= _THROUGH and (dist[loop] < TOUCHES).mean() >= _TIGHT]
-    return [(np.union1d(_some(touching), held[:_MOST_LOOKED_AT]), False), *((loop, True) for loop in rims)]
+    return np.union1d(_some(touching, _MOST_LOOKED_AT), held[:_MOST_LOOKED_AT]), rims
 
 
-def _some(rows: np.ndarray) -> np.ndarray:
-    return rows[:: -(-len(rows) // _MOST_LOOKED_AT)]
+def _some(rows: np.ndarray, most: int) -> np.ndarray:
+    return rows[:: max(1, -(-len(rows) // most))]
 
 
 class _Regions:
@@ -211,21 +230,23 @@ class _Regions:
         lengths = np.linalg.norm(body[links[:, 0]] - body[links[:, 1]], axis=1).clip(1e-9)
         self._graph = coo_matrix((lengths, (links[:, 0], links[:, 1])), shape=(count, count)).tocsr()
 
-    def around(self, points: np.ndarray) -> np.ndarray:
-        """(N, K): the points within 15 cm of each of ``points`` (N,), filled up with itself."""
+    def around(self, points: np.ndarray, reach: float = _REGION) -> np.ndarray:
+        """(N, K): each of ``points`` (N,) and what is within ``reach`` [m] of it, filled up with itself."""
         own, which = np.unique(points, return_inverse=True)
-        found = [np.flatnonzero(np.isfinite(row)) for row in self._far(own)]
+        found = [
+            np.append(point, np.flatnonzero(np.isfinite(row))) for point, row in zip(own, self._far(own, reach), strict=True)
+        ]
         most = max((len(row) for row in found), default=1)
         table = np.repeat(own[:, None], most, axis=1)
         for row, near in zip(table, found, strict=True):
             row[: len(near)] = near
         return table[which]
 
-    def _far(self, points: np.ndarray, at_once: int = 64) -> list[np.ndarray]:
+    def _far(self, points: np.ndarray, reach: float, at_once: int = 64) -> list[np.ndarray]:
         """Distances (W,) from each of ``points``, infinite beyond the region."""
         rows: list[np.ndarray] = []
         for first in range(0, len(points), at_once):
-            rows += list(dijkstra(self._graph, directed=False, indices=points[first : first + at_once], limit=_REGION))
+            rows += list(dijkstra(self._graph, directed=False, indices=points[first : first + at_once], limit=reach))
         return rows
 
 

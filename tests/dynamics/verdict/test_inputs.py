@@ -123,6 +123,7 @@ def test_arms_in_the_trunk_are_told() -> None:
         ({"density": 2e-4}, "density is 0.0002 kg/m²"),
         ({"lame_mu": 23600e6}, "shear stiffness"),
         ({"bending_stiffness": 40.0}, "bending stiffness"),
+        ({"warp": 0.03, "weft": 0.9}, "stretch stiffness"),
     ],
 )
 def test_fabrics_of_another_unit_are_told(changes: dict[str, float], what: str) -> None:

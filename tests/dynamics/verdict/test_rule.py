@@ -56,11 +56,20 @@ def test_the_median_hides_nothing() -> None:
 
 
 def test_two_percent_of_the_frames_after_the_fifth_are_suffered() -> None:
-    settling = {f"f{frame}": 9.0 for frame in range(5)}
+    settling = {f"f{frame}": 0.9 for frame in range(5)}
     assert by_network(frames(105, **settling)).sound
     assert by_network(frames(105, f50=0.6, f51=0.6)).sound
     assert not by_network(frames(105, f50=0.6, f51=0.6, f5=0.6)).sound
     assert by_network(frames(105, f50=0.5, f51=0.5, f5=0.5)).sound
+
+
+def test_a_single_bad_frame_is_not_seen_unless_it_is_torn() -> None:
+    assert by_network(frames(20, f12=0.9)).sound
+    assert not by_network(frames(20, f12=0.9, f13=0.6)).sound
+    assert not by_network(frames(20, f12=1.1)).sound
+    (reason,) = by_network(frames(20, f3=1.1)).reasons  # while it settles
+    assert reason.sentence == "strain p99 is beyond 50% in 1 of 16 frames: frame 3, worst 110% in frame 3"
+    assert by_network(frames(105, f3=1.1)).sound
 
 
 def test_bad_frames_of_all_causes_count_together() -> None:

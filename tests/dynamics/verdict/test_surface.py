@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 from stored import frames, stored, tube
 
@@ -76,6 +77,20 @@ def test_low_spots_of_skin_count_where_they_stay() -> None:
     (reason,) = judge_rollout(worn(np.full(COUNT, 0.0115), 5)).reasons
     assert "spots of skin stick out by more than 1.5 mm, and stay" in reason.sentence
     assert judge_rollout(worn(np.full(COUNT, 0.006), 5)).sound  # 1 mm
+
+
+def test_a_corner_between_the_vertices_of_the_cloth_is_no_spot() -> None:
+    """8 mm of a cube's corner and of a ball, in every frame."""
+    flat, faces = sheet((0.003, 0.5, 0.007), 1, 0.6, 30)
+    cube = trimesh.creation.box((0.2, 0.2, 0.2)).subdivide().subdivide().subdivide()
+    upwards = Rotation.align_vectors([[0, 1, 0]], [[1, 1, 1]])[0].as_matrix()
+    ball = trimesh.creation.icosphere(3, 0.04)
+    for pos, triangles, sound in ((cube.vertices @ upwards.T, cube.faces, True), (ball.vertices, ball.faces, False)):
+        body = np.array(pos) + [0, 0.508 - pos[:, 1].max(), 0]
+        data = stored(COUNT, {"strain_p99": frames(COUNT)}, cloth=flat, faces=faces, body=body,
+                      body_faces=triangles.astype(np.int32), config={"worn": False})  # fmt: skip
+        assert 0.002 < surface_metrics(data, drawn(data))["cut_face_share"][0] < 0.01
+        assert judge_rollout(data).sound is sound
 
 
 def test_a_body_that_goes_through_a_sheet_counts_by_how_far() -> None:
