@@ -18,6 +18,9 @@ from hood.assets.garment.garment import Garment
 from hood.assets.garment.units import find_scale, possible, used
 from hood.mesh import repair
 
+#: Beside the median edge a gap up to this share is short: within a longer one vertices along a rim would be joined too.
+_NEAR = 0.25
+
 
 def metres_per_unit(pos: np.ndarray, faces: np.ndarray, surface: np.ndarray) -> float:
     """Metres per unit of a file, by the size of what it shows beside a body (W, 3) [m]; 1 where that does not say."""
@@ -68,8 +71,18 @@ def mend(fitting: Fitting, wanted: Wanted, surface: np.ndarray | None, open_edge
         sew_panels(fitting, wanted, scale, sides)
         _drop_collapsed(fitting)
     let_ride(fitting, wanted, scale)
-    tell_apart(fitting, scale)
+    tell_apart(fitting, wanted, scale)
     _keep_numbers(fitting)
+
+
+def weld_and_mend(fitting: Fitting, wanted: Wanted, open_edges: np.ndarray) -> None:
+    """:func:`mend` of a garment in metres, or of one that has been through it, for ``hood prepare``: a gap that is short beside
+    the edges is that between vertices, which are welded; a longer one is that between rims."""
+    edge = repair.weld_tolerance(fitting.garment.rest_pos, fitting.garment.faces) / repair.WELD_RATIO
+    near = wanted.gap is not None and wanted.gap <= _NEAR * edge
+    if wanted.sew:
+        sew(fitting, wanted.gap if near else None, fitting.at_present(open_edges))
+    mend(fitting, replace(wanted, gap=None) if near else wanted, None, open_edges)
 
 
 def _is_made(garment: Garment) -> bool:
