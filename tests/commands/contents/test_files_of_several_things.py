@@ -261,3 +261,23 @@ def test_parts_with_names_are_garments() -> None:
 
 def test_an_order_of_parts_says_that_they_are_garments() -> None:
     assert run(sleeve_off(0.03), "layers=[part_2,part_1]", "allow_unsound=true")[0].cloth_pos.shape[0] == 2
+
+
+@pytest.mark.parametrize("unit", [1.0, 0.01])
+@pytest.mark.parametrize("count", [1, 3])
+def test_vertices_that_stand_out_are_told_by_their_numbers(unit: float, count: int, capsys: pytest.CaptureFixture[str]) -> None:
+    pos, faces = clean("tshirt")
+    pos, pulled = pos.copy(), np.argsort(-pos[:, 2])[[0, 30, 60][:count]]
+    pos[pulled] += [0.0, 0.0, 0.4]
+    path = write_mesh(Path("thorn.obj"), (pos / unit, faces))
+    who = f"vertex {pulled[0]} stands" if count == 1 else f"{count} vertices stand out of the mesh, vertex {pulled.min()}"
+    with heard(aloud=False) as said:
+        read_garment(str(path), Wanted(), load_body().v_template, False)
+    (doubt,) = said.doubts
+    assert doubt.kind == "garment"
+    assert who in str(doubt)
+    assert re.search(r"by 0\.(39|4|41) m, 12 times the edges", str(doubt))
+    assert main(["inspect", str(path)]) == 1
+    assert who in capsys.readouterr().out
+    assert main(["prepare", f"garment={path}", "output=thorn.npz"]) == 0
+    assert who in capsys.readouterr().out
