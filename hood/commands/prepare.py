@@ -20,7 +20,7 @@ from hood.assets.formats.mesh_file import mesh_suffixes, read_mesh_file
 from hood.assets.garment import alterations
 from hood.assets.garment.binding import PosedBody, bind_garment, posed_body
 from hood.assets.garment.contents.fitting import Fitting, start_fitting
-from hood.assets.garment.contents.sort_out import choose, mend
+from hood.assets.garment.contents.sort_out import choose, weld_and_mend
 from hood.assets.garment.garment import Garment, garment_of_mesh, load_garment, locate_garment, save_garment
 from hood.assets.garment.outfit import join_garments
 from hood.assets.garment.pins import pin_mask, pin_numbers
@@ -134,12 +134,9 @@ def _fit(name: str, config: DictConfig, body: Body, betas: np.ndarray) -> _Fitte
     choose(fitting, wanted, body.v_template)
     if not fitting.garment.bound:
         heed(fitting.garment.name, suspect_kind(fitting.garment.rest_pos, fitting.garment.faces, body.v_template))
-    tolerance = None if str(config.weld) == "none" else _number(config, "weld", "auto")
     posed = _place(fitting, config, body, betas)
     sides = fasten_as_asked(fitting, config)
-    if str(config.weld) != "none":
-        alterations.sew(fitting, tolerance, fitting.at_present(sides))
-    mend(fitting, replace(wanted, gap=None), None, sides)
+    weld_and_mend(fitting, wanted, sides)
     alterations.clean(fitting)
     check_triangles(fitting.garment.rest_pos, fitting.garment.faces, name)
     alterations.face_out(fitting, body.v_template if posed is None else posed.surface, body.faces)

@@ -20,7 +20,7 @@ from omegaconf import DictConfig
 from hood.assets.garment import alterations
 from hood.assets.garment.binding import push_out, signed_distances
 from hood.assets.garment.contents.fitting import Fitting
-from hood.assets.garment.contents.sort_out import choose, mend
+from hood.assets.garment.contents.sort_out import choose, weld_and_mend
 from hood.assets.garment.garment import Garment, locate_garment, save_garment
 from hood.assets.garment.outfit import join_garments
 from hood.assets.garment.pins import pin_mask, pin_numbers
@@ -93,9 +93,7 @@ def _fit(fitting: Fitting, name: str, config: DictConfig, motion: MeshMotion) ->
     sides = fasten_as_asked(fitting, config)
     if str(config.weld) == "none":
         heed(garment.name, suspect_seams(fitting.garment.rest_pos, fitting.garment.faces))
-    else:
-        alterations.sew(fitting, None if str(config.weld) == AUTO else float(config.weld), fitting.at_present(sides))
-    mend(fitting, replace(wanted, gap=None), None, sides)
+    weld_and_mend(fitting, wanted, sides)
     alterations.clean(fitting)
     check_triangles(fitting.garment.rest_pos, fitting.garment.faces, name)
     # What another body's weights say does not hold here: the place of a garment is where it is worn.

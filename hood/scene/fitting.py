@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hood.assets.garment.suspicions import Suspicion, suspect_place, suspect_sides
+from hood.assets.garment.suspicions import Suspicion, suspect_limbs, suspect_place, suspect_sides
 from hood.scene.contact import find_contact
 from hood.scene.motion import BodyMotion
 from hood.scene.scene import Scene
@@ -58,6 +58,9 @@ def misplacement(scene: Scene, frame: int = 0, on_meshes: bool = False) -> Suspi
         return None
     pos = scene.motion.skinned(scene.garment, frame, origin).double().cpu().numpy()
     found = suspect_place(pos, scene.garment.faces, surface, scene.motion.faces)
+    if isinstance(scene.motion, BodyMotion):  # in its T-pose, where planes of symmetry are seen
+        body = scene.motion.body
+        found = suspect_limbs(scene.garment.worn_pos, scene.garment.faces, body.v_template, body.faces) + found
     return next((one for one in found if one.grave or on_meshes or isinstance(scene.motion, BodyMotion)), None)
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from hood.assets.garment.binding import closest_points
 from hood.assets.garment.openings import find_openings
 from hood.assets.garment.placement import inward_share, surrounds
 from hood.mesh import repair, topology
@@ -34,6 +35,10 @@ _FALLS, _PARTS = ", and falls from there", 30
 #: A garment is inside out where the normals of more than this share of its area point to the body; those that are not have
 #: 0 to 0.04 of it, clothes with two sides a half.
 _INSIDE_OUT = 0.75
+#: A shape is the mirror image of itself where this share of it is at most so far [m] from its image.
+_MOST, _ALIKE = 0.9, 0.02
+#: Such a garment with so many openings is worn beside the body where the two planes are farther than this [m] from each other.
+_OPENINGS, _BESIDE = 3, 0.06
 
 
 @dataclass(frozen=True)
@@ -98,10 +103,11 @@ def body_of(pos: np.ndarray, faces: np.ndarray, surface: np.ndarray, height: flo
 def suspect_place(pos: np.ndarray, faces: np.ndarray, surface: np.ndarray, body_faces: np.ndarray) -> list[Suspicion]:
     """Whether a garment (V, 3) [m] is worn by the body (W, 3) [m] where both are; a sheet may lie anywhere.
 
-    Grave: it surrounds nothing of the body, or half of its openings are empty, as those of a shirt around the knees are. Of
-    several parts, those that are away from the body, or around nothing of it, are told by their numbers.
+    Grave: it surrounds nothing of the body, half of its openings are empty, as those of a shirt around the knees are, or they
+    are around other limbs than they were made for. Of several parts, those that are away from the body, or around nothing of
+    it, are told by their numbers.
     """
-    whole = _suspect_whole(pos, faces, surface, body_faces)
+    whole = _suspect_whole(pos, faces, surface, body_faces) or suspect_limbs(pos, faces, surface, body_faces)
     parts = find_parts(pos, faces)
     if any(one.grave for one in whole) or len(parts) == 1 or len(parts) > _PARTS:
         return whole
@@ -129,6 +135,35 @@ def _suspect_whole(pos: np.ndarray, faces: np.ndarray, surface: np.ndarray, body
         )
         return [Suspicion(what, fix, 2 * openings.num_empty >= openings.num)]
     return []
+
+
+def suspect_limbs(pos: np.ndarray, faces: np.ndarray, surface: np.ndarray, body_faces: np.ndarray) -> list[Suspicion]:
+    """Whether a part of a garment (V, 3) [m] is beside the body (W, 3) [m], the head in an armhole: by the planes of symmetry
+    of both, in a pose in which they have one."""
+    parts = find_parts(pos, faces)
+    for part in parts if len(parts) <= _PARTS else ():
+        used, corners = np.unique(faces[part.faces], return_inverse=True)
+        own = pos[used], corners.reshape(-1, 3)
+        beside = abs(_middle(own[0]) - _middle(surface))
+        if beside <= _BESIDE or not (_is_mirrored(*own) and _is_mirrored(surface, body_faces)):
+            continue
+        openings = find_openings(*own, surface, body_faces)
+        if openings.num - openings.num_empty >= _OPENINGS:
+            which = "" if len(parts) == 1 else f"has a part, of {len(used)} vertices from {int(used[0])} on, that "
+            what = f"is {100 * beside:.0f} cm beside the body: its openings are around other limbs than they were made for"
+            return [Suspicion(which + what, "hood inspect says how to place it", True)]
+    return []
+
+
+def _middle(pos: np.ndarray) -> float:
+    """x [m] of the upright plane in the middle of the points (V, 3) [m]."""
+    return 0.5 * float(pos[:, 0].min() + pos[:, 0].max())
+
+
+def _is_mirrored(pos: np.ndarray, faces: np.ndarray) -> bool:
+    """Whether the mesh (V, 3) [m], (F, 3) is its own image in the plane in its middle."""
+    dist, _ = closest_points(pos * [-1.0, 1.0, 1.0] + [2.0 * _middle(pos), 0.0, 0.0], pos, faces)
+    return float(np.quantile(np.abs(dist), _MOST)) <= _ALIKE
 
 
 def suspect_sides(pos: np.ndarray, faces: np.ndarray, surface: np.ndarray, body_faces: np.ndarray) -> list[Suspicion]:

@@ -28,6 +28,7 @@ def wanted_of(config: DictConfig) -> Wanted:
         gap=None if weld in (AUTO, NONE) else _metres(weld),
         shells=str(config.shells),
         small_parts=str(config.small_parts),
+        layered=plain(config.get("layers", AUTO)) != AUTO,
     )
 
 

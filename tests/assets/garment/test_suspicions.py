@@ -7,9 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hood.assets.body.body import Body
+from hood.assets.garment.binding import posed_body
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.openings import find_openings
-from hood.assets.garment.suspicions import suspect_kind, suspect_place, suspect_seams, suspect_sides
+from hood.assets.garment.suspicions import suspect_kind, suspect_limbs, suspect_place, suspect_seams, suspect_sides
 from hood.assets.motion.load import load_sequence
 from hood.scene.fitting import doubts, misplacement
 from hood.scene.scene import build_scene
@@ -112,3 +113,58 @@ def test_a_part_beside_the_body_is_told_by_its_number(body: Body, garments: dict
     assert f"part 2 of 2, {len(skirt)} vertices from {len(tank)} on, does not surround the body" in found.what
     assert not found.grave
     assert suspect_place(np.concatenate([tank, skirt]), faces, body.v_template, body.faces) == []
+
+
+def beside(garment: Garment, way: float) -> Garment:
+    """The garment as a file would have it, moved ``way`` [m] along x."""
+    pos = garment.tpose(np.zeros(10)) + [way, 0.0, 0.0]
+    return Garment(garment.name, pos, garment.faces, np.zeros(len(pos), dtype=bool))
+
+
+@pytest.mark.parametrize("way", [-0.13, 0.1])
+@pytest.mark.parametrize("name", ["tank", "tshirt", "longsleeve", "dress"])
+def test_a_garment_with_the_head_in_an_armhole_is_beside_the_body(
+    garments: dict[str, Garment], body: Body, name: str, way: float
+) -> None:
+    moved = beside(garments[name], way)
+    (found,) = suspect_place(moved.rest_pos, moved.faces, body.v_template, body.faces)
+    assert found.grave
+    assert f"is {100 * abs(way):.0f} cm beside the body" in found.what
+    for motion in ("walk_proud", "stand_sway"):  # a pose to walk in is no mirror image of itself
+        worn = misplacement(build_scene(moved, body, load_sequence(motion).window(30, 32)))
+        assert worn is not None
+        assert worn.grave
+
+
+def test_a_part_beside_the_body_is_told_by_its_vertices(garments: dict[str, Garment], body: Body) -> None:
+    tank, skirt = beside(garments["tank"], 0.1), garments["skirt"].tpose(np.zeros(10))
+    faces = np.concatenate([garments["skirt"].faces, tank.faces + len(skirt)])
+    (found,) = suspect_limbs(np.concatenate([skirt, tank.rest_pos]), faces, body.v_template, body.faces)
+    assert f"has a part, of {len(tank.rest_pos)} vertices from {len(skirt)} on, that is 10 cm beside" in found.what
+
+
+def without(garment: Garment, way: float, gone: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The moved garment without the faces ``gone`` (F,)."""
+    used, corners = np.unique(garment.faces[~gone], return_inverse=True)
+    return beside(garment, way).rest_pos[used], corners.reshape(-1, 3)
+
+
+def test_other_garments_are_not_beside_the_body(garments: dict[str, Garment], body: Body) -> None:
+    """Those that lie near their place; those without a plane of symmetry, or with few openings, or on a body that walks."""
+    middles = {name: garment.tpose(np.zeros(10))[garment.faces].mean(axis=1) for name, garment in garments.items()}
+    one_shoulder = (middles["tank"][:, 0] < 0.02) & (middles["tank"][:, 1] > 0.47 + 0.3 * middles["tank"][:, 0])
+    tube = np.abs(middles["longsleeve"][:, 0] - 0.35) > 0.1
+    cases = {
+        "near": without(garments["tank"], 0.05, np.zeros(len(garments["tank"].faces), dtype=bool)),
+        "one sleeve": without(garments["longsleeve"], 0.0, middles["longsleeve"][:, 0] > 0.22),
+        "one sleeve, moved": without(garments["longsleeve"], 0.1, middles["longsleeve"][:, 0] > 0.22),
+        "one shoulder": without(garments["tank"], 0.0, one_shoulder),
+        "around an arm": without(garments["longsleeve"], 0.0, tube),
+        "two openings": without(garments["skirt"], 0.1, np.zeros(len(garments["skirt"].faces), dtype=bool)),
+        "a cape": (grid(9, 9, 0.5)[0] + [0.3, 0.2, -0.2], grid(9, 9, 0.5)[1]),
+    }
+    for name, (pos, faces) in cases.items():
+        assert suspect_limbs(pos, faces, body.v_template, body.faces) == [], name
+    walking = posed_body(body, load_sequence("walk_proud"), 30, np.zeros(10))
+    tank = beside(garments["tank"], 0.13)
+    assert suspect_limbs(tank.rest_pos, tank.faces, walking.surface, walking.faces) == []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,7 @@ from hood.commands.notices import heard
 from hood.dynamics.recorder import RolloutData, read_rollout
 from hood.dynamics.verdict.rule import judge_rollout
 from hood.media.colouring import vertex_strain
+from hood.mesh.topology import boundary_loops
 
 ROLLOUT = ("rollout", "stepper=newton", "num_frames=2", "video=none", "sheet=false", "output=run")
 
@@ -214,3 +216,68 @@ def test_a_part_that_falls_is_named_and_the_others_settle(tmp_path: Path) -> Non
 def test_other_values_are_refused(words: tuple[str, ...], told: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*ROLLOUT, "garment=tank", *words]) == 2
     assert told in capsys.readouterr().err
+
+
+def sleeve_off(gap: float, *names: str, unit: float = 1.0) -> Path:
+    """A long-sleeved top whose left sleeve is moved ``gap`` [m] away, in ``unit`` [m]."""
+    mesh = clean("longsleeve")
+    beyond = mesh[0][mesh[1]].mean(axis=1)[:, 0] > 0.24
+    off, faces = part(mesh, beyond)
+    top, sleeve = part((mesh[0] / unit, mesh[1]), ~beyond), ((off + [gap, 0.0, 0.0]) / unit, faces)
+    if names:
+        return write_objects(Path("named.obj"), list(zip(names, (top, sleeve), strict=True)))
+    return write_mesh(Path("cut.obj"), joined(top, sleeve))
+
+
+@pytest.mark.parametrize("gap", [0.003, 0.015, 0.03])
+def test_a_sleeve_that_is_cut_off_is_refused_with_what_sews_it(gap: float, capsys: pytest.CaptureFixture[str]) -> None:
+    path, surface = sleeve_off(gap), load_body().v_template
+    with pytest.raises(
+        ValueError, match=f"'cut': part_1 and part_2 are .* {1e3 * gap:g} mm apart; weld=.* weld=none or"
+    ) as caught:
+        read_garment(str(path), Wanted(), surface, False)
+    (word,) = re.findall(r"weld=[\d.]+", str(caught.value))
+    for command in (ROLLOUT, ("prepare", "output=out.npz")):
+        assert main([*command, f"garment={path}"]) == 2
+    assert main(["inspect", str(path)]) == 1
+    assert str(caught.value) in capsys.readouterr().out
+    sewn = read_garment(str(path), Wanted(gap=float(word.removeprefix("weld="))), surface, False)
+    assert [len(rims) for rims in (boundary_loops(sewn.faces), boundary_loops(clean("longsleeve")[1]))] == [4, 4]
+    assert main(["prepare", f"garment={path}", word, "output=out.npz"]) == 0
+    assert len(load_garment("out.npz").rest_pos) == len(sewn.rest_pos) == len(clean("longsleeve")[0])
+
+
+@pytest.mark.parametrize(
+    "wanted", [Wanted(sew=False), Wanted(objects=("part_1", "part_2")), Wanted(layered=True)], ids=["weld", "objects", "layers"]
+)
+def test_parts_that_are_asked_for_are_garments(wanted: Wanted) -> None:
+    garment = read_garment(str(sleeve_off(0.03)), wanted, load_body().v_template, False)
+    assert garment.name == "part_1+part_2"
+
+
+def test_parts_with_names_are_garments() -> None:
+    assert read_garment(str(sleeve_off(0.03, "top", "cuff")), Wanted(), load_body().v_template, False).name == "top+cuff"
+
+
+def test_an_order_of_parts_says_that_they_are_garments() -> None:
+    assert run(sleeve_off(0.03), "layers=[part_2,part_1]", "allow_unsound=true")[0].cloth_pos.shape[0] == 2
+
+
+@pytest.mark.parametrize("unit", [1.0, 0.01])
+@pytest.mark.parametrize("count", [1, 3])
+def test_vertices_that_stand_out_are_told_by_their_numbers(unit: float, count: int, capsys: pytest.CaptureFixture[str]) -> None:
+    pos, faces = clean("tshirt")
+    pos, pulled = pos.copy(), np.argsort(-pos[:, 2])[[0, 30, 60][:count]]
+    pos[pulled] += [0.0, 0.0, 0.4]
+    path = write_mesh(Path("thorn.obj"), (pos / unit, faces))
+    who = f"vertex {pulled[0]} stands" if count == 1 else f"{count} vertices stand out of the mesh, vertex {pulled.min()}"
+    with heard(aloud=False) as said:
+        read_garment(str(path), Wanted(), load_body().v_template, False)
+    (doubt,) = said.doubts
+    assert doubt.kind == "garment"
+    assert who in str(doubt)
+    assert re.search(r"by 0\.(39|4|41) m, 12 times the edges", str(doubt))
+    assert main(["inspect", str(path)]) == 1
+    assert who in capsys.readouterr().out
+    assert main(["prepare", f"garment={path}", "output=thorn.npz"]) == 0
+    assert who in capsys.readouterr().out

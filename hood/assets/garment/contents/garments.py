@@ -7,7 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from hood.assets.formats.objects import PART
+from hood.assets.garment.contents.cut_apart import find_gaps
 from hood.assets.garment.contents.fitting import Fitting
+from hood.assets.garment.contents.wanted import Wanted
 from hood.assets.garment.garment import Garment
 from hood.mesh.parts import Part, find_parts, part_labels
 from hood.mesh.topology import connected_components
@@ -20,9 +22,13 @@ _MOST = 12
 _LEAST = 0.02
 
 
-def tell_apart(fitting: Fitting, scale: float) -> None:
+def tell_apart(fitting: Fitting, wanted: Wanted, scale: float) -> None:
     """Parts of a file that are left become garments of an outfit, with the names of their objects; parts of one object are one
-    garment."""
+    garment.
+
+    Raises:
+        ValueError: parts without names of their own were one garment, and nothing was asked that says what they are.
+    """
     garment = fitting.garment
     if garment.piece is not None:
         return
@@ -41,6 +47,8 @@ def tell_apart(fitting: Fitting, scale: float) -> None:
                 "weld=0.01 sews rims up to 1 cm apart, objects=[…] chooses",
             )
         return
+    if wanted == replace(Wanted(), shells=wanted.shells, small_parts=wanted.small_parts):
+        _refuse_cut_apart(garment, parts, names, scale)
     piece = np.full(len(garment.rest_pos), -1, dtype=np.int64)
     for part, name in zip(parts, names, strict=True):
         piece[part.vertices] = large.index(name) if name in large else 0
@@ -54,6 +62,19 @@ def tell_apart(fitting: Fitting, scale: float) -> None:
         what = f"the file holds {len(large)} parts that hang together by nothing, {counts}; each is simulated by itself"
         fix = "objects=[…] chooses, weld=0.01 sews rims up to 1 cm apart, pins=… hold what would fall"
     fitting.guess("garments", len(large), what, fix, names=large)
+
+
+def _refuse_cut_apart(garment: Garment, parts: list[Part], names: list[str], scale: float) -> None:
+    numbered = [part for part, name in zip(parts, names, strict=True) if name == f"{PART}{part.number}"]
+    gaps = find_gaps(scale * garment.rest_pos, garment.faces, numbered)
+    if gaps:
+        pairs = ", ".join(" and ".join(f"{PART}{numbered[row].number}" for row in gap.parts) for gap in gaps)
+        middle, widest = (max(getattr(gap, key) for gap in gaps) for key in ("middle", "widest"))
+        raise ValueError(
+            f"garment {garment.name!r}: {pairs} are one garment that is cut: their rims face each other all along, "
+            f"{1e3 * middle:.0f} mm apart; weld={np.floor(1e3 * widest + 1.5) / 1e3:g} sews them, weld=none or objects=[…] "
+            "takes them as garments of their own"
+        )
 
 
 def _names(garment: Garment, parts: list[Part]) -> list[str]:

@@ -17,6 +17,12 @@ from hood.assets.garment.contents.wanted import Wanted
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.units import find_scale, possible, used
 from hood.mesh import repair
+from hood.mesh.spikes import find_spikes
+
+#: Beside the median edge a gap up to this share is short: within a longer one vertices along a rim would be joined too.
+_NEAR = 0.25
+#: Vertices nearer than this [m] to a neighbour stand out too little to be seen.
+_SPIKE = 0.05
 
 
 def metres_per_unit(pos: np.ndarray, faces: np.ndarray, surface: np.ndarray) -> float:
@@ -67,9 +73,20 @@ def mend(fitting: Fitting, wanted: Wanted, surface: np.ndarray | None, open_edge
     if wanted.sew:
         sew_panels(fitting, wanted, scale, sides)
         _drop_collapsed(fitting)
+    _tell_spikes(fitting, scale)
     let_ride(fitting, wanted, scale)
-    tell_apart(fitting, scale)
+    tell_apart(fitting, wanted, scale)
     _keep_numbers(fitting)
+
+
+def weld_and_mend(fitting: Fitting, wanted: Wanted, open_edges: np.ndarray) -> None:
+    """:func:`mend` of a garment in metres, or of one that has been through it, for ``hood prepare``: a gap that is short beside
+    the edges is that between vertices, which are welded; a longer one is that between rims."""
+    edge = repair.weld_tolerance(fitting.garment.rest_pos, fitting.garment.faces) / repair.WELD_RATIO
+    near = wanted.gap is not None and wanted.gap <= _NEAR * edge
+    if wanted.sew:
+        sew(fitting, wanted.gap if near else None, fitting.at_present(open_edges))
+    mend(fitting, replace(wanted, gap=None) if near else wanted, None, open_edges)
 
 
 def _is_made(garment: Garment) -> bool:
@@ -96,3 +113,16 @@ def _drop_collapsed(fitting: Fitting) -> None:
     gone = (faces[:, 1:] == faces[:, :-1]).any(axis=1) | repair.duplicate_faces(faces)
     if gone.any():
         drop_faces(fitting, ~gone)
+
+
+def _tell_spikes(fitting: Fitting, scale: float) -> None:
+    """Vertices far out of the cloth: they are simulated as they are, for the rest shape has them."""
+    spikes = find_spikes(scale * fitting.garment.rest_pos, fitting.garment.faces, _SPIKE)
+    if not len(spikes.vertices):
+        return
+    numbers = fitting.in_file(spikes.vertices)
+    count, first = len(numbers), int(numbers.argmin())
+    who = f"vertex {numbers[first]} stands" if count == 1 else f"{count} vertices stand"
+    by = f"by {spikes.height[first]:.2g} m" if count == 1 else f"vertex {numbers[first]} by {spikes.height[first]:.2g} m"
+    text = f"{who} out of the mesh, {by}, {spikes.ratio[first]:.0f} times the edges around it"
+    fitting.guess("spikes", count, text, "smooth or delete what stands out where the mesh was made")

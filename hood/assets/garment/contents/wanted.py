@@ -23,3 +23,4 @@ class Wanted:
     gap: float | None = None  # m, within which rims are sewn; None: SEAM between pieces, none between garments
     shells: str = "auto"  # one of SHELLS: auto makes thick cloth one layer
     small_parts: str = "ride"  # one of SMALL_PARTS
+    layered: bool = False  # an order of the garments was asked for
