@@ -2,7 +2,7 @@
 
     python benchmarks/step_distance.py --rows distance.jsonl                 # all scenes; goes on where the file ends
     python benchmarks/step_distance.py --rows distance.jsonl --scenes skirt_jog_15 --methods quickstart newton
-    python benchmarks/step_distance.py --rows distance.jsonl --picture step_distance.png     # needs hood[charts]
+    python benchmarks/step_distance.py --rows distance.jsonl --picture step_distance.png     # needs hood-cloth[charts]
     python benchmarks/step_distance.py --cost                                # its share of a rollout's time
 
 States are steps of rollouts of 28 scenes by seven methods: two networks alone, five iterations after a network and after none,

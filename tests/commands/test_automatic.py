@@ -79,7 +79,7 @@ def test_a_larger_garment_is_not_left_to_the_network(capsys: pytest.CaptureFixtu
 )
 def test_what_is_given_wins_and_what_is_known_needs_nothing(key: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*QUICK, key]) == 0
-    assert "refine=5" not in capsys.readouterr().out
+    assert "refine=5: " not in capsys.readouterr().out
     asked = {"refine=2": "refine=2", "target_rg=0.5": "target_rg=0.5"}.get(key)
     assert summary().get("refinement", {}).get("asked") == asked
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import importlib.util
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -141,7 +142,7 @@ def test_an_interrupted_batch_goes_on_where_it_stopped(
     capsys.readouterr()
     assert main([*ROLLOUT, "resume=true"]) == 0
     printed = capsys.readouterr().out
-    assert "3 of 3 motions simulated; 1 of them finished before and skipped now\n" in printed
+    assert re.search(r"3 of 3 motions simulated(, \d doubtful)?; 1 of them finished before and skipped now\n", printed)
     assert printed.count("; finished before, skipped") == 1
     after = times(out)
     assert after["a"] == before["a"]

@@ -159,16 +159,17 @@ def test_a_rollout_warns_once_and_writes_it_down(
     known.trained_for = scene_conditions(tank_scene.garment, tank_scene.cloth, 1 / 30, DEFAULT)
     save_simulator(tmp_path / "paper.safetensors", known)
     quick = ["num_frames=2", "video=none", "sheet=false", "metrics=none", "allow_unsound=true", "garment=tank"]
-    quick += ["guard=off", f"checkpoint={tmp_path}/paper.safetensors", f"output={tmp_path}/out"]
+    quick += ["guard=off", f"checkpoint={tmp_path}/paper.safetensors"]
     (tmp_path / "list.txt").write_text("walk_proud\nplie\n")
     monkeypatch.chdir(tmp_path)
     for extra, expected in (([], []), (["fps=60", "sequence=list.txt"], ["fps=60 (trained on 30)"])):
-        assert main(["rollout", *quick, *extra]) == 0
+        out = tmp_path / ("many" if extra else "one")
+        assert main(["rollout", *quick, *extra, f"output={out}"]) == 0
         lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("hood: warning: ")]
         assert [re.findall(r"for (fps=\d+ \(trained on \d+\))", line)[0] for line in lines] == expected
-        folders = ["out/walk_proud", "out/plie"] if extra else ["out"]
+        folders = [out / "walk_proud", out / "plie"] if extra else [out]
         for folder in folders:
-            warned = json.loads((tmp_path / folder / "summary.json").read_text())["warnings"]
+            warned = json.loads((folder / "summary.json").read_text())["warnings"]
             assert [f"hood: warning: {text}" for text in warned] == lines
 
 

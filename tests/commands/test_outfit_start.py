@@ -41,7 +41,8 @@ def test_an_outfit_starts_and_stays_apart(keys: tuple[str, ...], tmp_path: Path,
 def test_without_contact_an_outfit_starts_as_it_is_put_on(tmp_path: Path) -> None:
     out = tmp_path / "out"
     keys = ("garment=[tank,skirt]", "sequence=plie", "stepper=newton", "cloth_contact=off", "settle=paper", "num_frames=2")
-    assert main(["rollout", *keys, f"output={out}", "video=none", "sheet=false"]) == 0
+    assert main(["rollout", *keys, f"output={out}", "video=none", "sheet=false"]) == 3
     summary = json.loads((out / "summary.json").read_text())
+    assert [reason["kind"] for reason in summary["reasons"]] == ["garments_through_each_other"]
     assert summary["surface"]["garment_crossings"]["worst"] > 100
     assert summary["cloth_contact"] == {"asked": "off", "used": "off"}

@@ -35,20 +35,23 @@ def _foremost(places: np.ndarray, points: np.ndarray, axes: tuple[np.ndarray, np
     """Which places (3, N) are not behind a point (3, M), seen along the third of the ``axes``."""
     right, up, towards = axes
     across, height = _along(right, places), _along(up, places)
-    left, low = across.min() - _CELL, height.min() - _CELL
-    width = int(np.ceil((height.max() + _CELL - low) / _CELL)) + 1
     x = _along(right, points)
-    points = points[:, (x >= left) & (x <= across.max() + _CELL)]
+    points = points[:, (x >= across.min() - _CELL) & (x <= across.max() + _CELL)]
     y = _along(up, points)
-    points = points[:, (y >= low) & (y <= height.max() + _CELL)]
-    cells = [
-        np.floor((u - left) / _CELL).astype(np.int64) * width + np.floor((v - low) / _CELL).astype(np.int64)
-        for u, v in ((across, height), (_along(right, points), _along(up, points)))
-    ]
-    front = np.full(int(cells[0].max()) + 1, -np.inf)
-    within = cells[1] < len(front)
-    np.maximum.at(front, cells[1][within], _along(towards, points)[within])
-    return np.asarray(_along(towards, places) >= front[cells[0]] - _BEHIND)
+    points = points[:, (y >= height.min() - _CELL) & (y <= height.max() + _CELL)]
+    own, where = np.unique(_cells(across, height), return_inverse=True)
+    cells = _cells(_along(right, points), _along(up, points))
+    slot = np.searchsorted(own, cells).clip(max=len(own) - 1)
+    within = own[slot] == cells
+    front = np.full(len(own), -np.inf)
+    np.maximum.at(front, slot[within], _along(towards, points)[within])
+    return np.asarray(_along(towards, places) >= front[where] - _BEHIND)
+
+
+def _cells(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """(N,) numbers of the cells; those of torn cloth beyond 10,000 km are one."""
+    column, row = (np.floor(np.clip(values / _CELL, -(2.0**30), 2.0**30)).astype(np.int64) for values in (x, y))
+    return column * 2**31 + row
 
 
 def _along(axis: np.ndarray, points: np.ndarray) -> np.ndarray:
