@@ -38,8 +38,9 @@ METHODS = {
     "newton": ("stepper=newton",),
 }
 CRITERIA = Criteria(climb=np.inf)
-#: Triangles of 5 cm on a body: the skin cuts 3% of them in a quiet dance, which says nothing about the method.
-MOST_CUT = 0.06
+#: Triangles of 5 cm on a body: the skin cuts 3% of them in a quiet dance and sticks out by 10 mm [m], which says nothing about
+#: the method.
+ORDINARY = {"skin_through_cloth": 0.06, "skin_depth": 0.015}
 
 Metrics = Mapping[str, np.ndarray]
 
@@ -108,7 +109,9 @@ class Battery:
         verdict = judge_rollout(_stored(frames, scene, metrics))
         assert guard is not None
         told = guard_sentence(mode, [alarm for alarm in guard.alarms if alarm.cause != CUT], len(frames))
-        counted = [reason for reason in verdict.reasons if reason.kind != "skin_through_cloth" or reason.value > MOST_CUT]
+        counted = [
+            reason for reason in verdict.reasons if reason.value is None or reason.value > ORDINARY.get(reason.kind, -1.0)
+        ]
         unsound = tuple(reason.sentence for reason in counted) if verdict.sound is False else ()
         return Run(3 if unsound else 0, "", (*warned, *([told] if told else [])), unsound, {**metrics, "finite": finite})
 
