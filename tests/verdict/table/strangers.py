@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from hood.testing import box, sphere
 from tests.verdict.table.bodies import person
-from tests.verdict.table.meshes import Mesh, body, joined, moved, part, sheet, worn, write_obj
+from tests.verdict.table.meshes import Mesh, body, joined, moved, part, worn, write_obj
 from tests.verdict.table.motions import recorded, turned, write
 from tests.verdict.table.scene import Maker
 from tests.verdict.table.takes import Angles
@@ -187,19 +187,6 @@ def driven(speed: float, at: int = 12) -> Callable[[Array, Array], tuple[Array, 
     )  # fmt: skip
 
 
-def comes_in(name: str, first: int, count: int, away: Sequence[float], at: int) -> Maker:
-    """A person as vertices that stands ``away`` [m] until frame ``at``, and is then where the garment is."""
-
-    def make(folder: Path) -> Path:
-        with np.load(person(name, first, count)(folder)) as file:
-            verts, faces = file["verts"].astype(np.float64), file["faces"]
-        share = np.clip(1 - np.arange(len(verts)) / at, 0, 1)
-        np.savez(folder / "late.npz", verts=verts + share[:, None, None] * np.asarray(away), faces=faces, fps=_STEPS)
-        return folder / "late.npz"
-
-    return make
-
-
 def coarse_person(name: str, first: int, count: int, cell: float) -> Maker:
     """A moving person whose vertices are drawn together in cells of ``cell`` [m] of the T-pose."""
 
@@ -239,24 +226,3 @@ def capsule(radius: float, length: float, at: Sequence[float], fine: int = 2) ->
     """Lies along x."""
     pos, faces = sphere(fine, radius)
     return pos + 0.5 * length * np.sign(np.round(pos[:, :1], 9)) * [1.0, 0.0, 0.0] + np.asarray(at), faces
-
-
-def fist(speed: float, radius: float = 0.12, count: int = 20) -> Maker:
-    """A ball that comes from behind at ``speed`` [m/s], towards the middle of a curtain of 0.8 m."""
-
-    def make(folder: Path) -> Path:
-        pos, faces = sphere(3, radius)
-        along = -0.35 + np.maximum(np.arange(count) - 2, 0) * speed / _STEPS
-        verts = pos + [0.0, -0.4, 0.0] + along[:, None, None] * [0.0, 0.0, 1.0]
-        np.savez(folder / "fist.npz", verts=verts, faces=faces, fps=_STEPS)
-        return folder / "fist.npz"
-
-    return make
-
-
-def shawl(folder: Path) -> Path:
-    """A wide strip over both shoulders, open in front, its neck line behind the neck."""
-    pos, faces = sheet(40, 22, 0.9, 0.6)
-    level = np.stack([pos[:, 0], 0.63 - 0.35 * np.maximum(np.abs(pos[:, 0]) - 0.1, 0), pos[:, 1] + 0.06], axis=1)
-    hole = (np.abs(level[faces].mean(axis=1)[:, 0]) < 0.09) & (level[faces].mean(axis=1)[:, 2] > -0.09)
-    return write_obj(folder / "shawl.obj", part((level, faces[:, ::-1]), ~hole))
