@@ -151,8 +151,6 @@ BODIES = [
           solid("ball", ball(0.25, (0, 0.5, 0)))),
     Scene("cover_capsule_edges", "coarse things", "edges", pieces.cover(0.66, 0.7, 0.6), "none", 24, PAPER,
           solid("capsule", capsule(0.14, 0.5, (0, 0.5, 0), 3))),
-    Scene("cover_cube_corner", "coarse things", "newton", pieces.cover(0.765, 0.4, 0.4, (0.22, 0.2)), "none", 24, PAPER,
-          solid("cube", slab((0.5, 0.5, 0.5), (0, 0.5, 0), 2))),
     Scene("sheet_on_edge", "thin plates", "newton", pieces.cover(0.72, 0.6, 0.6, (0.0, 0.02)), "none", 24, PAPER,
           solid("plate", slab((0.8, 0.6, 0.004), (0, 0.4, 0), 12))),
     Scene("sheet_on_edge_alone", "thin plates", "quickstart", pieces.cover(0.72, 0.6, 0.6, (0.0, 0.02)), "none", 24, PAPER,
