@@ -14,10 +14,14 @@ from hood.testing import grid, sphere
 from tests.verdict.table import counts
 from tests.verdict.table.pictures import sheet
 from tests.verdict.table.scene import STEPPERS, Scene, run, run_unread
-from tests.verdict.table.scenes import FAST, LABELS, REFUSED, SCENES, SECOND, SECOND_LABELS
+from tests.verdict.table.scenes import FAST, LABELS, REFUSED, SCENES, SECOND, SECOND_LABELS, THIRD, THIRD_LABELS
 
 
-@pytest.mark.parametrize(("scenes", "labels"), [(SCENES, LABELS), (SECOND, SECOND_LABELS)], ids=["first", "second"])
+@pytest.mark.parametrize(
+    ("scenes", "labels"),
+    [(SCENES, LABELS), (SECOND, SECOND_LABELS), (THIRD, THIRD_LABELS)],
+    ids=["first", "second", "third"],
+)
 def test_every_scene_has_a_label_and_every_label_a_scene(scenes: dict[str, Scene], labels: dict[str, dict[str, Any]]) -> None:
     assert set(labels) == set(scenes)
     for name, label in labels.items():
@@ -47,6 +51,16 @@ def test_the_second_table_is_another_one() -> None:
     assert not {scene.kind for scene in SECOND.values()} & {scene.kind for scene in SCENES.values()}
     share = Counter(label["label"] for label in SECOND_LABELS.values())
     assert min(share.values()) > 0.3 * len(SECOND_LABELS)
+
+
+def test_the_third_table_is_another_one() -> None:
+    assert len(THIRD) >= 60
+    assert len({scene.kind for scene in THIRD.values()}) >= 30
+    before = {scene.kind for scene in (*SCENES.values(), *SECOND.values())}
+    assert not {scene.kind for scene in THIRD.values()} & before
+    share = Counter(label["label"] for label in THIRD_LABELS.values())
+    assert min(share.values()) > 0.35 * len(THIRD_LABELS)
+    assert sum(label["margin"] == "near" for label in THIRD_LABELS.values()) <= 0.25 * len(THIRD_LABELS)
 
 
 def test_the_fast_scenes_are_of_many_kinds_and_half_of_them_broken() -> None:

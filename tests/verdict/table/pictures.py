@@ -25,7 +25,7 @@ from hood.media.camera import Camera
 from hood.media.render import RenderMesh, contact_sheet, render_frame
 from tests.verdict.table import counts
 from tests.verdict.table.scene import Scene, run_unread
-from tests.verdict.table.scenes import REFUSED, SCENES, SECOND
+from tests.verdict.table.scenes import REFUSED, SCENES, SECOND, THIRD
 
 Array = np.ndarray
 VIEWS = {"front": 8.0, "back": 188.0, "side": 98.0}
@@ -38,9 +38,9 @@ _CLOTH = np.array([[0.16, 0.38, 0.72], [0.75, 0.22, 0.20], [0.20, 0.58, 0.28], [
 
 def main(words: list[str]) -> None:
     keys = dict(word.split("=", 1) for word in words if "=" in word)
-    names = [word for word in words if "=" not in word] or [*SCENES, *SECOND]
+    names = [word for word in words if "=" not in word] or [*SCENES, *SECOND, *THIRD]
     folder = Path(keys.get("output", "outputs/table"))
-    scenes = {**SCENES, **SECOND, **REFUSED}
+    scenes = {**SCENES, **SECOND, **THIRD, **REFUSED}
     for name in names:
         refused = _made(scenes[name], folder / name, keys.get("again") == "true")
         if refused:

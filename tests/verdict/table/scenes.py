@@ -24,6 +24,7 @@ from tests.verdict.table.scenes_garments import LOOSE, OUTFITS, PARTS, SIZES
 from tests.verdict.table.scenes_poses import HARD, OTHER_BODIES, SHAPES, WRONG_MOTIONS
 from tests.verdict.table.scenes_second import ALL
 from tests.verdict.table.scenes_steppers import FABRICS, RATES, SOFT_CONTACT, STEPPERS
+from tests.verdict.table.scenes_third import ALL as THIRD_ALL
 
 _ALL = [
     *STEPPERS,
@@ -47,12 +48,18 @@ SECOND: dict[str, Scene] = {scene.name: scene for scene in ALL}
 assert len(SECOND) == len(ALL), "two scenes of one name"
 assert not set(SECOND) & set(SCENES), "a name of the first table"
 
+#: The third table, kept back: what strangers bring, labelled apart from both and from every rule.
+THIRD: dict[str, Scene] = {scene.name: scene for scene in THIRD_ALL}
+assert len(THIRD) == len(THIRD_ALL), "two scenes of one name"
+assert not set(THIRD) & (set(SCENES) | set(SECOND)), "a name of an earlier table"
+
 
 def _labels(file: str) -> dict[str, dict[str, Any]]:
     return dict(json.loads((Path(__file__).parent / file).read_text(encoding="utf-8")))
 
 
 LABELS, SECOND_LABELS = _labels("labels.json"), _labels("labels_second.json")
+THIRD_LABELS = _labels("labels_third.json")
 
 START = ("start=1.5",)
 #: Inputs of the kinds of the table that the command refuses, with one sentence; no rollout, no label.
