@@ -52,6 +52,7 @@ GRADIENT_UNSOUND = Limit(100.0, "times the weight", _RULE, "a coarse stand-in, w
 CUT_UNSOUND = Limit(0.01, "share of the cloth's triangles", _RULE, "pictures show ten of a thousand triangles")
 CUT_ALARM = Limit(0.02, "share of the cloth's triangles", _GUARD, "the worst of 28 ordinary rollouts is 1.4%")
 DEPTH_UNSOUND = Limit(0.01, "m", _RULE, "skin that sticks out so far is seen from every side")
+DEPTH_GROSS = Limit(0.03, "m", _RULE, "a hand that has gone through the cloth: one frame is seen")
 SPOTS_UNSOUND = Limit(0.002, "share of the cloth's triangles", _RULE, "four of two thousand: smaller spots are not seen")
 SPOTS_HEIGHT = Limit(0.0015, "m", _RULE, "lower spots flicker")
 SPOTS_LASTING = Limit(0.45, "share of frames", _RULE, "spots that come and go are not seen")
@@ -59,12 +60,13 @@ SPOTS_LASTING = Limit(0.45, "share of frames", _RULE, "spots that come and go ar
 INSIDE_UNSOUND = Limit(0.05, "share of the vertices", _RULE, "2 mm deep in the body; ordinary rollouts have less than 1%")
 INSIDE_ALARM = Limit(0.01, "m", _GUARD, "contact pushes out from 10 mm, from deeper it may push through the limb")
 #: Cloth through cloth where a viewer can see it: the length along which pairs of triangles are counted.
-CROSSINGS_UNSOUND = Limit(0.25, "m", _RULE, "the length of a hand; shorter ones look like a fold")
-CROSSINGS_LASTING = Limit(0.25, "share of frames", _RULE, "up to twice that length is not seen if it comes and goes")
+CROSSINGS_UNSOUND = Limit(0.4, "m", _RULE, "the length of a forearm; shorter ones look like a fold")
+CROSSINGS_SEEN = Limit(0.25, "m", _RULE, "the length of a hand, of what a viewer can see of them")
 
 #: Worn, see hood.dynamics.verdict.worn.
 AWAY_UNSOUND = Limit(0.20, "m", "hood.dynamics.verdict.worn", "43 rollouts: worn at most 0.11, come off at least 0.28")
-SLIPPED_UNSOUND = Limit(0.15, "m", "hood.dynamics.verdict.worn", "374 rollouts: worn at most 0.14, come off at least 0.15")
+SLIPPED_UNSOUND = Limit(0.15, "m", "hood.dynamics.verdict.worn", "498 rollouts: worn at most 0.14, come off at least 0.15")
+SUNK_UNSOUND = Limit(0.08, "m", "hood.dynamics.verdict.worn", "498 rollouts: worn at most 0.03, come off at least 0.09")
 
 #: The body.
 HEAD_DOWN = Limit(0.5, "share of frames", _BODY, "cartwheels are shorter, and handstands stand on the hands")

@@ -9,8 +9,9 @@ import numpy as np
 from hood.mesh.topology import unique_edges
 
 #: A thorn is at least so many times as long as the edges around it, and as the ring of its neighbours is wide. A mesh whose
-#: edges become longer has 2 at most, the tip of a cap or a hood is as far from its ring as that is wide.
-_LONGER = 5.0
+#: edges become longer has 2 at most, the tip of a cap or a hood is as far from its ring as that is wide. The tip of a fan of
+#: more triangles than these is a hat up to another multiple.
+_LONGER, _FAN, _HAT = 3.5, 12, 5.0
 
 
 class Spikes(NamedTuple):
@@ -37,7 +38,7 @@ def find_spikes(pos: np.ndarray, faces: np.ndarray, least: float) -> Spikes:
         rows = np.concatenate([np.arange(starts[other], starts[other + 1]) for other in ring])
         around = np.median(length[rows[both[rows, 1] != vertex]])
         wide = np.linalg.norm(pos[ring] - pos[ring].mean(axis=0), axis=1).max()
-        if nearest[vertex] >= _LONGER * max(around, wide):
+        if nearest[vertex] >= max(_LONGER * around, (_HAT if len(ring) > _FAN else _LONGER) * wide):
             found.append((vertex, nearest[vertex] / around))
     vertices = np.array([vertex for vertex, _ in found], dtype=np.int64)
     return Spikes(vertices, nearest[vertices], np.array([ratio for _, ratio in found]))

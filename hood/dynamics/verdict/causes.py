@@ -15,7 +15,7 @@ from hood.dynamics.verdict.skin import skin_causes
 from hood.dynamics.verdict.solved import solved_causes
 from hood.dynamics.verdict.surface import Drawn, drawn, surface_metrics, visible_crossings
 from hood.dynamics.verdict.torn import strain_causes
-from hood.limits import CROSSINGS_LASTING, CROSSINGS_UNSOUND
+from hood.limits import CROSSINGS_SEEN, CROSSINGS_UNSOUND
 from hood.mesh.topology import unique_edges
 
 
@@ -67,19 +67,17 @@ _CROSSINGS = {
 
 
 def crossing_causes(seen: Drawn, metrics: Mapping[str, np.ndarray]) -> Found:
-    """Cloth through cloth that a viewer sees. What is at most twice the limit for a moment is not seen."""
-    found, most = Found(), most_crossings(seen)
+    """Cloth through cloth that a viewer sees."""
+    found, most, most_seen = Found(), pairs_along(CROSSINGS_UNSOUND.value, seen), pairs_along(CROSSINGS_SEEN.value, seen)
     every_pair = sum((np.nan_to_num(metrics[name]) for name in _CROSSINGS), np.zeros(len(metrics["self_crossings"])))
     looked = visible_crossings(seen, every_pair, most)
-    hidden = bool(looked) and all(shown <= most for shown, _ in looked.values())
+    hidden = bool(looked) and all(shown <= most_seen for shown, _ in looked.values())
     for name, (kind, what) in _CROSSINGS.items():
         counts = metrics[name]
         text = f"more than {most} pairs of triangles of {what} pass through each other"
         first = counts[0] if len(counts) and np.isfinite(counts[0]) else 0.0
         start = f" (frame 0 has {first:.0f} already)" if first > 0 else ""
         bad = (np.nan_to_num(counts) > most) & (not hidden)
-        if bad.sum() < CROSSINGS_LASTING.value * np.isfinite(counts).sum() and np.nan_to_num(counts).max() <= 2 * most:
-            bad = np.zeros_like(bad)
         found += Found([Cause(kind, text + start, bad, counts, most, _PAIRS, ".0f", measured=np.isfinite(counts))])
         if 0 < first <= most:
             found.doubts.append(_of_start(first, what))
@@ -100,6 +98,6 @@ def _of_start(first: float, what: str) -> Doubt:
     return Doubt("garment", f"{text}; {way_out}", (0,), first, _PAIRS)
 
 
-def most_crossings(seen: Drawn) -> int:
-    """Pairs of triangles along :data:`hood.limits.CROSSINGS_UNSOUND` of cloth: the finer the mesh, the more."""
-    return max(1, round(CROSSINGS_UNSOUND.value / max(0.5 * seen.edge_length, 1e-6)))
+def pairs_along(length: float, seen: Drawn) -> int:
+    """Pairs of triangles along a ``length`` [m] of cloth: the finer the mesh, the more."""
+    return max(1, round(length / max(0.5 * seen.edge_length, 1e-6)))

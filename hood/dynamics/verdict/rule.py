@@ -7,7 +7,7 @@ A rollout is unsound
 - with more than one bad frame, and more than 2% of all, or of those after the fifth where frame 0 was not at rest. A frame is
   bad where the cloth is torn, its step ended too far from the minimum, or skin or cloth come through the cloth.
   What is measured in every n-th frame stands for those up to the next; of five frames or fewer all after the start must be bad.
-  Cloth that is torn to twice its length is judged in every frame, single ones as well.
+  Cloth that is torn to twice its length is judged in every frame, single ones as well; so is a limb that has gone through it.
 
 The numbers are those of :mod:`hood.limits`.
 """
@@ -28,7 +28,7 @@ from hood.dynamics.verdict.frames import name_frames, runs_of, worst_frame
 from hood.dynamics.verdict.solved import unknown_steps
 from hood.dynamics.verdict.surface import drawn
 from hood.dynamics.verdict.unworn import worn_causes
-from hood.limits import SETTLING, STRAIN_TORN, TOLERATED
+from hood.limits import DEPTH_GROSS, SETTLING, STRAIN_TORN, TOLERATED
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,8 @@ def judge_rollout(data: RolloutData) -> Verdict:
     bad = np.any([cause.spread for cause in found.causes], axis=0) & judged if found.causes else np.zeros_like(judged)
     few = len(finite) <= SETTLING.value
     among = "frames" if few or judged[: int(SETTLING.value)].any() else "frames after the fifth"
-    tolerated = judged.sum() - 1 if few else max(TOLERATED.value * judged.sum(), 0 if torn.any() else 1)
+    gross = torn.any() or any(_is_gross(cause, judged) for cause in found.causes)
+    tolerated = judged.sum() - 1 if few else max(TOLERATED.value * judged.sum(), 0 if gross else 1)
     if bad.sum() > tolerated:
         reasons += [_reason(cause, judged, among) for cause in found.causes if (cause.bad & judged).any()]
     doubts = (*stored_doubts(data), *(doubt.as_dict() for doubt in (*off.doubts, *found.doubts)))
@@ -114,6 +115,13 @@ def _torn(data: RolloutData) -> np.ndarray:
     if strain is None or len(data.step_finite) <= SETTLING.value:
         return np.zeros(len(data.step_finite), dtype=bool)
     return np.asarray(np.nan_to_num(strain) > STRAIN_TORN.value)
+
+
+def _is_gross(cause: Cause, judged: np.ndarray) -> bool:
+    """Whether a limb has gone through the cloth: one frame of that is seen."""
+    if cause.kind != "skin_depth" or cause.values is None:
+        return False
+    return bool((cause.values[cause.bad & judged] > DEPTH_GROSS.value).any())
 
 
 def _not_finite(finite: np.ndarray) -> Reason:

@@ -16,13 +16,13 @@ _OFTEN, _FAR = 0.25, 2.0
 
 
 def solved_causes(metrics: Mapping[str, np.ndarray], dt: float) -> Found:
-    """Bad steps of ``dt`` [s], of every stepper by the distance [m] where it was measured: a step in four beyond the limit, or
-    one beyond twice as much. Elsewhere a solver is held to its target and, as a
+    """Bad steps of ``dt`` [s], of every stepper by the distance [m] where it was measured: more than one step, and one in four,
+    beyond the limit, or one beyond twice as much. Elsewhere a solver is held to its target and, as a
     refinement, to the relative gradient; a network alone to nothing: its steps are no minima, and the force says little."""
     distance = metrics.get(DISTANCE)
     if distance is not None and np.isfinite(distance).any():
         limit, measured, way = DISTANCE_UNSOUND.value * dt, np.isfinite(distance), np.nan_to_num(distance)
-        often = (way > limit).sum() > _OFTEN * measured.sum()
+        often = (way > limit).sum() > max(_OFTEN * measured.sum(), 1)
         bad = way > (limit if often else _FAR * limit)
         text = f"steps ended more than {1e3 * limit:.2g} mm from their minimum (p99 over the vertices)"
         return Found([Cause("distance", text, bad, distance, limit, "m", ".0f", 1e3, " mm", measured)])

@@ -13,7 +13,7 @@ from hood.dynamics.recorder import RolloutData
 from hood.dynamics.verdict.cause import Cause, Found
 from hood.dynamics.verdict.surface import Drawn
 from hood.dynamics.verdict.worn import Wear, measure_wear
-from hood.limits import AWAY_UNSOUND, SLIPPED_UNSOUND, TOLERATED
+from hood.limits import AWAY_UNSOUND, SLIPPED_UNSOUND, SUNK_UNSOUND, TOLERATED
 
 #: Stored frames that are looked at, at most.
 _LOOKED_AT = 60
@@ -69,7 +69,8 @@ def _of_part(data: RolloutData, seen: Drawn, wear: Wear, part: int) -> Found:
     away, slipped = wear.away[:, part], wear.slipped[:, part]
     if not np.isfinite(away).any():
         return Found(doubts=[_not_worn_at_first(data, wear, part)])
-    off = (away > AWAY_UNSOUND.value) | (np.nan_to_num(slipped) > SLIPPED_UNSOUND.value)
+    sunk = wear.sunk[:, part]
+    off = (away > AWAY_UNSOUND.value) | (slipped > SLIPPED_UNSOUND.value) | (sunk > SUNK_UNSOUND.value)
     # What has come off stays off; a film does not show a moment.
     if not (off[-1] or off.mean() > TOLERATED.value and off.sum() > 1):
         return Found()
@@ -81,9 +82,15 @@ def _of_part(data: RolloutData, seen: Drawn, wear: Wear, part: int) -> Found:
         bad[frames[place] : until] = True
     values = np.full(count, np.nan)
     values[frames] = np.fmax(away, slipped)
-    by_rim = away[first] <= AWAY_UNSOUND.value
-    way, limit = (slipped, SLIPPED_UNSOUND) if by_rim else (away, AWAY_UNSOUND)
-    how = "its highest opening has slipped along the body" if by_rim else "it is away from where it was on the body"
+    way, limit, how = next(
+        (way, limit, how)
+        for way, limit, how in (
+            (away, AWAY_UNSOUND, "it is away from where it was on the body"),
+            (slipped, SLIPPED_UNSOUND, "its highest opening has slipped along the body"),
+            (sunk, SUNK_UNSOUND, "its highest opening has slipped down the body"),
+        )
+        if way[first] > limit.value
+    )
     text = (
         f"{name_part(data, wear, part)} has come off: from frame {frames[first]} on {how}, by "
         f"{np.nanmax(way):.2f} m at worst (beyond {limit.value:.2f})"

@@ -1,12 +1,13 @@
 """Whether a garment stays where it was worn: each of its parts against the region of the body that it started on.
 
-Two lengths say so, of every part that is worn in frame 0:
+Three lengths say so, of every part that is worn in frame 0:
 
 - *away*: how much farther its vertices are from their region of the body than they were from the body in frame 0, the median
   over the vertices that touched it there, and over the nearest of them for a part without an opening around a limb: a cape
   that is blown out hangs by its collar;
 - *slipped*: how far the highest opening around a limb has moved along the body: the way of the middle of the points of the body
-  that are nearest to its vertices, on the body of frame 0. An opening with no limb in it any more counts as a metre.
+  that are nearest to its vertices, on the body of frame 0. An opening with no limb in it any more counts as a metre;
+- *sunk*: how much of that is towards where the feet are in frame 0. Clothes slide up by more in a handstand, and stay on.
 
 The region of a vertex are the points of the body within 15 cm, along the skin, of its nearest one in frame 0; an opening is
 followed for 40 cm. Swinging hems, open jackets and crossed arms stay near their regions; trousers around the ankles do not.
@@ -53,6 +54,7 @@ class Wear:
     frames: np.ndarray  # (S,) that were looked at
     away: np.ndarray  # (S, P) m
     slipped: np.ndarray  # (S, P) m
+    sunk: np.ndarray  # (S, P) m
     num_vertices: np.ndarray  # (P,) of each part
     first_vertex: np.ndarray  # (P,) the lowest of each part
     gap: np.ndarray  # (P,) m, between part and body in frame 0
@@ -82,11 +84,11 @@ class _Opening:
     region: np.ndarray  # (N, K) points of the body, the first of each nearest in frame 0
     places: np.ndarray  # (B, 3) m, points of the body in frame 0
 
-    def slipped(self, pos: np.ndarray, body: np.ndarray) -> float:
-        """How far it has moved along the body [m]."""
+    def way(self, pos: np.ndarray, body: np.ndarray) -> np.ndarray:
+        """(3,) m: how it has moved along the body, as on the body of frame 0."""
         near = ((pos[self.vertices][:, None] - body[self.region]) ** 2).sum(axis=2).argmin(axis=1)
         now = self.places[self.region[np.arange(len(near)), near]]
-        return float(np.linalg.norm(now.mean(axis=0) - self.places[self.region[:, 0]].mean(axis=0)))
+        return np.asarray(now.mean(axis=0) - self.places[self.region[:, 0]].mean(axis=0))
 
 
 class WearMeter:
@@ -138,21 +140,18 @@ class WearMeter:
             followed = _Opening(highest, few, regions.around(nearest[few], _FOLLOWED), body) if len(few) else None
             self._openings.append(followed)
 
-    def __call__(self, pos: np.ndarray, body_pos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """``away`` (P,) and ``slipped`` (P,) [m] of one frame, see :class:`Wear`."""
+    def __call__(self, pos: np.ndarray, body_pos: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """``away``, ``slipped`` and ``sunk`` (P,) [m] of one frame, see :class:`Wear`."""
         body = self._points(body_pos)
-        away, slipped = np.full(len(self._touching), np.nan), np.full(len(self._touching), np.nan)
+        away, slipped, sunk = np.full((3, len(self._touching)), np.nan)
         for number, (touching, opening) in enumerate(zip(self._touching, self._openings, strict=True)):
             if touching is not None:
                 away[number] = touching.away(pos, body)
             if opening is not None:
-                slipped[number] = self._slipped(opening, pos, body, body_pos)
-        return away, slipped
-
-    def _slipped(self, opening: _Opening, pos: np.ndarray, body: np.ndarray, body_pos: np.ndarray) -> float:
-        if num_through(pos[opening.rim], body_pos, self._body_edges) == 0:
-            return _LOST
-        return opening.slipped(pos, body)
+                way = opening.way(pos, body)
+                lost = num_through(pos[opening.rim], body_pos, self._body_edges) == 0
+                slipped[number], sunk[number] = _LOST if lost else float(np.linalg.norm(way)), -float(way[1])
+        return away, slipped, sunk
 
     def _points(self, body_pos: np.ndarray) -> np.ndarray:
         """Vertices of the body, and the middles of its edges where it is coarse."""
@@ -179,8 +178,8 @@ def measure_wear(
         return None
     meter = WearMeter(pos[0].astype(np.float64), faces, body_pos[0].astype(np.float64), body_faces, pinned)
     rows = [meter(pos[frame].astype(np.float64), body_pos[frame].astype(np.float64)) for frame in frames]
-    away, slipped = (np.array([row[which] for row in rows]) for which in range(2))
-    return Wear(np.asarray(frames), away, slipped, meter.num_vertices, meter.first_vertex, meter.gap)
+    away, slipped, sunk = (np.array([row[which] for row in rows]) for which in range(3))
+    return Wear(np.asarray(frames), away, slipped, sunk, meter.num_vertices, meter.first_vertex, meter.gap)
 
 
 def num_through(rim: np.ndarray, body_pos: np.ndarray, body_edges: np.ndarray) -> int:

@@ -229,7 +229,13 @@ def sleeve_off(gap: float, *names: str, unit: float = 1.0) -> Path:
     return write_mesh(Path("cut.obj"), joined(top, sleeve))
 
 
-@pytest.mark.parametrize("gap", [0.003, 0.015, 0.03])
+def test_a_sleeve_that_lies_at_its_armhole_is_sewn() -> None:
+    garment = read_garment(str(sleeve_off(0.003)), Wanted(), load_body().v_template, False)
+    assert len(garment.rest_pos) == len(clean("longsleeve")[0])
+    assert garment.piece is None
+
+
+@pytest.mark.parametrize("gap", [0.015, 0.03])
 def test_a_sleeve_that_is_cut_off_is_refused_with_what_sews_it(gap: float, capsys: pytest.CaptureFixture[str]) -> None:
     path, surface = sleeve_off(gap), load_body().v_template
     with pytest.raises(

@@ -17,7 +17,7 @@ _ALIKE = 0.15
 _MOST, _FAR = 0.9, 0.05
 #: Cosine between the way out of a part across its rim and the way to the other rim, in the mean: a lining beside its garment
 #: has 0, a hem over a waistband less.
-_AHEAD = 0.4
+AHEAD = 0.4
 
 
 class Gap(NamedTuple):
@@ -31,7 +31,7 @@ class Gap(NamedTuple):
 def find_gaps(pos: np.ndarray, faces: np.ndarray, parts: list[Part]) -> list[Gap]:
     """Gaps between ``parts`` of the mesh ``pos`` (V, 3) [m], ``faces`` (F, 3) that can be worn by themselves."""
     rims = [
-        (number, rim, rim_length(pos, rim), pos[rim] - _inside(pos, faces[part.faces], rim))
+        (number, rim, rim_length(pos, rim), ahead_of(pos, faces[part.faces], rim))
         for number, part in enumerate(parts)
         if part.can_be_put_on
         for rim in part.rims
@@ -46,22 +46,23 @@ def find_gaps(pos: np.ndarray, faces: np.ndarray, parts: list[Part]) -> list[Gap
             its_dist, here = cKDTree(pos[rim]).query(pos[facing])
             way, its_way = pos[facing][there] - pos[rim], pos[rim][here] - pos[facing]
             both = np.concatenate([dist, its_dist])
-            if np.quantile(both, _MOST) <= _FAR and min(_cosine(ahead, way), _cosine(its_ahead, its_way)) > _AHEAD:
+            if np.quantile(both, _MOST) <= _FAR and min(mean_cosine(ahead, way), mean_cosine(its_ahead, its_way)) > AHEAD:
                 found.append(Gap((one, other), float(np.median(both)), float(both.max())))
     return found
 
 
-def _inside(pos: np.ndarray, faces: np.ndarray, rim: np.ndarray) -> np.ndarray:
-    """(n, 3) m: the middle of each rim vertex's neighbours that are not on the rim; itself where it has none."""
+def ahead_of(pos: np.ndarray, faces: np.ndarray, rim: np.ndarray) -> np.ndarray:
+    """(n, 3) m: the way out of a part across its rim, to each vertex from the middle of its neighbours that are not on the rim;
+    zero where it has none."""
     edges = unique_edges(faces)
     edges = np.concatenate([edges, edges[:, ::-1]])
     edges = edges[np.isin(edges[:, 0], rim) & ~np.isin(edges[:, 1], rim)]
     count = np.bincount(edges[:, 0], minlength=len(pos))[rim]
     total = np.stack([np.bincount(edges[:, 0], pos[edges[:, 1], axis], len(pos))[rim] for axis in range(3)], axis=1)
-    return np.where((count > 0)[:, None], total / np.maximum(count, 1)[:, None], pos[rim])
+    return np.where((count > 0)[:, None], pos[rim] - total / np.maximum(count, 1)[:, None], 0.0)
 
 
-def _cosine(one: np.ndarray, other: np.ndarray) -> float:
+def mean_cosine(one: np.ndarray, other: np.ndarray) -> float:
     """In the mean over vectors (n, 3)."""
     scale = np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1)
     return float(((one * other).sum(axis=1) / np.maximum(scale, 1e-30)).mean())

@@ -35,7 +35,7 @@ def tell_apart(fitting: Fitting, wanted: Wanted, scale: float) -> None:
     parts = find_parts(scale * garment.rest_pos, garment.faces)
     if len(parts) < 2:
         return
-    names = _names(garment, parts)
+    names = names_of(garment, parts)
     area = {name: sum(part.area for part, own in zip(parts, names, strict=True) if own == name) for name in names}
     large = [name for name in area if area[name] >= _LEAST * max(area.values())]
     if len(large) < 2 or len(large) > _MOST:
@@ -77,7 +77,7 @@ def _refuse_cut_apart(garment: Garment, parts: list[Part], names: list[str], sca
         )
 
 
-def _names(garment: Garment, parts: list[Part]) -> list[str]:
+def names_of(garment: Garment, parts: list[Part]) -> list[str]:
     """A name for every part: that of the first object, group or material that has all of it and not all of the file, else its
     number."""
     panels = {name: mask for name, mask in (garment.panels or {}).items() if not mask.all()}
