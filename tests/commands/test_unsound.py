@@ -44,7 +44,8 @@ def test_a_trunk_that_turns_at_once_ends_with_3(capsys: pytest.CaptureFixture[st
     assert "exit code 3 (0 with allow_unsound=true)" in shown.err
     assert main(["inspect", "out/rollout.h5"]) == 1
     shown = capsys.readouterr()
-    assert f"! unsound: {reasons[0]}" in shown.out
+    assert "! unsound: " in shown.out
+    assert reasons[0] in shown.out
     assert "nothing to repair" not in shown.out
 
 
@@ -95,7 +96,7 @@ def test_batches_count_the_unsound(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(command) == 3
     shown = capsys.readouterr()
     assert "2 of 2 motions simulated, 1 unsound" in shown.out
-    assert "; UNSOUND: strain p99 is beyond 50%" in shown.out
+    assert "; UNSOUND: 'belt' has come off: from frame " in shown.out
     # What is finished is not simulated again, and as unsound as before.
     before = Path("out/twist/rollout.h5").stat().st_mtime_ns
     assert main([*command, "resume=true"]) == 3

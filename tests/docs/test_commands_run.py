@@ -85,7 +85,10 @@ CHOICES = {
     r",…\]": "]",
 }
 #: Exit codes of commands that have something to say against their files, and what.
-EXIT_CODES = {"inspect skirt.obj twirl.npz": (1, "multiply it by 0.01")}
+EXIT_CODES = {
+    "inspect skirt.obj twirl.npz": (1, "multiply it by 0.01"),
+    "inspect rollout.h5": (1, "doubt: the guard saw"),  # of a network alone
+}
 #: Lines that wait for ``-m slow``, and which of the others are like them.
 SLOW = (
     (r"^evaluate .*models=\[(?!runs/mine)", "rows of other models, as of a run, a network and the solver"),
@@ -102,7 +105,7 @@ SLOW = (
     (r"^rollout .*wind=.*refine=5", "wind, as by the solver"),
     (r"^rollout .*plie fabrics={below", "fabrics by part, as on the page of sizes, and woven ones"),
     (r"^rollout .*size=1\.1 stepper", "a factor, as of the line with three"),
-    (r"^rollout .*export=\[rg\] output=", "the same with refine=5"),
+    (r"^rollout .*export=\[rg\] refine=0", "the same with refine=5"),
     (r"^rollout garment=dress_4k .*material=silk", "a fabric by name, as of the README"),
     (r"^train weights=quickstart model=", "weights to start from, as by experiment=quickstart"),
     (r"^plan garment=dress sequence", "the scene of a plan, as of hood plan alone"),

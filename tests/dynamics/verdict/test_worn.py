@@ -53,16 +53,19 @@ def test_a_sleeve_that_slides_down_has_come_off() -> None:
 
 def test_a_waistband_that_slips_by_a_hand_has_come_off() -> None:
     """Two thirds of the way are within the region of what touches the body."""
-    assert off(rollout(falling(SLEEVE, 0.14))) == []
+    for way in (0.06, -0.13):  # clothes slide up in a handstand
+        assert off(rollout(falling(SLEEVE, way))) == []
     (reason,) = off(rollout(falling(SLEEVE, 0.2)))
-    assert "its highest opening has slipped along the body, by 0.21 m at worst (beyond 0.15)" in reason.sentence
+    assert "its highest opening has slipped down the body, by 0.21 m at worst (beyond 0.08)" in reason.sentence
+    (reason,) = off(rollout(falling(SLEEVE, -0.2)))  # to the end of its post
+    assert "its highest opening has slipped along the body, by 0.19 m at worst (beyond 0.15)" in reason.sentence
     turned = SLEEVE @ Rotation.from_euler("y", 40, degrees=True).as_matrix().T
     assert off(rollout(np.linspace(SLEEVE, turned, COUNT))) == []  # around the post
 
 
 def test_what_slipped_while_it_settled_is_counted() -> None:
-    for before, worn in ((0.05, True), (0.10, False)):
-        data = stored(COUNT, {"settle_slipped": frames(COUNT, before)}, cloth=falling(SLEEVE, 0.08), faces=SLEEVE_FACES,
+    for before, worn in ((0.05, True), (0.12, False)):
+        data = stored(COUNT, {"settle_slipped": frames(COUNT, before)}, cloth=falling(SLEEVE, 0.06), faces=SLEEVE_FACES,
                       body=POST, body_faces=POST_FACES.astype(np.int32))  # fmt: skip
         assert (off(data) == []) is worn
 
