@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hood.dynamics.recorder import RolloutData
+from hood.dynamics.recorder import RolloutData, still_of
 from hood.dynamics.rollout import Frame
 from hood.scene.scene import Scene
 
@@ -38,4 +38,5 @@ class KeptFrames:
             time=np.arange(len(self.cloth)) * self.scene.dt,
             metrics={name: np.array([row.get(name, np.nan) for row in self.metrics]) for name in sorted(names)},
             attributes={"garment": self.scene.garment.name},
+            still=still_of(self.scene.garment),
         )

@@ -52,8 +52,8 @@ from hood.solver.step_figures import StepFigures
 _STRETCH = 0.1
 #: One with an edge lengthened by more than this is told; measured: at most 0.08 in ordinary poses, 0.18 to 0.69 seated.
 _TORN = 0.3
-#: The way of a relaxing step is looked at so often [m].
-_LOOK = 0.02
+#: The way of a relaxing step is looked at so often [m], in so many places at most.
+_LOOK, _LOOKS = 0.02, 100
 
 AttachmentSchedule = Callable[[int], Attachments | None]
 #: Called after a step with the frame it leads to, what the step had to solve and what came out.
@@ -375,7 +375,7 @@ def _passes(scene: Scene, frame: int, state: State, pos: Tensor) -> bool:
     """Whether the body of ``frame`` cuts the cloth on its straight way from ``state`` to ``pos``, and not where that begins."""
     body = scene.motion.surface(frame, state.origin[0].numpy()).double().cpu().numpy()
     start, end = (one.double().cpu().numpy() for one in (state.pos, pos))
-    looks = math.ceil(float(np.linalg.norm(end - start, axis=1).max()) / _LOOK)
+    looks = min(math.ceil(float(np.linalg.norm(end - start, axis=1).max()) / _LOOK), _LOOKS)
     if not len(scene.motion.faces) or not np.isfinite(body).all():
         return False
     for look in range(looks):

@@ -84,9 +84,8 @@ class Measured:
     drifts: list[float] = field(default_factory=list)  # [m] to the side, on a body that stands still
     ends: list[int | None] = field(default_factory=list)  # of every rollout: first frame failed, see FAILURE_STRAIN; None: none
 
-    kinds: list[list[str]] = field(
-        default_factory=list
-    )  # of every rollout: why it is unsound, by the rule; []: sound, or not known
+    #: Of every rollout why it is unsound, by the rule; []: sound; None: not known.
+    kinds: list[list[str] | None] = field(default_factory=list)
     spectra: list[dict[str, Any]] = field(default_factory=list)  # of the states of gaps, see error_spectrum
 
     def __add__(self, other: Measured) -> Measured:
@@ -153,7 +152,7 @@ def measure(
     for text in _run(candidate.stepper, scene, potential, num_frames, gaps or GapSettings(), measured, seen):
         tell(f"{candidate.name} {scene.garment.name} {scene.motion.name} {text}")
     verdict = judge_rollout(kept.data())
-    measured.kinds.append([reason.kind for reason in verdict.reasons] if verdict.sound is False else [])
+    measured.kinds.append(None if verdict.sound is None else [reason.kind for reason in verdict.reasons])
     return measured
 
 
@@ -266,13 +265,15 @@ def _failure_columns(ends: Sequence[int | None]) -> dict[str, Any]:
     }
 
 
-def _verdict_columns(kinds: Sequence[Sequence[str]]) -> dict[str, Any]:
-    """The share of rollouts that the rule calls sound, and what the others are called for; nothing of earlier logs."""
-    if not kinds:
+def _verdict_columns(kinds: Sequence[Sequence[str] | None]) -> dict[str, Any]:
+    """The share of rollouts that the rule calls sound, of those that it judges, and what the others are called for; nothing of
+    earlier logs, and where none was judged."""
+    judged = [one for one in kinds if one is not None]
+    if not judged:
         return {}
-    counts = Counter(kind for one in kinds for kind in dict.fromkeys(one))
+    counts = Counter(kind for one in judged for kind in dict.fromkeys(one))
     return {
-        "sound": sum(not one for one in kinds) / len(kinds),
+        "sound": sum(not one for one in judged) / len(judged),
         "unsound_for": ", ".join(f"{k} {n}" for k, n in counts.most_common()),
     }
 

@@ -15,6 +15,7 @@ from hood.config import build, load_config
 from hood.dynamics.rollout import simulate
 from hood.dynamics.simulator import build_simulator
 from hood.dynamics.stepper import NewtonStepper
+from hood.evaluation import table
 from hood.evaluation.report import columns, describe, format_table
 from hood.evaluation.rows import write_rows
 from hood.evaluation.table import ALL, TERMS, Candidate, GapSettings, evaluate, other_terms
@@ -50,6 +51,20 @@ def solver_rows(band_scene: Scene) -> list[dict]:
     guess = NewtonStepper(potential, NewtonSettings(max_iterations=0))
     pair = [Candidate("newton", "none", solver), Candidate("guess", "none", guess)]
     return evaluate(pair, {"band": [band_scene]}, potential, 7, GapSettings(states=2))
+
+
+def test_the_verdict_is_that_of_the_rule_and_what_it_does_not_judge_is_not_sound(
+    rows: list[dict], solver_rows: list[dict]
+) -> None:
+    assert [row["sound"] for row in solver_rows if row["model"] == "newton"] == [1.0, 1.0]
+    assert {row["sound"] for row in rows if row["model"] == "wild"} == {0.0}
+    whole = next(row for row in rows if row["model"] == "wild" and row["garment"] == ALL)
+    assert "not_finite 3" in whole["unsound_for"]
+    columns_of = table._verdict_columns
+    assert columns_of([]) == columns_of([None]) == {}
+    assert columns_of([[], None, ["strain", "strain", "distance"], ["strain"]]) == {
+        "sound": pytest.approx(1 / 3), "unsound_for": "strain 2, distance 1",
+    }  # fmt: skip
 
 
 def test_one_row_per_model_and_garment_and_one_over_all(rows: list[dict]) -> None:

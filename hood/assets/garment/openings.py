@@ -8,6 +8,7 @@ import numpy as np
 
 from hood.assets.garment.binding import signed_distances
 from hood.mesh import topology
+from hood.mesh.parts import rim_length
 
 #: Shorter openings are buttonholes and slits [body heights]: a child's cuff has 0.1.
 _LEAST_LENGTH = 0.07
@@ -28,15 +29,11 @@ def find_openings(pos: np.ndarray, faces: np.ndarray, surface: np.ndarray, body_
     An opening is spanned by segments from its middle to its rim; it holds the body if one of them enters it.
     """
     least = _LEAST_LENGTH * float(np.ptp(surface, axis=0).max())
-    loops = [loop for loop in topology.boundary_loops(faces) if _length(pos[loop]) >= least]
+    loops = [loop for loop in topology.boundary_loops(faces) if rim_length(pos, loop) >= least]
     part = topology.connected_components(len(pos), topology.unique_edges(faces))
     count = np.bincount([part[loop[0]] for loop in loops], minlength=1) if loops else np.zeros(1, dtype=np.int64)
     loops = [loop for loop in loops if count[part[loop[0]]] > 1]
     return Openings(len(loops), _num_empty([pos[loop] for loop in loops], surface, body_faces))
-
-
-def _length(rim: np.ndarray) -> float:
-    return float(np.linalg.norm(rim - np.roll(rim, 1, axis=0), axis=1).sum())
 
 
 def _num_empty(rims: list[np.ndarray], surface: np.ndarray, faces: np.ndarray) -> int:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from hood.assets.files.doubt import Doubt
-from hood.dynamics.verdict.frames import name_frames
+from hood.dynamics.verdict.frames import mask_of, name_frames
 from hood.limits import BODY_JUMP, BODY_OVERLAP, BODY_SPEED, FLOOR_OFF, HEAD_DOWN, TOLERATED
 from hood.mesh.compiled_crossing import eights
 from hood.mesh.crossing import self_crossings
@@ -81,7 +81,7 @@ def _floor(motion: BodyMotion, looked: np.ndarray, lowest: np.ndarray) -> Iterat
         yield Doubt(
             "floor",
             f"{motion.name!r}: the body sinks up to {-lowest.min():.2f} m below its own floor, in "
-            f"{name_frames(_mask(looked[under]))}; start=… and stop=… leave these frames out",
+            f"{name_frames(mask_of(looked[under]))}; start=… and stop=… leave these frames out",
             tuple(looked[under].tolist()),
             float(lowest.min()),
             "m",
@@ -112,7 +112,7 @@ def _jump(motion: Motion, count: int) -> Iterator[Doubt]:
     small = {frame: jump for frame, jump in found.items() if frame < count - 1 and frame not in carried}
     if small:
         worst = max(jump.metres for jump in small.values())
-        frames = name_frames(_mask(np.array(sorted(small))))
+        frames = name_frames(mask_of(sorted(small)))
         what = f"{motion.name!r}: the body is displaced by up to {worst:.2g} m from one frame to the next, after {frames}"
         yield Doubt(
             "jump", f"{what}; repair the motion there, or leave it out (start=…, stop=…)", tuple(sorted(small)), worst, "m"
@@ -153,9 +153,3 @@ def _ends_of(template: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     low, high = template.min(axis=0), template.max(axis=0)
     height, across = (template - low)[:, 1] / (high - low)[1], np.abs(template[:, 0]) / np.abs(template[:, 0]).max()
     return height > 1.0 - _ENDS, height < _ENDS, across > 1.0 - _ENDS
-
-
-def _mask(frames: np.ndarray) -> np.ndarray:
-    chosen = np.zeros(int(frames.max()) + 1, dtype=bool)
-    chosen[frames] = True
-    return chosen

@@ -13,22 +13,27 @@ from hood.dynamics.verdict.frames import name_frames
 from hood.dynamics.verdict.guarded import guard_doubts
 from hood.dynamics.verdict.skin import skin_causes
 from hood.dynamics.verdict.solved import solved_causes
-from hood.dynamics.verdict.surface import Drawn, drawn, surface_metrics, visible_crossings
+from hood.dynamics.verdict.surface import Meshes, surface_metrics, visible_crossings
 from hood.dynamics.verdict.torn import strain_causes
 from hood.limits import CROSSINGS_SEEN, CROSSINGS_UNSOUND
 from hood.mesh.topology import unique_edges
 
 
-def causes_of(data: RolloutData, seen: Drawn) -> Found:
-    """All of a rollout, but for what is not finite and for parts that have come off."""
-    metrics = {name: values for name, values in data.step_metrics.items() if values.shape == data.step_finite.shape}
-    surface, strain = surface_metrics(data, seen), strain_of(data)
-    torn = Found() if strain is None else strain_causes(data.step_finite, strain, seen)
+def causes_of(data: RolloutData, meshes: Meshes, finite: np.ndarray, strain: np.ndarray | None) -> Found:
+    """All of a rollout, but for what is not finite and for parts that have come off.
+
+    Args:
+        finite: (S,) bool, simulated frames that are finite.
+        strain: of :func:`strain_of`.
+    """
+    metrics = {name: values for name, values in data.step_metrics.items() if values.shape == finite.shape}
+    surface = surface_metrics(data, meshes)
+    torn = Found() if strain is None else strain_causes(finite, strain, meshes)
     return (
         torn
         + solved_causes(metrics, _step_of(data))
-        + skin_causes(surface, metrics, seen)
-        + crossing_causes(seen, surface)
+        + skin_causes(surface, metrics, meshes)
+        + crossing_causes(meshes, surface)
         + guard_doubts(data)
     )
 
@@ -39,21 +44,21 @@ def _step_of(data: RolloutData) -> float:
     return float(times[1] - times[0]) if len(times) > 1 else float(data.attributes.get("dt", 1.0))
 
 
-def strain_of(data: RolloutData) -> np.ndarray | None:
-    """(S,) 99th percentile of the absolute edge strain, NaN in frames that are not finite; None where it is not known."""
+def strain_of(data: RolloutData, meshes: Meshes, finite: np.ndarray) -> np.ndarray | None:
+    """(S,) 99th percentile of the absolute edge strain, NaN in frames that are not ``finite`` (S,); None where it is not
+    known."""
     known = data.step_metrics.get("strain_p99")
-    if known is not None and known.shape == data.step_finite.shape:
+    if known is not None and known.shape == finite.shape:
         return known
     if data.steps is not None:
         return None
-    seen = drawn(data)
-    start, end = unique_edges(seen.faces).T
-    finite, strain = data.step_finite, np.full(len(data.step_finite), np.nan)
+    start, end = unique_edges(meshes.faces).T
+    strain = np.full(len(finite), np.nan)
     if len(start) == 0:
         return np.where(finite, 0.0, strain)
-    rest = np.linalg.norm(seen.rest_pos[end] - seen.rest_pos[start], axis=1)
+    rest = np.linalg.norm(meshes.rest_pos[end] - meshes.rest_pos[start], axis=1)
     for frame in np.flatnonzero(finite):
-        pos = seen.cloth[frame].astype(np.float64)
+        pos = meshes.cloth[frame].astype(np.float64)
         strain[frame] = np.quantile(np.abs(np.linalg.norm(pos[end] - pos[start], axis=1) / rest - 1.0), 0.99)
     return strain
 
@@ -66,11 +71,12 @@ _CROSSINGS = {
 }
 
 
-def crossing_causes(seen: Drawn, metrics: Mapping[str, np.ndarray]) -> Found:
+def crossing_causes(meshes: Meshes, metrics: Mapping[str, np.ndarray]) -> Found:
     """Cloth through cloth that a viewer sees."""
-    found, most, most_seen = Found(), pairs_along(CROSSINGS_UNSOUND.value, seen), pairs_along(CROSSINGS_SEEN.value, seen)
+    found, edge = Found(), meshes.edge_length
+    most, most_seen = pairs_along(CROSSINGS_UNSOUND.value, edge), pairs_along(CROSSINGS_SEEN.value, edge)
     every_pair = sum((np.nan_to_num(metrics[name]) for name in _CROSSINGS), np.zeros(len(metrics["self_crossings"])))
-    looked = visible_crossings(seen, every_pair, most)
+    looked = visible_crossings(meshes, every_pair, most)
     hidden = bool(looked) and all(shown <= most_seen for shown, _ in looked.values())
     for name, (kind, what) in _CROSSINGS.items():
         counts = metrics[name]
@@ -98,6 +104,6 @@ def _of_start(first: float, what: str) -> Doubt:
     return Doubt("garment", f"{text}; {way_out}", (0,), first, _PAIRS)
 
 
-def pairs_along(length: float, seen: Drawn) -> int:
-    """Pairs of triangles along a ``length`` [m] of cloth: the finer the mesh, the more."""
-    return max(1, round(length / max(0.5 * seen.edge_length, 1e-6)))
+def pairs_along(length: float, edge: float) -> int:
+    """Pairs of triangles along a ``length`` [m] of cloth with edges of ``edge`` [m]: the finer the mesh, the more."""
+    return max(1, round(length / max(0.5 * edge, 1e-6)))

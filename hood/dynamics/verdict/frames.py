@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 
 #: Runs of frames that a sentence names.
@@ -14,6 +16,13 @@ def runs_of(chosen: np.ndarray) -> list[tuple[int, int]]:
     if not len(frames):
         return []
     return [(int(run[0]), int(run[-1])) for run in np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1)]
+
+
+def mask_of(frames: Collection[int] | np.ndarray) -> np.ndarray:
+    """(T,) bool, True at ``frames`` (N,), of which there is one at least; T is one more than the last of them."""
+    chosen = np.zeros(max(frames) + 1, dtype=bool)
+    chosen[np.asarray(frames)] = True
+    return chosen
 
 
 def name_frames(chosen: np.ndarray) -> str:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from hood.assets.files.doubt import Doubt
 from hood.dynamics.alarms import CHECK, CUT, FORCE, INSIDE, STRAIN
 from hood.dynamics.recorder import RolloutData
 from hood.dynamics.step_repair import LEFT, NOT_TRIED
 from hood.dynamics.verdict.cause import Found
-from hood.dynamics.verdict.frames import name_frames
+from hood.dynamics.verdict.frames import mask_of, name_frames
 from hood.limits import TOLERATED
 
 #: Alarms of steps that the rule does not judge by itself, and what is so in such a frame.
@@ -31,11 +29,8 @@ def guard_doubts(data: RolloutData) -> Found:
         if len(frames) <= TOLERATED.value * steps:
             continue
         worst = max(rows, key=lambda row: row["value"])
-        chosen = np.zeros(frames[-1] + 1, dtype=bool)
-        chosen[frames] = True
         what = text.format(value=worst["value"], limit=worst["limit"])
-        sentence = (
-            f"the guard saw {what}, in {name_frames(chosen)}, and did not mend it; guard=repair, refine=5 or stepper=newton"
-        )
+        where = name_frames(mask_of(frames))
+        sentence = f"the guard saw {what}, in {where}, and did not mend it; guard=repair, refine=5 or stepper=newton"
         doubts.append(Doubt("guard", sentence, tuple(frames), float(worst["value"])))
     return Found(doubts=doubts)

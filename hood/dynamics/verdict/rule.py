@@ -26,7 +26,7 @@ from hood.dynamics.verdict.cause import Cause
 from hood.dynamics.verdict.causes import causes_of, strain_of
 from hood.dynamics.verdict.frames import name_frames, runs_of, worst_frame
 from hood.dynamics.verdict.solved import unknown_steps
-from hood.dynamics.verdict.surface import drawn
+from hood.dynamics.verdict.surface import meshes_of
 from hood.dynamics.verdict.unworn import worn_causes
 from hood.limits import DEPTH_GROSS, SETTLING, STRAIN_TORN, TOLERATED
 
@@ -69,11 +69,12 @@ def judge_rollout(data: RolloutData) -> Verdict:
     finite = data.step_finite
     if len(finite) == 0:
         return Verdict(None, (Reason("empty", "it holds no frame"),))
-    seen = drawn(data)
-    off, found = worn_causes(data, seen), causes_of(data, seen)
+    meshes = meshes_of(data)
+    strain = strain_of(data, meshes, finite)
+    off, found = worn_causes(data, meshes, len(finite)), causes_of(data, meshes, finite, strain)
     reasons = [] if finite.all() else [_not_finite(finite)]
     reasons += [_reason(cause, np.ones(len(finite), dtype=bool), "frames") for cause in off.causes]
-    torn = _torn(data)
+    torn = _torn(strain, len(finite))
     judged = _judged(len(finite), _settled(data)) | torn
     bad = np.any([cause.spread for cause in found.causes], axis=0) & judged if found.causes else np.zeros_like(judged)
     few = len(finite) <= SETTLING.value
@@ -86,7 +87,7 @@ def judge_rollout(data: RolloutData) -> Verdict:
     notes = (*off.notes, *found.notes)
     if reasons:
         return Verdict(False, tuple(reasons), doubts, notes)
-    missing = _missing(data, judged)
+    missing = _missing(data, judged, strain is not None)
     return Verdict(None if missing else True, missing, doubts, notes)
 
 
@@ -109,11 +110,10 @@ def _judged(count: int, settled: bool) -> np.ndarray:
     return np.arange(count) >= first
 
 
-def _torn(data: RolloutData) -> np.ndarray:
+def _torn(strain: np.ndarray | None, count: int) -> np.ndarray:
     """(S,) bool: frames that are judged also where the start still settles."""
-    strain = strain_of(data)
-    if strain is None or len(data.step_finite) <= SETTLING.value:
-        return np.zeros(len(data.step_finite), dtype=bool)
+    if strain is None or count <= SETTLING.value:
+        return np.zeros(count, dtype=bool)
     return np.asarray(np.nan_to_num(strain) > STRAIN_TORN.value)
 
 
@@ -142,9 +142,9 @@ def _reason(cause: Cause, judged: np.ndarray, among: str) -> Reason:
     return Reason(cause.kind, text, tuple(runs_of(which)), value, frame, cause.limit, cause.unit, cause.part)
 
 
-def _missing(data: RolloutData, judged: np.ndarray) -> tuple[Reason, ...]:
+def _missing(data: RolloutData, judged: np.ndarray, has_strain: bool) -> tuple[Reason, ...]:
     """What has to be known before a rollout is called sound, and is not."""
-    if strain_of(data) is None:
+    if not has_strain:
         text = "the strain of simulated frames that are not stored was not measured; metrics=strain measures it"
         return (Reason("strain", text),)
     unknown = unknown_steps(data.step_metrics, judged)

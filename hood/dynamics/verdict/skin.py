@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from hood.dynamics.surface import in_folds
 from hood.dynamics.verdict.cause import Cause, Found
 from hood.dynamics.verdict.frames import name_frames
-from hood.dynamics.verdict.surface import Drawn, spread_over
+from hood.dynamics.verdict.surface import Meshes, spread_over
 from hood.dynamics.verdict.visible import sampled, visible
 from hood.limits import CUT_UNSOUND, DEPTH_UNSOUND, INSIDE_UNSOUND, SPOTS_HEIGHT, SPOTS_LASTING, SPOTS_UNSOUND
 from hood.mesh.crossing import crossings
@@ -22,7 +22,7 @@ _LOOKED_AT, _HARDLY = 8, 0.001
 _CORNER = np.deg2rad(60.0)
 
 
-def skin_causes(metrics: Mapping[str, np.ndarray], inside: Mapping[str, np.ndarray], seen: Drawn) -> Found:
+def skin_causes(metrics: Mapping[str, np.ndarray], inside: Mapping[str, np.ndarray], meshes: Meshes) -> Found:
     """Skin through cloth.
 
     A frame is bad where the skin that a viewer sees cuts more than 1% of the cloth's triangles, or sticks out by more than a
@@ -36,7 +36,7 @@ def skin_causes(metrics: Mapping[str, np.ndarray], inside: Mapping[str, np.ndarr
     """
     share, depth = metrics["cut_face_share"], metrics["skin_depth"]
     measured = np.isfinite(share)
-    shown, spots, poked = (spread_over(values, measured) for values in _seen(share, seen))
+    shown, spots, poked = (spread_over(values, measured) for values in _seen(share, meshes))
     depth = np.where(measured, np.fmax(depth, poked), np.nan)
     height = np.nan_to_num(depth)
     cut, deep = shown > CUT_UNSOUND.value, (height > DEPTH_UNSOUND.value) & (shown > 0)
@@ -69,30 +69,30 @@ def inside_causes(metrics: Mapping[str, np.ndarray]) -> Found:
     return Found([Cause("inside_body", text, bad, share, limit.value, limit.unit, ".0%", measured=np.isfinite(share))])
 
 
-def _seen(share: np.ndarray, seen: Drawn) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _seen(share: np.ndarray, meshes: Meshes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Shares (S,) of the cloth's triangles through which skin is seen, of those apart from corners, and how far the body goes
     through them [m].
 
     NaN in frames that were not looked at, 0 in those whose skin cuts hardly anything.
     """
     found = np.where(share <= _HARDLY, 0.0, np.nan)[None].repeat(3, axis=0)
-    stored = {int(step): frame for frame, step in enumerate(seen.step)}
+    stored = {int(step): frame for frame, step in enumerate(meshes.step)}
     over = [step for step in np.flatnonzero(np.nan_to_num(share) > _HARDLY).tolist() if step in stored]
     for place in np.unique(np.linspace(0, max(len(over) - 1, 0), min(len(over), _LOOKED_AT)).astype(np.int64)).tolist():
-        found[:, over[place]] = _seen_at(seen, stored[over[place]])
+        found[:, over[place]] = _seen_at(meshes, stored[over[place]])
     return found[0], found[1], found[2]
 
 
-def _seen_at(seen: Drawn, frame: int) -> tuple[float, float, float]:
-    pos, body = seen.cloth[frame].astype(np.float64), seen.body[frame].astype(np.float64)
-    cut = crossings(pos, seen.faces, body, seen.body_faces)
+def _seen_at(meshes: Meshes, frame: int) -> tuple[float, float, float]:
+    pos, body = meshes.cloth[frame].astype(np.float64), meshes.body[frame].astype(np.float64)
+    cut = crossings(pos, meshes.faces, body, meshes.body_faces)
     pairs = cut.pairs
-    pairs = pairs[~in_folds(pairs[:, 1], body, seen.body_faces)]
+    pairs = pairs[~in_folds(pairs[:, 1], body, meshes.body_faces)]
     faces = np.unique(pairs[:, 0])
-    found = faces[visible(pos[seen.faces[faces]].mean(axis=1), [(pos, seen.faces), (body, seen.body_faces)])]
-    round_faces = pairs[~_at_corners(body, seen.body_faces)[pairs[:, 1]], 0]
-    through = way_through(pos, seen.faces, body, seen.body_faces, cut.second_edges) if len(found) else 0.0
-    return len(found) / len(seen.faces), int(np.isin(found, round_faces).sum()) / len(seen.faces), through
+    found = faces[visible(pos[meshes.faces[faces]].mean(axis=1), [(pos, meshes.faces), (body, meshes.body_faces)])]
+    round_faces = pairs[~_at_corners(body, meshes.body_faces)[pairs[:, 1]], 0]
+    through = way_through(pos, meshes.faces, body, meshes.body_faces, cut.second_edges) if len(found) else 0.0
+    return len(found) / len(meshes.faces), int(np.isin(found, round_faces).sum()) / len(meshes.faces), through
 
 
 def _at_corners(pos: np.ndarray, faces: np.ndarray) -> np.ndarray:

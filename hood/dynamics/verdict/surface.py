@@ -20,7 +20,7 @@ _SAME = 1e-6
 
 
 @dataclass(frozen=True)
-class Drawn:
+class Meshes:
     """The simulated mesh of a rollout in its stored frames, and the body."""
 
     cloth: np.ndarray  # (T, V, 3) m
@@ -39,7 +39,7 @@ class Drawn:
         return float(np.median(np.linalg.norm(self.rest_pos[end] - self.rest_pos[start], axis=1))) if len(start) else 0.0
 
 
-def drawn(data: RolloutData) -> Drawn:
+def meshes_of(data: RolloutData) -> Meshes:
     """Of a rollout that was read back."""
     faces = data.cloth_faces[: len(data.cloth_faces) - data.riding[1]]
     count = data.cloth_pos.shape[1] - data.riding[0]
@@ -48,7 +48,7 @@ def drawn(data: RolloutData) -> Drawn:
     piece = data.still.get("piece")
     times = data.step_time
     step = np.abs(times[None] - data.time[:, None]).argmin(axis=1) if data.steps is not None else np.arange(len(data.time))
-    return Drawn(
+    return Meshes(
         data.cloth_pos[:, :count],
         np.asarray(faces, dtype=np.int64),
         np.asarray(data.rest_pos[:count], dtype=np.float64),
@@ -60,7 +60,7 @@ def drawn(data: RolloutData) -> Drawn:
     )
 
 
-def surface_metrics(data: RolloutData, seen: Drawn) -> dict[str, np.ndarray]:
+def surface_metrics(data: RolloutData, meshes: Meshes) -> dict[str, np.ndarray]:
     """:data:`hood.dynamics.surface.SURFACE_METRICS` (S,) of the simulated frames, NaN where not measured; of a rollout that
     measured none a dozen of its stored frames are, of those that were simulated."""
     found = {name: data.step_metrics[name] for name in SURFACE_METRICS if name in data.step_metrics}
@@ -68,19 +68,19 @@ def surface_metrics(data: RolloutData, seen: Drawn) -> dict[str, np.ndarray]:
         return found
     count = len(data.step_finite)
     table = {name: np.full(count, np.nan) for name in SURFACE_METRICS}
-    simulated = np.flatnonzero(np.abs(data.step_time[seen.step] - data.time) < _SAME)
-    if not len(simulated) or not len(seen.faces):
+    simulated = np.flatnonzero(np.abs(data.step_time[meshes.step] - data.time) < _SAME)
+    if not len(simulated) or not len(meshes.faces):
         return table
-    garment = Garment("", seen.rest_pos, seen.faces, np.zeros(len(seen.rest_pos), dtype=bool), piece=seen.piece)
-    meter = SurfaceMeter(garment, seen.body_faces)
+    garment = Garment("", meshes.rest_pos, meshes.faces, np.zeros(len(meshes.rest_pos), dtype=bool), piece=meshes.piece)
+    meter = SurfaceMeter(garment, meshes.body_faces)
     places = np.unique(np.linspace(0, len(simulated) - 1, _MEASURED).astype(np.int64))
     for frame in simulated[places].tolist():
-        for name, value in meter(seen.cloth[frame], seen.body[frame]).items():
-            table[name][seen.step[frame]] = value
+        for name, value in meter(meshes.cloth[frame], meshes.body[frame]).items():
+            table[name][meshes.step[frame]] = value
     return table
 
 
-def visible_crossings(seen: Drawn, counts: np.ndarray, most: float) -> dict[int, tuple[int, int]]:
+def visible_crossings(meshes: Meshes, counts: np.ndarray, most: float) -> dict[int, tuple[int, int]]:
     """Pairs of triangles of cloth through each other, of one garment or of two, that a viewer can see.
 
     Args:
@@ -90,21 +90,21 @@ def visible_crossings(seen: Drawn, counts: np.ndarray, most: float) -> dict[int,
     Returns:
         By simulated frame: how many of the pairs are seen, and how many there are.
     """
-    stored = {int(step): frame for frame, step in enumerate(seen.step)}
+    stored = {int(step): frame for frame, step in enumerate(meshes.step)}
     over = [step for step in np.flatnonzero(np.nan_to_num(counts) > most).tolist() if step in stored]
     if not over:
         return {}
     worst = max(over, key=lambda step: counts[step])
     places = np.unique(np.linspace(0, len(over) - 1, min(len(over), _LOOKED_AT)).astype(np.int64))
     chosen = sorted({worst, *(over[place] for place in places)})
-    return {step: _seen_at(seen, stored[step]) for step in chosen}
+    return {step: _seen_at(meshes, stored[step]) for step in chosen}
 
 
-def _seen_at(seen: Drawn, frame: int) -> tuple[int, int]:
-    pos, body = seen.cloth[frame].astype(np.float64), seen.body[frame].astype(np.float64)
-    pairs = self_crossings(pos, seen.faces)
-    places = pos[seen.faces[pairs]].mean(axis=(1, 2))
-    return int(visible(places, [(pos, seen.faces), (body, seen.body_faces)]).sum()), len(pairs)
+def _seen_at(meshes: Meshes, frame: int) -> tuple[int, int]:
+    pos, body = meshes.cloth[frame].astype(np.float64), meshes.body[frame].astype(np.float64)
+    pairs = self_crossings(pos, meshes.faces)
+    places = pos[meshes.faces[pairs]].mean(axis=(1, 2))
+    return int(visible(places, [(pos, meshes.faces), (body, meshes.body_faces)]).sum()), len(pairs)
 
 
 def spread_over(values: np.ndarray, measured: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 from hood.assets.files.doubt import Doubt
 from hood.dynamics.recorder import RolloutData
 from hood.dynamics.verdict.cause import Cause, Found
-from hood.dynamics.verdict.surface import Drawn
+from hood.dynamics.verdict.surface import Meshes
 from hood.dynamics.verdict.worn import Wear, measure_wear
 from hood.limits import AWAY_UNSOUND, SLIPPED_UNSOUND, SUNK_UNSOUND, TOLERATED
 
@@ -19,27 +19,27 @@ from hood.limits import AWAY_UNSOUND, SLIPPED_UNSOUND, SUNK_UNSOUND, TOLERATED
 _LOOKED_AT = 60
 
 
-def worn_causes(data: RolloutData, seen: Drawn) -> Found:
-    """Every part of the garment that has left its place on the body, by frames. Nothing without a body, with ``worn=false``,
-    and from the first event on that lets go of held cloth."""
+def worn_causes(data: RolloutData, meshes: Meshes, count: int) -> Found:
+    """Every part of the garment that has left its place on the body, by the ``count`` simulated frames. Nothing without a body,
+    with ``worn=false``, and from the first event on that lets go of held cloth."""
     config = _config(data)
-    if config.get("worn", True) is False or not len(seen.body_faces) or not len(seen.faces):
+    if config.get("worn", True) is False or not len(meshes.body_faces) or not len(meshes.faces):
         return Found()
-    last = _detached(config, data, len(seen.cloth))
-    notes = _note_on_events(seen, last)
-    finite = np.isfinite(seen.cloth[:last]).all(axis=(1, 2))
+    last = _detached(config, data, len(meshes.cloth))
+    notes = _note_on_events(meshes, last)
+    finite = np.isfinite(meshes.cloth[:last]).all(axis=(1, 2))
     usable = np.flatnonzero(finite)
     if not len(usable) or usable[0] != 0:
         return Found(notes=notes)
     chosen = usable[np.unique(np.linspace(0, len(usable) - 1, min(len(usable), _LOOKED_AT)).astype(np.int64))]
-    wear = measure_wear(seen.cloth, seen.faces, seen.body, seen.body_faces, chosen.tolist(), seen.pinned)
+    wear = measure_wear(meshes.cloth, meshes.faces, meshes.body, meshes.body_faces, chosen.tolist(), meshes.pinned)
     if wear is None:
         return Found(notes=notes)
-    found = Found(_fallen_before(data, len(data.step_finite)), notes=notes)
+    found = Found(_fallen_before(data, count), notes=notes)
     if len(wear.num_vertices) == 1 and not found.causes:
         wear = replace(wear, slipped=wear.slipped + np.nan_to_num(max(_before(data)[1], 0.0)))
     for part in range(len(wear.num_vertices)):
-        found += _of_part(data, seen, wear, part)
+        found += _of_part(data, meshes, wear, part, count)
     return found
 
 
@@ -65,7 +65,7 @@ def _fallen_before(data: RolloutData, count: int) -> list[Cause]:
     return [Cause("not_worn", text, bad, np.full(count, way), limit.value, limit.unit, ".2f", whole=True)]
 
 
-def _of_part(data: RolloutData, seen: Drawn, wear: Wear, part: int) -> Found:
+def _of_part(data: RolloutData, meshes: Meshes, wear: Wear, part: int, count: int) -> Found:
     away, slipped = wear.away[:, part], wear.slipped[:, part]
     if not np.isfinite(away).any():
         return Found(doubts=[_not_worn_at_first(data, wear, part)])
@@ -75,7 +75,7 @@ def _of_part(data: RolloutData, seen: Drawn, wear: Wear, part: int) -> Found:
     if not (off[-1] or off.mean() > TOLERATED.value and off.sum() > 1):
         return Found()
     first = int(np.argmax(off))
-    count, frames = len(data.step_finite), seen.step[wear.frames]
+    frames = meshes.step[wear.frames]
     bad = np.zeros(count, dtype=bool)
     for place in np.flatnonzero(off).tolist():
         until = frames[place + 1] if place + 1 < len(frames) else count
@@ -120,10 +120,10 @@ def name_part(data: RolloutData, wear: Wear, part: int) -> str:
     )
 
 
-def _note_on_events(seen: Drawn, last: int) -> list[str]:
-    if last >= len(seen.cloth):
+def _note_on_events(meshes: Meshes, last: int) -> list[str]:
+    if last >= len(meshes.cloth):
         return []
-    return [f"whether the garment stays on is not judged from frame {seen.step[last]} on, where an event lets go of it"]
+    return [f"whether the garment stays on is not judged from frame {meshes.step[last]} on, where an event lets go of it"]
 
 
 def _detached(config: dict[str, Any], data: RolloutData, count: int) -> int:

@@ -23,6 +23,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
+from hood.mesh.parts import rim_length
 from hood.mesh.topology import boundary_loops, connected_components, unique_edges
 
 #: A vertex nearer than this [m] to the body touches it; the region of a vertex reaches so far [m] along the skin, and openings
@@ -119,7 +120,7 @@ class WearMeter:
         self._near = cKDTree(body[self._known(body_faces, len(body))])
         dist, nearest = self._near.query(pos)
         nearest = self._known(body_faces, len(body))[nearest]
-        loops = [loop for loop in boundary_loops(faces) if _length(pos[loop]) >= _LEAST_OPENING]
+        loops = [loop for loop in boundary_loops(faces) if rim_length(pos, loop) >= _LEAST_OPENING]
         through = [num_through(pos[loop], body_pos, self._body_edges) for loop in loops]
         self.num_vertices = np.bincount(part_of_used, minlength=len(numbers))
         members = [used[part_of_used == number] for number in range(len(numbers))]
@@ -253,7 +254,3 @@ def _edges_to_split(body_pos: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """(B, 2): edges that get a point in their middle."""
     length = np.linalg.norm(body_pos[edges[:, 0]] - body_pos[edges[:, 1]], axis=1)
     return edges[length > _COARSE]
-
-
-def _length(rim: np.ndarray) -> float:
-    return float(np.linalg.norm(rim - np.roll(rim, 1, axis=0), axis=1).sum())

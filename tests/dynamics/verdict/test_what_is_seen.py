@@ -11,7 +11,7 @@ from stored import frames, stored, tube
 from hood.dynamics.recorder import RolloutData
 from hood.dynamics.verdict.rule import judge_rollout
 from hood.dynamics.verdict.skin import way_through
-from hood.dynamics.verdict.surface import drawn, surface_metrics
+from hood.dynamics.verdict.surface import meshes_of, surface_metrics
 from hood.dynamics.verdict.visible import sampled, visible
 from hood.mesh.crossing import crossings
 
@@ -89,7 +89,7 @@ def test_a_corner_between_the_vertices_of_the_cloth_is_no_spot() -> None:
         body = np.array(pos) + [0, 0.508 - pos[:, 1].max(), 0]
         data = stored(COUNT, {"strain_p99": frames(COUNT)}, cloth=flat, faces=faces, body=body,
                       body_faces=triangles.astype(np.int32), config={"worn": False})  # fmt: skip
-        assert 0.002 < surface_metrics(data, drawn(data))["cut_face_share"][0] < 0.01
+        assert 0.002 < surface_metrics(data, meshes_of(data))["cut_face_share"][0] < 0.01
         assert judge_rollout(data).sound is sound
 
 
@@ -186,7 +186,7 @@ def room() -> tuple[np.ndarray, np.ndarray]:
 
 def test_metrics_of_the_rollout_come_before_own_ones() -> None:
     data = measured(cut_face_share=np.where(np.arange(COUNT) % 5 == 0, 0.002, np.nan))
-    assert surface_metrics(data, drawn(data))["cut_face_share"][5] == 0.002
+    assert surface_metrics(data, meshes_of(data))["cut_face_share"][5] == 0.002
 
 
 def test_places_are_seen_where_nothing_lies_before_them() -> None:
