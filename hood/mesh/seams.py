@@ -58,7 +58,8 @@ class Facing(NamedTuple):
 def find_rims(faces: np.ndarray) -> Rims:
     """Edges that belong to exactly one face, in the direction in which that has them."""
     half = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    _, first, times = np.unique(np.sort(half, axis=1), axis=0, return_index=True, return_counts=True)
+    key = np.sort(half, axis=1) @ np.array([int(half.max(initial=0)) + 1, 1])
+    _, first, times = np.unique(key, return_index=True, return_counts=True)
     rows = np.sort(first[times == 1])
     return Rims(half[rows], rows // 3, rows % 3, faces.reshape(-1)[rows - rows % 3 + (rows + 2) % 3])
 
