@@ -15,7 +15,7 @@ from hood.assets.garment.contents.wanted import SEAM, THREAD, Wanted
 from hood.assets.garment.garment import Garment
 from hood.mesh import repair
 from hood.mesh.cut_edges import Cut, along, along_corners, cut_edges
-from hood.mesh.parts import Part, find_parts, part_labels
+from hood.mesh.parts import Part, find_parts, part_labels, rim_length
 from hood.mesh.seams import Facing, Rims, Seam, find_facing, find_rims
 from hood.mesh.topology import unique_edges
 
@@ -23,12 +23,15 @@ from hood.mesh.topology import unique_edges
 #: much of that in front of it. Halves of clothes have 0.28 and 0.89 at least; a hem that crosses a waistband has 0.13 of the
 #: rim or 0.75 in front at most.
 _CUT, _IN_FRONT = 0.2, 0.8
+#: A part with one rim is a bag, such as a sock, where its area is so many times that of a disc with this rim: the crown of a hat
+#: has 3 to 5, a glove 20.
+_BAG = 6.0
 
 
 def sew_panels(fitting: Fitting, wanted: Wanted, scale: float, open_edges: np.ndarray) -> None:
     """Sew rims of pattern pieces within the gap; they are pulled together half way each.
 
-    Two parts that are worn by themselves, each with two openings at least, are two garments, unless the gap is given or they
+    Two parts that are worn by themselves, each a bag or with two openings at least, are two garments, unless the gap is given or they
     have no names and end in front of each other, as the halves of a shirt do and a hem over a waistband does not. Vertices
     ``open_edges`` of the file, and those of fasteners, are left as they are.
     """
@@ -93,7 +96,7 @@ class _Pieces:
 
     def __init__(self, pos: np.ndarray, garment: Garment, parts: list[Part], asked: bool) -> None:
         self._named = [name is not None for name in own_names(garment, parts)]
-        self._worn = [num_openings(pos, part) >= 2 for part in parts]
+        self._worn = [num_openings(pos, part) >= 2 or _is_bag(pos, part) for part in parts]
         self._asked, self._several = asked, len(parts) > 1
 
     def are_sewn(self, seam: Seam) -> bool:
@@ -107,6 +110,10 @@ class _Pieces:
             return True
         cut = seam.share >= _CUT and seam.in_front >= _IN_FRONT
         return not (self._named[one] and self._named[other]) and cut
+
+
+def _is_bag(pos: np.ndarray, part: Part) -> bool:
+    return len(part.rims) == 1 and 4.0 * np.pi * part.area >= _BAG * rim_length(pos, part.rims[0]) ** 2
 
 
 def _close(fitting: Fitting, facing: Facing, rims: Rims) -> None:

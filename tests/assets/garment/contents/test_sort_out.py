@@ -167,6 +167,35 @@ def test_a_hem_over_a_waistband_is_not_sewn(lift: Callable[[np.ndarray], np.ndar
     assert garment.piece is not None
 
 
+def sock(leg: Mesh, over: float) -> Mesh:
+    """A closed sock that begins ``over`` [m] above the lower rim of the left leg, 2 mm inside of it."""
+    pos, faces = leg
+    rim = min(find_parts(pos, faces)[0].rims, key=lambda own: (round(float(pos[own, 1].mean()), 2), -float(pos[own, 0].mean())))
+    middle, count, rows = pos[rim].mean(axis=0), len(rim), 12
+    out = pos[rim] - middle
+    ring = out * (1.0 - 2e-3 / np.linalg.norm(out, axis=1, keepdims=True))
+    widths = np.concatenate([[1.0], np.linspace(0.6, 0.5, rows - 1)])
+    rings = [middle + width * ring + [0.0, over - 0.035 * row, 0.0] for row, width in enumerate(widths)]
+    here, after = np.arange(count), np.roll(np.arange(count), -1)
+    table = [
+        np.stack(face, axis=1) + row * count
+        for row in range(rows - 1)
+        for face in ((here, after, here + count), (after, after + count, here + count))
+    ]
+    toe = np.stack([here + (rows - 1) * count, after + (rows - 1) * count, np.full(count, rows * count)], axis=1)
+    return np.concatenate([*rings, [rings[-1].mean(axis=0) - [0.0, 0.01, 0.0]]]), np.concatenate([*table, toe])
+
+
+@pytest.mark.parametrize(("over", "names"), [(4e-3, None), (4e-3, ("trousers", "sock")), (-1e-3, ("trousers", "sock"))])
+def test_a_sock_at_a_trouser_leg_is_not_sewn(over: float, names: tuple[str, str] | None, tmp_path: Path) -> None:
+    trousers = clean("trousers")
+    things = (trousers, sock(trousers, over))
+    path = write_objects(tmp_path / "outfit.obj", list(zip(names or ("", ""), things, strict=True)))
+    garment = sorted_out(path).garment
+    assert len(find_parts(garment.rest_pos, garment.faces)) == 2
+    assert garment.piece is not None
+
+
 @pytest.mark.parametrize("gap", [0.0, 2e-3, 5e-3])
 @pytest.mark.parametrize("name", ["tshirt", "longsleeve", "dress", "trousers", "shirt"])
 def test_left_and_right_halves_are_sewn(name: str, gap: float, tmp_path: Path) -> None:
