@@ -8,6 +8,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
+from hood.mesh.topology import counted_edges
+
 Array = NDArray[np.float64]
 
 #: Distance [m] that stands for no hem near by.
@@ -30,8 +32,7 @@ def hem_distance(pos: ArrayLike, faces: ArrayLike) -> Array:
         faces: (F, 3).
     """
     points, corners = np.asarray(pos, dtype=np.float64), np.asarray(faces, dtype=np.int64)
-    pairs = np.sort(corners[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    edges, count = np.unique(pairs, axis=0, return_counts=True)
+    edges, count = counted_edges(corners)
     open_edges = edges[count == 1]
     result = np.full(len(points), FAR)
     if not len(open_edges) or not np.isfinite(points).all():

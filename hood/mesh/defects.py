@@ -64,8 +64,7 @@ def find_defects(pos: np.ndarray, faces: np.ndarray) -> Defects:
 
 def _crowded_edges(faces: np.ndarray) -> np.ndarray:
     """(n, 2) edges of three faces and more."""
-    half = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    edges, counts = np.unique(half, axis=0, return_counts=True)
+    edges, counts = topology.counted_edges(faces)
     return np.asarray(edges[counts > 2])
 
 

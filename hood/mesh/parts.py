@@ -39,7 +39,11 @@ class Part(NamedTuple):
 
 def part_labels(num_vertices: int, faces: np.ndarray) -> np.ndarray:
     """The part (V,) that each vertex is of, from 0 in the order of :func:`find_parts`; -1 of vertices of no face."""
-    label = topology.connected_components(num_vertices, topology.unique_edges(faces))
+    return _labels(num_vertices, faces, topology.unique_edges(faces))
+
+
+def _labels(num_vertices: int, faces: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    label = topology.connected_components(num_vertices, edges)
     used = np.zeros(num_vertices, dtype=bool)
     used[faces.reshape(-1)] = True
     known, number = np.unique(label[used], return_inverse=True)
@@ -51,7 +55,8 @@ def part_labels(num_vertices: int, faces: np.ndarray) -> np.ndarray:
 
 def find_parts(pos: np.ndarray, faces: np.ndarray) -> list[Part]:
     """The parts of the mesh ``pos`` (V, 3), ``faces`` (F, 3)."""
-    label = part_labels(len(pos), faces)
+    all_edges = topology.unique_edges(faces)
+    label = _labels(len(pos), faces, all_edges)
     of_faces = label[faces[:, 0]]
     corners = pos[faces]
     areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
@@ -59,7 +64,7 @@ def find_parts(pos: np.ndarray, faces: np.ndarray) -> list[Part]:
     for loop in topology.boundary_loops(faces):
         rims.setdefault(int(label[loop[0]]), []).append(loop)
     by_vertex, by_face = _rows(label), _rows(of_faces)
-    edges = np.bincount(label[topology.unique_edges(faces)[:, 0]], minlength=1)
+    edges = np.bincount(label[all_edges[:, 0]], minlength=1)
     found = []
     for number, vertices in by_vertex.items():
         rows, box = by_face[number], pos[vertices]

@@ -25,8 +25,7 @@ class Welded(NamedTuple):
 
 def boundary_vertices(faces: np.ndarray) -> np.ndarray:
     """Vertices (n,) of edges that belong to exactly one face, ascending."""
-    half = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    edges, counts = np.unique(half, axis=0, return_counts=True)
+    edges, counts = topology.counted_edges(faces)
     return np.unique(edges[counts == 1])
 
 

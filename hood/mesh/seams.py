@@ -15,6 +15,9 @@ _NEAR_END = 0.3
 #: Edges are cut no nearer than this share to their ends, and not for what faces an end [share]; and two vertices that are less
 #: apart along a rim than this [m] face each other.
 _LEAST, _AT_END, _SAME = 0.15, 0.05, 1e-9
+#: Two parts end in front of each other where the cosine between their ways out is below the first, and neither rim lies farther
+#: behind the other one than the second [m].
+_OPPOSITE, _BEHIND = -0.4, 1e-3
 #: Vertices of the same rim are no candidates for each other within so many times the gap along it.
 _ALONG = 6.0
 
@@ -25,6 +28,7 @@ class Rims(NamedTuple):
     edges: np.ndarray  # (E, 2) vertices
     face: np.ndarray  # (E,) the one that each is of
     corner: np.ndarray  # (E,) the edge runs from this corner of the face to the next
+    inner: np.ndarray  # (E,) the third vertex of the face
 
     @property
     def vertices(self) -> np.ndarray:
@@ -39,6 +43,7 @@ class Seam(NamedTuple):
     length: float  # m
     gap: float  # m, median distance
     share: float  # of the shorter of the two whole rims
+    in_front: float  # share of it where each part ends in front of the other, not over it
 
 
 class Facing(NamedTuple):
@@ -53,9 +58,29 @@ class Facing(NamedTuple):
 def find_rims(faces: np.ndarray) -> Rims:
     """Edges that belong to exactly one face, in the direction in which that has them."""
     half = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    _, first, times = np.unique(np.sort(half, axis=1), axis=0, return_index=True, return_counts=True)
+    key = np.sort(half, axis=1) @ np.array([int(half.max(initial=0)) + 1, 1])
+    _, first, times = np.unique(key, return_index=True, return_counts=True)
     rows = np.sort(first[times == 1])
-    return Rims(half[rows], rows // 3, rows % 3)
+    return Rims(half[rows], rows // 3, rows % 3, faces.reshape(-1)[rows - rows % 3 + (rows + 2) % 3])
+
+
+def ways_out(pos: np.ndarray, rims: Rims) -> np.ndarray:
+    """(V, 3) unit vectors: the way out of the mesh ``pos`` (V, 3) across its rim; zero at vertices that are not on it."""
+    length = np.linalg.norm(pos[rims.edges[:, 1]] - pos[rims.edges[:, 0]], axis=1)
+    total = np.zeros_like(pos)
+    np.add.at(total, rims.edges, (length[:, None] * _across(pos, rims))[:, None])
+    return _unit(total)
+
+
+def _across(pos: np.ndarray, rims: Rims) -> np.ndarray:
+    """(E, 3) unit vectors: the way out across every open edge, upright on it in the plane of its face."""
+    start, end = pos[rims.edges[:, 0]], pos[rims.edges[:, 1]]
+    along, out = _unit(end - start), start - pos[rims.inner]
+    return _unit(out - (out * along).sum(axis=1, keepdims=True) * along)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30))
 
 
 def find_facing(
@@ -158,18 +183,38 @@ def _seams(
     for side in (0, 1):
         np.add.at(share_of_vertex, rims.edges[:, side], 0.5 * length)
     whole = np.bincount(part[rims.edges[:, 0]], weights=length, minlength=int(part.max(initial=0)) + 1)
+    in_front = _in_front(pos, rims, matches)
     kept, seams = np.zeros(len(key), dtype=bool), []
     for one, other in np.unique(key, axis=0).tolist():
         rows = (key == (one, other)).all(axis=1)
         sides = [share_of_vertex[matches.vertex[rows & (here == side)]] for side in {one, other}]
         run = float(np.mean([side.sum() for side in sides])) / (2.0 if one == other else 1.0)
         enough = all(len(side) >= _FEWEST for side in sides) and run >= _SHORTEST
-        rim = min(whole[one], whole[other])
-        seam = Seam((one, other), run, float(np.median(matches.dist[rows])), run / max(rim, 1e-12))
-        if enough and sewn(seam):
+        if not enough:
+            continue
+        ahead = float(np.average(in_front[rows], weights=share_of_vertex[matches.vertex[rows]]))
+        share = run / float(min(whole[one], whole[other]))
+        if sewn(seam := Seam((one, other), run, float(np.median(matches.dist[rows])), share, ahead)):
             seams.append(seam)
             kept |= rows
     return seams, kept
+
+
+def _in_front(pos: np.ndarray, rims: Rims, matches: _Matches) -> np.ndarray:
+    """(N,) bool: whether the part of a matched vertex and that of its edge end in front of each other there. In a corner the
+    vertex has that one of its two edges which is more opposite."""
+    across, rows = _across(pos, rims), np.arange(len(rims.edges))
+    of_vertex = np.zeros((len(pos), 2), dtype=np.int64)
+    of_vertex[rims.edges] = rows[:, None, None]  # of a vertex that two edges begin or end at there is one of them
+    of_vertex[rims.edges[:, 0], 0], of_vertex[rims.edges[:, 1], 1] = rows, rows
+    facing = across[matches.edge]
+    both = across[of_vertex[matches.vertex]]
+    cosines = np.einsum("nki,ni->nk", both, facing)
+    own = both[np.arange(len(both)), cosines.argmin(axis=1)]
+    first, second = pos[rims.edges[matches.edge]].transpose(1, 0, 2)
+    between = first + matches.at[:, None] * (second - first) - pos[matches.vertex]
+    depth = np.minimum((own * between).sum(axis=1), -(facing * between).sum(axis=1))
+    return np.asarray((cosines.min(axis=1) < _OPPOSITE) & (depth >= -_BEHIND))
 
 
 def _mutual(pos: np.ndarray, rims: Rims, part: np.ndarray, matches: _Matches) -> np.ndarray:

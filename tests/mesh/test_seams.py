@@ -8,7 +8,8 @@ import pytest
 from hood.mesh import repair
 from hood.mesh.cut_edges import along, along_corners, cut_edges
 from hood.mesh.parts import part_labels
-from hood.mesh.seams import Facing, find_facing, find_rims
+from hood.mesh.seams import Facing, find_facing, find_rims, ways_out
+from hood.testing import cylinder
 
 
 def two_sheets(first: int, second: int, gap: float) -> tuple[np.ndarray, np.ndarray]:
@@ -61,6 +62,29 @@ def test_sheets_that_meet_in_a_corner_are_not_sewn() -> None:
     count = len(pos) // 2
     pos[count:] += [0.0, 0.99, 0.0]
     assert find_facing(pos, find_rims(faces), part_labels(len(pos), faces), 6e-3, lambda seam: True).seams == []
+
+
+@pytest.mark.parametrize(
+    ("gap", "along", "least", "most"),
+    [(0.0, 0.0, 0.8, 1.0), (3e-3, 0.0, 0.8, 1.0), (-3e-3, 0.0, 0.0, 0.0), (0.0, 0.01, 0.3, 0.7)],
+    ids=["at each other", "apart", "over each other", "crossing"],
+)
+def test_sheets_that_do_not_overlap_end_in_front_of_each_other(gap: float, along: float, least: float, most: float) -> None:
+    """Corners aside. The second one is 1 mm above the first, and turned by what moves its ends by ``along`` [m]."""
+    pos, faces = two_sheets(30, 41, gap)
+    second = slice(150, None)
+    pos[second] += np.stack([along * (pos[second, 1] - 0.5), 0.0 * pos[second, 1], 1e-3 + 0.0 * pos[second, 1]], axis=1)
+    (seam,) = find_facing(pos, find_rims(faces), part_labels(len(pos), faces), 6e-3, lambda seam: True).seams
+    assert least <= seam.in_front <= most
+
+
+def test_ways_out_lead_along_the_mesh_and_are_zero_within() -> None:
+    pos, faces = cylinder(12, 5)
+    ways, rims = ways_out(pos, find_rims(faces)), find_rims(faces).vertices
+    axis = int(np.argmin(np.abs(ways[rims].sum(axis=0)) - np.abs(ways[rims]).sum(axis=0)))
+    side = np.sign(pos[rims, axis] - pos[:, axis].mean())
+    np.testing.assert_allclose(ways[rims], side[:, None] * np.eye(3)[axis], atol=1e-9)
+    assert not np.delete(ways, rims, axis=0).any()
 
 
 def test_a_cut_edge_carries_what_its_ends_carry() -> None:

@@ -18,6 +18,14 @@ def test_edges_are_ascending_unique_and_sorted():
     assert edges.dtype == np.int64
 
 
+def test_edges_are_counted_by_their_faces():
+    edges, counts = topology.counted_edges(np.array([[0, 1, 2], [1, 0, 3], [0, 1, 4]]))
+    np.testing.assert_array_equal(edges, [[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [1, 3], [1, 4]])
+    np.testing.assert_array_equal(counts, [3, 1, 1, 1, 1, 1, 1])
+    none, number = topology.counted_edges(np.zeros((0, 3), dtype=np.int64))
+    assert (none.shape, number.shape) == ((0, 2), (0,))
+
+
 def test_hinge_names_edge_and_opposite_vertices():
     hinges = topology.hinges(np.array([[3, 1, 0], [3, 2, 1]]))
     np.testing.assert_array_equal(hinges.vertices, [[1, 3, 0, 2]])

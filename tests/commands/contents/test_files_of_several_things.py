@@ -235,6 +235,12 @@ def test_a_sleeve_that_lies_at_its_armhole_is_sewn() -> None:
     assert garment.piece is None
 
 
+@pytest.mark.parametrize("unit", [1.0, 0.01])
+def test_the_gap_is_told_in_metres(unit: float) -> None:
+    with pytest.raises(ValueError, match="30 mm apart; weld=0.031 sews them"):
+        read_garment(str(sleeve_off(0.03, unit=unit)), Wanted(), load_body().v_template, False)
+
+
 @pytest.mark.parametrize("gap", [0.015, 0.03])
 def test_a_sleeve_that_is_cut_off_is_refused_with_what_sews_it(gap: float, capsys: pytest.CaptureFixture[str]) -> None:
     path, surface = sleeve_off(gap), load_body().v_template

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from hood.assets.garment.contents.objects import OPENING
 from hood.mesh.parts import Part, rim_length
-from hood.mesh.topology import unique_edges
+from hood.mesh.seams import find_rims, ways_out
 
 #: Lengths of two rims of one cut differ by at most this share.
 _ALIKE = 0.15
@@ -17,7 +17,7 @@ _ALIKE = 0.15
 _MOST, _FAR = 0.9, 0.05
 #: Cosine between the way out of a part across its rim and the way to the other rim, in the mean: a lining beside its garment
 #: has 0, a hem over a waistband less.
-AHEAD = 0.4
+_AHEAD = 0.4
 
 
 class Gap(NamedTuple):
@@ -30,39 +30,29 @@ class Gap(NamedTuple):
 
 def find_gaps(pos: np.ndarray, faces: np.ndarray, parts: list[Part]) -> list[Gap]:
     """Gaps between ``parts`` of the mesh ``pos`` (V, 3) [m], ``faces`` (F, 3) that can be worn by themselves."""
+    ways = ways_out(pos, find_rims(faces))
     rims = [
-        (number, rim, rim_length(pos, rim), ahead_of(pos, faces[part.faces], rim))
+        (number, rim, length)
         for number, part in enumerate(parts)
         if part.can_be_put_on
         for rim in part.rims
-        if rim_length(pos, rim) >= OPENING
+        if (length := rim_length(pos, rim)) >= OPENING
     ]
     found = []
-    for row, (one, rim, length, ahead) in enumerate(rims):
-        for other, facing, its_length, its_ahead in rims[row + 1 :]:
+    for row, (one, rim, length) in enumerate(rims):
+        for other, facing, its_length in rims[row + 1 :]:
             if one == other or min(length, its_length) < (1.0 - _ALIKE) * max(length, its_length):
                 continue
             dist, there = cKDTree(pos[facing]).query(pos[rim])
             its_dist, here = cKDTree(pos[rim]).query(pos[facing])
-            way, its_way = pos[facing][there] - pos[rim], pos[rim][here] - pos[facing]
             both = np.concatenate([dist, its_dist])
-            if np.quantile(both, _MOST) <= _FAR and min(mean_cosine(ahead, way), mean_cosine(its_ahead, its_way)) > AHEAD:
+            ahead = _mean_cosine(ways[rim], pos[facing][there] - pos[rim])
+            its_ahead = _mean_cosine(ways[facing], pos[rim][here] - pos[facing])
+            if np.quantile(both, _MOST) <= _FAR and min(ahead, its_ahead) > _AHEAD:
                 found.append(Gap((one, other), float(np.median(both)), float(both.max())))
     return found
 
 
-def ahead_of(pos: np.ndarray, faces: np.ndarray, rim: np.ndarray) -> np.ndarray:
-    """(n, 3) m: the way out of a part across its rim, to each vertex from the middle of its neighbours that are not on the rim;
-    zero where it has none."""
-    edges = unique_edges(faces)
-    edges = np.concatenate([edges, edges[:, ::-1]])
-    edges = edges[np.isin(edges[:, 0], rim) & ~np.isin(edges[:, 1], rim)]
-    count = np.bincount(edges[:, 0], minlength=len(pos))[rim]
-    total = np.stack([np.bincount(edges[:, 0], pos[edges[:, 1], axis], len(pos))[rim] for axis in range(3)], axis=1)
-    return np.where((count > 0)[:, None], pos[rim] - total / np.maximum(count, 1)[:, None], 0.0)
-
-
-def mean_cosine(one: np.ndarray, other: np.ndarray) -> float:
-    """In the mean over vectors (n, 3)."""
-    scale = np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1)
-    return float(((one * other).sum(axis=1) / np.maximum(scale, 1e-30)).mean())
+def _mean_cosine(unit: np.ndarray, other: np.ndarray) -> float:
+    """Between unit vectors (n, 3) and others, in the mean."""
+    return float(((unit * other).sum(axis=1) / np.maximum(np.linalg.norm(other, axis=1), 1e-30)).mean())

@@ -6,16 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from hood.assets.formats.objects import PART
 from hood.assets.garment.contents.cut_apart import find_gaps
 from hood.assets.garment.contents.fitting import Fitting
+from hood.assets.garment.contents.names import names_of, own_names
 from hood.assets.garment.contents.wanted import Wanted
 from hood.assets.garment.garment import Garment
-from hood.mesh.parts import Part, find_parts, part_labels
-from hood.mesh.topology import connected_components
+from hood.mesh.parts import Part, find_parts
 
-#: A name is that of a part if it covers so much [share] of the part's faces.
-_COVERED = 0.9
 #: A file of more parts than these is one garment: they are beads, fringes, or loose triangles.
 _MOST = 12
 #: Parts smaller than this share of the largest one are no garments of their own.
@@ -65,34 +62,15 @@ def tell_apart(fitting: Fitting, wanted: Wanted, scale: float) -> None:
 
 
 def _refuse_cut_apart(garment: Garment, parts: list[Part], names: list[str], scale: float) -> None:
-    numbered = [part for part, name in zip(parts, names, strict=True) if name == f"{PART}{part.number}"]
-    gaps = find_gaps(scale * garment.rest_pos, garment.faces, numbered)
+    unnamed = [row for row, own in enumerate(own_names(garment, parts)) if own is None]
+    found = find_gaps(scale * garment.rest_pos, garment.faces, [parts[row] for row in unnamed])
+    gaps = [(gap, *(names[unnamed[row]] for row in gap.parts)) for gap in found]
+    gaps = [row for row in gaps if row[1] != row[2]]
     if gaps:
-        pairs = ", ".join(" and ".join(f"{PART}{numbered[row].number}" for row in gap.parts) for gap in gaps)
-        middle, widest = (max(getattr(gap, key) for gap in gaps) for key in ("middle", "widest"))
+        pairs = ", ".join(f"{one} and {other}" for _, one, other in gaps)
+        middle, widest = (max(getattr(gap, key) for gap, _, _ in gaps) for key in ("middle", "widest"))
         raise ValueError(
-            f"garment {garment.name!r}: {pairs} are one garment that is cut: their rims face each other all along, "
-            f"{1e3 * middle:.0f} mm apart; weld={np.floor(1e3 * widest + 1.5) / 1e3:g} sews them, weld=none or objects=[…] "
-            "takes them as garments of their own"
+            f"garment {garment.name!r}: {pairs} are one garment that is cut, or several that end in front of each other: their "
+            f"rims face each other all along, {1e3 * middle:.0f} mm apart; weld={np.floor(1e3 * widest + 1.5) / 1e3:g} sews "
+            "them, weld=none or objects=[…] takes them as garments of their own"
         )
-
-
-def names_of(garment: Garment, parts: list[Part]) -> list[str]:
-    """A name for every part: that of the first object, group or material that has all of it and not all of the file, else its
-    number."""
-    panels = {name: mask for name, mask in (garment.panels or {}).items() if not mask.all()}
-    names = []
-    for part in parts:
-        own = next((name for name, mask in panels.items() if mask[part.faces].mean() >= _COVERED), None)
-        names.append((own or f"{PART}{part.number}").replace("+", "_"))
-    return _fastened(garment, parts, names)
-
-
-def _fastened(garment: Garment, parts: list[Part], names: list[str]) -> list[str]:
-    """Names of parts, where those that fasteners hold together have one."""
-    rows = list((garment.fasteners or {}).values())
-    if not rows:
-        return names
-    label = part_labels(len(garment.rest_pos), garment.faces)
-    joined = connected_components(len(parts), label[np.concatenate(rows)])
-    return [names[int(np.argmax(joined == own))] for own in joined]

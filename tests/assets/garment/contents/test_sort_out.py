@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from garment_kinds import (
     KINDS,
+    Mesh,
     button,
     clean,
     eyelet,
@@ -123,6 +125,87 @@ def test_two_garments_whose_rims_are_near_each_other_stay_two(tmp_path: Path) ->
         len(find_parts(sorted_out(path, Wanted(gap=4e-3)).garment.rest_pos, sorted_out(path, Wanted(gap=4e-3)).garment.faces))
         == 1
     )
+
+
+def over_waistband(off: float, lift: Callable[[np.ndarray], np.ndarray]) -> Mesh:
+    """A tank whose hem is ``off`` [m] outside the waistband of a skirt, and the skirt; ``lift`` is how high [m] over the
+    waistband, by the angle around the body."""
+    (pos, faces), skirt = clean("tank"), clean("skirt")
+    (top,), (bottom,) = find_parts(pos, faces), find_parts(*skirt)
+    hem = min(top.rims, key=lambda rim: float(pos[rim, 1].mean()))
+    band = skirt[0][max(bottom.rims, key=lambda rim: float(skirt[0][rim, 1].mean()))]
+    middle, own = band.mean(axis=0), pos[hem] - pos[hem].mean(axis=0)
+    turn, places = np.arctan2(own[:, 2], own[:, 0]), np.arctan2(*(band - middle)[:, [2, 0]].T)
+    radius, height = (
+        np.interp(turn, np.sort(places), row[np.argsort(places)], period=2 * np.pi)
+        for row in (np.hypot(*(band - middle)[:, [0, 2]].T) + off, band[:, 1])
+    )
+    there = np.stack([middle[0] + radius * np.cos(turn), height + lift(turn), middle[2] + radius * np.sin(turn)], axis=1)
+    dist, nearest = cKDTree(pos[hem]).query(pos)
+    moved = pos + np.clip(1.0 - dist / 0.5, 0.0, 1.0)[:, None] * (there - pos[hem])[nearest]
+    return joined((moved, faces), skirt)
+
+
+@pytest.mark.parametrize("seed", [None, 0])
+@pytest.mark.parametrize(
+    "lift",
+    [
+        lambda turn: 0.0 * turn - 0.004,
+        lambda turn: 0.03 * np.cos(2 * turn) - 0.015,
+        lambda turn: 0.035 * np.cos(2 * turn) - 0.03,
+        lambda turn: 0.02 * np.sin(turn),
+        lambda turn: 0.02 * np.sin(turn) - 0.02,
+    ],
+    ids=["4 mm over it", "crossing it four times", "at the sides", "short in front", "at one place"],
+)
+def test_a_hem_over_a_waistband_is_not_sewn(lift: Callable[[np.ndarray], np.ndarray], seed: int | None, tmp_path: Path) -> None:
+    """However the vertices are numbered."""
+    pos, faces = over_waistband(0.002, lift)
+    number = np.arange(len(pos)) if seed is None else np.random.default_rng(seed).permutation(len(pos))
+    garment = sorted_out(write_mesh(tmp_path / "outfit.obj", (pos[np.argsort(number)], number[faces]))).garment
+    assert len(garment.rest_pos) == len(pos)
+    assert garment.piece is not None
+
+
+def sock(leg: Mesh, over: float) -> Mesh:
+    """A closed sock that begins ``over`` [m] above the lower rim of the left leg, 2 mm inside of it."""
+    pos, faces = leg
+    rim = min(find_parts(pos, faces)[0].rims, key=lambda own: (round(float(pos[own, 1].mean()), 2), -float(pos[own, 0].mean())))
+    middle, count, rows = pos[rim].mean(axis=0), len(rim), 12
+    out = pos[rim] - middle
+    ring = out * (1.0 - 2e-3 / np.linalg.norm(out, axis=1, keepdims=True))
+    widths = np.concatenate([[1.0], np.linspace(0.6, 0.5, rows - 1)])
+    rings = [middle + width * ring + [0.0, over - 0.035 * row, 0.0] for row, width in enumerate(widths)]
+    here, after = np.arange(count), np.roll(np.arange(count), -1)
+    table = [
+        np.stack(face, axis=1) + row * count
+        for row in range(rows - 1)
+        for face in ((here, after, here + count), (after, after + count, here + count))
+    ]
+    toe = np.stack([here + (rows - 1) * count, after + (rows - 1) * count, np.full(count, rows * count)], axis=1)
+    return np.concatenate([*rings, [rings[-1].mean(axis=0) - [0.0, 0.01, 0.0]]]), np.concatenate([*table, toe])
+
+
+@pytest.mark.parametrize(("over", "names"), [(4e-3, None), (4e-3, ("trousers", "sock")), (-1e-3, ("trousers", "sock"))])
+def test_a_sock_at_a_trouser_leg_is_not_sewn(over: float, names: tuple[str, str] | None, tmp_path: Path) -> None:
+    trousers = clean("trousers")
+    things = (trousers, sock(trousers, over))
+    path = write_objects(tmp_path / "outfit.obj", list(zip(names or ("", ""), things, strict=True)))
+    garment = sorted_out(path).garment
+    assert len(find_parts(garment.rest_pos, garment.faces)) == 2
+    assert garment.piece is not None
+
+
+@pytest.mark.parametrize("gap", [0.0, 2e-3, 5e-3])
+@pytest.mark.parametrize("name", ["tshirt", "longsleeve", "dress", "trousers", "shirt"])
+def test_left_and_right_halves_are_sewn(name: str, gap: float, tmp_path: Path) -> None:
+    mesh = clean(name)
+    left = mesh[0][mesh[1]].mean(axis=1)[:, 0] > 0.0
+    pos, faces = part(mesh, left)
+    path = write_mesh(tmp_path / "halves.obj", joined(part(mesh, ~left), (pos + [gap, 0.0, 0.0], faces)))
+    garment = sorted_out(path).garment
+    assert len(find_parts(garment.rest_pos, garment.faces)) == 1
+    assert garment.piece is None
 
 
 def test_shells_and_copies_can_be_kept(tmp_path: Path) -> None:
