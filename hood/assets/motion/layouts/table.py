@@ -19,7 +19,7 @@ WORLD_TRANSL = (
 )  # fmt: skip
 CAMERA_TRANSL = ("predtrans", "predcamt", "camt", "camtrans", "transcam", "cameratranslation", "camera", "cameratransl")
 #: A frame rate of recordings from video, where their layout says none.
-_VIDEO = 30.0
+VIDEO_FPS = 30.0
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Layout:
     transl: tuple[str, ...] = WORLD_TRANSL  # keys that may hold the translation, the first counts
     marks: tuple[str, ...] = ()  # keys of which one must be there as well
     above: str = ""  # key of the dict that the layout stands in
-    fps: float | None = _VIDEO
+    fps: float | None = VIDEO_FPS
     up: str = "y"
     camera: bool = False  # as seen from a camera, which need not be level
     family: str | None = None  # None: by the number of joints
