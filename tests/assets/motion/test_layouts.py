@@ -53,17 +53,7 @@ OTHERWISE = (
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_the_same_content_is_read_however_it_is_written(way: str, tmp_path: Path) -> None:
     suffix, change = SIBLINGS[way]
-    for name in (
-        "AIST++",
-        "3DPW, second of two",
-        "EMDB",
-        "GVHMR",
-        "PHALP, two tracks",
-        "ROMP",
-        "Motion-X",
-        "GRAB",
-        "quaternions, w first",
-    ):
+    for name in OTHERWISE:
         file = GENERATORS[name]
         path = write(tmp_path / f"m{suffix}", change(opened(file.make())))
         sequence = load_sequence(path, file.fps, **file.keys)
@@ -89,6 +79,12 @@ def test_fingers_stand_beside_the_body(tmp_path: Path) -> None:
     found = read_recording(write(tmp_path / "m.pkl", split(**hands, fps=30)))
     np.testing.assert_array_equal(found.fingers, own.fingers)
     np.testing.assert_array_equal(read_recording(write(tmp_path / "m.npy", motion_x())).fingers, own.fingers)
+    amass_x = {"root_orient": own.root, "pose_body": own.body, "pose_hand": own.fingers.reshape(-1, 90), "trans": own.transl}
+    one = {key: value[0] for key, value in amass_x.items()}
+    np.testing.assert_array_equal(read_recording(write(tmp_path / "n.npz", one)).fingers, own.fingers[:1])
+    for hand, words in ((0.0, r"shape \(\); it must be \(N, 90\)"), (own.fingers[:-1], "59 frames, the body has 60")):
+        with pytest.raises(ValueError, match=rf"o\.npz: pose_hand has {words}"):
+            read_recording(write(tmp_path / "o.npz", amass_x | {"pose_hand": hand, "fps": 30}))
     coefficients = {f"{side}_hand_pose": np.zeros((60, 12)) for side in ("left", "right")}
     assert read_recording(write(tmp_path / "m.pkl", split(**coefficients, fps=30))).fingers is None
 

@@ -150,10 +150,11 @@ def _hands(path: Path, person: Person, num_frames: int) -> np.ndarray | None:
         if any(side.size != 45 * num_frames for side in pair):
             return None  # coefficients of a hand model
         key, hand = "lefthandpose", np.concatenate([side.reshape(num_frames, 45) for side in pair], axis=1)
-    if len(hand) != num_frames:
-        raise ValueError(f"{path}: {person.keys[key]} has {len(hand)} frames, the body has {num_frames}; they must agree")
-    if hand.size != num_frames * NUM_FINGER_JOINTS * 3:
+    count, rest = divmod(hand.size, NUM_FINGER_JOINTS * 3)
+    if rest:
         raise ValueError(f"{path}: {person.keys[key]} has shape {hand.shape}; it must be (N, {NUM_FINGER_JOINTS * 3})")
+    if count != num_frames:
+        raise ValueError(f"{path}: {person.keys[key]} has {count} frames, the body has {num_frames}; they must agree")
     return hand.reshape(num_frames, NUM_FINGER_JOINTS, 3)
 
 
