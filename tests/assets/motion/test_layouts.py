@@ -17,6 +17,7 @@ from motion_kinds.writers import write
 from scipy.spatial.transform import Rotation
 
 from hood.assets.files.doubt import Doubt
+from hood.assets.identify import MOTION, identify
 from hood.assets.motion.load import load_sequence
 from hood.assets.motion.recording import read_recording
 from hood.assets.motion.up_axis import bearing_notice
@@ -56,6 +57,7 @@ def test_the_same_content_is_read_however_it_is_written(way: str, tmp_path: Path
     for name in OTHERWISE:
         file = GENERATORS[name]
         path = write(tmp_path / f"m{suffix}", change(opened(file.make())))
+        assert identify(str(path)) == MOTION, name
         sequence = load_sequence(path, file.fps, **file.keys)
         assert np.abs(sequence.transl - walk().transl).max() < 2e-6, name
         own, wanted = (Rotation.from_rotvec(poses[:, :22].reshape(-1, 3)) for poses in (sequence.poses, walk().poses))

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from hood.assets.files.doubt import Doubt
 from hood.assets.files.frame_rates import flat
 from hood.assets.motion.layouts.content import Unread
-from hood.assets.motion.layouts.foreign import unknown, unplaced
+from hood.assets.motion.layouts.foreign import are_weights, is_like_motion, unknown, unplaced
 from hood.assets.motion.layouts.frames import gather_frames
 from hood.assets.motion.layouts.people import Person, find_people
 from hood.assets.motion.layouts.rotations import Turns, as_turns, to_vectors
@@ -47,10 +47,24 @@ def people_in(path: Path, content: Any) -> list[Person]:
     Raises:
         ValueError: there is nobody; says what the file holds, and what to write instead.
     """
-    people = find_people(gather_frames(path, _with_motion_x(content)))
+    people = _found(path, content)
     if not people:
         raise ValueError(unknown(path, content))
     return people
+
+
+def is_of_motion(path: Path, content: Any) -> bool:
+    """Whether a file's content is a motion, or something that is given for one: joint positions, tables of features."""
+    if are_weights(content):
+        return False
+    try:
+        return bool(_found(path, content)) or is_like_motion(content)
+    except ValueError:  # several people in a frame
+        return True
+
+
+def _found(path: Path, content: Any) -> list[Person]:
+    return find_people(gather_frames(path, _with_motion_x(content)))
 
 
 def _with_motion_x(content: Any, depth: int = 0) -> Any:
