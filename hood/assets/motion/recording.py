@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from hood.assets.motion.layouts.frame_rate import frame_rate
 from hood.assets.motion.layouts.people import Person, choose
 from hood.assets.motion.layouts.read import NUM_FINGER_JOINTS, Track, people_in, read_track
 from hood.assets.motion.layouts.shape import subject_shape
+from hood.assets.motion.skeleton import joints_about_pelvis, spread, upright
 from hood.assets.motion.units import find_unit
 
 __all__ = ["MOTION_SUFFIXES", "NUM_BODY_JOINTS", "NUM_FINGER_JOINTS", "Recording", "motion_suffixes", "read_recording"]
@@ -51,6 +53,11 @@ class Recording:
     fps_assumed: bool = False  # the file does not say a frame rate
     rotations: str | None = None  # how joint rotations were read that are no axis-angle vectors
     notes: tuple[UserWarning, ...] = ()  # what whoever uses it is to be told, doubts among them
+
+    @cached_property
+    def uprights(self) -> np.ndarray:
+        """(M, 3): unit vectors from the feet to the head in the file's world, in M frames spread over the motion."""
+        return upright(joints_about_pelvis(self.poses[spread(len(self.poses))]))
 
 
 def read_recording(
