@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from motion_kinds.parameters import split
+from motion_kinds.parameters import posed, quaternions, six, split
 from motion_kinds.published import motion_x, wham
 from motion_kinds.refused import REFUSALS
 from motion_kinds.siblings import SIBLINGS, opened
@@ -62,6 +62,23 @@ def test_the_same_content_is_read_however_it_is_written(way: str, tmp_path: Path
         assert np.abs(sequence.transl - walk().transl).max() < 2e-6, name
         own, wanted = (Rotation.from_rotvec(poses[:, :22].reshape(-1, 3)) for poses in (sequence.poses, walk().poses))
         assert (own.inv() * wanted).magnitude().max() < 2e-6, name
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_people_seen_for_a_few_frames_are_no_frames(count: int, tmp_path: Path) -> None:
+    """Three rows of 72 numbers are as many as 24 matrices."""
+    people = {name: {key: table[:count] for key, table in person.items()} for name, person in wham(2).items()}
+    found = read_recording(write(tmp_path / "m.pkl", people), person=2)
+    assert (found.people, found.poses.shape) == (("0", "2"), (count, 24, 3))
+    by_joint = {str(name): posed(world("z").poses[:count], trans=world("z").transl[:count]) for name in range(2)}
+    assert read_recording(write(tmp_path / "n.pkl", by_joint), person=1).poses.shape == (count, 24, 3)
+
+
+def test_rows_of_frames_may_hold_any_representation(tmp_path: Path) -> None:
+    for turns in (quaternions(True), six("rows").reshape(-1, 144)):
+        rows = [{"poses": row, "trans": place} for row, place in zip(turns, world("z").transl, strict=True)]
+        found = read_recording(write(tmp_path / "m.pkl", {"fps": 30, "frames": rows}))
+        assert np.abs(found.poses[:, 1:22] - walk().poses[:, 1:22]).max() < 1e-6
 
 
 def test_frames_in_which_nobody_was_seen_are_filled_and_doubted(tmp_path: Path) -> None:

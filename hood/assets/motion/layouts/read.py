@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
 from hood.assets.files.doubt import Doubt
 from hood.assets.files.frame_rates import flat
@@ -16,6 +15,7 @@ from hood.assets.motion.layouts.frames import gather_frames
 from hood.assets.motion.layouts.people import Person, find_people
 from hood.assets.motion.layouts.rotations import Turns, as_turns, to_vectors
 from hood.assets.motion.layouts.table import CAMERA_TRANSL, WORLD_TRANSL, counts_of
+from hood.assets.motion.rotation_vectors import slerp
 
 NUM_FINGER_JOINTS = 30  # 15 a side, left first
 #: Columns of Motion-X: global orientation, body, hands, jaw, expression and face shape (left out), translation, betas.
@@ -191,11 +191,6 @@ def _filled(path: Path, person: Person, track: Track) -> Track:
     )
     doubt = Doubt("jump", said, tuple(missing[:100]), float(len(missing)), "frames")
     times, wanted = seen.astype(np.float64), np.arange(count) + float(seen[0])
-    fingers = None if track.fingers is None else _between(track.fingers, times, wanted)
+    fingers = None if track.fingers is None else slerp(track.fingers, times, wanted)
     transl = np.stack([np.interp(wanted, times, track.transl[:, axis]) for axis in range(3)], axis=1)
-    return track._replace(turns=_between(track.turns, times, wanted), transl=transl, fingers=fingers, doubt=doubt)
-
-
-def _between(turns: np.ndarray, times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    parts = [Slerp(times, Rotation.from_rotvec(turns[:, joint]))(wanted).as_rotvec() for joint in range(turns.shape[1])]
-    return np.stack(parts, axis=1)
+    return track._replace(turns=slerp(track.turns, times, wanted), transl=transl, fingers=fingers, doubt=doubt)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+#: Numbers of one rotation: axis-angle vectors, quaternions, 6D, matrices.
+PER_TURN = (3, 4, 6, 9)
 #: Numbers of joints of a whole skeleton: without hands, SMPL, SMPL-H, SMPL-X.
 WHOLE = (22, 24, 52, 55)
 _ROOT, _BODY = (1,), (21, 23)
@@ -51,6 +53,11 @@ class Layout:
 def counts_of(key: str) -> tuple[tuple[int, ...], int]:
     """How many joints a squeezed key of rotations may hold, and from which on."""
     return _COUNTS.get(key, (WHOLE, 0))
+
+
+def sizes_of(key: str) -> set[int]:
+    """How many numbers a pose under a squeezed key of rotations may have, in whatever representation."""
+    return {count * per for count in counts_of(key)[0] for per in PER_TURN}
 
 
 _TRACKS = ("trackids", "trackedids", "tid", "subjectids")
