@@ -84,7 +84,7 @@ def read_recording(
     betas, shape_doubt = subject_shape(path, chosen.fields, chosen.keys)
     poses = _body_poses(track.turns)
     unit = find_unit(path, track.transl_key, poses, track.transl, rate.fps, chosen.layout.up, trans_unit)
-    notes = (rate.doubt, track.doubt, shape_doubt, unit.note)
+    notes = (rate.doubt, *track.doubts, shape_doubt, unit.note)
     return Recording(
         poses=poses,
         fingers=track.turns[:, -NUM_FINGER_JOINTS:] if track.turns.shape[1] in (52, 55) else track.fingers,

@@ -13,7 +13,7 @@ from hood.assets.motion.layouts.content import Unread
 from hood.assets.motion.layouts.foreign import are_weights, is_like_motion, unknown, unplaced
 from hood.assets.motion.layouts.frames import gather_frames
 from hood.assets.motion.layouts.people import Person, find_people
-from hood.assets.motion.layouts.rotations import Turns, as_turns, to_vectors
+from hood.assets.motion.layouts.rotations import TRANSPOSED, Turns, as_turns, to_vectors
 from hood.assets.motion.layouts.table import CAMERA_TRANSL, WORLD_TRANSL, counts_of
 from hood.assets.motion.rotation_vectors import slerp
 
@@ -38,7 +38,7 @@ class Track(NamedTuple):
     fingers: np.ndarray | None  # (N, 30, 3) rad
     transl_key: str
     way: str | None  # how rotations were read that are no axis-angle vectors
-    doubt: Doubt | None  # frames that are missing
+    doubts: tuple[Doubt, ...] = ()  # how its rotations are arranged, frames that are missing
 
 
 def people_in(path: Path, content: Any) -> list[Person]:
@@ -94,7 +94,7 @@ def read_track(path: Path, person: Person) -> Track:
     transl, transl_key = _translation(path, person, len(turns))
     if len(turns) != len(transl):
         raise ValueError(f"{path}: {name} has {len(turns)} frames, {transl_key} has shape {transl.shape}; they must agree")
-    track = Track(turns, transl, _hands(path, person, len(turns)), transl_key, way, None)
+    track = Track(turns, transl, _hands(path, person, len(turns)), transl_key, way, _about_way(path, name, way))
     return _filled(path, person, track)
 
 
@@ -127,6 +127,16 @@ def _part(path: Path, person: Person, key: str) -> Turns:
         array = array[:24].transpose(2, 0, 1)  # joints, numbers, frames
     counts, first = counts_of(key)
     return as_turns(path, person.keys[key], array, counts, first)
+
+
+def _about_way(path: Path, key: str, way: str | None) -> tuple[Doubt, ...]:
+    if way is None or not way.endswith(TRANSPOSED):
+        return ()
+    said = (
+        f"{path}: by the matrices of {key} knees and elbows bend backwards, and they are read transposed; save poses as "
+        "axis-angle vectors [rad] where that is wrong"
+    )
+    return (Doubt("layout", said),)
 
 
 def _translation(path: Path, person: Person, num_frames: int) -> tuple[np.ndarray, str]:
@@ -193,4 +203,6 @@ def _filled(path: Path, person: Person, track: Track) -> Track:
     times, wanted = seen.astype(np.float64), np.arange(count) + float(seen[0])
     fingers = None if track.fingers is None else slerp(track.fingers, times, wanted)
     transl = np.stack([np.interp(wanted, times, track.transl[:, axis]) for axis in range(3)], axis=1)
-    return track._replace(turns=slerp(track.turns, times, wanted), transl=transl, fingers=fingers, doubt=doubt)
+    return track._replace(
+        turns=slerp(track.turns, times, wanted), transl=transl, fingers=fingers, doubts=(*track.doubts, doubt)
+    )
