@@ -20,7 +20,7 @@ from hood.assets.formats.point_cache import CACHE_SUFFIX
 from hood.assets.garment.reference_garments import garment_names
 from hood.assets.motion.animated_mesh import body_kind
 from hood.assets.motion.layouts.content import PICKLES, TENSORS, plain, read_content
-from hood.assets.motion.layouts.foreign import is_of_motion
+from hood.assets.motion.layouts.read import is_of_motion
 from hood.assets.motion.recording import motion_suffixes
 from hood.assets.pickles.content import load_content
 
@@ -95,14 +95,14 @@ def _kind_of_keys(keys: Collection[str]) -> str | None:
 def _is_torch_motion(path: Path) -> bool:
     """Whether a file of torch holds a motion; what cannot be read is left to the reader of checkpoints."""
     try:
-        return is_of_motion(read_content(path))
+        return is_of_motion(path, read_content(path))
     except ValueError:
         return False
 
 
 def _kind_of_content(path: Path, content: Any, keys: Collection[str]) -> str:
     """A motion may stand deeper in a file, or under keys of other layouts."""
-    if is_of_motion(content):
+    if is_of_motion(path, content):
         return MOTION
     raise ValueError(f"{path}: no garment, body, motion or mesh has the keys {listed(sorted(keys))}")
 

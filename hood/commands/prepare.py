@@ -29,7 +29,7 @@ from hood.assets.garment.units import UNITS
 from hood.assets.motion.animated_mesh import body_kind
 from hood.assets.motion.axes import UP_AXES
 from hood.assets.motion.load import load_sequence
-from hood.assets.motion.poses import POSE_SUFFIXES, arms_down, read_pose
+from hood.assets.motion.poses import arms_down, holds_pose, read_pose
 from hood.assets.motion.sequence import PoseSequence
 from hood.commands.common import prepare_folder
 from hood.commands.contents.reading import meant_by, said
@@ -237,7 +237,7 @@ def _given_pose(config: DictConfig, body: Body, betas: np.ndarray) -> PosedBody 
 
 def _named_pose(given: str, config: DictConfig) -> tuple[PoseSequence, int]:
     path, frame = locate("motions", given), int(config.frame)
-    if path.suffix.lower() in POSE_SUFFIXES:
+    if holds_pose(path):
         return read_pose(path), 0
     person = None if config.person is None else str(config.person)
     sequence = load_sequence(given, fps=float(config.fps), person=person)

@@ -194,8 +194,10 @@ def _sampling(config: DictConfig) -> dict[str, Any]:
 
 def _open_motions(config: DictConfig, names: list[str], fps: float, min_frames: int) -> MotionFiles:
     """The training motions, read when they are drawn."""
-    load = partial(load_sequence, fps=fps, **_reading(config))
-    motions = MotionFiles(names, load, fps, min_frames, str(config.data.unusable) == "skip")
+    reading = _reading(config)
+    load = partial(load_sequence, fps=fps, **reading)
+    skip = str(config.data.unusable) == "skip"
+    motions = MotionFiles(names, load, fps, min_frames, skip, file_fps=reading["file_fps"])
     if motions.skipped and distributed.rank() == 0:
         print(f"hood: {len(motions.skipped)} of {len(names)} motions skipped, first: {motions.skipped[0]}", file=sys.stderr)
     return motions

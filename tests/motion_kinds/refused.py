@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from hood.assets.motion.skeleton import joints_about_pelvis
 from motion_kinds.parameters import amass, posed, split
 from motion_kinds.published import phalp, romp, slahmr, threedpw, wham
-from motion_kinds.walks import COUNT, walk, world
+from motion_kinds.walks import COUNT, matrices, walk, world
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,13 @@ def stiff_six() -> np.ndarray:
     turns = np.tile(np.eye(3), (COUNT, 24, 1, 1))
     turns[:, 0] = Rotation.from_rotvec(walk().root).as_matrix()
     return turns[..., :2, :].reshape(COUNT, 24, 6)
+
+
+def hardly_bent_six() -> np.ndarray:
+    """(N, 24, 6): knees that bend backwards by a degree, as those of some who stand still do."""
+    turns = np.zeros((COUNT, 24, 3))
+    turns[:, [4, 5], 0] = -np.radians(1.0)
+    return matrices(turns)[..., :2, :].reshape(COUNT, 24, 6)
 
 
 def two_in_a_frame() -> dict[str, Any]:
@@ -118,6 +125,7 @@ REFUSALS: dict[str, Refusal] = {
     "quaternions in any order": Refusal(".npz", lambda: posed(tumbling()), r"neither w first nor w last.*from_quat"),
     "quaternions of another length": Refusal(".npz", lambda: posed(2.0 * tumbling()), "does not hold any"),
     "6D of a stiff body": Refusal(".npz", lambda: posed(stiff_six()), r"rows or columns.*from_matrix"),
+    "6D of a body with straight knees": Refusal(".npz", lambda: posed(hardly_bent_six()), "rows or columns"),
     "no matrices": Refusal(".npz", lambda: turns_of(np.ones((3, 3))), "shape of rotation matrices and does not hold any"),
     "mirrored matrices": Refusal(".npz", lambda: turns_of(-np.eye(3)), "shape of rotation matrices and does not"),
     "shapes of several people": Refusal(".pkl", shapes_of_many, r"betas changes in frame 1.*mean\(axis=0\)"),

@@ -123,6 +123,9 @@ GENERATORS: dict[str, File] = {
     "rotation matrices, flat and float32": File(
         ".pkl", lambda: of_kind(np.float32, posed(matrices(world("z").poses).reshape(COUNT, 216))), **_AMASS
     ),
+    "rotation matrices, transposed": File(
+        ".npz", lambda: posed(matrices(world("z").poses).swapaxes(2, 3)), **_AMASS, doubts=("layout",)
+    ),
     "6D, rows": File(".npz", lambda: posed(six("rows")), **_AMASS),
     "6D, columns": File(".npz", lambda: posed(six("columns").reshape(COUNT, 144)), **_AMASS),
     "6D, columns interleaved": File(".npz", lambda: posed(six("woven")), **_AMASS),

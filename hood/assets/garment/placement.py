@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hood.assets.garment.binding import closest_points
-from hood.assets.motion.sequence import Z_UP_TO_Y_UP
+from hood.assets.motion import axes
 
 #: A garment around the body has its middle vertex nearer to the skin than this [m] ...
 _FARTHEST = 0.35
@@ -22,7 +22,7 @@ _LEAST_ROUND = 0.3
 _LOOKED_AT = 4000
 
 #: Rotations (3, 3) that turn the up axis of a file to y.
-UP_AXES = {"y": np.eye(3), "z": Z_UP_TO_Y_UP, "x": np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])}
+UP_AXES = {axis: axes.UP_AXES[axis] for axis in ("y", "z", "x")}
 
 
 @dataclass(frozen=True)

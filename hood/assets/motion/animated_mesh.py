@@ -141,7 +141,7 @@ def _read(path: Path, fps: float, animation: int | str, parts: Sequence[str], en
 
 def _holds_vertices(path: Path) -> bool:
     """Whether an archive or pickle names vertices and no body model; nothing of it is read."""
-    if path.suffix == ".pkl":
+    if path.suffix.lower() == ".pkl":
         if path.stat().st_size == 0:
             return False
         with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:

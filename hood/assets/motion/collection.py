@@ -23,8 +23,7 @@ _NAME_COLUMNS = ("id", "file", "path", "sequence", "name")
 def expand_sequences(patterns: str | Path | Iterable[str | Path], part: str = "train") -> list[Path]:
     """Motion files that ``patterns`` stand for: in their order, folders and globs sorted, nothing twice.
 
-    A pattern is the name of an embedded motion; a file; a folder, whose motions are all ``.npz`` and ``.pkl`` files in it and
-    below (all ``.npy`` and ``.pt`` where there are none of these), but not the shapes that AMASS keeps beside them; a glob
+    A pattern is the name of an embedded motion; a file; a folder, with its motions as in :func:`motions_in`; a glob
     (``amass/**/*_poses.npz``); a list, see :func:`hood.assets.motion.motion_files.find_motions`; or a ``.csv`` table with a
     column ``id`` (or file, path, sequence, name; else its first), whose entries start from its folder, with or without suffix.
 
@@ -49,7 +48,8 @@ def expand_sequences(patterns: str | Path | Iterable[str | Path], part: str = "t
 
 
 def motions_in(folder: Path) -> list[Path]:
-    """Motion files in a folder and below, sorted; not the shapes and stages of the fit that AMASS keeps beside them.
+    """Motion files in a folder and below, sorted: archives, pickles and what plugins read, without the shapes and stages of the
+    fit that AMASS keeps beside them; where there are none, arrays and files of torch.
 
     Raises:
         ValueError: there are none.

@@ -12,7 +12,7 @@ from hood.assets.motion import sequence_edit as edit
 from hood.assets.motion.axes import UP_AXES, require_up
 from hood.assets.motion.recording import NUM_BODY_JOINTS, Recording, read_recording
 from hood.assets.motion.sequence import PoseSequence, resample, still, turn_world
-from hood.assets.motion.up_axis import bearing_notice, head_down_doubt
+from hood.assets.motion.up_axis import find_up
 
 HANDS = ("flat", "file")
 
@@ -95,8 +95,7 @@ def _sequence(name: str, recording: Recording, hands: str) -> PoseSequence:
 
 def _up_axis(path: Path, recording: Recording) -> str:
     """The axis along which the body stands; a warning where it is not that of the layout, a doubt where that is not sure."""
-    axis, notice = bearing_notice(path, recording)
-    notice = notice or head_down_doubt(path, recording, axis)
+    axis, notice = find_up(path, recording)
     if notice is not None:
         warnings.warn(notice, stacklevel=3)
     return axis

@@ -62,6 +62,7 @@ class MotionFiles(Sequence[PoseSequence]):
         skip: leave motions out that cannot be used or read, and count them in ``skipped``; otherwise they are refused.
             A file whose fault shows only when its poses are read is then passed over by whoever draws it.
         kept_frames: frames kept in memory, at 0.6 kB each, those of the motions used last.
+        file_fps: frame rate [1/s] at which ``load`` takes the files, whatever they say; None: what each says.
 
     Raises:
         ValueError: a motion that cannot be used; names the file, the reason and the way to skip it. No motion is left.
@@ -75,6 +76,7 @@ class MotionFiles(Sequence[PoseSequence]):
         min_frames: int = 2,
         skip: bool = False,
         kept_frames: int = 100_000,
+        file_fps: float | None = None,
     ) -> None:
         self._load, self.fps, self.skip, self.kept_frames = load, fps, skip, kept_frames
         self.names: list[str] = []
@@ -82,7 +84,7 @@ class MotionFiles(Sequence[PoseSequence]):
         lengths = []
         for name in names:
             try:
-                length = _num_frames(name, fps) or load(name).num_frames
+                length = _num_frames(name, fps, file_fps) or load(name).num_frames
                 if length < min_frames:
                     raise ValueError(f"{name}: {length} frames at {fps:g} fps, at least {min_frames} are needed")
             except (ValueError, OSError) as error:
@@ -222,8 +224,8 @@ _RATES = ("mocap_framerate", "mocap_frame_rate")
 _WIDTHS = (3, *(3 * count for count in WHOLE))
 
 
-def _num_frames(name: str, fps: float) -> int | None:
-    """Frames at ``fps`` of an AMASS archive, by its headers; None where they do not tell."""
+def _num_frames(name: str, fps: float, file_fps: float | None) -> int | None:
+    """Frames at ``fps`` of an AMASS archive, by its headers and ``file_fps``; None where they do not tell."""
     path = DATA_FOLDER / "motions" / f"{name}.npz"
     path = path if path.is_file() else Path(name).expanduser()
     if path.suffix.lower() != ".npz":
@@ -233,7 +235,7 @@ def _num_frames(name: str, fps: float) -> int | None:
             members = set(archive.namelist())
             poses = next((key for key in _POSES if f"{key}.npy" in members), None)
             rate = next((key for key in _RATES if f"{key}.npy" in members), None)
-            if poses is None or rate is None:
+            if poses is None or (rate is None and file_fps is None):
                 return None
             if {squeezed(name.removesuffix(".npy")) for name in members} & set(FRAME_IDS):
                 return None
@@ -242,9 +244,10 @@ def _num_frames(name: str, fps: float) -> int | None:
             # A pose alone, and tables of several people, have other axes than frames and numbers.
             if not (len(shape) == 2 and shape[1] in _WIDTHS) and not (len(shape) == 3 and shape[1] in WHOLE and shape[2] == 3):
                 return None
-            with archive.open(f"{rate}.npy") as file:
-                value = np.lib.format.read_array(file, allow_pickle=False)
-        frames = int(np.floor((shape[0] - 1) * fps / float(value.reshape(-1)[0]) + 1e-9)) + 1
+            if file_fps is None:
+                with archive.open(f"{rate}.npy") as file:
+                    file_fps = float(np.lib.format.read_array(file, allow_pickle=False).reshape(-1)[0])
+        frames = int(np.floor((shape[0] - 1) * fps / file_fps + 1e-9)) + 1
     except (OSError, ValueError, TypeError, IndexError, ArithmeticError, EOFError, zipfile.BadZipFile):
         return None  # reading it in full says better what is wrong
     return frames if frames >= 2 else None

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
 
 from hood.assets.files.guarded import check_size, guarded
+from hood.assets.files.library import npy_header
 from hood.assets.files.text import read_text
+from hood.assets.motion.layouts.table import WHOLE
 from hood.assets.motion.sequence import PoseSequence
 from hood.assets.motion.sequence_edit import standing_pose
 
@@ -17,6 +20,8 @@ _NUM_JOINTS = 24
 A_POSE_ANGLE = 45.0
 POSE_SUFFIXES = (".npy", ".json", ".txt")
 _SIZE_LIMIT = 16 << 20
+#: Numbers of one pose, of the smallest and the largest skeleton.
+_FEWEST, _MOST = 3 * min(WHOLE), 3 * max(WHOLE)
 
 
 def arms_down(angle: float) -> PoseSequence:
@@ -30,8 +35,22 @@ def one_frame(name: str, poses: np.ndarray) -> PoseSequence:
     return PoseSequence(name, poses, np.zeros((1, 3)), 30.0, np.zeros(10), np.eye(3))
 
 
+def holds_pose(path: Path) -> bool:
+    """Whether a file is one of :func:`read_pose`, by its name; an array by its header too: motions are arrays as well."""
+    suffix = path.suffix.lower()
+    if suffix != ".npy":
+        return suffix in POSE_SUFFIXES
+
+    def read() -> bool:
+        with open(path, "rb") as file:
+            shape, dtype = npy_header(file)
+        return not dtype.hasobject and math.prod(shape) <= _MOST
+
+    return bool(guarded(path, "pose", read))
+
+
 def read_pose(path: Path) -> PoseSequence:
-    """One frame from a file of axis-angle vectors [rad]: 66, 72 or more numbers in the order of the SMPL joints.
+    """One frame from a file of axis-angle vectors [rad]: 66 to 165 numbers, mostly 72, in the order of the SMPL joints.
 
     ``.npy``, ``.json`` or ``.txt``; hands are left out.
 
@@ -42,7 +61,7 @@ def read_pose(path: Path) -> PoseSequence:
         raise ValueError(f"{path}: unknown pose format {path.suffix!r}; give {', '.join(POSE_SUFFIXES)} or a motion")
     check_size(path, _SIZE_LIMIT)
     values = guarded(path, "pose", lambda: _numbers(path))
-    if values.size < 66 or values.size % 3 or not np.isfinite(values).all():
+    if not _FEWEST <= values.size <= _MOST or values.size % 3 or not np.isfinite(values).all():
         raise ValueError(f"{path}: {values.size} numbers; a pose has 72 finite ones, three for each of 24 joints")
     poses = np.zeros((1, _NUM_JOINTS, 3))
     poses[0, :22] = values.reshape(-1, 3)[:22]

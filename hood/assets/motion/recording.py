@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hood.assets.files.doubt import Doubt
 from hood.assets.files.frame_rates import flat
 from hood.assets.motion.layouts.content import MOTION_SUFFIXES, motion_suffixes, read_content
 from hood.assets.motion.layouts.frame_rate import frame_rate
 from hood.assets.motion.layouts.people import Person, choose
 from hood.assets.motion.layouts.read import NUM_FINGER_JOINTS, Track, people_in, read_track
 from hood.assets.motion.layouts.shape import subject_shape
+from hood.assets.motion.skeleton import joints_about_pelvis, spread, upright
 from hood.assets.motion.units import find_unit
 
 __all__ = ["MOTION_SUFFIXES", "NUM_BODY_JOINTS", "NUM_FINGER_JOINTS", "Recording", "motion_suffixes", "read_recording"]
@@ -53,6 +54,11 @@ class Recording:
     rotations: str | None = None  # how joint rotations were read that are no axis-angle vectors
     notes: tuple[UserWarning, ...] = ()  # what whoever uses it is to be told, doubts among them
 
+    @cached_property
+    def uprights(self) -> np.ndarray:
+        """(M, 3): unit vectors from the feet to the head in the file's world, in M frames spread over the motion."""
+        return upright(joints_about_pelvis(self.poses[spread(len(self.poses))]))
+
 
 def read_recording(
     path: Path, file_fps: float | None = None, person: int | str | None = None, trans_unit: str = "auto"
@@ -74,16 +80,16 @@ def read_recording(
     track = read_track(path, chosen)
     _check(path, chosen, track)
     own = {chosen.keys.get(key, key): value for key, value in chosen.fields.items()}
-    rate, rate_doubt = frame_rate(path, (own, *chosen.around), chosen.layout, file_fps)
+    rate = frame_rate(path, (own, *chosen.around), chosen.layout, file_fps, is_still=len(track.turns) == 1)
     betas, shape_doubt = subject_shape(path, chosen.fields, chosen.keys)
     poses = _body_poses(track.turns)
-    unit = find_unit(path, track.transl_key, poses, track.transl, rate, chosen.layout.up, trans_unit)
-    notes = (rate_doubt, track.doubt, shape_doubt, unit.note)
+    unit = find_unit(path, track.transl_key, poses, track.transl, rate.fps, chosen.layout.up, trans_unit)
+    notes = (rate.doubt, *track.doubts, shape_doubt, unit.note)
     return Recording(
         poses=poses,
         fingers=track.turns[:, -NUM_FINGER_JOINTS:] if track.turns.shape[1] in (52, 55) else track.fingers,
         transl=track.transl * unit.metres,
-        fps=rate,
+        fps=rate.fps,
         betas=betas,
         gender=_gender(chosen.fields.get("gender", chosen.fields.get("genders"))),
         family=_family(chosen, track.turns),
@@ -94,7 +100,7 @@ def read_recording(
         person=chosen.name,
         unit=unit.name,
         unit_sure=unit.sure,
-        fps_assumed=isinstance(rate_doubt, Doubt) and file_fps is None and "assumed" in str(rate_doubt),
+        fps_assumed=rate.assumed,
         rotations=track.way,
         notes=tuple(note for note in notes if note is not None),
     )

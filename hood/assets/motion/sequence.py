@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from hood.assets.motion.axes import Z_UP_TO_Y_UP
 from hood.assets.motion.recording import NUM_BODY_JOINTS
-from hood.assets.motion.rotation_vectors import from_vectors
+from hood.assets.motion.rotation_vectors import from_vectors, slerp
 
 __all__ = ["NUM_BODY_JOINTS", "Z_UP_TO_Y_UP", "PoseSequence", "resample", "still", "turn_world"]
 
@@ -62,8 +62,8 @@ def resample(sequence: PoseSequence, fps: float) -> PoseSequence:
         return sequence
     source, target = time_stamps(sequence.name, sequence.num_frames, sequence.fps, fps)
     transl = np.stack([np.interp(target, source, sequence.transl[:, axis]) for axis in range(3)], axis=1)
-    fingers = None if sequence.fingers is None else _slerp(sequence.fingers, source, target)
-    return replace(sequence, poses=_slerp(sequence.poses, source, target), transl=transl, fps=fps, fingers=fingers)
+    fingers = None if sequence.fingers is None else slerp(sequence.fingers, source, target)
+    return replace(sequence, poses=slerp(sequence.poses, source, target), transl=transl, fps=fps, fingers=fingers)
 
 
 def time_stamps(name: str, num_frames: int, fps: float, new_fps: float) -> tuple[np.ndarray, np.ndarray]:
@@ -87,12 +87,3 @@ def turn_world(sequence: PoseSequence, rotation: np.ndarray) -> PoseSequence:
     poses[:, 0] = (Rotation.from_matrix(rotation) * from_vectors(poses[:, 0])).as_rotvec()
     transl = sequence.transl @ rotation.T
     return replace(sequence, poses=poses, transl=transl, world_rotation=rotation @ sequence.world_rotation)
-
-
-def _slerp(poses: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """(T, J, 3) axis-angle at the times ``target`` of (N, J, 3) at the times ``source``."""
-    result = np.zeros((len(target), *poses.shape[1:]))
-    for joint in range(poses.shape[1]):
-        if np.any(poses[:, joint]):
-            result[:, joint] = Slerp(source, from_vectors(poses[:, joint]))(target).as_rotvec()
-    return result

@@ -10,7 +10,7 @@ import numpy as np
 from hood.assets.files.doubt import Doubt
 from hood.assets.motion.axes import UP_AXES
 from hood.assets.motion.recording import Recording
-from hood.assets.motion.skeleton import joints_about_pelvis, some_frames, spread, upright
+from hood.assets.motion.skeleton import joints_about_pelvis, some_frames, spread
 
 #: The head is over the feet along an axis where the unit vector between them has this component there, and a body stands
 #: along an axis where that is so in this share of the frames; along that of its layout in the second share.
@@ -56,7 +56,7 @@ class Carried(NamedTuple):
 
 def find_bearing(recording: Recording) -> Bearing:
     """The axis along which the body stands; that of the layout where the skeleton does not tell."""
-    along = _uprights(recording)
+    along = recording.uprights
     shares = {axis: float((along @ _vector(axis) > _ALONG).mean()) for axis in UP_AXES}
     if shares[recording.up] >= _OFTEN:
         return Bearing(recording.up, True)
@@ -75,6 +75,12 @@ def find_bearing(recording: Recording) -> Bearing:
         if other.fails:
             return Bearing(axis, False)
     return _by_heights(recording, axis, own is None or own.holds)
+
+
+def find_up(path: Path, recording: Recording) -> tuple[str, UserWarning | None]:
+    """The up axis to take where nobody gives one, and what to tell the user: :func:`bearing_notice`, else a body head down."""
+    axis, notice = bearing_notice(path, recording)
+    return axis, notice or head_down_doubt(path, recording, axis)
 
 
 def bearing_notice(path: Path, recording: Recording) -> tuple[str, UserWarning | None]:
@@ -101,7 +107,7 @@ def bearing_notice(path: Path, recording: Recording) -> tuple[str, UserWarning |
 
 def head_down_doubt(path: Path, recording: Recording, axis: str) -> Doubt | None:
     """The doubt about a body that is head down in most frames with ``axis`` up."""
-    height = _uprights(recording) @ _vector(axis)
+    height = recording.uprights @ _vector(axis)
     down = spread(len(recording.poses))[height < _HEAD_DOWN]
     if len(down) <= len(height) / 2:
         return None
@@ -112,11 +118,6 @@ def head_down_doubt(path: Path, recording: Recording, axis: str) -> Doubt | None
         f"up={axis} says that it is right"
     )
     return Doubt("orientation", said, tuple(map(int, down[:100])), share, "")
-
-
-def _uprights(recording: Recording) -> np.ndarray:
-    """(N, 3): unit vectors from the feet to the head, in frames spread over the motion."""
-    return upright(joints_about_pelvis(recording.poses[spread(len(recording.poses))]))
 
 
 def _vector(axis: str) -> np.ndarray:
@@ -164,7 +165,7 @@ def _camera_doubt(path: Path, recording: Recording) -> Doubt | None:
     """Cameras are not level: what is up in their picture is not exactly against gravity."""
     if not recording.camera:
         return None
-    lean = _uprights(recording).mean(axis=0) @ _vector(recording.up)
+    lean = recording.uprights.mean(axis=0) @ _vector(recording.up)
     degrees = float(np.degrees(np.arccos(np.clip(lean, -1.0, 1.0))))
     said = (
         f"{path}: its body is seen from a camera ({recording.layout} files), up is taken from the picture, and it leans "

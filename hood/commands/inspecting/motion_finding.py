@@ -9,10 +9,10 @@ import numpy as np
 
 from hood.assets.files.doubt import Doubt
 from hood.assets.files.library import locate
-from hood.assets.motion.axes import UP_AXES, require_up
+from hood.assets.motion.axes import require_up
 from hood.assets.motion.layouts.people import SeveralPeopleError
 from hood.assets.motion.recording import Recording, read_recording
-from hood.assets.motion.up_axis import bearing_notice, find_bearing, head_down_doubt
+from hood.assets.motion.up_axis import find_bearing, find_up
 from hood.commands.findings import Finding
 from hood.scene.load_motion import MotionOptions
 
@@ -31,18 +31,14 @@ def inspect_motion(name: str, options: MotionOptions) -> Finding:
         finding.facts = _of_people(error)
         _add(finding, path, error)
         return finding
-    notice = None
-    if options.up == "auto":
-        axis, notice = bearing_notice(path, recording)
-        notice = notice or head_down_doubt(path, recording, axis)
-    else:
-        axis = options.up
+    axis, notice = find_up(path, recording) if options.up == "auto" else (options.up, None)
     finding.facts = _facts(recording, axis, options)
     for note in (*recording.notes, *([] if notice is None else [notice])):
         _add(finding, path, note)
     doubted = any(isinstance(note, Doubt) and note.kind == "units" for note in recording.notes)
     if not doubted and float(np.quantile(_root_speed(recording), 0.99)) > _FASTEST:
-        finding.problem("the root moves faster than 20 m/s", "its unit or frame rate may be wrong: trans_unit=cm or file_fps=…")
+        fix = "its unit or frame rate may be wrong: trans_unit=cm or file_fps=…"
+        finding.problem(f"the root moves faster than {_FASTEST:g} m/s", fix)
     return finding
 
 
@@ -78,14 +74,14 @@ def _facts(recording: Recording, axis: str, options: MotionOptions) -> dict[str,
         "seen from a camera": recording.camera,
         "up axis by its layout": recording.up,
         "up axis by its poses": tested,
-        "up axis taken": axis if axis in UP_AXES and options.up == "auto" else f"{axis}, as given",
-        "greatest root speed [m/s]": round(float(speed.max(initial=0.0)), 2),
+        "up axis taken": axis if options.up == "auto" else f"{axis}, as given",
+        "greatest root speed [m/s]": round(float(speed.max()), 2),
         "fingers": recording.fingers is not None,
     }
 
 
 def _root_speed(recording: Recording) -> np.ndarray:
-    """(N − 1,) m/s; one 0 of a single pose."""
+    """(N − 1,) m/s of the root; one 0 of a single pose."""
     change = np.linalg.norm(np.diff(recording.transl, axis=0), axis=1)
     return change * recording.fps if len(change) else np.zeros(1)
 

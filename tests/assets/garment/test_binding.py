@@ -16,7 +16,7 @@ from hood.assets.garment.garment import Garment, load_garment, save_garment
 from hood.assets.garment.outfit import join_garments
 from hood.assets.garment.units import find_scale, require_metres, used
 from hood.assets.motion.load import load_sequence
-from hood.assets.motion.poses import arms_down, read_pose
+from hood.assets.motion.poses import arms_down, holds_pose, read_pose
 from hood.assets.motion.sequence import PoseSequence
 from hood.mesh import topology
 from hood.testing import sphere
@@ -164,6 +164,19 @@ def test_poses_from_files(tmp_path: Path) -> None:
         (tmp_path / name).write_text(text)
         with pytest.raises(ValueError, match=name):
             read_pose(tmp_path / name)
+
+
+def test_arrays_of_many_frames_are_no_pose(tmp_path: Path) -> None:
+    """A motion of Motion-X, poses without keys, and content by key."""
+    for name, table in (("x", np.zeros((60, 322))), ("poses", np.zeros((9, 72))), ("keys", np.array({"a": 1}, dtype=object))):
+        np.save(tmp_path / f"{name}.npy", table, allow_pickle=True)
+        assert not holds_pose(tmp_path / f"{name}.npy"), name
+    with pytest.raises(ValueError, match=r"x\.npy: 19320 numbers; a pose has 72"):
+        read_pose(tmp_path / "x.npy")
+    np.save(tmp_path / "one.npy", np.zeros((1, 24, 3)))
+    assert holds_pose(tmp_path / "one.npy")
+    assert holds_pose(tmp_path / "one.txt")
+    assert not holds_pose(tmp_path / "one.npz")
 
 
 def test_a_held_waistband_follows_the_trunk_alone(garments: dict[str, Garment], body: Body) -> None:

@@ -108,6 +108,13 @@ def test_every_file_is_the_same_motion(name: str, tmp_path: Path) -> None:
     assert found.fps == 30.0
 
 
+@pytest.mark.parametrize("suffix", [".pkl", ".PKL"])
+def test_pickles_of_vertices_are_meshes_whatever_the_case_of_their_suffix(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"rock{suffix}"
+    path.write_bytes(pickle.dumps({"verts": moving()[0], "faces": FACES}))
+    assert body_kind(path) == "mesh"
+
+
 @pytest.mark.parametrize("suffix", [".obj", ".ply", ".stl", ".off"])
 def test_still_meshes_have_one_frame(suffix: str, tmp_path: Path) -> None:
     trimesh = pytest.importorskip("trimesh")

@@ -63,9 +63,18 @@ def test_assumed_rates_are_those_of_the_layout_and_doubts(tmp_path: Path) -> Non
 
 
 def test_two_rates_that_disagree_are_a_doubt(tmp_path: Path) -> None:
-    found = read_recording(write(tmp_path / "m.pkl", split(fps=30, mocap_framerate=120.0)))
+    found = read_recording(write(tmp_path / "assumed.pkl", split(fps=30, mocap_framerate=120.0)))
     assert (found.fps, found.fps_assumed) == (120.0, False)
     assert "mocap_framerate=120 and fps=30" in str(found.notes[0])
+
+
+@pytest.mark.parametrize("content", [amass(72), split()])
+def test_a_single_pose_needs_no_rate(content: dict[str, Any], tmp_path: Path) -> None:
+    one = {key: value[:1] if np.ndim(value) == 2 else value for key, value in content.items() if "rate" not in key}
+    path = write(tmp_path / "m.pkl", one)
+    found = read_recording(path)
+    assert (found.fps, found.fps_assumed, found.notes) == (30.0, True, ())
+    assert load_sequence(path, 25.0, num_frames=10).fps == 25.0
 
 
 def test_a_doubt_reaches_whoever_loads(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from motion_kinds.parameters import split
+from motion_kinds.parameters import posed, quaternions, six, split
 from motion_kinds.published import motion_x, wham
 from motion_kinds.refused import REFUSALS
 from motion_kinds.siblings import SIBLINGS, opened
@@ -17,6 +17,7 @@ from motion_kinds.writers import write
 from scipy.spatial.transform import Rotation
 
 from hood.assets.files.doubt import Doubt
+from hood.assets.identify import MOTION, identify
 from hood.assets.motion.load import load_sequence
 from hood.assets.motion.recording import read_recording
 from hood.assets.motion.up_axis import bearing_notice
@@ -53,23 +54,31 @@ OTHERWISE = (
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_the_same_content_is_read_however_it_is_written(way: str, tmp_path: Path) -> None:
     suffix, change = SIBLINGS[way]
-    for name in (
-        "AIST++",
-        "3DPW, second of two",
-        "EMDB",
-        "GVHMR",
-        "PHALP, two tracks",
-        "ROMP",
-        "Motion-X",
-        "GRAB",
-        "quaternions, w first",
-    ):
+    for name in OTHERWISE:
         file = GENERATORS[name]
         path = write(tmp_path / f"m{suffix}", change(opened(file.make())))
+        assert identify(str(path)) == MOTION, name
         sequence = load_sequence(path, file.fps, **file.keys)
         assert np.abs(sequence.transl - walk().transl).max() < 2e-6, name
         own, wanted = (Rotation.from_rotvec(poses[:, :22].reshape(-1, 3)) for poses in (sequence.poses, walk().poses))
         assert (own.inv() * wanted).magnitude().max() < 2e-6, name
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_people_seen_for_a_few_frames_are_no_frames(count: int, tmp_path: Path) -> None:
+    """Three rows of 72 numbers are as many as 24 matrices."""
+    people = {name: {key: table[:count] for key, table in person.items()} for name, person in wham(2).items()}
+    found = read_recording(write(tmp_path / "m.pkl", people), person=2)
+    assert (found.people, found.poses.shape) == (("0", "2"), (count, 24, 3))
+    by_joint = {str(name): posed(world("z").poses[:count], trans=world("z").transl[:count]) for name in range(2)}
+    assert read_recording(write(tmp_path / "n.pkl", by_joint), person=1).poses.shape == (count, 24, 3)
+
+
+def test_rows_of_frames_may_hold_any_representation(tmp_path: Path) -> None:
+    for turns in (quaternions(True), six("rows").reshape(-1, 144)):
+        rows = [{"poses": row, "trans": place} for row, place in zip(turns, world("z").transl, strict=True)]
+        found = read_recording(write(tmp_path / "m.pkl", {"fps": 30, "frames": rows}))
+        assert np.abs(found.poses[:, 1:22] - walk().poses[:, 1:22]).max() < 1e-6
 
 
 def test_frames_in_which_nobody_was_seen_are_filled_and_doubted(tmp_path: Path) -> None:
@@ -89,6 +98,12 @@ def test_fingers_stand_beside_the_body(tmp_path: Path) -> None:
     found = read_recording(write(tmp_path / "m.pkl", split(**hands, fps=30)))
     np.testing.assert_array_equal(found.fingers, own.fingers)
     np.testing.assert_array_equal(read_recording(write(tmp_path / "m.npy", motion_x())).fingers, own.fingers)
+    amass_x = {"root_orient": own.root, "pose_body": own.body, "pose_hand": own.fingers.reshape(-1, 90), "trans": own.transl}
+    one = {key: value[0] for key, value in amass_x.items()}
+    np.testing.assert_array_equal(read_recording(write(tmp_path / "n.npz", one)).fingers, own.fingers[:1])
+    for hand, words in ((0.0, r"shape \(\); it must be \(N, 90\)"), (own.fingers[:-1], "59 frames, the body has 60")):
+        with pytest.raises(ValueError, match=rf"o\.npz: pose_hand has {words}"):
+            read_recording(write(tmp_path / "o.npz", amass_x | {"pose_hand": hand, "fps": 30}))
     coefficients = {f"{side}_hand_pose": np.zeros((60, 12)) for side in ("left", "right")}
     assert read_recording(write(tmp_path / "m.pkl", split(**coefficients, fps=30))).fingers is None
 

@@ -114,6 +114,13 @@ def test_lengths_by_header_are_those_of_the_motion(tmp_path: Path, frames: int, 
     assert list(MotionFiles([path], LOAD, 30.0).lengths) == [load_sequence(path, 30.0).num_frames]
 
 
+@pytest.mark.parametrize("key", ["mocap_framerate", "nothing"])
+def test_a_given_frame_rate_holds_for_lengths_as_well(tmp_path: Path, key: str) -> None:
+    path = str(write(tmp_path / "a.npz", 200, 120.0, key))
+    motions = MotionFiles([path], partial(LOAD, file_fps=60.0), 30.0, file_fps=60.0)
+    assert motions.lengths[0] == motions[0].num_frames == 100
+
+
 def test_files_are_read_when_they_are_used_and_kept_within_a_bound(folder: Path) -> None:
     reads: list[str] = []
 

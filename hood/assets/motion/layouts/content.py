@@ -76,6 +76,11 @@ def plain(item: Any, depth: int = 0) -> Any:
     return item
 
 
+def length(value: Any) -> int:
+    """How many entries a list or the first axis of an array has; -1 for what has no entries."""
+    return len(value) if isinstance(value, list) or (isinstance(value, np.ndarray) and value.ndim) else -1
+
+
 def _table(item: Any) -> np.ndarray | None:
     """Lists of numbers, or of such lists of one length, as an array; None for others."""
     first = item

@@ -11,7 +11,7 @@ import numpy as np
 from hood.assets.files.frame_rates import squeezed
 from hood.assets.files.guarded import listed
 from hood.assets.motion.layouts.content import Unread
-from hood.assets.motion.layouts.people import Person, find_people
+from hood.assets.motion.layouts.people import Person
 from hood.assets.motion.skeleton import PARENTS
 
 #: Bones keep their length: it varies by less than this share where triples are places of joints.
@@ -33,7 +33,7 @@ def unknown(path: Path, content: Any) -> str:
     if not isinstance(content, Mapping):
         return f"{path}: holds a {type(content).__name__}, not a motion; it must be a dict of arrays"
     keys = {squeezed(key): key for key in content}
-    if _are_weights(content):
+    if are_weights(content):
         return f"{path}: holds the weights of a network, not a motion; pass checkpoint={path}"
     if "vtemplate" in keys:
         return f"{path}: holds a body model, not a motion; pass body={path}"
@@ -58,20 +58,14 @@ def unknown(path: Path, content: Any) -> str:
     )
 
 
-def is_of_motion(content: Any) -> bool:
-    """Whether content is a motion, or something that is given for one: joint positions, tables of features."""
+def is_like_motion(content: Any) -> bool:
+    """Whether content in which no layout is found is given for a motion: arrays without keys, joint positions."""
     if isinstance(content, list):
-        return bool(find_people(content)) or (len(content) > 0 and is_of_motion(content[0]))
+        return len(content) > 0 and is_like_motion(content[0])
     if not isinstance(content, Mapping):
         return isinstance(content, np.ndarray)
-    if _are_weights(content):
-        return False
     keys = {squeezed(key) for key in content}
-    return (
-        bool(find_people(content))
-        or {"rh", "th"} <= keys
-        or any(_is_positions(squeezed(key), v) for key, v in _tables(content))
-    )
+    return {"rh", "th"} <= keys or any(_is_positions(squeezed(key), value) for key, value in _tables(content))
 
 
 def unplaced(path: Path, person: Person) -> str:
@@ -128,8 +122,10 @@ def _is_positions(key: str, value: Any) -> bool:
     return key in names and isinstance(value, np.ndarray) and value.ndim >= 3
 
 
-def _are_weights(content: Mapping[str, Any]) -> bool:
-    """Whether a dict is what training writes: tables whose names are paths of modules."""
+def are_weights(content: Any) -> bool:
+    """Whether content is what training writes: a dict of tables whose names are paths of modules."""
+    if not isinstance(content, Mapping):
+        return False
     if any(squeezed(key) in _WEIGHTS for key in content):
         return True
     names = [key for key, value in _tables(content) if "." in key]

@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 
 from hood.assets.files.frame_rates import flat, squeezed
-from hood.assets.motion.layouts.table import find_layout
+from hood.assets.motion.layouts.content import length
+from hood.assets.motion.layouts.rotations import as_turns
+from hood.assets.motion.layouts.table import counts_of, find_layout
 
 #: Names of frames: those of pictures, and numbers behind such a word.
 _FRAME_NAME = re.compile(r".*\.(jpe?g|png|bmp|webp)$|(frame|image|img)[_ -]?\d+$", re.IGNORECASE)
@@ -19,8 +21,6 @@ _IDS = ("tid", "trackids", "trackedids", "trackid", "id", "personid", "subjectid
 _POSES = ("smpl", "smplparams", "predsmplparams", "params")
 #: Containers within each other that are looked into.
 _DEEPEST = 4
-#: Numbers of a whole pose, in one row, of axis-angle vectors or matrices, of joints that the layouts have.
-_ROW = (63, 66, 69, 72, 156, 165, 189, 207, 198, 216)
 
 
 def gather_frames(path: Path, content: Any, depth: int = 0) -> Any:
@@ -78,8 +78,9 @@ def _is_row(entry: Any) -> bool:
     if layout is None:
         return False
     try:
-        return all(np.asarray(entry[keys[key]], dtype=float).size in (3, 4, 6, 9, *_ROW) for key in layout.poses)
-    except (TypeError, ValueError):  # no numbers, or rows of several lengths
+        parts = [(key, np.asarray(entry[keys[key]], dtype=float)) for key in layout.poses]
+        return all(len(as_turns(Path(), key, array, *counts_of(key)).values) == 1 for key, array in parts)
+    except (TypeError, ValueError):  # no numbers, rows of several lengths, or no rotations of these joints
         return False
 
 
@@ -102,7 +103,7 @@ def _rows(entry: Any) -> list[dict[str, Any]]:
             return [_named(dict(fields))]
     rows = []
     for index in range(count):
-        own = {key: value[index] for key, value in fields.items() if _length(value) == count}
+        own = {key: value[index] for key, value in fields.items() if length(value) == count}
         if poses is not None and isinstance(poses[index], Mapping):
             own |= {squeezed(key): value for key, value in poses[index].items()}
         rows.append(_named(own))
@@ -115,10 +116,6 @@ def _named(row: dict[str, Any]) -> dict[str, Any]:
     if name is not None and len(number) == 1 and number.dtype.kind in "iu":
         row["person"] = int(number[0])
     return row
-
-
-def _length(value: Any) -> int:
-    return len(value) if isinstance(value, list) or (isinstance(value, np.ndarray) and value.ndim) else -1
 
 
 def _stacked(rows: list[dict[str, Any]]) -> dict[str, Any]:

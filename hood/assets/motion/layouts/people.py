@@ -11,11 +11,9 @@ import numpy as np
 
 from hood.assets.files.frame_rates import flat, squeezed
 from hood.assets.files.guarded import listed
-from hood.assets.motion.layouts.content import Unread
-from hood.assets.motion.layouts.table import LAYOUTS, Layout, counts_of, find_layout
+from hood.assets.motion.layouts.content import Unread, length
+from hood.assets.motion.layouts.table import LAYOUTS, Layout, find_layout, sizes_of
 
-#: Numbers of one rotation in all representations, as in :mod:`hood.assets.motion.layouts.rotations`.
-_PER = (3, 4, 6, 9)
 #: Entries of a list that are looked into.
 _MOST = 1000
 
@@ -109,10 +107,8 @@ def _named(people: list[Person]) -> list[Person]:
 
 def _is_pose(person: Person) -> bool:
     for key in person.layout.poses:
-        counts, _ = counts_of(key)
-        value = person.fields[key]
+        value, sizes = person.fields[key], sizes_of(key)
         first = value[0] if isinstance(value, list) and value else value
-        sizes = {count * per for count in counts for per in _PER}
         shape = first.shape if isinstance(first, np.ndarray) else ()
         if not any(int(np.prod(shape[axis:])) in sizes for axis in range(len(shape))):
             return False
@@ -133,28 +129,22 @@ def _apart(person: Person) -> list[Person]:
 
 
 def _at(person: Person, index: int, count: int) -> Person:
-    return person.rows(str(index), lambda value: value[index] if _length(value) == count else value)
+    return person.rows(str(index), lambda value: value[index] if length(value) == count else value)
 
 
 def _of_rows(person: Person, name: str, chosen: np.ndarray, total: int) -> Person:
     def take(value: Any) -> Any:
-        if _length(value) != total:
+        if length(value) != total:
             return value
         return value[chosen] if isinstance(value, np.ndarray) else [value[row] for row in chosen]
 
     return person.rows(name, take)
 
 
-def _length(value: Any) -> int:
-    return len(value) if isinstance(value, list) or (isinstance(value, np.ndarray) and value.ndim) else -1
-
-
 def _entries_a_person(person: Person) -> int | None:
     """How many people the first axis of the poses, or their list, is over; None where it is over frames."""
     key = person.layout.poses[-1]
-    counts, _ = counts_of(key)
-    value = person.fields[key]
-    sizes = {count * per for count in counts for per in _PER}
+    value, sizes = person.fields[key], sizes_of(key)
     if isinstance(value, list):
         # A list of tables is one of people, a list of rows one of frames.
         many = [entry for entry in value if isinstance(entry, np.ndarray) and entry.ndim >= 2 and entry.size not in sizes]
@@ -172,7 +162,7 @@ def _groups(person: Person) -> dict[str, np.ndarray]:
         return _by_picture(person)
     key = next((key for key in person.layout.ids if key in person.fields), None)
     ids = flat(person.fields[key]) if key is not None else np.zeros(0)
-    if len(ids) != _length(person.fields[person.layout.poses[0]]):
+    if len(ids) != length(person.fields[person.layout.poses[0]]):
         return {}
     return {str(name): np.flatnonzero(ids == name) for name in np.unique(ids)}
 

@@ -6,16 +6,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
 from hood.assets.files.doubt import Doubt
 from hood.assets.files.frame_rates import flat
 from hood.assets.motion.layouts.content import Unread
-from hood.assets.motion.layouts.foreign import unknown, unplaced
+from hood.assets.motion.layouts.foreign import are_weights, is_like_motion, unknown, unplaced
 from hood.assets.motion.layouts.frames import gather_frames
 from hood.assets.motion.layouts.people import Person, find_people
-from hood.assets.motion.layouts.rotations import Turns, as_turns, to_vectors
+from hood.assets.motion.layouts.rotations import TRANSPOSED, Turns, as_turns, to_vectors
 from hood.assets.motion.layouts.table import CAMERA_TRANSL, WORLD_TRANSL, counts_of
+from hood.assets.motion.rotation_vectors import slerp
 
 NUM_FINGER_JOINTS = 30  # 15 a side, left first
 #: Columns of Motion-X: global orientation, body, hands, jaw, expression and face shape (left out), translation, betas.
@@ -38,7 +38,7 @@ class Track(NamedTuple):
     fingers: np.ndarray | None  # (N, 30, 3) rad
     transl_key: str
     way: str | None  # how rotations were read that are no axis-angle vectors
-    doubt: Doubt | None  # frames that are missing
+    doubts: tuple[Doubt, ...] = ()  # how its rotations are arranged, frames that are missing
 
 
 def people_in(path: Path, content: Any) -> list[Person]:
@@ -47,10 +47,24 @@ def people_in(path: Path, content: Any) -> list[Person]:
     Raises:
         ValueError: there is nobody; says what the file holds, and what to write instead.
     """
-    people = find_people(gather_frames(path, _with_motion_x(content)))
+    people = _found(path, content)
     if not people:
         raise ValueError(unknown(path, content))
     return people
+
+
+def is_of_motion(path: Path, content: Any) -> bool:
+    """Whether a file's content is a motion, or something that is given for one: joint positions, tables of features."""
+    if are_weights(content):
+        return False
+    try:
+        return bool(_found(path, content)) or is_like_motion(content)
+    except ValueError:  # several people in a frame
+        return True
+
+
+def _found(path: Path, content: Any) -> list[Person]:
+    return find_people(gather_frames(path, _with_motion_x(content)))
 
 
 def _with_motion_x(content: Any, depth: int = 0) -> Any:
@@ -80,7 +94,7 @@ def read_track(path: Path, person: Person) -> Track:
     transl, transl_key = _translation(path, person, len(turns))
     if len(turns) != len(transl):
         raise ValueError(f"{path}: {name} has {len(turns)} frames, {transl_key} has shape {transl.shape}; they must agree")
-    track = Track(turns, transl, _hands(path, person, len(turns)), transl_key, way, None)
+    track = Track(turns, transl, _hands(path, person, len(turns)), transl_key, way, _about_way(path, name, way))
     return _filled(path, person, track)
 
 
@@ -113,6 +127,16 @@ def _part(path: Path, person: Person, key: str) -> Turns:
         array = array[:24].transpose(2, 0, 1)  # joints, numbers, frames
     counts, first = counts_of(key)
     return as_turns(path, person.keys[key], array, counts, first)
+
+
+def _about_way(path: Path, key: str, way: str | None) -> tuple[Doubt, ...]:
+    if way is None or not way.endswith(TRANSPOSED):
+        return ()
+    said = (
+        f"{path}: by the matrices of {key} knees and elbows bend backwards, and they are read transposed; save poses as "
+        "axis-angle vectors [rad] where that is wrong"
+    )
+    return (Doubt("layout", said),)
 
 
 def _translation(path: Path, person: Person, num_frames: int) -> tuple[np.ndarray, str]:
@@ -150,10 +174,11 @@ def _hands(path: Path, person: Person, num_frames: int) -> np.ndarray | None:
         if any(side.size != 45 * num_frames for side in pair):
             return None  # coefficients of a hand model
         key, hand = "lefthandpose", np.concatenate([side.reshape(num_frames, 45) for side in pair], axis=1)
-    if len(hand) != num_frames:
-        raise ValueError(f"{path}: {person.keys[key]} has {len(hand)} frames, the body has {num_frames}; they must agree")
-    if hand.size != num_frames * NUM_FINGER_JOINTS * 3:
+    count, rest = divmod(hand.size, NUM_FINGER_JOINTS * 3)
+    if rest:
         raise ValueError(f"{path}: {person.keys[key]} has shape {hand.shape}; it must be (N, {NUM_FINGER_JOINTS * 3})")
+    if count != num_frames:
+        raise ValueError(f"{path}: {person.keys[key]} has {count} frames, the body has {num_frames}; they must agree")
     return hand.reshape(num_frames, NUM_FINGER_JOINTS, 3)
 
 
@@ -176,11 +201,8 @@ def _filled(path: Path, person: Person, track: Track) -> Track:
     )
     doubt = Doubt("jump", said, tuple(missing[:100]), float(len(missing)), "frames")
     times, wanted = seen.astype(np.float64), np.arange(count) + float(seen[0])
-    fingers = None if track.fingers is None else _between(track.fingers, times, wanted)
+    fingers = None if track.fingers is None else slerp(track.fingers, times, wanted)
     transl = np.stack([np.interp(wanted, times, track.transl[:, axis]) for axis in range(3)], axis=1)
-    return track._replace(turns=_between(track.turns, times, wanted), transl=transl, fingers=fingers, doubt=doubt)
-
-
-def _between(turns: np.ndarray, times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    parts = [Slerp(times, Rotation.from_rotvec(turns[:, joint]))(wanted).as_rotvec() for joint in range(turns.shape[1])]
-    return np.stack(parts, axis=1)
+    return track._replace(
+        turns=slerp(track.turns, times, wanted), transl=transl, fingers=fingers, doubts=(*track.doubts, doubt)
+    )

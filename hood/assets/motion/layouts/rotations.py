@@ -18,8 +18,11 @@ KINDS = {3: "axis-angle vectors", 4: "quaternions", 6: "6D rotations", 9: "rotat
 _STEADY = (3, 6, 9, 10, 11, 12, 13, 14, 15)
 #: The median turn [rad] of these joints is below the first in the right order of a quaternion, beyond the second in the wrong.
 _SMALL, _LARGE = 0.7, 1.2
-#: Knees and elbows bend one way: share of their turning that does so, by the right reading of a matrix.
-_ONE_WAY = 0.5
+#: Knees and elbows bend one way: share of their turning that does so, by the right reading of a matrix. Where they turn by less
+#: than the second [rad] on average, they are straight and tell nothing.
+_ONE_WAY, _STRAIGHT = 0.5, 0.05
+#: How matrices are read in which they bend backwards.
+TRANSPOSED = "transposed by the joints"
 #: Matrices and quaternions of half precision are off unit length by so much.
 _UNIT = 2e-2
 #: Ways to arrange two vectors in six numbers, from how (3, 3) matrices begin: two rows, two columns, and those interleaved.
@@ -82,6 +85,8 @@ def to_vectors(path: Path, key: str, parts: Sequence[Turns]) -> tuple[np.ndarray
     read = {way: _read(parts, kind, way) for way in ways[kind]}
     if len(read) == 1:
         way, vectors = next(iter(read.items()))
+        if kind == KINDS[9] and _bends(joints, vectors) < -_ONE_WAY:
+            return _read(parts, kind, TRANSPOSED), f"{kind}, {TRANSPOSED}"
         return vectors, None if kind == KINDS[3] else way if way == kind else f"{kind}, {way}"
     for way, vectors in read.items():
         if all(_is_better(joints, vectors, other, kind) for name, other in read.items() if name != way):
@@ -144,6 +149,7 @@ def _vectors(part: Turns, way: str) -> np.ndarray:
         return part.values
     if part.kind == KINDS[9]:
         found = Rotation.from_matrix(_nearest(flat.reshape(-1, 3, 3)))
+        found = found.inv() if way == TRANSPOSED else found
     elif part.kind == KINDS[4]:
         found = Rotation.from_quat(flat[:, [1, 2, 3, 0]] if way == "w first" else flat)
     else:
@@ -188,8 +194,9 @@ def _steadiness(joints: list[int], vectors: np.ndarray) -> float:
 
 
 def _bends(joints: list[int], vectors: np.ndarray) -> float:
-    """1 where knees and elbows bend as they do, −1 where all bend backwards; 0 without them."""
+    """1 where knees and elbows bend as they do, −1 where all bend backwards; near 0 where they are straight or not there."""
     hinges = [(KNEES[0], 0, 1.0), (KNEES[1], 0, 1.0), (ELBOWS[0], 1, -1.0), (ELBOWS[1], 1, 1.0)]
     own = [(joints.index(joint), axis, sign) for joint, axis, sign in hinges if joint in joints]
     bent = sum(sign * vectors[:, place, axis].sum() for place, axis, sign in own)
-    return float(bent / max(sum(np.linalg.norm(vectors[:, place], axis=1).sum() for place, _, _ in own), 1e-9))
+    turned = sum(np.linalg.norm(vectors[:, place], axis=1).sum() for place, _, _ in own)
+    return float(bent / max(turned, _STRAIGHT * len(own) * len(vectors), 1e-9))

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+#: Numbers of one rotation: axis-angle vectors, quaternions, 6D, matrices.
+PER_TURN = (3, 4, 6, 9)
 #: Numbers of joints of a whole skeleton: without hands, SMPL, SMPL-H, SMPL-X.
 WHOLE = (22, 24, 52, 55)
 _ROOT, _BODY = (1,), (21, 23)
@@ -19,7 +21,7 @@ WORLD_TRANSL = (
 )  # fmt: skip
 CAMERA_TRANSL = ("predtrans", "predcamt", "camt", "camtrans", "transcam", "cameratranslation", "camera", "cameratransl")
 #: A frame rate of recordings from video, where their layout says none.
-_VIDEO = 30.0
+VIDEO_FPS = 30.0
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,7 @@ class Layout:
     transl: tuple[str, ...] = WORLD_TRANSL  # keys that may hold the translation, the first counts
     marks: tuple[str, ...] = ()  # keys of which one must be there as well
     above: str = ""  # key of the dict that the layout stands in
-    fps: float | None = _VIDEO
+    fps: float | None = VIDEO_FPS
     up: str = "y"
     camera: bool = False  # as seen from a camera, which need not be level
     family: str | None = None  # None: by the number of joints
@@ -51,6 +53,11 @@ class Layout:
 def counts_of(key: str) -> tuple[tuple[int, ...], int]:
     """How many joints a squeezed key of rotations may hold, and from which on."""
     return _COUNTS.get(key, (WHOLE, 0))
+
+
+def sizes_of(key: str) -> set[int]:
+    """How many numbers a pose under a squeezed key of rotations may have, in whatever representation."""
+    return {count * per for count in counts_of(key)[0] for per in PER_TURN}
 
 
 _TRACKS = ("trackids", "trackedids", "tid", "subjectids")
