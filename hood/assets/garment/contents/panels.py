@@ -23,17 +23,17 @@ from hood.mesh.topology import unique_edges
 #: much of that in front of it. Halves of clothes have 0.28 and 0.89 at least; a hem that crosses a waistband has 0.13 of the
 #: rim or 0.75 in front at most.
 _CUT, _IN_FRONT = 0.2, 0.8
-#: A part with one rim is a bag, such as a sock, where its area is so many times that of a disc with this rim: the crown of a hat
-#: has 3 to 5, a glove 20.
+#: A part with one rim is a bag, such as a sock, where its area is so many times that of a disc with this rim: the crown of a
+#: hat has 3 to 5, a glove 20.
 _BAG = 6.0
 
 
 def sew_panels(fitting: Fitting, wanted: Wanted, scale: float, open_edges: np.ndarray) -> None:
     """Sew rims of pattern pieces within the gap; they are pulled together half way each.
 
-    Two parts that are worn by themselves, each a bag or with two openings at least, are two garments, unless the gap is given or they
-    have no names and end in front of each other, as the halves of a shirt do and a hem over a waistband does not. Vertices
-    ``open_edges`` of the file, and those of fasteners, are left as they are.
+    Two parts that are worn by themselves, each a bag or with two openings at least, are two garments, unless the gap is given
+    or they have no names and end in front of each other, as the halves of a shirt do and a hem over a waistband does not.
+    Vertices ``open_edges`` of the file, and those of fasteners, are left as they are.
     """
     gap = SEAM if wanted.gap is None else wanted.gap
     for _ in range(2):  # what was sewn to its neighbours may then be sewn to itself
