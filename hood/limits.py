@@ -66,7 +66,7 @@ CROSSINGS_SEEN = Limit(0.25, "m", _RULE, "the length of a hand, of what a viewer
 #: Worn, see hood.dynamics.verdict.worn.
 AWAY_UNSOUND = Limit(0.20, "m", "hood.dynamics.verdict.worn", "43 rollouts: worn at most 0.11, come off at least 0.28")
 SLIPPED_UNSOUND = Limit(0.15, "m", "hood.dynamics.verdict.worn", "498 rollouts: worn at most 0.14, come off at least 0.15")
-SUNK_UNSOUND = Limit(0.08, "m", "hood.dynamics.verdict.worn", "498 rollouts: worn at most 0.03, come off at least 0.09")
+SUNK_UNSOUND = Limit(0.06, "m", "hood.dynamics.verdict.worn", "498 rollouts: worn at most 0.04, come off at least 0.07")
 
 #: The body.
 HEAD_DOWN = Limit(0.5, "share of frames", _BODY, "cartwheels are shorter, and handstands stand on the hands")

@@ -17,6 +17,8 @@ from hood.testing import cylinder
 
 COMMAND = ["rollout", "stepper=newton", "sequence=walk.npz", "num_frames=2", "video=none", "sheet=false", "output=out"]
 QUICK = [*COMMAND, "metrics=none", "settle=paper"]
+#: The start is not what is asked: it need not be at rest.
+FEW = "solver.max_iterations=30"
 
 
 @pytest.fixture(autouse=True)
@@ -70,7 +72,7 @@ def test_held_vertices_inside_the_body_are_told() -> None:
 def test_garments_in_another_order_than_they_lie_are_told() -> None:
     _belt("inner.obj", 0.19)
     _belt("outer.obj", 0.2)
-    assert main([*QUICK, "garment=[inner.obj,outer.obj]", "layers=[outer,inner]"]) == 0
+    assert main([*QUICK, "garment=[inner.obj,outer.obj]", "layers=[outer,inner]", FEW]) == 0
     (sentence,) = _warnings()
     assert "'inner' lay under 'outer' and was taken over it, with edges stretched by up to" in sentence
     assert main([*QUICK, "garment=[inner.obj,outer.obj]", "layers=[inner,outer]"]) == 0

@@ -137,6 +137,15 @@ def test_the_body_is_posed_where_a_motion_is_given() -> None:
     assert all(frame.body_pos.shape == (5, 3) for frame in given if frame.simulated)
 
 
+@pytest.fixture
+def few_objects() -> Iterator[None]:
+    """A collection looks at objects that a test makes, not at all that the tests before it left."""
+    gc.freeze()
+    yield
+    gc.unfreeze()
+
+
+@pytest.mark.usefixtures("few_objects")
 def test_no_more_than_six_simulated_frames_are_kept() -> None:
     seen: list[weakref.ref[Frame]] = []
     alive: list[int] = []

@@ -33,7 +33,7 @@ ITERATIONS, CALM, SETTLED = 5, 5e-5, 0.1
 WHOLE, LEFT = 1.3, 0.08
 #: An estimate within this factor of the limit of a verdict is looked at again: up to so many iterations more, until Newton's
 #: step is less than this share of the way.
-NEAR, AGAIN, CLOSE = 2.5, 25, 0.02
+NEAR, AGAIN, CLOSE = 3.0, 25, 0.02
 #: So much of Newton's steps counts as gone at least: of a search that gets nowhere, all of the way is left.
 _LEAST = 0.2
 

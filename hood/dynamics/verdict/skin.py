@@ -18,8 +18,9 @@ from hood.mesh.topology import connected_components, hinges, unique_edges
 
 #: Frames that are looked at from all sides, at most, of those in which a larger share of the cloth's triangles is cut.
 _LOOKED_AT, _HARDLY = 8, 0.001
-#: Surfaces of people turn by less than this [rad] at an edge; those of furniture by 90 degrees.
-_CORNER = np.deg2rad(60.0)
+#: A thing turns by more than the first [rad] at an edge between two of its sides, and by less than the second within them;
+#: people do so at toes and fingers, but have no flat sides.
+_CORNER, _FLAT = np.deg2rad(60.0), 0.01
 
 
 def skin_causes(metrics: Mapping[str, np.ndarray], inside: Mapping[str, np.ndarray], meshes: Meshes) -> Found:
@@ -96,14 +97,16 @@ def _seen_at(meshes: Meshes, frame: int) -> tuple[float, float, float]:
 
 
 def _at_corners(pos: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(G,) bool: faces of a body that have a vertex on an edge where it turns by more than :data:`_CORNER`."""
+    """(G,) bool: faces of a body that have a vertex on an edge between two flat sides of it."""
     corners = pos[faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True).clip(1e-30)
     hinge = hinges(faces)
-    one, other = normal[hinge.faces].swapaxes(0, 1)
+    cosine = np.einsum("hx,hx->h", *normal[hinge.faces].swapaxes(0, 1))
+    flat = np.zeros(len(faces), dtype=bool)
+    flat[hinge.faces[cosine > np.cos(_FLAT)]] = True
     sharp = np.zeros(len(pos), dtype=bool)
-    sharp[hinge.vertices[(one * other).sum(axis=1) < np.cos(_CORNER), :2]] = True
+    sharp[hinge.vertices[(cosine < np.cos(_CORNER)) & flat[hinge.faces].all(axis=1), :2]] = True
     return np.asarray(sharp[faces].any(axis=1))
 
 

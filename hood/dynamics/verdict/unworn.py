@@ -80,20 +80,18 @@ def _of_part(data: RolloutData, meshes: Meshes, wear: Wear, part: int, count: in
     for place in np.flatnonzero(off).tolist():
         until = frames[place + 1] if place + 1 < len(frames) else count
         bad[frames[place] : until] = True
-    values = np.full(count, np.nan)
-    values[frames] = np.fmax(away, slipped)
-    way, limit, how = next(
-        (way, limit, how)
-        for way, limit, how in (
-            (away, AWAY_UNSOUND, "it is away from where it was on the body"),
-            (slipped, SLIPPED_UNSOUND, "its highest opening has slipped along the body"),
-            (sunk, SUNK_UNSOUND, "its highest opening has slipped down the body"),
-        )
-        if way[first] > limit.value
+    ways = (
+        (away, AWAY_UNSOUND, "it is away from where it was on the body"),
+        (slipped, SLIPPED_UNSOUND, "its highest opening has slipped along the body"),
+        (sunk, SUNK_UNSOUND, "its top has slid down the body"),
     )
+    beyond = [(float(np.nanmax(way)), way, limit, how) for way, limit, how in ways if (way > limit.value).any()]
+    worst, way, limit, how = max(beyond, key=lambda one: one[0])
+    values = np.full(count, np.nan)
+    values[frames] = way
     text = (
         f"{name_part(data, wear, part)} has come off: from frame {frames[first]} on {how}, by "
-        f"{np.nanmax(way):.2f} m at worst (beyond {limit.value:.2f})"
+        f"{worst:.2f} m at worst (beyond {limit.value:.2f})"
     )
     return Found([Cause("not_worn", text, bad, values, limit.value, limit.unit, ".2f", part=part + 1, whole=True)])
 

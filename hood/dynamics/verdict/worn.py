@@ -7,10 +7,11 @@ Three lengths say so, of every part that is worn in frame 0:
   that is blown out hangs by its collar;
 - *slipped*: how far the highest opening around a limb has moved along the body: the way of the middle of the points of the body
   that are nearest to its vertices, on the body of frame 0. An opening with no limb in it any more counts as a metre;
-- *sunk*: how much of that is towards where the feet are in frame 0. Clothes slide up by more in a handstand, and stay on.
+- *sunk*: how far its top has moved along the body towards where the feet are in frame 0, of a part with such an opening: a
+  waistband, or that shoulder of a dress which has moved farther. Clothes slide up by more in a handstand, and stay on.
 
-The region of a vertex are the points of the body within 15 cm, along the skin, of its nearest one in frame 0; an opening is
-followed for 40 cm. Swinging hems, open jackets and crossed arms stay near their regions; trousers around the ankles do not.
+The region of a vertex are the points of the body within 15 cm, along the skin, of its nearest one in frame 0; openings and tops
+are followed for 40 cm. Swinging hems, open jackets and crossed arms stay near their regions; trousers around the ankles do not.
 """
 
 from __future__ import annotations
@@ -27,10 +28,13 @@ from hood.mesh.parts import rim_length
 from hood.mesh.topology import boundary_loops, connected_components, unique_edges
 
 #: A vertex nearer than this [m] to the body touches it; the region of a vertex reaches so far [m] along the skin, and openings
-#: are followed so far.
+#: and tops are followed so far.
 TOUCHES, _REGION, _FOLLOWED = 0.03, 0.15, 0.40
-#: Of an opening so many vertices are followed, at most.
-_OF_OPENING = 60
+#: Of an opening, and of a top, so many vertices are followed, at most.
+_OF_OPENING, _OF_TOP = 60, 30
+#: The top of a part is what touches the body so near [m] to its highest place that does: every connected piece of so many
+#: vertices, at least.
+_TOP, _LEAST_TOP = 0.06, 5
 #: An opening lies around a limb where so many edges of the body go through it and this share of its vertices touches the body.
 _THROUGH, _TIGHT = 6, 0.6
 #: Shorter openings [m] are buttonholes and slits.
@@ -44,8 +48,8 @@ _MOST_LOOKED_AT = 300
 #: What an opening that has lost its limb has slipped by [m].
 _LOST = 1.0
 _NONE = np.zeros(0, dtype=np.int64)
-#: Bodies with longer edges [m] get points between their vertices.
-_COARSE = 0.04
+#: Bodies with longer edges [m] get points between their vertices, so far apart, and so many at most.
+_COARSE, _MOST_BETWEEN = 0.04, 20
 
 
 @dataclass(frozen=True)
@@ -77,19 +81,35 @@ class _Group:
 
 
 @dataclass(frozen=True)
-class _Opening:
-    """An opening around a limb, and where on the body of frame 0 it was."""
+class _Followed:
+    """Vertices, and where on the body of frame 0 they were."""
 
-    rim: np.ndarray  # (R,) vertices along it
-    vertices: np.ndarray  # (N,) of them, followed
+    vertices: np.ndarray  # (N,)
     region: np.ndarray  # (N, K) points of the body, the first of each nearest in frame 0
     places: np.ndarray  # (B, 3) m, points of the body in frame 0
 
-    def way(self, pos: np.ndarray, body: np.ndarray) -> np.ndarray:
-        """(3,) m: how it has moved along the body, as on the body of frame 0."""
+    def ways(self, pos: np.ndarray, body: np.ndarray) -> np.ndarray:
+        """(N, 3) m: how they have moved along the body, as on the body of frame 0."""
         near = ((pos[self.vertices][:, None] - body[self.region]) ** 2).sum(axis=2).argmin(axis=1)
         now = self.places[self.region[np.arange(len(near)), near]]
-        return np.asarray(now.mean(axis=0) - self.places[self.region[:, 0]].mean(axis=0))
+        return np.asarray(now - self.places[self.region[:, 0]])
+
+
+@dataclass(frozen=True)
+class _Hold:
+    """What a part is held by: its highest opening around a limb, and the pieces of its top."""
+
+    rim: np.ndarray  # (R,) vertices along the opening
+    opening: _Followed
+    tops: list[_Followed]
+
+    def slipped(self, pos: np.ndarray, body: np.ndarray) -> float:
+        """m."""
+        return float(np.linalg.norm(self.opening.ways(pos, body).mean(axis=0)))
+
+    def sunk(self, pos: np.ndarray, body: np.ndarray) -> float:
+        """m."""
+        return max((-float(np.median(top.ways(pos, body)[:, 1])) for top in self.tops), default=np.nan)
 
 
 class WearMeter:
@@ -112,10 +132,11 @@ class WearMeter:
         pinned: np.ndarray = _NONE,
     ) -> None:
         self._body_edges = unique_edges(body_faces)
-        self._between = _edges_to_split(body_pos, self._body_edges)
+        self._between, self._at = _between(body_pos, self._body_edges)
         body = self._points(body_pos)
         used = np.unique(faces)
-        part = connected_components(len(pos), unique_edges(faces))
+        edges = unique_edges(faces)
+        part = connected_components(len(pos), edges)
         numbers, part_of_used = np.unique(part[used], return_inverse=True)
         self._near = cKDTree(body[self._known(body_faces, len(body))])
         dist, nearest = self._near.query(pos)
@@ -132,33 +153,37 @@ class WearMeter:
             chosen.append(_to_follow(rows, dist, own, np.intersect1d(rows, pinned)))
         regions = _Regions(body, self._body_edges, self._between)
         self._touching: list[_Group | None] = []
-        self._openings: list[_Opening | None] = []
-        for rows, rims in chosen:
+        self._holds: list[_Hold | None] = []
+
+        def follow(vertices: np.ndarray) -> _Followed:
+            return _Followed(vertices, regions.around(nearest[vertices], _FOLLOWED), body)
+
+        for own, (rows, rims) in zip(members, chosen, strict=True):
             share = 0.5 if rims else _HANGS
             self._touching.append(_Group(rows, regions.around(nearest[rows]), dist[rows], share) if len(rows) else None)
             highest = max(rims, key=lambda rim: float(pos[rim, 1].mean()), default=_NONE)
-            few = _some(highest, _OF_OPENING)
-            followed = _Opening(highest, few, regions.around(nearest[few], _FOLLOWED), body) if len(few) else None
-            self._openings.append(followed)
+            tops = _tops(pos, edges, own[dist[own] < TOUCHES]) if rims else []
+            hold = _Hold(highest, follow(_some(highest, _OF_OPENING)), [follow(_some(top, _OF_TOP)) for top in tops])
+            self._holds.append(hold if rims else None)
 
     def __call__(self, pos: np.ndarray, body_pos: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """``away``, ``slipped`` and ``sunk`` (P,) [m] of one frame, see :class:`Wear`."""
         body = self._points(body_pos)
         away, slipped, sunk = np.full((3, len(self._touching)), np.nan)
-        for number, (touching, opening) in enumerate(zip(self._touching, self._openings, strict=True)):
+        for number, (touching, hold) in enumerate(zip(self._touching, self._holds, strict=True)):
             if touching is not None:
                 away[number] = touching.away(pos, body)
-            if opening is not None:
-                way = opening.way(pos, body)
-                lost = num_through(pos[opening.rim], body_pos, self._body_edges) == 0
-                slipped[number], sunk[number] = _LOST if lost else float(np.linalg.norm(way)), -float(way[1])
+            if hold is not None:
+                lost = num_through(pos[hold.rim], body_pos, self._body_edges) == 0
+                slipped[number], sunk[number] = _LOST if lost else hold.slipped(pos, body), hold.sunk(pos, body)
         return away, slipped, sunk
 
     def _points(self, body_pos: np.ndarray) -> np.ndarray:
-        """Vertices of the body, and the middles of its edges where it is coarse."""
+        """Vertices of the body, and points on its edges where it is coarse."""
         if not len(self._between):
             return body_pos
-        return np.concatenate([body_pos, body_pos[self._between].mean(axis=1)])
+        first, second = body_pos[self._between].swapaxes(0, 1)
+        return np.concatenate([body_pos, first + self._at * (second - first)])
 
     def _known(self, body_faces: np.ndarray, count: int) -> np.ndarray:
         """Points that belong to a face: others are no skin."""
@@ -217,6 +242,16 @@ def _to_follow(
     return np.union1d(_some(touching, _MOST_LOOKED_AT), held[:_MOST_LOOKED_AT]), rims
 
 
+def _tops(pos: np.ndarray, edges: np.ndarray, touching: np.ndarray) -> list[np.ndarray]:
+    """The connected pieces of what is highest of the vertices ``touching`` the body."""
+    top = touching[pos[touching, 1] > pos[touching, 1].max(initial=-np.inf) - _TOP]
+    inside = np.zeros(len(pos), dtype=bool)
+    inside[top] = True
+    label = connected_components(len(pos), edges[inside[edges].all(axis=1)])[top]
+    pieces = [top[label == number] for number in np.unique(label)]
+    return [piece for piece in pieces if len(piece) >= _LEAST_TOP]
+
+
 def _some(rows: np.ndarray, most: int) -> np.ndarray:
     return rows[:: max(1, -(-len(rows) // most))]
 
@@ -225,8 +260,8 @@ class _Regions:
     """Points of the body by distance along the skin."""
 
     def __init__(self, body: np.ndarray, edges: np.ndarray, between: np.ndarray) -> None:
-        count, middles = len(body), np.arange(len(body) - len(between), len(body))
-        links = np.concatenate([edges, *(np.stack([middles, between[:, side]], axis=1) for side in range(2))])
+        count, added = len(body), np.arange(len(body) - len(between), len(body))
+        links = np.concatenate([edges, *(np.stack([added, between[:, side]], axis=1) for side in range(2))])
         lengths = np.linalg.norm(body[links[:, 0]] - body[links[:, 1]], axis=1).clip(1e-9)
         self._graph = coo_matrix((lengths, (links[:, 0], links[:, 1])), shape=(count, count)).tocsr()
 
@@ -250,7 +285,9 @@ class _Regions:
         return rows
 
 
-def _edges_to_split(body_pos: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """(B, 2): edges that get a point in their middle."""
+def _between(body_pos: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points on long edges: the ends (B, 2) of each one's edge, and how far (B, 1) along it the point is, 0 to 1."""
     length = np.linalg.norm(body_pos[edges[:, 0]] - body_pos[edges[:, 1]], axis=1)
-    return edges[length > _COARSE]
+    count = np.clip(np.ceil(length / _COARSE) - 1, 0, _MOST_BETWEEN).astype(np.int64)
+    place = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    return np.repeat(edges, count, axis=0), ((place + 1) / (np.repeat(count, count) + 1))[:, None]

@@ -80,12 +80,15 @@ def test_low_spots_of_skin_count_where_they_stay() -> None:
 
 
 def test_a_corner_between_the_vertices_of_the_cloth_is_no_spot() -> None:
-    """8 mm of a cube's corner and of a ball, in every frame."""
+    """8 mm of a cube's corner, of a ball, and of a toe that turns as sharply but has no flat sides, in every frame."""
     flat, faces = sheet((0.003, 0.5, 0.007), 1, 0.6, 30)
     cube = trimesh.creation.box((0.2, 0.2, 0.2)).subdivide().subdivide().subdivide()
     upwards = Rotation.align_vectors([[0, 1, 0]], [[1, 1, 1]])[0].as_matrix()
     ball = trimesh.creation.icosphere(3, 0.04)
-    for pos, triangles, sound in ((cube.vertices @ upwards.T, cube.faces, True), (ball.vertices, ball.faces, False)):
+    toe = trimesh.convex.convex_hull(np.concatenate([np.eye(3), -np.eye(3)]) * [0.06, 0.05, 0.06])
+    shapes = [(cube.vertices @ upwards.T, cube.faces, True)]
+    shapes += [(shape.vertices, shape.faces, False) for shape in (ball, toe)]
+    for pos, triangles, sound in shapes:
         body = np.array(pos) + [0, 0.508 - pos[:, 1].max(), 0]
         data = stored(COUNT, {"strain_p99": frames(COUNT)}, cloth=flat, faces=faces, body=body,
                       body_faces=triangles.astype(np.int32), config={"worn": False})  # fmt: skip
