@@ -130,7 +130,8 @@ def test_every_kind_of_model_has_such_a_step(kind: str, name: str, request: pyte
         with native.in_torch(), torch.no_grad():
             expected = simulator.predict(case, prepared).next_pos
         assert error(stepper.predict(case, prepared).next_pos, expected, case) < 5e-4
-    assert_no_data(simulator, scene, cases[0])
+    if name == "skirt_scene":  # which has pins and springs
+        assert_no_data(simulator, scene, cases[0])
 
 
 @pytest.mark.parametrize("kind", ["local", "base"])

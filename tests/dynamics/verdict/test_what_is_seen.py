@@ -15,7 +15,7 @@ from hood.dynamics.verdict.surface import meshes_of, surface_metrics
 from hood.dynamics.verdict.visible import sampled, visible
 from hood.mesh.crossing import crossings
 
-COUNT = 31
+COUNT = 16
 
 
 def sheet(centre: tuple[float, float, float], across: int, size: float = 0.4, cells: int = 8) -> tuple[np.ndarray, np.ndarray]:
@@ -59,21 +59,21 @@ def kinds(data: RolloutData) -> list[str]:
 def test_skin_through_much_of_the_cloth_counts_in_every_frame() -> None:
     assert judge_rollout(worn(np.zeros(COUNT), 9)).sound
     assert judge_rollout(worn(np.full(COUNT, 0.004), 9)).sound  # still outside
-    (reason,) = judge_rollout(worn(np.where(np.arange(COUNT) > 20, 0.0055, 0.0), 20)).reasons
+    (reason,) = judge_rollout(worn(np.where(np.arange(COUNT) > 10, 0.0055, 0.0), 20)).reasons
     assert (reason.kind, reason.limit, reason.unit) == ("skin_through_cloth", 0.01, "share of the cloth's triangles")
-    assert reason.frames[0][0] > 20
+    assert reason.frames[0][0] > 10
     assert reason.value is not None
     assert 0.01 < reason.value < 0.1
 
 
 def test_skin_that_sticks_out_far_counts_by_its_height() -> None:
-    assert kinds(worn(np.where(np.arange(COUNT) > 20, 0.025, 0.0), 5)) == ["skin_depth"]
-    (reason,) = judge_rollout(worn(np.where(np.arange(COUNT) > 20, 0.025, 0.0), 5)).reasons
+    assert kinds(worn(np.where(np.arange(COUNT) > 10, 0.025, 0.0), 5)) == ["skin_depth"]
+    (reason,) = judge_rollout(worn(np.where(np.arange(COUNT) > 10, 0.025, 0.0), 5)).reasons
     assert reason.value == pytest.approx(0.02, abs=3e-3)
 
 
 def test_low_spots_of_skin_count_where_they_stay() -> None:
-    assert judge_rollout(worn(np.where(np.arange(COUNT) > 25, 0.0115, 0.0), 5)).sound
+    assert judge_rollout(worn(np.where(np.arange(COUNT) > 13, 0.0115, 0.0), 5)).sound
     (reason,) = judge_rollout(worn(np.full(COUNT, 0.0115), 5)).reasons
     assert "spots of skin stick out by more than 1.5 mm, and stay" in reason.sentence
     assert judge_rollout(worn(np.full(COUNT, 0.006), 5)).sound  # 1 mm
