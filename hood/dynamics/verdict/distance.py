@@ -8,6 +8,7 @@ contact or the line search stops them early, Newton's own steps tell how much is
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import torch
@@ -31,11 +32,12 @@ ITERATIONS, CALM, SETTLED = 5, 5e-5, 0.1
 #: The whole way over what the iterations tell of it, and the power of the share of the force that they leave: fitted to 500
 #: states of scenes that ``benchmarks/step_distance.py`` does not have.
 WHOLE, LEFT = 1.3, 0.08
-#: An estimate within this factor of the limit of a verdict is looked at again: up to so many iterations more, until Newton's
-#: step is less than this share of the way.
+#: Within this factor of the limit of a verdict, by the estimate or by Newton's steps, it is looked at again: up to so many
+#: iterations more, until Newton's step is less than this share of the way.
 NEAR, AGAIN, CLOSE = 3.0, 25, 0.02
-#: So much of Newton's steps counts as gone at least: of a search that gets nowhere, all of the way is left.
-_LEAST = 0.2
+#: So much of Newton's steps counts as gone at least: of a search that gets nowhere, all of the way is left. A step so many
+#: times longer than all before it is of a model without a minimum, and tells nothing.
+_LEAST, _WILD = 0.2, 50.0
 
 
 class Distance(NamedTuple):
@@ -81,22 +83,32 @@ def estimate(potential: Potential, problem: StepProblem, next_pos: Tensor, limit
         return Distance(began, began)
     steps = _follow(way, free)
     whole = WHOLE if len(steps) == 1 else max(WHOLE * min(way.residual / began, 1.0) ** LEFT, 1.0)
-    gone, sums = _sizes(way.pos - next_pos, free), (sum(sizes) for sizes in zip(*steps, strict=True))
+    gone, sums = _sizes(way.pos - next_pos, free), Distance(*(_whole(sizes) for sizes in zip(*steps, strict=True)))
     found = Distance(*(whole * math.sqrt(max(d, _LEAST * p) * p) for d, p in zip(gone, sums, strict=True)))
-    near = limit is not None and limit / NEAR < found.p99 < limit * NEAR
-    return _looked_at_again(way, next_pos, free) if near else found
+    near = limit is not None and max(found.p99, sums.p99) > limit / NEAR and found.p99 < limit * NEAR
+    return _looked_at_again(way, next_pos, free, found) if near else found
 
 
-def _looked_at_again(way: Further, start: Tensor, free: Tensor) -> Distance:
-    """How far the solver gets when it goes on, and its last step, of which some is left."""
+def _whole(sizes: Iterable[float]) -> float:
+    """The sum of Newton's steps, each as long as it is, but for wild ones."""
+    total = longest = 0.0
+    for size in sizes:
+        if not total or size < _WILD * longest:
+            total, longest = total + size, max(longest, size)
+    return total
+
+
+def _looked_at_again(way: Further, start: Tensor, free: Tensor, before: Distance) -> Distance:
+    """How far the solver gets when it goes on, and its last step, of which some is left; what was estimated ``before`` where it
+    does not get there and that is more."""
     gone, last = _sizes(way.pos - start, free), Distance(0.0, 0.0)
     for _ in range(AGAIN):
         if not (way.residual > 0.0 and way.move()):
             break
         gone, last = _sizes(way.pos - start, free), _sizes(way.direction, free)
         if last.p99 < CLOSE * gone.p99:
-            break
-    return Distance(gone.p99 + last.p99, gone.most + last.most)
+            return Distance(gone.p99 + last.p99, gone.most + last.most)
+    return Distance(max(gone.p99 + last.p99, before.p99), max(gone.most + last.most, before.most))
 
 
 def _follow(way: Further, free: Tensor) -> list[Distance]:

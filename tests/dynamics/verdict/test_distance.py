@@ -15,7 +15,7 @@ from hood.dynamics.rollout import metric_names, simulate
 from hood.dynamics.simulator import build_simulator
 from hood.dynamics.stepper import NewtonStepper, Stepper
 from hood.dynamics.stopping import Count
-from hood.dynamics.verdict.distance import DISTANCE_METRICS, distance_metrics
+from hood.dynamics.verdict.distance import DISTANCE_METRICS, distance_metrics, estimate
 from hood.losses.layer_sides import LayerSides
 from hood.losses.layers import LayerBarrier
 from hood.losses.potential import default_potential
@@ -68,6 +68,44 @@ def test_the_way_of_a_quadratic_potential_is_known(offset: float) -> None:
     found = distance_metrics(potential, problem, pos)
     assert found["distance_p99"] == pytest.approx(true, rel=0.05)
     assert found["distance_max"] == pytest.approx(3.0 * offset, rel=0.05)
+
+
+def estimated(monkeypatch: pytest.MonkeyPatch, sizes: list[float], limit: float | None = None) -> tuple[float, int]:
+    """The 99th percentile and the iterations where Newton's steps have these lengths [m], the search takes a tenth of each, and
+    the force stays."""
+    taken = iter(range(100))
+
+    class Way:
+        residual = 1.0
+
+        def __init__(self, potential: object, problem: object, start: torch.Tensor) -> None:
+            self.pos, self.direction = start.clone(), torch.zeros_like(start)
+
+        def move(self) -> bool:
+            self.direction = torch.zeros_like(self.pos)
+            self.direction[:, 0] = sizes[min(next(taken), len(sizes) - 1)]
+            self.pos = self.pos + 0.1 * self.direction
+            return True
+
+    monkeypatch.setattr("hood.dynamics.verdict.distance.Further", Way)
+    problem = sheet()
+    found = estimate(POTENTIAL, problem, problem.state.pos, limit)
+    return found.p99, next(taken)
+
+
+def test_a_step_of_a_model_without_a_minimum_tells_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    usual, _ = estimated(monkeypatch, [0.01, 0.01, 0.01, 0.01, 0.01])
+    wild, _ = estimated(monkeypatch, [0.01, 0.01, 0.01, 1.0, 0.01])
+    assert usual == pytest.approx(1.3 * math.sqrt(0.2) * 0.05)
+    assert wild < 3.0 * usual
+
+
+@pytest.mark.parametrize(("limit", "iterations"), [(None, 5), (0.010, 30), (0.060, 30), (0.5, 5), (0.002, 5)])
+def test_near_the_limit_it_looks_again_by_the_estimate_or_by_newtons_steps(
+    limit: float | None, iterations: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The estimate is 2.9 cm, the steps are 5 cm in all."""
+    assert estimated(monkeypatch, [0.01], limit)[1] == iterations
 
 
 def test_the_estimate_is_within_a_factor_of_two_for_a_sheet_that_was_pulled() -> None:
