@@ -14,6 +14,7 @@ from hood.dynamics.verdict.surface import Meshes, spread_over
 from hood.dynamics.verdict.visible import sampled, visible
 from hood.limits import CUT_UNSOUND, DEPTH_UNSOUND, INSIDE_UNSOUND, SPOTS_HEIGHT, SPOTS_LASTING, SPOTS_UNSOUND
 from hood.mesh.crossing import crossings
+from hood.mesh.repair import boundary_vertices
 from hood.mesh.topology import connected_components, hinges, unique_edges
 
 #: Frames that are looked at from all sides, at most, of those in which a larger share of the cloth's triangles is cut.
@@ -21,6 +22,8 @@ _LOOKED_AT, _HARDLY = 8, 0.001
 #: A thing turns by more than the first [rad] at an edge between two of its sides, and by less than the second within them;
 #: people do so at toes and fingers, but have no flat sides.
 _CORNER, _FLAT = np.deg2rad(60.0), 0.01
+#: Where a limb passes through cloth, at most this share of the triangles is at the cloth's edge; more: a hem cuts into it.
+_AT_EDGE = 0.5
 
 
 def skin_causes(metrics: Mapping[str, np.ndarray], inside: Mapping[str, np.ndarray], meshes: Meshes) -> Found:
@@ -112,7 +115,8 @@ def _at_corners(pos: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 def way_through(cloth: np.ndarray, faces: np.ndarray, body: np.ndarray, body_faces: np.ndarray, cut: np.ndarray) -> float:
     """How far [m] a body (W, 3) goes through the middle of a cloth (V, 3), (F, 3): the greatest distance to the cloth of what
-    is cut off from the rest of the body where edges of it pass through the cloth; 0 where nothing is cut off.
+    is cut off from the rest of the body where edges of it pass through the cloth; 0 where nothing is cut off. A limb that a
+    hem cuts all around, as one that lies too close does, has not gone through: most of what it passes is at the cloth's edge.
 
     Args:
         cut: (K, 3) the ends of these edges, ascending, and the face.
@@ -120,10 +124,14 @@ def way_through(cloth: np.ndarray, faces: np.ndarray, body: np.ndarray, body_fac
     edges, count = unique_edges(body_faces), len(body)
     kept = edges[~np.isin(edges @ [count, 1], cut[:, :2] @ [count, 1])]
     whole, piece = (connected_components(count, some) for some in (edges, kept))
+    at_edge = np.asarray(np.isin(faces, boundary_vertices(faces)).any(axis=1))[cut[:, 2]]
     beyond = np.zeros(count, dtype=bool)
     for part in np.unique(whole[cut[:, 0]]):
         pieces = np.where(whole == part, piece, -1)
-        beyond |= (pieces >= 0) & (pieces != np.bincount(pieces[pieces >= 0]).argmax())
+        main = np.bincount(pieces[pieces >= 0]).argmax()
+        for own in np.setdiff1d(pieces[cut[:, :2]], [-1, main]):
+            if at_edge[(pieces[cut[:, :2]] == own).any(axis=1)].mean() <= _AT_EDGE:
+                beyond |= pieces == own
     return float(cKDTree(sampled(cloth, faces)).query(body[beyond])[0].max()) if beyond.any() else 0.0
 
 

@@ -109,6 +109,14 @@ def test_a_body_that_goes_through_a_sheet_counts_by_how_far() -> None:
     assert way_through(flat, faces, spear - [0, 0.5, 0], spear_faces, below.second_edges) == 0.0
 
 
+def test_a_limb_that_a_hem_cuts_all_around_has_not_gone_through() -> None:
+    cuff, faces = tube(0.105, 0.3, 0.7, 96, 40)
+    cuff[cuff[:, 1] > 0.695] *= [0.94, 1.0, 0.94]  # 1 mm in the skin
+    cut = crossings(cuff, faces, POST, POST_FACES)
+    assert len(np.unique(cut.second_edges[:, :2])) > 90
+    assert way_through(cuff, faces, POST, POST_FACES, cut.second_edges) == 0.0
+
+
 def test_folds_of_the_skin_are_told_and_do_not_count() -> None:
     """Two posts in one place: cloth cannot be outside both."""
     doubled = np.concatenate([POST, POST @ Rotation.from_euler("y", 1.9, degrees=True).as_matrix()])
