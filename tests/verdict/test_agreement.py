@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from tests.verdict.table.scene import run
-from tests.verdict.table.scenes import FAST, LABELS, SCENES, SECOND, SECOND_LABELS
+from tests.verdict.table.scenes import FAST, LABELS, SCENES, SECOND, SECOND_LABELS, run_named
 
 #: Share of the scenes on which rule and person have to agree, and of the doubts of a person that have to be told.
 AGREEMENT, TOLD = 0.97, 0.8
@@ -45,10 +45,9 @@ def test_the_verdict_is_that_of_a_person(name: str, tmp_path: Path, compiled_lay
 @pytest.mark.slow
 def test_both_tables(tmp_path: Path, compiled_layers: None) -> None:
     """An hour of a core. No scene that is clearly broken is called sound without a doubt."""
-    labels, scenes = {**LABELS, **SECOND_LABELS}, {**SCENES, **SECOND}
-    folders = [tmp_path / name for name in scenes]
+    labels, names = {**LABELS, **SECOND_LABELS}, [*SCENES, *SECOND]
     with ProcessPoolExecutor(os.cpu_count(), get_context("spawn"), torch.set_num_threads, (1,)) as pool:
-        found = dict(zip(scenes, pool.map(run, scenes.values(), folders), strict=True))
+        found = dict(zip(names, pool.map(run_named, names, [tmp_path / name for name in names]), strict=True))
     wrong = {name: labels[name] for name, one in found.items() if not agrees(labels[name], *one)}
     assert [name for name, label in wrong.items() if (label["label"], label["margin"]) == ("broken", "clear")] == []
     assert len(wrong) <= (1.0 - AGREEMENT) * len(found), sorted(wrong)

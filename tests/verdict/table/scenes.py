@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.verdict.table import garments, motions, pieces, things
-from tests.verdict.table.scene import Scene
+from tests.verdict.table.scene import Scene, run
 from tests.verdict.table.scenes_garments import LOOSE, OUTFITS, PARTS, SIZES
 from tests.verdict.table.scenes_poses import HARD, OTHER_BODIES, SHAPES, WRONG_MOTIONS
 from tests.verdict.table.scenes_second import ALL
@@ -92,3 +92,8 @@ FAST = (
     "spear_through_sheet", "tshirt_walk_untrained_paper", "dress_walk_guess", "armband", "dress_walk_newton1",
     "tshirt_jumps_ours", "cape_not_pinned", "tank_soft_contact", "dress_skirt_off", "tshirt_trousers_off",
 )  # fmt: skip
+
+
+def run_named(name: str, folder: Path) -> tuple[dict[str, Any], int]:
+    """What :func:`run` returns for a scene of the first or the second table: a name can be sent to another process."""
+    return run((SCENES | SECOND)[name], folder)
