@@ -67,6 +67,7 @@ CROSSINGS_SEEN = Limit(0.25, "m", _RULE, "the length of a hand, of what a viewer
 AWAY_UNSOUND = Limit(0.20, "m", "hood.dynamics.verdict.worn", "43 rollouts: worn at most 0.11, come off at least 0.28")
 SLIPPED_UNSOUND = Limit(0.15, "m", "hood.dynamics.verdict.worn", "498 rollouts: worn at most 0.14, come off at least 0.15")
 SUNK_UNSOUND = Limit(0.06, "m", "hood.dynamics.verdict.worn", "498 rollouts: worn at most 0.04, come off at least 0.07")
+SUNK_SETTLING = Limit(0.12, "m", "hood.dynamics.verdict.unworn", "worn at most 0.11, but for a band; come off at least 0.14")
 
 #: The body.
 HEAD_DOWN = Limit(0.5, "share of frames", _BODY, "cartwheels are shorter, and handstands stand on the hands")

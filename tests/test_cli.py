@@ -409,7 +409,7 @@ def test_a_rollout_without_metrics_holds_times_and_its_start_alone(tmp_path: Pat
         "settle_speed",
         "settle_reached",
         "settle_away",
-        "settle_slipped",
+        "settle_sunk",
     }
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["strain_p50"] is summary["potential_mean_J"] is summary["first_frame"]["strain_p99"] is None

@@ -80,7 +80,7 @@ METRIC_CHOICES = ("all", "strain", "none")
 FIELD_CHOICES = ("rg",)
 #: How frame 0 is made, see :func:`simulate`, and what frame 0 says of an equilibrium.
 SETTLE_CHOICES = ("equilibrium", "paper")
-SETTLE_METRICS = ("settle_steps", "settle_seconds", "settle_speed", "settle_reached", "settle_away", "settle_slipped")
+SETTLE_METRICS = ("settle_steps", "settle_seconds", "settle_speed", "settle_reached", "settle_away", "settle_sunk")
 
 
 def metric_names(
@@ -473,7 +473,7 @@ def _settled(rest: Rest, scene: Scene, frame: int, state: State) -> dict[str, fl
     faces, pinned = scene.garment.faces, np.flatnonzero(scene.garment.pinned)
     both = (np.concatenate([before, after]), faces, np.stack([body, body]), scene.motion.faces)
     wear = measure_wear(*both, [1], pinned) if len(body) and np.isfinite(after).all() else None
-    came = (np.nan, np.nan) if wear is None else (_most(wear.away), _most(wear.slipped))
+    came = (np.nan, np.nan) if wear is None else (_most(wear.away), _most(wear.sunk))
     values = (float(rest.steps), rest.seconds, rest.speed, float(rest.reached), *came)
     return dict(zip(SETTLE_METRICS, values, strict=True))
 

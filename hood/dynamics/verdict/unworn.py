@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from hood.dynamics.recorder import RolloutData
 from hood.dynamics.verdict.cause import Cause, Found
 from hood.dynamics.verdict.surface import Meshes
 from hood.dynamics.verdict.worn import Wear, measure_wear
-from hood.limits import AWAY_UNSOUND, SLIPPED_UNSOUND, SUNK_UNSOUND, TOLERATED
+from hood.limits import AWAY_UNSOUND, SLIPPED_UNSOUND, SUNK_SETTLING, SUNK_UNSOUND, TOLERATED
 
 #: Stored frames that are looked at, at most.
 _LOOKED_AT = 60
@@ -36,27 +35,24 @@ def worn_causes(data: RolloutData, meshes: Meshes, count: int) -> Found:
     if wear is None:
         return Found(notes=notes)
     found = Found(_fallen_before(data, count), notes=notes)
-    if len(wear.num_vertices) == 1 and not found.causes:
-        wear = replace(wear, slipped=wear.slipped + np.nan_to_num(max(_before(data)[1], 0.0)))
     for part in range(len(wear.num_vertices)):
         found += _of_part(data, meshes, wear, part, count)
     return found
 
 
 def _before(data: RolloutData) -> tuple[float, float]:
-    """How far the garment moved away and slipped while the start was settled [m], the worst of its parts; NaN: not known."""
-    rows = [data.step_metrics.get(name) for name in ("settle_away", "settle_slipped")]
-    away, slipped = (np.nan if row is None or not len(row) else float(row[0]) for row in rows)
-    return away, slipped
+    """How far the garment moved away and sank while the start was settled [m], the worst of its parts; NaN: not known."""
+    rows = [data.step_metrics.get(name) for name in ("settle_away", "settle_sunk")]
+    away, sunk = (np.nan if row is None or not len(row) else float(row[0]) for row in rows)
+    return away, sunk
 
 
 def _fallen_before(data: RolloutData, count: int) -> list[Cause]:
     """What came off while the start was settled, before frame 0."""
-    away, slipped = _before(data)
-    if not (away > AWAY_UNSOUND.value or slipped > SLIPPED_UNSOUND.value):
+    away, sunk = _before(data)
+    if not (away > AWAY_UNSOUND.value or sunk > SUNK_SETTLING.value):
         return []
-    limit = AWAY_UNSOUND if away > AWAY_UNSOUND.value else SLIPPED_UNSOUND
-    way = float(np.fmax(away, slipped))
+    way, limit = (away, AWAY_UNSOUND) if away > AWAY_UNSOUND.value else (sunk, SUNK_SETTLING)
     text = (
         f"{str(data.attributes.get('garment', 'garment'))!r} came off when it was settled on the body, before frame 0: it has "
         f"moved by {way:.2f} m from where it was put on (beyond {limit.value:.2f}); pins=… hold it, a smaller size stays"
