@@ -44,7 +44,7 @@ STRAIN_RATIO = Limit(1.5, "times the solver's strain", _GUARD, "soft, heavy and 
 STRAIN_START = Limit(0.04, "share of the length", "hood.scene.start", "more would show as a jerk in frame 1")
 
 #: How far the 99th percentile of the vertices still had to go to the minimum of a step, over the time step: 25 mm at 30 fps.
-DISTANCE_UNSOUND = Limit(0.75, "m/s", "hood.dynamics.verdict.rule", "of 374 rollouts the right ones, but for one, reach 0.68")
+DISTANCE_UNSOUND = Limit(0.75, "m/s", _RULE, "of 374 rollouts the right ones, but for one, reach 0.68")
 #: Where no distance was measured: the unbalanced force over the weight.
 GRADIENT_UNSOUND = Limit(100.0, "times the weight", _RULE, "a coarse stand-in, wrong both ways by a factor of ten")
 

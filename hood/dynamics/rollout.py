@@ -133,9 +133,8 @@ def simulate(
     (:class:`hood.dynamics.frames.Relaxing`), the last one leads from frame 0 to frame 1 instead. With ``equilibrium`` there
     are no relaxing steps: the solver settles the cloth on the still body (:func:`hood.dynamics.equilibrium.find_equilibrium`),
     the same way for every stepper, and frame 0 has :data:`SETTLE_METRICS` (number, s, m/s, 0 or 1, and how far the part that
-    moved most has come from its place on the body, m, see :mod:`hood.dynamics.verdict.worn`). What has a start of its
-    own (:func:`own_start`) keeps ``paper``. Either way frame 0 has the velocity
-    of the skinned garment.
+    moved most is away from its place on the body and has sunk along it, m, see :mod:`hood.dynamics.verdict.worn`). What has
+    a start of its own (:func:`own_start`) keeps ``paper``. Either way frame 0 has the velocity of the skinned garment.
 
     Where the body jumps, as at a cut in a recording, the cloth is carried along (:mod:`hood.scene.jumps`); a warning says so.
 

@@ -66,8 +66,8 @@ def estimate(potential: Potential, problem: StepProblem, next_pos: Tensor, limit
 
     d is how far they get in up to :data:`ITERATIONS` iterations, p the sum of Newton's steps on the way, taken whole, and r the
     share of the force that is left: the way is √(d p) times 1.3 r^0.08, or times 1 where that is less; d and every step are
-    99th percentiles or largest values. Near ``limit`` the solver goes on, and the way is how far it gets. Cloth that passes
-    through cloth has no way to go for that: ``self_crossings`` counts it.
+    99th percentiles or largest values. Where this or p is near ``limit`` the solver goes on, and the way is how far it gets.
+    Cloth that passes through cloth has no way to go for that: ``self_crossings`` counts it.
 
     Args:
         potential: what the step is measured by.

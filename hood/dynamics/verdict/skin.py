@@ -128,9 +128,9 @@ def way_through(cloth: np.ndarray, faces: np.ndarray, body: np.ndarray, body_fac
     beyond = np.zeros(count, dtype=bool)
     for part in np.unique(whole[cut[:, 0]]):
         pieces = np.where(whole == part, piece, -1)
-        main = np.bincount(pieces[pieces >= 0]).argmax()
-        for own in np.setdiff1d(pieces[cut[:, :2]], [-1, main]):
-            if at_edge[(pieces[cut[:, :2]] == own).any(axis=1)].mean() <= _AT_EDGE:
+        ends, main = pieces[cut[:, :2]], np.bincount(pieces[pieces >= 0]).argmax()
+        for own in np.setdiff1d(ends, [-1, main]):
+            if at_edge[(ends == own).any(axis=1)].mean() <= _AT_EDGE:
                 beyond |= pieces == own
     return float(cKDTree(sampled(cloth, faces)).query(body[beyond])[0].max()) if beyond.any() else 0.0
 

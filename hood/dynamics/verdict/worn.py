@@ -104,11 +104,11 @@ class _Hold:
     tops: list[_Followed]
 
     def slipped(self, pos: np.ndarray, body: np.ndarray) -> float:
-        """m."""
+        """How far the opening has moved along the body [m]."""
         return float(np.linalg.norm(self.opening.ways(pos, body).mean(axis=0)))
 
     def sunk(self, pos: np.ndarray, body: np.ndarray) -> float:
-        """m."""
+        """How far that piece of the top has moved down the body which has moved farthest [m]; NaN without a top."""
         return max((-float(np.median(top.ways(pos, body)[:, 1])) for top in self.tops), default=np.nan)
 
 
@@ -132,7 +132,7 @@ class WearMeter:
         pinned: np.ndarray = _NONE,
     ) -> None:
         self._body_edges = unique_edges(body_faces)
-        self._between, self._at = _between(body_pos, self._body_edges)
+        self._between, self._at = _points_between(body_pos, self._body_edges)
         body = self._points(body_pos)
         used = np.unique(faces)
         edges = unique_edges(faces)
@@ -161,10 +161,12 @@ class WearMeter:
         for own, (rows, rims) in zip(members, chosen, strict=True):
             share = 0.5 if rims else _HANGS
             self._touching.append(_Group(rows, regions.around(nearest[rows]), dist[rows], share) if len(rows) else None)
-            highest = max(rims, key=lambda rim: float(pos[rim, 1].mean()), default=_NONE)
-            tops = _tops(pos, edges, own[dist[own] < TOUCHES]) if rims else []
-            hold = _Hold(highest, follow(_some(highest, _OF_OPENING)), [follow(_some(top, _OF_TOP)) for top in tops])
-            self._holds.append(hold if rims else None)
+            if not rims:
+                self._holds.append(None)
+                continue
+            highest = max(rims, key=lambda rim: float(pos[rim, 1].mean()))
+            tops = [follow(_some(top, _OF_TOP)) for top in _tops(pos, edges, own[dist[own] < TOUCHES])]
+            self._holds.append(_Hold(highest, follow(_some(highest, _OF_OPENING)), tops))
 
     def __call__(self, pos: np.ndarray, body_pos: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """``away``, ``slipped`` and ``sunk`` (P,) [m] of one frame, see :class:`Wear`."""
@@ -285,9 +287,10 @@ class _Regions:
         return rows
 
 
-def _between(body_pos: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _points_between(body_pos: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points on long edges: the ends (B, 2) of each one's edge, and how far (B, 1) along it the point is, 0 to 1."""
     length = np.linalg.norm(body_pos[edges[:, 0]] - body_pos[edges[:, 1]], axis=1)
     count = np.clip(np.ceil(length / _COARSE) - 1, 0, _MOST_BETWEEN).astype(np.int64)
-    place = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-    return np.repeat(edges, count, axis=0), ((place + 1) / (np.repeat(count, count) + 1))[:, None]
+    edge = np.repeat(np.arange(len(edges)), count)
+    place = np.arange(len(edge)) - (np.cumsum(count) - count)[edge] + 1
+    return edges[edge], (place / (count[edge] + 1))[:, None]
