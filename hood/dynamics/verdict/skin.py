@@ -13,7 +13,7 @@ from hood.dynamics.verdict.frames import name_frames
 from hood.dynamics.verdict.surface import Meshes, spread_over
 from hood.dynamics.verdict.visible import sampled, visible
 from hood.limits import CUT_UNSOUND, DEPTH_UNSOUND, INSIDE_UNSOUND, SPOTS_HEIGHT, SPOTS_LASTING, SPOTS_UNSOUND
-from hood.mesh.crossing import crossings
+from hood.mesh.crossing import Crossings, crossings
 from hood.mesh.repair import boundary_vertices
 from hood.mesh.topology import connected_components, hinges, unique_edges
 
@@ -22,8 +22,6 @@ _LOOKED_AT, _HARDLY = 8, 0.001
 #: A thing turns by more than the first [rad] at an edge between two of its sides, and by less than the second within them;
 #: people do so at toes and fingers, but have no flat sides.
 _CORNER, _FLAT = np.deg2rad(60.0), 0.01
-#: Where a limb passes through cloth, at most this share of the triangles is at the cloth's edge; more: a hem cuts into it.
-_AT_EDGE = 0.5
 
 
 def skin_causes(metrics: Mapping[str, np.ndarray], inside: Mapping[str, np.ndarray], meshes: Meshes) -> Found:
@@ -95,7 +93,7 @@ def _seen_at(meshes: Meshes, frame: int) -> tuple[float, float, float]:
     faces = np.unique(pairs[:, 0])
     found = faces[visible(pos[meshes.faces[faces]].mean(axis=1), [(pos, meshes.faces), (body, meshes.body_faces)])]
     round_faces = pairs[~_at_corners(body, meshes.body_faces)[pairs[:, 1]], 0]
-    through = way_through(pos, meshes.faces, body, meshes.body_faces, cut.second_edges) if len(found) else 0.0
+    through = way_through(pos, meshes.faces, body, meshes.body_faces, cut) if len(found) else 0.0
     return len(found) / len(meshes.faces), int(np.isin(found, round_faces).sum()) / len(meshes.faces), through
 
 
@@ -113,26 +111,32 @@ def _at_corners(pos: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.asarray(sharp[faces].any(axis=1))
 
 
-def way_through(cloth: np.ndarray, faces: np.ndarray, body: np.ndarray, body_faces: np.ndarray, cut: np.ndarray) -> float:
+def way_through(cloth: np.ndarray, faces: np.ndarray, body: np.ndarray, body_faces: np.ndarray, cut: Crossings) -> float:
     """How far [m] a body (W, 3) goes through the middle of a cloth (V, 3), (F, 3): the greatest distance to the cloth of what
-    is cut off from the rest of the body where edges of it pass through the cloth; 0 where nothing is cut off. A limb that a
-    hem cuts all around, as one that lies too close does, has not gone through: most of what it passes is at the cloth's edge.
+    is cut off from the rest of the body where edges of it pass through the cloth; 0 where nothing is cut off. A limb has not
+    gone through where the cloth ends inside of it, as a hem does that lies too close all around.
 
     Args:
-        cut: (K, 3) the ends of these edges, ascending, and the face.
+        cut: of the cloth and the body.
     """
-    edges, count = unique_edges(body_faces), len(body)
+    piece, off = _cut_off(len(body), body_faces, cut.second_edges)
+    cloth_piece, inside = _cut_off(len(cloth), faces, cut.first_edges)
+    inside &= np.isin(cloth_piece, cloth_piece[boundary_vertices(faces)])
+    ends, at_end = piece[cut.second_edges[:, :2]], inside[faces].any(axis=1)[cut.second_edges[:, 2]]
+    beyond = off & ~np.isin(piece, ends[at_end])
+    return float(cKDTree(sampled(cloth, faces)).query(body[beyond])[0].max()) if beyond.any() else 0.0
+
+
+def _cut_off(count: int, faces: np.ndarray, cut: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of a mesh of ``count`` vertices, without the edges that ``cut`` (K, 3) begins with, the piece (count,) that each vertex
+    is of, and whether (count,) that is another than the largest one of what the mesh connects."""
+    edges = unique_edges(faces)
     kept = edges[~np.isin(edges @ [count, 1], cut[:, :2] @ [count, 1])]
     whole, piece = (connected_components(count, some) for some in (edges, kept))
-    at_edge = np.asarray(np.isin(faces, boundary_vertices(faces)).any(axis=1))[cut[:, 2]]
-    beyond = np.zeros(count, dtype=bool)
-    for part in np.unique(whole[cut[:, 0]]):
-        pieces = np.where(whole == part, piece, -1)
-        ends, main = pieces[cut[:, :2]], np.bincount(pieces[pieces >= 0]).argmax()
-        for own in np.setdiff1d(ends, [-1, main]):
-            if at_edge[(ends == own).any(axis=1)].mean() <= _AT_EDGE:
-                beyond |= pieces == own
-    return float(cKDTree(sampled(cloth, faces)).query(body[beyond])[0].max()) if beyond.any() else 0.0
+    _, first, sizes = np.unique(piece, return_index=True, return_counts=True)
+    largest, order = np.zeros(count, dtype=np.int64), np.argsort(sizes, kind="stable")
+    largest[whole[first[order]]] = order  # of several the last one stays
+    return piece, largest[whole] != piece
 
 
 def _notes(metrics: Mapping[str, np.ndarray], share: np.ndarray, shown: np.ndarray) -> list[str]:

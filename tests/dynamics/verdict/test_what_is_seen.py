@@ -104,9 +104,9 @@ def test_a_body_that_goes_through_a_sheet_counts_by_how_far() -> None:
                   body_faces=spear_faces.astype(np.int32), config={"worn": False})  # fmt: skip
     assert "skin_depth" in kinds(data)
     cut = crossings(flat, faces, spear, spear_faces)
-    assert way_through(flat, faces, spear, spear_faces, cut.second_edges) == pytest.approx(0.3, abs=0.02)
+    assert way_through(flat, faces, spear, spear_faces, cut) == pytest.approx(0.3, abs=0.02)
     below = crossings(flat, faces, spear - [0, 0.5, 0], spear_faces)
-    assert way_through(flat, faces, spear - [0, 0.5, 0], spear_faces, below.second_edges) == 0.0
+    assert way_through(flat, faces, spear - [0, 0.5, 0], spear_faces, below) == 0.0
 
 
 def test_a_limb_that_a_hem_cuts_all_around_has_not_gone_through() -> None:
@@ -114,7 +114,10 @@ def test_a_limb_that_a_hem_cuts_all_around_has_not_gone_through() -> None:
     cuff[cuff[:, 1] > 0.695] *= [0.94, 1.0, 0.94]  # 1 mm in the skin
     cut = crossings(cuff, faces, POST, POST_FACES)
     assert len(np.unique(cut.second_edges[:, :2])) > 90
-    assert way_through(cuff, faces, POST, POST_FACES, cut.second_edges) == 0.0
+    assert way_through(cuff, faces, POST, POST_FACES, cut) == 0.0
+    plate, plate_faces = sheet((0.003, 0.503, 0.007), 1, 0.24, 1)  # its edge is near, but all of it is outside
+    cut = crossings(plate, plate_faces, POST, POST_FACES)
+    assert way_through(plate, plate_faces, POST, POST_FACES, cut) == pytest.approx(0.5, abs=0.02)
 
 
 def test_folds_of_the_skin_are_told_and_do_not_count() -> None:
