@@ -51,6 +51,19 @@ _RECORD_LIMIT, _DEEPEST, _REASON = 1 << 20, 32, 300
 #: the network, unless another stepper is named.
 NETWORK_KEYS = ("checkpoint", "model", "precision", "kernels")
 _REFINING = ("refine", "target_rg", "budget_ms", "max_strain", "refine_method", "refine_most", "refine_table")
+#: Keys that people look for under another word.
+_OTHER_WORDS = {
+    "motion": ("sequence", "sequences"),
+    "motions": ("sequences", "sequence"),
+    "pose": ("sequence", "sequences"),
+    "poses": ("sequence", "sequences"),
+    "avatar": ("body",),
+    "character": ("body",),
+    "cloth": ("garment",),
+    "mesh": ("garment",),
+    "fabric": ("material",),
+    "out": ("output",),
+}
 #: What configs may name; and classes of plugins (:mod:`hood.plugins`).
 _TARGETS = ("hood.", "torch.optim.")
 
@@ -273,7 +286,7 @@ def _check_override(name: str, text: str, defaults: DictConfig) -> tuple[str, Ov
         raise ConfigError(f"{key}=null: cannot be left out; give one of {', '.join(options(key))}")
     if _is_group(override) and override.value() is not None and str(override.value()) not in options(key):
         lost = without_options()
-        raise ConfigError(unknown(f"option of {key}", str(override.value()), options(key)) + (f"; {lost}" if lost else ""))
+        raise ConfigError(unknown(key, str(override.value()), options(key)) + (f"; {lost}" if lost else ""))
     return text, override
 
 
@@ -344,7 +357,9 @@ def _check_key(override: Override, known: DictConfig) -> None:
         raise ConfigError(f"override {override.input_line!r}: keys are fixed; write key=value without '+' or '~'")
     key = override.key_or_group
     if OmegaConf.select(known, key, default=OmegaConf) is OmegaConf:
-        raise ConfigError(unknown("key", key, _siblings(known, key)))
+        siblings = _siblings(known, key)
+        meant = next((name for name in _OTHER_WORDS.get(key, ()) if name in siblings), None)
+        raise ConfigError(unknown("key", key, siblings, meant))
 
 
 def _siblings(known: DictConfig, key: str) -> list[str]:

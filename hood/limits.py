@@ -56,6 +56,11 @@ DEPTH_GROSS = Limit(0.03, "m", _RULE, "a hand that has gone through the cloth: o
 SPOTS_UNSOUND = Limit(0.002, "share of the cloth's triangles", _RULE, "four of two thousand: smaller spots are not seen")
 SPOTS_HEIGHT = Limit(0.0015, "m", _RULE, "lower spots flicker")
 SPOTS_LASTING = Limit(0.45, "share of frames", _RULE, "spots that come and go are not seen")
+#: Larger spots count where they last less long.
+SPOTS_LARGE = Limit(
+    0.004, "share of the cloth's triangles", _RULE, "498 rollouts: right ones have them in one of the frames looked at, at most"
+)
+SPOTS_LARGE_LASTING = Limit(0.25, "share of frames", _RULE, "a right one of four looked at reaches a quarter")
 #: Cloth that is under the skin as a whole cuts nothing.
 INSIDE_UNSOUND = Limit(0.05, "share of the vertices", _RULE, "2 mm deep in the body; ordinary rollouts have less than 1%")
 INSIDE_ALARM = Limit(0.01, "m", _GUARD, "contact pushes out from 10 mm, from deeper it may push through the limb")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -15,14 +17,33 @@ from hood.assets.garment.garment import Garment, load_garment
 from hood.assets.motion.load import load_sequence
 from hood.assets.motion.sequence import PoseSequence
 from hood.mesh import layers
-from hood.native.build import BuildError
+from hood.native.build import BuildError, keep
+from hood.native.libraries import LIBRARIES
 from hood.scene.scene import Scene, build_scene
 from hood.testing import cylinder
 
 GARMENT_NAMES = ("tshirt", "tank", "longsleeve", "shorts", "trousers", "dress", "skirt")
 
 torch.set_num_threads(1)
-os.environ["HOOD_CACHE"] = "off"  # tests leave nothing in the user's folder
+#: Where compiled libraries are kept while the tests run: nothing is left in the user's folder.
+_KEPT = pytest.StashKey[tempfile.TemporaryDirectory[str]]()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Compile the libraries once, on all cores, before the processes that run the tests start."""
+    if hasattr(config, "workerinput") or config.option.collectonly:
+        return
+    config.stash[_KEPT] = folder = tempfile.TemporaryDirectory(prefix="hood_tests_")
+    os.environ["HOOD_CACHE"] = folder.name
+    with ThreadPoolExecutor() as pool:
+        for made in [pool.submit(keep, *library) for library in LIBRARIES]:
+            if not isinstance(made.exception(), (BuildError, OSError, type(None))):
+                made.result()
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    if _KEPT in config.stash:
+        config.stash[_KEPT].cleanup()
 
 
 @pytest.fixture(autouse=True)

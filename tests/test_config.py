@@ -58,7 +58,7 @@ def test_names_that_look_like_numbers_are_names() -> None:
     [
         (["garmnet=dress"], ("'garmnet'", "'garment'")),
         (["material.densty=0.3"], ("'material.densty'", "'material.density'")),
-        (["material=demin"], ("option of material", "'demin'", "'denim'")),
+        (["material=demin"], ("unknown material", "'demin'", "'denim'")),
         (["num_frames=abc"], ("num_frames=abc: give a whole number, such as num_frames=150",)),
         (["num_frames=2.5"], ("num_frames=2.5: give a whole number",)),
         (["num_frames=null"], ("num_frames=null: give a whole number",)),
@@ -168,6 +168,20 @@ def test_require_choice() -> None:
     config = load_config("rollout", ["video=mp5"])
     with pytest.raises(ConfigError, match="video 'mp5': did you mean 'mp4'"):
         require_choice(config, "video", ("mp4", "gif", "none"))
+
+
+@pytest.mark.parametrize(
+    ("command", "word", "key"),
+    [
+        ("rollout", "motion", "sequence"),
+        ("rollout", "avatar", "body"),
+        ("rollout", "sequnce", "sequence"),
+        ("evaluate", "motion", "sequences"),
+    ],
+)
+def test_another_word_for_a_key(command: str, word: str, key: str) -> None:
+    with pytest.raises(ConfigError, match=f"unknown key '{word}': did you mean '{key}'"):
+        load_config(command, [f"{word}=walk"])
 
 
 def test_run_record(tmp_path: Path) -> None:

@@ -91,7 +91,7 @@ def test_lists_tables_and_quotes_are_read_as_such(word: str, value: object) -> N
         ("garment=[tank,,ö]", "a value is missing beside a comma"),
         ("fabrics={ö:}}", "close every bracket"),
         ("gärment=dress", "'gärment' cannot be a key"),
-        ("material=Loden ö", "unknown option of material 'Loden ö'"),
+        ("material=Loden ö", "unknown material 'Loden ö'"),
         ("fabrics.ö=silk", "'fabrics.ö' cannot be a key"),
     ],
 )

@@ -76,7 +76,7 @@ def test_a_wheel_without_its_options_is_told_by_the_command_that_names_one(tmp_p
     install(project, tmp_path / "site")
     done = python("-m", "hood", "rollout", "losses=windy", where=project, path=tmp_path / "site")
     assert done.returncode == 2
-    assert "unknown option of losses 'windy'" in done.stderr
+    assert "unknown losses 'windy'" in done.stderr
     assert "'my_cloth' is installed without its files configs/GROUP/*.yaml" in done.stderr
     assert 'add [tool.setuptools.package-data] my_cloth = ["configs/**/*.yaml"]' in done.stderr
     assert done.stderr.count("\n") == 1

@@ -75,10 +75,10 @@ def unknown_suffix(path: Path, what: str) -> str:
     return f"unknown {what} format {path.suffix!r}" if path.suffix else "its name has no ending that says the format"
 
 
-def unknown(what: str, given: str, known: Iterable[str]) -> str:
-    """The sentence for a misspelt name: the nearest known one first."""
+def unknown(what: str, given: str, known: Iterable[str], meant: str | None = None) -> str:
+    """The sentence for a misspelt name: the nearest known one first, or the one that is ``meant``."""
     known = list(known)
-    near = nearest(given, known)
+    near = meant or nearest(given, known)
     hint = f"did you mean {near!r}? " if near else ""
     return f"unknown {what} {given!r}: {hint}known are {', '.join(known) or 'none'}"
 

@@ -12,13 +12,24 @@ from hood.dynamics.verdict.cause import Cause, Found
 from hood.dynamics.verdict.frames import name_frames
 from hood.dynamics.verdict.surface import Meshes, spread_over
 from hood.dynamics.verdict.visible import sampled, visible
-from hood.limits import CUT_UNSOUND, DEPTH_UNSOUND, INSIDE_UNSOUND, SPOTS_HEIGHT, SPOTS_LASTING, SPOTS_UNSOUND
+from hood.limits import (
+    CUT_UNSOUND,
+    DEPTH_UNSOUND,
+    INSIDE_UNSOUND,
+    SPOTS_HEIGHT,
+    SPOTS_LARGE,
+    SPOTS_LARGE_LASTING,
+    SPOTS_LASTING,
+    SPOTS_UNSOUND,
+)
 from hood.mesh.crossing import Crossings, crossings
 from hood.mesh.repair import boundary_vertices
 from hood.mesh.topology import connected_components, hinges, unique_edges
 
 #: Frames that are looked at from all sides, at most, of those in which a larger share of the cloth's triangles is cut.
 _LOOKED_AT, _HARDLY = 8, 0.001
+#: How large spots of skin are, and in how many of the frames they then count.
+_LASTING = ((SPOTS_UNSOUND, SPOTS_LASTING), (SPOTS_LARGE, SPOTS_LARGE_LASTING))
 #: A thing turns by more than the first [rad] at an edge between two of its sides, and by less than the second within them;
 #: people do so at toes and fingers, but have no flat sides.
 _CORNER, _FLAT = np.deg2rad(60.0), 0.01
@@ -28,9 +39,9 @@ def skin_causes(metrics: Mapping[str, np.ndarray], inside: Mapping[str, np.ndarr
     """Skin through cloth.
 
     A frame is bad where the skin that a viewer sees cuts more than 1% of the cloth's triangles, or sticks out by more than a
-    centimetre. Spots of some millimetres are seen where they stay: they count if nearly half of the frames have them, and not
-    where a corner of a thing comes through between the vertices of the cloth. Triangles caught in a fold of the skin do not
-    count.
+    centimetre. Spots of some millimetres are seen where they stay: they count if nearly half of the frames have them, or a
+    quarter of the frames larger ones, and not where a corner of a thing comes through between the vertices of the cloth.
+    Triangles caught in a fold of the skin do not count.
 
     Args:
         metrics: of the surface, (S,) each.
@@ -42,9 +53,10 @@ def skin_causes(metrics: Mapping[str, np.ndarray], inside: Mapping[str, np.ndarr
     depth = np.where(measured, np.fmax(depth, poked), np.nan)
     height = np.nan_to_num(depth)
     cut, deep = shown > CUT_UNSOUND.value, (height > DEPTH_UNSOUND.value) & (shown > 0)
-    lasting = measured & (spots > SPOTS_UNSOUND.value) & (height > SPOTS_HEIGHT.value)
-    if lasting.sum() <= SPOTS_LASTING.value * measured.sum():
-        lasting = np.zeros_like(lasting)
+    lasting = np.zeros_like(measured)
+    for size, share_of_frames in _LASTING:
+        there = measured & (spots > size.value) & (height > SPOTS_HEIGHT.value)
+        lasting |= there & (there.sum() > share_of_frames.value * measured.sum())
     lasting &= ~deep
     causes = [
         Cause("skin_through_cloth", f"the skin is seen through more than {cut_text()} of the cloth's triangles", cut & measured,

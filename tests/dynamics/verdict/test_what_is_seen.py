@@ -79,6 +79,14 @@ def test_low_spots_of_skin_count_where_they_stay() -> None:
     assert judge_rollout(worn(np.full(COUNT, 0.006), 5)).sound  # 1 mm
 
 
+def test_larger_spots_count_where_they_last_less_long() -> None:
+    sometimes = np.where(np.arange(COUNT) > 8, 0.0115, 0.0)
+    assert judge_rollout(worn(sometimes, 3)).sound  # 0.3% of the triangles
+    (reason,) = judge_rollout(worn(sometimes, 6)).reasons  # 0.6%
+    assert (reason.kind, reason.frames) == ("skin_depth", ((9, 10), (12, 13), (15, 15)))
+    assert judge_rollout(worn(np.where(np.arange(COUNT) > 11, 0.0115, 0.0), 6)).sound  # a quarter, and no more
+
+
 def test_a_corner_between_the_vertices_of_the_cloth_is_no_spot() -> None:
     """8 mm of a cube's corner, of a ball, and of a toe that turns as sharply but has no flat sides, in every frame."""
     flat, faces = sheet((0.003, 0.5, 0.007), 1, 0.6, 30)
