@@ -134,7 +134,7 @@ def test_every_kind_of_model_has_such_a_step(kind: str, name: str, request: pyte
         assert_no_data(simulator, scene, cases[0])
 
 
-@pytest.mark.parametrize("kind", ["local", "base"])
+@pytest.mark.parametrize("kind", [pytest.param("local", marks=pytest.mark.slow), "base"])
 def test_a_compiler_takes_it_on_a_cpu(kind: str, tank_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """By the compiler's front; contact by curvature asks stretched cloth for values elsewhere, and fans are written with
     gaps."""

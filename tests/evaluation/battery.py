@@ -57,7 +57,7 @@ class Battery:
     def __init__(self, folder: Path) -> None:
         self._folder, self.dress = folder, folder / "dress.npz"
         write_garment(self.dress, "dress", "remesh:300")
-        self._solved: dict[str, Metrics] = {}
+        self._runs: dict[tuple[Cell, str, str], Run] = {}
         self._finer: dict[str, Metrics] = {}
         self._configs: dict[str, DictConfig] = {}
         self._network: Stepper | None = None
@@ -76,20 +76,25 @@ class Battery:
         if cell.name not in self._finer:
             settings = tuple(text for text in cell.settings if not text.startswith("fps="))
             fine = replace(cell, settings=(*settings, f"fps={FINER * cell.fps:g}"))
-            metrics = self.run(fine, "newton", "report", FINER).metrics
+            metrics = self._run(fine, "newton", "report", FINER).metrics
             assert metrics is not None
             self._finer[cell.name] = metrics
         return self._finer[cell.name]
 
     def solved(self, cell: Cell) -> Metrics:
         """The solver's metrics in a cell."""
-        if cell.name not in self._solved:
-            metrics = self.run(cell, "newton", "report").metrics
-            assert metrics is not None
-            self._solved[cell.name] = metrics
-        return self._solved[cell.name]
+        metrics = self.run(cell, "newton", "report").metrics
+        assert metrics is not None
+        return metrics
 
-    def run(self, cell: Cell, method: str, mode: str, finer: int = 1) -> Run:
+    def run(self, cell: Cell, method: str, mode: str) -> Run:
+        """A rollout, made once."""
+        key = (cell, method, mode)
+        if key not in self._runs:
+            self._runs[key] = self._run(cell, method, mode)
+        return self._runs[key]
+
+    def _run(self, cell: Cell, method: str, mode: str, finer: int = 1) -> Run:
         """A rollout as of ``hood rollout``, of ``finer`` times as many frames, and what it says of itself.
 
         Two things that it says of every cell do not count: that networks were not trained on so coarse a dress, and how much

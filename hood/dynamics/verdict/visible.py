@@ -21,14 +21,16 @@ def visible(places: np.ndarray, surfaces: Sequence[tuple[np.ndarray, np.ndarray]
     Args:
         surfaces: positions (V, 3) [m] and faces (F, 3) of all that can hide them.
     """
-    seen = np.zeros(len(places), dtype=bool)
-    if not len(places):
-        return seen
+    hidden = np.arange(len(places))  # so far: what one side sees is not asked for again
+    if not len(hidden):
+        return np.zeros(0, dtype=bool)
     points = np.concatenate([sampled(pos, faces) for pos, faces in surfaces]).T.copy()
     for towards in _directions():
         right, up = _across(towards)
-        seen |= _foremost(places.T, points, (right, up, towards))
-    return seen
+        hidden = hidden[~_foremost(places[hidden].T, points, (right, up, towards))]
+        if not len(hidden):
+            break
+    return ~np.isin(np.arange(len(places)), hidden)
 
 
 def _foremost(places: np.ndarray, points: np.ndarray, axes: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
