@@ -20,6 +20,7 @@ from hood.assets.material import RANGES, UNITS, WEAVE, Material, values_of
 from hood.assets.motion.motion_files import MotionFiles
 from hood.losses.potential import Potential
 from hood.losses.problem import STANDARD_GRAVITY
+from hood.losses.term import kind_in_file
 from hood.mesh.topology import connected_components, unique_edges
 from hood.scene.cloth import Cloth
 from hood.scene.dataset import SceneSampler
@@ -32,8 +33,8 @@ _TITLES = {"vertices": "garment vertices", "edge_length": "garment mean edge", "
 
 #: Settings of terms that files from before them do not name, and what these files were trained with.
 _LATER = {
-    f"hood.losses.{name}": {"contact": "vertices", "reach": "constant", "sides": "nearest"}
-    for name in ("collision.Collision", "collision.CentroidCollision", "friction.Friction")
+    kind: {"contact": "vertices", "reach": "constant", "sides": "nearest"}
+    for kind in ("Collision", "CentroidCollision", "Friction")
 }
 #: Settings that weights take as they are, whatever they were trained with: figures in docs/contact.md.
 _TAKEN = ("reach", "sides")
@@ -72,13 +73,19 @@ class Conditions:
             content = json.loads(text)
             spans = {str(name): (float(low), float(high)) for name, (low, high) in content["spans"].items()}
             terms = {str(name): dict(term) for name, term in content["potential"].items()}
-            potential = {name: _LATER.get(str(term.get("term")), {}) | term for name, term in terms.items()}
+            potential = {name: _as_written_today(term) for name, term in terms.items()}
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise ValueError(f"training ranges cannot be read ({type(error).__name__}: {error})") from error
         wrong = next((name for name, span in spans.items() if not (np.isfinite(span).all() and span[0] <= span[1])), None)
         if wrong is not None:
             raise ValueError(f"training range {wrong!r} is {list(spans[wrong])}, no range of finite numbers")
         return Conditions(spans, potential)
+
+
+def _as_written_today(term: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of a term from a file of any age."""
+    kind = kind_in_file(str(term.get("term", "")))
+    return {**_LATER.get(kind, {}), **term, **({"term": kind} if kind else {})}
 
 
 def scene_conditions(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor
 
@@ -17,6 +19,8 @@ class Attachment:
     Args:
         stiffness: k [N/m]. At the default the weight of 100 g opens a button by 1 mm.
     """
+
+    kind: ClassVar[str] = "Attachment"
 
     def __init__(self, stiffness: float = 1e3) -> None:
         if stiffness < 0:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -22,6 +23,8 @@ class Bending:
     k → ``cloth.bending_stiffness`` [J] (H,), l₀ → ``cloth.hinge_rest_length`` [m], A₁ + A₂ → ``cloth.hinge_area`` [m²],
     θ₀ → ``cloth.rest_angle`` [rad].
     """
+
+    kind: ClassVar[str] = "Bending"
 
     def applies(self, problem: StepProblem) -> bool:
         return problem.cloth.hinges.shape[0] > 0
@@ -46,6 +49,8 @@ class CurrentLengthBending:
 
     k → ``cloth.bending_stiffness`` [J] (H,), A₁ + A₂ → ``cloth.hinge_area`` [m²].
     """
+
+    kind: ClassVar[str] = "CurrentLengthBending"
 
     def applies(self, problem: StepProblem) -> bool:
         return problem.cloth.hinges.shape[0] > 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import replace
-from typing import Any, NamedTuple, Self, TypeVar, cast
+from typing import Any, ClassVar, NamedTuple, Self, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -81,6 +81,8 @@ class Collision:
         sides: ``both`` or ``nearest``, see :data:`SIDES`.
     """
 
+    kind: ClassVar[str] = "Collision"
+
     def __init__(
         self,
         weight: float = 5e5,
@@ -150,6 +152,8 @@ class CentroidCollision(Collision):
         lagged: the body one frame behind, as the code of the ``cvpr`` weights has it: the face nearest at t - 1, its plane at
             t. That of the ``postcvpr`` weights has the face nearest at t and its plane at t + 1.
     """
+
+    kind: ClassVar[str] = "CentroidCollision"
 
     def __init__(self, weight: float = 5e5, epsilon: float = 2e-3, lagged: bool = False) -> None:
         super().__init__(weight, epsilon, reach="constant", sides="nearest")

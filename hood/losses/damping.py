@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -24,6 +25,8 @@ class StretchDamping:
     Args:
         time: η [s], the retardation time of the fabric.
     """
+
+    kind: ClassVar[str] = "StretchDamping"
 
     def __init__(self, time: float) -> None:
         self.time = _checked("stretch_damping", time)
@@ -50,6 +53,8 @@ class BendDamping:
     Args:
         time: η [s], the retardation time of the fabric.
     """
+
+    kind: ClassVar[str] = "BendDamping"
 
     def __init__(self, time: float) -> None:
         self.time = _checked("bend_damping", time)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Self
+from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -97,6 +97,8 @@ class Friction(LaggedFriction):
         weight, epsilon, contact, reach, sides: those of the collision term, which make w [J/m³] and ε [m].
     """
 
+    kind: ClassVar[str] = "Friction"
+
     def __init__(
         self,
         coefficient: float = 0.5,
@@ -181,6 +183,8 @@ class WeightFriction(LaggedFriction):
         radius: [m].
     """
 
+    kind: ClassVar[str] = "WeightFriction"
+
     def __init__(self, coefficient: float = 0.5, slip_speed: float = 5e-3, radius: float = 3e-3) -> None:
         super().__init__(coefficient, slip_speed)
         if radius <= 0:
@@ -214,6 +218,8 @@ class CodedFriction(LaggedFriction):
     Args:
         radius: [m²] in effect; the code takes it for metres.
     """
+
+    kind: ClassVar[str] = "CodedFriction"
 
     def __init__(self, coefficient: float = 0.5, slip_speed: float = 5e-3, radius: float = 3e-3) -> None:
         super().__init__(coefficient, slip_speed)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from torch import Tensor
 
 from hood.losses.problem import StepProblem
@@ -9,6 +11,8 @@ from hood.losses.problem import StepProblem
 
 class Gravity:
     """Gravitational energy [J], the sum over vertices of -m g·x; zero at the local frame's origin."""
+
+    kind: ClassVar[str] = "Gravity"
 
     def applies(self, problem: StepProblem) -> bool:
         return bool(problem.gravity.any())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from torch import Tensor
 
 from hood.losses.problem import StepProblem
@@ -14,6 +16,8 @@ class Inertia:
     would leave an error of 6e-4 g in float32 at 1/240 s, this form 2e-8 g. A longer ``dt`` of the first step
     lets the cloth relax (HOOD paper, section 3.4: the factor α).
     """
+
+    kind: ClassVar[str] = "Inertia"
 
     def applies(self, problem: StepProblem) -> bool:
         return True

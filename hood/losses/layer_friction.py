@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -53,6 +54,8 @@ class LayerFriction:
         coefficient: μ.
         slip_speed: speed [m/s] below which friction counts as static.
     """
+
+    kind: ClassVar[str] = "LayerFriction"
 
     def __init__(self, coefficient: float = 0.5, slip_speed: float = 5e-3) -> None:
         if coefficient < 0 or slip_speed <= 0:

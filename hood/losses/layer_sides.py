@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor
 
@@ -25,6 +27,8 @@ class LayerSides:
         epsilon: ε [m]; where faces are small, half of the smallest height around.
         reach: distance [m] at t below which cloth is near; farther than cloth moves against cloth in a step.
     """
+
+    kind: ClassVar[str] = "LayerSides"
 
     def __init__(self, weight: float = 5e5, epsilon: float = 3e-3, reach: float = 2e-2) -> None:
         if weight < 0 or epsilon <= 0 or reach < epsilon:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor
 
@@ -32,6 +34,8 @@ class LayerBarrier:
         pressure: p [Pa].
         between: layers of different pieces of cloth (garments of an outfit) alone.
     """
+
+    kind: ClassVar[str] = "LayerBarrier"
 
     def __init__(self, reach: float = 3e-3, pressure: float = 20.0, between: bool = False) -> None:
         if not (reach > 0 and pressure > 0):

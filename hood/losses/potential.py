@@ -20,7 +20,7 @@ from hood.losses.inertia import Inertia
 from hood.losses.layer_friction import LayerFriction
 from hood.losses.problem import STANDARD_GRAVITY, StepProblem, sum_per_scene
 from hood.losses.stretching import Stretching
-from hood.losses.term import PreparedTerm, RestingTerm, checked
+from hood.losses.term import PreparedTerm, RestingTerm, checked, kind_of
 from hood.losses.term import Term as Term
 
 
@@ -62,9 +62,9 @@ class Potential:
 
     @property
     def settings(self) -> dict[str, dict[str, Any]]:
-        """Class and plain values of every term, by its name: what tells two potentials apart, and can be written down."""
+        """Kind and plain values of every term, by its name: what tells two potentials apart, and can be written down."""
         return {
-            name: {"term": f"{type(term).__module__}.{type(term).__qualname__}"}
+            name: {"term": kind_of(term)}
             | {key: value for key, value in vars(term).items() if isinstance(value, (bool, int, float, str))}
             for name, term in self.terms.items()
         }

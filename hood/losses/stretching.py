@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from torch import Tensor
 
 from hood.losses.problem import StepProblem, sum_per_scene
@@ -20,6 +22,8 @@ class Stretching:
     [Pa], D_m⁻¹ → ``cloth.rest_inverse`` [1/m]. Cloth that has a ``weave`` has the orthotropic energy of
     :mod:`hood.losses.weave` instead.
     """
+
+    kind: ClassVar[str] = "Stretching"
 
     def applies(self, problem: StepProblem) -> bool:
         return True

@@ -10,7 +10,8 @@ from hood.losses.problem import StepProblem
 
 
 class Term(Protocol):
-    """An energy. A new one is a class with these two methods and an entry in the potential's ``terms``.
+    """An energy. A new one is a class with these two methods and an entry in the potential's ``terms``; files name it by its
+    path, or by its ``kind`` (a class attribute, one word) if it has one.
 
     Training ramps the weight of the terms named ``collision`` and ``friction``; such a term is also a :class:`WeightedTerm`.
     """
@@ -51,9 +52,26 @@ class WeightedTerm(Protocol):
         ...
 
 
+def kind_of(term: Term) -> str:
+    """What the class of a term is called in files: its own ``kind``, which stays wherever the class moves, else its path.
+
+    A subclass does not inherit it: it may be another energy.
+    """
+    return str(vars(type(term)).get("kind", _path(term)))
+
+
+def kind_in_file(text: str) -> str:
+    """The kind that a file names; earlier ones named the path of a class."""
+    return text.rpartition(".")[2] if text.startswith("hood.losses.") else text
+
+
 def named(name: str, term: Term) -> str:
     """A term in a sentence: its name and its class."""
-    return f"losses.terms.{name} ({type(term).__module__}.{type(term).__qualname__})"
+    return f"losses.terms.{name} ({_path(term)})"
+
+
+def _path(term: Term) -> str:
+    return f"{type(term).__module__}.{type(term).__qualname__}"
 
 
 def checked(name: str, term: Term, energy: Tensor, num_scenes: int) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -49,6 +49,8 @@ class Wind:
     Raises:
         ValueError: a value that is not finite or out of range.
     """
+
+    kind: ClassVar[str] = "Wind"
 
     def __init__(
         self,

@@ -64,6 +64,14 @@ def test_a_scene_that_has_no_such_value_is_not_outside() -> None:
     assert outside(TRAINED, replace(scene, spans=spans)) == []
 
 
+def test_files_that_name_an_energy_by_the_path_of_its_class_are_read() -> None:
+    text = Conditions({}, default_potential().settings).to_json()
+    older = text.replace('"term": "Collision"', '"term": "hood.losses.collision.Collision"')
+    assert older != text
+    assert Conditions.from_json(older) == Conditions.from_json(text)
+    assert Conditions.from_json('{"spans": {}, "potential": {"mine": {"weight": 1.0}}}').potential == {"mine": {"weight": 1.0}}
+
+
 def test_files_from_before_a_setting_were_trained_with_what_it_is_by_default() -> None:
     text = Conditions({}, default_potential().settings).to_json()
     older = Conditions.from_json(text.replace(', "contact": "vertices"', ""))

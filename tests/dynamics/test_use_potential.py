@@ -130,7 +130,7 @@ def test_settings_tell_potentials_apart() -> None:
     assert default == default_potential().settings
     assert default["friction"] | {"coefficient": 10.0, "epsilon": 1e-2} == ROUGH.settings["friction"]
     assert default["collision"] == {
-        "term": "hood.losses.collision.Collision",
+        "term": "Collision",
         "weight": 5e5,
         "epsilon": 2e-3,
         "contact": "vertices",

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import importlib
+import pkgutil
+
 import pytest
 import torch
 from torch import Tensor
 from torch.fx.experimental.proxy_tensor import make_fx
 
+from hood import losses
 from hood.assets.material import Material
 from hood.losses.collision import CentroidCollision, Collision
 from hood.losses.friction import CodedFriction, Friction, WeightFriction
 from hood.losses.potential import default_potential
 from hood.losses.problem import StepProblem
+from hood.losses.term import kind_in_file
 from hood.scene.cloth import build_cloth, concatenate_cloths
 from hood.testing import grid, make_problem
 from hood.training.curriculum import CollisionRamp
@@ -105,3 +110,29 @@ def test_the_shape_is_checked_where_a_step_is_traced_too() -> None:
     torch.testing.assert_close(graph(problem.state.pos), good.total(problem, problem.state.pos))
     with pytest.raises(ValueError, match="losses.terms.own"):
         make_fx(lambda pos: bad.total(problem, pos))(problem.state.pos)
+
+
+def test_files_name_an_energy_by_a_word_that_stays() -> None:
+    """A subclass is another energy and is named by its path; files from before name that of every class."""
+    settings = default_potential().with_terms(collision=SoftCollision(2.0)).settings
+    assert settings["friction"]["term"] == "Friction"
+    assert settings["collision"]["term"] == f"{__name__}.SoftCollision"
+    assert kind_in_file("hood.losses.friction.Friction") == "Friction"
+    assert kind_in_file(f"{__name__}.SoftCollision") == f"{__name__}.SoftCollision"
+
+
+def test_every_energy_of_the_package_has_its_own_word() -> None:
+    found = [
+        kind
+        for module in pkgutil.iter_modules(losses.__path__)
+        for kind in vars(importlib.import_module(f"hood.losses.{module.name}")).values()
+        if isinstance(kind, type)
+        and kind.__module__ == f"hood.losses.{module.name}"
+        and hasattr(kind, "applies")
+        and not getattr(kind, "_is_protocol", False)
+    ]
+    own = {kind.__name__: vars(kind).get("kind") for kind in found}
+    assert own.pop("LaggedFriction") is None  # what three energies share
+    assert len(own) >= 17
+    assert all(word == name for name, word in own.items())
+    assert len(set(own.values())) == len(own)

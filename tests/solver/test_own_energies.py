@@ -1,0 +1,75 @@
+"""An energy of somebody's own that is a subclass of one of the package gets the derivatives of its own energy, not those that
+the package has written out for its parent."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from hood.assets.material import Material
+from hood.losses.damping import BendDamping, StretchDamping
+from hood.losses.potential import default_potential, relative_gradient
+from hood.losses.problem import StepProblem
+from hood.losses.term import Term
+from hood.losses.wind import Wind
+from hood.scene.cloth import build_cloth
+from hood.solver.forces import energies_and_gradient, total_energy
+from hood.solver.newton import NewtonSettings, minimize
+from hood.testing import grid, make_problem, plane_contact
+
+POTENTIAL = default_potential().with_terms(
+    air=Wind((3.0, 0.0, 1.0)), stretch_damping=StretchDamping(1e-2), bend_damping=BendDamping(1e-2)
+)
+NAMES = [name for name in POTENTIAL.terms if name not in ("attachment", "layers", "layer_friction")]
+
+
+def doubled(term: Term) -> Term:
+    """A subclass with twice the energy and nothing else of its own."""
+    own = copy.copy(term)
+
+    def energy(self: Term, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> Tensor:
+        return 2.0 * type(term).__call__(self, problem, next_pos, acc)
+
+    own.__class__ = type(f"Doubled{type(term).__name__}", (type(term),), {"__call__": energy})
+    return own
+
+
+@pytest.fixture(scope="module")
+def sliding() -> StepProblem:
+    """A bent sheet, partly in a plane on which it slides."""
+    rng = np.random.default_rng(1)
+    cloth = build_cloth(*grid(6, 5, 0.4), Material(), dtype=torch.float64)
+    noise = torch.as_tensor(rng.normal(size=cloth.rest_pos.shape))
+    pos = cloth.rest_pos * torch.tensor([1.0, 0.0, 1.0], dtype=torch.float64) + 1e-3 * noise
+    return make_problem(cloth, pos, 0.1 * noise.numpy(), 1 / 30, plane_contact(pos))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_energies_and_forces_are_its_own(name: str, sliding: StepProblem) -> None:
+    potential = POTENTIAL.with_terms(**{name: doubled(POTENTIAL.terms[name])})
+    problem = potential.prepare(sliding)
+    pos = problem.state.pos + 1e-3 * torch.as_tensor(np.random.default_rng(2).normal(size=problem.state.pos.shape))
+    expected, energies = potential.gradient(problem, pos)
+    gradient, found = energies_and_gradient(potential, problem, pos)
+    torch.testing.assert_close(found[name], energies[name], rtol=1e-12, atol=1e-20)
+    torch.testing.assert_close(gradient, expected, rtol=1e-10, atol=1e-12 * float(expected.abs().max()))
+    torch.testing.assert_close(total_energy(potential, problem, pos), potential.total(problem, pos), rtol=1e-12, atol=1e-20)
+    plain = POTENTIAL.gradient(POTENTIAL.prepare(sliding), pos)[1]
+    torch.testing.assert_close(energies[name], 2.0 * plain[name], rtol=1e-12, atol=1e-20)
+
+
+@pytest.mark.parametrize("engine", ["auto", "torch"])
+@pytest.mark.parametrize("name", NAMES)
+def test_the_solver_tells_how_far_its_minimum_is(name: str, engine: str, sliding: StepProblem) -> None:
+    """Of stiff energies it knows the slope alone, which may not be enough to arrive; it says so."""
+    potential = POTENTIAL.with_terms(**{name: doubled(POTENTIAL.terms[name])})
+    problem = potential.prepare(sliding)
+    pos, report = minimize(potential, problem, settings=NewtonSettings(target_rg=1e-4, max_iterations=60, engine=engine))
+    assert report.relative_gradient is not None
+    true = relative_gradient(problem, potential.gradient(problem, pos)[0])
+    torch.testing.assert_close(report.relative_gradient, true, rtol=1e-6, atol=1e-9)
+    assert bool(report.converged.all()) or name in ("stretching", "collision", "friction")
