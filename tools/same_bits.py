@@ -28,11 +28,12 @@ SCENES = {
     "tank": "garment=tank sequence=walk_proud",
     "tshirt_in_wind": "garment=tshirt sequence=dance_mixed wind=3 gusts=0.2 damping=0.002 material=denim",
     "dress_from_above": "garment=dress sequence=jumps fps=60 settle=paper body_friction={left_wrist:3}",
-    "skirt_held": "garment=skirt sequence=walk_proud start=1.0 cloth_contact=on cloth_friction=0.3",
+    "skirt_held": "garment=skirt sequence=walk_proud start=1.0",
     "trousers_in_two_fabrics": "garment=trousers sequence=plie betas=[1.5,-1] size={below_waistband:1.05} "
-    "fabrics={below_knees:silk}",
+    "fabrics={below_left_knee:silk}",
     "outfit": "garment=[tank,skirt] sequence=walk_proud",
-    "jacket_opens": "garment=jacket sequence=walk_proud events=[{frame:4,open:front_buttons}]",
+    "folds_apart": "garment=longsleeve sequence=squats cloth_contact=on cloth_friction=0.3",
+    "jacket_opens": "garment=jacket sequence=walk_proud events=[{frame:4,open:front_zip}]",
 }
 #: What takes its steps.
 METHODS = {
