@@ -30,11 +30,13 @@ _KEPT = pytest.StashKey[tempfile.TemporaryDirectory[str]]()
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Compile the libraries once, on all cores, before the processes that run the tests start."""
-    if hasattr(config, "workerinput") or config.option.collectonly:
+    """Where several processes run the tests, the libraries are compiled before, on all cores; else each when it is needed."""
+    if hasattr(config, "workerinput"):
         return
     config.stash[_KEPT] = folder = tempfile.TemporaryDirectory(prefix="hood_tests_")
     os.environ["HOOD_CACHE"] = folder.name
+    if not getattr(config.option, "numprocesses", None):
+        return
     with ThreadPoolExecutor() as pool:
         for made in [pool.submit(keep, *library) for library in LIBRARIES]:
             if not isinstance(made.exception(), (BuildError, OSError, type(None))):

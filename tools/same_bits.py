@@ -49,8 +49,8 @@ METHODS = {
 }
 _ROLLOUT = "num_frames=8 video=none sheet=false allow_unsound=true export=[rg] seed=3"
 _TRAINING = "trainer.iterations=20 trainer.statistics_iterations=4 trainer.log_every=5 trainer.workers=0 trainer.kernels=torch"
-#: Results that are times, or depend on them.
-_TIMES = ("ms_", "seconds", "per_s", "rate")
+#: In the names of results that are times [ms], [s], or made of them [1/s].
+_TIMES = ("ms_", "seconds", "per_second")
 
 
 def main(words: list[str]) -> int:
@@ -63,6 +63,9 @@ def main(words: list[str]) -> int:
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         found = dict(zip(cases, pool.map(_run, cases.values()), strict=True))
     Path(words[0]).write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    for name, result in found.items():
+        if "exit" in result:
+            print(f"refused: {name}: {result['said']}")
     if len(words) == 1:
         return 0
     before = json.loads(Path(words[1]).read_text(encoding="utf-8"))
@@ -75,7 +78,7 @@ def main(words: list[str]) -> int:
 
 
 def _run(words: list[str]) -> dict[str, str]:
-    """Digests of what a command writes; its exit code and message where it refuses."""
+    """Digests of what a command writes, by array; ``exit`` and ``said``, its code and last line, where it refuses."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-P", "-m", "hood", *words, f"output={folder}/out"]
@@ -111,6 +114,7 @@ def _of_training(folder: Path) -> dict[str, str]:
 
 
 def _digest(array: np.ndarray) -> str:
+    """SHA-256 of an array of any shape, with its type and shape."""
     array = np.ascontiguousarray(array)
     return hashlib.sha256(f"{array.dtype} {array.shape}".encode() + array.tobytes()).hexdigest()
 

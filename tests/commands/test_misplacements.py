@@ -276,9 +276,9 @@ def test_what_fits_nowhere_or_twice_is_refused(capsys: pytest.CaptureFixture[str
         finding = json.loads(capsys.readouterr().out)["files"][0]
         assert finding["command"] is None
         assert any("no place" in entry["problem"] for entry in finding["problems"])
-    assert main(["prepare", "garment=flat.obj", "output=bad.npz"]) == 2
-    assert not Path("bad.npz").exists()
-    capsys.readouterr()
+        assert main(["prepare", f"garment={name}.obj", "output=bad.npz"]) == 2
+        assert not Path("bad.npz").exists()
+        capsys.readouterr()
 
 
 MESHES = {

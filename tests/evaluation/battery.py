@@ -57,8 +57,7 @@ class Battery:
     def __init__(self, folder: Path) -> None:
         self._folder, self.dress = folder, folder / "dress.npz"
         write_garment(self.dress, "dress", "remesh:300")
-        self._runs: dict[tuple[Cell, str, str], Run] = {}
-        self._finer: dict[str, Metrics] = {}
+        self._runs: dict[tuple[Cell, str, str, int], Run] = {}
         self._configs: dict[str, DictConfig] = {}
         self._network: Stepper | None = None
 
@@ -73,28 +72,27 @@ class Battery:
 
     def finer(self, cell: Cell) -> Metrics:
         """The solver's metrics in a cell at a quarter of the time step."""
-        if cell.name not in self._finer:
-            settings = tuple(text for text in cell.settings if not text.startswith("fps="))
-            fine = replace(cell, settings=(*settings, f"fps={FINER * cell.fps:g}"))
-            metrics = self._run(fine, "newton", "report", FINER).metrics
-            assert metrics is not None
-            self._finer[cell.name] = metrics
-        return self._finer[cell.name]
+        settings = tuple(text for text in cell.settings if not text.startswith("fps="))
+        fine = replace(cell, settings=(*settings, f"fps={FINER * cell.fps:g}"))
+        return self._metrics(fine, FINER)
 
     def solved(self, cell: Cell) -> Metrics:
         """The solver's metrics in a cell."""
-        metrics = self.run(cell, "newton", "report").metrics
+        return self._metrics(cell)
+
+    def _metrics(self, cell: Cell, finer: int = 1) -> Metrics:
+        metrics = self.run(cell, "newton", "report", finer).metrics
         assert metrics is not None
         return metrics
 
-    def run(self, cell: Cell, method: str, mode: str) -> Run:
-        """A rollout, made once."""
-        key = (cell, method, mode)
+    def run(self, cell: Cell, method: str, mode: str, finer: int = 1) -> Run:
+        """A rollout of :meth:`_run`, made once."""
+        key = (cell, method, mode, finer)
         if key not in self._runs:
-            self._runs[key] = self._run(cell, method, mode)
+            self._runs[key] = self._run(*key)
         return self._runs[key]
 
-    def _run(self, cell: Cell, method: str, mode: str, finer: int = 1) -> Run:
+    def _run(self, cell: Cell, method: str, mode: str, finer: int) -> Run:
         """A rollout as of ``hood rollout``, of ``finer`` times as many frames, and what it says of itself.
 
         Two things that it says of every cell do not count: that networks were not trained on so coarse a dress, and how much

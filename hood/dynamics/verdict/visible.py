@@ -30,7 +30,9 @@ def visible(places: np.ndarray, surfaces: Sequence[tuple[np.ndarray, np.ndarray]
         hidden = hidden[~_foremost(places[hidden].T, points, (right, up, towards))]
         if not len(hidden):
             break
-    return ~np.isin(np.arange(len(places)), hidden)
+    seen = np.ones(len(places), dtype=bool)
+    seen[hidden] = False
+    return seen
 
 
 def _foremost(places: np.ndarray, points: np.ndarray, axes: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
