@@ -5,13 +5,17 @@ VENV ?= .venv
 PIP_ARGS ?=
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint slow envelope docs clean
+.PHONY: demo test tests lint style types slow envelope docs clean
 
 demo: $(VENV)/.demo
 	$(BIN)/hood rollout garment=dress_4k output=outputs/demo
 	@echo "Look at outputs/demo/contact_sheet.png and outputs/demo/rollout.mp4"
 
-test: lint
+# Types are checked beside the tests: on one core they take half a minute.
+test: style
+	$(MAKE) --no-print-directory -j 2 types tests
+
+tests: $(VENV)/.dev
 	$(BIN)/python -m pytest -n auto --dist loadfile
 
 slow: $(VENV)/.dev
@@ -26,11 +30,15 @@ docs: $(VENV)/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo "Open site/index.html"
 
-lint: $(VENV)/.dev
+lint: style types
+
+style: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+types: $(VENV)/.dev
+	$(BIN)/mypy
 
 $(VENV)/bin/python:
 	$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11) and 'hood needs Python 3.11 or newer; set PYTHON=')"

@@ -89,7 +89,7 @@ def test_a_step_is_the_plain_one(name: str, skirt_scene: Scene, monkeypatch: pyt
     assert len(stepper._plans) == 1
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", [name for name in MODELS if name not in ("small2", "small3")])  # small1 with other values
 def test_nothing_in_a_step_depends_on_data(name: str, skirt_scene: Scene) -> None:
     """Tensors without values on a device other than the CPU: asking for a value, or for an array whose size follows from
     values, raises an error there, as does one tensor from the CPU."""
