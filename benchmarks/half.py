@@ -18,7 +18,8 @@ from hood.assets.files.library import locate
 from hood.assets.garment.garment import load_garment
 from hood.assets.motion.load import load_sequence
 from hood.dynamics.checkpoint import load_simulator
-from hood.dynamics.rollout import prepare_stepper, simulate
+from hood.dynamics.refine import prepare_stepper
+from hood.dynamics.rollout import simulate
 from hood.dynamics.simulator import Prediction, Simulator
 from hood.losses.potential import default_potential
 from hood.losses.problem import StepProblem

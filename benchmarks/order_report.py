@@ -17,7 +17,7 @@ from scipy.stats import t
 
 from hood.assets.files.atomic import write_atomically
 from hood.evaluation.bootstrap import LEVEL
-from hood.media.charts import write_png
+from hood.media.bars import write_png
 
 NAMES = {"fine15": "Fine15", "ours": "Ours", "fine48": "Fine48"}
 COLOURS = {"fine15": "#c8503c", "ours": "#2a6fbb", "fine48": "#3f8f4f"}

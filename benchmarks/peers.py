@@ -56,8 +56,8 @@ from peer_scenes import (
 from hood.assets.files.library import locate
 from hood.commands.conditions import machine_name
 from hood.dynamics.checkpoint import load_simulator
-from hood.dynamics.refine import GuessStepper, RefinedStepper
-from hood.dynamics.rollout import Frame, prepare_stepper, simulate
+from hood.dynamics.refine import GuessStepper, RefinedStepper, prepare_stepper
+from hood.dynamics.rollout import Frame, simulate
 from hood.dynamics.stepper import NewtonStepper, Stepper
 from hood.dynamics.stopping import Count
 from hood.losses.potential import Potential, default_potential

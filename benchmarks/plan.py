@@ -34,7 +34,8 @@ import workshop
 import hood
 from hood.assets.garment.garment import load_garment
 from hood.commands import plan_auto
-from hood.dynamics.rollout import prepare_stepper, simulate
+from hood.dynamics.refine import prepare_stepper
+from hood.dynamics.rollout import simulate
 from hood.evaluation.sample import StepSample
 from hood.losses.potential import scale
 from hood.losses.problem import StepProblem

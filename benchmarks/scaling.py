@@ -28,7 +28,7 @@ import numpy as np
 from scipy.stats import t
 
 from hood.evaluation.bootstrap import LEVEL, Estimate, pooled_interval
-from hood.media.charts import write_png
+from hood.media.bars import write_png
 
 #: By resolution: garments, and frames of a rollout.
 SIZES = {"1k": ("tshirt,trousers,dress,skirt", 60), "4k": ("dress_4k,skirt_4k", 30)}

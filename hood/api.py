@@ -24,8 +24,7 @@ from hood.commands.checks.idle_keys import idle_in_rollout
 from hood.commands.common import read_model
 from hood.commands.guarding import GuardStopped, make_guard
 from hood.commands.output_fps import at_output_fps, output_rate
-from hood.commands.plan_auto import planned
-from hood.commands.plan_file import plan_mode, plan_path, rollout_config
+from hood.commands.plan_file import plan_mode, plan_path, planned, rollout_config
 from hood.commands.refine_mesh import finer_mesh, on_finer_mesh
 from hood.commands.setup import Setup, check_config, make_stepper, set_up
 from hood.commands.words import overrides

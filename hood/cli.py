@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from hood import plugins
 from hood.assets.files.extras import DISTRIBUTION
 from hood.commands.exit_codes import exit_code_lines
 
@@ -43,6 +44,21 @@ COMMANDS = {
     "convert": "write published HOOD weights (.pth) as a model file",
 }
 
+#: Where each of them lives; the others, and those of installed packages, are registered (:mod:`hood.plugins`).
+_HOMES = {
+    "rollout": "hood.commands.rollout",
+    "view": "hood.commands.view",
+    "compare": "hood.commands.compare",
+    "export": "hood.commands.export",
+    "inspect": "hood.commands.inspect",
+    "prepare": "hood.commands.prepare",
+    "fabric": "hood.commands.fabric",
+    "sizes": "hood.commands.sizes",
+    "train": "hood.commands.train",
+    "evaluate": "hood.commands.evaluate",
+    "convert": "hood.commands.convert",
+}
+
 _LESS_MEMORY = "free some, raise the limit (ulimit -v), or take a smaller garment, fewer frames or a smaller model"
 
 #: Commands that take steps: libraries for these are compiled while torch is loaded, where that has not been done before.
@@ -61,11 +77,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         print(f"hood {__version__} ({DISTRIBUTION})")
         return 0
-    if name not in COMMANDS:
+    if name not in COMMANDS and name not in plugins.names("commands"):
         from hood.assets.files.library import unknown
 
-        return _fail(unknown("command", name, COMMANDS))
-    if any(word in ("-h", "--help") for word in overrides):
+        return _fail(unknown("command", name, [*COMMANDS, *plugins.names("commands")]))
+    if name in COMMANDS and any(word in ("-h", "--help") for word in overrides):
         from hood.commands.help import describe
 
         print(describe(name))
@@ -131,7 +147,8 @@ def _fail(message: str) -> int:
 def _command(name: str) -> Callable[[Sequence[str]], int]:
     from importlib import import_module
 
-    run: Callable[[Sequence[str]], int] = import_module(f"hood.commands.{name}").run
+    known = name in _HOMES
+    run: Callable[[Sequence[str]], int] = import_module(_HOMES[name]).run if known else plugins.find("commands", name)
     gc.freeze()  # modules stay until the end: looking through them for garbage is 4% of a solver's frame
     return run
 
@@ -139,6 +156,8 @@ def _command(name: str) -> Callable[[Sequence[str]], int]:
 def _usage() -> str:
     lines = ["usage: hood COMMAND [key=value ...]", ""]
     lines += [f"  {name:<10}{text}" for name, text in COMMANDS.items()]
+    further = [name for name in plugins.names("commands") if name not in COMMANDS]
+    lines += [f"  {name:<10}of the installed package {plugins.origin('commands', name)}" for name in further]
     lines += [
         "",
         "hood COMMAND --help lists the keys, their defaults and the names that can be given.",

@@ -18,8 +18,7 @@ from hood.config import ConfigError, build, load_config, options
 from hood.dynamics.captured import network_of
 from hood.dynamics.refine import RefinedStepper
 from hood.dynamics.stopping import Count
-from hood.evaluation.grid import GUESS, model_name
-from hood.evaluation.table import Candidate
+from hood.evaluation.table import GUESS, Candidate, model_name
 
 
 def make_candidate(name: str, config: DictConfig) -> Candidate:

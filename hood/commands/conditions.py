@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 from hood.config import plain
 from hood.dynamics.checkpoint import read_header
 from hood.dynamics.reference import SUFFIXES
-from hood.evaluation.table_one import Conditions
+from hood.evaluation.table_one import TableConditions
 
 #: Arguments that change nothing about the figures.
 _ASIDE = ("output", "resume", "max_rollouts", "contact_sheets")
@@ -25,9 +25,9 @@ def conditions(
     motions: Sequence[str],
     vertices: Mapping[str, int],
     training: Mapping[str, str],
-) -> Conditions:
+) -> TableConditions:
     """Of an evaluation with ``config``: ``vertices`` by garment, ``training`` in words by model."""
-    return Conditions(
+    return TableConditions(
         command=command_line("evaluate", overrides),
         machine=machine_name(str(config.device)),
         body=f"{Path(str(config.body)).stem} (embedded)" if str(config.body) == "default" else Path(str(config.body)).name,

@@ -21,8 +21,8 @@ from hood.evaluation.cells import NOMINAL
 from hood.evaluation.envelope import Criteria, Run, judge, shares, table, usual_of
 from hood.evaluation.envelope_figures import FIGURES, at_same_times, figures
 from hood.evaluation.envelope_prose import write_section
-from hood.evaluation.grid import NEWTON
 from hood.evaluation.rows import write_rows
+from hood.evaluation.table import NEWTON
 from hood.media.envelope_curve import Curve
 from hood.media.envelope_page import View, write_page
 from hood.media.envelope_sheet import small_sheet

@@ -19,7 +19,8 @@ from hood.commands.candidates import split_refinement
 from hood.commands.steppers import find_option
 from hood.config import ConfigError
 from hood.evaluation.cells import NOMINAL, Cell, cells
-from hood.evaluation.grid import GUESS, NEWTON, quoted
+from hood.evaluation.grid import quoted
+from hood.evaluation.table import GUESS, NEWTON
 
 #: The solver at a quarter of the time step, which the solver itself is held against; and no rollout has more frames per second.
 REFERENCE, _FINER, _MOST_FPS = "newton, dt/4", 4, 1000.0

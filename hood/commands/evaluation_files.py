@@ -11,10 +11,10 @@ from hood.evaluation.report import columns, describe, format_table
 from hood.evaluation.rows import write_rows
 from hood.evaluation.spectrum import COLUMNS as SPECTRUM_COLUMNS
 from hood.evaluation.spectrum import bar_panels, format_spectrum
-from hood.evaluation.table_one import Conditions, page
+from hood.evaluation.table_one import TableConditions, page
 
 
-def report_table(rows: Sequence[Mapping[str, Any]], about: Conditions, folder: Path) -> None:
+def report_table(rows: Sequence[Mapping[str, Any]], about: TableConditions, folder: Path) -> None:
     """Print the table; write it as ``table.csv``, ``table.json`` and, beside the paper's, ``table1.md``."""
     print(format_table(rows))
     print(f"\n{describe(rows)}")

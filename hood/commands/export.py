@@ -13,10 +13,9 @@ from hood.assets.files.atomic import write_atomically
 from hood.assets.files.extras import install
 from hood.assets.formats.image import Texture
 from hood.commands.common import frame_count, split_words
-from hood.commands.compare import read_checked
 from hood.commands.textures import lay_on, read_textures
 from hood.config import ConfigError, plain, require_choice
-from hood.dynamics.recorder import RolloutData
+from hood.dynamics.recorder import RolloutData, read_rollout
 from hood.media.exports.clip import PARTS, Clip, clip_of
 from hood.media.exports.gltf import gltf_bytes
 from hood.media.exports.sequences import write_obj_sequence, write_ply_sequence, write_point_cache
@@ -207,3 +206,28 @@ def remove_whole(path: Path) -> None:
 def _megabytes(target: Path) -> float:
     files = [target] if target.is_file() else list(target.iterdir())
     return sum(file.stat().st_size for file in files) / 1e6
+
+
+def read_checked(path: Path, colour: str) -> RolloutData:
+    """A rollout that can be drawn in ``colour``.
+
+    Raises:
+        ValueError: it cannot, or the file is none.
+    """
+    if not path.is_file():
+        raise ConfigError(f"{path}: no such file; give the rollout.h5 of hood rollout, or its folder")
+    data = read_rollout(path)
+    sizes = {len(data.time), len(data.cloth_pos), len(data.body_pos)}
+    meshes = ((data.cloth_pos, data.cloth_faces, "cloth"), (data.body_pos, data.body_faces, "body"))
+    for pos, faces, which in meshes:
+        if pos.ndim != 3 or pos.shape[2] != 3 or len(sizes) > 1:
+            raise ValueError(f"{path}: not a rollout file ({which}/pos has the shape {pos.shape}); make one with hood rollout")
+        if faces.ndim != 2 or faces.shape[1] != 3 or (faces.size and not 0 <= faces.min() <= faces.max() < pos.shape[1]):
+            raise ValueError(f"{path}: not a rollout file ({which}/faces name vertices that are not there)")
+    if len(data.time) == 0:
+        raise ValueError(f"{path}: holds no frames; run hood rollout again")
+    if colour == "rg" and "rg" not in data.fields:
+        raise ValueError(f"{path}: colour=rg needs cloth/rg, which is missing; simulate it with export=[rg]")
+    if colour == "contact" and not len(data.body_faces):
+        raise ValueError(f"{path}: colour=contact shows the distance from the body, and the rollout has none")
+    return data

@@ -24,17 +24,17 @@ from hood.scene.load_motion import load_motion
 from hood.scene.scene import Scene
 
 #: Stored frames for a simulated one, at most: more would show the interpolation, not the simulation.
-_MOST = 10
+_MOST_BETWEEN = 10
 
 
 def check_output_fps(config: DictConfig) -> None:
     """Raise ConfigError unless frames can be stored at ``output_fps``."""
     if config.output_fps is None:
         return
-    given, most = config.output_fps, min(1000.0, _MOST * float(config.fps))
+    given, most = config.output_fps, min(1000.0, _MOST_BETWEEN * float(config.fps))
     if isinstance(given, bool) or not isinstance(given, int | float) or not 1.0 <= given <= most:
         raise ConfigError(
-            f"output_fps={shown(given)}: give stored frames per second, 1 to {most:g}, {_MOST} times fps at most; "
+            f"output_fps={shown(given)}: give stored frames per second, 1 to {most:g}, {_MOST_BETWEEN} times fps at most; "
             "null stores every simulated frame"
         )
 

@@ -16,11 +16,6 @@ from hood.native.build import processor
 from hood.native.cache import cache_folder
 
 
-def without_accuracy(overrides: Sequence[str]) -> list[str]:
-    """The words of the full model of a rollout that may plan first."""
-    return [word for word in overrides if _key(word) != "accuracy"]
-
-
 def planned(overrides: Sequence[str]) -> list[str]:
     """The words of a rollout; with ``accuracy`` its plan is made, or found where it was kept, and stands in them.
 

@@ -15,6 +15,7 @@ import h5py
 import numpy as np
 from omegaconf import DictConfig
 
+from hood import plugins
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.guarded import check_size
 from hood.commands.plan_content import content_digest
@@ -46,6 +47,19 @@ def plan_mode(config: Mapping[Any, Any]) -> str:
     if plan_path(config) is not None:
         return "file"
     return "full" if config.get("plan") is not None and str(config["plan"]) == "full" else "auto"
+
+
+def without_accuracy(overrides: Sequence[str]) -> list[str]:
+    """The words of the full model of a rollout that may plan first."""
+    return [word for word in overrides if word.partition("=")[0].lstrip("+~") != "accuracy"]
+
+
+def planned(overrides: Sequence[str]) -> list[str]:
+    """The words of a rollout; with ``accuracy`` its plan stands in them, see :func:`hood.commands.plan_auto.planned`."""
+    if len(without_accuracy(overrides)) == len(overrides):
+        return list(overrides)
+    words: list[str] = plugins.find("planners", "accuracy")(overrides)
+    return words
 
 
 def rollout_config(overrides: Sequence[str]) -> DictConfig:

@@ -16,15 +16,15 @@ from hood.mesh.subdivision import Subdivision
 from hood.scene.scene import Scene
 
 #: Sixteen times the faces show all that the surface has.
-_MOST = 2
+_LEVELS = 2
 
 
 def check_refine_mesh(config: DictConfig) -> None:
     """Raise ConfigError unless a mesh can be refined so often."""
-    if not 0 <= int(config.refine_mesh) <= _MOST:
+    if not 0 <= int(config.refine_mesh) <= _LEVELS:
         raise ConfigError(
-            f"refine_mesh={config.refine_mesh}: give how often every face is cut into four for stored frames, 1 or {_MOST}; 0 "
-            "stores the simulated mesh"
+            f"refine_mesh={config.refine_mesh}: give how often every face is cut into four for stored frames, 1 or {_LEVELS}; "
+            "0 stores the simulated mesh"
         )
 
 

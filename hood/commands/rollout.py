@@ -35,8 +35,15 @@ from hood.commands.export import check_outputs, export_beside
 from hood.commands.guarding import OFF, GuardStopped, guard_sentences, make_guard, write_alarms
 from hood.commands.notices import Heard, heard
 from hood.commands.output_fps import at_output_fps, planned_steps
-from hood.commands.plan_auto import planned, without_accuracy
-from hood.commands.plan_file import plan_mode, plan_path, plan_sentences, rollout_config, summarise_plan
+from hood.commands.plan_file import (
+    plan_mode,
+    plan_path,
+    plan_sentences,
+    planned,
+    rollout_config,
+    summarise_plan,
+    without_accuracy,
+)
 from hood.commands.refine_mesh import finer_mesh, on_finer_mesh, refined_still
 from hood.commands.refinement import exported
 from hood.commands.resizing import describe_ease, summarise_ease

@@ -20,10 +20,11 @@ from hood.commands.points import Failure, Points
 from hood.commands.tradeoff_checks import check_config, check_models, check_points, check_settings
 from hood.config import ConfigError, load_config, plain, save_run_record
 from hood.evaluation.comparison import pareto_front
-from hood.evaluation.grid import Grid, Point, Size, listed, model_name
+from hood.evaluation.grid import Grid, Point, Size, listed
 from hood.evaluation.reached import Reached, overstretched, read_reached, read_record, refinement_tables
 from hood.evaluation.rows import write_rows
 from hood.evaluation.study import Study
+from hood.evaluation.table import model_name
 
 #: Where no models are given: those of them that are embedded.
 KNOWN = ("fine15", "fine48", "ours", "small1", "small2", "small3", "quickstart")

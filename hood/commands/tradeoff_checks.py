@@ -16,7 +16,8 @@ from hood.config import ConfigError, load_config, options, plain
 from hood.dynamics.checkpoint import read_header
 from hood.dynamics.reference import SUFFIXES
 from hood.dynamics.refine import METHODS
-from hood.evaluation.grid import GUESS, NEWTON, Point
+from hood.evaluation.grid import Point
+from hood.evaluation.table import GUESS, NEWTON
 from hood.nn.precision import PRECISIONS, TF32, check_precision
 
 #: Keys of ``hood evaluate`` that every point sets by itself.

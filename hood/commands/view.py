@@ -10,7 +10,8 @@ from omegaconf import DictConfig
 
 from hood.assets.files.atomic import write_atomically
 from hood.commands.common import frame_count, output_folder, split_words
-from hood.commands.compare import names_of, read_checked
+from hood.commands.compare import names_of
+from hood.commands.export import read_checked
 from hood.commands.textures import lay_on, read_textures
 from hood.config import ConfigError
 from hood.dynamics.recorder import RolloutData

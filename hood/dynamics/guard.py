@@ -68,7 +68,7 @@ from hood.dynamics.stepper import Stepper
 from hood.limits import CUT_ALARM, INSIDE_ALARM, STRAIN_ALARM, STRAIN_RATIO
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
-from hood.scene.held_off import ALLOWED
+from hood.scene.held_off import CUT_SHARE
 from hood.scene.jumps import moved_in_step
 from hood.scene.state import Obstacle
 from hood.solver.newton import NewtonSettings, minimize
@@ -207,7 +207,7 @@ class Guard:
         if depth > max(DEPTH_LIMIT, problem.next_depth(prediction.next_pos)):
             done = RepairedStep(prediction, LEFT, done.iterations, done.before, done.before)
         share = int(problem.num_in_skin(prediction.next_pos)) / len(problem.cloth.faces)
-        self.alarms.append(Alarm(frame, CUT, share, ALLOWED).repaired(done))
+        self.alarms.append(Alarm(frame, CUT, share, CUT_SHARE).repaired(done))
         return self._told(done)
 
     def see_surface(self, frame: int, row: Mapping[str, float]) -> None:

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -18,12 +18,12 @@ from torch import Tensor
 from hood.assets.garment.garment import Garment
 from hood.assets.material import RANGES, UNITS, WEAVE, Material, values_of
 from hood.assets.motion.motion_files import MotionFiles
+from hood.assets.motion.sequence import PoseSequence
 from hood.losses.potential import Potential
 from hood.losses.problem import STANDARD_GRAVITY
 from hood.losses.term import kind_in_file
 from hood.mesh.topology import connected_components, unique_edges
 from hood.scene.cloth import Cloth
-from hood.scene.dataset import SceneSampler
 from hood.scene.sizing import Sizes
 
 #: A value this share beyond an end of its range is on it: float32 and text have rounded.
@@ -88,6 +88,23 @@ def _as_written_today(term: Mapping[str, Any]) -> dict[str, Any]:
     return {**_LATER.get(kind, {}), **term, **({"term": kind} if kind else {})}
 
 
+class Sampling(Protocol):
+    """What is asked of those who draw scenes for training, see :class:`hood.scene.dataset.SceneSampler`."""
+
+    size_low: float
+    size_high: float
+    beta_range: float
+    material: Material | None
+
+    @property
+    def garments(self) -> Sequence[Garment]:
+        """Those that are drawn from."""
+
+    @property
+    def sequences(self) -> MotionFiles | Sequence[PoseSequence]:
+        """Motions that windows are cut from."""
+
+
 def scene_conditions(
     garment: Garment,
     cloth: Cloth,
@@ -112,7 +129,7 @@ def scene_conditions(
     return Conditions(spans, potential.settings)
 
 
-def training_conditions(sampler: SceneSampler, potential: Potential) -> Conditions:
+def training_conditions(sampler: Sampling, potential: Potential) -> Conditions:
     """What a model sees that is trained with ``potential`` on the scenes of ``sampler``."""
     low, high = sampler.size_low, sampler.size_high
     motions = sampler.sequences

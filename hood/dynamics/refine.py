@@ -15,11 +15,12 @@ from hood.dynamics.simulator import Prediction
 from hood.dynamics.stepper import Stepper
 from hood.dynamics.stopping import RefinementState, StoppingCriterion
 from hood.dynamics.stopwatch import Stopwatch, timed
+from hood.graph.given import given_hierarchy
 from hood.losses.potential import Potential
 from hood.losses.problem import StepProblem
 from hood.scene.batch import to_device
 from hood.scene.cloth import Cloth
-from hood.scene.scene import RELAXING_DT
+from hood.scene.scene import RELAXING_DT, Scene
 from hood.solver.colouring import colours_of
 from hood.solver.iterate import Progress, in_single, rounded
 from hood.solver.layers import approached, layers_of
@@ -234,6 +235,21 @@ class RefinedStepper:
 def unrefined(stepper: Stepper) -> Stepper:
     """The stepper that a :class:`RefinedStepper` takes further; any other one itself."""
     return stepper.inner if isinstance(stepper, RefinedStepper) else stepper
+
+
+def prepare_stepper(stepper: Stepper, scene: Scene) -> Any:
+    """What the stepper computes once per cloth. Coarse levels that came with the garment are used where there are enough."""
+    levels = scene.garment.coarse_edges
+    inner: Any = unrefined(stepper)
+    cloth = scene.cloth
+    needed: int | None = getattr(inner, "num_coarse", None)
+    if isinstance(stepper, RefinedStepper):
+        stepper.begin_rollout()
+        cloth = stepper.inner_cloth(cloth)
+    if needed is not None and levels is not None and len(levels) >= needed:
+        hierarchy = given_hierarchy(cloth.num_vertices, levels, needed)
+        return inner.prepare(cloth, scene.garment.rest_pos, hierarchy)
+    return stepper.prepare(scene.cloth, scene.garment.rest_pos)
 
 
 def _sum(values: Tensor) -> float:

@@ -6,7 +6,6 @@ import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -25,14 +24,13 @@ from hood.dynamics.measure import (
     strain_metrics,
     vertex_residual,
 )
-from hood.dynamics.refine import RefinedStepper, unrefined
+from hood.dynamics.refine import RefinedStepper, prepare_stepper
 from hood.dynamics.simulator import Prediction
 from hood.dynamics.stepper import Stepper
 from hood.dynamics.stopwatch import Stopwatch
 from hood.dynamics.surface import SURFACE_METRICS, SURFACE_STRIDE, SurfaceMeter
 from hood.dynamics.verdict.distance import DISTANCE_EVERY, DISTANCE_METRICS, distance_metrics
 from hood.dynamics.verdict.worn import measure_wear
-from hood.graph.given import given_hierarchy
 from hood.limits import CUT_UNSOUND
 from hood.losses.layers import for_networks, has_layers
 from hood.losses.potential import Potential
@@ -300,21 +298,6 @@ def _state_metrics(
         contact = _contact_now(scene, state, frame) if problem is None else problem.with_contact().contact
         measured |= penetration_metrics(contact, scene.cloth)
     return measured
-
-
-def prepare_stepper(stepper: Stepper, scene: Scene) -> Any:
-    """What the stepper computes once per cloth. Coarse levels that came with the garment are used where there are enough."""
-    levels = scene.garment.coarse_edges
-    inner: Any = unrefined(stepper)
-    cloth = scene.cloth
-    needed: int | None = getattr(inner, "num_coarse", None)
-    if isinstance(stepper, RefinedStepper):
-        stepper.begin_rollout()
-        cloth = stepper.inner_cloth(cloth)
-    if needed is not None and levels is not None and len(levels) >= needed:
-        hierarchy = given_hierarchy(cloth.num_vertices, levels, needed)
-        return inner.prepare(cloth, scene.garment.rest_pos, hierarchy)
-    return stepper.prepare(scene.cloth, scene.garment.rest_pos)
 
 
 @torch.no_grad()

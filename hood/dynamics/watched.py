@@ -11,6 +11,7 @@ from torch import Tensor
 
 from hood.dynamics.captured import network_of
 from hood.dynamics.frames import Relaxing
+from hood.dynamics.refine import prepare_stepper
 from hood.dynamics.simulator import Prediction
 from hood.dynamics.stepper import Stepper
 from hood.dynamics.stopwatch import Stopwatch, timed
@@ -132,8 +133,6 @@ class WatchedStepper:
 
     def prepare(self, cloth: Any, rest_pos: Any) -> tuple[Any, Any]:
         """What both need of the scene's garment."""
-        from hood.dynamics.rollout import prepare_stepper
-
         self._start_over()
         return prepare_stepper(self._lean, self._scene), prepare_stepper(self._full, self._scene)
 

@@ -13,8 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from hood.evaluation.bootstrap import LEVEL, Estimate, interval
-from hood.evaluation.grid import NEWTON, Point
+from hood.evaluation.grid import Point
 from hood.evaluation.reached import Reached
+from hood.evaluation.table import NEWTON
 
 NETWORK, SOLVER, REFINED, OPEN = "network", "solver", "refined", "open"
 #: Fewer rollouts than these do not tell how far rollouts differ: no verdict.

@@ -8,12 +8,8 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
-from pathlib import Path
 
-#: ``models=[newton]``: no network, the potential minimised in every frame.
-NEWTON = "newton"
-#: No network either: where the solver starts, the inertial guess out of contact.
-GUESS = "guess"
+from hood.evaluation.table import GUESS, NEWTON, model_name
 
 
 @dataclass(frozen=True)
@@ -51,7 +47,7 @@ class Point:
     """One setting at one size; exactly one run of ``hood evaluate``.
 
     Args:
-        model: name or path of the weights, or :data:`GUESS` or :data:`NEWTON`.
+        model: name or path of the weights, or :data:`hood.evaluation.table.GUESS` or :data:`hood.evaluation.table.NEWTON`.
         method: of the refinement.
         settings: ``key=value`` of the command.
         rollouts: how many that makes.
@@ -169,14 +165,6 @@ class Grid:
         ]
         rollouts = len(size.garments) * self.motions * len(size.shapes)
         return Point(size.name, model, refine, precision, method, tuple(settings), rollouts)
-
-
-def model_name(model: str) -> str:
-    """What weights are called, given by name or path: a run's ``model.safetensors`` by its folder."""
-    path = Path(model)
-    if path.suffix not in (".safetensors", ".pth"):
-        return model
-    return path.stem if path.stem != "model" else path.parent.name
 
 
 def quoted(text: str) -> str:

@@ -15,7 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hood.dynamics.rollout import own_start, prepare_stepper, rest_state, simulate
+from hood.dynamics.refine import prepare_stepper
+from hood.dynamics.rollout import own_start, rest_state, simulate
 from hood.dynamics.simulator import Prediction
 from hood.dynamics.stepper import Stepper
 from hood.evaluation.gap import REFERENCE

@@ -13,9 +13,9 @@ import numpy as np
 
 from hood.evaluation.bootstrap import Estimate, estimate, resample
 from hood.evaluation.gap import AGREEMENT
-from hood.evaluation.grid import NEWTON, Point
+from hood.evaluation.grid import Point
 from hood.evaluation.rollout_log import RolloutLog
-from hood.evaluation.table import Measured
+from hood.evaluation.table import NEWTON, Measured
 
 #: Parts of a frame's time, and which entries of a frame belong to each.
 PARTS = {

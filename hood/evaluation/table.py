@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,10 @@ from hood.solver.newton import NewtonSettings
 #: Frames at the start of a rollout that are left out of the times: caches fill and pages are mapped there.
 _WARMUP = 2
 ALL = "all"
+#: ``models=[newton]``: no network, the potential minimised in every frame.
+NEWTON = "newton"
+#: No network either: where the solver starts, the inertial guess out of contact.
+GUESS = "guess"
 #: A frame whose 99th percentile of strain exceeds this is a failure: a hundredth of its edges is twice as long as at rest.
 FAILURE_STRAIN = 1.0
 #: Columns that have a confidence interval NAME_low, NAME_high: of what they are which figure.
@@ -307,3 +312,11 @@ def _gap_columns(gaps: Sequence[Mapping[str, float]]) -> dict[str, Any]:
 
 def _mean(frames: Sequence[Mapping[str, float]], key: str) -> float:
     return float(np.mean([frame.get(key, 0.0) for frame in frames]))
+
+
+def model_name(model: str) -> str:
+    """What weights are called, given by name or path: a run's ``model.safetensors`` by its folder."""
+    path = Path(model)
+    if path.suffix not in (".safetensors", ".pth"):
+        return model
+    return path.stem if path.stem != "model" else path.parent.name

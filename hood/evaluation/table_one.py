@@ -48,7 +48,7 @@ _MORE = (
 
 
 @dataclass(frozen=True)
-class Conditions:
+class TableConditions:
     """What the figures depend on besides the models."""
 
     command: str
@@ -85,7 +85,7 @@ def checks(rows: Sequence[Row]) -> list[Check]:
     return found
 
 
-def page(rows: Sequence[Row], about: Conditions) -> str:
+def page(rows: Sequence[Row], about: TableConditions) -> str:
     """The page in Markdown; the same rows and conditions give the same text."""
     parts = [
         "# Cost, reach and accuracy",
@@ -226,7 +226,7 @@ def _check_table(found: Sequence[Check]) -> str:
     return "\n".join(lines) + "\n\n≈ stands between two models whose 95% intervals overlap, or are not known."
 
 
-def _differences(rows: Sequence[Row], about: Conditions) -> str:
+def _differences(rows: Sequence[Row], about: TableConditions) -> str:
     sizes = ", ".join(f"{name} {count:,}" for name, count in about.vertices.items())
     models = dict.fromkeys((row["model"], row["weights"]) for row in rows)
     budgets = [f"{name}: {_budget(name, weights, about)}" for name, weights in models if weights != "none"]
@@ -245,7 +245,7 @@ def _differences(rows: Sequence[Row], about: Conditions) -> str:
     )
 
 
-def _budget(name: str, weights: str, about: Conditions) -> str:
+def _budget(name: str, weights: str, about: TableConditions) -> str:
     if weights == _UNTRAINED:
         return "random weights"
     return about.training.get(name) or "its file does not say"

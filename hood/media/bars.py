@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
-from hood.media.charts import write_png
+from hood.assets.files.atomic import write_atomically
 
 #: Of the series, in their order; far apart in lightness too.
 COLOURS = ("#345c8e", "#d6843e", "#609668", "#a05478", "#78787e", "#debe60")
@@ -45,3 +47,10 @@ def write_bars(panels: Mapping[str, Panel], path: Path) -> None:
         axes.grid(axis="y", color="#e6e6e6")
         axes.set_axisbelow(True)
     write_png(figure, path, dpi=100)
+
+
+def write_png(figure: Any, path: Path, dpi: int = 150) -> None:
+    """Write the figure as a picture; the file appears when it is complete."""
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=dpi, metadata={"Software": None})
+    write_atomically(path, content.getvalue())

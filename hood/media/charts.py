@@ -5,13 +5,12 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Collection, Sequence
-from pathlib import Path
 from typing import Any
 
-from hood.assets.files.atomic import write_atomically
 from hood.evaluation.comparison import RESOLUTION, pareto_front
-from hood.evaluation.grid import NEWTON, Point
+from hood.evaluation.grid import Point
 from hood.evaluation.reached import PARTS, Reached
+from hood.evaluation.table import NEWTON
 
 #: Gaps below are not drawn in their place: a logarithm has none for γ ≤ 0, and minima are not known that exactly.
 FLOOR = RESOLUTION
@@ -181,13 +180,6 @@ def cost_chart(reached: Sequence[Reached], title: str) -> Any:
         axes.set_title(title, loc="left")
         axes.legend(ncols=len(PARTS), loc="lower right", bbox_to_anchor=(1.0, 1.0), fontsize=8)
     return figure
-
-
-def write_png(figure: Any, path: Path, dpi: int = 150) -> None:
-    """Write the figure as a picture; the file appears when it is complete."""
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=dpi, metadata={"Software": None})
-    write_atomically(path, content.getvalue())
 
 
 def inline_svg(figure: Any, name: str, label: str) -> str:

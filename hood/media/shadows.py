@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from hood.evaluation.drape import DISC, PIXEL, SAMPLE, Rest
-from hood.media.charts import write_png
+from hood.media.bars import write_png
 
 #: Panels in a row at most, and inches of one.
 _COLUMNS, _INCHES = 5, 2.2

@@ -20,7 +20,8 @@ from hood.evaluation.comparison import (
 )
 from hood.evaluation.study import Study
 from hood.media import tradeoff_prose as prose
-from hood.media.charts import cost_chart, front_chart, inline_svg, series_colours, write_png
+from hood.media.bars import write_png
+from hood.media.charts import cost_chart, front_chart, inline_svg, series_colours
 from hood.media.page import paragraph, section, table, whole_page
 
 #: Accuracies of the table of choices.

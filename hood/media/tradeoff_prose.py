@@ -5,9 +5,9 @@ from __future__ import annotations
 from hood.evaluation.bootstrap import DRAWS, LEVEL
 from hood.evaluation.comparison import LEAST_ROLLOUTS, USEFUL
 from hood.evaluation.gap import AGREEMENT
-from hood.evaluation.grid import NEWTON
 from hood.evaluation.reached import OVERSTRETCHED, Reached
 from hood.evaluation.study import Study
+from hood.evaluation.table import NEWTON
 from hood.media.charts import FLOOR, below_floor
 
 CHOICES = (

@@ -11,7 +11,7 @@ from hood.nn.message_passing import ProcessorStep
 from hood.nn.mlp import MLP
 
 #: By class what its parts are, alone or in lists and tables.
-_PARTS: Mapping[type[nn.Module], Mapping[str, type[nn.Module]]] = {
+_CLASSES: Mapping[type[nn.Module], Mapping[str, type[nn.Module]]] = {
     ProcessorStep: {"edge_mlps": MLP, "node_mlp": MLP},
     EdgeDecoder: {"mlp": MLP},
     MLP: {"first": nn.Linear, "second": nn.Linear, "third": nn.Linear, "norm": nn.LayerNorm},
@@ -27,7 +27,7 @@ def own_part(module: nn.Module, kind: type[nn.Module], parts: Mapping[str, type[
     """
     if _differs(module, kind):
         return _named(module)
-    known = _PARTS.get(kind, {}) if parts is None else parts
+    known = _CLASSES.get(kind, {}) if parts is None else parts
     for name, child in module.named_children():
         if name not in known:
             return f"{name}, {_named(child)}"

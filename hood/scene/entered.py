@@ -20,7 +20,7 @@ from hood.scene.contact import Contact, Fold, match_surface
 from hood.scene.state import Obstacle
 
 #: Vertices no deeper than this [m] have not entered: contact gives way by some millimetres.
-ALLOWED = 4e-3
+ENTERED_DEPTH = 4e-3
 #: A plane shows skin that it is no farther in front of than this [m].
 SHOWN = 3e-3
 #: Deeper than this [m] the nearest skin says nothing about where a vertex came in.
@@ -37,7 +37,7 @@ def find_entered(next_pos: Tensor, pos: Tensor, cloth: Cloth, obstacle: Obstacle
     if not len(obstacle.faces) or not len(pos):
         return None
     depth = -signed_distance(next_pos, cloth.vertex_scene, obstacle.next_pos, obstacle)
-    entered = cloth.free & (depth > ALLOWED) & (depth < DEEPEST)
+    entered = cloth.free & (depth > ENTERED_DEPTH) & (depth < DEEPEST)
     for contact in contacts:
         if not bool(entered.any()):
             return None

@@ -23,7 +23,7 @@ from hood.scene.contact import Contact
 from hood.scene.state import Obstacle
 
 #: Up to this share of a garment's triangles may be in the skin.
-ALLOWED = 0.005
+CUT_SHARE = 0.005
 #: Corners of a triangle in the skin are held off by so much more [m], by twice as much where that was not enough, and by no
 #: more than that in all.
 RISE, MOST = 3e-3, 45e-3
@@ -55,11 +55,11 @@ def num_in_skin(next_pos: Tensor, cloth: Cloth, obstacle: Obstacle) -> Tensor:
 
 
 def _cut_faces(next_pos: Tensor, cloth: Cloth, obstacle: Obstacle) -> list[Tensor]:
-    """Corners (N, 3) of the triangles in the skin, of every scene that has more than :data:`ALLOWED`."""
+    """Corners (N, 3) of the triangles in the skin, of every scene that has more than :data:`CUT_SHARE`."""
     if not bool(torch.isfinite(next_pos).all()):
         return []
     found = _cut(next_pos, cloth, obstacle)
-    return [faces[torch.as_tensor(cut, device=faces.device)] for faces, cut in found if len(cut) > ALLOWED * len(faces)]
+    return [faces[torch.as_tensor(cut, device=faces.device)] for faces, cut in found if len(cut) > CUT_SHARE * len(faces)]
 
 
 def _cut(next_pos: Tensor, cloth: Cloth, obstacle: Obstacle) -> list[tuple[Tensor, np.ndarray]]:

@@ -10,7 +10,7 @@ import pytest
 from hood.assets.body.body import Body
 from hood.assets.garment.garment import Garment
 from hood.assets.motion.sequence import PoseSequence
-from hood.dynamics.rollout import prepare_stepper
+from hood.dynamics.refine import prepare_stepper
 from hood.dynamics.simulator import build_simulator
 from hood.scene.scene import build_scene
 

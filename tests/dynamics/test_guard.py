@@ -37,7 +37,7 @@ from hood.dynamics.stopwatch import Stopwatch
 from hood.losses.potential import default_potential
 from hood.losses.problem import StepProblem
 from hood.scene.contact import find_contact
-from hood.scene.held_off import ALLOWED
+from hood.scene.held_off import CUT_SHARE
 from hood.scene.scene import Scene, build_scene
 from hood.solver.newton import NewtonSettings
 
@@ -324,7 +324,7 @@ def test_triangles_in_the_skin_are_taken_out_by_a_repair_alone(scene: Scene) -> 
     problem, sound = one_step(scene)
     cut = replace(sound, next_pos=drawn_in(sound.next_pos), residual=1.0)
     share = in_skin(problem, cut.next_pos)
-    assert in_skin(problem, sound.next_pos) <= ALLOWED < share
+    assert in_skin(problem, sound.next_pos) <= CUT_SHARE < share
     told = Guard("report", guess(12), POTENTIAL)
     assert told.see(1, problem, cut) is cut
     assert told.alarms == []
@@ -332,10 +332,10 @@ def test_triangles_in_the_skin_are_taken_out_by_a_repair_alone(scene: Scene) -> 
     better = guard.see(1, problem, cut)
     (alarm,) = guard.alarms
     assert (alarm.frame, alarm.cause, alarm.repair) == (1, CUT, REFINED)
-    assert (alarm.value, alarm.limit) == (pytest.approx(share), ALLOWED)
+    assert (alarm.value, alarm.limit) == (pytest.approx(share), CUT_SHARE)
     assert alarm.rg_after < alarm.rg_before
     assert better.held_off is not None
-    assert in_skin(problem, better.next_pos) <= ALLOWED
+    assert in_skin(problem, better.next_pos) <= CUT_SHARE
     hasty = Guard("repair", guess(12), POTENTIAL, most=1)
     assert hasty.see(1, problem, cut) is cut
     assert [(alarm.cause, alarm.repair) for alarm in hasty.alarms] == [(CUT, LEFT)]

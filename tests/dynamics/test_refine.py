@@ -12,8 +12,8 @@ from torch import Tensor
 
 from hood.dynamics.captured import CapturedSimulator
 from hood.dynamics.reference import import_reference_weights
-from hood.dynamics.refine import METHODS, GuessStepper, RefinedStepper, unrefined
-from hood.dynamics.rollout import Frame, metric_names, prepare_stepper, simulate, start_state
+from hood.dynamics.refine import METHODS, GuessStepper, RefinedStepper, prepare_stepper, unrefined
+from hood.dynamics.rollout import Frame, metric_names, simulate, start_state
 from hood.dynamics.simulator import Prediction, build_simulator
 from hood.dynamics.stepper import Stepper
 from hood.dynamics.stopping import Budget, Count, MaxStrain, StoppingCriterion, TargetResidual

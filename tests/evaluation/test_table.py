@@ -19,7 +19,7 @@ from hood.evaluation import table
 from hood.evaluation.report import columns, describe, format_table
 from hood.evaluation.rows import write_rows
 from hood.evaluation.table import ALL, TERMS, Candidate, GapSettings, evaluate, other_terms
-from hood.evaluation.table_one import Conditions, page
+from hood.evaluation.table_one import TableConditions, page
 from hood.evaluation.validation import Validation
 from hood.losses.potential import default_potential
 from hood.losses.problem import StepProblem
@@ -205,7 +205,7 @@ def test_other_energies_have_columns_and_all_add_up(candidates: list[Candidate],
     text = format_table(found)
     assert max(map(len, text.splitlines())) <= 160
     assert [text.count(f"L_{name}") for name in other_terms(found)] == [1, 1, 1]
-    page_of = page(found, Conditions("hood evaluate", "A Processor", "default", ["walk"], 1, FRAMES, 30.0))
+    page_of = page(found, TableConditions("hood evaluate", "A Processor", "default", ["walk"], 1, FRAMES, 30.0))
     assert "| friction | air | stretch damping | a long wind |" in page_of
 
 

@@ -10,11 +10,11 @@ from hood.assets.files.library import locate
 from hood.commands.conditions import command_line, training_note
 from hood.dynamics.stepper import NewtonStepper
 from hood.evaluation.table import ALL, Candidate, Measured, candidate_rows
-from hood.evaluation.table_one import Conditions, checks, page
+from hood.evaluation.table_one import TableConditions, checks, page
 from hood.losses.potential import default_potential
 from hood.solver.newton import NewtonSettings
 
-ABOUT = Conditions(
+ABOUT = TableConditions(
     "hood evaluate models=[fine15,ours]", "A Processor, 1 thread(s)", "default (embedded)", ["walk", "plie"], 1, 30, 30.0,
     {"dress": 1000, "tank": 500}, {"ours": "2,400 updates"},
 )  # fmt: skip

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from measured_points import reached, solver
 
-from hood.media.charts import FLOOR, below_floor, cost_chart, front_chart, inline_svg, series_colours, write_png
+from hood.media.bars import write_png
+from hood.media.charts import FLOOR, below_floor, cost_chart, front_chart, inline_svg, series_colours
 
 ITEMS = [
     *(reached("net", k, 100.0 + 10 * k, 0.5 / (k + 1)) for k in (0, 1, 2, 5)),

@@ -13,8 +13,6 @@ from hood.assets.motion.sequence import PoseSequence
 
 _UP = np.array([0.0, 1.0, 0.0])
 _SHOULDERS = (16, 17)  # left, right
-#: How far the arms hang below the horizontal in the A-pose [rad].
-A_POSE_ANGLE = np.pi / 4
 #: Time [s] before the end of a play during which it turns into its own first pose.
 _SEAM = 0.25
 _MAX_FRAMES = 1_000_000
@@ -32,7 +30,7 @@ def standing_pose(kind: str) -> np.ndarray:
     if kind == "a":
         # The left arm points along +x: turning it about z by a negative angle lowers it.
         for joint, sign in zip(_SHOULDERS, (-1.0, 1.0), strict=True):
-            pose[joint, 2] = sign * A_POSE_ANGLE
+            pose[joint, 2] = sign * np.pi / 4
     return pose
 
 

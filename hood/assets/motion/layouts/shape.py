@@ -16,7 +16,7 @@ _KEYS = ("betas", "shape", "smplbetas", "smplshape", "predshape", "predbetas", "
 _SAME = 1e-3
 #: Estimates of one person differ by less than this from frame to frame: standard deviation of the coefficient that varies most.
 _VARIES = 0.5
-_LARGEST = 1e3
+_LARGEST_COEFFICIENT = 1e3
 
 
 def subject_shape(path: Path, fields: Mapping[str, Any], keys: Mapping[str, str]) -> tuple[np.ndarray, Doubt | None]:
@@ -33,7 +33,7 @@ def subject_shape(path: Path, fields: Mapping[str, Any], keys: Mapping[str, str]
     scalar = table.ndim == 0
     rows = table.ndim > 2 or (table.ndim == 2 and table.shape[-1] > 1)
     table = table.reshape(-1, table.shape[-1]) if rows else table.reshape(-1)
-    if table.size == 0 or scalar or not (np.abs(table) <= _LARGEST).all():
+    if table.size == 0 or scalar or not (np.abs(table) <= _LARGEST_COEFFICIENT).all():
         raise ValueError(f"{path}: {name} has shape {table.shape} or absurd values; give (S,) finite shape coefficients")
     if table.ndim == 1:
         return table, None
