@@ -11,8 +11,8 @@ from __future__ import annotations
 import torch
 
 from hood.assets.material import Material
-from hood.losses.potential import default_potential, relative_gradient, scale
-from hood.scene.cloth import build_cloth
+from hood.cloth.cloth import build_cloth
+from hood.energies.potential import default_potential, relative_gradient, scale
 from hood.testing import grid, make_problem
 
 DT, GRAVITY = 1 / 30, 9.81

@@ -24,14 +24,14 @@ from hood.assets.body.load import load_body
 from hood.assets.files.library import locate
 from hood.assets.garment.garment import load_garment
 from hood.assets.motion.load import load_sequence
-from hood.dynamics.checkpoint import load_simulator
-from hood.dynamics.simulator import Simulator
-from hood.losses.potential import Potential, default_potential
-from hood.losses.problem import StepProblem
-from hood.scene.cloth import concatenate_cloths
+from hood.cloth.cloth import concatenate_cloths
+from hood.cloth.state import concatenate_states, concatenate_step_inputs
+from hood.energies.potential import Potential, default_potential
+from hood.energies.problem import StepProblem
 from hood.scene.scene import Scene, build_scene
-from hood.scene.state import concatenate_states, concatenate_step_inputs
 from hood.solver.newton import NewtonSettings, minimize
+from hood.steppers.checkpoint import load_simulator
+from hood.steppers.network import Simulator
 
 SOLVERS = {"solver, 5 iterations": NewtonSettings(max_iterations=5), "solver, until 0.01": NewtonSettings(target_rg=1e-2)}
 

@@ -32,15 +32,15 @@ from torch import Tensor
 
 import hood
 from hood.assets.material import Material, values_of
-from hood.dynamics.implicit_euler import implicit_euler
-from hood.dynamics.rollout import simulate
-from hood.dynamics.simulator import Prediction
+from hood.cloth.cloth import build_cloth
+from hood.energies.potential import default_potential
+from hood.energies.problem import StepProblem
 from hood.evaluation.gap import gap
-from hood.losses.potential import default_potential
-from hood.losses.problem import StepProblem
-from hood.mesh.isotropic import isotropic
-from hood.scene.cloth import build_cloth
+from hood.mesh.editing.remeshing import isotropic
+from hood.rollouts.loop import simulate
 from hood.solver.newton import NewtonSettings
+from hood.steppers.network import Prediction
+from hood.steppers.newton import implicit_euler
 from hood.testing import Mesh, grid, make_problem
 
 G = 9.81

@@ -37,23 +37,23 @@ import numpy as np
 import torch
 from frame import refined
 
+from hood.app.candidates import machine_name
 from hood.assets.body.load import load_body
 from hood.assets.garment.garment import load_garment
 from hood.assets.motion.load import load_sequence
-from hood.cli import ENVIRONMENT
-from hood.commands.conditions import machine_name
-from hood.dynamics.rollout import simulate
-from hood.dynamics.simulator import Prediction
-from hood.dynamics.stepper import NewtonStepper
-from hood.dynamics.stopwatch import Stopwatch
+from hood.cli.main import ENVIRONMENT
+from hood.cloth.state import State
+from hood.contact.contact import find_contact
+from hood.energies.potential import default_potential, scale
+from hood.energies.problem import StepProblem
 from hood.evaluation.gap import gap
-from hood.losses.potential import default_potential, scale
-from hood.losses.problem import StepProblem
-from hood.mesh import surface_tree
-from hood.scene.contact import find_contact
+from hood.mesh.closest_point import tree
+from hood.rollouts.loop import simulate
 from hood.scene.scene import Scene, build_scene
-from hood.scene.state import State
 from hood.solver.newton import NewtonSettings, Report, minimize
+from hood.steppers.network import Prediction
+from hood.steppers.newton import NewtonStepper
+from hood.steppers.protocol import Stopwatch
 
 #: Steps whose potentials differ by so much [e0] count as the same.
 SAME = 1e-3
@@ -87,14 +87,14 @@ def _keep(steps: list[Seen], index: int, problem: StepProblem, prediction: Predi
 
 def solve_both(scene: Scene, frames: int, iterations: int, times: dict[str, list[float]]) -> list[float]:
     """Differences of the potential [e0] step by step; ``times`` of the parts are appended."""
-    potential, compiled = default_potential(), surface_tree.library
+    potential, compiled = default_potential(), tree.library
     differences, state = [], scene.start(0)
     for frame in range(frames):
         step = scene.step_input(frame, state)
         obstacle = step.obstacle
         assert obstacle is not None
         for name, library in (("search torch", lambda: None), ("search compiled", compiled)):
-            surface_tree.library = library
+            tree.library = library
             timed(times[name], find_contact, state.pos, scene.cloth.vertex_scene, obstacle)
         problem = potential.prepare(StepProblem(scene.cloth, state, step))
         found = {}

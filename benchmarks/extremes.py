@@ -18,13 +18,13 @@ import numpy as np
 import torch
 
 from hood.assets.material import Material
-from hood.dynamics.implicit_euler import implicit_euler
-from hood.dynamics.measure import strain_metrics
-from hood.losses.potential import Potential, default_potential
-from hood.losses.problem import StepProblem
-from hood.scene.cloth import build_cloth
-from hood.scene.state import Obstacle, State
+from hood.cloth.cloth import build_cloth
+from hood.cloth.state import Obstacle, State
+from hood.energies.potential import Potential, default_potential
+from hood.energies.problem import StepProblem
 from hood.solver.newton import NewtonSettings
+from hood.solver.step_figures import strain_metrics
+from hood.steppers.newton import implicit_euler
 from hood.testing import grid, make_problem, sphere
 
 STIFFNESS, DENSITY, STEPS = (1.0, 10.0, 100.0), (1.0, 0.1), (1 / 240, 1 / 30, 1 / 5)

@@ -20,10 +20,10 @@ import torch
 import hood
 from hood.assets.garment.parts import part_faces
 from hood.assets.material import Material
-from hood.dynamics.measure import edge_strain
-from hood.dynamics.recorder import read_rollout
+from hood.cloth.cloth import build_cloth
 from hood.mesh.geometry import dihedral_angles
-from hood.scene.cloth import build_cloth
+from hood.rollouts.file.recorder import read_rollout
+from hood.solver.step_figures import edge_strain
 
 #: Frames in which the cloth is still taking up the motion.
 LEAD = 10

@@ -30,21 +30,20 @@ from hood.assets.files.library import DATA_FOLDER
 from hood.assets.garment.garment import Garment, load_garment
 from hood.assets.material import Material
 from hood.assets.motion.load import load_sequence
-from hood.cli import ENVIRONMENT
-from hood.dynamics import passes as passes_module
-from hood.dynamics.checkpoint import load_simulator
-from hood.dynamics.measure import penetration_metrics, strain_metrics
-from hood.dynamics.passes import Passes
-from hood.dynamics.simulator import Simulator, build_simulator
-from hood.dynamics.stopwatch import Stopwatch
-from hood.losses.potential import default_potential
-from hood.losses.problem import StepProblem
+from hood.cli.main import ENVIRONMENT
+from hood.cloth.state import State
+from hood.energies.potential import default_potential
+from hood.energies.problem import StepProblem
 from hood.mesh.topology import unique_edges
+from hood.model.kernels.block import KERNELS
+from hood.model.readout import network_step as passes_module
+from hood.model.readout.network_step import Passes
 from hood.native import features as native
-from hood.nn.compiled import KERNELS
 from hood.scene.scene import Scene, build_scene, recentre
-from hood.scene.state import State
-from hood.solver.step_figures import StepFigures
+from hood.solver.step_figures import StepFigures, penetration_metrics, strain_metrics
+from hood.steppers.checkpoint import load_simulator
+from hood.steppers.network import Simulator, build_simulator
+from hood.steppers.protocol import Stopwatch
 
 PARTS = ("posing", "search", "features", "feedback", "network", "rest", "total", "metrics")
 WEIGHTS = DATA_FOLDER / "weights"

@@ -33,8 +33,8 @@ from fuzz_hostile import hostile
 from fuzz_inputs import Sample, damage, encode, rollout, samples
 
 import hood
+from hood.app.settings.compose import CONFIG_FOLDER
 from hood.assets.identify import identify
-from hood.config import CONFIG_FOLDER
 from hood.testing import cylinder
 
 MEMORY, SECONDS = 2 << 30, 10

@@ -18,19 +18,19 @@ import numpy as np
 import torch
 from omegaconf import DictConfig
 
-from hood.assets.body.model_file import read_model
-from hood.assets.files.index_list import read_indices
+from hood.app.common import require_same_config
+from hood.app.settings.compose import load_config
+from hood.assets.body.load import read_model
+from hood.assets.files.text import read_indices
 from hood.assets.formats.mesh_file import read_mesh_file
 from hood.assets.garment.garment import load_garment
 from hood.assets.motion.animated_mesh import load_mesh_sequence
-from hood.assets.motion.poses import read_pose
 from hood.assets.motion.recording import read_recording
+from hood.assets.motion.sequence_edit import read_pose
 from hood.assets.pickles.torch_file import load_torch
-from hood.commands.common import require_same_config
-from hood.config import load_config
-from hood.dynamics.checkpoint import load_simulator, save_simulator
-from hood.dynamics.recorder import ALARM_COLUMNS, read_rollout
-from hood.dynamics.simulator import build_simulator
+from hood.rollouts.file.recorder import ALARM_COLUMNS, read_rollout
+from hood.steppers.checkpoint import load_simulator, save_simulator
+from hood.steppers.network import build_simulator
 from hood.testing import cylinder
 
 Content = bytes | dict[str, Any]
@@ -131,7 +131,7 @@ solver.max_iterations=7"""
 #: What a run leaves about its settings, in a few lines.
 _RECORD = b"""seed: 0
 output: outputs/train
-losses: {_target_: hood.losses.potential.default_potential, x: [1, 2.5, null, text]}
+losses: {_target_: hood.energies.potential.default_potential, x: [1, 2.5, null, text]}
 trainer:
   lr: 1.0e-3
   nested: {a: {b: [1, 2, {c: 3}]}}

@@ -12,8 +12,8 @@ the minutes are over; what was left out is said at the end. Columns:
 ``ms``        of a frame, search included, metrics not: median of wall-clock time between two waits for the device, ways taking
               turns state by state.
 ``floor ms``  what the frame's kernels take at least, one after the other: for each the longest of the gap between two kernels,
-              its bytes over the bandwidth, its operations over their rate (:mod:`hood.dynamics.work`). On a GPU all of these
-              constants are measured first, in this very run; else they are those of ``--device-specs``.
+              its bytes over the bandwidth, its operations over their rate (:mod:`hood.steppers.static_shapes.roofline`). On a
+              GPU all of these constants are measured first, in this very run; else they are those of ``--device-specs``.
 ``share``     floor / ms: how near the frame is to the roofline.
 ``kernels``   of the traced frame, views not counted; of fused rows those before fusion.
 ``launches``  calls of the CUDA runtime that start something.
@@ -48,26 +48,25 @@ from hood.assets.files.library import locate
 from hood.assets.garment.garment import load_garment
 from hood.assets.material import Material
 from hood.assets.motion.load import load_sequence
-from hood.cli import ENVIRONMENT
-from hood.dynamics.captured import CapturedSimulator
-from hood.dynamics.captured_newton import CapturedNewton
-from hood.dynamics.checkpoint import load_simulator
-from hood.dynamics.fixed_problem import settled_potential, step_inputs
-from hood.dynamics.fixed_step import FixedStep
-from hood.dynamics.simulator import Prepared, Simulator
-from hood.dynamics.stepper import NewtonStepper, Stepper
-from hood.dynamics.trace import trace
-from hood.dynamics.work import DATA_SHEETS, Device, Work, WorkCounter
-from hood.graph.fixed import lay_out
-from hood.losses.potential import default_potential, scale
-from hood.losses.problem import StepProblem
-from hood.mesh.proximity import Incidence, build_incidence
-from hood.nn.dense import whole_arrays
-from hood.scene.contact import find_fixed_contact
+from hood.cli.main import ENVIRONMENT
+from hood.cloth.state import State
+from hood.contact.contact import find_fixed_contact
+from hood.energies.potential import default_potential, scale
+from hood.energies.problem import StepProblem
+from hood.mesh.closest_point.search import Incidence, build_incidence
+from hood.model.graph.static_shapes import lay_out
 from hood.scene.scene import Scene, build_scene, recentre
-from hood.scene.state import State
-from hood.solver.iterate import in_double
 from hood.solver.newton import NewtonSettings, minimize
+from hood.solver.system.iterate import in_double
+from hood.steppers.checkpoint import load_simulator
+from hood.steppers.network import Prepared, Simulator
+from hood.steppers.newton import NewtonStepper, Stepper
+from hood.steppers.static_shapes.cuda_graph import trace
+from hood.steppers.static_shapes.newton import CapturedNewton
+from hood.steppers.static_shapes.problem import settled_potential, step_inputs
+from hood.steppers.static_shapes.roofline import DATA_SHEETS, Device, Work, WorkCounter
+from hood.steppers.static_shapes.simulator import CapturedSimulator, FixedStep
+from hood.tensors.dense import whole_arrays
 from hood.testing import without_values
 
 SWITCH = "HOOD_TRITON"

@@ -25,17 +25,17 @@ from hood.assets.body.load import load_body
 from hood.assets.files.library import motion_split
 from hood.assets.garment.garment import load_garment
 from hood.assets.motion.load import load_sequence
-from hood.dynamics.guard import Guard
-from hood.dynamics.rollout import simulate
-from hood.dynamics.simulator import Prediction
-from hood.dynamics.step_repair import step_quality
-from hood.dynamics.stepper import Stepper
-from hood.losses.layers import LayerBarrier
-from hood.losses.potential import Potential, default_potential
-from hood.losses.problem import StepProblem
-from hood.nn.compiled import KERNELS
+from hood.energies.potential import Potential, default_potential
+from hood.energies.problem import StepProblem
+from hood.energies.self_contact import LayerBarrier
+from hood.model.kernels.block import KERNELS
+from hood.rollouts.checks.guard import Guard
+from hood.rollouts.checks.step_repair import step_quality
+from hood.rollouts.loop import simulate
 from hood.scene.jumps import moved_in_step
 from hood.scene.scene import Scene, build_scene
+from hood.steppers.network import Prediction
+from hood.steppers.newton import Stepper
 
 COLUMNS = ("rg", "typical", "strain", "turn", "way")
 

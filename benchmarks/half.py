@@ -17,13 +17,13 @@ from hood.assets.body.load import load_body
 from hood.assets.files.library import locate
 from hood.assets.garment.garment import load_garment
 from hood.assets.motion.load import load_sequence
-from hood.dynamics.checkpoint import load_simulator
-from hood.dynamics.refine import prepare_stepper
-from hood.dynamics.rollout import simulate
-from hood.dynamics.simulator import Prediction, Simulator
-from hood.losses.potential import default_potential
-from hood.losses.problem import StepProblem
+from hood.energies.potential import default_potential
+from hood.energies.problem import StepProblem
+from hood.rollouts.loop import simulate
 from hood.scene.scene import build_scene
+from hood.steppers.checkpoint import load_simulator
+from hood.steppers.network import Prediction, Simulator
+from hood.steppers.refined import prepare_stepper
 
 START = 5  # frames that are not compared: the start settles
 

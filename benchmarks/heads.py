@@ -33,21 +33,20 @@ from hood.assets.body.load import load_body
 from hood.assets.files.library import locate
 from hood.assets.garment.garment import load_garment
 from hood.assets.motion.load import load_sequence
-from hood.dynamics.checkpoint import load_simulator, save_simulator
-from hood.dynamics.edge_output import EdgeOutput
-from hood.dynamics.network_step import Held, Moved, NetworkStep
-from hood.dynamics.rollout import simulate
-from hood.dynamics.simulator import build_simulator
-from hood.dynamics.stepper import NewtonStepper, Stepper
-from hood.evaluation.gap import REFERENCE, starts
-from hood.evaluation.sample import StepSample
-from hood.graph.builder import MESH, Graph, StaticGraph, build_graph, edge_set
-from hood.losses.potential import default_potential, scale
-from hood.losses.problem import StepProblem
+from hood.cloth.state import StepInput
+from hood.energies.potential import default_potential, scale
+from hood.energies.problem import StepProblem
+from hood.evaluation.gap import REFERENCE, StepSample, starts
+from hood.model.graph.builder import MESH, Graph, StaticGraph, build_graph, edge_set
+from hood.model.readout.edges import EdgeOutput
+from hood.model.readout.network_step import Held, Moved, NetworkStep
+from hood.rollouts.loop import simulate
 from hood.scene.scene import Scene, build_scene
-from hood.scene.state import StepInput
-from hood.solver.iterate import in_double
 from hood.solver.newton import minimize
+from hood.solver.system.iterate import in_double
+from hood.steppers.checkpoint import load_simulator, save_simulator
+from hood.steppers.network import build_simulator
+from hood.steppers.newton import NewtonStepper, Stepper
 
 POTENTIAL = default_potential()
 MOTIONS = {"dress": "walk_proud", "tshirt": "dance_mixed", "skirt": "twist_and_bend", "trousers": "plie"}

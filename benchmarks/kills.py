@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 from safetensors.numpy import load_file
 
-from hood.dynamics.recorder import read_rollout
+from hood.rollouts.file.recorder import read_rollout
 
 #: Files of this ending are half written, and no results.
 PARTIAL = ".partial"
@@ -85,7 +85,7 @@ def start(case: Case, folder: Path, again: bool) -> subprocess.Popen[bytes]:
     texts = [text.replace("{out}", str(folder)) for text in given]
     with (folder.parent / "printed").open("ab") as printed:
         return subprocess.Popen(
-            [sys.executable, "-P", "-m", "hood.cli", *texts],
+            [sys.executable, "-P", "-m", "hood.cli.main", *texts],
             stdout=printed,
             stderr=subprocess.STDOUT,
             start_new_session=True,

@@ -6,9 +6,9 @@
     python benchmarks/layer_scenes.py --rates 60 --sheet layers.png          # a picture of every scene at six times
 
 Prints, per scene and time step: pairs of triangles that pass through each other in the worst frame (by
-:mod:`hood.mesh.crossing`, which shares nothing with the solver's search), the least distance of two features at the end of a
-step, iterations (mean, 95th percentile, most), steps that missed the accuracy, and milliseconds of CPU time of a step. With
---compare a second line: the same scene with layers free to cross, step by step in turns, and the ratio of the times.
+:mod:`hood.mesh.penetration.crossing`, which shares nothing with the solver's search), the least distance of two features at the
+end of a step, iterations (mean, 95th percentile, most), steps that missed the accuracy, and milliseconds of CPU time of a step.
+With --compare a second line: the same scene with layers free to cross, step by step in turns, and the ratio of the times.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))  # the tests' own scenes
 from layer_scenes import SCENES
 
-from hood.dynamics.implicit_euler import EulerStep, implicit_euler
-from hood.losses.layer_friction import LayerFriction
-from hood.losses.layers import LayerBarrier
-from hood.losses.potential import Potential, default_potential
-from hood.losses.problem import StepProblem
-from hood.media.camera import Camera
-from hood.media.palette import outfit_colours
-from hood.media.render import BODY_COLOR, Picture, RenderMesh, contact_sheet, render_frame
+from hood.energies.potential import Potential, default_potential
+from hood.energies.problem import StepProblem
+from hood.energies.self_contact import LayerBarrier
+from hood.energies.self_friction import LayerFriction
+from hood.media.pieces import outfit_colours
+from hood.media.renderer.camera import Camera
+from hood.media.renderer.render import BODY_COLOR, Picture, RenderMesh, contact_sheet, render_frame
 from hood.media.video import save_png
-from hood.mesh.crossing import self_crossings
+from hood.mesh.penetration.crossing import self_crossings
 from hood.solver.newton import NewtonSettings
+from hood.steppers.newton import EulerStep, implicit_euler
 
 #: Pictures of a scene.
 PICTURES = 6

@@ -26,21 +26,21 @@ import torch
 from frame import refined
 from torch import Tensor
 
+from hood.app.candidates import machine_name
 from hood.assets.body.load import load_body
 from hood.assets.garment.garment import Garment, load_garment
 from hood.assets.garment.outfit import join_garments
 from hood.assets.motion.load import load_sequence
-from hood.cli import ENVIRONMENT
-from hood.commands.conditions import machine_name
-from hood.dynamics.rollout import Frame, simulate
-from hood.dynamics.simulator import Prediction
-from hood.dynamics.stepper import NewtonStepper
-from hood.losses.layers import LayerBarrier
-from hood.losses.potential import Potential, default_potential
-from hood.losses.problem import StepProblem
-from hood.mesh.layers import Work
+from hood.cli.main import ENVIRONMENT
+from hood.energies.potential import Potential, default_potential
+from hood.energies.problem import StepProblem
+from hood.energies.self_contact import LayerBarrier
+from hood.mesh.cloth_proximity import Work
+from hood.rollouts.loop import Frame, simulate
 from hood.scene.scene import Scene, build_scene
 from hood.solver.newton import NewtonSettings
+from hood.steppers.network import Prediction
+from hood.steppers.newton import NewtonStepper
 
 CASES = ("longsleeve@dance_mixed", "tank+skirt@plie", "longsleeve_4k@dance_mixed", "tank_4k+skirt_4k@plie")
 #: Frames that make tables and are not counted.

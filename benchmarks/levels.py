@@ -21,9 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from hood.commands.plan import make_plan
-from hood.commands.plan_choices import levels_of
-from hood.config import load_config
+from hood.app.settings.compose import load_config
+from hood.studies.plan.choices import levels_of
+from hood.studies.plan.plan import make_plan
 
 STEMS = "tank tshirt longsleeve shorts trousers skirt dress".split()
 GARMENTS = [f"{stem}_{size}" for size in ("4k", "12k") for stem in STEMS]

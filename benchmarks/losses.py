@@ -22,14 +22,14 @@ from solver import device_name
 from torch import Tensor
 
 from hood.assets.material import Material
-from hood.cli import ENVIRONMENT
-from hood.dynamics.simulator import build_simulator
-from hood.losses.potential import Potential, default_potential
-from hood.losses.problem import StepProblem
-from hood.scene.batch import to_device
-from hood.scene.cloth import build_cloth
-from hood.scene.contact import find_contact
-from hood.scene.state import Obstacle, State, StepInput
+from hood.cli.main import ENVIRONMENT
+from hood.cloth.cloth import build_cloth
+from hood.cloth.state import Obstacle, State, StepInput
+from hood.contact.contact import find_contact
+from hood.energies.potential import Potential, default_potential
+from hood.energies.problem import StepProblem
+from hood.steppers.network import build_simulator
+from hood.tensors.batch import to_device
 from hood.testing import cylinder, grid
 
 DT = 1.0 / 30.0

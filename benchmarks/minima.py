@@ -20,15 +20,14 @@ from hood.assets.body.load import load_body
 from hood.assets.files.library import locate
 from hood.assets.garment.garment import load_garment
 from hood.assets.motion.load import load_sequence
-from hood.dynamics.checkpoint import load_simulator
-from hood.dynamics.rollout import simulate
-from hood.evaluation.gap import REFERENCE, starts
-from hood.evaluation.sample import StepSample
-from hood.losses.potential import default_potential, scale
-from hood.losses.problem import StepProblem
+from hood.energies.potential import default_potential, scale
+from hood.energies.problem import StepProblem
+from hood.evaluation.gap import REFERENCE, StepSample, starts
+from hood.rollouts.loop import simulate
 from hood.scene.scene import build_scene
-from hood.solver.iterate import in_double
 from hood.solver.newton import minimize
+from hood.solver.system.iterate import in_double
+from hood.steppers.checkpoint import load_simulator
 
 FRAMES, STATES, SHAKES, SHAKE = 24, 5, 2, 2e-3
 

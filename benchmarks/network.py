@@ -42,18 +42,18 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from hood.assets.material import Material
-from hood.cli import ENVIRONMENT
-from hood.graph.builder import BODY, Graph, build_graph, build_static
-from hood.graph.hierarchy import build_hierarchy
-from hood.nn.dense import affine
-from hood.nn.message_passing import ProcessorStep
-from hood.nn.mlp import MLP
-from hood.nn.model import MeshGraphNet
-from hood.nn.precision import PRECISIONS
-from hood.nn.schedule import edge_set_names, finest_level, parse_schedule, set_level
-from hood.scene.cloth import build_cloth
-from hood.scene.contact import Contact
-from hood.scene.state import Obstacle, StepInput
+from hood.cli.main import ENVIRONMENT
+from hood.cloth.cloth import build_cloth
+from hood.cloth.state import Obstacle, StepInput
+from hood.contact.contact import Contact
+from hood.model.graph.builder import BODY, Graph, build_graph, build_static
+from hood.model.graph.hierarchy import build_hierarchy
+from hood.model.graph.schedule import edge_set_names, finest_level, parse_schedule, set_level
+from hood.model.network.message_passing import ProcessorStep
+from hood.model.network.mlp import MLP
+from hood.model.network.model import MeshGraphNet
+from hood.tensors.dense import affine
+from hood.tensors.precision import PRECISIONS
 from hood.testing import grid, plane_contact
 
 NUM_BODY = 6890

@@ -16,23 +16,22 @@ from torch import Tensor
 from hood.assets.body.load import load_body
 from hood.assets.garment.garment import load_garment
 from hood.assets.motion.load import load_sequence
-from hood.dynamics.equilibrium import find_equilibrium
-from hood.dynamics.output import LocalStepOutput
-from hood.dynamics.rollout import simulate
-from hood.dynamics.simulator import Prediction
-from hood.dynamics.stepper import NewtonStepper, Stepper
-from hood.dynamics.stopwatch import Stopwatch
-from hood.evaluation.gap import REFERENCE
-from hood.evaluation.sample import StepSample
+from hood.cloth.cloth import Cloth
+from hood.cloth.state import State
+from hood.energies.potential import default_potential, scale
+from hood.energies.problem import StepProblem, inertial_guess
+from hood.evaluation.gap import REFERENCE, StepSample
 from hood.evaluation.table import Candidate, GapSettings, evaluate
-from hood.features.physical import GRAVITY
-from hood.losses.potential import default_potential, scale
-from hood.losses.problem import StepProblem, inertial_guess
-from hood.scene.cloth import Cloth
+from hood.model.features.physical import GRAVITY
+from hood.model.readout.output import LocalStepOutput
+from hood.rollouts.equilibrium import find_equilibrium
+from hood.rollouts.loop import simulate
 from hood.scene.scene import Scene, build_scene
-from hood.scene.state import State
-from hood.solver.iterate import in_double
 from hood.solver.newton import NewtonSettings, minimize
+from hood.solver.system.iterate import in_double
+from hood.steppers.network import Prediction
+from hood.steppers.newton import NewtonStepper, Stepper
+from hood.steppers.protocol import Stopwatch
 
 POTENTIAL = default_potential()
 #: How far [m] pins are pulled up in :func:`felt`: little beside what gravity stretches.

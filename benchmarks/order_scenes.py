@@ -18,7 +18,7 @@ from hood.assets.body.body import Body
 from hood.assets.files.atomic import write_atomically
 from hood.assets.garment.garment import Garment, load_garment, save_garment
 from hood.assets.material import Material
-from hood.features.physical import GRAVITY
+from hood.model.features.physical import GRAVITY
 
 #: Of the strips [m] and [vertices across]: long beside ℓ, so narrow that loads travel along it.
 LENGTH, ACROSS = 1.2, 4

@@ -20,9 +20,9 @@ from torch import Tensor
 
 import hood
 from hood.assets.garment.binding import signed_distances
-from hood.dynamics.output_frames import hermite, output_frames
-from hood.dynamics.output_rate import OutputRate
-from hood.dynamics.rollout import Frame
+from hood.rollouts.file.step_table import OutputRate
+from hood.rollouts.frames import hermite, output_frames
+from hood.rollouts.loop import Frame
 
 FPS, EVERY = 120, 4
 

@@ -22,10 +22,10 @@ import numpy as np
 import torch
 from peer_scenes import CONTACT_RADIUS, FPS, GRAVITY, CannotDoError, Moment, Setting, membrane
 
-from hood.losses.bending import Bending
-from hood.losses.potential import Potential
-from hood.losses.problem import StepProblem
-from hood.scene.state import State, StepInput
+from hood.cloth.state import State, StepInput
+from hood.energies.bending import Bending
+from hood.energies.potential import Potential
+from hood.energies.problem import StepProblem
 
 #: Radius [m] of the cylinder that bending is compared on.
 _WIDE = 2.0

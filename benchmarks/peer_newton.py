@@ -38,9 +38,9 @@ from peer_scenes import (
 from scipy import optimize
 from torch import Tensor
 
-from hood.losses.potential import Potential, scale
-from hood.losses.problem import StepProblem, sum_per_scene
-from hood.losses.stretching import green_strain
+from hood.energies.membrane import green_strain
+from hood.energies.potential import Potential, scale
+from hood.energies.problem import StepProblem, sum_per_scene
 
 #: The weight of hood's contact [J/m³] that contact is made as stiff as.
 COLLISION_WEIGHT = 5e5

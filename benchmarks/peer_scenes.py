@@ -15,21 +15,21 @@ from hood.assets.body.load import load_body
 from hood.assets.garment.garment import Garment, load_garment
 from hood.assets.material import Material
 from hood.assets.motion.load import load_sequence
-from hood.dynamics.equilibrium import find_equilibrium
-from hood.dynamics.measure import strain_metrics
-from hood.dynamics.rollout import rest_state
-from hood.dynamics.stepper import NewtonStepper
-from hood.dynamics.surface import SurfaceMeter
+from hood.cloth.cloth import Cloth
+from hood.cloth.state import State, StepInput
+from hood.energies.bending import Bending, bending_weight
+from hood.energies.inertia import Gravity
+from hood.energies.membrane import Stretching
+from hood.energies.potential import Potential
+from hood.energies.problem import StepProblem
 from hood.evaluation.gap import gap
-from hood.losses.bending import Bending, bending_weight
-from hood.losses.gravity import Gravity
-from hood.losses.potential import Potential
-from hood.losses.problem import StepProblem
-from hood.losses.stretching import Stretching
-from hood.scene.cloth import Cloth
-from hood.scene.mesh_motion import NoBody
+from hood.rollouts.equilibrium import find_equilibrium
+from hood.rollouts.loop import rest_state
+from hood.rollouts.verdict.surface import SurfaceMeter
+from hood.scene.body_motion.mesh_motion import NoBody
 from hood.scene.scene import Scene, build_scene, dress, local_origin
-from hood.scene.state import State, StepInput
+from hood.solver.step_figures import strain_metrics
+from hood.steppers.newton import NewtonStepper
 from hood.testing import grid
 
 #: Frames a second of every scene, and the fabric: the default one.

@@ -53,19 +53,19 @@ from peer_scenes import (
     static_minimum,
 )
 
+from hood.app.candidates import machine_name
 from hood.assets.files.library import locate
-from hood.commands.conditions import machine_name
-from hood.dynamics.checkpoint import load_simulator
-from hood.dynamics.refine import GuessStepper, RefinedStepper, prepare_stepper
-from hood.dynamics.rollout import Frame, simulate
-from hood.dynamics.stepper import NewtonStepper, Stepper
-from hood.dynamics.stopping import Count
-from hood.losses.potential import Potential, default_potential
-from hood.media.camera import Camera
-from hood.media.render import BODY_COLOR, RenderMesh, captioned, render_frame
+from hood.energies.potential import Potential, default_potential
+from hood.media.renderer.camera import Camera
+from hood.media.renderer.render import BODY_COLOR, RenderMesh, captioned, render_frame
 from hood.media.video import save_png
-from hood.nn.choice import choose_kernels
+from hood.model.network.kernel_choice import choose_kernels
+from hood.rollouts.loop import Frame, simulate
 from hood.solver.newton import NewtonSettings
+from hood.steppers.checkpoint import load_simulator
+from hood.steppers.newton import NewtonStepper, Stepper
+from hood.steppers.refined import GuessStepper, RefinedStepper, prepare_stepper
+from hood.steppers.stopping import Count
 
 VBD = ("vbd:10x5", "vbd:10x10", "vbd:10x20", "vbd:20x10")
 XPBD = ("xpbd:10x10", "xpbd:20x2", "xpbd:20x10", "xpbd:40x5")

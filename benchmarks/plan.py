@@ -33,12 +33,12 @@ import workshop
 
 import hood
 from hood.assets.garment.garment import load_garment
-from hood.commands import plan_auto
-from hood.dynamics.refine import prepare_stepper
-from hood.dynamics.rollout import simulate
-from hood.evaluation.sample import StepSample
-from hood.losses.potential import scale
-from hood.losses.problem import StepProblem
+from hood.energies.potential import scale
+from hood.energies.problem import StepProblem
+from hood.evaluation.gap import StepSample
+from hood.rollouts.loop import simulate
+from hood.steppers.refined import prepare_stepper
+from hood.studies.plan import plan as plan_auto
 
 #: Frames of the motions and bodies that the tests' files hold here.
 LONGEST = 90

@@ -18,17 +18,17 @@ from torch import Tensor
 from torch.nn import functional
 
 from hood.assets.material import Material
-from hood.losses.bending import Bending
-from hood.losses.collision import Collision
-from hood.losses.friction import mollified_norm
-from hood.losses.inertia import Inertia
-from hood.losses.potential import Potential
-from hood.losses.stretching import Stretching
+from hood.cloth.cloth import Cloth, build_cloth
+from hood.cloth.state import Obstacle, State
+from hood.contact.contact import find_contact
+from hood.energies.bending import Bending
+from hood.energies.contact import Collision
+from hood.energies.friction import mollified_norm
+from hood.energies.inertia import Inertia
+from hood.energies.membrane import Stretching
+from hood.energies.potential import Potential
 from hood.mesh.geometry import dihedral_angles, face_normals, vertex_normals
-from hood.scene.cloth import Cloth, build_cloth
-from hood.scene.contact import find_contact
 from hood.scene.scene import recentre
-from hood.scene.state import Obstacle, State
 from hood.testing import Mesh, cylinder, grid, make_problem, plane_contact, sphere
 
 G = 9.81

@@ -27,7 +27,7 @@ def measure(ranks: int, batch_size: int, iterations: int, options: list[str]) ->
         if ranks > 1:
             launcher += ["torch.distributed.run", "--standalone", "--nproc-per-node", str(ranks), "-m"]
         environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONSAFEPATH": "1"}
-        result = subprocess.run([*launcher, "hood.cli", *arguments], env=environment, capture_output=True, text=True)
+        result = subprocess.run([*launcher, "hood.cli.main", *arguments], env=environment, capture_output=True, text=True)
         if result.returncode:
             sys.exit(result.stderr[-2000:])
         lines = [json.loads(line) for line in (Path(folder) / "run" / "metrics.jsonl").read_text().splitlines()]

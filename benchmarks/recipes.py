@@ -148,7 +148,7 @@ def hood(arguments: list[str], log: Path) -> tuple[int, float]:
     """Exit code and CPU seconds of one ``hood`` command with one thread; what it prints goes to ``log``."""
     with open(log, "ab") as sink:
         process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "hood.cli", *arguments],
+            [sys.executable, "-P", "-m", "hood.cli.main", *arguments],
             stdout=sink,
             stderr=sink,
             env=os.environ | {"OMP_NUM_THREADS": "1"},

@@ -17,12 +17,12 @@ import torch
 
 import hood
 from hood.assets.garment.binding import signed_distances
-from hood.dynamics.refined_frames import refined_frames
-from hood.dynamics.rollout import Frame
-from hood.dynamics.surface import SurfaceMeter
+from hood.mesh.editing.subdivision import Subdivision
 from hood.mesh.geometry import face_normals
-from hood.mesh.subdivision import Subdivision
 from hood.mesh.topology import hinges
+from hood.rollouts.frames import refined_frames
+from hood.rollouts.loop import Frame
+from hood.rollouts.verdict.surface import SurfaceMeter
 
 
 def main() -> None:

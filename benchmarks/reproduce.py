@@ -47,7 +47,7 @@ def measured_again(row: Mapping[str, Any], *overrides: str) -> Mapping[str, Any]
     words = [word for word in shlex.split(row["command"])[1:] if word.split("=")[0] not in replaced]
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / "again"
-        command = [sys.executable, "-P", "-m", "hood.cli", *words, *overrides, f"output={folder}"]
+        command = [sys.executable, "-P", "-m", "hood.cli.main", *words, *overrides, f"output={folder}"]
         done = subprocess.run(command, env=os.environ | {"OMP_NUM_THREADS": "1"}, capture_output=True, text=True, check=False)
         if done.returncode:
             raise SystemExit(f"{row['setting']}: exit code {done.returncode}\n{done.stderr[-2000:]}")

@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from hood.assets.extremes.garments import FAULTS
 from hood.assets.garment.garment import load_garment, save_garment
+from hood.studies.envelope.extreme_garments import FAULTS
 
 #: What a size is made of: a garment, and what is done to it.
 SIZES = {
@@ -54,7 +54,7 @@ def evaluate(models: list[str], size: str, folder: Path) -> list[dict[str, Any]]
         "gap_iterations": 100,
         "output": folder / size,
     }
-    command = [sys.executable, "-c", "from hood.cli import entry; entry()", "evaluate"]
+    command = [sys.executable, "-c", "from hood.cli.main import entry; entry()", "evaluate"]
     subprocess.run([*command, *(f"{key}={value}" for key, value in settings.items())], check=True, stdout=subprocess.DEVNULL)
     rows = json.loads((folder / size / "table.json").read_text())
     return [row for row in rows if row["garment"] != "all"]

@@ -88,7 +88,15 @@ def measure(mark: Mark, size: str, output: Path, kernels: str) -> None:
     folder = output / mark.run / f"{mark.updates:06d}" / size
     if not (folder / "table.json").exists():
         garments, frames = SIZES[size]
-        command = [sys.executable, "-P", "-m", "hood.cli", "evaluate", f"models=[{mark.weights}]", f"garments=[{garments}]"]
+        command = [
+            sys.executable,
+            "-P",
+            "-m",
+            "hood.cli.main",
+            "evaluate",
+            f"models=[{mark.weights}]",
+            f"garments=[{garments}]",
+        ]
         command += [f"sequences=[{MOTIONS}]", f"num_frames={frames}", "gap_states=4", "gap_iterations=100"]
         command += [f"kernels={kernels}", f"output={folder}", f"resume={str((folder / 'config.yaml').exists()).lower()}"]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)

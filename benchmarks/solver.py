@@ -12,7 +12,7 @@ the run went: frames not converged, frames whose starts disagree, steps of risin
 
 OpenBLAS has threads of its own: without OMP_NUM_THREADS=1 the direct solver takes ten times as long on a busy machine.
 
-Why block-Jacobi. The levels of :mod:`hood.graph.hierarchy` were tried as a second preconditioner: interpolation from kept
+Why block-Jacobi. The levels of :mod:`hood.model.graph.hierarchy` were tried as a second preconditioner: interpolation from kept
 vertices to their dropped neighbours, Galerkin matrices, the coarsest factorised, added to block-Jacobi or in a V-cycle with
 one damped block-Jacobi step before and after. On Newton systems of this drape, mean over 4 to 14 systems, one thread of an
 AMD server CPU, to a tenth of the residual, iterations and ms without the set-up (which took 16, 99 and 1,028 ms):
@@ -39,19 +39,19 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from hood.app.candidates import device_name
 from hood.assets.material import Material
-from hood.commands.conditions import device_name
+from hood.cloth.cloth import build_cloth
+from hood.cloth.state import Obstacle, State, StepInput
+from hood.contact.contact import find_contact
+from hood.energies.potential import default_potential, scale
+from hood.energies.problem import StepProblem, inertial_guess
 from hood.evaluation.gap import AGREEMENT
-from hood.losses.potential import default_potential, scale
-from hood.losses.problem import StepProblem, inertial_guess
-from hood.scene.batch import to_device
-from hood.scene.cloth import build_cloth
-from hood.scene.contact import find_contact
-from hood.scene.state import Obstacle, State, StepInput
-from hood.solver.iterate import Progress
 from hood.solver.newton import NewtonSettings, Report, minimize
-from hood.solver.plan import plan_for
-from hood.solver.sweeps import sweep
+from hood.solver.system.iterate import Progress
+from hood.solver.system.plan import plan_for
+from hood.solver.vertex.gauss_seidel import sweep
+from hood.tensors.batch import to_device
 from hood.testing import grid, sphere
 
 TARGETS: dict[str, Callable[[float, float], bool]] = {

@@ -28,25 +28,26 @@ from frame import refined
 from torch import Tensor
 
 from hood.assets.body.load import load_body
-from hood.assets.extremes.files import write_motion
 from hood.assets.files.library import locate
 from hood.assets.garment.garment import load_garment
 from hood.assets.motion.load import load_sequence
-from hood.dynamics.checkpoint import load_simulator
-from hood.dynamics.output import VelocityBaseOutput
-from hood.dynamics.rollout import simulate
-from hood.dynamics.simulator import Simulator
-from hood.dynamics.stepper import NewtonStepper
-from hood.evaluation.sample import StepSample
-from hood.losses.potential import Potential, default_potential
-from hood.losses.problem import StepProblem
-from hood.scene.batch import to_device
+from hood.energies.potential import Potential, default_potential
+from hood.energies.problem import StepProblem
+from hood.evaluation.gap import StepSample
+from hood.model.readout.output import VelocityBaseOutput
+from hood.rollouts.loop import simulate
 from hood.scene.scene import Scene, build_scene
-from hood.solver.iterate import in_double, in_single
 from hood.solver.newton import NewtonSettings, Report, first_guess, minimize
+from hood.solver.system.iterate import in_double, in_single
+from hood.steppers.checkpoint import load_simulator
+from hood.steppers.network import Simulator
+from hood.steppers.newton import NewtonStepper
+from hood.studies.envelope.extreme_files import write_motion
+from hood.tensors.batch import to_device
 
 SETTINGS = NewtonSettings(target_rg=1e-2, max_iterations=100)
-#: By name: garment, motion (of the project, or of hood.assets.extremes.files with an amount), frames per second, speed, frames.
+#: By name: garment, motion (of the project, or of hood.studies.envelope.extreme_files with an amount), frames per second,
+#: speed, frames.
 SCENES = {
     "walk": ("tshirt", "walk_proud", 30.0, 1.0, 40),
     "dance": ("dress", "dance_mixed", 30.0, 1.0, 40),

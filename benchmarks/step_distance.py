@@ -12,7 +12,7 @@ estimate; how many iterations it takes was chosen with nine of them in sight. Fr
 gradient of 1e-6: how far the vertices have moved by then (99th percentile over those that are free) is the true distance.
 Another minimum may be nearer: that is the one the solver goes to.
 
-Near the limit of the verdict rollouts look again (:mod:`hood.dynamics.verdict.distance`), and so do these.
+Near the limit of the verdict rollouts look again (:mod:`hood.rollouts.verdict.distance`), and so do these.
 
 Printed are, over all states and by method, size, frames a second and fabric: states, the median of the true distance, rank
 correlation, and the shares of the estimates within a factor of 2 and of 4, of the states whose true or estimated distance is at
@@ -35,15 +35,15 @@ import numpy as np
 import torch
 
 import hood
-from hood.dynamics import rollout
-from hood.dynamics.rollout import simulate
-from hood.dynamics.verdict.distance import distance_metrics, estimate
-from hood.evaluation.sample import StepSample
+from hood.cloth.state import State
+from hood.energies.potential import Potential
+from hood.energies.problem import StepProblem
+from hood.evaluation.gap import StepSample
 from hood.limits import DISTANCE_UNSOUND
-from hood.losses.potential import Potential
-from hood.losses.problem import StepProblem
-from hood.scene.state import State
-from hood.solver.further import Further
+from hood.rollouts import loop
+from hood.rollouts.loop import simulate
+from hood.rollouts.verdict.distance import distance_metrics, estimate
+from hood.solver.newton import Further
 
 #: Where the true end is, and the most iterations to there.
 FINE, MOST = 1e-6, 400
@@ -250,7 +250,7 @@ def cost(garments: Iterable[str], motions: Iterable[str], frames: int) -> None:
             for method in ("quickstart", "quickstart+5", "guess+5", "newton"):
                 inside = [0.0, 0.0]
                 began, whole = time.process_time(), 0.0
-                with mock.patch.object(rollout, "distance_metrics", _timed(inside)):
+                with mock.patch.object(loop, "distance_metrics", _timed(inside)):
                     for frame in hood.simulate(garment, motion, num_frames=frames, **METHODS[method]):
                         if frame.index == 0:
                             began = time.process_time()  # the start at rest is no part of it

@@ -29,10 +29,10 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))  # the tests' own f
 import workshop
 
 import hood
-from hood.dynamics.rollout import simulate
-from hood.evaluation.sample import StepSample
-from hood.losses.potential import scale
-from hood.losses.problem import StepProblem
+from hood.energies.potential import scale
+from hood.energies.problem import StepProblem
+from hood.evaluation.gap import StepSample
+from hood.rollouts.loop import simulate
 from hood.solver.newton import NewtonSettings, minimize
 
 FINE = NewtonSettings(target_rg=1e-4)

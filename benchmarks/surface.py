@@ -27,21 +27,21 @@ from hood.assets.body.load import load_body
 from hood.assets.files.library import locate, motion_split
 from hood.assets.garment.garment import load_garment
 from hood.assets.motion.load import load_sequence
-from hood.dynamics.checkpoint import load_simulator
-from hood.dynamics.refine import RefinedStepper
-from hood.dynamics.rollout import simulate
-from hood.dynamics.stepper import NewtonStepper, Stepper
-from hood.dynamics.stopping import Count
-from hood.dynamics.surface import SURFACE_METRICS, SURFACE_STRIDE, SurfaceMeter
-from hood.losses.collision import SIDES
-from hood.losses.layers import LayerBarrier, for_networks
-from hood.losses.potential import Potential, default_potential
-from hood.mesh.proximity import search_surface
-from hood.nn.compiled import KERNELS, check_kernels
-from hood.scene.contact_points import PLACES
-from hood.scene.reach import REACHES
+from hood.contact.activation_distance import REACHES
+from hood.contact.sample_points import PLACES
+from hood.energies.contact import SIDES
+from hood.energies.potential import Potential, default_potential
+from hood.energies.self_contact import LayerBarrier, for_networks
+from hood.mesh.closest_point.search import search_surface
+from hood.model.kernels.block import KERNELS, check_kernels
+from hood.rollouts.loop import simulate
+from hood.rollouts.verdict.surface import SURFACE_METRICS, SURFACE_STRIDE, SurfaceMeter
 from hood.scene.scene import Scene, build_scene
 from hood.solver.newton import NewtonSettings
+from hood.steppers.checkpoint import load_simulator
+from hood.steppers.newton import NewtonStepper, Stepper
+from hood.steppers.refined import RefinedStepper
+from hood.steppers.stopping import Count
 
 GARMENTS = ("tshirt", "longsleeve", "tank", "dress", "skirt", "trousers", "shorts")
 HEADER = (

@@ -32,13 +32,13 @@ import torch
 from network import NUM_BODY, Case, kept_rows, list_edges, naive, resident
 from torch import Tensor
 
+from hood.app.settings.compose import load_config
+from hood.app.train import make_trainer
 from hood.assets.garment.garment import Garment, load_garment, save_garment
-from hood.cli import ENVIRONMENT
-from hood.commands.train import make_trainer
-from hood.config import load_config
-from hood.graph.builder import BODY, Graph
+from hood.cli.main import ENVIRONMENT
 from hood.mesh import topology
-from hood.nn.model import MeshGraphNet
+from hood.model.graph.builder import BODY, Graph
+from hood.model.network.model import MeshGraphNet
 from hood.training.trainer import Trainer
 
 PARTS = ("data", "search", "features", "network", "energies", "backward", "optimiser", "rest")
@@ -140,9 +140,9 @@ class Parts:
 @contextmanager
 def counted(trainer: Trainer) -> Iterator[Parts]:
     """Count the trainer's updates by parts."""
-    import hood.dynamics.simulator as simulator_module
-    import hood.losses.problem as problem_module
-    from hood.losses.potential import Potential
+    import hood.energies.problem as problem_module
+    import hood.steppers.network as simulator_module
+    from hood.energies.potential import Potential
 
     parts = Parts()
     simulator = trainer.simulator

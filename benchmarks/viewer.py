@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hood.cli import main as hood
+from hood.cli.main import main as hood
 from tools.browser import Browser
 
 #: Notes the milliseconds of every animation frame and the rollout's frame that it left.

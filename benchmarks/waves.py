@@ -6,8 +6,8 @@
 γ after some iterations from the base of ``output=local_steps``, on states of the solver, median and worst. Directions: every
 vertex alone (local steps); all together, coupled by springs of one stiffness along the edges (a Sobolev gradient, as of
 projective dynamics), with what contact adds to the diagonal or without; all together by the potential's positive matrix
-(:mod:`hood.solver.global_step`). Each is taken as far as the potential falls along it, or whole, and then out of the body; the
-solver's own iterations beside them, with their line search around the body. Before that the CPU time of every direction.
+(:mod:`hood.solver.vertex.cg_step`). Each is taken as far as the potential falls along it, or whole, and then out of the body;
+the solver's own iterations beside them, with their line search around the body. Before that the CPU time of every direction.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ import torch
 from heads import POTENTIAL, Case, cases, make_scene
 from torch import Tensor
 
-from hood.dynamics.stepper import NewtonStepper
-from hood.losses.problem import StepProblem
-from hood.nn.edge_solve import EdgeSystem, fit_edges
-from hood.solver.local import LocalTerms
-from hood.solver.local_engine import local_terms
+from hood.energies.problem import StepProblem
+from hood.model.readout.edges import EdgeSystem, fit_edges
 from hood.solver.newton import NewtonSettings, minimize
+from hood.solver.vertex.block_jacobi import LocalTerms
+from hood.solver.vertex.compiled import local_terms
+from hood.steppers.newton import NewtonStepper
 
 ITERATIONS = (1, 2, 4, 8)
 STIFFNESSES = (10.0, 40.0)  # N/m

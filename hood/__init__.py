@@ -35,11 +35,11 @@ _HOMES = {
     "EdgeField": "hood.assets.material",
     "Scene": "hood.scene.scene",
     "build_scene": "hood.scene.scene",
-    "Potential": "hood.losses.potential",
-    "default_potential": "hood.losses.potential",
-    "RolloutData": "hood.dynamics.recorder",
-    "read_rollout": "hood.dynamics.recorder",
-    "load_reference_checkpoint": "hood.dynamics.reference",
+    "Potential": "hood.energies.potential",
+    "default_potential": "hood.energies.potential",
+    "RolloutData": "hood.rollouts.file.recorder",
+    "read_rollout": "hood.rollouts.file.recorder",
+    "load_reference_checkpoint": "hood.steppers.published",
 }
 __all__ = ["__version__", *_HOMES]
 

@@ -16,37 +16,35 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from hood.app.common import read_model
+from hood.app.output.frames import at_output_fps, finer_mesh, on_finer_mesh, output_rate
+from hood.app.plan_file import plan_mode, plan_path, planned, rollout_config
+from hood.app.settings.compose import ConfigError, load_config
+from hood.app.settings.python_words import overrides
+from hood.app.setup import Setup, check_config, make_stepper, set_up
+from hood.app.stepping.cautions import idle_in_rollout
+from hood.app.stepping.guarding import GuardStopped, make_guard
 from hood.assets.files.library import locate
-from hood.assets.garment.garment import Garment
-from hood.assets.garment.own_garment import checked_garment
+from hood.assets.garment.garment import Garment, checked_garment
 from hood.assets.material import Material
-from hood.commands.checks.idle_keys import idle_in_rollout
-from hood.commands.common import read_model
-from hood.commands.guarding import GuardStopped, make_guard
-from hood.commands.output_fps import at_output_fps, output_rate
-from hood.commands.plan_file import plan_mode, plan_path, planned, rollout_config
-from hood.commands.refine_mesh import finer_mesh, on_finer_mesh
-from hood.commands.setup import Setup, check_config, make_stepper, set_up
-from hood.commands.words import overrides
-from hood.config import ConfigError, load_config
-from hood.dynamics import rollout as frames
-from hood.dynamics.rollout import Frame
-from hood.dynamics.simulator import Simulator
-from hood.dynamics.stepper import Stepper, require_stepper
-from hood.losses.potential import Potential
+from hood.energies.potential import Potential
+from hood.rollouts import loop as frames
+from hood.rollouts.loop import Frame
 from hood.scene.scene import Scene
+from hood.steppers.network import Simulator
+from hood.steppers.newton import Stepper, require_stepper
 
 
 class Simulation:
     """A garment on a moving body, put together and ready to run; made by :func:`simulate`.
 
-    Iterating yields :class:`hood.dynamics.rollout.Frame` objects, frame 0 first. A second iteration simulates again.
-    With ``guard="strict"``, :class:`hood.commands.guarding.GuardStopped` is raised before the first frame that cannot be
+    Iterating yields :class:`hood.rollouts.loop.Frame` objects, frame 0 first. A second iteration simulates again.
+    With ``guard="strict"``, :class:`hood.app.stepping.guarding.GuardStopped` is raised before the first frame that cannot be
     trusted.
 
     Attributes:
         scene: the cloth, the body and its motion (:class:`hood.scene.scene.Scene`).
-        stepper: what takes the steps, refinement included (:class:`hood.dynamics.stepper.Stepper`).
+        stepper: what takes the steps, refinement included (:class:`hood.steppers.newton.Stepper`).
         potential: the energies that it moves by (:class:`hood.Potential`).
         num_frames: how many frames there will be: no more than the motion has, and with ``output_fps`` those at that rate.
         faces: (F, 3) of the frames' ``world_pos``: those of the garment, or with ``refine_mesh`` of the finer mesh.
@@ -188,7 +186,7 @@ def rollout(**keys: Any) -> dict[str, Any]:
         >>> summary["num_frames"]
         3
     """
-    from hood.commands.rollout import run
+    from hood.app.rollout import run
 
     words = overrides(keys)
     if run(words) == 130:
@@ -221,7 +219,7 @@ def export(rollout: str | Path, **keys: Any) -> Path:
         outputs/tank/rollout.glb: ...
         'rollout.glb'
     """
-    from hood.commands.export import export as write
+    from hood.app.output.export import export as write
 
     return write([str(Path(rollout)), *overrides(keys)])
 
@@ -248,7 +246,7 @@ def train(**keys: Any) -> Path:
         >>> weights.name
         'model.safetensors'
     """
-    from hood.commands.train import run
+    from hood.app.train import run
 
     words = overrides(keys)
     if run(words) != 0:

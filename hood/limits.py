@@ -28,7 +28,7 @@ class Range(NamedTuple):
     reason: str
 
 
-_RULE, _GUARD, _BODY = "hood.dynamics.verdict.rule", "hood.dynamics.guard", "hood.dynamics.verdict.body"
+_RULE, _GUARD, _BODY = "hood.rollouts.verdict.rule", "hood.rollouts.checks.guard", "hood.rollouts.verdict.doubts"
 
 #: Of the frames that are judged this share may be bad.
 TOLERATED = Limit(0.02, "share of frames", _RULE, "one frame in fifty is not seen in a film")
@@ -68,11 +68,11 @@ INSIDE_ALARM = Limit(0.01, "m", _GUARD, "contact pushes out from 10 mm, from dee
 CROSSINGS_UNSOUND = Limit(0.4, "m", _RULE, "the length of a forearm; shorter ones look like a fold")
 CROSSINGS_SEEN = Limit(0.25, "m", _RULE, "the length of a hand, of what a viewer can see of them")
 
-#: Worn, see hood.dynamics.verdict.worn.
-AWAY_UNSOUND = Limit(0.20, "m", "hood.dynamics.verdict.worn", "43 rollouts: worn at most 0.11, come off at least 0.28")
-SLIPPED_UNSOUND = Limit(0.15, "m", "hood.dynamics.verdict.worn", "498 rollouts: worn at most 0.14, come off at least 0.15")
-SUNK_UNSOUND = Limit(0.06, "m", "hood.dynamics.verdict.worn", "498 rollouts: worn at most 0.04, come off at least 0.07")
-SUNK_SETTLING = Limit(0.12, "m", "hood.dynamics.verdict.unworn", "worn at most 0.11, but for a band; come off at least 0.14")
+#: Worn, see hood.rollouts.verdict.worn.
+AWAY_UNSOUND = Limit(0.20, "m", "hood.rollouts.verdict.worn", "43 rollouts: worn at most 0.11, come off at least 0.28")
+SLIPPED_UNSOUND = Limit(0.15, "m", "hood.rollouts.verdict.worn", "498 rollouts: worn at most 0.14, come off at least 0.15")
+SUNK_UNSOUND = Limit(0.06, "m", "hood.rollouts.verdict.worn", "498 rollouts: worn at most 0.04, come off at least 0.07")
+SUNK_SETTLING = Limit(0.12, "m", "hood.rollouts.verdict.unworn", "worn at most 0.11, but for a band; come off at least 0.14")
 
 #: The body.
 HEAD_DOWN = Limit(0.5, "share of frames", _BODY, "cartwheels are shorter, and handstands stand on the hands")
@@ -82,7 +82,7 @@ BODY_OVERLAP = Limit(0.0175, "share of the body's triangles", _BODY, "jumps have
 BODY_JUMP = Limit(5.0, "m/s", _BODY, "faster than in the steps around; captured motions reach 0.3")
 
 #: Fabrics.
-_FABRIC = "hood.dynamics.verdict.fabric"
+_FABRIC = "hood.rollouts.verdict.doubts"
 DENSITY_KNOWN = Range(0.005, 1.2, "kg/m²", _FABRIC, "silk gauze to coats of leather")
 SHEAR_KNOWN = Range(1.0, 1e6, "N/m", _FABRIC, "nets to sailcloth")
 STRETCH_KNOWN = Range(5.0, 1e7, "N/m", _FABRIC, "fishnet to sailcloth")

@@ -27,8 +27,8 @@ GROUP = "hood.plugins"
 #: Entry points of the group ``hood.KIND`` name objects: groups of features, outputs and networks of models, and readers of
 #: mesh and motion files, which have a file's suffix, without its dot, as their name.
 READERS = ("meshes", "motions")
-#: ``commands``: functions that run ``hood NAME``, and ``planners``, of which ``accuracy`` makes the plan of a rollout that has
-#: the key ``accuracy``. hood registers its own studies so; its core imports none of them.
+#: ``commands``: functions that run ``hood COMMAND``, and ``planners``, of which ``accuracy`` makes the plan of a rollout that
+#: has the key ``accuracy``. hood registers its own studies so; its core imports none of them.
 KINDS = ("features", "outputs", "networks", "commands", "planners", *READERS)
 #: Suffixes that mean something already.
 TAKEN = frozenset(

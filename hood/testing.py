@@ -14,16 +14,15 @@ import torch
 from torch import Tensor, nn
 
 from hood.assets.material import Material
-from hood.features.groups import EdgeGroup, NodeGroup
-from hood.features.inputs import Inputs
-from hood.graph.builder import build_graph, build_static
-from hood.graph.hierarchy import Hierarchy
-from hood.losses.potential import Potential, Term
-from hood.losses.problem import StepProblem
-from hood.scene.cloth import Cloth, build_cloth, concatenate_cloths
-from hood.scene.contact import Contact
-from hood.scene.grain import along_grain, grain_of
-from hood.scene.state import Obstacle, State, StepInput
+from hood.cloth.cloth import Cloth, along_grain, build_cloth, concatenate_cloths, grain_of
+from hood.cloth.state import Obstacle, State, StepInput
+from hood.contact.contact import Contact
+from hood.energies.potential import Potential, Term
+from hood.energies.problem import StepProblem
+from hood.model.features.groups import EdgeGroup, NodeGroup
+from hood.model.features.inputs import Inputs
+from hood.model.graph.builder import build_graph, build_static
+from hood.model.graph.hierarchy import Hierarchy
 
 Mesh = tuple[np.ndarray, np.ndarray]
 
@@ -88,7 +87,7 @@ def random_rotation(rng: np.random.Generator) -> np.ndarray:
 
 
 def with_weave(cloth: Cloth, warp: float = 40.0, weft: float = 15.0, shear: float = 0.3) -> Cloth:
-    """The same cloth with these factors along its warp, which runs upwards at rest; see :mod:`hood.losses.weave`."""
+    """The same cloth with these factors along its warp, which runs upwards at rest; see :mod:`hood.energies.membrane`."""
     grain = torch.as_tensor(grain_of(cloth.rest_pos.double().numpy(), cloth.faces.numpy())).to(cloth.rest_pos)
     weave = cloth.rest_area.new_tensor([warp, weft, shear]).repeat(len(cloth.faces), 1)
     return replace(cloth, weave=weave, grain=grain, rest_inverse=along_grain(cloth.rest_inverse, grain))

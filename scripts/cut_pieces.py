@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hood.assets.extremes.garments import FAULTS
-from hood.assets.garment.alterations import piece_of
+from hood.assets.fitting.alterations import piece_of
 from hood.assets.garment.garment import Garment, load_garment, save_garment
+from hood.studies.envelope.extreme_garments import FAULTS
 
 #: Bands of the dress lie beyond this share of its half width at every height, which is measured in so many steps.
 _SHARE, _HEIGHTS = 0.42, 40

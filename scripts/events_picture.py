@@ -11,8 +11,8 @@ from pathlib import Path
 
 from PIL import Image
 
-from hood.dynamics.recorder import read_rollout
 from hood.media.film import Film
+from hood.rollouts.file.recorder import read_rollout
 
 _WIDTH, _HEIGHT = 260, 340  # pixels of one frame
 _FRAMES = (30, 45, 65, 80, 91)  # closed, open, open, closing, closed

@@ -12,8 +12,7 @@ import numpy as np
 from PIL import Image
 
 import hood
-from hood.media.hem import hem_distance
-from hood.media.render import BODY_COLOR, Camera, RenderMesh, contact_sheet, render_frame
+from hood.media.renderer.render import BODY_COLOR, Camera, RenderMesh, contact_sheet, hem_distance, render_frame
 
 GARMENTS = ("tshirt", "longsleeve", "tank", "dress", "skirt", "shorts", "trousers")
 #: Fabrics and the colour that each is drawn in, sRGB.

@@ -11,10 +11,10 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from hood.commands.train import make_trainer
-from hood.config import load_config
-from hood.dynamics.checkpoint import load_simulator, record_ranges
-from hood.dynamics.ranges import describe
+from hood.app.settings.compose import load_config
+from hood.app.train import make_trainer
+from hood.steppers.checkpoint import load_simulator, record_ranges
+from hood.steppers.ranges import describe
 
 
 def main() -> None:

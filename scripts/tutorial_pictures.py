@@ -13,9 +13,8 @@ from PIL import Image
 
 from hood import Garment, load_body, load_garment, read_rollout
 from hood.media.film import Film
-from hood.media.hem import hem_distance
-from hood.media.palette import part_colour
-from hood.media.render import BODY_COLOR, Camera, RenderMesh, contact_sheet, render_frame
+from hood.media.pieces import part_colour
+from hood.media.renderer.render import BODY_COLOR, Camera, RenderMesh, contact_sheet, hem_distance, render_frame
 
 _WIDTH, _HEIGHT = 310, 390  # pixels of one view
 _COLUMNS = 4

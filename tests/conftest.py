@@ -16,7 +16,7 @@ from hood.assets.files.library import DATA_FOLDER
 from hood.assets.garment.garment import Garment, load_garment
 from hood.assets.motion.load import load_sequence
 from hood.assets.motion.sequence import PoseSequence
-from hood.mesh import layers
+from hood.mesh import cloth_proximity
 from hood.native.build import BuildError, keep
 from hood.native.libraries import LIBRARIES
 from hood.scene.scene import Scene, build_scene
@@ -58,7 +58,7 @@ def own_random_numbers() -> None:
 def compiled_layers() -> None:
     """Skips where there is no compiler: layers of cloth have no other form than the compiled one, and commands say so."""
     try:
-        layers.library()
+        cloth_proximity.library()
     except BuildError as error:
         pytest.skip(str(error))
 

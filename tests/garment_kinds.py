@@ -17,7 +17,7 @@ from imitations import GltfWriter
 from hood.assets.body.load import load_body
 from hood.assets.garment.garment import load_garment
 from hood.mesh import topology
-from hood.mesh.repair import flipped_faces
+from hood.mesh.editing.repair import flipped_faces
 
 Mesh = tuple[np.ndarray, np.ndarray]  # (V, 3) m, (F, 3)
 

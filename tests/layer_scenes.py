@@ -8,9 +8,9 @@ import numpy as np
 import torch
 
 from hood.assets.material import Material
-from hood.losses.problem import StepProblem
-from hood.scene.cloth import build_cloth
-from hood.scene.state import Obstacle
+from hood.cloth.cloth import build_cloth
+from hood.cloth.state import Obstacle
+from hood.energies.problem import StepProblem
 from hood.testing import box, grid, make_problem, sphere
 
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hood.evaluation.grid import Grid, Point, Size
-from hood.evaluation.reached import Reached, summarise
-from hood.evaluation.rollout_log import RolloutLog, Unit
+from hood.evaluation.files import RolloutLog, Unit
 from hood.evaluation.table import GUESS, NEWTON, Measured
+from hood.studies.tradeoff.grid import Grid, Point, Size
+from hood.studies.tradeoff.results import Reached, summarise
 
 PARTS = {"ms_search": 0.1, "ms_features": 0.1, "ms_network": 0.6, "ms_refine": 0.1, "ms_guess": 0.05, "ms_rest": 0.05}
 

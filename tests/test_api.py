@@ -14,16 +14,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from reference_oracle import make_state
 
 import hood
 from hood import api
-from hood.assets.garment.own_garment import checked_garment
-from hood.commands.guarding import GuardStopped
-from hood.config import ConfigError, load_config, plain
-from hood.dynamics.stepper import NewtonStepper
-
-sys.path.insert(0, str(Path(__file__).parent / "dynamics"))
-from reference_oracle import make_state
+from hood.app.settings.compose import ConfigError, load_config, plain
+from hood.app.stepping.guarding import GuardStopped
+from hood.assets.garment.garment import checked_garment
+from hood.steppers.newton import NewtonStepper
 
 PACKAGE = Path(hood.__file__).parent
 SHORT = {"num_frames": 3, "metrics": "strain"}

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import hood
-from hood.assets.files.extras import DISTRIBUTION, install
+from hood.assets.files.said import DISTRIBUTION, install
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -90,7 +90,7 @@ def test_what_is_built_installs_and_runs(tmp_path: Path) -> None:
     target = tmp_path / "site"
     python("-m", "pip", "install", "-q", "--no-deps", "--no-index", "--no-compile", "--target", target, wheel)
     code = (
-        "import hood, importlib.metadata as m, hood.config as c, pathlib; "
+        "import hood, importlib.metadata as m, hood.app.settings.compose as c, pathlib; "
         f"print(m.version('{DISTRIBUTION}'), hood.__file__, c.CONFIG_FOLDER)"
     )
     assert python("-P", "-c", code, PYTHONPATH=str(target)).split() == [

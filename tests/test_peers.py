@@ -11,11 +11,11 @@ import pytest
 import torch
 
 from hood.assets.material import Material
-from hood.losses.bending import Bending
-from hood.losses.potential import Potential, default_potential
-from hood.losses.stretching import Stretching
+from hood.cloth.cloth import build_cloth
+from hood.energies.bending import Bending
+from hood.energies.membrane import Stretching
+from hood.energies.potential import Potential, default_potential
 from hood.mesh.topology import unique_edges
-from hood.scene.cloth import build_cloth
 from hood.testing import grid, make_problem
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"

@@ -11,8 +11,8 @@ import pytest
 
 import hood
 from hood import plugins
-from hood.cli import main
-from hood.config import ConfigError, build, load_config, options
+from hood.app.settings.compose import ConfigError, build, load_config, options
+from hood.cli.main import main
 
 WIND = '''
 import os

@@ -25,7 +25,7 @@ def note(event, arguments):
             with open(os.environ["MARKS"] + "/looked", "a") as file:
                 file.write(f"{event} {path}\\n")
 sys.addaudithook(note)
-from hood.cli import entry
+from hood.cli.main import entry
 sys.exit(entry())
 """
 #: Before its last two lines: the processes that make the scenes of a training start at once, and it is told.
@@ -78,7 +78,7 @@ def test_no_file_of_the_working_folder_is_run_or_looked_at(words: tuple[str, ...
 
 def test_processes_that_a_training_starts_run_nothing_there_and_not_the_command_again(folder: Path) -> None:
     command = folder.parent / "bin" / "hood"
-    command.write_text(COMMAND.replace("from hood.cli", f"{SPAWNING}from hood.cli"))
+    command.write_text(COMMAND.replace("from hood.cli.main", f"{SPAWNING}from hood.cli.main"))
     done = run(folder, str(command), *TRAINING)
     assert done.returncode == 0, done.stderr
     assert "a pool" in done.stderr
@@ -96,7 +96,7 @@ def test_scripts_and_the_module_run_nothing_there(folder: Path) -> None:
 
 def test_commands_beside_run_nothing_there(folder: Path) -> None:
     code = (
-        "from pathlib import Path; from hood.commands.rollouts_beside import run_beside; "
+        "from pathlib import Path; from hood.studies.processes import run_beside; "
         "print([ended.exit_code for _, ended in run_beside([(0, ['rollout', '--help'], Path('out'))], 1, 60.0)])"
     )
     assert run(folder, "-P", "-c", code).stdout.strip() == "[0]"

@@ -17,9 +17,9 @@ from hood.assets.body.load import load_body
 from hood.assets.files.library import locate
 from hood.assets.garment.garment import load_garment
 from hood.assets.motion.load import load_sequence
-from hood.assets.motion.poses import arms_down
 from hood.assets.motion.recording import read_recording
 from hood.assets.motion.sequence import PoseSequence
+from hood.assets.motion.sequence_edit import arms_down
 from hood.scene.scene import build_scene
 
 FPS, FIRST, COUNT = 30.0, 40, 10

@@ -9,14 +9,11 @@ from typing import Any
 
 import h5py
 
-from hood.assets.files.foreign_formats import require_readable
-from hood.assets.files.guarded import guarded, listed
-from hood.assets.files.h5_links import own_group
-from hood.assets.files.library import names, nearest
+from hood.assets.files.guarded import guarded, listed, own_group
+from hood.assets.files.library import names, nearest, require_readable
 from hood.assets.formats.gltf import read_gltf
-from hood.assets.formats.mesh_file import mesh_suffixes
-from hood.assets.formats.objects import split_object
-from hood.assets.formats.point_cache import CACHE_SUFFIX
+from hood.assets.formats.mesh_file import mesh_suffixes, split_object
+from hood.assets.formats.vertex_files import CACHE_SUFFIX
 from hood.assets.garment.reference_garments import garment_names
 from hood.assets.motion.animated_mesh import body_kind
 from hood.assets.motion.layouts.content import PICKLES, TENSORS, plain, read_content

@@ -17,14 +17,13 @@ from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
 from hood.assets.material import Material
-from hood.losses.bending import Bending
-from hood.losses.gravity import Gravity
-from hood.losses.inertia import Inertia
-from hood.losses.potential import Potential
-from hood.losses.problem import StepProblem
-from hood.losses.stretching import Stretching
-from hood.scene.cloth import Cloth, build_cloth
-from hood.scene.state import State, StepInput
+from hood.cloth.cloth import Cloth, build_cloth
+from hood.cloth.state import State, StepInput
+from hood.energies.bending import Bending
+from hood.energies.inertia import Gravity, Inertia
+from hood.energies.membrane import Stretching
+from hood.energies.potential import Potential
+from hood.energies.problem import StepProblem
 from hood.solver.newton import NewtonSettings, minimize
 
 Array = NDArray[np.float64]

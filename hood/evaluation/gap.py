@@ -7,6 +7,8 @@ about √γ = 0.1 g, root mean square over the mass, and positions by 0.1 g dt²
 same energy is spent on less. The *relative gradient* rg = ‖∇Φ‖ / ‖M g‖ is the force left unbalanced in units of the weight
 and needs no minimum, but does not say how far away that is: at edges of 1 cm, stretching cotton by 10 µm counts as much as
 swinging it 1 cm too far. So both are reported, on the states that the method itself reaches.
+
+Steps kept out of a rollout, for measurements after it.
 """
 
 from __future__ import annotations
@@ -16,10 +18,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from hood.losses.potential import Potential, scale
-from hood.losses.problem import StepProblem
-from hood.solver.iterate import Unknowns, in_double
+from hood.energies.potential import Potential, scale
+from hood.energies.problem import StepProblem
 from hood.solver.newton import NewtonSettings, minimize
+from hood.solver.system.iterate import Unknowns, in_double
+from hood.steppers.network import Prediction
 
 #: Accuracy of a reference minimum; a start that misses it is flagged.
 REFERENCE = NewtonSettings(target_rg=1e-3, max_iterations=300)
@@ -86,3 +89,21 @@ def gap(
     # A state that is the minimum already may differ from its own minimisation by rounding.
     reached = sound.gather(0, which.unsqueeze(0)).squeeze(0) & ~(phi < lowest - noise)
     return Gap((phi - reference) / e0, phi, reference, reached, spread)
+
+
+class StepSample:
+    """Observer of :func:`hood.rollouts.loop.simulate` that keeps ``count`` steps, spread evenly over ``frames``.
+
+    Steps are kept instead of measured on the spot: what runs between two frames slows the next one down. Steps that
+    lead to positions that are not finite have no gap and are passed over.
+    """
+
+    def __init__(self, frames: range, count: int) -> None:
+        # The middles of equal stretches.
+        self.wanted = {frames[(2 * i + 1) * len(frames) // (2 * count)] for i in range(count if len(frames) else 0)}
+        self.steps: list[tuple[StepProblem, Prediction]] = []
+
+    def __call__(self, frame: int, problem: StepProblem, prediction: Prediction) -> None:
+        """Keep the step to ``frame`` if it is one of those wanted."""
+        if frame in self.wanted and bool(torch.isfinite(prediction.next_pos).all()):
+            self.steps.append((problem, prediction))

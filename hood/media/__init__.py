@@ -1,1 +1,4 @@
-"""Pictures and films of simulated clothing, drawn in software: no display and no graphics card needed."""
+"""Pictures, films, exports and the viewer of simulated clothing, drawn in software: no display, no graphics card.
+
+It reads rollouts and never computes one.
+"""

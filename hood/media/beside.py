@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hood.assets.files.extras import install
+from hood.assets.files.said import install
 from hood.assets.formats.image import Texture
-from hood.dynamics.recorder import RolloutData
 from hood.media.film import Film, seconds_per_frame, sheet_frames
 from hood.media.video import VideoWriter
+from hood.rollouts.file.recorder import RolloutData
 
 Picture = NDArray[np.uint8]
 

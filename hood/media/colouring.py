@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hood.assets.files.extras import install
-from hood.dynamics.recorder import RolloutData
-from hood.mesh.proximity import search_surface
-from hood.mesh.subdivision import Subdivision
+from hood.assets.files.said import install
+from hood.mesh.closest_point.search import search_surface
+from hood.mesh.editing.subdivision import Subdivision
+from hood.rollouts.file.recorder import RolloutData
 
 Picture = NDArray[np.uint8]
 

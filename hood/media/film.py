@@ -12,15 +12,22 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from hood.assets.formats.image import Texture
-from hood.dynamics.recorder import RolloutData
 from hood.media.colouring import colouring_of
-from hood.media.hem import hem_distance
-from hood.media.palette import outfit_colours
-from hood.media.pieces import pieces_of
-from hood.media.prints import Print, pixels_of
-from hood.media.render import BODY_COLOR, Camera, RenderMesh, captioned, contact_sheet, render_frame
+from hood.media.pieces import outfit_colours, pieces_of
+from hood.media.renderer.render import (
+    BODY_COLOR,
+    Camera,
+    Print,
+    RenderMesh,
+    captioned,
+    contact_sheet,
+    hem_distance,
+    pixels_of,
+    render_frame,
+)
 from hood.media.video import VideoWriter, save_png
-from hood.native.threads import num_parts
+from hood.native.arguments import num_parts
+from hood.rollouts.file.recorder import RolloutData
 
 _SHEET_FRAMES = 12
 #: Where the body is to be drawn thinner, it is where cloth is this near [m].

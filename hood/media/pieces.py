@@ -1,4 +1,7 @@
-"""The garments in a rollout, one by one, with their texture coordinates."""
+"""The garments in a rollout, one by one, with their texture coordinates.
+
+Colours that tell the garments of an outfit apart.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +10,39 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from hood.dynamics.recorder import RolloutData
+from hood.media.renderer.render import GARMENT_COLOR
+from hood.mesh import topology
+from hood.rollouts.file.recorder import RolloutData
+
+#: In their order; far from the body's colour and from each other, in lightness as well.
+_OTHERS = ((0.80, 0.45, 0.22), (0.30, 0.52, 0.34), (0.62, 0.28, 0.42), (0.86, 0.74, 0.38), (0.28, 0.26, 0.42))
+
+
+def outfit_colours(name: str, faces: np.ndarray, num_vertices: int, piece: np.ndarray | None = None) -> ArrayLike:
+    """sRGB, 0 to 1: one colour (3,) of a garment; (V, 3) of several, whose ``name`` joins theirs by ``+``.
+
+    Args:
+        faces: (F, 3).
+        piece: (V,) garment that a vertex belongs to. None, as in older recordings: every connected component counts as one.
+    """
+    if piece is not None and piece.shape == (num_vertices,):
+        return np.array([part_colour(rank) for rank in np.unique(piece, return_inverse=True)[1].tolist()])
+    if "+" not in name:
+        return GARMENT_COLOR
+    part = topology.connected_components(num_vertices, topology.unique_edges(faces))
+    # By their first vertices: garments lie one after another. Vertices of no face are not drawn.
+    order = {int(label): rank for rank, label in enumerate(dict.fromkeys(part[np.unique(faces)].tolist()))}
+    colours = np.array([GARMENT_COLOR, *_OTHERS])
+    return colours[[order.get(int(label), 0) % len(colours) for label in part]]
+
+
+def part_colour(rank: int) -> tuple[float, float, float]:
+    """Colour, sRGB from 0 to 1, of garment number ``rank`` of an outfit."""
+    colours = (GARMENT_COLOR, *_OTHERS)
+    red, green, blue = (float(channel) for channel in colours[rank % len(colours)])
+    return red, green, blue
 
 
 @dataclass(frozen=True)
@@ -37,7 +71,7 @@ def pieces_of(data: RolloutData) -> list[Piece]:
 
 def pieces_by(title: str, count: int, faces: np.ndarray, still: Mapping[str, np.ndarray]) -> list[Piece]:
     """The same by the names of the garments, joined by ``+``, the number of vertices, the faces (F, 3) and what a rollout holds
-    beside them (:data:`hood.dynamics.recorder.STILL`)."""
+    beside them (:data:`hood.rollouts.file.recorder.STILL`)."""
     piece, uv, uv_faces = (still.get(name) for name in ("piece", "uv", "uv_faces"))
     if (
         uv is None

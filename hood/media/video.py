@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hood.assets.files.atomic import write_atomically
-from hood.assets.files.extras import install
+from hood.assets.files.said import install
 
 logger = logging.getLogger(__name__)
 Picture = NDArray[np.uint8]

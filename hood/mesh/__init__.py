@@ -1,1 +1,4 @@
-"""Pure geometry on triangle meshes: topology, geometry, proximity, quality."""
+"""Geometry on triangle meshes: topology, closest points, penetration, repair and remeshing.
+
+Never knows what a mesh is of: garments, bodies and their files come later.
+"""

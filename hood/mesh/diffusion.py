@@ -8,8 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from hood.mesh.kept import forget
 from hood.native import features
+from hood.tensors.weak_cache import forget
 
 
 class Diffusion:

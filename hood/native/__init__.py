@@ -1,1 +1,5 @@
-"""C++ parts of the library: their sources, and how they are compiled where they run."""
+"""C++ sources, and how they are compiled where the package runs.
+
+Needs the standard library alone, but for :mod:`hood.native.features` and :mod:`hood.native.arguments`. Never knows what the
+functions it compiles are for.
+"""

@@ -1,4 +1,7 @@
-"""C++ sources as libraries: those that came with the installation, else compiled at their first use and kept."""
+"""C++ sources as libraries: those that came with the installation, else compiled at their first use and kept.
+
+The folder for files that can be made again, such as compiled libraries.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ import os
 import platform
 import shutil
 import subprocess
+import sys
 import tempfile
 import threading
 from collections import defaultdict
@@ -15,8 +19,24 @@ from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 
-from hood.native.cache import cache_folder
 from hood.native.prebuilt import FOLDER, load, prebuilt, source_text
+
+
+def cache_folder() -> Path | None:
+    """The user's cache folder as the platform has it, or ``HOOD_CACHE``; None where that turns caching off."""
+    chosen = os.environ.get("HOOD_CACHE")
+    if chosen is not None:
+        return None if chosen.strip().lower() in ("", "off") else Path(chosen).expanduser()
+    try:
+        home = Path.home()
+    except RuntimeError:  # a user without a home
+        return None
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA", home / "AppData" / "Local")) / "hood" / "Cache"
+    if sys.platform == "darwin":
+        return home / "Library" / "Caches" / "hood"
+    return Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache") / "hood"
+
 
 #: For sources that use what the processor has; arithmetic as IEEE has it.
 NATIVE_FLAGS = ("-O3", "-std=c++17", "-shared", "-fPIC", "-pthread", "-fno-math-errno", "-Wno-psabi", "-march=native")

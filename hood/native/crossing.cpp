@@ -1,4 +1,4 @@
-// Where triangles pass through each other, and how far skin sticks out: see hood/mesh/crossing.py and hood/mesh/skin.py.
+// Where triangles pass through each other, and how far skin sticks out: see hood/mesh/penetration/crossing.py and hood/mesh/penetration/exposure.py.
 //
 // To be compiled without contracted products: faces that share an edge must compute the same signs for it, to the last bit.
 #include <algorithm>
@@ -304,7 +304,7 @@ void crossing_find(const Eights* first, const Eights* second, int64_t same, doub
     sort_rows<2>(rows->pairs, rows->found), sort_rows<3>(rows->first_edges, rows->found + 1), sort_rows<3>(rows->second_edges, rows->found + 2);
 }
 
-// What is known of cloth, of skin and of how they cut, and the rules of hood/mesh/skin.py.
+// What is known of cloth, of skin and of how they cut, and the rules of hood/mesh/penetration/exposure.py.
 struct Depth {
     int64_t num_vertices, num_faces, num_edges, num_skin, num_pairs, num_cuts;
     const double* pos;                // (V, 3) m
@@ -320,7 +320,7 @@ struct Depth {
 
 namespace {
 
-// Which vertices of the cloth are under the skin: see hood.mesh.skin.sunken.
+// Which vertices of the cloth are under the skin: see hood.mesh.penetration.exposure.sunken.
 std::vector<uint8_t> sunken(const Depth& d) {
     Parts parts(d.num_vertices);
     for (int64_t e = 0, at_cut = 0; e < d.num_edges; ++e) {
@@ -432,7 +432,7 @@ std::vector<Above> candidates(const Depth& d, const Pile& suspects) {
 
 extern "C" {
 
-// Largest height of a vertex of the skin above the cloth: see hood.mesh.skin.skin_depth.
+// Largest height of a vertex of the skin above the cloth: see hood.mesh.penetration.exposure.skin_depth.
 double crossing_depth(const Depth* depth) {
     const Depth& d = *depth;
     std::vector<uint8_t> suspect(d.num_faces, 0);

@@ -49,7 +49,7 @@ struct Faces {
     int64_t count, padded;
     const int32_t *corners, *scene;                // (3, F), (F)
     const double *inverse, *weight, *mu, *lambda;  // (4, F) 1/m, (F) m^3, Pa, Pa
-    const double* weave;  // (4, F) roots of the stiffness of cloth with warp and weft, see hood.losses.weave; or none
+    const double* weave;  // (4, F) roots of the stiffness of cloth with warp and weft, see hood.energies.membrane; or none
 };
 
 struct Hinges {
@@ -182,18 +182,18 @@ void elements_vertices(const Vertices* all, const double* pos, const double* acc
     }
 }
 
-// The contact of a step as it was searched for, see hood.scene.contact.Contact, and what tells how hard vertices are pressed on it.
+// The contact of a step as it was searched for, see hood.contact.contact.Contact, and what tells how hard vertices are pressed on it.
 struct Contact {
     int64_t count;
     const uint8_t* valid;                                           // (V)
     const int64_t* scene;                                           // (V)
     const double *mass, *pos, *vel;                                 // (V) kg, (V, 3) m, (V, 3) m/s
-    const double *dist, *sag;                                       // (V) m, (V) m, see hood.scene.reach
+    const double *dist, *sag;                                       // (V) m, (V) m, see hood.contact.activation_distance
     const double *point, *next_point, *next_normal;                 // (V, 3) m, (V, 3) m, (V, 3)
     const double *pull, *dt, *gravity;                              // (V, 3) N or none, (B) s, (3) m/s^2
 };
 
-// How far off the skin contact sets in, see hood.scene.reach: ``least`` [m], and the sag as well unless it is the same everywhere.
+// How far off the skin contact sets in, see hood.contact.activation_distance: ``least`` [m], and the sag as well unless it is the same everywhere.
 struct Reach {
     double least;
     int64_t curved;
@@ -205,7 +205,7 @@ inline double reach_of(const Contact& contact, const Reach& reach, int64_t v) {
     return reach.least + (reach.curved ? contact.sag[v] : 0.0);
 }
 
-// A collision term's planes and their reach, see hood.losses.collision; rows that touch nothing are zero.
+// A collision term's planes and their reach, see hood.energies.contact; rows that touch nothing are zero.
 void elements_wall(const Contact* all, const Reach* reach, double* point, double* normal, double* reaches) {
     for (int64_t v = 0; v < all->count; ++v) {
         const bool touching = touches(*all, v);
@@ -217,7 +217,7 @@ void elements_wall(const Contact* all, const Reach* reach, double* point, double
     }
 }
 
-// A friction term's lagged force, see hood.losses.friction.Friction, and what the slip is measured against; rows without force are
+// A friction term's lagged force, see hood.energies.friction.Friction, and what the slip is measured against; rows without force are
 // zero but for the last two.
 void elements_grip(const Contact* all, const Reach* reach, double weight, double coefficient, double slip_speed, double* normal,
                    double* anchor, double* force, double* limit) {

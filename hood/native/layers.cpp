@@ -1,4 +1,4 @@
-// Cloth near cloth, as Python asks for it; see layers.h and hood/mesh/layers.py. Positions are (V, 3) float64 [m].
+// Cloth near cloth, as Python asks for it; see layers.h and hood/mesh/cloth_proximity.py. Positions are (V, 3) float64 [m].
 #include "layers.h"
 #include "layer_pins.h"
 #include "layer_pressing.h"

@@ -1,5 +1,5 @@
 // Cloth near cloth: a list of pairs of features that may come near each other, a barrier on their distance, and how far vertices
-// may move along straight lines before two features meet. See hood/mesh/layers.py and hood/losses/layers.py.
+// may move along straight lines before two features meet. See hood/mesh/cloth_proximity.py and hood/energies/self_contact.py.
 //
 // A pair is a vertex and a face, or two edges, without a common vertex. The list is made for straight ways: all pairs that can be
 // within their reach while every vertex is within its margin of its place on the way, all of them equally far along, are in the list.

@@ -1,6 +1,6 @@
 // One scene's implicit step by projected Newton: energies, gradient, Hessian, conjugate gradients and line search.
 //
-// Everything lives in arrays that the caller owns (hood/solver/engine.py), so nothing here allocates. Vertices are numbered anew:
+// Everything lives in arrays that the caller owns (hood/solver/compiled/newton.py), so nothing here allocates. Vertices are numbered anew:
 // the free ones first, in an order that keeps neighbours near each other, then the fixed ones. A table of triples is padded to four
 // numbers a row. Elements are taken eight at a time, one per lane, in float64; a row of 3 x 3 blocks is then gathered from the
 // elements at its vertex, in cache, and written once: no two writers, a fixed order, the same bits in every run. Of the symmetric
@@ -62,7 +62,7 @@ struct Engine {
     // The fabric: constant as long as the cloth's numbers.
     const double *shape, *area, *mu, *lambda, *bulk, *soft;  // (6, F) 1/m, (F) m^3, Pa, Pa and roots of moduli times area
     const double *rest_angle, *hinge_weight, *rest_length;   // (H)
-    // Cloth with warp and weft: (4, F) roots of its stiffness, see hood.losses.weave, in place of mu, lambda, bulk and soft; or none.
+    // Cloth with warp and weft: (4, F) roots of its stiffness, see hood.energies.membrane, in place of mu, lambda, bulk and soft; or none.
     const double* weave;
     // Damping in the step: viscous stress or moment over the elastic one of what the step adds, and the shape before; or none.
     const double *face_rate, *face_before;    // (F), (3, F) Green strains
@@ -987,7 +987,7 @@ template <class T> bool solve(Engine& e, double tolerance, int64_t most) {
     return definite;
 }
 
-// As much of the slack as the system bears, see hood.solver.direction.Directions.
+// As much of the slack as the system bears, see hood.solver.system.linear.Directions.
 template <class T> void direct(Engine& e, double residual, int64_t most) {
     e.sharpness = e.raised;
     gather_matrix<T>(e);
@@ -1067,7 +1067,7 @@ inline double push_of(double cubic, double start, double end, double compliance)
     return end > balance ? (end - balance) / compliance : 0.0;
 }
 
-// Points ask their vertices to give way; a vertex takes the mean of what those that push ask, see hood.solver.search.
+// Points ask their vertices to give way; a vertex takes the mean of what those that push ask, see hood.solver.system.line_search.
 void walk_points(const Engine& e, const Points& set) {
     for (int64_t w = 0; w < set.num_walls; ++w) {
         const Wall& wall = set.walls[w];
@@ -1243,7 +1243,7 @@ void newton_start(Engine* e, const double* acc) {
     energy(*e, e->pos, e->acc, &e->phi, &e->noise);
 }
 
-// The better of two guesses becomes the state, see hood.solver.iterate.first_iterate; masses (V) kg, gravity (3) m/s^2.
+// The better of two guesses becomes the state, see hood.solver.system.iterate.first_iterate; masses (V) kg, gravity (3) m/s^2.
 void newton_guess(Engine* e, const double* mass, const double* gravity) {
     LayerView* const layers = e->layers;  // the guess is the one that would be best without
     const LayerGrips* const layer_grips = e->layer_grips;

@@ -14,7 +14,7 @@ inline Vec unit(Vec a) { return (1.0 / std::max(std::sqrt(dot(a, a)), 1e-12)) * 
 
 extern "C" {
 
-// As `LightValues` of hood/media/drawing.py.
+// As `LightValues` of hood/media/renderer/raster.py.
 struct Light {
     const double* map;     // (size, size) nearness of what the key light sees
     const double* probes;  // (num_probes, 2) texels
@@ -26,7 +26,7 @@ struct Light {
     double key_color[3], fill_color[3], sky_color[3], bounce_color[3];
 };
 
-// As `SeenValues` of hood/media/drawing.py: what is drawn, and from where.
+// As `SeenValues` of hood/media/renderer/raster.py: what is drawn, and from where.
 struct Seen {
     const double *pos, *color, *normal, *screen, *depth;  // of vertices: (V, 3) three times, (V, 2) pixels, (V,) m
     const double* hem;                                    // (V,) m from the next hem
@@ -42,7 +42,7 @@ struct Seen {
     double focal, reach, inside;  // pixels, m, share of the colour that an inside shows
 };
 
-// As `FloorValues` of hood/media/drawing.py: what lies behind the surface.
+// As `FloorValues` of hood/media/renderer/raster.py: what lies behind the surface.
 struct Floor {
     const double* dark;  // (cells, cells) shade under low parts
     double* image;       // (samples * height, samples * width, 3) linear colours
@@ -123,7 +123,7 @@ double power_24(double v) {
     return eighth * eighth * eighth;
 }
 
-// Share of the light from all sides that is not kept off by what is near: as `openness` of hood/media/occlusion.py.
+// Share of the light from all sides that is not kept off by what is near: as `openness` of hood/media/renderer/shading.py.
 double openness(const Seen& s, int64_t row, int64_t column, Vec normal) {
     const double across = 0.5 * s.width, up = 0.5 * s.height, depth = 1.0 / s.nearness[row * s.width + column];
     const double x = (column + 0.5 - across) / s.focal * depth, y = (up - row - 0.5) / s.focal * depth;

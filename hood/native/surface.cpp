@@ -62,7 +62,7 @@ struct Tree {
     int64_t num_faces, num_vertices, num_nodes, num_leaves, num_blocks, edge_width;
     // The topology. Places are those of faces in the order: leaf times eight and lane.
     const int64_t* faces;                     // (G, 3)
-    const int64_t *around, *first, *valence;  // (3G), (W), (W), see hood.mesh.proximity.Incidence
+    const int64_t *around, *first, *valence;  // (3G), (W), (W), see hood.mesh.closest_point.search.Incidence
     const int64_t *face_edges, *edge_faces;   // (G, 3), (E, M) with -1
     int32_t* order;         // (L, 8) the faces in the tree, leaf after leaf; the last one is repeated
     int32_t* place;         // (G) where they are in it, -1 for others
@@ -456,7 +456,7 @@ void make_normals(const Tree& tree, const Fans& fans, const double* const* pos, 
     for (int p = 0; p < places; ++p) put(tree.vertex_normal + 3 * p, 6, fans.vertex, unit(sum[p]));
 }
 
-// Largest normal curvatures over the edges at vertices, see hood/mesh/curvature.py.
+// Largest normal curvatures over the edges at vertices, see hood/mesh/geometry.py.
 V8 bend(const Tree& tree, const Query& query, const Fans& fans) {
     const Axes here = pick(tree.pos, 3, fans.vertex), normal = pick(tree.vertex_normal, 6, fans.vertex);
     V8 most = all(0.0);
@@ -926,7 +926,7 @@ void surface_refit(Tree* tree) {
 // Makes ready for another search where the vertices are as they were.
 void surface_again(Tree* tree) { ++tree->call; }
 
-// Curvatures of vertices, see hood/mesh/curvature.py; ``memory`` is (vertices, 3), ``of_face`` (faces).
+// Curvatures of vertices, see hood/mesh/geometry.py; ``memory`` is (vertices, 3), ``of_face`` (faces).
 void surface_curvature(int64_t num_faces, int64_t num_edges, int64_t num_vertices, const int64_t* faces, const int64_t* edges,
                        const int64_t* around, const int64_t* first, const int64_t* valence, const double* pos, double* memory,
                        double* of_face, double* curvature, double most, int64_t rounds) {
@@ -978,7 +978,7 @@ void surface_find(const Tree* tree, const Query* query) {
 void surface_describe(const Tree* tree, const Query* query) { describe(*tree, *query); }
 
 // The other side of folds: of points whose nearest surface points are known, the rows of those that have one are filled in, and
-// ``found`` (N) says which they are. What it is, see hood/scene/contact.py.
+// ``found`` (N) says which they are. What it is, see hood/contact/contact.py.
 void surface_folds(Tree* tree, const Matched* matched, const Query* all, uint8_t* found) {
     fit_all_normals(*tree);
     for_parts(tree->parts, [&](int64_t part) {

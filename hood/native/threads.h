@@ -18,7 +18,7 @@
 
 namespace {
 
-constexpr int64_t MOST_PARTS = 64;  // as in hood/native/threads.py
+constexpr int64_t MOST_PARTS = 64;  // as in hood/native/arguments.py
 
 inline void pause_briefly() {
 #if defined(__x86_64__) || defined(__i386__)

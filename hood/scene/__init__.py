@@ -1,1 +1,4 @@
-"""What a step works on: cloth, state, obstacle, contact; windows of motions for training."""
+"""What is simulated: a garment on a body in motion, where it starts, and what holds it.
+
+It makes start states and obstacles. It takes no step.
+"""

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hood.assets.garment.suspicions import Suspicion, suspect_limbs, suspect_place, suspect_sides
-from hood.scene.contact import find_contact
-from hood.scene.motion import BodyMotion
+from hood.assets.fitting.suspicions import Suspicion, suspect_limbs, suspect_place, suspect_sides
+from hood.contact.contact import find_contact
+from hood.scene.body_motion.motion import BodyMotion
 from hood.scene.scene import Scene
 from hood.scene.start import settle
 
@@ -49,8 +49,8 @@ def fit_figures(scene: Scene, frame: int = 0, settled: bool = True) -> FitFigure
 def misplacement(scene: Scene, frame: int = 0, on_meshes: bool = False) -> Suspicion | None:
     """Why the garment is not worn where ``frame`` puts it, not yet settled; None: it is, or there is no body.
 
-    Of sheets far from a mesh that mesh warns itself, see :meth:`hood.scene.mesh_motion.MeshMotion.dressed`: with ``on_meshes``
-    alone they are told here too.
+    Of sheets far from a mesh that mesh warns itself, see :meth:`hood.scene.body_motion.mesh_motion.MeshMotion.dressed`: with
+    ``on_meshes`` alone they are told here too.
     """
     origin = scene.motion.translation[frame]
     surface = scene.motion.surface(frame, origin).double().cpu().numpy()

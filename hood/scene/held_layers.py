@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from hood.assets.garment.garment import Garment
-from hood.scene.motion import BodyMotion
+from hood.scene.body_motion.motion import BodyMotion
 from hood.scene.scene import LEAD_IN, Scene
 from hood.scene.start import settle
 from hood.scene.untangle import TangledError, crossing_pairs, likely_orders, separate

@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hood.mesh.rigid import best_turn, moved
-from hood.scene.motion import Motion
+from hood.cloth.state import Attachments, Obstacle, State, StepInput
+from hood.scene.body_motion.mesh_motion import best_turn, moved
+from hood.scene.body_motion.motion import Motion
 from hood.scene.scene import Scene, local_origin
-from hood.scene.state import Attachments, Obstacle, State, StepInput
 
 #: A step is a jump where the body is so much faster [m/s], or turns so much faster [rad/s], than it mostly does within so many
 #: seconds around; motions that ship with the package reach 0.3 m/s and 0.8 rad/s, at eight times their speed 7 and 11.

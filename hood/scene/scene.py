@@ -9,20 +9,18 @@ import torch
 from torch import Tensor
 
 from hood.assets.body.body import Body
-from hood.assets.garment.garment import Garment
-from hood.assets.garment.own_garment import checked_garment
+from hood.assets.garment.garment import Garment, checked_garment
 from hood.assets.material import Material
 from hood.assets.motion.sequence import PoseSequence
-from hood.scene.batch import to_device
-from hood.scene.cloth import Cloth, build_cloth
-from hood.scene.fastening import Fastening, fastening_of
-from hood.scene.holding import Holding
-from hood.scene.motion import BodyMotion, Motion, body_motion
-from hood.scene.parts.worn import worst_part
+from hood.cloth.cloth import Cloth, build_cloth
+from hood.cloth.state import Attachments, Obstacle, State, StepInput
+from hood.scene.body_motion.motion import BodyMotion, Motion, body_motion
+from hood.scene.holding import Fastening, Holding, fastening_of
 from hood.scene.sizing import Size, Sizes, resized, sizes_of
 from hood.scene.start import free_stretch, settle
-from hood.scene.state import Attachments, Obstacle, State, StepInput
 from hood.scene.untangle import Outfit, Separation, separate, smooth_out
+from hood.scene.worn import worst_part
+from hood.tensors.batch import to_device
 
 #: Time step [s] of the relaxing first step: inertia shrinks by 100, the paper's α (section 3.4).
 RELAXING_DT = 1.0 / 3.0

@@ -10,9 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from hood.cloth.cloth import Cloth, along_grain
 from hood.mesh import geometry
-from hood.scene.cloth import Cloth
-from hood.scene.grain import along_grain
 
 #: Sizes outside are no garment's.
 LEAST, MOST = 0.2, 5.0
@@ -27,7 +26,7 @@ class Sizes:
     On the way the factor is a polynomial of fifth degree whose speed and acceleration are zero at both ends: nothing jerks.
 
     Args:
-        parts: factors by which parts of the garment were cut before (:mod:`hood.assets.garment.tailoring`).
+        parts: factors by which parts of the garment were cut before (:mod:`hood.assets.garment.parts`).
         to_measure: whether the rest shape is that of the body's shape, or of the mean body whoever wears it.
 
     Raises:

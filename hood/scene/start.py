@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from hood.cloth.cloth import Cloth
+from hood.cloth.state import Obstacle
+from hood.contact.activation_distance import sag
+from hood.contact.contact import Contact, find_contact
 from hood.limits import STRAIN_START
-from hood.scene.cloth import Cloth
-from hood.scene.contact import Contact, find_contact
-from hood.scene.reach import sag
-from hood.scene.state import Obstacle
 
 #: Edges may start this much longer or shorter than at rest; beyond it they are projected back.
 _STRAIN_LIMIT = STRAIN_START.value
@@ -33,7 +33,7 @@ def settle(
     thorough: bool = False,
 ) -> Tensor:
     """Positions (V, 3) [m] near ``pos`` with bounded edge strain, at least ``clearance`` [m] outside the body, and
-    where it bulges under long edges so far that these are outside as well (:func:`hood.scene.reach.sag`).
+    where it bulges under long edges so far that these are outside as well (:func:`hood.contact.activation_distance.sag`).
 
     Skinning stretches loose cloth between the limbs and pushes cuffs into the skin; the first frame would then start with
     forces far beyond the weight. Alternates averaged edge-length projections (position based dynamics, Müller et al. 2007)

@@ -2,6 +2,8 @@
 
 Garments are drafted one by one on the bare body, so that an outfit starts with hundreds of triangles through each other.
 Forces between layers keep what has been crossed, so the layers are sorted out before the first step.
+
+Garments of an outfit that lie in the same place, as a lining made of the garment itself: none is over the other.
 """
 
 from __future__ import annotations
@@ -16,14 +18,35 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hood.assets.files.progress import Progress
-from hood.mesh.crossing import self_crossings
+from hood.assets.files.said import Progress
+from hood.cloth.cloth import Cloth
+from hood.cloth.state import Obstacle
+from hood.contact.contact import match_surface
+from hood.mesh.penetration.crossing import self_crossings
 from hood.mesh.topology import boundary_loops
-from hood.scene.cloth import Cloth
-from hood.scene.coincident import layers_below
-from hood.scene.contact import match_surface
 from hood.scene.start import LazySearch, Momentum, descend, free_stretch, leave, push_out
-from hood.scene.state import Obstacle
+
+#: Vertices nearer than this [m] are in the same place, and garments where that is more than this share of one's vertices.
+#: Seams that two garments share are fewer.
+_SAME, _SHARE = 1e-5, 0.5
+
+
+def layers_below(pos: Tensor, piece: np.ndarray, order: Sequence[int]) -> np.ndarray:
+    """On how many garments that lie in the same place each vertex of ``pos`` (V, 3) [m] comes to lie, (V,); 0 where on none.
+
+    Args:
+        piece: (V,) garment of a vertex.
+        order: garments from the body outwards.
+    """
+    place = np.round(pos.detach().double().cpu().numpy() / _SAME).astype(np.int64)
+    number = np.unique(place, axis=0, return_inverse=True)[1].reshape(-1)
+    below = np.zeros(len(piece), np.int64)
+    for rank, outer in enumerate(order):
+        rows = np.flatnonzero(piece == outer)
+        same = (np.isin(number[rows], number[piece == inner]).mean() > _SHARE for inner in order[:rank])
+        below[rows] = sum(map(bool, same))
+    return below
+
 
 #: Distance [m] that layers are taken apart to; where triangles still cross, by so much more a round, up to the last.
 _GAP, _MORE, _WIDEST = 3e-3, 1e-3, 1.5e-2

@@ -1,1 +1,4 @@
-"""Minimises the incremental potential without a network: projected Newton, and local sweeps."""
+"""Minimises the incremental potential without a network: projected Newton, and steps of single vertices.
+
+It solves one step. Sequences of steps are :mod:`hood.rollouts`.
+"""

@@ -1,4 +1,7 @@
-"""The implicit step without a network: projected Newton on the incremental potential."""
+"""The implicit step without a network: projected Newton on the incremental potential.
+
+The solver's way on from a place, iteration by iteration, for those who look at the way and not at its end.
+"""
 
 from __future__ import annotations
 
@@ -12,18 +15,17 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from hood.losses.layer_sides import LayerSides
-from hood.losses.layers import without_layers
-from hood.losses.potential import Potential, relative_gradient
-from hood.losses.problem import StepProblem
+from hood.energies.potential import Potential, relative_gradient
+from hood.energies.problem import StepProblem
+from hood.energies.self_contact import LayerSides, without_layers
 from hood.native.build import BuildError
-from hood.solver import engine
-from hood.solver.direction import Directions
-from hood.solver.iterate import Proceed, Progress, Unknowns, in_double, rounded
-from hood.solver.layers import free_way, grips_of, layers_of, touching
-from hood.solver.plan import ModelBuilder, SolverPlan, plan_for
-from hood.solver.reasons import CONVERGED, LATE, MOST_ITERATIONS, NOT_FINITE, STOPPED, STUCK
-from hood.solver.search import Path, backtrack
+from hood.solver.compiled import newton as compiled_newton
+from hood.solver.derivatives.self_contact import approached, free_way, grips_of, layers_of, touching
+from hood.solver.step_figures import CONVERGED, LATE, MOST_ITERATIONS, NOT_FINITE, STOPPED, STUCK
+from hood.solver.system.iterate import Proceed, Progress, Unknowns, fixed_positions, in_double, rounded
+from hood.solver.system.line_search import Path, backtrack
+from hood.solver.system.linear import Directions
+from hood.solver.system.plan import ModelBuilder, SolverPlan, plan_for
 
 #: Forms of the solver.
 ENGINES = ("auto", "compiled", "torch")
@@ -34,7 +36,7 @@ class NewtonSettings:
     """How far and how :func:`minimize` goes.
 
     Args:
-        target_rg: relative gradient to reach, see :func:`hood.losses.potential.relative_gradient`.
+        target_rg: relative gradient to reach, see :func:`hood.energies.potential.relative_gradient`.
         max_iterations: Newton iterations; ordinary steps take about 10, those of cloth a thousand times stiffer about 100.
         budget_ms: stop after the iteration that passes this time [ms]; None for no limit.
         linear: ``cg`` (conjugate gradients, block-Jacobi) or ``direct`` (band Cholesky, on the CPU). A Newton
@@ -76,7 +78,7 @@ class Report:
     phi: Tensor  # (B,) J
     relative_gradient: Tensor  # (B,)
     converged: Tensor  # (B,) bool
-    reason: tuple[str, ...]  # (B) of :mod:`hood.solver.reasons`
+    reason: tuple[str, ...]  # (B) of :mod:`hood.solver.step_figures`
     acc: Tensor  # (V, 3) m/s² that leads to the positions, without their cancellation in float32
     history: list[Progress] = field(default_factory=list)
 
@@ -92,14 +94,14 @@ def minimize(
 ) -> tuple[Tensor, Report]:
     """Positions (V, 3) at t + 1 that minimise ``potential``: one step of implicit Euler.
 
-    Newton's method with as much of the Hessian as is positive definite (:class:`hood.solver.direction.Directions`) and an
-    Armijo line search along paths that respect contact (:class:`hood.solver.search.Path`), both scene by scene; the scenes
-    of a batch do not touch each other. Pinned vertices are at their targets exactly, massless ones
+    Newton's method with as much of the Hessian as is positive definite (:class:`hood.solver.system.linear.Directions`) and an
+    Armijo line search along paths that respect contact (:class:`hood.solver.system.line_search.Path`), both scene by scene; the
+    scenes of a batch do not touch each other. Pinned vertices are at their targets exactly, massless ones
     stay. The potential never rises beyond rounding; the minimum is a local one. A scene that is not finite at
     the start is left there and reported.
 
     Args:
-        start: (V, 3) m, free vertices are taken from it; default :func:`hood.solver.iterate.first_iterate`.
+        start: (V, 3) m, free vertices are taken from it; default :func:`hood.solver.system.iterate.first_iterate`.
         settings: default ``NewtonSettings()``.
         plan: of the problem's cloth; default from a cache.
         proceed: asked before every iteration but the one that nothing is left for; default always.
@@ -128,7 +130,7 @@ def minimize(
 @torch.no_grad()
 def first_guess(potential: Potential, problem: StepProblem, settings: NewtonSettings | None = None) -> tuple[Tensor, Tensor]:
     """Where :func:`minimize` starts by default, positions (V, 3) m and the accelerations (V, 3) m/s² that lead there, in the
-    problem's type; see :func:`hood.solver.iterate.first_iterate`."""
+    problem's type; see :func:`hood.solver.system.iterate.first_iterate`."""
     problem = potential.prepare(problem)
     work = in_double(problem)
     system = system_of(potential, work, plan_for(work), settings or NewtonSettings())
@@ -219,7 +221,7 @@ class TorchSystem:
 
 def system_of(
     potential: Potential, problem: StepProblem, plan: SolverPlan, settings: NewtonSettings
-) -> TorchSystem | engine.EngineSystem:
+) -> TorchSystem | compiled_newton.EngineSystem:
     """The fastest form of the solver that does what ``settings`` ask for.
 
     Raises:
@@ -231,9 +233,14 @@ def system_of(
                 f"losses.terms.{name} is for training: where it sets in the solver does not converge; layers of cloth are kept "
                 "apart by cloth_contact=on"
             )
-    if settings.engine != "torch" and settings.double and settings.linear == "cg" and engine.applies(potential, problem):
+    if (
+        settings.engine != "torch"
+        and settings.double
+        and settings.linear == "cg"
+        and compiled_newton.applies(potential, problem)
+    ):
         try:
-            return engine.EngineSystem(potential, problem, plan, settings.cg_iterations)
+            return compiled_newton.EngineSystem(potential, problem, plan, settings.cg_iterations)
         except BuildError as error:
             if settings.engine == "compiled":
                 raise BuildError(f"solver.engine=compiled: {error} or use solver.engine=torch") from error
@@ -284,3 +291,54 @@ def _reason(finite: bool, wanted: bool, stuck: bool, otherwise: str) -> str:
     if not finite:
         return NOT_FINITE
     return CONVERGED if not wanted else STUCK if stuck else otherwise
+
+
+class Further:
+    """Iterations from ``start`` (V, 3) m, as :func:`hood.solver.newton.minimize` takes them, in float64.
+
+    Where cloth would have to cross cloth on the straight way from the step's beginning to ``start``, layers are kept apart as
+    they lie at ``start``. What is remembered of them for the next step does not change.
+
+    Args:
+        problem: prepared by ``potential``.
+    """
+
+    def __init__(
+        self, potential: Potential, problem: StepProblem, start: Tensor, settings: NewtonSettings | None = None
+    ) -> None:
+        start, work = start.double(), in_double(problem)
+        layers = layers_of(potential, work)
+        if layers:
+            start = torch.where(work.cloth.free.unsqueeze(1), start, fixed_positions(work))
+            if not torch.equal(approached(layers, start), start):
+                work = work.with_ways_from(start)
+        self._system = system_of(potential, work, plan_for(work), settings or NewtonSettings())
+        self._system.begin(start)
+        self._residual: list[float] | None = None
+
+    @property
+    def residual(self) -> float:
+        """Relative gradient where the way has got to, the largest over the scenes."""
+        return max(self._modelled())
+
+    def move(self) -> bool:
+        """Take an iteration, from a :attr:`residual` that is finite; whether it led anywhere."""
+        residual = self._modelled()
+        self._residual = None if any(self._system.move(residual, [value > 0.0 for value in residual])) else residual
+        return self._residual is None
+
+    @property
+    def pos(self) -> Tensor:
+        """(V, 3) m, where the way has got to."""
+        return self._system.state()[0]
+
+    @property
+    def direction(self) -> Tensor:
+        """(V, 3) m: the last Newton step, before contact and the line search took less of it."""
+        return self._system.direction()
+
+    def _modelled(self) -> list[float]:
+        if self._residual is None:
+            with torch.no_grad():
+                self._residual = self._system.model()
+        return self._residual

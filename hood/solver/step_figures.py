@@ -1,20 +1,148 @@
 """What is measured of a step that was taken: energies, the force left over, and what they are compared with.
 
 On a CPU everything goes through compiled passes and numpy: between two frames a small call of torch costs 30 µs, and there are
-a hundred of them. :class:`hood.losses.potential.Potential` is the reference, and computes the energies on an accelerator and
+a hundred of them. :class:`hood.energies.potential.Potential` is the reference, and computes the energies on an accelerator and
 without a compiler.
+
+What is reported about a frame: strain and penetration. Never part of the loss.
+
+Why a minimisation ended, as words in a report and as numbers in a rollout's metrics.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from hood.losses import elements
-from hood.losses.potential import Potential
-from hood.losses.problem import STANDARD_GRAVITY, StepProblem
-from hood.solver import forces, vertex_pass
+from hood.cloth.cloth import Cloth
+from hood.contact.contact import Contact
+from hood.energies import compiled_elements
+from hood.energies.compiled_elements import absolute_strain
+from hood.energies.potential import Potential
+from hood.energies.problem import STANDARD_GRAVITY, StepProblem
+from hood.solver.derivatives import compiled_vertices, vertices
+
+#: A vertex deeper than this [m] inside the body counts as penetrating.
+PENETRATION_DEPTH = 2e-3
+
+STRAIN_METRICS = ("strain_p50", "strain_p99", "strain_max")
+PENETRATION_METRICS = ("penetration_count", "penetration_share", "penetration_depth")
+
+
+#: Of a step in which layers of cloth are kept apart: pairs of features within their reach at its end, pairs of faces that were
+#: crossed at its start, pairs of features that held vertices drove through each other, 1 where nearly everything is near
+#: everything and nothing is kept apart, what it took, and how far held vertices stop short of their targets at most [m], which
+#: files from before do not have.
+LAYER_METRICS = ("layer_contacts", "layer_crossed", "layer_forced", "layer_overflow", "ms_layers", "pin_lag")
+
+
+def layer_metrics(problem: StepProblem, next_pos: Tensor) -> dict[str, float]:
+    """:data:`LAYER_METRICS` of the step to ``next_pos`` (V, 3); nothing where layers play no role."""
+    if not problem.layers:
+        return {}
+    work = [scene.layers.work for scene in problem.layers]
+    pins = [scene.pins for scene in problem.layers if scene.pins is not None]
+    near = sum(len(scene.layers.contacts(scene.of(next_pos)).corners) for scene in problem.layers)
+    values = (
+        near,
+        sum(scene.layers.crossed for scene in problem.layers),
+        sum(scene.layers.forced for scene in problem.layers),
+        any(one.overflowed for one in work),
+        1e3 * (sum(one.seconds for one in work) + sum(one.seconds for one in pins)),
+        max((one.lag.max(initial=0.0) for one in pins), default=0.0),
+    )
+    return dict(zip(LAYER_METRICS, map(float, values), strict=True))
+
+
+def edge_strain(cloth: Cloth, pos: Tensor) -> Tensor:
+    """Relative length change of every edge, (E,), signed."""
+    start, end = cloth.edges.unbind(dim=1)
+    rest = (cloth.rest_pos[end] - cloth.rest_pos[start]).norm(dim=1)
+    return (pos[end] - pos[start]).norm(dim=1) / rest - 1.0
+
+
+def strain_metrics(cloth: Cloth, pos: Tensor) -> dict[str, float]:
+    """Median, 99th percentile and maximum of the absolute edge strain; NaN where ``pos`` (V, 3) is not finite, and
+    without edges."""
+    strain = absolute_strain(cloth, pos)
+    if strain is None:
+        strain = edge_strain(cloth, pos).abs().double().cpu().numpy()
+    if len(strain) == 0 or not np.isfinite(strain).all():
+        return dict.fromkeys(STRAIN_METRICS, float("nan"))
+    strain.sort()
+    return dict(zip(STRAIN_METRICS, (_quantile(strain, share) for share in (0.5, 0.99, 1.0)), strict=True))
+
+
+def _quantile(ascending: np.ndarray, share: float) -> float:
+    """What numpy's function says, of values (N,) in ascending order, for a quarter of its time."""
+    place = share * (len(ascending) - 1)
+    below = int(place)
+    low, high = float(ascending[below]), float(ascending[min(below + 1, len(ascending) - 1)])
+    return low + (place - below) * (high - low)
+
+
+def penetration_metrics(contact: Contact | None, cloth: Cloth) -> dict[str, float]:
+    """Count, share and depth [m] of the vertices deeper than :data:`PENETRATION_DEPTH` inside the body at t.
+
+    Vertices beyond the reach of the contact energy count as well: there nothing pushes them out. Massless ones do not: they
+    belong to no face, nothing moves them, and nobody sees them.
+    """
+    if contact is None:
+        return {"penetration_count": 0.0, "penetration_share": 0.0, "penetration_depth": 0.0}
+    # In numpy: a few small calls of torch would take as long as a search.
+    dist, seen = contact.dist.detach().cpu().numpy(), cloth.mass.cpu().numpy() > 0
+    depth = -dist[np.isfinite(dist) & seen]
+    count = int(np.count_nonzero(depth > PENETRATION_DEPTH))
+    return {
+        "penetration_count": float(count),
+        "penetration_share": count / max(int(np.count_nonzero(seen)), 1),
+        "penetration_depth": float(depth.max(initial=0.0)),
+    }
+
+
+def vertex_residual(problem: StepProblem, gradient: Tensor) -> Tensor:
+    """Relative gradient vertex by vertex: ‖∂Φ/∂x_v‖ / (m_v g), (V,), the force left unbalanced in units of the vertex's own
+    weight, from ``gradient`` (V, 3) [N]. 0 where nothing moves.
+
+    Its root mean square, weighted by the squares of the weights, is :func:`hood.energies.potential.relative_gradient`. Standard
+    gravity stands in where the problem has none.
+    """
+    cloth, strength = problem.cloth, float(problem.gravity.norm())
+    weight = cloth.mass * (strength if strength > 0 else STANDARD_GRAVITY)
+    moves = cloth.free & (weight > 0)
+    return torch.where(moves, gradient.norm(dim=1) / torch.where(moves, weight, 1.0), 0.0)
+
+
+CONVERGED, MOST_ITERATIONS, STOPPED, LATE = "", "max iterations", "stopped", "time budget"
+STUCK, NO_PROGRESS, NOT_FINITE = "line search failed", "no progress", "not finite"
+#: The number of a reason is its place here; of several scenes the last one counts.
+REASONS = (CONVERGED, MOST_ITERATIONS, STOPPED, LATE, NO_PROGRESS, STUCK, NOT_FINITE)
+
+
+#: What a count of reasons calls the first one.
+MET = "converged"
+
+
+def reason_number(reasons: Sequence[str]) -> float:
+    """The reason of the scene that went worst, as a number."""
+    return float(max(map(REASONS.index, reasons), default=0))
+
+
+def count_reasons(numbers: np.ndarray) -> dict[str, int]:
+    """How often each reason occurs among ``numbers`` (T,), those of steps that met their target as ``converged``.
+
+    NaN, where no minimisation took place, is left out.
+    """
+    counts = {reason or MET: int((numbers == number).sum()) for number, reason in enumerate(REASONS)}
+    return {reason: count for reason, count in counts.items() if count}
+
+
+def name_counts(counts: Mapping[str, int]) -> str:
+    """``24 max iterations, 3 line search failed``."""
+    return ", ".join(f"{count} {reason}" for reason, count in counts.items())
 
 
 class StepFigures:
@@ -32,14 +160,14 @@ class StepFigures:
 
     def __init__(self, potential: Potential, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> None:
         self._potential, self._problem = potential, problem
-        self._compiled = elements.applies(next_pos) and vertex_pass.applies(next_pos)
+        self._compiled = compiled_elements.applies(next_pos) and compiled_vertices.applies(next_pos)
         if self._compiled:
             gradient = np.zeros(tuple(next_pos.shape))
-            found = self._compiled_energies(elements.as_double(next_pos), elements.as_double(acc), gradient)
+            found = self._compiled_energies(compiled_elements.as_double(next_pos), compiled_elements.as_double(acc), gradient)
             self.gradient = torch.from_numpy(gradient)
         else:
-            self.gradient, parts = elements.energies_and_gradient(
-                potential, problem, next_pos, acc, by=forces.energies_and_gradient
+            self.gradient, parts = compiled_elements.energies_and_gradient(
+                potential, problem, next_pos, acc, by=vertices.energies_and_gradient
             )
             found = {name: float(value) for name, value in parts.items()}
         self.energies = {name: found[name] for name in potential.terms if name in found}
@@ -47,15 +175,15 @@ class StepFigures:
     @np.errstate(all="ignore")  # a step may be anywhere, or nowhere
     def metrics(self) -> dict[str, float]:
         """Energies [J], and for comparison the potential of the inertial guess x_t + dt v_t; gradient norm [N] (the paper's:
-        mean over vertices of ‖∂Φ/∂x_v‖₂), rg (:func:`hood.losses.potential.relative_gradient`) and e0 [J]
-        (:func:`hood.losses.potential.scale`)."""
+        mean over vertices of ‖∂Φ/∂x_v‖₂), rg (:func:`hood.energies.potential.relative_gradient`) and e0 [J]
+        (:func:`hood.energies.potential.scale`)."""
         result = {f"energy_{name}": value for name, value in self.energies.items()}
         result["energy_total"] = sum(result.values())
         result["energy_inertial_guess"] = self._of_guess()
         size = np.sqrt(self._forces_sq)
         result["gradient_norm"] = float(size.mean()) if len(size) else 0.0
         result["relative_gradient"] = self.relative_gradient
-        dt, mass = float(self._problem.step.dt[0]), elements.as_double(self._problem.cloth.mass)
+        dt, mass = float(self._problem.step.dt[0]), compiled_elements.as_double(self._problem.cloth.mass)
         result["e0"] = 0.5 * float(mass.sum()) * (self._gravity * dt) ** 2
         return result
 
@@ -63,14 +191,14 @@ class StepFigures:
     @np.errstate(all="ignore")
     def relative_gradient(self) -> float:
         """rg alone: the force left over as a share of the weight."""
-        moving = elements.as_double(self._problem.cloth.mass)[self._free]
+        moving = compiled_elements.as_double(self._problem.cloth.mass)[self._free]
         weight_sq = self._gravity**2 * float(moving @ moving)
         return float(np.sqrt(self._forces_sq.sum() / weight_sq)) if weight_sq > 0 else 0.0
 
     @property
     def _forces_sq(self) -> np.ndarray:
         """(N,) N², ‖∂Φ/∂x_v‖² of the free vertices."""
-        slope = elements.as_double(self.gradient)
+        slope = compiled_elements.as_double(self.gradient)
         return np.asarray(np.einsum("vi,vi->v", slope, slope)[self._free])
 
     @property
@@ -79,32 +207,32 @@ class StepFigures:
 
     @property
     def _gravity(self) -> float:
-        return float(np.linalg.norm(elements.as_double(self._problem.gravity))) or STANDARD_GRAVITY
+        return float(np.linalg.norm(compiled_elements.as_double(self._problem.gravity))) or STANDARD_GRAVITY
 
     def _of_guess(self) -> float:
         """Φ [J] where the cloth would be without forces, pins where they go."""
         problem, dt = self._problem, float(self._problem.step.dt[0])
         state, target = problem.state, problem.step.pin_target
-        guess = elements.as_double(state.pos) + dt * elements.as_double(state.vel)
+        guess = compiled_elements.as_double(state.pos) + dt * compiled_elements.as_double(state.vel)
         acc = np.zeros_like(guess)
         if target is not None:
             pinned = problem.cloth.pinned.cpu().numpy()
-            goal = elements.as_double(target)[pinned]
+            goal = compiled_elements.as_double(target)[pinned]
             acc[pinned] = (goal - guess[pinned]) / dt**2
             guess[pinned] = goal
         if self._compiled:
             return sum(self._compiled_energies(guess, acc, None).values())
         pos = torch.from_numpy(guess).to(state.pos)
-        return float(elements.total_energy(self._potential, problem, pos, by=forces.total_energy).sum())
+        return float(compiled_elements.total_energy(self._potential, problem, pos, by=vertices.total_energy).sum())
 
     def _compiled_energies(self, pos: np.ndarray, acc: np.ndarray, gradient: np.ndarray | None) -> dict[str, float]:
         """Energies [J] by term, other terms than those of the passes by torch; their gradient is added to ``gradient``."""
         problem = self._problem
-        found = elements.element_energies(self._potential, problem, pos, gradient)
+        found = compiled_elements.element_energies(self._potential, problem, pos, gradient)
         energies = {name: float(value[0]) for name, value in found.items()}
-        others = elements.split(self._potential)[0]
-        single, rest = forces.split(others)
-        known = forces.known(single, problem)
+        others = compiled_elements.split(self._potential)[0]
+        single, rest = vertices.split(others)
+        known = vertices.known(single, problem)
         if known.names is not None:
             others, step = rest, problem.step
             parts = known.forces.compiled.add(pos, acc, problem.cloth.vertex_scene, step.dt, gradient)
@@ -115,5 +243,5 @@ class StepFigures:
         if gradient is None:
             return energies | {name: float(value) for name, value in others.energies(problem, place, given).items()}
         slope, parts_of_rest = others.gradient(problem, place, given)
-        gradient += elements.as_double(slope)
+        gradient += compiled_elements.as_double(slope)
         return energies | {name: float(value) for name, value in parts_of_rest.items()}

@@ -7,8 +7,8 @@ import math
 from dataclasses import dataclass, replace
 from typing import cast
 
-from hood.losses.potential import Potential
-from hood.losses.term import Term, WeightedTerm, named
+from hood.energies.potential import Potential
+from hood.energies.term import Term, WeightedTerm, named
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from hood.dynamics.measure import edge_strain
-from hood.scene.dataset import SceneSampler, Window
-from hood.scene.state import State
+from hood.cloth.state import State
+from hood.solver.step_figures import edge_strain
+from hood.training.scenes import SceneSampler, Window
 
 #: Skinning cannot dress every pose: a start with 2% of its edges beyond this strain is drawn again, a few times.
 _BAD_START = 0.25

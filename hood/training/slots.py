@@ -1,22 +1,82 @@
-"""The running rollouts of a batch: each slot carries one training scene forward until its horizon is reached."""
+"""The running rollouts of a batch: each slot carries one training scene forward until its horizon is reached.
+
+Garments by size: a batch holds scenes of similar size, and as many of them as a budget of vertices allows.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from hood.dynamics.measure import edge_strain
-from hood.dynamics.simulator import Prepared, Simulator
-from hood.scene.cloth import Cloth, concatenate_cloths
-from hood.scene.dataset import SceneSampler, Window
+from hood.cloth.cloth import Cloth, concatenate_cloths
+from hood.cloth.state import State, StepInput, concatenate_states, concatenate_step_inputs
 from hood.scene.scene import recentre
-from hood.scene.state import State, StepInput, concatenate_states, concatenate_step_inputs
-from hood.training.buckets import make_buckets, next_bucket
+from hood.solver.step_figures import edge_strain
+from hood.steppers.network import Prepared, Simulator
 from hood.training.prefetch import MAX_DRAWS, Request, SceneFeed, Start, choose_workers, draw_window, make_start
+from hood.training.scenes import SceneSampler, Window
+
+#: Templates share a bucket up to this ratio of vertices.
+_SPREAD = 1.5
+
+
+@dataclass(frozen=True)
+class Bucket:
+    """Templates of similar size and the slots that train them."""
+
+    templates: tuple[int, ...]  # indices into the list of garments
+    first: int  # number of its first slot; slots are numbered through
+    count: int  # slots, the scenes of one update
+
+    def template(self, place: int, draw: int) -> int:
+        """The garment of scene number ``draw`` of slot ``first + place``: they go round, each as often as the others."""
+        return self.templates[(place + draw * self.count) % len(self.templates)]
+
+
+def make_buckets(sizes: Sequence[int], batch_size: int, max_vertices: int | None = None) -> list[Bucket]:
+    """Buckets for garments of ``sizes`` vertices, small ones first.
+
+    Without ``max_vertices`` there is one bucket of ``batch_size`` scenes of all garments. With it, a bucket's largest garment
+    has at most 1.5 × the vertices of its smallest, and its updates hold the largest multiple of ``batch_size`` scenes that
+    stays within ``max_vertices``. Nothing here depends on how many processes share the scenes; a number of processes that
+    divides ``batch_size`` divides every bucket.
+
+    Raises:
+        ValueError: ``batch_size`` scenes of the largest garment are more than ``max_vertices``.
+    """
+    if max_vertices is None:
+        return [Bucket(tuple(range(len(sizes))), 0, batch_size)]
+    if batch_size * max(sizes) > max_vertices:
+        raise ValueError(
+            f"trainer.max_vertices={max_vertices}: {batch_size} scenes (trainer.batch_size) of the largest garment, "
+            f"{max(sizes)} vertices, are {batch_size * max(sizes)}; raise the one or lower the other"
+        )
+    groups: list[list[int]] = []
+    for index in sorted(range(len(sizes)), key=lambda i: (sizes[i], i)):
+        if groups and sizes[index] <= _SPREAD * sizes[groups[-1][0]]:
+            groups[-1].append(index)
+        else:
+            groups.append([index])
+    buckets: list[Bucket] = []
+    for group in groups:
+        count = max_vertices // (batch_size * sizes[group[-1]]) * batch_size
+        first = buckets[-1].first + buckets[-1].count if buckets else 0
+        buckets.append(Bucket(tuple(sorted(group)), first, count))
+    return buckets
+
+
+def next_bucket(buckets: Sequence[Bucket], turns: Sequence[int]) -> int:
+    """Whose update is next after ``turns`` updates of each: they take turns in proportion to their numbers of templates.
+
+    An update's loss is the mean over its own scenes, so every template has the same weight in the expected gradient,
+    whatever its size. The scenes behind that mean are fewer for large garments: their share of it is noisier.
+    """
+    return min(range(len(buckets)), key=lambda k: ((turns[k] + 1) / len(buckets[k].templates), k))
+
 
 #: A training rollout is given up once 1% of its edges are strained beyond this: nothing can be learned from debris.
 _BROKEN_STRAIN = 1.5
@@ -34,7 +94,7 @@ class _Slot:
 
 
 class Slots:
-    """Running rollouts, a batch of them for every bucket of garments of similar size (:mod:`hood.training.buckets`).
+    """Running rollouts, a batch of them for every bucket of garments of similar size (:mod:`hood.training.slots`).
 
     Scene number ``draws`` of slot *i* is a function of (seed, i, draws), the bucket of an update one of their number: a
     checkpoint stores these numbers and the states, nothing else. Garments go round the slots of their bucket, so that every

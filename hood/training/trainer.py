@@ -14,16 +14,15 @@ import torch
 from torch import Tensor
 
 from hood.assets.files.atomic import write_atomically
-from hood.dynamics.checkpoint import save_simulator
-from hood.dynamics.ranges import training_conditions
-from hood.dynamics.simulator import Prediction, Simulator
-from hood.dynamics.stopwatch import Stopwatch, timed
-from hood.features.normalizer import RunningNormalizer
-from hood.losses.layers import for_networks
-from hood.losses.potential import Potential, relative_gradient, scale
-from hood.losses.problem import StepProblem
-from hood.nn.choice import AUTO, Choice, choose_for
-from hood.scene.dataset import SceneSampler
+from hood.energies.potential import Potential, relative_gradient, scale
+from hood.energies.problem import StepProblem
+from hood.energies.self_contact import for_networks
+from hood.model.features.normalizer import RunningNormalizer
+from hood.model.network.kernel_choice import AUTO, Choice, choose_for
+from hood.steppers.checkpoint import save_simulator
+from hood.steppers.network import Prediction, Simulator
+from hood.steppers.protocol import Stopwatch, timed
+from hood.steppers.ranges import training_conditions
 from hood.training import distributed
 from hood.training.checkpoint import (
     generator_states,
@@ -33,12 +32,9 @@ from hood.training.checkpoint import (
     set_aside,
     set_generator_states,
 )
-from hood.training.clock import Clock
-from hood.training.loss import relative_loss
-from hood.training.metrics_log import MetricsLog, Window
-from hood.training.optimiser import make_optimizer
-from hood.training.settings import TrainerSettings
-from hood.training.skipped import Skipped, made_behind, told
+from hood.training.log import Clock, MetricsLog, Skipped, Window, made_behind, relative_loss, told
+from hood.training.scenes import SceneSampler
+from hood.training.settings import TrainerSettings, make_optimizer
 from hood.training.slots import Slots
 from hood.training.watch import Watch
 

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from hood.assets.files.atomic import write_atomically
-from hood.dynamics.kept_frames import KeptFrames
-from hood.dynamics.simulator import Simulator
 from hood.evaluation.validation import Validation, summarise
+from hood.rollouts.frames import KeptFrames
+from hood.steppers.network import Simulator
 from hood.training import distributed
 
 #: Pixels of one picture of a strip.

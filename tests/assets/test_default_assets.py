@@ -9,15 +9,15 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
+from hood.assets.body.body import linear_blend_skinning
 from hood.assets.body.load import load_body
-from hood.assets.body.skinning import linear_blend_skinning
 from hood.assets.files.library import DATA_FOLDER, names
 from hood.assets.garment.binding import posed_body
 from hood.assets.garment.garment import load_garment
 from hood.assets.garment.pins import MARKS
-from hood.assets.motion.poses import arms_down
+from hood.assets.motion.sequence_edit import arms_down
 from hood.mesh import topology
-from hood.mesh.proximity import search_surface
+from hood.mesh.closest_point.search import search_surface
 
 LOOPS = {
     "tshirt": 4, "tank": 4, "longsleeve": 4, "shorts": 3, "trousers": 3, "dress": 4, "skirt": 2, "shirt": 3, "jacket": 3,

@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from hood.assets.material import Material
-from hood.assets.measured import bending_length, measured, stretch_stiffness
-from hood.config import build, load_config, options
-from hood.losses.bending import Bending
-from hood.losses.problem import StepProblem
-from hood.losses.stretching import Stretching
-from hood.scene.cloth import Cloth, build_cloth
-from hood.scene.state import State, StepInput
+from hood.app.settings.compose import build, load_config, options
+from hood.assets.material import Material, bending_length, measured, stretch_stiffness
+from hood.cloth.cloth import Cloth, build_cloth
+from hood.cloth.state import State, StepInput
+from hood.energies.bending import Bending
+from hood.energies.membrane import Stretching
+from hood.energies.problem import StepProblem
 
 LIBRARY = sorted(
     name for name in options("material") if load_config("rollout", [f"material={name}"]).material._target_.endswith("measured")
@@ -96,7 +95,7 @@ def test_there_are_ten_fabrics_and_more() -> None:
 
 @pytest.mark.parametrize("name", LIBRARY)
 def test_every_fabric_says_its_source_and_is_cloth(name: str) -> None:
-    from hood.config import CONFIG_FOLDER
+    from hood.app.settings.compose import CONFIG_FOLDER
 
     assert "\n# Source: " in (CONFIG_FOLDER / "material" / f"{name}.yaml").read_text(encoding="utf-8")
     node = load_config("rollout", [f"material={name}"]).material

@@ -70,7 +70,7 @@ def of_hood(line: str) -> bool:
 
 
 def words_of(line: str) -> list[str]:
-    """The command and its words, without what starts it (python -m hood.cli, torchrun …) and what a page leaves open."""
+    """The command and its words, without what starts it (python -m hood.cli.main, torchrun …) and what a page leaves open."""
     bare = re.sub(r"^.*?(\bhood |-m hood\.cli |scripts/(?=rollout|train|evaluate))", "", line, count=1)
     words = shlex.split(bare, comments=True)
     return [words[0].removesuffix(".py"), *(word for word in words[1:] if "…" not in word)]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import runpy
 import shutil
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -13,16 +12,14 @@ import numpy as np
 import torch
 from pages import ROOT, blocks
 from PIL import Image
+from reference_oracle import make_state
 from workshop import Workshop, write_obj
 
 from hood.assets.garment.garment import Garment, load_garment, save_garment
-from hood.cli import main
-from hood.dynamics.recorder import RolloutWriter
-from hood.evaluation.envelope_prose import BEGIN, END
+from hood.cli.main import main
+from hood.rollouts.file.recorder import RolloutWriter
+from hood.studies.envelope.prose import BEGIN, END
 from hood.testing import cylinder, sphere
-
-sys.path.insert(0, str(ROOT / "tests" / "dynamics"))
-from reference_oracle import make_state
 
 #: What makes a training short; the model and its weights are as large as the line's.
 BRIEF = (

@@ -13,12 +13,12 @@ import pytest
 from omegaconf import DictConfig
 from pages import CARDS, EXTENDING, EXTENDING_HAS_A_TEST, PAGES, ROOT, command_lines, of_hood, prose_of, words_of
 
+from hood.app.settings.compose import groups, load_config, options, plain
+from hood.app.setup import check_config
 from hood.assets.files.library import names
-from hood.cli import COMMANDS
-from hood.commands.help import _EXAMPLES
-from hood.commands.plan import is_training
-from hood.commands.setup import check_config
-from hood.config import groups, load_config, options, plain
+from hood.cli.help import _EXAMPLES
+from hood.cli.main import COMMANDS
+from hood.studies.plan.plan import is_training
 
 #: Commands with a config of their own; others take files.
 CONFIGURED = {path.stem for path in (ROOT / "configs").glob("*.yaml")} & set(COMMANDS)

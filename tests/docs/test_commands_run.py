@@ -12,13 +12,13 @@ import pytest
 from pages import EXTENDING, EXTENDING_HAS_A_TEST, ROOT, command_lines, of_hood, words_of
 from stand_ins import BRIEF, Desk
 
+from hood.app.settings.compose import load_config
 from hood.assets.files.library import locate
-from hood.cli import main
-from hood.commands import envelope
-from hood.commands.envelope_tasks import make_tasks
-from hood.commands.rollouts_beside import Ended
-from hood.commands.tradeoff import chosen_models, make_grid
-from hood.config import load_config
+from hood.cli.main import main
+from hood.studies.envelope import envelope
+from hood.studies.envelope.tasks import make_tasks
+from hood.studies.processes import Ended
+from hood.studies.tradeoff.tradeoff import chosen_models, make_grid
 
 #: What ``make`` runs of them.
 RECIPES = re.findall(r"^\t\$\(BIN\)/(hood .*)$", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)

@@ -7,8 +7,8 @@ import re
 import pytest
 from pages import ROOT, text_of
 
-from hood.cli import main
-from hood.commands.exit_codes import EXIT_CODES, exit_code_lines
+from hood.app.output.verdict import EXIT_CODES, exit_code_lines
+from hood.cli.main import main
 
 ROW = re.compile(r"^\| (\d+) \| (.+) \|$", re.MULTILINE)
 
@@ -32,7 +32,7 @@ def test_the_page_of_rollouts_has_those_that_a_rollout_ends_with() -> None:
 
 def test_no_command_ends_with_another_number() -> None:
     told = set()
-    for path in [ROOT / "hood" / "cli.py", *sorted((ROOT / "hood" / "commands").rglob("*.py"))]:
+    for path in [path for room in ("app", "cli", "studies") for path in sorted((ROOT / "hood" / room).rglob("*.py"))]:
         text = text_of(path)
         told |= {
             int(number)

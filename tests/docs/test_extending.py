@@ -17,15 +17,15 @@ import pytest
 
 import hood
 from hood import plugins
+from hood.app.settings.compose import load_config
 from hood.assets.garment.garment import load_garment
 from hood.assets.motion.load import load_sequence
-from hood.cli import main
-from hood.commands.envelope_tasks import command_of, make_tasks
-from hood.commands.tradeoff_checks import check_models
-from hood.config import load_config
-from hood.dynamics.checkpoint import load_simulator, read_header, save_simulator
-from hood.dynamics.simulator import build_simulator
-from hood.features.sets import SetSettings, build_features
+from hood.cli.main import main
+from hood.model.features.sets import SetSettings, build_features
+from hood.steppers.checkpoint import load_simulator, read_header, save_simulator
+from hood.steppers.network import build_simulator
+from hood.studies.envelope.tasks import command_of, make_tasks
+from hood.studies.tradeoff.tradeoff import check_models
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "extending.md"
 BLOCK = re.compile(r"(?P<before>[^\n]*)\n\n```(?P<language>\w*)\n(?P<body>.*?)^```$", re.DOTALL | re.MULTILINE)

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from pages import EXTENDING, EXTENDING_HAS_A_TEST, PAGES, ROOT, blocks
 
-from hood.cli import main
-from hood.dynamics.recorder import read_rollout
+from hood.cli.main import main
+from hood.rollouts.file.recorder import read_rollout
 
 #: Pages whose blocks run as they stand; the tutorial's need the files of its commands.
 ELSEWHERE = {"tutorial.md", *([EXTENDING] if EXTENDING_HAS_A_TEST else [])}

@@ -15,7 +15,7 @@ import pytest
 from pages import ROOT, command_lines, of_hood
 from stand_ins import Desk
 
-from hood.cli import ENVIRONMENT
+from hood.cli.main import ENVIRONMENT
 
 LINES = [(page, line) for page, line in command_lines() if not of_hood(line)]
 

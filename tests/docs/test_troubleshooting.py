@@ -7,8 +7,8 @@ import re
 import pytest
 from pages import ROOT, text_of
 
-from hood.commands.setup import check_config
-from hood.config import load_config
+from hood.app.settings.compose import load_config
+from hood.app.setup import check_config
 
 ROWS = re.findall(r"^\| (`.*?) \| (.*?) \| (.*?) \|$", text_of(ROOT / "docs" / "troubleshooting.md"), re.MULTILINE)
 _TEXT = "\n".join(path.read_text(encoding="utf-8") for path in sorted((ROOT / "hood").rglob("*.py")))

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from hood.assets.material import Material
-from hood.assets.measured import bending_length, measured
+from hood.assets.material import Material, bending_length, measured
+from hood.cloth.cloth import build_cloth
 from hood.evaluation.drape import DISC, SAMPLE, cast_shadow, coefficient_of, drape, folds_of, sample_mesh, settled
-from hood.scene.cloth import build_cloth
 
 COARSE = 0.03
 

@@ -8,14 +8,14 @@ import torch
 
 from hood.assets.body.load import load_body
 from hood.assets.garment.garment import load_garment
-from hood.dynamics.simulator import Prediction, Simulator, build_simulator
-from hood.dynamics.stepper import NewtonStepper
-from hood.evaluation.drift import sideways_drift, standing_scene
+from hood.energies.potential import default_potential
+from hood.energies.problem import StepProblem
 from hood.evaluation.table import ALL, Candidate, Measured, candidate_rows
-from hood.losses.potential import default_potential
-from hood.losses.problem import StepProblem
+from hood.evaluation.validation import sideways_drift, standing_scene
 from hood.scene.scene import Scene
 from hood.solver.newton import NewtonSettings
+from hood.steppers.network import Prediction, Simulator, build_simulator
+from hood.steppers.newton import NewtonStepper
 
 
 @pytest.fixture(scope="module")

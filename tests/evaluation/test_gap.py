@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from hood.assets.material import Material
+from hood.cloth.cloth import build_cloth
+from hood.energies.potential import Potential, default_potential
+from hood.energies.problem import StepProblem
 from hood.evaluation.gap import gap
-from hood.losses.potential import Potential, default_potential
-from hood.losses.problem import StepProblem
-from hood.scene.cloth import build_cloth
 from hood.solver.newton import NewtonSettings, minimize
 from hood.testing import grid, make_problem
 

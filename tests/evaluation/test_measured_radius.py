@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from hood.dynamics.simulator import build_simulator
-from hood.evaluation.radius import measured_radius
-from hood.nn.schedule import parse_schedule, radius
+from hood.evaluation.table import measured_radius
+from hood.model.graph.schedule import parse_schedule, radius
+from hood.steppers.network import build_simulator
 
 
 @pytest.mark.parametrize("schedule, expected", [("fine15", 15), ("ours", 48), ("fine48", 48)])

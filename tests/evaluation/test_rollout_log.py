@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hood.evaluation.rollout_log import RolloutLog, Unit
+from hood.evaluation.files import RolloutLog, Unit
 from hood.evaluation.table import Measured
 
 FIRST, SECOND = Unit(0, "tank", "walk"), Unit(1, "dress", "a b/c.npz")

@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 
-from hood.dynamics.rollout import simulate
-from hood.dynamics.simulator import Prediction, build_simulator
-from hood.evaluation.sample import StepSample
-from hood.losses.potential import default_potential
+from hood.energies.potential import default_potential
+from hood.evaluation.gap import StepSample
+from hood.rollouts.loop import simulate
 from hood.scene.scene import Scene
+from hood.steppers.network import Prediction, build_simulator
 
 
 def test_kept_steps_are_the_rollouts(band_scene: Scene) -> None:

@@ -12,7 +12,11 @@ import pytest
 import torch
 
 from hood.assets.material import Material
-from hood.evaluation.rows import write_rows
+from hood.cloth.cloth import Cloth, build_cloth
+from hood.energies.potential import Potential, default_potential
+from hood.energies.problem import StepProblem
+from hood.evaluation import spectrum
+from hood.evaluation.files import write_rows
 from hood.evaluation.spectrum import (
     COLUMNS,
     Bands,
@@ -23,10 +27,6 @@ from hood.evaluation.spectrum import (
     garment_bands,
     spectrum_rows,
 )
-from hood.losses.potential import Potential, default_potential
-from hood.losses.problem import StepProblem
-from hood.mesh import laplacian
-from hood.scene.cloth import Cloth, build_cloth
 from hood.solver.newton import NewtonSettings, minimize
 from hood.testing import grid, make_problem
 
@@ -82,8 +82,8 @@ def test_the_bands_are_all_of_the_error(bands: Bands, problem: StepProblem) -> N
 
 def test_unresolved_waves_are_in_the_last_band(problem: StepProblem, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = garment_bands(problem.cloth)
-    monkeypatch.setattr(laplacian, "DENSE_VERTICES", 10)
-    monkeypatch.setattr(laplacian, "NUM_LONGEST", 40)
+    monkeypatch.setattr(spectrum, "DENSE_VERTICES", 10)
+    monkeypatch.setattr(spectrum, "NUM_LONGEST", 40)
     part = garment_bands(problem.cloth)
     assert part.limits == whole.limits[: len(part.limits)]
     assert 0 < len(part.limits) < len(whole.limits)

@@ -11,20 +11,19 @@ import pytest
 import torch
 from torch import Tensor
 
-from hood.config import build, load_config
-from hood.dynamics.rollout import simulate
-from hood.dynamics.simulator import build_simulator
-from hood.dynamics.stepper import NewtonStepper
+from hood.app.settings.compose import build, load_config
+from hood.energies.potential import default_potential
+from hood.energies.problem import StepProblem
 from hood.evaluation import table
-from hood.evaluation.report import columns, describe, format_table
-from hood.evaluation.rows import write_rows
+from hood.evaluation.files import columns, describe, format_table, write_rows
 from hood.evaluation.table import ALL, TERMS, Candidate, GapSettings, evaluate, other_terms
 from hood.evaluation.table_one import TableConditions, page
 from hood.evaluation.validation import Validation
-from hood.losses.potential import default_potential
-from hood.losses.problem import StepProblem
+from hood.rollouts.loop import simulate
 from hood.scene.scene import Scene
 from hood.solver.newton import NewtonSettings
+from hood.steppers.network import build_simulator
+from hood.steppers.newton import NewtonStepper
 
 FRAMES = 6
 

@@ -6,13 +6,13 @@ from typing import Any
 
 import pytest
 
+from hood.app.candidates import command_line, training_note
 from hood.assets.files.library import locate
-from hood.commands.conditions import command_line, training_note
-from hood.dynamics.stepper import NewtonStepper
+from hood.energies.potential import default_potential
 from hood.evaluation.table import ALL, Candidate, Measured, candidate_rows
 from hood.evaluation.table_one import TableConditions, checks, page
-from hood.losses.potential import default_potential
 from hood.solver.newton import NewtonSettings
+from hood.steppers.newton import NewtonStepper
 
 ABOUT = TableConditions(
     "hood evaluate models=[fine15,ours]", "A Processor, 1 thread(s)", "default (embedded)", ["walk", "plie"], 1, 30, 30.0,

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import pytest
 
-from hood.dynamics.rollout import simulate
-from hood.dynamics.simulator import Simulator, build_simulator
+from hood.energies.potential import default_potential
 from hood.evaluation.gap import REFERENCE
 from hood.evaluation.validation import Rollout, Validation, score, summarise
-from hood.losses.potential import default_potential
+from hood.rollouts.loop import simulate
 from hood.scene.scene import Scene
+from hood.steppers.network import Simulator, build_simulator
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hood.dynamics.recorder import RolloutData
 from hood.media.colouring import colouring_of, skin_distance, vertex_strain
 from hood.media.film import Film
+from hood.rollouts.file.recorder import RolloutData
 from hood.testing import cylinder, sphere
 
 needs_pillow = pytest.mark.skipif(importlib.util.find_spec("PIL") is None, reason="needs Pillow")

@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hood.dynamics.recorder import RolloutData
 from hood.media.film import Film, drawn
+from hood.rollouts.file.recorder import RolloutData
 from hood.testing import cylinder, sphere
 
 pytest.importorskip("PIL")

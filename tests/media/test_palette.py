@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from hood.media.palette import outfit_colours
-from hood.media.render import GARMENT_COLOR
+from hood.media.pieces import outfit_colours
+from hood.media.renderer.render import GARMENT_COLOR
 from hood.testing import grid
 
 

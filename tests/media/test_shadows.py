@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hood.evaluation.drape import DISC, PIXEL, Rest
-from hood.media.shadows import write_shadows
+from hood.media.bars import write_shadows
 
 Image = pytest.importorskip("PIL.Image")
 pytest.importorskip("matplotlib")

@@ -10,12 +10,12 @@ import pytest
 
 from hood.assets.formats import image as texture_module
 from hood.assets.formats.image import Texture, read_texture
-from hood.dynamics.recorder import RolloutData
-from hood.media import drawing, raster, render, shading
-from hood.media.camera import Camera
 from hood.media.pieces import pieces_of, split_seams
-from hood.media.prints import Print, pixels_of
-from hood.media.render import RenderMesh, render_frame
+from hood.media.renderer import raster, render, shading
+from hood.media.renderer import raster as drawing
+from hood.media.renderer.camera import Camera
+from hood.media.renderer.render import Print, RenderMesh, pixels_of, render_frame
+from hood.rollouts.file.recorder import RolloutData
 
 RED, GREEN, BLUE, WHITE = (255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 255)
 #: Left to right, the top row first.

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from hood.mesh import surface_tree
-from hood.mesh.curvature import MOST_CURVATURE, convex_curvature
-from hood.mesh.proximity import build_incidence
+from hood.mesh.closest_point import tree
+from hood.mesh.closest_point.search import build_incidence
+from hood.mesh.geometry import MOST_CURVATURE, convex_curvature
 from hood.testing import Mesh, cylinder, grid, sphere
 
 F64 = torch.float64
@@ -19,7 +19,7 @@ def curvature(mesh: Mesh, dtype: torch.dtype = F64) -> torch.Tensor:
     pos, faces = torch.as_tensor(mesh[0]).to(dtype), torch.as_tensor(mesh[1])
     incidence = build_incidence(faces, len(pos))
     scene, face_scene = (torch.zeros(len(part), dtype=torch.long) for part in (pos, faces))
-    found = surface_tree.search(pos, scene, pos, faces, face_scene, incidence.adjacency, pos, curved=True)
+    found = tree.search(pos, scene, pos, faces, face_scene, incidence.adjacency, pos, curved=True)
     if found is None:
         return convex_curvature(pos, faces, incidence)
     assert found.curvature is not None
@@ -30,8 +30,8 @@ def curvature(mesh: Mesh, dtype: torch.dtype = F64) -> torch.Tensor:
 def form(request, monkeypatch) -> str:
     """Both forms, where there is a compiler."""
     if request.param == "torch":
-        monkeypatch.setattr(surface_tree, "library", lambda: None)
-    elif surface_tree.library() is None:
+        monkeypatch.setattr(tree, "library", lambda: None)
+    elif tree.library() is None:
         pytest.skip("no C++ compiler")
     return request.param
 
@@ -84,12 +84,12 @@ def test_flat_and_tiny_surfaces_are_bounded() -> None:
 
 
 def test_both_forms_agree(monkeypatch) -> None:
-    if surface_tree.library() is None:
+    if tree.library() is None:
         pytest.skip("no C++ compiler")
     for mesh, rows in ((bumpy(), -3), (bumpy(1), -3), (fans(), None), (sphere(3, 0.06), None)):
         found = [curvature(mesh), curvature(mesh, torch.float32)]
         with monkeypatch.context() as patched:
-            patched.setattr(surface_tree, "library", lambda: None)
+            patched.setattr(tree, "library", lambda: None)
             expected = [curvature(mesh), curvature(mesh, torch.float32)]
         for one, other, bound in zip(found, expected, (1e-12, 1e-3), strict=True):
             torch.testing.assert_close(one[:rows], other[:rows], rtol=bound, atol=bound)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from hood.mesh import geometry, topology
-from hood.mesh.proximity import build_incidence
+from hood.mesh.closest_point.search import build_incidence
 from hood.testing import cylinder, grid, random_rotation, sphere
 
 HINGE = torch.tensor([[0, 1, 2, 3]])

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hood.mesh.crossing import self_crossings
-from hood.mesh.layer_pins import Followed, follow
-from hood.mesh.layers import LayerMesh, Layers
+from hood.mesh.cloth_proximity import Followed, LayerMesh, Layers, follow
+from hood.mesh.penetration.crossing import self_crossings
 from hood.testing import grid
 
 pytestmark = pytest.mark.usefixtures("compiled_layers")

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from hood.mesh import topology
-from hood.mesh.crossing import self_crossings
-from hood.mesh.layers import LayerMesh, Layers
+from hood.mesh.cloth_proximity import LayerMesh, Layers
+from hood.mesh.penetration.crossing import self_crossings
 from hood.testing import grid
 
 pytestmark = pytest.mark.usefixtures("compiled_layers")

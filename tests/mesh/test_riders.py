@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hood.mesh.parts import find_parts
-from hood.mesh.riders import Riders, clusters, join_riders, rigid_anchors
+from hood.mesh.parts import Riders, clusters, find_parts, join_riders, rigid_anchors
 from hood.testing import cylinder, grid
 
 

@@ -5,8 +5,7 @@ import pytest
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import shortest_path
 
-from hood.mesh.rings import Rings
-from hood.mesh.topology import unique_edges
+from hood.mesh.topology import Rings, unique_edges
 from hood.testing import grid
 
 

@@ -69,13 +69,13 @@ def test_what_cannot_be_compiled_is_left_out_and_named(source, tmp_path, monkeyp
 
 
 def test_the_list_names_what_the_modules_ask_for():
-    from hood.media import drawing
-    from hood.mesh import surface_tree
-    from hood.solver import engine
+    from hood.media.renderer import raster
+    from hood.mesh.closest_point import tree
+    from hood.solver.compiled import newton
 
-    assert (engine.SOURCE, libraries.WIDE_FLAGS) in libraries.SELDOM
+    assert (newton.SOURCE, libraries.WIDE_FLAGS) in libraries.SELDOM
     listed = {path for path, _ in libraries.LIBRARIES}
-    assert {engine.SOURCE, surface_tree.SOURCE, drawing.SOURCE} <= listed
+    assert {newton.SOURCE, tree.SOURCE, raster.SOURCE} <= listed
     assert all(path.exists() for path in listed)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from hood.scene.fastening import SPEED, Event, Fastening, fastening_of, first_step
+from hood.scene.holding import SPEED, Event, Fastening, fastening_of, first_step
 from hood.scene.scene import Scene
 
 ROWS = {"zip": np.array([[0, 1], [2, 3]]), "buttons": np.array([[4, 5]])}

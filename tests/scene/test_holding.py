@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import torch
 
+from hood.cloth.state import State
 from hood.scene.holding import Grasp, Holding
 from hood.scene.scene import Scene
-from hood.scene.state import State
 
 
 def some(scene: Scene, *vertices: int) -> torch.Tensor:

@@ -11,20 +11,20 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from hood.assets.body.body import Body
-from hood.assets.extremes.files import write_motion
 from hood.assets.files.library import names
 from hood.assets.garment.garment import Garment
 from hood.assets.motion.load import load_sequence
 from hood.assets.motion.mesh_sequence import MeshSequence
 from hood.assets.motion.sequence import PoseSequence
-from hood.dynamics.rollout import simulate
-from hood.dynamics.stepper import NewtonStepper
-from hood.losses.potential import default_potential
+from hood.energies.potential import default_potential
+from hood.rollouts.loop import simulate
+from hood.scene.body_motion.mesh_motion import mesh_motion
+from hood.scene.body_motion.motion import Motion, body_motion
 from hood.scene.jumps import Jump, carried, describe_jumps, find_jumps
-from hood.scene.mesh_motion import mesh_motion
-from hood.scene.motion import Motion, body_motion
 from hood.scene.scene import Scene, build_scene
 from hood.solver.newton import NewtonSettings
+from hood.steppers.newton import NewtonStepper
+from hood.studies.envelope.extreme_files import write_motion
 
 
 def jumping(walk: PoseSequence, shift: tuple[float, float, float], turn: float = 0.0, frame: int = 4) -> PoseSequence:

@@ -13,11 +13,11 @@ from hood.assets.garment.garment import Garment
 from hood.assets.garment.mirror import mirror_body, mirror_garment, reflect
 from hood.assets.material import Material, sample_material
 from hood.assets.motion.sequence import PoseSequence
-from hood.losses.potential import default_potential
-from hood.losses.problem import StepProblem
-from hood.scene.dataset import SceneSampler
+from hood.cloth.state import State
+from hood.energies.potential import default_potential
+from hood.energies.problem import StepProblem
 from hood.scene.scene import Scene, build_scene
-from hood.scene.state import State
+from hood.training.scenes import SceneSampler
 
 
 @pytest.fixture(scope="module", params=["tank", "skirt"])

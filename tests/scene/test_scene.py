@@ -9,8 +9,8 @@ import torch
 from hood.assets.body.body import Body
 from hood.assets.garment.garment import Garment
 from hood.assets.motion.sequence import PoseSequence
+from hood.cloth.state import Attachments, State, StepInput, concatenate_step_inputs
 from hood.scene.scene import RELAXING_DT, Scene, build_scene, recentre
-from hood.scene.state import Attachments, State, StepInput, concatenate_step_inputs
 
 
 @pytest.mark.parametrize("dtype, tolerance", [(torch.float32, 3e-8), (torch.float64, 1e-9)])

@@ -12,7 +12,7 @@ from hood.assets.body.body import Body
 from hood.assets.garment.garment import Garment
 from hood.assets.material import Material
 from hood.assets.motion.sequence import PoseSequence
-from hood.scene.cloth import build_cloth
+from hood.cloth.cloth import build_cloth
 from hood.scene.scene import build_scene
 from hood.scene.sizing import Sizes, resized, sizes_of
 from hood.testing import cylinder

@@ -11,12 +11,12 @@ from hood.assets.garment.garment import Garment
 from hood.assets.material import Material
 from hood.assets.motion.load import load_sequence
 from hood.assets.motion.sequence import PoseSequence
-from hood.dynamics.measure import strain_metrics
-from hood.scene.cloth import build_cloth
-from hood.scene.contact import find_contact
+from hood.cloth.cloth import build_cloth
+from hood.cloth.state import Obstacle
+from hood.contact.contact import find_contact
 from hood.scene.scene import build_scene
 from hood.scene.start import free_stretch, push_out, settle
-from hood.scene.state import Obstacle
+from hood.solver.step_figures import strain_metrics
 from hood.testing import grid, sphere
 
 

@@ -9,11 +9,11 @@ from hood.assets.garment.garment import load_garment
 from hood.assets.garment.outfit import join_garments
 from hood.assets.material import Material
 from hood.assets.motion.load import load_sequence
-from hood.mesh.crossing import self_crossings
-from hood.scene.cloth import build_cloth
-from hood.scene.contact import find_contact
+from hood.cloth.cloth import build_cloth
+from hood.cloth.state import Obstacle
+from hood.contact.contact import find_contact
+from hood.mesh.penetration.crossing import self_crossings
 from hood.scene.scene import build_scene
-from hood.scene.state import Obstacle
 from hood.scene.untangle import Outfit, TangledError, crossing_pairs, likely_orders, separate, smooth_out
 from hood.testing import cylinder
 

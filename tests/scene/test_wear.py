@@ -8,9 +8,9 @@ import pytest
 from hood.assets.body.body import Body
 from hood.assets.garment.binding import PosedBody, posed_body, push_out, signed_distances
 from hood.assets.garment.garment import Garment
-from hood.assets.motion.poses import arms_down
+from hood.assets.motion.sequence_edit import arms_down
 from hood.mesh import topology
-from hood.scene.wear import STRETCHED, put_on
+from hood.scene.worn import STRETCHED, put_on
 from hood.testing import sphere
 
 

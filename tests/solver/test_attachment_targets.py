@@ -9,13 +9,13 @@ import torch
 from test_newton import batch
 from test_plan import states, touching_sheet
 
-from hood.losses.potential import default_potential
-from hood.scene.state import Attachments
-from hood.solver.local import LocalTerms
+from hood.cloth.state import Attachments
+from hood.energies.potential import default_potential
+from hood.solver.derivatives.step_terms import StepTerms
 from hood.solver.newton import NewtonSettings, minimize
-from hood.solver.plan import plan_for, quadratic_model
-from hood.solver.sweeps import neighbourhoods, vertex_systems
-from hood.solver.terms import StepTerms
+from hood.solver.system.plan import plan_for, quadratic_model
+from hood.solver.vertex.block_jacobi import LocalTerms
+from hood.solver.vertex.gauss_seidel import neighbourhoods, vertex_systems
 
 
 def fastened(active=(True, False)):

@@ -12,19 +12,20 @@ from test_newton import batch, falling, hanging, pieces
 from test_plan import states, touching_sheet
 
 from hood.assets.material import Material
-from hood.losses.damping import BendDamping, StretchDamping
-from hood.losses.gravity import Gravity
-from hood.losses.potential import default_potential, reference_potential
-from hood.losses.wind import Wind
+from hood.cloth.cloth import build_cloth
+from hood.energies.damping import BendDamping, StretchDamping
+from hood.energies.inertia import Gravity
+from hood.energies.potential import default_potential, reference_potential
+from hood.energies.wind import Wind
 from hood.native import build as native_build
 from hood.native.build import BuildError
-from hood.scene.batch import to_device
-from hood.scene.cloth import build_cloth
-from hood.solver import engine, newton
-from hood.solver.engine import EngineSystem, SceneEngine
-from hood.solver.iterate import Unknowns
+from hood.solver import newton
+from hood.solver.compiled import newton as engine
+from hood.solver.compiled.newton import EngineSystem, SceneEngine
 from hood.solver.newton import NewtonSettings, TorchSystem, minimize
-from hood.solver.plan import plan_for, quadratic_model
+from hood.solver.system.iterate import Unknowns
+from hood.solver.system.plan import plan_for, quadratic_model
+from hood.tensors.batch import to_device
 from hood.testing import grid, make_problem
 
 pytestmark = pytest.mark.usefixtures("compiled_solver")

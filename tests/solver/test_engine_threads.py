@@ -16,8 +16,8 @@ from test_newton import batch, falling, hanging, pieces
 from test_plan import states, touching_sheet
 from test_points import PLACES, pressed
 
-from hood.losses.potential import default_potential
-from hood.solver import engine
+from hood.energies.potential import default_potential
+from hood.solver.compiled import newton
 from hood.solver.newton import minimize
 
 pytestmark = pytest.mark.usefixtures("compiled_solver")
@@ -29,7 +29,7 @@ def share(monkeypatch):
     """Sets the parts that every following step is solved in."""
 
     def set_parts(parts: int) -> None:
-        monkeypatch.setattr(engine, "num_parts", lambda count, least: min(parts, count))
+        monkeypatch.setattr(newton, "num_parts", lambda count, least: min(parts, count))
 
     return set_parts
 

@@ -14,17 +14,16 @@ from hood.assets.body.body import Body
 from hood.assets.garment.garment import Garment
 from hood.assets.material import Material
 from hood.assets.motion.sequence import PoseSequence
-from hood.dynamics.implicit_euler import EulerStep, implicit_euler
-from hood.dynamics.measure import penetration_metrics, strain_metrics
-from hood.dynamics.rollout import simulate
-from hood.dynamics.stepper import NewtonStepper
-from hood.losses.potential import Potential, default_potential, relative_gradient
-from hood.losses.problem import StepProblem
-from hood.scene.cloth import build_cloth
-from hood.scene.contact import find_contact
+from hood.cloth.cloth import build_cloth
+from hood.cloth.state import Obstacle, State, StepInput
+from hood.contact.contact import find_contact
+from hood.energies.potential import Potential, default_potential, relative_gradient
+from hood.energies.problem import StepProblem
+from hood.rollouts.loop import simulate
 from hood.scene.scene import build_scene
-from hood.scene.state import Obstacle, State, StepInput
 from hood.solver.newton import NewtonSettings
+from hood.solver.step_figures import penetration_metrics, strain_metrics
+from hood.steppers.newton import EulerStep, NewtonStepper, implicit_euler
 from hood.testing import Mesh, grid, make_problem, sphere
 
 G = 9.81

@@ -7,13 +7,12 @@ import pytest
 import torch
 
 from hood.assets.material import Material
-from hood.losses.layers import LayerBarrier
-from hood.losses.potential import default_potential, relative_gradient
-from hood.losses.problem import StepProblem
-from hood.scene.cloth import build_cloth
-from hood.solver.further import Further
-from hood.solver.layers import approached
-from hood.solver.newton import NewtonSettings, minimize
+from hood.cloth.cloth import build_cloth
+from hood.energies.potential import default_potential, relative_gradient
+from hood.energies.problem import StepProblem
+from hood.energies.self_contact import LayerBarrier
+from hood.solver.derivatives.self_contact import approached
+from hood.solver.newton import Further, NewtonSettings, minimize
 from hood.testing import grid, make_problem, plane_contact
 
 POTENTIAL = default_potential()

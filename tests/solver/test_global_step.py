@@ -13,19 +13,19 @@ from torch import Tensor
 
 from hood.assets.garment.garment import Garment
 from hood.assets.material import Material
-from hood.losses.potential import Potential, default_potential
-from hood.losses.problem import StepProblem
-from hood.nn.fixed_gradients import Steps
-from hood.scene.batch import to_device
-from hood.scene.cloth import build_cloth, concatenate_cloths
+from hood.cloth.cloth import build_cloth, concatenate_cloths
+from hood.cloth.state import Attachments, concatenate_states, concatenate_step_inputs
+from hood.energies.potential import Potential, default_potential
+from hood.energies.problem import StepProblem
 from hood.scene.scene import Scene
-from hood.scene.state import Attachments, concatenate_states, concatenate_step_inputs
-from hood.solver import global_step
-from hood.solver.iterate import in_double, in_single
-from hood.solver.linear import block_product
-from hood.solver.local import LocalTerms
-from hood.solver.local_engine import EngineTerms, local_terms
-from hood.solver.plan import plan_for, quadratic_model
+from hood.solver.system.iterate import in_double, in_single
+from hood.solver.system.linear import block_product
+from hood.solver.system.plan import plan_for, quadratic_model
+from hood.solver.vertex import cg_step
+from hood.solver.vertex.block_jacobi import LocalTerms
+from hood.solver.vertex.compiled import EngineTerms, local_terms
+from hood.tensors.batch import to_device
+from hood.tensors.conjugate_gradients import Steps
 from hood.testing import make_problem
 
 BUTTONS = Attachments(torch.tensor([[0, 9], [5, 30], [2, 40]]), torch.tensor([True, True, False]))
@@ -115,7 +115,7 @@ def test_partners_in_a_batch_change_nothing(compiled: bool, band_scene: Scene, t
     potential, scenes = default_potential(), (band_scene, tank_scene)
     singles = [problem_of(scene) for scene in scenes]
     counts = [scene.cloth.num_vertices for scene in scenes]
-    assert global_step.STEPS(counts[0]) < global_step.STEPS(counts[1])
+    assert cg_step.STEPS(counts[0]) < cg_step.STEPS(counts[1])
     together = StepProblem(
         concatenate_cloths([scene.cloth for scene in scenes]),
         concatenate_states([problem.state for problem, _ in singles]),

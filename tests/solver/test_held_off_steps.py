@@ -8,13 +8,13 @@ import pytest
 import torch
 
 from hood.assets.material import Material
-from hood.losses.potential import Potential, default_potential
-from hood.losses.problem import StepProblem
-from hood.scene.cloth import build_cloth, concatenate_cloths
-from hood.scene.state import Obstacle, State, StepInput, concatenate_obstacles
-from hood.solver import held_off
-from hood.solver.held_off import minimize_held_off
+from hood.cloth.cloth import build_cloth, concatenate_cloths
+from hood.cloth.state import Obstacle, State, StepInput, concatenate_obstacles
+from hood.energies.potential import Potential, default_potential
+from hood.energies.problem import StepProblem
+from hood.solver import retry
 from hood.solver.newton import NewtonSettings, Report, minimize
+from hood.solver.retry import minimize_held_off
 from hood.testing import grid, sphere
 
 F64 = torch.float64
@@ -63,12 +63,12 @@ def test_the_minimum_with_the_fewest_triangles_in_the_skin_counts(monkeypatch: p
         found.append((first.pos + torch.tensor([0.0, -0.001, 0.0], dtype=F64) * len(found), report))
         return (found[-1][0], report) if len(found) == 1 else (pos, report)
 
-    monkeypatch.setattr(held_off, "minimize", worse)
+    monkeypatch.setattr(retry, "minimize", worse)
     monkeypatch.setattr(StepProblem, "with_held_off", lambda self, *_: replace(self, contact=first.problem.contact))
     kept = minimize_held_off(default_potential(), problem, pos, NewtonSettings(), report)
-    assert len(found) == held_off.MOST_RAISED
+    assert len(found) == retry.MOST_RAISED
     assert torch.equal(kept.pos, first.pos)
-    assert kept.iterations == held_off.MOST_RAISED * report.iterations
+    assert kept.iterations == retry.MOST_RAISED * report.iterations
 
 
 def test_what_misses_its_target_is_not_taken_and_tried_once_more() -> None:
@@ -76,7 +76,7 @@ def test_what_misses_its_target_is_not_taken_and_tried_once_more() -> None:
     pos, report = solved(problem)
     short = NewtonSettings(max_iterations=1, target_rg=1e-12)
     missed = minimize_held_off(default_potential(), problem, pos, short, report)
-    assert (missed.problem, missed.report, missed.iterations) == (problem, report, held_off.MOST_MISSES)
+    assert (missed.problem, missed.report, missed.iterations) == (problem, report, retry.MOST_MISSES)
     assert torch.equal(missed.pos, pos)
     start = problem.state.pos
     _, unsolved = minimize(default_potential(), problem, start, short)

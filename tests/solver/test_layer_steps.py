@@ -9,17 +9,17 @@ import pytest
 import torch
 from layer_scenes import folding_strip, sheet_over_bar, sheets_on_sphere, stack
 
-from hood.dynamics.implicit_euler import EulerStep, implicit_euler
-from hood.losses.collision import Collision
-from hood.losses.layer_friction import LayerFriction
-from hood.losses.layers import LayerBarrier
-from hood.losses.potential import Potential, default_potential
-from hood.losses.problem import StepProblem
-from hood.mesh.crossing import self_crossings
-from hood.scene.cloth import concatenate_cloths
-from hood.scene.state import concatenate_states, concatenate_step_inputs
+from hood.cloth.cloth import concatenate_cloths
+from hood.cloth.state import concatenate_states, concatenate_step_inputs
+from hood.energies.contact import Collision
+from hood.energies.potential import Potential, default_potential
+from hood.energies.problem import StepProblem
+from hood.energies.self_contact import LayerBarrier
+from hood.energies.self_friction import LayerFriction
+from hood.mesh.penetration.crossing import self_crossings
 from hood.solver.newton import NewtonSettings, minimize
-from hood.solver.sweeps import sweep
+from hood.solver.vertex.gauss_seidel import sweep
+from hood.steppers.newton import EulerStep, implicit_euler
 
 pytestmark = pytest.mark.usefixtures("compiled_layers")
 

@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from hood.losses.potential import default_potential
-from hood.losses.problem import StepProblem
+from hood.energies.potential import default_potential
+from hood.energies.problem import StepProblem
 from hood.scene.scene import Scene
-from hood.solver.local import LocalTerms
+from hood.solver.vertex.block_jacobi import LocalTerms
 
 
 def problem_of(scene: Scene) -> tuple[StepProblem, torch.Tensor]:

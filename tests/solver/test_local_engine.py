@@ -6,27 +6,28 @@ import pytest
 import torch
 from test_local import problem_of
 
-from hood.losses.attachment import Attachment
-from hood.losses.bending import CurrentLengthBending
-from hood.losses.collision import CentroidCollision
-from hood.losses.damping import BendDamping, StretchDamping
-from hood.losses.friction import WeightFriction
-from hood.losses.potential import Potential, default_potential
-from hood.losses.problem import StepProblem
-from hood.losses.wind import Wind
+from hood.cloth.state import Attachments
+from hood.energies.bending import CurrentLengthBending
+from hood.energies.contact import CentroidCollision
+from hood.energies.damping import BendDamping, StretchDamping
+from hood.energies.friction import WeightFriction
+from hood.energies.potential import Potential, default_potential
+from hood.energies.problem import StepProblem
+from hood.energies.springs import Attachment
+from hood.energies.wind import Wind
 from hood.native.build import BuildError
 from hood.scene.scene import Scene
-from hood.scene.state import Attachments
-from hood.solver import engine, local_engine
-from hood.solver.iterate import in_double
-from hood.solver.local import LocalTerms
-from hood.solver.local_engine import EngineTerms, local_terms
+from hood.solver.compiled import newton
+from hood.solver.system.iterate import in_double
+from hood.solver.vertex import compiled as local_engine
+from hood.solver.vertex.block_jacobi import LocalTerms
+from hood.solver.vertex.compiled import EngineTerms, local_terms
 from hood.testing import with_weave
 
 
 def compiler_is_missing() -> bool:
     try:
-        engine.library()
+        newton.library()
     except BuildError:
         return True
     return False

@@ -10,14 +10,14 @@ import torch
 from scipy import optimize
 
 from hood.assets.material import Material
-from hood.losses.potential import Potential, default_potential, relative_gradient
-from hood.losses.problem import StepProblem, inertial_guess
-from hood.scene.batch import to_device
-from hood.scene.cloth import build_cloth, concatenate_cloths
-from hood.scene.state import Attachments, State, StepInput, concatenate_states
-from hood.solver import linear
+from hood.cloth.cloth import build_cloth, concatenate_cloths
+from hood.cloth.state import Attachments, State, StepInput, concatenate_states
+from hood.energies.potential import Potential, default_potential, relative_gradient
+from hood.energies.problem import StepProblem, inertial_guess
 from hood.solver.newton import NewtonSettings, minimize
-from hood.solver.pattern import Scatter
+from hood.solver.system import linear
+from hood.solver.system.sparsity import Scatter
+from hood.tensors.batch import to_device
 from hood.testing import concatenate_contacts, cylinder, grid, make_problem, plane_contact, strip
 
 F64 = torch.float64

@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 
 from hood.assets.material import Material
-from hood.losses.damping import BendDamping, StretchDamping
-from hood.losses.potential import default_potential, relative_gradient
-from hood.losses.problem import StepProblem
-from hood.losses.term import Term
-from hood.losses.wind import Wind
-from hood.scene.cloth import build_cloth
-from hood.solver.forces import energies_and_gradient, total_energy
+from hood.cloth.cloth import build_cloth
+from hood.energies.damping import BendDamping, StretchDamping
+from hood.energies.potential import default_potential, relative_gradient
+from hood.energies.problem import StepProblem
+from hood.energies.term import Term
+from hood.energies.wind import Wind
+from hood.solver.derivatives.vertices import energies_and_gradient, total_energy
 from hood.solver.newton import NewtonSettings, minimize
 from hood.testing import grid, make_problem, plane_contact
 

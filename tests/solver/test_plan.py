@@ -9,15 +9,15 @@ import pytest
 import torch
 
 from hood.assets.material import Material
-from hood.losses.damping import BendDamping, StretchDamping
-from hood.losses.potential import default_potential
-from hood.losses.wind import Wind
+from hood.cloth.cloth import build_cloth
+from hood.cloth.state import Attachments
+from hood.energies.damping import BendDamping, StretchDamping
+from hood.energies.potential import default_potential
+from hood.energies.wind import Wind
 from hood.native.build import BuildError
-from hood.scene.cloth import build_cloth
-from hood.scene.state import Attachments
-from hood.solver import linear
 from hood.solver.newton import NewtonSettings, minimize
-from hood.solver.plan import SolverPlan, plan_for, quadratic_model
+from hood.solver.system import linear
+from hood.solver.system.plan import SolverPlan, plan_for, quadratic_model
 from hood.testing import fold, grid, make_problem, plane_contact
 
 F64 = torch.float64

@@ -10,24 +10,24 @@ import torch
 from test_engine import dense, dense_of, model_at
 
 from hood.assets.material import Material
-from hood.dynamics.implicit_euler import implicit_euler
-from hood.losses.collision import Collision
-from hood.losses.friction import Friction, WeightFriction
-from hood.losses.potential import Potential, default_potential
-from hood.losses.problem import StepProblem
-from hood.mesh.crossing import crossings
-from hood.scene.cloth import build_cloth, concatenate_cloths
-from hood.scene.state import Obstacle, State, StepInput, concatenate_obstacles
-from hood.solver import linear
-from hood.solver.forces import energies_and_gradient
-from hood.solver.iterate import Unknowns, in_double
-from hood.solver.linear import by_blocks, diagonal_inverse
-from hood.solver.local import LocalTerms
-from hood.solver.local_engine import EngineTerms
+from hood.cloth.cloth import build_cloth, concatenate_cloths
+from hood.cloth.state import Obstacle, State, StepInput, concatenate_obstacles
+from hood.energies.contact import Collision
+from hood.energies.friction import Friction, WeightFriction
+from hood.energies.potential import Potential, default_potential
+from hood.energies.problem import StepProblem
+from hood.mesh.penetration.crossing import crossings
+from hood.solver.derivatives.vertices import energies_and_gradient
 from hood.solver.newton import NewtonSettings, minimize
-from hood.solver.plan import plan_for, quadratic_model
-from hood.solver.search import Path
-from hood.solver.sweeps import sweep
+from hood.solver.system import linear
+from hood.solver.system.iterate import Unknowns, in_double
+from hood.solver.system.line_search import Path
+from hood.solver.system.linear import by_blocks, diagonal_inverse
+from hood.solver.system.plan import plan_for, quadratic_model
+from hood.solver.vertex.block_jacobi import LocalTerms
+from hood.solver.vertex.compiled import EngineTerms
+from hood.solver.vertex.gauss_seidel import sweep
+from hood.steppers.newton import implicit_euler
 from hood.testing import grid, make_problem, sphere
 
 F64 = torch.float64

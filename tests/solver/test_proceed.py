@@ -7,12 +7,12 @@ import torch
 from torch import Tensor
 
 from hood.assets.material import Material
-from hood.losses.potential import default_potential
-from hood.losses.problem import StepProblem
-from hood.scene.cloth import build_cloth
-from hood.solver.iterate import Progress
+from hood.cloth.cloth import build_cloth
+from hood.energies.potential import default_potential
+from hood.energies.problem import StepProblem
 from hood.solver.newton import NewtonSettings, minimize
-from hood.solver.sweeps import sweep
+from hood.solver.system.iterate import Progress
+from hood.solver.vertex.gauss_seidel import sweep
 from hood.testing import grid, make_problem
 
 POTENTIAL = default_potential()

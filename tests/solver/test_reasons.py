@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hood.solver.reasons import CONVERGED, MOST_ITERATIONS, NOT_FINITE, STUCK, count_reasons, name_counts, reason_number
+from hood.solver.step_figures import CONVERGED, MOST_ITERATIONS, NOT_FINITE, STUCK, count_reasons, name_counts, reason_number
 
 
 def test_the_worst_scene_counts() -> None:

@@ -9,19 +9,19 @@ import pytest
 import torch
 
 from hood.assets.material import Material
-from hood.losses.bending import CurrentLengthBending
-from hood.losses.potential import Potential, coded_potential, default_potential, reference_potential, relative_gradient
-from hood.losses.problem import StepProblem
-from hood.scene.cloth import build_cloth
-from hood.scene.contact import CentroidContact, find_contact
-from hood.scene.state import Obstacle, State
-from hood.solver import linear
-from hood.solver.forces import other_terms
-from hood.solver.iterate import in_double
+from hood.cloth.cloth import build_cloth
+from hood.cloth.state import Obstacle, State
+from hood.contact.contact import CentroidContact, find_contact
+from hood.energies.bending import CurrentLengthBending
+from hood.energies.potential import Potential, coded_potential, default_potential, reference_potential, relative_gradient
+from hood.energies.problem import StepProblem
+from hood.solver.derivatives.step_terms import StepTerms
+from hood.solver.derivatives.vertices import other_terms
 from hood.solver.newton import NewtonSettings, minimize
-from hood.solver.plan import plan_for, quadratic_model
-from hood.solver.sweeps import neighbourhoods, sweep, vertex_systems
-from hood.solver.terms import StepTerms
+from hood.solver.system import linear
+from hood.solver.system.iterate import in_double
+from hood.solver.system.plan import plan_for, quadratic_model
+from hood.solver.vertex.gauss_seidel import neighbourhoods, sweep, vertex_systems
 from hood.testing import cylinder, fold, grid, make_problem, sphere
 
 F64 = torch.float64

@@ -10,14 +10,14 @@ import torch
 from torch import Tensor
 
 from hood.assets.material import Material
-from hood.losses import elements
-from hood.losses.attachment import Attachment
-from hood.losses.gravity import Gravity
-from hood.losses.potential import Potential, default_potential, relative_gradient, scale
-from hood.losses.problem import StepProblem, inertial_guess
-from hood.scene.cloth import build_cloth
-from hood.scene.state import Attachments
-from hood.solver import vertex_pass
+from hood.cloth.cloth import build_cloth
+from hood.cloth.state import Attachments
+from hood.energies import compiled_elements
+from hood.energies.inertia import Gravity
+from hood.energies.potential import Potential, default_potential, relative_gradient, scale
+from hood.energies.problem import StepProblem, inertial_guess
+from hood.energies.springs import Attachment
+from hood.solver.derivatives import compiled_vertices
 from hood.solver.step_figures import StepFigures
 from hood.testing import grid, make_problem, plane_contact
 
@@ -70,9 +70,9 @@ def test_figures_are_those_of_the_potential(
     potential: Potential, pinned: bool, form: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if form == "torch":
-        for module in (elements, vertex_pass):
+        for module in (compiled_elements, compiled_vertices):
             monkeypatch.setattr(module, "library", lambda: None)
-    elif elements.library() is None:
+    elif compiled_elements.library() is None:
         pytest.skip("no C++ compiler")
     problem, pos = sliding(pinned)
     problem = potential.prepare(problem)

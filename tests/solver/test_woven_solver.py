@@ -11,21 +11,19 @@ from test_engine import COMPILED, TORCH, dense, dense_of, model_at
 from test_plan import states, touching_sheet
 from torch import Tensor
 
-from hood.assets.material import Material
-from hood.assets.measured import stretch_stiffness
-from hood.losses.damping import BendDamping, StretchDamping
-from hood.losses.gravity import Gravity
-from hood.losses.inertia import Inertia
-from hood.losses.potential import Potential, default_potential
-from hood.losses.problem import StepProblem
-from hood.losses.stretching import Stretching
-from hood.scene.cloth import Cloth, build_cloth, concatenate_cloths
-from hood.solver.elements import Corners, face_constants, face_model
-from hood.solver.engine import EngineSystem
-from hood.solver.iterate import Unknowns
+from hood.assets.material import Material, stretch_stiffness
+from hood.cloth.cloth import Cloth, build_cloth, concatenate_cloths
+from hood.energies.damping import BendDamping, StretchDamping
+from hood.energies.inertia import Gravity, Inertia
+from hood.energies.membrane import Stretching
+from hood.energies.potential import Potential, default_potential
+from hood.energies.problem import StepProblem
+from hood.solver.compiled.newton import EngineSystem
+from hood.solver.derivatives.elements import Corners, face_constants, face_model
 from hood.solver.newton import NewtonSettings, minimize
-from hood.solver.plan import plan_for, quadratic_model
-from hood.solver.sweeps import sweep
+from hood.solver.system.iterate import Unknowns
+from hood.solver.system.plan import plan_for, quadratic_model
+from hood.solver.vertex.gauss_seidel import sweep
 from hood.testing import cylinder, grid, make_problem, with_weave
 
 F64 = torch.float64

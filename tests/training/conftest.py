@@ -7,7 +7,7 @@ import pytest
 from hood.assets.body.body import Body
 from hood.assets.garment.garment import Garment
 from hood.assets.motion.sequence import PoseSequence
-from hood.scene.dataset import SceneSampler
+from hood.training.scenes import SceneSampler
 
 
 @pytest.fixture(scope="session")

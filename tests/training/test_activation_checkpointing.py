@@ -13,9 +13,9 @@ from torch.autograd.graph import saved_tensors_hooks
 from hood.assets.body.body import Body
 from hood.assets.garment.garment import Garment
 from hood.assets.motion.sequence import PoseSequence
-from hood.dynamics.simulator import build_simulator
-from hood.losses.potential import default_potential
-from hood.scene.dataset import SceneSampler
+from hood.energies.potential import default_potential
+from hood.steppers.network import build_simulator
+from hood.training.scenes import SceneSampler
 from hood.training.settings import TrainerSettings
 from hood.training.trainer import Trainer
 

@@ -6,7 +6,7 @@ from collections import Counter
 
 import pytest
 
-from hood.training.buckets import Bucket, make_buckets, next_bucket
+from hood.training.slots import Bucket, make_buckets, next_bucket
 
 SIZES = [1014, 4476, 981, 11935, 4393, 1026, 1003]
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import pytest
 
-from hood.config import build, load_config
-from hood.losses.friction import Friction
-from hood.losses.gravity import Gravity
-from hood.losses.potential import default_potential, reference_potential
+from hood.app.settings.compose import build, load_config
+from hood.energies.friction import Friction
+from hood.energies.inertia import Gravity
+from hood.energies.potential import default_potential, reference_potential
 from hood.training.curriculum import CollisionRamp, Horizon, InverseRoot, StepDecay, WarmupCosine
 from hood.training.settings import TrainerSettings
 
@@ -95,7 +95,7 @@ def test_a_contact_of_another_package_keeps_its_own_weight_if_it_says_so() -> No
     applied = ramp.apply(potential, 0)
     assert applied.terms["collision"] is potential.terms["collision"]
     assert applied.terms["friction"].weight == 1e3  # type: ignore[attr-defined]
-    with pytest.raises(ValueError, match=r"losses\.terms\.collision \(hood\.losses\.gravity\.Gravity\).*no method with_weight"):
+    with pytest.raises(ValueError, match=r"terms\.collision \(hood\.energies\.inertia\.Gravity\).*no method with_weight"):
         ramp.require_its_weight(potential.with_terms(collision=Gravity()))
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from hood.features.normalizer import RunningNormalizer
+from hood.model.features.normalizer import RunningNormalizer
 from hood.training import distributed
 
 

@@ -14,13 +14,13 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from hood.dynamics.checkpoint import load_simulator
+from hood.steppers.checkpoint import load_simulator
 from hood.training.checkpoint import load_checkpoint, load_last_good, previous
 
 _KILLS = 20
 _ITERATIONS = 80
 _COMMAND = [
-    sys.executable, "-m", "hood.cli", "train", "model.latent_dim=16", "model.schedule='1x(mesh)'",
+    sys.executable, "-m", "hood.cli.main", "train", "model.latent_dim=16", "model.schedule='1x(mesh)'",
     f"trainer.iterations={_ITERATIONS}", "trainer.batch_size=1", "trainer.log_every=1", "trainer.checkpoint_every=1",
     "trainer.horizon.start=2", "trainer.horizon.maximum=2", "trainer.workers=0", "data.garments=[tank]",
     "data.sequences=[walk_proud]",

@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from hood.assets.material import Material
-from hood.losses.potential import Potential, default_potential
-from hood.losses.problem import StepProblem
-from hood.scene.cloth import build_cloth
-from hood.scene.state import State, StepInput
+from hood.cloth.cloth import build_cloth
+from hood.cloth.state import State, StepInput
+from hood.energies.potential import Potential, default_potential
+from hood.energies.problem import StepProblem
 from hood.testing import grid
-from hood.training.loss import relative_loss
+from hood.training.log import relative_loss
 
 
 def test_the_loss_does_not_depend_on_where_the_scene_is() -> None:

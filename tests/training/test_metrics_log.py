@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from hood.training.metrics_log import MetricsLog, Window
+from hood.training.log import MetricsLog, Window
 
 
 def read(folder: Path) -> list[dict]:

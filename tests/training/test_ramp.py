@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 import torch
 
+from hood.app.settings.compose import build, load_config
 from hood.assets.body.body import Body
 from hood.assets.files.library import motion_split
 from hood.assets.garment.garment import Garment
 from hood.assets.motion.load import load_sequence
-from hood.config import build, load_config
-from hood.dynamics.simulator import build_simulator
-from hood.losses.potential import default_potential
-from hood.scene.dataset import SceneSampler
+from hood.energies.potential import default_potential
+from hood.steppers.network import build_simulator
 from hood.training.curriculum import CollisionRamp
+from hood.training.scenes import SceneSampler
 from hood.training.trainer import Trainer
 
 #: Losses of one entry of a curve: batches of one scene differ from one update to the next.

@@ -20,12 +20,12 @@ import torch
 from hood.assets.body.load import load_body
 from hood.assets.garment.garment import load_garment
 from hood.assets.motion.load import load_sequence
-from hood.dynamics.recorder import read_rollout
-from hood.dynamics.simulator import build_simulator
-from hood.losses.potential import default_potential
-from hood.scene.dataset import SceneSampler
+from hood.energies.potential import default_potential
+from hood.rollouts.file.recorder import read_rollout
+from hood.steppers.network import build_simulator
 from hood.training import distributed
 from hood.training.curriculum import CollisionRamp, Horizon, WarmupCosine
+from hood.training.scenes import SceneSampler
 from hood.training.settings import TrainerSettings
 from hood.training.trainer import Trainer
 
@@ -144,10 +144,10 @@ def test_two_ranks_share_rollouts(tmp_path: Path) -> None:
         "rollout", "checkpoint=untrained", "model=small", *TINY, "garment=tank", "num_frames=3", "video=none", "sheet=false",
         "sequence=in",
     ]  # fmt: skip
-    result = torchrun(["-m", "hood.cli", *command, "output=two"], tmp_path)
+    result = torchrun(["-m", "hood.cli.main", *command, "output=two"], tmp_path)
     assert result.returncode == 0, result.stderr[-2000:]
     assert result.stdout.count("3 of 3 motions simulated") == 1
-    one = torchrun(["-m", "hood.cli", *command, "output=one"], tmp_path, ranks=1)
+    one = torchrun(["-m", "hood.cli.main", *command, "output=one"], tmp_path, ranks=1)
     assert one.returncode == 0, one.stderr[-2000:]
     for index in range(3):
         alone, shared = (read_rollout(tmp_path / name / f"m{index}" / "rollout.h5").cloth_pos for name in ("one", "two"))
@@ -163,7 +163,7 @@ def test_shards_of_two_ranks_each_lose_no_file_in_one_folder(tmp_path: Path) -> 
     for shard in ("01", "02"):
         motions(tmp_path / shard, 3)
         (tmp_path / f"{shard}.txt").write_text(f"{shard}/*.npz\n")
-    command = ["-m", "hood.cli", "rollout", "checkpoint=untrained", "model=small", *TINY, "garment=tank", "num_frames=3"]
+    command = ["-m", "hood.cli.main", "rollout", "checkpoint=untrained", "model=small", *TINY, "garment=tank", "num_frames=3"]
     command += ["video=none", "sheet=false", "root=.", "output=out"]
     with ThreadPoolExecutor() as pool:
         results = list(pool.map(lambda shard: torchrun([*command, f"sequence={shard}.txt"], tmp_path), ("01", "02")))
@@ -184,7 +184,7 @@ def test_two_ranks_share_an_evaluation(tmp_path: Path) -> None:
     command = ["evaluate", "models=[newton]", "garments=[tank,skirt]", "sequences=[in]", "num_frames=4", "gap_states=0"]
     command += ["solver.max_iterations=1"]
     for ranks, name in ((2, "two"), (1, "one")):
-        result = torchrun(["-m", "hood.cli", *command, f"output={name}"], tmp_path, ranks)
+        result = torchrun(["-m", "hood.cli.main", *command, f"output={name}"], tmp_path, ranks)
         assert result.returncode == 0, result.stderr[-2000:]
         assert result.stdout.count("tables in") == 1
     one, two = (json.loads((tmp_path / name / "table.json").read_text()) for name in ("one", "two"))
@@ -198,7 +198,7 @@ def test_two_ranks_share_an_evaluation(tmp_path: Path) -> None:
 def test_training_by_two_ranks_from_the_command_line(tmp_path: Path) -> None:
     """One record, one set of files, one complaint."""
     command = [
-        "-m", "hood.cli", "train", *TINY, "trainer.iterations=2", "trainer.batch_size=2", "trainer.log_every=1",
+        "-m", "hood.cli.main", "train", *TINY, "trainer.iterations=2", "trainer.batch_size=2", "trainer.log_every=1",
         "trainer.workers=0", "data.garments=[tank]", "data.sequences=[walk_proud]", "output=run",
     ]  # fmt: skip
     result = torchrun(command, tmp_path)

@@ -13,15 +13,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from hood.dynamics.checkpoint import load_simulator
-from hood.dynamics.simulator import build_simulator
-from hood.losses.potential import default_potential
-from hood.losses.problem import StepProblem
-from hood.scene.dataset import SceneSampler
+from hood.energies.potential import default_potential
+from hood.energies.problem import StepProblem
+from hood.steppers.checkpoint import load_simulator
+from hood.steppers.network import build_simulator
 from hood.training.checkpoint import load_checkpoint, previous
 from hood.training.curriculum import CollisionRamp, Horizon, WarmupCosine
+from hood.training.log import Skipped, told
+from hood.training.scenes import SceneSampler
 from hood.training.settings import TrainerSettings
-from hood.training.skipped import Skipped, told
 from hood.training.trainer import Trainer
 
 SETTINGS = TrainerSettings(

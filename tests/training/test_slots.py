@@ -21,10 +21,10 @@ from torch import Tensor
 from hood.assets.body.body import Body
 from hood.assets.garment.garment import Garment
 from hood.assets.motion.sequence import PoseSequence
-from hood.dynamics.simulator import Simulator, build_simulator
-from hood.scene.dataset import SceneSampler, Window
+from hood.steppers.network import Simulator, build_simulator
 from hood.training import prefetch
 from hood.training.prefetch import MAX_DRAWS, Request, SceneFeed, choose_workers, make_start
+from hood.training.scenes import SceneSampler, Window
 from hood.training.slots import Slots
 
 HORIZON = 1

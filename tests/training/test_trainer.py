@@ -15,18 +15,17 @@ from hood.assets.body.body import Body
 from hood.assets.garment.garment import Garment
 from hood.assets.motion.load import load_sequence
 from hood.assets.motion.sequence import PoseSequence
-from hood.dynamics.checkpoint import load_simulator
-from hood.dynamics.feedback import Feedback
-from hood.dynamics.output import AccelerationOutput
-from hood.dynamics.ranges import training_conditions
-from hood.dynamics.simulator import Simulator, build_simulator
-from hood.features.inputs import Inputs
-from hood.losses.layer_sides import LayerSides
-from hood.losses.layers import for_networks
-from hood.losses.potential import Potential, default_potential
-from hood.nn.choice import Choice
-from hood.scene.dataset import SceneSampler, Window
+from hood.energies.potential import Potential, default_potential
+from hood.energies.self_contact import LayerSides, for_networks
+from hood.model.features.inputs import Inputs
+from hood.model.network.kernel_choice import Choice
+from hood.model.readout.network_step import Feedback
+from hood.model.readout.output import AccelerationOutput
+from hood.steppers.checkpoint import load_simulator
+from hood.steppers.network import Simulator, build_simulator
+from hood.steppers.ranges import training_conditions
 from hood.training.curriculum import CollisionRamp, Horizon, InverseRoot, WarmupCosine
+from hood.training.scenes import SceneSampler, Window
 from hood.training.settings import TrainerSettings
 from hood.training.trainer import Trainer
 
@@ -272,7 +271,7 @@ def test_kernels_are_those_that_train_fastest_here(
         assert (precision, width, device.type, training) == ("bf16", 8, "cpu", True)
         return Choice("torch", "measured")
 
-    monkeypatch.setattr("hood.nn.choice.choose_kernels", choose)
+    monkeypatch.setattr("hood.model.network.kernel_choice.choose_kernels", choose)
     trainer = make(tmp_path, sampler, settings=replace(SETTINGS, kernels="auto", precision="bf16"))
     assert str(trainer.choice) == "kernels=auto: torch (measured)"
     assert trainer.simulator.network.kernels == "torch"

@@ -12,14 +12,14 @@ import pytest
 import torch
 from safetensors import safe_open
 
-from hood.dynamics.checkpoint import load_simulator
-from hood.dynamics.simulator import Simulator, build_simulator
+from hood.energies.potential import default_potential
 from hood.evaluation.gap import REFERENCE
 from hood.evaluation.validation import Validation
-from hood.losses.potential import default_potential
-from hood.scene.dataset import SceneSampler
 from hood.scene.scene import Scene
+from hood.steppers.checkpoint import load_simulator
+from hood.steppers.network import Simulator, build_simulator
 from hood.training.curriculum import CollisionRamp, Horizon, WarmupCosine
+from hood.training.scenes import SceneSampler
 from hood.training.settings import TrainerSettings
 from hood.training.trainer import Trainer
 from hood.training.watch import Watch
@@ -88,7 +88,7 @@ def test_models_that_break_are_never_best(tmp_path: Path, sampler: SceneSampler)
 def test_validation_does_not_count_as_training(tmp_path: Path, sampler: SceneSampler, monkeypatch: pytest.MonkeyPatch) -> None:
     """An update takes one second here, a validation a hundred."""
     now = [0.0]
-    monkeypatch.setattr("hood.training.clock.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("hood.training.log.time.monotonic", lambda: now[0])
 
     def watch(simulator: Simulator, iteration: int) -> tuple[dict[str, float], None]:
         now[0] += 100.0

@@ -7,8 +7,8 @@ import time
 from hood.assets.body.load import load_body
 from hood.assets.garment.garment import load_garment
 from hood.assets.motion.load import load_sequence
-from hood.scene.dataset import SceneSampler
 from hood.training import prefetch
+from hood.training.scenes import SceneSampler
 
 
 def main() -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hood.assets.files.doubt import KINDS
+from hood.assets.files.said import KINDS
 from hood.testing import grid, sphere
 from tests.verdict.table import counts
 from tests.verdict.table.pictures import sheet

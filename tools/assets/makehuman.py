@@ -20,7 +20,7 @@ from scipy import optimize, sparse
 from scipy.sparse.linalg import factorized
 
 from hood.mesh import topology
-from hood.mesh.local_edits import closest
+from hood.mesh.editing.remeshing import closest
 from tools.assets.remesh import require
 from tools.assets.tpose import JOINT_NAMES, PARENTS, apply_tpose, tpose_rotations
 

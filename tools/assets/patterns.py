@@ -16,7 +16,7 @@ import numpy as np
 from scipy import ndimage
 
 from hood.assets.garment.binding import PosedBody
-from hood.mesh.local_edits import Array, closest
+from hood.mesh.editing.remeshing import Array, closest
 
 VOXEL = 0.006  # m
 CLEARANCE = 0.005  # m, smallest distance to the body

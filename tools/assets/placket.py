@@ -6,11 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hood.mesh import topology
-from hood.mesh.isotropic import isotropic
-from hood.mesh.local_edits import Array, Faces, compact
+from hood.mesh.editing.remeshing import Array, Faces, compact, isotropic
 from tools.assets.remesh import cut, largest_component
 
-#: Width [m] of the slit: layers of cloth are kept 3 mm apart (hood/losses/layers.py), and what is fastened is at rest.
+#: Width [m] of the slit: layers of cloth are kept 3 mm apart (hood/energies/self_contact.py), and what is fastened is at rest.
 WIDTH = 0.004
 #: The half is cut off so far [m] from the middle, then drawn there: cuts through vertices would make edges without length.
 _OFF = 0.0005

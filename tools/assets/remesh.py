@@ -9,9 +9,9 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import factorized
 
-from hood.assets.files.extras import install
+from hood.assets.files.said import install
 from hood.mesh import topology
-from hood.mesh.local_edits import Array, Faces, closest, compact, laplacian, neighbours, vertex_normals
+from hood.mesh.editing.remeshing import Array, Faces, closest, compact, laplacian, neighbours, vertex_normals
 
 _LEAST_LOOP = 12
 

@@ -18,10 +18,9 @@ from hood.assets.body.load import load_body
 from hood.assets.garment.binding import PosedBody, posed_body, undo_skinning
 from hood.assets.garment.garment_arrays import write_fields
 from hood.assets.garment.pins import MARKS, opening_names
-from hood.assets.motion.poses import arms_down
+from hood.assets.motion.sequence_edit import arms_down
 from hood.mesh import topology
-from hood.mesh.isotropic import isotropic
-from hood.mesh.local_edits import Array, Faces, closest, compact, flip_edges, relax
+from hood.mesh.editing.remeshing import Array, Faces, closest, compact, flip_edges, isotropic, relax
 from tools.assets.isosurface import zero_level
 from tools.assets.patterns import CLEARANCE, ORIGIN, PATTERNS, SIZES, VOXEL, Fields, Pattern, body_fields
 from tools.assets.placket import open_front, pull_apart, sewn_together, slit_pairs
@@ -29,7 +28,8 @@ from tools.assets.remesh import collapse_short, cut, diffuse, largest_component,
 from tools.assets.unwrap import panels, unwrap
 
 #: m. What the T-pose brings nearer to the skin than the first, of garments drafted in another pose, is moved to the second:
-#: contact holds edges of 35 mm as far off the crest of the shoulders (hood/scene/reach.py), and would stretch nearer cloth.
+#: contact holds edges of 35 mm as far off the crest of the shoulders (hood/contact/activation_distance.py), and would stretch
+#: nearer cloth.
 _TPOSE_NEAR, _TPOSE_CLEARANCE = 0.004, 0.007
 #: How many times as stiff as plain cloth bindings and linings are; within the range of fabrics that networks are trained with
 #: (hood/assets/material.py). Bindings and linings reach so far [m] from a rim and from the crotch.

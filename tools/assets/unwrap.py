@@ -10,7 +10,7 @@ from scipy import sparse
 from scipy.sparse.linalg import factorized
 
 from hood.mesh import topology
-from hood.mesh.local_edits import Array, Faces, compact, vertex_normals
+from hood.mesh.editing.remeshing import Array, Faces, compact, vertex_normals
 from tools.assets.remesh import diffuse
 
 #: Length [m] over which the facing of the cloth is smoothed: a seam is a smooth line.

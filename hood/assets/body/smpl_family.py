@@ -9,8 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hood.assets.body.body import Body
-from hood.assets.body.skinning import axis_angle_to_matrix
+from hood.assets.body.body import Body, axis_angle_to_matrix
 from hood.assets.motion.sequence import PoseSequence
 
 #: Number of joints in a file → name of the model.
@@ -56,7 +55,7 @@ class SmplFamilyBody(Body):
 
 
 def smpl_family_body(path: Path, arrays: dict[str, np.ndarray]) -> SmplFamilyBody:
-    """A licensed model from the arrays of its file (see :func:`hood.assets.body.model_file.read_model`).
+    """A licensed model from the arrays of its file (see :func:`hood.assets.body.load.read_model`).
 
     Raises:
         ValueError: the number of joints belongs to no model of the family.

@@ -1,9 +1,72 @@
-"""Text files in the encodings that programs write: UTF-8 with or without a byte-order mark, UTF-16, UTF-32, Latin-1."""
+"""Text files in the encodings that programs write: UTF-8 with or without a byte-order mark, UTF-16, UTF-32, Latin-1.
+
+Names that people give, such as those of pattern pieces, in letters that every keyboard and every command line has.
+
+Lists of numbers in text or JSON files.
+"""
 
 from __future__ import annotations
 
 import codecs
+import json
+import re
+import unicodedata
+from collections.abc import Iterable, Mapping
+from itertools import chain, count
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+#: Letters that are written as two.
+_PAIRS = {"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss", "æ": "ae", "œ": "oe", "ø": "oe", "å": "aa", "þ": "th", "đ": "d", "ł": "l"}
+#: What stays in a folded name; the key of a table may hold it.
+_KEPT = re.compile(r"[A-Za-z0-9_./+@ -]")
+
+
+def folded(name: str) -> str:
+    """The name in ASCII letters, digits, blanks and ``_ . / + - @``: ö is oe, é is e; a letter of another alphabet is its
+    number, u5de6; whatever else is one ``_``. A name that holds nothing but these stays."""
+    if all(map(_KEPT.fullmatch, name)):
+        return name
+    plain = re.sub(r" *_[_ ]*", "_", "".join(map(_letter, unicodedata.normalize("NFC", name)))).strip("_ ")
+    return plain or "_"
+
+
+def folded_names(names: Iterable[str]) -> dict[str, str]:
+    """Names, each with its folded one; of two that fold alike the later one ends with ``_2``, and so on."""
+    given = list(names)
+    found = {name: name for name in given if folded(name) == name}
+    for name in given:
+        if name not in found:
+            numbered = chain([folded(name)], (f"{folded(name)}_{k}" for k in count(2)))
+            found[name] = next(short for short in numbered if short not in found.values())
+    return {name: found[name] for name in given}
+
+
+def meant(name: str, known: Mapping[str, Any] | Iterable[str]) -> str | None:
+    """Which of the ``known`` names is ``name``, as it is or once both are folded; None where none is."""
+    known = list(known)
+    if name in known:
+        return name
+    return next((other for other in known if _loose(other) == _loose(name)), None)
+
+
+def _loose(name: str) -> str:
+    return folded(name).replace(" ", "_")
+
+
+def _letter(letter: str) -> str:
+    if _KEPT.fullmatch(letter):
+        return letter
+    pair = _PAIRS.get(letter.lower())
+    if pair is not None:
+        return pair if letter.islower() else pair.capitalize()
+    base = unicodedata.normalize("NFKD", letter)[0]
+    if base.isascii() and base.isalnum():
+        return base
+    return f"u{ord(letter):04x}" if letter.isalnum() else "_"
+
 
 #: Marks, the longer ones first: that of UTF-32 begins like that of UTF-16.
 _MARKS = (
@@ -44,3 +107,31 @@ def decoded(content: bytes) -> str:
 def read_text(path: Path) -> str:
     """The text of a file, whatever it is encoded in."""
     return decoded(path.read_bytes())
+
+
+_LIST_LIMIT = 64 << 20
+
+
+def read_indices(path: Path) -> np.ndarray:
+    """Vertex numbers from a text file (any white space or commas between, # starts a comment) or a JSON list.
+
+    Raises:
+        ValueError: something else than whole numbers; names the file.
+    """
+    if path.stat().st_size > _LIST_LIMIT:
+        raise ValueError(f"{path}: {path.stat().st_size} bytes are no list of vertices")
+    text = read_text(path)
+    try:
+        if path.suffix.lower() == ".json":
+            values = json.loads(text)
+        else:
+            values = [int(word) for line in text.splitlines() for word in line.split("#")[0].replace(",", " ").split()]
+    except (ValueError, RecursionError):
+        values = None
+    if not isinstance(values, list) or not all(
+        isinstance(v, int) and not isinstance(v, bool) and abs(v) < 2**62 for v in values
+    ):
+        raise ValueError(
+            f"{path}: not a list of vertex numbers; write whole numbers, as in 12 13 14 (.txt) or [12, 13] (.json)"
+        )
+    return np.array(values, dtype=np.int64)

@@ -1,1 +1,4 @@
-"""Readers of mesh and animation files."""
+"""Readers of mesh and animation files, one format a module.
+
+They return arrays. What the arrays mean is decided later.
+"""

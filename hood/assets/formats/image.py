@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hood.assets.files.extras import install
+from hood.assets.files.said import install
 
 #: Larger files [bytes] are refused: pages and glTF hold them whole.
 LARGEST = 4_000_000

@@ -1,4 +1,7 @@
-"""Mesh files as the user wrote them: same vertices, same faces, same order; what cannot be kept is refused or reported."""
+"""Mesh files as the user wrote them: same vertices, same faces, same order; what cannot be kept is refused or reported.
+
+One object of a mesh file, by a name behind the file's: ``scene.obj:Avatar``.
+"""
 
 from __future__ import annotations
 
@@ -11,14 +14,16 @@ from typing import Any
 import numpy as np
 
 from hood import plugins
-from hood.assets.files.guarded import check_size, guarded
+from hood.assets.files.guarded import check_size, guarded, listed
+from hood.assets.files.text import meant
 from hood.assets.formats.gltf_mesh import read_glb
 from hood.assets.formats.obj import read_obj
 from hood.assets.formats.off_stl import read_off, read_stl
 from hood.assets.formats.ply import read_ply
 from hood.assets.formats.raw_mesh import RawMesh, Unreadable
-from hood.mesh.polygons import MAX_CORNERS, triangulate
-from hood.mesh.quality import far_vertex
+from hood.mesh.editing.polygons import MAX_CORNERS, triangulate
+from hood.mesh.editing.quality import far_vertex
+from hood.mesh.parts import part_labels
 
 _READERS: dict[str, Callable[[Path], RawMesh]] = {
     ".obj": read_obj,
@@ -71,8 +76,8 @@ def read_mesh_file(path: Path, split_polygons: bool = False) -> MeshFile:
     """A mesh file (OBJ, PLY, OFF, STL, GLB, and the formats of plugins).
 
     Args:
-        split_polygons: split faces of four and more corners (:func:`hood.mesh.polygons.triangulate`) instead of refusing
-            them.
+        split_polygons: split faces of four and more corners (:func:`hood.mesh.editing.polygons.triangulate`) instead of
+            refusing them.
 
     Raises:
         FileNotFoundError: no such file.
@@ -217,3 +222,37 @@ def _equal_positions(pos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     order = np.argsort(first)
     rank = np.argsort(order)
     return rank[inverse.reshape(-1)], first[order]
+
+
+#: Names of connected parts, which the file gives none.
+PART = "part_"
+
+
+def split_object(name: str | Path) -> tuple[Path, str | None]:
+    """The file, and the name of the object in it that is meant; None: all of it. A file that there is by the whole name counts
+    before."""
+    head, colon, entry = str(name).rpartition(":")
+    whole = Path(name).expanduser()
+    if not colon or not entry or whole.exists() or not head.lower().endswith(mesh_suffixes()):
+        return whole, None
+    return Path(head).expanduser(), entry
+
+
+def parts_by_name(num_vertices: int, faces: np.ndarray) -> dict[str, np.ndarray]:
+    """(F,) bool of every connected part, named by its number from 1."""
+    label = part_labels(num_vertices, faces)[faces[:, 0]]
+    return {f"{PART}{number + 1}": label == number for number in range(int(label.max(initial=-1)) + 1)}
+
+
+def object_alone(path: Path, mesh: MeshFile, name: str) -> MeshFile:
+    """One object, group, material or part of a file, by itself: its vertices and triangles.
+
+    Raises:
+        ValueError: there is none of that name; says which there are.
+    """
+    known = {**parts_by_name(len(mesh.pos), mesh.faces), **(mesh.panels or {})}
+    found = meant(name, known)
+    if found is None:
+        raise ValueError(f"{path}: no object, group, material or part {name!r}; there are {listed(reversed(list(known)))}")
+    used, corners = np.unique(mesh.faces[known[found]], return_inverse=True)
+    return MeshFile(mesh.pos[used], corners.reshape(-1, 3))

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from hood.assets.files.folded import folded_names
+from hood.assets.files.text import folded_names
 
 #: A garment has not so many panels: the names mean something else, such as single faces.
 MOST_PANELS = 256

@@ -14,7 +14,7 @@ from hood.assets.body.body import Body
 from hood.assets.garment.garment import Garment
 from hood.assets.motion.sequence import PoseSequence
 from hood.mesh import topology
-from hood.mesh.proximity import search_surface
+from hood.mesh.closest_point.search import search_surface
 
 #: Distance [m] over which the body's influence on a garment vertex halves: beyond it neighbours decide.
 _BINDING_REACH = 0.03

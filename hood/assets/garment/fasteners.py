@@ -11,8 +11,8 @@ import numpy as np
 from scipy import sparse
 from scipy.spatial import cKDTree
 
-from hood.assets.files.index_list import read_indices
 from hood.assets.files.library import unknown
+from hood.assets.files.text import read_indices
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.parts import COLOURS, coloured_vertices
 from hood.mesh import topology

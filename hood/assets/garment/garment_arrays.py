@@ -12,7 +12,7 @@ import numpy as np
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.guarded import check_size
 from hood.assets.files.library import DATA_FOLDER, read_arrays
-from hood.mesh.riders import Riders
+from hood.mesh.parts import Riders
 
 #: Per-vertex fields and the shape of a row; None: any size.
 _ROWS: dict[str, tuple[int | None, ...]] = {

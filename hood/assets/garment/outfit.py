@@ -8,7 +8,7 @@ from itertools import chain, count
 import numpy as np
 
 from hood.assets.garment.garment import Garment
-from hood.mesh.riders import join_riders
+from hood.mesh.parts import join_riders
 
 
 def join_garments(garments: Sequence[Garment]) -> Garment:

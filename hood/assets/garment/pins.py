@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from hood.assets.body.body import JOINTS, Body
-from hood.assets.files.index_list import read_indices
 from hood.assets.files.library import unknown
+from hood.assets.files.text import read_indices
 from hood.assets.garment.garment import Garment
 from hood.mesh import topology
 

@@ -12,19 +12,25 @@ from typing import Any
 
 import numpy as np
 
-from hood.assets.files.doubt import Doubt
 from hood.assets.files.frame_rates import parse_rate
 from hood.assets.files.library import DATA_FOLDER
+from hood.assets.files.said import Doubt
 from hood.assets.formats import vertex_files
 from hood.assets.formats.gltf_animation import read_gltf_animation
-from hood.assets.formats.mesh_file import read_mesh_file
-from hood.assets.formats.objects import object_alone, split_object
-from hood.assets.formats.point_cache import CACHE_SUFFIX, caches, read_point_cache
-from hood.assets.formats.vertex_files import FACE_KEYS, FOLDER_SUFFIXES, VERTEX_KEYS, VertexFile
+from hood.assets.formats.mesh_file import object_alone, read_mesh_file, split_object
+from hood.assets.formats.vertex_files import (
+    CACHE_SUFFIX,
+    FACE_KEYS,
+    FOLDER_SUFFIXES,
+    VERTEX_KEYS,
+    VertexFile,
+    caches,
+    read_point_cache,
+)
 from hood.assets.motion.axes import require_up
 from hood.assets.motion.mesh_sequence import MeshSequence, loop_mesh, resample_mesh, trim_mesh, turn_mesh
 from hood.mesh import topology
-from hood.mesh.repair import sew_moving
+from hood.mesh.editing.repair import sew_moving
 
 NO_BODY = "none"
 _STILL_SUFFIXES = (".obj", ".ply", ".off", ".stl")

@@ -1,23 +1,129 @@
-"""Motion files as recorded: whatever layout they have, joint rotations, a translation in metres, and what is known of them."""
+"""Motion files as recorded: whatever layout they have, joint rotations, a translation in metres, and what is known of them.
+
+The frame rate of a motion, under every key and in every form in which files say it; a doubt where none does.
+
+The shape of a recorded subject: one row of coefficients, or what rows of every frame have in common.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from hood.assets.files.frame_rates import flat
+from hood.assets.files.frame_rates import flat, parse_rate, rates_in
+from hood.assets.files.said import Doubt
 from hood.assets.motion.layouts.content import MOTION_SUFFIXES, motion_suffixes, read_content
-from hood.assets.motion.layouts.frame_rate import frame_rate
 from hood.assets.motion.layouts.people import Person, choose
-from hood.assets.motion.layouts.read import NUM_FINGER_JOINTS, Track, people_in, read_track
-from hood.assets.motion.layouts.shape import subject_shape
-from hood.assets.motion.skeleton import joints_about_pelvis, spread, upright
-from hood.assets.motion.units import find_unit
+from hood.assets.motion.layouts.read import NUM_FINGER_JOINTS, Track, numbers, people_in, read_track
+from hood.assets.motion.layouts.table import VIDEO_FPS, Layout
+from hood.assets.motion.skeleton import find_unit, joints_about_pelvis, spread, upright
+
+#: Rates [1/s] that are taken from a file.
+_SLOWEST, _FASTEST = 0.1, 1e5
+
+
+class Rate(NamedTuple):
+    """A frame rate [1/s]. ``assumed``: neither the file nor the caller says it; ``doubt``: about it, where it counts."""
+
+    fps: float
+    assumed: bool = False
+    doubt: Doubt | None = None
+
+
+def frame_rate(
+    path: Path, sources: Sequence[Mapping[str, Any]], layout: Layout, given: float | None, is_still: bool = False
+) -> Rate:
+    """The frame rate of a motion, and the doubt where it is assumed or said twice.
+
+    Args:
+        sources: what the file holds of the person, and the dicts in which that stands, which may say it as well.
+        given: by the caller, instead of what the file says.
+        is_still: a single pose, which is held at any rate: none need be said.
+
+    Raises:
+        ValueError: no number, out of range, or not there in a layout that has it; names file, key and fix.
+    """
+    if given is not None:
+        if not _SLOWEST <= given <= _FASTEST:
+            raise ValueError(f"{path}: file_fps={given}; give the file's frames per second, 0.1 to 100000")
+        return Rate(float(given))
+    found = [(key, _rate(path, key, value)) for source in sources for key, value in rates_in(source)]
+    if found:
+        key, rate = found[0]
+        other = next(((name, value) for name, value in found if abs(value / rate - 1.0) > 1e-3), None)
+        if other is None:
+            return Rate(rate)
+        said = f"{path}: says {key}={rate:g} and {other[0]}={other[1]:g}; {rate:g} is taken, file_fps={other[1]:g} is the other"
+        return Rate(rate, doubt=Doubt("frame_rate", said, value=rate, unit="fps"))
+    if is_still:
+        return Rate(layout.fps or VIDEO_FPS, assumed=True)
+    if layout.fps is None:
+        raise ValueError(f"{path}: no mocap_framerate: add it (frames per second) to the file, or pass file_fps=…")
+    said = f"{path}: says no frame rate, {layout.fps:g} fps are assumed ({_reason(layout)}); file_fps=… gives the right one"
+    return Rate(layout.fps, assumed=True, doubt=Doubt("frame_rate", said, value=layout.fps, unit="fps"))
+
+
+def _rate(path: Path, key: str, value: Any) -> float:
+    rate = parse_rate(value)
+    if not _SLOWEST <= rate <= _FASTEST:
+        raise ValueError(
+            f"{path}: {key} is {' '.join(str(value).split())[:40]}; it must be a positive number of frames per "
+            "second (0.1 to 100000; file_fps=… overrides it)"
+        )
+    return rate
+
+
+def _reason(layout: Layout) -> str:
+    return f"as in {layout.name} files" if layout.name[0].isupper() or layout.name[0].isdigit() else "as in most videos"
+
+
+_KEYS = ("betas", "shape", "smplbetas", "smplshape", "predshape", "predbetas", "shapes", "beta", "smplbeta")
+#: Rows within this of the first are the same shape, written with less precision.
+_SAME = 1e-3
+#: Estimates of one person differ by less than this from frame to frame: standard deviation of the coefficient that varies most.
+_VARIES = 0.5
+_LARGEST_COEFFICIENT = 1e3
+
+
+def subject_shape(path: Path, fields: Mapping[str, Any], keys: Mapping[str, str]) -> tuple[np.ndarray, Doubt | None]:
+    """(S,) coefficients, zeros where the file has none; a doubt where they are the mean of estimates of every frame.
+
+    Raises:
+        ValueError: no numbers, or rows of different people; names the file, the key and the frame.
+    """
+    key = next((key for key in _KEYS if key in fields), None)
+    if key is None:
+        return np.zeros(10), None
+    name = keys[key]
+    table = np.asarray(numbers(path, name, fields[key]))
+    scalar = table.ndim == 0
+    rows = table.ndim > 2 or (table.ndim == 2 and table.shape[-1] > 1)
+    table = table.reshape(-1, table.shape[-1]) if rows else table.reshape(-1)
+    if table.size == 0 or scalar or not (np.abs(table) <= _LARGEST_COEFFICIENT).all():
+        raise ValueError(f"{path}: {name} has shape {table.shape} or absurd values; give (S,) finite shape coefficients")
+    if table.ndim == 1:
+        return table, None
+    return _common(path, name, table)
+
+
+def _common(path: Path, name: str, table: np.ndarray) -> tuple[np.ndarray, Doubt | None]:
+    changed = np.abs(table - table[0]).max(axis=1)
+    if changed.max() <= _SAME:
+        return table[0], None
+    spread = float(table.std(axis=0).max())
+    if spread > _VARIES:
+        raise ValueError(
+            f"{path}: {name} changes in frame {int(np.argmax(changed > _SAME))}; a body keeps one shape, keep one row of them, "
+            f"{name} = {name}.mean(axis=0)"
+        )
+    said = f"{path}: {name} varies by {spread:.2g} (standard deviation over frames); its mean is taken, betas=[…] gives a shape"
+    return table.mean(axis=0), Doubt("shape", said, value=spread)
+
 
 __all__ = ["MOTION_SUFFIXES", "NUM_BODY_JOINTS", "NUM_FINGER_JOINTS", "Recording", "motion_suffixes", "read_recording"]
 

@@ -1,1 +1,4 @@
-"""Rollouts for other programs."""
+"""Rollouts for other programs: USD, glTF, point caches, mesh sequences.
+
+Positions are written as they are stored.
+"""

@@ -8,11 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hood.assets.formats.image import Texture
-from hood.dynamics.recorder import RolloutData
-from hood.media.mesh_export import corner_normals
-from hood.media.palette import part_colour
-from hood.media.pieces import pieces_of
-from hood.media.render import BODY_COLOR
+from hood.media.exports.mesh import corner_normals
+from hood.media.pieces import part_colour, pieces_of
+from hood.media.renderer.render import BODY_COLOR
+from hood.rollouts.file.recorder import RolloutData
 
 #: Farther from the origin than this [m] float32, which most formats hold, is no longer good to 2 µm.
 FAR = 32.0

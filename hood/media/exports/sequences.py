@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from hood.media.exports.clip import Clip, Part
-from hood.media.mesh_export import obj_faces, obj_points
+from hood.media.exports.mesh import obj_faces, obj_points
 
 
 def write_obj_sequence(folder: Path, clip: Clip) -> None:

@@ -1,24 +1,145 @@
-"""The page of ``hood view``: program, pictures of the data and drawing library in one file of HTML."""
+"""The page of ``hood view``: program, pictures of the data and drawing library in one file of HTML.
+
+What a rollout's settings say of its course, in words: when something is opened, closed, held or let go, and the wind.
+
+Numbers that change little from frame to frame, as short text inside a page, and back.
+"""
 
 from __future__ import annotations
 
 import base64
 import html
 import json
+import zlib
 from collections.abc import Mapping, Sequence
+from math import ceil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hood.assets.formats.image import Texture
-from hood.dynamics.recorder import RolloutData
 from hood.media.colouring import COLOURINGS, Colouring, colouring_of, colours_at
 from hood.media.film import seconds_per_frame
-from hood.media.moments import shared_moments, wind_of
-from hood.media.palette import outfit_colours
-from hood.media.pieces import pieces_of, split_seams
-from hood.media.viewer.packing import pack_bytes, pack_integers, pack_positions
+from hood.media.pieces import outfit_colours, pieces_of, split_seams
+from hood.rollouts.file.recorder import RolloutData
+from hood.scene.holding import first_step
+
+_ACTIONS = ("open", "close", "detach", "attach")
+
+
+def moments_of(data: RolloutData) -> list[tuple[int, str]]:
+    """Frames whose steps are the first with an event, and what that does: ``(30, "open front_buttons")``, by frame.
+
+    Events count simulated frames; where others are stored (``output_fps``) it is the first stored one that is no earlier.
+    Events that no step shows are left out. Rollouts made otherwise than by ``hood rollout`` have none.
+    """
+    found, dt = [], float(data.attributes.get("dt", 0.0))
+    rate = None if data.steps is None else data.steps.rate
+    step = dt if rate is None else 1.0 / rate.simulated_fps
+    for event in (_settings(data).get("events") or []) if dt > 0 else []:
+        action = next(action for action in _ACTIONS if action in event)
+        frame = int(event["frame"]) if "frame" in event else first_step(float(event["time"]), step)
+        frame = frame if rate is None else ceil(frame / rate.stride)
+        if frame < len(data.time) - 1:
+            found.append((frame, f"{action} {_names(event[action])}"))
+    return sorted(found, key=lambda moment: moment[0])
+
+
+def shared_moments(rollouts: Sequence[tuple[str, RolloutData]]) -> list[tuple[int, str]]:
+    """Those of several named rollouts; where not all have one, with the names of those that do."""
+    by_moment: dict[tuple[int, str], list[str]] = {}
+    for name, data in rollouts:
+        for moment in dict.fromkeys(moments_of(data)):
+            by_moment.setdefault(moment, []).append(name)
+    return [
+        (frame, words if len(names) == len(rollouts) else f"{words} ({', '.join(names)})")
+        for (frame, words), names in sorted(by_moment.items())
+    ]
+
+
+def wind_of(data: RolloutData) -> str:
+    """``wind 3 m/s, gusts 20%``, or nothing where there is no air."""
+    settings = _settings(data)
+    wind, gusts = settings.get("wind"), settings.get("gusts")
+    if wind is None:
+        return ""
+    speed = f"({', '.join(f'{part:g}' for part in wind)})" if isinstance(wind, list) else f"{wind:g}"
+    return f"wind {speed} m/s" + (f", gusts {gusts:.0%}" if gusts else "")
+
+
+def _settings(data: RolloutData) -> dict[str, Any]:
+    try:
+        settings = json.loads(data.attributes.get("config", "{}"))
+    except ValueError:
+        return {}
+    return settings if isinstance(settings, dict) else {}
+
+
+def _names(given: Any) -> str:
+    names = given if isinstance(given, list) else [given]
+    numbers = [name for name in names if isinstance(name, int)]
+    counted = [f"{len(numbers)} vertices" if len(numbers) > 1 else f"vertex {numbers[0]}"] if numbers else []
+    return ", ".join([*(Path(name).name for name in names if isinstance(name, str)), *counted])
+
+
+#: Distance [m] between the positions that a page can hold: none is off by more than half of it in each coordinate.
+STEP = 1.8e-4
+#: Coordinates beyond this [m] are taken for cloth that blew up.
+_FARTHEST = 3e4
+
+
+def pack_positions(pos: np.ndarray) -> tuple[dict[str, Any], list[int]]:
+    """Positions as JSON, within ``STEP / 2`` of what they are, and the frames that cannot be drawn.
+
+    Whole multiples of ``STEP`` are kept as their second differences over the frames, which are small while a mesh moves
+    smoothly. Frames with a coordinate that is not finite or is beyond 30 km repeat the frame before.
+
+    Args:
+        pos: (T, V, 3) [m].
+    """
+    flat = np.asarray(pos, dtype=np.float64).reshape(len(pos), -1)
+    with np.errstate(invalid="ignore"):
+        sound = (np.abs(flat) <= _FARTHEST).all(axis=1)  # false for NaN
+    latest = np.maximum.accumulate(np.where(sound, np.arange(len(flat)), -1))
+    first = int(np.argmax(sound)) if sound.any() else 0
+    drawn = flat[np.where(latest < 0, first, latest)] if sound.any() else np.zeros_like(flat)
+    whole = np.rint(drawn / STEP).astype(np.int64)
+    second = np.diff(np.diff(whole, axis=0, prepend=0), axis=0, prepend=0)
+    packed = {"frames": len(flat), "vertices": int(pos.shape[1]), "step": STEP, "data": pack_integers(second)}
+    return packed, np.flatnonzero(~sound).tolist()
+
+
+def unpack_positions(packed: dict[str, Any]) -> np.ndarray:
+    """(T, V, 3) [m] of :func:`pack_positions`; the page does the same."""
+    second = unpack_integers(packed["data"]).reshape(packed["frames"], -1)
+    whole = np.cumsum(np.cumsum(second, axis=0, dtype=np.int32), axis=0, dtype=np.int32)
+    return (whole * packed["step"]).reshape(packed["frames"], packed["vertices"], 3)
+
+
+def pack_integers(values: np.ndarray) -> str:
+    """Integers modulo 2^32 as text: signs folded into the lowest bit, all lowest bytes first, deflated, base64."""
+    wrapped = np.asarray(values).astype(np.int64).astype(np.int32).ravel()
+    folded = ((wrapped << 1) ^ (wrapped >> 31)).view(np.uint32).astype("<u4")
+    return pack_bytes(folded.view(np.uint8).reshape(-1, 4).T)
+
+
+def unpack_integers(text: str) -> np.ndarray:
+    """(N,) int32 of :func:`pack_integers`."""
+    planes = np.frombuffer(unpack_bytes(text), dtype=np.uint8).reshape(4, -1)
+    folded = planes.T.copy().view("<u4").ravel()
+    return ((folded >> 1) ^ (np.uint32(0) - (folded & 1))).view(np.int32)
+
+
+def pack_bytes(values: np.ndarray) -> str:
+    """(...) uint8, deflated and in base64."""
+    return base64.b64encode(zlib.compress(np.ascontiguousarray(values, dtype=np.uint8).tobytes(), 6)).decode()
+
+
+def unpack_bytes(text: str) -> bytes:
+    """The bytes of :func:`pack_bytes`."""
+    return zlib.decompress(base64.b64decode(text))
+
 
 #: The ramp's last colour, of vertices without a value.
 _UNKNOWN = 255

@@ -12,8 +12,7 @@ import torch
 from imitations import evaluate, model_arrays, write_official_pickle
 
 from hood.assets.body.body import Body
-from hood.assets.body.load import load_body
-from hood.assets.body.model_file import choose_model, model_gender, read_model
+from hood.assets.body.load import choose_model, load_body, model_gender, read_model
 from hood.assets.motion.load import load_sequence
 from hood.assets.motion.sequence import Z_UP_TO_Y_UP, PoseSequence
 

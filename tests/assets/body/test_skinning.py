@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from hood.assets.body.body import Body
-from hood.assets.body.skinning import axis_angle_to_matrix, joint_transforms, linear_blend_skinning
+from hood.assets.body.body import Body, axis_angle_to_matrix, joint_transforms, linear_blend_skinning
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from hood.assets.files.folder_lock import OccupiedError, is_occupied, occupy
+from hood.assets.files.atomic import OccupiedError, is_occupied, occupy
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="folders are not locked there")
 ROOT = Path(__file__).parents[3]
 HOLD = """
 import sys, pathlib
-from hood.assets.files.folder_lock import occupy
+from hood.assets.files.atomic import occupy
 with occupy(pathlib.Path(sys.argv[1])):
     print(flush=True)
     input()

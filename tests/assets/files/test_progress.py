@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from hood.assets.files.progress import Progress
+from hood.assets.files.said import Progress
 
 
 def test_lines_come_after_a_while_and_not_too_often(

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from garment_kinds import off_text, ply_text, stl_text
 
-from hood.assets.files.index_list import read_indices
-from hood.assets.files.text import decoded, encoding_of
+from hood.assets.files.text import decoded, encoding_of, read_indices
 from hood.assets.formats.mesh_file import read_mesh, read_mesh_file
 
 _ENCODINGS = ("utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32", "latin-1")

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from garment_kinds import ply_text, write_glb, write_objects
 
-from hood.assets.formats.mesh_file import read_mesh_file
-from hood.assets.formats.objects import object_alone, parts_by_name, split_object
+from hood.assets.formats.mesh_file import object_alone, parts_by_name, read_mesh_file, split_object
 from hood.assets.garment.garment import load_garment
 from hood.assets.motion.animated_mesh import body_kind, load_mesh_sequence
 from hood.testing import cylinder, grid

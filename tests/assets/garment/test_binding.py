@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from hood.assets.body.body import Body
-from hood.assets.body.skinning import linear_blend_skinning
+from hood.assets.body.body import Body, linear_blend_skinning
+from hood.assets.fitting.placement import find_scale, require_metres, used
 from hood.assets.garment.binding import bind_garment, bind_posed, hold_on_trunk, posed_body, push_out, signed_distances
 from hood.assets.garment.garment import Garment, load_garment, save_garment
 from hood.assets.garment.outfit import join_garments
-from hood.assets.garment.units import find_scale, require_metres, used
 from hood.assets.motion.load import load_sequence
-from hood.assets.motion.poses import arms_down, holds_pose, read_pose
 from hood.assets.motion.sequence import PoseSequence
+from hood.assets.motion.sequence_edit import arms_down, holds_pose, read_pose
 from hood.mesh import topology
 from hood.testing import sphere
 

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hood.assets.garment.alterations import clean, sew
-from hood.assets.garment.contents.fitting import start_fitting
+from hood.assets.fitting.alterations import clean, sew
 from hood.assets.garment.fasteners import ROOM, fasten, with_room
 from hood.assets.garment.garment import Garment, load_garment, save_garment
 from hood.assets.garment.mirror import mirror_garment
 from hood.assets.garment.outfit import join_garments
+from hood.assets.garment.record import start_fitting
 from hood.testing import grid
 
 

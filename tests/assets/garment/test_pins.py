@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hood.assets.body.body import Body
-from hood.assets.files.index_list import read_indices
+from hood.assets.files.text import read_indices
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.pins import opening_names, pin_mask
 from hood.mesh import topology

@@ -8,8 +8,7 @@ import pytest
 from hood.assets.body.body import Body
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.outfit import join_garments
-from hood.assets.garment.parts import part_faces
-from hood.assets.garment.tailoring import lengths_of, tailored
+from hood.assets.garment.parts import lengths_of, part_faces, tailored
 from hood.mesh.topology import unique_edges
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from hood.assets.body.body import Body
-from hood.assets.files.doubt import Doubt
+from hood.assets.files.said import Doubt
 from hood.assets.formats.mesh_file import read_mesh
 from hood.assets.motion.animated_mesh import body_kind, load_mesh_sequence
 from hood.assets.motion.axes import UP_AXES

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from hood.assets.files.library import DATA_FOLDER
-from hood.assets.motion.collection import expand_sequences
+from hood.assets.motion.motion_files import expand_sequences
 
 
 @pytest.fixture

@@ -16,11 +16,10 @@ from motion_kinds.walks import walk, world
 from motion_kinds.writers import write
 from scipy.spatial.transform import Rotation
 
-from hood.assets.files.doubt import Doubt
+from hood.assets.files.said import Doubt
 from hood.assets.identify import MOTION, identify
-from hood.assets.motion.load import load_sequence
+from hood.assets.motion.load import bearing_notice, load_sequence
 from hood.assets.motion.recording import read_recording
-from hood.assets.motion.up_axis import bearing_notice
 
 
 @pytest.mark.parametrize("name", GENERATORS)

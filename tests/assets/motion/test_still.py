@@ -17,7 +17,7 @@ from hood.assets.motion.load import load_sequence
 from hood.assets.motion.motion_files import MotionFiles
 from hood.assets.motion.sequence import PoseSequence, resample, turn_world
 from hood.assets.motion.sequence_edit import blend_in, loop
-from hood.scene.load_motion import MotionOptions, load_motion
+from hood.scene.body_motion.load import MotionOptions, load_motion
 
 SINGLE = {
     "amass": (".npz", amass(72, poses=world("z").flat()[:1], trans=world("z").transl[:1])),

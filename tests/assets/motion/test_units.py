@@ -10,11 +10,11 @@ from motion_kinds.parameters import amass
 from motion_kinds.walks import world
 from motion_kinds.writers import write
 
-from hood.assets.files.doubt import Doubt
 from hood.assets.files.library import locate, names
+from hood.assets.files.said import Doubt
 from hood.assets.motion.load import load_sequence
 from hood.assets.motion.recording import Recording, read_recording
-from hood.assets.motion.units import UNITS, Unit, find_unit
+from hood.assets.motion.skeleton import UNITS, Unit, find_unit
 
 
 def unit_of(recording: Recording, transl: np.ndarray, up: str = "z") -> Unit:

@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 
 from hood.assets.formats.image import Texture
-from hood.dynamics.recorder import RolloutData
-from hood.media.camera import Camera
-from hood.media.render import RenderMesh, render_frame
+from hood.media.renderer.camera import Camera
+from hood.media.renderer.render import RenderMesh, render_frame
 from hood.media.viewer.page import view_page
+from hood.rollouts.file.recorder import RolloutData
 from hood.testing import cylinder, sphere
 from tools.browser import Browser
 

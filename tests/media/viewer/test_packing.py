@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hood.media.viewer.packing import STEP, pack_integers, pack_positions, unpack_integers, unpack_positions
+from hood.media.viewer.page import STEP, pack_integers, pack_positions, unpack_integers, unpack_positions
 
 
 @pytest.mark.parametrize("place", [0.0, 6.0, -250.0])

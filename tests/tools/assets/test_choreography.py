@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from hood.assets.body.skinning import axis_angle_to_matrix, joint_transforms
+from hood.assets.body.body import axis_angle_to_matrix, joint_transforms
 from tools.assets.choreography import Motion, all_motions, perform, write_motions
 from tools.assets.gait import ease
 from tools.assets.puppet import Controls, Skeleton, solve

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hood.mesh import topology
-from hood.mesh.isotropic import isotropic
+from hood.mesh.editing.remeshing import isotropic
 from hood.testing import cylinder
 from tools.assets.unwrap import flatten, panels, unwrap
 

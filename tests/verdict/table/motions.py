@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hood.assets.extremes.motions import MOTIONS
 from hood.assets.files.library import locate
+from hood.studies.envelope.extreme_files import MOTIONS
 from tests.verdict.table.scene import Maker
 
 Array = np.ndarray
@@ -22,7 +22,7 @@ _TO_Y = Rotation.from_euler("x", -90, degrees=True)
 
 
 def posed(kind: str, amount: float, seconds: float = 1.4, calm: float = 0.1, rate: float = 1.0) -> Maker:
-    """From standing into a pose or movement of :data:`hood.assets.extremes.motions.MOTIONS`, ``rate`` times as fast."""
+    """From standing into a pose or movement of :data:`hood.studies.envelope.extreme_files.MOTIONS`, ``rate`` times as fast."""
 
     def make(folder: Path) -> Path:
         count = round(seconds * _FPS) + 1

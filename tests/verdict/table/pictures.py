@@ -21,8 +21,8 @@ import h5py
 import numpy as np
 from PIL import Image
 
-from hood.media.camera import Camera
-from hood.media.render import RenderMesh, contact_sheet, render_frame
+from hood.media.renderer.camera import Camera
+from hood.media.renderer.render import RenderMesh, contact_sheet, render_frame
 from tests.verdict.table import counts
 from tests.verdict.table.scene import Scene, run_unread
 from tests.verdict.table.scenes import REFUSED, SCENES, SECOND, THIRD

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hood.cli import main
+from hood.cli.main import main
 
 #: Writes a file into a folder and returns its path.
 Maker = Callable[[Path], Path]

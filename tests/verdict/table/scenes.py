@@ -6,7 +6,7 @@ A label says what a person saw in the pictures of :mod:`tests.verdict.table.pict
 - ``margin``: clear, or near, where two people might differ.
 - ``why``: what was seen. ``since``: first frame in which it shows, to within three frames; ``part``: where.
 - ``cause``: of what is broken, cloth, or input where the cloth does what it must on a body or motion that came in wrong.
-- ``doubts``: what a person would want to be told about the input, in the words of :data:`hood.assets.files.doubt.KINDS`.
+- ``doubts``: what a person would want to be told about the input, in the words of :data:`hood.assets.files.said.KINDS`.
 - ``seen``: when, and from where.
 
 ``since``, ``part`` and ``cause`` are null for what is right.

@@ -1,0 +1,256 @@
+"""What the commands share: the output folder, the device, the word for random weights."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import sys
+import warnings
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+
+from hood.app.settings.compose import ConfigError, load_config, plain, read_record, require_choice, shown
+from hood.assets.files.atomic import occupy
+from hood.assets.files.said import install
+from hood.model.kernels.block import check_kernels, why_slow
+from hood.model.network.kernel_choice import AUTO, Choice, choose_for
+from hood.steppers.checkpoint import load_simulator
+from hood.steppers.network import Simulator
+from hood.steppers.newton import Stepper
+from hood.steppers.published import SUFFIXES, load_reference_checkpoint
+from hood.tensors.precision import check_precision
+from hood.training import distributed
+
+#: ``checkpoint=untrained``: seeded random weights instead of a file.
+UNTRAINED = "untrained"
+#: A body drawn thinner than this [mm] is another body.
+_THINNEST = 20.0
+
+
+def together(command: Callable[[], int]) -> int:
+    """Run a command that torchrun may have started several times; an error of process 0 that ends all is told once."""
+    distributed.start()
+    try:
+        return command()
+    except (ValueError, OSError, ImportError) as error:
+        if distributed.rank() == 0:
+            raise
+        if not distributed.is_told(error):
+            print(f"hood: process {distributed.rank()}: {error}", file=sys.stderr)
+        return 2
+    finally:
+        distributed.stop()
+
+
+def split_words(command: str, arguments: Sequence[str]) -> tuple[list[str], DictConfig]:
+    """Files of a command that takes files, in their order, and its config: a word of the form ``key=value`` is an override,
+    every other word a file.
+
+    Raises:
+        ConfigError: a word begins like an option, or a key or value is unknown.
+    """
+    overrides = [word for word in arguments if "=" in word and not Path(word).exists()]
+    given = [word for word in arguments if word not in overrides]
+    strange = next((word for word in given if word.startswith("-")), None)
+    if strange is not None:
+        raise ConfigError(f"unknown option {strange!r}; write key=value, see hood {command} --help")
+    return given, load_config(command, overrides)
+
+
+def frame_count(config: DictConfig) -> int | None:
+    """``config.num_frames`` of a command that shows frames of a rollout: the first so many; None: all.
+
+    Raises:
+        ConfigError: no whole number above 0.
+    """
+    count = config.num_frames
+    if count is not None and (isinstance(count, bool) or not isinstance(count, int) or count < 1):
+        raise ConfigError(f"num_frames={count}: must be a whole number, at least 1")
+    return None if count is None else int(count)
+
+
+def output_folder(config: DictConfig) -> Path:
+    """The folder that ``config.output`` names; nothing is made yet.
+
+    Raises:
+        ConfigError: it names none.
+    """
+    if config.output is None or not str(config.output):
+        raise ConfigError("output: no folder is named; give one, e.g. output=outputs/mine")
+    return Path(str(config.output)).expanduser()
+
+
+def require_package(module: str, title: str, extra: str, what: str) -> None:
+    """Raise ConfigError unless ``module`` is there, before ``what`` is begun that draws with it."""
+    if importlib.util.find_spec(module) is None:
+        raise ConfigError(f"{what}: drawing needs {title} ({install(extra)})")
+
+
+def require_distinct(key: str, values: Sequence[Any]) -> None:
+    """Raise ConfigError where one of ``values`` is given twice: it would be computed twice."""
+    twice = next((value for place, value in enumerate(values) if value in values[:place]), None)
+    if twice is not None:
+        raise ConfigError(f"{key}: {twice!r} is given twice; leave one out")
+
+
+def thinning(config: DictConfig) -> float:
+    """[m] of ``config.thin_body``, which is in millimetres.
+
+    Raises:
+        ConfigError: it is no such number.
+    """
+    value = config.thin_body
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value <= _THINNEST:
+        raise ConfigError(f"thin_body={value}: give millimetres, 0 (the body as it is) to {_THINNEST:g}")
+    return 1e-3 * float(value)
+
+
+def prepare_folder(folder: Path) -> Path:
+    """The output folder, made and checked for writing.
+
+    Raises:
+        OSError: it cannot be made or written to.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise FileExistsError(f"output={folder}: a file of this name exists; choose another output, a folder")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileNotFoundError as error:  # as below /proc
+        raise FileNotFoundError(f"output={folder}: the folder cannot be made there; choose another output") from error
+    if not os.access(folder, os.W_OK):
+        raise PermissionError(13, "Permission denied", str(folder))
+    return folder
+
+
+@contextmanager
+def held_folder(config: DictConfig) -> Iterator[Path]:
+    """The output folder, made, checked, and held for this run by the first of its processes
+    (:mod:`hood.assets.files.atomic`).
+
+    Raises:
+        OSError: it cannot be made or written to.
+        OccupiedError: another run is writing there.
+    """
+    folder = output_folder(config)
+    with ExitStack() as stack:
+        distributed.on_main(lambda: stack.enter_context(occupy(prepare_folder(folder))))
+        yield folder
+
+
+def read_model(path: Path, fps: float) -> Simulator:
+    """The simulator in a model file or in published HOOD weights (``.pth``), for motions at ``fps``.
+
+    Raises:
+        ConfigError: the model knows another frame rate only.
+    """
+    simulator = load_reference_checkpoint(path) if path.suffix.lower() in SUFFIXES else load_simulator(path)
+    frame_dt = simulator.rules.frame_dt
+    if frame_dt is not None and abs(fps * frame_dt - 1) > 1e-3:
+        raise ConfigError(f"fps={fps:g}: {path} knows steps of 1/{1 / frame_dt:g} s only; use fps={1 / frame_dt:g}")
+    return simulator
+
+
+def require_same_model(path: Path, held: Simulator, asked: Simulator, way_out: str, free: Collection[str] = ()) -> None:
+    """Refuse weights of another model than the one ``asked`` for, and name the settings that differ; those ``free`` may.
+
+    Raises:
+        ConfigError: see above; ends with ``way_out``.
+    """
+    theirs, ours = held.config, asked.config
+    keys = {*theirs, *ours} - {*free}
+    different = sorted(key for key in keys if key not in theirs or key not in ours or theirs[key] != ours[key])
+    if different:
+        named = ", ".join(f"{key}={theirs.get(key, 'its default')}" for key in different)
+        raise ConfigError(f"{path}: holds a model of {named}, not the model asked for; {way_out}")
+
+
+def weigh(stepper: Stepper, config: DictConfig) -> None:
+    """Let ``config.gravity`` [m/s²] act in the stepper's steps, on ``config.device``."""
+    stepper.gravity = torch.tensor([0.0, -float(config.gravity), 0.0], device=str(config.device))
+
+
+def use_arithmetic(simulator: Simulator, config: DictConfig, traced: bool = False) -> None:
+    """Let the simulator's network compute as ``config.precision`` and ``config.kernels`` say; a choice is told in one line.
+
+    A step that is ``traced`` is torch's operations, which leaves no choice.
+
+    Raises:
+        ValueError: no such precision or kernels, or not on this device.
+    """
+    precision, kernels, device = str(config.precision), str(config.kernels), torch.device(str(config.device))
+    network = simulator.network
+    check_precision(precision, device)
+    warn_if_slow("precision", precision, device)
+    if kernels == AUTO and traced:
+        kernels = "torch"
+    if kernels == AUTO:
+        choice = choose_for(network, precision, device)
+        tell_choice(choice)
+        kernels = choice.kernels
+    check_kernels(kernels, precision, network.latent_dim, device)
+    network.use_precision(precision)
+    network.use_kernels(kernels)
+
+
+def warn_if_slow(key: str, precision: str, device: torch.device) -> None:
+    """A warning where a precision that should save time costs some here."""
+    reason = why_slow(precision, device)
+    if reason and distributed.rank() == 0:
+        warnings.warn(f"{key}={precision}: {reason}", stacklevel=2)
+
+
+@cache
+def tell_choice(choice: Choice) -> None:
+    """Print what ``kernels=auto`` has chosen, once."""
+    if distributed.rank() == 0:
+        print(choice, flush=True)
+
+
+def require_same_config(config: DictConfig, folder: Path, free: Sequence[str], free_below: Sequence[str] = ()) -> None:
+    """Raise ConfigError where the run in ``folder`` was started with other settings.
+
+    Keys in ``free`` may differ, and so may keys in ``free_below`` of the groups.
+    """
+    record = folder / "config.yaml"
+    if not record.exists():
+        return
+    before = read_record(record)
+
+    for key in map(str, config):
+        if key in free:
+            continue
+        there, here = plain(before.get(key)), plain(config[key])
+        if isinstance(there, dict) and isinstance(here, dict):
+            # A key that is newer than the record is null where nobody asks for anything.
+            there, here = (
+                {name: item for name, item in side.items() if name not in free_below and item is not None}
+                for side in (there, here)
+            )
+        if there != here:
+            name, there, here = _difference(key, there, here)
+            raise ConfigError(
+                f"{record}: {name} is {shown(there)} there, {shown(here)} in this command; resume with the same settings or "
+                "use another output"
+            )
+
+
+def _difference(name: str, there: Any, here: Any) -> tuple[str, Any, Any]:
+    """The first place in two values of a config that is not the same in both: its name, and what is there."""
+    if isinstance(there, dict) and isinstance(here, dict):
+        for key in dict.fromkeys([*there, *here]):
+            if there.get(key) != here.get(key):
+                return _difference(f"{name}.{key}", there.get(key), here.get(key))
+    return name, there, here
+
+
+def require_device(config: DictConfig) -> None:
+    """Raise ConfigError unless ``config.device`` is known and present."""
+    require_choice(config, "device", ("cpu", "cuda"))
+    if str(config.device) == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("device=cuda: no CUDA device is available; use device=cpu")

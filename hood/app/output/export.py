@@ -1,0 +1,260 @@
+"""``hood export rollout.h5 format=usd``: a rollout as files that other programs open.
+
+Files of the rollout that was in a folder before: without them, what lies there is of one rollout.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+
+from hood.app.common import frame_count, split_words
+from hood.app.output.textures import lay_on, read_textures
+from hood.app.settings.compose import ConfigError, plain, require_choice
+from hood.assets.files.atomic import write_atomically
+from hood.assets.files.said import install
+from hood.assets.formats.image import Texture
+from hood.media.exports.clip import PARTS, Clip, clip_of
+from hood.media.exports.gltf import gltf_bytes
+from hood.media.exports.sequences import write_obj_sequence, write_ply_sequence, write_point_cache
+from hood.media.exports.usd import image_name, write_usd
+from hood.rollouts.file.recorder import RolloutData, read_rollout
+
+_SUFFIXES = {"usd": (".usd", ".usdc", ".usda"), "glb": (".glb",)}
+_FOLDERS: dict[str, Callable[[Path, Clip], None]] = {
+    "pc2": write_point_cache,
+    "obj": write_obj_sequence,
+    "ply": write_ply_sequence,
+}
+FORMATS = ("usd", "glb", *_FOLDERS)
+#: Those that hold images.
+_TEXTURED = ("usd", "glb", "pc2", "obj")
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run the command; returns the exit code."""
+    export(arguments)
+    return 0
+
+
+def export(arguments: Sequence[str]) -> Path:
+    """Write what the command's words ask for; returns the file or folder."""
+    files, config = split_words("export", arguments)
+    if len(files) != 1:
+        raise ConfigError(f"number of rollouts given: {len(files)}; give one, hood export rollout.h5")
+    source = Path(files[0]).expanduser()
+    source = source / "rollout.h5" if source.is_dir() else source
+    count = frame_count(config)
+    form, up, parts = _checked(config)
+    textures = read_textures(config)
+    _check_textured(textures, [form], "format", f"format={form}")
+    if textures and "cloth" not in parts:
+        raise ConfigError(f"texture: parts={parts} leaves the garments out; leave texture= out, or take parts=[cloth,body]")
+    target = _target(config, source, form)
+    data = read_checked(source, "fabric")
+    print(_export(source, data, target, form, textures, clip_arguments=(parts, count, up)))
+    if not bool(data.attributes.get("complete", True)):
+        print(f"the rollout is not finished: {len(data.time)} of {data.attributes.get('num_planned', '?')} frames are there")
+    return target
+
+
+def check_outputs(config: DictConfig) -> None:
+    """Refuse formats of ``hood rollout formats=[…]`` that cannot be written, and images that nothing would show, before the
+    first frame.
+
+    Raises:
+        ConfigError: no such format, or its package is missing; or no picture and no format shows ``texture``.
+        ValueError: an image cannot be used.
+    """
+    forms = [str(form) for form in config.formats]
+    for form in forms:
+        _check_format(form, "formats", f"formats={forms}")
+    textures = read_textures(config)
+    drawn = str(config.video) != "none" or bool(config.sheet)
+    if not drawn or str(config.colour) != "none":
+        _check_textured(textures, forms, "formats", f"colour={config.colour} formats={forms}")
+
+
+def _check_textured(textures: Mapping[str, Texture], forms: Sequence[str], key: str, asked: str) -> None:
+    if textures and not any(form in _TEXTURED for form in forms):
+        raise ConfigError(f"texture: {asked} shows no images; take {key}={' or '.join(_TEXTURED)}, or hood view")
+
+
+def export_beside(source: Path, forms: Sequence[str], textures: Mapping[str, Texture]) -> list[str]:
+    """Write all of the rollout ``source`` in every format beside it, in place of what an earlier run has left there.
+
+    Args:
+        textures: images of garments, of :func:`hood.app.output.textures.read_textures`.
+
+    Returns:
+        A sentence about each.
+    """
+    if not forms:
+        return []
+    data = read_checked(source, "fabric")
+    return [_export(source, data, _beside(source, form), form, textures, (list(PARTS), None, "y"), True) for form in forms]
+
+
+def _export(
+    source: Path,
+    data: RolloutData,
+    target: Path,
+    form: str,
+    textures: Mapping[str, Texture],
+    clip_arguments: tuple[list[str], int | None, str],
+    replace: bool = False,
+) -> str:
+    """Write one format; what there is to say of it."""
+    up = clip_arguments[2]
+    try:
+        clip = clip_of(data, *clip_arguments, lay_on(textures, [data])[0])
+        _write(target, form, clip, up, replace)
+    except ValueError as error:
+        raise ValueError(f"{source}: {error}") from error
+    names = ", ".join(f"{part.name} ({part.pos.shape[1]} vertices)" for part in clip.parts)
+    text = f"{target}: {_megabytes(target):.1f} MB, {clip.num_frames} frames at {clip.fps:g} fps, metres, {up} up: {names}"
+    if clip.origin.any() and form in _FOLDERS:
+        x, y, z = clip.origin.tolist()
+        text += f"\nfar from the origin: positions are from ({x:g}, {y:g}, {z:g}) m; move the objects there"
+    return text
+
+
+def _checked(config: DictConfig) -> tuple[str, str, list[str]]:
+    """Format, axis that points up, and parts."""
+    form, up = str(config.format), str(config.up)
+    _check_format(form, "format", f"format={form}")
+    require_choice(config, "up", ("y", "z"))
+    if form == "glb" and up != "y":
+        raise ConfigError("up=z: glTF has y up always, and programs turn it themselves; leave up= out")
+    parts = plain(config.parts)
+    parts = parts if isinstance(parts, list) else [parts]
+    if not parts or any(part not in PARTS for part in parts):
+        raise ConfigError(f"parts={plain(config.parts)}: give some of [cloth,body]")
+    return form, up, parts
+
+
+def _check_format(form: str, key: str, asked: str) -> None:
+    if form.lower() in ("abc", "alembic"):
+        raise ConfigError(f"{asked}: no maintained package writes Alembic; take {key}=usd, which the same programs read")
+    if form not in FORMATS:
+        raise ConfigError(f"{asked}: choose {' or '.join(FORMATS)}")
+    if form == "usd" and importlib.util.find_spec("pxr") is None:
+        raise ConfigError(f"{asked}: writing needs usd-core ({install('usd')}); glb, pc2, obj and ply need nothing more")
+
+
+def exports_beside(source: Path) -> list[Path]:
+    """What :func:`export_beside` has written beside a rollout, in any format, and images that belong to it."""
+    made = [_beside(source, form) for form in FORMATS]
+    return [*(path for path in made if path.exists()), *source.parent.glob(f"{source.stem}_*_texture.*")]
+
+
+def _beside(source: Path, form: str) -> Path:
+    return source.with_suffix(f".{form}") if form in _SUFFIXES else source.with_name(f"{source.stem}_{form}")
+
+
+def _target(config: DictConfig, source: Path, form: str) -> Path:
+    """File or folder to write."""
+    if config.output is None:
+        target = _beside(source, form)
+    else:
+        target = Path(str(config.output)).expanduser()
+    if form in _SUFFIXES:
+        if target.suffix.lower() not in _SUFFIXES[form] or target.is_dir():
+            raise ConfigError(f"output={target}: name a file that ends in {' or '.join(_SUFFIXES[form])}")
+    elif target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise ConfigError(f"output={target}: is there already; name a folder that is new or empty")
+    return target
+
+
+def _write(target: Path, form: str, clip: Clip, up: str, replace: bool = False) -> None:
+    """Write the whole, or nothing; a folder that is not empty only to ``replace`` it."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if form == "glb":
+        write_atomically(target, gltf_bytes(clip))
+        return
+    draft = target.with_name(f".partial.{target.name}")  # USD tells the format by the suffix
+    remove_whole(draft)
+    try:
+        if form == "usd":
+            write_usd(draft, clip, up, target.name)
+            for part in clip.parts:
+                if part.texture is not None:
+                    write_atomically(target.with_name(image_name(target.stem, part)), part.texture.content)
+        else:
+            draft.mkdir()
+            _FOLDERS[form](draft, clip)
+            if replace:
+                remove_whole(target)
+            elif target.is_dir():
+                target.rmdir()  # empty
+        draft.replace(target)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(target)) from error
+    finally:
+        remove_whole(draft)
+
+
+def remove_whole(path: Path) -> None:
+    """Remove a file, or a folder with what is in it; of a link the link alone."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def _megabytes(target: Path) -> float:
+    files = [target] if target.is_file() else list(target.iterdir())
+    return sum(file.stat().st_size for file in files) / 1e6
+
+
+def read_checked(path: Path, colour: str) -> RolloutData:
+    """A rollout that can be drawn in ``colour``.
+
+    Raises:
+        ValueError: it cannot, or the file is none.
+    """
+    if not path.is_file():
+        raise ConfigError(f"{path}: no such file; give the rollout.h5 of hood rollout, or its folder")
+    data = read_rollout(path)
+    sizes = {len(data.time), len(data.cloth_pos), len(data.body_pos)}
+    meshes = ((data.cloth_pos, data.cloth_faces, "cloth"), (data.body_pos, data.body_faces, "body"))
+    for pos, faces, which in meshes:
+        if pos.ndim != 3 or pos.shape[2] != 3 or len(sizes) > 1:
+            raise ValueError(f"{path}: not a rollout file ({which}/pos has the shape {pos.shape}); make one with hood rollout")
+        if faces.ndim != 2 or faces.shape[1] != 3 or (faces.size and not 0 <= faces.min() <= faces.max() < pos.shape[1]):
+            raise ValueError(f"{path}: not a rollout file ({which}/faces name vertices that are not there)")
+    if len(data.time) == 0:
+        raise ValueError(f"{path}: holds no frames; run hood rollout again")
+    if colour == "rg" and "rg" not in data.fields:
+        raise ValueError(f"{path}: colour=rg needs cloth/rg, which is missing; simulate it with export=[rg]")
+    if colour == "contact" and not len(data.body_faces):
+        raise ValueError(f"{path}: colour=contact shows the distance from the body, and the rollout has none")
+    return data
+
+
+_NAMES = ("summary.json", "contact_sheet.png", "rollout.mp4", "rollout.gif", "plan.json")
+
+
+def remove_earlier(folder: Path, config: DictConfig) -> None:
+    """Remove summary, pictures, exports and plan of the rollout that was in ``folder``: they would pass for the next one's.
+
+    The summary goes first: its presence says that everything is there. What ``config`` names as input stays.
+    """
+    given = {Path(word).expanduser().resolve() for word in _words(plain(config))}
+    for path in (*(folder / name for name in _NAMES), *exports_beside(folder / "rollout.h5")):
+        if path.resolve() not in given:
+            remove_whole(path)
+
+
+def _words(value: Any) -> Iterator[str]:
+    """All strings in a value of a config."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, (dict, list)):
+        for item in value.values() if isinstance(value, dict) else value:
+            yield from _words(item)

@@ -1,0 +1,300 @@
+"""``hood rollout``: a garment, a body and a motion in; ``rollout.h5``, a video, a contact sheet and a summary out."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from omegaconf import DictConfig
+from tqdm import tqdm
+
+from hood.app.batch.batch import Job, find_jobs, share, with_one_stepper, write_overview
+from hood.app.batch.folders import as_begun, motion_attributes, refuse_others, resumed
+from hood.app.common import output_folder, prepare_folder, thinning, together
+from hood.app.notices import Heard, heard
+from hood.app.output.export import check_outputs, export_beside, remove_earlier
+from hood.app.output.frames import at_output_fps, finer_mesh, on_finer_mesh, planned_steps, refined_still
+from hood.app.output.summary import describe, describe_all, summarise
+from hood.app.output.textures import check_worn, lay_on, read_textures
+from hood.app.output.verdict import exit_code
+from hood.app.plan_file import plan_mode, plan_path, plan_sentences, planned, rollout_config, summarise_plan, without_accuracy
+from hood.app.scene.events import describe_held, fastening_attributes, summarise_held
+from hood.app.scene.garments import describe_ease, summarise_ease
+from hood.app.settings.compose import plain, save_run_record
+from hood.app.setup import Setup, check_config, make_stepper, set_up, solves_in_double
+from hood.app.stepping.automatic import advice
+from hood.app.stepping.cautions import idle_in_rollout, warn
+from hood.app.stepping.cloth_contact import why_not
+from hood.app.stepping.guarding import OFF, GuardStopped, guard_sentences, make_guard, write_alarms
+from hood.app.stepping.refinement import exported
+from hood.assets.files.atomic import occupy, write_atomically
+from hood.assets.files.said import Doubt
+from hood.rollouts.checks.fit import Ease, measure_ease
+from hood.rollouts.file.recorder import RolloutWriter, read_rollout, still_of
+from hood.rollouts.frames import ridden_faces, ridden_frames, ridden_rest, ridden_still, riding_attributes
+from hood.rollouts.loop import Frame, metric_names, simulate
+from hood.scene.sizing import Sizes
+from hood.steppers.newton import Stepper
+from hood.steppers.static_shapes.simulator import network_of
+from hood.training import distributed
+
+
+def run(overrides: Sequence[str]) -> int:
+    """Run the command; returns the exit code: 130 where the user interrupted it, else 2 where a motion of many could not be
+    used, else 3 where a result is unsound (:mod:`hood.rollouts.verdict`), else 0."""
+    config = rollout_config(without_accuracy(overrides))
+    check_config(config)
+    check_outputs(config)
+    if distributed.is_first():
+        _tell(idle_in_rollout(overrides, config))
+    return together(lambda: _run(rollout_config(distributed.on_main(lambda: planned(overrides)))))
+
+
+def _run(config: DictConfig) -> int:
+    """One motion, or each of many in a folder of its own; processes that torchrun started share the many."""
+    output = output_folder(config)
+    jobs = distributed.on_main(lambda: find_jobs(str(config.sequence), output, config.root))
+    if jobs is not None:
+        return _run_all(config, jobs, output)
+    if distributed.rank() != 0:
+        return 0
+    config = as_begun(config, [(str(config.sequence), output)])
+    stepper, digest = make_stepper(config)
+    summary, interrupted = resumed(config, digest), False
+    if summary is None:
+        summary, interrupted = _run_one(config, stepper, digest)
+    else:
+        print(f"resume=true: {output} holds this rollout, finished with the same settings; it stays")
+    return 130 if interrupted else exit_code([summary], bool(config.allow_unsound), str(config.doubts))
+
+
+def _run_one(config: DictConfig, stepper: Stepper, digest: str, alone: bool = True) -> tuple[dict[str, Any], bool]:
+    """The rollout of one motion with all its files: the summary, and whether the user interrupted it. Where many are run
+    none may replace another's, and none is the place for advice on the stepper."""
+    with heard() as warned:
+        return _run_heard(config, stepper, digest, warned, alone)
+
+
+def _tell(sentences: Sequence[str]) -> None:
+    for sentence in sentences:
+        print(sentence)
+
+
+def _keep_plan(config: DictConfig, folder: Path) -> None:
+    """The plan beside what was made by it: the rollout can be made again when the plan's own place is gone."""
+    path, here = plan_path(config), folder / "plan.json"
+    if path is not None and path.resolve() != here.resolve():
+        write_atomically(here, path.read_bytes())
+
+
+def _first_positions(path: Path, count: int) -> np.ndarray:
+    """Where the ``count`` simulated vertices of a rollout file are in frame 0, (V, 3) float64 [m], world."""
+    with h5py.File(path, "r") as file:
+        return np.asarray(file["cloth/pos"][0, :count], dtype=np.float64)
+
+
+def _run_heard(config: DictConfig, stepper: Stepper, digest: str, warned: Heard, alone: bool) -> tuple[dict[str, Any], bool]:
+    """The rollout of one motion; ``warned`` is what has been warned about when the summary is written."""
+    ready = set_up(config, stepper)
+    check_worn(read_textures(config), ready.scene.garment)
+    with occupy(prepare_folder(output_folder(config))):
+        if not alone:
+            refuse_others(output_folder(config), str(config.sequence))
+        return _run_there(ready, config, digest, warned, alone)
+
+
+def _run_there(ready: Setup, asked: DictConfig, digest: str, warned: Heard, advise: bool) -> tuple[dict[str, Any], bool]:
+    """The rollout in its folder, which is there and held."""
+    config, scene, stepper = ready.config, ready.scene, ready.stepper
+    folder = output_folder(config)
+    remove_earlier(folder, config)
+    save_run_record(folder, config, int(config.seed))
+    eases: list[Ease | None] = []
+    interrupted = _simulate_to_disk(ready, digest, folder / "rollout.h5", asked, eases, warned.doubts)
+    summary = summarise(folder / "rollout.h5")
+    if eases:
+        summary |= summarise_ease(eases[0], eases[-1])
+    if scene.holding is not None:
+        summary |= summarise_held(scene, read_rollout(folder / "rollout.h5"))
+    warn(guard_sentences(summary.get("guard")))
+    summary["choice"] = asdict(ready.choice)
+    summary |= summarise_plan(folder / "rollout.h5", config)
+    _keep_plan(config, folder)
+    print(describe(summary))
+    _tell(describe_held(summary))
+    _tell(describe_ease(summary))
+    _tell(plan_sentences(summary))
+    if advise:
+        _tell(advice(config, scene, summary, _first_positions(folder / "rollout.h5", scene.cloth.num_vertices)))
+    simulator = network_of(stepper)
+    try:
+        if not interrupted:
+            _draw(config, folder)
+            _tell(export_beside(folder / "rollout.h5", [str(form) for form in config.formats], read_textures(config)))
+    finally:
+        summary["kernels"] = None if simulator is None else simulator.network.kernels
+        summary["warnings"] = list(warned)
+        _write_json(folder / "summary.json", summary)
+    print(f"files in {folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
+    if interrupted:
+        print(
+            f"hood: interrupted; the {summary['num_frames']} frames done are kept in {folder / 'rollout.h5'}",
+            file=sys.stderr,
+        )
+    return summary, interrupted
+
+
+def _run_all(config: DictConfig, jobs: list[Job], output: Path) -> int:
+    """Every motion in its folder, and ``summary.json`` over all of them; one stepper for all."""
+    config = distributed.on_main(lambda: with_one_stepper(config, jobs))
+    stepper, digest = make_stepper(config)
+
+    def work(job: Job) -> tuple[dict[str, Any], bool]:
+        one = job.of(config)
+        done = resumed(one, digest)
+        return (done | {"skipped": True}, False) if done is not None else _run_one(one, stepper, digest, alone=False)
+
+    outcome = share(jobs, work)
+    if distributed.rank() == 0:
+        overview = write_overview(prepare_folder(output), outcome.rows, {job.sequence: job.folder for job in jobs})
+        print(describe_all(outcome.rows, len(jobs)))
+        print(f"summary of all in {overview}")
+        if len(outcome.rows) < len(jobs):
+            print("hood: not all done; the same command with resume=true goes on", file=sys.stderr)
+    if outcome.hopeless is not None:
+        raise outcome.hopeless
+    if outcome.interrupted:
+        return 130
+    if any("error" in row for row in outcome.rows.values()):
+        return 2
+    return exit_code(outcome.rows.values(), bool(config.allow_unsound), str(config.doubts))
+
+
+def _simulate_to_disk(
+    ready: Setup, digest: str, path: Path, asked: DictConfig, eases: list[Ease | None], doubts: Sequence[Doubt]
+) -> bool:
+    """Stream the rollout into ``path``; True when the user interrupted it. ``asked`` is the config with ``auto`` in it,
+    ``doubts`` those about its inputs. Where a size was asked for, how the garment sat is added to ``eases``, at the beginning
+    and the end."""
+    config, scene, stepper, potential = ready.config, ready.scene, ready.stepper, ready.potential
+    guard = make_guard(config, stepper, potential)
+    count = min(int(config.num_frames), scene.num_frames)
+    if count < int(config.num_frames):
+        print(f"{scene.motion.name} has {count} frames at {1 / scene.dt:g} fps; the rollout ends there")
+    attributes = {
+        "material": plain(config.material),
+        "config": plain(config),
+        "asked": plain(asked),
+        "checkpoint": str(config.checkpoint),
+        "checkpoint_sha256": digest,
+        "model": stepper.config,
+        "stepper": str(config.stepper),
+        "garment": scene.garment.name,
+        "sequence": scene.motion.name,
+        "surface_stride": int(config.surface_stride),
+        "cloth_contact_off": why_not(config),
+        "guard": OFF if guard is None else guard.mode,
+        "doubts": [doubt.as_dict() for doubt in doubts],
+        **motion_attributes(str(config.sequence)),
+        **fastening_attributes(scene),
+    }
+    steps, finer = planned_steps(config, scene, count), finer_mesh(config, scene)
+    if finer is not None:
+        attributes |= {"refine_mesh": int(config.refine_mesh), "simulated_vertices": finer.num_coarse}
+    garment, riders = scene.garment, scene.garment.riders
+    attributes |= riding_attributes(riders)
+    still = refined_still(still_of(garment, scene.fastening), finer, garment.faces)
+    stored_rest = scene.cloth.rest_pos.cpu().numpy() if finer is None else finer.rest_pos
+    writer = RolloutWriter(
+        path,
+        count if steps is None else steps.rate.count(count),
+        ridden_rest(stored_rest, garment),
+        ridden_faces(garment.faces if finer is None else finer.faces, len(stored_rest), riders),
+        scene.motion.faces,
+        scene.motion.num_vertices,
+        metric_names(potential, stepper, str(config.metrics), str(config.settle), guard is not None),
+        scene.dt if steps is None else 1.0 / steps.rate.fps,
+        attributes,
+        farthest=float(np.abs(scene.motion.translation).max()),
+        fields=exported(config),
+        double=solves_in_double(config),
+        guarded=guard is not None,
+        still=ridden_still(still, riders),
+        steps=steps,
+    )
+    frames = simulate(
+        stepper,
+        scene,
+        potential,
+        count,
+        int(config.relaxing_steps),
+        metrics=str(config.metrics),
+        fields=exported(config),
+        surface_stride=int(config.surface_stride),
+        settle=str(config.settle),
+        guard=guard,
+        afresh=plan_mode(config) == "full",
+    )
+
+    def simulated() -> Iterator[Frame]:
+        """The simulated frames, each noted before it is passed on."""
+        for frame in tqdm(frames, total=count, desc=f"rollout {scene.garment.name}", unit="frame", disable=_quiet()):
+            if steps is not None:
+                writer.append_step(frame.world_pos.numpy(), frame.metrics)
+            if scene.sizes != Sizes() and frame.index in (0, count - 1):
+                eases.append(measure_ease(scene, scene.cloth_at(frame.index), frame.state, frame.index))
+            yield frame
+            write_alarms(writer, guard)
+
+    try:
+        with writer:
+            shown = on_finer_mesh(at_output_fps(simulated(), config, scene, count), finer, scene)
+            for frame in ridden_frames(shown, garment):
+                fields = {name: values.numpy() for name, values in frame.fields.items()}
+                writer.append(frame.world_pos.numpy(), frame.body_pos.numpy(), frame.metrics, fields)
+            write_alarms(writer, guard)
+            if guard is not None and guard.stopped is not None:
+                raise GuardStopped
+    except GuardStopped:
+        return False
+    except KeyboardInterrupt:
+        if writer.frames_done == 0:
+            raise
+        return True
+    return False
+
+
+def _draw(config: DictConfig, folder: Path) -> None:
+    """Contact sheet and video, when the picture libraries are installed."""
+    if str(config.video) == "none" and not bool(config.sheet):
+        return
+    try:
+        from hood.media.film import write_sheet, write_video
+    except ImportError as error:
+        print(f"no pictures: {error}", file=sys.stderr)
+        return
+    data, colour, thinner = read_rollout(folder / "rollout.h5"), str(config.colour), thinning(config)
+    textures = lay_on(read_textures(config), [data])[0]
+    if bool(config.sheet):
+        write_sheet(data, folder / "contact_sheet.png", colour, thinner, textures)
+    if str(config.video) != "none":
+        frames = tqdm(range(0, len(data.cloth_pos), int(config.video_stride)), desc="video", unit="frame", disable=_quiet())
+        write_video(data, folder / f"rollout.{config.video}", frames, int(config.video_stride), colour, thinner, textures)
+
+
+def _write_json(path: Path, value: dict[str, Any]) -> None:
+    temporary = path.with_name(path.name + ".partial")
+    temporary.write_text(json.dumps(value, indent=1), encoding="utf-8")
+    os.replace(temporary, path)
+
+
+def _quiet() -> bool | None:
+    """For progress bars: shown on a terminal, by one process."""
+    return True if distributed.rank() else None

@@ -1,0 +1,99 @@
+"""``material=`` and ``fabrics=``: what a garment of a rollout is made of, all of it or part by part."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from omegaconf import DictConfig
+
+from hood.app.settings.compose import ConfigError, build, load_config, options, plain
+from hood.assets.files.library import unknown
+from hood.assets.garment.garment import Garment
+from hood.assets.garment.parts import part_faces
+from hood.assets.material import Material, measured
+from hood.cloth.fabric import patchwork
+from hood.scene.body_motion.motion import BodyMotion, Motion
+
+_MEASURED = f"{measured.__module__}.{measured.__name__}"
+
+
+def fabric_of(config: DictConfig, garment: Garment, motion: Motion) -> Material:
+    """The fabric that the config gives to ``garment``.
+
+    Raises:
+        ConfigError: ``fabrics`` is no table of parts and fabrics, or names a fabric that there is not.
+        ValueError: it names a part that the garment does not have.
+    """
+    material: Material = build(config.material)
+    parts, width = checked_fabrics(config), checked_seams(config)
+    if not parts:
+        return material
+    body = motion.body if isinstance(motion, BodyMotion) else None
+    pieces = [(part_faces(part, garment, body), fabric) for part, fabric in parts.items()]
+    return patchwork(material, pieces, garment.rest_pos, garment.faces, width)
+
+
+def checked_fabrics(config: DictConfig) -> dict[str, Material]:
+    """``fabrics`` of a config: fabrics by part.
+
+    Raises:
+        ConfigError: it is something else, or a fabric or a property is unknown.
+        ValueError: a property has no physical value.
+    """
+    value = plain(config.fabrics)
+    if value is None:
+        return {}
+    if not isinstance(value, dict) or not all(isinstance(fabric, (str, dict)) for fabric in value.values()):
+        raise ConfigError(
+            f"fabrics={value}: give fabrics by part, such as fabrics={{below_waistband:silk,above_waistband:denim}}"
+        )
+    return {str(part): _fabric(str(part), fabric, config) for part, fabric in value.items()}
+
+
+def checked_seams(config: DictConfig) -> float:
+    """``fabrics_seam`` of a config [m].
+
+    Raises:
+        ConfigError: it is no length, or there are no fabrics that it could be between.
+    """
+    width = config.fabrics_seam
+    if isinstance(width, bool) or not isinstance(width, (int, float)) or not 0.0 <= width < float("inf"):
+        raise ConfigError(f"fabrics_seam={width}: give metres (0.03), 0 for a sharp seam")
+    if width > 0.0 and config.fabrics is None:
+        raise ConfigError(
+            f"fabrics_seam={width:g}: is between fabrics; give fabrics={{below_waistband:silk}} too, or leave it out"
+        )
+    return float(width)
+
+
+def _fabric(part: str, given: str | dict[str, Any], config: DictConfig) -> Material:
+    """The fabric of a part: an option of ``material=``, or a table of one and of properties instead of its own."""
+    own = {} if isinstance(given, str) else {str(key): value for key, value in given.items()}
+    name = given if isinstance(given, str) else own.pop("material", None)
+    known = options("material")
+    if name is not None and name not in known:
+        raise ConfigError(f"fabrics: {part}: {unknown('material', str(name), known)}")
+    woven = own.pop("woven", None)
+    for key, value in own.items():
+        if key not in Material.names():
+            raise ConfigError(f"fabrics: {part}: {unknown('property', key, ['material', 'woven', *Material.names()])}")
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise ConfigError(f"fabrics: {part}: {key} is {value!r}; give a number")
+    if woven is not None and (name is None or not is_measured(name)):
+        raise ConfigError(f"fabrics: {part}: woven is for measured cloth by its name (material: linen); give warp and weft")
+    base: Material = build(config.material) if name is None else fabric_named(name, woven)
+    return replace(base, **own)
+
+
+def fabric_named(name: str, woven: Any = None) -> Material:
+    """The fabric of an option of ``material=``; of measured cloth also with another ``woven`` than its own."""
+    material: Material = build(
+        load_config("rollout", [f"material={name}"]).material, **({} if woven is None else {"woven": woven})
+    )
+    return material
+
+
+def is_measured(name: str) -> bool:
+    """Whether an option of ``material=`` tells measured cloth."""
+    return str(load_config("rollout", [f"material={name}"]).material.get("_target_")) == _MEASURED

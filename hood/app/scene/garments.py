@@ -1,0 +1,258 @@
+"""Reading the garments that a command is given: one or several, repaired or not, with their pins.
+
+``size=``, ``fit=`` and how the garment sits: keys of a rollout, and what its summary says.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig
+
+from hood.app.scene.garment_files import read_garment
+from hood.app.settings.compose import ConfigError, brief, plain, require_choice, shown
+from hood.assets.body.load import load_body
+from hood.assets.fitting.alterations import OPENING, SHORT, join_short_edges, part_open_seams, turn_flat_faces
+from hood.assets.fitting.placement import require_metres, used
+from hood.assets.fitting.suspicions import Suspicion, suspect_kind, suspect_seams
+from hood.assets.garment.garment import Garment
+from hood.assets.garment.outfit import join_garments
+from hood.assets.garment.parts import tailored
+from hood.assets.garment.pins import pin_mask
+from hood.assets.garment.record import Wanted
+from hood.mesh.editing.repair import FLAT
+from hood.rollouts.checks.fit import Ease
+from hood.scene.body_motion.motion import BodyMotion, Motion
+from hood.scene.sizing import Sizes, sizes_of
+
+
+def names_of(given: Any, key: str = "garment") -> list[str]:
+    """Names in a config value that is one name or a list of them.
+
+    Raises:
+        ConfigError: neither, or an empty list.
+    """
+    value = plain(given)
+    names = value if isinstance(value, list) else [value]
+    if not names or not all(isinstance(name, (str, int, float)) and not isinstance(name, bool) for name in names):
+        raise ConfigError(f"{key}={brief(value)}: give a name, a file, or several, {key}=[shirt.obj,trousers]")
+    return [str(name) for name in names]
+
+
+def read_outfit(
+    given: Any, motion: Motion, triangulate: bool = False, pins: Any = None, wanted: Wanted | None = None
+) -> Garment:
+    """The garment or garments named by a config value, as one garment that can follow ``motion``.
+
+    Args:
+        given: a name, a file, a list of them, or a garment that is read already.
+        triangulate: split polygons of mesh files instead of refusing them.
+        pins: what is held instead of the files' own pins, see :func:`hood.assets.garment.pins.pin_mask`; None: the files' own.
+        wanted: what is asked of files that are not one sheet of cloth; None: what is usual.
+
+    Raises:
+        ValueError: a garment that cannot be read, is not in metres or does not fit, or pins it does not have.
+    """
+    if isinstance(given, Garment):
+        garments = [given]
+    else:
+        beside, wanted = _measured_against(motion), wanted or Wanted()
+        garments = [read_garment(name, wanted, beside, triangulate) for name in names_of(given)]
+    for garment in garments:
+        if not garment.bound:
+            heed(garment.name, suspect_seams(garment.rest_pos, garment.faces))
+    garments = [as_simulated(garment) for garment in garments]
+    pins = plain(pins)
+    if pins is not None:  # what is held differs in how it follows the body
+        garments = [replace(garment, pinned=np.zeros_like(garment.pinned)) for garment in garments]
+    if motion.num_vertices:
+        surface = motion.surface(0, motion.translation[0]).cpu().numpy()
+        for garment in garments:
+            if not garment.bound:
+                require_metres(used(garment.rest_pos, garment.faces), surface, garment.name)
+                heed(garment.name, suspect_kind(garment.rest_pos, garment.faces, surface))
+    outfit = join_garments([motion.dressed(garment) for garment in garments])
+    if pins is None:
+        return outfit
+    body = motion.body if isinstance(motion, BodyMotion) else None
+    return replace(outfit, pinned=pin_mask(checked_pins(pins), outfit, body))
+
+
+def _measured_against(motion: Motion) -> np.ndarray:
+    """(W, 3) m: the body that says how large a garment may be; the default one where there is none."""
+    if motion.num_vertices:
+        return motion.surface(0, motion.translation[0]).double().cpu().numpy()
+    return load_body("default").v_template
+
+
+def as_simulated(garment: Garment) -> Garment:
+    """The garment without what no step can resolve: short edges, flat faces, open seams that lie on each other. Vertices keep
+    their numbers. Warnings say what was done; of seams of garments that are not bound :func:`suspect_seams` does."""
+    joined, near = join_short_edges(garment)
+    turned, flat = turn_flat_faces(joined)
+    parted, doubled = part_open_seams(turned)
+    for count, what in (
+        (
+            near,
+            f"vertices lie within {SHORT:g} of an edge's length of a neighbour; faces take the neighbour, and those vertices "
+            "are left out of the simulation",
+        ),
+        (flat, f"faces are lower than {FLAT:g} of their length; they are divided anew with their neighbours"),
+        (
+            doubled if garment.bound else 0,
+            f"vertices lie on others along open seams, which hold nothing together; they are drawn back by "
+            f"{1e3 * OPENING:g} mm, hood prepare garment=… sews them",
+        ),
+    ):
+        if count:
+            warnings.warn(f"garment {garment.name!r}: {count} {what}", stacklevel=2)
+    return parted
+
+
+def layer_order(given: Any, names: Sequence[str]) -> tuple[int, ...] | None:
+    """Garments from the body outwards, by their places among ``names`` (of files the stem is enough); None for ``auto``.
+
+    Raises:
+        ConfigError: ``given`` is not ``auto``, nor all of the names in some order.
+    """
+    if plain(given) == "auto":
+        return None
+    wanted, left, order = names_of(given, "layers"), list(enumerate(names)), []
+    for name in wanted:
+        place = next((item for item in left if name in (item[1], Path(item[1]).stem)), None)
+        if place is None:
+            break
+        left.remove(place)
+        order.append(place[0])
+    if left or len(order) != len(wanted):
+        raise ConfigError(
+            f"layers={','.join(wanted)}: give all garments from the body outwards, layers=[{','.join(names)}] or another order"
+        )
+    return tuple(order)
+
+
+def heed(name: str, suspicions: Sequence[Suspicion]) -> None:
+    """Warn about what the garment ``name`` seems to be.
+
+    Raises:
+        ValueError: a grave suspicion.
+    """
+    for suspicion in suspicions:
+        if suspicion.grave:
+            raise ValueError(f"garment {name!r} {suspicion.sentence}")
+        warnings.warn(f"garment {name!r} {suspicion.sentence}", stacklevel=2)
+
+
+def checked_pins(pins: Any) -> str | int | Sequence[str | int]:
+    """A config value for pins: a word, a number, or a list of them.
+
+    Raises:
+        ConfigError: something else.
+    """
+    if isinstance(pins, (str, int)) and not isinstance(pins, bool):
+        return pins
+    if isinstance(pins, list) and all(isinstance(pin, (str, int)) and not isinstance(pin, bool) for pin in pins):
+        return pins
+    raise ConfigError(
+        f"pins={brief(pins)}: give vertex numbers, regions or lists, such as pins=[waistband,12,13] or pins=held.txt"
+    )
+
+
+def shape_coefficients(given: Any, key: str = "betas") -> np.ndarray:
+    """Ten shape coefficients from a config value of at most ten finite numbers; ``key`` is where it stands.
+
+    Raises:
+        ConfigError: something else.
+    """
+    values = plain(given)
+    numbers = isinstance(values, list) and all(isinstance(b, (int, float)) and np.isfinite(b) for b in values)
+    if not numbers or len(values) > 10:
+        raise ConfigError(f"{key}={brief(values)}: give at most 10 finite shape coefficients, e.g. [1.5,0,-1]")
+    return np.array([*values, *[0.0] * (10 - len(values))], dtype=np.float64)
+
+
+#: Whether the pattern follows the body's shape, or is that of the mean body for everybody.
+FITS = ("betas", "none")
+
+
+def checked_sizes(config: DictConfig) -> Sizes:
+    """The sizes that the config asks for.
+
+    Raises:
+        ConfigError: they are none, or they change in steps of fixed shapes.
+    """
+    end, parts = plain(config.size_end), checked_parts(config)
+    require_choice(config, "fit", FITS)
+    if parts and end is not None:
+        raise ConfigError(f"size_end={end}: parts of a garment keep their size; give size as one factor or three")
+    seconds = float(config.size_seconds)
+    if not seconds > 0:
+        raise ConfigError(f"size_seconds={config.size_seconds}: give seconds above 0, such as size_seconds=2")
+    size = 1.0 if parts else plain(config.size)
+    for key, value in (("size", size), ("size_end", size if end is None else end)):
+        try:
+            sizes = replace(sizes_of(value), parts=tuple(parts.values()))
+        except (ValueError, TypeError) as error:
+            raise ConfigError(f"{key}={shown(config[key])}: {error}") from error
+    sizes = replace(sizes_of(size, end, seconds), parts=tuple(parts.values()))
+    if sizes.changing and str(config.step) != "plain":
+        raise ConfigError(
+            f"size_end={end}: step={config.step} has fixed shapes, which a garment that grows has not; use step=plain"
+        )
+    return replace(sizes, to_measure=str(config.fit) == "betas")
+
+
+def checked_parts(config: DictConfig) -> dict[str, float]:
+    """Factors by part, where ``size`` is a table of them; empty where it is not.
+
+    Raises:
+        ConfigError: a factor that is no number.
+    """
+    value = plain(config.size)
+    if not isinstance(value, dict):
+        return {}
+    for part, factor in value.items():
+        if isinstance(factor, bool) or not isinstance(factor, (int, float)):
+            raise ConfigError(f"size: {part} is {factor!r}; give a factor of the part, such as size={{{part}:1.1}}")
+    if not value:
+        raise ConfigError("size={}: names no part; give parts and factors, such as size={sleeves:1.2}, or one factor")
+    return {str(part): float(factor) for part, factor in value.items()}
+
+
+def cut_to_size(config: DictConfig, garment: Garment, motion: Motion) -> Garment:
+    """``garment`` with its parts cut as the config asks for, if it does.
+
+    Raises:
+        ValueError: it names a part that the garment does not have.
+    """
+    parts = checked_parts(config)
+    body = motion.body if isinstance(motion, BodyMotion) else None
+    return tailored(garment, parts, body) if parts else garment
+
+
+def summarise_ease(first: Ease | None, last: Ease | None) -> dict[str, Any]:
+    """What ``summary.json`` says of how the garment sat in frame 0 and in the last one; nothing where it was not measured."""
+    if first is None or last is None:
+        return {}
+    return {"ease": {name: asdict(ease) | {"word": ease.word} for name, ease in (("first", first), ("last", last))}}
+
+
+def describe_ease(summary: Mapping[str, Any]) -> list[str]:
+    """A line on it; none where the summary does not say."""
+    found = summary.get("ease")
+    if not found:
+        return []
+    words = []
+    for name, when in (("first", "frame 0"), ("last", "the last frame")):
+        ease = found[name]
+        low, middle, high = (1e3 * value for value in ease["gap"])
+        skin = f"skin {low:.0f}, {middle:.0f}, {high:.0f} mm away at p5, p50, p95; on the skin {100 * ease['on_skin']:.0f}%"
+        skin = skin if low == low else "no skin within 10 cm"
+        stretched = f"stretched by {100 * ease['stretch']:.1f}% there; upper rim {100 * ease['slid']:.0f} cm down"
+        words.append(f"{when}: {ease['word']} ({skin}, {stretched})")
+    return ["size, " + "; ".join(words)]

@@ -1,0 +1,170 @@
+"""Reading the body and motion that a command is given.
+
+``body_friction=``: parts of the body that grip the cloth more or less than the rest.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from hood.app.settings.compose import ConfigError, brief, plain, require_choice, shown
+from hood.assets.body.parts import body_part
+from hood.assets.files.library import names
+from hood.assets.motion.animated_mesh import body_kind
+from hood.assets.motion.load import HANDS
+from hood.assets.motion.skeleton import UNITS
+from hood.scene.body_motion.load import NO_MOTION, MotionOptions, load_motion
+from hood.scene.body_motion.motion import BodyMotion, Motion
+from hood.scene.scene import Scene
+
+
+def checked_friction(config: DictConfig) -> dict[str, float]:
+    """``body_friction`` of a config: factors on the coefficient of friction by part of the body.
+
+    Raises:
+        ConfigError: it is something else.
+    """
+    value = plain(config.body_friction)
+    if value is None:
+        return {}
+    if not isinstance(value, dict) or not value:
+        raise ConfigError(f"body_friction={value}: give factors by part, such as body_friction={{left_wrist:3,below_pelvis:0}}")
+    for part, factor in value.items():
+        if isinstance(factor, bool) or not isinstance(factor, (int, float)) or not 0.0 <= factor < math.inf:
+            raise ConfigError(f"body_friction: {part} is {factor!r}; give a finite factor >= 0, 1 for the usual friction")
+    return {str(part): float(factor) for part, factor in value.items()}
+
+
+def with_body_friction(scene: Scene, config: DictConfig) -> Scene:
+    """The scene whose body grips as the config says; the same where it says nothing.
+
+    Raises:
+        ConfigError: the config has no such table, or there is no body.
+        ValueError: the body has no such part.
+    """
+    parts = checked_friction(config)
+    if not parts:
+        return scene
+    motion = scene.motion
+    if motion.num_vertices == 0:
+        raise ConfigError("body_friction: there is no body; leave it out")
+    body = motion.body if isinstance(motion, BodyMotion) else None
+    grip = np.ones(len(motion.faces))
+    for part, factor in parts.items():
+        try:
+            grip[body_part(part, motion.faces, motion.num_vertices, body)] = factor
+        except ValueError as error:
+            raise ValueError(f"body_friction: {error}") from error
+    return replace(scene, grip=torch.as_tensor(grip))
+
+
+#: Values of the keys that take numbers.
+_SUCH_AS = {"fps": 30, "file_fps": 120, "blend_in": 1, "body_scale": 0.01}
+#: Keys of one word and their words; a null is the file's own.
+_WORDS = {
+    "hands": HANDS,
+    "blend_from": ("t", "a"),
+    "gender": ("neutral", "male", "female"),
+    "trans_unit": (*UNITS, "auto"),
+}
+
+
+def check_motion_options(config: DictConfig) -> None:
+    """Raise ConfigError where a key that says how a motion is performed has a value that none can have, used or not."""
+    for key, known in _WORDS.items():
+        if config[key] is not None:
+            require_choice(config, key, known)
+    for key in ("file_fps", "body_scale"):
+        value = _optional(config, key)
+        if value is not None and not value > 0:
+            raise ConfigError(f"{key}={shown(config[key])}: give a number above 0, such as {key}={_SUCH_AS[key]}")
+    check_rate(config)
+
+
+def check_rate(config: DictConfig, key: str = "fps") -> None:
+    """Raise ConfigError unless a key is a frame rate at which steps can be taken."""
+    value = OmegaConf.select(config, key)
+    if not 1.0 <= float(value) <= 1000.0:
+        raise ConfigError(f"{key}={value}: give the simulation's frames per second, 1 to 1000")
+
+
+def make_motion(config: DictConfig, dtype: torch.dtype = torch.float32) -> Motion:
+    """What moves in the scene, in ``dtype`` on the config's device.
+
+    A body that performs no motion but its own does so beside an embedded motion, the default, and says that; a file was
+    meant.
+
+    Raises:
+        FileNotFoundError, ValueError: from :func:`hood.scene.body_motion.load.load_motion`.
+        ConfigError: a value of the wrong kind, or a motion file that the body cannot perform; names the key.
+    """
+    kind = body_kind(str(config.body))
+    if kind != "model" and str(config.sequence) != NO_MOTION:
+        has = "performs its own motion" if kind == "mesh" else "does not move"
+        if str(config.sequence) not in names("motions"):
+            raise ConfigError(
+                f"sequence={config.sequence}: body={config.body} {has}; leave sequence out, or give a body of the SMPL family"
+            )
+        print(f"body={config.body} {has}: sequence={config.sequence} is not used", file=sys.stderr)
+    return load_motion(str(config.body), str(config.sequence), motion_options(config), dtype, str(config.device))
+
+
+def motion_options(config: DictConfig) -> MotionOptions:
+    """The keys of a config that say how a motion is performed.
+
+    Raises:
+        ConfigError: a value of the wrong kind; names the key.
+    """
+    return MotionOptions(
+        fps=_number(config, "fps"),
+        up=str(config.up),
+        start=config.start,
+        stop=config.stop,
+        loop=int(config.loop),
+        file_fps=_optional(config, "file_fps"),
+        num_frames=int(config.num_frames),
+        betas=_betas(plain(config.betas)),
+        gender=None if config.gender is None else str(config.gender),
+        blend_in=_number(config, "blend_in"),
+        blend_from=str(config.blend_from),
+        hands=str(config.hands),
+        person=None if config.person is None else str(config.person),
+        trans_unit=str(config.trans_unit or "auto"),
+        scale=_optional(config, "body_scale"),
+        animation=config.animation,
+        parts=_names(config, "body_parts"),
+    )
+
+
+def _number(config: DictConfig, key: str) -> float:
+    try:
+        return float(config[key])
+    except (TypeError, ValueError):
+        raise ConfigError(f"{key}={shown(config[key])}: give a number, such as {key}={_SUCH_AS[key]}") from None
+
+
+def _optional(config: DictConfig, key: str) -> float | None:
+    return None if config[key] is None else _number(config, key)
+
+
+def _betas(given: Any) -> Any:
+    if given is None:
+        return None
+    # bool is an int, and no coefficient.
+    if not isinstance(given, list) or not all(isinstance(b, (int, float)) and not isinstance(b, bool) for b in given):
+        raise ConfigError(f"betas={brief(given)}: give at most 10 finite shape coefficients, e.g. betas=[1.5,0,-1]")
+    return given
+
+
+def _names(config: DictConfig, key: str) -> list[str]:
+    given = plain(config[key])
+    if not isinstance(given, list):
+        raise ConfigError(f"{key}={brief(given)}: give a list of names, e.g. {key}=[Body]")
+    return [str(name) for name in given]

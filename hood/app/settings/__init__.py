@@ -1,0 +1,4 @@
+"""Settings: YAML and ``key=value`` words become one checked config.
+
+Hydra is used here alone.
+"""

@@ -1,0 +1,198 @@
+"""Scene and stepper of a rollout, put together from its configuration."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from omegaconf import DictConfig
+
+from hood.app.common import require_device, thinning
+from hood.app.output.frames import check_output_fps, check_refine_mesh
+from hood.app.output.verdict import DOUBTS
+from hood.app.plan_file import plan_path, read_watch
+from hood.app.scene.events import checked_events, with_events
+from hood.app.scene.fabrics import checked_fabrics, fabric_of
+from hood.app.scene.garment_files import wanted_of
+from hood.app.scene.garments import checked_sizes, cut_to_size, heed, layer_order, names_of, read_outfit
+from hood.app.scene.motion import check_motion_options, make_motion, with_body_friction
+from hood.app.settings.compose import ConfigError, load_config, require_choice
+from hood.app.stepping.automatic import Choice, choose, decided
+from hood.app.stepping.cautions import known_by_slope, scene_cautions, warn
+from hood.app.stepping.cloth_contact import acts, check_cloth_contact, potential_of, tell_if_off
+from hood.app.stepping.guarding import check_guard
+from hood.app.stepping.refinement import AUTO, check_refinement, chosen, refined
+from hood.app.stepping.steppers import PLAIN, losses_of, make_network, make_solver, option_of
+from hood.assets.garment.garment import Garment
+from hood.assets.material import Material
+from hood.energies.potential import Potential
+from hood.model.kernels.block import KERNELS
+from hood.rollouts.loop import METRIC_CHOICES, SETTLE_CHOICES, own_start
+from hood.rollouts.verdict.doubts import doubt_body, doubt_fabric
+from hood.scene.fitting import doubts, misplacement
+from hood.scene.held_layers import with_held_layers_apart
+from hood.scene.scene import Scene, dress
+from hood.steppers.newton import Stepper
+from hood.steppers.static_shapes.simulator import MODES, network_of
+from hood.steppers.watched import WatchedStepper
+from hood.tensors.precision import PRECISIONS, TF32
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What a rollout runs: ``config`` is the one asked for, with everything settled that it left to ``auto``."""
+
+    config: DictConfig
+    scene: Scene
+    stepper: Stepper
+    choice: Choice
+    potential: Potential  # what steps are judged by; of a plan, that of the full model
+
+
+def check_config(config: DictConfig) -> None:
+    """Raise ConfigError where keys of ``hood rollout`` have values that no rollout can have, before a file is read."""
+    require_device(config)
+    require_choice(config, "video", ("mp4", "gif", "none"))
+    require_choice(config, "metrics", METRIC_CHOICES)
+    require_choice(config, "settle", SETTLE_CHOICES)
+    require_choice(config, "doubts", DOUBTS)
+    _check_numbers(config)
+    checked_fabrics(config)
+    checked_sizes(config)
+    checked_events(config)
+    require_choice(config, "kernels", (AUTO, *KERNELS))
+    require_choice(config, "precision", (*PRECISIONS, TF32))
+    option_of(config)
+    wanted_of(config)
+    require_choice(config, "step", (PLAIN, *MODES))
+    check_refinement(config)
+    check_guard(config)
+    check_cloth_contact(config)
+
+
+def set_up(
+    config: DictConfig,
+    stepper: Stepper,
+    garment: Garment | None = None,
+    material: Material | None = None,
+    tell: Callable[[str], None] = print,
+) -> Setup:
+    """The scene that the config names, and ``stepper`` with its steps refined as the config, or the scene, needs.
+
+    Args:
+        garment: worn instead of ``config.garment``.
+        material: of the cloth, instead of ``config.material``.
+        tell: is called with every choice that was made, a sentence each.
+
+    Raises:
+        ConfigError, ValueError, FileNotFoundError: keys, files or assets that cannot be used.
+    """
+    config, why = decided(config)
+    scene = make_scene(config, garment, material)
+    choice = choose(config, stepper, scene)
+    choice.why[:0] = why
+    settled = choice.settle(config)
+    for sentence in choice.why:
+        tell(sentence)
+    if solves_in_double(settled) != solves_in_double(config):
+        scene = make_scene(settled, garment, material)
+    if acts(settled):
+        scene = with_held_layers_apart(scene)
+    if not option_of(settled).network and network_of(stepper) is not None:
+        stepper, _ = make_stepper(settled)
+    stepper = refined(stepper, settled, scene.cloth.num_vertices, potential_of(settled))
+    _check_start(settled, stepper, scene, tell)
+    tell_if_off(settled, 1 if scene.outfit is None else len(scene.outfit.names))
+    for doubt in (*doubt_body(scene.motion, int(settled.num_frames)), *doubt_fabric(scene.cloth, scene.garment.name)):
+        warnings.warn(doubt, stacklevel=2)
+    warn(scene_cautions(stepper, scene, losses_of(settled), str(settled.checkpoint)))
+    for sentence in known_by_slope(stepper, losses_of(settled)):
+        tell(sentence)
+    potential = potential_of(settled)
+    path = plan_path(config)
+    if path is not None:
+        stepper, potential = _watched(settled, stepper, scene, path)
+    return Setup(settled, scene, stepper, choice, potential)
+
+
+def _watched(config: DictConfig, lean: Stepper, scene: Scene, path: Path) -> tuple[Stepper, Potential]:
+    """A plan's stepper with its watch, and the potential of the full model; what it has alone where the plan has no watch."""
+    potential, watch = potential_of(config), read_watch(path)
+    if watch is None:
+        return lean, potential
+    whole = load_config("rollout", watch.words)
+    check_config(whole)
+    everything = potential_of(whole)
+    full = refined(make_stepper(whole)[0], whole, scene.cloth.num_vertices, everything)
+    return WatchedStepper(lean, full, (potential, everything), scene, watch.limit, watch.hold), everything
+
+
+def make_scene(config: DictConfig, garment: Garment | None = None, material: Material | None = None) -> Scene:
+    """Assets named in the config, put together; ``garment`` and ``material`` stand for those of the config where given."""
+    motion = make_motion(config, torch.float64 if solves_in_double(config) else torch.float32)
+    given = config.garment if garment is None else garment
+    ordered = garment is None
+    garment = read_outfit(given, motion, bool(config.triangulate), config.pins, wanted_of(config))
+    order = layer_order(config.layers, _names_in(garment, names_of(config.garment))) if ordered else None
+    garment = cut_to_size(config, garment, motion)
+    fabric = fabric_of(config, garment, motion) if material is None else material
+    scene = with_events(replace(dress(garment, motion, fabric, checked_sizes(config)), layers=order), config)
+    scene = with_body_friction(scene, config)
+    found = misplacement(scene)
+    if found is not None and found.grave:
+        raise ValueError(
+            f"garment {garment.name!r}: not worn by {motion.name!r} in its first frame: it {found.what}; give it as it is worn "
+            f"there, {found.fix}"
+        )
+    heed(garment.name, [found] if found is not None else [])
+    for name, doubt in doubts(scene):
+        heed(name, [doubt])
+    return scene
+
+
+def _names_in(garment: Garment, files: list[str]) -> list[str]:
+    """The garments of an outfit by the names of their files; by their own where a file holds several."""
+    count = 1 if garment.piece is None else int(garment.piece.max()) + 1
+    return files if len(files) == count else garment.name.split("+")
+
+
+def solves_in_double(config: DictConfig) -> bool:
+    """Whether steps are judged in float64: then states are kept in it, rounded ones would not meet what is said of them."""
+    return bool(config.solver.double) and (not option_of(config).network or chosen(config) is not None)
+
+
+def make_stepper(config: DictConfig) -> tuple[Stepper, str]:
+    """What takes the steps, before they are refined, and the SHA-256 of its weights (``none`` without a network)."""
+    config, _ = decided(config)
+    option, step = option_of(config), str(config.step)
+    if option.network:
+        return make_network(config, str(config.checkpoint), config.get("model"), step)
+    return make_solver(option, config, potential_of(config), step), "none"
+
+
+def _check_start(config: DictConfig, stepper: Stepper, scene: Scene, tell: Callable[[str], None]) -> None:
+    """A line where a rollout has a start of its own; ConfigError where the number of relaxing steps would play no role."""
+    if str(config.settle) != "equilibrium":
+        return
+    reason = own_start(stepper, scene)
+    if reason is not None:
+        tell(f"settle=paper: {reason}")
+    elif int(config.relaxing_steps) != 1:
+        raise ConfigError(
+            f"relaxing_steps={config.relaxing_steps}: belongs to settle=paper, settle=equilibrium has none; add settle=paper"
+        )
+
+
+def _check_numbers(config: DictConfig) -> None:
+    for key, least in (("num_frames", 1), ("relaxing_steps", 0), ("video_stride", 1), ("surface_stride", 1), ("seed", 0)):
+        if int(config[key]) < least:
+            raise ConfigError(f"{key}={config[key]}: must be at least {least}")
+    thinning(config)
+    check_motion_options(config)
+    check_output_fps(config)
+    check_refine_mesh(config)
+    if not 0.0 <= float(config.gravity) <= 1000.0:
+        raise ConfigError(f"gravity={config.gravity}: give m/s², downwards, 0 to 1000")

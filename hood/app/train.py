@@ -1,0 +1,275 @@
+"""``hood train``: a model from a config; resumes exactly from its own checkpoints."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
+
+from hood.app.common import (
+    held_folder,
+    output_folder,
+    read_model,
+    require_device,
+    require_same_config,
+    require_same_model,
+    tell_choice,
+    together,
+    warn_if_slow,
+)
+from hood.app.scene.garments import as_simulated
+from hood.app.scene.motion import check_rate
+from hood.app.settings.compose import ConfigError, build, load_config, plain, require_choice, save_run_record, shown
+from hood.app.stepping.cautions import idle_in_training
+from hood.assets.body.load import load_body
+from hood.assets.files.library import locate, motion_split, unknown
+from hood.assets.garment.garment import load_garment
+from hood.assets.material import Material
+from hood.assets.motion.axes import UP_AXES
+from hood.assets.motion.load import load_sequence
+from hood.assets.motion.motion_files import MotionFiles, find_motions
+from hood.energies.potential import Potential
+from hood.energies.self_contact import for_networks
+from hood.evaluation.validation import Validation
+from hood.steppers.checkpoint import read_header
+from hood.steppers.network import Simulator
+from hood.steppers.published import SUFFIXES
+from hood.training import distributed
+from hood.training.checkpoint import previous
+from hood.training.scenes import SceneSampler
+from hood.training.settings import TrainerSettings
+from hood.training.trainer import Trainer
+from hood.training.watch import Watch
+
+#: Keys that a resumed run may change: they do not change what is learned.
+_FREE = ("resume", "output", "device", "validation_states")
+_BOOKKEEPING = (
+    "kernels",
+    "workers",
+    "activation_checkpointing",
+    "checkpoint_every",
+    "keep_at",
+    "log_every",
+    "validate_every",
+    "validation_frames",
+    "max_rollbacks",
+)
+
+
+def run(overrides: Sequence[str]) -> int:
+    """Run the command; returns the exit code."""
+    config = load_config("train", overrides)
+    require_device(config)
+    if distributed.is_first():
+        for sentence in idle_in_training(overrides, config):
+            print(sentence)
+    return together(lambda: _train(config))
+
+
+def _check_values(config: DictConfig) -> None:
+    """Raise ConfigError where a key has a value that no training can have, before a file is read."""
+    for key, least in (("seed", 0), ("validation_states", 0), ("data.validation_frames", 2)):
+        if int(OmegaConf.select(config, key)) < least:
+            raise ConfigError(f"{key}={OmegaConf.select(config, key)}: must be at least {least}")
+    require_choice(config, "data.unusable", ("refuse", "skip"))
+    require_choice(config, "data.up", ("auto", *UP_AXES))
+    check_rate(config, "data.fps")
+    if not len(config.data.garments):
+        raise ConfigError("data.garments=[]: give at least one, such as data.garments=[dress]")
+
+
+def _train(config: DictConfig) -> int:
+    trainer = make_trainer(config)
+    with held_folder(config) as folder:
+        return _run(config, trainer, folder)
+
+
+def _run(config: DictConfig, trainer: Trainer, folder: Path) -> int:
+    main = distributed.rank() == 0
+    if distributed.on_main(lambda: _is_resumed(config, folder, trainer.checkpoint_path)):
+        trainer.resume(trainer.checkpoint_path)
+    distributed.on_main(lambda: save_run_record(folder, config, int(config.seed)))
+    if trainer.choice is not None:
+        tell_choice(trainer.choice)
+    if main:
+        parameters = sum(p.numel() for p in trainer.simulator.parameters())
+        print(
+            f"{parameters:,} parameters, {len(trainer.slots.sampler.garments)} garments, "
+            f"{len(trainer.slots.sampler.sequences)} motions"
+        )
+    try:
+        finished = _run_with_progress(trainer)
+    except OSError:
+        if main and trainer.checkpoint_path.exists():
+            print(
+                f"hood: stopped at iteration {trainer.iteration}; {trainer.checkpoint_path} is intact, the same command with "
+                "resume=true goes on from it",
+                file=sys.stderr,
+            )
+        raise
+    if trainer.skipped:
+        why, tried = trainer.why_skipped(), trainer.skipped + trainer.made
+        if main:
+            print(f"hood: {trainer.skipped} of {tried} updates were skipped, the last one{why}", file=sys.stderr)
+    if main:
+        print(f"weights in {folder / 'model.safetensors'}, checkpoint in {trainer.checkpoint_path}")
+    if not finished:
+        if main:
+            print(
+                f"hood: stopped at iteration {trainer.iteration}; the same command with resume=true goes on",
+                file=sys.stderr,
+            )
+        return 130
+    return 0
+
+
+def make_trainer(config: DictConfig) -> Trainer:
+    """Everything named in the config, put together; seeds are set before the weights are made."""
+    _check_values(config)
+    torch.manual_seed(int(config.seed))
+    simulator: Simulator = build(config.model)
+    settings: TrainerSettings = build(config.trainer)
+    potential: Potential = build(config.losses)
+    settings.collision.require_its_weight(potential)
+    fps = float(config.data.fps)
+    earlier = 0
+    if config.weights is not None:
+        earlier = _start_from(simulator, str(config.weights), fps)
+        settings = replace(settings, statistics_iterations=0)  # they come with the weights
+    simulator.to(str(config.device))
+    warn_if_slow("trainer.precision", settings.precision, torch.device(str(config.device)))
+    leave_out = str(config.data.unusable) == "skip"
+    names = find_motions(list(config.data.sequences) or motion_split()["train"], check=not leave_out)
+    sampler = SceneSampler(
+        body=load_body(str(config.data.body)),
+        garments=[as_simulated(load_garment(str(name))) for name in config.data.garments],
+        sequences=_open_motions(config, names, fps, settings.horizon.maximum + 3),
+        **_sampling(config),
+        device=str(config.device),
+    )
+    folder = output_folder(config)
+    watch = _make_watch(config, sampler, settings.collision.at_end(potential), folder) if settings.validate_every else None
+    return Trainer(simulator, potential, sampler, settings, folder, int(config.seed), watch, earlier)
+
+
+def _start_from(simulator: Simulator, name: str, fps: float) -> int:
+    """Give the simulator the weights and statistics of a shipped model or of a file; the updates behind them, 0 if unknown.
+
+    Raises:
+        ConfigError: they are of another model.
+    """
+    path = locate("weights", name)
+    given = read_model(path, fps)
+    way_out = f"give the model= that weights={name} were trained as"
+    require_same_model(path, given, simulator, way_out, free=("coarse_edge",))  # no weight depends on which levels are taken
+    simulator.load_state_dict(given.state_dict())
+    return 0 if path.suffix.lower() in SUFFIXES else int(read_header(path).get("iteration", 0))
+
+
+def _sampling(config: DictConfig) -> dict[str, Any]:
+    """How scenes are drawn, with the fabric that was given for all of them."""
+    sampling = plain(config.data.sampling)
+    fabric = sampling["material"]
+    if fabric is not None:
+        key = f"data.sampling.material={shown(fabric)}"
+        if not isinstance(fabric, dict):
+            raise ConfigError(f"{key}: give properties of a fabric in braces, such as data.sampling.material={{density:0.2}}")
+        strange = next((name for name in fabric if name not in Material.names()), None)
+        if strange is not None:
+            raise ConfigError(f"{key}: {unknown('property', str(strange), Material.names())}")
+        text = next((name for name, value in fabric.items() if isinstance(value, str)), None)
+        if text is not None:
+            raise ConfigError(f"{key}: {text} is {fabric[text]!r}; give a number")
+        sampling["material"] = Material(**fabric)
+    return sampling
+
+
+def _open_motions(config: DictConfig, names: list[str], fps: float, min_frames: int) -> MotionFiles:
+    """The training motions, read when they are drawn."""
+    reading = _reading(config)
+    load = partial(load_sequence, fps=fps, **reading)
+    skip = str(config.data.unusable) == "skip"
+    motions = MotionFiles(names, load, fps, min_frames, skip, file_fps=reading["file_fps"])
+    if motions.skipped and distributed.rank() == 0:
+        print(f"hood: {len(motions.skipped)} of {len(names)} motions skipped, first: {motions.skipped[0]}", file=sys.stderr)
+    return motions
+
+
+def _reading(config: DictConfig) -> dict[str, Any]:
+    """The keys of ``data`` that say how motion files are read, for :func:`hood.assets.motion.load.load_sequence`."""
+    person, rate = config.data.person, config.data.file_fps
+    return {
+        "up": str(config.data.up),
+        "person": None if person is None else str(person),
+        "trans_unit": str(config.data.trans_unit or "auto"),
+        "file_fps": None if rate is None else float(rate),
+    }
+
+
+def _make_watch(config: DictConfig, sampler: SceneSampler, potential: Potential, folder: Path) -> Watch:
+    names = find_motions(list(config.data.validation_sequences) or motion_split()["validation"], "validation")
+    motions = [load_sequence(str(name), float(config.data.fps), **_reading(config)) for name in names]
+    validation = Validation(
+        sampler.body,
+        sampler.garments,
+        motions,
+        for_networks(potential),
+        num_frames=int(config.data.validation_frames),
+        states=int(config.validation_states),
+        device=str(config.device),
+    )
+    return Watch(validation, folder)
+
+
+def _is_resumed(config: DictConfig, folder: Path, checkpoint: Path) -> bool:
+    """Whether the folder's run goes on; a run that is in the way is refused."""
+    if checkpoint.exists() or previous(checkpoint).exists():
+        if not bool(config.resume):
+            raise ConfigError(f"{folder} holds a training run; pass resume=true to go on or another output")
+        # It must see the same data and schedule, or its losses would not be those of an uninterrupted run.
+        require_same_config(config, folder, _FREE, _BOOKKEEPING)
+        return True
+    if bool(config.resume) and any(folder.glob("*.safetensors")):
+        raise ConfigError(f"{folder}: nothing to resume, checkpoint.pt is missing")
+    if bool(config.resume):
+        print(f"resume=true: no training in {folder} yet, this one begins", flush=True)
+    return False
+
+
+def _run_with_progress(trainer: Trainer) -> bool:
+    """Train under a progress bar; SIGTERM and Ctrl-C end it after the current iteration, with a checkpoint."""
+    stop = {"asked": False}
+
+    def ask(signum: int, frame: object) -> None:
+        stop["asked"] = True
+
+    previous = {number: signal.signal(number, ask) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        with tqdm(
+            total=trainer.settings.iterations,
+            initial=trainer.iteration,
+            desc="train",
+            unit="it",
+            disable=distributed.rank() != 0 or None,
+        ) as bar:
+
+            def progress(iteration: int, report: dict[str, float] | None) -> None:
+                if report is None:
+                    bar.unpause()  # a validation is no part of the rate
+                    return
+                bar.update(iteration - bar.n)
+                if iteration % 20 == 0:
+                    bar.set_postfix(rg=f"{report['relative_gradient']:.2f}", horizon=int(report["horizon"]), refresh=False)
+
+            return trainer.run(progress, lambda: stop["asked"])
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)

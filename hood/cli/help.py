@@ -1,0 +1,159 @@
+"""``hood COMMAND --help``: keys with their defaults, and every name that can be given."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from collections.abc import Iterator
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from hood.app.output.verdict import exit_code_lines
+from hood.app.settings.compose import CONFIG_FOLDER, headings, load_config, notes, options, plain, shown
+from hood.assets.files import library
+
+_EXAMPLES = {
+    "sizes": [
+        "hood sizes garment=tshirt",
+        "hood sizes garment=dress 'sizes={S:0.95,L:1.05}' 'shapes=[[],[2]]' sequence=plie output=outputs/dress_sizes",
+    ],
+    "train": [
+        "hood train experiment=quickstart output=runs/quickstart",
+        "hood train model=ours trainer=paper data.garments=[dress]",
+    ],
+    "rollout": [
+        "hood rollout garment=dress sequence=walk_steady num_frames=200 output=outputs/dress",
+        "hood rollout garment=my_shirt.obj sequence=CMU_01_poses.npz material=denim",
+    ],
+    "plan": [
+        "hood plan garment=dress sequence=plie stepper=newton accuracy=0.01",
+        "hood plan garment=[tank,skirt] sequence=walk_proud stepper=newton accuracy=5mm frames=30",
+        "hood plan garment=dress_4k sequence=dance_mixed stepper=newton budget_ms=15",
+        "hood plan experiment=quickstart",
+    ],
+    "compare": [
+        "hood compare outputs/network/rollout.h5 outputs/solver/rollout.h5",
+        "hood compare a=outputs/plain b=outputs/refined colour=rg output=outputs/compare",
+        "hood compare outputs/plain outputs/refined colour=fabric blind=true seed=7 output=outputs/pair_7",
+    ],
+    "fabric": [
+        "hood fabric",
+        "hood fabric silk_habotai denim_12oz wool_suiting output=outputs/fabrics",
+    ],
+    "view": [
+        "hood view outputs/dress/rollout.h5 output=dress.html",
+        "hood view outputs/network outputs/solver output=both.html",
+    ],
+    "export": [
+        "hood export outputs/dress/rollout.h5 format=usd",
+        "hood export outputs/dress format=pc2 up=z output=for_blender",
+        "hood export outputs/dress format=glb parts=[cloth] num_frames=120 output=dress.glb",
+    ],
+    "inspect": [
+        "hood inspect my_shirt.obj",
+        "hood inspect my_shirt.obj CMU_01_poses.npz --json",
+    ],
+    "prepare": [
+        "hood prepare garment=my_shirt.obj output=my_shirt.npz",
+        "hood prepare garment=[shirt.obj,trousers.glb] pins=waistband output=outfit.npz",
+        "hood prepare garment=suit.obj pose=CMU_01_poses.npz frame=0 output=suit.npz",
+    ],
+    "convert": ["hood convert checkpoint=postcvpr.pth output=postcvpr.safetensors"],
+    "evaluate": [
+        "hood evaluate",
+        "hood evaluate models=[runs/a/model.safetensors,newton] garments=[dress] sequences=[] gap_states=3",
+    ],
+    "tradeoff": [
+        "hood tradeoff",
+        "hood tradeoff models=[runs/a/model.safetensors] precisions=[fp32] garments_4k=[] garments_12k=[] output=outputs/a",
+    ],
+    "envelope": [
+        "hood envelope",
+        "hood envelope models=[runs/a/model.safetensors,newton] factors=[dt,spin,teleport] output=outputs/a",
+    ],
+}
+#: Words of a command that are no keys.
+_BEFORE_KEYS = {**dict.fromkeys(("inspect", "compare", "view", "export"), "FILE ... "), "fabric": "[NAME ...] "}
+
+
+#: Keys that take an embedded name of a kind, or a file; a command has one of each, or none.
+_NAMED = {
+    "garments": ("garment", "garments", "garments_4k", "data.garments"),
+    "motions": ("sequence", "sequences", "data.sequences"),
+    "body": ("body", "data.body"),
+    "weights": ("checkpoint", "models", "weights"),
+}
+_ABSENT = object()
+#: Groups whose keys a command's help lists one by one, those of the chosen option.
+_LISTED = {"train": {"data": "default", "trainer": "fast"}, "rollout": {"material": "default", "solver": "newton"}}
+
+
+def describe(name: str) -> str:
+    """Help text of the command ``name``."""
+    config = load_config(name)
+    said, titles = notes(name), headings(name)
+    lines = [f"usage: hood {name} {_BEFORE_KEYS.get(name, '')}[key=value ...]", ""]
+    lines += ["In a shell, put words with brackets or braces in quotes: 'key=[1,2]'.", ""]
+    for key in config:
+        value = plain(config[key])
+        if isinstance(value, dict):
+            continue
+        if key in titles:
+            lines += ["", titles[key]]
+        lines.append(_row(str(key), value, said.get(str(key), "")))
+    if name == "plan":
+        lines += ["", "The keys of hood rollout say the scene and the full model: garment, sequence, stepper, fps, …"]
+        lines += ["The keys of hood train say a training; experiment=, trainer= or data.* has to be among them."]
+    if name == "fabric":
+        lines += ["", textwrap.fill(f"  {'NAME':<14}{' '.join(options('material'))}", 118, subsequent_indent=" " * 16)]
+    groups = _groups_of(name)
+    if groups:
+        lines += ["", f"config groups: one word stands for several keys, such as {groups[0]}={options(groups[0])[-1]}"]
+        rows = [f"  {group + '=':<14}{' | '.join(options(group))}" for group in groups]
+        lines += [textwrap.fill(row, 118, subsequent_indent=" " * 16) for row in rows]
+    for group, option in _LISTED.get(name, {}).items():
+        lines += ["", f"keys of {group}={option}, which can be changed one by one"]
+        within = notes(f"{group}/{option}")
+        lines += [_row(f"{group}.{key}", value, within.get(key, "")) for key, value in _leaves(plain(config[group]))]
+    lines += _elsewhere(config, [group for group in groups if group not in _LISTED.get(name, {})])
+    if groups or name in ("tradeoff", "envelope"):
+        lines += _names(config)
+    lines += ["", "examples:", *(f"  {example}" for example in _EXAMPLES[name]), "", *exit_code_lines()]
+    return "\n".join(lines)
+
+
+def _elsewhere(config: DictConfig, groups: list[str]) -> list[str]:
+    """Where the keys stand of groups that are not listed."""
+    keys = ", ".join(f"{group}.*" for group in groups if isinstance(config.get(group), DictConfig))
+    return ["", f"keys of {keys} stand in the files of the options:", f"  {CONFIG_FOLDER}/GROUP/OPTION.yaml"] if keys else []
+
+
+def _names(config: DictConfig) -> list[str]:
+    """The embedded names, each kind with the command's key for it."""
+    lines = ["", "embedded names; these keys take files as well"]
+    for kind, keys in _NAMED.items():
+        for key in [key for key in keys if OmegaConf.select(config, key, default=_ABSENT) is not _ABSENT][:1]:
+            lines.append(textwrap.fill(f"  {key + '=':<16}{' '.join(library.names(kind))}", 118, subsequent_indent=" " * 18))
+    return lines
+
+
+def _row(key: str, value: object, note: str) -> str:
+    """A key with its default, and behind it what it is."""
+    text = f"  {key}={shown(value)}"
+    text = f"{text:<34}" if len(text) < 34 else text + "  "
+    return textwrap.fill(text + note, 118, subsequent_indent=" " * 34)
+
+
+def _leaves(node: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Keys and values of a group, ``a.b`` for a key in another, without the names of classes."""
+    for key, value in node.items():
+        if isinstance(value, dict):
+            yield from _leaves(value, f"{prefix}{key}.")
+        elif key != "_target_":
+            yield f"{prefix}{key}", value
+
+
+def _groups_of(name: str) -> list[str]:
+    text = (CONFIG_FOLDER / f"{name}.yaml").read_text(encoding="utf-8")
+    return [match for match in re.findall(r"^\s+- (?:override )?/?(\w+):", text, flags=re.M) if match != "_self_"]

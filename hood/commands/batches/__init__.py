@@ -1,1 +1,0 @@
-"""Where the results of many motions go, so that no two of them meet in one place."""

@@ -1,1 +1,0 @@
-"""What ``hood inspect`` says of files, a module for each kind that needs more than a few lines."""

@@ -1,0 +1,162 @@
+"""Contact at points inside the cloth's edges and faces: weighted sums of up to three vertices, each against a body point.
+
+At its vertices alone the cloth holds off the body only there: an edge of 35 mm over a limb of 60 mm sags by 2.5 mm between two
+vertices that lie on the skin. Like :class:`hood.contact.contact.Contact` all of this is found once, at x_t against the body at
+t.
+"""
+
+from __future__ import annotations
+
+import weakref
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hood.cloth.cloth import Cloth
+from hood.cloth.state import Obstacle
+from hood.contact.contact import Contact, match_surface
+from hood.mesh import topology
+from hood.mesh.closest_point.search import build_incidence
+from hood.mesh.geometry import normals_of_fans, vertex_masses
+from hood.tensors.weak_cache import forget
+
+#: Where the cloth meets the body: at its vertices alone; at the midpoints of its edges as well; at the midpoints of its rims
+#: and, face by face, where vertices of the body are nearest.
+PLACES = ("vertices", "edges", "strict")
+#: Matches farther away [m] are none: the vertices, which are matched farther, come first.
+_CAP = 0.03
+#: A body vertex and the cloth nearest to it face each other where less of the gap is along the skin than across it, or all of
+#: it is below this [m].
+_CLOSE = 2e-3
+#: And where the skin that the cloth's own vertices are matched with looks the same way, to 60 degrees.
+_SAME_SIDE = 0.5
+
+
+@dataclass(frozen=True)
+class PointContact:
+    """N points x_p = Σ w_i x_i of the cloth, each matched with a point of the body during the step t → t+1.
+
+    ``share`` is the area that a point stands for, over the mean area of its vertices (thirds of the faces around, at rest).
+    With energies times their shares points press as hard per area as vertices do, however many there are.
+    """
+
+    place: str  # of PLACES
+    vertices: Tensor  # (N, 3) cloth vertices; what is not needed repeats one
+    weights: Tensor  # (N, 3) >= 0, sum to 1
+    scene: Tensor  # (N,)
+    share: Tensor  # (N,)
+    dist: Tensor  # (N,) m, signed distance at t, negative inside
+    point: Tensor  # (N, 3) m, the body point at t
+    next_point: Tensor  # (N, 3) m, the same material point at t + 1
+    next_normal: Tensor  # (N, 3) outward unit normal there at t + 1
+    face: Tensor  # (N,) of the body, there
+
+    def at(self, values: Tensor) -> Tensor:
+        """``values`` (V, 3) of vertices at the points, (N, 3)."""
+        return (self.weights.unsqueeze(2) * values[self.vertices]).sum(dim=1)
+
+
+def find_point_contact(place: str, cloth: Cloth, pos: Tensor, obstacle: Obstacle, contact: Contact) -> PointContact:
+    """Contact of the points of a cloth at ``pos`` (V, 3) with the obstacle at t.
+
+    Args:
+        place: ``edges``: all edges' midpoints. ``strict``: midpoints of edges with one face, and the points of faces that are
+            nearest to vertices of the body.
+        contact: that of the vertices at ``pos``.
+    """
+    middles = _midpoints(cloth)
+    if place == "strict":
+        rims = _match_midpoints(place, middles.take(middles.rim), pos, obstacle, contact)
+        return _joined(rims, _match_skin(place, cloth, pos, obstacle, contact))
+    return _match_midpoints(place, middles, pos, obstacle, contact)
+
+
+@dataclass(frozen=True)
+class _Midpoints:
+    """Midpoints of edges: what does not change during a rollout."""
+
+    vertices: Tensor  # (N, 3), the third weighs nothing
+    share: Tensor  # (N,)
+    scene: Tensor  # (N,)
+    rim: Tensor  # (N,) bool, one face at the edge
+
+    def take(self, rows: Tensor) -> _Midpoints:
+        return _Midpoints(self.vertices[rows], self.share[rows], self.scene[rows], self.rim[rows])
+
+
+_MIDPOINTS: dict[int, tuple[weakref.ref[Cloth], _Midpoints]] = {}
+
+
+def _midpoints(cloth: Cloth) -> _Midpoints:
+    """Midpoints of all edges, kept as long as the cloth lives. An edge stands for a third of its faces."""
+    key = id(cloth)
+    if key in _MIDPOINTS and _MIDPOINTS[key][0]() is cloth:
+        return _MIDPOINTS[key][1]
+    faces, edges = cloth.faces.cpu().numpy(), cloth.edges.cpu().numpy()
+    sides = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    side = torch.as_tensor(topology.edge_index(edges, sides), device=cloth.faces.device)
+    area = cloth.rest_area.new_zeros(len(edges)).index_add(0, side, cloth.rest_area.repeat_interleave(3) / 3.0)
+    share = area / vertex_masses(cloth.rest_pos, cloth.faces, 1.0)[cloth.edges].mean(dim=1)
+    rim = torch.as_tensor(np.bincount(side.cpu().numpy(), minlength=len(edges)) == 1, device=share.device)
+    made = _Midpoints(cloth.edges[:, [0, 1, 1]], share, cloth.edge_scene, rim)
+    _MIDPOINTS[key] = (weakref.ref(cloth, forget(_MIDPOINTS, key)), made)
+    return made
+
+
+def _match_midpoints(place: str, middles: _Midpoints, pos: Tensor, obstacle: Obstacle, contact: Contact) -> PointContact:
+    ends = middles.vertices[:, :2]
+    half = 0.5 * (pos[ends[:, 0]] - pos[ends[:, 1]]).norm(dim=1)
+    # No nearer than an end less the way from there.
+    middles = middles.take((contact.dist[ends].abs().amax(dim=1) - half <= _CAP).nonzero().squeeze(1))
+    start, end = pos[middles.vertices[:, 0]], pos[middles.vertices[:, 1]]
+    match = match_surface(0.5 * (start + end), middles.scene, obstacle)
+    rows = (match.dist.abs() <= _CAP).nonzero().squeeze(1)
+    middles = middles.take(rows)
+    weights = pos.new_tensor([0.5, 0.5, 0.0]).expand(len(rows), 3)
+    found = (values[rows] for values in (match.dist, match.point, match.next_point, match.next_normal, match.face))
+    return PointContact(place, middles.vertices, weights, middles.scene, middles.share, *found)
+
+
+def _match_skin(place: str, cloth: Cloth, pos: Tensor, obstacle: Obstacle, contact: Contact) -> PointContact:
+    """Vertices of the body against the nearest points of the cloth's faces."""
+    rows = _near(cloth, pos, obstacle)
+    then, later = obstacle.pos[rows], obstacle.next_pos[rows]
+    surface = Obstacle(pos, pos, pos, cloth.faces, cloth.vertex_scene, cloth.face_scene)
+    match = match_surface(then, obstacle.vertex_scene[rows], surface)
+    incidence = build_incidence(obstacle.faces, len(obstacle.pos))
+    normal, next_normal = (
+        normals_of_fans(at, obstacle.faces, incidence.around, incidence.first, rows) for at in (obstacle.pos, obstacle.next_pos)
+    )
+    vertices, gap = cloth.faces[match.face], match.point - then
+    across = (gap * normal).sum(dim=1)
+    along = (gap - across.unsqueeze(1) * normal).norm(dim=1)
+    seen = contact.valid[vertices].unsqueeze(2) * contact.normal[vertices]
+    same_side = ((match.bary.unsqueeze(2) * seen).sum(dim=1) * normal).sum(dim=1) > _SAME_SIDE
+    faces_it = (along <= across.abs()) | (match.dist.abs() <= _CLOSE)
+    kept = ((match.dist.abs() <= _CAP) & same_side & faces_it).nonzero().squeeze(1)
+    vertices, weights = vertices[kept], match.bary[kept]
+    of_cloth = (weights * vertex_masses(cloth.rest_pos, cloth.faces, 1.0)[vertices]).sum(dim=1)
+    of_skin = vertex_masses(obstacle.pos, obstacle.faces, 1.0)[rows[kept]]
+    # A floor's vertex stands for more than the cloth that meets it.
+    share = (of_skin / of_cloth).clamp(max=1.0)
+    one_of = incidence.around[incidence.first[rows]]
+    found = (values[kept] for values in (across, then, later, next_normal, one_of))
+    return PointContact(place, vertices, weights, obstacle.vertex_scene[rows[kept]], share, *found)
+
+
+def _near(cloth: Cloth, pos: Tensor, obstacle: Obstacle) -> Tensor:
+    """Body vertices (n,) that the cloth of their scene may be within the cap of."""
+    near = torch.zeros(len(obstacle.pos), dtype=torch.bool, device=pos.device)
+    near[obstacle.faces.reshape(-1)] = True
+    low, high = pos.new_full((cloth.num_scenes, 3), torch.inf), pos.new_full((cloth.num_scenes, 3), -torch.inf)
+    scene = cloth.vertex_scene.unsqueeze(1).expand_as(pos)
+    low, high = low.scatter_reduce(0, scene, pos, "amin"), high.scatter_reduce(0, scene, pos, "amax")
+    inside = (obstacle.pos >= low[obstacle.vertex_scene] - _CAP) & (obstacle.pos <= high[obstacle.vertex_scene] + _CAP)
+    return (near & inside.all(dim=1)).nonzero().squeeze(1)
+
+
+def _joined(first: PointContact, second: PointContact) -> PointContact:
+    names = [spec.name for spec in fields(first) if spec.name != "place"]
+    return PointContact(first.place, *(torch.cat([getattr(first, name), getattr(second, name)]) for name in names))

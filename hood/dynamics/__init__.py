@@ -1,1 +1,0 @@
-"""Integrate, simulate, roll out."""

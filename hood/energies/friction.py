@@ -1,0 +1,277 @@
+"""Coulomb friction between cloth and body, as a lagged potential."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Self
+
+import torch
+from torch import Tensor
+
+from hood.contact.activation_distance import vertex_reach
+from hood.contact.contact import Contact, LaggedContact
+from hood.contact.sample_points import PointContact
+from hood.energies.contact import checked_contact, contacts_of, lagged_contact, weighted, with_lagged_centroids, with_places
+from hood.energies.problem import StepProblem, sum_per_scene
+
+
+def gripped(problem: StepProblem, face: Tensor, force: Tensor) -> Tensor:
+    """Forces (N,) [N] times how much the body's faces (N,) that they act on grip; themselves where all grip alike."""
+    grip = None if problem.step.obstacle is None else problem.step.obstacle.grip
+    return force if grip is None else force * grip.to(force)[face.clamp_min(0)]
+
+
+class LaggedFriction:
+    """Friction energy [J], the sum over vertices of μ_f φ N f(‖u_T‖); subclasses say what the normal force N is.
+
+    u_T is the tangential slip from t to t+1 relative to the matched body point, N is taken at t (lagged, so that
+    the friction is a potential). f is the C¹ mollifier of Li et al. ("Incremental Potential Contact", 2020, eq.
+    12 and 13) with e = ``slip_speed`` · dt: quadratic-cubic below a slip of e, equal to ‖u_T‖ above. The force
+    is at most μ_f φ N and reaches it at ``slip_speed``; below, contacts creep.
+
+    φ → ``cloth.friction`` (V,), what the fabric makes of the coefficient, times ``obstacle.grip`` (G,) of the body's face.
+
+    Args:
+        coefficient: μ_f.
+        slip_speed: ε_v [m/s], speed below which friction counts as static.
+    """
+
+    def __init__(self, coefficient: float, slip_speed: float) -> None:
+        if coefficient < 0 or slip_speed <= 0:
+            raise ValueError(
+                f"friction: coefficient is {coefficient}, slip_speed {slip_speed}; give coefficient >= 0 and slip_speed > 0"
+            )
+        self.coefficient = coefficient
+        self.slip_speed = slip_speed
+
+    def prepare(self, problem: StepProblem) -> StepProblem:
+        """The problem with its contact searched for, once per step, if there is friction."""
+        return problem.with_contact() if self.coefficient > 0 else problem
+
+    def applies(self, problem: StepProblem) -> bool:
+        return self.coefficient > 0 and problem.searched_contact is not None
+
+    def normal_force(self, problem: StepProblem, contact: Contact) -> Tensor:
+        """Lagged normal forces N [N], shape (V,)."""
+        raise NotImplementedError
+
+    def greatest(self, problem: StepProblem, contact: Contact) -> Tensor:
+        """Greatest forces of friction [N], μ_f φ N, shape (V,)."""
+        return self.coefficient * problem.cloth.friction * gripped(problem, contact.face, self.normal_force(problem, contact))
+
+    def contacts(self, problem: StepProblem) -> tuple[Contact, ...]:
+        """The contacts of the vertices that the term acts at; none without a body."""
+        return contacts_of(problem, "nearest")
+
+    def carrier(self, contact: Contact) -> tuple[Tensor, Tensor]:
+        """What the slip is measured against: the way (V, 3) [m] of the matched body points, and the normals (V, 3) there."""
+        return contact.next_point - contact.point, contact.next_normal
+
+    def __call__(self, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> Tensor:
+        """Energy [J] (B,) at ``next_pos`` (V, 3)."""
+        energy, limit = next_pos.new_zeros(problem.num_scenes), self.slip_speed * problem.vertex_dt.squeeze(1)
+        for contact in self.contacts(problem):
+            force = self.greatest(problem, contact)
+            carried, normal = self.carrier(contact)
+            moved = next_pos - problem.state.pos - carried
+            energy = energy + problem.sum_vertices(_slipping(force, moved, normal, limit))
+        return energy
+
+
+class Friction(LaggedFriction):
+    """Friction by the contact's own force: N = 3 w max(ε - d_t, 0)², that of the collision term at t, but no more than what
+    presses the vertex onto the skin during the step.
+
+    The penalty has no bound: a vertex 6 mm deep, where a limb has passed it or the nearest skin has changed, would be held with
+    thousands of times its weight, although a few weights take it out. What presses it is
+
+        P = m/dt² max(ε - d̂, 0) + max(-f·n, 0),
+
+    the force that stops its own mass at the edge of the zone, with d̂ the distance at t+1 of where it would fly under its
+    weight, and what the forces f of the cloth around it (:attr:`hood.energies.problem.StepProblem.pull`) add along the normal
+    n. Cloth that lies still, or is stretched over the skin, is pressed with exactly N.
+
+    At points inside edges and faces N has the factor of the collision there, the area share, and so has P, of the weighted
+    vertices.
+
+    Args:
+        weight, epsilon, contact, reach, sides: those of the collision term, which make w [J/m³] and ε [m].
+    """
+
+    kind: ClassVar[str] = "Friction"
+
+    def __init__(
+        self,
+        coefficient: float = 0.5,
+        slip_speed: float = 5e-3,
+        weight: float = 5e5,
+        epsilon: float = 2e-3,
+        contact: str = "vertices",
+        reach: str = "curvature",
+        sides: str = "both",
+    ) -> None:
+        super().__init__(coefficient, slip_speed)
+        self.weight = weight
+        self.epsilon = epsilon
+        self.contact, self.reach, self.sides = checked_contact("friction", contact, reach, sides)
+
+    def with_weight(self, weight: float) -> Self:
+        """The same term with another collision weight, for a ramp during training; subclasses see to what they derive."""
+        return weighted(self, weight)
+
+    def prepare(self, problem: StepProblem) -> StepProblem:
+        """The problem with its contact searched for, once per step, if there is friction."""
+        return with_places(problem, self.contact, self.sides) if self.coefficient > 0 else problem
+
+    def contacts(self, problem: StepProblem) -> tuple[Contact, ...]:
+        return contacts_of(problem, self.sides)
+
+    def __call__(self, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> Tensor:
+        """Energy [J] (B,) at ``next_pos`` (V, 3)."""
+        energy = super().__call__(problem, next_pos, acc)
+        points = problem.points_at(self.contact)
+        if points is None:
+            return energy
+        moved = points.at(next_pos - problem.state.pos) - (points.next_point - points.point)
+        limit = self.slip_speed * problem.step.dt[points.scene]
+        slipping = _slipping(self.greatest_at(problem, points), moved, points.next_normal, limit)
+        return energy + sum_per_scene(slipping, points.scene, problem.num_scenes)
+
+    def greatest_at(self, problem: StepProblem, points: PointContact) -> Tensor:
+        """Greatest forces of friction [N] (N,) at the points, φ as the weighted vertices have it."""
+        factor = 1.0 + (problem.cloth.friction - 1.0)[points.vertices].mul(points.weights).sum(dim=1)
+        return self.coefficient * factor * gripped(problem, points.face, self.point_force(problem, points))
+
+    def point_force(self, problem: StepProblem, points: PointContact) -> Tensor:
+        """Lagged normal forces [N] (N,) at the points."""
+        force = 3.0 * self.weight * (self.epsilon - points.dist).clamp_min(0.0) ** 2
+        pull = problem.searched_pull
+        if pull is not None:
+            carried = problem.cloth.mass[points.vertices].mul(points.weights).sum(dim=1)
+            dt = problem.step.dt[points.scene]
+            depth = self.epsilon - _along(points.at(flown(problem)) - points.next_point, points.next_normal)
+            force = torch.minimum(force, _pressing(carried / dt**2, depth, points.at(pull), points.next_normal))
+        return points.share * force
+
+    def normal_force(self, problem: StepProblem, contact: Contact) -> Tensor:
+        touching = contact.valid & (problem.cloth.mass > 0)
+        reach = vertex_reach(self.reach, self.epsilon, problem.cloth, contact, problem.state.pos)
+        depth = torch.where(touching, reach - contact.dist, 0.0).clamp_min(0.0)
+        force = 3.0 * self.weight * depth**2
+        pull = problem.searched_pull
+        if pull is None:
+            return force
+        # where() before the arithmetic: rows without a match may hold infinite or undefined numbers.
+        point, normal = (torch.where(touching[:, None], given, 0.0) for given in (contact.next_point, contact.next_normal))
+        depth = reach - _along(flown(problem) - point, normal)
+        inertia = problem.cloth.mass / problem.vertex_dt.squeeze(1) ** 2
+        return torch.minimum(force, _pressing(inertia, depth, pull, normal))
+
+
+class WeightFriction(LaggedFriction):
+    """Friction by weight, as HOOD's published code means it: N = m ‖g‖ max(n·up, 0) within ``radius`` of the surface.
+
+    n is the surface normal at t and up the direction against gravity, so the weight counts as far as the surface is
+    horizontal, and not at all under an overhang. Cloth pressed on by tight fit or a moving limb gets no more
+    friction than cloth that just lies there, and cloth hovering within the radius gets as much: the default
+    follows the contact force. For comparisons with that code only.
+
+    What that code does is another matter, see :class:`CodedFriction`. Here the distance is a distance (signed, to the
+    closest point of the surface: penetrating vertices count), up is the problem's, and the body moves from t to t+1 as it
+    does for the collision.
+
+    Args:
+        radius: [m].
+    """
+
+    kind: ClassVar[str] = "WeightFriction"
+
+    def __init__(self, coefficient: float = 0.5, slip_speed: float = 5e-3, radius: float = 3e-3) -> None:
+        super().__init__(coefficient, slip_speed)
+        if radius <= 0:
+            raise ValueError(f"friction: radius is {radius}; give radius > 0")
+        self.radius = radius
+
+    def with_weight(self, weight: float) -> Self:
+        """The term itself: the weight of a collision term plays no role in it."""
+        return self
+
+    def normal_force(self, problem: StepProblem, contact: Contact) -> Tensor:
+        near = contact.valid & (contact.dist <= self.radius)
+        normal = torch.where(near.unsqueeze(1), contact.normal, 0.0)
+        return problem.cloth.mass * (-(normal * problem.gravity.to(normal)).sum(dim=1)).clamp_min(0.0)
+
+
+class CodedFriction(LaggedFriction):
+    """Friction by weight, as HOOD's published code computes it: N = m ‖g‖ |n_z| where ‖x_t - c‖² < ``radius``.
+
+    c is the nearest face centroid of the body at t-1, n the normal of that face at t; the slip is measured against the way of
+    the centroid from t-1 to t. Each differs from what was meant (:class:`WeightFriction`):
+
+    - the squared distance is compared with the radius itself, so that 3e-3 reaches 5.5 cm, nearly all of a shirt;
+    - z counts as up while gravity acts along y: walls in front and behind grip, shoulders do not;
+    - the body is one frame behind that of the collision.
+
+    Two details are not known for certain. The sign of n_z is taken to play no role: the code is reported to act on 1,011 of
+    a shirt's 1,014 vertices, which is every vertex in reach; those with n_z > 0 are half of them. The law of slip near rest
+    is that of :class:`LaggedFriction`; beyond ``slip_speed`` the force is μ_f N in any case.
+
+    Args:
+        radius: [m²] in effect; the code takes it for metres.
+    """
+
+    kind: ClassVar[str] = "CodedFriction"
+
+    def __init__(self, coefficient: float = 0.5, slip_speed: float = 5e-3, radius: float = 3e-3) -> None:
+        super().__init__(coefficient, slip_speed)
+        if radius <= 0:
+            raise ValueError(f"friction: radius is {radius}; give radius > 0")
+        self.radius = radius
+
+    def with_weight(self, weight: float) -> Self:
+        """The term itself: the weight of a collision term plays no role in it."""
+        return self
+
+    def prepare(self, problem: StepProblem) -> StepProblem:
+        """The problem with the body at t-1 searched, once per step, if there is friction."""
+        return with_lagged_centroids(problem) if self.coefficient > 0 else problem
+
+    def normal_force(self, problem: StepProblem, contact: Contact) -> Tensor:
+        contact = lagged_contact(problem)
+        near = contact.lagged_facing & (contact.lagged_dist**2 < self.radius)
+        weight = problem.cloth.mass * problem.gravity.norm().to(problem.cloth.mass)
+        return torch.where(near, weight * contact.lagged_normal[:, 2].abs(), 0.0)
+
+    def carrier(self, contact: Contact) -> tuple[Tensor, Tensor]:
+        """The way of the matched centroids from t-1 to t and the normals at t."""
+        assert isinstance(contact, LaggedContact)
+        return contact.lagged_motion, contact.lagged_normal
+
+
+def flown(problem: StepProblem) -> Tensor:
+    """Where (V, 3) [m] vertices would be at t + 1 with nothing but their weight."""
+    dt = problem.vertex_dt
+    return problem.state.pos + dt * (problem.state.vel + dt * problem.gravity.to(dt))
+
+
+def _pressing(inertia: Tensor, depth: Tensor, pull: Tensor, normal: Tensor) -> Tensor:
+    """P [N] (N,) of masses over dt² ``inertia`` [N/m] that would fly ``depth`` [m] deep, and of the ``pull`` (N, 3) [N]."""
+    return inertia * depth.clamp_min(0.0) - _along(pull, normal).clamp_max(0.0)
+
+
+def _along(vectors: Tensor, normal: Tensor) -> Tensor:
+    return (vectors * normal).sum(dim=1)
+
+
+def _slipping(force: Tensor, moved: Tensor, normal: Tensor, limit: Tensor) -> Tensor:
+    """F f(‖u_T‖) [J] (N,) with F = ``force`` (N,), u_T the tangential part of ``moved`` (N, 3) and e = ``limit`` (N,)."""
+    slip = torch.where(force.unsqueeze(1) > 0, moved, 0.0)
+    slip = slip - (slip * normal).sum(dim=1, keepdim=True) * normal
+    return force * mollified_norm((slip * slip).sum(dim=1), limit)
+
+
+def mollified_norm(norm_sq: Tensor, limit: Tensor) -> Tensor:
+    """f(y) for y² = ``norm_sq``: y²/e - y³/(3e²) + e/3 below e = ``limit``, y above; C¹, flat at y = 0."""
+    positive = norm_sq > 0
+    norm = torch.where(positive, torch.where(positive, norm_sq, 1.0).sqrt(), 0.0)
+    small = norm_sq / limit * (1.0 - norm / (3.0 * limit)) + limit / 3.0
+    return torch.where(norm < limit, small, norm)

@@ -1,1 +1,0 @@
-"""Features of a step: groups that know their width, and normalisation."""

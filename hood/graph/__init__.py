@@ -1,1 +1,0 @@
-"""The hierarchical graph over a garment and its body edges."""

@@ -1,1 +1,0 @@
-"""One energy per file and the potential that sums them."""

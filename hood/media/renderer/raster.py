@@ -1,0 +1,208 @@
+"""Triangle rasteriser in numpy; compiled where there is a compiler (:mod:`hood.media.renderer.raster`).
+
+Triangles are expanded twice into flat arrays, first into (triangle, row) pairs and then into the pixels
+of each row, whose first and last column follow from the three edge functions in closed form. So no pixel
+outside a triangle is ever visited, and the work is proportional to the drawn area.
+
+Drawing in C++ (``hood/native/picture.cpp``): the pictures of the numpy form, several times as fast.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hood import native
+from hood.native.arguments import COUNT, POINTER, REAL, fields
+from hood.native.build import optional
+
+SOURCE = Path(native.__file__).with_name("picture.cpp")
+
+Array = NDArray[np.float64]
+_TRIPLE = REAL * 3
+
+
+class LightValues(ctypes.Structure):
+    """``Light`` of ``picture.cpp``."""
+
+    _fields_ = [
+        *fields("map probes axes", POINTER),
+        *fields("size num_probes", COUNT),
+        ("low", REAL * 2),
+        *fields("scale texel", REAL),
+        *fields("key fill key_color fill_color sky_color bounce_color", _TRIPLE),
+    ]
+
+
+class SeenValues(ctypes.Structure):
+    """``Seen`` of ``picture.cpp``."""
+
+    _fields_ = [
+        *fields("pos color normal screen depth hem faces face nearness around axes image own", POINTER),
+        *fields("width height num_around", COUNT),
+        ("eye", _TRIPLE),
+        *fields("focal reach inside", REAL),
+    ]
+
+
+class FloorValues(ctypes.Structure):
+    """``Floor`` of ``picture.cpp``."""
+
+    _fields_ = [
+        *fields("dark image", POINTER),
+        *fields("width height cells samples", COUNT),
+        *fields("eye right up forward center", _TRIPLE),
+        *fields("tan_y floor cell", REAL),
+        *fields("ground horizon zenith", _TRIPLE),
+    ]
+
+
+@cache
+def library() -> ctypes.CDLL | None:
+    """The compiled drawing; None without a compiler."""
+    lib = optional(SOURCE)
+    if lib is None:
+        return None
+    lib.picture_rasterise.argtypes = [*[POINTER] * 3, *[COUNT] * 3, REAL, REAL, *[POINTER] * 2]
+    lib.picture_lit.argtypes = [POINTER, POINTER, COUNT, REAL, POINTER]
+    lib.picture_shade.argtypes = [POINTER] * 2
+    lib.picture_backdrop.argtypes = [POINTER] * 2
+    lib.picture_resolve.argtypes = [POINTER, COUNT, COUNT, POINTER]
+    for name in ("picture_rasterise", "picture_lit", "picture_shade", "picture_backdrop", "picture_resolve"):
+        getattr(lib, name).restype = None
+    return lib
+
+
+def packed(values: Any, kind: type = np.float64) -> NDArray[Any]:
+    """``values`` without gaps, as C++ takes them."""
+    return np.ascontiguousarray(values, dtype=kind)
+
+
+def address(values: NDArray[Any]) -> int:
+    """Of an array that :func:`packed` made and that outlives the call."""
+    return int(values.ctypes.data)
+
+
+FloatArray = NDArray[np.floating]
+IntArray = NDArray[np.integer]
+
+# Columns this close to an edge [pixels] count as inside: shared edges leave no pinholes after rounding.
+_EDGE_TOLERANCE = 2e-3
+_MIN_AREA_PIXELS_SQ = 1e-9
+
+
+@dataclass(frozen=True)
+class VisibilityBuffer:
+    """What each pixel sees. `face` (H, W) is -1 where nothing is drawn; `nearness` (H, W) is -inf there."""
+
+    face: IntArray
+    nearness: FloatArray
+
+
+def rasterise(
+    screen: FloatArray,
+    nearness: FloatArray,
+    faces: IntArray,
+    width: int,
+    height: int,
+    chunk_faces: int = 32768,
+) -> VisibilityBuffer:
+    """Nearest face of every pixel.
+
+    Args:
+        screen: pixel coordinates (V, 2), x right, y down; pixel (i, j) has its centre at (j + 0.5, i + 0.5).
+        nearness: (V,), affine on screen within a face and larger for nearer points (1/depth under
+            perspective, minus the distance under a parallel projection).
+        faces: (F, 3) vertex indices; degenerate faces are not drawn.
+        chunk_faces: faces expanded at once, a bound on memory.
+    """
+    best = np.full(width * height, -np.inf, dtype=np.float64)
+    owner = np.full(width * height, -1, dtype=np.int32)
+    lib = library()
+    if lib is not None:
+        points, near, corners = packed(screen), packed(nearness), packed(faces, np.int64)
+        inputs = address(points), address(near), address(corners), len(corners), width, height
+        lib.picture_rasterise(*inputs, _EDGE_TOLERANCE, _MIN_AREA_PIXELS_SQ, address(best), address(owner))
+        return VisibilityBuffer(owner.reshape(height, width), best.reshape(height, width))
+    for start in range(0, len(faces), chunk_faces):
+        pixel, value, face = _expand(screen, nearness, faces[start : start + chunk_faces], width, height)
+        np.maximum.at(best, pixel, value)
+        wins = value == best[pixel]
+        owner[pixel[wins]] = face[wins] + start
+    return VisibilityBuffer(owner.reshape(height, width), best.reshape(height, width))
+
+
+def barycentric(screen: FloatArray, corners: IntArray, points: FloatArray) -> FloatArray:
+    """Barycentric coordinates (P, 3) of the screen points (P, 2) in the triangles `corners` (P, 3)."""
+    a, b, c = (screen[corners[:, k]] for k in range(3))
+    ab, ac, ap = b - a, c - a, points - a
+    area = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]
+    second = (ap[:, 0] * ac[:, 1] - ap[:, 1] * ac[:, 0]) / area
+    third = (ab[:, 0] * ap[:, 1] - ab[:, 1] * ap[:, 0]) / area
+    return np.stack([1.0 - second - third, second, third], axis=1)
+
+
+def _expand(
+    screen: FloatArray, nearness: FloatArray, faces: IntArray, width: int, height: int
+) -> tuple[IntArray, FloatArray, IntArray]:
+    """Covered pixels: flat pixel index, nearness and face index, one entry per (pixel, face)."""
+    corners = screen[faces].astype(np.float64)
+    x, y = corners[..., 0], corners[..., 1]
+    area = (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0]) - (y[:, 1] - y[:, 0]) * (x[:, 2] - x[:, 0])
+    top = np.maximum(np.ceil(y.min(axis=1) - 0.5), 0.0)
+    bottom = np.minimum(np.floor(y.max(axis=1) - 0.5), height - 1.0)
+    on_screen = (x.max(axis=1) > 0) & (x.min(axis=1) < width) & (bottom >= top)
+    keep = np.flatnonzero((np.abs(area) > _MIN_AREA_PIXELS_SQ) & on_screen)
+
+    x, y, area, top = x[keep], y[keep], area[keep], top[keep]
+    slope_x, slope_y, constant = _edge_functions(x, y, area)
+    near = nearness[faces[keep]].astype(np.float64)
+
+    row_count = (bottom[keep] - top + 1).astype(np.int64)
+    tri, step = _ragged(row_count)
+    row = step + top[tri].astype(np.int64)
+    at_row = slope_y[tri] * (row[:, None] + 0.5) + constant[tri]
+    first, last = _row_span(slope_x[tri], at_row, width)
+    tri_near = (slope_x * near).sum(axis=1)
+    row_near = (at_row * near[tri]).sum(axis=1)
+
+    pixel_count = np.maximum(last - first + 1, 0).astype(np.int64)
+    span, column = _ragged(pixel_count)
+    column = column + first[span].astype(np.int64)
+    pixel = row[span] * width + column
+    owner = tri[span]
+    value = row_near[span] + tri_near[owner] * (column + 0.5)
+    return pixel, value, keep[owner].astype(np.int32)
+
+
+def _edge_functions(x: FloatArray, y: FloatArray, area: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Barycentric coordinate k of a screen point is slope_x[:, k] px + slope_y[:, k] py + constant[:, k]."""
+    nxt, prv = [1, 2, 0], [2, 0, 1]
+    slope_x = (y[:, nxt] - y[:, prv]) / area[:, None]
+    slope_y = (x[:, prv] - x[:, nxt]) / area[:, None]
+    constant = (x[:, nxt] * y[:, prv] - x[:, prv] * y[:, nxt]) / area[:, None]
+    return slope_x, slope_y, constant
+
+
+def _row_span(slope: FloatArray, at_row: FloatArray, width: int) -> tuple[FloatArray, FloatArray]:
+    """First and last column whose centre has three non-negative barycentric coordinates."""
+    safe = np.where(np.abs(slope) < 1e-12, 1e-12, slope)
+    root = -at_row / safe
+    lower = np.where(safe > 0, root, -np.inf).max(axis=1)
+    upper = np.where(safe < 0, root, np.inf).min(axis=1)
+    first = np.maximum(np.ceil(lower - 0.5 - _EDGE_TOLERANCE), 0.0)
+    last = np.minimum(np.floor(upper - 0.5 + _EDGE_TOLERANCE), width - 1.0)
+    return first, last
+
+
+def _ragged(counts: IntArray) -> tuple[IntArray, IntArray]:
+    """Flat (group, position in group) of groups with the given sizes."""
+    group = np.repeat(np.arange(len(counts)), counts)
+    start = np.cumsum(counts) - counts
+    return group, np.arange(len(group)) - start[group]

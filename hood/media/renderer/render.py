@@ -1,0 +1,345 @@
+"""Shaded pictures of a body and its clothing on a CPU: no display, no graphics card.
+
+Deferred shading: `raster.rasterise` finds the nearest face of every pixel at twice the resolution, then
+one vectorised pass lights the covered pixels (key light with a soft shadow map, sky and bounce light, a
+rim) and the floor behind them, darker in creases and where one surface lies near another. Lights turn
+with the camera, so that every view is lit from the upper left.
+
+The hems of a garment in pictures: how far its vertices are from them, and the lines along them.
+
+Images on surfaces, looked up in every pixel.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
+
+from hood.assets.files.said import install
+from hood.assets.formats.image import Texture
+from hood.media.renderer.camera import NEAR, Camera, unit
+from hood.media.renderer.raster import SeenValues, VisibilityBuffer, address, barycentric, library, packed, rasterise
+from hood.media.renderer.shading import AROUND, REACH, Light, Surface, backdrop, openness
+from hood.mesh.topology import counted_edges
+
+Array = NDArray[np.float64]
+
+#: Distance [m] that stands for no hem near by.
+FAR = 1.0
+#: Distances of at least this [m] do not matter: the seam is nearer.
+_REACH = 0.08
+_SAMPLES = 8  # points of every boundary edge
+
+_EDGE_WIDTH, _EDGE_SHADE = 0.0025, 0.3  # m, share of the colour taken
+_SEAM_AT, _SEAM_HALF_WIDTH, _SEAM_SHADE = 0.02, 0.0015, 0.35
+
+
+def hem_distance(pos: ArrayLike, faces: ArrayLike) -> Array:
+    """Distance [m] of every vertex from the next open edge of its surface, (V,); :data:`FAR` where none is near.
+
+    Near is what is near along the surface: a sleeve beside the waist is not.
+
+    Args:
+        pos: (V, 3) [m], at rest.
+        faces: (F, 3).
+    """
+    points, corners = np.asarray(pos, dtype=np.float64), np.asarray(faces, dtype=np.int64)
+    edges, count = counted_edges(corners)
+    open_edges = edges[count == 1]
+    result = np.full(len(points), FAR)
+    if not len(open_edges) or not np.isfinite(points).all():
+        return result
+    length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
+    graph = coo_matrix((np.maximum(length, 1e-9), (edges[:, 0], edges[:, 1])), shape=2 * (len(points),))
+    along = dijkstra(graph, directed=False, indices=np.unique(open_edges), min_only=True, limit=_REACH)
+    share = np.linspace(0.0, 1.0, _SAMPLES)[:, None, None]
+    start, end = points[open_edges[:, 0]], points[open_edges[:, 1]]
+    dist, _ = cKDTree((start + share * (end - start)).reshape(-1, 3)).query(points)
+    near = np.isfinite(along)
+    result[near] = dist[near]
+    return result
+
+
+def sewn(dist: Array, foot: Array) -> Array:
+    """Share (P,) of a colour that is left by the edge of a hem and by its seam, 2 cm from it.
+
+    Args:
+        dist: (P,) distance from the hem [m].
+        foot: (P,) side of a pixel there [m], over which lines are smoothed.
+    """
+    edge = np.clip((_EDGE_WIDTH - dist) / foot + 0.5, 0.0, 1.0)
+    seam = np.clip((_SEAM_HALF_WIDTH - np.abs(dist - _SEAM_AT)) / foot + 0.5, 0.0, 1.0)
+    seam *= np.minimum(1.0, 2.0 * _SEAM_HALF_WIDTH / foot)
+    left: Array = 1.0 - _EDGE_SHADE * edge - _SEAM_SHADE * seam
+    return left
+
+
+#: Larger images [pixels along a side] are drawn smaller: pictures are small, and their pixels would miss most of it.
+_SIDE = 1024
+
+
+@dataclass(frozen=True)
+class Print:
+    """An image on some faces of a mesh."""
+
+    image: Array  # (H, W, 3) linear colours, the top row first
+    faces: NDArray[np.int64]  # (N,) numbers of the faces
+    corners: Array  # (N, 3, 2) texture coordinates of their corners, v up; the image repeats beyond 0 and 1
+
+    def at(self, uv: Array) -> Array:
+        """Colours (P, 3) at texture coordinates (P, 2), linear between pixels."""
+        height, width = self.image.shape[:2]
+        across, down = uv[:, 0] * width - 0.5, (1.0 - uv[:, 1]) * height - 0.5
+        left, top = np.floor(across), np.floor(down)
+        right_share, low_share = (across - left)[:, None], (down - top)[:, None]
+        columns = [(left + k).astype(np.int64) % width for k in range(2)]
+        rows = [(top + k).astype(np.int64) % height for k in range(2)]
+        upper, lower = (
+            (1.0 - right_share) * self.image[row, columns[0]] + right_share * self.image[row, columns[1]] for row in rows
+        )
+        return np.asarray((1.0 - low_share) * upper + low_share * lower)
+
+
+def pixels_of(texture: Texture) -> Array:
+    """(H, W, 3) linear colours of an image, of 1,024 pixels a side at most.
+
+    Raises:
+        ImportError: Pillow is missing.
+        ValueError: the image is damaged.
+    """
+    return np.asarray((texture.pixels(_SIDE) / 255.0) ** 2.2)
+
+
+def printed(prints: Sequence[tuple[int, Print]], face: NDArray[np.int64], weights: Array) -> Array:
+    """Colours (P, 3) of pixels whose faces have an image; NaN for others.
+
+    Args:
+        prints: every image with the number from which the faces of its mesh are counted.
+        face: (P,) number of the face in each pixel.
+        weights: (P, 3) shares of its corners there.
+    """
+    found = np.full((len(face), 3), np.nan)
+    for first, one in prints:
+        place = np.full(max(int(face.max(initial=-1)), int(one.faces.max(initial=-1)) + first) + 1, -1)
+        place[one.faces + first] = np.arange(len(one.faces))
+        mine = np.flatnonzero(place[face] >= 0)
+        uv = (weights[mine, :, None] * one.corners[place[face[mine]]]).sum(axis=1)
+        found[mine] = one.at(uv)
+    return found
+
+
+Picture = NDArray[np.uint8]
+
+BODY_COLOR = (0.74, 0.70, 0.66)
+GARMENT_COLOR = (0.20, 0.42, 0.66)
+
+_SUPERSAMPLING = 2
+#: Share of its colour that a face seen from inside shows.
+_INSIDE = 0.62
+
+
+@dataclass(frozen=True)
+class RenderMesh:
+    """A surface to draw: `pos` (V, 3) [m], y up, `faces` (F, 3), `color` (3,) or per vertex (V, 3) in 0..1.
+
+    Both sides are drawn; the side that faces against its normal is darker. `hem` (V,) [m] is the distance from the next
+    hem, along which a line and a seam are drawn; without it there is none. `behind` [m] draws the surface farther from
+    the eye than it is: what lies closer upon it is not cut by it. `prints` are images on some of its faces.
+    """
+
+    pos: ArrayLike
+    faces: ArrayLike
+    color: ArrayLike = GARMENT_COLOR
+    hem: ArrayLike | None = None
+    behind: float = 0.0
+    prints: Sequence[Print] = ()
+
+
+def render_frame(
+    meshes: Sequence[RenderMesh],
+    camera: Camera,
+    width: int = 480,
+    height: int = 640,
+    *,
+    floor: float | None = None,
+) -> Picture:
+    """Draws the meshes above a floor; returns (height, width, 3) uint8.
+
+    Args:
+        floor: height of the floor [m]. By default the lowest vertex drawn; give it for a film, where it must
+            not move.
+    """
+    surface = _join(meshes)
+    light = Light(camera, surface.pos, surface.faces)
+    floor_height = float(surface.pos[:, 1].min()) if floor is None else floor
+    image = backdrop(camera, light, surface, floor_height, width, height, _SUPERSAMPLING)
+    firsts = np.cumsum([0, *(len(np.asarray(mesh.faces)) for mesh in meshes)]).tolist()
+    prints = [(first, one) for first, mesh in zip(firsts, meshes, strict=False) for one in mesh.prints]
+    _draw_surface(image, camera, light, surface, prints)
+    lib = library()
+    if lib is not None:
+        picture = np.empty((height, width, 3), dtype=np.uint8)
+        lib.picture_resolve(address(image), width, height, address(picture))
+        return picture
+    steps = range(_SUPERSAMPLING)
+    samples = [image[i::_SUPERSAMPLING, j::_SUPERSAMPLING] for i in steps for j in steps]
+    image = np.sum(samples, axis=0) / len(samples)
+    return (255.0 * np.clip(image, 0.0, 1.0) ** (1 / 2.2) + 0.5).astype(np.uint8)
+
+
+def contact_sheet(images: Sequence[Picture], columns: int, labels: Sequence[str] | None = None) -> Picture:
+    """Equal-sized pictures in rows of `columns`, each with its label in the upper left corner."""
+    if not images or columns < 1:
+        raise ValueError(f"contact_sheet: needs an image and a column, got {len(images)} images, {columns} columns")
+    if labels is not None and len(labels) != len(images):
+        raise ValueError(f"contact_sheet: {len(labels)} labels for {len(images)} images; give one for each")
+    height, width = images[0].shape[:2]
+    for index, image in enumerate(images):
+        if image.shape != (height, width, 3):
+            raise ValueError(f"contact_sheet: image {index} is {image.shape}, image 0 {images[0].shape}; use one size")
+    rows = -(-len(images) // columns)
+    sheet = np.full((rows * height, columns * width, 3), 255, dtype=np.uint8)
+    for index, image in enumerate(images):
+        top, left = (index // columns) * height, (index % columns) * width
+        cell = image if labels is None else _labelled(image, labels[index])
+        sheet[top : top + height, left : left + width] = cell
+    return sheet
+
+
+def captioned(image: Picture, text: str) -> Picture:
+    """A copy of the picture with a line of small text in its upper right corner."""
+    size = max(11, image.shape[0] // 40)
+    return _written(image, text, size, (image.shape[1] - size // 2, size // 3), "ra")
+
+
+def _labelled(image: Picture, label: str) -> Picture:
+    size = max(12, image.shape[0] // 28)
+    return _written(image, label, size, (size // 2, size // 3), "la")
+
+
+def _written(image: Picture, text: str, size: int, place: tuple[int, int], anchor: str) -> Picture:
+    try:
+        from PIL import Image, ImageDraw, ImageFont
+    except ImportError as error:
+        raise ImportError(f"labels on pictures need Pillow: {install('pictures')}") from error
+    canvas = Image.fromarray(image)
+    font = ImageFont.load_default(size)
+    ImageDraw.Draw(canvas).text(place, text, fill=(60, 62, 66), font=font, anchor=anchor)
+    return np.asarray(canvas)
+
+
+def _join(meshes: Sequence[RenderMesh]) -> Surface:
+    if not meshes:
+        raise ValueError("render_frame: no meshes given; pass at least one RenderMesh")
+    parts: list[tuple[Array, NDArray[np.int64], Array, Array, Array, Array]] = []
+    offset = 0
+    for index, mesh in enumerate(meshes):
+        pos, faces = np.asarray(mesh.pos, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
+        color = np.asarray(mesh.color, dtype=np.float64)
+        if not np.isfinite(pos).all():
+            bad = int(np.flatnonzero(~np.isfinite(pos).all(axis=1))[0])
+            raise ValueError(f"render_frame: mesh {index}: vertex {bad} is not finite; draw an earlier frame")
+        if color.shape not in ((3,), pos.shape):
+            raise ValueError(f"render_frame: mesh {index}: color is {color.shape}, needs (3,) or {pos.shape}")
+        linear = np.broadcast_to(np.clip(color, 0.0, 1.0) ** 2.2, pos.shape)
+        hem = np.full(len(pos), FAR) if mesh.hem is None else np.asarray(mesh.hem, dtype=np.float64)
+        if hem.shape != (len(pos),):
+            raise ValueError(f"render_frame: mesh {index}: hem is {hem.shape}, needs ({len(pos)},)")
+        behind = np.full(len(pos), mesh.behind)
+        parts.append((pos, faces + offset, linear, _vertex_normals(pos, faces), hem, behind))
+        offset += len(pos)
+    return Surface(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _draw_surface(
+    image: Array, camera: Camera, light: Light, surface: Surface, prints: Sequence[tuple[int, Print]] = ()
+) -> None:
+    height, width = image.shape[:2]
+    axes = camera.axes()
+    seen = (surface.pos - np.asarray(camera.position)) @ axes.T
+    before = (seen[surface.faces, 2] > NEAR).all(axis=1)
+    faces = surface.faces[before]
+    depth = np.maximum(seen[:, 2], NEAR)
+    focal = camera.focal(height)
+    offset = focal * seen[:, :2] / depth[:, None]
+    screen = np.stack([0.5 * width + offset[:, 0], 0.5 * height - offset[:, 1]], axis=1)
+    buffer = rasterise(screen, 1.0 / (depth + surface.behind), faces, width, height)
+    visible = buffer.face
+    compiled, own = library() is not None, None
+    if compiled and not prints:
+        _shade_compiled(image, camera, light, replace(surface, faces=faces), (screen, depth, buffer), None)
+        return
+    row, column = np.nonzero(visible >= 0)
+    if len(row) == 0:
+        return
+    corners = faces[visible[row, column]]
+    weights = barycentric(screen, corners, np.stack([column + 0.5, row + 0.5], axis=1)) / depth[corners]
+    weights = np.clip(weights / (weights @ np.ones(3))[:, None], 0.0, 1.0)
+    if prints:
+        own = np.full(image.shape, np.nan)
+        own[row, column] = printed(prints, np.flatnonzero(before)[visible[row, column]], weights)
+    if compiled:
+        _shade_compiled(image, camera, light, replace(surface, faces=faces), (screen, depth, buffer), own)
+        return
+
+    pos = _blend(weights, surface.pos, corners)
+    color = _blend(weights, surface.color, corners)
+    if own is not None:
+        color = np.where(np.isnan(own[row, column]), color, own[row, column])
+    normal = unit(_blend(weights, surface.normal, corners))
+    view = unit(np.asarray(camera.position) - pos)
+    a, b, c = (screen[faces[:, k]] for k in range(3))
+    turned = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) > (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    inside = turned[visible[row, column]]
+    normal[inside] *= -1.0
+    foot = np.asarray(1.0 / (focal * buffer.nearness[row, column]), dtype=np.float64)
+    color = np.where(inside[:, None], _INSIDE * color, color)
+    color = sewn((weights * surface.hem[corners]).sum(axis=1), foot)[:, None] * color
+    image[row, column] = light.shade(pos, normal, view, color, openness(buffer, focal, row, column, normal @ axes.T))
+
+
+def _shade_compiled(
+    image: Array,
+    camera: Camera,
+    light: Light,
+    surface: Surface,
+    view: tuple[Array, Array, VisibilityBuffer],
+    own: Array | None,
+) -> None:
+    """The rest of :func:`_draw_surface` in C++, from a ``view``: pixels and depths of vertices, and what is seen; with colours
+    ``own`` (H, W, 3) of pixels instead of those of vertices, where they are not NaN."""
+    lib = library()
+    assert lib is not None
+    assert image.flags.c_contiguous
+    screen, depth, buffer = view
+    arrays = [packed(value) for value in (surface.pos, surface.color, surface.normal, screen, depth, surface.hem)]
+    arrays += [packed(surface.faces, np.int64), packed(buffer.face, np.int32)]
+    arrays += [packed(value) for value in (buffer.nearness, AROUND, camera.axes())] + [image]
+    height, width = image.shape[:2]
+    eye = tuple(float(value) for value in camera.position)
+    sizes = width, height, AROUND.shape[1]
+    addresses = *(address(value) for value in arrays), None if own is None else address(own)
+    seen = SeenValues(*addresses, *sizes, eye, camera.focal(height), REACH, _INSIDE)
+    lib.picture_shade(ctypes.byref(light.values()), ctypes.byref(seen))
+
+
+def _vertex_normals(pos: Array, faces: NDArray[np.int64]) -> Array:
+    """Area-weighted unit normals (V, 3)."""
+    a, b, c = (pos[faces[:, k]] for k in range(3))
+    face_normal = np.cross(b - a, c - a)
+    total = [
+        sum(np.bincount(faces[:, k], weights=face_normal[:, axis], minlength=len(pos)) for k in range(3)) for axis in range(3)
+    ]
+    return unit(np.stack(total, axis=1))
+
+
+def _blend(weights: Array, values: Array, corners: NDArray[np.int64]) -> Array:
+    a, b, c = (weights[:, k, None] * values[corners[:, k]] for k in range(3))
+    return a + b + c

@@ -1,0 +1,278 @@
+"""Light on surfaces and on the floor. Colours are linear here; gamma comes at the very end.
+
+Shade where surfaces are near each other: what of the light from all sides reaches the pixels of a picture.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hood.media.renderer.camera import Camera, unit, view_axes
+from hood.media.renderer.raster import FloorValues, LightValues, VisibilityBuffer, address, library, packed, rasterise
+
+Array = NDArray[np.float64]
+
+#: Distance [m] within which one surface shades another.
+REACH = 0.09
+_COUNT = 6
+#: Sine of the angle above the tangent plane from which a surface shades: flat faces of a round surface do not.
+_LEAST = 0.1
+_STRENGTH, _DARKEST = 2.2, 0.2
+
+
+def _around() -> Array:
+    """Places (4, 6, 2) on the unit disc where a pixel looks, turned by a quarter of their angle among four pixels."""
+    turn, index = np.arange(4)[:, None], np.arange(_COUNT)
+    angle = 2.0 * np.pi * (2.0 * index / _COUNT * 1.5 + turn / 4.0 / _COUNT * 2.0 + index * 0.08)
+    radius = np.sqrt((index + (turn + 0.5) / 4.0) / _COUNT)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
+
+
+AROUND = np.ascontiguousarray(_around())
+
+
+def openness(
+    buffer: VisibilityBuffer, focal: float, row: NDArray[np.integer], column: NDArray[np.integer], normal: Array
+) -> Array:
+    """Share (P,) of the light from all sides that reaches pixels: 1 in the open, less in creases and gaps.
+
+    Every pixel looks at a few others within :data:`REACH`, and counts how far what they see stands above its own tangent
+    plane, less the farther it is (ambient occlusion in screen space, as Mittring, "Finding next gen", 2007, and McGuire et
+    al., "The Alchemy screen-space ambient obscurance algorithm", 2011). What no pixel sees keeps no light off.
+
+    Args:
+        buffer: what is seen; its nearness is 1/depth [1/m].
+        focal: pixels that 1 m takes at a distance of 1 m.
+        row, column: (P,) of the pixels, all of them covered.
+        normal: (P, 3) towards the eye; right, up and forward.
+    """
+    height, width = buffer.face.shape
+    pos = _positions(buffer, focal, row, column)
+    offset = AROUND[2 * (row % 2) + column % 2]
+    reach = focal * REACH / pos[:, 2]
+    kept = np.zeros(len(row))
+    for k in range(_COUNT):
+        c = np.floor(column + 0.5 + reach * offset[:, k, 0]).astype(np.int64)
+        r = np.floor(row + 0.5 + reach * offset[:, k, 1]).astype(np.int64)
+        at = np.flatnonzero((c >= 0) & (r >= 0) & (c < width) & (r < height))
+        at = at[buffer.face[r[at], c[at]] >= 0]
+        away = _positions(buffer, focal, r[at], c[at]) - pos[at]
+        dist_sq = np.einsum("pi,pi->p", away, away)
+        share = np.maximum(1.0 - dist_sq / REACH**2, 0.0)
+        above = np.einsum("pi,pi->p", normal[at], away) / np.sqrt(np.maximum(dist_sq, 1e-300))
+        kept[at] += np.where(dist_sq > 0, np.maximum(above - _LEAST, 0.0) * share, 0.0)
+    return np.clip(1.0 - _STRENGTH * kept / _COUNT, _DARKEST, 1.0)
+
+
+def _positions(buffer: VisibilityBuffer, focal: float, row: NDArray[np.integer], column: NDArray[np.integer]) -> Array:
+    """Seen points (P, 3) [m] right, up and forward of the eye."""
+    height, width = buffer.face.shape
+    depth = 1.0 / buffer.nearness[row, column]
+    return np.stack([(column + 0.5 - 0.5 * width) / focal * depth, (0.5 * height - row - 0.5) / focal * depth, depth], axis=1)
+
+
+Faces = NDArray[np.int64]
+
+_DARK_SIZE, _CELL = 128, 0.03  # cells of the map of shade on the floor along a side, and the side of one [m]
+_SHADOW_SIZE = 640  # pixels of the shadow map
+# Where the shadow map is probed around a point, in texels: two rings, turned against each other.
+_PROBES = (
+    (0.0, 0.0), (1.7, 0.6), (-0.6, 1.7), (-1.7, -0.6), (0.6, -1.7), (3.0, -2.4), (2.4, 3.0), (-3.0, 2.4),
+    (-2.4, -3.0),
+)  # fmt: skip
+_PROBE_TEXELS = packed(_PROBES)
+_GROUND = np.array([0.80, 0.81, 0.82])
+_HORIZON = np.array([0.93, 0.935, 0.94])
+_ZENITH = np.array([0.80, 0.82, 0.85])
+_KEY = 1.14 * np.array([1.0, 0.97, 0.92])
+_FILL = 0.22 * np.array([0.86, 0.92, 1.0])
+_SKY = 0.43 * np.array([0.95, 0.98, 1.0])
+_BOUNCE = 0.18 * np.array([1.0, 0.97, 0.94])
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Everything drawn as one mesh: `pos` (V, 3), `faces` (F, 3), linear `color` and unit `normal` (V, 3), distance from
+    the next `hem` and how far the vertices are drawn `behind` where they are (V,) [m]."""
+
+    pos: Array
+    faces: Faces
+    color: Array
+    normal: Array
+    hem: Array
+    behind: Array
+
+
+class Light:
+    """A key light with a shadow map, a fill light, a hemisphere of sky and bounce light, and a rim."""
+
+    def __init__(self, camera: Camera, pos: Array, faces: NDArray[np.int64]):
+        right, _, forward = camera.axes()
+        flat_forward = unit(np.array([forward[0], 0.0, forward[2]]) + 1e-9)
+        self.key = unit(-0.55 * right + 1.0 * np.array([0.0, 1.0, 0.0]) - 0.75 * flat_forward)
+        self.fill = unit(0.9 * right + 0.25 * np.array([0.0, 1.0, 0.0]) - 0.6 * flat_forward)
+        self._axes = packed(view_axes(-self.key))
+        seen = pos @ self._axes.T
+        self._low = seen[:, :2].min(axis=0)
+        extent = float((seen[:, :2].max(axis=0) - self._low).max()) + 1e-6
+        self._scale = (_SHADOW_SIZE - 8) / extent
+        screen = (seen[:, :2] - self._low) * self._scale + 4.0
+        self._map = rasterise(screen, -seen[:, 2], faces, _SHADOW_SIZE, _SHADOW_SIZE).nearness
+        self._texel = 1.0 / self._scale
+
+    def values(self) -> LightValues:
+        """For the compiled drawing; valid as long as this light is."""
+        size, low, count = _SHADOW_SIZE, (float(self._low[0]), float(self._low[1])), len(_PROBES)
+        colors = (tuple(value) for value in (self.key, self.fill, _KEY, _FILL, _SKY, _BOUNCE))
+        at = (address(value) for value in (self._map, _PROBE_TEXELS, self._axes))
+        return LightValues(*at, size, count, low, self._scale, self._texel, *colors)
+
+    def lit(self, pos: Array, spread: float = 1.0) -> Array:
+        """Share of the key light that reaches `pos` (P, 3): percentage-closer filtering of the shadow map."""
+        lib = library()
+        if lib is not None:
+            points, out = packed(pos), np.empty(len(pos))
+            lib.picture_lit(ctypes.byref(self.values()), address(points), len(points), spread, address(out))
+            return out
+        seen = pos @ self._axes.T
+        at = (seen[:, :2] - self._low) * self._scale + 4.0
+        bias = 0.004 + 1.5 * spread * self._texel
+        shade = np.zeros(len(pos))
+        for dx, dy in _PROBES:
+            column = np.clip(at[:, 0] + spread * dx, 0, _SHADOW_SIZE - 1).astype(np.int64)
+            row = np.clip(at[:, 1] + spread * dy, 0, _SHADOW_SIZE - 1).astype(np.int64)
+            shade += self._map[row, column] > bias - seen[:, 2]
+        return 1.0 - shade / len(_PROBES)
+
+    def shade(self, pos: Array, normal: Array, view: Array, color: Array, openness: Array) -> Array:
+        """Linear colours (P, 3) of points with these unit normals, directions to the eye and colours.
+
+        Args:
+            openness: (P,) share of the light from all sides that is not kept off by what is near.
+        """
+        key = normal @ self.key
+        # Wrapped diffuse light: soft terminators, as under a large lamp.
+        diffuse = np.clip((key + 0.25) / 1.25, 0.0, 1.0)
+        shadow = (0.25 + 0.75 * self.lit(pos + 0.006 * normal, spread=0.9)) * (0.5 + 0.5 * openness)
+        fill = np.clip(normal @ self.fill, 0.0, 1.0)
+        up = 0.5 + 0.5 * normal[:, 1]
+        facing = np.clip(_dot(normal, view), 0.0, 1.0)
+        half = unit(view + self.key)
+        gloss = 0.06 * np.clip(_dot(normal, half), 0.0, 1.0) ** 24 * shadow
+        rim = 0.10 * (1.0 - facing) ** 3 * up
+        around = fill[:, None] * _FILL + up[:, None] * _SKY + (1.0 - up)[:, None] * _BOUNCE
+        received = (diffuse * shadow)[:, None] * _KEY + openness[:, None] * around
+        return color * received * (0.72 + 0.28 * facing[:, None]) + (gloss + rim)[:, None]
+
+
+def backdrop(camera: Camera, light: Light, surface: Surface, floor: float, width: int, height: int, samples: int) -> Array:
+    """Linear colours (samples * height, samples * width, 3) of the floor, which fades into a plain background.
+
+    A pixel of the picture of this ``width`` and ``height`` has one colour, in all its ``samples`` rows and columns.
+    """
+    right, up, forward = camera.axes()
+    tan_y = np.tan(np.radians(camera.fov) / 2)
+    lib = library()
+    if lib is not None:
+        image, dark = np.empty((samples * height, samples * width, 3)), _dark_map(surface, floor)
+        where = (tuple(value) for value in (camera.position, right, up, forward, _middle(surface)))
+        colors = (tuple(value) for value in (_GROUND**2.2, _HORIZON, _ZENITH))
+        sizes = width, height, len(dark), samples
+        values = FloorValues(address(dark), address(image), *sizes, *where, tan_y, floor, _CELL, *colors)
+        lib.picture_backdrop(ctypes.byref(light.values()), ctypes.byref(values))
+        return image
+    x = (np.arange(width) + 0.5 - 0.5 * width) / (0.5 * height) * tan_y
+    y = (0.5 * height - np.arange(height) - 0.5) / (0.5 * height) * tan_y
+    rays = forward + x[None, :, None] * right + y[:, None, None] * up
+    slope = rays[..., 1] / np.linalg.norm(rays, axis=-1)
+    image = (_HORIZON + (_ZENITH - _HORIZON) * np.clip(1.6 * slope, 0.0, 1.0)[..., None]) ** 2.2
+
+    eye = np.asarray(camera.position)
+    drop = eye[1] - floor
+    row, column = np.nonzero(rays[..., 1] < -1e-4)
+    if drop < 1e-3:
+        return _repeated(image, samples)
+    reach = drop / -rays[row, column, 1]
+    pos = eye + reach[:, None] * rays[row, column]
+    pixel = reach * 2.0 * tan_y / height
+    center = _middle(surface)
+    away = np.hypot(pos[:, 0] - center[0], pos[:, 2] - center[2])
+    fade = np.exp(-((away / 3.2) ** 2))
+    ground = _GROUND**2.2 * (1.0 - 0.16 * _grid_lines(pos, pixel, reach / drop) * fade)[:, None]
+    ground *= _floor_shadow(light, surface, pos, floor, away)[:, None]
+    blend = np.clip(fade, 0.0, 1.0)[:, None]
+    image[row, column] = blend * ground + (1.0 - blend) * image[row, column]
+    return _repeated(image, samples)
+
+
+def _repeated(image: Array, samples: int) -> Array:
+    return np.repeat(np.repeat(image, samples, axis=0), samples, axis=1)
+
+
+def _grid_lines(pos: Array, pixel: Array, stretch: Array) -> Array:
+    """Coverage of 1 cm lines every half metre, smoothed over the pixel's footprint."""
+    lines = np.zeros(len(pos))
+    foot = np.maximum(pixel, 1e-4) * np.sqrt(np.maximum(stretch, 1.0))
+    for axis in (0, 2):
+        offset = np.abs((pos[:, axis] / 0.5 + 0.5) % 1.0 - 0.5) * 0.5
+        cover = np.clip((0.005 - offset) / foot + 0.5, 0.0, 1.0) * np.minimum(1.0, 0.01 / foot)
+        lines = np.maximum(lines, cover)
+    return lines
+
+
+def _floor_shadow(light: Light, surface: Surface, pos: Array, floor: float, away: Array) -> Array:
+    """What is left of the light on the floor: the cast shadow, and a soft dark patch under low parts."""
+    dark, center = _dark_map(surface, floor), _middle(surface)
+    at = (pos[:, [2, 0]] - center[[2, 0]]) / _CELL + _DARK_SIZE / 2 - 0.5
+    left = 1.0 - np.clip(_sample(dark, at), 0.0, 0.6)
+    near = away < 3.0
+    left[near] *= 0.80 + 0.20 * light.lit(pos[near], spread=2.5)
+    return left
+
+
+def _dark_map(surface: Surface, floor: float) -> Array:
+    """Shade under low parts, (_DARK_SIZE, _DARK_SIZE) cells of _CELL along z and x about the surface's middle."""
+    center = _middle(surface)
+    a, b, c = (surface.pos[surface.faces[:, k]] for k in range(3))
+    middle = (a + b + c) / 3.0
+    area = 0.25 * np.abs(np.cross(b - a, c - a)[:, 1])
+    weight = area / _CELL**2 * np.exp(-np.maximum(middle[:, 1] - floor, 0.0) / 0.12)
+    at = np.clip((middle[:, [2, 0]] - center[[2, 0]]) / _CELL + _DARK_SIZE / 2, 0, _DARK_SIZE - 1).astype(np.int64)
+    flat = np.bincount(at[:, 0] * _DARK_SIZE + at[:, 1], weights=weight, minlength=_DARK_SIZE * _DARK_SIZE)
+    low = flat.astype(np.float64).reshape(_DARK_SIZE, _DARK_SIZE)
+    return packed(0.55 * _blur(low, 1.4) + 0.6 * _blur(low, 4.0))
+
+
+def _middle(surface: Surface) -> Array:
+    """Of the box that holds the surface, (3,)."""
+    middle: Array = 0.5 * (surface.pos.min(axis=0) + surface.pos.max(axis=0))
+    return middle
+
+
+def _blur(image: Array, sigma: float) -> Array:
+    """Gaussian blur; the image is taken as zero outside."""
+    reach = int(3 * sigma + 0.5)
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
+    kernel /= kernel.sum()
+    for axis in (0, 1):
+        image = np.apply_along_axis(np.convolve, axis, image, kernel, mode="same")
+    return image
+
+
+def _sample(image: Array, at: Array) -> Array:
+    """Bilinear samples (P,) at (row, column) `at` (P, 2); the border is repeated."""
+    at = np.clip(at, 0.0, np.array(image.shape) - 1.001)
+    low = at.astype(np.int64)
+    part = at - low
+    r, c = low[:, 0], low[:, 1]
+    upper = image[r, c] * (1 - part[:, 1]) + image[r, c + 1] * part[:, 1]
+    lower = image[r + 1, c] * (1 - part[:, 1]) + image[r + 1, c + 1] * part[:, 1]
+    return upper * (1 - part[:, 0]) + lower * part[:, 0]
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return np.einsum("pi,pi->p", a, b)

@@ -1,0 +1,159 @@
+"""Feature groups of models that correct their own predictions: what the potential says about positions, of single vertices
+and of neighbourhoods. The same columns, fewer, are seen again between the passes of such a model (:func:`look`)."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from hood.model.features.groups import EdgeGroup, FeatureSet, NodeGroup, cloth_difference
+from hood.model.features.inputs import Inputs
+from hood.model.features.normalizer import FixedScale
+from hood.model.features.physical import GRAVITY, ContactDistance, Residual, length, mean_rest_length, physical
+
+#: Rounds of diffusion of the residuals of small and of large neighbourhoods.
+WIDE_ROUNDS = (4, 16)
+#: Local steps of stiff cloth are of this size [m]; displacements of a pass of that one; strains of a percent matter.
+STEP, MOVE, GAIN = 1e-4, 1e-2, 100.0
+#: Global steps are of this size [m]; they turn and stretch edges by such shares of their lengths.
+WAVE, TURN, STRETCH = 1e-3, 0.03, 0.01
+
+
+class _View(NodeGroup, ABC):
+    """asinh(value/scale) of what the potential says about the cloth; 0 on the body."""
+
+    needs_contact = True
+    needs_feedback = True
+
+    def __init__(self, scale: float) -> None:
+        super().__init__()
+        self.scale = FixedScale(scale, asinh=True)
+
+    @abstractmethod
+    def value(self, inputs: Inputs) -> Tensor | None:
+        """(V, width), None where it was not computed."""
+
+    def cloth(self, inputs: Inputs) -> Tensor:
+        return self.scale(_demand(self.value(inputs)))
+
+    def body(self, inputs: Inputs) -> Tensor:
+        return inputs.state.pos.new_zeros(inputs.num_body, self.width)
+
+
+class LocalStep(_View):
+    """What a vertex alone would do about the residual [m], in the unit of stiff cloth's errors."""
+
+    width = 3
+
+    def __init__(self, scale: float = STEP) -> None:
+        super().__init__(scale)
+
+    def value(self, inputs: Inputs) -> Tensor | None:
+        return inputs.local_step
+
+
+class GlobalStep(_View):
+    """What all vertices together would do about the residual [m]."""
+
+    width = 3
+    needs_global_step = True
+
+    def __init__(self, scale: float = WAVE) -> None:
+        super().__init__(scale)
+
+    def value(self, inputs: Inputs) -> Tensor | None:
+        return inputs.global_step
+
+
+class WideResidual(_View):
+    """The residual [m/s²] of neighbourhoods instead of single vertices: what is left where internal forces cancel. Sums over
+    compressed residuals of single vertices could not recover it."""
+
+    width = 3 * len(WIDE_ROUNDS)
+
+    def __init__(self, scale: float = GRAVITY) -> None:
+        super().__init__(scale)
+
+    def value(self, inputs: Inputs) -> Tensor | None:
+        return inputs.wide_residual
+
+
+class EdgeGlobalStep(EdgeGroup):
+    """What the global step makes of an edge: asinh(change/``turn``), in mean rest lengths of its set, and of its length,
+    asinh(change/``stretch``). Differences of compressed columns of the two vertices could not recover either."""
+
+    width = 4
+    needs_base = True
+    needs_global_step = True
+
+    def __init__(self, turn: float = TURN, stretch: float = STRETCH) -> None:
+        super().__init__()
+        self.turn, self.stretch = FixedScale(turn, asinh=True), FixedScale(stretch, asinh=True)
+
+    def forward(self, inputs: Inputs) -> Tensor:
+        unit = inputs.edges.once("mean length", lambda: mean_rest_length(inputs))
+        change, before = (cloth_difference(pos, inputs) for pos in (_demand(inputs.global_step), inputs.base))
+        longer = length(before + change) - length(before)
+        return torch.cat([self.turn(change / unit), self.stretch(longer / unit)], dim=1)
+
+
+#: What :func:`look` reads; they have no parameters.
+_RESIDUAL, _LOCAL_STEP, _WIDE, CONTACT, _GLOBAL = Residual(), LocalStep(), WideResidual(), ContactDistance(), GlobalStep()
+
+#: Columns of :func:`look` of nodes and of edges.
+LOOK_WIDTHS = (3 + 3 + 3 + 1 + 1 + WideResidual.width, 1)
+#: The same where global steps are seen.
+GLOBAL_LOOK_WIDTHS = (LOOK_WIDTHS[0] + GlobalStep.width + 1, LOOK_WIDTHS[1])
+
+
+def look(inputs: Inputs, sets: Sequence[str]) -> tuple[Tensor, dict[str, Tensor]]:
+    """What is seen of a prediction ``inputs.base`` before the next pass: columns of the cloth nodes (V, 17), or (V, 21) with
+    global steps, and the strain (N, 1) of the edge sets ``sets``; fixed scales, outliers compressed by asinh."""
+    step = _demand(inputs.local_step)
+    moved = inputs.state.vel * inputs.vertex_dt - (inputs.base - inputs.state.pos)
+    nodes = [
+        _RESIDUAL.cloth(inputs),
+        _LOCAL_STEP.cloth(inputs),
+        torch.asinh(moved / MOVE),
+        CONTACT.cloth(inputs)[:, :1],
+        _LOCAL_STEP.scale(length(step)),
+        _WIDE.cloth(inputs),
+    ]
+    if inputs.global_step is not None:
+        nodes += [_GLOBAL.cloth(inputs), _GLOBAL.scale(length(inputs.global_step))]
+    return torch.cat(nodes, dim=1), {name: _strain(inputs, name) for name in sets}
+
+
+def local(
+    num_levels: int = 3,
+    layers: bool = False,
+    together: bool = False,
+    more: Sequence[NodeGroup | EdgeGroup] = (),
+    of_edges: bool = False,
+) -> FeatureSet:
+    """The physical features with local steps and wide residuals, and with global steps (``together``), of edges as well
+    (``of_edges``)."""
+    views: list[NodeGroup | EdgeGroup] = [LocalStep(), WideResidual()]
+    views += [GlobalStep()] if together else []
+    views += [EdgeGlobalStep()] if together and of_edges else []
+    return physical(num_levels, views, layers, more)
+
+
+def _strain(inputs: Inputs, name: str) -> Tensor:
+    """asinh(100·(length/rest length − 1)) of the edges (N, 1) at the base; 0 for edges of no rest length."""
+    rows = inputs.graph.edge_sets[name]
+    now, rest = (length(pos[rows.senders] - pos[rows.receivers]) for pos in (inputs.base, inputs.cloth.rest_pos))
+    proper = rest > 1e-6
+    return torch.asinh(GAIN * torch.where(proper, now / torch.where(proper, rest, 1.0) - 1, 0.0))
+
+
+def _demand(values: Tensor | None) -> Tensor:
+    if values is None:
+        raise ValueError(
+            "features: these features say what the potential does; pass Inputs(local_step=…, wide_residual=…), "
+            "and global_step=… to models that see it"
+        )
+    return values

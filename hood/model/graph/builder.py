@@ -1,0 +1,280 @@
+"""The graph of one step: static mesh and coarse edges, and the edges that change every step: to the body, between layers of
+cloth that are near each other, and attachments."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from hood.cloth.cloth import Cloth
+from hood.cloth.state import Attachments, Obstacle, StepInput
+from hood.mesh.closest_point.vertices import Nearest
+from hood.model.graph.hierarchy import Hierarchy
+
+MESH = "mesh"
+BODY = "body"
+LAYERS = "layers"
+
+
+def coarse_name(level: int) -> str:
+    """Name of the coarse set c_k: ``coarse0`` is level 1."""
+    return f"coarse{level}"
+
+
+def set_level(name: str) -> int:
+    """Level of a cloth edge set: 0 for the mesh, k + 1 for ``coarse{k}``."""
+    return int(name.removeprefix("coarse")) + 1 if name.startswith("coarse") else 0
+
+
+@dataclass(frozen=True)
+class EdgeSet:
+    """Directed edges, both directions of every undirected edge, sorted by receiver and then sender.
+
+    Sums over the edges of a node are sums over consecutive rows (``offsets``). The network works on the M nodes that
+    have an edge; ``nodes`` maps them to the graph's nodes and the ``local_*`` indices point into them. Row
+    ``reverse[i]`` is row i in the other direction, so ``reverse`` also lists the edges in the order of their senders.
+    """
+
+    senders: Tensor  # (N,) graph nodes
+    receivers: Tensor  # (N,) graph nodes, ascending
+    source: Tensor  # (N,) row of the undirected edge in the list the set was built from
+    reverse: Tensor  # (N,)
+    nodes: Tensor  # (M,) ascending
+    local_senders: Tensor  # (N,) into nodes
+    local_receivers: Tensor  # (N,) into nodes, ascending
+    offsets: Tensor  # (M + 1,) rows of node m: offsets[m] … offsets[m + 1]
+
+    @cached_property
+    def rows(self) -> Tensor:
+        """0 … N − 1."""
+        return torch.arange(self.num_edges, device=self.senders.device)
+
+    @cached_property
+    def ends(self) -> Tensor:
+        """2 · receiver and 2 · sender + 1 of every edge, (N, 2): rows of a table of two values per node."""
+        return torch.stack([2 * self.local_receivers, 2 * self.local_senders + 1], dim=1)
+
+    def spans(self, length: int) -> list[tuple[slice, Tensor]]:
+        """For every ``length`` consecutive rows the nodes that receive them, and their offsets within those rows."""
+        if length not in self._spans:
+            self._spans[length] = self._find_spans(length)
+        return self._spans[length]
+
+    @cached_property
+    def _spans(self) -> dict[int, list[tuple[slice, Tensor]]]:
+        return {}
+
+    def _find_spans(self, length: int) -> list[tuple[slice, Tensor]]:
+        count = self.num_edges
+        if length >= count:
+            return [(slice(0, self.nodes.shape[0]), self.offsets)]
+        starts = list(range(0, count, length))
+        stops = [min(start + length, count) for start in starts]
+        first = self.local_receivers[starts].tolist()
+        last = self.local_receivers[[stop - 1 for stop in stops]].tolist()
+        return [
+            (slice(a, b + 1), self.offsets[a : b + 2].clamp(start, stop) - start)
+            for a, b, start, stop in zip(first, last, starts, stops, strict=True)
+        ]
+
+    @property
+    def num_edges(self) -> int:
+        return self.senders.shape[0]
+
+
+@dataclass(frozen=True)
+class Subset:
+    """Part of an edge set: ``edges`` are its rows ``rows`` (None: all of them)."""
+
+    edges: EdgeSet
+    rows: Tensor | None
+
+
+@dataclass(frozen=True)
+class StaticGraph:
+    """What does not change during a rollout; built once per cloth (or batch of cloths)."""
+
+    num_cloth: int
+    mesh_edges: Tensor  # (E, 2) undirected
+    edge_sets: dict[str, EdgeSet]  # mesh and the coarse sets the network uses
+    node_level: Tensor  # (V,)
+
+
+@dataclass(frozen=True)
+class Graph:
+    """Nodes 0 … V − 1 are the cloth's, the rest the body vertices that carry an edge now, in the order of
+    ``body_vertex`` (indices into the obstacle's vertices).
+
+    ``body_subsets[l]`` holds the body edges of cloth nodes on level l or deeper: a processor step that works on
+    levels ≥ l only (paper, section 4.2) uses these. ``layer_subsets[l]`` holds the edges between layers of cloth both of
+    whose nodes are: there are none in graphs of models that know no such edges.
+    """
+
+    num_cloth: int
+    body_vertex: Tensor  # (W_active,)
+    edge_sets: dict[str, EdgeSet]  # mesh, coarse0, …, body (always present, possibly without edges), layers
+    body_subsets: dict[int, Subset]
+    node_level: Tensor  # (V,)
+    num_mesh_edges: int  # undirected mesh edges; mesh rows with a larger ``source`` are attachments
+    layer_subsets: dict[int, Subset] = field(default_factory=dict, kw_only=True)
+
+    def subset(self, name: str, level: int) -> Subset:
+        """The edges of a set that a processor step on levels ≥ ``level`` works on; all of a static one."""
+        if name == BODY:
+            return self.body_subsets[level]
+        return self.layer_subsets[level] if name == LAYERS else Subset(self.edge_sets[name], None)
+
+    @property
+    def num_nodes(self) -> int:
+        return self.num_cloth + self.body_vertex.shape[0]
+
+
+def edge_set(pairs: Tensor) -> EdgeSet:
+    """Both directions of undirected ``pairs`` (E, 2) as a sorted set of 2E rows."""
+    count = pairs.shape[0]
+    receivers, senders = torch.cat([pairs, pairs.flip(1)]).unbind(1)
+    width = int(pairs.max()) + 1 if count else 1
+    order = torch.argsort(receivers * width + senders, stable=True)
+    position = torch.empty_like(order)
+    position[order] = torch.arange(2 * count, device=order.device)
+    # Row i of the unsorted list and row i + E are the two directions of one edge.
+    reverse = position[(order + count) % max(2 * count, 1)]
+    receivers = receivers[order].contiguous()
+    nodes, local, degree = torch.unique_consecutive(receivers, return_inverse=True, return_counts=True)
+    return EdgeSet(
+        senders=senders[order],
+        receivers=receivers,
+        source=order % max(count, 1),
+        reverse=reverse,
+        nodes=nodes,
+        local_senders=local[reverse],
+        local_receivers=local,
+        offsets=torch.cat([degree.new_zeros(1), degree.cumsum(0)]),
+    )
+
+
+def build_static(cloth: Cloth, hierarchy: Hierarchy, names: Sequence[str]) -> StaticGraph:
+    """Static edge sets ``names`` of a cloth: ``mesh`` and the coarse sets that the network's schedule uses.
+
+    ``node_level`` keeps all levels of the hierarchy, also those without a set here.
+    """
+    device = cloth.edges.device
+    available = {MESH: cloth.edges}
+    available |= {coarse_name(k): edges.to(device) for k, edges in enumerate(hierarchy.coarse_edges)}
+    missing = [name for name in names if name not in available and name != BODY]
+    if missing:
+        raise ValueError(
+            f"graph: no edge set {missing[0]!r}; the hierarchy has {len(hierarchy.coarse_edges)} coarse levels, "
+            f"build it with more (available: {', '.join(available)})"
+        )
+    if hierarchy.num_vertices != cloth.num_vertices:
+        raise ValueError(
+            f"graph: the hierarchy is of {hierarchy.num_vertices} vertices but the cloth has {cloth.num_vertices}; "
+            "build it from the same garments in the same order"
+        )
+    sets = {name: edge_set(available[name]) for name in names if name != BODY}
+    return StaticGraph(cloth.num_vertices, cloth.edges, sets, hierarchy.node_level.to(device))
+
+
+def build_graph(
+    static: StaticGraph,
+    step: StepInput,
+    nearest: Nearest | None = None,
+    radius: float = 0.03,
+    active_edges: Tensor | None = None,
+    layers: Tensor | None = None,
+) -> Graph:
+    """Graph of one step.
+
+    Args:
+        static: the cloth's static part.
+        step: its closed ``attachments`` join the mesh edges; its ``obstacle`` tells which body vertices are omitted.
+        nearest: nearest body vertices of the cloth's; None without a body.
+        radius: body edges are kept where the nearest body vertex is closer than this [m] (paper: 3 cm).
+        active_edges: (E,) bool, mesh edges that exist in this step; None for all of them.
+        layers: (L, 2) cloth nodes near each other (:func:`hood.model.graph.near_cloth.find_near_cloth`); None for models that
+            know no such edges.
+    """
+    sets = dict(static.edge_sets)
+    if MESH in sets:
+        sets[MESH] = mesh_set(static, step.attachments, active_edges)
+    cloth_node, body_vertex = _body_pairs(static, step.obstacle, nearest, radius)
+    body_vertex, compact = torch.unique(body_vertex, return_inverse=True)
+    pairs = torch.stack([cloth_node, static.num_cloth + compact], dim=1)
+    body = edge_set(pairs)
+    sets[BODY] = body
+    row_level = static.node_level[cloth_node][body.source]
+    depth = max((set_level(name) for name in static.edge_sets), default=0)
+    graph = Graph(
+        static.num_cloth, body_vertex, sets, _by_level(body, row_level, depth), static.node_level, static.mesh_edges.shape[0]
+    )
+    return graph if layers is None else _with_layers(graph, layers, depth)
+
+
+def _with_layers(graph: Graph, pairs: Tensor, depth: int) -> Graph:
+    edges = edge_set(pairs)
+    level = torch.minimum(graph.node_level[edges.senders], graph.node_level[edges.receivers])
+    sets = {**graph.edge_sets, LAYERS: edges}
+    return replace(graph, edge_sets=sets, layer_subsets=_by_level(edges, level, depth))
+
+
+def _by_level(edges: EdgeSet, row_level: Tensor, depth: int) -> dict[int, Subset]:
+    """The rows on every level or deeper, by level."""
+    return {0: Subset(edges, None)} | {level: _subset(edges, row_level >= level) for level in range(1, depth + 1)}
+
+
+def mesh_set(static: StaticGraph, attachments: Attachments | None, active_edges: Tensor | None) -> EdgeSet:
+    """Mesh edges that exist in a step (all of them if ``active_edges`` is None) and the attachments closed in it."""
+    closed = attachments is not None and bool(attachments.active.any())
+    if active_edges is None and not closed:
+        return static.edge_sets[MESH]
+    # Sources keep pointing into the full lists [mesh edges, attachments], which the features read.
+    keep = torch.ones(len(static.mesh_edges), dtype=torch.bool, device=static.mesh_edges.device)
+    keep = keep if active_edges is None else active_edges
+    pairs = static.mesh_edges
+    if attachments is not None:
+        pairs = torch.cat([pairs, attachments.edges])
+        keep = torch.cat([keep, attachments.active])
+    kept = keep.nonzero().squeeze(1)
+    built = edge_set(pairs[kept])
+    return replace(built, source=kept[built.source])
+
+
+def _body_pairs(
+    static: StaticGraph, obstacle: Obstacle | None, nearest: Nearest | None, radius: float
+) -> tuple[Tensor, Tensor]:
+    """Cloth node and body vertex of every body edge; omitted vertices drop out after the search, not before it."""
+    if obstacle is None or nearest is None:
+        none = static.node_level.new_zeros(0)
+        return none, none
+    near = nearest.dist < radius
+    if obstacle.omitted is not None:
+        near = near & ~obstacle.omitted[nearest.vertex]
+    cloth_node = near.nonzero().squeeze(1)
+    return cloth_node, nearest.vertex[cloth_node]
+
+
+def _subset(edges: EdgeSet, keep: Tensor) -> Subset:
+    """Rows ``keep`` of a set; both directions of an edge must be kept or dropped together."""
+    rows = keep.nonzero().squeeze(1)
+    if rows.shape[0] == edges.num_edges:
+        return Subset(edges, None)
+    position = torch.cumsum(keep, 0) - 1
+    receivers = edges.receivers[rows]
+    nodes, local, degree = torch.unique_consecutive(receivers, return_inverse=True, return_counts=True)
+    reverse = position[edges.reverse[rows]]
+    part = EdgeSet(
+        senders=edges.senders[rows],
+        receivers=receivers,
+        source=edges.source[rows],
+        reverse=reverse,
+        nodes=nodes,
+        local_senders=local[reverse],
+        local_receivers=local,
+        offsets=torch.cat([degree.new_zeros(1), degree.cumsum(0)]),
+    )
+    return Subset(part, rows)

@@ -1,0 +1,132 @@
+"""The kernels behind :mod:`hood.model.kernels.triton_edge`; importing this module needs Triton.
+
+No annotations from the future here: Triton reads the annotations of a kernel's constants.
+"""
+# mypy: disable-error-code="no-untyped-def, misc"
+
+import triton
+import triton.language as tl
+
+
+@triton.jit
+def _product(left, right, PRECISION: tl.constexpr, WIDEN: tl.constexpr):
+    """left right, summed in float32. WIDEN: bfloat16 as float32, for Triton's interpreter, whose product has none."""
+    if WIDEN:
+        left, right = left.to(tl.float32), right.to(tl.float32)
+    return tl.dot(left, right, input_precision=PRECISION)
+
+
+@triton.jit
+def _layer(x, pointer, stride, columns, present, PRECISION: tl.constexpr, WIDEN: tl.constexpr):
+    """x Wᵀ for a layer's weights W (out, in), rounded to the precision of ``x``; columns not present are zero."""
+    mask = present[:, None] & present[None, :]
+    weight = tl.load(pointer + columns[None, :] * stride + columns[:, None], mask=mask, other=0.0).to(x.dtype)
+    return _product(x, weight, PRECISION, WIDEN)
+
+
+@triton.jit
+def _vector(pointer, columns, present):
+    """A layer's bias, or scale or shift of its norm, in float32."""
+    return tl.load(pointer + columns, mask=present, other=0.0).to(tl.float32)
+
+
+@triton.jit
+def tile_pass(
+    latent,
+    table,
+    receivers,
+    senders,
+    weight_1,
+    stride_1,
+    weight_2,
+    bias_2,
+    weight_3,
+    bias_3,
+    scale,
+    shift,
+    updated,
+    received,
+    borders,
+    count,
+    tiles,
+    eps,
+    PRECISION: tl.constexpr,
+    WIDEN: tl.constexpr,
+    WIDTH: tl.constexpr,
+    PADDED: tl.constexpr,
+    TILE: tl.constexpr,
+):
+    """New latents of TILE edges; sums at the nodes of which the tile holds all edges; partial sums at its two ends."""
+    tile = tl.program_id(0)
+    rows = tile * TILE + tl.arange(0, TILE)
+    inside = rows < count
+    columns = tl.arange(0, PADDED)
+    present = columns < WIDTH
+    both = inside[:, None] & present[None, :]
+    places = rows[:, None].to(tl.int64) * WIDTH + columns[None, :]
+    dtype = latent.dtype.element_ty
+
+    receiver = tl.load(receivers + rows, mask=inside, other=-1)
+    sender = tl.load(senders + rows, mask=inside, other=0)
+    edge = tl.load(latent + places, mask=both, other=0.0)
+    hidden = tl.load(table + receiver[:, None] * (2 * WIDTH) + columns[None, :], mask=both, other=0.0).to(tl.float32)
+    hidden += tl.load(table + sender[:, None] * (2 * WIDTH) + WIDTH + columns[None, :], mask=both, other=0.0).to(tl.float32)
+    hidden += _layer(edge, weight_1, stride_1, columns, present, PRECISION, WIDEN)
+    hidden = tl.maximum(hidden, 0.0).to(dtype)
+    hidden = _layer(hidden, weight_2, WIDTH, columns, present, PRECISION, WIDEN)
+    hidden = tl.maximum(hidden + _vector(bias_2, columns, present)[None, :], 0.0).to(dtype)
+    raw = _layer(hidden, weight_3, WIDTH, columns, present, PRECISION, WIDEN)
+    raw += _vector(bias_3, columns, present)[None, :]
+
+    centred = tl.where(present[None, :], raw - (tl.sum(raw, axis=1) / WIDTH)[:, None], 0.0)
+    variance = tl.sum(centred * centred, axis=1) / WIDTH
+    message = centred * (1.0 / tl.sqrt(variance + eps))[:, None] * _vector(scale, columns, present)[None, :]
+    message += _vector(shift, columns, present)[None, :]
+    tl.store(updated + places, (edge.to(tl.float32) + message).to(dtype), mask=both)
+
+    # Row i of the sums is that of all edges of the tile with the receiver of edge i: a product with a matrix of 0 and 1.
+    same = (receiver[:, None] == tl.load(receivers + rows, mask=inside, other=-2)[None, :]).to(tl.float32).to(dtype)
+    sums = _product(same, message.to(dtype), PRECISION, WIDEN)
+    before = tl.load(receivers + rows - 1, mask=inside & (rows > 0), other=-1)
+    stop = tl.minimum((tile + 1) * TILE, count)
+    last = tl.load(receivers + stop - 1)
+    after = tl.load(receivers + stop, mask=stop < count, other=-1)
+    unfinished = tl.where(after == last, last, -2)  # the node whose edges go on in the next tile, if there is one
+    whole = inside & (receiver != before) & (receiver != unfinished)
+    tl.store(received + receiver[:, None] * WIDTH + columns[None, :], sums.to(dtype), mask=whole[:, None] & present[None, :])
+    ends = borders + tile * WIDTH + columns[None, :] + tl.zeros((TILE, 1), tl.int32)
+    tl.store(ends, sums, mask=(rows == tile * TILE)[:, None] & present[None, :])
+    tl.store(ends + tiles * WIDTH, sums, mask=(rows == stop - 1)[:, None] & present[None, :])
+
+
+@triton.jit
+def border_pass(
+    receivers,
+    offsets,
+    borders,
+    received,
+    count,
+    tiles,
+    WIDTH: tl.constexpr,
+    PADDED: tl.constexpr,
+    TILE: tl.constexpr,
+    CHUNK: tl.constexpr,
+):
+    """The sum at the last node of a tile if its edges begin there and go on in the next tiles."""
+    tile = tl.program_id(0)
+    columns = tl.arange(0, PADDED)
+    present = columns < WIDTH
+    stop = (tile + 1) * TILE
+    node = tl.load(receivers + stop - 1)
+    begins = tl.load(offsets + node) >= tile * TILE
+    end = tl.load(offsets + node + 1)
+    if begins & (end > stop):
+        total = tl.load(borders + (tiles + tile) * WIDTH + columns, mask=present, other=0.0)
+        final = (end - 1) // TILE
+        start = tile + 1
+        while start <= final:  # a range with bounds of the device is not known to Triton's interpreter
+            others = start + tl.arange(0, CHUNK)
+            mask = (others <= final)[:, None] & present[None, :]
+            total += tl.sum(tl.load(borders + others[:, None] * WIDTH + columns[None, :], mask=mask, other=0.0), axis=0)
+            start += CHUNK
+        tl.store(received + node * WIDTH + columns, total.to(received.dtype.element_ty), mask=present)

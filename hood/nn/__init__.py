@@ -1,1 +1,0 @@
-"""The multi-level MeshGraphNet."""

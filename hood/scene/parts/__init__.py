@@ -1,1 +1,0 @@
-"""The connected parts of a scene's garment."""

@@ -1,0 +1,163 @@
+"""Tables that the compiled solver reads: one scene's cloth with its vertices, blocks and elements numbered anew.
+
+The free vertices come first, in an order that keeps neighbours near each other (reverse Cuthill-McKee), then the fixed ones.
+Elements are sorted by their first vertex and padded to a multiple of eight by elements that weigh nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse import csgraph
+
+from hood.cloth.cloth import Cloth
+from hood.cloth.state import Attachments
+
+#: Elements that the compiled solver takes at a time.
+LANES = 8
+
+
+@dataclass(frozen=True)
+class Elements:
+    """Faces or hinges of one scene, and where each row of blocks finds those at its vertex."""
+
+    order: np.ndarray  # (N,) elements of the cloth, in the new order
+    corners: np.ndarray  # (C, P) int32 vertices of the padded elements
+    starts: np.ndarray  # (R C + 1,) int32, where the uses of a row with C, ..., 1 blocks there begin
+    uses: np.ndarray  # (U, 2 + 2 C) int32: element, corner, then corner and place in the row of every block, the diagonal first
+
+    def padded(self, values: np.ndarray, padding: float = 0.0) -> np.ndarray:
+        """Numbers (..., elements of the cloth) in the new order (..., P), float64."""
+        missing = self.corners.shape[1] - len(self.order)
+        widths = [(0, 0)] * (values.ndim - 1) + [(0, missing)]
+        return np.ascontiguousarray(np.pad(values[..., self.order].astype(np.float64), widths, constant_values=padding))
+
+
+@dataclass(frozen=True)
+class Tables:
+    """Topology of one scene for the compiled solver; valid as long as its plan."""
+
+    vertex: np.ndarray  # (V,) int64 vertices of the cloth, the R free ones first
+    num_rows: int
+    row_starts: np.ndarray  # (R + 1,) int32
+    cols: np.ndarray  # (K,) int32, that of the diagonal first in every row, then later ones
+    faces: Elements
+    hinges: Elements
+    springs: Elements  # attachments of the step
+
+    @property
+    def most_blocks(self) -> int:
+        """Blocks of the longest row."""
+        return int(np.diff(self.row_starts).max(initial=0))
+
+    @property
+    def reach(self) -> int:
+        """How far a column is behind its row at most."""
+        return int((self.cols - np.repeat(np.arange(self.num_rows), np.diff(self.row_starts))).max(initial=0))
+
+
+def build_tables(cloth: Cloth, attachments: Attachments | None, scene: int) -> Tables:
+    """Tables of one ``scene`` of a cloth and the attachments of its steps."""
+    members = (cloth.vertex_scene == scene).cpu().numpy()
+    free = cloth.free.cpu().numpy() & members
+    tables = [cloth.faces.cpu().numpy(), cloth.hinges.cpu().numpy()]
+    tables.append(np.zeros((0, 2), np.int64) if attachments is None else attachments.edges.cpu().numpy())
+    chosen = [np.flatnonzero(members[table[:, 0]]) for table in tables]
+    unknown, vertices = _order(free, [table[rows] for table, rows in zip(tables, chosen, strict=True)])
+    number = np.full(len(members), -1, np.int64)
+    vertex = np.concatenate([vertices, np.flatnonzero(members & ~free)])
+    number[vertex] = np.arange(len(vertex))
+    size = len(vertices)
+    corners = [number[table[rows]] for table, rows in zip(tables, chosen, strict=True)]
+    keys = _block_keys(corners, size)
+    rows, cols = keys // max(size, 1), keys % max(size, 1)
+    starts = np.searchsorted(rows, np.arange(size + 1))
+    return Tables(
+        vertex=vertex,
+        num_rows=size,
+        row_starts=starts.astype(np.int32),
+        cols=cols.astype(np.int32),
+        faces=_elements(chosen[0], corners[0], keys, starts),
+        hinges=_elements(chosen[1], corners[1], keys, starts),
+        springs=_elements(chosen[2], corners[2], keys, starts, lanes=1),
+    )
+
+
+def point_uses(tables: Tables, corners: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where the points at the vertex of a row begin, (R + 1,), and what is known of each, (U, 5); both int32.
+
+    Known are the point, the corner that is the row's vertex, and the places in the row of the blocks with the point's three
+    corners, 0 where another row keeps the block or there is none.
+
+    Args:
+        corners: (N, 3) vertices of the points in the new numbering.
+        weights: (N, 3), 0 where there is no corner.
+    """
+    size = tables.num_rows
+    point, corner = np.nonzero((corners < size) & (weights > 0))
+    row = corners[point, corner]
+    order = np.argsort(row, kind="stable")
+    point, corner, row = point[order], corner[order], row[order]
+    cols = corners[point]
+    keys = np.repeat(np.arange(size), np.diff(tables.row_starts)) * size + tables.cols
+    places = np.searchsorted(keys, row[:, None] * size + cols) - tables.row_starts[row][:, None]
+    places = np.where((cols > row[:, None]) & (cols < size) & (weights[point] > 0), places, 0)
+    uses = np.concatenate([point[:, None], corner[:, None], places], axis=1)
+    return np.searchsorted(row, np.arange(size + 1)).astype(np.int32), np.ascontiguousarray(uses, np.int32)
+
+
+def _order(free: np.ndarray, tables: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers (V,) of free vertices in their own order, and the free vertices in an order of small bandwidth."""
+    unknown = np.where(free, np.cumsum(free) - 1, -1)
+    size = int(free.sum())
+    keys = _block_keys([unknown[table] for table in tables], size)
+    rows, cols = keys // max(size, 1), keys % max(size, 1)
+    upper = sparse.csr_matrix((np.ones(len(keys), np.int8), (rows, cols)), shape=(size, size))
+    graph = (upper + upper.T).tocsr()
+    order = csgraph.reverse_cuthill_mckee(graph, symmetric_mode=True) if size else np.zeros(0, np.int64)
+    return unknown, np.flatnonzero(free)[order]
+
+
+def _block_keys(tables: list[np.ndarray], size: int) -> np.ndarray:
+    """Sorted keys row × ``size`` + column of the blocks of the upper triangle between the unknowns of elements (N, C)."""
+    keys = [np.arange(size, dtype=np.int64) * (size + 1)]
+    for table in tables:
+        for a, b in combinations(range(table.shape[1]), 2):
+            row, col = np.minimum(table[:, a], table[:, b]), np.maximum(table[:, a], table[:, b])
+            inside = (row >= 0) & (col < size)
+            keys.append(row[inside] * size + col[inside])
+    return np.unique(np.concatenate(keys))
+
+
+def _elements(chosen: np.ndarray, corners: np.ndarray, keys: np.ndarray, starts: np.ndarray, lanes: int = LANES) -> Elements:
+    size, width = len(starts) - 1, corners.shape[1]
+    order = np.lexsort(corners.T[::-1]) if len(corners) else np.zeros(0, np.int64)
+    corners = corners[order]
+    padding = -len(corners) % lanes
+    padded = np.concatenate([corners, np.repeat(corners[-1:], padding, axis=0)]) if padding else corners
+    table = np.concatenate([_uses(corners, corner, keys, starts) for corner in range(width)])
+    table = table[np.lexsort((-table[:, 1], table[:, 0]))]
+    groups = table[:, 0] * width + width - table[:, 1]
+    return Elements(
+        order=chosen[order],
+        corners=np.ascontiguousarray(padded.T, dtype=np.int32),
+        starts=np.searchsorted(groups, np.arange(size * width + 1)).astype(np.int32),
+        uses=np.ascontiguousarray(table[:, 2:], dtype=np.int32),
+    )
+
+
+def _uses(corners: np.ndarray, corner: int, keys: np.ndarray, starts: np.ndarray) -> np.ndarray:
+    """Row, number of blocks and use (U, 2 + 2 + 2 C) of the elements whose ``corner`` is free, one for each."""
+    size, width = len(starts) - 1, corners.shape[1]
+    element = np.flatnonzero(corners[:, corner] < size)
+    row, cols = corners[element, corner], corners[element]
+    # Blocks of earlier columns are kept by their rows, fixed corners have none; they come last and are not read.
+    upper = (cols >= row[:, None]) & (cols < size)
+    others = np.argsort(np.where(upper, cols, size), axis=1, kind="stable")
+    cols = np.take_along_axis(np.where(upper, cols, row[:, None]), others, axis=1)
+    places = np.searchsorted(keys, row[:, None] * size + cols) - starts[row][:, None]
+    blocks = np.stack([others, places], axis=2).reshape(len(element), 2 * width)
+    return np.concatenate([np.stack([row, upper.sum(axis=1), element, np.full(len(row), corner)], axis=1), blocks], axis=1)

@@ -1,0 +1,220 @@
+"""Collision and friction terms as C++ reads them, and the compiled pass over what acts on single vertices.
+
+Planes of the default collision term and grips of the default friction term in one compiled pass over the vertices.
+
+What :class:`hood.energies.contact.Collision` and :class:`hood.energies.friction.Friction` say in some forty operations of
+torch, which takes longer than the solver's pass over all elements.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hood.contact.activation_distance import sag
+from hood.contact.contact import Contact
+from hood.energies.compiled_elements import library
+from hood.energies.contact import Collision
+from hood.energies.friction import Friction, gripped
+from hood.energies.problem import StepProblem
+from hood.native.arguments import COUNT, POINTER, REAL, fields
+
+if TYPE_CHECKING:
+    from hood.energies.wind import Drag
+    from hood.solver.derivatives.vertices import Grip, VertexForces, Walls
+
+
+class WallStructure(ctypes.Structure):
+    """``Wall`` of ``vertex_terms.h``."""
+
+    _fields_ = [*fields("point normal reach", POINTER), ("weight", REAL), ("share", POINTER)]
+
+
+class GripStructure(ctypes.Structure):
+    """``Grip`` of ``vertex_terms.h``."""
+
+    _fields_ = fields("force normal anchor limit", POINTER)
+
+
+class DragStructure(ctypes.Structure):
+    """``Drag`` of ``vertex_terms.h``."""
+
+    _fields_ = fields("normal target across along", POINTER)
+
+
+class _Vertices(ctypes.Structure):
+    """``Vertices`` of ``elements.cpp``."""
+
+    _fields_ = [
+        *fields("count num_scenes num_walls num_grips", COUNT),
+        *fields("scene inertia stiffness weight dt walls grips", POINTER),
+    ]
+
+
+def wall_structures(walls: tuple[Walls, ...]) -> tuple[ctypes.Array[WallStructure], list[Tensor]]:
+    """Walls as C++ reads them, and what they point to."""
+    structures, kept = (WallStructure * len(walls))(), list[Tensor]()
+    for structure, wall in zip(structures, walls, strict=True):
+        kept += _pointed(structure, wall, ("point", "normal", "reach"))
+        structure.weight = 1.0 if isinstance(wall.weight, Tensor) else wall.weight
+        if isinstance(wall.weight, Tensor):
+            kept.append(whole(wall.weight))
+            structure.share = kept[-1].data_ptr()
+    return structures, kept
+
+
+def grip_structures(grips: tuple[Grip, ...]) -> tuple[ctypes.Array[GripStructure], list[Tensor]]:
+    """The same for grips."""
+    structures, kept = (GripStructure * len(grips))(), list[Tensor]()
+    for structure, grip in zip(structures, grips, strict=True):
+        kept += _pointed(structure, grip, ("force", "normal", "anchor", "limit"))
+    return structures, kept
+
+
+def drag_structures(drags: tuple[Drag, ...]) -> tuple[ctypes.Array[DragStructure], list[Tensor]]:
+    """The same for drags."""
+    structures, kept = (DragStructure * len(drags))(), list[Tensor]()
+    for structure, drag in zip(structures, drags, strict=True):
+        kept += _pointed(structure, drag, ("normal", "target", "across", "along"))
+    return structures, kept
+
+
+def _pointed(structure: ctypes.Structure, item: Walls | Grip | Drag, names: tuple[str, ...]) -> list[Tensor]:
+    tensors = [whole(getattr(item, name)) for name in names]
+    for name, tensor in zip(names, tensors, strict=True):
+        setattr(structure, name, tensor.data_ptr())
+    return tensors
+
+
+def whole(values: Tensor) -> Tensor:
+    """In float64 without gaps: itself where it is that."""
+    sound = values.dtype is torch.float64 and values.is_contiguous() and not values.requires_grad
+    return values if sound else values.detach().double().contiguous()
+
+
+def applies(pos: Tensor) -> bool:
+    """Whether there is a compiled pass for these positions."""
+    return type(pos) is Tensor and pos.device.type == "cpu" and library() is not None
+
+
+class VertexPass:
+    """Forces of a step as C++ reads them, for as many evaluations as are asked for.
+
+    Args:
+        forces: what acts on the vertices; it must stay as it is.
+    """
+
+    def __init__(self, forces: VertexForces) -> None:
+        self._walls, self._grips = wall_structures(forces.walls), grip_structures(forces.grips)
+        self._constants = [whole(values) for values in (forces.inertia, forces.stiffness, forces.weight)]
+        self._num_parts = 2 + len(forces.walls) + len(forces.grips)
+        self._structure = _Vertices(
+            count=len(forces.stiffness),
+            num_walls=len(forces.walls),
+            num_grips=len(forces.grips),
+            inertia=self._constants[0].data_ptr(),
+            stiffness=self._constants[1].data_ptr(),
+            weight=self._constants[2].data_ptr(),
+            walls=ctypes.addressof(self._walls[0]),
+            grips=ctypes.addressof(self._grips[0]),
+        )
+
+    def evaluate(self, pos: Tensor, acc: Tensor, scene: Tensor, dt: Tensor, gradient: bool) -> tuple[Tensor, Tensor | None]:
+        """Energies [J] (2 + W + G, B) of inertia, gravity, walls and grips, and where asked for their gradient [N] (V, 3),
+        float64.
+
+        Args:
+            pos, acc: (V, 3) m and m/s².
+            scene, dt: of every vertex (V,), and seconds of each (B,).
+        """
+        slope = np.zeros(tuple(pos.shape)) if gradient else None
+        energies = self.add(whole(pos).numpy(), whole(acc).numpy(), scene, dt, slope)
+        return torch.from_numpy(energies), None if slope is None else torch.from_numpy(slope)
+
+    def add(self, pos: np.ndarray, acc: np.ndarray, scene: Tensor, dt: Tensor, gradient: np.ndarray | None) -> np.ndarray:
+        """The energies of :meth:`evaluate`; their gradient is added to ``gradient`` (V, 3). All float64 without gaps."""
+        lib = library()
+        assert lib is not None
+        structure, seconds = self._structure, whole(dt)
+        structure.num_scenes, structure.scene, structure.dt = len(dt), scene.data_ptr(), seconds.data_ptr()
+        energies = np.zeros((self._num_parts, len(dt)))
+        arrays = (pos, acc, energies, gradient)
+        lib.elements_vertices(ctypes.byref(structure), *(None if a is None else POINTER(a.ctypes.data) for a in arrays))
+        return energies
+
+
+class _Contact(ctypes.Structure):
+    """``Contact`` of ``elements.cpp``."""
+
+    _fields_ = [
+        ("count", COUNT),
+        *fields("valid scene mass pos vel dist sag point next_point next_normal pull dt gravity", POINTER),
+    ]
+
+
+class _Reach(ctypes.Structure):
+    """``Reach`` of ``elements.cpp``."""
+
+    _fields_ = [("least", REAL), ("curved", COUNT)]
+
+
+class ContactPass:
+    """The contact of a step as C++ reads it; made by :func:`contact_pass`."""
+
+    def __init__(self, lib: ctypes.CDLL, problem: StepProblem, contact: Contact) -> None:
+        self._lib, self._problem, self._face = lib, problem, contact.face
+        cloth, state = problem.cloth, problem.state
+        self._values = _Contact(count=len(state.pos))
+        given = {name: getattr(contact, name) for name in ("dist", "point", "next_point", "next_normal")}
+        given |= {"mass": cloth.mass, "sag": sag(cloth, contact, state.pos), "pos": state.pos, "vel": state.vel}
+        given |= {"dt": problem.step.dt, "gravity": problem.gravity}
+        self._kept = {name: whole(values) for name, values in given.items()}
+        self._kept |= {"valid": contact.valid.contiguous(), "scene": cloth.vertex_scene.contiguous()}
+        for name, values in self._kept.items():
+            setattr(self._values, name, values.data_ptr())
+
+    def planes(self, term: Collision) -> list[Tensor]:
+        """Points [m] (V, 3), normals (V, 3) and distances [m] (V,) of :class:`hood.solver.derivatives.vertices.Walls`."""
+        found = self._empty(2, 1)
+        self._lib.elements_wall(*self._given(term), *_addresses(found))
+        return found
+
+    def grips(self, term: Friction) -> list[Tensor]:
+        """Normals (V, 3), anchors [m] (V, 3), forces [N] (V,) and limits [m] (V,) of
+        :class:`hood.solver.derivatives.vertices.Grip`."""
+        pull = self._problem.searched_pull
+        if pull is not None:
+            self._kept["pull"] = whole(pull)
+            self._values.pull = self._kept["pull"].data_ptr()
+        found = self._empty(2, 2)
+        numbers = (REAL(value) for value in (term.weight, term.coefficient, term.slip_speed))
+        self._lib.elements_grip(*self._given(term), *numbers, *_addresses(found))
+        found[2].mul_(self._problem.cloth.friction)
+        found[2] = gripped(self._problem, self._face, found[2])
+        return found
+
+    def _given(self, term: Collision | Friction) -> tuple[object, object]:
+        reach = _Reach(term.epsilon, term.reach == "curvature")
+        return ctypes.byref(self._values), ctypes.byref(reach)
+
+    def _empty(self, vectors: int, numbers: int) -> list[Tensor]:
+        pos = self._kept["pos"]
+        return [torch.empty_like(pos) for _ in range(vectors)] + [pos.new_empty(len(pos)) for _ in range(numbers)]
+
+
+def contact_pass(problem: StepProblem, contact: Contact) -> ContactPass | None:
+    """The pass over a contact of a step in float64; None where there is no compiled pass, or not for these tensors."""
+    pos = problem.state.pos
+    plain = type(pos) is Tensor and pos.device.type == "cpu" and not pos.requires_grad
+    if not plain or pos.dtype is not torch.float64:
+        return None
+    lib = library()
+    return None if lib is None else ContactPass(lib, problem, contact)
+
+
+def _addresses(tensors: list[Tensor]) -> list[ctypes.c_void_p]:
+    return [POINTER(values.data_ptr()) for values in tensors]

@@ -1,0 +1,97 @@
+"""The potential of one step with everything constant gathered once: its energies, and derivatives element by element.
+
+The numbers are those of :class:`hood.energies.potential.Potential`, to rounding, in a third of the time: the tables that
+every iteration reads lie as its arithmetic wants them.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from hood.energies.damping import BendDamping, StretchDamping
+from hood.energies.membrane import Stretching
+from hood.energies.potential import Potential
+from hood.energies.problem import StepProblem, sum_per_scene
+from hood.energies.springs import Attachment, attachment_targets
+from hood.solver.derivatives import elements
+from hood.solver.derivatives.elements import BENDINGS, Corners
+from hood.solver.derivatives.points import point_forces
+from hood.solver.derivatives.vertices import attachment_stiffness, other_terms, vertex_forces
+
+
+class StepTerms:
+    """Energies and derivatives of a potential for one step."""
+
+    def __init__(self, potential: Potential, problem: StepProblem) -> None:
+        self.problem = problem
+        cloth, terms = problem.cloth, list(potential.active(problem).values())
+        self.vertices = vertex_forces(potential, problem)
+        self.points = point_forces(potential, problem)
+        self.bendings = [term for term in terms if type(term) in BENDINGS]
+        self.springs = [term for term in terms if type(term) is Attachment]
+        self.others = other_terms(potential, problem)
+        targets = attachment_targets(problem) if self.springs else None
+        self.spring_targets = None if targets is None else targets.t()  # (3, A) m
+        num_membranes = sum(type(term) is Stretching for term in terms)
+        self.has_membrane = num_membranes > 0
+        self.face_constants = elements.face_constants(cloth, num_membranes)
+        self.hinge_constants = elements.hinge_constants(cloth)
+        rate = stretch_rate(potential, problem)
+        if rate is not None:
+            self.face_constants = self.face_constants.damped(rate, problem.state.pos, cloth.faces)
+        if any(type(term) is BendDamping for term in self.bendings):
+            dt = problem.step.dt[cloth.hinge_scene]
+            self.hinge_constants = self.hinge_constants.moving(problem.state.pos, cloth.hinges, dt)
+        self._face_corners, self._hinge_corners = Corners(cloth.faces), Corners(cloth.hinges)
+
+    def energies(self, pos: Tensor, acc: Tensor) -> list[Tensor]:
+        """Energies [J] (B,), term by term or several together, at ``pos`` (V, 3) reached with ``acc`` (V, 3)."""
+        problem, cloth = self.problem, self.problem.cloth
+        parts = [(energy, cloth.vertex_scene) for energy in self.vertices.energies(pos, acc, problem.vertex_dt)]
+        parts += [(energy, points.scene) for points in self.points for energy in points.energies(pos)]
+        if self.has_membrane:
+            parts.append((elements.face_energy(self._face_corners(pos), self.face_constants), cloth.face_scene))
+        if self.bendings:
+            x = self._hinge_corners(pos)
+            parts += [(elements.hinge_energy(term, x, self.hinge_constants), cloth.hinge_scene) for term in self.bendings]
+        sums = [_sum(values, scene, problem.num_scenes) for values, scene in parts]
+        sums += [term(problem, pos, acc) for term in self.springs]
+        return sums + ([] if self.others is None else list(self.others.energies(problem, pos, acc).values()))
+
+    def faces(self, pos: Tensor, out: Tensor | None = None) -> elements.FaceModel | None:
+        """The membrane at ``pos`` (V, 3), its matrix in ``out``; None without such a term."""
+        return elements.face_model(self._face_corners(pos), self.face_constants, out=out) if self.has_membrane else None
+
+    def hinges(self, pos: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Gradient and row of every bending term, see :func:`hood.solver.derivatives.elements.hinge_model`."""
+        if not self.bendings:
+            return []
+        x = self._hinge_corners(pos)
+        return [elements.hinge_model(term, x, self.hinge_constants) for term in self.bendings]
+
+    def attachments(self, pos: Tensor) -> tuple[Tensor, Tensor] | None:
+        """Gradient and matrix of the springs, see :func:`hood.solver.derivatives.elements.spring_model`; None without any."""
+        attachments = self.problem.step.attachments
+        if attachments is None or not self.springs:
+            return None
+        return elements.spring_model(self.spring_stiffness(), Corners(attachments.edges)(pos), self.spring_targets)
+
+    def spring_stiffness(self) -> Tensor:
+        """Spring constants [N/m] (A,), of all terms together."""
+        return torch.stack([attachment_stiffness(term, self.problem) for term in self.springs]).sum(0)
+
+    def other_gradient(self, pos: Tensor, acc: Tensor) -> Tensor | None:
+        """Gradient (V, 3) [N] of the energies that have no closed form here, by autograd; None without any."""
+        return None if self.others is None else self.others.gradient(self.problem, pos, acc)[0]
+
+
+def stretch_rate(potential: Potential, problem: StepProblem) -> Tensor | None:
+    """Viscous stress of the membrane in units of the elastic one of the step's strain, (F,); None without damping."""
+    terms = potential.active(problem).values()
+    time, elastic = sum(term.time for term in terms if type(term) is StretchDamping), sum(type(t) is Stretching for t in terms)
+    return time / elastic / problem.step.dt[problem.cloth.face_scene] if time and elastic else None
+
+
+def _sum(values: Tensor, scene: Tensor, num_scenes: int) -> Tensor:
+    return values.sum().reshape(1) if num_scenes == 1 else sum_per_scene(values, scene, num_scenes)

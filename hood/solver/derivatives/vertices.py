@@ -1,0 +1,357 @@
+"""First and second derivatives of the energies that act on single vertices, with everything constant in a step gathered."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from hood.contact.contact import Contact
+from hood.energies.contact import CentroidCollision, Collision
+from hood.energies.damping import StretchDamping
+from hood.energies.friction import CodedFriction, Friction, LaggedFriction, WeightFriction, mollified_norm
+from hood.energies.inertia import Gravity, Inertia
+from hood.energies.membrane import Stretching
+from hood.energies.potential import Potential, Term
+from hood.energies.problem import StepProblem
+from hood.energies.springs import Attachment
+from hood.energies.wind import Drag, Wind
+from hood.solver.derivatives import compiled_vertices
+from hood.solver.derivatives.compiled_vertices import ContactPass, VertexPass, contact_pass
+from hood.solver.derivatives.elements import BENDINGS
+from hood.tensors.weak_cache import forget
+
+COLLISIONS = (Collision, CentroidCollision)
+FRICTIONS = (Friction, WeightFriction, CodedFriction)
+#: Terms whose derivatives are written out. A subclass may compute something else and does not count.
+CLOSED_FORM = (Stretching, StretchDamping, *BENDINGS, Attachment, Inertia, Gravity, *COLLISIONS, *FRICTIONS, Wind)
+#: Those that act on single vertices.
+SINGLE = (Inertia, Gravity, *COLLISIONS, *FRICTIONS)
+
+
+@dataclass(frozen=True)
+class Walls:
+    """A collision term as N planes; rows without one are zero and feel nothing."""
+
+    weight: float | Tensor  # J/m³, one for all or (N,)
+    point: Tensor  # (N, 3) m
+    normal: Tensor  # (N, 3)
+    reach: Tensor  # (N,) m, distance at which the penalty sets in
+
+    def depth(self, pos: Tensor) -> Tensor:
+        """Depth ε - d (N,) [m] of ``pos`` (N, 3) in the contact zone, negative outside."""
+        return self.reach - _rows(pos - self.point, self.normal)
+
+    def pressure(self, pos: Tensor) -> Tensor:
+        """Force (N,) [N] along the normals at ``pos`` (N, 3)."""
+        depth = self.depth(pos).clamp_min(0.0)
+        return 3.0 * self.weight * depth * depth
+
+    def take(self, rows: Tensor) -> Walls:
+        weight = self.weight[rows] if isinstance(self.weight, Tensor) else self.weight
+        return Walls(weight, self.point[rows], self.normal[rows], self.reach[rows])
+
+
+@dataclass(frozen=True)
+class Grip:
+    """A friction term on N vertices, force f at most along the tangential slip; rows without any are zero."""
+
+    force: Tensor  # (N,) N, the coefficient included
+    normal: Tensor  # (N, 3)
+    anchor: Tensor  # (N, 3) m, where the vertex would be if it stuck
+    limit: Tensor  # (N,) m, slip below which it counts as sticking
+
+    def slip(self, pos: Tensor) -> Tensor:
+        """Tangential slip (N, 3) [m] of ``pos`` (N, 3)."""
+        slip = torch.where((self.force > 0)[:, None], pos - self.anchor, 0.0)
+        return slip - _rows(slip, self.normal)[:, None] * self.normal
+
+    def take(self, rows: Tensor) -> Grip:
+        return Grip(self.force[rows], self.normal[rows], self.anchor[rows], self.limit[rows])
+
+
+@dataclass(frozen=True)
+class VertexModel:
+    """Second-order model of the energies on N vertices."""
+
+    gradient: Tensor  # (N, 3) N
+    matrix: Tensor  # (N, 3, 3) N/m, positive semi-definite
+    slack: Tensor | None  # (N, 3, 3) N/m, exact matrix minus ``matrix``, negative semi-definite; None for zero
+
+
+@dataclass(frozen=True)
+class VertexForces:
+    """Inertia, gravity, contact and friction of N vertices."""
+
+    inertia: Tensor  # (N, 1) kg, 0 where there is no such term
+    stiffness: Tensor  # (N,) N/m, of inertia
+    weight: Tensor  # (N, 3) N
+    walls: tuple[Walls, ...]
+    grips: tuple[Grip, ...]
+    drags: tuple[Drag, ...] = ()  # at points inside faces alone
+
+    @cached_property
+    def compiled(self) -> VertexPass:
+        """What the compiled pass reads of them, gathered once."""
+        return VertexPass(self)
+
+    def take(self, rows: Tensor) -> VertexForces:
+        """Those of some vertices."""
+        walls, grips = tuple(wall.take(rows) for wall in self.walls), tuple(grip.take(rows) for grip in self.grips)
+        drags = tuple(drag.take(rows) for drag in self.drags)
+        return VertexForces(self.inertia[rows], self.stiffness[rows], self.weight[rows], walls, grips, drags)
+
+    def without_walls(self) -> VertexForces:
+        """The same without contact."""
+        return VertexForces(self.inertia, self.stiffness, self.weight, (), self.grips, self.drags)
+
+    def energies(self, pos: Tensor, acc: Tensor, dt: Tensor) -> list[Tensor]:
+        """Energies [J] (N,) of the terms at positions and accelerations (N, 3); time step ``dt`` (N, 1)."""
+        moved = dt**2 * acc
+        return [0.5 * self.stiffness * _rows(moved, moved), -_rows(self.weight, pos), *self.contact_energies(pos)]
+
+    def contact_energies(self, pos: Tensor) -> list[Tensor]:
+        """Those of contact, friction and drag alone."""
+        parts = [wall.weight * wall.depth(pos).clamp_min(0.0) ** 3 for wall in self.walls]
+        for grip in self.grips:
+            slip = grip.slip(pos)
+            parts.append(grip.force * mollified_norm(_rows(slip, slip), grip.limit))
+        return parts + [drag.energy(pos) for drag in self.drags]
+
+    def gradient(self, pos: Tensor, acc: Tensor) -> Tensor:
+        """Gradient [N] (N, 3) at positions and accelerations (N, 3)."""
+        gradient = self.inertia * acc - self.weight
+        for wall in self.walls:
+            gradient = gradient - wall.pressure(pos)[:, None] * wall.normal
+        for grip in self.grips:
+            slip, _, slope = _slope(grip, pos)
+            gradient = gradient + slope[:, None] * slip
+        for drag in self.drags:
+            gradient = gradient + drag.derivatives(pos)[0]
+        return gradient
+
+    def model(self, pos: Tensor, acc: Tensor) -> VertexModel:
+        """Derivatives at positions and accelerations (N, 3).
+
+        Friction is majorised: its matrix is the slope f'/y across *and* along the slip, so that a step does not overshoot
+        the kink at rest; the curvature f'' along it is smaller, which is the slack.
+        """
+        gradient = self.inertia * acc - self.weight
+        matrix = torch.diag_embed(self.stiffness.unsqueeze(1).expand(-1, 3))
+        slack = None
+        for wall in self.walls:
+            depth = wall.depth(pos).clamp_min(0.0)
+            gradient = gradient - wall.pressure(pos)[:, None] * wall.normal
+            matrix += _outer((6.0 * wall.weight * depth)[:, None] * wall.normal, wall.normal)
+        for grip in self.grips:
+            force, block, less = _friction(grip, pos)
+            gradient, matrix = gradient + force, matrix.add_(block)
+            slack = less if slack is None else slack + less
+        for drag in self.drags:
+            force, block = drag.derivatives(pos)
+            gradient, matrix = gradient + force, matrix + block
+        return VertexModel(gradient, matrix, slack)
+
+
+def vertex_forces(potential: Potential, problem: StepProblem, compiled: bool = False) -> VertexForces:
+    """The potential's terms of :data:`CLOSED_FORM` that act on single vertices; ``compiled`` may leave torch."""
+    mass, pos = problem.cloth.mass, problem.state.pos
+    inertia, weight = torch.zeros_like(mass), torch.zeros_like(pos)
+    walls: list[Walls] = []
+    grips: list[Grip] = []
+    passes: dict[int, ContactPass | None] = {}
+
+    def pass_of(contact: Contact) -> ContactPass | None:
+        if compiled and id(contact) not in passes:
+            passes[id(contact)] = contact_pass(problem, contact)
+        return passes.get(id(contact))
+
+    for term in potential.active(problem).values():
+        if type(term) is Inertia:
+            inertia = inertia + mass
+        elif type(term) is Gravity:
+            weight = weight + mass[:, None] * problem.gravity.to(pos)
+        elif isinstance(term, Collision) and type(term) in COLLISIONS:
+            walls += [walls_of(term, problem, contact, pass_of(contact)) for contact in term.contacts(problem)]
+        elif isinstance(term, LaggedFriction) and type(term) in FRICTIONS:
+            grips += [_grip(term, problem, contact, pass_of(contact)) for contact in term.contacts(problem)]
+    return VertexForces(inertia[:, None], inertia / problem.vertex_dt.squeeze(1) ** 2, weight, tuple(walls), tuple(grips))
+
+
+def walls_of(term: Collision, problem: StepProblem, contact: Contact, compiled: ContactPass | None = None) -> Walls:
+    """The planes of a collision term at one of its contacts, by the ``compiled`` pass where there is one."""
+    if compiled is not None and type(term) is Collision:
+        return Walls(term.weight, *compiled.planes(term))
+    planes = term.planes(problem, contact)
+    reach = torch.where(planes.touching, term.reaches(problem, contact), 0.0)
+    return Walls(term.weight, planes.point, planes.normal, reach)
+
+
+def _grip(term: LaggedFriction, problem: StepProblem, contact: Contact, compiled: ContactPass | None) -> Grip:
+    if compiled is not None and type(term) is Friction:
+        normal, anchor, force, limit = compiled.grips(term)
+        return Grip(force, normal, anchor, limit)
+    force = term.greatest(problem, contact)
+    # Rows without a match may hold infinite or undefined numbers.
+    sliding = (force > 0)[:, None]
+    carried, normal = term.carrier(contact)
+    anchor = problem.state.pos + torch.where(sliding, carried, 0.0)
+    limit = term.slip_speed * problem.vertex_dt.squeeze(1)
+    return Grip(force, torch.where(sliding, normal, 0.0), anchor, limit)
+
+
+def _slope(grip: Grip, pos: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Slip (N, 3) [m], its size (N,) and the force along it in units of it (N,) [N/m]."""
+    slip = grip.slip(pos)
+    size = _rows(slip, slip).sqrt()
+    small = size < grip.limit
+    slope = grip.force * torch.where(small, (2.0 - size / grip.limit) / grip.limit, 1.0 / torch.where(small, 1.0, size))
+    return slip, size, slope
+
+
+def _friction(grip: Grip, pos: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Gradient, matrix and slack."""
+    normal, (slip, size, slope) = grip.normal, _slope(grip, pos)
+    along = grip.force * torch.where(size < grip.limit, 2.0 * (1.0 - size / grip.limit) / grip.limit, 0.0)
+    heading = slip / torch.where(size > 0, size, 1.0)[:, None]
+    matrix = torch.diag_embed(slope.unsqueeze(1).expand(-1, 3)) - _outer(slope[:, None] * normal, normal)
+    return slope[:, None] * slip, matrix, _outer((along - slope)[:, None] * heading, heading)
+
+
+class KnownForces(NamedTuple):
+    """Forces of a step, the terms that they are of, and the names in the order of :meth:`VertexForces.energies`."""
+
+    problem: weakref.ref[StepProblem]
+    terms: dict[str, Term]
+    forces: VertexForces
+    names: list[str] | None  # None where several terms are added up into one
+
+
+#: Of the last steps that were asked about, as long as these live: by the solver, and by those who measure.
+_KNOWN: dict[int, KnownForces] = {}
+
+
+def known_forces(potential: Potential, problem: StepProblem) -> VertexForces:
+    """What :func:`vertex_forces` gathers, once for a step and the same terms."""
+    return known(potential, problem).forces
+
+
+@torch.no_grad()
+def known(potential: Potential, problem: StepProblem) -> KnownForces:
+    """The same, with the terms that they are of."""
+    key, terms = id(problem), {name: term for name, term in potential.terms.items() if type(term) in SINGLE}
+    last = _KNOWN.get(key)
+    if last is None or last.problem() is not problem or not _same(last.terms, terms):
+        found, names = vertex_forces(potential, problem, compiled=True), _names(potential.only(terms).active(problem), problem)
+        last = _KNOWN[key] = KnownForces(weakref.ref(problem, forget(_KNOWN, key)), terms, found, names)
+    return last
+
+
+def _same(terms: Mapping[str, Term], others: Mapping[str, Term]) -> bool:
+    return list(terms) == list(others) and all(a is b for a, b in zip(terms.values(), others.values(), strict=True))
+
+
+def _names(terms: Mapping[str, Term], problem: StepProblem) -> list[str] | None:
+    """Names of terms in the order of :meth:`VertexForces.energies`, "" for none; None where two share a place."""
+    inertia, gravity = ([name for name, term in terms.items() if isinstance(term, kind)] for kind in (Inertia, Gravity))
+    if max(len(inertia), len(gravity)) > 1:
+        return None
+    names = [(inertia or [""])[0], (gravity or [""])[0]]
+    for kinds in (COLLISIONS, FRICTIONS):
+        for name, term in terms.items():
+            if isinstance(term, (Collision, LaggedFriction)) and isinstance(term, kinds):
+                names += [name] * len(term.contacts(problem))
+    return names
+
+
+@torch.no_grad()
+def energies_and_gradient(
+    potential: Potential, problem: StepProblem, next_pos: Tensor, acc: Tensor | None = None
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """What :meth:`hood.energies.potential.Potential.gradient` computes; terms of single vertices in closed form.
+
+    Contact that also acts inside edges and faces is left to autograd.
+    """
+    acc = problem.acceleration(next_pos) if acc is None else acc
+    single, rest = split(potential)
+    energies, gradient = _single(single, problem, next_pos, acc, slope=True)
+    assert gradient is not None
+    if rest.active(problem):
+        slope, found = rest.gradient(problem, next_pos, acc)
+        gradient, energies = gradient + slope, energies | found
+    return gradient, {name: energies[name] for name in potential.terms if name in energies}
+
+
+@torch.no_grad()
+def total_energy(potential: Potential, problem: StepProblem, next_pos: Tensor) -> Tensor:
+    """What :meth:`hood.energies.potential.Potential.total` computes, (B,) J; terms of single vertices in closed form."""
+    single, rest = split(potential)
+    energies = list(_single(single, problem, next_pos, problem.acceleration(next_pos), slope=False)[0].values())
+    if rest.active(problem):
+        energies.append(rest.total(problem, next_pos))
+    return sum(energies, start=next_pos.new_zeros(problem.num_scenes))
+
+
+def split(potential: Potential) -> tuple[Potential, Potential]:
+    """The terms that act on single vertices alone, and the others."""
+    single = {
+        name: term
+        for name, term in potential.terms.items()
+        if type(term) in SINGLE and getattr(term, "contact", "vertices") == "vertices"
+    }
+    return potential.only(single), potential.only({n: term for n, term in potential.terms.items() if n not in single})
+
+
+def _single(
+    potential: Potential, problem: StepProblem, pos: Tensor, acc: Tensor, slope: bool
+) -> tuple[dict[str, Tensor], Tensor | None]:
+    """Energies [J] (B,) by term of those that act on single vertices, and their gradient [N] (V, 3) where asked for."""
+    _, _, forces, names = known(potential, problem)
+    if names is None:
+        alone = (potential.only({name: term}) for name, term in potential.active(problem).items())
+        energies = {name: value for part in alone for name, value in _single(part, problem, pos, acc, slope=False)[0].items()}
+        return energies, forces.gradient(pos, acc) if slope else None
+    found = None
+    if compiled_vertices.applies(pos):
+        found = forces.compiled.evaluate(pos, acc, problem.cloth.vertex_scene, problem.step.dt, slope)
+    if found is None:
+        sums = [problem.sum_vertices(part) for part in forces.energies(pos, acc, problem.vertex_dt)]
+        gradient = forces.gradient(pos, acc) if slope else None
+    else:
+        sums, gradient = list(found[0].to(pos.dtype)), None if found[1] is None else found[1].to(pos.dtype)
+    energies = {}
+    for name, part in zip(names, sums, strict=True):
+        if name:  # on both sides of folds
+            energies[name] = energies[name] + part if name in energies else part
+    return energies, gradient
+
+
+def attachment_stiffness(term: Term, problem: StepProblem) -> Tensor:
+    """Spring constants [N/m] (A,) of the step's attachments, 0 where open."""
+    attachments = problem.step.attachments
+    assert attachments is not None
+    assert isinstance(term, Attachment)
+    return term.stiffness * attachments.active.to(problem.state.pos.dtype)
+
+
+def other_terms(potential: Potential, problem: StepProblem) -> Potential | None:
+    """The terms that have no closed form here and play a role in the problem; None without any."""
+    active = potential.active(problem)
+    others = {name: term for name, term in active.items() if type(term) not in CLOSED_FORM}
+    if not any(type(term) is Stretching for term in active.values()):  # the two share a closed form
+        others |= {name: term for name, term in active.items() if type(term) is StretchDamping}
+    return potential.only(others) if others else None
+
+
+def _rows(a: Tensor, b: Tensor) -> Tensor:
+    """Products (N,) of rows (N, 3); a sum over so short an axis would be slow."""
+    return torch.mv(a * b, a.new_ones(3))
+
+
+def _outer(a: Tensor, b: Tensor) -> Tensor:
+    return a[:, :, None] * b[:, None, :]

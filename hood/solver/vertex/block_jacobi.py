@@ -1,0 +1,143 @@
+"""The potential as every vertex sees it alone: its force, and the step it would take with its neighbours held."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from hood.cloth.cloth import Cloth
+from hood.energies.inertia import Inertia
+from hood.energies.potential import Potential
+from hood.energies.problem import StepProblem
+from hood.solver.derivatives.elements import FaceModel
+from hood.solver.derivatives.step_terms import StepTerms
+from hood.solver.derivatives.vertices import CLOSED_FORM
+from hood.solver.system.linear import invert_blocks
+from hood.solver.vertex.cg_step import STEPS, PositiveMatrix, global_step
+from hood.tensors.conjugate_gradients import Steps
+from hood.tensors.weak_cache import forget
+
+#: Upper triangle of a 3 × 3 block.
+_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+@dataclass(frozen=True)
+class LocalView:
+    """Force and local step of every vertex at one set of positions; zero where nothing moves."""
+
+    force: Tensor  # (V, 3) N, −∂Φ/∂x
+    step: Tensor  # (V, 3) m, D⁻¹ force with the positive diagonal block D of the Hessian
+
+
+class LocalTerms:
+    """Views of one step's potential; everything constant in the step is gathered once."""
+
+    _looked_at: tuple[Tensor, PositiveMatrix, Tensor] | None = None  # positions, the matrix there and its diagonal blocks
+
+    def __init__(self, potential: Potential, problem: StepProblem) -> None:
+        self.problem = problem
+        self.terms = StepTerms(potential, problem)
+        self._incidence = incidence_of(problem.cloth)
+
+    @torch.no_grad()
+    def __call__(self, pos: Tensor) -> LocalView:
+        """The view at positions (V, 3)."""
+        terms, cloth = self.terms, self.problem.cloth
+        acc = self.problem.acceleration(pos)
+        own = terms.vertices.model(pos, acc)
+        gradient, matrix = own.gradient, own.matrix
+        faces, hinges = terms.faces(pos), terms.hinges(pos)
+        if faces is not None or hinges:
+            order, offsets = self._incidence
+            table = torch.cat([_of_faces(faces, cloth, pos), _of_hinges(hinges, cloth, pos)], dim=1).t().contiguous()
+            sums = functional.embedding_bag(order, table, offsets, mode="sum", include_last_offset=True)
+            gradient = gradient + sums[:, :3]
+            a, b, c, d, e, f = sums[:, 3:].unbind(dim=1)
+            matrix = matrix + torch.stack([a, b, c, b, d, e, c, e, f], dim=1).view(-1, 3, 3)
+        springs = terms.attachments(pos)
+        if springs is not None:
+            ends = self.problem.step.attachments.edges.t().reshape(-1)  # type: ignore[union-attr]
+            gradient = gradient.index_add(0, ends, springs[0].permute(0, 2, 1).reshape(-1, 3))
+            stiffness = terms.spring_stiffness().repeat(2)
+            matrix = matrix.index_add(
+                0, ends, stiffness[:, None, None] * torch.eye(3, dtype=matrix.dtype, device=matrix.device)
+            )
+        models = [points.model(pos) for points in terms.points]
+        for points, model in zip(terms.points, models, strict=True):
+            gradient = gradient + points.spread(model.gradient, gradient)
+            matrix = matrix + points.spread_blocks(model.matrix, len(gradient))
+        other = terms.other_gradient(pos, acc)
+        gradient = gradient if other is None else gradient + other
+        force = torch.where(cloth.free.unsqueeze(1), -gradient, 0.0)
+        step = torch.bmm(invert_blocks(matrix), force.unsqueeze(2)).squeeze(2)
+        whole = PositiveMatrix(own.matrix, faces, tuple(row for _, row in hinges), tuple(model.matrix for model in models))
+        self._looked_at = pos, whole, matrix
+        return LocalView(force, torch.where(cloth.free.unsqueeze(1), step, 0.0))
+
+    @torch.no_grad()
+    def solve(self, pos: Tensor, force: Tensor, damping: Tensor, steps: Steps = STEPS) -> Tensor:
+        """The global step (V, 3) [m] under forces (V, 3) [N]: u with (A + diag(``damping``)) u = ``force`` where vertices are
+        free, 0 elsewhere, as nearly as ``steps`` of conjugate gradients come. A is the positive matrix at positions (V, 3),
+        ``damping`` (V,) [N/m]."""
+        if self._looked_at is None or self._looked_at[0] is not pos:
+            self(pos)
+        assert self._looked_at is not None
+        return global_step(self.terms, *self._looked_at[1:], self._incidence, force, damping, steps)
+
+
+def check_local(potential: Potential) -> None:
+    """Raise ValueError where local steps of ``potential`` are not known: they take second derivatives of every term, and a
+    positive one of every vertex, which inertia alone is sure to have."""
+    for name, term in potential.terms.items():
+        if type(term) not in CLOSED_FORM:
+            raise ValueError(
+                f"losses.terms.{name} is a {type(term).__name__}: its second derivatives are not written out "
+                f"(hood/solver/derivatives/vertices.py, elements.py), and what single vertices would do about it is not known"
+            )
+    if not any(type(term) is Inertia for term in potential.terms.values()):
+        raise ValueError("losses.terms: no inertia, without which what single vertices would do is not determined")
+
+
+def _of_faces(faces: FaceModel | None, cloth: Cloth, pos: Tensor) -> Tensor:
+    """(9, 3F) gradient and diagonal block of the corners; zeros without a membrane, which has its place all the same."""
+    if faces is None:
+        return pos.new_zeros(9, cloth.faces.numel())
+    return torch.cat([faces.gradient.transpose(0, 1), _diagonal(faces.matrix)]).flatten(1)
+
+
+def _of_hinges(hinges: Sequence[tuple[Tensor, Tensor]], cloth: Cloth, pos: Tensor) -> Tensor:
+    """(9, 4H) the same of all bending terms together."""
+    parts = [
+        torch.cat([slope.transpose(0, 1), torch.stack([row[:, a] * row[:, b] for a, b in _PAIRS])]) for slope, row in hinges
+    ]
+    return sum(parts[1:], start=parts[0]).flatten(1) if parts else pos.new_zeros(9, cloth.hinges.numel())
+
+
+def _diagonal(upper: Tensor) -> Tensor:
+    """(6, 3, N) diagonal blocks of element matrices given by their upper triangles (45, N)."""
+    return torch.stack([torch.stack([upper[_place(3 * c + a, 3 * c + b)] for c in range(3)]) for a, b in _PAIRS])
+
+
+def _place(row: int, col: int, size: int = 9) -> int:
+    return row * size - row * (row - 1) // 2 + col - row
+
+
+_INCIDENCES: dict[int, tuple[weakref.ref[Tensor], tuple[Tensor, Tensor]]] = {}
+
+
+def incidence_of(cloth: Cloth) -> tuple[Tensor, Tensor]:
+    """Corners of faces and hinges by the vertex they are at, kept as long as the cloth's faces live."""
+    key = id(cloth.faces)
+    if key in _INCIDENCES and _INCIDENCES[key][0]() is cloth.faces:
+        return _INCIDENCES[key][1]
+    vertex = torch.cat([cloth.faces.t().reshape(-1), cloth.hinges.t().reshape(-1)])
+    order = torch.argsort(vertex, stable=True)
+    count = vertex.new_zeros(cloth.num_vertices).index_add(0, vertex, torch.ones_like(vertex))
+    value = (order, torch.cat([count.new_zeros(1), count.cumsum(0)]))
+    _INCIDENCES[key] = (weakref.ref(cloth.faces, forget(_INCIDENCES, key)), value)
+    return value

@@ -1,0 +1,185 @@
+"""What a rollout needs of whatever takes the step, and the stepper that needs no network.
+
+Implicit Euler steps of any cloth and obstacle; needs no garment, body or file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from hood.cloth.cloth import Cloth
+from hood.cloth.state import State, StepInput
+from hood.contact.contact import Contact
+from hood.energies.potential import Potential
+from hood.energies.problem import StepProblem
+from hood.solver.newton import NewtonSettings, Report, minimize
+from hood.solver.retry import MOST_AGAIN, minimize_held_off
+from hood.solver.step_figures import reason_number
+from hood.steppers.network import Prediction
+from hood.steppers.protocol import Relaxing, Stopwatch, timed
+
+
+@dataclass(frozen=True)
+class EulerStep:
+    """A step taken: what it solved, where it led and how well."""
+
+    problem: StepProblem
+    state: State
+    report: Report
+
+
+def implicit_euler(
+    potential: Potential,
+    problem: StepProblem,
+    num_steps: int,
+    settings: NewtonSettings | None = None,
+    step_input: Callable[[int], StepInput] | None = None,
+    contact: Callable[[int, State], Contact | None] | None = None,
+    start: Callable[[StepProblem], Tensor] | None = None,
+) -> Iterator[EulerStep]:
+    """Implicit Euler steps from the state of ``problem``, one by one; v_{t+1} = v_t + dt a = (x_{t+1} - x_t) / dt.
+
+    Steps that miss the target accuracy are taken as far as they got: read ``report.converged``. The frame of the state
+    stays, so obstacles and pins are all given in the one of ``problem``.
+
+    Args:
+        step_input: by step; default the one of ``problem`` in every step.
+        contact: by step and state; default, and where it gives None, one search per step against the step's obstacle.
+        start: (V, 3) m, where a step's minimisation starts; default that of :func:`hood.solver.newton.minimize`.
+    """
+    state = problem.state
+    for index in range(num_steps):
+        step = problem.step if step_input is None else step_input(index)
+        found = None if contact is None else contact(index, state)
+        fresh = replace(problem, state=state, step=step, contact=found, point_contacts=(), pull=None, layers=(), fold=None)
+        now = potential.prepare(fresh)
+        pos, report = minimize(potential, now, None if start is None else start(now), settings)
+        state = State(pos, state.vel + now.vertex_dt * report.acc, state.origin)
+        yield EulerStep(now, state, report)
+
+
+class Stepper(Protocol):
+    """Takes steps: :class:`hood.steppers.network.Simulator` by a network, :class:`NewtonStepper` by minimisation.
+
+    A stepper of your own is a class with these attributes and methods. Some may be there beside them: ``simulator``, the
+    :class:`hood.steppers.network.Simulator` that takes its steps; ``solves_to``, the
+    :class:`hood.solver.newton.NewtonSettings` that every step is to meet; ``any_precision`` where it computes in the precision
+    of the state, whatever that of its gravity is; ``num_coarse``, the coarse levels that it takes as a third argument of
+    ``prepare``; ``in_fixed_shapes(mode)``, the same steps by functions of fixed shapes.
+    """
+
+    gravity: Tensor  # (3,) m/s²
+    config: dict[str, Any]  # travels into the rollout file
+    times: tuple[str, ...]  # parts of a frame's time
+    metrics: tuple[str, ...]  # names of the entries of ``Prediction.metrics``
+
+    @property
+    def relaxing(self) -> Relaxing:
+        """What a rollout makes of the relaxing step."""
+        ...
+
+    def prepare(self, cloth: Cloth, rest_pos: Any) -> Any:
+        """What is computed once per cloth."""
+        ...
+
+    def search(self, problem: StepProblem) -> StepProblem:
+        """The problem with the contact, if the step itself needs it: itself where that is there already or not needed."""
+        ...
+
+    def predict(self, problem: StepProblem, prepared: Any, watch: Stopwatch | None = None) -> Prediction:
+        """Positions at t + 1."""
+        ...
+
+    def next_velocity(self, problem: StepProblem, prediction: Prediction) -> Tensor:
+        """(V, 3) m/s at t + 1."""
+        ...
+
+
+#: What every stepper has.
+_PARTS = ("gravity", "config", "times", "metrics", "relaxing", "prepare", "search", "predict", "next_velocity")
+
+
+def require_stepper(given: object) -> None:
+    """Raise ValueError where an own stepper lacks an attribute or a method of :class:`Stepper`; names them."""
+    missing = [name for name in _PARTS if not hasattr(given, name)]
+    if missing:
+        raise ValueError(
+            f"stepper is of type {type(given).__name__}, which has no {', '.join(missing)}; give an option of hood rollout, or "
+            "an object with what hood.steppers.newton.Stepper lists"
+        )
+
+
+class NewtonStepper:
+    """Implicit Euler by projected Newton on the same potential that trains the networks; no weights.
+
+    Steps that miss the target accuracy are taken as far as they got and counted in the metrics, with the number of the reason
+    (:mod:`hood.solver.step_figures`). What is said holds for the next state as it is kept in a scene of float64; positions
+    rounded to float32 leave a force of a few per cent of the weight.
+    """
+
+    times: tuple[str, ...] = ("search", "solver", "rest", "total")
+    metrics: tuple[str, ...] = ("solver_iterations", "solver_converged", "solver_reason")
+    relaxing = Relaxing.SETTLE
+
+    def __init__(self, potential: Potential, settings: NewtonSettings | None = None) -> None:
+        self.potential, self.settings = potential, settings or NewtonSettings()
+        self.gravity = torch.tensor([0.0, -9.81, 0.0])
+        held_by_curvature = any(getattr(term, "reach", None) == "curvature" for term in potential.terms.values())
+        self._holds_off = held_by_curvature and self.settings.budget_ms is None
+        self.config: dict[str, Any] = {"stepper": "newton", **asdict(self.settings)}
+
+    @property
+    def solves_to(self) -> NewtonSettings:
+        """What every step is to meet."""
+        return self.settings
+
+    def in_fixed_shapes(self, mode: str) -> Stepper:
+        """The same steps with fixed shapes; ``mode`` is one of :data:`hood.steppers.static_shapes.simulator.MODES`."""
+        from hood.steppers.static_shapes.newton import CapturedNewton
+
+        return CapturedNewton(self, mode)
+
+    def prepare(self, cloth: Cloth, rest_pos: Any) -> None:
+        """Nothing: the solver keeps its plan of a cloth itself."""
+
+    def search(self, problem: StepProblem) -> StepProblem:
+        """The problem with what the potential's terms ask of it."""
+        return self.potential.prepare(problem)
+
+    def predict(self, problem: StepProblem, prepared: None, watch: Stopwatch | None = None) -> Prediction:
+        """The minimum next to the contact-projected inertial guess; where that lies in skin that its contact did not show, the
+        one next to it with that as well, and where it leaves triangles in the skin, the one that holds them farther off."""
+        with timed(watch, "search"):
+            problem = asked = self.search(problem)
+        with timed(watch, "solver"):
+            pos, report = minimize(self.potential, problem, settings=self.settings)
+            iterations = report.iterations
+            for _ in range(MOST_AGAIN if self.settings.budget_ms is None else 0):
+                again = problem.with_entered(pos)
+                if again is problem:
+                    break
+                problem = again
+                pos, report = minimize(self.potential, problem, pos, self.settings)
+                iterations += report.iterations
+            if self._holds_off:
+                held = minimize_held_off(self.potential, problem, pos, self.settings, report)
+                problem, pos, report = held.problem, held.pos, held.report or report
+                iterations += held.iterations
+        reached = {
+            "solver_iterations": float(iterations),
+            "solver_converged": float(bool(report.converged.all())),
+            "solver_reason": reason_number(report.reason),
+        }
+        entered = None if problem.fold is asked.fold else problem.fold
+        held_off = None if problem.contact is asked.contact else problem.contact
+        rg = float(report.relative_gradient.max())
+        return Prediction(pos, report.acc, reached, rg, entered=entered, held_off=held_off)
+
+    def next_velocity(self, problem: StepProblem, prediction: Prediction) -> Tensor:
+        """(V, 3) m/s at t + 1: (x_{t+1} − x_t) / dt."""
+        return problem.state.vel + problem.vertex_dt * prediction.acc

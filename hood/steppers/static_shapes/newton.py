@@ -1,0 +1,153 @@
+"""The solver's step with fixed shapes: on CUDA a few graphs, between which the host reads how far it has come."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from hood.cloth.cloth import Cloth
+from hood.energies.potential import keeps_both_sides
+from hood.energies.problem import StepProblem
+from hood.solver.derivatives.vertices import other_terms
+from hood.solver.newton import Report, run
+from hood.solver.step_figures import reason_number
+from hood.solver.system.iterate import rounded
+from hood.solver.system.plan import plan_for
+from hood.steppers.network import Prediction
+from hood.steppers.protocol import Relaxing, Stopwatch, timed
+from hood.steppers.static_shapes.cuda_graph import CudaGraph, InputMemory
+from hood.steppers.static_shapes.newton_pieces import FixedSystem, Piece
+from hood.steppers.static_shapes.problem import (
+    Constants,
+    problem_from,
+    settled_potential,
+    step_inputs,
+    step_shape,
+    with_fixed_contact,
+)
+
+if TYPE_CHECKING:
+    from hood.steppers.newton import NewtonStepper
+
+#: How the solver's step of fixed shapes is taken.
+MODES = ("fixed", "captured")
+
+
+class CapturedNewton:
+    """Takes the steps of a :class:`hood.steppers.newton.NewtonStepper` in pieces of fixed shapes, the search included.
+
+    Args:
+        mode: ``fixed``: one operation after the other; ``captured``: a CUDA graph for every piece.
+
+    Raises:
+        ValueError: another mode, ``captured`` without CUDA, or settings that have no such form.
+    """
+
+    times: tuple[str, ...] = ("solver", "rest", "total")
+    relaxing = Relaxing.SETTLE
+
+    def __init__(self, stepper: NewtonStepper, mode: str = "captured") -> None:
+        if mode not in MODES:
+            raise ValueError(f"step={mode} serves networks; the solver takes steps plain, {' or '.join(MODES)}")
+        if mode == "captured" and stepper.gravity.device.type != "cuda":
+            raise ValueError("step=captured needs device=cuda, a CPU has no graphs to replay; use step=fixed or step=plain")
+        if stepper.settings.linear != "cg":
+            raise ValueError(f"solver.linear={stepper.settings.linear} has no form of fixed shapes; use cg or step=plain")
+        self.stepper, self.mode = stepper, mode
+        self.gravity, self.config, self.metrics = stepper.gravity, stepper.config, stepper.metrics
+        self.solves_to = stepper.solves_to
+        self._plan: _Plan | None = None
+
+    def prepare(self, cloth: Cloth, rest_pos: Any) -> None:
+        """Nothing: what is known of a cloth is kept with the step."""
+
+    def search(self, problem: StepProblem) -> StepProblem:
+        """The problem as it is: the search is part of the step."""
+        return problem
+
+    @torch.no_grad()
+    def predict(self, problem: StepProblem, prepared: None, watch: Stopwatch | None = None) -> Prediction:
+        """The minimum next to the contact-projected inertial guess."""
+        began = time.perf_counter()
+        with timed(watch, "solver"):
+            plan = self._plan
+            if plan is None or plan.is_stale(problem):
+                plan = self._make_plan(problem, 0)
+            while (faces := plan.enter(problem)) > plan.places:
+                plan = self._make_plan(problem, faces)
+            pos, report = plan.minimize(problem, began)
+        reached = {
+            "solver_iterations": float(report.iterations),
+            "solver_converged": float(bool(report.converged.all())),
+            "solver_reason": reason_number(report.reason),
+        }
+        return Prediction(pos, report.acc.to(pos.dtype), reached, float(report.relative_gradient.max()))
+
+    def next_velocity(self, problem: StepProblem, prediction: Prediction) -> Tensor:
+        """(V, 3) m/s at t + 1: (x_{t+1} − x_t) / dt."""
+        return self.stepper.next_velocity(problem, prediction)
+
+    def _make_plan(self, problem: StepProblem, places: int) -> _Plan:
+        self._plan = None  # its memory is free before there is another
+        self._plan = _Plan(self.stepper, problem, places, self.mode == "captured")
+        return self._plan
+
+
+class _Plan:
+    """The pieces for problems of one shape, and the memory of their inputs."""
+
+    def __init__(self, stepper: NewtonStepper, problem: StepProblem, places: int, captured: bool) -> None:
+        self.places, self._stepper, self._like = places, stepper, problem
+        self._constants, self._shape = Constants(problem, stepper.potential), step_shape(problem, surface=True)
+        self._inputs = InputMemory(step_inputs(problem, surface=True))
+        potential, known = settled_potential(stepper.potential, problem), problem.with_fold()
+        self._potential, self._folds = potential, keeps_both_sides(potential)
+        others = other_terms(potential, known)
+        if others is not None:
+            raise ValueError(
+                f"losses.terms.{next(iter(others.terms))}: its second derivatives are not written out, which steps of fixed "
+                "shapes need: use step=plain"
+            )
+        settings = stepper.settings
+        record = _recorded if captured else None
+        self._system = FixedSystem(potential, self._read, plan_for(known), settings.cg_iterations, settings.double, record)
+
+    def is_stale(self, problem: StepProblem) -> bool:
+        """Whether a problem needs another plan."""
+        same = step_shape(problem, surface=True) == self._shape
+        return not same or not self._constants.hold(problem, self._stepper.potential)
+
+    def enter(self, problem: StepProblem) -> int:
+        """Take up a problem; the number of body faces that need a place."""
+        self._inputs.load(step_inputs(problem, surface=True))
+        self._system.enter()
+        return int(self._faces)
+
+    def minimize(self, problem: StepProblem, began: float) -> tuple[Tensor, Report]:
+        """Positions (V, 3) at t + 1 of the problem that has been taken up."""
+        settings = self._stepper.settings
+        self._system.begin(None)
+        like = problem.state.pos.double() if settings.double else problem.state.pos
+        pos, report = run(self._system, like, settings, began, None)
+        return rounded(problem, pos), report
+
+    def _read(self) -> StepProblem:
+        problem, incidence = problem_from(self._like, self._inputs.tensors)
+        problem, self._faces = with_fixed_contact(problem, incidence, self.places, self._folds)
+        return self._potential.with_pull(problem, compiled=False)
+
+
+def _recorded(piece: Piece) -> Piece:
+    def run_piece() -> tuple[Tensor, ...]:
+        piece()
+        return ()
+
+    graph = CudaGraph(run_piece, ())
+
+    def replay() -> None:
+        graph()
+
+    return replay

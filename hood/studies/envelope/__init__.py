@@ -1,0 +1,1 @@
+"""``hood envelope``: where each method holds and fails in extreme scenes, as a map."""

@@ -1,0 +1,1 @@
+"""``hood tradeoff``: time against accuracy for many settings, as a chart."""

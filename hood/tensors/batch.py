@@ -1,0 +1,77 @@
+"""Concatenate frozen dataclasses of tensors into one flat batch: indices shifted, everything else stacked end to end.
+
+Selection by a mask into a fixed number of rows, as captured graphs need it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import Field, field, fields
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+
+def gather_true(mask: Tensor, size: int) -> Tensor:
+    """Indices of the first ``size`` − 1 true entries of ``mask`` (N,) in places 0 …, N in the others: (size,)."""
+    count = mask.shape[0]
+    place = torch.where(mask, mask.cumsum(0) - 1, size - 1).clamp_max(size - 1)
+    index = torch.arange(count, device=mask.device)
+    found = torch.full((size,), count, dtype=torch.int64, device=mask.device).scatter(0, place, index)
+    # Whatever had no place of its own went to the last one.
+    return functional.pad(found[: size - 1], (0, 1), value=count)
+
+
+T = TypeVar("T")
+
+
+def indexes(kind: str) -> Any:
+    """Dataclass field holding indices into ``kind`` (``"vertices"``, ``"scenes"``…): shifted when batched."""
+    return field(metadata={"indexes": kind})
+
+
+def concatenate(items: Sequence[T], counts: Mapping[str, Sequence[int]]) -> T:
+    """One dataclass from several of the same class.
+
+    ``counts[kind][i]`` is how many of ``kind`` item *i* holds; index fields of item *i* are shifted by the sum of the
+    counts before it. Tensor fields are concatenated along the first axis, integer fields are summed, None stays None.
+    """
+    first = items[0]
+    if len(items) == 1:
+        return first
+    merged: dict[str, Any] = {}
+    for spec in fields(first):  # type: ignore[arg-type]
+        values = [getattr(item, spec.name) for item in items]
+        merged[spec.name] = _merge(spec, values, counts)
+    return type(first)(**merged)
+
+
+def _merge(spec: Field[Any], values: list[Any], counts: Mapping[str, Sequence[int]]) -> Any:
+    if all(value is None for value in values):
+        return None
+    if any(value is None for value in values):
+        raise ValueError(f"cannot batch {spec.name!r}: present in some items and absent in others")
+    if isinstance(values[0], int):
+        return sum(values)
+    kind = spec.metadata.get("indexes")
+    if kind is not None:
+        shifted, offset = [], 0
+        for value, count in zip(values, counts[kind], strict=True):
+            shifted.append(value + offset)
+            offset += count
+        values = shifted
+    return torch.cat(values)
+
+
+def to_device(item: T, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> T:
+    """The same dataclass with its tensors on ``device`` and its floating tensors in ``dtype`` (float64 origins stay)."""
+    moved: dict[str, Any] = {}
+    for spec in fields(item):  # type: ignore[arg-type]
+        value = getattr(item, spec.name)
+        if isinstance(value, Tensor):
+            keep = spec.metadata.get("float64", False) or not value.is_floating_point()
+            value = value.to(device=device, dtype=None if keep else dtype)
+        moved[spec.name] = value
+    return type(item)(**moved)

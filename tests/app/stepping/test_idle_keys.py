@@ -1,0 +1,74 @@
+"""Words that do nothing beside the others are told, one line each; those that do something are not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import hood
+from hood.app.settings.compose import load_config
+from hood.app.stepping.cautions import idle_in_rollout, idle_in_training
+from hood.cli.main import main
+
+IDLE = [
+    (
+        ["stepper=newton", "checkpoint=ours", "precision=bf16"],
+        "checkpoint=ours precision=bf16 has no effect: with stepper=newton",
+    ),
+    (
+        ["stepper=refine", "refine=2", "kernels=torch"],
+        "kernels=torch has no effect: with stepper=refine no network takes the steps",
+    ),
+    (
+        ["stepper=guess", "model=small", "model.latent_dim=8"],
+        "model=small model.latent_dim=8 has no effect: with stepper=guess",
+    ),
+    (["blend_from=a"], "blend_from=a has no effect: blend_in is 0"),
+    (["size_seconds=3"], "size_seconds=3 has no effect: size_end is not given"),
+    (["fabrics_seam=0.1"], "fabrics_seam=0.1 has no effect: fabrics are not given"),
+    (["events_speed=0.1"], "events_speed=0.1 has no effect: events are not given"),
+    (["metrics=strain", "surface_stride=2"], "surface_stride=2 has no effect: the surface is measured with metrics=all alone"),
+    (["video=none", "video_stride=2"], "video_stride=2 has no effect: video=none"),
+    (["video=none", "sheet=false", "thin_body=8"], "thin_body=8 has no effect: nothing is drawn"),
+    (["video=none", "sheet=false", "colour=strain"], "colour=strain has no effect: nothing is drawn"),
+    (["cloth_contact=off", "cloth_friction=0.5"], "cloth_friction=0.5 has no effect: cloth_contact=off"),
+]
+BUSY = [
+    ["checkpoint=ours", "precision=bf16"],
+    ["stepper=network", "kernels=torch"],
+    ["blend_from=a", "blend_in=0.5"],
+    ["size_end=1.1", "size_seconds=3"],
+    ["video=none", "thin_body=8"],
+    ["video=none", "sheet=false", "colour=rg"],  # it is stored as well
+    ["cloth_friction=0.5"],
+]
+
+
+@pytest.mark.parametrize(("words", "told"), IDLE, ids=lambda value: " ".join(value) if isinstance(value, list) else "")
+def test_a_word_that_does_nothing_is_told(words: list[str], told: str) -> None:
+    (line,) = idle_in_rollout(words, load_config("rollout", words))
+    assert line.startswith(told)
+
+
+@pytest.mark.parametrize("words", BUSY, ids=" ".join)
+def test_a_word_that_does_something_is_not(words: list[str]) -> None:
+    assert idle_in_rollout(words, load_config("rollout", words)) == []
+
+
+def test_validation_that_never_happens_is_told() -> None:
+    words = ["data.validation_sequences=[plie]", "validation_states=2"]
+    assert idle_in_training(words, load_config("train", words)) == [
+        "data.validation_sequences=[plie] has no effect: trainer.validate_every is 0",
+        "validation_states=2 has no effect: trainer.validate_every is 0",
+    ]
+    words.append("trainer.validate_every=10")
+    assert idle_in_training(words, load_config("train", words)) == []
+
+
+def test_commands_and_python_say_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    quick = ["garment=tank", "num_frames=2", "metrics=none", "video=none", "sheet=false", f"output={tmp_path / 'out'}"]
+    assert main(["rollout", *quick, "stepper=guess", "checkpoint=ours", "allow_unsound=true"]) == 0
+    line = "checkpoint=ours has no effect: with stepper=guess no network takes the steps"
+    assert capsys.readouterr().out.splitlines().count(line) == 1
+    assert line in hood.simulate("tank", num_frames=2, stepper="guess", checkpoint="ours").notes

@@ -1,0 +1,119 @@
+"""Refinement keys on the command line: what is refused, what is written, what is reported."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hood.app.stepping.refinement import describe_refinement, summarise_refinement
+from hood.cli.main import main
+from hood.rollouts.file.recorder import read_rollout
+
+UNTRAINED = ["checkpoint=untrained", "model=small", "model.latent_dim=4", "model.schedule='1x(mesh)'"]
+SHORT = ["rollout", *UNTRAINED, "garment=tank", "num_frames=4", "video=none", "sheet=false", "output=run"]
+REFUSED = {
+    "two keys": (["refine=3", "target_rg=0.1"], "refine=3 and target_rg=0.1: these say in 2 ways"),
+    "three keys": (["max_strain=0.1", "target_rg=0.1", "budget_ms=40"], "in 3 ways how far a step is refined; give one of"),
+    "a key on the solver": (["stepper=newton", "refine=3"], "stepper=newton goes as far as solver.* says"),
+    "refinement of nothing by nothing": (["stepper=refine"], "stepper=refine takes its steps by refinement alone"),
+    "details without a key": (["refine_method=sweeps"], "refine_method=sweeps: nothing is refined"),
+    "a table for another key": (
+        ["refine=2", "refine_table=t.json"],
+        "says where budget_ms and max_strain begin; refine needs none",
+    ),
+    "no such table": (["max_strain=0.1", "refine_table=t.json"], "t.json: no such file"),
+    "no such table of times": (["budget_ms=50", "refine_table=t.json"], "t.json: no such file"),
+    "misspelt method": (["refine=2", "refine_method=sweep"], "'sweeps'"),
+    "zero budget": (["budget_ms=0"], "budget_ms is 0; give the milliseconds of a frame"),
+    "negative count": (["refine=-1"], "refine is -1; give 0 or more iterations"),
+    "a word": (["target_rg=low"], "target_rg=low: give a number"),
+    "no iterations": (["target_rg=0.1", "refine_most=0"], "refine_most=0: must be at least 1"),
+    "unknown export": (["export=[gamma]"], "unknown 'gamma'; give some of"),
+    "unknown colour": (["colour=heat"], "unknown value for colour 'heat'"),
+}
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_does_not_fit_together_is_refused(case: str, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    overrides, words = REFUSED[case]
+    assert main([*SHORT, *overrides]) == 2
+    told = capsys.readouterr().err
+    assert words in told
+    assert told.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_target_is_reported_frame_by_frame(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*SHORT, "target_rg=0.5", "refine_most=4", "colour=rg", "sheet=true", "num_frames=3"]) == 0
+    assert Path("run/contact_sheet.png").stat().st_size > 0
+    data = read_rollout(Path("run/rollout.h5"))
+    met, reached = data.metrics["refine_met"], data.metrics["refine_rg"]
+    assert np.isnan(met[0])
+    np.testing.assert_array_equal(met[1:], (reached <= 0.5)[1:])
+    assert (data.metrics["refine_phi_after"] < data.metrics["refine_phi_before"])[1:].all()
+    assert (data.metrics["refine_iterations"] <= 4)[1:].all()
+    assert (data.metrics["ms_refine"] > 0)[1:].all()
+    entry = json.loads(Path("run/summary.json").read_text())["refinement"]
+    assert entry["asked"] == "target_rg=0.5"
+    assert (entry["frames_met"], entry["frames_missed"]) == ((met == 1).sum(), (met == 0).sum())
+    assert f"{entry['frames_met']} frames met it, {entry['frames_missed']} missed it\n" in capsys.readouterr().out
+    assert data.fields["rg"].shape == data.cloth_pos.shape[:2]
+    assert np.isfinite(data.fields["rg"][1:]).all()
+
+
+def test_without_a_network() -> None:
+    assert main([*SHORT, "stepper=refine", "refine=5", "num_frames=3"]) == 0
+    data = read_rollout(Path("run/rollout.h5"))
+    assert data.attributes["checkpoint_sha256"] == "none"
+    assert "ms_network" not in data.metrics
+    assert np.isfinite(data.cloth_pos).all()
+    assert (data.metrics["energy_total"] < data.metrics["energy_inertial_guess"])[1:].all()
+
+
+def test_off_is_off() -> None:
+    """No trace in the file: nothing of a refinement was computed."""
+    assert main([*SHORT, "num_frames=2"]) == 0
+    first = read_rollout(Path("run/rollout.h5"))
+    assert not any("refine" in name for name in first.metrics)
+    assert "refinement" not in json.loads(Path("run/summary.json").read_text())
+    assert first.fields == {}
+
+
+def test_a_budget_counts_whole_frames() -> None:
+    """Frame 0 has no step; what is not finite is not counted."""
+    config = {"budget_ms": 100.0, "refine": 0, "refine_method": "newton"}
+    times = np.array([np.nan, 90.0, 100.0, 110.0, np.nan])
+    metrics = {"ms_total": times, "refine_iterations": np.array([np.nan, 3, 2, 4, np.nan]), "refine_rg": times / 100}
+    entry = summarise_refinement(config, metrics)["refinement"]
+    assert (entry["frames_met"], entry["frames_missed"]) == (2, 1)
+    assert entry["budget_used_median"] == pytest.approx(1.0)
+    assert entry["ms_p95"] == pytest.approx(109.0)
+    assert entry["iterations_max"] == 4
+    assert summarise_refinement({"refine": 0}, metrics) == {}
+
+
+@pytest.mark.parametrize(
+    ("iterations", "refining", "told"),
+    [
+        ([0, 0, 0], [0.1, 0.1, 0.1], "in 3 of 3 frames, which are not refined at all and take 10.0 ms; about budget_ms=16 has"),
+        ([0, 0, 2], [0.1, 0.1, 8.0], "in 2 of 3 frames, which are not refined at all and take 10.0 ms; about budget_ms=16 has"),
+        ([0, 1, 2], [0.1, 3.0, 8.0], None),
+    ],
+)
+def test_a_budget_that_is_used_up_before_an_iteration_is_told(iterations: list, refining: list, told: str | None) -> None:
+    config = {"budget_ms": 3.0, "refine": 0, "refine_method": "newton"}
+    metrics = {
+        "refine_iterations": np.array([np.nan, *iterations]), "refine_rg": np.full(4, np.nan),
+        "ms_total": np.array([np.nan, 10.0, 10.0, 10.0]), "ms_refine": np.array([np.nan, *refining]),
+    }  # fmt: skip
+    lines = describe_refinement(summarise_refinement(config, metrics))
+    assert len(lines) == (1 if told is None else 2)
+    assert told is None or f"budget_ms=3 is used up before the first iteration {told} room for one" in lines[1]

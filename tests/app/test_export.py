@@ -1,0 +1,244 @@
+"""``hood export``: every format is read back by a reader that is not ours, or by the few lines of its specification."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from hood.cli.main import main
+from hood.rollouts.file.recorder import RolloutWriter, read_rollout
+
+FRAMES, DT = 4, 1.0 / 24.0
+#: Two squares of two triangles, of two garments; the texture of the first has a seam along its diagonal.
+FACES = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
+UV = np.array([[0, 0], [0.4, 0], [0.4, 0.4], [0.6, 0.6], [1, 1], [0.6, 1], [0, 0.5], [0.5, 0.5], [0.5, 1], [0, 1]])
+UV_FACES = np.array([[0, 1, 2], [3, 4, 5], [6, 7, 8], [6, 8, 9]])
+BODY = trimesh.creation.icosphere(1, 0.3)
+
+
+def _cloth(shift: float = 0.0) -> np.ndarray:
+    """(T, 8, 3) m."""
+    square = np.array([[0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1.0]])
+    rest = np.concatenate([square, square + [0, 0.1, 0]])
+    random = np.random.default_rng(3)
+    return np.stack([rest + [0, 0.01 * t**2, 0] + 1e-3 * random.normal(size=rest.shape) for t in range(FRAMES)]) + [shift, 0, 0]
+
+
+def _rollout(folder: Path, shift: float = 0.0, outfit: bool = True, pos: np.ndarray | None = None) -> Path:
+    pos, path = _cloth(shift) if pos is None else pos, folder / "rollout.h5"
+    body = np.stack([BODY.vertices + [shift, -0.5, 0.02 * t] for t in range(FRAMES)])
+    still = {"uv": UV, "uv_faces": UV_FACES, **({"piece": np.repeat([0, 1], 4)} if outfit else {})}
+    attributes = {"garment": "top+skirt" if outfit else "my dress.obj"}
+    writer = RolloutWriter(
+        path, FRAMES, pos[0], FACES, BODY.faces, len(BODY.vertices), ("rg",), DT, attributes, farthest=shift, still=still
+    )
+    for t in range(FRAMES):
+        writer.append(pos[t], body[t], {"rg": 0.0})
+    writer.close(complete=True)
+    return path
+
+
+def _glb(path: Path) -> tuple[dict, list[np.ndarray]]:
+    """The document and its accessors, by the specification's two chunks."""
+    content = path.read_bytes()
+    magic, version, length, size, kind = struct.unpack_from("<4sIII4s", content)
+    assert (magic, version, length, kind) == (b"glTF", 2, len(content), b"JSON")
+    document, binary = json.loads(content[20 : 20 + size]), content[28 + size :]
+    columns = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}
+    arrays = []
+    for accessor in document["accessors"]:
+        view = document["bufferViews"][accessor["bufferView"]]
+        numbers = np.frombuffer(
+            binary,
+            {5126: "<f4", 5125: "<u4"}[accessor["componentType"]],
+            offset=view["byteOffset"],
+            count=accessor["count"] * columns[accessor["type"]],
+        )
+        assert numbers.nbytes == view["byteLength"]
+        assert view["byteOffset"] % 4 == 0
+        arrays.append(numbers.reshape(accessor["count"], -1))
+        if "min" in accessor:
+            assert np.array_equal(arrays[-1].min(axis=0), np.float32(accessor["min"]))
+            assert np.array_equal(arrays[-1].max(axis=0), np.float32(accessor["max"]))
+    return document, arrays
+
+
+@pytest.mark.parametrize("shift", [0.0, 3000.0])
+def test_usd_is_read_back_by_pxr(tmp_path: Path, shift: float) -> None:
+    pxr = pytest.importorskip("pxr", reason="usd-core has no wheel for this machine")
+    from pxr import Usd, UsdGeom
+
+    assert pxr
+    assert main(["export", str(_rollout(tmp_path, shift)), "format=usd", "up=z"]) == 0
+    stage = Usd.Stage.Open(str(tmp_path / "rollout.usd"))
+    assert UsdGeom.GetStageUpAxis(stage) == "Z"
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0
+    assert stage.GetTimeCodesPerSecond() == pytest.approx(24.0)
+    assert stage.GetEndTimeCode() == FRAMES - 1
+    data = read_rollout(tmp_path / "rollout.h5")
+    for name, wanted in (("top", data.cloth_pos[:, :4]), ("skirt", data.cloth_pos[:, 4:]), ("body", data.body_pos)):
+        mesh = UsdGeom.Mesh(stage.GetPrimAtPath(f"/rollout/{name}"))
+        for t in range(FRAMES):
+            place = np.array(UsdGeom.XformCache(t).GetLocalToWorldTransform(mesh.GetPrim()))
+            found = np.array(mesh.GetPointsAttr().Get(t), np.float64) @ place[:3, :3] + place[3, :3]
+            assert np.abs(found - wanted[t][:, [0, 2, 1]] * [1, -1, 1]).max() < 1e-6
+    texture = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/rollout/top")).GetPrimvar("st")
+    assert np.allclose(texture.ComputeFlattened(), UV[UV_FACES[:2].reshape(-1)])
+
+
+@pytest.mark.parametrize("shift", [0.0, 3000.0])
+def test_glb_moves_as_the_rollout(tmp_path: Path, shift: float) -> None:
+    assert main(["export", str(_rollout(tmp_path, shift)), "format=glb"]) == 0
+    document, arrays = _glb(tmp_path / "rollout.glb")
+    data = read_rollout(tmp_path / "rollout.h5")
+    wanted = {"top": data.cloth_pos[:, :4], "skirt": data.cloth_pos[:, 4:], "body": data.body_pos}
+    animation = document["animations"][0]
+    assert [channel["target"]["node"] for channel in animation["channels"]] == [0, 1, 2]
+    sampler = animation["samplers"][0]
+    times, weights = arrays[sampler["input"]][:, 0], arrays[sampler["output"]].reshape(FRAMES, -1)
+    assert np.allclose(times, data.time, atol=1e-6)
+    for node in document["nodes"]:
+        primitive = document["meshes"][node["mesh"]]["primitives"][0]
+        base = arrays[primitive["attributes"]["POSITION"]].astype(np.float64)
+        targets = [arrays[target["POSITION"]] for target in primitive["targets"]]
+        here = wanted[node["name"]]
+        for t in range(FRAMES):
+            moved = base + sum(w * target for w, target in zip(weights[t], targets, strict=True)) + node["translation"]
+            miss = np.abs(moved[:, None] - here[t][None]).max(axis=2).min(axis=1)  # points on seams come twice
+            assert miss.max() < 1e-6
+    top = document["meshes"][0]["primitives"][0]
+    uv, faces = arrays[top["attributes"]["TEXCOORD_0"]], arrays[top["indices"]].reshape(-1, 3)
+    assert np.allclose(uv[faces] * [1, -1] + [0, 1], UV[UV_FACES[:2]], atol=1e-6)
+    assert len(trimesh.load(tmp_path / "rollout.glb").geometry) == 3
+
+
+@pytest.mark.parametrize("form", ["usd", "glb", "pc2"])
+def test_a_place_that_cannot_be_written_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str], form: str) -> None:
+    if form == "usd":
+        pytest.importorskip("pxr", reason="usd-core has no wheel for this machine")
+    source, blocked = _rollout(tmp_path), tmp_path / ("x" * 250)  # too long a name with the draft's prefix
+    target = blocked.with_name(blocked.name + (".usd" if form == "usd" else f".{form}"))
+    assert main(["export", str(source), f"format={form}", f"output={target}"]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert target.name in error
+    assert [file.name for file in tmp_path.iterdir()] == ["rollout.h5"]
+
+
+def test_point_cache(tmp_path: Path) -> None:
+    assert main(["export", str(_rollout(tmp_path)), "format=pc2", f"output={tmp_path / 'pc'}"]) == 0
+    data = read_rollout(tmp_path / "rollout.h5")
+    content = (tmp_path / "pc" / "skirt.pc2").read_bytes()
+    assert struct.unpack_from("<12siiffi", content) == (b"POINTCACHE2\0", 1, 4, 0.0, 1.0, FRAMES)
+    assert np.array_equal(np.frombuffer(content, "<f4", offset=32).reshape(FRAMES, 4, 3), data.cloth_pos[:, 4:])
+    mesh = trimesh.load(tmp_path / "pc" / "skirt.obj", process=False, maintain_order=True)
+    assert len(mesh.faces) == 2
+
+
+@pytest.mark.parametrize("form", ["obj", "ply"])
+def test_sequences(tmp_path: Path, form: str) -> None:
+    assert main(["export", str(_rollout(tmp_path, outfit=False)), f"format={form}", "num_frames=3"]) == 0
+    data, folder = read_rollout(tmp_path / "rollout.h5"), tmp_path / f"rollout_{form}"
+    assert len(list(folder.iterdir())) == 6
+    for name, wanted, faces in (("my_dress_obj", data.cloth_pos, FACES), ("body", data.body_pos, BODY.faces)):
+        mesh = trimesh.load(folder / f"{name}_0003.{form}", process=False, maintain_order=True)
+        corners = mesh.vertices[mesh.faces]  # trimesh splits vertices on seams
+        assert np.abs(corners - wanted[2][faces]).max() < 1e-6
+
+
+def test_only_what_is_asked_for(tmp_path: Path) -> None:
+    assert main(["export", str(_rollout(tmp_path)), "format=ply", "parts=[body]", "num_frames=1"]) == 0
+    assert [path.name for path in (tmp_path / "rollout_ply").iterdir()] == ["body_0001.ply"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["format=abc"], "format=usd"),
+        (["format=fbx"], "usd"),
+        (["format=glb", "up=z"], "leave up= out"),
+        (["format=glb", "output=a.usd"], "ends in .glb"),
+        (["format=glb", "parts=[shoes]"], "[cloth,body]"),
+        (["format=glb", "num_frames=0"], "at least 1"),
+    ],
+)
+def test_refusals_name_the_way_out(tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], said: str) -> None:
+    path = _rollout(tmp_path)
+    assert main(["export", str(path), *words]) == 2
+    assert said in capsys.readouterr().err
+    assert [file.name for file in tmp_path.iterdir()] == ["rollout.h5"]
+
+
+def test_a_frame_that_is_not_finite_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pos = _cloth()
+    pos[2, 1] = np.nan
+    path = _rollout(tmp_path, outfit=False, pos=pos)
+    assert main(["export", str(path), "format=glb"]) == 2
+    assert "num_frames=2 " in capsys.readouterr().err
+    assert main(["export", str(path), "format=glb", "num_frames=2"]) == 0
+
+
+def test_a_folder_with_something_in_it_stays(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, folder = _rollout(tmp_path), tmp_path / "mine"
+    folder.mkdir()
+    (folder / "notes.txt").write_text("keep")
+    assert main(["export", str(path), "format=obj", f"output={folder}"]) == 2
+    assert "new or empty" in capsys.readouterr().err
+    assert [file.name for file in folder.iterdir()] == ["notes.txt"]
+
+
+def test_too_large_a_glb_is_refused_before_it_is_made(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from hood.media.exports import gltf
+
+    monkeypatch.setattr(gltf, "LARGEST", 1000)
+    assert main(["export", str(_rollout(tmp_path)), "format=glb"]) == 2
+    assert "num_frames=" in capsys.readouterr().err
+    assert not (tmp_path / "rollout.glb").exists()
+
+
+SHORT = (
+    "garment=skirt",
+    "sequence=plie",
+    "num_frames=2",
+    "stepper=refine",
+    "refine=1",
+    "metrics=none",
+    "video=none",
+    "sheet=false",
+)
+
+
+def test_a_rollout_writes_formats_and_replaces_its_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "rollout_obj").mkdir()
+    (tmp_path / "rollout_obj" / "frame_9999.obj").write_text("of a longer run before")
+    assert main(["rollout", *SHORT, "formats=[glb,obj]", f"output={tmp_path}"]) == 0
+    told = capsys.readouterr().out
+    assert "rollout.glb: " in told
+    assert "2 frames at 30 fps" in told
+    pos = read_rollout(tmp_path / "rollout.h5").cloth_pos
+    document, _ = _glb(tmp_path / "rollout.glb")
+    assert {mesh["name"] for mesh in document["meshes"]} >= {"skirt", "body"}
+    files = sorted((tmp_path / "rollout_obj").glob("*.obj"))
+    assert "frame_9999.obj" not in {file.name for file in files}
+    loaded = trimesh.load(files[-1], process=False, group_material=False)
+    parts = [loaded] if isinstance(loaded, trimesh.Trimesh) else list(loaded.geometry.values())
+    vertices = np.concatenate([part.vertices for part in parts])
+    near = np.linalg.norm(vertices[:, None] - pos[-1][None, :5], axis=2).min(axis=0)
+    assert float(near.max()) < 1e-6
+    assert not list(tmp_path.glob(".partial*"))
+
+
+@pytest.mark.parametrize(("forms", "word"), [("[abc]", "Alembic"), ("[glb,fbx]", "choose usd or glb")])
+def test_formats_are_refused_before_the_first_frame(
+    forms: str, word: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["rollout", *SHORT, f"formats={forms}", f"output={tmp_path / 'run'}"]) == 2
+    assert word in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()

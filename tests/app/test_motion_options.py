@@ -1,0 +1,65 @@
+"""From the keys of a config to what moves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hood.app.scene.motion import make_motion, motion_options
+from hood.app.settings.compose import ConfigError, load_config
+from hood.scene.body_motion.load import MotionOptions
+from hood.scene.body_motion.mesh_motion import MeshMotion, NoBody
+from hood.scene.body_motion.motion import BodyMotion
+from hood.testing import sphere
+
+
+def test_defaults_of_the_config_are_those_of_the_code() -> None:
+    """Written once in the code; the file repeats them where it explains them."""
+    assert motion_options(load_config("rollout")) == MotionOptions(parts=[])
+
+
+def test_every_key_reaches_the_options() -> None:
+    words = (
+        "fps=25 up=y file_fps=90 start=10f stop=2.5 loop=3 blend_in=0.5 blend_from=a betas=[1,-2.5] gender=male hands=file "
+        "body_scale=0.01 animation=Walk body_parts=[Body,Shoes] num_frames=7"
+    )
+    expected = MotionOptions(
+        fps=25.0, up="y", file_fps=90.0, start="10f", stop=2.5, loop=3, blend_in=0.5, blend_from="a", betas=[1, -2.5],
+        gender="male", hands="file", scale=0.01, animation="Walk", parts=["Body", "Shoes"], num_frames=7,
+    )  # fmt: skip
+    assert motion_options(load_config("rollout", words.split())) == expected
+
+
+@pytest.mark.parametrize(
+    "word", ["file_fps=fast", "blend_in=[]", "betas=all", "betas=[true]", "body_parts=Body", "body_scale=x"]
+)
+def test_values_of_the_wrong_kind_name_the_key(word: str) -> None:
+    with pytest.raises(ConfigError, match=f"{word.split('=')[0]}="):
+        motion_options(load_config("rollout", [word]))
+
+
+def test_what_is_not_performed_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    points, faces = sphere(1, 0.5)
+    np.savez(tmp_path / "ball.npz", verts=points, faces=faces)
+    kinds = {
+        "default": (BodyMotion, ""),
+        str(tmp_path / "ball.npz"): (MeshMotion, "sequence=walk_proud is not used"),
+        "none": (NoBody, "body=none does not move: sequence=walk_proud is not used"),
+    }
+    for body, (kind, words) in kinds.items():
+        assert isinstance(make_motion(load_config("rollout", [f"body={body}"])), kind)
+        said = capsys.readouterr().err
+        assert words in said
+        assert bool(said) == bool(words)
+    make_motion(load_config("rollout", ["body=none", "sequence=none"]))
+    assert not capsys.readouterr().err
+
+
+def test_a_motion_file_that_is_not_performed_is_refused(tmp_path: Path) -> None:
+    points, faces = sphere(1, 0.5)
+    np.savez(tmp_path / "ball.npz", verts=points, faces=faces)
+    for body, words in ((str(tmp_path / "ball.npz"), "performs its own motion"), ("none", "does not move")):
+        with pytest.raises(ConfigError, match=rf"sequence=mine\.npz: body=\S+ {words}; leave sequence out"):
+            make_motion(load_config("rollout", [f"body={body}", "sequence=mine.npz"]))

@@ -1,0 +1,39 @@
+"""Hems: distances from the open edges along the surface, and the lines drawn by them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hood.media.renderer.render import FAR, hem_distance, sewn
+from hood.testing import cylinder, sphere
+
+
+def test_distance_from_both_ends_of_a_tube() -> None:
+    pos, faces = (np.asarray(values) for values in cylinder(40, 30, radius=0.2, height=0.6))
+    dist = hem_distance(pos, faces)
+    along = np.minimum(pos[:, 1] - pos[:, 1].min(), pos[:, 1].max() - pos[:, 1])
+    near = along < 0.055
+    assert near.sum() > 100
+    np.testing.assert_allclose(dist[near], along[near], atol=1e-3)
+    assert (dist[along > 0.1] == FAR).all()
+
+
+def test_a_surface_near_by_has_hems_of_its_own() -> None:
+    """A ball without an open edge a millimetre beside the tube's hem."""
+    pos, faces = (np.asarray(values) for values in cylinder(40, 30, radius=0.2, height=0.6))
+    ball, ball_faces = sphere(2, 0.1)
+    ball = ball + [0.301, pos[:, 1].max(), 0.0]
+    both = hem_distance(np.concatenate([pos, ball]), np.concatenate([faces, ball_faces + len(pos)]))
+    np.testing.assert_array_equal(both[: len(pos)], hem_distance(pos, faces))
+    assert (both[len(pos) :] == FAR).all()
+    assert (hem_distance(ball, ball_faces) == FAR).all()
+    assert (hem_distance(np.full_like(pos, np.nan), faces) == FAR).all()
+
+
+def test_an_edge_and_a_seam_are_drawn_and_fade_where_pixels_are_large() -> None:
+    dist = np.array([0.0, 0.01, 0.02, 0.03, FAR])
+    near = sewn(dist, np.full(5, 5e-4))
+    np.testing.assert_allclose(near, [0.7, 1.0, 0.65, 1.0, 1.0])
+    far = sewn(dist, np.full(5, 0.03))
+    assert near[2] < far[2] < 1.0
+    assert far[4] == 1.0

@@ -1,0 +1,78 @@
+"""What a rollout's settings say of its course, in words."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hood.media.viewer.page import moments_of, shared_moments, wind_of
+from hood.rollouts.file.recorder import RolloutData
+from hood.rollouts.file.step_table import OutputRate, Steps
+
+
+def rollout(frames: int = 10, **settings: Any) -> RolloutData:
+    """At ten frames a second."""
+    pos, none = np.zeros((frames, 3, 3)), np.zeros((frames, 0, 3))
+    faces, attributes = np.array([[0, 1, 2]]), {"dt": 0.1, "config": json.dumps(settings)}
+    return RolloutData(pos, faces, pos[0], none, faces[:0], 0.1 * np.arange(frames), {}, attributes)
+
+
+def test_events_by_their_frames_in_words() -> None:
+    events = [
+        {"time": 0.25, "close": ["zip", "hood"]},
+        {"frame": 1, "open": "zip"},
+        {"frame": 4, "detach": [7, 8, "waistband"]},
+        {"frame": 5, "attach": "lists/hem.txt"},
+        {"frame": 6, "detach": 3},
+        {"frame": 9, "open": "zip"},  # no step begins in the last frame
+    ]
+    assert moments_of(rollout(events=events)) == [
+        (1, "open zip"),
+        (3, "close zip, hood"),  # the first step that begins then or later
+        (4, "detach waistband, 2 vertices"),
+        (5, "attach hem.txt"),
+        (6, "detach vertex 3"),
+    ]
+
+
+def test_events_count_simulated_frames_where_others_are_stored() -> None:
+    """Stored ten times a second, simulated forty times."""
+    early = [{"time": 0.25, "close": "zip"}, {"frame": 8, "open": "zip"}]
+    events = [*early, {"frame": 17, "close": "hood"}, {"frame": 39, "open": "x"}]
+    usual = rollout(events=events)
+    none = np.zeros(0, dtype=np.int64)
+    steps = Steps(OutputRate(10.0, 40.0), np.ones(37, dtype=bool), {}, none, np.zeros((37, 0, 3)))
+    assert moments_of(replace(usual, steps=steps)) == [(2, "open zip"), (3, "close zip"), (5, "close hood")]
+
+
+def test_moments_of_several_rollouts() -> None:
+    opens, closes = {"frame": 2, "open": "zip"}, {"frame": 5, "close": "zip"}
+    one, other = rollout(events=[opens, closes]), rollout(frames=4, events=[closes, opens])
+    assert shared_moments([("a", one), ("b", other)]) == [(2, "open zip"), (5, "close zip (a)")]
+    assert shared_moments([("a", one)]) == [(2, "open zip"), (5, "close zip")]
+
+
+@pytest.mark.parametrize("attributes", [{}, {"config": "no table"}, {"config": "[]"}, {"dt": 0.1, "config": "{}"}])
+def test_files_made_otherwise_say_nothing(attributes: dict[str, Any]) -> None:
+    data = rollout()
+    data.attributes.clear()
+    data.attributes.update(attributes)
+    assert moments_of(data) == []
+    assert wind_of(data) == ""
+
+
+@pytest.mark.parametrize(
+    "settings, words",
+    [
+        ({"wind": None, "gusts": 0.0}, ""),
+        ({"wind": 3, "gusts": 0.0}, "wind 3 m/s"),
+        ({"wind": [1, 0, -2.5], "gusts": 0.2}, "wind (1, 0, -2.5) m/s, gusts 20%"),
+        ({"wind": 0}, "wind 0 m/s"),
+    ],
+)
+def test_wind_in_words(settings: dict[str, Any], words: str) -> None:
+    assert wind_of(rollout(**settings)) == words
