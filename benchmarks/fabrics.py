@@ -22,7 +22,7 @@ from hood.assets.garment.parts import part_faces
 from hood.assets.material import Material
 from hood.cloth.cloth import build_cloth
 from hood.mesh.geometry import dihedral_angles
-from hood.rollouts.file.recorder import read_rollout
+from hood.rollouts.file.reader import read_rollout
 from hood.solver.step_figures import edge_strain
 
 #: Frames in which the cloth is still taking up the motion.

@@ -12,7 +12,7 @@ the minutes are over; what was left out is said at the end. Columns:
 ``ms``        of a frame, search included, metrics not: median of wall-clock time between two waits for the device, ways taking
               turns state by state.
 ``floor ms``  what the frame's kernels take at least, one after the other: for each the longest of the gap between two kernels,
-              its bytes over the bandwidth, its operations over their rate (:mod:`hood.steppers.static_shapes.roofline`). On a
+              its bytes over the bandwidth, its operations over their rate (``benchmarks/roofline.py``). On a
               GPU all of these constants are measured first, in this very run; else they are those of ``--device-specs``.
 ``share``     floor / ms: how near the frame is to the roofline.
 ``kernels``   of the traced frame, views not counted; of fused rows those before fusion.
@@ -40,6 +40,7 @@ from pathlib import Path
 
 import torch
 from frame import refined
+from roofline import DATA_SHEETS, Device, Work, WorkCounter
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
@@ -64,7 +65,6 @@ from hood.steppers.newton import NewtonStepper, Stepper
 from hood.steppers.static_shapes.cuda_graph import trace
 from hood.steppers.static_shapes.newton import CapturedNewton
 from hood.steppers.static_shapes.problem import settled_potential, step_inputs
-from hood.steppers.static_shapes.roofline import DATA_SHEETS, Device, Work, WorkCounter
 from hood.steppers.static_shapes.simulator import CapturedSimulator, FixedStep
 from hood.tensors.dense import whole_arrays
 from hood.testing import without_values

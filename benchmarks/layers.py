@@ -36,7 +36,8 @@ from hood.energies.potential import Potential, default_potential
 from hood.energies.problem import StepProblem
 from hood.energies.self_contact import LayerBarrier
 from hood.mesh.cloth_proximity import Work
-from hood.rollouts.loop import Frame, simulate
+from hood.rollouts.frame import Frame
+from hood.rollouts.loop import simulate
 from hood.scene.scene import Scene, build_scene
 from hood.solver.newton import NewtonSettings
 from hood.steppers.network import Prediction

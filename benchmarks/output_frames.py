@@ -21,8 +21,8 @@ from torch import Tensor
 import hood
 from hood.assets.garment.binding import signed_distances
 from hood.rollouts.file.step_table import OutputRate
+from hood.rollouts.frame import Frame
 from hood.rollouts.frames import hermite, output_frames
-from hood.rollouts.loop import Frame
 
 FPS, EVERY = 120, 4
 

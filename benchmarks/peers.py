@@ -60,7 +60,8 @@ from hood.media.renderer.camera import Camera
 from hood.media.renderer.render import BODY_COLOR, RenderMesh, captioned, render_frame
 from hood.media.video import save_png
 from hood.model.network.kernel_choice import choose_kernels
-from hood.rollouts.loop import Frame, simulate
+from hood.rollouts.frame import Frame
+from hood.rollouts.loop import simulate
 from hood.solver.newton import NewtonSettings
 from hood.steppers.checkpoint import load_simulator
 from hood.steppers.newton import NewtonStepper, Stepper

@@ -20,8 +20,8 @@ from hood.assets.garment.binding import signed_distances
 from hood.mesh.editing.subdivision import Subdivision
 from hood.mesh.geometry import face_normals
 from hood.mesh.topology import hinges
+from hood.rollouts.frame import Frame
 from hood.rollouts.frames import refined_frames
-from hood.rollouts.loop import Frame
 from hood.rollouts.verdict.surface import SurfaceMeter
 
 

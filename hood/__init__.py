@@ -37,8 +37,8 @@ _HOMES = {
     "build_scene": "hood.scene.scene",
     "Potential": "hood.energies.potential",
     "default_potential": "hood.energies.potential",
-    "RolloutData": "hood.rollouts.file.recorder",
-    "read_rollout": "hood.rollouts.file.recorder",
+    "RolloutData": "hood.rollouts.file.reader",
+    "read_rollout": "hood.rollouts.file.reader",
     "load_reference_checkpoint": "hood.steppers.published",
 }
 __all__ = ["__version__", *_HOMES]

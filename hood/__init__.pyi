@@ -13,7 +13,7 @@ from hood.assets.files.library import names as names
 from hood.assets.material import EdgeField as EdgeField, FaceField as FaceField, Material as Material
 from hood.assets.motion.load import load_sequence as load_sequence
 from hood.assets.motion.sequence import PoseSequence as PoseSequence
-from hood.rollouts.file.recorder import RolloutData as RolloutData, read_rollout as read_rollout
+from hood.rollouts.file.reader import RolloutData as RolloutData, read_rollout as read_rollout
 from hood.steppers.published import load_reference_checkpoint as load_reference_checkpoint
 from hood.energies.potential import Potential as Potential, default_potential as default_potential
 from hood.scene.scene import Scene as Scene, build_scene as build_scene

@@ -29,7 +29,7 @@ from hood.assets.garment.garment import Garment, checked_garment
 from hood.assets.material import Material
 from hood.energies.potential import Potential
 from hood.rollouts import loop as frames
-from hood.rollouts.loop import Frame
+from hood.rollouts.frame import Frame
 from hood.scene.scene import Scene
 from hood.steppers.network import Simulator
 from hood.steppers.newton import Stepper, require_stepper
@@ -38,7 +38,7 @@ from hood.steppers.newton import Stepper, require_stepper
 class Simulation:
     """A garment on a moving body, put together and ready to run; made by :func:`simulate`.
 
-    Iterating yields :class:`hood.rollouts.loop.Frame` objects, frame 0 first. A second iteration simulates again.
+    Iterating yields :class:`hood.rollouts.frame.Frame` objects, frame 0 first. A second iteration simulates again.
     With ``guard="strict"``, :class:`hood.app.stepping.guarding.GuardStopped` is raised before the first frame that cannot be
     trusted.
 

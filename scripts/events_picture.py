@@ -12,7 +12,7 @@ from pathlib import Path
 from PIL import Image
 
 from hood.media.film import Film
-from hood.rollouts.file.recorder import read_rollout
+from hood.rollouts.file.reader import read_rollout
 
 _WIDTH, _HEIGHT = 260, 340  # pixels of one frame
 _FRAMES = (30, 45, 65, 80, 91)  # closed, open, open, closing, closed

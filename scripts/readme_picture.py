@@ -11,7 +11,7 @@ from pathlib import Path
 from PIL import Image
 
 from hood.media.film import Film
-from hood.rollouts.file.recorder import read_rollout
+from hood.rollouts.file.reader import read_rollout
 
 _WIDTH, _HEIGHT = 300, 420  # pixels of one view
 _VIEWS = (25.0, 115.0)  # degrees, side by side

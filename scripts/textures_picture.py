@@ -16,7 +16,7 @@ from hood.assets.formats.image import read_texture
 from hood.media.film import Film
 from hood.media.pieces import pieces_of
 from hood.media.video import save_png
-from hood.rollouts.file.recorder import read_rollout
+from hood.rollouts.file.reader import read_rollout
 
 _WIDTH, _HEIGHT, _FRAME = 230, 330, 59
 _SIDE, _BANDS = 800, 20  # pixels of a pattern, bands of it along a side

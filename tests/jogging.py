@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from hood.cli.main import main
-from hood.rollouts.file.recorder import RolloutData, read_rollout
+from hood.rollouts.file.reader import RolloutData, read_rollout
 
 #: Without contact cloth passes through itself.
 WORDS = ["sequence=jog", "start=1.0", "stepper=newton", "cloth_contact=off", "allow_unsound=true", "video=none", "sheet=false",

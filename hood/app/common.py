@@ -15,7 +15,8 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 
-from hood.app.settings.compose import ConfigError, load_config, plain, read_record, require_choice, shown
+from hood.app.settings.compose import ConfigError, load_config, plain, require_choice, shown
+from hood.app.settings.record import read_record
 from hood.assets.files.atomic import occupy
 from hood.assets.files.said import install
 from hood.model.kernels.block import check_kernels, why_slow

@@ -27,7 +27,8 @@ from hood.app.output.verdict import exit_code
 from hood.app.plan_file import plan_mode, plan_path, plan_sentences, planned, rollout_config, summarise_plan, without_accuracy
 from hood.app.scene.events import describe_held, fastening_attributes, summarise_held
 from hood.app.scene.garments import describe_ease, summarise_ease
-from hood.app.settings.compose import plain, save_run_record
+from hood.app.settings.compose import plain
+from hood.app.settings.record import save_run_record
 from hood.app.setup import Setup, check_config, make_stepper, set_up, solves_in_double
 from hood.app.stepping.automatic import advice
 from hood.app.stepping.cautions import idle_in_rollout, warn
@@ -37,9 +38,11 @@ from hood.app.stepping.refinement import exported
 from hood.assets.files.atomic import occupy, write_atomically
 from hood.assets.files.said import Doubt
 from hood.rollouts.checks.fit import Ease, measure_ease
-from hood.rollouts.file.recorder import RolloutWriter, read_rollout, still_of
+from hood.rollouts.file.reader import read_rollout
+from hood.rollouts.file.recorder import RolloutWriter, still_of
+from hood.rollouts.frame import Frame, metric_names
 from hood.rollouts.frames import ridden_faces, ridden_frames, ridden_rest, ridden_still, riding_attributes
-from hood.rollouts.loop import Frame, metric_names, simulate
+from hood.rollouts.loop import simulate
 from hood.scene.sizing import Sizes
 from hood.steppers.newton import Stepper
 from hood.steppers.static_shapes.simulator import network_of

@@ -30,7 +30,8 @@ from hood.assets.garment.garment import Garment
 from hood.assets.material import Material
 from hood.energies.potential import Potential
 from hood.model.kernels.block import KERNELS
-from hood.rollouts.loop import METRIC_CHOICES, SETTLE_CHOICES, own_start
+from hood.rollouts.frame import METRIC_CHOICES, SETTLE_CHOICES
+from hood.rollouts.loop import own_start
 from hood.rollouts.verdict.doubts import doubt_body, doubt_fabric
 from hood.scene.fitting import doubts, misplacement
 from hood.scene.held_layers import with_held_layers_apart

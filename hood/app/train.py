@@ -27,7 +27,8 @@ from hood.app.common import (
 )
 from hood.app.scene.garments import as_simulated
 from hood.app.scene.motion import check_rate
-from hood.app.settings.compose import ConfigError, build, load_config, plain, require_choice, save_run_record, shown
+from hood.app.settings.compose import ConfigError, build, load_config, plain, require_choice, shown
+from hood.app.settings.record import save_run_record
 from hood.app.stepping.cautions import idle_in_training
 from hood.assets.body.load import load_body
 from hood.assets.files.library import locate, motion_split, unknown

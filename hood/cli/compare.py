@@ -20,7 +20,7 @@ from hood.app.output.textures import lay_on, read_textures
 from hood.app.settings.compose import ConfigError, require_choice
 from hood.assets.files.atomic import write_atomically
 from hood.assets.formats.image import Texture
-from hood.rollouts.file.recorder import RolloutData
+from hood.rollouts.file.reader import RolloutData
 
 COLOURS = ("strain", "rg", "contact", "fabric")
 #: Written above a rollout where its file holds them: medians over the frames that have a value.

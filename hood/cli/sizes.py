@@ -22,7 +22,8 @@ from hood.media.film import Film
 from hood.media.renderer.render import contact_sheet
 from hood.media.video import save_png
 from hood.rollouts.checks.fit import Ease, measure_ease
-from hood.rollouts.file.recorder import RolloutData, still_of
+from hood.rollouts.file.reader import RolloutData
+from hood.rollouts.file.recorder import still_of
 from hood.rollouts.loop import simulate
 from hood.steppers.newton import Stepper
 

@@ -14,7 +14,7 @@ from hood.app.output.textures import lay_on, read_textures
 from hood.app.settings.compose import ConfigError
 from hood.assets.files.atomic import write_atomically
 from hood.cli.compare import names_of
-from hood.rollouts.file.recorder import RolloutData
+from hood.rollouts.file.reader import RolloutData
 
 #: More would be too narrow to see anything.
 _MOST = 4

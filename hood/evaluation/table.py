@@ -29,8 +29,9 @@ from hood.evaluation.spectrum import error_spectrum, garment_bands
 from hood.model.graph.builder import LAYERS, Graph, build_graph, build_static
 from hood.model.graph.hierarchy import build_hierarchy
 from hood.model.network.model import MeshGraphNet
+from hood.rollouts.frame import Frame
 from hood.rollouts.frames import KeptFrames
-from hood.rollouts.loop import Frame, simulate
+from hood.rollouts.loop import simulate
 from hood.rollouts.verdict.rule import judge_rollout
 from hood.scene.scene import Scene
 from hood.solver.newton import NewtonSettings

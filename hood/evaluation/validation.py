@@ -19,7 +19,8 @@ from hood.assets.motion.sequence import PoseSequence
 from hood.assets.motion.sequence_edit import A_POSE_ANGLE, arms_down
 from hood.energies.potential import Potential
 from hood.evaluation.gap import REFERENCE, StepSample, gap
-from hood.rollouts.loop import Frame, simulate
+from hood.rollouts.frame import Frame
+from hood.rollouts.loop import simulate
 from hood.scene.scene import Scene, build_scene
 from hood.solver.newton import NewtonSettings
 from hood.steppers.network import Simulator

@@ -13,7 +13,7 @@ from hood.assets.files.said import install
 from hood.assets.formats.image import Texture
 from hood.media.film import Film, seconds_per_frame, sheet_frames
 from hood.media.video import VideoWriter
-from hood.rollouts.file.recorder import RolloutData
+from hood.rollouts.file.reader import RolloutData
 
 Picture = NDArray[np.uint8]
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hood.assets.files.said import install
 from hood.mesh.closest_point.search import search_surface
 from hood.mesh.editing.subdivision import Subdivision
-from hood.rollouts.file.recorder import RolloutData
+from hood.rollouts.file.reader import RolloutData
 
 Picture = NDArray[np.uint8]
 

@@ -27,7 +27,7 @@ from hood.media.renderer.render import (
 )
 from hood.media.video import VideoWriter, save_png
 from hood.native.arguments import num_parts
-from hood.rollouts.file.recorder import RolloutData
+from hood.rollouts.file.reader import RolloutData
 
 _SHEET_FRAMES = 12
 #: Where the body is to be drawn thinner, it is where cloth is this near [m].

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from hood.media.renderer.render import GARMENT_COLOR
 from hood.mesh import topology
-from hood.rollouts.file.recorder import RolloutData
+from hood.rollouts.file.reader import RolloutData
 
 #: In their order; far from the body's colour and from each other, in lightness as well.
 _OTHERS = ((0.80, 0.45, 0.22), (0.30, 0.52, 0.34), (0.62, 0.28, 0.42), (0.86, 0.74, 0.38), (0.28, 0.26, 0.42))

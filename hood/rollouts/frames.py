@@ -24,9 +24,10 @@ from hood.mesh.editing.subdivision import Subdivision
 from hood.mesh.parts import Riders
 from hood.mesh.penetration.compiled import Eights, eights
 from hood.mesh.penetration.crossing import self_crossings
-from hood.rollouts.file.recorder import RolloutData, still_of
+from hood.rollouts.file.reader import RolloutData
+from hood.rollouts.file.recorder import still_of
 from hood.rollouts.file.step_table import OutputRate
-from hood.rollouts.loop import Frame
+from hood.rollouts.frame import Frame
 from hood.scene.scene import Scene
 
 

@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from hood.cloth.cloth import Cloth
 from hood.cloth.state import Attachments, State
-from hood.contact.contact import Contact, find_contact
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem
 from hood.energies.self_contact import for_networks, has_layers
@@ -22,21 +20,28 @@ from hood.mesh.closest_point.tree import forget_searches
 from hood.mesh.penetration.crossing import crossings
 from hood.rollouts.checks.guard import Guard
 from hood.rollouts.equilibrium import Rest, find_equilibrium, without_hold
-from hood.rollouts.verdict.distance import DISTANCE_EVERY, DISTANCE_METRICS, distance_metrics
-from hood.rollouts.verdict.surface import SURFACE_METRICS, SURFACE_STRIDE, SurfaceMeter
+from hood.rollouts.frame import (
+    FIELD_CHOICES,
+    METRIC_CHOICES,
+    SETTLE_CHOICES,
+    SETTLE_METRICS,
+    Frame,
+    _is_measured,
+    _state_metrics,
+    _surface_now,
+    _times,
+    _with_guard,
+)
+from hood.rollouts.verdict.distance import DISTANCE_EVERY, distance_metrics
+from hood.rollouts.verdict.surface import SURFACE_STRIDE, SurfaceMeter
 from hood.rollouts.verdict.worn import measure_wear
 from hood.scene.jumps import Jump, carried, describe_jumps, find_jumps
 from hood.scene.scene import LEAD_IN, RELAXING_DT, NotWornError, Scene, recentre
 from hood.scene.start import free_stretch, push_out
 from hood.scene.worn import worn_vertices, worst_part
 from hood.solver.step_figures import (
-    LAYER_METRICS,
-    PENETRATION_METRICS,
-    STRAIN_METRICS,
     StepFigures,
     layer_metrics,
-    penetration_metrics,
-    strain_metrics,
     vertex_residual,
 )
 from hood.steppers.network import Prediction
@@ -45,64 +50,12 @@ from hood.steppers.protocol import Relaxing, Stopwatch
 from hood.steppers.refined import RefinedStepper, prepare_stepper
 from hood.steppers.static_shapes.simulator import network_of
 
-#: A start with an edge lengthened by more than this share would snap back in the first frames.
-_STRETCH = 0.1
-#: One with an edge lengthened by more than this is told; measured: at most 0.08 in ordinary poses, 0.18 to 0.69 seated.
-_TORN = 0.3
 #: The way of a relaxing step is looked at so often [m], in so many places at most.
 _LOOK, _LOOKS = 0.02, 100
 
 AttachmentSchedule = Callable[[int], Attachments | None]
 #: Called after a step with the frame it leads to, what the step had to solve and what came out.
 Observer = Callable[[int, StepProblem, Prediction], None]
-
-
-@dataclass(frozen=True)
-class Frame:
-    """One frame of a rollout."""
-
-    index: int
-    state: State
-    world_pos: Tensor  # (V, 3) m float64
-    body_pos: Tensor  # (W, 3) m float64
-    metrics: dict[str, float]
-    fields: dict[str, Tensor] = field(default_factory=dict)  # (V,) by name, of the step that led here; NaN in frame 0
-    simulated: bool = True  # False: between two simulated frames, see :mod:`hood.rollouts.frames`
-
-
-#: What is measured of a frame besides its time and what the stepper reports: strain, penetration, cut surface and energies,
-#: strain alone, or nothing. Only ``all`` needs contact with the body's surface.
-METRIC_CHOICES = ("all", "strain", "none")
-#: What can be had of every vertex: the relative gradient, see :func:`hood.solver.step_figures.vertex_residual`.
-FIELD_CHOICES = ("rg",)
-#: How frame 0 is made, see :func:`simulate`, and what frame 0 says of an equilibrium.
-SETTLE_CHOICES = ("equilibrium", "paper")
-SETTLE_METRICS = ("settle_steps", "settle_seconds", "settle_speed", "settle_reached", "settle_away", "settle_sunk")
-
-
-def metric_names(
-    potential: Potential, stepper: Stepper, metrics: str = "all", settle: str = "paper", guarded: bool = False
-) -> tuple[str, ...]:
-    """Every metric a frame of a rollout can have, for one of :data:`METRIC_CHOICES` and of :data:`SETTLE_CHOICES`, with a guard
-    or without."""
-    energies = (
-        *(f"energy_{name}" for name in potential.terms),
-        "energy_total",
-        "energy_inertial_guess",
-        "gradient_norm",
-        "relative_gradient",
-        "e0",
-    )
-    measured = {
-        "all": (*STRAIN_METRICS, *PENETRATION_METRICS, *SURFACE_METRICS, *DISTANCE_METRICS, *energies),
-        "strain": STRAIN_METRICS,
-        "none": (),
-    }
-    layers = LAYER_METRICS if has_layers(potential) else ()
-    settled = SETTLE_METRICS if settle == "equilibrium" else ()
-    own = (*layers, *stepper.metrics, *settled)
-    times = (*stepper.times, *(["guard"] if guarded else []), "metrics")
-    return (*measured[metrics], *own, *(f"ms_{part}" for part in times))
 
 
 @torch.no_grad()
@@ -254,11 +207,6 @@ def simulate(
                 observe(index + 1, known, prediction)
 
 
-def _is_measured(index: int, count: int, stride: int) -> bool:
-    """Whether a frame of ``count`` is one in which what takes longer is measured."""
-    return index % stride == 0 or index + 1 == count
-
-
 def _jumps_within(scene: Scene, start_frame: int, count: int) -> dict[int, Jump]:
     """Jumps of the body in these frames, by frame; a warning says so."""
     jumps = find_jumps(scene.motion, 1.0 / scene.dt)
@@ -274,29 +222,10 @@ def _as_taken(problem: StepProblem, prediction: Prediction) -> StepProblem:
     return problem if prediction.held_off is None else replace(problem, contact=prediction.held_off)
 
 
-def _with_guard(lap: dict[str, float], spent: float) -> dict[str, float]:
-    """A frame's times with those of its guard."""
-    return {**lap, "guard": spent, "total": lap["total"] + spent}
-
-
-def _times(stepper: Stepper, lap: dict[str, float]) -> dict[str, float]:
-    """The parts that the stepper names, and the guard's; the others (posing the body) go to the rest."""
-    named = (*stepper.times, *(["guard"] if "guard" in lap else []))
-    times = {part: lap.get(part, 0.0) for part in named}
-    times["rest"] += sum(value for part, value in lap.items() if part not in times)
-    return {f"ms_{part}": value for part, value in times.items()}
-
-
-def _state_metrics(
-    scene: Scene, cloth: Cloth, state: State, frame: int, problem: StepProblem | None, metrics: str
-) -> dict[str, float]:
-    """Strain and penetration at ``frame``, as far as ``metrics`` asks for them, of the ``cloth`` there; ``problem`` is the step
-    from there."""
-    measured = {} if metrics == "none" else strain_metrics(cloth, state.pos)
-    if metrics == "all":
-        contact = _contact_now(scene, state, frame) if problem is None else problem.with_contact().contact
-        measured |= penetration_metrics(contact, scene.cloth)
-    return measured
+#: A start with an edge lengthened by more than this share would snap back in the first frames.
+_STRETCH = 0.1
+#: One with an edge lengthened by more than this is told; measured: at most 0.08 in ordinary poses, 0.18 to 0.69 seated.
+_TORN = 0.3
 
 
 @torch.no_grad()
@@ -490,12 +419,3 @@ def _led_in(
 def _longest(scene: Scene, pos: Tensor) -> float:
     """Largest relative lengthening of an edge that is not held at both ends."""
     return float(free_stretch(scene.cloth, pos).max()) if len(scene.cloth.edges) else 0.0
-
-
-def _surface_now(meter: SurfaceMeter, scene: Scene, state: State, frame: int) -> dict[str, float]:
-    return meter(state.pos.cpu().numpy(), scene.motion.surface(frame, state.origin[0].numpy()).cpu().numpy())
-
-
-def _contact_now(scene: Scene, state: State, frame: int) -> Contact | None:
-    obstacle = scene.motion.obstacle(frame, state.origin[0].numpy(), static=True)
-    return None if obstacle is None else find_contact(state.pos, scene.cloth.vertex_scene, obstacle)

@@ -20,6 +20,7 @@ from hood.energies.problem import StepProblem
 from hood.energies.self_contact import LayerSides, without_layers
 from hood.native.build import BuildError
 from hood.solver.compiled import newton as compiled_newton
+from hood.solver.compiled.system import EngineSystem
 from hood.solver.derivatives.self_contact import approached, free_way, grips_of, layers_of, touching
 from hood.solver.step_figures import CONVERGED, LATE, MOST_ITERATIONS, NOT_FINITE, STOPPED, STUCK
 from hood.solver.system.iterate import Proceed, Progress, Unknowns, fixed_positions, in_double, rounded
@@ -221,7 +222,7 @@ class TorchSystem:
 
 def system_of(
     potential: Potential, problem: StepProblem, plan: SolverPlan, settings: NewtonSettings
-) -> TorchSystem | compiled_newton.EngineSystem:
+) -> TorchSystem | EngineSystem:
     """The fastest form of the solver that does what ``settings`` ask for.
 
     Raises:
@@ -240,7 +241,7 @@ def system_of(
         and compiled_newton.applies(potential, problem)
     ):
         try:
-            return compiled_newton.EngineSystem(potential, problem, plan, settings.cg_iterations)
+            return EngineSystem(potential, problem, plan, settings.cg_iterations)
         except BuildError as error:
             if settings.engine == "compiled":
                 raise BuildError(f"solver.engine=compiled: {error} or use solver.engine=torch") from error

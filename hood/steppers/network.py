@@ -18,7 +18,7 @@ from hood.energies.potential import Potential, default_potential
 from hood.energies.problem import StepProblem
 from hood.mesh.closest_point.vertices import Nearest
 from hood.model.features import compiled
-from hood.model.features.groups import FeatureSet
+from hood.model.features.feature_set import FeatureSet
 from hood.model.features.inputs import EdgeRows, Inputs
 from hood.model.features.sets import SETS, SetSettings, build_features, split_name
 from hood.model.graph.builder import Graph, StaticGraph, build_graph, build_static

@@ -13,7 +13,7 @@ from hood.app.scene.events import Asked, checked_events, describe_fasteners, des
 from hood.app.settings.compose import ConfigError, load_config
 from hood.assets.garment.garment import Garment, save_garment
 from hood.cli.main import main
-from hood.rollouts.file.recorder import RolloutData, read_rollout
+from hood.rollouts.file.reader import RolloutData, read_rollout
 from hood.scene.holding import SPEED
 from hood.testing import grid
 

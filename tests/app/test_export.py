@@ -11,7 +11,8 @@ import pytest
 import trimesh
 
 from hood.cli.main import main
-from hood.rollouts.file.recorder import RolloutWriter, read_rollout
+from hood.rollouts.file.reader import read_rollout
+from hood.rollouts.file.recorder import RolloutWriter
 
 FRAMES, DT = 4, 1.0 / 24.0
 #: Two squares of two triangles, of two garments; the texture of the first has a seam along its diagonal.

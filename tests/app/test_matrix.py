@@ -18,7 +18,7 @@ from workshop import Workshop
 from hood.assets.garment.binding import signed_distances
 from hood.cli.main import main
 from hood.mesh import topology
-from hood.rollouts.file.recorder import read_rollout
+from hood.rollouts.file.reader import read_rollout
 
 MODELS = ("default", "smpl_pickle", "smpl_npz", "smplh_npz", "smplx_npz")
 MESHES = ("folder", "verts_npz", "verts_h5", "mesh_pickle", "gltf_skin", "gltf_morph", "still")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hood.cli.main import main
-from hood.rollouts.file.recorder import read_rollout
+from hood.rollouts.file.reader import read_rollout
 
 QUICK = ["rollout", "stepper=newton", "garment=tank", "num_frames=2", "metrics=none", "video=none", "sheet=false",
          "allow_unsound=true", "output=run"]  # fmt: skip

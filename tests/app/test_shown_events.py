@@ -12,7 +12,7 @@ from test_export import _glb
 from test_view import content
 
 from hood.cli.main import main
-from hood.rollouts.file.recorder import RolloutData
+from hood.rollouts.file.reader import RolloutData
 
 EVENTS = "events=[{frame: 4, open: seam}, {time: 0.3, close: seam}, {frame: 6, detach: pins}]"
 

@@ -17,7 +17,7 @@ from hood.cli.main import main
 from hood.cloth.state import State
 from hood.energies.potential import relative_gradient
 from hood.energies.problem import StepProblem
-from hood.rollouts.file.recorder import RolloutData, read_rollout
+from hood.rollouts.file.reader import RolloutData, read_rollout
 
 ROLLOUT = ["rollout", "garment=belt.obj", "sequence=walk.npz", "num_frames=5", "video=none", "sheet=false", "output=out"]
 NETWORK = ["checkpoint=untrained", "model=small", "model.latent_dim=4", "model.schedule='1x(mesh)'"]

@@ -15,7 +15,8 @@ from test_view import content
 from hood.assets.formats import image as texture_module
 from hood.cli.main import main
 from hood.media.viewer.page import unpack_integers
-from hood.rollouts.file.recorder import RolloutWriter, read_rollout
+from hood.rollouts.file.reader import read_rollout
+from hood.rollouts.file.recorder import RolloutWriter
 
 CHECKS = np.indices((16, 16)).sum(axis=0)[..., None] // 4 % 2 * np.array([200, 100, 50], np.uint8)
 

@@ -13,7 +13,8 @@ import pytest
 
 from hood.cli.main import main
 from hood.media.viewer.page import unpack_bytes, unpack_integers, unpack_positions
-from hood.rollouts.file.recorder import RolloutWriter, read_rollout
+from hood.rollouts.file.reader import read_rollout
+from hood.rollouts.file.recorder import RolloutWriter
 from hood.testing import cylinder, sphere
 
 

@@ -13,7 +13,7 @@ import pytest
 from hood.app.common import require_same_config
 from hood.app.settings.compose import ConfigError, load_config
 from hood.assets.identify import identify
-from hood.rollouts.file.recorder import read_rollout
+from hood.rollouts.file.reader import read_rollout
 
 FUZZ = Path(__file__).parents[2] / "benchmarks" / "fuzz.py"
 

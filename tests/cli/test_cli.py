@@ -16,7 +16,7 @@ import torch
 from hood import __version__
 from hood.assets.files.library import names
 from hood.cli.main import COMMANDS, main
-from hood.rollouts.file.recorder import read_rollout
+from hood.rollouts.file.reader import read_rollout
 from hood.steppers.checkpoint import save_simulator
 from hood.steppers.network import build_simulator
 

@@ -12,7 +12,7 @@ from reference_oracle import make_state
 from safetensors import safe_open
 
 from hood.cli.main import main
-from hood.rollouts.file.recorder import read_rollout
+from hood.rollouts.file.reader import read_rollout
 from hood.steppers.checkpoint import load_simulator, read_header
 
 

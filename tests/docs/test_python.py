@@ -9,7 +9,7 @@ import pytest
 from pages import EXTENDING, EXTENDING_HAS_A_TEST, PAGES, ROOT, blocks
 
 from hood.cli.main import main
-from hood.rollouts.file.recorder import read_rollout
+from hood.rollouts.file.reader import read_rollout
 
 #: Pages whose blocks run as they stand; the tutorial's need the files of its commands.
 ELSEWHERE = {"tutorial.md", *([EXTENDING] if EXTENDING_HAS_A_TEST else [])}

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hood.media.beside import Panel, SideBySide, require_same_motion
-from hood.rollouts.file.recorder import RolloutData
+from hood.rollouts.file.reader import RolloutData
 from hood.testing import cylinder, sphere
 
 needs_pillow = pytest.mark.skipif(importlib.util.find_spec("PIL") is None, reason="needs Pillow")

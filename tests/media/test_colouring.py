@@ -10,7 +10,7 @@ import pytest
 
 from hood.media.colouring import colouring_of, skin_distance, vertex_strain
 from hood.media.film import Film
-from hood.rollouts.file.recorder import RolloutData
+from hood.rollouts.file.reader import RolloutData
 from hood.testing import cylinder, sphere
 
 needs_pillow = pytest.mark.skipif(importlib.util.find_spec("PIL") is None, reason="needs Pillow")

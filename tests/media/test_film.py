@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hood.media.film import Film, drawn
-from hood.rollouts.file.recorder import RolloutData
+from hood.rollouts.file.reader import RolloutData
 from hood.testing import cylinder, sphere
 
 pytest.importorskip("PIL")

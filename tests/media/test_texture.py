@@ -15,7 +15,7 @@ from hood.media.renderer import raster, render, shading
 from hood.media.renderer import raster as drawing
 from hood.media.renderer.camera import Camera
 from hood.media.renderer.render import Print, RenderMesh, pixels_of, render_frame
-from hood.rollouts.file.recorder import RolloutData
+from hood.rollouts.file.reader import RolloutData
 
 RED, GREEN, BLUE, WHITE = (255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 255)
 #: Left to right, the top row first.

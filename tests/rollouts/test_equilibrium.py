@@ -24,7 +24,8 @@ from hood.energies.problem import StepProblem
 from hood.mesh.penetration.crossing import crossings
 from hood.rollouts import equilibrium
 from hood.rollouts.equilibrium import Rest, find_equilibrium, without_hold
-from hood.rollouts.loop import SETTLE_CHOICES, SETTLE_METRICS, Frame, metric_names, own_start, simulate
+from hood.rollouts.frame import SETTLE_CHOICES, SETTLE_METRICS, Frame, metric_names
+from hood.rollouts.loop import own_start, simulate
 from hood.scene.body_motion.mesh_motion import NoBody, mesh_motion
 from hood.scene.scene import Scene, build_scene, dress
 from hood.solver import retry

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from hood.cloth.state import State
 from hood.rollouts.file.step_table import OutputRate
+from hood.rollouts.frame import Frame
 from hood.rollouts.frames import hermite, output_frames
-from hood.rollouts.loop import Frame
 
 Path = Callable[[Tensor], Tensor]
 

@@ -18,8 +18,9 @@ from hood.cloth.state import Attachments
 from hood.contact import contact
 from hood.energies.potential import default_potential
 from hood.model.graph.builder import MESH, Graph
-from hood.rollouts.file.recorder import read_rollout
-from hood.rollouts.loop import METRIC_CHOICES, Frame, metric_names, simulate, start_state
+from hood.rollouts.file.reader import read_rollout
+from hood.rollouts.frame import METRIC_CHOICES, Frame, metric_names
+from hood.rollouts.loop import simulate, start_state
 from hood.scene.scene import Scene, build_scene
 from hood.steppers.network import Simulator, build_simulator
 from tests.verdict.table.scene import run

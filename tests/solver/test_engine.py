@@ -21,7 +21,7 @@ from hood.native import build as native_build
 from hood.native.build import BuildError
 from hood.solver import newton
 from hood.solver.compiled import newton as engine
-from hood.solver.compiled.newton import EngineSystem, SceneEngine
+from hood.solver.compiled.system import EngineSystem, SceneEngine
 from hood.solver.newton import NewtonSettings, TorchSystem, minimize
 from hood.solver.system.iterate import Unknowns
 from hood.solver.system.plan import plan_for, quadratic_model
@@ -221,7 +221,7 @@ def test_without_a_float64_form_the_step_ends_where_it_is(monkeypatch):
             raise BuildError("no C++ compiler")
         return single
 
-    monkeypatch.setattr(engine, "library", gone)
+    monkeypatch.setattr("hood.solver.compiled.system.library", gone)
     monkeypatch.setattr(scene, "move", lambda *args: False)
     assert system.move(residual, [True]) == [False]
     assert not scene.wide

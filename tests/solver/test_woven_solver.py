@@ -18,7 +18,7 @@ from hood.energies.inertia import Gravity, Inertia
 from hood.energies.membrane import Stretching
 from hood.energies.potential import Potential, default_potential
 from hood.energies.problem import StepProblem
-from hood.solver.compiled.newton import EngineSystem
+from hood.solver.compiled.system import EngineSystem
 from hood.solver.derivatives.elements import Corners, face_constants, face_model
 from hood.solver.newton import NewtonSettings, minimize
 from hood.solver.system.iterate import Unknowns

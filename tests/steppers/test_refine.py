@@ -12,7 +12,8 @@ from torch import Tensor
 
 from hood.energies.potential import default_potential, reference_potential
 from hood.energies.problem import StepProblem
-from hood.rollouts.loop import Frame, metric_names, simulate, start_state
+from hood.rollouts.frame import Frame, metric_names
+from hood.rollouts.loop import simulate, start_state
 from hood.scene.scene import Scene
 from hood.solver.system.iterate import Unknowns, first_iterate, in_double
 from hood.steppers.network import Prediction, build_simulator

@@ -9,7 +9,8 @@ from hood.assets.body.body import Body
 from hood.assets.garment.garment import Garment
 from hood.assets.motion.load import load_sequence
 from hood.energies.potential import default_potential
-from hood.rollouts.loop import metric_names, simulate
+from hood.rollouts.frame import metric_names
+from hood.rollouts.loop import simulate
 from hood.scene.scene import Scene, build_scene
 from hood.solver.newton import NewtonSettings
 from hood.steppers.newton import NewtonStepper

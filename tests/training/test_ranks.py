@@ -21,7 +21,7 @@ from hood.assets.body.load import load_body
 from hood.assets.garment.garment import load_garment
 from hood.assets.motion.load import load_sequence
 from hood.energies.potential import default_potential
-from hood.rollouts.file.recorder import read_rollout
+from hood.rollouts.file.reader import read_rollout
 from hood.steppers.network import build_simulator
 from hood.training import distributed
 from hood.training.curriculum import CollisionRamp, Horizon, WarmupCosine

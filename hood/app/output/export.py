@@ -23,7 +23,7 @@ from hood.media.exports.clip import PARTS, Clip, clip_of
 from hood.media.exports.gltf import gltf_bytes
 from hood.media.exports.sequences import write_obj_sequence, write_ply_sequence, write_point_cache
 from hood.media.exports.usd import image_name, write_usd
-from hood.rollouts.file.recorder import RolloutData, read_rollout
+from hood.rollouts.file.reader import RolloutData, read_rollout
 
 _SUFFIXES = {"usd": (".usd", ".usdc", ".usda"), "glb": (".glb",)}
 _FOLDERS: dict[str, Callable[[Path, Clip], None]] = {

@@ -18,10 +18,10 @@ from torch import Tensor
 from hood.app.scene.motion import motion_options
 from hood.app.settings.compose import ConfigError, shown
 from hood.mesh.editing.subdivision import Subdivision
-from hood.rollouts.file.recorder import RolloutData
+from hood.rollouts.file.reader import RolloutData
 from hood.rollouts.file.step_table import OutputRate, StepPlan
+from hood.rollouts.frame import Frame
 from hood.rollouts.frames import output_frames, refined_frames
-from hood.rollouts.loop import Frame
 from hood.scene.body_motion.load import load_motion
 from hood.scene.jumps import find_jumps
 from hood.scene.scene import Scene

@@ -23,7 +23,7 @@ from hood.app.scene.events import describe_fasteners, summarise_fasteners
 from hood.app.stepping.cloth_contact import describe_cloth_contact, summarise_cloth_contact
 from hood.app.stepping.guarding import summarise_guard
 from hood.app.stepping.refinement import describe_refinement, summarise_refinement
-from hood.rollouts.file.recorder import read_rollout
+from hood.rollouts.file.reader import read_rollout
 from hood.solver.step_figures import MET, count_reasons, name_counts
 
 

@@ -13,7 +13,8 @@ from hood.assets.files.library import unknown
 from hood.assets.formats.image import Texture, read_texture
 from hood.assets.garment.garment import Garment
 from hood.media.pieces import Piece, pieces_by, pieces_of, plain_name
-from hood.rollouts.file.recorder import RolloutData, still_of
+from hood.rollouts.file.reader import RolloutData
+from hood.rollouts.file.recorder import still_of
 
 #: The one image of all garments.
 _EVERY = ""

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from hood.limits import CUT_UNSOUND
-from hood.rollouts.file.recorder import RolloutData
+from hood.rollouts.file.reader import RolloutData
 from hood.rollouts.verdict.frames import worst_frame
 from hood.rollouts.verdict.rule import judge_rollout
 

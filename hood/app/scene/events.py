@@ -21,7 +21,7 @@ from torch import Tensor
 from hood.app.settings.compose import ConfigError, plain
 from hood.assets.files.library import unknown
 from hood.assets.garment.pins import pin_mask
-from hood.rollouts.file.recorder import RolloutData
+from hood.rollouts.file.reader import RolloutData
 from hood.scene.body_motion.motion import BodyMotion
 from hood.scene.holding import CLOSED, SPEED, Event, Grasp, Holding, first_step
 from hood.scene.scene import Scene

@@ -15,7 +15,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from hood.app.settings.compose import ConfigError, brief, plain, require_choice, shown
-from hood.assets.body.parts import body_part
+from hood.assets.body.body import body_part
 from hood.assets.files.library import names
 from hood.assets.motion.animated_mesh import body_kind
 from hood.assets.motion.load import HANDS

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import copy
-import json
 import math
-import platform
 import re
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import yaml
 from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
@@ -22,8 +19,6 @@ from omegaconf.errors import OmegaConfBaseException
 
 from hood.app.settings.old_targets import rename_targets
 from hood.app.settings.overrides import decoded, decoded_text, is_coded, loop, parse, quoted, readable
-from hood.assets.files.atomic import write_atomically
-from hood.assets.files.guarded import check_size
 from hood.assets.files.library import unknown
 from hood.plugins import config_folders, packages, without_options
 
@@ -46,8 +41,8 @@ _KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: 
 _SHORT_NOTE = 160
 #: Characters of a value that a message repeats at most.
 _BRIEF = 100
-#: Bytes of a run's record at most, levels of its nesting, and characters of a reason why it is none.
-_RECORD_LIMIT, _DEEPEST, _REASON = 1 << 20, 32, 300
+#: Characters of a reason why something cannot be read.
+_REASON = 300
 #: Keys of a rollout that say which network takes the steps and how it computes, and how they are refined: who gives one means
 #: the network, unless another stepper is named.
 NETWORK_KEYS = ("checkpoint", "model", "precision", "kernels")
@@ -151,39 +146,6 @@ def plain(node: Any) -> Any:
     return OmegaConf.to_container(node, resolve=True) if isinstance(node, (DictConfig, ListConfig)) else node
 
 
-def read_record(path: Path) -> dict[str, Any]:
-    """The settings that a run left in its ``config.yaml``, as dicts, lists and scalars; nothing in them is resolved.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ConfigError: not such a record.
-    """
-    check_size(path, _RECORD_LIMIT)
-    content = path.read_bytes()
-    try:
-        text = content.decode("utf-8")
-        _require_plain(text)
-        record = OmegaConf.to_container(OmegaConf.create(text), resolve=False)
-    except (ValueError, yaml.YAMLError, OmegaConfBaseException, RecursionError) as error:
-        reason = _one_line(error)[:_REASON]
-        raise ConfigError(f"{path}: not the record of a run ({reason}); use another output") from error
-    if not isinstance(record, dict):
-        raise ConfigError(f"{path}: not the record of a run (it holds no keys); use another output")
-    rename_targets(record)
-    return {str(key): value for key, value in record.items()}
-
-
-def _require_plain(text: str) -> None:
-    """Refuse YAML that takes long to build: references to references multiply, and deep nesting costs its square."""
-    depth = 0
-    for event in yaml.parse(text, yaml.SafeLoader):
-        if isinstance(event, yaml.AliasEvent):
-            raise ConfigError("it holds references")
-        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-        if depth > _DEEPEST:
-            raise ConfigError(f"it is nested more than {_DEEPEST} deep")
-
-
 def notes(name: str) -> dict[str, str]:
     """The comments behind the keys of ``configs/<name>.yaml``: what ``--help`` says of each, ``a.b`` for a key in another."""
     found: dict[str, str] = {}
@@ -253,25 +215,6 @@ def with_words(config: DictConfig, words: Sequence[str]) -> DictConfig:
             raise ConfigError(f"{word}: no such key")
         OmegaConf.update(changed, said.key_or_group, decoded(said.value()), merge=False)
     return changed
-
-
-def save_run_record(folder: Path, config: DictConfig, seed: int) -> None:
-    """Write ``config.yaml`` (resolved) and ``versions.json`` (packages, platform, seed) into a run folder."""
-    from importlib.metadata import version
-
-    folder.mkdir(parents=True, exist_ok=True)
-    write_atomically(folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True).encode())
-    packages = {name: version(name) for name in ("torch", "numpy", "scipy", "h5py", "hydra-core", "safetensors")}
-    from hood import __version__
-
-    record = {
-        "hood": __version__,
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        **packages,
-        "seed": seed,
-    }
-    write_atomically(folder / "versions.json", json.dumps(record, indent=1).encode())
 
 
 def _check_override(name: str, text: str, defaults: DictConfig) -> tuple[str, Override]:

@@ -29,7 +29,8 @@ from hood.rollouts.checks.guard import (
     Guard,
 )
 from hood.rollouts.checks.step_repair import LEFT, REFINED, SOLVED
-from hood.rollouts.file.recorder import RolloutData, RolloutWriter
+from hood.rollouts.file.reader import RolloutData
+from hood.rollouts.file.recorder import RolloutWriter
 from hood.rollouts.verdict.frames import name_frames
 from hood.steppers.newton import Stepper
 

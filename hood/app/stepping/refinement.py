@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 from hood.app.settings.compose import ConfigError, brief, build, plain, require_choice
 from hood.app.stepping.steppers import ALWAYS, NEVER, losses_of, option_of
 from hood.energies.potential import Potential
-from hood.rollouts.loop import FIELD_CHOICES
+from hood.rollouts.frame import FIELD_CHOICES
 from hood.solver.step_figures import count_reasons, name_counts
 from hood.steppers.newton import Stepper
 from hood.steppers.refined import METHODS, RefinedStepper

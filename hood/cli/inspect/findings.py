@@ -36,7 +36,7 @@ from hood.cli.inspect.garment import describe_made, describe_objects, describe_p
 from hood.mesh.editing.quality import check_triangles
 from hood.mesh.editing.repair import Defects, find_defects
 from hood.mesh.topology import boundary_loops
-from hood.rollouts.file.recorder import read_rollout
+from hood.rollouts.file.reader import read_rollout
 from hood.rollouts.verdict.frames import worst_frame
 from hood.rollouts.verdict.rule import judge_rollout
 from hood.scene.body_motion.load import NO_MOTION, MotionOptions, load_motion

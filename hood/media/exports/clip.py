@@ -11,7 +11,7 @@ from hood.assets.formats.image import Texture
 from hood.media.exports.mesh import corner_normals
 from hood.media.pieces import part_colour, pieces_of
 from hood.media.renderer.render import BODY_COLOR
-from hood.rollouts.file.recorder import RolloutData
+from hood.rollouts.file.reader import RolloutData
 
 #: Farther from the origin than this [m] float32, which most formats hold, is no longer good to 2 µm.
 FAR = 32.0

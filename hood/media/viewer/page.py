@@ -22,7 +22,7 @@ from hood.assets.formats.image import Texture
 from hood.media.colouring import COLOURINGS, Colouring, colouring_of, colours_at
 from hood.media.film import seconds_per_frame
 from hood.media.pieces import outfit_colours, pieces_of, split_seams
-from hood.rollouts.file.recorder import RolloutData
+from hood.rollouts.file.reader import RolloutData
 from hood.scene.holding import first_step
 
 _ACTIONS = ("open", "close", "detach", "attach")

@@ -18,7 +18,8 @@ from torch import Tensor, nn
 from hood.contact.contact import Contact
 from hood.mesh.closest_point.search import build_incidence
 from hood.model.features import local, physical
-from hood.model.features.groups import Columns, FeatureSet, Normal
+from hood.model.features.feature_set import Columns, FeatureSet
+from hood.model.features.groups import Normal
 from hood.model.features.inputs import EdgeRows, Inputs
 from hood.model.graph.static_shapes import FixedGraph
 from hood.native import features as native

@@ -9,7 +9,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from hood.model.features.groups import EdgeGroup, FeatureSet, NodeGroup, cloth_difference
+from hood.model.features.feature_set import FeatureSet
+from hood.model.features.groups import EdgeGroup, NodeGroup, cloth_difference
 from hood.model.features.inputs import Inputs
 from hood.model.features.normalizer import FixedScale
 from hood.model.features.physical import GRAVITY, ContactDistance, Residual, length, mean_rest_length, physical

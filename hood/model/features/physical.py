@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from hood.model.features.feature_set import FeatureSet
 from hood.model.features.groups import (
     EdgeGroup,
-    FeatureSet,
     NodeGroup,
     Normal,
     body_difference,

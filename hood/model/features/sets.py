@@ -6,8 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from hood import plugins
-from hood.model.features import groups, local, physical
-from hood.model.features.groups import EdgeGroup, FeatureSet, NodeGroup
+from hood.model.features import local, physical
+from hood.model.features.feature_set import FeatureSet, paper
+from hood.model.features.groups import EdgeGroup, NodeGroup
 
 #: Groups of plugins, see :mod:`hood.plugins`: classes that take no arguments.
 PLUGINS = "features"
@@ -22,7 +23,7 @@ class SetSettings:
         layers: with edges between layers of cloth.
         together: with what all vertices together would do (``local``).
         of_edges: and what that would make of edges.
-        body_velocity, decay, divisor_floor: of ``paper``, see :func:`hood.model.features.groups.paper`.
+        body_velocity, decay, divisor_floor: of ``paper``, see :func:`hood.model.features.paper`.
     """
 
     num_levels: int
@@ -38,7 +39,7 @@ Groups = list[NodeGroup | EdgeGroup]
 
 
 def _paper(of: SetSettings, more: Groups) -> FeatureSet:
-    return groups.paper(of.num_levels, of.body_velocity, of.decay, of.divisor_floor, of.layers, more)
+    return paper(of.num_levels, of.body_velocity, of.decay, of.divisor_floor, of.layers, more)
 
 
 def _physical(of: SetSettings, more: Groups) -> FeatureSet:

@@ -57,7 +57,7 @@ class Output(ABC, nn.Module):
     needs_contact: ClassVar[bool] = False  # of the problem that ``base`` is asked for
     width: ClassVar[int] = 3  # columns of the raw output of vertices
     edge_width: ClassVar[int] = 0  # and of mesh edges
-    #: Feature sets that tell the network enough (:data:`hood.model.features.sets.SETS`).
+    #: Feature sets that tell the network enough (:data:`hood.model.parts.SETS`).
     feature_sets: ClassVar[tuple[str, ...]] = ("paper", "physical", "local")
     #: Whether schedules of several passes can be taken, and columns of nodes and edges that are seen between them.
     several_passes: ClassVar[bool] = False

@@ -18,7 +18,7 @@ from hood.limits import CROSSINGS_SEEN, CROSSINGS_UNSOUND, DISTANCE_UNSOUND, GRA
 from hood.mesh.topology import unique_edges
 from hood.rollouts.checks.guard import CHECK, CUT, FORCE, INSIDE, STRAIN
 from hood.rollouts.checks.step_repair import LEFT, NOT_TRIED
-from hood.rollouts.file.recorder import RolloutData
+from hood.rollouts.file.reader import RolloutData
 from hood.rollouts.verdict.frames import Cause, Found, mask_of, name_frames
 from hood.rollouts.verdict.skin import skin_causes
 from hood.rollouts.verdict.surface import Meshes, surface_metrics, visible, visible_crossings

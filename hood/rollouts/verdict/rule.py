@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from hood.limits import DEPTH_GROSS, SETTLING, STRAIN_TORN, TOLERATED
-from hood.rollouts.file.recorder import RolloutData
+from hood.rollouts.file.reader import RolloutData
 from hood.rollouts.verdict.causes import causes_of, strain_of, unknown_steps
 from hood.rollouts.verdict.frames import Cause, name_frames, runs_of, worst_frame
 from hood.rollouts.verdict.surface import meshes_of

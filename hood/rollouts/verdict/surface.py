@@ -21,7 +21,7 @@ from hood.mesh.penetration.compiled import Eights, eights
 from hood.mesh.penetration.crossing import crossings, self_crossings
 from hood.mesh.penetration.exposure import Sheet, skin_depth
 from hood.mesh.topology import unique_edges
-from hood.rollouts.file.recorder import RolloutData
+from hood.rollouts.file.reader import RolloutData
 
 SURFACE_METRICS = ("cut_face_share", "cut_edge_share", "skin_depth", "self_crossings", "garment_crossings", "cut_in_folds")
 #: Frames from one measurement to the next: less than 1 ms a frame at 1,000 vertices, 1 ms at 12,000.

@@ -16,7 +16,8 @@ from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem
 from hood.native.build import BuildError
 from hood.solver.compiled import newton
-from hood.solver.compiled.newton import SceneEngine, engine_step
+from hood.solver.compiled.newton import engine_step
+from hood.solver.compiled.system import SceneEngine
 from hood.solver.compiled.tables import build_tables
 from hood.solver.vertex.block_jacobi import LocalTerms, LocalView
 from hood.solver.vertex.cg_step import STEPS

@@ -19,11 +19,12 @@ from tqdm import tqdm
 
 from hood.app.common import held_folder, require_distinct, require_same_config, together
 from hood.app.output.verdict import surface_warnings
-from hood.app.settings.compose import ConfigError, load_config, save_run_record, shown
+from hood.app.settings.compose import ConfigError, load_config, shown
+from hood.app.settings.record import save_run_record
 from hood.assets.files.atomic import write_atomically
 from hood.evaluation.files import write_rows
 from hood.evaluation.table import NEWTON
-from hood.rollouts.file.recorder import read_rollout
+from hood.rollouts.file.reader import read_rollout
 from hood.rollouts.verdict.rule import judge_rollout
 from hood.studies.envelope.cells import NOMINAL
 from hood.studies.envelope.judge import FIGURES, Criteria, Run, at_same_times, figures, judge, shares, table, usual_of

@@ -22,7 +22,7 @@ from hood.assets.files.atomic import write_atomically
 from hood.limits import CUT_UNSOUND
 from hood.media.film import Film, sheet_frames
 from hood.media.renderer.render import contact_sheet
-from hood.rollouts.file.recorder import RolloutData, read_rollout
+from hood.rollouts.file.reader import RolloutData, read_rollout
 from hood.studies.envelope.judge import CLASSES, DEGRADED, FAILED, FIGURES, REFUSED, SILENT, SOUND, Criteria, Judged, shares
 from hood.studies.envelope.prose import ranges
 from hood.studies.page import paragraph, section, table, whole_page

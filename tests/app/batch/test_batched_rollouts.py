@@ -15,7 +15,7 @@ from hood.app import rollout
 from hood.app.batch.batch import Job, find_jobs, share
 from hood.app.settings.compose import ConfigError
 from hood.cli.main import main
-from hood.rollouts.file.recorder import read_rollout
+from hood.rollouts.file.reader import read_rollout
 
 UNTRAINED = ["checkpoint=untrained", "model=small", "model.latent_dim=4", "model.schedule='1x(mesh)'"]
 ROLLOUT = ["rollout", *UNTRAINED, "garment=tank", "num_frames=2", "video=none", "sheet=false", "sequence=motions", "output=out"]

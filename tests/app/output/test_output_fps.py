@@ -16,7 +16,7 @@ from hood.cli.inspect.findings import inspect_rollout
 from hood.cli.main import main
 from hood.media.exports.clip import clip_of
 from hood.media.film import seconds_per_frame
-from hood.rollouts.file.recorder import RolloutData, read_rollout
+from hood.rollouts.file.reader import RolloutData, read_rollout
 from hood.scene.body_motion.load import MotionOptions, load_motion
 from hood.studies.envelope.extreme_files import write_motion
 from hood.testing import grid

@@ -22,9 +22,9 @@ from hood.media.exports.clip import clip_of
 from hood.mesh.editing.subdivision import Subdivision
 from hood.mesh.penetration.crossing import self_crossings
 from hood.mesh.topology import unique_edges
-from hood.rollouts.file.recorder import RolloutData, read_rollout
+from hood.rollouts.file.reader import RolloutData, read_rollout
+from hood.rollouts.frame import Frame
 from hood.rollouts.frames import refined_frames
-from hood.rollouts.loop import Frame
 from hood.rollouts.verdict.rule import judge_rollout
 from hood.testing import cylinder, grid
 

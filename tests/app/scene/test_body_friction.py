@@ -11,7 +11,7 @@ from hood.app.scene.motion import checked_friction
 from hood.app.settings.compose import ConfigError, load_config
 from hood.app.setup import make_scene
 from hood.cli.main import main
-from hood.rollouts.file.recorder import read_rollout
+from hood.rollouts.file.reader import read_rollout
 
 SHORT = ["garment=skirt", "sequence=plie", "stepper=newton", "num_frames=4", "video=none", "sheet=false"]
 

@@ -35,7 +35,7 @@ from hood.cli.inspect.findings import inspect_garment
 from hood.cli.main import main
 from hood.media.colouring import vertex_strain
 from hood.mesh.topology import boundary_loops
-from hood.rollouts.file.recorder import RolloutData, read_rollout
+from hood.rollouts.file.reader import RolloutData, read_rollout
 from hood.rollouts.verdict.rule import judge_rollout
 
 ROLLOUT = ("rollout", "stepper=newton", "num_frames=2", "video=none", "sheet=false", "output=run")

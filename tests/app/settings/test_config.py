@@ -7,17 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from hood.app.settings.compose import (
-    ConfigError,
-    build,
-    groups,
-    load_config,
-    options,
-    plain,
-    require_choice,
-    save_run_record,
-    with_words,
-)
+from hood.app.settings.compose import ConfigError, build, groups, load_config, options, plain, require_choice, with_words
+from hood.app.settings.record import save_run_record
 from hood.assets.material import Material
 from hood.energies.potential import Potential, default_potential
 from hood.steppers.network import Simulator

@@ -15,7 +15,7 @@ from hood.app.stepping.guarding import guard_sentence
 from hood.cli.main import main
 from hood.rollouts.checks.guard import CUT, FORCE, INSIDE, STRAIN, TURN, Alarm
 from hood.rollouts.checks.step_repair import LEFT, REFINED
-from hood.rollouts.file.recorder import read_rollout
+from hood.rollouts.file.reader import read_rollout
 
 CHEAP = ["rollout", "stepper=refine", "refine=20", "metrics=none", "garment=belt.obj", "sequence=walk.npz", "video=none",
          "sheet=false", "output=out"]  # fmt: skip

@@ -10,7 +10,7 @@ import pytest
 
 from hood.app.stepping.refinement import describe_refinement, summarise_refinement
 from hood.cli.main import main
-from hood.rollouts.file.recorder import read_rollout
+from hood.rollouts.file.reader import read_rollout
 
 UNTRAINED = ["checkpoint=untrained", "model=small", "model.latent_dim=4", "model.schedule='1x(mesh)'"]
 SHORT = ["rollout", *UNTRAINED, "garment=tank", "num_frames=4", "video=none", "sheet=false", "output=run"]

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hood.assets.body.body import JOINTS, Body
-from hood.assets.body.parts import body_part
+from hood.assets.body.body import JOINTS, Body, body_part
 
 
 def part(name: str, body: Body) -> np.ndarray:

@@ -18,7 +18,7 @@ from hood.assets.motion.sequence import PoseSequence
 from hood.assets.motion.sequence_edit import arms_down
 from hood.cli.main import main
 from hood.mesh import geometry, topology
-from hood.rollouts.file.recorder import read_rollout
+from hood.rollouts.file.reader import read_rollout
 from hood.scene.scene import build_scene
 from hood.testing import cylinder
 

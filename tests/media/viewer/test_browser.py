@@ -19,7 +19,7 @@ from hood.assets.formats.image import Texture
 from hood.media.renderer.camera import Camera
 from hood.media.renderer.render import RenderMesh, render_frame
 from hood.media.viewer.page import view_page
-from hood.rollouts.file.recorder import RolloutData
+from hood.rollouts.file.reader import RolloutData
 from hood.testing import cylinder, sphere
 from tools.browser import Browser
 

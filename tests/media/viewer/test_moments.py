@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hood.media.viewer.page import moments_of, shared_moments, wind_of
-from hood.rollouts.file.recorder import RolloutData
+from hood.rollouts.file.reader import RolloutData
 from hood.rollouts.file.step_table import OutputRate, Steps
 
 

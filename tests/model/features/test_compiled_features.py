@@ -8,8 +8,8 @@ from test_local_features import make_inputs
 from torch import Tensor
 
 from hood.cloth.state import State
-from hood.model.features import compiled, groups, physical
-from hood.model.features.groups import FeatureSet
+from hood.model.features import compiled, feature_set, physical
+from hood.model.features.feature_set import FeatureSet
 from hood.model.features.inputs import Inputs
 from hood.model.features.local import local, look
 from hood.native import features as native
@@ -51,7 +51,7 @@ def test_columns_are_those_of_torch(name: str, request: pytest.FixtureRequest) -
     inputs = moving_inputs(request.getfixturevalue(name))
     both(local(2), inputs)
     both(physical.physical(3), inputs)
-    both(groups.paper(3).eval(), inputs)  # groups that the library does not know
+    both(feature_set.paper(3).eval(), inputs)  # groups that the library does not know
 
 
 @needs_compiler
@@ -68,7 +68,7 @@ def test_columns_of_a_cloth_are_not_those_of_another(band_scene: Scene, tank_sce
 def test_a_step_without_a_body_and_without_contact(band_scene: Scene) -> None:
     inputs = moving_inputs(band_scene)
     both(local(2), replace(inputs, contact=None))
-    free = groups.BODY
+    free = feature_set.BODY
     empty = {key: value[:0] for key, value in vars(inputs.body_edges).items() if isinstance(value, Tensor)}
     sets = {**inputs.graph.edge_sets, free: replace(inputs.body_edges, **empty)}
     graph = replace(inputs.graph, edge_sets=sets, body_vertex=inputs.graph.body_vertex[:0])

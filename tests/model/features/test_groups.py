@@ -9,7 +9,7 @@ from hood.assets.material import RANGES, Material
 from hood.cloth.cloth import build_cloth, concatenate_cloths
 from hood.cloth.state import Obstacle, State, StepInput, concatenate_obstacles, concatenate_states
 from hood.contact.contact import Contact
-from hood.model.features import groups, local, physical
+from hood.model.features import feature_set, groups, local, physical
 from hood.model.features.inputs import Inputs
 from hood.model.graph.builder import build_graph, build_static
 from hood.model.graph.hierarchy import Hierarchy, concatenate_hierarchies
@@ -49,15 +49,19 @@ def make_inputs(base: bool = True, shift: float = 0.0, dt: float = DT) -> Inputs
 
 
 def test_widths_are_the_papers():
-    assert (groups.paper(3).node_width, groups.paper(1).node_width) == (24, 20)
-    assert groups.paper().edge_widths == {"mesh": 12, "coarse": 12, "body": 9}
-    normalizers = groups.paper().node_normalizer, groups.paper().edge_normalizer, groups.paper().body_edge_normalizer
+    assert (feature_set.paper(3).node_width, feature_set.paper(1).node_width) == (24, 20)
+    assert feature_set.paper().edge_widths == {"mesh": 12, "coarse": 12, "body": 9}
+    normalizers = (
+        feature_set.paper().node_normalizer,
+        feature_set.paper().edge_normalizer,
+        feature_set.paper().body_edge_normalizer,
+    )
     assert [n.width for n in normalizers] == [21, 9, 9]
-    embeddings = sum(p.numel() for p in groups.paper(3).parameters())
+    embeddings = sum(p.numel() for p in feature_set.paper(3).parameters())
     assert embeddings == 9 * 9 + 3 * 4
 
 
-@pytest.mark.parametrize("make", [groups.paper, physical.physical])
+@pytest.mark.parametrize("make", [feature_set.paper, physical.physical])
 def test_features_have_the_widths_they_promise(make):
     features, inputs = make(2).double(), make_inputs()
     nodes, edges = features(inputs)
@@ -72,7 +76,7 @@ def test_features_have_the_widths_they_promise(make):
 
 
 def test_node_features_of_the_paper_by_hand():
-    features, inputs = groups.paper(2).double().eval(), make_inputs()
+    features, inputs = feature_set.paper(2).double().eval(), make_inputs()
     nodes, _ = features(inputs)  # identity normaliser: no statistics yet
     types, levels = features.node[1].table.weight, features.node[2].table.weight
     assert nodes[1, :3].tolist() == pytest.approx([0, 0, 0.1])
@@ -91,15 +95,15 @@ def test_node_features_of_the_paper_by_hand():
 
 
 def test_body_velocity_can_be_the_next_displacement():
-    nodes, _ = groups.paper(1, body_velocity="next").double().eval()(make_inputs())
+    nodes, _ = feature_set.paper(1, body_velocity="next").double().eval()(make_inputs())
     assert nodes[4, :3].tolist() == pytest.approx([0.01] * 3)
     with pytest.raises(ValueError, match="'previous' or 'next'"):
-        groups.paper(body_velocity="later")
+        feature_set.paper(body_velocity="later")
 
 
 def test_edge_features_of_the_paper_by_hand():
     inputs = make_inputs()
-    _, edges = groups.paper(2).double().eval()(inputs)
+    _, edges = feature_set.paper(2).double().eval()(inputs)
     mesh = inputs.graph.edge_sets["mesh"]
     row = next(i for i in range(mesh.num_edges) if (mesh.senders[i], mesh.receivers[i]) == (1, 0))
     norm = (1 + 0.1**2) ** 0.5
@@ -115,7 +119,7 @@ def test_edge_features_of_the_paper_by_hand():
 
 def test_relaxing_step_is_told_by_the_timestep_feature_alone():
     inputs = replace(make_inputs(), timestep=torch.tensor([1 / 3], dtype=torch.float64))
-    nodes, edges = groups.paper(2).double().eval()(inputs)
+    nodes, edges = feature_set.paper(2).double().eval()(inputs)
     assert nodes[1, 2].item() == pytest.approx(0.1)  # displacement of the true dt
     assert nodes[:, 19].tolist() == pytest.approx([1 / 3] * 5)
     assert edges["mesh"][:, 8].unique().item() == pytest.approx(1 / 3)
@@ -144,7 +148,7 @@ def test_physical_features_need_a_base():
         physical.physical(2)(make_inputs(base=False))
 
 
-@pytest.mark.parametrize("features", [groups.paper(2).double().eval(), physical.physical(2)])
+@pytest.mark.parametrize("features", [feature_set.paper(2).double().eval(), physical.physical(2)])
 def test_features_do_not_depend_on_where_the_scene_is(features):
     here, there = features(make_inputs()), features(make_inputs(shift=3.0))
     torch.testing.assert_close(there[0], here[0], atol=1e-10, rtol=0)
@@ -152,7 +156,7 @@ def test_features_do_not_depend_on_where_the_scene_is(features):
         torch.testing.assert_close(there[1][name], here[1][name], atol=1e-10, rtol=0)
 
 
-@pytest.mark.parametrize("features", [groups.paper(2).double().eval(), physical.physical(2)])
+@pytest.mark.parametrize("features", [feature_set.paper(2).double().eval(), physical.physical(2)])
 def test_batch_equals_singles(features):
     single, other = make_inputs(), make_inputs(shift=1.0, dt=1 / 60)
     items = [single, other]
@@ -180,19 +184,19 @@ def test_massless_and_unbending_cloth_has_finite_features():
     mass = inputs.cloth.mass.clone()
     mass[1] = 0.0
     inputs = replace(inputs, cloth=replace(inputs.cloth, vertex_fabric=fabric, edge_fabric=fabric[[0] * 5], mass=mass))
-    for features in (groups.paper(2).double(), physical.physical(2)):
+    for features in (feature_set.paper(2).double(), physical.physical(2)):
         nodes, edges = features(inputs)
         assert all(torch.isfinite(t).all() for t in (nodes, *edges.values()))
 
 
 def test_unnormalised_groups_come_last():
     with pytest.raises(ValueError, match="move the latter to the end"):
-        groups.FeatureSet([groups.NodeMaterial(), groups.Normal()], [groups.EdgeTimestep()], [groups.BodyTimestep()])
+        feature_set.FeatureSet([groups.NodeMaterial(), groups.Normal()], [groups.EdgeTimestep()], [groups.BodyTimestep()])
 
 
 EVERY_GROUP = [
     group
-    for features in (groups.paper(2, layers=True), physical.physical(2, layers=True), local.local(2, together=True))
+    for features in (feature_set.paper(2, layers=True), physical.physical(2, layers=True), local.local(2, together=True))
     for rows in (features.node, features.edge, features.body_edge, features.layer_edge)
     for group in rows
 ]

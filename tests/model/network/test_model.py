@@ -11,7 +11,7 @@ from hood.assets.material import Material
 from hood.cloth.cloth import build_cloth, concatenate_cloths
 from hood.cloth.state import Obstacle, StepInput
 from hood.contact.contact import Contact
-from hood.model.features import groups
+from hood.model.features import feature_set
 from hood.model.graph.builder import Graph, Subset, build_graph, build_static, edge_set
 from hood.model.graph.hierarchy import build_hierarchy, concatenate_hierarchies
 from hood.model.network.message_passing import ProcessorStep
@@ -77,7 +77,7 @@ def make_net(schedule: str = SHORT, latent_dim: int = 8, **options) -> MeshGraph
 )
 def test_parameter_counts_at_latent_128(schedule, num_levels, expected):
     with torch.device("meta"):
-        features = groups.paper(num_levels)
+        features = feature_set.paper(num_levels)
         network = MeshGraphNet(features.node_width, features.edge_widths, 128, schedule)
     assert network.num_parameters() + sum(p.numel() for p in features.parameters()) == expected
 

@@ -47,7 +47,8 @@ from hood.rollouts.checks.step_repair import (
     repair_step,
     step_quality,
 )
-from hood.rollouts.loop import Frame, metric_names, simulate
+from hood.rollouts.frame import Frame, metric_names
+from hood.rollouts.loop import simulate
 from hood.scene.scene import Scene, build_scene
 from hood.solver.newton import NewtonSettings
 from hood.steppers.network import Prediction

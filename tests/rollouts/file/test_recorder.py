@@ -12,7 +12,8 @@ import h5py
 import numpy as np
 import pytest
 
-from hood.rollouts.file.recorder import RolloutData, RolloutWriter, read_rollout
+from hood.rollouts.file.reader import RolloutData, read_rollout
+from hood.rollouts.file.recorder import RolloutWriter
 from hood.rollouts.file.step_table import OutputRate, StepPlan
 
 NAMES = ("strain_p99", "energy_total")
@@ -188,7 +189,7 @@ READER = """
 import sys, time
 import numpy as np
 from pathlib import Path
-from hood.rollouts.file.recorder import read_rollout
+from hood.rollouts.file.reader import read_rollout
 path, seen, polls, complete = Path(sys.argv[1]), 0, 0, False
 while not complete:
     try:

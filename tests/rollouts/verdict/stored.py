@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hood.rollouts.file.recorder import RolloutData
+from hood.rollouts.file.reader import RolloutData
 
 NO_BODY = np.zeros((0, 3), dtype=np.int32)
 

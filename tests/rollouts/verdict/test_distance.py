@@ -14,7 +14,8 @@ from hood.cloth.cloth import build_cloth
 from hood.energies.potential import default_potential
 from hood.energies.problem import StepProblem
 from hood.energies.self_contact import LayerBarrier, LayerSides
-from hood.rollouts.loop import metric_names, simulate
+from hood.rollouts.frame import metric_names
+from hood.rollouts.loop import simulate
 from hood.rollouts.verdict.distance import DISTANCE_METRICS, distance_metrics, estimate
 from hood.scene.scene import Scene
 from hood.solver.newton import NewtonSettings, minimize

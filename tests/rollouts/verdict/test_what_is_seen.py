@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from stored import frames, stored, tube
 
 from hood.mesh.penetration.crossing import crossings
-from hood.rollouts.file.recorder import RolloutData
+from hood.rollouts.file.reader import RolloutData
 from hood.rollouts.verdict.rule import judge_rollout
 from hood.rollouts.verdict.skin import way_through
 from hood.rollouts.verdict.surface import meshes_of, sampled, surface_metrics, visible

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from stored import frames, stored, tube
 
 from hood.mesh.topology import unique_edges
-from hood.rollouts.file.recorder import RolloutData
+from hood.rollouts.file.reader import RolloutData
 from hood.rollouts.verdict.rule import Reason, judge_rollout
 from hood.rollouts.verdict.worn import measure_wear, num_through
 

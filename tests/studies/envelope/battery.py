@@ -18,8 +18,9 @@ from hood.app.stepping.guarding import guard_sentence, make_guard
 from hood.app.stepping.refinement import refined
 from hood.model.kernels.block import check_kernels
 from hood.rollouts.checks.guard import CUT
-from hood.rollouts.file.recorder import RolloutData
-from hood.rollouts.loop import Frame, simulate
+from hood.rollouts.file.reader import RolloutData
+from hood.rollouts.frame import Frame
+from hood.rollouts.loop import simulate
 from hood.rollouts.verdict.rule import judge_rollout
 from hood.scene.scene import Scene
 from hood.steppers.newton import Stepper

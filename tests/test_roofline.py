@@ -1,10 +1,14 @@
 """Kernels, bytes and operations of a function, and the time that follows from them."""
 
+import sys
+from pathlib import Path
+
 import pytest
 import torch
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from hood.steppers.static_shapes.roofline import DATA_SHEETS, Device, Kernel, Work, WorkCounter
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+from roofline import DATA_SHEETS, Device, Kernel, Work, WorkCounter
 
 
 def counted() -> Work:

@@ -1,0 +1,72 @@
+"""Settings that a run leaves in its folder, written and read back."""
+
+from __future__ import annotations
+
+import json
+import platform
+from pathlib import Path
+from typing import Any
+
+import yaml
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from hood.app.settings.compose import _REASON, ConfigError, _one_line
+from hood.app.settings.old_targets import rename_targets
+from hood.assets.files.atomic import write_atomically
+from hood.assets.files.guarded import check_size
+
+#: Bytes of a record at most, and levels of its nesting.
+_RECORD_LIMIT, _DEEPEST = 1 << 20, 32
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """The settings that a run left in its ``config.yaml``, as dicts, lists and scalars; nothing in them is resolved.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ConfigError: not such a record.
+    """
+    check_size(path, _RECORD_LIMIT)
+    content = path.read_bytes()
+    try:
+        text = content.decode("utf-8")
+        _require_plain(text)
+        record = OmegaConf.to_container(OmegaConf.create(text), resolve=False)
+    except (ValueError, yaml.YAMLError, OmegaConfBaseException, RecursionError) as error:
+        reason = _one_line(error)[:_REASON]
+        raise ConfigError(f"{path}: not the record of a run ({reason}); use another output") from error
+    if not isinstance(record, dict):
+        raise ConfigError(f"{path}: not the record of a run (it holds no keys); use another output")
+    rename_targets(record)
+    return {str(key): value for key, value in record.items()}
+
+
+def _require_plain(text: str) -> None:
+    """Refuse YAML that takes long to build: references to references multiply, and deep nesting costs its square."""
+    depth = 0
+    for event in yaml.parse(text, yaml.SafeLoader):
+        if isinstance(event, yaml.AliasEvent):
+            raise ConfigError("it holds references")
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > _DEEPEST:
+            raise ConfigError(f"it is nested more than {_DEEPEST} deep")
+
+
+def save_run_record(folder: Path, config: DictConfig, seed: int) -> None:
+    """Write ``config.yaml`` (resolved) and ``versions.json`` (packages, platform, seed) into a run folder."""
+    from importlib.metadata import version
+
+    folder.mkdir(parents=True, exist_ok=True)
+    write_atomically(folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True).encode())
+    packages = {name: version(name) for name in ("torch", "numpy", "scipy", "h5py", "hydra-core", "safetensors")}
+    from hood import __version__
+
+    record = {
+        "hood": __version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        **packages,
+        "seed": seed,
+    }
+    write_atomically(folder / "versions.json", json.dumps(record, indent=1).encode())
