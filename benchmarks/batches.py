@@ -31,7 +31,7 @@ from hood.energies.problem import StepProblem
 from hood.scene.scene import Scene, build_scene
 from hood.solver.newton import NewtonSettings, minimize
 from hood.steppers.checkpoint import load_simulator
-from hood.steppers.network import Simulator
+from hood.steppers.network import NetworkStepper
 
 SOLVERS = {"solver, 5 iterations": NewtonSettings(max_iterations=5), "solver, until 0.01": NewtonSettings(target_rg=1e-2)}
 
@@ -46,7 +46,7 @@ def make_batch(scenes: list[Scene]) -> StepProblem:
     return StepProblem(cloth, concatenate_states(states), concatenate_step_inputs(steps, counts))
 
 
-def network_call(simulator: Simulator, scenes: list[Scene]) -> Callable[[], object]:
+def network_call(simulator: NetworkStepper, scenes: list[Scene]) -> Callable[[], object]:
     """A step of the network, search included."""
     batch = make_batch(scenes)
     single = {id(scene): simulator.prepare(scene.cloth, scene.garment.rest_pos) for scene in scenes}

@@ -37,12 +37,12 @@ from hood.energies.problem import StepProblem
 from hood.mesh.topology import unique_edges
 from hood.model.kernels.block import KERNELS
 from hood.model.readout import network_step as passes_module
-from hood.model.readout.network_step import Passes
+from hood.model.readout.network_step import CorrectionPasses
 from hood.native import features as native
 from hood.scene.scene import Scene, build_scene, recentre
 from hood.solver.step_figures import StepFigures, penetration_metrics, strain_metrics
 from hood.steppers.checkpoint import load_simulator
-from hood.steppers.network import Simulator, build_simulator
+from hood.steppers.network import NetworkStepper, build_simulator
 from hood.steppers.protocol import Stopwatch
 
 PARTS = ("posing", "search", "features", "feedback", "network", "rest", "total", "metrics")
@@ -86,8 +86,8 @@ def make_scene(count: int) -> Scene:
     return build_scene(garment, load_body("default"), load_sequence("walk_proud", 30.0), Material())
 
 
-class Timed(Passes):
-    """Passes whose looks are timed."""
+class Timed(CorrectionPasses):
+    """CorrectionPasses whose looks are timed."""
 
     spent = 0.0  # ms of CPU time, of all of them
 
@@ -99,7 +99,7 @@ class Timed(Passes):
 
 
 @torch.no_grad()
-def time_frame(simulator: Simulator, scene: Scene, prepared: object, frame: int) -> tuple[dict[str, float], Tensor]:
+def time_frame(simulator: NetworkStepper, scene: Scene, prepared: object, frame: int) -> tuple[dict[str, float], Tensor]:
     """One step from the skinned garment at ``frame``: milliseconds by part, and where it leads."""
     state = recentre(scene.start(frame, relaxed=False), scene.cloth.vertex_scene)
     Timed.spent, watch = 0.0, Stopwatch(time.process_time)
@@ -119,7 +119,7 @@ def time_frame(simulator: Simulator, scene: Scene, prepared: object, frame: int)
     return {**times, "metrics": watch.spent_aside("metrics")}, prediction.next_pos
 
 
-def make_simulator(model: str) -> Simulator:
+def make_simulator(model: str) -> NetworkStepper:
     """An architecture with random weights, or embedded weights by the name of their file."""
     if model.endswith(".safetensors"):
         return load_simulator(WEIGHTS / model)
@@ -165,7 +165,7 @@ def main() -> None:
         os.execve(sys.executable, [sys.executable, *sys.argv], {**ENVIRONMENT, **os.environ})
     torch.set_num_threads(args.threads)
     forms = [(form, precision) for precision in args.precision for form in args.forms if (form, precision) != ("fused", "bf16")]
-    passes_module.Passes = Timed  # type: ignore[misc]
+    passes_module.CorrectionPasses = Timed  # type: ignore[misc]
     titles = ["vertices", "model", "form", "precision", *PARTS, "network's share", "apart"]
     print("| " + " | ".join(titles) + " |\n" + "|---" * len(titles) + "|")
     for size in args.sizes:

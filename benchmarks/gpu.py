@@ -60,7 +60,7 @@ from hood.scene.scene import Scene, build_scene, recentre
 from hood.solver.newton import NewtonSettings, minimize
 from hood.solver.system.iterate import in_double
 from hood.steppers.checkpoint import load_simulator
-from hood.steppers.network import Prepared, Simulator
+from hood.steppers.network import NetworkStepper, Prepared
 from hood.steppers.newton import NewtonStepper, Stepper
 from hood.steppers.static_shapes.cuda_graph import trace
 from hood.steppers.static_shapes.newton import CapturedNewton
@@ -153,7 +153,7 @@ class Bench:
     def _minimum(self, problem: StepProblem) -> float:
         return float(minimize(self.potential, problem, settings=NewtonSettings(target_rg=1e-3, max_iterations=60))[1].phi)
 
-    def work_of(self, model: str, simulator: Simulator, precision: str) -> Work:
+    def work_of(self, model: str, simulator: NetworkStepper, precision: str) -> Work:
         """Of a frame of a model on a CPU; the same in fp32 and tf32."""
         key = model, precision == "bf16"
         if key not in self._work:
@@ -183,7 +183,7 @@ class Bench:
 
 
 @torch.no_grad()
-def network_work(simulator: Simulator, bench: Bench) -> Work:
+def network_work(simulator: NetworkStepper, bench: Bench) -> Work:
     """Of a step of fixed shapes as a GPU is given it, what depends on no input computed before; without computing it."""
     problem, simulator = bench.problems[0], copy.deepcopy(simulator)
     simulator.network.use_precision("bf16" if simulator.network.precision == "bf16" else "fp32")

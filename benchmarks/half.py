@@ -22,14 +22,16 @@ from hood.energies.problem import StepProblem
 from hood.rollouts.loop import simulate
 from hood.scene.scene import build_scene
 from hood.steppers.checkpoint import load_simulator
-from hood.steppers.network import Prediction, Simulator
+from hood.steppers.network import NetworkStepper, Prediction
 from hood.steppers.refined import prepare_stepper
 
 START = 5  # frames that are not compared: the start settles
 
 
 @torch.no_grad()
-def compare(first: Simulator, second: Simulator, garment: str, sequence: str, num_frames: int) -> tuple[float, float, float]:
+def compare(
+    first: NetworkStepper, second: NetworkStepper, garment: str, sequence: str, num_frames: int
+) -> tuple[float, float, float]:
     """Root of the mean square and largest distance of the next positions [mm], and the accelerations' median relative one."""
     scene = build_scene(load_garment(garment), load_body(), load_sequence(sequence).window(0, num_frames))
     steps: list[tuple[StepProblem, Prediction]] = []

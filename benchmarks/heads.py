@@ -52,7 +52,7 @@ POTENTIAL = default_potential()
 MOTIONS = {"dress": "walk_proud", "tshirt": "dance_mixed", "skirt": "twist_and_bend", "trousers": "plie"}
 ERRORS = (0.3, 0.1, 0.03)
 SOLVES = 10
-#: Passes of the controls of ``model=forces``.
+#: CorrectionPasses of the controls of ``model=forces``.
 WHOLE_STEPS = (1, 2, 4, 8)
 #: Logarithm of how much more than by default vertices near the body are held where nothing is predicted: 300 N/m, which is best
 #: for the controls.

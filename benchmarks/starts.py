@@ -40,7 +40,7 @@ from hood.scene.scene import Scene, build_scene
 from hood.solver.newton import NewtonSettings, Report, first_guess, minimize
 from hood.solver.system.iterate import in_double, in_single
 from hood.steppers.checkpoint import load_simulator
-from hood.steppers.network import Simulator
+from hood.steppers.network import NetworkStepper
 from hood.steppers.newton import NewtonStepper
 from hood.studies.envelope.extreme_files import write_motion
 from hood.tensors.batch import to_device
@@ -87,7 +87,7 @@ class Network:
     """A network's step as a start."""
 
     def __init__(self, name: str, scene: Scene, kernels: str) -> None:
-        self.simulator: Simulator = load_simulator(Path(name) if Path(name).exists() else locate("weights", name)).eval()
+        self.simulator: NetworkStepper = load_simulator(Path(name) if Path(name).exists() else locate("weights", name)).eval()
         self.simulator.network.use_kernels(kernels)
         self.cloth = to_device(scene.cloth, dtype=torch.float32)
         self.prepared = self.simulator.prepare(self.cloth, scene.garment.rest_pos)

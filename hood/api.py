@@ -31,7 +31,7 @@ from hood.energies.potential import Potential
 from hood.rollouts import loop as frames
 from hood.rollouts.frame import Frame
 from hood.scene.scene import Scene
-from hood.steppers.network import Simulator
+from hood.steppers.network import NetworkStepper
 from hood.steppers.newton import Stepper, require_stepper
 
 
@@ -254,7 +254,7 @@ def train(**keys: Any) -> Path:
     return Path(str(load_config("train", words).output)).expanduser() / "model.safetensors"
 
 
-def load_model(name: str | Path = "quickstart", fps: float = 30.0, device: str = "cpu") -> Simulator:
+def load_model(name: str | Path = "quickstart", fps: float = 30.0, device: str = "cpu") -> NetworkStepper:
     """A trained network with its rules of motion, ready to take steps.
 
     Args:

@@ -6,7 +6,7 @@ import torch
 
 from hood.cloth.state import State
 from hood.scene.scene import Scene
-from hood.steppers.network import Simulator, build_simulator
+from hood.steppers.network import NetworkStepper, build_simulator
 
 SCHEDULE = "1x(mesh+coarse0) 1x(coarse0)"
 KINDS = {
@@ -17,13 +17,13 @@ KINDS = {
 }
 
 
-def make(kind: str, seed: int = 0, **options: object) -> Simulator:
+def make(kind: str, seed: int = 0, **options: object) -> NetworkStepper:
     torch.manual_seed(seed)
     arguments = {"schedule": SCHEDULE, "latent_dim": 8, "output_init": 0.1, **KINDS[kind], **options}
     return build_simulator(**arguments).eval()
 
 
-def take(simulator: Simulator, scene: Scene, frame: int = 0) -> tuple[State, State]:
+def take(simulator: NetworkStepper, scene: Scene, frame: int = 0) -> tuple[State, State]:
     """The start of ``scene`` and the state one step later."""
     with torch.no_grad():
         state = scene.start(frame)

@@ -22,7 +22,7 @@ from hood.assets.files.said import install
 from hood.model.kernels.block import check_kernels, why_slow
 from hood.model.network.kernel_choice import AUTO, Choice, choose_for
 from hood.steppers.checkpoint import load_simulator
-from hood.steppers.network import Simulator
+from hood.steppers.network import NetworkStepper
 from hood.steppers.newton import Stepper
 from hood.steppers.published import SUFFIXES, load_reference_checkpoint
 from hood.tensors.precision import check_precision
@@ -144,7 +144,7 @@ def held_folder(config: DictConfig) -> Iterator[Path]:
         yield folder
 
 
-def read_model(path: Path, fps: float) -> Simulator:
+def read_model(path: Path, fps: float) -> NetworkStepper:
     """The simulator in a model file or in published HOOD weights (``.pth``), for motions at ``fps``.
 
     Raises:
@@ -157,7 +157,9 @@ def read_model(path: Path, fps: float) -> Simulator:
     return simulator
 
 
-def require_same_model(path: Path, held: Simulator, asked: Simulator, way_out: str, free: Collection[str] = ()) -> None:
+def require_same_model(
+    path: Path, held: NetworkStepper, asked: NetworkStepper, way_out: str, free: Collection[str] = ()
+) -> None:
     """Refuse weights of another model than the one ``asked`` for, and name the settings that differ; those ``free`` may.
 
     Raises:
@@ -176,7 +178,7 @@ def weigh(stepper: Stepper, config: DictConfig) -> None:
     stepper.gravity = torch.tensor([0.0, -float(config.gravity), 0.0], device=str(config.device))
 
 
-def use_arithmetic(simulator: Simulator, config: DictConfig, traced: bool = False) -> None:
+def use_arithmetic(simulator: NetworkStepper, config: DictConfig, traced: bool = False) -> None:
     """Let the simulator's network compute as ``config.precision`` and ``config.kernels`` say; a choice is told in one line.
 
     A step that is ``traced`` is torch's operations, which leaves no choice.

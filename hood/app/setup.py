@@ -119,16 +119,16 @@ def set_up(
     return Setup(settled, scene, stepper, choice, potential)
 
 
-def _watched(config: DictConfig, lean: Stepper, scene: Scene, path: Path) -> tuple[Stepper, Potential]:
+def _watched(config: DictConfig, reduced: Stepper, scene: Scene, path: Path) -> tuple[Stepper, Potential]:
     """A plan's stepper with its watch, and the potential of the full model; what it has alone where the plan has no watch."""
     potential, watch = potential_of(config), read_watch(path)
     if watch is None:
-        return lean, potential
+        return reduced, potential
     whole = load_config("rollout", watch.words)
     check_config(whole)
     everything = potential_of(whole)
     full = refined(make_stepper(whole)[0], whole, scene.cloth.num_vertices, everything)
-    return WatchedStepper(lean, full, (potential, everything), scene, watch.limit, watch.hold), everything
+    return WatchedStepper(reduced, full, (potential, everything), scene, watch.limit, watch.hold), everything
 
 
 def make_scene(config: DictConfig, garment: Garment | None = None, material: Material | None = None) -> Scene:

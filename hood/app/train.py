@@ -41,7 +41,7 @@ from hood.energies.potential import Potential
 from hood.energies.self_contact import for_networks
 from hood.evaluation.validation import Validation
 from hood.steppers.checkpoint import read_header
-from hood.steppers.network import Simulator
+from hood.steppers.network import NetworkStepper
 from hood.steppers.published import SUFFIXES
 from hood.training import distributed
 from hood.training.checkpoint import previous
@@ -136,7 +136,7 @@ def make_trainer(config: DictConfig) -> Trainer:
     """Everything named in the config, put together; seeds are set before the weights are made."""
     _check_values(config)
     torch.manual_seed(int(config.seed))
-    simulator: Simulator = build(config.model)
+    simulator: NetworkStepper = build(config.model)
     settings: TrainerSettings = build(config.trainer)
     potential: Potential = build(config.losses)
     settings.collision.require_its_weight(potential)
@@ -161,7 +161,7 @@ def make_trainer(config: DictConfig) -> Trainer:
     return Trainer(simulator, potential, sampler, settings, folder, int(config.seed), watch, earlier)
 
 
-def _start_from(simulator: Simulator, name: str, fps: float) -> int:
+def _start_from(simulator: NetworkStepper, name: str, fps: float) -> int:
     """Give the simulator the weights and statistics of a shipped model or of a file; the updates behind them, 0 if unknown.
 
     Raises:

@@ -13,7 +13,7 @@ from hood.app.common import prepare_folder
 from hood.app.settings.compose import ConfigError, load_config
 from hood.assets.files.library import locate
 from hood.steppers.checkpoint import load_simulator, read_header, save_simulator
-from hood.steppers.network import Simulator
+from hood.steppers.network import NetworkStepper
 from hood.steppers.published import SUFFIXES, read_reference_checkpoint
 
 _MODEL = ".safetensors"
@@ -32,7 +32,7 @@ def run(overrides: Sequence[str]) -> int:
     return 0
 
 
-def _read(source: Path) -> tuple[Simulator, dict[str, str]]:
+def _read(source: Path) -> tuple[NetworkStepper, dict[str, str]]:
     """The model and what its file will say about where it comes from."""
     if source.suffix == _MODEL:
         return load_simulator(source), read_header(source)
@@ -42,7 +42,7 @@ def _read(source: Path) -> tuple[Simulator, dict[str, str]]:
 
 
 @torch.no_grad()
-def _change(simulator: Simulator, path: Path) -> float:
+def _change(simulator: NetworkStepper, path: Path) -> float:
     """The root of the mean square change of the weights in the file over that of the weights."""
     written = dict(load_simulator(path).named_parameters())
     change = sum(float((written[name] - value).square().sum()) for name, value in simulator.named_parameters())

@@ -31,7 +31,7 @@ class Obstacle:
     vertex_scene: Tensor = indexes("scenes")  # (W,)
     face_scene: Tensor = indexes("scenes")  # (G,)
     omitted: Tensor = None  # type: ignore[assignment]  # (W,) bool: no body edges to these (hands)
-    grip: Tensor | None = None  # (G,) factors on the coefficient of friction; None: 1
+    friction_scale: Tensor | None = None  # (G,) factors on the coefficient of friction; None: 1
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from hood.contact.contact import Contact
 
 #: ``curvature``: farther where the body bulges under long edges; ``constant``: the same everywhere.
 REACHES = ("curvature", "constant")
-#: How much of L² κ vertices are held off: an eighth for the edges; triangles sag more, and their corners differ.
+#: How much of L² κ vertices are held off: an eighth for the edges; triangles chord error more, and their corners differ.
 SAG_SHARE = 1.5 / 8.0
 #: Squares of edges that have grown by up to this factor, 12% in length, change nothing.
 COVERED = 1.25
@@ -22,7 +22,7 @@ MOST_SAG = 8e-3
 MOST_STRETCHED = 8e-3
 
 
-def sag(cloth: Cloth, contact: Contact, pos: Tensor) -> Tensor:
+def chord_error(cloth: Cloth, contact: Contact, pos: Tensor) -> Tensor:
     """How much farther off the skin [m] (V,) vertices have to be for the triangles between them: min(1.5 L² κ/8, 8 mm).
 
     An edge of length L whose ends are at a bulge of curvature κ cuts L² κ/8 deep into it. L² is the mean square of the rest
@@ -70,6 +70,6 @@ def _growth(cloth: Cloth, pos: Tensor) -> Tensor | None:
 
 
 def vertex_reach(form: str, least: float, cloth: Cloth, contact: Contact, pos: Tensor) -> Tensor:
-    """Distance from the skin [m] (V,) at which contact sets in: ``least`` [m], and by ``curvature`` the :func:`sag` as well,
-    of cloth that is at ``pos`` (V, 3) [m] at t."""
-    return least + (sag(cloth, contact, pos) if form == "curvature" else torch.zeros_like(contact.dist))
+    """Distance from the skin [m] (V,) at which contact sets in: ``least`` [m], and by ``curvature`` the :func:`chord_error` as
+    well, of cloth that is at ``pos`` (V, 3) [m] at t."""
+    return least + (chord_error(cloth, contact, pos) if form == "curvature" else torch.zeros_like(contact.dist))

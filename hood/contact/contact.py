@@ -74,15 +74,15 @@ _RULE = FoldRule(ahead=15e-3, near=20e-3, cosine=0.3, behind=1e-3)
 
 
 @dataclass(frozen=True)
-class Fold:
+class SecondContact:
     """The other side of folds of the body: of vertices between two parts of the skin that face each other, as in the bend of an
     elbow, contact with the one that is not nearest. Everything else is not ``valid``; None where nothing is."""
 
     contact: Contact | None
 
-    def to(self, dtype: torch.dtype) -> Fold:
+    def to(self, dtype: torch.dtype) -> SecondContact:
         """The same with its numbers in ``dtype``."""
-        return Fold(None if self.contact is None else to_device(self.contact, dtype=dtype))
+        return SecondContact(None if self.contact is None else to_device(self.contact, dtype=dtype))
 
 
 def find_contact(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, cap: float = 0.1) -> Contact:
@@ -94,16 +94,16 @@ def find_contact(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, cap: flo
     return Contact(**match._asdict(), valid=match.dist.abs() <= cap)
 
 
-def find_fold(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, contact: Contact) -> Fold:
+def find_second_contact(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, contact: Contact) -> SecondContact:
     """The other side of folds for cloth positions ``pos`` (V, 3) at t, whose ``contact`` is known.
 
     A vertex is matched with the nearest skin, and nothing would keep it out of what faces that: while a bend closes it would
     pass from one side into the other and back. The other side is the skin nearest to a place 15 mm ahead of the vertex.
     """
     if not len(obstacle.faces) or not len(pos):
-        return Fold(None)
+        return SecondContact(None)
     match, other = _match_folds(pos, vertex_scene, obstacle, contact)
-    return Fold(Contact(**match._asdict(), valid=other) if bool(other.any()) else None)
+    return SecondContact(Contact(**match._asdict(), valid=other) if bool(other.any()) else None)
 
 
 def _match_folds(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, contact: Contact) -> tuple[Match, Tensor]:
@@ -121,7 +121,7 @@ def _match_folds(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, contact:
     return match._replace(dist=_plane_dist(pos, match)), other
 
 
-def find_fixed_fold(
+def find_static_second_contact(
     pos: Tensor,
     vertex_scene: Tensor,
     contact: Contact,
@@ -129,14 +129,14 @@ def find_fixed_fold(
     incidence: Incidence,
     num_scenes: int,
     places: int,
-) -> Fold:
-    """The same as :func:`find_fold` without waiting for the device: contact of as many rows whatever is found."""
+) -> SecondContact:
+    """The same as :func:`find_second_contact` without waiting for the device: contact of as many rows whatever is found."""
     ahead = torch.where(contact.valid.unsqueeze(1), _ahead(pos, contact), pos)
     match = _match_fixed(ahead, vertex_scene, obstacle, incidence, num_scenes, places)[0]
     near = contact.valid & (contact.dist.abs() < _RULE.near)
     valid = near & _is_other(match, obstacle, contact.point, contact.normal)
     match = match._replace(dist=_plane_dist(pos, match))
-    return Fold(Contact(**match._asdict(), valid=valid))
+    return SecondContact(Contact(**match._asdict(), valid=valid))
 
 
 def _ahead(pos: Tensor, contact: Contact) -> Tensor:

@@ -1,6 +1,6 @@
 """Cloth that is held farther off where a step left its triangles in the skin.
 
-Contact acts at vertices, and how far off it holds them is an estimate of how deep the flat triangles between them sag
+Contact acts at vertices, and how far off it holds them is an estimate of how deep the flat triangles between them chord error
 (:mod:`hood.contact.activation_distance`). Where cloth is heavy, very soft or coarse, or lands fast, the estimate can be too
 small. Where a step
 has left triangles in the skin is known afterwards: their corners are held farther off, and the step is taken to its end again.
@@ -25,7 +25,7 @@ from torch import Tensor
 
 from hood.cloth.cloth import Cloth
 from hood.cloth.state import Obstacle
-from hood.contact.contact import Contact, Fold, match_surface
+from hood.contact.contact import Contact, SecondContact, match_surface
 from hood.mesh.closest_point import tree
 from hood.mesh.closest_point.search import build_incidence, search_surface
 from hood.mesh.closest_point.tree import Match
@@ -41,7 +41,9 @@ SHOWN = 3e-3
 DEEPEST = 50e-3
 
 
-def find_entered(next_pos: Tensor, pos: Tensor, cloth: Cloth, obstacle: Obstacle, contacts: Sequence[Contact]) -> Fold | None:
+def find_entered(
+    next_pos: Tensor, pos: Tensor, cloth: Cloth, obstacle: Obstacle, contacts: Sequence[Contact]
+) -> SecondContact | None:
     """The contacts of a step with the skin that its solution ``next_pos`` (V, 3) [m] lies in added; None where there is none.
 
     Args:
@@ -64,7 +66,7 @@ def find_entered(next_pos: Tensor, pos: Tensor, cloth: Cloth, obstacle: Obstacle
     known = contacts[-1]
     both = {name: getattr(known, name).index_copy(0, rows, values) for name, values in match._asdict().items()}
     valid = entered | known.valid if len(contacts) > 1 else entered
-    return Fold(Contact(**both, valid=valid))
+    return SecondContact(Contact(**both, valid=valid))
 
 
 def signed_distance(pos: Tensor, vertex_scene: Tensor, surface: Tensor, obstacle: Obstacle) -> Tensor:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from hood.cloth.state import Obstacle
-from hood.contact.contact import Contact, Fold, find_fold, match_surface
+from hood.contact.contact import Contact, SecondContact, find_second_contact, match_surface
 from hood.mesh.closest_point.tree import Match
 
 #: Vertices that move less than this [m] past the skin they are matched with are held by its tangent plane.
@@ -27,10 +27,11 @@ HIDDEN = 3e-3
 INSIDE = 10e-3
 
 
-def find_other_skin(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, contact: Contact, flight: Tensor) -> Fold:
+def find_second_side(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, contact: Contact, flight: Tensor) -> SecondContact:
     """The skin besides the nearest that cloth at ``pos`` (V, 3) [m] has to be kept off: the other side of folds
-    (:func:`hood.contact.contact.find_fold`), and where vertices would land (:func:`find_landing`), which come first."""
-    fold = find_fold(pos, vertex_scene, obstacle, contact)
+    (:func:`hood.contact.contact.find_second_contact`), and where vertices would land (:func:`find_landing`), which come
+    first."""
+    fold = find_second_contact(pos, vertex_scene, obstacle, contact)
     if not len(obstacle.faces) or not len(pos):
         return fold
     landing = find_landing(pos, vertex_scene, obstacle, contact, flight)
@@ -38,11 +39,11 @@ def find_other_skin(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, conta
         return fold
     match, lands = landing
     if fold.contact is None:
-        return Fold(Contact(**match._asdict(), valid=lands))
+        return SecondContact(Contact(**match._asdict(), valid=lands))
     known = fold.contact
     row = {name: lands.view(-1, *(1,) * (values.ndim - 1)) for name, values in match._asdict().items()}
     both = {name: torch.where(row[name], values, getattr(known, name)) for name, values in match._asdict().items()}
-    return Fold(Contact(**both, valid=lands | known.valid))
+    return SecondContact(Contact(**both, valid=lands | known.valid))
 
 
 def find_landing(

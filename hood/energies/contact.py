@@ -62,11 +62,11 @@ class Collision:
     Vertices without a match within the search's cap, and isolated ones, feel nothing.
 
     At vertices ε is ``epsilon`` and by ``reach=curvature`` the depth as well to which the skin would bulge through the flat
-    triangles between them (:func:`hood.contact.activation_distance.sag`). Like the correspondence it is found at t and constant
-    in the step.
+    triangles between them (:func:`hood.contact.activation_distance.chord_error`). Like the correspondence it is found at t and
+    constant in the step.
 
     In folds of the body, as in the bend of an elbow, a vertex lies between two parts of the skin. By ``sides=both`` it is kept
-    off the one that faces the nearest as well, by the same energy (:func:`hood.contact.contact.find_fold`).
+    off the one that faces the nearest as well, by the same energy (:func:`hood.contact.contact.find_second_contact`).
 
     With ``contact`` at more places than the vertices the same energy acts at points x_p = Σ w_i x_i of edges and faces, with w
     times the area share of the point (:class:`hood.contact.sample_points.PointContact`). Per area of cloth all points together

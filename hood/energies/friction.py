@@ -14,9 +14,9 @@ from hood.energies.contact import checked_contact, contacts_of, lagged_contact, 
 from hood.energies.problem import StepProblem, sum_per_scene
 
 
-def gripped(problem: StepProblem, face: Tensor, force: Tensor) -> Tensor:
+def scaled_by_body_friction(problem: StepProblem, face: Tensor, force: Tensor) -> Tensor:
     """Forces (N,) [N] times how much the body's faces (N,) that they act on grip; themselves where all grip alike."""
-    grip = None if problem.step.obstacle is None else problem.step.obstacle.grip
+    grip = None if problem.step.obstacle is None else problem.step.obstacle.friction_scale
     return force if grip is None else force * grip.to(force)[face.clamp_min(0)]
 
 
@@ -28,7 +28,8 @@ class LaggedFriction:
     12 and 13) with e = ``slip_speed`` · dt: quadratic-cubic below a slip of e, equal to ‖u_T‖ above. The force
     is at most μ_f φ N and reaches it at ``slip_speed``; below, contacts creep.
 
-    φ → ``cloth.friction`` (V,), what the fabric makes of the coefficient, times ``obstacle.grip`` (G,) of the body's face.
+    φ → ``cloth.friction`` (V,), what the fabric makes of the coefficient, times ``obstacle.friction_scale`` (G,) of the body's
+    face.
 
     Args:
         coefficient: μ_f.
@@ -56,7 +57,11 @@ class LaggedFriction:
 
     def greatest(self, problem: StepProblem, contact: Contact) -> Tensor:
         """Greatest forces of friction [N], μ_f φ N, shape (V,)."""
-        return self.coefficient * problem.cloth.friction * gripped(problem, contact.face, self.normal_force(problem, contact))
+        return (
+            self.coefficient
+            * problem.cloth.friction
+            * scaled_by_body_friction(problem, contact.face, self.normal_force(problem, contact))
+        )
 
     def contacts(self, problem: StepProblem) -> tuple[Contact, ...]:
         """The contacts of the vertices that the term acts at; none without a body."""
@@ -87,8 +92,8 @@ class Friction(LaggedFriction):
         P = m/dt² max(ε - d̂, 0) + max(-f·n, 0),
 
     the force that stops its own mass at the edge of the zone, with d̂ the distance at t+1 of where it would fly under its
-    weight, and what the forces f of the cloth around it (:attr:`hood.energies.problem.StepProblem.pull`) add along the normal
-    n. Cloth that lies still, or is stretched over the skin, is pressed with exactly N.
+    weight, and what the forces f of the cloth around it (:attr:`hood.energies.problem.StepProblem.internal_force`) add along
+    the normal n. Cloth that lies still, or is stretched over the skin, is pressed with exactly N.
 
     At points inside edges and faces N has the factor of the collision there, the area share, and so has P, of the weighted
     vertices.
@@ -139,16 +144,16 @@ class Friction(LaggedFriction):
     def greatest_at(self, problem: StepProblem, points: PointContact) -> Tensor:
         """Greatest forces of friction [N] (N,) at the points, φ as the weighted vertices have it."""
         factor = 1.0 + (problem.cloth.friction - 1.0)[points.vertices].mul(points.weights).sum(dim=1)
-        return self.coefficient * factor * gripped(problem, points.face, self.point_force(problem, points))
+        return self.coefficient * factor * scaled_by_body_friction(problem, points.face, self.point_force(problem, points))
 
     def point_force(self, problem: StepProblem, points: PointContact) -> Tensor:
         """Lagged normal forces [N] (N,) at the points."""
         force = 3.0 * self.weight * (self.epsilon - points.dist).clamp_min(0.0) ** 2
-        pull = problem.searched_pull
+        pull = problem.searched_internal_force
         if pull is not None:
             carried = problem.cloth.mass[points.vertices].mul(points.weights).sum(dim=1)
             dt = problem.step.dt[points.scene]
-            depth = self.epsilon - _along(points.at(flown(problem)) - points.next_point, points.next_normal)
+            depth = self.epsilon - _along(points.at(ballistic_position(problem)) - points.next_point, points.next_normal)
             force = torch.minimum(force, _pressing(carried / dt**2, depth, points.at(pull), points.next_normal))
         return points.share * force
 
@@ -157,12 +162,12 @@ class Friction(LaggedFriction):
         reach = vertex_reach(self.reach, self.epsilon, problem.cloth, contact, problem.state.pos)
         depth = torch.where(touching, reach - contact.dist, 0.0).clamp_min(0.0)
         force = 3.0 * self.weight * depth**2
-        pull = problem.searched_pull
+        pull = problem.searched_internal_force
         if pull is None:
             return force
         # where() before the arithmetic: rows without a match may hold infinite or undefined numbers.
         point, normal = (torch.where(touching[:, None], given, 0.0) for given in (contact.next_point, contact.next_normal))
-        depth = reach - _along(flown(problem) - point, normal)
+        depth = reach - _along(ballistic_position(problem) - point, normal)
         inertia = problem.cloth.mass / problem.vertex_dt.squeeze(1) ** 2
         return torch.minimum(force, _pressing(inertia, depth, pull, normal))
 
@@ -247,14 +252,15 @@ class CodedFriction(LaggedFriction):
         return contact.lagged_motion, contact.lagged_normal
 
 
-def flown(problem: StepProblem) -> Tensor:
+def ballistic_position(problem: StepProblem) -> Tensor:
     """Where (V, 3) [m] vertices would be at t + 1 with nothing but their weight."""
     dt = problem.vertex_dt
     return problem.state.pos + dt * (problem.state.vel + dt * problem.gravity.to(dt))
 
 
 def _pressing(inertia: Tensor, depth: Tensor, pull: Tensor, normal: Tensor) -> Tensor:
-    """P [N] (N,) of masses over dt² ``inertia`` [N/m] that would fly ``depth`` [m] deep, and of the ``pull`` (N, 3) [N]."""
+    """P [N] (N,) of masses over dt² ``inertia`` [N/m] that would fly ``depth`` [m] deep, and of the ``internal_force`` (N, 3)
+    [N]."""
     return inertia * depth.clamp_min(0.0) - _along(pull, normal).clamp_max(0.0)
 
 

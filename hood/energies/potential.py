@@ -34,8 +34,8 @@ def _may_rest(kind: type) -> bool:
     return issubclass(kind, RestingTerm)
 
 
-#: What a pull leaves out, see :meth:`Potential.with_pull`.
-_NOT_PULLING = (Inertia, Gravity, Collision, LaggedFriction, LayerFriction)
+#: What a pull leaves out, see :meth:`Potential.with_internal_force`.
+_NOT_INTERNAL = (Inertia, Gravity, Collision, LaggedFriction, LayerFriction)
 
 
 class Potential:
@@ -76,22 +76,22 @@ class Potential:
         for term in self.terms.values():
             if _prepares(type(term)):
                 problem = cast(PreparedTerm, term).prepare(problem)
-        return self.with_pull(problem)
+        return self.with_internal_force(problem)
 
     @torch.no_grad()
-    def with_pull(self, problem: StepProblem, compiled: bool = True) -> StepProblem:
+    def with_internal_force(self, problem: StepProblem, compiled: bool = True) -> StepProblem:
         """The problem with the forces at x_t of all terms but inertia, gravity, contact and friction, if a friction by the
         contact's own force asks for them; itself where that is done, there is no contact or nobody asks.
 
         Args:
             compiled: may leave torch; False where a graph is recorded or traced.
         """
-        if problem.pull is not None or not any(_asks_for_pull(term, problem) for term in self.terms.values()):
+        if problem.internal_force is not None or not any(_needs_internal_force(term, problem) for term in self.terms.values()):
             return problem
         pos = problem.state.pos
-        pulling = Potential({name: term for name, term in self.terms.items() if _pulls(term, problem)})
+        pulling = Potential({name: term for name, term in self.terms.items() if _counts_as_internal(term, problem)})
         by = energies_and_gradient if compiled else Potential.gradient
-        return replace(problem, pull=-by(pulling, problem, pos)[0].to(pos.dtype))
+        return replace(problem, internal_force=-by(pulling, problem, pos)[0].to(pos.dtype))
 
     def active(self, problem: StepProblem) -> dict[str, Term]:
         """The terms that can be anything but a constant zero for a prepared ``problem``."""
@@ -155,12 +155,12 @@ def keeps_both_sides(potential: Potential) -> bool:
     return any(getattr(term, "sides", "nearest") == "both" for term in potential.terms.values())
 
 
-def _pulls(term: Term, problem: StepProblem) -> bool:
+def _counts_as_internal(term: Term, problem: StepProblem) -> bool:
     rests = _may_rest(type(term)) and cast(RestingTerm, term).rests(problem)
-    return not (rests or isinstance(term, _NOT_PULLING))
+    return not (rests or isinstance(term, _NOT_INTERNAL))
 
 
-def _asks_for_pull(term: Term, problem: StepProblem) -> bool:
+def _needs_internal_force(term: Term, problem: StepProblem) -> bool:
     if isinstance(term, Friction):
         return term.coefficient > 0 and problem.contact is not None
     return isinstance(term, LayerFriction) and term.applies(problem)

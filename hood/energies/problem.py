@@ -9,10 +9,10 @@ from torch import Tensor
 
 from hood.cloth.cloth import Cloth
 from hood.cloth.state import State, StepInput
-from hood.contact.contact import Contact, Fold, find_contact
+from hood.contact.contact import Contact, SecondContact, find_contact
 from hood.contact.post_step import find_entered, hold_off, num_in_skin, signed_distance
 from hood.contact.sample_points import PointContact, find_point_contact
-from hood.contact.second_side import find_other_skin
+from hood.contact.second_side import find_second_side
 from hood.contact.self_contact import LayerPairs, SceneLayers, find_layers, find_sides, late_targets
 
 #: Standard gravity [m/s²], y up.
@@ -31,8 +31,8 @@ class StepProblem:
     what terms asked for by :meth:`with_points`, ``fold`` contact with the other side of folds of the body where
     :meth:`with_fold` was asked for, ``layers`` the cloth near cloth where :meth:`with_layers` was asked for, ``sides`` its
     sides where :meth:`with_sides` was.
-    ``pull`` are the forces at x_t of everything but inertia, weight and the body, by which the cloth around a vertex presses it
-    onto the skin; None where nobody has asked :meth:`hood.energies.potential.Potential.with_pull`.
+    ``internal_force`` are the forces at x_t of everything but inertia, weight and the body, by which the cloth around a vertex
+    presses it onto the skin; None where nobody has asked :meth:`hood.energies.potential.Potential.with_internal_force`.
     """
 
     cloth: Cloth
@@ -41,10 +41,10 @@ class StepProblem:
     contact: Contact | None = None
     gravity: Tensor = field(default_factory=_standard_gravity)  # (3,) m/s²
     point_contacts: tuple[PointContact, ...] = ()
-    pull: Tensor | None = None  # (V, 3) N
+    internal_force: Tensor | None = None  # (V, 3) N
     layers: tuple[SceneLayers, ...] = ()  # one per scene, or none
     sides: LayerPairs | None = None
-    fold: Fold | None = None
+    second_contact: SecondContact | None = None
 
     def __post_init__(self) -> None:
         if len(self.step.dt) != self.cloth.num_scenes:
@@ -67,10 +67,10 @@ class StepProblem:
         """The problem with its contact on the other side of folds as well; itself where that has been done or there is no
         body."""
         problem, obstacle = self.with_contact(), self.step.obstacle
-        if self.fold is not None or obstacle is None or problem.contact is None:
+        if self.second_contact is not None or obstacle is None or problem.contact is None:
             return problem
         given = self.state.pos, self.cloth.vertex_scene, obstacle, problem.contact
-        return replace(problem, fold=find_other_skin(*given, free_flight(self)))
+        return replace(problem, second_contact=find_second_side(*given, free_flight(self)))
 
     def next_depth(self, next_pos: Tensor) -> float:
         """Depth [m] of the free vertex that lies deepest inside the body at t + 1, at ``next_pos`` (V, 3) [m]; 0 where none."""
@@ -84,10 +84,10 @@ class StepProblem:
         """The problem with contact where its solution ``next_pos`` (V, 3) [m] lies in skin that it did not know of; itself
         where there is none, and where contact is on the nearest side only."""
         obstacle = self.step.obstacle
-        if obstacle is None or self.contact is None or self.fold is None:
+        if obstacle is None or self.contact is None or self.second_contact is None:
             return self
         fold = find_entered(next_pos, self.state.pos, self.cloth, obstacle, self.contacts)
-        return self if fold is None else replace(self, fold=fold)
+        return self if fold is None else replace(self, second_contact=fold)
 
     def with_held_off(self, next_pos: Tensor, scenes: Tensor | None = None) -> StepProblem:
         """The problem with cloth held farther off where its solution ``next_pos`` (V, 3) [m] has left too many triangles in the
@@ -184,22 +184,26 @@ class StepProblem:
         """
         if self.contact is None:
             return ()
-        if self.fold is None and self.step.obstacle is not None:
+        if self.second_contact is None and self.step.obstacle is not None:
             raise ValueError(
                 "step problem: folds of the body not searched for yet; pass the problem through Potential.prepare once"
             )
-        return (self.contact,) if self.fold is None or self.fold.contact is None else (self.contact, self.fold.contact)
+        return (
+            (self.contact,)
+            if self.second_contact is None or self.second_contact.contact is None
+            else (self.contact, self.second_contact.contact)
+        )
 
     @property
-    def searched_pull(self) -> Tensor | None:
-        """``pull``, demanded: None in a problem that was given its contact without a body only.
+    def searched_internal_force(self) -> Tensor | None:
+        """``internal_force``, demanded: None in a problem that was given its contact without a body only.
 
         Raises:
             ValueError: there is a body, but nobody asked for the pull.
         """
-        if self.pull is None and self.step.obstacle is not None:
+        if self.internal_force is None and self.step.obstacle is not None:
             raise ValueError("step problem: pull not known yet; pass the problem through Potential.prepare once")
-        return self.pull
+        return self.internal_force
 
     @property
     def vertex_dt(self) -> Tensor:

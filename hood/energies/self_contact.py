@@ -16,7 +16,7 @@ from hood.energies.problem import StepProblem, sum_per_scene
 from hood.energies.self_friction import LayerFriction, fading
 
 
-class LayerSides:
+class SignedSelfContactPenalty:
     """Energy [J] of layers of cloth, a sum over pairs of a vertex and a face near each other at t: w max(ε - d, 0)³.
 
     d = ± n · (x_v - x_f) is the distance of the vertex from the face's plane, both at t + 1, positive on the side on which the
@@ -35,7 +35,7 @@ class LayerSides:
         reach: distance [m] at t below which cloth is near; farther than cloth moves against cloth in a step.
     """
 
-    kind: ClassVar[str] = "LayerSides"
+    kind: ClassVar[str] = "SignedSelfContactPenalty"
 
     def __init__(self, weight: float = 5e5, epsilon: float = 3e-3, reach: float = 2e-2) -> None:
         if weight < 0 or epsilon <= 0 or reach < epsilon:
@@ -72,9 +72,9 @@ class LayerSides:
         return sum_per_scene(self.weight * depth**3, pairs.scene, problem.num_scenes)
 
 
-def layer_sides(weight: float = 0.0, epsilon: float = 3e-3, reach: float = 2e-2) -> LayerSides | None:
+def layer_sides(weight: float = 0.0, epsilon: float = 3e-3, reach: float = 2e-2) -> SignedSelfContactPenalty | None:
     """The term of a config; None, which a potential leaves out, where it weighs nothing."""
-    return LayerSides(weight, epsilon, reach) if weight else None
+    return SignedSelfContactPenalty(weight, epsilon, reach) if weight else None
 
 
 #: Distance [m] below which features count as this far apart: the energy stays finite where they touch.
@@ -166,5 +166,5 @@ def without_layers(potential: Potential) -> Potential:
 def for_networks(potential: Potential) -> Potential:
     """What a network is shown of the potential, and known to have been trained with: no feature tells of layers of cloth."""
     return potential.only(
-        {name: term for name, term in potential.terms.items() if type(term) not in (*LAYER_TERMS, LayerSides)}
+        {name: term for name, term in potential.terms.items() if type(term) not in (*LAYER_TERMS, SignedSelfContactPenalty)}
     )

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from hood.contact.self_contact import SceneLayers
-from hood.energies.friction import flown, mollified_norm
+from hood.energies.friction import ballistic_position, mollified_norm
 from hood.energies.problem import StepProblem, sum_per_scene
 from hood.mesh.cloth_proximity import Contacts, library
 from hood.native.arguments import COUNT, POINTER, fields
@@ -162,12 +162,12 @@ class _Pressing(ctypes.Structure):
 def _pressing(problem: StepProblem, pairs: _Pairs) -> Tensor:
     """P [N] (N,), of the side that can bring less; ``hood/native/layer_pressing.h``."""
     cloth = problem.cloth
-    there = torch.where(cloth.free.unsqueeze(1), flown(problem), _held(problem))
+    there = torch.where(cloth.free.unsqueeze(1), ballistic_position(problem), _held(problem))
     inertia = cloth.mass.double() / problem.vertex_dt.squeeze(1).double() ** 2
     vectors = (pairs.weights, pairs.normal, pairs.force, pairs.reach, inertia, there)
     arrays = [np.ascontiguousarray(values.cpu().numpy(), np.int64) for values in (pairs.corners, pairs.edges)]
     arrays += [np.ascontiguousarray(values.double().cpu().numpy()) for values in vectors]
-    pull = None if problem.pull is None else np.ascontiguousarray(problem.pull.double().cpu().numpy())
+    pull = None if problem.internal_force is None else np.ascontiguousarray(problem.internal_force.double().cpu().numpy())
     backed = np.ascontiguousarray((~cloth.free | _on_body(problem)).cpu().numpy(), np.uint8)
     pointers = [array.ctypes.data for array in arrays] + [None if pull is None else pull.ctypes.data, backed.ctypes.data]
     pressing = np.empty(len(pairs.force))

@@ -35,7 +35,7 @@ from hood.rollouts.loop import simulate
 from hood.rollouts.verdict.rule import judge_rollout
 from hood.scene.scene import Scene
 from hood.solver.newton import NewtonSettings
-from hood.steppers.network import Simulator
+from hood.steppers.network import NetworkStepper
 from hood.steppers.newton import Stepper
 from hood.steppers.static_shapes.simulator import network_of
 
@@ -43,7 +43,7 @@ _LENGTH = 128  # edges along the strip: its diameter must exceed twice the large
 _TRIES = 4  # inputs per node; a ReLU may block a path for one input
 
 
-def measured_radius(simulator: Simulator, seed: int = 0) -> int:
+def measured_radius(simulator: NetworkStepper, seed: int = 0) -> int:
     """Farthest mesh-hop distance between nodes i and j at which ∂a_j/∂(velocity feature of i) is not zero.
 
     Float64 autograd on a strip of diameter > 100 without body edges; random features; maximum over nodes of every level, the

@@ -23,7 +23,7 @@ from hood.rollouts.frame import Frame
 from hood.rollouts.loop import simulate
 from hood.scene.scene import Scene, build_scene
 from hood.solver.newton import NewtonSettings
-from hood.steppers.network import Simulator
+from hood.steppers.network import NetworkStepper
 from hood.steppers.newton import Stepper
 
 
@@ -96,11 +96,11 @@ class Validation:
     reference: NewtonSettings = replace(REFERENCE, max_iterations=100)
     device: str = "cpu"
 
-    def __call__(self, simulator: Simulator) -> dict[str, float]:
+    def __call__(self, simulator: NetworkStepper) -> dict[str, float]:
         """Figures over all rollouts, see :func:`summarise`."""
         return summarise([self.rollout(simulator, index) for index in range(len(self.garments))])
 
-    def rollout(self, simulator: Simulator, index: int, see: Callable[[Scene, Frame], None] | None = None) -> Rollout:
+    def rollout(self, simulator: NetworkStepper, index: int, see: Callable[[Scene, Frame], None] | None = None) -> Rollout:
         """The rollout of garment ``index``; ``see`` is shown every frame."""
         motion = self.motions[index % len(self.motions)]
         scene = build_scene(self.garments[index], self.body, motion, device=self.device)

@@ -188,12 +188,12 @@ struct Contact {
     const uint8_t* valid;                                           // (V)
     const int64_t* scene;                                           // (V)
     const double *mass, *pos, *vel;                                 // (V) kg, (V, 3) m, (V, 3) m/s
-    const double *dist, *sag;                                       // (V) m, (V) m, see hood.contact.activation_distance
+    const double *dist, *chord_error;                                       // (V) m, (V) m, see hood.contact.activation_distance
     const double *point, *next_point, *next_normal;                 // (V, 3) m, (V, 3) m, (V, 3)
     const double *pull, *dt, *gravity;                              // (V, 3) N or none, (B) s, (3) m/s^2
 };
 
-// How far off the skin contact sets in, see hood.contact.activation_distance: ``least`` [m], and the sag as well unless it is the same everywhere.
+// How far off the skin contact sets in, see hood.contact.activation_distance: ``least`` [m], and the chord error as well unless it is the same everywhere.
 struct Reach {
     double least;
     int64_t curved;
@@ -202,7 +202,7 @@ struct Reach {
 inline bool touches(const Contact& contact, int64_t v) { return contact.valid[v] && contact.mass[v] > 0.0; }
 
 inline double reach_of(const Contact& contact, const Reach& reach, int64_t v) {
-    return reach.least + (reach.curved ? contact.sag[v] : 0.0);
+    return reach.least + (reach.curved ? contact.chord_error[v] : 0.0);
 }
 
 // A collision term's planes and their reach, see hood.energies.contact; rows that touch nothing are zero.

@@ -14,7 +14,7 @@ struct LayerGrips {
     const int32_t* corners;                           // (N, 4)
     const double *weights, *normal, *force, *limit;   // (N, 4), (N, 3), (N), (N)
     double* model;                                    // (N, 5) heading of the slip, force by slip across it, and what is less along it
-    double *gradient, *own, *own_slack;               // (V, 3), (V, 6), (V, 6) of the last model, by vertex
+    double *gradient, *own, *own_indefinite_part;               // (V, 3), (V, 6), (V, 6) of the last model, by vertex
 };
 }
 
@@ -47,7 +47,7 @@ inline void add_symmetric(double* upper, double factor, const double* n) {
 void model_layer_grips(const LayerGrips& g, int64_t num_vertices, const double* pos) {
     std::memset(g.gradient, 0, sizeof(double) * 3 * num_vertices);
     std::memset(g.own, 0, sizeof(double) * 6 * num_vertices);
-    std::memset(g.own_slack, 0, sizeof(double) * 6 * num_vertices);
+    std::memset(g.own_indefinite_part, 0, sizeof(double) * 6 * num_vertices);
     for (int64_t i = 0; i < g.count; ++i) {
         double slip[3], block[6] = {}, less[6] = {}, *model = g.model + 5 * i;
         const double size = layer_slip(g, i, pos, slip), force = g.force[i], limit = g.limit[i];
@@ -62,14 +62,14 @@ void model_layer_grips(const LayerGrips& g, int64_t num_vertices, const double* 
             const int64_t v = g.corners[4 * i + c];
             const double weight = g.weights[4 * i + c], square = weight * weight;
             for (int k = 0; k < 3; ++k) g.gradient[3 * v + k] += weight * slope * slip[k];
-            for (int k = 0; k < 6; ++k) g.own[6 * v + k] += square * block[k], g.own_slack[6 * v + k] += square * less[k];
+            for (int k = 0; k < 6; ++k) g.own[6 * v + k] += square * block[k], g.own_indefinite_part[6 * v + k] += square * less[k];
         }
     }
 }
 
-// Adds what pairs bring beside the diagonal blocks, with a share of the slack, to q = H p: all that they bring, less those blocks.
+// Adds what pairs bring beside the diagonal blocks, with a share of the indefinite part, to q = H p: all that they bring, less those blocks.
 // Returns their p . q. Vertices from num_rows on do not move.
-template <class T> double couple_layer_grips(const LayerGrips& g, int64_t num_rows, double sharpness, const T* p, T* q) {
+template <class T> double couple_layer_grips(const LayerGrips& g, int64_t num_rows, double indefinite_share, const T* p, T* q) {
     double sum = 0.0;
     for (int64_t i = 0; i < g.count; ++i) {
         const double *model = g.model + 5 * i, *normal = g.normal + 3 * i, *weights = g.weights + 4 * i;
@@ -77,7 +77,7 @@ template <class T> double couple_layer_grips(const LayerGrips& g, int64_t num_ro
         double slip[3] = {0.0, 0.0, 0.0};
         for (int c = 0; c < 4; ++c)
             for (int k = 0; k < 3 && corners[c] < num_rows; ++k) slip[k] += weights[c] * (double)p[4 * (int64_t)corners[c] + k];
-        const double across = model[3] * dot3(slip, normal), along = sharpness * model[4] * dot3(slip, model);
+        const double across = model[3] * dot3(slip, normal), along = indefinite_share * model[4] * dot3(slip, model);
         const double push[3] = {model[3] * slip[0] - across * normal[0] + along * model[0],
                                 model[3] * slip[1] - across * normal[1] + along * model[1],
                                 model[3] * slip[2] - across * normal[2] + along * model[2]};
@@ -87,11 +87,11 @@ template <class T> double couple_layer_grips(const LayerGrips& g, int64_t num_ro
     }
     constexpr int PLACE[3][3] = {{0, 1, 2}, {1, 3, 4}, {2, 4, 5}};
     for (int64_t row = 0; row < num_rows; ++row) {
-        const double *own = g.own + 6 * row, *less = g.own_slack + 6 * row;
+        const double *own = g.own + 6 * row, *less = g.own_indefinite_part + 6 * row;
         if (own[0] == 0.0 && own[3] == 0.0 && own[5] == 0.0) continue;
         for (int a = 0; a < 3; ++a) {
             double push = 0.0;
-            for (int b = 0; b < 3; ++b) push += (own[PLACE[a][b]] + sharpness * less[PLACE[a][b]]) * (double)p[4 * row + b];
+            for (int b = 0; b < 3; ++b) push += (own[PLACE[a][b]] + indefinite_share * less[PLACE[a][b]]) * (double)p[4 * row + b];
             q[4 * row + a] -= (T)push;
             sum -= push * (double)p[4 * row + a];
         }

@@ -45,7 +45,7 @@ struct Points {
     const Wall* walls;
     const Grip* grips;
     const Drag* drags;
-    double* model;  // (N, 16) gradient, matrix and slack by the point, and 1 where there are any
+    double* model;  // (N, 16) gradient, matrix and indefinite part by the point, and 1 where there are any
     double* path;   // (W, N, 14) of the line search: give of the corners, compliance, depth, 1 where it acts, push
 };
 
@@ -85,11 +85,11 @@ struct Engine {
     double *path;                   // (W, N, 8) stops of the line search: give, compliance, depth, of every wall
     double *face_force, *hinge_force;  // (F, 10), (H, 14) gradients by corner, then axis, and what loads of four read beyond
     void *face_model, *hinge_model; // records of the elements, see below, of float or double like the rest
-    void *matrix, *slack;           // (R, 9) + 1, (R)
-    void *own, *own_slack;          // (N, 6) what acts on single vertices
+    void *matrix, *indefinite_part;           // (R, 9) + 1, (R)
+    void *own, *own_indefinite_part;          // (N, 6) what acts on single vertices
     void *row_sum;                  // (parts, most_blocks, 16), aligned to 32 bytes
     void *inverse, *x, *r, *z, *p, *q; // (N, 12), (N, 4) five times
-    double sharpness, raised;       // of the matrix as it stands, and of the next one
+    double indefinite_share, raised;       // of the matrix as it stands, and of the next one
     double phi, noise;
     int64_t cg_used;
     // Threads.
@@ -128,7 +128,7 @@ template <class V> struct Sums {
 
 template <class T> struct FaceRecord {
     T root[28];   // three vectors over the corners whose outer products are the material part; a spare one for loads of four
-    T axial[14];  // pairs of corners 00 01 02 11 12 22: what acts on the three axes alike, and its slack
+    T axial[14];  // pairs of corners 00 01 02 11 12 22: what acts on the three axes alike, and its indefinite part
 };
 template <class T> struct HingeRecord {
     T row[14];
@@ -276,10 +276,10 @@ template <class T> void face_models(const Engine& e, const double* pos, Range ra
         int place = 0;
         for (int c = 0; c < 3; ++c)
             for (int d = c; d < 3; ++d, ++place) {
-                const V8 axial = ten0[c] * b0[d] + ten1[c] * b1[d], slack = pull0[c] * b0[d] + pull1[c] * b1[d] - axial;
+                const V8 axial = ten0[c] * b0[d] + ten1[c] * b1[d], indefinite_part = pull0[c] * b0[d] + pull1[c] * b1[d] - axial;
                 for (int lane = 0; lane < LANES; ++lane) {
                     records[i + lane].axial[2 * place] = (T)axial[lane];
-                    records[i + lane].axial[2 * place + 1] = (T)slack[lane];
+                    records[i + lane].axial[2 * place + 1] = (T)indefinite_part[lane];
                 }
             }
     }
@@ -404,7 +404,7 @@ inline void add_outer(double* upper, double factor, const double* n) {
 }
 
 // Adds contact and friction at the position of a row of walls and grips; whether there is any. Set has the fields of Points.
-template <class Set> inline bool add_contact(const Set& set, int64_t v, const double* pos, double* gradient, double* upper, double* slack) {
+template <class Set> inline bool add_contact(const Set& set, int64_t v, const double* pos, double* gradient, double* upper, double* indefinite_part) {
     bool any = false;
     for (int64_t w = 0; w < set.num_walls; ++w) {
         const Wall& wall = set.walls[w];
@@ -429,7 +429,7 @@ template <class Set> inline bool add_contact(const Set& set, int64_t v, const do
         add_outer(upper, -slope, normal);
         if (size > 0.0) {
             const double heading[3] = {slip[0] / size, slip[1] / size, slip[2] / size};
-            add_outer(slack, along - slope, heading);
+            add_outer(indefinite_part, along - slope, heading);
         }
     }
     return any;
@@ -450,13 +450,13 @@ inline bool add_drag(const Points& set, int64_t i, const double* pos, double* gr
     return set.num_drags > 0;
 }
 
-inline void vertex_model(const Engine& e, int64_t row, double* gradient, double* upper, double* slack) {
+inline void vertex_model(const Engine& e, int64_t row, double* gradient, double* upper, double* indefinite_part) {
     const int64_t v = e.vertex[row];
     const double *pos = e.pos + 4 * row, *acc = e.acc + 4 * row, *weight = e.weight + 3 * v;
     for (int k = 0; k < 3; ++k) gradient[k] = e.inertia[v] * acc[k] - weight[k];
-    for (int k = 0; k < 6; ++k) upper[k] = slack[k] = 0.0;
+    for (int k = 0; k < 6; ++k) upper[k] = indefinite_part[k] = 0.0;
     upper[0] = upper[3] = upper[5] = e.inertia[v] / e.dt_sq;
-    add_contact(e, v, pos, gradient, upper, slack);
+    add_contact(e, v, pos, gradient, upper, indefinite_part);
 }
 
 // ---- points inside edges and faces ---------------------------------------------------------------------------------------
@@ -478,7 +478,7 @@ void point_models(const Points& set, const double* pos, Range range) {
 }
 
 // Adds the gradient and the diagonal block that points bring to a row.
-inline void add_points(const Engine& e, int64_t row, double* gradient, double* upper, double* slack) {
+inline void add_points(const Engine& e, int64_t row, double* gradient, double* upper, double* indefinite_part) {
     for (int64_t s = 0; s < e.num_points; ++s) {
         const Points& set = e.points[s];
         for (int32_t i = set.starts[row]; i < set.starts[row + 1]; ++i) {
@@ -487,12 +487,12 @@ inline void add_points(const Engine& e, int64_t row, double* gradient, double* u
             if (model[15] == 0.0) continue;
             const double weight = set.weights[3 * (int64_t)use[0] + use[1]], square = weight * weight;
             for (int k = 0; k < 3; ++k) gradient[k] += weight * model[k];
-            for (int k = 0; k < 6; ++k) upper[k] += square * model[3 + k], slack[k] += square * model[9 + k];
+            for (int k = 0; k < 6; ++k) upper[k] += square * model[3 + k], indefinite_part[k] += square * model[9 + k];
         }
     }
 }
 
-// What points bring to the blocks of a row beside its diagonal: add(place, factor, matrix, slack), upper triangles.
+// What points bring to the blocks of a row beside its diagonal: add(place, factor, matrix, indefinite_part), upper triangles.
 template <class Add> inline void couple_points(const Engine& e, int64_t row, const Add& add) {
     for (int64_t s = 0; s < e.num_points; ++s) {
         const Points& set = e.points[s];
@@ -535,10 +535,10 @@ inline void add_layers(const Engine& e, int64_t row, double* gradient, double* u
 inline const float* rows_of_layers(const LayerView& layers, float) { return layers.normals_single; }
 inline const double* rows_of_layers(const LayerView& layers, double) { return layers.normals; }
 
-inline void add_layer_grips(const Engine& e, int64_t row, double* gradient, double* upper, double* slack) {
+inline void add_layer_grips(const Engine& e, int64_t row, double* gradient, double* upper, double* indefinite_part) {
     const LayerGrips& grips = *e.layer_grips;
     for (int k = 0; k < 3; ++k) gradient[k] += grips.gradient[3 * row + k];
-    for (int k = 0; k < 6; ++k) upper[k] += grips.own[6 * row + k], slack[k] += grips.own_slack[6 * row + k];
+    for (int k = 0; k < 6; ++k) upper[k] += grips.own[6 * row + k], indefinite_part[k] += grips.own_indefinite_part[6 * row + k];
 }
 
 // Adds the blocks beside the diagonal to q = H p; returns their p . q.
@@ -660,13 +660,13 @@ template <int CORNERS> inline D4 pull_of(const double* forces, int size, const i
 
 // The gradient, and the blocks of single vertices; the elements' forces have been made.
 template <class T> void gather_gradient(const Engine& e, Range range, bool near) {
-    T *own = (T*)e.own, *own_slack = (T*)e.own_slack;
+    T *own = (T*)e.own, *own_indefinite_part = (T*)e.own_indefinite_part;
     for (int64_t row = range.begin; row < range.end; ++row) {
-        double gradient[3], upper[6], slack[6];
-        vertex_model(e, row, gradient, upper, slack);
-        add_points(e, row, gradient, upper, slack);
+        double gradient[3], upper[6], indefinite_part[6];
+        vertex_model(e, row, gradient, upper, indefinite_part);
+        add_points(e, row, gradient, upper, indefinite_part);
         if (near) add_layers(e, row, gradient, upper);
-        if (e.layer_grips) add_layer_grips(e, row, gradient, upper, slack);
+        if (e.layer_grips) add_layer_grips(e, row, gradient, upper, indefinite_part);
         D4 force = D4{gradient[0], gradient[1], gradient[2], 0.0};
         if (e.membrane) force += pull_of<3>(e.face_force, 10, e.face_starts, e.face_uses, row);
         if (e.bending) force += pull_of<4>(e.hinge_force, 14, e.hinge_starts, e.hinge_uses, row);
@@ -678,13 +678,13 @@ template <class T> void gather_gradient(const Engine& e, Range range, bool near)
             force += e.spring_stiffness[spring] * (corner == 0 ? gap - target : gap + target);
         }
         store(e.gradient + 4 * row, D4{force[0], force[1], force[2], 0.0});
-        for (int k = 0; k < 6; ++k) own[6 * row + k] = (T)upper[k], own_slack[6 * row + k] = (T)slack[k];
+        for (int k = 0; k < 6; ++k) own[6 * row + k] = (T)upper[k], own_indefinite_part[6 * row + k] = (T)indefinite_part[k];
     }
 }
 
 template <class T> struct Row {
     typedef typename Four<T>::type V4;
-    V4 *axial, *block;  // of every block what is added to its diagonal and the slack of that, and its three rows
+    V4 *axial, *block;  // of every block what is added to its diagonal and the indefinite part of that, and its three rows
 };
 
 // Faces with as many BLOCKS in the row.
@@ -740,11 +740,11 @@ template <class T, class V4> inline void invert(const V4* m, T* inverse) {
     }
 }
 
-// The upper rows of blocks, with a share of the slack, and the inverse diagonal blocks of the matrix without it.
+// The upper rows of blocks, with a share of the indefinite part, and the inverse diagonal blocks of the matrix without it.
 template <class T> void gather_matrix(const Engine& e, int64_t part) {
     typedef typename Four<T>::type V4;
-    T *matrix = (T*)e.matrix, *slack = (T*)e.slack, *inverse = (T*)e.inverse;
-    const T sharpness = (T)e.sharpness;
+    T *matrix = (T*)e.matrix, *indefinite_part = (T*)e.indefinite_part, *inverse = (T*)e.inverse;
+    const T indefinite_share = (T)e.indefinite_share;
     const V4 unit[3] = {V4{1, 0, 0, 0}, V4{0, 1, 0, 0}, V4{0, 0, 1, 0}};
     V4* memory = (V4*)e.row_sum + 4 * e.most_blocks * part;
     Row<T> sum = {memory, memory + e.most_blocks};
@@ -754,7 +754,7 @@ template <class T> void gather_matrix(const Engine& e, int64_t part) {
         const int64_t start = e.row_starts[row], degree = e.row_starts[row + 1] - start;
         for (int64_t i = 0; i < 3 * degree; ++i) sum.block[i] = V4{};
         for (int64_t i = 0; i < degree; ++i) sum.axial[i] = V4{};
-        const T *own = (const T*)e.own + 6 * row, *own_slack = (const T*)e.own_slack + 6 * row;
+        const T *own = (const T*)e.own + 6 * row, *own_indefinite_part = (const T*)e.own_indefinite_part + 6 * row;
         for (int k = 0; k < 3; ++k) sum.block[k] = V4{own[PAIR[k][0]], own[PAIR[k][1]], own[PAIR[k][2]], T(0)};
         if (e.membrane) {
             const int32_t* starts = e.face_starts + 3 * row;
@@ -778,21 +778,21 @@ template <class T> void gather_matrix(const Engine& e, int64_t part) {
         couple_points(e, row, [&](int32_t place, double factor, const double* m, const double* less) {
             for (int k = 0; k < 3; ++k)
                 for (int j = 0; j < 3; ++j)
-                    sum.block[3 * place + k][j] += (T)(factor * (m[PAIR[k][j]] + e.sharpness * less[PAIR[k][j]]));
+                    sum.block[3 * place + k][j] += (T)(factor * (m[PAIR[k][j]] + e.indefinite_share * less[PAIR[k][j]]));
         });
         for (int k = 0; k < 3; ++k) sum.block[k] += sum.axial[0][0] * unit[k];
         invert<T>(sum.block, inverse + 12 * row);
         for (int k = 0; k < 3; ++k)
-            sum.block[k] += sharpness * V4{own_slack[PAIR[k][0]], own_slack[PAIR[k][1]], own_slack[PAIR[k][2]], T(0)};
+            sum.block[k] += indefinite_share * V4{own_indefinite_part[PAIR[k][0]], own_indefinite_part[PAIR[k][1]], own_indefinite_part[PAIR[k][2]], T(0)};
         sum.axial[0][0] = T(0);
         for (int64_t i = 0; i < degree; ++i) {
             T* target = matrix + 9 * (start + i);
-            const T axial = sum.axial[i][0] + sharpness * sum.axial[i][1];
+            const T axial = sum.axial[i][0] + indefinite_share * sum.axial[i][1];
             for (int k = 0; k < 2; ++k) store(target + 3 * k, sum.block[3 * i + k] + axial * unit[k]);
             const V4 third = sum.block[3 * i + 2] + axial * unit[2];
             if (start + i + 1 < end) store(target + 6, third);  // the fourth number is overwritten by the next store
             else std::memcpy(target + 6, &third, 3 * sizeof(T));  // it would be another part's
-            slack[start + i] = sum.axial[i][1];
+            indefinite_part[start + i] = sum.axial[i][1];
         }
     }
 }
@@ -812,21 +812,21 @@ template <class T> void differentiate(const Engine& e) {
     for_parts(e.parts, [&](int64_t part) { gather_gradient<T>(e, rows_of(e, part), near); });
 }
 
-// The share of the slack that is in the matrix, from what it was to what it shall be.
-template <class T> void sharpen(Engine& e, double sharpness) {
-    T *matrix = (T*)e.matrix, *slack = (T*)e.slack, *own_slack = (T*)e.own_slack;
-    const T change = (T)(sharpness - e.sharpness);
-    e.sharpness = sharpness;
+// The share of the indefinite part that is in the matrix, from what it was to what it shall be.
+template <class T> void sharpen(Engine& e, double indefinite_share) {
+    T *matrix = (T*)e.matrix, *indefinite_part = (T*)e.indefinite_part, *own_indefinite_part = (T*)e.own_indefinite_part;
+    const T change = (T)(indefinite_share - e.indefinite_share);
+    e.indefinite_share = indefinite_share;
     if (change == T(0)) return;
     for_parts(e.parts, [&](int64_t part) {
         const Range range = rows_of(e, part);
         for (int64_t i = e.row_starts[range.begin]; i < e.row_starts[range.end]; ++i)
-            for (int k = 0; k < 3; ++k) matrix[9 * i + 4 * k] += change * slack[i];
+            for (int k = 0; k < 3; ++k) matrix[9 * i + 4 * k] += change * indefinite_part[i];
         if (e.num_grips || e.num_points || e.layer_grips)
             for (int64_t row = range.begin; row < range.end; ++row)
                 for (int a = 0; a < 3; ++a)
                     for (int b = 0; b < 3; ++b)
-                        matrix[9 * (int64_t)e.row_starts[row] + 3 * a + b] += change * own_slack[6 * row + PAIR[a][b]];
+                        matrix[9 * (int64_t)e.row_starts[row] + 3 * a + b] += change * own_indefinite_part[6 * row + PAIR[a][b]];
         for (int64_t row = range.begin; row < range.end && e.num_points; ++row)
             couple_points(e, row, [&](int32_t place, double factor, const double*, const double* less) {
                 T* block = matrix + 9 * ((int64_t)e.row_starts[row] + place);
@@ -969,7 +969,7 @@ template <class T> bool solve(Engine& e, double tolerance, int64_t most) {
     for (int64_t iteration = 0; iteration < most && rz > limit; ++iteration) {
         double curvature = sum_parts(e, [&](int64_t part) { return multiply<T>(e, part); });
         if (near_layers(e)) curvature += couple_layers<T>(e);
-        if (e.layer_grips) curvature += couple_layer_grips<T>(*e.layer_grips, e.num_rows, e.sharpness, (const T*)e.p, (T*)e.q);
+        if (e.layer_grips) curvature += couple_layer_grips<T>(*e.layer_grips, e.num_rows, e.indefinite_share, (const T*)e.p, (T*)e.q);
         if (!(curvature > 0.0)) {
             definite = false;
             break;
@@ -987,22 +987,22 @@ template <class T> bool solve(Engine& e, double tolerance, int64_t most) {
     return definite;
 }
 
-// As much of the slack as the system bears, see hood.solver.system.linear.Directions.
+// As much of the indefinite part as the system bears, see hood.solver.system.linear.Directions.
 template <class T> void direct(Engine& e, double residual, int64_t most) {
-    e.sharpness = e.raised;
+    e.indefinite_share = e.raised;
     gather_matrix<T>(e);
     double tolerance = std::sqrt(residual);
     tolerance = tolerance < 1e-3 ? 1e-3 : tolerance > 0.1 ? 0.1 : tolerance;
-    double sharpness = e.raised;
+    double indefinite_share = e.raised;
     bool halved = false;
     while (true) {
-        sharpen<T>(e, sharpness);
-        if (solve<T>(e, tolerance, most) || !(sharpness > 0.0)) break;
-        sharpness = sharpness > 0.2 ? 0.5 * sharpness : 0.0;
+        sharpen<T>(e, indefinite_share);
+        if (solve<T>(e, tolerance, most) || !(indefinite_share > 0.0)) break;
+        indefinite_share = indefinite_share > 0.2 ? 0.5 * indefinite_share : 0.0;
         halved = true;
     }
-    const double raised = 2.0 * sharpness;
-    e.raised = halved ? sharpness : raised < 0.1 ? 0.1 : raised > 1.0 ? 1.0 : raised;
+    const double raised = 2.0 * indefinite_share;
+    e.raised = halved ? indefinite_share : raised < 0.1 ? 0.1 : raised > 1.0 ? 1.0 : raised;
 }
 
 // ---- the line search -----------------------------------------------------------------------------------------------------
@@ -1268,9 +1268,9 @@ double newton_model(Engine* e) {
     return std::sqrt(sum);
 }
 
-// The matrix with a share of the slack, from the model.
-void newton_matrix(Engine* e, double sharpness) {
-    e->sharpness = sharpness;
+// The matrix with a share of the indefinite part, from the model.
+void newton_matrix(Engine* e, double indefinite_share) {
+    e->indefinite_share = indefinite_share;
     gather_matrix<Real>(*e);
 }
 
@@ -1345,7 +1345,7 @@ void newton_alone(Engine* e, const float* pos, float* force, float* step) {
 // were looked at last and so much more on its diagonal (V): as many iterations of conjugate gradients, however near they come.
 void newton_together(Engine* e, const float* force, const float* damping, int64_t iterations, float* step) {
     typedef typename Four<Real>::type V4;
-    e->sharpness = 0.0;
+    e->indefinite_share = 0.0;
     gather_matrix<Real>(*e);
     for (int64_t row = 0; row < e->num_rows; ++row) {
         const int64_t v = e->vertex[row];

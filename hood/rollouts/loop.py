@@ -218,7 +218,7 @@ def _jumps_within(scene: Scene, start_frame: int, count: int) -> dict[int, Jump]
 
 def _as_taken(problem: StepProblem, prediction: Prediction) -> StepProblem:
     """The problem with the contact that its step was taken with in the end."""
-    problem = problem if prediction.entered is None else replace(problem, fold=prediction.entered)
+    problem = problem if prediction.entered is None else replace(problem, second_contact=prediction.entered)
     return problem if prediction.held_off is None else replace(problem, contact=prediction.held_off)
 
 

@@ -52,7 +52,7 @@ class Scene:
     sizes: Sizes = Sizes()  # of the rest shape; that of ``cloth`` is the first
     fastening: Fastening | None = None  # of steps that are given no attachments; None: nothing is fastened
     holding: Holding | None = None  # what is held and let go; None: the pins of ``cloth``, throughout
-    grip: Tensor | None = None  # (G,) factors on the coefficient of friction on the body's faces; None: 1
+    friction_scale: Tensor | None = None  # (G,) factors on the coefficient of friction on the body's faces; None: 1
 
     def cloth_at(self, frame: int, start: int = 0) -> Cloth:
         """The cloth at ``frame`` of a rollout that begins at the frame ``start``: ``cloth`` where its size does not change."""
@@ -203,8 +203,8 @@ class Scene:
         dt = RELAXING_DT if relaxing else self.dt
         time = (frame if relaxing else frame + 1) * self.dt
         obstacle = self.motion.obstacle(frame, origin, static=relaxing)
-        if obstacle is not None and self.grip is not None:
-            obstacle = replace(obstacle, grip=self.grip.to(obstacle.pos))
+        if obstacle is not None and self.friction_scale is not None:
+            obstacle = replace(obstacle, friction_scale=self.friction_scale.to(obstacle.pos))
         return StepInput(
             dt=torch.tensor([dt], dtype=state.pos.dtype, device=state.pos.device),
             obstacle=obstacle,

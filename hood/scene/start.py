@@ -7,7 +7,7 @@ from torch import Tensor
 
 from hood.cloth.cloth import Cloth
 from hood.cloth.state import Obstacle
-from hood.contact.activation_distance import sag
+from hood.contact.activation_distance import chord_error
 from hood.contact.contact import Contact, find_contact
 from hood.limits import STRAIN_START
 
@@ -33,7 +33,8 @@ def settle(
     thorough: bool = False,
 ) -> Tensor:
     """Positions (V, 3) [m] near ``pos`` with bounded edge strain, at least ``clearance`` [m] outside the body, and
-    where it bulges under long edges so far that these are outside as well (:func:`hood.contact.activation_distance.sag`).
+    where it bulges under long edges so far that these are outside as well
+    (:func:`hood.contact.activation_distance.chord_error`).
 
     Skinning stretches loose cloth between the limbs and pushes cuffs into the skin; the first frame would then start with
     forces far beyond the weight. Alternates averaged edge-length projections (position based dynamics, Müller et al. 2007)
@@ -162,13 +163,13 @@ class LazySearch:
 
 
 def leave(cloth: Cloth, pos: Tensor, contact: Contact, clearance: float) -> Tensor:
-    """Free vertices nearer than ``clearance`` and the :func:`sag` to their tangent planes moved there."""
-    depth = (clearance + sag(cloth, contact, pos) - ((pos - contact.point) * contact.normal).sum(1)).clamp_min(0.0)
+    """Free vertices nearer than ``clearance`` and the :func:`chord_error` to their tangent planes moved there."""
+    depth = (clearance + chord_error(cloth, contact, pos) - ((pos - contact.point) * contact.normal).sum(1)).clamp_min(0.0)
     return pos + (depth * contact.valid * cloth.free).unsqueeze(1) * contact.normal
 
 
 def push_out(cloth: Cloth, pos: Tensor, obstacle: Obstacle | None, clearance: float, rounds: int = 4) -> Tensor:
-    """``pos`` (V, 3) with every free vertex at least ``clearance`` [m] and the :func:`sag` outside the body at t (up to
+    """``pos`` (V, 3) with every free vertex at least ``clearance`` [m] and the :func:`chord_error` outside the body at t (up to
     ``rounds`` searches: leaving one limb may enter another)."""
     if obstacle is None:
         return pos
@@ -176,7 +177,7 @@ def push_out(cloth: Cloth, pos: Tensor, obstacle: Obstacle | None, clearance: fl
     for _ in range(rounds):
         contact = find_contact(pos, cloth.vertex_scene, obstacle)
         # The margin covers the difference between the tangent plane and the true distance.
-        depth = (clearance + sag(cloth, contact, pos) - contact.dist) * (contact.valid & free)
+        depth = (clearance + chord_error(cloth, contact, pos) - contact.dist) * (contact.valid & free)
         if not bool((depth > 0).any()):
             break
         pos = pos + (depth.clamp_min(0.0) + 2e-4 * (depth > 0)).unsqueeze(1) * contact.normal

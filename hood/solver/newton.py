@@ -17,10 +17,10 @@ from torch import Tensor
 
 from hood.energies.potential import Potential, relative_gradient
 from hood.energies.problem import StepProblem
-from hood.energies.self_contact import LayerSides, without_layers
+from hood.energies.self_contact import SignedSelfContactPenalty, without_layers
 from hood.native.build import BuildError
 from hood.solver.compiled import newton as compiled_newton
-from hood.solver.compiled.system import EngineSystem
+from hood.solver.compiled.system import CompiledSystem
 from hood.solver.derivatives.self_contact import approached, free_way, grips_of, layers_of, touching
 from hood.solver.step_figures import CONVERGED, LATE, MOST_ITERATIONS, NOT_FINITE, STOPPED, STUCK
 from hood.solver.system.iterate import Proceed, Progress, Unknowns, fixed_positions, in_double, rounded
@@ -222,14 +222,14 @@ class TorchSystem:
 
 def system_of(
     potential: Potential, problem: StepProblem, plan: SolverPlan, settings: NewtonSettings
-) -> TorchSystem | EngineSystem:
+) -> TorchSystem | CompiledSystem:
     """The fastest form of the solver that does what ``settings`` ask for.
 
     Raises:
         ValueError: a term is for training alone.
     """
     for name, term in potential.terms.items():
-        if type(term) is LayerSides:
+        if type(term) is SignedSelfContactPenalty:
             raise ValueError(
                 f"losses.terms.{name} is for training: where it sets in the solver does not converge; layers of cloth are kept "
                 "apart by cloth_contact=on"
@@ -241,7 +241,7 @@ def system_of(
         and compiled_newton.applies(potential, problem)
     ):
         try:
-            return EngineSystem(potential, problem, plan, settings.cg_iterations)
+            return CompiledSystem(potential, problem, plan, settings.cg_iterations)
         except BuildError as error:
             if settings.engine == "compiled":
                 raise BuildError(f"solver.engine=compiled: {error} or use solver.engine=torch") from error

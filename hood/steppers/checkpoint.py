@@ -16,7 +16,7 @@ from hood import plugins
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.guarded import first_line
 from hood.model.parts import plugins_of
-from hood.steppers.network import Simulator, build_simulator
+from hood.steppers.network import NetworkStepper, build_simulator
 from hood.steppers.ranges import Conditions
 
 _FORMAT = "hood-1"
@@ -27,7 +27,9 @@ _PLUGINS = "plugins"
 _TOLD = 80
 
 
-def save_simulator(path: Path, simulator: Simulator, metadata: Mapping[str, str] | None = None, half: bool = False) -> None:
+def save_simulator(
+    path: Path, simulator: NetworkStepper, metadata: Mapping[str, str] | None = None, half: bool = False
+) -> None:
     """Write weights and model config as safetensors, atomically.
 
     ``half`` stores what was learned in float16; statistics stay in float32, their counts are beyond its range.
@@ -89,7 +91,7 @@ def read_header(path: Path) -> dict[str, str]:
     return _read_file(path)[1]
 
 
-def load_simulator(path: Path) -> Simulator:
+def load_simulator(path: Path) -> NetworkStepper:
     """Read a simulator written by :func:`save_simulator`.
 
     Raises:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from hood.cloth.cloth import Cloth
 from hood.cloth.state import State, StepInput
-from hood.contact.contact import Contact, Fold, find_nearest
+from hood.contact.contact import Contact, SecondContact, find_nearest
 from hood.energies.potential import Potential, default_potential
 from hood.energies.problem import StepProblem
 from hood.mesh.closest_point.vertices import Nearest
@@ -28,7 +28,7 @@ from hood.model.graph.near_cloth import find_near_cloth
 from hood.model.graph.schedule import edge_set_names, parse_passes, parse_schedule, set_level
 from hood.model.network.model import MeshGraphNet
 from hood.model.parts import MULTILEVEL, OUTPUTS, network_class, output_class
-from hood.model.readout.network_step import Feedback, Held, NetworkStep
+from hood.model.readout.network_step import Dirichlet, Feedback, NetworkStep
 from hood.model.readout.output import Output, OutputSettings
 from hood.native import features as native
 from hood.solver.vertex.block_jacobi import check_local
@@ -54,11 +54,11 @@ class Prediction:
     residual: float = math.nan  # relative gradient at next_pos; NaN where the step does not know it
     #: Of models in several passes: (V, 3) m after every pass but the last, and the forces (V, 3) N there.
     early: tuple[tuple[Tensor, Tensor], ...] = ()
-    entered: Fold | None = None  # the second contacts that it was taken with, where the step had led into skin first
+    entered: SecondContact | None = None  # the second contacts that it was taken with, where the step had led into skin first
     held_off: Contact | None = None  # the contact that it was taken with, where it had left triangles in the skin first
 
 
-class Sight(NamedTuple):
+class NetworkInputs(NamedTuple):
     """What a network is shown of a step."""
 
     inputs: Inputs
@@ -67,7 +67,7 @@ class Sight(NamedTuple):
     feedback: Feedback | None  # what it is told between its passes
 
 
-class Simulator(nn.Module):
+class NetworkStepper(nn.Module):
     """``State → State``: next_state = simulator.step(cloth, prepared, state, step_input).
 
     Build it with :func:`build_simulator`; ``config`` holds that call's arguments and travels with the weights.
@@ -103,7 +103,7 @@ class Simulator(nn.Module):
         self._wants_base = features.needs("base")
 
     @property
-    def simulator(self) -> Simulator:
+    def simulator(self) -> NetworkStepper:
         """Whoever takes its steps by a simulator has one."""
         return self
 
@@ -233,7 +233,7 @@ class Simulator(nn.Module):
         graph: Graph,
         potential: Potential | None = None,
         edge_rows: EdgeRows | None = None,
-    ) -> Sight:
+    ) -> NetworkInputs:
         """What the features are computed from.
 
         Args:
@@ -250,18 +250,18 @@ class Simulator(nn.Module):
             seen.cloth, seen.state, seen.step, seen.contact, graph, guess, residual, timestep=dt, edge_rows=edge_rows
         )
         if not self._wants_feedback:
-            return Sight(inputs, None, base, None)
+            return NetworkInputs(inputs, None, base, None)
         together = self.features.needs("global_step")
         feedback = Feedback(potential, seen, together, together and self.training, self.output.view_steps)
         held_back = self.output.held_back(seen, base) if together else None
-        return Sight(*feedback(inputs, base, held_back), base, feedback)
+        return NetworkInputs(*feedback(inputs, base, held_back), base, feedback)
 
     def advance(
-        self, problem: StepProblem, seen: StepProblem, sight: Sight, nodes: Tensor, edges: dict[str, Tensor]
+        self, problem: StepProblem, seen: StepProblem, sight: NetworkInputs, nodes: Tensor, edges: dict[str, Tensor]
     ) -> Prediction:
         """Positions at t + 1 from the features of what was looked at."""
         free, fixed = problem.cloth.free, self._fixed(problem)
-        shown = (sight.inputs, nodes, edges, sight.base, Held(free, fixed), sight.force, sight.feedback)
+        shown = (sight.inputs, nodes, edges, sight.base, Dirichlet(free, fixed), sight.force, sight.feedback)
         moved = self.output.move(NetworkStep(self.network, seen, *shown))
         acc = problem.acceleration(moved.pos if moved.displacement is None else fixed)
         if moved.displacement is not None:
@@ -289,7 +289,7 @@ class Simulator(nn.Module):
         prediction = self.predict(problem, prepared)
         return State(prediction.next_pos, self.next_velocity(problem, prediction), state.origin)
 
-    def clone(self) -> Simulator:
+    def clone(self) -> NetworkStepper:
         """A new simulator of the same model with the same weights, which looks at the same potential."""
         # A copy must not move the generator that a resumed run shares with an uninterrupted one.
         with torch.random.fork_rng(devices=[]):
@@ -328,7 +328,7 @@ def build_simulator(
     network: str = MULTILEVEL,
     output_options: Mapping[str, Any] | None = None,
     coarse_edge: float | None = None,
-) -> Simulator:
+) -> NetworkStepper:
     """A simulator from plain arguments.
 
     The arguments from ``body_velocity`` on are conventions of earlier weights; their defaults are the project's own and leave
@@ -399,7 +399,7 @@ def build_simulator(
     built = net(
         *widths, latent_dim, schedule, head.width, aggregation, output_init, coarse_encoders, head.look_widths, head.edge_width
     )
-    return Simulator(feature_set, built, made, body_radius, config, rules, num_levels, layer_radius, coarse_edge)
+    return NetworkStepper(feature_set, built, made, body_radius, config, rules, num_levels, layer_radius, coarse_edge)
 
 
 #: Arguments of :func:`build_simulator` that are written down only where they differ from its defaults: files of models that

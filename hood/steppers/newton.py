@@ -56,7 +56,16 @@ def implicit_euler(
     for index in range(num_steps):
         step = problem.step if step_input is None else step_input(index)
         found = None if contact is None else contact(index, state)
-        fresh = replace(problem, state=state, step=step, contact=found, point_contacts=(), pull=None, layers=(), fold=None)
+        fresh = replace(
+            problem,
+            state=state,
+            step=step,
+            contact=found,
+            point_contacts=(),
+            internal_force=None,
+            layers=(),
+            second_contact=None,
+        )
         now = potential.prepare(fresh)
         pos, report = minimize(potential, now, None if start is None else start(now), settings)
         state = State(pos, state.vel + now.vertex_dt * report.acc, state.origin)
@@ -64,10 +73,10 @@ def implicit_euler(
 
 
 class Stepper(Protocol):
-    """Takes steps: :class:`hood.steppers.network.Simulator` by a network, :class:`NewtonStepper` by minimisation.
+    """Takes steps: :class:`hood.steppers.network.NetworkStepper` by a network, :class:`NewtonStepper` by minimisation.
 
     A stepper of your own is a class with these attributes and methods. Some may be there beside them: ``simulator``, the
-    :class:`hood.steppers.network.Simulator` that takes its steps; ``solves_to``, the
+    :class:`hood.steppers.network.NetworkStepper` that takes its steps; ``solves_to``, the
     :class:`hood.solver.newton.NewtonSettings` that every step is to meet; ``any_precision`` where it computes in the precision
     of the state, whatever that of its gravity is; ``num_coarse``, the coarse levels that it takes as a third argument of
     ``prepare``; ``in_fixed_shapes(mode)``, the same steps by functions of fixed shapes.
@@ -175,7 +184,7 @@ class NewtonStepper:
             "solver_converged": float(bool(report.converged.all())),
             "solver_reason": reason_number(report.reason),
         }
-        entered = None if problem.fold is asked.fold else problem.fold
+        entered = None if problem.second_contact is asked.second_contact else problem.second_contact
         held_off = None if problem.contact is asked.contact else problem.contact
         rg = float(report.relative_gradient.max())
         return Prediction(pos, report.acc, reached, rg, entered=entered, held_off=held_off)

@@ -1,4 +1,4 @@
-"""Published HOOD weights as a :class:`hood.steppers.network.Simulator`, with the conventions they were trained with.
+"""Published HOOD weights as a :class:`hood.steppers.network.NetworkStepper`, with the conventions they were trained with.
 
 Four files exist: ``postcvpr`` (the authors' later training), ``cvpr`` (the paper's), and the paper's single-level baselines
 ``fine15`` and ``fine48``. The function computed is that of the reference implementation: the same features in the same
@@ -28,7 +28,7 @@ from hood.assets.pickles.torch_file import load_torch
 from hood.assets.pickles.unpickle import SIZE_LIMIT
 from hood.model.graph.builder import BODY, MESH
 from hood.model.graph.schedule import SCHEDULES, Step, edge_set_names, parse_schedule
-from hood.steppers.network import Simulator, build_simulator
+from hood.steppers.network import NetworkStepper, build_simulator
 
 MODEL = "model."
 NETWORK = "model._learned_model."
@@ -211,7 +211,7 @@ _SUMS = {"weight": "_acc_count", "num_updates": "_num_accumulations", "first": "
 _EMBEDDINGS = {"features.node.1.table.weight": "nodetype_embedding", "features.node.2.table.weight": "vertexlevel_embedding"}
 
 
-def load_reference_checkpoint(path: str | Path, size_limit: int = SIZE_LIMIT) -> Simulator:
+def load_reference_checkpoint(path: str | Path, size_limit: int = SIZE_LIMIT) -> NetworkStepper:
     """The simulator in a published ``.pth`` checkpoint, in evaluation mode; nothing in the file is run.
 
     Args:
@@ -231,7 +231,7 @@ def load_reference_checkpoint(path: str | Path, size_limit: int = SIZE_LIMIT) ->
     return read_reference_checkpoint(path, size_limit)[0]
 
 
-def read_reference_checkpoint(path: str | Path, size_limit: int = SIZE_LIMIT) -> tuple[Simulator, str]:
+def read_reference_checkpoint(path: str | Path, size_limit: int = SIZE_LIMIT) -> tuple[NetworkStepper, str]:
     """The same, and the name of the layout: ``postcvpr``, ``cvpr``, ``fine15`` or ``fine48``."""
     content = load_torch(path, size_limit)
     try:
@@ -240,8 +240,8 @@ def read_reference_checkpoint(path: str | Path, size_limit: int = SIZE_LIMIT) ->
         raise ValueError(f"{path}: {error}") from error
 
 
-def import_reference_weights(state: Mapping[str, Tensor]) -> tuple[Simulator, str]:
-    """Simulator and layout name of a state dict in one of the published layouts.
+def import_reference_weights(state: Mapping[str, Tensor]) -> tuple[NetworkStepper, str]:
+    """NetworkStepper and layout name of a state dict in one of the published layouts.
 
     Its trainable parameters are those of the file, a coarse encoder that no step uses included. Statistics are frozen.
 

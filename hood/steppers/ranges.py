@@ -1,6 +1,6 @@
 """What weights were trained for, and which values of a scene lie outside it.
 
-The ranges travel with the weights: training writes them into the model file, :attr:`Simulator.trained_for` holds them.
+The ranges travel with the weights: training writes them into the model file, :attr:`NetworkStepper.trained_for` holds them.
 """
 
 from __future__ import annotations

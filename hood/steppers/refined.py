@@ -81,7 +81,7 @@ class RefinedStepper:
     In a scene of float64 a network sees the problem in its own precision; its positions are refined and kept in float64.
 
     Args:
-        inner: a network's :class:`hood.steppers.network.Simulator`, or :class:`GuessStepper`.
+        inner: a network's :class:`hood.steppers.network.NetworkStepper`, or :class:`GuessStepper`.
         potential: what is lowered, usually the one that the network was trained with.
         goal: how far. What it learns belongs to a rollout, which begins with a fresh copy.
         method: ``newton``, a few global iterations, or ``sweeps`` of single vertices, which smooth at short range.

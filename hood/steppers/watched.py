@@ -23,7 +23,7 @@ from hood.steppers.static_shapes.simulator import network_of
 #: Metrics of a watched rollout: the price of what is left out, as γ; and 1 where the full model took the step.
 PLAN_METRICS = ("plan_price", "plan_full")
 
-#: Steps after which the lean model is tried again at the latest.
+#: Steps after which the reduced model is tried again at the latest.
 LONGEST = 240
 #: A bound overstates γ by no more than this, however much was measured.
 MOST_OVERSTATED = 100.0
@@ -66,9 +66,9 @@ def vertex_bounds(potential: Potential, names: Sequence[str], problem: StepProbl
     return torch.where(movable, lowered, 0.0).cpu() / float(scale(problem).sum())
 
 
-def lacking(lean: Potential, full: Potential) -> list[str]:
+def lacking(reduced: Potential, full: Potential) -> list[str]:
     """Names of the energies that only the full potential has."""
-    return [name for name in full.terms if name not in lean.terms]
+    return [name for name in full.terms if name not in reduced.terms]
 
 
 @dataclass(frozen=True)
@@ -81,21 +81,21 @@ class _Known:
 
 
 class WatchedStepper:
-    """Steps of ``lean``; each is priced, and taken by ``full`` where the price is above the limit.
+    """Steps of ``reduced``; each is priced, and taken by ``full`` where the price is above the limit.
 
-    The price of a step is made of :func:`vertex_bounds` of every energy that ``lean`` lacks, each sum divided by how much it
+    The price of a step is made of :func:`vertex_bounds` of every energy that ``reduced`` lacks, each sum divided by how much it
     overstates γ: (Σ √(bound / ratio))², since forces that pull together count more than one by one. Where it is too high,
-    the full model takes that very step, and tells what the lean one's was worth: how much higher the full potential is there.
-    If that is below the limit by :data:`MARGIN`, the bounds were too wide: what they overstate by is known for the next
+    the full model takes that very step, and tells what the reduced one's was worth: how much higher the full potential is
+    there. If that is below the limit by :data:`MARGIN`, the bounds were too wide: what they overstate by is known for the next
     :data:`REMEMBERED` steps, of the energy that the price came from and of the forces that were there, up to :data:`GROWTH`
-    times as large at a vertex (of what is new, its square root); the next step is the lean model's. Else the full model takes
-    the steps after it too.
-    After ``hold`` of them ``lean`` is tried again; where that fails at once, after twice as many, :data:`LONGEST` at most.
+    times as large at a vertex (of what is new, its square root); the next step is the reduced model's. Else the full model
+    takes the steps after it too.
+    After ``hold`` of them ``reduced`` is tried again; where that fails at once, after twice as many, :data:`LONGEST` at most.
 
     What keeps layers of cloth apart is always priced in full: through each other, they are worth nothing any more.
 
     Args:
-        lean, full: take the steps.
+        reduced, full: take the steps.
         potentials: what the two move by.
         scene: of the rollout; both prepare for its garment.
         limit: the largest price that is accepted, in units of γ.
@@ -104,52 +104,52 @@ class WatchedStepper:
 
     def __init__(
         self,
-        lean: Stepper,
+        reduced: Stepper,
         full: Stepper,
         potentials: tuple[Potential, Potential],
         scene: Scene,
         limit: float,
         hold: int,
     ) -> None:
-        self._lean, self._full, self._scene = lean, full, scene
+        self._reduced, self._full, self._scene = reduced, full, scene
         self._limit, self._hold = limit, hold
         self._potential = potentials[1]
         self._lacking = lacking(*potentials)
         self._start_over()
-        self.gravity = lean.gravity
-        self.times = lean.times
-        self.metrics = (*lean.metrics, *(name for name in full.metrics if name not in lean.metrics), *PLAN_METRICS)
-        self.config: dict[str, Any] = {**lean.config, "plan_limit": limit, "plan_hold": hold}
-        for stepper, potential in zip((lean, full), potentials, strict=True):
+        self.gravity = reduced.gravity
+        self.times = reduced.times
+        self.metrics = (*reduced.metrics, *(name for name in full.metrics if name not in reduced.metrics), *PLAN_METRICS)
+        self.config: dict[str, Any] = {**reduced.config, "plan_limit": limit, "plan_hold": hold}
+        for stepper, potential in zip((reduced, full), potentials, strict=True):
             network = network_of(stepper)
             if network is not None:
                 network.use_potential(for_networks(potential))
 
     @property
     def relaxing(self) -> Relaxing:
-        """That of the lean model."""
-        return self._lean.relaxing
+        """That of the reduced model."""
+        return self._reduced.relaxing
 
     def prepare(self, cloth: Any, rest_pos: Any) -> tuple[Any, Any]:
         """What both need of the scene's garment."""
         self._start_over()
-        return prepare_stepper(self._lean, self._scene), prepare_stepper(self._full, self._scene)
+        return prepare_stepper(self._reduced, self._scene), prepare_stepper(self._full, self._scene)
 
     def _start_over(self) -> None:
-        self._remaining = self._failed = 0  # steps that the full model still takes; times in a row that the lean one failed
+        self._remaining = self._failed = 0  # steps that the full model still takes; times in a row that the reduced one failed
         self._mistaken = 0  # times in a row that the price was too high
         self._bounds: dict[str, Tensor] = {}  # (V,) of the last step that was priced
         self._known: dict[str, _Known] = {}  # by energy
 
     def search(self, problem: StepProblem) -> StepProblem:
-        """The problem with the contact that the lean model needs."""
-        return problem if self._remaining else self._lean.search(problem)
+        """The problem with the contact that the reduced model needs."""
+        return problem if self._remaining else self._reduced.search(problem)
 
     def predict(self, problem: StepProblem, prepared: tuple[Any, Any], watch: Stopwatch | None = None) -> Prediction:
-        """The lean model's step, or the full one's where that is too far off."""
+        """The reduced model's step, or the full one's where that is too far off."""
         price, tried = 0.0, None
         if not self._remaining:
-            prediction = self._lean.predict(problem, prepared[0], watch)
+            prediction = self._reduced.predict(problem, prepared[0], watch)
             with timed(watch, "rest"):
                 price = self.price(problem, prediction.next_pos)
             if price <= self._limit:
@@ -183,15 +183,15 @@ class WatchedStepper:
                 self._known[name] = _Known(max(overstated, 1.0), GROWTH * self._bounds[name], REMEMBERED)
 
     @torch.no_grad()
-    def _worth(self, problem: StepProblem, lean: Tensor, full: Tensor) -> float:
-        """How much higher the full potential is at ``lean`` (V, 3) [m] than at ``full`` (V, 3) [m], as γ."""
+    def _worth(self, problem: StepProblem, reduced: Tensor, full: Tensor) -> float:
+        """How much higher the full potential is at ``reduced`` (V, 3) [m] than at ``full`` (V, 3) [m], as γ."""
         problem = self._potential.prepare(problem)
-        there, here = (self._potential.total(problem, pos.detach()).double().sum() for pos in (lean, full))
+        there, here = (self._potential.total(problem, pos.detach()).double().sum() for pos in (reduced, full))
         return float((there - here) / scale(problem).sum())
 
     def next_velocity(self, problem: StepProblem, prediction: Prediction) -> Tensor:
         """(V, 3) m/s at t + 1."""
-        stepper = self._full if prediction.metrics["plan_full"] else self._lean
+        stepper = self._full if prediction.metrics["plan_full"] else self._reduced
         return stepper.next_velocity(problem, prediction)
 
     @torch.no_grad()

@@ -15,7 +15,7 @@ from torch import Tensor
 from hood.model.kernels.block import KERNELS
 from hood.model.network.kernel_choice import AUTO
 from hood.model.network.model import PRECISIONS
-from hood.steppers.network import Simulator
+from hood.steppers.network import NetworkStepper
 from hood.training.curriculum import CollisionRamp, Horizon, InverseRoot, StepDecay, WarmupCosine, scaled_count
 
 #: Coefficients of the quintic Newton-Schulz iteration towards the nearest orthogonal matrix (Jordan et al., "Muon", 2024).
@@ -28,7 +28,7 @@ _ADAM_RMS = 0.2
 OPTIMIZERS = ("adam", "muon")
 
 
-def make_optimizer(name: str, simulator: Simulator, learning_rate: float) -> torch.optim.Optimizer:
+def make_optimizer(name: str, simulator: NetworkStepper, learning_rate: float) -> torch.optim.Optimizer:
     """``adam``, or ``muon`` for the matrices between latents with Adam for encoders' inputs, outputs, biases and norms."""
     if name == "adam":
         return torch.optim.Adam(simulator.parameters(), lr=learning_rate)

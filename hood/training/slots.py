@@ -16,7 +16,7 @@ from hood.cloth.cloth import Cloth, concatenate_cloths
 from hood.cloth.state import State, StepInput, concatenate_states, concatenate_step_inputs
 from hood.scene.scene import recentre
 from hood.solver.step_figures import edge_strain
-from hood.steppers.network import Prepared, Simulator
+from hood.steppers.network import NetworkStepper, Prepared
 from hood.training.prefetch import MAX_DRAWS, Request, SceneFeed, Start, choose_workers, draw_window, make_start
 from hood.training.scenes import SceneSampler, Window
 
@@ -111,7 +111,7 @@ class Slots:
     def __init__(
         self,
         sampler: SceneSampler,
-        simulator: Simulator,
+        simulator: NetworkStepper,
         batch_size: int,
         seed: int,
         max_horizon: int,

@@ -20,7 +20,7 @@ from hood.energies.self_contact import for_networks
 from hood.model.features.normalizer import RunningNormalizer
 from hood.model.network.kernel_choice import AUTO, Choice, choose_for
 from hood.steppers.checkpoint import save_simulator
-from hood.steppers.network import Prediction, Simulator
+from hood.steppers.network import NetworkStepper, Prediction
 from hood.steppers.protocol import Stopwatch, timed
 from hood.steppers.ranges import training_conditions
 from hood.training import distributed
@@ -56,7 +56,7 @@ class Trainer:
 
     def __init__(
         self,
-        simulator: Simulator,
+        simulator: NetworkStepper,
         potential: Potential,
         sampler: SceneSampler,
         settings: TrainerSettings,
@@ -222,7 +222,7 @@ class Trainer:
         self.iteration += 1
         return report
 
-    def averaged(self) -> Simulator:
+    def averaged(self) -> NetworkStepper:
         """The simulator with exponentially averaged weights (the plain ones when averaging is off), in eval mode."""
         clone = self.simulator.clone()
         clone.load_state_dict(self.simulator.state_dict() | (self._average if self.settings.ema_decay > 0 else {}))

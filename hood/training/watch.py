@@ -12,7 +12,7 @@ import numpy as np
 from hood.assets.files.atomic import write_atomically
 from hood.evaluation.validation import Validation, summarise
 from hood.rollouts.frames import KeptFrames
-from hood.steppers.network import Simulator
+from hood.steppers.network import NetworkStepper
 from hood.training import distributed
 
 #: Pixels of one picture of a strip.
@@ -31,7 +31,7 @@ class Watch:
     pictures: int = 8
     _said: bool = field(default=False, init=False)
 
-    def __call__(self, simulator: Simulator, iteration: int) -> tuple[dict[str, float], np.ndarray | None]:
+    def __call__(self, simulator: NetworkStepper, iteration: int) -> tuple[dict[str, float], np.ndarray | None]:
         """Figures over all validation rollouts, the same on every process, and on process 0 the strip (H, W, 3) uint8.
 
         Raises:

@@ -262,9 +262,9 @@ def test_an_interrupt_has_its_own_exit_code(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     """Ctrl-C during the second step keeps the frames done."""
-    from hood.steppers.network import Simulator
+    from hood.steppers.network import NetworkStepper
 
-    step, calls = Simulator.predict, []
+    step, calls = NetworkStepper.predict, []
 
     def interrupted(*arguments: object) -> object:
         calls.append(1)
@@ -272,7 +272,7 @@ def test_an_interrupt_has_its_own_exit_code(
             raise KeyboardInterrupt
         return step(*arguments)
 
-    monkeypatch.setattr(Simulator, "predict", interrupted)
+    monkeypatch.setattr(NetworkStepper, "predict", interrupted)
     assert main(["rollout", *UNTRAINED, "garment=tank", "num_frames=9", "video=none", "output=run"]) == 130
     assert "2 frames done are kept" in capsys.readouterr().err
     data = read_rollout(tmp_path / "run" / "rollout.h5")
@@ -297,12 +297,12 @@ def test_an_interrupt_has_its_own_exit_code(
 def test_faults_of_the_machine_are_one_sentence(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: Exception, said: str
 ) -> None:
-    from hood.steppers.network import Simulator
+    from hood.steppers.network import NetworkStepper
 
     def fail(*arguments: object) -> object:
         raise error
 
-    monkeypatch.setattr(Simulator, "predict", fail)
+    monkeypatch.setattr(NetworkStepper, "predict", fail)
     monkeypatch.delenv("HOOD_TRACEBACK", raising=False)
     command = ["rollout", *UNTRAINED, "garment=tank", "num_frames=3", "video=none", "sheet=false", "output=run"]
     assert main(command) == 2
@@ -326,9 +326,9 @@ def test_a_running_rollout_is_told_from_one_that_was_stopped(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     """While it runs its frames so far are read, and a second run into its folder is refused with nothing changed."""
-    from hood.steppers.network import Simulator
+    from hood.steppers.network import NetworkStepper
 
-    step, calls, reports = Simulator.predict, [], []
+    step, calls, reports = NetworkStepper.predict, [], []
     command = ["rollout", *UNTRAINED, "garment=tank", "video=none", "sheet=false", "output=run"]
 
     def look(*arguments: object) -> object:
@@ -345,7 +345,7 @@ def test_a_running_rollout_is_told_from_one_that_was_stopped(
             raise KeyboardInterrupt
         return step(*arguments)
 
-    monkeypatch.setattr(Simulator, "predict", look)
+    monkeypatch.setattr(NetworkStepper, "predict", look)
     assert main([*command, "num_frames=9"]) == 130
     assert "  so far: 2 of 9 frames, its run goes on\n" in reports[0]
     assert "not finished" not in reports[0]

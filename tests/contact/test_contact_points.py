@@ -42,7 +42,7 @@ def test_midpoints_are_matched_like_vertices_there() -> None:
     contact = find_contact(middles, cloth.edge_scene, obstacle)
     for name in ("dist", "point", "next_point", "next_normal"):
         assert torch.equal(getattr(points, name), getattr(contact, name)), name
-    # Edges of chords sag below the vertices, which is what vertices alone do not see.
+    # Edges of chords chord error below the vertices, which is what vertices alone do not see.
     assert float(points.dist.max()) < float(find_contact(pos, cloth.vertex_scene, obstacle).dist.min())
 
 

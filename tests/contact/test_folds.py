@@ -14,7 +14,7 @@ from hood.assets.material import Material
 from hood.assets.motion.load import load_sequence
 from hood.cloth.cloth import build_cloth
 from hood.cloth.state import Obstacle, concatenate_obstacles
-from hood.contact.contact import Contact, find_contact, find_fixed_fold, find_fold
+from hood.contact.contact import Contact, find_contact, find_second_contact, find_static_second_contact
 from hood.energies.contact import Collision
 from hood.energies.potential import default_potential, keeps_both_sides, reference_potential
 from hood.energies.problem import StepProblem
@@ -56,7 +56,7 @@ def contact_at(points: list[list[float]], body: Obstacle) -> tuple[Tensor, Tenso
 
 def fold_at(points: list[list[float]], body: Obstacle) -> Contact | None:
     pos, scene, contact = contact_at(points, body)
-    return find_fold(pos, scene, body, contact).contact
+    return find_second_contact(pos, scene, body, contact).contact
 
 
 def test_between_two_limbs_the_other_one_is_found() -> None:
@@ -72,7 +72,7 @@ def test_between_two_limbs_the_other_one_is_found() -> None:
 def test_cloth_that_is_already_in_the_other_limb_is_seen() -> None:
     body = obstacle(*limbs(0.004))
     pos, scene, contact = contact_at([[0.1, 0.0, 0.003]], body)
-    fold = find_fold(pos, scene, body, contact).contact
+    fold = find_second_contact(pos, scene, body, contact).contact
     assert fold is not None
     assert bool(fold.valid[0])
     assert float(contact.dist[0]) == pytest.approx(-1e-3)
@@ -101,7 +101,7 @@ def test_a_batch_finds_what_each_scene_does() -> None:
     points = [[0.1, 0.05 * i, 0.001 * i] for i in range(4)]
     pos = torch.tensor(points + points, dtype=F64)
     both, scene = concatenate_obstacles([narrow, wide]), torch.arange(8) // 4
-    together = find_fold(pos, scene, both, find_contact(pos, scene, both)).contact
+    together = find_second_contact(pos, scene, both, find_contact(pos, scene, both)).contact
     assert together is not None
     for index, body in enumerate((narrow, wide)):
         alone = fold_at(points, body)
@@ -115,9 +115,9 @@ def test_the_form_of_fixed_shapes_finds_the_same() -> None:
     body = obstacle(*limbs(0.012, 0.1))
     points = [[0.02 * i, 0.03 * j, 1e-3 * (i - j)] for i in range(1, 6) for j in range(4)] + [[0.1, 0.0, 2.0]]
     pos, scene, contact = contact_at(points, body)
-    plain = find_fold(pos, scene, body, contact).contact
+    plain = find_second_contact(pos, scene, body, contact).contact
     incidence = build_incidence(body.faces, len(body.pos))
-    fixed = find_fixed_fold(pos, scene, contact, body, incidence, 1, len(body.faces)).contact
+    fixed = find_static_second_contact(pos, scene, contact, body, incidence, 1, len(body.faces)).contact
     assert plain is not None
     assert fixed is not None
     assert 10 <= int(plain.valid.sum()) < len(points)
@@ -132,10 +132,10 @@ def test_fixed_shapes_do_not_depend_on_what_is_found() -> None:
         body = problem.step.obstacle
         assert body is not None
         fixed, _ = with_fixed_contact(problem, build_incidence(body.faces, len(body.pos)), len(body.faces), folds=True)
-        assert fixed.fold is not None
-        assert fixed.fold.contact is not None
-        assert bool(fixed.fold.contact.valid.any()) is found
-        assert len(fixed.fold.contact.valid) == len(problem.state.pos)
+        assert fixed.second_contact is not None
+        assert fixed.second_contact.contact is not None
+        assert bool(fixed.second_contact.contact.valid.any()) is found
+        assert len(fixed.second_contact.contact.valid) == len(problem.state.pos)
 
 
 @pytest.mark.skipif(library() is None, reason="without a compiler every search begins anew")
@@ -159,8 +159,8 @@ def between(gap: float, speed: float = 0.0) -> StepProblem:
 
 def test_the_energy_is_that_of_either_side() -> None:
     problem = Collision().prepare(between(0.006))
-    assert problem.fold is not None
-    assert problem.fold.contact is not None
+    assert problem.second_contact is not None
+    assert problem.second_contact.contact is not None
     middle = problem.state.pos * torch.tensor([1.0, 1.0, 0.0], dtype=F64)
     deep = [(2e-3 - 3e-3 + shift) for shift in (0.0015, -0.0015)]
     energy = Collision(reach="constant")(problem, middle + torch.tensor([0.0, 0.0, 0.0015], dtype=F64), middle)
@@ -213,9 +213,9 @@ def test_the_compiled_search_finds_what_torch_does(body, monkeypatch: pytest.Mon
     pos = surface.pos[rows] + 0.01 * torch.randn(3000, 3, generator=generator, dtype=F64)
     scene = torch.zeros(len(pos)).long()
     contact = find_contact(pos, scene, surface)
-    compiled = find_fold(pos, scene, surface, contact).contact
+    compiled = find_second_contact(pos, scene, surface, contact).contact
     monkeypatch.setattr(tree, "search_folds", lambda *given: None)
-    plain = find_fold(pos, scene, surface, contact).contact
+    plain = find_second_contact(pos, scene, surface, contact).contact
     assert compiled is not None
     assert plain is not None
     assert int(plain.valid.sum()) > 50
@@ -229,5 +229,5 @@ def test_nothing_folds_without_a_surface_or_without_cloth() -> None:
     body = obstacle(*limbs(0.01))
     pos, scene, contact = contact_at([[0.1, 0.0, 0.002]], body)
     empty = Obstacle(body.pos, body.pos, body.pos, body.faces[:0], body.vertex_scene, body.face_scene[:0])
-    assert find_fold(pos, scene, empty, contact).contact is None
-    assert find_fold(pos[:0], scene[:0], body, contact).contact is None
+    assert find_second_contact(pos, scene, empty, contact).contact is None
+    assert find_second_contact(pos[:0], scene[:0], body, contact).contact is None

@@ -12,8 +12,8 @@ from torch import Tensor
 from hood.assets.material import Material
 from hood.cloth.cloth import build_cloth
 from hood.cloth.state import Obstacle, State, StepInput, concatenate_obstacles
-from hood.contact.contact import find_contact, find_fold
-from hood.contact.second_side import find_landing, find_other_skin
+from hood.contact.contact import find_contact, find_second_contact
+from hood.contact.second_side import find_landing, find_second_side
 from hood.energies.potential import default_potential
 from hood.energies.problem import StepProblem, free_flight
 from hood.mesh.closest_point.search import build_incidence
@@ -96,13 +96,15 @@ def test_a_step_ends_on_the_free_side(speed: float) -> None:
     """Positions against the wall itself: nothing of the search is used."""
     potential, problem = default_potential(), thrown(speed)
     known = potential.prepare(problem)
-    assert known.fold is not None
-    assert known.fold.contact is not None
+    assert known.second_contact is not None
+    assert known.second_contact.contact is not None
     pos, report = minimize(potential, known, None, NewtonSettings())
     assert report.converged
     assert float(pos[:, 0].max()) < 1e-3
     assert float(pos[:, 1].min()) > -1e-3
-    without = replace(known, fold=find_fold(known.state.pos, known.cloth.vertex_scene, known.step.obstacle, known.contact))  # type: ignore[arg-type]
+    without = replace(
+        known, second_contact=find_second_contact(known.state.pos, known.cloth.vertex_scene, known.step.obstacle, known.contact)
+    )  # type: ignore[arg-type]
     through, _ = minimize(potential, without, None, NewtonSettings())
     assert float(through[:, 0].max()) > 0.02
 
@@ -112,8 +114,8 @@ def test_calm_cloth_has_the_folds_alone() -> None:
     known = problem.with_fold()
     assert known.contact is not None
     assert known.step.obstacle is not None
-    plain = find_fold(problem.state.pos, problem.cloth.vertex_scene, known.step.obstacle, known.contact)
-    assert (known.fold is None or known.fold.contact is None) == (plain.contact is None)
+    plain = find_second_contact(problem.state.pos, problem.cloth.vertex_scene, known.step.obstacle, known.contact)
+    assert (known.second_contact is None or known.second_contact.contact is None) == (plain.contact is None)
 
 
 def test_a_batch_finds_what_each_scene_does() -> None:
@@ -121,12 +123,12 @@ def test_a_batch_finds_what_each_scene_does() -> None:
     points = torch.tensor([[0.02, 0.25, 0.0], [0.0, 0.3, 0.0], [-0.06, 0.03, 0.0], [-0.2, 0.3, 0.0]], dtype=F64)
     ways = torch.tensor([[0, -0.3, 0], [0, 0.1, 0], [0.1, 0.03, 0.02], [0.1, 0, 0]], dtype=F64)
     scene, both = torch.arange(4) // 2, concatenate_obstacles([ball, room])
-    together = find_other_skin(points, scene, both, find_contact(points, scene, both), ways).contact
+    together = find_second_side(points, scene, both, find_contact(points, scene, both), ways).contact
     assert together is not None
     assert together.valid.tolist() == [True, False, True, False]
     for index, body in enumerate((ball, room)):
         own, zero = slice(2 * index, 2 * index + 2), torch.zeros(2).long()
-        alone = find_other_skin(points[own], zero, body, find_contact(points[own], zero, body), ways[own]).contact
+        alone = find_second_side(points[own], zero, body, find_contact(points[own], zero, body), ways[own]).contact
         assert alone is not None
         for name in ("valid", "dist", "next_point", "next_normal"):
             rows = alone.valid
@@ -138,12 +140,14 @@ def test_single_precision_and_steps_of_fixed_shapes_find_the_same_on_a_cpu() -> 
     incidence = build_incidence(double.step.obstacle.faces, len(double.step.obstacle.pos))  # type: ignore[union-attr]
     fixed, _ = with_fixed_contact(thrown(4.0), incidence, 0, folds=True)
     for other in (single, fixed):
-        assert other.fold is not None
-        assert other.fold.contact is not None
-        assert double.fold is not None
-        assert double.fold.contact is not None
-        assert torch.equal(other.fold.contact.valid, double.fold.contact.valid)
-        torch.testing.assert_close(other.fold.contact.next_point.double(), double.fold.contact.next_point, rtol=0, atol=1e-5)
+        assert other.second_contact is not None
+        assert other.second_contact.contact is not None
+        assert double.second_contact is not None
+        assert double.second_contact.contact is not None
+        assert torch.equal(other.second_contact.contact.valid, double.second_contact.contact.valid)
+        torch.testing.assert_close(
+            other.second_contact.contact.next_point.double(), double.second_contact.contact.next_point, rtol=0, atol=1e-5
+        )
 
 
 @pytest.mark.parametrize("speed", [float("nan"), float("inf"), 1e30])
@@ -162,4 +166,4 @@ def test_free_flight_is_that_of_a_step_without_forces() -> None:
 def test_cloth_without_vertices() -> None:
     body = obstacle(*sphere(2, 0.1))
     none, scene = torch.zeros(0, 3, dtype=F64), torch.zeros(0).long()
-    assert find_other_skin(none, scene, body, find_contact(none, scene, body), none).contact is None
+    assert find_second_side(none, scene, body, find_contact(none, scene, body), none).contact is None

@@ -11,7 +11,7 @@ import torch
 from hood.assets.material import Material
 from hood.cloth.cloth import build_cloth, concatenate_cloths
 from hood.cloth.state import Obstacle, concatenate_obstacles
-from hood.contact.activation_distance import MOST_STRETCHED, sag, vertex_reach
+from hood.contact.activation_distance import MOST_STRETCHED, chord_error, vertex_reach
 from hood.contact.contact import find_contact, find_fixed_contact
 from hood.energies.contact import Collision
 from hood.energies.friction import Friction
@@ -59,32 +59,32 @@ def cut(problem: StepProblem, pos: torch.Tensor) -> int:
 
 
 def test_sag_is_that_of_a_chord_with_a_margin() -> None:
-    """Edges of length L between points of a circle of radius r sag by r − √(r² − L²/4)."""
+    """Edges of length L between points of a circle of radius r chord error by r − √(r² − L²/4)."""
     problem = sleeve().with_contact()
     assert problem.contact is not None
     length_sq, radius = problem.cloth.edge_length_sq, 0.06
     chord = radius - (radius**2 - length_sq / 4.0).sqrt()
-    found = sag(problem.cloth, problem.contact, problem.state.pos)
+    found = chord_error(problem.cloth, problem.contact, problem.state.pos)
     assert float((found / chord).min()) > 1.0
     assert float((found / chord).max()) < 1.7
     assert float(found.max()) <= 8e-3
 
 
 def test_stretched_cloth_is_held_off_as_its_present_triangles_need() -> None:
-    """Edges twice as long as at rest sag four times as far; what ordinary strain adds is within the margin."""
+    """Edges twice as long as at rest chord error four times as far; what ordinary strain adds is within the margin."""
     problem = sleeve().with_contact()
     contact, cloth = problem.contact, problem.cloth
     assert contact is not None
-    at_rest = sag(cloth, contact, cloth.rest_pos)
-    assert torch.equal(sag(cloth, contact, 1.1 * cloth.rest_pos), at_rest)
-    assert torch.equal(sag(cloth, contact, 0.5 * cloth.rest_pos), at_rest)
-    stretched = sag(cloth, contact, 1.5 * cloth.rest_pos)
+    at_rest = chord_error(cloth, contact, cloth.rest_pos)
+    assert torch.equal(chord_error(cloth, contact, 1.1 * cloth.rest_pos), at_rest)
+    assert torch.equal(chord_error(cloth, contact, 0.5 * cloth.rest_pos), at_rest)
+    stretched = chord_error(cloth, contact, 1.5 * cloth.rest_pos)
     assert float((stretched / at_rest).min()) > 1.9  # 1.5² less a quarter more of even edges
     assert float((stretched - at_rest).max()) <= MOST_STRETCHED
     alone = cloth.rest_pos.clone()
     alone[0] += 0.05 * torch.tensor([0.0, 1.0, 0.0])  # one vertex is pulled away: its neighbours have one long edge each
     near = torch.unique(cloth.edges[(cloth.edges == 0).any(dim=1)])
-    changed = (sag(cloth, contact, alone) != at_rest).nonzero().squeeze(1)
+    changed = (chord_error(cloth, contact, alone) != at_rest).nonzero().squeeze(1)
     assert set(changed.tolist()) <= set(near.tolist())
     assert len(changed) > 2
 
@@ -95,7 +95,7 @@ def test_constant_reach_is_the_same_everywhere_and_curvature_adds_the_sag() -> N
     assert contact is not None
     even, bent = (vertex_reach(form, 2e-3, cloth, contact, pos) for form in ("constant", "curvature"))
     assert torch.equal(even, torch.full_like(even, 2e-3))
-    torch.testing.assert_close(bent - even, sag(cloth, contact, pos))
+    torch.testing.assert_close(bent - even, chord_error(cloth, contact, pos))
     flat = find_contact(cloth.rest_pos, cloth.vertex_scene, body(grid(5, 5, 2.0), (-1.0, -0.2, -1.0)))
     assert torch.equal(vertex_reach("curvature", 2e-3, cloth, flat, pos), even)
 
@@ -136,10 +136,10 @@ def test_scenes_of_a_batch_keep_their_own() -> None:
     both = find_contact(cloth.rest_pos, cloth.vertex_scene, concatenate_obstacles([ball for ball in balls if ball is not None]))
     rests = [problem.cloth.rest_pos for problem in (first, second)]
     alone = [
-        sag(p.cloth, find_contact(p.cloth.rest_pos, p.cloth.vertex_scene, p.step.obstacle), p.cloth.rest_pos)
+        chord_error(p.cloth, find_contact(p.cloth.rest_pos, p.cloth.vertex_scene, p.step.obstacle), p.cloth.rest_pos)
         for p in (first, second)
     ]  # type: ignore[arg-type]
-    torch.testing.assert_close(sag(cloth, both, torch.cat(rests)), torch.cat(alone))
+    torch.testing.assert_close(chord_error(cloth, both, torch.cat(rests)), torch.cat(alone))
 
 
 @pytest.mark.parametrize("form", ["curvature", "constant"])
@@ -171,7 +171,7 @@ def test_a_ball_is_held_off_by_its_own_curvature() -> None:
     ball = body(sphere(4, 0.1), (0.08, -0.1, 0.08))
     contact = find_contact(cloth.rest_pos, cloth.vertex_scene, ball)
     expected = 1.5 / 8.0 * cloth.edge_length_sq / 0.1
-    torch.testing.assert_close(sag(cloth, contact, cloth.rest_pos), expected, rtol=0.1, atol=0)
+    torch.testing.assert_close(chord_error(cloth, contact, cloth.rest_pos), expected, rtol=0.1, atol=0)
 
 
 def test_a_body_that_has_moved_has_another_curvature() -> None:

@@ -99,7 +99,7 @@ def test_layers_that_lie_still_are_pressed_with_the_weight_above_them() -> None:
     count = 4
     *_, last = implicit_euler(POTENTIAL, stack(1 / 30, n=4, count=count), 40, NewtonSettings(target_rg=1e-5))
     assert float(last.state.vel.norm(dim=1).max()) < 0.01
-    problem = POTENTIAL.prepare(replace(last.problem, state=last.state, contact=None, pull=None, layers=()))
+    problem = POTENTIAL.prepare(replace(last.problem, state=last.state, contact=None, internal_force=None, layers=()))
     grips = LayerFriction(1.0).grips(problem)
     sheet = float(problem.cloth.mass.sum()) * 9.81 / count
     above = sum(range(1, count))  # sheets above a gap, of all gaps
@@ -140,7 +140,7 @@ def test_sheet_slides_above_it_with_what_is_left_of_gravity(coefficient: float, 
 
 def test_compiled_and_torch_reach_the_same_minimum() -> None:
     *_, before = implicit_euler(POTENTIAL, stack(1 / 30, n=4, count=4), 4)
-    problem = POTENTIAL.prepare(replace(before.problem, state=before.state, contact=None, pull=None, layers=()))
+    problem = POTENTIAL.prepare(replace(before.problem, state=before.state, contact=None, internal_force=None, layers=()))
     ends = []
     for engine in ("compiled", "torch"):
         pos, report = minimize(POTENTIAL, problem, settings=NewtonSettings(target_rg=1e-6, engine=engine))

@@ -14,7 +14,7 @@ from hood.cloth.cloth import build_cloth, concatenate_cloths
 from hood.contact.self_contact import find_sides
 from hood.energies.potential import Potential, default_potential
 from hood.energies.problem import StepProblem
-from hood.energies.self_contact import LayerBarrier, LayerSides, for_networks
+from hood.energies.self_contact import LayerBarrier, SignedSelfContactPenalty, for_networks
 from hood.solver.newton import minimize
 from hood.tensors.batch import to_device
 from hood.testing import cylinder, grid, make_problem, random_rotation
@@ -38,7 +38,7 @@ def lowered(problem: StepProblem, by: float) -> torch.Tensor:
     return problem.state.pos - by * upper[:, None] * UP
 
 
-def forces(term: LayerSides, problem: StepProblem, pos: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def forces(term: SignedSelfContactPenalty, problem: StepProblem, pos: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Energy (B,) and gradient (V, 3)."""
     potential = Potential({"sides": term})
     gradient, energies = potential.gradient(potential.prepare(problem), pos)
@@ -47,7 +47,7 @@ def forces(term: LayerSides, problem: StepProblem, pos: torch.Tensor) -> tuple[t
 
 @pytest.mark.parametrize("by", [0.003, 0.008])
 def test_gradient_is_that_of_the_energy(by: float) -> None:
-    problem, term = two_sheets(), LayerSides()
+    problem, term = two_sheets(), SignedSelfContactPenalty()
     prepared, pos = term.prepare(problem), lowered(two_sheets(), by).requires_grad_(True)
     assert float(term(prepared, pos, pos).detach()) > 0
     assert torch.autograd.gradcheck(lambda x: term(prepared, x, x), (pos,), eps=1e-7, atol=1e-6)
@@ -55,8 +55,8 @@ def test_gradient_is_that_of_the_energy(by: float) -> None:
 
 def test_nothing_is_felt_apart_and_along_a_sheet_at_rest() -> None:
     problem = two_sheets()
-    assert float(forces(LayerSides(), problem, problem.state.pos)[0]) == 0
-    assert float(forces(LayerSides(), problem, lowered(problem, -0.05))[1].abs().max()) == 0
+    assert float(forces(SignedSelfContactPenalty(), problem, problem.state.pos)[0]) == 0
+    assert float(forces(SignedSelfContactPenalty(), problem, lowered(problem, -0.05))[1].abs().max()) == 0
     assert len(find_sides(problem.cloth, lowered(problem, -0.05), 0.02).vertex) == 0
     tube, faces = cylinder(around=40, rows=30, radius=0.03, height=0.2)  # edges of 5 mm, well within the reach
     cloth = build_cloth(tube, faces, Material(), dtype=F64)
@@ -68,7 +68,7 @@ def test_crossed_cloth_is_pushed_back_however_deep() -> None:
     problem, before = two_sheets(), 0.0
     for by in (0.004, 0.006, 0.012, 0.03):
         pos = lowered(problem, by)
-        energy, gradient = forces(LayerSides(), problem, pos)
+        energy, gradient = forces(SignedSelfContactPenalty(), problem, pos)
         assert float(energy) > before
         before = float(energy)
         # Down the slope the upper sheet goes up, and the lower one down.
@@ -78,7 +78,10 @@ def test_crossed_cloth_is_pushed_back_however_deep() -> None:
 
 def test_sides_are_those_at_t_in_every_position() -> None:
     problem = two_sheets()
-    over, under = LayerSides().prepare(problem), LayerSides().prepare(make_problem(problem.cloth, lowered(problem, 0.01)))
+    over, under = (
+        SignedSelfContactPenalty().prepare(problem),
+        SignedSelfContactPenalty().prepare(make_problem(problem.cloth, lowered(problem, 0.01))),
+    )
     assert over.sides is not None
     assert under.sides is not None
     normal_up = over.sides.side[over.sides.vertex >= 36]
@@ -87,7 +90,7 @@ def test_sides_are_those_at_t_in_every_position() -> None:
     assert len(normal_down) >= 25
     assert normal_up.abs().min() == 1
     assert float(normal_up.mean()) == -float(normal_down.mean())
-    term = LayerSides()
+    term = SignedSelfContactPenalty()
     assert float(term(under, lowered(problem, 0.01), problem.state.pos)) == 0  # crossed at t: stays so
     assert float(term(over, lowered(problem, 0.01), problem.state.pos)) > 0
     assert float(term(under, problem.state.pos, problem.state.pos)) > 0
@@ -113,7 +116,7 @@ def test_one_sheet_folded_has_sides_against_itself() -> None:
 
 
 def test_rigid_motion_changes_nothing_and_no_net_force_or_torque_remains() -> None:
-    problem, term = two_sheets(), LayerSides()
+    problem, term = two_sheets(), SignedSelfContactPenalty()
     pos = lowered(problem, 0.006)
     energy, gradient = forces(term, problem, pos)
     turn, shift = torch.as_tensor(random_rotation(np.random.default_rng(2))), torch.tensor([0.3, -0.2, 0.1], dtype=F64)
@@ -130,8 +133,8 @@ def test_a_batch_is_its_scenes() -> None:
     first, second = two_sheets(seed=1), two_sheets(gap=0.004, seed=2)
     batch = make_problem(concatenate_cloths([first.cloth, second.cloth]), torch.cat([first.state.pos, second.state.pos]))
     ends = [lowered(first, 0.006), lowered(second, 0.006)]
-    energy, gradient = forces(LayerSides(), batch, torch.cat(ends))
-    alone = [forces(LayerSides(), problem, pos) for problem, pos in zip((first, second), ends, strict=True)]
+    energy, gradient = forces(SignedSelfContactPenalty(), batch, torch.cat(ends))
+    alone = [forces(SignedSelfContactPenalty(), problem, pos) for problem, pos in zip((first, second), ends, strict=True)]
     torch.testing.assert_close(energy, torch.cat([one for one, _ in alone]))
     torch.testing.assert_close(gradient, torch.cat([one for _, one in alone]))
     assert float(energy.min()) > 0
@@ -139,7 +142,7 @@ def test_a_batch_is_its_scenes() -> None:
 
 def test_faces_without_an_area_leave_it_finite() -> None:
     problem = two_sheets()
-    energy, gradient = forces(LayerSides(), problem, torch.zeros_like(problem.state.pos))
+    energy, gradient = forces(SignedSelfContactPenalty(), problem, torch.zeros_like(problem.state.pos))
     assert bool(torch.isfinite(energy).all())
     assert bool(torch.isfinite(gradient).all())
 
@@ -150,18 +153,18 @@ def test_a_config_has_it_off_and_turns_it_on() -> None:
     assert asked.settings["layer_sides"]["weight"] == 1e6
     assert set(for_networks(asked.with_terms(layers=LayerBarrier())).terms) == set(default_potential().terms)
     with pytest.raises(ValueError, match="0 < epsilon <= reach"):
-        LayerSides(epsilon=0.03)
+        SignedSelfContactPenalty(epsilon=0.03)
 
 
 def test_the_solver_refuses_it() -> None:
     problem = two_sheets()
     with pytest.raises(ValueError, match=r"losses.terms.layer_sides is for training.*cloth_contact=on"):
-        minimize(default_potential().with_terms(layer_sides=LayerSides()), problem)
+        minimize(default_potential().with_terms(layer_sides=SignedSelfContactPenalty()), problem)
 
 
 @pytest.mark.gpu
 def test_the_same_on_a_gpu() -> None:
-    problem, term = two_sheets(), LayerSides()
+    problem, term = two_sheets(), SignedSelfContactPenalty()
     pos = lowered(problem, 0.006)
     there = replace(problem, cloth=to_device(problem.cloth, "cuda"), state=to_device(problem.state, "cuda"))
     there = replace(there, step=to_device(problem.step, "cuda"))

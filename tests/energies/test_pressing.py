@@ -63,8 +63,8 @@ def test_deep_cloth_at_rest_shape_is_held_by_no_more_than_stops_it(depth: float,
     problem = on(floor(), -depth)
     problem = replace(problem, state=replace(problem.state, vel=torch.tensor([0.0, speed, 0.0], dtype=F64).expand(36, 3)))
     problem = potential.prepare(problem)
-    flown = -depth + dt * speed - dt**2 * G
-    expected = problem.cloth.mass / dt**2 * max(2e-3 - flown, 0.0)
+    ballistic_position = -depth + dt * speed - dt**2 * G
+    expected = problem.cloth.mass / dt**2 * max(2e-3 - ballistic_position, 0.0)
     assert float((penalty(potential, problem) / problem.cloth.mass / G).min()) > 100
     torch.testing.assert_close(force(potential, problem), expected, rtol=1e-6, atol=1e-9)
 
@@ -75,10 +75,12 @@ def test_cloth_that_lies_still_and_cloth_over_a_ball_keep_the_contacts_own_force
     for body, height in ((floor(), 2e-3), (sphere(3, 0.1), 0.106)):
         for taken in implicit_euler(potential, on(body, height), 40, NewtonSettings(target_rg=1e-6, linear="direct")):
             assert taken.report.converged.all()
-        last = potential.prepare(replace(taken.problem, state=taken.state, contact=None, pull=None))
+        last = potential.prepare(replace(taken.problem, state=taken.state, contact=None, internal_force=None))
         still = State(last.state.pos, torch.zeros_like(last.state.vel), last.state.origin)
         last = replace(last, state=still)
-        unbounded = force(potential, replace(last, pull=torch.full_like(last.state.pos, -1e6) * last.contact.next_normal))  # type: ignore[union-attr]
+        unbounded = force(
+            potential, replace(last, internal_force=torch.full_like(last.state.pos, -1e6) * last.contact.next_normal)
+        )  # type: ignore[union-attr]
         assert float(unbounded.sum()) > 0.9 * float(last.cloth.mass.sum()) * G
         assert float((unbounded - force(potential, last)).abs().sum()) < 0.02 * float(unbounded.sum())
 
@@ -90,10 +92,10 @@ def test_stretched_cloth_presses_with_its_tension() -> None:
     pos = problem.state.pos.clone()
     pos[:, 1] -= 0.6 * pos[:, [0, 2]].square().sum(dim=1).sqrt()
     problem = potential.prepare(replace(problem, state=replace(problem.state, pos=pos)))
-    assert problem.pull is not None
+    assert problem.internal_force is not None
     contact = problem.contact
     assert contact is not None
-    pressed = -(problem.pull * contact.next_normal).sum(dim=1)
+    pressed = -(problem.internal_force * contact.next_normal).sum(dim=1)
     rows = (penalty(potential, problem) > 0) & (pressed > 50 * problem.cloth.mass * G)
     assert int(rows.sum()) > 0
     assert bool((force(potential, problem)[rows] > 30 * problem.cloth.mass[rows] * G).any())
@@ -112,17 +114,19 @@ def test_every_other_term_pulls() -> None:
     problem = on(floor(), 1e-3)
     calm, windy = (default_potential(), default_potential().with_terms(wind=Wind()))
     still, pressed = calm.prepare(problem), windy.prepare(problem)
-    assert still.pull is not None
-    assert pressed.pull is not None
-    torch.testing.assert_close(pressed.pull - still.pull, torch.tensor([0.0, -0.03, 0.0], dtype=F64).expand(36, 3))
+    assert still.internal_force is not None
+    assert pressed.internal_force is not None
+    torch.testing.assert_close(
+        pressed.internal_force - still.internal_force, torch.tensor([0.0, -0.03, 0.0], dtype=F64).expand(36, 3)
+    )
     assert float((force(windy, pressed) - force(calm, still)).min()) == pytest.approx(0.03)
     assert calm.prepare(still) is still
 
 
 def test_who_does_not_ask_gets_no_pull_and_who_asks_too_late_is_refused() -> None:
     problem = on(floor(), 1e-3)
-    assert reference_potential().prepare(problem).pull is None
-    assert default_potential(friction_coefficient=0.0).prepare(problem).pull is None
+    assert reference_potential().prepare(problem).internal_force is None
+    assert default_potential(friction_coefficient=0.0).prepare(problem).internal_force is None
     potential = default_potential()
     with pytest.raises(ValueError, match="pull not known yet"):
         potential.total(problem.with_fold(), problem.state.pos)
@@ -143,6 +147,6 @@ def test_both_forms_of_the_pull_agree() -> None:
     potential, problem = default_potential(), on(sphere(3, 0.1), 0.103).with_contact()
     noise = 1e-3 * torch.as_tensor(np.random.default_rng(0).normal(size=(36, 3)))
     problem = replace(problem, state=replace(problem.state, pos=problem.state.pos + noise))
-    found = [potential.with_pull(problem, compiled).pull for compiled in (True, False)]
+    found = [potential.with_internal_force(problem, compiled).internal_force for compiled in (True, False)]
     assert found[0] is not None
     torch.testing.assert_close(found[0], found[1], rtol=1e-9, atol=1e-12)

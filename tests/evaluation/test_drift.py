@@ -14,7 +14,7 @@ from hood.evaluation.table import ALL, Candidate, Measured, candidate_rows
 from hood.evaluation.validation import sideways_drift, standing_scene
 from hood.scene.scene import Scene
 from hood.solver.newton import NewtonSettings
-from hood.steppers.network import Prediction, Simulator, build_simulator
+from hood.steppers.network import NetworkStepper, Prediction, build_simulator
 from hood.steppers.newton import NewtonStepper
 
 
@@ -23,7 +23,7 @@ def scene() -> Scene:
     return standing_scene(load_garment("tank"), load_body(), 8)
 
 
-def pusher(push: float) -> Simulator:
+def pusher(push: float) -> NetworkStepper:
     """Moves every vertex sideways by ``push`` [m] a step."""
     simulator = build_simulator("physical", "velocity_base", "1x(mesh)", latent_dim=4).eval()
     plain = simulator.predict

@@ -11,16 +11,16 @@ from hood.evaluation.gap import REFERENCE
 from hood.evaluation.validation import Rollout, Validation, score, summarise
 from hood.rollouts.loop import simulate
 from hood.scene.scene import Scene
-from hood.steppers.network import Simulator, build_simulator
+from hood.steppers.network import NetworkStepper, build_simulator
 
 
 @pytest.fixture(scope="module")
-def idle() -> Simulator:
+def idle() -> NetworkStepper:
     """A model whose cloth moves with the body and does nothing else."""
     return build_simulator("physical", "velocity_base", "1x(mesh)", latent_dim=4, output_init=0.0).eval()
 
 
-def test_gap_and_frames_are_those_of_the_rollout(idle: Simulator, band_scene: Scene) -> None:
+def test_gap_and_frames_are_those_of_the_rollout(idle: NetworkStepper, band_scene: Scene) -> None:
     potential = default_potential()
     reference = replace(REFERENCE, max_iterations=60)
     motion = band_scene.motion

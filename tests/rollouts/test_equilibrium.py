@@ -99,7 +99,7 @@ def test_an_equilibrium_stays_where_it_is(band_scene: Scene) -> None:
 
 
 def test_coarse_cloth_rests_out_of_the_skin(garments: dict[str, Garment], body: Body, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Flat triangles of 7 cm sag into the body: held farther off, they do not."""
+    """Flat triangles of 7 cm chord error into the body: held farther off, they do not."""
     coarse = FAULTS["remesh"](garments["dress"], 300.0, np.random.default_rng(0))
     scene = build_scene(coarse, body, load_sequence("dance_mixed"), dtype=torch.float32)
 

@@ -22,7 +22,7 @@ from hood.rollouts.file.reader import read_rollout
 from hood.rollouts.frame import METRIC_CHOICES, Frame, metric_names
 from hood.rollouts.loop import simulate, start_state
 from hood.scene.scene import Scene, build_scene
-from hood.steppers.network import Simulator, build_simulator
+from hood.steppers.network import NetworkStepper, build_simulator
 from tests.verdict.table.scene import run
 from tests.verdict.table.scenes import SECOND
 
@@ -43,7 +43,7 @@ class Cheat(nn.Module):
         return self.answer(len(self.graphs) - 1, graph).to(nodes)
 
 
-def cheating(answer: Callable[[int, Graph], Tensor], dtype: torch.dtype = torch.float32) -> Simulator:
+def cheating(answer: Callable[[int, Graph], Tensor], dtype: torch.dtype = torch.float32) -> NetworkStepper:
     """The paper's features and output; without statistics its raw output is the displacement per frame² [m]."""
     simulator = build_simulator("paper", "acceleration", "1x(mesh)", latent_dim=4).to(dtype).eval()
     simulator.network = Cheat(simulator.network, answer)
@@ -54,7 +54,7 @@ def zeros(step: int, graph: Graph) -> Tensor:
     return torch.zeros(graph.num_cloth, 3)
 
 
-def small(seed: int = 0) -> Simulator:
+def small(seed: int = 0) -> NetworkStepper:
     torch.manual_seed(seed)
     return build_simulator("physical", "velocity_base", "1x(mesh+coarse0)", latent_dim=8, output_init=0.1).eval()
 
@@ -116,8 +116,8 @@ def test_relaxing_lowers_the_potential_of_its_problem(tank_scene: Scene) -> None
     """Half the way down the residual is a good answer and must be taken."""
     simulator = small()
     settled = start_state(simulator, tank_scene, POTENTIAL, 0)
-    sag = torch.tensor([0.0, -2e-4, 0.0])
-    helpful = cheating(lambda step, graph: sag.expand(graph.num_cloth, 3))
+    chord_error = torch.tensor([0.0, -2e-4, 0.0])
+    helpful = cheating(lambda step, graph: chord_error.expand(graph.num_cloth, 3))
     relaxed = start_state(helpful, tank_scene, POTENTIAL, 1)
     assert not torch.equal(relaxed.pos, settled.pos)
     torch.testing.assert_close(relaxed.vel, settled.vel)
@@ -163,7 +163,7 @@ def surface_searches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return calls
 
 
-def of_paper() -> Simulator:
+def of_paper() -> NetworkStepper:
     torch.manual_seed(0)
     return build_simulator("paper", "acceleration", "1x(mesh)", latent_dim=4, output_init=0.01).eval()
 
@@ -173,7 +173,7 @@ def of_paper() -> Simulator:
     [("none", of_paper, 0), ("strain", of_paper, 0), ("all", of_paper, 3), ("none", small, 2), ("all", small, 3)],
 )
 def test_the_surface_is_searched_where_somebody_asks_for_it_and_once_a_step(
-    metrics: str, make: Callable[[], Simulator], expected: int, tank_scene: Scene, surface_searches: list[int]
+    metrics: str, make: Callable[[], NetworkStepper], expected: int, tank_scene: Scene, surface_searches: list[int]
 ) -> None:
     """After frame 0: metrics of contact ask at frames 1, 2, 3, a model that needs it at the two that a step follows."""
     frames = simulate(make(), tank_scene, POTENTIAL, 4, relaxing_steps=0, metrics=metrics)

@@ -21,7 +21,7 @@ from hood.native import build as native_build
 from hood.native.build import BuildError
 from hood.solver import newton
 from hood.solver.compiled import newton as engine
-from hood.solver.compiled.system import EngineSystem, SceneEngine
+from hood.solver.compiled.system import CompiledScene, CompiledSystem
 from hood.solver.newton import NewtonSettings, TorchSystem, minimize
 from hood.solver.system.iterate import Unknowns
 from hood.solver.system.plan import plan_for, quadratic_model
@@ -34,7 +34,7 @@ TORCH, COMPILED = NewtonSettings(engine="torch"), NewtonSettings(engine="compile
 
 def model_at(problem, potential, pos, wide):
     """Engine of a problem with one scene, with the model at ``pos`` made."""
-    system = EngineSystem(potential, problem, plan_for(problem), 100)
+    system = CompiledSystem(potential, problem, plan_for(problem), 100)
     (scene,) = system._engines
     scene.widen(wide)
     system.begin(pos)
@@ -43,15 +43,15 @@ def model_at(problem, potential, pos, wide):
     return scene
 
 
-def dense(scene: SceneEngine, name: str) -> np.ndarray:
-    """``matrix`` or ``slack`` of an engine as (3N, 3N), unknowns in the order of the cloth."""
+def dense(scene: CompiledScene, name: str) -> np.ndarray:
+    """``matrix`` or ``indefinite_part`` of an engine as (3N, 3N), unknowns in the order of the cloth."""
     tables, size = scene.tables, scene.tables.num_rows
     blocks = np.zeros((len(tables.cols), 3, 3))
     if name == "matrix":
         blocks += scene.array("matrix")[: 9 * len(tables.cols)].reshape(-1, 3, 3)
     else:
-        blocks += scene.array("slack")[:, None, None] * np.eye(3)
-        upper = scene.array("own_slack").reshape(-1, 6)
+        blocks += scene.array("indefinite_part")[:, None, None] * np.eye(3)
+        upper = scene.array("own_indefinite_part").reshape(-1, 6)
         blocks[tables.row_starts[:-1]] += upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
     rows = np.repeat(np.arange(size), np.diff(tables.row_starts))
     rank = np.argsort(np.argsort(tables.vertex[:size]))
@@ -92,7 +92,7 @@ def test_potential_gradient_and_matrix_are_those_of_the_torch_form(name, kind):
     expected, found = model.gradient.numpy()[free], scene.array("gradient")[:, :3]
     assert np.abs(found - expected).max() <= 2e-14 * np.abs(expected).max()
     matrix = dense(scene, "matrix")
-    for part, triples in (("matrix", model.triples), ("slack", model.slack)):
+    for part, triples in (("matrix", model.triples), ("indefinite_part", model.indefinite_part)):
         error = np.abs(dense(scene, part) - dense_of(plan, triples)).max()
         assert error <= 2e-15 * np.abs(matrix).max(), part
     half = model_at(problem, potential, pos, wide=False)
@@ -195,7 +195,7 @@ def test_a_damaged_library_is_built_anew(monkeypatch, tmp_path):
 
 def test_float64_takes_over_where_a_step_in_float32_leads_nowhere(monkeypatch):
     problem = hanging()
-    system = EngineSystem(default_potential(), problem, plan_for(problem), 100)
+    system = CompiledSystem(default_potential(), problem, plan_for(problem), 100)
     (scene,) = system._engines
     system.begin(None)
     residual = system.model()
@@ -209,7 +209,7 @@ def test_float64_takes_over_where_a_step_in_float32_leads_nowhere(monkeypatch):
 
 def test_without_a_float64_form_the_step_ends_where_it_is(monkeypatch):
     problem = hanging()
-    system = EngineSystem(default_potential(), problem, plan_for(problem), 100)
+    system = CompiledSystem(default_potential(), problem, plan_for(problem), 100)
     (scene,) = system._engines
     system.begin(None)
     residual = system.model()
@@ -241,7 +241,7 @@ def test_a_scene_that_is_not_finite_is_left_alone():
 def test_the_torch_system_and_the_engine_tell_the_same_of_a_state():
     problem = falling()
     plan = plan_for(problem)
-    systems = [TorchSystem(default_potential(), problem, plan, TORCH), EngineSystem(default_potential(), problem, plan, 100)]
+    systems = [TorchSystem(default_potential(), problem, plan, TORCH), CompiledSystem(default_potential(), problem, plan, 100)]
     for system in systems:
         system.begin(None)
     plain, compiled = systems

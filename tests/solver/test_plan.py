@@ -67,10 +67,10 @@ BLOWN = default_potential().with_terms(
 
 
 def product_and_difference(problem, pos, direction, h=1e-7, potential=None):
-    """The exact matrix, slack included, times a direction, and finite differences of the gradient."""
+    """The exact matrix, indefinite part included, times a direction, and finite differences of the gradient."""
     potential, plan = potential or default_potential(), plan_for(problem)
     model = quadratic_model(potential, problem, plan, pos, problem.acceleration(pos))
-    applied = linear.product(plan.pattern, model.triples + model.slack)(direction[plan.vertices])
+    applied = linear.product(plan.pattern, model.triples + model.indefinite_part)(direction[plan.vertices])
     ahead, behind = (potential.gradient(problem, pos + sign * h * direction)[0] for sign in (1.0, -1.0))
     return applied, ((ahead - behind) / (2 * h))[plan.vertices]
 
@@ -111,13 +111,13 @@ def test_the_matrix_is_positive_and_the_slack_is_not():
     plan = plan_for(problem)
     for name, pos in states(problem).items():
         model = quadratic_model(default_potential(), problem, plan, pos, problem.acceleration(pos))
-        matrix, slack = dense(plan.pattern, model.triples), dense(plan.pattern, model.slack)
+        matrix, indefinite_part = dense(plan.pattern, model.triples), dense(plan.pattern, model.indefinite_part)
         size = float(matrix.abs().max())
         torch.testing.assert_close(matrix, matrix.T, rtol=0, atol=1e-12 * size)
-        torch.testing.assert_close(slack, slack.T, rtol=0, atol=1e-12 * size)
+        torch.testing.assert_close(indefinite_part, indefinite_part.T, rtol=0, atol=1e-12 * size)
         inertia = float((problem.cloth.mass / problem.vertex_dt.squeeze(1) ** 2).min())
         assert float(torch.linalg.eigvalsh(matrix).min()) >= 0.99 * inertia, name
-        assert float(torch.linalg.eigvalsh(slack).max()) <= 1e-10 * size, name
+        assert float(torch.linalg.eigvalsh(indefinite_part).max()) <= 1e-10 * size, name
 
 
 def test_the_hessian_is_indefinite_under_compression():
@@ -154,9 +154,9 @@ def test_the_compiled_solver_does_without_the_pattern_of_the_torch_form():
         minimize(default_potential(), problem, settings=NewtonSettings(engine="compiled"), plan=plan)
     except BuildError as error:
         pytest.skip(str(error))
-    assert not {"pattern", "matrix", "slack", "face_vertices", "hinge_vertices"} & vars(plan).keys()
+    assert not {"pattern", "matrix", "indefinite_part", "face_vertices", "hinge_vertices"} & vars(plan).keys()
     minimize(default_potential(), problem, settings=NewtonSettings(engine="torch"), plan=plan)
-    assert {"pattern", "matrix", "slack"} <= vars(plan).keys()
+    assert {"pattern", "matrix", "indefinite_part"} <= vars(plan).keys()
 
 
 def test_fixed_vertices_are_no_unknowns():

@@ -96,13 +96,13 @@ def test_matrix_and_slack_are_the_hessian(place: str) -> None:
     plan = plan_for(problem)
     model = quadratic_model(potential, problem, plan, pos, problem.acceleration(pos))
     direction = torch.as_tensor(np.random.default_rng(2).normal(size=pos.shape)) * problem.cloth.free[:, None]
-    applied = linear.product(plan.pattern, model.triples + model.slack)(direction[plan.vertices])
+    applied = linear.product(plan.pattern, model.triples + model.indefinite_part)(direction[plan.vertices])
     ahead, behind = (potential.gradient(problem, pos + sign * 1e-9 * direction)[0] for sign in (1.0, -1.0))
     difference = ((ahead - behind) / 2e-9)[plan.vertices]
     torch.testing.assert_close(applied, difference, rtol=0, atol=2e-6 * float(difference.abs().max()))
     eigenvalues = np.linalg.eigvalsh(dense_of(plan, model.triples))
     assert eigenvalues.min() > 0
-    assert np.linalg.eigvalsh(dense_of(plan, model.slack)).max() <= 1e-9 * eigenvalues.max()
+    assert np.linalg.eigvalsh(dense_of(plan, model.indefinite_part)).max() <= 1e-9 * eigenvalues.max()
 
 
 @pytest.mark.usefixtures("compiled_solver")
@@ -118,11 +118,11 @@ def test_compiled_model_is_that_of_the_torch_form(place: str) -> None:
     free = scene.tables.vertex[: scene.tables.num_rows]
     expected = model.gradient.numpy()[free]
     assert np.abs(scene.array("gradient")[:, :3] - expected).max() <= 2e-14 * np.abs(expected).max()
-    plain, slack = dense_of(plan, model.triples), dense_of(plan, model.slack)
+    plain, indefinite_part = dense_of(plan, model.triples), dense_of(plan, model.indefinite_part)
     size = np.abs(plain).max()
     assert np.abs(dense(scene, "matrix") - plain).max() <= 2e-14 * size
     scene.matrix(0.7)
-    assert np.abs(dense(scene, "matrix") - plain - 0.7 * slack).max() <= 1e-12 * size  # the heading of a small slip
+    assert np.abs(dense(scene, "matrix") - plain - 0.7 * indefinite_part).max() <= 1e-12 * size  # the heading of a small slip
     rank = np.searchsorted(plan.vertices.numpy(), free)
     inverse = diagonal_inverse(plan.pattern, model.triples).numpy()[rank]
     found = scene.array("inverse").reshape(-1, 3, 4)[:, :, :3]

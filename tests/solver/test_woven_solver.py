@@ -18,7 +18,7 @@ from hood.energies.inertia import Gravity, Inertia
 from hood.energies.membrane import Stretching
 from hood.energies.potential import Potential, default_potential
 from hood.energies.problem import StepProblem
-from hood.solver.compiled.system import EngineSystem
+from hood.solver.compiled.system import CompiledSystem
 from hood.solver.derivatives.elements import Corners, face_constants, face_model
 from hood.solver.newton import NewtonSettings, minimize
 from hood.solver.system.iterate import Unknowns
@@ -60,7 +60,7 @@ def test_matrix_and_slack_are_the_hessian_and_the_matrix_is_positive(damped, siz
     if damped:
         constants = constants.damped(0.05 / problem.step.dt[cloth.face_scene], problem.state.pos, cloth.faces)
     model = face_model(Corners(cloth.faces)(pos), constants)
-    matrix, slack = torch.zeros_like(exact), torch.zeros_like(exact)
+    matrix, indefinite_part = torch.zeros_like(exact), torch.zeros_like(exact)
     rows, cols = torch.triu_indices(9, 9)
     corner_rows, corner_cols = torch.triu_indices(3, 3)
     for face, corners in enumerate(cloth.faces):
@@ -69,11 +69,11 @@ def test_matrix_and_slack_are_the_hessian_and_the_matrix_is_positive(damped, siz
         block[rows, cols] = block[cols, rows] = model.matrix[:, face]
         assert float(torch.linalg.eigvalsh(block).min()) > -1e-12 * float(block.abs().max())
         axial = torch.zeros(3, 3, dtype=F64)
-        axial[corner_rows, corner_cols] = axial[corner_cols, corner_rows] = model.slack[:, face]
+        axial[corner_rows, corner_cols] = axial[corner_cols, corner_rows] = model.indefinite_part[:, face]
         assert float(torch.linalg.eigvalsh(axial).max()) < 1e-12 * float(block.abs().max())
         matrix[index[:, None], index] += block
-        slack[index[:, None], index] += torch.kron(axial, torch.eye(3, dtype=F64))
-    torch.testing.assert_close(matrix + slack, exact, rtol=1e-10, atol=1e-12 * float(exact.abs().max()))
+        indefinite_part[index[:, None], index] += torch.kron(axial, torch.eye(3, dtype=F64))
+    torch.testing.assert_close(matrix + indefinite_part, exact, rtol=1e-10, atol=1e-12 * float(exact.abs().max()))
 
 
 @pytest.mark.usefixtures("compiled_solver")
@@ -92,7 +92,7 @@ def test_the_compiled_model_is_that_of_the_torch_form(name, potential):
     expected, found = model.gradient.numpy()[free], scene.array("gradient")[:, :3]
     assert np.abs(found - expected).max() <= 2e-13 * np.abs(expected).max()
     matrix = dense(scene, "matrix")
-    for part, triples in (("matrix", model.triples), ("slack", model.slack)):
+    for part, triples in (("matrix", model.triples), ("indefinite_part", model.indefinite_part)):
         error = np.abs(dense(scene, part) - dense_of(plan_for(problem), triples)).max()
         assert error <= 1e-14 * np.abs(matrix).max(), part
     half = model_at(problem, potential, pos, wide=False)
@@ -142,7 +142,7 @@ def test_the_compiled_solver_sees_a_changed_weave():
     found = [minimize(default_potential(), one, settings=COMPILED)[1] for one in (problem, softer, plain, problem)]
     energies = [float(report.phi) for report in found]
     assert energies[0] == energies[3]
-    (scene,) = EngineSystem(default_potential(), plain, plan_for(plain), 100)._engines
+    (scene,) = CompiledSystem(default_potential(), plain, plan_for(plain), 100)._engines
     assert scene.values.weave is None  # isotropic again: the compiled solver runs what it ran before
     assert len(set(energies)) == 3
 

@@ -14,7 +14,7 @@ from hood.energies.potential import default_potential
 from hood.energies.problem import StepProblem
 from hood.rollouts.loop import simulate, start_state
 from hood.scene.scene import Scene
-from hood.steppers.network import Prediction, Simulator, build_simulator
+from hood.steppers.network import NetworkStepper, Prediction, build_simulator
 from hood.steppers.protocol import FrameRules, Relaxing
 from hood.testing import grid, sphere
 
@@ -123,7 +123,7 @@ def test_wrong_conventions_are_named(options: dict, words: str) -> None:
         build_simulator(latent_dim=4, **options)
 
 
-def tiny(**options: object) -> Simulator:
+def tiny(**options: object) -> NetworkStepper:
     torch.manual_seed(0)
     return build_simulator(schedule="1x(mesh)", latent_dim=4, output_init=0.01, **options).eval()
 

@@ -20,7 +20,7 @@ from hood.energies.problem import StepProblem
 from hood.model.graph.builder import build_static
 from hood.model.graph.hierarchy import Hierarchy, build_hierarchy
 from hood.scene.scene import build_scene
-from hood.steppers.network import Prepared, Simulator, build_simulator
+from hood.steppers.network import NetworkStepper, Prepared, build_simulator
 from hood.testing import cylinder, grid, sphere, strip
 
 SCHEDULES = ["fine15", "ours"]
@@ -38,7 +38,7 @@ STRIP = shifted(strip(2, 0.1, 0.05), 0.0, 0.31, 0.0)
 TRIANGLE = np.array([[0.0, 0.31, 0], [0.05, 0.31, 0], [0, 0.31, 0.05]]), np.array([[0, 2, 1]])
 
 
-def make(schedule: str) -> Simulator:
+def make(schedule: str) -> NetworkStepper:
     """A network of the paper's width with random weights."""
     torch.manual_seed(0)
     return build_simulator(schedule=schedule).eval()
@@ -60,7 +60,7 @@ def make_case(mesh: Mesh, order: np.ndarray | None = None) -> tuple[Cloth, State
 
 
 @torch.no_grad()
-def accelerations(simulator: Simulator, cloth: Cloth, prepared: Prepared, state: State, step: StepInput) -> Tensor:
+def accelerations(simulator: NetworkStepper, cloth: Cloth, prepared: Prepared, state: State, step: StepInput) -> Tensor:
     contact = find_contact(state.pos, cloth.vertex_scene, step.obstacle)
     assert bool((contact.vertex_dist < simulator.body_radius).any()), "no body edge"
     problem = StepProblem(cloth, state, step, contact, simulator.gravity)

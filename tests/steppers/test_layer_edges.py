@@ -16,7 +16,7 @@ from hood.evaluation.table import measured_radius
 from hood.model.graph.builder import LAYERS
 from hood.model.kernels.block import check_kernels
 from hood.steppers.checkpoint import load_simulator, save_simulator
-from hood.steppers.network import Prepared, Simulator, build_simulator
+from hood.steppers.network import NetworkStepper, Prepared, build_simulator
 from hood.steppers.static_shapes.simulator import CapturedSimulator
 from hood.tensors.batch import to_device
 from hood.testing import grid, make_problem
@@ -29,12 +29,12 @@ KINDS = {
 }
 
 
-def make(kind: str, layer_radius: float | None = RADIUS, width: int = 16) -> Simulator:
+def make(kind: str, layer_radius: float | None = RADIUS, width: int = 16) -> NetworkStepper:
     torch.manual_seed(0)
     return build_simulator(**KINDS[kind], latent_dim=width, output_init=0.5, layer_radius=layer_radius).eval()
 
 
-def without(simulator: Simulator) -> Simulator:
+def without(simulator: NetworkStepper) -> NetworkStepper:
     """The same weights in a model that knows no layers."""
     config = {name: value for name, value in simulator.config.items() if name != "layer_radius"}
     other = build_simulator(**config).eval()
@@ -58,14 +58,14 @@ def sheets(gap: float = 0.01, n: int = 9, seed: int = 0, dtype: torch.dtype = to
     return make_problem(cloth, np.concatenate([pos, pos + [0.005, gap, 0.003]]) + noise, vel=30 * noise)
 
 
-def step(simulator: Simulator, problem: StepProblem) -> torch.Tensor:
+def step(simulator: NetworkStepper, problem: StepProblem) -> torch.Tensor:
     """Next positions (V, 3)."""
     prepared = simulator.prepare(problem.cloth, problem.cloth.rest_pos.cpu().numpy())
     with torch.no_grad():
         return simulator.predict(problem, prepared).next_pos
 
 
-def num_layer_edges(simulator: Simulator, problem: StepProblem) -> int:
+def num_layer_edges(simulator: NetworkStepper, problem: StepProblem) -> int:
     """Pairs of vertices of two layers that a step has edges between."""
     pairs = simulator.near_cloth(problem)
     assert pairs is not None
@@ -132,7 +132,7 @@ def test_names_of_vertices_do_not_matter(kind: str) -> None:
     torch.testing.assert_close(step(simulator, renamed), step(simulator, problem)[order], rtol=0, atol=1e-9)
 
 
-def together(simulator: Simulator, problems: list[StepProblem]) -> tuple[StepProblem, Prepared]:
+def together(simulator: NetworkStepper, problems: list[StepProblem]) -> tuple[StepProblem, Prepared]:
     cloths = [problem.cloth for problem in problems]
     batch: Cloth = concatenate_cloths(cloths)
     prepared = [simulator.prepare(cloth, cloth.rest_pos.numpy()) for cloth in cloths]

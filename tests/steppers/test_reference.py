@@ -26,7 +26,7 @@ from hood.model.graph.known_hierarchies import given_hierarchy
 from hood.rollouts.loop import simulate
 from hood.scene.scene import build_scene
 from hood.steppers.checkpoint import load_simulator, save_simulator
-from hood.steppers.network import Prepared, Simulator, build_simulator
+from hood.steppers.network import NetworkStepper, Prepared, build_simulator
 from hood.steppers.protocol import Relaxing
 from hood.steppers.published import import_reference_weights
 from hood.testing import cylinder, sphere
@@ -71,7 +71,7 @@ class Bench:
     def cloth(self, dtype: torch.dtype) -> Cloth:
         return build_cloth(self.rest, self.faces, self.material, self.pinned, dtype=dtype)
 
-    def prepare(self, simulator: Simulator, cloth: Cloth) -> Prepared:
+    def prepare(self, simulator: NetworkStepper, cloth: Cloth) -> Prepared:
         hierarchy = given_hierarchy(len(self.rest), self.coarse, simulator.num_coarse)
         return simulator.prepare(cloth, self.rest, hierarchy)
 
@@ -167,7 +167,9 @@ def test_a_step_at_the_published_width(dtype: torch.dtype) -> None:
     assert error(mine[bench.compared], expected[bench.compared]) <= LIMIT[dtype]
 
 
-def own_rollout(bench: Bench, simulator: Simulator, dtype: torch.dtype, num_steps: int = 5) -> Iterator[tuple[Tensor, Tensor]]:
+def own_rollout(
+    bench: Bench, simulator: NetworkStepper, dtype: torch.dtype, num_steps: int = 5
+) -> Iterator[tuple[Tensor, Tensor]]:
     """Accelerations per frame² and positions of a relaxing step and the regular ones that follow."""
     cloth = bench.cloth(dtype)
     prepared = bench.prepare(simulator, cloth)

@@ -13,14 +13,14 @@ from reference_oracle import LAYOUTS, make_state
 from torch import Tensor
 
 import hood
-from hood.steppers.network import Simulator, build_simulator
+from hood.steppers.network import NetworkStepper, build_simulator
 from hood.steppers.published import import_reference_weights, read_reference_checkpoint
 
 WEIGHT = "model._learned_model.node_encoder.0.layers.2.weight"
 MESH = "model._learned_model.levels.1.2.edge_processor_dict.coarse_edge1.0.layers.0.bias"
 
 
-def same(first: Simulator, second: Simulator) -> bool:
+def same(first: NetworkStepper, second: NetworkStepper) -> bool:
     other = second.state_dict()
     equal = all(torch.equal(value, other[name]) for name, value in first.state_dict().items())
     return equal and first.config == second.config

@@ -15,7 +15,7 @@ from hood.energies.problem import StepProblem
 from hood.energies.self_contact import LayerBarrier
 from hood.mesh.penetration.crossing import self_crossings
 from hood.scene.scene import RELAXING_DT
-from hood.steppers.network import Simulator, build_simulator
+from hood.steppers.network import NetworkStepper, build_simulator
 from hood.steppers.protocol import Relaxing
 from hood.steppers.refined import RefinedStepper
 from hood.steppers.stopping import Count
@@ -39,7 +39,7 @@ def sheets(pinned: bool = False, dt: float = 1 / 30) -> StepProblem:
     return replace(problem, step=replace(problem.step, pin_target=problem.state.pos)) if pinned else problem
 
 
-def wild(**options: object) -> Simulator:
+def wild(**options: object) -> NetworkStepper:
     """A network with random weights that throws vertices about by centimetres."""
     torch.manual_seed(0)
     arguments = {"features": "physical", "output": "velocity_base", "output_scale": 0.02, "latent_dim": 8, **options}

@@ -15,7 +15,7 @@ from hood.rollouts.loop import simulate
 from hood.scene.scene import Scene
 from hood.solver.newton import NewtonSettings
 from hood.steppers.checkpoint import load_simulator
-from hood.steppers.network import Simulator
+from hood.steppers.network import NetworkStepper
 from hood.steppers.refined import GuessStepper, RefinedStepper
 from hood.steppers.static_shapes.simulator import CapturedSimulator, network_of
 from hood.steppers.stopping import Count
@@ -33,11 +33,11 @@ SLIPPERY, ROUGH = (default_potential(collision_epsilon=1e-2, friction_coefficien
 SOFT, HARD = (default_potential(collision_epsilon=1e-2, collision_weight=weight) for weight in (5e4, 5e5))
 
 
-def simulator_of(kind: str) -> Simulator:
+def simulator_of(kind: str) -> NetworkStepper:
     return make("physical", **LOOKING[kind]) if kind in LOOKING else make(kind)
 
 
-def last_pos(simulator: Simulator, scene: Scene, potential: Potential) -> Tensor:
+def last_pos(simulator: NetworkStepper, scene: Scene, potential: Potential) -> Tensor:
     """(V, 3) m after three steps."""
     return list(simulate(simulator, scene, potential, 4))[-1].world_pos
 
@@ -140,6 +140,6 @@ def test_settings_tell_potentials_apart() -> None:
     assert reference_potential().settings["collision"]["term"] != default["collision"]["term"]
 
 
-def step_of(scene: Scene, simulator: Simulator) -> StepProblem:
+def step_of(scene: Scene, simulator: NetworkStepper) -> StepProblem:
     state = scene.start(2)
     return StepProblem(scene.cloth, state, scene.step_input(2, state), gravity=simulator.gravity)

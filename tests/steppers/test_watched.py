@@ -41,8 +41,8 @@ def without(*names: str) -> Potential:
     return Potential({name: term for name, term in FULL.terms.items() if name not in names})
 
 
-def watched(scene: Scene, lean: Potential, limit: float, hold: int = 2) -> WatchedStepper:
-    return WatchedStepper(NewtonStepper(lean, TIGHT), NewtonStepper(FULL, TIGHT), (lean, FULL), scene, limit, hold)
+def watched(scene: Scene, reduced: Potential, limit: float, hold: int = 2) -> WatchedStepper:
+    return WatchedStepper(NewtonStepper(reduced, TIGHT), NewtonStepper(FULL, TIGHT), (reduced, FULL), scene, limit, hold)
 
 
 def rolled(stepper: Any, scene: Scene, count: int = 5) -> list[Any]:
@@ -52,9 +52,9 @@ def rolled(stepper: Any, scene: Scene, count: int = 5) -> list[Any]:
 @pytest.mark.parametrize("names", [("bending",), ("friction",), ("bending", "friction")])
 def test_the_bound_is_not_below_gamma(names: tuple[str, ...], tank_scene: Scene) -> None:
     full = Variant(NewtonStepper(FULL, TIGHT), FULL, tank_scene)
-    lean = Variant(NewtonStepper(without(*names), TIGHT), without(*names), tank_scene)
+    reduced = Variant(NewtonStepper(without(*names), TIGHT), without(*names), tank_scene)
     (one,) = begin(full, [Window(0, "the start")], "paper", lead=1)
-    pos, _ = take_steps(lean, one, 1, Effect())
+    pos, _ = take_steps(reduced, one, 1, Effect())
     gamma = float(gap(FULL, one.step, pos).gamma)
     assert gamma > 1e-6
     assert force_bound(FULL, list(names), one.step, pos) >= gamma
@@ -83,9 +83,9 @@ def test_layers_are_priced_by_their_own_gradient() -> None:
 
 
 def test_below_the_limit_the_rollout_is_the_lean_one(tank_scene: Scene) -> None:
-    lean = without("bending")
-    frames = rolled(watched(tank_scene, lean, 1e9), tank_scene)
-    alone = rolled(NewtonStepper(lean, TIGHT), tank_scene)
+    reduced = without("bending")
+    frames = rolled(watched(tank_scene, reduced, 1e9), tank_scene)
+    alone = rolled(NewtonStepper(reduced, TIGHT), tank_scene)
     assert all(torch.equal(one.world_pos, other.world_pos) for one, other in zip(frames, alone, strict=True))
     assert [frame.metrics["plan_full"] for frame in frames[1:]] == [0.0] * 4
     assert all(frame.metrics["plan_price"] > 0.0 for frame in frames[1:])
@@ -206,8 +206,8 @@ def test_what_is_not_finite_is_taken_by_the_full_model(tank_scene: Scene) -> Non
             found = super().predict(*arguments)
             return replace(found, next_pos=found.next_pos * float("nan"))
 
-    lean = without("bending")
-    stepper = WatchedStepper(Broken(lean, TIGHT), NewtonStepper(FULL, TIGHT), (lean, FULL), tank_scene, 0.01, 2)
+    reduced = without("bending")
+    stepper = WatchedStepper(Broken(reduced, TIGHT), NewtonStepper(FULL, TIGHT), (reduced, FULL), tank_scene, 0.01, 2)
     frames = rolled(stepper, tank_scene, 3)
     assert all(bool(torch.isfinite(frame.world_pos).all()) for frame in frames)
     assert frames[-1].metrics["plan_full"] == 1.0

@@ -43,7 +43,7 @@ class Fault:
         return True
 
     def __call__(self, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> Tensor:
-        before_the_step = problem.contact is not None and problem.pull is None
+        before_the_step = problem.contact is not None and problem.internal_force is None
         self.calls += not before_the_step
         bad = not before_the_step and self.when(self.calls)
         slope = self.slope if bad else 0.0

@@ -21,7 +21,7 @@ from torch import Tensor
 from hood.assets.body.body import Body
 from hood.assets.garment.garment import Garment
 from hood.assets.motion.sequence import PoseSequence
-from hood.steppers.network import Simulator, build_simulator
+from hood.steppers.network import NetworkStepper, build_simulator
 from hood.training import prefetch
 from hood.training.prefetch import MAX_DRAWS, Request, SceneFeed, choose_workers, make_start
 from hood.training.scenes import SceneSampler, Window
@@ -31,7 +31,7 @@ HORIZON = 1
 
 
 @pytest.fixture(scope="module")
-def simulator() -> Simulator:
+def simulator() -> NetworkStepper:
     torch.manual_seed(0)
     return build_simulator("physical", "velocity_base", "1x(mesh+coarse0)", 8, output_init=0.1).eval()
 
@@ -94,7 +94,7 @@ def closing() -> Iterator[list[SceneFeed]]:
 
 @pytest.mark.usefixtures("at_once")
 def test_workers_make_the_same_scenes_and_a_dead_one_is_done_without(
-    sampler: SceneSampler, simulator: Simulator, closing: list[SceneFeed], monkeypatch: pytest.MonkeyPatch
+    sampler: SceneSampler, simulator: NetworkStepper, closing: list[SceneFeed], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     alone = record(Slots(sampler, simulator, 2, 0, HORIZON), 8)
     slots = Slots(sampler, simulator, 2, 0, HORIZON, workers=1)
@@ -167,7 +167,7 @@ def test_bad_starts_are_drawn_again(sampler: SceneSampler, monkeypatch: pytest.M
     assert torch.equal(start.state.pos, last.state.pos)
 
 
-def test_buckets_take_turns_and_shares_do_not_matter(mixed: SceneSampler, simulator: Simulator) -> None:
+def test_buckets_take_turns_and_shares_do_not_matter(mixed: SceneSampler, simulator: NetworkStepper) -> None:
     whole = Slots(mixed, simulator, 2, 0, HORIZON, max_vertices=2200)
     assert whole.num_slots == 2 + 2 * (2200 // (2 * len(mixed.garments[2].rest_pos)))
     parts = [Slots(mixed, simulator, 2, 0, HORIZON, rank, 2, max_vertices=2200) for rank in range(2)]
@@ -183,7 +183,7 @@ def test_buckets_take_turns_and_shares_do_not_matter(mixed: SceneSampler, simula
     assert len(set(sizes)) > 1, "both buckets had a turn"
 
 
-def test_state_is_restored_between_turns(mixed: SceneSampler, simulator: Simulator) -> None:
+def test_state_is_restored_between_turns(mixed: SceneSampler, simulator: NetworkStepper) -> None:
     whole = Slots(mixed, simulator, 1, 3, HORIZON, max_vertices=1100)
     record(whole, 5)
     saved = whole.state_dict()
@@ -194,7 +194,7 @@ def test_state_is_restored_between_turns(mixed: SceneSampler, simulator: Simulat
     assert_same(record(whole, 5), record(resumed, 5))
 
 
-def test_short_runs_start_no_workers(sampler: SceneSampler, simulator: Simulator) -> None:
+def test_short_runs_start_no_workers(sampler: SceneSampler, simulator: NetworkStepper) -> None:
     slots = Slots(sampler, simulator, 2, 0, HORIZON, workers=2)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -16,13 +16,13 @@ from hood.assets.garment.garment import Garment
 from hood.assets.motion.load import load_sequence
 from hood.assets.motion.sequence import PoseSequence
 from hood.energies.potential import Potential, default_potential
-from hood.energies.self_contact import LayerSides, for_networks
+from hood.energies.self_contact import SignedSelfContactPenalty, for_networks
 from hood.model.features.inputs import Inputs
 from hood.model.network.kernel_choice import Choice
 from hood.model.readout.network_step import Feedback
 from hood.model.readout.output import AccelerationOutput
 from hood.steppers.checkpoint import load_simulator
-from hood.steppers.network import Simulator, build_simulator
+from hood.steppers.network import NetworkStepper, build_simulator
 from hood.steppers.ranges import training_conditions
 from hood.training.curriculum import CollisionRamp, Horizon, InverseRoot, WarmupCosine
 from hood.training.scenes import SceneSampler, Window
@@ -39,7 +39,7 @@ SETTINGS = TrainerSettings(
 )  # fmt: skip
 
 
-def tiny(options: dict, seed: int = 0) -> Simulator:
+def tiny(options: dict, seed: int = 0) -> NetworkStepper:
     torch.manual_seed(seed)
     return build_simulator(**{"schedule": "1x(mesh+coarse0)", "latent_dim": 8, **options})
 
@@ -83,7 +83,7 @@ def test_a_network_learns_to_leave_layers_on_their_sides(tmp_path: Path, body: B
     scenes = OneScene(body, [garments["longsleeve"]], [load_sequence("dance_mixed", 30.0).window(30, 90)])
     felt = {}
     for weight in (1e-3, 5e6):
-        potential = default_potential().with_terms(layer_sides=LayerSides(weight, epsilon=5e-3))
+        potential = default_potential().with_terms(layer_sides=SignedSelfContactPenalty(weight, epsilon=5e-3))
         settings = replace(SETTINGS, batch_size=1, learning_rate=1e-2, **constant)
         trainer = make(tmp_path / str(weight), scenes, PHYSICAL | {"output_init": 1.0}, settings, potential=potential)
         assert "layer_sides" not in trainer.simulator.potential.terms

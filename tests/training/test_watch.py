@@ -17,7 +17,7 @@ from hood.evaluation.gap import REFERENCE
 from hood.evaluation.validation import Validation
 from hood.scene.scene import Scene
 from hood.steppers.checkpoint import load_simulator
-from hood.steppers.network import Simulator, build_simulator
+from hood.steppers.network import NetworkStepper, build_simulator
 from hood.training.curriculum import CollisionRamp, Horizon, WarmupCosine
 from hood.training.scenes import SceneSampler
 from hood.training.settings import TrainerSettings
@@ -31,7 +31,7 @@ SETTINGS = TrainerSettings(
 )  # fmt: skip
 
 
-def tiny() -> Simulator:
+def tiny() -> NetworkStepper:
     torch.manual_seed(0)
     return build_simulator("physical", "velocity_base", "1x(mesh)", latent_dim=4, output_init=0.1)
 
@@ -50,7 +50,7 @@ class Scripted:
     def __init__(self, scores: dict[int, float]) -> None:
         self.scores, self.seen = scores, {}  # type: ignore[var-annotated]
 
-    def __call__(self, simulator: Simulator, iteration: int) -> tuple[dict[str, float], None]:
+    def __call__(self, simulator: NetworkStepper, iteration: int) -> tuple[dict[str, float], None]:
         self.seen[iteration] = simulator.state_dict()
         return {"score": self.scores[iteration]}, None
 
@@ -90,7 +90,7 @@ def test_validation_does_not_count_as_training(tmp_path: Path, sampler: SceneSam
     now = [0.0]
     monkeypatch.setattr("hood.training.log.time.monotonic", lambda: now[0])
 
-    def watch(simulator: Simulator, iteration: int) -> tuple[dict[str, float], None]:
+    def watch(simulator: NetworkStepper, iteration: int) -> tuple[dict[str, float], None]:
         now[0] += 100.0
         return {"score": 1.0}, None
 

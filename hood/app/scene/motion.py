@@ -62,7 +62,7 @@ def with_body_friction(scene: Scene, config: DictConfig) -> Scene:
             grip[body_part(part, motion.faces, motion.num_vertices, body)] = factor
         except ValueError as error:
             raise ValueError(f"body_friction: {error}") from error
-    return replace(scene, grip=torch.as_tensor(grip))
+    return replace(scene, friction_scale=torch.as_tensor(grip))
 
 
 #: Values of the keys that take numbers.

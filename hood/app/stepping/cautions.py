@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 from hood.app.settings.compose import NETWORK_KEYS, plain
 from hood.app.stepping.steppers import option_of
 from hood.energies.potential import Potential, default_potential
-from hood.energies.self_contact import LAYER_TERMS, LayerSides
+from hood.energies.self_contact import LAYER_TERMS, SignedSelfContactPenalty
 from hood.energies.term import named
 from hood.scene.body_motion.motion import BodyMotion
 from hood.scene.scene import Scene
@@ -32,9 +32,9 @@ def scene_cautions(stepper: Stepper, scene: Scene, potential: Potential, name: s
     betas = scene.motion.betas if isinstance(scene.motion, BodyMotion) else None
     gravity = float(stepper.gravity.norm())
     asked = scene_conditions(scene.garment, scene.cloth, scene.dt, potential, betas, gravity, scene.sizes)
-    if scene.grip is not None:
+    if scene.friction_scale is not None:
         low, high = asked.spans["material.friction"]
-        on_body = {"material.friction": (low * float(scene.grip.min()), high * float(scene.grip.max()))}
+        on_body = {"material.friction": (low * float(scene.friction_scale.min()), high * float(scene.friction_scale.max()))}
         asked = replace(asked, spans={**asked.spans, **on_body})
     way_out = "stepper=newton needs no weights" + ("" if _is_refined(stepper) else ", refine=10 corrects every step")
     sentences = []
@@ -104,7 +104,7 @@ def known_by_slope(stepper: Stepper, potential: Potential) -> list[str]:
     """One sentence on energies whose curvature the solver does not know, where it takes or refines the steps; else none."""
     if network_of(stepper) is not None and not _is_refined(stepper):
         return []
-    known = (*CLOSED_FORM, *LAYER_TERMS, LayerSides)
+    known = (*CLOSED_FORM, *LAYER_TERMS, SignedSelfContactPenalty)
     names = [named(name, term) for name, term in potential.terms.items() if type(term) not in known]
     if not names:
         return []

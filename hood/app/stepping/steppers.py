@@ -24,7 +24,7 @@ from hood.app.settings.compose import ConfigError, build, load_config, options, 
 from hood.assets.files.library import locate
 from hood.energies.potential import Potential
 from hood.plugins import config_folders
-from hood.steppers.network import Simulator
+from hood.steppers.network import NetworkStepper
 from hood.steppers.newton import Stepper
 from hood.steppers.static_shapes.simulator import CapturedSimulator
 
@@ -176,7 +176,7 @@ def make_network(
     if checkpoint == UNTRAINED:
         if model is None:
             raise ConfigError("checkpoint=untrained needs a model: add model=small (or ours, fine15, fine48)")
-        simulator: Simulator = build(model)
+        simulator: NetworkStepper = build(model)
         digest = UNTRAINED
     else:
         path = locate("weights", checkpoint)

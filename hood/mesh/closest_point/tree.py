@@ -74,7 +74,7 @@ _PLACES = ("point", "normal", "next_point", "next_normal")
 
 
 class FoldRule(NamedTuple):
-    """What another side of a fold is, see :func:`hood.contact.contact.find_fold`."""
+    """What another side of a fold is, see :func:`hood.contact.contact.find_second_contact`."""
 
     ahead: float  # m, it is looked for this far off the skin
     near: float  # m, of points that are nearer
@@ -346,8 +346,8 @@ def search_folds(
     matched: dict[str, Tensor],
     rule: FoldRule,
 ) -> tuple[Match, Tensor] | None:
-    """The other side of folds, see :func:`hood.contact.contact.find_fold`, scene by scene: matches with the curvature of the
-    ``points`` (N, 3) that have one, zeros for the others, and which they are, (N,) bool. None where there is no compiled
+    """The other side of folds, see :func:`hood.contact.contact.find_second_contact`, scene by scene: matches with the curvature
+    of the ``points`` (N, 3) that have one, zeros for the others, and which they are, (N,) bool. None where there is no compiled
     search, or not for these tensors.
 
     Args:

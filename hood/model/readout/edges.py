@@ -36,11 +36,11 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from hood.cloth.cloth import Cloth
-from hood.contact.activation_distance import sag
+from hood.contact.activation_distance import chord_error
 from hood.contact.contact import Contact
 from hood.energies.problem import StepProblem
 from hood.model.graph.builder import MESH, EdgeSet, Graph
-from hood.model.readout.network_step import Held, Moved, NetworkStep
+from hood.model.readout.network_step import Dirichlet, Moved, NetworkStep
 from hood.model.readout.output import DEEPEST, VelocityBaseOutput
 from hood.native import features as native
 from hood.tensors.conjugate_gradients import Scenes, Steps, solve
@@ -215,7 +215,9 @@ class EdgeOutput(VelocityBaseOutput):
         raw = step.network.with_edges(step.graph, step.nodes, step.edges)
         return Moved(self.positions(step.problem, step.graph, step.base, *raw, step.held))
 
-    def positions(self, problem: StepProblem, graph: Graph, base: Tensor, raw: Tensor, edge_raw: Tensor, held: Held) -> Tensor:
+    def positions(
+        self, problem: StepProblem, graph: Graph, base: Tensor, raw: Tensor, edge_raw: Tensor, held: Dirichlet
+    ) -> Tensor:
         """Positions (V, 3) [m] at t + 1.
 
         Args:
@@ -262,7 +264,7 @@ class EdgeOutput(VelocityBaseOutput):
         contact = problem.contact
         if contact is None:
             return torch.zeros_like(pos[:, 0])
-        gap = contact.next_dist(pos) - self.clearance - sag(problem.cloth, contact, problem.state.pos)
+        gap = contact.next_dist(pos) - self.clearance - chord_error(problem.cloth, contact, problem.state.pos)
         return (1.0 - gap / _NEAR).clamp(0.0, 1.0) * contact.valid
 
     def base(self, problem: StepProblem) -> Tensor:
@@ -273,7 +275,7 @@ class EdgeOutput(VelocityBaseOutput):
         """Where contact sets in, less a depth that goes with the length of the edges: contact pushes every vertex with 3 w p²,
         and those of fine meshes weigh less."""
         cloth = problem.cloth
-        return self.clearance + sag(cloth, contact, problem.state.pos) - DEEPEST * _area(cloth).clamp_max(1.0).sqrt()
+        return self.clearance + chord_error(cloth, contact, problem.state.pos) - DEEPEST * _area(cloth).clamp_max(1.0).sqrt()
 
     def held_back(self, problem: StepProblem, base: Tensor) -> Tensor:
         return _VIEW * self.held_area(problem, base)

@@ -85,7 +85,7 @@ class Feedback:
         return residual, wide
 
 
-class Held(NamedTuple):
+class Dirichlet(NamedTuple):
     """What the network does not move."""
 
     free: Tensor  # (V,) bool, what it does
@@ -102,7 +102,7 @@ class NetworkStep:
     nodes: Tensor  # (V + W_active, node_width) features
     edges: dict[str, Tensor]  # features by edge set
     base: Tensor  # (V, 3) m, what the output is relative to
-    held: Held
+    held: Dirichlet
     force: Tensor | None = None  # (V, 3) N, −∂Φ/∂x at the base, where there is feedback
     feedback: Feedback | None = None  # what the potential says about other positions
 
@@ -136,7 +136,7 @@ class Pass:
     last: Tensor  # (V, 3) m, the place itself
     before: Tensor | None  # (V, 3) m, the displacement of the pass before
     force: Tensor  # (V, 3) N, −∂Φ/∂x there
-    held: Held
+    held: Dirichlet
     feedback: Feedback
 
 
@@ -148,7 +148,7 @@ class Leads(Protocol):
         ...
 
 
-class Passes:
+class CorrectionPasses:
     """The passes of one step: turns each raw output into positions and shows the next pass what they look like.
 
     A pass starts from what the pass before led to, without a gradient: it answers for its own correction.
@@ -183,6 +183,6 @@ class Passes:
 
 def take_passes(output: Leads, step: NetworkStep) -> Moved:
     """Where the passes of a step lead."""
-    passes = Passes(output, step)
+    passes = CorrectionPasses(output, step)
     pos = passes.take(step.network(step.graph, step.nodes, step.edges, passes.look))
     return Moved(pos, early=tuple(zip(passes.positions[:-1], passes.forces, strict=True)))

@@ -24,7 +24,7 @@ from hood.mesh.diffusion import neighbours_of
 from hood.model.features.compiled import planes_of
 from hood.model.features.local import GLOBAL_LOOK_WIDTHS, LOOK_WIDTHS
 from hood.model.features.normalizer import RunningNormalizer
-from hood.model.readout.network_step import Held, Moved, NetworkStep, Pass, take_passes
+from hood.model.readout.network_step import Dirichlet, Moved, NetworkStep, Pass, take_passes
 from hood.native import features as native
 from hood.solver.vertex.cg_step import STEPS
 from hood.tensors.conjugate_gradients import Steps
@@ -226,7 +226,7 @@ class LocalStepOutput(VelocityBaseOutput):
         return moved if before is None else moved + raw[:, 4:5] * before
 
     def take(
-        self, problem: StepProblem, raw: Tensor, index: int, step: Tensor, before: Tensor | None, last: Tensor, held: Held
+        self, problem: StepProblem, raw: Tensor, index: int, step: Tensor, before: Tensor | None, last: Tensor, held: Dirichlet
     ) -> Tensor:
         """Positions (V, 3) after pass ``index`` from where the one before left off: its :meth:`correction`, then
         :meth:`outside`; vertices that are not free where they are held."""
@@ -297,7 +297,9 @@ class GlobalStepOutput(VelocityBaseOutput):
         """Positions (V, 3) [m] after a pass."""
         return self.positions(start.problem, raw, start.last, start.force, start.held, start.feedback.terms)
 
-    def positions(self, problem: StepProblem, raw: Tensor, last: Tensor, force: Tensor, held: Held, solver: Solver) -> Tensor:
+    def positions(
+        self, problem: StepProblem, raw: Tensor, last: Tensor, force: Tensor, held: Dirichlet, solver: Solver
+    ) -> Tensor:
         """Positions (V, 3) [m] after a pass.
 
         Args:

@@ -224,7 +224,7 @@ class Guard:
                 known, problem = problem, problem.with_entered(inside)
                 if tried and problem is known:
                     break
-                prediction = replace(given, residual=math.nan, entered=problem.fold)
+                prediction = replace(given, residual=math.nan, entered=problem.second_contact)
                 now = step_quality(self._potential, problem, prediction, typical=self._alone)
                 # Cloth taken out of the body is strained the more: within the limit that is no loss.
                 now = replace(now, strain=max(now.strain, self._strain_limit))

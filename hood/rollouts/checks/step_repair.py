@@ -129,7 +129,7 @@ def out_of_skin(
     left as it was where that does not help or strains it beyond ``strain`` (99th percentile); None where it leaves few."""
     pos = prediction.next_pos
     if prediction.entered is not None:
-        problem = replace(problem, fold=prediction.entered)
+        problem = replace(problem, second_contact=prediction.entered)
     held = minimize_held_off(potential, problem, pos, settings)
     if not held.rounds:
         return None

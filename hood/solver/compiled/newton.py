@@ -65,8 +65,8 @@ class _Engine(ctypes.Structure):
         *fields("num_walls num_grips num_points bending membrane", COUNT),
         ("dt_sq", REAL),
         *fields("pos acc trial_pos trial_acc gradient direction path face_force hinge_force", POINTER),
-        *fields("face_model hinge_model matrix slack own own_slack row_sum inverse x r z p q", POINTER),
-        *fields("sharpness raised phi noise", REAL),
+        *fields("face_model hinge_model matrix indefinite_part own own_indefinite_part row_sum inverse x r z p q", POINTER),
+        *fields("indefinite_share raised phi noise", REAL),
         *fields("cg_used parts reach", COUNT),
         *fields("spill layers vertex_of_scene", POINTER),
         *fields("kept eased", REAL),
@@ -77,7 +77,7 @@ class _Engine(ctypes.Structure):
 class _LayerGrips(ctypes.Structure):
     """``LayerGrips`` of ``layer_grips.h``."""
 
-    _fields_ = [("count", COUNT), *fields("corners weights normal force limit model gradient own own_slack", POINTER)]
+    _fields_ = [("count", COUNT), *fields("corners weights normal force limit model gradient own own_indefinite_part", POINTER)]
 
 
 @cache
@@ -144,7 +144,7 @@ def build_fabric(cloth: Cloth, tables: Tables, factor: float) -> Fabric:
 
 
 @dataclass(frozen=True)
-class EngineStep:
+class CompiledStep:
     """One step of a whole batch as the compiled solver reads it: float64, vertices in their own order."""
 
     cloth: Cloth
@@ -166,7 +166,7 @@ class EngineStep:
     bend_damping: tuple[np.ndarray, np.ndarray] | None  # (H,) rates and (H,) angles at t
 
 
-def engine_step(potential: Potential, problem: StepProblem) -> EngineStep:
+def compiled_step(potential: Potential, problem: StepProblem) -> CompiledStep:
     """The step ``problem``, in float64 and prepared, with the terms of ``potential``."""
     terms = [term for term in potential.terms.values() if term.applies(problem)]
     forces: VertexForces = known_forces(potential, problem)
@@ -174,7 +174,7 @@ def engine_step(potential: Potential, problem: StepProblem) -> EngineStep:
     springs = [attachment_stiffness(term, problem) for term in terms if type(term) is Attachment]
     stiffness = torch.stack(springs).sum(0) if springs else problem.state.pos.new_zeros(_num_attachments(problem))
     base = inertial_guess(problem.state, problem.step, problem.cloth.vertex_scene)
-    return EngineStep(
+    return CompiledStep(
         cloth=problem.cloth,
         dt=problem.step.dt,
         base=_array(base),

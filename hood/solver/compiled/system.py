@@ -19,14 +19,14 @@ from hood.native.arguments import POINTER, num_parts
 from hood.native.build import BuildError
 from hood.solver.compiled.newton import (
     _ROWS,
-    EngineStep,
+    CompiledStep,
     Fabric,
     _array,
     _Engine,
     _LayerGrips,
     _Points,
     build_fabric,
-    engine_step,
+    compiled_step,
     library,
 )
 from hood.solver.compiled.tables import Tables, build_tables, point_uses
@@ -36,12 +36,12 @@ from hood.solver.derivatives.self_contact import approached
 from hood.solver.system.plan import SolverPlan
 
 
-class SceneEngine:
+class CompiledScene:
     """One scene of a cloth in the compiled solver: memory that every step uses again, and the step's own numbers."""
 
     def __init__(self, cloth: Cloth, tables: Tables) -> None:
         self.tables = tables
-        self.step: EngineStep | None = None  # what was taken up last
+        self.step: CompiledStep | None = None  # what was taken up last
         self._kept: dict[str, Any] = {}  # what the structure points to
         self._fabric: tuple[tuple[Tensor | float | None, ...], Fabric] | None = None
         self.values = _Engine(
@@ -92,7 +92,13 @@ class SceneEngine:
     def _working_memory(self) -> dict[str, np.ndarray]:
         values, kind = self.values, np.float64 if self.wide else np.float32
         rows, blocks = values.num_rows, values.num_blocks
-        sizes = {"matrix": 9 * blocks + 1, "slack": blocks, "own": 6 * rows, "own_slack": 6 * rows, "inverse": 12 * rows}
+        sizes = {
+            "matrix": 9 * blocks + 1,
+            "indefinite_part": blocks,
+            "own": 6 * rows,
+            "own_indefinite_part": 6 * rows,
+            "inverse": 12 * rows,
+        }
         memory = {name: np.zeros(count, kind) for name, count in sizes.items()}
         memory |= {name: np.zeros(4 * rows, kind) for name in "xrzpq"}
         memory["row_sum"] = _aligned(16 * values.most_blocks * values.parts, kind)
@@ -101,7 +107,7 @@ class SceneEngine:
         memory["hinge_model"] = np.zeros(values.num_hinges * self._lib.newton_hinge_record(), np.uint8)
         return memory
 
-    def enter(self, step: EngineStep, scene: int) -> None:
+    def enter(self, step: CompiledStep, scene: int) -> None:
         """Take up scene ``scene`` of a step; the state is undefined until :meth:`start`."""
         values = self.values
         self.step = step
@@ -126,7 +132,7 @@ class SceneEngine:
         self._take_layer_grips(step.layer_grips, scene, step.cloth.num_vertices)
         self.share(num_parts(values.num_rows, _ROWS))
 
-    def _take_damping(self, step: EngineStep) -> None:
+    def _take_damping(self, step: CompiledStep) -> None:
         for kind, damping, elements in (
             ("face", step.stretch_damping, self.tables.faces),
             ("hinge", step.bend_damping, self.tables.hinges),
@@ -160,7 +166,7 @@ class SceneEngine:
         size, count = len(self.tables.vertex), int(rows.sum())
         arrays = {name: _array(getattr(grips, name)[rows]) for name in ("weights", "normal", "force", "limit")}
         arrays |= {"corners": number[grips.corners[rows].numpy()], "model": np.empty((count, 5))}
-        arrays |= {"gradient": np.empty((size, 3)), "own": np.empty((size, 6)), "own_slack": np.empty((size, 6))}
+        arrays |= {"gradient": np.empty((size, 3)), "own": np.empty((size, 6)), "own_indefinite_part": np.empty((size, 6))}
         structure = _LayerGrips(count=count)
         for name, array in arrays.items():
             setattr(structure, name, array.ctypes.data)
@@ -179,9 +185,9 @@ class SceneEngine:
         """Gradient at the state; its norm [N]."""
         return float(self._lib.newton_model(self._address))
 
-    def matrix(self, sharpness: float = 0.0) -> None:
-        """The matrix of the model with a share of its slack; a move makes its own."""
-        self._lib.newton_matrix(self._address, sharpness)
+    def matrix(self, indefinite_share: float = 0.0) -> None:
+        """The matrix of the model with a share of its indefinite part; a move makes its own."""
+        self._lib.newton_matrix(self._address, indefinite_share)
 
     def move(self, residual: float, cg_iterations: int) -> bool:
         """Take a Newton step from a state whose model has been made; whether it led anywhere."""
@@ -210,7 +216,7 @@ class SceneEngine:
         """An array that the structure points to, by its name there."""
         return np.asarray(self._kept[name])
 
-    def _take_fabric(self, step: EngineStep) -> None:
+    def _take_fabric(self, step: CompiledStep) -> None:
         cloth = step.cloth
         now = (cloth.rest_inverse, cloth.rest_area, cloth.thickness, cloth.lame_mu, cloth.lame_lambda, cloth.bending_stiffness,
                cloth.rest_angle, cloth.hinge_rest_length, cloth.hinge_area, cloth.weave, float(step.membrane))  # fmt: skip
@@ -269,23 +275,23 @@ def _identical(a: object, b: object) -> bool:
     return a is b or (isinstance(a, float) and a == b)
 
 
-def scene_engines(problem: StepProblem, plan: SolverPlan) -> list[SceneEngine]:
+def compiled_scenes(problem: StepProblem, plan: SolverPlan) -> list[CompiledScene]:
     """The engines of a cloth's scenes, made once per plan; ``problem`` has the plan's cloth and attachments."""
     engines = plan.cache.get("engines")
     if engines is None:
         parts = [build_tables(problem.cloth, problem.step.attachments, scene) for scene in range(problem.num_scenes)]
-        engines = plan.cache["engines"] = [SceneEngine(problem.cloth, tables) for tables in parts]
+        engines = plan.cache["engines"] = [CompiledScene(problem.cloth, tables) for tables in parts]
     assert isinstance(engines, list)
     return engines
 
 
-class EngineSystem:
+class CompiledSystem:
     """The unknowns of a step in the compiled solver, scene by scene; see :class:`hood.solver.newton.System`."""
 
     def __init__(self, potential: Potential, problem: StepProblem, plan: SolverPlan, cg_iterations: int) -> None:
         self.problem, self._cg_iterations = problem, cg_iterations
-        self._engines = scene_engines(problem, plan)
-        self._step = engine_step(potential, problem)
+        self._engines = compiled_scenes(problem, plan)
+        self._step = compiled_step(potential, problem)
         for scene, engine in enumerate(self._engines):
             engine.enter(self._step, scene)
         self._dt_sq = _array(problem.vertex_dt**2)
@@ -333,7 +339,7 @@ class EngineSystem:
         moving = zip(self._engines, residual, active, strict=True)
         return [wanted and self._move(engine, share) for engine, share, wanted in moving]
 
-    def _move(self, engine: SceneEngine, residual: float) -> bool:
+    def _move(self, engine: CompiledScene, residual: float) -> bool:
         if engine.move(residual, self._cg_iterations):
             return True
         if engine.wide:

@@ -15,11 +15,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hood.contact.activation_distance import sag
+from hood.contact.activation_distance import chord_error
 from hood.contact.contact import Contact
 from hood.energies.compiled_elements import library
 from hood.energies.contact import Collision
-from hood.energies.friction import Friction, gripped
+from hood.energies.friction import Friction, scaled_by_body_friction
 from hood.energies.problem import StepProblem
 from hood.native.arguments import COUNT, POINTER, REAL, fields
 
@@ -152,7 +152,7 @@ class _Contact(ctypes.Structure):
 
     _fields_ = [
         ("count", COUNT),
-        *fields("valid scene mass pos vel dist sag point next_point next_normal pull dt gravity", POINTER),
+        *fields("valid scene mass pos vel dist chord_error point next_point next_normal pull dt gravity", POINTER),
     ]
 
 
@@ -170,7 +170,7 @@ class ContactPass:
         cloth, state = problem.cloth, problem.state
         self._values = _Contact(count=len(state.pos))
         given = {name: getattr(contact, name) for name in ("dist", "point", "next_point", "next_normal")}
-        given |= {"mass": cloth.mass, "sag": sag(cloth, contact, state.pos), "pos": state.pos, "vel": state.vel}
+        given |= {"mass": cloth.mass, "chord_error": chord_error(cloth, contact, state.pos), "pos": state.pos, "vel": state.vel}
         given |= {"dt": problem.step.dt, "gravity": problem.gravity}
         self._kept = {name: whole(values) for name, values in given.items()}
         self._kept |= {"valid": contact.valid.contiguous(), "scene": cloth.vertex_scene.contiguous()}
@@ -186,7 +186,7 @@ class ContactPass:
     def grips(self, term: Friction) -> list[Tensor]:
         """Normals (V, 3), anchors [m] (V, 3), forces [N] (V,) and limits [m] (V,) of
         :class:`hood.solver.derivatives.vertices.Grip`."""
-        pull = self._problem.searched_pull
+        pull = self._problem.searched_internal_force
         if pull is not None:
             self._kept["pull"] = whole(pull)
             self._values.pull = self._kept["pull"].data_ptr()
@@ -194,7 +194,7 @@ class ContactPass:
         numbers = (REAL(value) for value in (term.weight, term.coefficient, term.slip_speed))
         self._lib.elements_grip(*self._given(term), *numbers, *_addresses(found))
         found[2].mul_(self._problem.cloth.friction)
-        found[2] = gripped(self._problem, self._face, found[2])
+        found[2] = scaled_by_body_friction(self._problem, self._face, found[2])
         return found
 
     def _given(self, term: Collision | Friction) -> tuple[object, object]:

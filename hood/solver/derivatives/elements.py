@@ -1,7 +1,8 @@
 """Energies, first and positive second derivatives, element by element, in closed form.
 
 Every matrix here is positive semi-definite: exact where the energy is convex, otherwise larger than the exact one. What
-was added comes along as *slack*, the exact second derivative minus the matrix, where it is written out. Elements come last
+was added comes along as *indefinite part*, the exact second derivative minus the matrix, where it is written out. Elements come
+last
 in every table: sums over three axes are slow in torch where those are the last ones. Element matrices are given by the
 rows of their upper triangle, see :func:`hood.solver.system.sparsity.upper_pairs`.
 """
@@ -83,7 +84,7 @@ class FaceModel:
 
     gradient: Tensor  # (C, 3, N) N
     matrix: Tensor  # (3C (3C + 1) / 2, N) N/m, upper triangle by corner, then axis
-    slack: Tensor  # (C (C + 1) / 2, N) N/m, acts on the three axes alike; negative semi-definite
+    indefinite_part: Tensor  # (C (C + 1) / 2, N) N/m, acts on the three axes alike; negative semi-definite
 
 
 def face_energy(x: Tensor, constants: FaceConstants) -> Tensor:
@@ -111,8 +112,8 @@ def face_model(x: Tensor, constants: FaceConstants, num_corners: int = 3, out: T
 
     With S = 2 μ G + λ tr(G) I the gradient by corner j is A h F S b_j. The second derivative has a material part,
     positive for μ, λ + μ >= 0, and (b_j · S b_k) I₃, which is indefinite under compression: S is replaced there by
-    its positive part, from the eigenvalues of a 2 × 2 matrix. The rest is the slack. Damping adds its stress to S and makes
-    the material part stiffer. Cloth with warp and weft has the S and the material part of :mod:`hood.energies.membrane`.
+    its positive part, from the eigenvalues of a 2 × 2 matrix. The rest is the indefinite part. Damping adds its stress to S and
+    makes the material part stiffer. Cloth with warp and weft has the S and the material part of :mod:`hood.energies.membrane`.
 
     Args:
         x: (3, 3, N) m, of corner and axis.

@@ -81,7 +81,7 @@ class VertexModel:
 
     gradient: Tensor  # (N, 3) N
     matrix: Tensor  # (N, 3, 3) N/m, positive semi-definite
-    slack: Tensor | None  # (N, 3, 3) N/m, exact matrix minus ``matrix``, negative semi-definite; None for zero
+    indefinite_part: Tensor | None  # (N, 3, 3) N/m, exact matrix minus ``matrix``, negative semi-definite; None for zero
 
 
 @dataclass(frozen=True)
@@ -139,11 +139,11 @@ class VertexForces:
         """Derivatives at positions and accelerations (N, 3).
 
         Friction is majorised: its matrix is the slope f'/y across *and* along the slip, so that a step does not overshoot
-        the kink at rest; the curvature f'' along it is smaller, which is the slack.
+        the kink at rest; the curvature f'' along it is smaller, which is the indefinite part.
         """
         gradient = self.inertia * acc - self.weight
         matrix = torch.diag_embed(self.stiffness.unsqueeze(1).expand(-1, 3))
-        slack = None
+        indefinite_part = None
         for wall in self.walls:
             depth = wall.depth(pos).clamp_min(0.0)
             gradient = gradient - wall.pressure(pos)[:, None] * wall.normal
@@ -151,11 +151,11 @@ class VertexForces:
         for grip in self.grips:
             force, block, less = _friction(grip, pos)
             gradient, matrix = gradient + force, matrix.add_(block)
-            slack = less if slack is None else slack + less
+            indefinite_part = less if indefinite_part is None else indefinite_part + less
         for drag in self.drags:
             force, block = drag.derivatives(pos)
             gradient, matrix = gradient + force, matrix + block
-        return VertexModel(gradient, matrix, slack)
+        return VertexModel(gradient, matrix, indefinite_part)
 
 
 def vertex_forces(potential: Potential, problem: StepProblem, compiled: bool = False) -> VertexForces:
@@ -215,7 +215,7 @@ def _slope(grip: Grip, pos: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _friction(grip: Grip, pos: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Gradient, matrix and slack."""
+    """Gradient, matrix and indefinite part."""
     normal, (slip, size, slope) = grip.normal, _slope(grip, pos)
     along = grip.force * torch.where(size < grip.limit, 2.0 * (1.0 - size / grip.limit) / grip.limit, 0.0)
     heading = slip / torch.where(size > 0, size, 1.0)[:, None]

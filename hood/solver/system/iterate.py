@@ -178,10 +178,10 @@ def _in_precision(problem: StepProblem, cloth: Cloth) -> StepProblem:
         None if problem.contact is None else to_device(problem.contact, dtype=real),
         problem.gravity.to(real),
         tuple(to_device(points, dtype=real) for points in problem.point_contacts),
-        None if problem.pull is None else problem.pull.to(real),
+        None if problem.internal_force is None else problem.internal_force.to(real),
         problem.layers,
         None if problem.sides is None else to_device(problem.sides, dtype=real),
-        None if problem.fold is None else problem.fold.to(real),
+        None if problem.second_contact is None else problem.second_contact.to(real),
     )
 
 

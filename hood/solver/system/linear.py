@@ -19,7 +19,7 @@ from hood.solver.system.plan import QuadraticModel, SolverPlan
 from hood.solver.system.sparsity import BlockPattern, row_product
 from hood.tensors.dense import is_whole
 
-#: Below this share of the slack the next try does without.
+#: Below this share of the indefinite part the next try does without.
 LEAST_SHARPNESS = 0.2
 #: The first share that is tried.
 FIRST_SHARPNESS = 0.1
@@ -31,11 +31,11 @@ class Directions:
     The positive matrix of :class:`hood.solver.system.plan.QuadraticModel` is larger than the Hessian under compression and
     along
     sliding contacts: with it alone the last digits come linearly, by a factor of about 2 an iteration. So a share of the
-    slack is added, the *sharpness*: none at first, where the model is farthest from the energy, then a tenth, twice as much
-    with every system solved, half as much wherever the linear solver meets negative curvature, none below 0.2. Over 96 steps
-    of worn garments of 1,000 and 4,400 vertices this needs 4 and 4.5 iterations to γ = 0.01 in the median; to begin with all
-    of the slack took 5 and 6. The idea to convexify only where that turns out necessary is that of Fernández-Fernández et
-    al. ("Progressively Projected Newton's Method", 2025), who decide element by element.
+    indefinite part is added, the *indefinite share*: none at first, where the model is farthest from the energy, then a tenth,
+    twice as much with every system solved, half as much wherever the linear solver meets negative curvature, none below 0.2.
+    Over 96 steps of worn garments of 1,000 and 4,400 vertices this needs 4 and 4.5 iterations to γ = 0.01 in the median; to
+    begin with all of the indefinite part took 5 and 6. The idea to convexify only where that turns out necessary is that of
+    Fernández-Fernández et al. ("Progressively Projected Newton's Method", 2025), who decide element by element.
     """
 
     def __init__(self, plan: SolverPlan, num_scenes: int, linear: str, cg_iterations: int) -> None:
@@ -52,24 +52,24 @@ class Directions:
             active: (B,) bool, scenes to move.
         """
         plan = self.plan
-        sharpness = torch.zeros_like(residual) if self._sharpness is None else self._sharpness
+        indefinite_share = torch.zeros_like(residual) if self._sharpness is None else self._sharpness
         moving = active[plan.scene].unsqueeze(1)
         rhs = torch.where(moving, -model.gradient[plan.vertices], 0.0)
         inverse = diagonal_inverse(plan.pattern, self._idle(model.triples, active))
         solution, pending, halved = torch.zeros_like(rhs), active, torch.zeros_like(active)
         while True:
-            triples = self._idle(self._sharpened(model, sharpness), pending)
+            triples = self._idle(self._sharpened(model, indefinite_share), pending)
             right = torch.where(pending[plan.scene].unsqueeze(1), rhs, 0.0)
             found, failed = self._solve(triples, inverse, right, residual, model.layers)
-            failed = failed & pending & (sharpness > 0)
+            failed = failed & pending & (indefinite_share > 0)
             solution = torch.where((pending & ~failed)[plan.scene].unsqueeze(1), found, solution)
             if not bool(failed.any()):
                 break
             pending, halved = failed, halved | failed
-            smaller = torch.where(sharpness > LEAST_SHARPNESS, 0.5 * sharpness, 0.0)
-            sharpness = torch.where(failed, smaller, sharpness)
-        raised = (2.0 * sharpness).clamp(FIRST_SHARPNESS, 1.0)
-        self._sharpness = torch.where(halved, sharpness, raised)
+            smaller = torch.where(indefinite_share > LEAST_SHARPNESS, 0.5 * indefinite_share, 0.0)
+            indefinite_share = torch.where(failed, smaller, indefinite_share)
+        raised = (2.0 * indefinite_share).clamp(FIRST_SHARPNESS, 1.0)
+        self._sharpness = torch.where(halved, indefinite_share, raised)
         direction = torch.zeros_like(model.gradient)
         direction[plan.vertices] = torch.where(moving, solution, 0.0)
         return direction, inverse
@@ -103,11 +103,11 @@ class Directions:
         # A descent direction where not even the positive matrix is one to rounding: stiffness ratios beyond the type.
         return torch.where(failed[self.plan.scene].unsqueeze(1), by_blocks(inverse)(rhs), solution), failed
 
-    def _sharpened(self, model: QuadraticModel, sharpness: Tensor) -> Tensor:
+    def _sharpened(self, model: QuadraticModel, indefinite_share: Tensor) -> Tensor:
         if self.num_scenes == 1:
-            share = float(sharpness)
-            return torch.add(model.triples, model.slack, alpha=share) if share > 0 else model.triples
-        return torch.addcmul(model.triples, model.slack, sharpness[self._triple_scene()].unsqueeze(1))
+            share = float(indefinite_share)
+            return torch.add(model.triples, model.indefinite_part, alpha=share) if share > 0 else model.triples
+        return torch.addcmul(model.triples, model.indefinite_part, indefinite_share[self._triple_scene()].unsqueeze(1))
 
     def _triple_scene(self) -> Tensor:
         return self.plan.scene[torch.as_tensor(self.plan.pattern.triple_rows // 3, device=self.plan.scene.device)]

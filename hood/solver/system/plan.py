@@ -54,7 +54,7 @@ class SolverPlan:
         return _matrix_sum(self.pattern, self.unknown, self._unknowns)
 
     @cached_property
-    def slack(self) -> Scatter:
+    def indefinite_part(self) -> Scatter:
         """Slack of vertices and faces onto the pattern."""
         return _slack_sum(self.pattern, self.unknown, self._unknowns[0])
 
@@ -88,7 +88,7 @@ class QuadraticModel:
 
     gradient: Tensor  # (V, 3) N, pinned and massless vertices included
     triples: Tensor  # (R, 3) N/m, positive definite matrix of the free vertices in the pattern's layout
-    slack: Tensor  # (R, 3) N/m, what is missing to the Hessian; negative semi-definite
+    indefinite_part: Tensor  # (R, 3) N/m, what is missing to the Hessian; negative semi-definite
     layers: LayerRows | None = None  # what cloth near cloth adds; None where there is none
 
 
@@ -123,7 +123,7 @@ class ModelBuilder:
         cloth, like = terms.problem.cloth, terms.problem.state.pos
         sizes = [9 * len(like), 45 * len(cloth.faces), 78 * len(cloth.hinges)]
         # Zero where nothing is ever written: no such term.
-        self._values, self._slack = like.new_zeros(plan.matrix.num_values), like.new_zeros(plan.slack.num_values)
+        self._values, self._slack = like.new_zeros(plan.matrix.num_values), like.new_zeros(plan.indefinite_part.num_values)
         parts = self._values.split([*sizes, len(self._values) - sum(sizes)])
         self._vertices, self._faces, self._hinges, self._springs = parts
         self._vertex_slack, self._face_slack = self._slack.split([sizes[0], len(self._slack) - sizes[0]])
@@ -140,12 +140,12 @@ class ModelBuilder:
         vertices = terms.vertices.model(pos, acc)
         gradient = vertices.gradient
         self._vertices.copy_(vertices.matrix.view(-1))
-        if vertices.slack is not None:
-            self._vertex_slack.copy_(vertices.slack.view(-1))
+        if vertices.indefinite_part is not None:
+            self._vertex_slack.copy_(vertices.indefinite_part.view(-1))
         faces = terms.faces(pos, out=self._faces.view(45, -1))
         if faces is not None:
             gradient = gradient + plan.face_vertices(faces.gradient).view(-1, 3)
-            self._face_slack.copy_(faces.slack.view(-1))
+            self._face_slack.copy_(faces.indefinite_part.view(-1))
         for index, (slope, row) in enumerate(terms.hinges(pos)):
             gradient = gradient + plan.hinge_vertices(slope).view(-1, 3)
             elements.outer_upper(row.flatten(0, 1), self._hinges.view(78, -1), add=index > 0)
@@ -155,22 +155,24 @@ class ModelBuilder:
             self._springs.copy_(springs[1].view(-1))
         other = terms.other_gradient(pos, acc)
         gradient = gradient if other is None else gradient + other
-        triples, slack = plan.matrix(self._values).view(-1, 3), plan.slack(self._slack).view(-1, 3)
+        triples, indefinite_part = plan.matrix(self._values).view(-1, 3), plan.indefinite_part(self._slack).view(-1, 3)
         for points, blocks in zip(terms.points, self._blocks, strict=True):
             model = points.model(pos)
             gradient = gradient + points.spread(model.gradient, gradient)
             triples = blocks.add(triples, model.matrix)
-            slack = slack if model.slack is None else blocks.add(slack, model.slack)
+            indefinite_part = (
+                indefinite_part if model.indefinite_part is None else blocks.add(indefinite_part, model.indefinite_part)
+            )
         near = layer_rows(self._layers, self._grips, pos, plan.unknown) if self._layers else None
         if near is not None:
             triples = triples.index_add(0, plan.pattern.diagonal.to(triples.device).reshape(-1), near.own.reshape(-1, 3))
-        return QuadraticModel(gradient, triples, slack, near)
+        return QuadraticModel(gradient, triples, indefinite_part, near)
 
 
 def quadratic_model(potential: Potential, problem: StepProblem, plan: SolverPlan, pos: Tensor, acc: Tensor) -> QuadraticModel:
     """Gradient of the potential, equal to :meth:`Potential.gradient`, a positive definite matrix and what it lacks.
 
-    Matrix plus slack is the Hessian, exact for inertia, contact, friction and membrane, Gauss-Newton for bending (see
+    Matrix plus indefinite part is the Hessian, exact for inertia, contact, friction and membrane, Gauss-Newton for bending (see
     :mod:`hood.solver.derivatives.elements`). Terms of other classes enter the gradient, by autograd, but not the matrix.
     """
     return ModelBuilder(StepTerms(potential, problem), plan)(pos, acc)

@@ -16,8 +16,8 @@ from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem
 from hood.native.build import BuildError
 from hood.solver.compiled import newton
-from hood.solver.compiled.newton import engine_step
-from hood.solver.compiled.system import SceneEngine
+from hood.solver.compiled.newton import compiled_step
+from hood.solver.compiled.system import CompiledScene
 from hood.solver.compiled.tables import build_tables
 from hood.solver.vertex.block_jacobi import LocalTerms, LocalView
 from hood.solver.vertex.cg_step import STEPS
@@ -39,7 +39,7 @@ class EngineTerms:
     def __init__(self, potential: Potential, problem: StepProblem) -> None:
         state, dt = problem.state, problem.vertex_dt.double()
         base = (state.pos.double() + dt * state.vel.double()).numpy()
-        self._step = replace(engine_step(potential, problem), base=base)
+        self._step = replace(compiled_step(potential, problem), base=base)
         self._engines = _engines_of(problem.cloth, problem.step.attachments)
         self._sizes = problem.cloth.scene_sizes
         self._enter()
@@ -86,17 +86,17 @@ def applies(potential: Potential, problem: StepProblem) -> bool:
     return type(pos) is Tensor and pos.dtype == torch.float32 and newton.applies(potential, problem)
 
 
-_Known = tuple[weakref.ref[Tensor], tuple[Tensor, Tensor, Tensor | None], list[SceneEngine]]
+_Known = tuple[weakref.ref[Tensor], tuple[Tensor, Tensor, Tensor | None], list[CompiledScene]]
 _ENGINES: dict[int, _Known] = {}
 
 
-def _engines_of(cloth: Cloth, attachments: Attachments | None) -> list[SceneEngine]:
+def _engines_of(cloth: Cloth, attachments: Attachments | None) -> list[CompiledScene]:
     """Engines of a cloth's scenes, apart from those that the solver moves; kept as long as the cloth's faces live."""
     key, now = id(cloth.faces), (cloth.hinges, cloth.free, None if attachments is None else attachments.edges)
     known = _ENGINES.get(key)
     if known is not None and known[0]() is cloth.faces and all(_same(a, b) for a, b in zip(now, known[1], strict=True)):
         return known[2]
-    made = [SceneEngine(cloth, build_tables(cloth, attachments, scene)) for scene in range(cloth.num_scenes)]
+    made = [CompiledScene(cloth, build_tables(cloth, attachments, scene)) for scene in range(cloth.num_scenes)]
     _ENGINES[key] = (weakref.ref(cloth.faces, forget(_ENGINES, key)), now, made)
     return made
 

@@ -137,7 +137,7 @@ class _Plan:
     def _read(self) -> StepProblem:
         problem, incidence = problem_from(self._like, self._inputs.tensors)
         problem, self._faces = with_fixed_contact(problem, incidence, self.places, self._folds)
-        return self._potential.with_pull(problem, compiled=False)
+        return self._potential.with_internal_force(problem, compiled=False)
 
 
 def _recorded(piece: Piece) -> Piece:

@@ -187,9 +187,9 @@ class FixedSystem:
 
     @torch.no_grad()
     def _sharpen(self) -> None:
-        """The matrix with its share of the slack, and where conjugate gradients begin."""
+        """The matrix with its share of the indefinite part, and where conjugate gradients begin."""
         share = self._sharpness.index_select(0, self._triple_scene).unsqueeze(1)
-        self._triples = self._idle(torch.addcmul(self._model.triples, self._model.slack, share), self._pending)
+        self._triples = self._idle(torch.addcmul(self._model.triples, self._model.indefinite_part, share), self._pending)
         rhs = torch.where(self._pending.index_select(0, self._scene).unsqueeze(1), self._rhs, 0.0)
         z = by_blocks(self._inverse)(rhs)
         rz = self._dot(rhs, z)
@@ -225,7 +225,8 @@ class FixedSystem:
 
     @torch.no_grad()
     def _judge(self) -> None:
-        """Take solutions over; scenes whose matrix is not positive definite try again with half the share of the slack."""
+        """Take solutions over; scenes whose matrix is not positive definite try again with half the share of the
+        indefinite part."""
         failed = self._indefinite & self._pending & (self._sharpness > 0)
         found = (self._pending & ~failed).index_select(0, self._scene).unsqueeze(1)
         self._solution.copy_(torch.where(found, self._x, self._solution))

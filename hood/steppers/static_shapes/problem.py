@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from hood.cloth.state import Attachments, Obstacle, State
-from hood.contact.contact import Fold, find_contact, find_fixed_contact, find_fixed_fold
-from hood.contact.second_side import find_other_skin
+from hood.contact.contact import SecondContact, find_contact, find_fixed_contact, find_static_second_contact
+from hood.contact.second_side import find_second_side
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem, free_flight
 from hood.energies.term import PreparedTerm
@@ -86,7 +86,9 @@ def problem_from(like: StepProblem, inputs: Sequence[Tensor]) -> tuple[StepProbl
         obstacle = altered(obstacle, **present)
     tables = list(values)
     step = altered(like.step, dt=dt, pin_target=pins, obstacle=obstacle)
-    problem = altered(like, state=State(pos, vel, like.state.origin), step=step, contact=None, pull=None, fold=None)
+    problem = altered(
+        like, state=State(pos, vel, like.state.origin), step=step, contact=None, internal_force=None, second_contact=None
+    )
     return problem, Incidence(*tables) if tables else None
 
 
@@ -106,14 +108,14 @@ def with_fixed_contact(
         return altered(problem, contact=None), cloth.faces.new_zeros(1)
     if pos.device.type == "cpu" and not dense:
         contact, num_faces = find_contact(pos, cloth.vertex_scene, obstacle), cloth.faces.new_zeros(1)
-        fold = find_other_skin(pos, cloth.vertex_scene, obstacle, contact, free_flight(problem)) if folds else None
+        fold = find_second_side(pos, cloth.vertex_scene, obstacle, contact, free_flight(problem)) if folds else None
         if fold is not None and fold.contact is None:
-            fold = Fold(altered(contact, valid=torch.zeros_like(contact.valid)))
+            fold = SecondContact(altered(contact, valid=torch.zeros_like(contact.valid)))
     else:
         surface = obstacle, incidence, cloth.num_scenes, places
         contact, num_faces = find_fixed_contact(pos, cloth.vertex_scene, *surface)
-        fold = find_fixed_fold(pos, cloth.vertex_scene, contact, *surface) if folds else None
-    return altered(problem, contact=contact, fold=fold), num_faces
+        fold = find_static_second_contact(pos, cloth.vertex_scene, contact, *surface) if folds else None
+    return altered(problem, contact=contact, second_contact=fold), num_faces
 
 
 def step_shape(problem: StepProblem, surface: bool = False) -> tuple[Any, ...]:

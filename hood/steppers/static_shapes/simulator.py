@@ -3,7 +3,7 @@
 A whole step of a simulator (search, features, network, integration) as a function of tensors of fixed shapes.
 
 It waits for nothing on the host and no shape in it depends on a value, so that a CUDA graph can hold it and a compiler
-needs to see it once. Its result is that of :meth:`hood.steppers.network.Simulator.predict` up to rounding.
+needs to see it once. Its result is that of :meth:`hood.steppers.network.NetworkStepper.predict` up to rounding.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from hood.model.graph.static_shapes import Capacity, Layout, build_fixed_graph, 
 from hood.model.kernels import triton_edge
 from hood.native import features as native
 from hood.solver.vertex.block_jacobi import incidence_of
-from hood.steppers.network import Prediction, Prepared, Simulator
+from hood.steppers.network import NetworkStepper, Prediction, Prepared
 from hood.steppers.newton import Stepper
 from hood.steppers.protocol import Relaxing, Stopwatch, timed
 from hood.steppers.refined import unrefined
@@ -75,7 +75,7 @@ class FixedStep:
 
     def __init__(
         self,
-        simulator: Simulator,
+        simulator: NetworkStepper,
         layout: Layout,
         like: StepProblem,
         dense: bool = False,
@@ -99,7 +99,7 @@ class FixedStep:
         folds = self._potential is not None and keeps_both_sides(self._potential)
         problem, num_faces = with_fixed_contact(problem, incidence, self.layout.capacity.faces, folds, self.dense)
         if self._potential is not None:
-            problem = self._potential.with_pull(problem, compiled=False)
+            problem = self._potential.with_internal_force(problem, compiled=False)
         seen = simulator.rules.stand(self._in_frames(problem))
         obstacle, nearest = seen.step.obstacle, None
         if obstacle is not None:
@@ -135,7 +135,7 @@ class FixedStep:
         return given.edges
 
 
-def check_model(simulator: Simulator) -> None:
+def check_model(simulator: NetworkStepper) -> None:
     """Raise ValueError if the simulator's step has no form of fixed shapes."""
     if simulator.training:
         raise ValueError("fixed-shape steps are for inference: call simulator.eval() first")
@@ -178,7 +178,7 @@ class CapturedSimulator:
 
     times: tuple[str, ...] = ("step", "rest", "total")
 
-    def __init__(self, simulator: Simulator, mode: str = "captured", capacity: Capacity | None = None) -> None:
+    def __init__(self, simulator: NetworkStepper, mode: str = "captured", capacity: Capacity | None = None) -> None:
         if mode not in MODES:
             raise ValueError(f"step is {mode!r}; choose plain, {', '.join(MODES[:-1])} or {MODES[-1]}")
         if mode == "captured" and simulator.gravity.device.type != "cuda":
@@ -197,7 +197,7 @@ class CapturedSimulator:
         return self.simulator.relaxing
 
     def prepare(self, cloth: Cloth, rest_pos: Any) -> Prepared:
-        """As :meth:`hood.steppers.network.Simulator.prepare`."""
+        """As :meth:`hood.steppers.network.NetworkStepper.prepare`."""
         return self.simulator.prepare(cloth, rest_pos)
 
     def search(self, problem: StepProblem) -> StepProblem:
@@ -253,17 +253,19 @@ class CapturedSimulator:
         return capacity_for((int(near.sum()), len(nearest.vertex[near].unique()), 0), _limits(problem))
 
 
-def network_of(stepper: Stepper) -> Simulator | None:
+def network_of(stepper: Stepper) -> NetworkStepper | None:
     """The simulator that takes a stepper's steps, refined or not, in fixed shapes or not; None where a solver does."""
     stepper = unrefined(stepper)
-    simulator: Simulator | None = getattr(stepper, "simulator", None)
+    simulator: NetworkStepper | None = getattr(stepper, "simulator", None)
     return simulator
 
 
 class _Plan:
     """A step made ready for problems of one shape: its input and output memory and how it is run."""
 
-    def __init__(self, simulator: Simulator, problem: StepProblem, prepared: Prepared, capacity: Capacity, mode: str) -> None:
+    def __init__(
+        self, simulator: NetworkStepper, problem: StepProblem, prepared: Prepared, capacity: Capacity, mode: str
+    ) -> None:
         assert prepared.static is not None
         self._simulator, self._prepared, self._precision = simulator, prepared, simulator.network.precision
         potential = self._potential()
@@ -300,7 +302,7 @@ class _Plan:
         return step_inputs(problem, self._simulator.needs_contact)
 
 
-def _has_fused_edges(simulator: Simulator, like: Tensor) -> bool:
+def _has_fused_edges(simulator: NetworkStepper, like: Tensor) -> bool:
     """Whether edges are updated by kernels of our own, which a graph can hold and a trace cannot look into."""
     precision = torch.bfloat16 if simulator.network.precision == "bf16" else like.dtype
     return triton_edge.applies(like.new_empty(1, simulator.config["latent_dim"], dtype=precision))

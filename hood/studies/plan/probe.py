@@ -216,13 +216,13 @@ class _Probe:
         words = list(dict.fromkeys(word for part in self.parts if part.name in names for word in part.words))
         if not other and not words:
             return self.full
-        lean = self.variants[names[0]] if not other and len(names) == 1 else self.made.make(words, other)
+        reduced = self.variants[names[0]] if not other and len(names) == 1 else self.made.make(words, other)
         if not self._lacking(names):
-            return lean
-        full = self.made.full_in(lean.scene)
-        potentials = lean.potential, full.potential
-        watched = WatchedStepper(lean.stepper, full.stepper, potentials, lean.scene, self._limit(names), HOLD)
-        return replace(lean, stepper=watched)
+            return reduced
+        full = self.made.full_in(reduced.scene)
+        potentials = reduced.potential, full.potential
+        watched = WatchedStepper(reduced.stepper, full.stepper, potentials, reduced.scene, self._limit(names), HOLD)
+        return replace(reduced, stepper=watched)
 
     def _together(self, names: Sequence[str]) -> tuple[Effect, Effect]:
         """The full model and the parts' combination, side by side."""

@@ -18,10 +18,10 @@ SHORT = ["garment=skirt", "sequence=plie", "stepper=newton", "num_frames=4", "vi
 
 def test_parts_have_their_factors_and_later_ones_count() -> None:
     words = ["garment=tank", "num_frames=3", "body_friction={below_pelvis:0,left_knee:4}"]
-    grip = make_scene(load_config("rollout", words)).grip
+    grip = make_scene(load_config("rollout", words)).friction_scale
     assert grip is not None
     assert set(grip.tolist()) == {0.0, 1.0, 4.0}
-    assert make_scene(load_config("rollout", words[:2])).grip is None
+    assert make_scene(load_config("rollout", words[:2])).friction_scale is None
 
 
 def test_a_factor_of_one_is_the_same_rollout_and_another_is_not(tmp_path: Path) -> None:

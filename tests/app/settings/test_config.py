@@ -11,7 +11,7 @@ from hood.app.settings.compose import ConfigError, build, groups, load_config, o
 from hood.app.settings.record import save_run_record
 from hood.assets.material import Material
 from hood.energies.potential import Potential, default_potential
-from hood.steppers.network import Simulator
+from hood.steppers.network import NetworkStepper
 from hood.training.curriculum import WarmupCosine
 from hood.training.settings import TrainerSettings
 
@@ -102,7 +102,7 @@ def test_training_config_builds_what_it_says() -> None:
     settings = build(config.trainer)
     assert isinstance(settings, TrainerSettings)
     assert settings.schedule == WarmupCosine(7, config.trainer.schedule.floor)
-    assert isinstance(build(config.model), Simulator)
+    assert isinstance(build(config.model), NetworkStepper)
 
 
 def test_default_losses_are_the_librarys(rollout_losses: Potential) -> None:

@@ -24,12 +24,12 @@ from hood.assets.motion.sequence import PoseSequence
 from hood.cli.main import main
 from hood.energies.contact import Collision
 from hood.energies.potential import coded_potential, default_potential
-from hood.energies.self_contact import LayerBarrier, LayerSides
+from hood.energies.self_contact import LayerBarrier, SignedSelfContactPenalty
 from hood.energies.self_friction import LayerFriction
 from hood.scene.scene import Scene, build_scene
 from hood.solver.newton import NewtonSettings
 from hood.steppers.checkpoint import load_simulator, save_simulator
-from hood.steppers.network import Simulator, build_simulator
+from hood.steppers.network import NetworkStepper, build_simulator
 from hood.steppers.newton import NewtonStepper
 from hood.steppers.ranges import Conditions, scene_conditions
 from hood.steppers.refined import GuessStepper, RefinedStepper
@@ -39,21 +39,21 @@ DEFAULT, ROUGH = default_potential(), default_potential(friction_coefficient=10.
 
 
 @pytest.fixture(scope="module")
-def quickstart() -> Simulator:
+def quickstart() -> NetworkStepper:
     return load_simulator(locate("weights", "quickstart"))
 
 
 @pytest.fixture(scope="module")
-def paper() -> Simulator:
+def paper() -> NetworkStepper:
     torch.manual_seed(0)
     return build_simulator("paper", "acceleration", "1x(mesh)", latent_dim=8).eval()
 
 
-def refined(stepper: Simulator) -> RefinedStepper:
+def refined(stepper: NetworkStepper) -> RefinedStepper:
     return RefinedStepper(stepper, DEFAULT, Count(1), "newton", NewtonSettings())
 
 
-def test_nothing_is_said_of_what_was_trained(quickstart: Simulator, tank_scene: Scene) -> None:
+def test_nothing_is_said_of_what_was_trained(quickstart: NetworkStepper, tank_scene: Scene) -> None:
     assert scene_cautions(quickstart, tank_scene, DEFAULT, "quickstart") == []
 
 
@@ -61,7 +61,7 @@ class OwnCollision(Collision):
     """Contact that somebody has written."""
 
 
-def test_terms_that_the_solver_knows_by_their_slope_are_named_where_it_works(quickstart: Simulator) -> None:
+def test_terms_that_the_solver_knows_by_their_slope_are_named_where_it_works(quickstart: NetworkStepper) -> None:
     own = DEFAULT.with_terms(collision=OwnCollision())
     (sentence,) = known_by_slope(refined(quickstart), own)
     assert "\n" not in sentence
@@ -69,7 +69,7 @@ def test_terms_that_the_solver_knows_by_their_slope_are_named_where_it_works(qui
     assert "take many iterations" in sentence
     assert known_by_slope(NewtonStepper(own, NewtonSettings()), own) == [sentence]
     assert known_by_slope(quickstart, own) == []
-    layered = DEFAULT.with_terms(layers=LayerBarrier(), layer_friction=LayerFriction(), sides=LayerSides())
+    layered = DEFAULT.with_terms(layers=LayerBarrier(), layer_friction=LayerFriction(), sides=SignedSelfContactPenalty())
     for potential in (DEFAULT, coded_potential(), layered, losses_of(load_config("rollout", []))):
         assert known_by_slope(refined(quickstart), potential) == []
 
@@ -83,18 +83,18 @@ def test_a_rollout_says_so_when_it_begins(monkeypatch: pytest.MonkeyPatch) -> No
     assert sum("the solver knows the slope alone" in sentence for sentence in said) == 1
 
 
-def vertices(simulator: Simulator) -> str:
+def vertices(simulator: NetworkStepper) -> str:
     """Of the garments that it was trained on, as it is told."""
     assert simulator.trained_for is not None
     return " to ".join(f"{value:,.0f}" for value in simulator.trained_for.spans["vertices"])
 
 
-def test_garments_of_1k_and_4k_were_trained(quickstart: Simulator, body: Body, walk: PoseSequence) -> None:
+def test_garments_of_1k_and_4k_were_trained(quickstart: NetworkStepper, body: Body, walk: PoseSequence) -> None:
     scene = build_scene(load_garment("dress_4k"), body, walk.window(0, 4))
     assert scene_cautions(quickstart, scene, DEFAULT, "quickstart") == []
 
 
-def test_finer_garments_are_named_with_the_way_out(quickstart: Simulator, body: Body, walk: PoseSequence) -> None:
+def test_finer_garments_are_named_with_the_way_out(quickstart: NetworkStepper, body: Body, walk: PoseSequence) -> None:
     scene = build_scene(load_garment("dress_12k"), body, walk.window(0, 4))
     (sentence,) = scene_cautions(quickstart, scene, DEFAULT, "quickstart")
     assert sentence.startswith(
@@ -107,14 +107,14 @@ def test_finer_garments_are_named_with_the_way_out(quickstart: Simulator, body: 
     assert scene_cautions(GuessStepper(DEFAULT), scene, DEFAULT, "") == []
 
 
-def test_the_potential_of_a_network_that_looks_at_it(quickstart: Simulator, tank_scene: Scene) -> None:
+def test_the_potential_of_a_network_that_looks_at_it(quickstart: NetworkStepper, tank_scene: Scene) -> None:
     (sentence,) = scene_cautions(quickstart, tank_scene, ROUGH, "quickstart")
     assert sentence.startswith(
         "quickstart was not trained for losses.terms.friction.coefficient=10 (trained on 0.5); the motion may be wrong"
     )
 
 
-def test_the_potential_of_a_network_that_does_not(paper: Simulator, tank_scene: Scene) -> None:
+def test_the_potential_of_a_network_that_does_not(paper: NetworkStepper, tank_scene: Scene) -> None:
     assert scene_cautions(paper, tank_scene, DEFAULT, "old.pth") == []
     (sentence,) = scene_cautions(paper, tank_scene, ROUGH, "old.pth")
     assert sentence.startswith(
@@ -125,7 +125,7 @@ def test_the_potential_of_a_network_that_does_not(paper: Simulator, tank_scene: 
     assert sentence.endswith("old.pth does not look at the potential; moved by it: stepper=newton")
 
 
-def test_such_a_networks_own_potential_is_the_one_it_was_trained_with(paper: Simulator, tank_scene: Scene) -> None:
+def test_such_a_networks_own_potential_is_the_one_it_was_trained_with(paper: NetworkStepper, tank_scene: Scene) -> None:
     trained = paper.clone().eval()
     trained.trained_for = scene_conditions(tank_scene.garment, tank_scene.cloth, tank_scene.dt, ROUGH)
     assert scene_cautions(trained, tank_scene, ROUGH, "mine") == []
@@ -133,7 +133,7 @@ def test_such_a_networks_own_potential_is_the_one_it_was_trained_with(paper: Sim
     assert sentence.startswith("losses.terms.friction.coefficient=0.5 (trained on 10) changes only what is measured")
 
 
-def test_an_evaluation_says_it_once(quickstart: Simulator, paper: Simulator, tank_scene: Scene) -> None:
+def test_an_evaluation_says_it_once(quickstart: NetworkStepper, paper: NetworkStepper, tank_scene: Scene) -> None:
     tank = scene_conditions(tank_scene.garment, tank_scene.cloth, 1 / 60, DEFAULT)
     fine = Conditions({**tank.spans, "vertices": (9e3, 9e3)}, tank.potential)
     steppers = {"quickstart": quickstart, "copy": quickstart.clone(), "old": paper, "guess": GuessStepper(DEFAULT)}
@@ -151,7 +151,7 @@ def test_a_rollout_warns_once_and_writes_it_down(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
-    paper: Simulator,
+    paper: NetworkStepper,
     tank_scene: Scene,
 ) -> None:
     known = paper.clone().eval()
@@ -178,7 +178,7 @@ def test_an_evaluation_warns(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert "hood: warning: fine15: not trained for fps=25 (trained on 30);" in capsys.readouterr().err
 
 
-def test_inspect_prints_the_ranges(tmp_path: Path, quickstart: Simulator, capsys: pytest.CaptureFixture[str]) -> None:
+def test_inspect_prints_the_ranges(tmp_path: Path, quickstart: NetworkStepper, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["inspect", str(locate("weights", "quickstart"))]) == 0
     shown = capsys.readouterr().out
     known = f"garment vertices: {vertices(quickstart)}"
@@ -190,7 +190,7 @@ def test_inspect_prints_the_ranges(tmp_path: Path, quickstart: Simulator, capsys
     assert "trained on: unknown" in capsys.readouterr().out
 
 
-def test_a_gravity_that_nobody_was_trained_for(quickstart: Simulator, tank_scene: Scene) -> None:
+def test_a_gravity_that_nobody_was_trained_for(quickstart: NetworkStepper, tank_scene: Scene) -> None:
     heavy = quickstart.clone().eval()
     weigh(heavy, load_config("rollout", ["gravity=98.1"]))
     (sentence,) = scene_cautions(heavy, tank_scene, DEFAULT, "quickstart")
@@ -210,7 +210,7 @@ def test_a_gravity_that_is_none_is_refused(value: str, capsys: pytest.CaptureFix
     assert "gravity" in capsys.readouterr().err
 
 
-def test_a_network_says_that_it_knows_no_warp_and_weft(quickstart: Simulator, body: Body, walk: PoseSequence) -> None:
+def test_a_network_says_that_it_knows_no_warp_and_weft(quickstart: NetworkStepper, body: Body, walk: PoseSequence) -> None:
     woven = build_scene(load_garment("tank"), body, walk.window(0, 4), Material(warp=50.0, weft=20.0, shear=0.5))
     for stepper, ways in ((quickstart, "refine=10 corrects every step"), (refined(quickstart), "needs no weights")):
         (sentence,) = scene_cautions(stepper, woven, DEFAULT, "quickstart")

@@ -72,7 +72,7 @@ def test_depth_is_that_of_numpy(seed: int, size: float, monkeypatch: pytest.Monk
 
 
 def test_what_is_kept_of_the_faces_and_its_order_do_not_matter() -> None:
-    """Passes over other positions in between, and an order by another shape, change nothing."""
+    """CorrectionPasses over other positions in between, and an order by another shape, change nothing."""
     pos, faces = crumpled(25, 3)
     ball, ball_faces = sphere(4, 0.4)
     cut, own = crossings(pos, faces, ball, ball_faces), self_crossings(pos, faces)

@@ -9,18 +9,18 @@ from hood.energies.problem import StepProblem
 from hood.model.features import compiled, local
 from hood.model.features.inputs import Inputs
 from hood.model.graph.builder import build_graph
-from hood.model.readout.network_step import Feedback, Held
+from hood.model.readout.network_step import Dirichlet, Feedback
 from hood.model.readout.output import LocalStepOutput, VelocityBaseOutput
 from hood.native import features as native
 from hood.scene.scene import Scene
-from hood.steppers.network import Simulator, build_simulator
+from hood.steppers.network import NetworkStepper, build_simulator
 
 pytestmark = pytest.mark.skipif(native.library() is None, reason="no C++ compiler")
 PASSES = "1x(mesh+coarse0) 1x(coarse0) | 1x(mesh+coarse0) | 1x(mesh)"
 SCENES = ["band_scene", "tank_scene"]
 
 
-def make(features: str = "local", output: str = "local_steps", schedule: str = PASSES) -> Simulator:
+def make(features: str = "local", output: str = "local_steps", schedule: str = PASSES) -> NetworkStepper:
     torch.manual_seed(0)
     return build_simulator(features, output, schedule, latent_dim=16, output_init=0.3).eval()
 
@@ -78,7 +78,9 @@ def test_a_correction_is_that_of_torch(name: str, index: int, request: pytest.Fi
     fixed = torch.randn_like(pos)
 
     def take() -> Tensor:
-        return output.take(problem, raw, index, step, before, pos - 3e-3 * torch.sin(9 * pos), Held(problem.cloth.free, fixed))
+        return output.take(
+            problem, raw, index, step, before, pos - 3e-3 * torch.sin(9 * pos), Dirichlet(problem.cloth.free, fixed)
+        )
 
     found = take()
     with native.in_torch():

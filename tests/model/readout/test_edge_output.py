@@ -14,12 +14,12 @@ from test_output import ball_problem
 from torch import Tensor
 
 from hood.cloth.state import Attachments
-from hood.contact.activation_distance import sag
+from hood.contact.activation_distance import chord_error
 from hood.energies.problem import StepProblem
 from hood.model.graph.builder import MESH, Graph, build_graph, build_static
 from hood.model.graph.hierarchy import build_hierarchy
 from hood.model.readout.edges import EdgeOutput
-from hood.model.readout.network_step import Held
+from hood.model.readout.network_step import Dirichlet
 from hood.scene.scene import Scene
 from hood.steppers.checkpoint import load_simulator, save_simulator
 
@@ -34,7 +34,7 @@ def graph_of(problem: StepProblem) -> Graph:
 
 def positions(problem: StepProblem, raw: Tensor, edge_raw: Tensor) -> Tensor:
     output, cloth = EdgeOutput(), problem.cloth
-    held = Held(cloth.free, problem.state.pos)
+    held = Dirichlet(cloth.free, problem.state.pos)
     return output.positions(problem, graph_of(problem), output.base(problem), raw, edge_raw, held)
 
 
@@ -168,7 +168,7 @@ def test_vertices_of_fine_meshes_are_pressed_less_deep(rounds: int, share: float
     cloth, contact = problem.cloth, problem.contact
     assert contact is not None
     found = output.outside(problem, 0.9 * problem.state.pos)
-    onset = output.clearance + sag(cloth, contact, problem.state.pos)
+    onset = output.clearance + chord_error(cloth, contact, problem.state.pos)
     edge = cloth.edge_length_sq.sqrt().clamp_max(17e-3)
     depth = onset - contact.next_dist(found)
     torch.testing.assert_close(depth, 3e-4 * edge / 17e-3, rtol=1e-6, atol=1e-12)

@@ -9,10 +9,10 @@ from test_passes import step_of
 from torch import Tensor
 
 from hood.energies.potential import default_potential
-from hood.model.readout.network_step import Held
+from hood.model.readout.network_step import Dirichlet
 from hood.model.readout.output import GlobalStepOutput
 from hood.scene.scene import Scene
-from hood.steppers.network import Simulator, build_simulator
+from hood.steppers.network import NetworkStepper, build_simulator
 
 
 class Dense:
@@ -24,7 +24,7 @@ class Dense:
         return torch.linalg.solve(matrix + torch.diag(damping), force)
 
 
-def make(schedule: str = "1x(mesh+coarse0) | 1x(mesh)", output_init: float = 0.3) -> Simulator:
+def make(schedule: str = "1x(mesh+coarse0) | 1x(mesh)", output_init: float = 0.3) -> NetworkStepper:
     torch.manual_seed(0)
     return build_simulator("local", "global_steps", schedule, latent_dim=16, output_init=output_init)
 
@@ -33,7 +33,7 @@ def test_the_derivative_is_that_of_the_positions(band_scene: Scene) -> None:
     problem, _ = step_of(band_scene, make())
     problem = replace(problem, contact=None, cloth=replace(problem.cloth, mass=problem.cloth.mass.double()))
     last = problem.state.pos.double()
-    output, held, force = GlobalStepOutput(), Held(problem.cloth.free, last), 1e-3 * torch.randn_like(last)
+    output, held, force = GlobalStepOutput(), Dirichlet(problem.cloth.free, last), 1e-3 * torch.randn_like(last)
 
     def positions(raw: Tensor) -> Tensor:
         return output.positions(problem, raw, last, force, held, Dense())

@@ -9,17 +9,17 @@ from hood.energies.potential import default_potential
 from hood.energies.problem import StepProblem
 from hood.scene.scene import Scene
 from hood.steppers.checkpoint import load_simulator, save_simulator
-from hood.steppers.network import Prediction, Simulator, build_simulator
+from hood.steppers.network import NetworkStepper, Prediction, build_simulator
 
 SCHEDULE = "1x(mesh+coarse0) 1x(coarse0) | 1x(mesh+coarse0) | 1x(mesh)"
 
 
-def make(schedule: str = SCHEDULE) -> Simulator:
+def make(schedule: str = SCHEDULE) -> NetworkStepper:
     torch.manual_seed(0)
     return build_simulator("local", "local_steps", schedule, latent_dim=16, output_init=0.3)
 
 
-def step_of(scene: Scene, simulator: Simulator) -> tuple[StepProblem, Prediction]:
+def step_of(scene: Scene, simulator: NetworkStepper) -> tuple[StepProblem, Prediction]:
     state = scene.start(2)
     problem = StepProblem(scene.cloth, state, scene.step_input(2, state), gravity=simulator.gravity)
     problem = default_potential().prepare(problem)

@@ -251,9 +251,9 @@ def test_a_mended_step_is_never_worse(scene: Scene) -> None:
     assert hopeless.kind == LEFT
     assert hopeless.prediction is prediction
     # Less force for much more strain is no bargain.
-    slack = replace(prediction, next_pos=prediction.next_pos.clone())
+    indefinite_part = replace(prediction, next_pos=prediction.next_pos.clone())
     said = StepQuality(True, residual=1e9, strain=-1.0)
-    refused = repair_step(POTENTIAL, problem, slack, said, Limits(1.0, 0.25), SETTINGS, 5)
+    refused = repair_step(POTENTIAL, problem, indefinite_part, said, Limits(1.0, 0.25), SETTINGS, 5)
     assert refused.kind == LEFT
 
 

@@ -13,7 +13,7 @@ from hood.assets.material import Material
 from hood.cloth.cloth import build_cloth
 from hood.energies.potential import default_potential
 from hood.energies.problem import StepProblem
-from hood.energies.self_contact import LayerBarrier, LayerSides
+from hood.energies.self_contact import LayerBarrier, SignedSelfContactPenalty
 from hood.rollouts.frame import metric_names
 from hood.rollouts.loop import simulate
 from hood.rollouts.verdict.distance import DISTANCE_METRICS, distance_metrics, estimate
@@ -164,7 +164,7 @@ def test_nothing_is_known_of_steps_that_are_not_finite_and_of_potentials_for_tra
     problem = POTENTIAL.prepare(sheet())
     broken = problem.state.pos.clone()
     broken[40, 1] = math.inf
-    training = POTENTIAL.with_terms(sides=LayerSides())
+    training = POTENTIAL.with_terms(sides=SignedSelfContactPenalty())
     for potential, pos in ((POTENTIAL, broken), (training, problem.state.pos)):
         found = distance_metrics(potential, potential.prepare(problem), pos)
         assert list(found) == list(DISTANCE_METRICS)

@@ -60,7 +60,7 @@ def test_it_says_what_the_terms_say(speed: float, reach: str) -> None:
     held = int((found.grips[0].force > 0).sum())
     assert held < len(problem.contact.dist) - 5
     assert held > 0 or speed > 0
-    assert_same(*both(potential, replace(problem, step=replace(problem.step, obstacle=None), pull=None)))
+    assert_same(*both(potential, replace(problem, step=replace(problem.step, obstacle=None), internal_force=None)))
 
 
 def test_rows_without_a_match_may_hold_anything() -> None:

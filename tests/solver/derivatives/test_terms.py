@@ -93,7 +93,7 @@ def test_a_term_given_twice_counts_twice():
     once, twice = Potential({"a": Stretching()}), Potential({"a": Stretching(), "b": Stretching()})
     plan, pos = SolverPlan(problem.cloth, problem.step.attachments), problem.state.pos
     models = [quadratic_model(potential, problem, plan, pos, 0 * pos) for potential in (once, twice)]
-    for name in ("gradient", "triples", "slack"):
+    for name in ("gradient", "triples", "indefinite_part"):
         torch.testing.assert_close(getattr(models[1], name), 2 * getattr(models[0], name))
     torch.testing.assert_close(
         StepTerms(twice, problem).energies(pos, pos)[-1], 2 * StepTerms(once, problem).energies(pos, pos)[-1]

@@ -23,7 +23,7 @@ from hood.energies.problem import StepProblem
 from hood.model.graph.static_shapes import Capacity, lay_out
 from hood.rollouts.loop import simulate
 from hood.scene.scene import Scene, build_scene
-from hood.steppers.network import Prepared, Simulator, build_simulator
+from hood.steppers.network import NetworkStepper, Prepared, build_simulator
 from hood.steppers.static_shapes.cuda_graph import count_operations, trace
 from hood.steppers.static_shapes.problem import step_inputs
 from hood.steppers.static_shapes.simulator import CapturedSimulator, FixedStep, StepPrediction
@@ -34,7 +34,7 @@ SMALL = "1x(mesh+coarse0) 1x(coarse0+coarse1) 1x(coarse1)"
 LIMITS = {torch.float32: 1e-5, torch.float64: 1e-12}
 
 
-def make(schedule: str = SMALL, dtype: torch.dtype = torch.float32, latent_dim: int = 16, **options: Any) -> Simulator:
+def make(schedule: str = SMALL, dtype: torch.dtype = torch.float32, latent_dim: int = 16, **options: Any) -> NetworkStepper:
     torch.manual_seed(0)
     return build_simulator(schedule=schedule, latent_dim=latent_dim, **options).to(dtype).eval()
 
@@ -47,7 +47,7 @@ def problem_of(scene: Scene, frame: int = 0) -> StepProblem:
     return StepProblem(scene.cloth, state, scene.step_input(frame, state))
 
 
-def prepare(simulator: Simulator, scene: Scene) -> Prepared:
+def prepare(simulator: NetworkStepper, scene: Scene) -> Prepared:
     """The scene's prepared cloth; the simulator's statistics are those of the step."""
     prepared = simulator.prepare(scene.cloth, scene.garment.rest_pos)
     simulator.train()
@@ -64,7 +64,9 @@ def difference(acc: Tensor, expected: Tensor) -> float:
     return float(((acc - expected).square().mean() / expected.square().mean()).sqrt())
 
 
-def compare(simulator: Simulator, stepper: CapturedSimulator, problem: StepProblem, prepared: Prepared, limit: float) -> None:
+def compare(
+    simulator: NetworkStepper, stepper: CapturedSimulator, problem: StepProblem, prepared: Prepared, limit: float
+) -> None:
     with torch.no_grad():
         plain = simulator.predict(problem, prepared)
         plain_vel = simulator.next_velocity(problem, plain)

@@ -24,7 +24,7 @@ from hood.native import features as native
 from hood.rollouts.loop import simulate
 from hood.scene.scene import Scene, build_scene
 from hood.steppers.checkpoint import load_simulator
-from hood.steppers.network import Simulator, build_simulator
+from hood.steppers.network import NetworkStepper, build_simulator
 from hood.steppers.static_shapes.cuda_graph import trace
 from hood.steppers.static_shapes.problem import settled_potential, step_inputs
 from hood.steppers.static_shapes.simulator import CapturedSimulator, FixedStep, StepResult
@@ -46,7 +46,7 @@ KINDS = {
 }
 
 
-def load(name: str) -> Simulator:
+def load(name: str) -> NetworkStepper:
     return load_simulator(locate("weights", name)).eval()
 
 
@@ -55,7 +55,7 @@ def problem_of(scene: Scene, frame: int) -> StepProblem:
     return StepProblem(scene.cloth, state, scene.step_input(frame, state))
 
 
-def fixed_step(simulator: Simulator, scene: Scene, problem: StepProblem, capacity: Capacity, dense: bool) -> FixedStep:
+def fixed_step(simulator: NetworkStepper, scene: Scene, problem: StepProblem, capacity: Capacity, dense: bool) -> FixedStep:
     static = simulator.prepare(scene.cloth, scene.garment.rest_pos).static
     assert static is not None
     potential = settled_potential(simulator.potential, problem) if simulator.looks_at_potential else None
@@ -95,7 +95,7 @@ def test_nothing_in_a_step_depends_on_data(name: str, skirt_scene: Scene) -> Non
     assert_no_data(load(name), skirt_scene, problem_of(skirt_scene, 2))
 
 
-def assert_no_data(simulator: Simulator, scene: Scene, problem: StepProblem) -> None:
+def assert_no_data(simulator: NetworkStepper, scene: Scene, problem: StepProblem) -> None:
     simulator = copy.deepcopy(simulator)
     potential = settled_potential(simulator.potential, problem) if simulator.looks_at_potential else None
     static = simulator.prepare(scene.cloth, scene.garment.rest_pos).static
@@ -109,7 +109,7 @@ def assert_no_data(simulator: Simulator, scene: Scene, problem: StepProblem) -> 
     assert {value.device.type for value in values} == {"meta"}
 
 
-def make(kind: str) -> Simulator:
+def make(kind: str) -> NetworkStepper:
     torch.manual_seed(0)
     features, output, schedule = KINDS[kind]
     return build_simulator(features, output, schedule, latent_dim=16, output_init=0.3).eval()

@@ -99,7 +99,7 @@ def test_nothing_in_a_piece_depends_on_data(skirt_scene, potential):
     problem = replace(problem, step=replace(problem.step, attachments=buttons))
     potential, plan = potential.settled(problem), plan_for(problem)
     system = FixedSystem(potential, lambda: problem, plan, 100)
-    scatters = ("matrix", "slack", "face_vertices", "hinge_vertices", "attachment_vertices")
+    scatters = ("matrix", "indefinite_part", "face_vertices", "hinge_vertices", "attachment_vertices")
     made = {name: getattr(plan, name) for name in scatters}
     with FakeTensorMode(allow_non_fake_inputs=False), whole_arrays():
         empty = without_values(problem)

@@ -43,7 +43,7 @@ def test_common_points_are_the_coarse_vertices_on_the_fine_mesh(tank: Scene, tan
     assert torch.equal(on_coarse.of(coarse), coarse)
     assert torch.allclose(on_fine.weights.sum(dim=1), torch.ones(tank.cloth.num_vertices, dtype=torch.float64))
     miss = (on_fine.of(fine) - coarse).norm(dim=1)
-    assert float(miss.max()) < 0.01  # a chord's sag, far below the edges of 35 mm
+    assert float(miss.max()) < 0.01  # a chord's chord error, far below the edges of 35 mm
     # They move with the mesh: under an affine map both stay together.
     turn = torch.tensor([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
     assert torch.allclose((on_fine.of(fine @ turn) - coarse @ turn).norm(dim=1), miss, atol=1e-9)
