@@ -17,7 +17,7 @@ from test_plan import states, touching_sheet
 from test_points import PLACES, pressed
 
 from hood.energies.potential import default_potential
-from hood.solver.compiled import newton
+from hood.solver.compiled import system
 from hood.solver.newton import minimize
 
 pytestmark = pytest.mark.usefixtures("compiled_solver")
@@ -29,7 +29,7 @@ def share(monkeypatch):
     """Sets the parts that every following step is solved in."""
 
     def set_parts(parts: int) -> None:
-        monkeypatch.setattr(newton, "num_parts", lambda count, least: min(parts, count))
+        monkeypatch.setattr(system, "num_parts", lambda count, least: min(parts, count))
 
     return set_parts
 
