@@ -21,9 +21,9 @@ tests: $(VENV)/.dev
 slow: $(VENV)/.dev
 	$(BIN)/python -m pytest -m slow
 
-# Hours: the stability map, its page in outputs/envelope, and the section of docs/stability.md that is written from it.
+# Hours: the stability map, its page in outputs/envelope, and the section of hood/studies/notes/stability.md that is written from it.
 envelope: $(VENV)/.demo
-	$(BIN)/hood envelope output=outputs/envelope document=docs/stability.md
+	$(BIN)/hood envelope output=outputs/envelope document=hood/studies/notes/stability.md
 
 # The pages of docs/ with the reference of all public names, into site/; a warning is an error.
 docs: $(VENV)/.docs

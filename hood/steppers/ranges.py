@@ -36,7 +36,7 @@ _LATER = {
     kind: {"contact": "vertices", "reach": "constant", "sides": "nearest"}
     for kind in ("Collision", "CentroidCollision", "Friction")
 }
-#: Settings that weights take as they are, whatever they were trained with: figures in docs/contact.md.
+#: Settings that weights take as they are, whatever they were trained with: figures in hood/studies/notes/contact.md.
 _TAKEN = ("reach", "sides")
 
 Span = tuple[float, float]

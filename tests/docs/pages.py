@@ -12,8 +12,10 @@ ROOT = Path(__file__).resolve().parents[2]
 README = ROOT / "README.md"
 #: Pages that lead a reader on; the changelog is a record.
 PAGES = [README, ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
-#: Pages beside the data of the package; they are linked from others, and are no part of the site.
-CARDS = sorted((ROOT / "hood" / "data").rglob("*.md"))
+#: Measurements behind the pages.
+NOTES = sorted((ROOT / "hood" / "studies" / "notes").glob("*.md"))
+#: Pages beside the data of the package, and the notes; they are linked from others, and are no part of the site.
+CARDS = [*sorted((ROOT / "hood" / "data").rglob("*.md")), *NOTES]
 _FENCE = re.compile(r"^( *)```(\w*)\n(.*?)^\1```$", re.DOTALL | re.MULTILINE)
 #: A page whose code is that of a package of the reader's; where it has a test of its own, that runs all of it.
 EXTENDING = "extending.md"
@@ -50,7 +52,7 @@ def headings(page: Path) -> set[str]:
 
 
 def command_lines() -> list[tuple[str, str]]:
-    """Page and line of every command, in blocks and between backticks in a text; those of the cards of data as well."""
+    """Page and line of every command, in blocks and between backticks in a text; those of cards and notes as well."""
     found = []
     for page in [*PAGES, *CARDS]:
         lines = [

@@ -52,7 +52,7 @@ class Desk:
             (r"hero\.glb", self.hero),
             (r"pieces/.*\.npz", self.piece),
             (r"skirt\.obj|twirl\.npz|skirt_prepared\.npz", self.of_tutorial),
-            (r"docs/stability\.md", self.page),
+            (r"hood/studies/notes/stability\.md", self.page),
             (r"(outputs/patterns/)?(plaid|bands|map)\.(png|jpg)", self.picture),
         ]
 

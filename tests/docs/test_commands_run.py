@@ -62,7 +62,7 @@ SHORT = (
     ),
     Short(
         "^envelope",
-        ("factors=[nominal]", "models=[newton]", "long=false", "timeout=900", "document=docs/stability.md"),
+        ("factors=[nominal]", "models=[newton]", "long=false", "timeout=900", "document=hood/studies/notes/stability.md"),
         "two rollouts and the page; the line's own rollouts are listed, not done",
     ),
     Short(r"^rollout.*accuracy=", ("num_frames=12",), "windows of the plan that comes first are as long"),

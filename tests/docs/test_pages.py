@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from pages import PAGES, README, ROOT, headings, prose_of, text_of
+from pages import CARDS, NOTES, PAGES, README, ROOT, headings, prose_of, text_of
 
 import hood
 
@@ -29,7 +29,7 @@ def test_the_readme_is_short_and_has_a_picture_first() -> None:
     assert (ROOT / picture[1]).stat().st_size <= _MOVING
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", [*PAGES, *CARDS], ids=lambda page: "/".join(page.parts[-2:]))
 def test_links_lead_to_what_is_there(page: Path) -> None:
     for link in links(page):
         name, _, anchor = link.partition("#")
@@ -46,11 +46,11 @@ def test_every_page_is_reached_from_the_readme() -> None:
         if page not in seen:
             seen.add(page)
             left += [(page.parent / link.partition("#")[0]).resolve() for link in links(page) if ".md" in link]
-    assert set(PAGES) <= seen
+    assert {*PAGES, *NOTES} <= seen
 
 
 def test_pictures_are_light_and_shown() -> None:
-    shown = {(page.parent / link).resolve() for page in PAGES for link in links(page)}
+    shown = {(page.parent / link).resolve() for page in [*PAGES, *NOTES] for link in links(page)}
     for picture in [*(ROOT / "docs").glob("**/*.png"), *(ROOT / "docs").glob("**/*.gif")]:
         assert picture in shown, picture.name
         assert picture.stat().st_size <= (_MOVING if picture.suffix == ".gif" else _STILL), picture.name

@@ -23,7 +23,7 @@ from hood.steppers.ranges import scene_conditions
 from hood.steppers.static_shapes.simulator import network_of
 
 #: Iterations after a network on a garment larger than those it was trained on: γ about 0.01 from 1,000 to 12,000 vertices
-#: (docs/accuracy.md).
+#: (hood/studies/notes/accuracy.md).
 ITERATIONS = 5
 #: A garment has more vertices than the weights know where it has this many times the most of their training.
 _LARGER = 1.1

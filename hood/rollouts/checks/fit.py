@@ -12,7 +12,7 @@ from hood.contact.contact import find_contact
 from hood.scene.scene import Scene
 from hood.solver.step_figures import edge_strain
 
-#: Edges at the skin that are stretched by so much on average are tight: figures in docs/sizes.md.
+#: Edges at the skin that are stretched by so much on average are tight: figures in hood/studies/notes/sizes.md.
 TIGHT = 0.04
 #: A garment whose upper rim is so far [m] below its place has come off.
 FALLEN = 0.1
