@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from hood.app.common import read_model
+from hood.app.common import load_stepper
 from hood.app.output.frames import at_output_fps, finer_mesh, on_finer_mesh, output_rate
 from hood.app.plan_file import plan_mode, plan_path, planned, rollout_config
 from hood.app.settings.compose import ConfigError, load_config
@@ -271,4 +271,4 @@ def load_model(name: str | Path = "quickstart", fps: float = 30.0, device: str =
         >>> hood.load_model("quickstart").network.latent_dim
         48
     """
-    return read_model(locate("weights", name), fps).eval().to(device)
+    return load_stepper(locate("weights", name), fps).eval().to(device)

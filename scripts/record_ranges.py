@@ -14,7 +14,7 @@ from pathlib import Path
 from hood.app.settings.compose import load_config
 from hood.app.train import make_trainer
 from hood.steppers.checkpoint import load_simulator, record_ranges
-from hood.steppers.ranges import describe
+from hood.steppers.ranges import describe_conditions
 
 
 def main() -> None:
@@ -27,7 +27,7 @@ def main() -> None:
         raise SystemExit(f"{path}: holds {held}; these settings train {trained.config}")
     assert trained.trained_for is not None
     record_ranges(path, trained.trained_for)
-    print("\n".join([str(path), *(f"  {name}: {value}" for name, value in describe(trained.trained_for).items())]))
+    print("\n".join([str(path), *(f"  {name}: {value}" for name, value in describe_conditions(trained.trained_for).items())]))
 
 
 if __name__ == "__main__":

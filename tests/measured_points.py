@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hood.evaluation.files import RolloutLog, Unit
-from hood.evaluation.table import GUESS, NEWTON, Measured
-from hood.studies.tradeoff.grid import Grid, Point, Size
-from hood.studies.tradeoff.results import Reached, summarise
+from hood.evaluation.files import EvaluationUnit, RolloutLog
+from hood.evaluation.table import GUESS, NEWTON, MeasuredRollout
+from hood.studies.tradeoff.grid import Grid, GridSize, Point
+from hood.studies.tradeoff.results import Reached, summarise_points
 
 PARTS = {"ms_search": 0.1, "ms_features": 0.1, "ms_network": 0.6, "ms_refine": 0.1, "ms_guess": 0.05, "ms_rest": 0.05}
 
@@ -20,7 +20,7 @@ def point(model: str = "net", refine: int = 0, size: str = "1k", precision: str 
     return Point(size, model, refine, precision, method, (f"models=[{model}+{refine}]", f"garments=[{size}]"))
 
 
-def rollout(ms: Sequence[float], gaps: Sequence[float], strain: float = 0.1, **flags: float) -> Measured:
+def rollout(ms: Sequence[float], gaps: Sequence[float], strain: float = 0.1, **flags: float) -> MeasuredRollout:
     """A rollout with these times and gaps; ``converged`` and ``spread`` of its references."""
     frames = [
         {
@@ -31,7 +31,7 @@ def rollout(ms: Sequence[float], gaps: Sequence[float], strain: float = 0.1, **f
         }
         for time in ms
     ]
-    return Measured(frames, [], [{"gamma": gap, "converged": 1.0, "spread": 1e-4, **flags} for gap in gaps])
+    return MeasuredRollout(frames, [], [{"gamma": gap, "converged": 1.0, "spread": 1e-4, **flags} for gap in gaps])
 
 
 def reached(
@@ -44,7 +44,7 @@ def reached(
         rollout(ms * (1 + noise * random.normal(size=10)), gap * (1 + noise * random.normal(size=4)), strain) for _ in range(8)
     ]
     made = point(model, refine, size, precision)
-    return summarise(made, rollouts, vertices, {"device": "CPU (made up)", "jobs": 2, "load_at_start": 1.5})
+    return summarise_points(made, rollouts, vertices, {"device": "CPU (made up)", "jobs": 2, "load_at_start": 1.5})
 
 
 def solver(curve: dict[int, tuple[float, float]], converged: float = 300.0, **options: object) -> list[Reached]:
@@ -55,12 +55,17 @@ def solver(curve: dict[int, tuple[float, float]], converged: float = 300.0, **op
 
 def tiny_grid(*models: str, refine: tuple[int, ...] = (0, 2)) -> Grid:
     return Grid(
-        models, ("fp32",), ("newton",), (Size("1k", ("tank",), refine, (2,), 5, 1),), ("sequences=[walk_proud]",), newton=False
+        models,
+        ("fp32",),
+        ("newton",),
+        (GridSize("1k", ("tank",), refine, (2,), 5, 1),),
+        ("sequences=[walk_proud]",),
+        newton=False,
     )
 
 
-def write_point(folder: Path, one: Point, rollouts: Sequence[Measured]) -> None:
+def write_point(folder: Path, one: Point, rollouts: Sequence[MeasuredRollout]) -> None:
     """The folder of a point that is done."""
     for index, measured in enumerate(rollouts):
-        RolloutLog(folder).write(Unit(0, "tank", f"motion{index}"), "none", measured)
+        RolloutLog(folder).write(EvaluationUnit(0, "tank", f"motion{index}"), "none", measured)
     (folder / "point.json").write_text(json.dumps({"command": one.command, "weights": "none", "device": "CPU (made up)"}))

@@ -120,7 +120,7 @@ def test_few_public_names_stand_in_several_modules() -> None:
                 if not name.startswith("_"):
                     places[name].add(dotted(path))
     several = {name: sorted(modules) for name, modules in places.items() if len(modules) > 1}
-    assert len(several) <= 108, several
+    assert len(several) <= 45, several
 
 
 def test_few_modules_ask_for_the_class_of_an_energy() -> None:

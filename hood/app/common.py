@@ -20,7 +20,7 @@ from hood.app.settings.record import read_record
 from hood.assets.files.atomic import occupy
 from hood.assets.files.said import install
 from hood.model.kernels.block import check_kernels, why_slow
-from hood.model.network.kernel_choice import AUTO, Choice, choose_for
+from hood.model.network.kernel_choice import AUTO, KernelChoice, choose_for
 from hood.steppers.checkpoint import load_simulator
 from hood.steppers.network import NetworkStepper
 from hood.steppers.newton import Stepper
@@ -144,7 +144,7 @@ def held_folder(config: DictConfig) -> Iterator[Path]:
         yield folder
 
 
-def read_model(path: Path, fps: float) -> NetworkStepper:
+def load_stepper(path: Path, fps: float) -> NetworkStepper:
     """The simulator in a model file or in published HOOD weights (``.pth``), for motions at ``fps``.
 
     Raises:
@@ -209,7 +209,7 @@ def warn_if_slow(key: str, precision: str, device: torch.device) -> None:
 
 
 @cache
-def tell_choice(choice: Choice) -> None:
+def tell_choice(choice: KernelChoice) -> None:
     """Print what ``kernels=auto`` has chosen, once."""
     if distributed.rank() == 0:
         print(choice, flush=True)

@@ -82,13 +82,13 @@ FREE = (
 
 
 #: Values of ``plan`` that name no file; null, as older records have it, is the first.
-MODES = ("auto", "full")
+_MODES = ("auto", "full")
 
 
 def plan_path(config: Mapping[Any, Any]) -> Path | None:
     """The file that ``plan`` names; None for ``auto`` and ``full``."""
     asked = config.get("plan")
-    return None if asked is None or str(asked) in MODES else Path(str(asked)).expanduser()
+    return None if asked is None or str(asked) in _MODES else Path(str(asked)).expanduser()
 
 
 def plan_mode(config: Mapping[Any, Any]) -> str:
@@ -139,7 +139,7 @@ def rollout_config(overrides: Sequence[str]) -> DictConfig:
 
 
 @dataclass(frozen=True)
-class Watch:
+class _Watch:
     """When energies that a plan leaves out come back: see :class:`hood.steppers.watched.WatchedStepper`.
 
     Args:
@@ -151,7 +151,7 @@ class Watch:
     hold: int
 
 
-def read_watch(path: Path) -> Watch | None:
+def read_watch(path: Path) -> _Watch | None:
     """The watch of a plan; None where it leaves out no energy.
 
     Raises:
@@ -165,7 +165,7 @@ def read_watch(path: Path) -> Watch | None:
     numbers = [float(value) for value in values if isinstance(value, (int, float)) and 0.0 < value < float("inf")]
     if len(numbers) != 2:
         raise ConfigError(f"plan={path}: 'watch' must hold limit and hold, both above 0; make the plan again")
-    return Watch(_with_stepper(plan["words"]), numbers[0], max(int(numbers[1]), 1))
+    return _Watch(_with_stepper(plan["words"]), numbers[0], max(int(numbers[1]), 1))
 
 
 def write_plan(path: Path, plan: Mapping[str, Any]) -> None:

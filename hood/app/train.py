@@ -16,8 +16,8 @@ from tqdm import tqdm
 
 from hood.app.common import (
     held_folder,
+    load_stepper,
     output_folder,
-    read_model,
     require_device,
     require_same_config,
     require_same_model,
@@ -48,7 +48,7 @@ from hood.training.checkpoint import previous
 from hood.training.scenes import SceneSampler
 from hood.training.settings import TrainerSettings
 from hood.training.trainer import Trainer
-from hood.training.watch import Watch
+from hood.training.watch import ValidationWatch
 
 #: Keys that a resumed run may change: they do not change what is learned.
 _FREE = ("resume", "output", "device", "validation_states")
@@ -168,7 +168,7 @@ def _start_from(simulator: NetworkStepper, name: str, fps: float) -> int:
         ConfigError: they are of another model.
     """
     path = locate("weights", name)
-    given = read_model(path, fps)
+    given = load_stepper(path, fps)
     way_out = f"give the model= that weights={name} were trained as"
     require_same_model(path, given, simulator, way_out, free=("coarse_edge",))  # no weight depends on which levels are taken
     simulator.load_state_dict(given.state_dict())
@@ -215,7 +215,7 @@ def _reading(config: DictConfig) -> dict[str, Any]:
     }
 
 
-def _make_watch(config: DictConfig, sampler: SceneSampler, potential: Potential, folder: Path) -> Watch:
+def _make_watch(config: DictConfig, sampler: SceneSampler, potential: Potential, folder: Path) -> ValidationWatch:
     names = find_motions(list(config.data.validation_sequences) or motion_split()["validation"], "validation")
     motions = [load_sequence(str(name), float(config.data.fps), **_reading(config)) for name in names]
     validation = Validation(
@@ -227,7 +227,7 @@ def _make_watch(config: DictConfig, sampler: SceneSampler, potential: Potential,
         states=int(config.validation_states),
         device=str(config.device),
     )
-    return Watch(validation, folder)
+    return ValidationWatch(validation, folder)
 
 
 def _is_resumed(config: DictConfig, folder: Path, checkpoint: Path) -> bool:

@@ -16,7 +16,7 @@ from hood.assets.formats.mesh_file import mesh_suffixes, split_object
 from hood.assets.formats.vertex_files import CACHE_SUFFIX
 from hood.assets.garment.reference_garments import garment_names
 from hood.assets.motion.animated_mesh import body_kind
-from hood.assets.motion.layouts.content import PICKLES, TENSORS, plain, read_content
+from hood.assets.motion.layouts.content import PICKLES, TENSORS, plain_content, read_content
 from hood.assets.motion.layouts.read import is_of_motion
 from hood.assets.motion.recording import motion_suffixes
 from hood.assets.pickles.content import load_content
@@ -77,7 +77,7 @@ def identify(name: str) -> str:
         if garment_names(content):
             return GARMENT
         keys = [str(key) for key in content] if isinstance(content, dict) else []
-        return _kind_of_keys(keys) or _kind_of_content(path, plain(content), keys)
+        return _kind_of_keys(keys) or _kind_of_content(path, plain_content(content), keys)
     if suffix in motion_suffixes():
         return MOTION
     kind = f"unknown file type {path.suffix!r}" if path.suffix else "its name has no ending, such as .obj or .npz"

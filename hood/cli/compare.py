@@ -22,7 +22,7 @@ from hood.assets.files.atomic import write_atomically
 from hood.assets.formats.image import Texture
 from hood.rollouts.file.reader import RolloutData
 
-COLOURS = ("strain", "rg", "contact", "fabric")
+_COLOURS = ("strain", "rg", "contact", "fabric")
 #: Written above a rollout where its file holds them: medians over the frames that have a value.
 _NOTED = (
     ("gap", "gap {:.2g}"),
@@ -45,7 +45,7 @@ class _Entry:
 def run(arguments: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     files, config = _split(arguments)
-    require_choice(config, "colour", COLOURS)
+    require_choice(config, "colour", _COLOURS)
     require_choice(config, "video", ("mp4", "gif", "none"))
     for key, least in (("num_frames", 1), ("video_stride", 1), ("seed", 0), ("height", 64)):
         if config[key] is not None and (not isinstance(config[key], int) or config[key] < least):
@@ -91,10 +91,10 @@ def _read(files: Sequence[Path], config: DictConfig) -> list[_Entry]:
     read = [(str(path), read_checked(path, str(config.colour))) for path in paths]
     count = None if config.num_frames is None else int(config.num_frames)
     cut = require_same_motion(read, count)
-    return [_Entry(*one) for one in zip(paths, names_of(paths), cut, strict=True)]
+    return [_Entry(*one) for one in zip(paths, short_names(paths), cut, strict=True)]
 
 
-def names_of(paths: Sequence[Path]) -> list[str]:
+def short_names(paths: Sequence[Path]) -> list[str]:
     """The shortest ends of the paths that tell them apart, ``rollout.h5`` left out."""
     parts = [path.absolute().parent.parts + (() if path.name == "rollout.h5" else (path.stem,)) for path in paths]
     for length in range(1, max(map(len, parts)) + 1):

@@ -40,11 +40,11 @@ from hood.assets.motion.load import load_sequence
 from hood.assets.motion.sequence import PoseSequence
 from hood.cloth.cloth import build_cloth
 from hood.energies.potential import Potential
-from hood.evaluation.files import RolloutLog, Unit, columns, describe, format_table, write_rows
+from hood.evaluation.files import EvaluationUnit, RolloutLog, columns, describe_rows, format_table, write_rows
 from hood.evaluation.gap import REFERENCE
-from hood.evaluation.spectrum import COLUMNS as SPECTRUM_COLUMNS
+from hood.evaluation.spectrum import SPECTRUM_COLUMNS as SPECTRUM_COLUMNS
 from hood.evaluation.spectrum import bar_panels, format_spectrum, spectrum_rows
-from hood.evaluation.table import Candidate, GapSettings, Measured, candidate_rows, measure
+from hood.evaluation.table import Candidate, GapSettings, MeasuredRollout, candidate_rows, measure
 from hood.evaluation.table_one import TableConditions, page
 from hood.evaluation.validation import sideways_drift, standing_scene
 from hood.model.kernels.block import KERNELS
@@ -60,7 +60,7 @@ from hood.training import distributed
 def report_table(rows: Sequence[Mapping[str, Any]], about: TableConditions, folder: Path) -> None:
     """Print the table; write it as ``table.csv``, ``table.json`` and, beside the paper's, ``table1.md``."""
     print(format_table(rows))
-    print(f"\n{describe(rows)}")
+    print(f"\n{describe_rows(rows)}")
     csv_path, json_path = write_rows(rows, columns(rows), folder, "table")
     page_path = folder / "table1.md"
     write_atomically(page_path, page(rows, about).encode())
@@ -108,7 +108,7 @@ def run(overrides: Sequence[str]) -> int:
 
 
 def _evaluate(config: DictConfig, overrides: Sequence[str]) -> int:
-    plan = make_plan(config)
+    plan = _make_plan(config)
     with held_folder(config) as folder:
         return _run(plan, folder, overrides)
 
@@ -133,12 +133,14 @@ def _run(plan: Plan, folder: Path, overrides: Sequence[str]) -> int:
     return 0
 
 
-def _measure(config: DictConfig, plan: Plan, todo: Sequence[Unit], log: RolloutLog) -> dict[Unit, Measured]:
+def _measure(
+    config: DictConfig, plan: Plan, todo: Sequence[EvaluationUnit], log: RolloutLog
+) -> dict[EvaluationUnit, MeasuredRollout]:
     """This process's share of the rollouts; each is written down as soon as it is done."""
     potential, count = build(config.losses), int(config.num_frames)
     reference = replace(REFERENCE, max_iterations=int(config.gap_iterations))
     gaps = GapSettings(int(config.gap_states), reference, config.spectrum != "none")
-    measured: dict[Unit, Measured] = {}
+    measured: dict[EvaluationUnit, MeasuredRollout] = {}
     quiet = True if distributed.rank() else None
     with tqdm(total=len(todo), desc="evaluate", unit="rollout", disable=quiet) as bar:
 
@@ -156,16 +158,16 @@ def _measure(config: DictConfig, plan: Plan, todo: Sequence[Unit], log: RolloutL
 def _measure_unit(
     config: DictConfig,
     plan: Plan,
-    unit: Unit,
+    unit: EvaluationUnit,
     potential: Potential,
     count: int,
     gaps: GapSettings,
     tell: Callable[[str], None],
-) -> Measured:
+) -> MeasuredRollout:
     candidate, scene = plan.candidates[unit.model], plan.scene(unit)
     if unit.motion == STANDING:
         tell(f"{candidate.name} {unit.garment} {STANDING}")
-        return Measured(drifts=[sideways_drift(candidate.stepper, scene, potential)])
+        return MeasuredRollout(drifts=[sideways_drift(candidate.stepper, scene, potential)])
     kept, drawn = KeptFrames(), bool(config.contact_sheets)
     measured = measure(candidate, scene, potential, count, gaps, tell, partial(kept.see, scene) if drawn else None)
     if drawn:
@@ -181,11 +183,11 @@ def _write_sheet(kept: KeptFrames, path: Path) -> None:
     write_sheet(kept.data(), path)
 
 
-def _report(plan: Plan, measured: Mapping[Unit, Measured], folder: Path, overrides: Sequence[str]) -> None:
+def _report(plan: Plan, measured: Mapping[EvaluationUnit, MeasuredRollout], folder: Path, overrides: Sequence[str]) -> None:
     rows: list[dict[str, Any]] = []
     waves: list[dict[str, Any]] = []
     for index, candidate in enumerate(plan.candidates):
-        parts: dict[str, list[Measured]] = {name: [] for name in plan.garments}
+        parts: dict[str, list[MeasuredRollout]] = {name: [] for name in plan.garments}
         for unit in plan.units:
             if unit.model == index:
                 parts[unit.garment].append(measured[unit])
@@ -220,12 +222,12 @@ class Plan:
     shapes: list[np.ndarray]  # (10,) each
 
     @property
-    def units(self) -> list[Unit]:
+    def units(self) -> list[EvaluationUnit]:
         """The rollouts, in a fixed order."""
         performed = [(motion, shape) for shape in range(len(self.shapes)) for motion in self.motions]
         if int(self.config.drift_frames):
             performed.append((STANDING, 0))
-        return [Unit(m, g, *one) for m in range(len(self.candidates)) for g in self.garments for one in performed]
+        return [EvaluationUnit(m, g, *one) for m in range(len(self.candidates)) for g in self.garments for one in performed]
 
     def conditions(self) -> dict[str, Conditions]:
         """What every garment, on all bodies, asks of a model."""
@@ -239,12 +241,12 @@ class Plan:
             name: scene_conditions(self.garments[name], cloth, 1.0 / fps, potential, betas) for name, cloth in cloths.items()
         }
 
-    def scene(self, unit: Unit) -> Scene:
+    def scene(self, unit: EvaluationUnit) -> Scene:
         """The scene of a rollout; the last one is kept, and so is its motion."""
         return _scene(self, unit)
 
 
-def make_plan(config: DictConfig) -> Plan:
+def _make_plan(config: DictConfig) -> Plan:
     """Candidates, garments and motions named in the config.
 
     Raises:
@@ -271,7 +273,7 @@ def _sequence(name: str, fps: float) -> PoseSequence:
     return load_sequence(name, fps)
 
 
-def _scene(plan: Plan, unit: Unit) -> Scene:
+def _scene(plan: Plan, unit: EvaluationUnit) -> Scene:
     config, garment, body = plan.config, plan.garments[unit.garment], load_body(str(plan.config.body))
     material, fps = build(config.material), float(config.fps)
     if unit.motion == STANDING:

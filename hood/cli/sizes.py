@@ -36,7 +36,7 @@ _KEYS = ("garment", "fit", "sequence", "num_frames", "body", "material", "steppe
 
 
 @dataclass(frozen=True)
-class Worn:
+class _Worn:
     """A size on a body at the last frame.
 
     Args:
@@ -105,7 +105,7 @@ def _rollout_config(config: DictConfig, size: Any, shape: tuple[float, ...]) -> 
     return load_config("rollout", overrides({key: plain(value) for key, value in keys.items()}))
 
 
-def _wear(size: str, shape: tuple[float, ...], config: DictConfig, stepper: Stepper) -> Worn:
+def _wear(size: str, shape: tuple[float, ...], config: DictConfig, stepper: Stepper) -> _Worn:
     """The garment after the frames of its rollout."""
     ready = set_up(config, stepper, tell=lambda sentence: None)
     scene, count = ready.scene, min(int(config.num_frames), ready.scene.num_frames)
@@ -124,10 +124,10 @@ def _wear(size: str, shape: tuple[float, ...], config: DictConfig, stepper: Step
         {"garment": scene.garment.name},
         still=still_of(scene.garment),
     )
-    return Worn(size, shape, ease, still)
+    return _Worn(size, shape, ease, still)
 
 
-def _table(worn: Sequence[Worn]) -> list[str]:
+def _table(worn: Sequence[_Worn]) -> list[str]:
     head = ("shape", "size", "sits", "skin mm, p5", "p50", "p95", "on skin", "stretched", "slid cm")
     rows: list[tuple[str, ...]] = [head]
     for one in worn:
@@ -143,7 +143,7 @@ def _shown(shape: tuple[float, ...]) -> str:
     return f"[{','.join(f'{value:g}' for value in shape)}]" if shape else "mean"
 
 
-def _sheet(worn: Sequence[Worn], columns: int) -> np.ndarray:
+def _sheet(worn: Sequence[_Worn], columns: int) -> np.ndarray:
     """A row for each body, a column for each size; one scale of strain for all."""
     stills = [one.still for one in worn]
     pictures = []

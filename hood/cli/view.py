@@ -13,7 +13,7 @@ from hood.app.output.export import read_checked
 from hood.app.output.textures import lay_on, read_textures
 from hood.app.settings.compose import ConfigError
 from hood.assets.files.atomic import write_atomically
-from hood.cli.compare import names_of
+from hood.cli.compare import short_names
 from hood.rollouts.file.reader import RolloutData
 
 #: More would be too narrow to see anything.
@@ -33,7 +33,7 @@ def run(arguments: Sequence[str]) -> int:
     rollouts = [_first_frames(read_checked(path, "fabric"), count) for path in files]
     from hood.media.viewer.page import view_page
 
-    names = names_of(files)
+    names = short_names(files)
     title = " and ".join(names) if config.title is None else str(config.title)
     page = view_page(list(zip(names, rollouts, strict=True)), title, lay_on(textures, rollouts)).encode()
     target.parent.mkdir(parents=True, exist_ok=True)

@@ -38,7 +38,7 @@ ENTERED_DEPTH = 4e-3
 #: A plane shows skin that it is no farther in front of than this [m].
 SHOWN = 3e-3
 #: Deeper than this [m] the nearest skin says nothing about where a vertex came in.
-DEEPEST = 50e-3
+_DEEPEST = 50e-3
 
 
 def find_entered(
@@ -53,7 +53,7 @@ def find_entered(
     if not len(obstacle.faces) or not len(pos):
         return None
     depth = -signed_distance(next_pos, cloth.vertex_scene, obstacle.next_pos, obstacle)
-    entered = cloth.free & (depth > ENTERED_DEPTH) & (depth < DEEPEST)
+    entered = cloth.free & (depth > ENTERED_DEPTH) & (depth < _DEEPEST)
     for contact in contacts:
         if not bool(entered.any()):
             return None

@@ -19,7 +19,7 @@ LEAST_WAY = 20e-3
 #: Least distance [m] from one place on a way to the next, and how many places are looked at: a step at 10 m/s and 30 fps.
 STRIDE, MOST_PLACES = 15e-3, 24
 #: A way ends where the cloth is nearer to the skin than this [m].
-NEAR = 2e-3
+_NEAR = 2e-3
 #: And where the tangent plane that it has already is this much [m] farther off than the skin. Along a bulge it never is: that
 #: plane is in front of the skin everywhere.
 HIDDEN = 3e-3
@@ -62,7 +62,7 @@ def find_landing(
     """
     way = flight - (contact.next_point - contact.point)
     length = way.norm(dim=1)
-    far = (length > LEAST_WAY) & length.isfinite() & (contact.dist > -INSIDE) & (contact.dist - length < NEAR)
+    far = (length > LEAST_WAY) & length.isfinite() & (contact.dist > -INSIDE) & (contact.dist - length < _NEAR)
     rows = far.nonzero().squeeze(1)
     share = _first_touch(rows, pos, way, length, vertex_scene, obstacle, contact)
     rows = (share > 0.0).nonzero().squeeze(1)
@@ -97,9 +97,9 @@ def _first_touch(
         skin = match_surface(places, vertex_scene[rows], obstacle).dist
         plane = ((places - contact.point[rows]) * contact.normal[rows]).sum(dim=1)
         hidden = ~contact.valid[rows] | (plane - skin > HIDDEN)
-        touches = (skin < NEAR) & hidden
+        touches = (skin < _NEAR) & hidden
         touched = touched.index_copy(0, rows, torch.where(touches, gone / whole, 0.0))
-        goes_on = ~touches & (skin < whole - gone + NEAR) & (gone < whole)
+        goes_on = ~touches & (skin < whole - gone + _NEAR) & (gone < whole)
         gone = (gone + skin.clamp_min(STRIDE)).minimum(whole)[goes_on]
         rows = rows[goes_on]
     return touched

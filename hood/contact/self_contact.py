@@ -15,7 +15,7 @@ from torch import Tensor
 
 from hood.cloth.cloth import Cloth
 from hood.mesh.closest_point.search import closest_point_on_triangles
-from hood.mesh.cloth_proximity import Contacts, Followed, LayerMesh, Layers, follow, vertex_room
+from hood.mesh.cloth_proximity import ClothSurface, Contacts, Followed, LayerMesh, follow, vertex_room
 from hood.mesh.topology import Rings, unique_edges
 from hood.tensors.weak_cache import forget
 
@@ -129,7 +129,7 @@ def _patches(cloth: Cloth) -> list[_Patch]:
 class SceneLayers:
     """The layers of one scene, and where its vertices are in the batch."""
 
-    layers: Layers
+    layers: ClothSurface
     first: int
     last: int
     at_start: Contacts | None = None  # what is within its reach where the step begins, if anybody asked
@@ -152,20 +152,20 @@ def find_layers(
     cloth: Cloth, pos: Tensor, ahead: Tensor, reach: float, pressure: float, between: bool
 ) -> tuple[SceneLayers, ...]:
     """The layers of every scene at ``pos`` (V, 3), from where the step may lead to ``ahead`` (V, 3): targets of held vertices
-    are in there, which may be out of reach (:func:`late_targets`). See :class:`hood.mesh.cloth_proximity.Layers`."""
+    are in there, which may be out of reach (:func:`late_targets`). See :class:`hood.mesh.cloth_proximity.ClothSurface`."""
     found = []
     for mesh, first, last in _meshes(cloth, reach):
         fixed, pinned = (~cloth.free[first:last]).cpu().numpy(), cloth.pinned[first:last].cpu().numpy()
         here, there = (values[first:last].detach().cpu().double().numpy() for values in (pos, ahead))
         held = bool(pinned.any() and np.isfinite(here).all() and np.isfinite(there[pinned]).all())
         there = np.where(np.isfinite(there), there, here)
-        layers, pins = Layers(mesh, here, fixed, pressure, between, there), None
+        layers, pins = ClothSurface(mesh, here, fixed, pressure, between, there), None
         if held:
             pins = follow(layers, here, pinned, there)
             if pins.late:
                 short = torch.as_tensor(pins.pos).to(ahead).cpu().double().numpy()
                 there = np.where((pins.lag > 0)[:, None], short, there)
-                layers = Layers(mesh, here, fixed, pressure, between, there)
+                layers = ClothSurface(mesh, here, fixed, pressure, between, there)
             layers.resort_to(np.where(pinned[:, None], there, np.where(fixed[:, None], here, pins.pos)))
         found.append(SceneLayers(layers, first, last, pins=pins))
     return tuple(found)

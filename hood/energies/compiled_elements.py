@@ -29,7 +29,7 @@ from hood.tensors.weak_cache import forget
 if TYPE_CHECKING:  # potentials use this pass
     from hood.energies.potential import Potential, Term
 
-SOURCE = Path(native.__file__).with_name("elements.cpp")
+_SOURCE = Path(native.__file__).with_name("elements.cpp")
 _LANES = 8
 #: Terms of the pass. A subclass may compute something else and does not count.
 ELEMENT_TERMS = (Stretching, Bending, CurrentLengthBending)
@@ -63,7 +63,7 @@ class _Constants(NamedTuple):
 @cache
 def library() -> ctypes.CDLL | None:
     """The compiled pass; None without a compiler."""
-    return optional(SOURCE)
+    return optional(_SOURCE)
 
 
 def _by_gradient(

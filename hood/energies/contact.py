@@ -45,7 +45,7 @@ def weighted(term: Weighted, weight: float) -> Weighted:
     return cast("Weighted", found)
 
 
-class Planes(NamedTuple):
+class _Planes(NamedTuple):
     """One plane per vertex at t+1, on whose outer side it should be; rows not ``touching`` are zero."""
 
     touching: Tensor  # (V,) bool
@@ -113,7 +113,7 @@ class Collision:
         """The contacts of the vertices that the term acts at; none without a body."""
         return contacts_of(problem, self.sides)
 
-    def planes(self, problem: StepProblem, contact: Contact) -> Planes:
+    def planes(self, problem: StepProblem, contact: Contact) -> _Planes:
         """The planes that d is measured from, of one of :meth:`contacts`."""
         return _planes(problem, contact.valid, contact.next_point, contact.next_normal)
 
@@ -164,7 +164,7 @@ class CentroidCollision(Collision):
         """The problem with the centroid search done, once per step."""
         return with_lagged_centroids(problem) if self.lagged else with_centroids(problem)
 
-    def planes(self, problem: StepProblem, contact: Contact) -> Planes:
+    def planes(self, problem: StepProblem, contact: Contact) -> _Planes:
         """The planes that d is measured from; the problem must have been prepared."""
         if self.lagged:
             contact = lagged_contact(problem)
@@ -221,8 +221,8 @@ def lagged_contact(problem: StepProblem) -> LaggedContact:
     return problem.contact
 
 
-def _planes(problem: StepProblem, valid: Tensor, point: Tensor, normal: Tensor) -> Planes:
+def _planes(problem: StepProblem, valid: Tensor, point: Tensor, normal: Tensor) -> _Planes:
     touching = valid & (problem.cloth.mass > 0)
     # where() before the arithmetic: rows without a match may hold infinite or undefined numbers.
     row = touching.unsqueeze(1)
-    return Planes(touching, torch.where(row, point, 0.0), torch.where(row, normal, 0.0))
+    return _Planes(touching, torch.where(row, point, 0.0), torch.where(row, normal, 0.0))

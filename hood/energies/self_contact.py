@@ -91,7 +91,8 @@ class LayerBarrier:
     and vertices and faces carry the load. Rigid-motion invariant; no net force or torque.
 
     The energy knows no sides, so cloth that is crossed at x_t would stay crossed: such pairs are left out until they have come
-    apart (:class:`hood.mesh.cloth_proximity.Layers`). Solvers never cross cloth on their way; elsewhere the energy alone acts.
+    apart (:class:`hood.mesh.cloth_proximity.ClothSurface`). Solvers never cross cloth on their way; elsewhere the energy alone
+    acts.
 
     Args:
         reach: r [m]; where faces are small, half of the smallest height around.

@@ -68,7 +68,7 @@ def pooled_interval(
     return interval(samples, level, len(filled))
 
 
-def resample(groups: Sequence[Sequence[float]], quantile: float, draws: int = DRAWS, seed: int = 0) -> np.ndarray:
+def resample_rows(groups: Sequence[Sequence[float]], quantile: float, draws: int = DRAWS, seed: int = 0) -> np.ndarray:
     """``quantile`` (0 to 1) of the values in each of ``draws`` bootstrap samples, (draws,).
 
     ``groups`` holds the values of one rollout each. Every sample draws as many rollouts as there are, with replacement, and
@@ -94,12 +94,12 @@ def resample(groups: Sequence[Sequence[float]], quantile: float, draws: int = DR
     return np.where(np.isnan(found), np.quantile(known, quantile) if len(known) else np.nan, found)
 
 
-def estimate(groups: Sequence[Sequence[float]], quantile: float, samples: np.ndarray | None = None) -> Estimate:
-    """``quantile`` of all values with its interval; ``samples`` are those of :func:`resample` if they are there."""
+def estimate_interval(groups: Sequence[Sequence[float]], quantile: float, samples: np.ndarray | None = None) -> Estimate:
+    """``quantile`` of all values with its interval; ``samples`` are those of :func:`resample_rows` if they are there."""
     filled = _filled(groups)
     if not filled:
         return Estimate(np.nan, np.nan, np.nan)
-    samples = resample(groups, quantile) if samples is None else samples
+    samples = resample_rows(groups, quantile) if samples is None else samples
     return Estimate(float(np.quantile(np.concatenate(filled), quantile)), *interval(samples, rollouts=len(filled)))
 
 

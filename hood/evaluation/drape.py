@@ -26,8 +26,8 @@ from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem
 from hood.solver.newton import NewtonSettings, minimize
 
-Array = NDArray[np.float64]
-Faces = NDArray[np.int64]
+_Array = NDArray[np.float64]
+_Faces = NDArray[np.int64]
 
 #: Radii [m] of the disc and of the sample.
 DISC, SAMPLE = 0.09, 0.15
@@ -50,7 +50,7 @@ PIXEL = 5e-4
 
 
 @dataclass(frozen=True)
-class Rest:
+class DrapedRest:
     """A state of rest of a sample.
 
     Args:
@@ -65,7 +65,7 @@ class Rest:
     coefficient: float
     folds: int
     energy: float
-    pos: Array
+    pos: _Array
     shadow: NDArray[np.bool_]
     reached: bool
 
@@ -81,11 +81,11 @@ class Drape:
     """
 
     edge: float
-    faces: Faces
-    states: tuple[Rest, ...]
+    faces: _Faces
+    states: tuple[DrapedRest, ...]
 
     @property
-    def rest(self) -> Rest:
+    def rest(self) -> DrapedRest:
         return self.states[0]
 
 
@@ -117,11 +117,11 @@ def drape(material: Material, edge: float = 0.01) -> Drape:
         rest, reached = settled(cloth, start)
         shadow = cast_shadow(rest, faces)
         energy = _energy(_problem(cloth, rest))
-        states.append(Rest(coefficient_of(shadow), folds_of(rest[rim]), energy, rest, shadow, reached))
+        states.append(DrapedRest(coefficient_of(shadow), folds_of(rest[rim]), energy, rest, shadow, reached))
     return Drape(edge, faces, tuple(sorted(states, key=lambda state: state.energy)))
 
 
-def _problem(cloth: Cloth, pos: Array) -> StepProblem:
+def _problem(cloth: Cloth, pos: _Array) -> StepProblem:
     """A step from rest at ``pos`` (V, 3)."""
     state = State(torch.as_tensor(pos), torch.zeros_like(cloth.rest_pos), torch.zeros(1, 3, dtype=torch.float64))
     step = StepInput(torch.tensor([_SHORTEST], dtype=torch.float64), pin_target=cloth.rest_pos)
@@ -135,7 +135,7 @@ def _energy(problem: StepProblem) -> float:
 
 
 @torch.no_grad()
-def settled(cloth: Cloth, start: Array) -> tuple[Array, bool]:
+def settled(cloth: Cloth, start: _Array) -> tuple[_Array, bool]:
     """Where a cloth comes to rest under its weight, (V, 3) [m], from ``start`` (V, 3), and whether it has come to rest.
 
     Args:
@@ -158,7 +158,7 @@ def settled(cloth: Cloth, start: Array) -> tuple[Array, bool]:
 
 
 @cache
-def sample_mesh(edge: float) -> tuple[Array, Faces]:
+def sample_mesh(edge: float) -> tuple[_Array, _Faces]:
     """The ring of the sample that hangs, and a narrow rim by which it is held: positions (V, 3) [m] in the plane y = 0 and
     faces (F, 3), nearly equilateral where they hang."""
     height = edge * math.sqrt(3.0) / 2.0
@@ -181,19 +181,19 @@ def sample_mesh(edge: float) -> tuple[Array, Faces]:
     return pos, _ring_triangles(points)
 
 
-def _ring(radius: float, edge: float) -> Array:
+def _ring(radius: float, edge: float) -> _Array:
     angle = 2.0 * math.pi * np.arange(round(2.0 * math.pi * radius / edge)) / round(2.0 * math.pi * radius / edge)
     return radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
-def _ring_triangles(points: Array) -> Faces:
+def _ring_triangles(points: _Array) -> _Faces:
     triangles = Delaunay(points).simplices
     inside = np.linalg.norm(points, axis=1).min() * (1.0 + 1e-9)
     hole = (np.linalg.norm(points[triangles], axis=2) < inside).all(axis=1)
     return triangles[~hole].astype(np.int64)
 
 
-def cast_shadow(pos: Array, faces: Faces) -> NDArray[np.bool_]:
+def cast_shadow(pos: _Array, faces: _Faces) -> NDArray[np.bool_]:
     """(N, N) bool, which pixels of :data:`PIXEL` the disc and a cloth (V, 3) hide from light that falls along y."""
     half = round(1.1 * SAMPLE / PIXEL)
     centre = (np.arange(-half, half) + 0.5) * PIXEL
@@ -215,7 +215,7 @@ def coefficient_of(shadow: NDArray[np.bool_]) -> float:
     return (float(shadow.sum()) * PIXEL**2 - disc) / (sample - disc)
 
 
-def folds_of(rim: Array) -> int:
+def folds_of(rim: _Array) -> int:
     """Waves of a rim (N, 3) in its order around the axis: the strongest of its distance from it; 0 where none is 1 mm high."""
     radius = np.hypot(rim[:, 0], rim[:, 2])
     waves = 2.0 * np.abs(np.fft.rfft(radius - radius.mean())) / len(radius)

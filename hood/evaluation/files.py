@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 from hood.assets.files.atomic import write_atomically
 from hood.evaluation.gap import AGREEMENT
-from hood.evaluation.table import ALL, FAILURE_STRAIN, INTERVALS, TERMS, Measured, other_terms
+from hood.evaluation.table import ALL, FAILURE_STRAIN, INTERVALS, TERMS, MeasuredRollout, other_terms
 
 _NAMES = ("model", "weights", "garment")
 _MAIN = ("steps", "radius", "ms", "ms_p99", "fps", "L_total", "gradient_norm", "rg")
@@ -48,7 +48,7 @@ def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
     return "\n\n".join((_fixed_width(rows, first), *energies, _fixed_width(rows, last)))
 
 
-def describe(rows: Sequence[Mapping[str, Any]]) -> str:
+def describe_rows(rows: Sequence[Mapping[str, Any]]) -> str:
     """Meaning and units of the columns, and how far the figures of these rows can be trusted."""
     lines = [
         "ms per frame; means: L [J], L_guess of the inertial guess, gradient_norm [N], penetration, the share of vertices "
@@ -97,7 +97,7 @@ def _cell(value: Any) -> str:
     return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
-class Unit(NamedTuple):
+class EvaluationUnit(NamedTuple):
     """One rollout of an evaluation."""
 
     model: int  # place in the list of candidates
@@ -113,7 +113,7 @@ class RolloutLog:
         self.folder = folder
         self.path = folder / f"rollouts.{rank}.jsonl"
 
-    def read(self, digests: Sequence[str] | None) -> dict[Unit, Measured]:
+    def read(self, digests: Sequence[str] | None) -> dict[EvaluationUnit, MeasuredRollout]:
         """What was written for candidates whose weights have these ``digests``, the latest of every rollout; None for whatever
         weights they had. Lines cut by a kill are passed over."""
         found = {}
@@ -121,14 +121,14 @@ class RolloutLog:
             for line in path.read_text(encoding="utf-8").splitlines():
                 try:
                     entry = json.loads(line)
-                    unit = Unit(*entry["unit"])
+                    unit = EvaluationUnit(*entry["unit"])
                     if digests is None or digests[unit.model] == entry["weights"]:
-                        found[unit] = Measured(**entry["measured"])
+                        found[unit] = MeasuredRollout(**entry["measured"])
                 except (ValueError, KeyError, TypeError, IndexError):
                     continue
         return found
 
-    def write(self, unit: Unit, digest: str, measured: Measured) -> None:
+    def write(self, unit: EvaluationUnit, digest: str, measured: MeasuredRollout) -> None:
         """Add a rollout.
 
         Raises:

@@ -31,7 +31,7 @@ AGREEMENT = 1e-2
 
 
 @dataclass(frozen=True)
-class Gap:
+class _Gap:
     """Gap of a method's positions, scene by scene.
 
     γ = (Φ(x) − Φ*) / e0 with e0 = ½ M g² dt²; √γ is about the RMS error of the acceleration in g. Positions that beat every
@@ -64,7 +64,7 @@ def gap(
     problem: StepProblem,
     next_pos: Tensor,
     settings: NewtonSettings = REFERENCE,
-) -> Gap:
+) -> _Gap:
     """Gap γ of ``next_pos`` (V, 3) for the step ``problem``.
 
     The reference Φ* is the lowest of the minimisations from :func:`starts`. Computed in float64.
@@ -88,7 +88,7 @@ def gap(
     reference = torch.where(torch.isfinite(phi), torch.minimum(lowest, phi), lowest)
     # A state that is the minimum already may differ from its own minimisation by rounding.
     reached = sound.gather(0, which.unsqueeze(0)).squeeze(0) & ~(phi < lowest - noise)
-    return Gap((phi - reference) / e0, phi, reference, reached, spread)
+    return _Gap((phi - reference) / e0, phi, reference, reached, spread)
 
 
 class StepSample:

@@ -106,7 +106,7 @@ def cotangent_laplacian(pos: np.ndarray, faces: np.ndarray) -> tuple[sparse.csr_
     return sparse.csr_matrix(entries, shape=(num_vertices, num_vertices)), area
 
 
-COLUMNS = ("model", "garment", "longest", "shortest", "rms", "share", "energy", "states", "unconverged")
+SPECTRUM_COLUMNS = ("model", "garment", "longest", "shortest", "rms", "share", "energy", "states", "unconverged")
 
 
 @dataclass(frozen=True)

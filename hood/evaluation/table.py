@@ -146,7 +146,7 @@ TERMS = ("stretching", "bending", "inertia", "gravity", "collision", "friction")
 _SUMS, _ENERGY = (*TERMS, "total"), "energy_"
 
 #: Told what is being done and how many rollouts are done.
-Progress = Callable[[str, int], None]
+_Progress = Callable[[str, int], None]
 #: Shown every frame of a rollout.
 See = Callable[[Frame], None]
 
@@ -177,7 +177,7 @@ class GapSettings:
 
 
 @dataclass
-class Measured:
+class MeasuredRollout:
     """What rollouts gave, as plain numbers: it can be written down and added up in any order."""
 
     frames: list[dict[str, float]] = field(default_factory=list)  # metrics of the finite frames that count
@@ -190,8 +190,8 @@ class Measured:
     kinds: list[list[str] | None] = field(default_factory=list)
     spectra: list[dict[str, Any]] = field(default_factory=list)  # of the states of gaps, see error_spectrum
 
-    def __add__(self, other: Measured) -> Measured:
-        return Measured(*(getattr(self, item.name) + getattr(other, item.name) for item in fields(self)))
+    def __add__(self, other: MeasuredRollout) -> MeasuredRollout:
+        return MeasuredRollout(*(getattr(self, item.name) + getattr(other, item.name) for item in fields(self)))
 
 
 def evaluate(
@@ -200,7 +200,7 @@ def evaluate(
     potential: Potential,
     num_frames: int,
     gaps: GapSettings | None = None,
-    progress: Progress = lambda text, done: None,
+    progress: _Progress = lambda text, done: None,
 ) -> list[dict[str, Any]]:
     """Rows of the table: one per candidate and garment, and one per candidate over all garments.
 
@@ -223,7 +223,7 @@ def evaluate(
     """
     rows, done = [], 0
     for candidate in candidates:
-        parts: dict[str, list[Measured]] = {garment: [] for garment in scenes}
+        parts: dict[str, list[MeasuredRollout]] = {garment: [] for garment in scenes}
         for garment, variants in scenes.items():
             for scene in variants:
                 tell = partial(_tell, progress, done)
@@ -242,9 +242,9 @@ def measure(
     gaps: GapSettings | None = None,
     tell: Callable[[str], None] = lambda text: None,
     see: See | None = None,
-) -> Measured:
+) -> MeasuredRollout:
     """One rollout of a candidate; ``tell`` hears what is being done, ``see`` is shown every frame."""
-    measured, kept = Measured(), KeptFrames()
+    measured, kept = MeasuredRollout(), KeptFrames()
 
     def seen(frame: Frame) -> None:
         kept.see(scene, frame)
@@ -258,13 +258,13 @@ def measure(
     return measured
 
 
-def candidate_rows(candidate: Candidate, parts: Mapping[str, Sequence[Measured]]) -> list[dict[str, Any]]:
+def candidate_rows(candidate: Candidate, parts: Mapping[str, Sequence[MeasuredRollout]]) -> list[dict[str, Any]]:
     """The candidate's rows of the table, from its rollouts by garment: one per garment and one over all, see
     :func:`evaluate`."""
     shared = {"model": candidate.name, "weights": candidate.weights, **_reach(candidate.stepper)}
     whole = [rollout for part in parts.values() for rollout in part]
     return [
-        {**shared, "garment": name, **_row(sum(part, start=Measured())), **_intervals(part)}
+        {**shared, "garment": name, **_row(sum(part, start=MeasuredRollout())), **_intervals(part)}
         for name, part in {**parts, ALL: whole}.items()
     ]
 
@@ -276,7 +276,7 @@ def other_terms(rows: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(column.removeprefix("L_") for column in columns))
 
 
-def _tell(progress: Progress, done: int, text: str) -> None:
+def _tell(progress: _Progress, done: int, text: str) -> None:
     progress(text, done)
 
 
@@ -288,7 +288,7 @@ def _reach(stepper: Stepper) -> dict[str, int | None]:
 
 
 def _run(
-    stepper: Stepper, scene: Scene, potential: Potential, num_frames: int, gaps: GapSettings, into: Measured, see: See
+    stepper: Stepper, scene: Scene, potential: Potential, num_frames: int, gaps: GapSettings, into: MeasuredRollout, see: See
 ) -> Iterator[str]:
     """One rollout, added to ``into``; yields what is being done."""
     count, end = min(num_frames, scene.num_frames), None
@@ -314,7 +314,7 @@ def _run(
             into.spectra.append(error_spectrum(potential, problem, prediction.next_pos, bands, gaps.reference))
 
 
-def _row(measured: Measured) -> dict[str, Any]:
+def _row(measured: MeasuredRollout) -> dict[str, Any]:
     frames, failures = measured.frames, measured.failures
     row: dict[str, Any] = {"frames": len(frames), "failed_at": min(failures) if failures else None}
     row |= _failure_columns(measured.ends) | _verdict_columns(measured.kinds) | _gap_columns(measured.gaps)
@@ -380,7 +380,7 @@ def _verdict_columns(kinds: Sequence[Sequence[str] | None]) -> dict[str, Any]:
     }
 
 
-def _intervals(rollouts: Sequence[Measured]) -> dict[str, float]:
+def _intervals(rollouts: Sequence[MeasuredRollout]) -> dict[str, float]:
     """``NAME_low`` and ``NAME_high`` of the columns of :data:`INTERVALS` that have one."""
     found: dict[str, float] = {}
     for column, (key, statistic) in _STATISTICS.items():

@@ -97,8 +97,8 @@ class Validation:
     device: str = "cpu"
 
     def __call__(self, simulator: NetworkStepper) -> dict[str, float]:
-        """Figures over all rollouts, see :func:`summarise`."""
-        return summarise([self.rollout(simulator, index) for index in range(len(self.garments))])
+        """Figures over all rollouts, see :func:`summarise_validation`."""
+        return summarise_validation([self.rollout(simulator, index) for index in range(len(self.garments))])
 
     def rollout(self, simulator: NetworkStepper, index: int, see: Callable[[Scene, Frame], None] | None = None) -> Rollout:
         """The rollout of garment ``index``; ``see`` is shown every frame."""
@@ -119,7 +119,7 @@ class Validation:
         return Rollout(self.garments[index].name, metrics, tuple(float(item.gamma) for item in gaps), finite)
 
 
-def summarise(rollouts: Sequence[Rollout]) -> dict[str, float]:
+def summarise_validation(rollouts: Sequence[Rollout]) -> dict[str, float]:
     """Medians over garments of p99 strain and rg, mean shares of vertices inside the body and of triangles
     cut by it, the worst such frame, crossing pairs of triangles, worst strain, number of non-finite rollouts, gap γ
     (median and 95th percentile over all states) and ``score``."""

@@ -12,16 +12,16 @@ from pathlib import Path
 from typing import Any
 
 from hood.assets.files.atomic import write_atomically
-from hood.evaluation.drape import DISC, PIXEL, SAMPLE, Rest
+from hood.evaluation.drape import DISC, PIXEL, SAMPLE, DrapedRest
 
 #: Of the series, in their order; far apart in lightness too.
 COLOURS = ("#345c8e", "#d6843e", "#609668", "#a05478", "#78787e", "#debe60")
 
 #: Values by category and series.
-Panel = Mapping[str, Mapping[str, float]]
+_Panel = Mapping[str, Mapping[str, float]]
 
 
-def write_bars(panels: Mapping[str, Panel], path: Path) -> None:
+def write_bars(panels: Mapping[str, _Panel], path: Path) -> None:
     """Draw a chart per panel, by its title, one below the other, into a PNG. Bars start at 0; values are not negative."""
     from matplotlib.figure import Figure
 
@@ -66,7 +66,7 @@ _COLUMNS, _INCHES = 5, 2.2
 _CLOTH = "#345c8e"
 
 
-def write_shadows(states: Mapping[str, Rest], path: Path) -> None:
+def write_shadows(states: Mapping[str, DrapedRest], path: Path) -> None:
     """Draw a panel per fabric, by its name, into a PNG."""
     from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure

@@ -15,7 +15,7 @@ from hood.media.film import Film, seconds_per_frame, sheet_frames
 from hood.media.video import VideoWriter
 from hood.rollouts.file.reader import RolloutData
 
-Picture = NDArray[np.uint8]
+_Picture = NDArray[np.uint8]
 
 #: Frames of the contact sheet: it has one row for every rollout.
 _SHEET_FRAMES = 6
@@ -76,7 +76,7 @@ class SideBySide:
     def num_frames(self) -> int:
         return len(self.panels[0].data.cloth_pos)
 
-    def frame(self, index: int) -> Picture:
+    def frame(self, index: int) -> _Picture:
         """Picture (H, W, 3) uint8 of frame ``index`` of all rollouts, from left to right."""
         columns = [
             np.concatenate([self._heading(panel, self.width), film.picture(index)])
@@ -85,7 +85,7 @@ class SideBySide:
         _divide(columns)
         return self._with_bar(np.concatenate(columns, axis=1))
 
-    def sheet(self, count: int = _SHEET_FRAMES) -> Picture:
+    def sheet(self, count: int = _SHEET_FRAMES) -> _Picture:
         """``count`` evenly spaced moments from left to right, a row for every rollout."""
         # The start has no unbalanced force: it would be a grey column.
         first = int(self.num_frames > 1 and all(self._is_grey(film) for film in self._films))
@@ -101,12 +101,12 @@ class SideBySide:
         """Whether the first frame has no values to be coloured by."""
         return film.colouring is not None and not np.isfinite(film.colouring.values[0]).any()
 
-    def _heading(self, panel: Panel, width: int) -> Picture:
+    def _heading(self, panel: Panel, width: int) -> _Picture:
         size = self._size
         lines = [(panel.title, _INK), (panel.note, _FAINT)] if any(p.note for p in self.panels) else [(panel.title, _INK)]
         return _write(_blank(len(lines) * (size + size // 3) + size // 2, width), lines, size)
 
-    def _with_bar(self, picture: Picture) -> Picture:
+    def _with_bar(self, picture: _Picture) -> _Picture:
         """The picture with the scale of colours below it; itself where garments have their own colours."""
         colouring = self._films[0].colouring
         if colouring is None:
@@ -182,17 +182,17 @@ def _first_frames(data: RolloutData, count: int) -> RolloutData:
     )
 
 
-def _blank(height: int, width: int) -> Picture:
+def _blank(height: int, width: int) -> _Picture:
     return np.full((height, width, 3), 255, dtype=np.uint8)
 
 
-def _divide(columns: Sequence[Picture]) -> None:
+def _divide(columns: Sequence[_Picture]) -> None:
     """A white line between pictures that stand side by side."""
     for column in columns[1:]:
         column[:, :2] = 255
 
 
-def _write(picture: Picture, lines: Sequence[tuple[str, tuple[int, int, int]]], size: int) -> Picture:
+def _write(picture: _Picture, lines: Sequence[tuple[str, tuple[int, int, int]]], size: int) -> _Picture:
     """The picture with lines of text in its upper left corner, shortened in the middle where they are too long."""
     try:
         from PIL import Image, ImageDraw, ImageFont

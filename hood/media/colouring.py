@@ -14,7 +14,7 @@ from hood.mesh.closest_point.search import search_surface
 from hood.mesh.editing.subdivision import Subdivision
 from hood.rollouts.file.reader import RolloutData
 
-Picture = NDArray[np.uint8]
+_Picture = NDArray[np.uint8]
 
 #: From low to high; lightness falls all the way, so that the order shows in grey as well.
 _SCALE = np.array(
@@ -47,7 +47,7 @@ class Colouring:
         """(V, 3) in 0..1 of the vertices in ``frame``."""
         return colours_at(self.place(self.values[frame]))
 
-    def with_bar(self, picture: Picture, size: int | None = None) -> Picture:
+    def with_bar(self, picture: _Picture, size: int | None = None) -> _Picture:
         """A copy of ``picture`` with the bar, its ticks and title along the lower edge, in letters of ``size`` pixels."""
         try:
             from PIL import Image, ImageDraw, ImageFont

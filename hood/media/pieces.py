@@ -46,7 +46,7 @@ def part_colour(rank: int) -> tuple[float, float, float]:
 
 
 @dataclass(frozen=True)
-class Piece:
+class GarmentPiece:
     """One garment."""
 
     name: str  # letters, digits and underscores
@@ -64,12 +64,12 @@ class Piece:
         return bool((corners != corners[0]).any())
 
 
-def pieces_of(data: RolloutData) -> list[Piece]:
+def pieces_of(data: RolloutData) -> list[GarmentPiece]:
     """The garments of a rollout, in their order; one where the file does not say which vertex belongs to which."""
     return pieces_by(str(data.attributes.get("garment", "cloth")), data.cloth_pos.shape[1], data.cloth_faces, data.still)
 
 
-def pieces_by(title: str, count: int, faces: np.ndarray, still: Mapping[str, np.ndarray]) -> list[Piece]:
+def pieces_by(title: str, count: int, faces: np.ndarray, still: Mapping[str, np.ndarray]) -> list[GarmentPiece]:
     """The same by the names of the garments, joined by ``+``, the number of vertices, the faces (F, 3) and what a rollout holds
     beside them (:data:`hood.rollouts.file.recorder.STILL`)."""
     piece, uv, uv_faces = (still.get(name) for name in ("piece", "uv", "uv_faces"))
@@ -83,13 +83,13 @@ def pieces_by(title: str, count: int, faces: np.ndarray, still: Mapping[str, np.
     ):
         uv = uv_faces = None
     if piece is None or piece.shape != (count,) or piece.min(initial=0) == piece.max(initial=0):
-        return [Piece(plain_name(title), np.arange(count), np.arange(len(faces)), uv, uv_faces)]
-    words, labels, found = title.split("+"), sorted(set(piece.tolist())), list[Piece]()
+        return [GarmentPiece(plain_name(title), np.arange(count), np.arange(len(faces)), uv, uv_faces)]
+    words, labels, found = title.split("+"), sorted(set(piece.tolist())), list[GarmentPiece]()
     for rank, label in enumerate(labels):
         mine = np.flatnonzero((piece[faces] == label).all(axis=1))
         name = plain_name(words[rank]) if len(words) == len(labels) else f"cloth_{rank}"
         name = name if name not in [other.name for other in found] else f"{name}_{rank}"
-        found.append(Piece(name, np.flatnonzero(piece == label), mine, uv, None if uv_faces is None else uv_faces[mine]))
+        found.append(GarmentPiece(name, np.flatnonzero(piece == label), mine, uv, None if uv_faces is None else uv_faces[mine]))
     return found
 
 

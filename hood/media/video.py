@@ -16,12 +16,12 @@ from hood.assets.files.atomic import write_atomically
 from hood.assets.files.said import install
 
 logger = logging.getLogger(__name__)
-Picture = NDArray[np.uint8]
+_Picture = NDArray[np.uint8]
 
 _PICTURES_HINT = f"need Pillow: {install('pictures')}"
 
 
-def save_png(path: str | Path, image: Picture) -> Path:
+def save_png(path: str | Path, image: _Picture) -> Path:
     """Writes (H, W, 3) uint8 as PNG; returns the path."""
     try:
         from PIL import Image
@@ -63,7 +63,7 @@ class VideoWriter:
         self._stream: Any = None
         self._gif_frames: list[io.BytesIO] = []
 
-    def append(self, image: Picture) -> None:
+    def append(self, image: _Picture) -> None:
         """Adds one frame (H, W, 3) uint8; all frames have one size. An odd last row or column is dropped."""
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
             given = f"{image.shape} {image.dtype}"
@@ -94,7 +94,7 @@ class VideoWriter:
         finally:
             self._partial.unlink(missing_ok=True)
 
-    def _send(self, image: Picture) -> None:
+    def _send(self, image: _Picture) -> None:
         if self._stream is None:
             height, width = image.shape[:2]
             self._stream = self._ffmpeg.write_frames(
@@ -110,7 +110,7 @@ class VideoWriter:
             self._stream.send(None)
         self._stream.send(image)
 
-    def _keep(self, image: Picture) -> None:
+    def _keep(self, image: _Picture) -> None:
         try:
             from PIL import Image
         except ImportError as error:

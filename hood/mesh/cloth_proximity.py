@@ -23,7 +23,7 @@ from hood.native.arguments import COUNT, POINTER, REAL, fields
 from hood.native.build import build
 from hood.native.libraries import LAYER_FLAGS
 
-SOURCE = Path(native.__file__).with_name("layers.cpp")
+_SOURCE = Path(native.__file__).with_name("layers.cpp")
 #: Of the distance of two features at least this share is left by one move.
 LEFT = 0.1
 #: How far vertices may be off the ways that the list of pairs was made for: a share of half of the smallest height of a face
@@ -49,7 +49,7 @@ def library() -> ctypes.CDLL:
     Raises:
         hood.native.build.BuildError: there is no compiler, or it fails.
     """
-    lib = build(SOURCE, LAYER_FLAGS)
+    lib = build(_SOURCE, LAYER_FLAGS)
     lib.layers_make.restype = POINTER
     lib.layers_make.argtypes = [*[POINTER] * 5, REAL, COUNT, COUNT]
     lib.layers_free.argtypes = [POINTER]
@@ -74,7 +74,7 @@ def library() -> ctypes.CDLL:
     return lib
 
 
-class Apart(NamedTuple):
+class _Apart(NamedTuple):
     """Positions where nothing is near or through anything, with :data:`SPARE` to spare."""
 
     pos: np.ndarray  # (V, 3) m
@@ -113,7 +113,7 @@ class LayerMesh:
             "edge_area": np.bincount(sides.reshape(-1), thirds, minlength=len(edges)),
             "edge_length_sq": length**2,
         }
-        self.apart: Apart | None = None  # where a step has ended lately
+        self.apart: _Apart | None = None  # where a step has ended lately
         self.num_vertices, self.reach = len(rest), self._arrays["reach"]  # (V,) m
         counts = len(rest), len(faces), len(edges)
         self.structure = _Mesh(*counts, *(self._arrays[name].ctypes.data for name in self._arrays))
@@ -192,7 +192,7 @@ class Work(NamedTuple):
         return self.searching + self.limiting + self.energies + self.models
 
 
-class Layers:
+class ClothSurface:
     """Cloth near cloth during one step, from positions ``pos`` (V, 3) [m] on.
 
     Faces that pass through each other at ``pos`` would be held there: pairs of their features are left out until they have
@@ -226,9 +226,9 @@ class Layers:
         self._held, self.between = held, between
         self.forced = 0  # pairs of features that held vertices drive through each other
 
-    def begun_at(self, pos: np.ndarray) -> Layers:
+    def begun_at(self, pos: np.ndarray) -> ClothSurface:
         """The layers of a step that begins at ``pos`` (V, 3); these here do not change."""
-        return Layers(self.mesh, pos, self._held, self.pressure, self.between)
+        return ClothSurface(self.mesh, pos, self._held, self.pressure, self.between)
 
     @property
     def crossed(self) -> int:
@@ -243,7 +243,7 @@ class Layers:
         """Spare the next step from ``pos`` (V, 3) its search there, if nothing is near anything at ``pos``."""
         here = _positions(pos)
         if self._lib.layers_apart(self.handle, here.ctypes.data, SPARE):
-            self.mesh.apart = Apart(here.copy(), self._held, self.between)
+            self.mesh.apart = _Apart(here.copy(), self._held, self.between)
 
     def approach(self, target: np.ndarray) -> np.ndarray:
         """Positions (V, 3) near ``target`` (V, 3) that straight ways from the start lead to on which no two features meet.
@@ -355,7 +355,7 @@ class Followed(NamedTuple):
         return bool(self.lag.any())
 
 
-def follow(layers: Layers, pos: np.ndarray, held: np.ndarray, target: np.ndarray) -> Followed:
+def follow(layers: ClothSurface, pos: np.ndarray, held: np.ndarray, target: np.ndarray) -> Followed:
     """Held vertices on their ways from ``pos`` to their targets, stopped where cloth would meet cloth.
 
     First all vertices turn and shift as one body with the held ones, and meet nothing. From there the held ones go straight
@@ -373,7 +373,7 @@ def follow(layers: Layers, pos: np.ndarray, held: np.ndarray, target: np.ndarray
     there = np.where(held[:, None], target, along)
     if layers.fixed_are_free(along, there):
         return Followed(there, np.zeros(len(pos)), 0.0)
-    ways = Layers(layers.mesh, along, held, layers.pressure, layers.between)
+    ways = ClothSurface(layers.mesh, along, held, layers.pressure, layers.between)
     reached, arrived = ways.follow(target)
     lag = np.zeros(len(pos)) if arrived else np.where(held, np.linalg.norm(reached - target, axis=1), 0.0)
     return Followed(reached, lag, ways.work.seconds)

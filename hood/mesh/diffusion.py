@@ -36,7 +36,7 @@ class Diffusion:
         return torch.zeros_like(values).index_add(0, self._receivers, values.index_select(0, self._senders))
 
 
-class Neighbours(NamedTuple):
+class _Neighbours(NamedTuple):
     """Neighbours of the vertices of a mesh, vertex by vertex."""
 
     first: Tensor  # (V + 1,) where those of each vertex begin
@@ -47,10 +47,10 @@ class Neighbours(NamedTuple):
         return features.Neighbours(len(self.first) - 1, self.first.data_ptr(), self.other.data_ptr())
 
 
-_NEIGHBOURS: dict[int, tuple[weakref.ref[Tensor], int, Neighbours]] = {}
+_NEIGHBOURS: dict[int, tuple[weakref.ref[Tensor], int, _Neighbours]] = {}
 
 
-def neighbours_of(edges: Tensor, num_vertices: int) -> Neighbours:
+def neighbours_of(edges: Tensor, num_vertices: int) -> _Neighbours:
     """Neighbours by undirected ``edges`` (E, 2), kept as long as that tensor lives."""
     key = id(edges)
     known = _NEIGHBOURS.get(key)
@@ -60,6 +60,6 @@ def neighbours_of(edges: Tensor, num_vertices: int) -> Neighbours:
     senders, receivers = torch.cat([start, end]), torch.cat([end, start])
     degree = torch.bincount(receivers, minlength=num_vertices)
     first = torch.cat([degree.new_zeros(1), degree.cumsum(0)])
-    found = Neighbours(first, senders[torch.argsort(receivers, stable=True)].contiguous())
+    found = _Neighbours(first, senders[torch.argsort(receivers, stable=True)].contiguous())
     _NEIGHBOURS[key] = (weakref.ref(edges, forget(_NEIGHBOURS, key)), num_vertices, found)
     return found

@@ -16,7 +16,7 @@ from hood.mesh import topology
 from hood.mesh.topology import connected_components
 
 
-class Part(NamedTuple):
+class MeshPart(NamedTuple):
     """What hangs together by faces."""
 
     number: int  # from 1, in the order of their first vertices
@@ -60,7 +60,7 @@ def _labels(num_vertices: int, faces: np.ndarray, edges: np.ndarray) -> np.ndarr
     return found
 
 
-def find_parts(pos: np.ndarray, faces: np.ndarray) -> list[Part]:
+def find_parts(pos: np.ndarray, faces: np.ndarray) -> list[MeshPart]:
     """The parts of the mesh ``pos`` (V, 3), ``faces`` (F, 3)."""
     all_edges = topology.unique_edges(faces)
     label = _labels(len(pos), faces, all_edges)
@@ -77,7 +77,7 @@ def find_parts(pos: np.ndarray, faces: np.ndarray) -> list[Part]:
         rows, box = by_face[number], pos[vertices]
         loops = tuple(rims.get(number, ()))
         found.append(
-            Part(
+            MeshPart(
                 number + 1,
                 vertices,
                 rows,

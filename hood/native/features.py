@@ -16,7 +16,7 @@ from torch import Tensor
 
 from hood.native.build import optional
 
-SOURCE = Path(__file__).with_name("features.cpp")
+_SOURCE = Path(__file__).with_name("features.cpp")
 _TYPES = {"p": ctypes.c_void_p, "i": ctypes.c_int64, "f": ctypes.c_float}
 #: Functions of the library and their arguments: pointers, numbers of rows or columns, and real numbers.
 _SIGNATURES = {
@@ -50,7 +50,7 @@ class Neighbours(ctypes.Structure):
 @cache
 def library() -> ctypes.CDLL | None:
     """The compiled functions; None without a compiler."""
-    lib = optional(SOURCE)
+    lib = optional(_SOURCE)
     if lib is None:
         return None
     for name, kinds in _SIGNATURES.items():

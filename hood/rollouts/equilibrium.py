@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from hood.assets.files.said import Progress
+from hood.assets.files.said import Said
 from hood.cloth.cloth import Cloth
 from hood.cloth.state import Attachments, State, StepInput
 from hood.energies.potential import Potential
@@ -19,7 +19,7 @@ from hood.energies.problem import StepProblem
 from hood.mesh.parts import find_parts
 from hood.mesh.topology import connected_components
 from hood.scene.scene import Scene
-from hood.scene.worn import name_part, worn_vertices
+from hood.scene.worn import name_worn_part, worn_vertices
 from hood.solver.newton import NewtonSettings, minimize
 from hood.solver.retry import minimize_held_off
 from hood.solver.step_figures import NOT_FINITE
@@ -146,7 +146,7 @@ class _Way:
 
     def settle(self, potential: Potential, most_steps: int) -> tuple[int, float]:
         """Number of steps taken, and the speed [m/s] in the last, until the cloth is at rest, lost, or out of steps."""
-        dt, speed, progress = _SHORTEST, math.inf, Progress("settling the cloth")
+        dt, speed, progress = _SHORTEST, math.inf, Said("settling the cloth")
         count, last = 0, most_steps
         while count < last:
             count += 1
@@ -237,7 +237,7 @@ def _named(scene: Scene, numbers: Sequence[int]) -> str:
     label = connected_components(scene.cloth.num_vertices, scene.cloth.edges.cpu().numpy())
     parts = find_parts(scene.garment.rest_pos, scene.garment.faces)
     own = [part for part in parts if label[part.vertices[0]] in numbers]
-    words = [name_part(scene, part, len(parts)) for part in own[:_TOLD]]
+    words = [name_worn_part(scene, part, len(parts)) for part in own[:_TOLD]]
     return ", ".join(filter(None, words)) + (f" and {len(own) - _TOLD} more" if len(own) > _TOLD else "")
 
 

@@ -37,7 +37,7 @@ from hood.rollouts.verdict.surface import SURFACE_STRIDE, SurfaceMeter
 from hood.rollouts.verdict.worn import measure_wear
 from hood.scene.jumps import Jump, carried, describe_jumps, find_jumps
 from hood.scene.scene import LEAD_IN, RELAXING_DT, NotWornError, Scene, recentre
-from hood.scene.start import free_stretch, push_out
+from hood.scene.start import free_stretch, push_out_of_body
 from hood.scene.worn import worn_vertices, worst_part
 from hood.solver.step_figures import (
     StepFigures,
@@ -55,7 +55,7 @@ _LOOK, _LOOKS = 0.02, 100
 
 AttachmentSchedule = Callable[[int], Attachments | None]
 #: Called after a step with the frame it leads to, what the step had to solve and what came out.
-Observer = Callable[[int, StepProblem, Prediction], None]
+_Observer = Callable[[int, StepProblem, Prediction], None]
 
 
 @torch.no_grad()
@@ -67,7 +67,7 @@ def simulate(
     relaxing_steps: int = 1,
     attachments: AttachmentSchedule | None = None,
     start_frame: int = 0,
-    observe: Observer | None = None,
+    observe: _Observer | None = None,
     metrics: str = "all",
     fields: Sequence[str] = (),
     surface_stride: int = SURFACE_STRIDE,
@@ -272,7 +272,7 @@ def start_state(stepper: Stepper, scene: Scene, potential: Potential, relaxing_s
             state = State(prediction.next_pos, state.vel, state.origin)
             velocity = stepper.next_velocity(problem, prediction)
             continue
-        pos = push_out(scene.cloth, prediction.next_pos, step.obstacle, scene.clearance)
+        pos = push_out_of_body(scene.cloth, prediction.next_pos, step.obstacle, scene.clearance)
         problem = potential.prepare(problem)
         lower = bool((potential.total(problem, pos) < potential.total(problem, state.pos)).all())
         kept = lower and bool(torch.isfinite(pos).all()) and _longest(scene, pos) <= max(_STRETCH, _longest(scene, state.pos))

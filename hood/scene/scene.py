@@ -16,7 +16,7 @@ from hood.cloth.cloth import Cloth, build_cloth
 from hood.cloth.state import Attachments, Obstacle, State, StepInput
 from hood.scene.body_motion.motion import BodyMotion, Motion, body_motion
 from hood.scene.holding import Fastening, Holding, fastening_of
-from hood.scene.sizing import Size, Sizes, resized, sizes_of
+from hood.scene.sizing import GarmentSize, Sizes, resized, sizes_of
 from hood.scene.start import free_stretch, settle
 from hood.scene.untangle import Outfit, Separation, separate, smooth_out
 from hood.scene.worn import worst_part
@@ -220,7 +220,7 @@ def build_scene(
     sequence: PoseSequence,
     material: Material | None = None,
     betas: np.ndarray | None = None,
-    size: Size | Sizes = 1.0,
+    size: GarmentSize | Sizes = 1.0,
     dtype: torch.dtype = torch.float32,
     device: torch.device | str = "cpu",
 ) -> Scene:
@@ -260,7 +260,7 @@ def build_scene(
     return dress(garment, body_motion(body, sequence, betas, dtype, device), material, size)
 
 
-def dress(garment: Garment, motion: Motion, material: Material | None = None, size: Size | Sizes = 1.0) -> Scene:
+def dress(garment: Garment, motion: Motion, material: Material | None = None, size: GarmentSize | Sizes = 1.0) -> Scene:
     """Garment on whatever moves, in the motion's precision and on its device; ``size`` scales the rest shape, which is that of
     the body's shape if it is made to measure.
 

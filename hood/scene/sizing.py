@@ -16,7 +16,7 @@ from hood.mesh import geometry
 #: Sizes outside are no garment's.
 LEAST, MOST = 0.2, 5.0
 
-Size = float | Sequence[float]
+GarmentSize = float | Sequence[float]
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Sizes:
         return x, y, z
 
 
-def sizes_of(size: Size, end: Size | None = None, seconds: float = 1.0) -> Sizes:
+def sizes_of(size: GarmentSize, end: GarmentSize | None = None, seconds: float = 1.0) -> Sizes:
     """Sizes from numbers for all axes, or three each; ``end`` None: the size stays.
 
     Raises:
@@ -94,7 +94,7 @@ def resized(cloth: Cloth, before: tuple[float, float, float], now: tuple[float, 
     return replace(cloth, **rounded)
 
 
-def _three(size: Size) -> tuple[float, float, float]:
+def _three(size: GarmentSize) -> tuple[float, float, float]:
     factors = [size] * 3 if isinstance(size, (int, float)) else list(size)
     if len(factors) != 3 or not all(isinstance(f, (int, float)) and not isinstance(f, bool) for f in factors):
         raise ValueError(f"size is {size}; give one factor, such as 1.1, or three along x, y and z, such as [1,1.05,1]")

@@ -77,7 +77,7 @@ def _project(cloth: Cloth, pos: Tensor, obstacle: Obstacle | None, clearance: fl
         move = span * ((length - target) / length.clamp_min(1e-9) / share.clamp_min(1.0)).unsqueeze(1)
         total = torch.zeros_like(pos).index_add(0, start, move).index_add(0, end, -move)
         pos = pos + 1.5 * total / valence.unsqueeze(1) * free.unsqueeze(1)
-    return push_out(cloth, pos, obstacle, clearance)
+    return push_out_of_body(cloth, pos, obstacle, clearance)
 
 
 def _unstretch(cloth: Cloth, pos: Tensor, obstacle: Obstacle | None, clearance: float) -> Tensor:
@@ -100,7 +100,7 @@ def _unstretch(cloth: Cloth, pos: Tensor, obstacle: Obstacle | None, clearance: 
         now = descend(cloth, course.ahead, weight, rest_length)
         course.go(now if contact is None else leave(cloth, now, contact, clearance))
         if iteration % _LOOK_EVERY == 0:
-            outside = push_out(cloth, course.pos, obstacle, clearance)
+            outside = push_out_of_body(cloth, course.pos, obstacle, clearance)
             stretch = free_stretch(cloth, outside)
             if float(stretch.max()) < least:
                 best, least = outside, float(stretch.max())
@@ -168,7 +168,7 @@ def leave(cloth: Cloth, pos: Tensor, contact: Contact, clearance: float) -> Tens
     return pos + (depth * contact.valid * cloth.free).unsqueeze(1) * contact.normal
 
 
-def push_out(cloth: Cloth, pos: Tensor, obstacle: Obstacle | None, clearance: float, rounds: int = 4) -> Tensor:
+def push_out_of_body(cloth: Cloth, pos: Tensor, obstacle: Obstacle | None, clearance: float, rounds: int = 4) -> Tensor:
     """``pos`` (V, 3) with every free vertex at least ``clearance`` [m] and the :func:`chord_error` outside the body at t (up to
     ``rounds`` searches: leaving one limb may enter another)."""
     if obstacle is None:

@@ -18,13 +18,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hood.assets.files.said import Progress
+from hood.assets.files.said import Said
 from hood.cloth.cloth import Cloth
 from hood.cloth.state import Obstacle
 from hood.contact.contact import match_surface
 from hood.mesh.penetration.crossing import self_crossings
 from hood.mesh.topology import boundary_loops
-from hood.scene.start import LazySearch, Momentum, descend, free_stretch, leave, push_out
+from hood.scene.start import LazySearch, Momentum, descend, free_stretch, leave, push_out_of_body
 
 #: Vertices nearer than this [m] are in the same place, and garments where that is more than this share of one's vertices.
 #: Seams that two garments share are fewer.
@@ -119,7 +119,7 @@ def smooth_out(cloth: Cloth, faces: np.ndarray, pos: Tensor, obstacle: Obstacle 
     start, end = cloth.edges.unbind(dim=1)
     both, other = torch.cat([start, end]), torch.cat([end, start])
     count = torch.zeros_like(pos[:, 0]).index_add(0, both, torch.ones_like(pos[:, 0])[both]).clamp_min(1.0)[:, None]
-    progress = Progress("smoothing places where the garment passes through itself")
+    progress = Said("smoothing places where the garment passes through itself")
     for turn in range(_SMOOTHED):
         pairs = self_crossings(pos.double().cpu().numpy(), faces)
         progress.tell(f"round {turn + 1} of at most {_SMOOTHED}, {len(pairs)} pairs of triangles are left")
@@ -131,7 +131,7 @@ def smooth_out(cloth: Cloth, faces: np.ndarray, pos: Tensor, obstacle: Obstacle 
         near[torch.as_tensor(np.unique(faces[pairs.reshape(-1)]))] = True
         near = near.index_put((both[near[other]],), torch.tensor(True)) & cloth.free
         mean = torch.zeros_like(pos).index_add(0, both, pos[other]) / count
-        pos = push_out(cloth, torch.where(near[:, None], 0.5 * (pos + mean), pos), obstacle, clearance)
+        pos = push_out_of_body(cloth, torch.where(near[:, None], 0.5 * (pos + mean), pos), obstacle, clearance)
     return best
 
 
@@ -306,11 +306,11 @@ def _take_apart(
     """The garments apart in one order; the best of the rounds. What is not yet as the order has it counts as one crossing."""
     course = _Course(outfit, pos, obstacle, clearance, order)
     best, found, clean = Separation(pos, order, before, before + len(turned), _longest(outfit, pos), turned), 0, 0
-    progress = Progress("taking garments apart")
+    progress = Said("taking garments apart")
     for number in range(_ROUNDS):
         progress.tell(f"round {number + 1} of at most {_ROUNDS}, {best.after} pairs of triangles are left")
         course.round(inner_share, lengths=number > 0, carried=clean > 0)
-        ended = push_out(outfit.cloth, course.pos, obstacle, clearance)
+        ended = push_out_of_body(outfit.cloth, course.pos, obstacle, clearance)
         pairs = crossing_pairs(outfit, ended)
         left = len(pairs) + (len(_against(outfit, ended, obstacle, order)) if turned else 0)
         now = Separation(ended, order, before, left, _longest(outfit, ended), turned)

@@ -17,7 +17,7 @@ from hood.assets.garment.garment import Garment
 from hood.assets.material import Material
 from hood.cloth.cloth import build_cloth
 from hood.cloth.state import Obstacle
-from hood.mesh.parts import Part, find_parts
+from hood.mesh.parts import MeshPart, find_parts
 from hood.scene.start import free_stretch, settle
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def worn_vertices(scene: Scene, frame: int = 0) -> np.ndarray:
     return worn
 
 
-def name_part(scene: Scene, part: Part, num_parts: int) -> str:
+def name_worn_part(scene: Scene, part: MeshPart, num_parts: int) -> str:
     """What a part is called in a message: its number, its vertices and where it is at rest; "" where there is one alone."""
     if num_parts == 1:
         return ""
@@ -66,7 +66,7 @@ def worst_part(scene: Scene, pos: np.ndarray) -> str:
     rest = scene.cloth.rest_pos.double().cpu().numpy()
     now, before = (np.linalg.norm(table[edges[:, 0]] - table[edges[:, 1]], axis=1) for table in (pos, rest))
     vertex = edges[int(np.argmax(now / np.maximum(before, 1e-12))), 0]
-    return next(name_part(scene, part, len(parts)) for part in parts if vertex in part.vertices)
+    return next(name_worn_part(scene, part, len(parts)) for part in parts if vertex in part.vertices)
 
 
 #: An edge that is worn longer by more than this share counts as stretched.

@@ -221,7 +221,7 @@ class NetworkStepper(nn.Module):
         with timed(watch, "features"):
             graph = build_graph(prepared.static, seen.step, nearest, self.body_radius, layers=layers)
             sight = self.look(problem, seen, graph)
-            features = self.features(sight.inputs, compiled.COLUMNS if compiled.applies(sight.inputs) else None)
+            features = self.features(sight.inputs, compiled.COMPILED_COLUMNS if compiled.applies(sight.inputs) else None)
         with timed(watch, "network"):
             return self.advance(problem, seen, sight, *features)
 

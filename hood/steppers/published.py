@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from hood.assets.pickles.torch_file import load_torch
-from hood.assets.pickles.unpickle import SIZE_LIMIT
+from hood.assets.pickles.unpickle import PICKLE_LIMIT
 from hood.model.graph.builder import BODY, MESH
 from hood.model.graph.schedule import SCHEDULES, Step, edge_set_names, parse_schedule
 from hood.steppers.network import NetworkStepper, build_simulator
@@ -42,7 +42,7 @@ _STEP = re.compile(
 
 
 @dataclass(frozen=True)
-class Layout:
+class _Layout:
     """One way of writing a model down.
 
     ``coarse_encoders`` is None where there is one network for all coarse levels.
@@ -85,7 +85,7 @@ def neutral(key: str) -> str:
     return key if step is None else ".".join(step.groups())
 
 
-def detect_layout(keys: Iterable[str]) -> Layout:
+def detect_layout(keys: Iterable[str]) -> _Layout:
     """The layout that the names of a state dict belong to.
 
     Raises:
@@ -95,20 +95,20 @@ def detect_layout(keys: Iterable[str]) -> Layout:
     names = [neutral(key) for key in keys]
     if any(name.startswith("levels.") for name in names):
         count = len({name.split(".")[1] for name in names if re.match(r"edgeset_encoders\.coarse\d+\.", name)})
-        return Layout("postcvpr", "ours", count)
+        return _Layout("postcvpr", "ours", count)
     if any(re.match(r"processor_steps\d+\.", name) for name in names):
-        return Layout("cvpr", "ours", None)
+        return _Layout("cvpr", "ours", None)
     steps = {int(name.split(".")[1]) for name in names if re.match(r"processor_steps\.\d+\.", name)}
     if steps:
         name = f"fine{len(steps)}"
-        return Layout(name, name if name in SCHEDULES else f"{len(steps)}x(mesh)")
+        return _Layout(name, name if name in SCHEDULES else f"{len(steps)}x(mesh)")
     anchors = [NETWORK + anchor for anchor in ("levels.0.0", "processor_steps1.0", "processor_steps.0", "node_encoder")]
-    near = nearest(anchors[0], keys)
+    near = _nearest(anchors[0], keys)
     found = f"the nearest key is {near!r}" if near else f"found {len(keys)} keys, such as {keys[:2]}"
     raise ValueError(f"not HOOD weights: no processor steps ({' or '.join(a + '.…' for a in anchors[:3])}); {found}")
 
 
-def network_sources(layout: Layout) -> dict[str, Source]:
+def network_sources(layout: _Layout) -> dict[str, Source]:
     """Where each tensor of our network comes from, by our name."""
     sources = {**_mlp("node_encoder", "node_encoder.0", "node_encoder.1"), **_mlp("decoder", "decoder", None)}
     for ours, theirs in _encoders(layout).items():
@@ -148,7 +148,7 @@ def match(sources: Mapping[str, Source], state: Mapping[str, Tensor]) -> dict[st
     return {ours: source.take(state[given[neutral(source.key)]]) for ours, source in sources.items()}
 
 
-def nearest(key: str, known: Iterable[str]) -> str | None:
+def _nearest(key: str, known: Iterable[str]) -> str | None:
     """The most similar of ``known``."""
     # Keys share long prefixes: only the part behind them tells them apart.
     by_tail = {neutral(name): name for name in known}
@@ -157,11 +157,11 @@ def nearest(key: str, known: Iterable[str]) -> str | None:
 
 
 def _hint(key: str, known: Iterable[str]) -> str:
-    near = nearest(key, known)
+    near = _nearest(key, known)
     return "" if near is None else f"; the nearest expected key is {near!r}"
 
 
-def _encoders(layout: Layout) -> dict[str, str]:
+def _encoders(layout: _Layout) -> dict[str, str]:
     """Our edge encoders and theirs."""
     names = {MESH: "mesh", BODY: "world"}
     if layout.coarse_encoders is None:
@@ -174,7 +174,7 @@ def _edge_name(name: str) -> str:
     return {MESH: "mesh_edge", BODY: "world_edge"}.get(name, name.replace("coarse", "coarse_edge"))
 
 
-def _step_key(layout: Layout, index: int, name: str) -> str:
+def _step_key(layout: _Layout, index: int, name: str) -> str:
     if layout.nodes_last:
         return f"processor_steps.{index}.{name}_processor"
     block, step = divmod(index, 3)
@@ -211,7 +211,7 @@ _SUMS = {"weight": "_acc_count", "num_updates": "_num_accumulations", "first": "
 _EMBEDDINGS = {"features.node.1.table.weight": "nodetype_embedding", "features.node.2.table.weight": "vertexlevel_embedding"}
 
 
-def load_reference_checkpoint(path: str | Path, size_limit: int = SIZE_LIMIT) -> NetworkStepper:
+def load_reference_checkpoint(path: str | Path, size_limit: int = PICKLE_LIMIT) -> NetworkStepper:
     """The simulator in a published ``.pth`` checkpoint, in evaluation mode; nothing in the file is run.
 
     Args:
@@ -231,7 +231,7 @@ def load_reference_checkpoint(path: str | Path, size_limit: int = SIZE_LIMIT) ->
     return read_reference_checkpoint(path, size_limit)[0]
 
 
-def read_reference_checkpoint(path: str | Path, size_limit: int = SIZE_LIMIT) -> tuple[NetworkStepper, str]:
+def read_reference_checkpoint(path: str | Path, size_limit: int = PICKLE_LIMIT) -> tuple[NetworkStepper, str]:
     """The same, and the name of the layout: ``postcvpr``, ``cvpr``, ``fine15`` or ``fine48``."""
     content = load_torch(path, size_limit)
     try:
@@ -280,7 +280,7 @@ def _weights(content: Any) -> dict[str, Tensor]:
     return {str(key): value for key, value in state.items()}
 
 
-def _sources(layout: Layout) -> dict[str, Source]:
+def _sources(layout: _Layout) -> dict[str, Source]:
     sources = {f"network.{name}": source for name, source in network_sources(layout).items()}
     for ours, theirs in _NORMALIZERS.items():
         sources |= {f"{ours}.{sum_}": Source(f"{MODEL}{theirs}.{key}") for sum_, key in _SUMS.items()}
@@ -288,7 +288,7 @@ def _sources(layout: Layout) -> dict[str, Source]:
     return sources | {ours: Source(f"{MODEL}{theirs}.weight") for ours, theirs in embeddings}
 
 
-def _arguments(layout: Layout, tensors: Mapping[str, Tensor]) -> dict[str, Any]:
+def _arguments(layout: _Layout, tensors: Mapping[str, Tensor]) -> dict[str, Any]:
     """Arguments of build_simulator: the sizes of the file and the conventions of its layout."""
     later = layout.name == "postcvpr"
     arguments: dict[str, Any] = {

@@ -39,10 +39,10 @@ _LATER = {
 #: Settings that weights take as they are, whatever they were trained with: figures in hood/studies/notes/contact.md.
 _TAKEN = ("reach", "sides")
 
-Span = tuple[float, float]
+_Span = tuple[float, float]
 
 #: What all trainings have had, those of files that do not say included.
-_USUAL: dict[str, Span] = {"gravity": (STANDARD_GRAVITY, STANDARD_GRAVITY), "material.friction": (1.0, 1.0)}
+_USUAL: dict[str, _Span] = {"gravity": (STANDARD_GRAVITY, STANDARD_GRAVITY), "material.friction": (1.0, 1.0)}
 _USUAL |= {f"material.{name}": (1.0, 1.0) for name in WEAVE}
 
 
@@ -55,7 +55,7 @@ class Conditions:
     garment; ``betas``, shape coefficients. Those that a scene does not have (no parametric body) are absent.
     """
 
-    spans: Mapping[str, Span]
+    spans: Mapping[str, _Span]
     potential: Mapping[str, Mapping[str, Any]]  # see Potential.settings
 
     def to_json(self) -> str:
@@ -118,7 +118,7 @@ def scene_conditions(
     a body of shape ``betas`` (S,), under ``gravity`` [m/s²]."""
     factors = (1.0,) if sizes is None else (*sizes.start, *sizes.end, *sizes.parts)
     size = min(factors), max(factors)
-    spans: dict[str, Span] = {"fps": (1.0 / dt, 1.0 / dt), "size": size, "gravity": (gravity, gravity)}
+    spans: dict[str, _Span] = {"fps": (1.0 / dt, 1.0 / dt), "size": size, "gravity": (gravity, gravity)}
     fabric = {name: getattr(cloth, name) for name in Material.names() if name not in WEAVE}
     weave = cloth.rest_area.new_ones(1, 3) if cloth.weave is None else cloth.weave
     fabric |= dict(zip(WEAVE, weave.unbind(dim=1), strict=True))
@@ -134,7 +134,7 @@ def training_conditions(sampler: Sampling, potential: Potential) -> Conditions:
     low, high = sampler.size_low, sampler.size_high
     motions = sampler.sequences
     fps = [motions.fps] if isinstance(motions, MotionFiles) else [motion.fps for motion in motions]
-    spans: dict[str, Span] = {"fps": (min(fps), max(fps)), "size": (low, high), **_USUAL}
+    spans: dict[str, _Span] = {"fps": (min(fps), max(fps)), "size": (low, high), **_USUAL}
     spans["betas"] = (-sampler.beta_range, sampler.beta_range)
     spans |= {f"material.{name}": span for name, span in _fabrics(sampler.material).items()}
     spans |= _resolution(sampler.garments)
@@ -181,7 +181,7 @@ def different(
     return sentences
 
 
-def describe(trained: Conditions | None) -> dict[str, str]:
+def describe_conditions(trained: Conditions | None) -> dict[str, str]:
     """The ranges in words, by the name that a command or a sentence uses; ``unknown`` where a file says nothing."""
     if trained is None:
         return {"trained on": "unknown, the file does not say"}
@@ -193,14 +193,14 @@ def describe(trained: Conditions | None) -> dict[str, str]:
     return spans | {"trained on losses": ", ".join(term.removesuffix("()") for term in terms)}
 
 
-def _fabrics(material: Material | None) -> dict[str, Span]:
+def _fabrics(material: Material | None) -> dict[str, _Span]:
     """Extent of every property of a fabric; None: of those that are sampled."""
     given = {name: values_of(getattr(material or Material(), name))[0] for name in Material.names()}
     spans = {name: (float(values.min()), float(values.max())) for name, values in given.items()}
     return spans if material is not None else spans | RANGES
 
 
-def _resolution(garments: Iterable[Garment]) -> dict[str, Span]:
+def _resolution(garments: Iterable[Garment]) -> dict[str, _Span]:
     """Spans of ``vertices`` and ``edge_length``."""
     counts, lengths = [], []
     for garment in garments:
@@ -210,12 +210,12 @@ def _resolution(garments: Iterable[Garment]) -> dict[str, Span]:
     return {"vertices": (min(counts), max(counts)), "edge_length": (min(lengths), max(lengths))}
 
 
-def _extent(values: Tensor) -> Span:
+def _extent(values: Tensor) -> _Span:
     low, high = torch.aminmax(values)
     return float(low), float(high)
 
 
-def _range(name: str, span: Span) -> str:
+def _range(name: str, span: _Span) -> str:
     forms: dict[str, Callable[[float], str]] = {"vertices": "{:,.0f}".format, "edge_length": lambda m: f"{1e3 * m:.3g}"}
     low, high = map(forms.get(name, "{:.5g}".format), span)
     unit = "mm" if name == "edge_length" else UNITS.get(name.removeprefix("material."), "")

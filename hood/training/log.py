@@ -117,7 +117,7 @@ class MetricsLog:
             print(f"hood: no more TensorBoard events: {error}", file=sys.stderr)
 
 
-class Window:
+class LogWindow:
     """Means of what was reported since the last record: one update of a few scenes says little, a hard one looks like trouble.
 
     What is not finite is passed over unless there is nothing else; what is no measurement (``LATEST``) keeps its last value.

@@ -18,7 +18,7 @@ from hood.energies.potential import Potential, relative_gradient, scale
 from hood.energies.problem import StepProblem
 from hood.energies.self_contact import for_networks
 from hood.model.features.normalizer import RunningNormalizer
-from hood.model.network.kernel_choice import AUTO, Choice, choose_for
+from hood.model.network.kernel_choice import AUTO, KernelChoice, choose_for
 from hood.steppers.checkpoint import save_simulator
 from hood.steppers.network import NetworkStepper, Prediction
 from hood.steppers.protocol import Stopwatch, timed
@@ -32,16 +32,16 @@ from hood.training.checkpoint import (
     set_aside,
     set_generator_states,
 )
-from hood.training.log import Clock, MetricsLog, Skipped, Window, made_behind, relative_loss, told
+from hood.training.log import Clock, LogWindow, MetricsLog, Skipped, made_behind, relative_loss, told
 from hood.training.scenes import SceneSampler
 from hood.training.settings import TrainerSettings, make_optimizer
 from hood.training.slots import Slots
-from hood.training.watch import Watch
+from hood.training.watch import ValidationWatch
 
 #: Told the iteration and what was measured; None instead of a report: time passed that was not training.
-Progress = Callable[[int, dict[str, float] | None], None]
+_Progress = Callable[[int, dict[str, float] | None], None]
 #: Told of an update: what had to be solved, by which potential, the prediction, and its residual (B,).
-Observer = Callable[[StepProblem, Potential, Prediction, Tensor], None]
+_Observer = Callable[[StepProblem, Potential, Prediction, Tensor], None]
 
 
 class Trainer:
@@ -62,7 +62,7 @@ class Trainer:
         settings: TrainerSettings,
         folder: Path,
         seed: int,
-        watch: Watch | None = None,
+        watch: ValidationWatch | None = None,
         earlier: int = 0,
     ) -> None:
         settings = settings.compressed()
@@ -78,7 +78,7 @@ class Trainer:
         self.simulator, self.potential, self.settings = simulator, potential, settings
         self.folder, self.seed, self.watch = folder, seed, watch
         simulator.network.use_precision(settings.precision)
-        self.choice: Choice | None = None  # of kernels, where that was left open
+        self.choice: KernelChoice | None = None  # of kernels, where that was left open
         if settings.kernels == AUTO:
             self.choice = choose_for(simulator.network, settings.precision, simulator.gravity.device, training=True)
         simulator.network.use_kernels(settings.kernels if self.choice is None else self.choice.kernels)
@@ -102,13 +102,13 @@ class Trainer:
         self.rollbacks = 0
         self.best = math.inf
         self.stopwatch: Stopwatch | None = None  # told where an update's time goes
-        self.observe: Observer | None = None
+        self.observe: _Observer | None = None
         self._skips = Skipped()
         self._rollbacks_in_row = 0
         self._failed_at = -1
         self._saved_at = -1
         self._metrics: MetricsLog | None = None
-        self._window = Window()
+        self._window = LogWindow()
         self._average = {name: value.detach().clone() for name, value in simulator.named_parameters()}
 
     @property
@@ -129,7 +129,7 @@ class Trainer:
         """Why the last of them was, in brackets; all processes must ask."""
         return told(distributed.gather(self._skips.reason))
 
-    def run(self, progress: Progress | None = None, should_stop: Callable[[], bool] = lambda: False) -> bool:
+    def run(self, progress: _Progress | None = None, should_stop: Callable[[], bool] = lambda: False) -> bool:
         """Train up to ``settings.iterations``; True when finished, False when ``should_stop`` ended it early.
 
         Raises:
@@ -346,7 +346,7 @@ class Trainer:
         self._restore(state)
         self.slots.restart()
         self.optimizer.zero_grad(set_to_none=True)
-        self._window = Window()
+        self._window = LogWindow()
         self._skips.in_row = 0
         self.rollbacks, self._rollbacks_in_row = self.rollbacks + 1, self._rollbacks_in_row + 1
         self._failed_at = max(failed, self._failed_at)

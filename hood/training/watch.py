@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from hood.assets.files.atomic import write_atomically
-from hood.evaluation.validation import Validation, summarise
+from hood.evaluation.validation import Validation, summarise_validation
 from hood.rollouts.frames import KeptFrames
 from hood.steppers.network import NetworkStepper
 from hood.training import distributed
@@ -20,7 +20,7 @@ _WIDTH, _HEIGHT = 240, 336
 
 
 @dataclass
-class Watch:
+class ValidationWatch:
     """Validates a model in training; draws ``pictures`` frames of the first garment as one row.
 
     Files: ``validation/strip_ITERATION.png`` in ``folder``. Without the picture libraries there is no strip, said once.
@@ -44,7 +44,7 @@ class Watch:
             shown = film.see if index == 0 and self.pictures else None
             rollouts[index] = self.validation.rollout(simulator, index, shown)
         together = {index: item for part in distributed.gather(rollouts) for index, item in part.items()}
-        values = summarise([together[index] for index in sorted(together)])
+        values = summarise_validation([together[index] for index in sorted(together)])
         strip = self._draw(film)
         distributed.on_main(lambda: None if strip is None else self._write(strip, iteration))
         return values, strip

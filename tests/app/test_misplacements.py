@@ -18,7 +18,7 @@ from hood.app.scene import placing
 from hood.app.scene.placing import find_place
 from hood.assets.body.body import Body
 from hood.assets.body.load import load_body
-from hood.assets.fitting.fit_search import Asked, Found
+from hood.assets.fitting.fit_search import AskedFit, FoundFit
 from hood.assets.fitting.placement import Placement
 from hood.assets.garment.binding import posed_body
 from hood.assets.garment.garment import Garment, load_garment
@@ -208,7 +208,7 @@ def test_the_unit_alone_is_named_only_where_the_garment_stays(monkeypatch: pytes
     file = replace(garment, rest_pos=1000.0 * garment.rest_pos)
     offsets = {"scale=0.001": np.zeros(3), None: np.array([0.0, 0.3, 0.0])}
     for key, offset in offsets.items():
-        found = Found(Placement(0.001, "y", 0.0, offset), 0.7, 0.1)
+        found = FoundFit(Placement(0.001, "y", 0.0, offset), 0.7, 0.1)
         monkeypatch.setattr(placing, "find_place", lambda *words, found=found: found)
         assert placing.unit_alone(file, body, np.zeros(10)) == key
 
@@ -235,7 +235,7 @@ def test_prepare_resizes_nothing_unasked(capsys: pytest.CaptureFixture[str]) -> 
 def test_a_cut_that_is_a_little_wider_or_tighter_keeps_its_size(body: Body, name: str, factor: float) -> None:
     garment, pos, _ = truth(Case(name))
     middle = pos.mean(axis=0)
-    found = find_place(replace(garment, rest_pos=middle + factor * (pos - middle)), body, np.zeros(10), Asked(), None)
+    found = find_place(replace(garment, rest_pos=middle + factor * (pos - middle)), body, np.zeros(10), AskedFit(), None)
     assert found.resized is None
     assert found.placement.scale == 1.0
 

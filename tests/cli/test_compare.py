@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
-from hood.cli.compare import names_of
+from hood.cli.compare import short_names
 from hood.cli.help import describe
 from hood.cli.main import main
 from hood.rollouts.file.recorder import RolloutWriter
@@ -181,10 +181,10 @@ def test_what_cannot_be_compared_is_refused_in_a_sentence(case: str, capsys: pyt
 
 
 def test_names_are_as_short_as_they_may_be() -> None:
-    assert names_of([Path("x/one/rollout.h5"), Path("x/two/rollout.h5")]) == ["one", "two"]
-    assert names_of([Path("a/run/rollout.h5"), Path("b/run/rollout.h5")]) == ["a/run", "b/run"]
-    assert names_of([Path("x/p.h5"), Path("x/q.h5")]) == ["p", "q"]
-    assert names_of([Path("x/p.h5"), Path("x/p.h5")]) == ["p", "p"]
+    assert short_names([Path("x/one/rollout.h5"), Path("x/two/rollout.h5")]) == ["one", "two"]
+    assert short_names([Path("a/run/rollout.h5"), Path("b/run/rollout.h5")]) == ["a/run", "b/run"]
+    assert short_names([Path("x/p.h5"), Path("x/q.h5")]) == ["p", "q"]
+    assert short_names([Path("x/p.h5"), Path("x/p.h5")]) == ["p", "p"]
 
 
 def test_help_lists_its_keys() -> None:

@@ -19,7 +19,7 @@ from hood.energies.potential import coded_potential, default_potential, referenc
 from hood.energies.problem import StepProblem
 from hood.mesh.closest_point.search import build_incidence
 from hood.mesh.penetration.crossing import crossings
-from hood.scene.start import push_out, settle
+from hood.scene.start import push_out_of_body, settle
 from hood.solver.derivatives.vertices import walls_of
 from hood.solver.newton import NewtonSettings
 from hood.steppers.newton import implicit_euler
@@ -154,7 +154,7 @@ def test_a_tight_sleeve_is_cut_only_with_a_constant_reach(form: str) -> None:
 
 def test_a_start_keeps_the_triangles_out_as_well() -> None:
     problem = sleeve(8, 0.055)
-    for leave in (push_out, settle):
+    for leave in (push_out_of_body, settle):
         pos = leave(problem.cloth, problem.state.pos, problem.step.obstacle, 2e-3)
         assert cut(problem, pos) == 0
 

@@ -7,14 +7,14 @@ import math
 import numpy as np
 import pytest
 
-from hood.evaluation.bootstrap import Estimate, estimate, interval, pooled_interval, resample
+from hood.evaluation.bootstrap import Estimate, estimate_interval, interval, pooled_interval, resample_rows
 
 
 def test_the_interval_covers_the_true_median_as_often_as_it_says() -> None:
     random = np.random.default_rng(3)
     hits = 0
     for _ in range(200):
-        found = estimate(random.normal(5.0, 2.0, size=(40, 1)).tolist(), 0.5, None)
+        found = estimate_interval(random.normal(5.0, 2.0, size=(40, 1)).tolist(), 0.5, None)
         hits += found.low <= 5.0 <= found.high
     # 95% of 200; five standard deviations of a binomial either way, and percentile intervals of 40 values are a little narrow.
     assert 172 <= hits <= 199
@@ -22,7 +22,7 @@ def test_the_interval_covers_the_true_median_as_often_as_it_says() -> None:
 
 def test_its_width_is_that_of_the_normal_distribution() -> None:
     """The median's standard error is 1.2533 σ / √n."""
-    found = estimate(np.random.default_rng(0).normal(size=(400, 1)).tolist(), 0.5)
+    found = estimate_interval(np.random.default_rng(0).normal(size=(400, 1)).tolist(), 0.5)
     assert found.high - found.low == pytest.approx(2 * 1.96 * 1.2533 / 20, rel=0.25)
 
 
@@ -30,24 +30,24 @@ def test_states_of_one_rollout_do_not_count_as_if_they_were_independent() -> Non
     random = np.random.default_rng(1)
     places = random.normal(size=12)
     alike = [[place] * 20 for place in places]
-    few, many = estimate([[place] for place in places], 0.5), estimate(alike, 0.5)
+    few, many = estimate_interval([[place] for place in places], 0.5), estimate_interval(alike, 0.5)
     assert (many.low, many.high) == (few.low, few.high)
     mixed = random.permutation(np.repeat(places, 20)).reshape(12, 20)
-    independent = estimate(mixed.tolist(), 0.5)
+    independent = estimate_interval(mixed.tolist(), 0.5)
     assert independent.value == many.value
     assert many.high - many.low > 1.3 * (independent.high - independent.low)
 
 
 def test_the_value_is_the_quantile_of_everything_unclamped() -> None:
     groups = [[-3.0, 1.0], [2.0], [-5.0, 7.0, 0.5]]
-    assert estimate(groups, 0.5).value == np.quantile([-3, 1, 2, -5, 7, 0.5], 0.5)
-    assert estimate(groups, 0.95).value == np.quantile([-3, 1, 2, -5, 7, 0.5], 0.95)
-    assert estimate(groups, 0.5).low < 0
+    assert estimate_interval(groups, 0.5).value == np.quantile([-3, 1, 2, -5, 7, 0.5], 0.5)
+    assert estimate_interval(groups, 0.95).value == np.quantile([-3, 1, 2, -5, 7, 0.5], 0.95)
+    assert estimate_interval(groups, 0.5).low < 0
 
 
 def test_rollouts_of_different_lengths_are_drawn_with_their_own_states() -> None:
     groups = [[1.0], [2.0, 2.0, 2.0], [], [3.0]]
-    draws = resample(groups, 0.5, draws=400)
+    draws = resample_rows(groups, 0.5, draws=400)
     assert set(draws) <= {1.0, 1.5, 2.0, 2.5, 3.0}
     # One state of the first rollout in a draw of three from it alone, not three padded ones.
     assert np.isfinite(draws).all()
@@ -59,9 +59,9 @@ def test_a_rollout_without_values_keeps_its_place() -> None:
     whole, gap = [[1.0], [2.0], [3.0], [4.0]], [[1.0], [], [3.0], [4.0]]
     random = np.random.default_rng(0)
     drawn = random.integers(4, size=(2000, 4))
-    np.testing.assert_array_equal(resample(whole, 1.0), (drawn + 1.0).max(axis=1))
+    np.testing.assert_array_equal(resample_rows(whole, 1.0), (drawn + 1.0).max(axis=1))
     expected = np.where(drawn == 1, 0.0, drawn + 1.0).max(axis=1)
-    np.testing.assert_array_equal(resample(gap, 1.0), np.where(expected == 0.0, 4.0, expected))
+    np.testing.assert_array_equal(resample_rows(gap, 1.0), np.where(expected == 0.0, 4.0, expected))
 
 
 def test_few_rollouts_widen_the_interval() -> None:
@@ -77,7 +77,7 @@ def test_few_rollouts_widen_the_interval() -> None:
 def test_quantiles_are_those_of_numpy(level: float) -> None:
     values = np.random.default_rng(0).normal(size=9)
     # One rollout is drawn every time, so draws differ in their states alone: all are quantiles of values that occur.
-    draws = resample([values.tolist()], level, draws=50, seed=4)
+    draws = resample_rows([values.tolist()], level, draws=50, seed=4)
     random = np.random.default_rng(4)
     random.integers(1, size=(50, 1))
     places = (random.random((50, 1, 9)) * 9).astype(int)[:, 0]
@@ -87,15 +87,15 @@ def test_quantiles_are_those_of_numpy(level: float) -> None:
 def test_settings_on_the_same_rollouts_are_drawn_alike() -> None:
     """What rollouts have in common cancels: the difference of two settings is known far better than each of them."""
     scenes = np.random.default_rng(0).normal(size=(10, 5))
-    one, other = resample(scenes.tolist(), 0.5), resample((scenes + 0.01).tolist(), 0.5)
+    one, other = resample_rows(scenes.tolist(), 0.5), resample_rows((scenes + 0.01).tolist(), 0.5)
     assert np.ptp(one) > 0.5
     np.testing.assert_allclose(other - one, 0.01, atol=1e-12)
 
 
 def test_nothing_measured_is_nan_and_infinity_survives() -> None:
-    assert all(np.isnan(estimate([], 0.5)))
-    assert all(np.isnan(estimate([[], []], 0.5)))
-    assert isinstance(estimate([[1.0]], 0.5), Estimate)
+    assert all(np.isnan(estimate_interval([], 0.5)))
+    assert all(np.isnan(estimate_interval([[], []], 0.5)))
+    assert isinstance(estimate_interval([[1.0]], 0.5), Estimate)
     assert interval(np.array([1.0] * 50 + [np.inf] * 50)) == (1.0, np.inf)
 
 

@@ -10,7 +10,7 @@ from hood.assets.body.load import load_body
 from hood.assets.garment.garment import load_garment
 from hood.energies.potential import default_potential
 from hood.energies.problem import StepProblem
-from hood.evaluation.table import ALL, Candidate, Measured, candidate_rows
+from hood.evaluation.table import ALL, Candidate, MeasuredRollout, candidate_rows
 from hood.evaluation.validation import sideways_drift, standing_scene
 from hood.scene.scene import Scene
 from hood.solver.newton import NewtonSettings
@@ -61,5 +61,7 @@ def test_the_solver_stays(scene: Scene) -> None:
 def test_the_largest_drift_is_in_the_table() -> None:
     frames = [{"ms_total": 1.0, "strain_p99": 0.1, "relative_gradient": 1.0}]
     candidate = Candidate("newton", "none", NewtonStepper(default_potential(), NewtonSettings()))
-    rows = candidate_rows(candidate, {"a": [Measured(frames, drifts=[0.001])], "b": [Measured(frames, drifts=[0.004])]})
+    rows = candidate_rows(
+        candidate, {"a": [MeasuredRollout(frames, drifts=[0.001])], "b": [MeasuredRollout(frames, drifts=[0.004])]}
+    )
     assert {row["garment"]: row["drift"] for row in rows} == {"a": 0.001, "b": 0.004, ALL: 0.004}

@@ -7,17 +7,17 @@ from pathlib import Path
 
 import pytest
 
-from hood.evaluation.files import RolloutLog, Unit
-from hood.evaluation.table import Measured
+from hood.evaluation.files import EvaluationUnit, RolloutLog
+from hood.evaluation.table import MeasuredRollout
 
-FIRST, SECOND = Unit(0, "tank", "walk"), Unit(1, "dress", "a b/c.npz")
-MEASURED = Measured([{"ms_total": 1.5}, {"ms_total": 2.5}], [7], [{"gamma": 0.1, "converged": 1.0, "spread": 0.0}])
+FIRST, SECOND = EvaluationUnit(0, "tank", "walk"), EvaluationUnit(1, "dress", "a b/c.npz")
+MEASURED = MeasuredRollout([{"ms_total": 1.5}, {"ms_total": 2.5}], [7], [{"gamma": 0.1, "converged": 1.0, "spread": 0.0}])
 
 
 def test_every_process_reads_what_all_wrote(tmp_path: Path) -> None:
     RolloutLog(tmp_path, 0).write(FIRST, "x", MEASURED)
-    RolloutLog(tmp_path, 1).write(SECOND, "y", Measured())
-    assert RolloutLog(tmp_path, 5).read(["x", "y"]) == {FIRST: MEASURED, SECOND: Measured()}
+    RolloutLog(tmp_path, 1).write(SECOND, "y", MeasuredRollout())
+    assert RolloutLog(tmp_path, 5).read(["x", "y"]) == {FIRST: MEASURED, SECOND: MeasuredRollout()}
 
 
 def test_other_weights_are_not_taken_over(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from hood.energies.problem import StepProblem
 from hood.evaluation import spectrum
 from hood.evaluation.files import write_rows
 from hood.evaluation.spectrum import (
-    COLUMNS,
+    SPECTRUM_COLUMNS,
     Bands,
     band_name,
     bar_panels,
@@ -150,11 +150,11 @@ def test_rows_text_and_files(tmp_path: Path) -> None:
     assert {(row["states"], row["unconverged"]) for row in rows} == {(2, 0.5)}
     assert [band_name(row) for row in rows] == ["above 40 cm", "20 to 40 cm", "below 20 cm"]
     assert format_spectrum(rows).splitlines()[2].split() == ["above", "40", "cm", "2.000", "(", "68%;", "0.2)"]
-    csv_path, json_path = write_rows(rows, COLUMNS, tmp_path, "spectrum")
+    csv_path, json_path = write_rows(rows, SPECTRUM_COLUMNS, tmp_path, "spectrum")
     assert json.loads(json_path.read_text()) == rows
     with open(csv_path, newline="") as file:
         table = list(csv.DictReader(file))
-    assert list(table[0]) == list(COLUMNS)
+    assert list(table[0]) == list(SPECTRUM_COLUMNS)
     assert (table[0]["longest"], float(table[0]["rms"])) == ("", pytest.approx(2.0))
 
 

@@ -15,7 +15,7 @@ from hood.app.settings.compose import build, load_config
 from hood.energies.potential import default_potential
 from hood.energies.problem import StepProblem
 from hood.evaluation import table
-from hood.evaluation.files import columns, describe, format_table, write_rows
+from hood.evaluation.files import columns, describe_rows, format_table, write_rows
 from hood.evaluation.table import ALL, TERMS, Candidate, GapSettings, evaluate, other_terms
 from hood.evaluation.table_one import TableConditions, page
 from hood.evaluation.validation import Validation
@@ -131,7 +131,7 @@ def test_references_that_stop_early_are_flagged(band_scene: Scene) -> None:
     settings = GapSettings(2, NewtonSettings(target_rg=1e-3, max_iterations=1))
     rows = evaluate([guess], {"band": [band_scene]}, potential, 7, settings)
     assert rows[0]["unconverged"] == 1.0
-    assert "2 of 2 reference minima did not converge" in describe(rows)
+    assert "2 of 2 reference minima did not converge" in describe_rows(rows)
 
 
 def test_no_states_no_minimisation(candidates: list[Candidate], band_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -166,9 +166,9 @@ def test_text_and_files(rows: list[dict], solver_rows: list[dict], tmp_path: Pat
         assert len(lines) == 1 + len(rows)
         assert len({len(line) for line in lines}) == 1
         assert max(map(len, lines)) <= 160
-    assert "untrained: random weights" in describe(rows)
-    assert "untrained" not in describe(solver_rows)
-    assert "did not converge" not in describe(rows)
+    assert "untrained: random weights" in describe_rows(rows)
+    assert "untrained" not in describe_rows(solver_rows)
+    assert "did not converge" not in describe_rows(rows)
     csv_path, json_path = write_rows(rows, columns(rows), tmp_path, "table")
     with open(csv_path, newline="") as file:
         table = list(csv.DictReader(file))

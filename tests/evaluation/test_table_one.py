@@ -9,7 +9,7 @@ import pytest
 from hood.app.candidates import command_line, training_note
 from hood.assets.files.library import locate
 from hood.energies.potential import default_potential
-from hood.evaluation.table import ALL, Candidate, Measured, candidate_rows
+from hood.evaluation.table import ALL, Candidate, MeasuredRollout, candidate_rows
 from hood.evaluation.table_one import TableConditions, checks, page
 from hood.solver.newton import NewtonSettings
 from hood.steppers.newton import NewtonStepper
@@ -26,9 +26,9 @@ def row(model: str, garment: str = ALL, **values: Any) -> dict[str, Any]:
     return base | {"fps": 10.0, "L_total": 1.0, "gradient_norm": 0.02} | values
 
 
-def rollout(value: float, end: int | None = None) -> Measured:
+def rollout(value: float, end: int | None = None) -> MeasuredRollout:
     frame = {"ms_total": value, "energy_total": value, "strain_p99": 0.1, "relative_gradient": 1.0, "gradient_norm": value}
-    return Measured([frame] * 3, gaps=[{"gamma": value, "converged": 1.0, "spread": 0.0}], ends=[end])
+    return MeasuredRollout([frame] * 3, gaps=[{"gamma": value, "converged": 1.0, "spread": 0.0}], ends=[end])
 
 
 def solver() -> Candidate:
@@ -127,7 +127,7 @@ def test_failures_are_counted_by_rollout() -> None:
 def test_how_far_minima_are_apart_is_told() -> None:
     """States with one converged minimisation know of no distance."""
     gaps = [{"gamma": 0.1, "converged": 1.0, "spread": value} for value in (0.0, 0.02, 0.04, float("nan"))]
-    known, unknown = (candidate_rows(solver(), {"a": [Measured(gaps=part)]})[0] for part in (gaps, gaps[3:]))
+    known, unknown = (candidate_rows(solver(), {"a": [MeasuredRollout(gaps=part)]})[0] for part in (gaps, gaps[3:]))
     assert (known["disagree"], known["gap_spread"]) == (0.5, pytest.approx(0.038))
     assert (unknown["disagree"], unknown["gap_spread"]) == (0.0, None)
 

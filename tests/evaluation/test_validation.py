@@ -8,7 +8,7 @@ import pytest
 
 from hood.energies.potential import default_potential
 from hood.evaluation.gap import REFERENCE
-from hood.evaluation.validation import Rollout, Validation, score, summarise
+from hood.evaluation.validation import Rollout, Validation, score, summarise_validation
 from hood.rollouts.loop import simulate
 from hood.scene.scene import Scene
 from hood.steppers.network import NetworkStepper, build_simulator
@@ -46,7 +46,7 @@ def figures(strain: float, share: float) -> dict[str, float]:
 
 
 def result(gap: float, strain: float, finite: bool = True) -> dict[str, float]:
-    return summarise([Rollout("band", figures(strain, 0.0), (gap,), finite)])
+    return summarise_validation([Rollout("band", figures(strain, 0.0), (gap,), finite)])
 
 
 def test_better_in_either_is_better_and_broken_is_worst() -> None:
@@ -63,7 +63,7 @@ def test_several_garments_are_summed_up() -> None:
         Rollout(f"g{i}", figures(s, p), (g, 3 * g), True)
         for i, (s, p, g) in enumerate([(0.1, 0.0, 1.0), (0.3, 0.06, 2.0), (0.2, 0.0, 10.0)])
     ]
-    values = summarise(rows)
+    values = summarise_validation(rows)
     assert (values["strain_p99"], values["strain_p99_worst"], values["penetration_share"]) == pytest.approx((0.2, 0.3, 0.02))
     surface = [values[key] for key in ("cut_face_share", "cut_face_share_worst", "self_crossings")]
     assert surface == pytest.approx([0.02, 0.18, 2.0])

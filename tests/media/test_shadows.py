@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hood.evaluation.drape import DISC, PIXEL, Rest
+from hood.evaluation.drape import DISC, PIXEL, DrapedRest
 from hood.media.bars import write_shadows
 
 Image = pytest.importorskip("PIL.Image")
@@ -19,7 +19,7 @@ def test_every_fabric_has_a_panel_and_dark_is_what_the_shadow_covers(tmp_path: P
     half = 330
     centre = (np.arange(-half, half) + 0.5) * PIXEL
     radius = np.hypot(*np.meshgrid(centre, centre))
-    small = Rest(0.0, 0, 0.0, np.zeros((0, 3)), radius < DISC, True)
+    small = DrapedRest(0.0, 0, 0.0, np.zeros((0, 3)), radius < DISC, True)
     large = replace(small, coefficient=0.6, folds=6, shadow=radius < 0.13)
     for name, states in {
         "one": {"a": small},

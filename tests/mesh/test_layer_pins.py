@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hood.mesh.cloth_proximity import Followed, LayerMesh, Layers, follow
+from hood.mesh.cloth_proximity import ClothSurface, Followed, LayerMesh, follow
 from hood.mesh.penetration.crossing import self_crossings
 from hood.testing import grid
 
@@ -29,11 +29,11 @@ def _held(*rows: np.ndarray) -> np.ndarray:
 
 
 def _follow(mesh: LayerMesh, pos: np.ndarray, held: np.ndarray, target: np.ndarray) -> Followed:
-    return follow(Layers(mesh, pos, held, 20.0), pos, held, target)
+    return follow(ClothSurface(mesh, pos, held, 20.0), pos, held, target)
 
 
 def _free_way(mesh: LayerMesh, pos: np.ndarray, there: np.ndarray) -> bool:
-    return Layers(mesh, pos, np.zeros(len(pos), bool), 1.0).limit(pos, there) == 1.0
+    return ClothSurface(mesh, pos, np.zeros(len(pos), bool), 1.0).limit(pos, there) == 1.0
 
 
 def test_free_layers_make_way() -> None:
@@ -95,7 +95,7 @@ def test_as_one_body_nothing_is_in_the_way(rows: np.ndarray) -> None:
 def test_nothing_is_searched_for_where_all_is_apart_and_little_changes() -> None:
     mesh, pos, _ = _sheets()
     held = _held(_MIDDLE, _MIDDLE + _SIZE)
-    Layers(mesh, pos, held, 20.0).remember_apart(pos)
+    ClothSurface(mesh, pos, held, 20.0).remember_apart(pos)
     target = pos + [0.0, 0.3, 0.0]
     target[_MIDDLE] += 2e-4
     found = _follow(mesh, pos, held, target)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hood.mesh import topology
-from hood.mesh.cloth_proximity import LayerMesh, Layers
+from hood.mesh.cloth_proximity import ClothSurface, LayerMesh
 from hood.mesh.penetration.crossing import self_crossings
 from hood.testing import grid
 
@@ -19,11 +19,11 @@ def _sheets(n: int = 8) -> tuple[LayerMesh, np.ndarray, np.ndarray]:
     return LayerMesh(rest, both, 3e-3), rest, both
 
 
-def _layers(mesh: LayerMesh, pos: np.ndarray, fixed: np.ndarray | None = None) -> Layers:
-    return Layers(mesh, pos, np.zeros(len(pos), bool) if fixed is None else fixed, pressure=20.0)
+def _layers(mesh: LayerMesh, pos: np.ndarray, fixed: np.ndarray | None = None) -> ClothSurface:
+    return ClothSurface(mesh, pos, np.zeros(len(pos), bool) if fixed is None else fixed, pressure=20.0)
 
 
-def _pairs(layers: Layers, pos: np.ndarray) -> set[tuple[int, ...]]:
+def _pairs(layers: ClothSurface, pos: np.ndarray) -> set[tuple[int, ...]]:
     return {tuple(row) for row in layers.contacts(pos).corners.tolist()}
 
 
@@ -105,7 +105,7 @@ def _all_pairs(mesh: LayerMesh, faces: np.ndarray, pos: np.ndarray) -> dict[tupl
     return found | {(1, *pair): far for pair, far in zip(corners.tolist(), dist.tolist(), strict=True)}
 
 
-def _require_all_pairs(layers: Layers, faces: np.ndarray, pos: np.ndarray) -> int:
+def _require_all_pairs(layers: ClothSurface, faces: np.ndarray, pos: np.ndarray) -> int:
     """Check what is in reach against all pairs; how many are."""
     reach = layers.mesh.reach
     everything = _all_pairs(layers.mesh, faces, pos)
@@ -137,7 +137,7 @@ def test_pairs_in_reach_are_those_of_all_pairs_whatever_was_asked_before() -> No
     rng = np.random.default_rng(5)
     here = pos * np.array([0.5, 0.3, 0.5])
     ahead = here + [0.03, 0.0, 0.0] + 2e-3 * rng.normal(size=pos.shape)
-    layers = Layers(mesh, here, np.zeros(len(pos), bool), 20.0, ahead=ahead)
+    layers = ClothSurface(mesh, here, np.zeros(len(pos), bool), 20.0, ahead=ahead)
     fresh = 0
     for turn in range(16):
         there = here + 0.02 * rng.normal(size=3) + 4e-4 * rng.normal(size=pos.shape)
@@ -181,7 +181,7 @@ def test_where_cloth_is_known_to_be_apart_no_search_is_made() -> None:
     others = [
         _layers(mesh, near),
         _layers(mesh, pos, np.ones(len(pos), bool)),
-        Layers(mesh, pos, np.zeros(len(pos), bool), 1.0, True),
+        ClothSurface(mesh, pos, np.zeros(len(pos), bool), 1.0, True),
     ]
     for other in others:
         other.contacts(pos)

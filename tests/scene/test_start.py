@@ -15,7 +15,7 @@ from hood.cloth.cloth import build_cloth
 from hood.cloth.state import Obstacle
 from hood.contact.contact import find_contact
 from hood.scene.scene import build_scene
-from hood.scene.start import free_stretch, push_out, settle
+from hood.scene.start import free_stretch, push_out_of_body, settle
 from hood.solver.step_figures import strain_metrics
 from hood.testing import grid, sphere
 
@@ -62,16 +62,16 @@ def test_cloth_inside_a_ball_is_pushed_out() -> None:
     inside = cloth.rest_pos + torch.tensor([-0.1, 0.27, -0.1]).double()
     obstacle = ball(0.3)
     assert float(find_contact(inside, cloth.vertex_scene, obstacle).dist.min()) < -0.02
-    outside = push_out(cloth, inside, obstacle, clearance=2e-3)
+    outside = push_out_of_body(cloth, inside, obstacle, clearance=2e-3)
     assert float(find_contact(outside, cloth.vertex_scene, obstacle).dist.min()) >= 2e-3 - 1e-4
-    assert torch.equal(push_out(cloth, inside, None, 2e-3), inside)
+    assert torch.equal(push_out_of_body(cloth, inside, None, 2e-3), inside)
 
 
 def test_cloth_far_inside_is_not_sent_across_the_body() -> None:
     """Deeper than the cap nothing is known about the way out."""
     cloth = build_cloth(*grid(3, 3, 0.02), Material(), dtype=torch.float64)
     centre = cloth.rest_pos - 0.01
-    assert torch.equal(push_out(cloth, centre, ball(0.3), 2e-3), centre)
+    assert torch.equal(push_out_of_body(cloth, centre, ball(0.3), 2e-3), centre)
 
 
 @pytest.mark.parametrize(

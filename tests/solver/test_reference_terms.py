@@ -16,7 +16,7 @@ from hood.energies.bending import CurrentLengthBending
 from hood.energies.potential import Potential, coded_potential, default_potential, reference_potential, relative_gradient
 from hood.energies.problem import StepProblem
 from hood.solver.derivatives.step_terms import StepTerms
-from hood.solver.derivatives.vertices import other_terms
+from hood.solver.derivatives.vertices import terms_without_form
 from hood.solver.newton import NewtonSettings, minimize
 from hood.solver.system import linear
 from hood.solver.system.iterate import in_double
@@ -69,7 +69,7 @@ def draped() -> StepProblem:
 def test_gradient_is_that_of_the_potential(draped: StepProblem, state: str, form: str) -> None:
     potential = POTENTIALS[form]
     problem = potential.prepare(draped)
-    assert other_terms(potential, problem) is None  # all in closed form
+    assert terms_without_form(potential, problem) is None  # all in closed form
     noise = 1e-3 * torch.as_tensor(np.random.default_rng(0).normal(size=problem.state.pos.shape))
     rest = problem.cloth.rest_pos
     fallen = problem.state.pos.clone()

@@ -14,7 +14,7 @@ from hood.cloth.cloth import build_cloth
 from hood.energies.potential import default_potential, reference_potential
 from hood.scene.scene import Scene
 from hood.steppers.checkpoint import load_simulator
-from hood.steppers.ranges import Conditions, describe, different, outside, scene_conditions, training_conditions
+from hood.steppers.ranges import Conditions, describe_conditions, different, outside, scene_conditions, training_conditions
 from hood.testing import grid
 from hood.training.scenes import SceneSampler
 
@@ -167,16 +167,16 @@ def test_the_shipped_files_say_what_they_were_trained_for(name: str, garments: d
         cloth = build_cloth(garment.rest_pos, garment.faces, Material())
         assert outside(trained, scene_conditions(garment, cloth, 1 / 30, default_potential(), np.zeros(10))) == []
     expected = {"quickstart": "11.7 to 39.6 mm", "edges": "3.57 to 39.6 mm"}.get(name, "22.2 to 39.7 mm")
-    assert describe(trained)["trained on garment mean edge"] == expected
+    assert describe_conditions(trained)["trained on garment mean edge"] == expected
 
 
 def test_unknown_ranges_are_called_so() -> None:
-    assert describe(None) == {"trained on": "unknown, the file does not say"}
+    assert describe_conditions(None) == {"trained on": "unknown, the file does not say"}
 
 
 def test_ranges_of_fabrics_have_their_units() -> None:
     trained = Conditions({f"material.{name}": span for name, span in RANGES.items()} | {"material.friction": (1.0, 1.0)}, {})
-    told = describe(trained)
+    told = describe_conditions(trained)
     assert told["trained on material.bending_stiffness"] == "6.3708e-08 to 0.001314 J"
     assert told["trained on material.lame_mu"] == "15909 to 63636 Pa"
     assert told["trained on material.density"] == "0.0434 to 0.7 kg/m²"

@@ -30,7 +30,7 @@ from hood.steppers.watched import (
     force_bound,
     lacking,
 )
-from hood.studies.plan.ablation import Effect, Variant, Window, begin, take_steps
+from hood.studies.plan.ablation import AblationWindow, Effect, Variant, begin, take_steps
 from hood.testing import cylinder
 
 FULL = default_potential()
@@ -53,7 +53,7 @@ def rolled(stepper: Any, scene: Scene, count: int = 5) -> list[Any]:
 def test_the_bound_is_not_below_gamma(names: tuple[str, ...], tank_scene: Scene) -> None:
     full = Variant(NewtonStepper(FULL, TIGHT), FULL, tank_scene)
     reduced = Variant(NewtonStepper(without(*names), TIGHT), without(*names), tank_scene)
-    (one,) = begin(full, [Window(0, "the start")], "paper", lead=1)
+    (one,) = begin(full, [AblationWindow(0, "the start")], "paper", lead=1)
     pos, _ = take_steps(reduced, one, 1, Effect())
     gamma = float(gap(FULL, one.step, pos).gamma)
     assert gamma > 1e-6
@@ -63,7 +63,7 @@ def test_the_bound_is_not_below_gamma(names: tuple[str, ...], tank_scene: Scene)
 def test_a_lone_force_is_worth_what_inertia_gives_it(tank_scene: Scene) -> None:
     """Weight alone: γ of ignoring it is 1, its share of e0, where nothing but inertia resists."""
     full = Variant(NewtonStepper(FULL, TIGHT), FULL, tank_scene)
-    (one,) = begin(full, [Window(0, "the start")], "paper", lead=0)
+    (one,) = begin(full, [AblationWindow(0, "the start")], "paper", lead=0)
     assert force_bound(FULL, ["gravity"], one.step, one.state.pos) == pytest.approx(1.0, rel=1e-5)
     assert force_bound(FULL, ["attachment"], one.step, one.state.pos) == 0.0
 

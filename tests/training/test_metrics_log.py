@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from hood.training.log import MetricsLog, Window
+from hood.training.log import LogWindow, MetricsLog
 
 
 def read(folder: Path) -> list[dict]:
@@ -103,10 +103,10 @@ def test_lines_cut_by_a_kill_are_dropped(tmp_path: Path) -> None:
 
 
 def test_a_window_is_the_mean_of_its_updates() -> None:
-    window = Window()
+    window = LogWindow()
     for value in (1.0, float("nan"), 4.0, 7.0):
         window.add({"loss": value, "horizon": value, "skipped": 2.0})
-    copy = Window()
+    copy = LogWindow()
     copy.load_state_dict(window.state_dict())
     assert window.close() == copy.close() == {"loss": 4.0, "horizon": 7.0, "skipped": 2.0}
     window.add({"loss": 3.0})

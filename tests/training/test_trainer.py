@@ -18,7 +18,7 @@ from hood.assets.motion.sequence import PoseSequence
 from hood.energies.potential import Potential, default_potential
 from hood.energies.self_contact import SignedSelfContactPenalty, for_networks
 from hood.model.features.inputs import Inputs
-from hood.model.network.kernel_choice import Choice
+from hood.model.network.kernel_choice import KernelChoice
 from hood.model.readout.network_step import Feedback
 from hood.model.readout.output import AccelerationOutput
 from hood.steppers.checkpoint import load_simulator
@@ -267,9 +267,9 @@ def test_kernels_are_those_that_train_fastest_here(
 ) -> None:
     assert make(tmp_path, sampler).choice is None  # as named
 
-    def choose(precision: str, width: int, device: torch.device, training: bool) -> Choice:
+    def choose(precision: str, width: int, device: torch.device, training: bool) -> KernelChoice:
         assert (precision, width, device.type, training) == ("bf16", 8, "cpu", True)
-        return Choice("torch", "measured")
+        return KernelChoice("torch", "measured")
 
     monkeypatch.setattr("hood.model.network.kernel_choice.choose_kernels", choose)
     trainer = make(tmp_path, sampler, settings=replace(SETTINGS, kernels="auto", precision="bf16"))

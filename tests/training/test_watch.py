@@ -22,7 +22,7 @@ from hood.training.curriculum import CollisionRamp, Horizon, WarmupCosine
 from hood.training.scenes import SceneSampler
 from hood.training.settings import TrainerSettings
 from hood.training.trainer import Trainer
-from hood.training.watch import Watch
+from hood.training.watch import ValidationWatch
 
 SETTINGS = TrainerSettings(
     iterations=6, batch_size=1, learning_rate=1e-3, schedule=WarmupCosine(3), horizon=Horizon(every=100, maximum=2, start=2),
@@ -109,7 +109,7 @@ def test_validation_does_not_count_as_training(tmp_path: Path, sampler: SceneSam
 
 
 def test_validation_changes_nothing_that_is_learned(tmp_path: Path, sampler: SceneSampler, band_scene: Scene) -> None:
-    watch = Watch(_validation(band_scene, states=0), tmp_path / "watched", pictures=0)
+    watch = ValidationWatch(_validation(band_scene, states=0), tmp_path / "watched", pictures=0)
     watched = make(tmp_path / "watched", sampler, watch)
     plain = Trainer(tiny(), default_potential(), sampler, replace(SETTINGS, validate_every=0), tmp_path / "plain", 0)
     assert watched.run()
@@ -126,7 +126,7 @@ def test_a_strip_of_frames_and_the_figures(tmp_path: Path, band_scene: Scene) ->
     from PIL import Image
 
     model = tiny().eval()
-    watch = Watch(_validation(band_scene, states=1), tmp_path, pictures=4)
+    watch = ValidationWatch(_validation(band_scene, states=1), tmp_path, pictures=4)
     values, strip = watch(model, 1200)
     assert values == watch.validation(model)
     assert {"gap", "strain_p99", "penetration_share", "score"} <= set(values)
@@ -149,7 +149,7 @@ def test_without_picture_libraries_there_is_no_strip_and_one_line(
         raise ImportError("labels on pictures need Pillow")
 
     monkeypatch.setattr("hood.media.film.Film.sheet", missing)
-    watch = Watch(_validation(band_scene, states=0), tmp_path)
+    watch = ValidationWatch(_validation(band_scene, states=0), tmp_path)
     for iteration in (1, 2):
         values, strip = watch(tiny().eval(), iteration)
         assert strip is None

@@ -11,7 +11,7 @@ from scipy.sparse.linalg import factorized
 
 from hood.assets.files.said import install
 from hood.mesh import topology
-from hood.mesh.editing.remeshing import Array, Faces, closest, compact, laplacian, neighbours, vertex_normals
+from hood.mesh.editing.remeshing import Array, Faces, closest, compact, laplacian, neighbours, remesh_normals
 
 _LEAST_LOOP = 12
 
@@ -144,5 +144,5 @@ def push_out(
         if push.max() <= 0:
             break
         spread = push - 0.5 * (laplacian(faces, len(verts)) @ push)
-        verts = verts + np.maximum(push, spread)[:, None] * vertex_normals(verts, faces)
+        verts = verts + np.maximum(push, spread)[:, None] * remesh_normals(verts, faces)
     return verts

@@ -10,7 +10,7 @@ from scipy import sparse
 from scipy.sparse.linalg import factorized
 
 from hood.mesh import topology
-from hood.mesh.editing.remeshing import Array, Faces, compact, vertex_normals
+from hood.mesh.editing.remeshing import Array, Faces, compact, remesh_normals
 from tools.assets.remesh import diffuse
 
 #: Length [m] over which the facing of the cloth is smoothed: a seam is a smooth line.
@@ -28,7 +28,7 @@ def panels(verts: Array, faces: Faces, parts: Sequence[Array] = ()) -> NDArray[n
         parts: vertex values (V,), each negative on one part, a sleeve or a leg, that has panels of its own: a front with two
             legs would fold over itself at the crotch, laid flat.
     """
-    facing = diffuse(vertex_normals(verts, faces)[:, 2:], verts, faces, _SEAM_REACH)[:, 0]
+    facing = diffuse(remesh_normals(verts, faces)[:, 2:], verts, faces, _SEAM_REACH)[:, 0]
     panel = _halves(facing, faces)
     for k, part in enumerate(parts, start=1):
         panel += 2**k * _halves(part, faces)
@@ -95,7 +95,7 @@ def flatten(verts: Array, faces: Faces) -> Array:
     local = _in_their_planes(verts, faces)
     weight = np.maximum(_cotangents(local), _LEAST_WEIGHT)  # (F,3), of the edge opposite to corner k
     plane = verts[:, :2].copy()
-    if (vertex_normals(verts, faces)[:, 2]).mean() < 0:
+    if (remesh_normals(verts, faces)[:, 2]).mean() < 0:
         plane[:, 0] *= -1.0
     first, second = np.roll(faces, -1, axis=1), np.roll(faces, -2, axis=1)
     rows, columns, values = first.ravel(), second.ravel(), weight.ravel()
@@ -112,7 +112,7 @@ def flatten(verts: Array, faces: Faces) -> Array:
         np.add.at(right, first.ravel(), pull.reshape(-1, 2))
         np.subtract.at(right, second.ravel(), pull.reshape(-1, 2))
         plane = np.stack([solve(column) for column in right.T], axis=1)
-    return plane if (vertex_normals(verts, faces)[:, 2]).mean() >= 0 else plane * [-1.0, 1.0]
+    return plane if (remesh_normals(verts, faces)[:, 2]).mean() >= 0 else plane * [-1.0, 1.0]
 
 
 def _in_their_planes(verts: Array, faces: Faces) -> Array:

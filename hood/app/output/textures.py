@@ -12,7 +12,7 @@ from hood.app.settings.compose import ConfigError, plain
 from hood.assets.files.library import unknown
 from hood.assets.formats.image import Texture, read_texture
 from hood.assets.garment.garment import Garment
-from hood.media.pieces import Piece, pieces_by, pieces_of, plain_name
+from hood.media.pieces import GarmentPiece, pieces_by, pieces_of, plain_name
 from hood.rollouts.file.reader import RolloutData
 from hood.rollouts.file.recorder import still_of
 
@@ -60,7 +60,7 @@ def check_worn(textures: Mapping[str, Texture], garment: Garment) -> None:
     _laid_on_all(textures, [pieces_by(garment.name, len(garment.rest_pos), garment.faces, still_of(garment))])
 
 
-def _laid_on_all(textures: Mapping[str, Texture], worn: Sequence[Sequence[Piece]]) -> list[dict[str, Texture]]:
+def _laid_on_all(textures: Mapping[str, Texture], worn: Sequence[Sequence[GarmentPiece]]) -> list[dict[str, Texture]]:
     names = list(dict.fromkeys(piece.name for pieces in worn for piece in pieces))
     for name in textures:
         if name != _EVERY and plain_name(name) not in names:
@@ -69,7 +69,7 @@ def _laid_on_all(textures: Mapping[str, Texture], worn: Sequence[Sequence[Piece]
     return [_laid_on(asked, pieces) for pieces in worn]
 
 
-def _laid_on(textures: Mapping[str, Texture], pieces: Sequence[Piece]) -> dict[str, Texture]:
+def _laid_on(textures: Mapping[str, Texture], pieces: Sequence[GarmentPiece]) -> dict[str, Texture]:
     found = {}
     for piece in pieces:
         texture: Any = textures.get(piece.name, textures.get(_EVERY))

@@ -15,7 +15,7 @@ import numpy as np
 from omegaconf import DictConfig
 
 from hood.app.settings.compose import ConfigError, brief, plain, require_choice
-from hood.assets.contents.sort_out import choose, mend
+from hood.assets.contents.sort_out import mend, take_objects
 from hood.assets.files.said import Doubt
 from hood.assets.fitting.suspicions import suspect_seams
 from hood.assets.formats.mesh_file import mesh_suffixes, read_mesh_file
@@ -51,7 +51,7 @@ def read_garment(name: str, wanted: Wanted, surface: np.ndarray, triangulate: bo
         check_triangles(garment.rest_pos, garment.faces[~twice], str(path))
     _refuse_soup(garment)
     fitting = start_fitting(garment, stitches)
-    choose(fitting, wanted, surface)
+    take_objects(fitting, wanted, surface)
     mend(fitting, wanted, surface)
     check_triangles(fitting.garment.rest_pos, fitting.garment.faces, str(path))
     tell(path, fitting.changes)

@@ -19,7 +19,7 @@ from hood.assets.body.body import body_part
 from hood.assets.files.library import names
 from hood.assets.motion.animated_mesh import body_kind
 from hood.assets.motion.load import HANDS
-from hood.assets.motion.skeleton import UNITS
+from hood.assets.motion.skeleton import TRANSLATION_UNITS
 from hood.scene.body_motion.load import NO_MOTION, MotionOptions, load_motion
 from hood.scene.body_motion.motion import BodyMotion, Motion
 from hood.scene.scene import Scene
@@ -72,7 +72,7 @@ _WORDS = {
     "hands": HANDS,
     "blend_from": ("t", "a"),
     "gender": ("neutral", "male", "female"),
-    "trans_unit": (*UNITS, "auto"),
+    "trans_unit": (*TRANSLATION_UNITS, "auto"),
 }
 
 

@@ -9,8 +9,8 @@ from omegaconf import DictConfig
 
 from hood.app.settings.compose import ConfigError, plain, require_choice
 from hood.assets.body.body import Body
-from hood.assets.fitting.fit_search import CLOSE, Asked, Found, Resized, Wearer, find_placement
-from hood.assets.fitting.placement import UP_AXES, Placement, find_scale, possible, size_ratio, used
+from hood.assets.fitting.fit_search import CLOSE, AskedFit, FoundFit, Resized, Wearer, find_placement
+from hood.assets.fitting.placement import UPWARD, Placement, find_scale, possible, size_ratio, used
 from hood.assets.garment.binding import PosedBody, posed_body
 from hood.assets.garment.garment import Garment
 from hood.assets.motion.sequence_edit import A_POSE_ANGLE, arms_down
@@ -23,19 +23,19 @@ _TURNS = (0, 90, 180, 270)
 _ANGLES = {"tpose": 0.0, "apose": A_POSE_ANGLE}
 
 
-def asked_keys(config: DictConfig) -> Asked:
+def asked_keys(config: DictConfig) -> AskedFit:
     """What ``scale``, ``up``, ``turn`` and ``offset`` of a config fix.
 
     Raises:
         ConfigError: a value of the wrong kind; names the key.
     """
-    require_choice(config, "up", (AUTO, *UP_AXES))
+    require_choice(config, "up", (AUTO, *UPWARD))
     given = {key: plain(config[key]) for key in ("scale", "up", "turn", "offset")}
     if given["turn"] != AUTO and given["turn"] not in _TURNS:
         raise ConfigError(
             f"turn={given['turn']}: give auto or one of {', '.join(map(str, _TURNS))}, degrees about the vertical"
         )
-    return Asked(
+    return AskedFit(
         scale=None if given["scale"] == AUTO else _scale(given["scale"]),
         up=None if given["up"] == AUTO else given["up"],
         turn=None if given["turn"] == AUTO else float(given["turn"]),
@@ -59,14 +59,14 @@ def arm_angle(pose: Any) -> float | None:
     return angle
 
 
-def find_place(garment: Garment, body: Body, betas: np.ndarray, asked: Asked, posed: PosedBody | None) -> Found:
+def find_place(garment: Garment, body: Body, betas: np.ndarray, asked: AskedFit, posed: PosedBody | None) -> FoundFit:
     """The placement of an unbound garment on ``body`` of shape ``betas``, in a pose between T and arms hanging or in ``posed``.
 
     Nothing is searched where everything is asked for.
     """
     given = (asked.scale, asked.up, asked.turn, asked.offset)
     if posed is not None and all(value is not None for value in given):
-        return Found(_as_asked(asked), 0.0, 1.0)
+        return FoundFit(_as_asked(asked), 0.0, 1.0)
     if posed is not None:
         wearer = _statue(posed.surface, body.faces)
     else:
@@ -74,7 +74,7 @@ def find_place(garment: Garment, body: Body, betas: np.ndarray, asked: Asked, po
     return find_placement(garment.rest_pos, garment.faces, wearer, asked)
 
 
-def find_place_on_mesh(garment: Garment, motion: MeshMotion, asked: Asked) -> Found | None:
+def find_place_on_mesh(garment: Garment, motion: MeshMotion, asked: AskedFit) -> FoundFit | None:
     """The placement of an unbound garment on a mesh as it stands in its first frame, or in its rest pose where that is closer.
 
     None where nothing is searched and the garment stays where it is: a sheet has no place on a body, and a mesh larger than
@@ -83,14 +83,14 @@ def find_place_on_mesh(garment: Garment, motion: MeshMotion, asked: Asked) -> Fo
     surfaces = [motion.points(0)] + ([] if motion.sequence.rest is None else [motion.sequence.rest])
     if garment.bound or not wearable(garment) or float(np.ptp(surfaces[0], axis=0).max()) > _LARGEST_BODY:
         return None
-    best: Found | None = None
+    best: FoundFit | None = None
     for surface in surfaces:
         found = find_placement(garment.worn_pos, garment.faces, _statue(surface, motion.faces), asked)
         best = found if best is None or _rank(found) < _rank(best) else best
     return best
 
 
-def _rank(found: Found) -> tuple[bool, bool, float]:
+def _rank(found: FoundFit) -> tuple[bool, bool, float]:
     """What lies around one surface where it is stays there, unless it fits another closely."""
     return found.refusal is not None, not found.worn and found.misfit > CLOSE, found.misfit
 
@@ -114,7 +114,7 @@ def unit_alone(garment: Garment, body: Body, betas: np.ndarray) -> str | None:
     units = possible(used(garment.rest_pos, garment.faces), body.shaped(betas)[0])
     if len(units) != 1 or units[0] == 1.0:
         return None
-    found = find_place(garment, body, betas, Asked(scale=units[0]), None)
+    found = find_place(garment, body, betas, AskedFit(scale=units[0]), None)
     place = found.placement
     stays = place.up == "y" and place.turn == 0 and not place.offset.any()
     return place.keys()[0] if stays and found.refusal is None and found.resized is None else None
@@ -126,7 +126,7 @@ def explain_unplaced(unit: str | None) -> str:
     return f"{enough}give the body that it was made for (body=…, betas=…), or scale, up, turn, offset and pose"
 
 
-def keep_place(garment: Garment, surface: np.ndarray, asked: Asked) -> Placement:
+def keep_place(garment: Garment, surface: np.ndarray, asked: AskedFit) -> Placement:
     """The placement of a bound garment: it stays where its binding has it, but for what is asked and its unit.
 
     Raises:
@@ -139,10 +139,10 @@ def keep_place(garment: Garment, surface: np.ndarray, asked: Asked) -> Placement
         raise ValueError(
             f"{garment.name}: {ratio:.3g} times the body's height fits no unit; give scale=FACTOR, metres per unit"
         )
-    return _as_asked(Asked(scale, asked.up, asked.turn, asked.offset))
+    return _as_asked(AskedFit(scale, asked.up, asked.turn, asked.offset))
 
 
-def _as_asked(asked: Asked) -> Placement:
+def _as_asked(asked: AskedFit) -> Placement:
     offset = np.zeros(3) if asked.offset is None else asked.offset
     return Placement(asked.scale or 1.0, asked.up or "y", asked.turn or 0.0, offset)
 

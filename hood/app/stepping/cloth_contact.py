@@ -22,14 +22,14 @@ from hood.mesh import cloth_proximity
 from hood.native.build import BuildError
 from hood.solver.step_figures import LAYER_METRICS
 
-CHOICES = ("auto", "on", "off", "layers")
+_CHOICES = ("auto", "on", "off", "layers")
 #: Contact of the published code, which has none of cloth with cloth. A subclass is somebody's own.
 PUBLISHED = (CentroidCollision, WeightFriction, CodedFriction)
 
 
 def check_cloth_contact(config: DictConfig) -> None:
     """Raise ConfigError where the key asks for what the other keys rule out."""
-    require_choice(config, "cloth_contact", CHOICES)
+    require_choice(config, "cloth_contact", _CHOICES)
     if not float(config.cloth_friction) >= 0.0:
         raise ConfigError(f"cloth_friction={config.cloth_friction}: give a coefficient of at least 0; 0 for none")
     if str(config.cloth_contact) in ("on", "layers"):

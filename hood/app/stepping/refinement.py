@@ -30,7 +30,7 @@ from hood.steppers.stopping import (
 REFINEMENT_KEYS = ("refine", "target_rg", "budget_ms", "max_strain")
 #: ``refine=auto``: as the garment's size needs (:mod:`hood.app.stepping.automatic`).
 AUTO = "auto"
-COLOURS = ("none", "strain", "rg", "contact")
+_COLOURS = ("none", "strain", "rg", "contact")
 _BEGIN_FROM_TABLE = ("budget_ms", "max_strain")
 #: An iteration in units of a frame without any, where none was taken: 0.3 of garments of 1,000 to 4,000 vertices; and how
 #: much more than the median frame is given.
@@ -70,7 +70,7 @@ def check_refinement(config: DictConfig) -> None:
     """Raise ConfigError where what is said about refinement, export and colour does not fit together."""
     asked = chosen(config)
     require_choice(config, "refine_method", METHODS)
-    require_choice(config, "colour", COLOURS)
+    require_choice(config, "colour", _COLOURS)
     if config.colour == "contact" and config.body == "none":
         raise ConfigError("colour=contact shows the distance from the body, and body=none has none; choose colour=strain")
     exported(config)

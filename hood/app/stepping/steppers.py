@@ -19,7 +19,7 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from hood.app.common import UNTRAINED, read_model, require_same_model, use_arithmetic, weigh
+from hood.app.common import UNTRAINED, load_stepper, require_same_model, use_arithmetic, weigh
 from hood.app.settings.compose import ConfigError, build, load_config, options, plain
 from hood.assets.files.library import locate
 from hood.energies.potential import Potential
@@ -180,7 +180,7 @@ def make_network(
         digest = UNTRAINED
     else:
         path = locate("weights", checkpoint)
-        simulator = read_model(path, float(config.fps))
+        simulator = load_stepper(path, float(config.fps))
         if model is not None:
             require_same_model(path, simulator, build(model), way_out)
         digest = hashlib.sha256(path.read_bytes()).hexdigest()

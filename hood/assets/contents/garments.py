@@ -13,9 +13,9 @@ from scipy.spatial import cKDTree
 
 from hood.assets.contents.objects import OPENING
 from hood.assets.garment.garment import Garment
-from hood.assets.garment.record import Fitting, Wanted, names_of, own_names
+from hood.assets.garment.record import Fitting, Wanted, names_of_parts, own_names
 from hood.mesh.editing.seams import find_rims, ways_out
-from hood.mesh.parts import Part, find_parts, rim_length
+from hood.mesh.parts import MeshPart, find_parts, rim_length
 
 #: Lengths of two rims of one cut differ by at most this share.
 _ALIKE = 0.15
@@ -34,7 +34,7 @@ class Gap(NamedTuple):
     widest: float  # m
 
 
-def find_gaps(pos: np.ndarray, faces: np.ndarray, parts: list[Part]) -> list[Gap]:
+def find_gaps(pos: np.ndarray, faces: np.ndarray, parts: list[MeshPart]) -> list[Gap]:
     """Gaps between ``parts`` of the mesh ``pos`` (V, 3) [m], ``faces`` (F, 3) that can be worn by themselves."""
     ways = ways_out(pos, find_rims(faces))
     rims = [
@@ -83,7 +83,7 @@ def tell_apart(fitting: Fitting, wanted: Wanted, scale: float) -> None:
     parts = find_parts(scale * garment.rest_pos, garment.faces)
     if len(parts) < 2:
         return
-    names = names_of(garment, parts)
+    names = names_of_parts(garment, parts)
     area = {name: sum(part.area for part, own in zip(parts, names, strict=True) if own == name) for name in names}
     large = [name for name in area if area[name] >= _LEAST * max(area.values())]
     if len(large) < 2 or len(large) > _MOST:
@@ -112,7 +112,7 @@ def tell_apart(fitting: Fitting, wanted: Wanted, scale: float) -> None:
     fitting.guess("garments", len(large), what, fix, names=large)
 
 
-def _refuse_cut_apart(garment: Garment, parts: list[Part], names: list[str], scale: float) -> None:
+def _refuse_cut_apart(garment: Garment, parts: list[MeshPart], names: list[str], scale: float) -> None:
     unnamed = [row for row, own in enumerate(own_names(garment, parts)) if own is None]
     found = find_gaps(scale * garment.rest_pos, garment.faces, [parts[row] for row in unnamed])
     gaps = [(gap, *(names[unnamed[row]] for row in gap.parts)) for gap in found]

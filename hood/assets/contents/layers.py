@@ -10,7 +10,7 @@ from hood.assets.contents.objects import SMALL, THICKEST
 from hood.assets.fitting.alterations import drop_faces
 from hood.assets.garment.record import Fitting
 from hood.mesh.editing.shells import find_shell, paired_sheet, same_sheet
-from hood.mesh.parts import Part, find_parts
+from hood.mesh.parts import MeshPart, find_parts
 
 #: Copies of a sheet lie on it within this share of its size.
 _COPY = 1e-6
@@ -60,7 +60,7 @@ def to_one_layer(fitting: Fitting, scale: float) -> None:
     fitting.guess("layers", int(dropped.sum()), f"the file shows {text}", _KEEP, thickness=max(apart))
 
 
-def _tell_closed(fitting: Fitting, parts: list[Part], dropped: np.ndarray) -> None:
+def _tell_closed(fitting: Fitting, parts: list[MeshPart], dropped: np.ndarray) -> None:
     """Say which large parts are closed and stay so."""
     largest = max(part.area for part in parts)
     closed = [part for part in parts if part.closed and part.extent > SMALL and part.area > _LARGE * largest]
@@ -80,7 +80,7 @@ def _range(thick: list[float]) -> str:
 _Layers = tuple[np.ndarray, np.ndarray, float]
 
 
-def _shells(pos: np.ndarray, faces: np.ndarray, parts: list[Part]) -> list[_Layers]:
+def _shells(pos: np.ndarray, faces: np.ndarray, parts: list[MeshPart]) -> list[_Layers]:
     """Those of closed parts."""
     found: list[_Layers] = []
     for part in parts:
@@ -91,7 +91,7 @@ def _shells(pos: np.ndarray, faces: np.ndarray, parts: list[Part]) -> list[_Laye
     return found
 
 
-def _pairs(pos: np.ndarray, faces: np.ndarray, parts: list[Part]) -> list[_Layers]:
+def _pairs(pos: np.ndarray, faces: np.ndarray, parts: list[MeshPart]) -> list[_Layers]:
     """Those of two open parts, one the other's lining and of its make."""
     found: list[_Layers] = []
     open_ones = [part for part in parts if not part.closed]
@@ -103,13 +103,13 @@ def _pairs(pos: np.ndarray, faces: np.ndarray, parts: list[Part]) -> list[_Layer
     return found
 
 
-def _near(parts: list[Part]) -> list[tuple[Part, Part]]:
+def _near(parts: list[MeshPart]) -> list[tuple[MeshPart, MeshPart]]:
     """Pairs whose boxes are about the same, or one in the other."""
     if len(parts) > _MOST:
         return []
     return [(one, other) for one, other in combinations(parts, 2) if _holds(one, other) or _holds(other, one)]
 
 
-def _holds(one: Part, other: Part) -> bool:
+def _holds(one: MeshPart, other: MeshPart) -> bool:
     spare = THICKEST + 1e-3 * one.extent
     return bool((other.low >= one.low - spare).all() and (other.high <= one.high + spare).all())

@@ -9,14 +9,14 @@ import numpy as np
 from hood.assets.files.guarded import listed
 from hood.assets.files.text import meant
 from hood.assets.fitting.alterations import drop_faces
-from hood.assets.fitting.placement import UNITS
+from hood.assets.fitting.placement import LENGTH_UNITS
 from hood.assets.fitting.suspicions import body_of
 from hood.assets.formats.mesh_file import parts_by_name
 from hood.assets.garment.binding import signed_distances
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.record import Fitting
 from hood.mesh.editing.shells import find_shell
-from hood.mesh.parts import Part, find_parts, part_labels, rim_length
+from hood.mesh.parts import MeshPart, find_parts, part_labels, rim_length
 
 #: An object has at most so much [share] of its faces elsewhere than in the parts that it is made of.
 _WHOLE = 0.99
@@ -66,7 +66,7 @@ def seems(pos: np.ndarray, faces: np.ndarray, surface: np.ndarray) -> str:
     return largest if len(parts) == 1 else f"{len(parts)} parts, the largest {largest}"
 
 
-def _seems_part(pos: np.ndarray, faces: np.ndarray, part: Part) -> str:
+def _seems_part(pos: np.ndarray, faces: np.ndarray, part: MeshPart) -> str:
     if part.closed and part.extent <= SMALL:
         return "a small thing such as a button"
     if part.closed:
@@ -76,7 +76,7 @@ def _seems_part(pos: np.ndarray, faces: np.ndarray, part: Part) -> str:
     return f"cloth with {openings} openings" if openings > 1 else "a sheet"
 
 
-def num_openings(pos: np.ndarray, part: Part) -> int:
+def num_openings(pos: np.ndarray, part: MeshPart) -> int:
     """Rims of a part that are long enough to put something on by."""
     return sum(rim_length(pos, rim) >= OPENING for rim in part.rims)
 
@@ -147,7 +147,7 @@ def _candidates(garment: Garment) -> dict[str, np.ndarray]:
 def _is_body(pos: np.ndarray, faces: np.ndarray, surface: np.ndarray, height: float) -> bool:
     """Whether a mesh is a body in some unit, eyes and teeth of its own aside."""
     size = float(np.ptp(pos[faces].reshape(-1, 3), axis=0).max())
-    unit = min(UNITS, key=lambda unit: abs(np.log(max(unit * size, 1e-12) / height)))  # a body is as large as a body
+    unit = min(LENGTH_UNITS, key=lambda unit: abs(np.log(max(unit * size, 1e-12) / height)))  # a body is as large as a body
     if not 0.5 * height < unit * size < 2.0 * height or size < _LARGE * float(np.ptp(pos, axis=0).max()):
         return False
     largest = max(find_parts(pos, faces), key=lambda part: part.area)

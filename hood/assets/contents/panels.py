@@ -13,7 +13,7 @@ from hood.assets.garment.garment import Garment
 from hood.assets.garment.record import SEAM, THREAD, Fitting, Wanted, own_names
 from hood.mesh.editing import repair
 from hood.mesh.editing.seams import Cut, Facing, Rims, Seam, along, along_corners, cut_edges, find_facing, find_rims
-from hood.mesh.parts import Part, find_parts, part_labels, rim_length
+from hood.mesh.parts import MeshPart, find_parts, part_labels, rim_length
 from hood.mesh.topology import unique_edges
 
 #: Two worn parts without names are one that was cut where so much [share] of the shorter rim lies along the other one, and so
@@ -91,7 +91,7 @@ def _pieces(count: int) -> str:
 class _Pieces:
     """Which parts of a file are pieces of one garment."""
 
-    def __init__(self, pos: np.ndarray, garment: Garment, parts: list[Part], asked: bool) -> None:
+    def __init__(self, pos: np.ndarray, garment: Garment, parts: list[MeshPart], asked: bool) -> None:
         self._named = [name is not None for name in own_names(garment, parts)]
         self._worn = [num_openings(pos, part) >= 2 or _is_bag(pos, part) for part in parts]
         self._asked, self._several = asked, len(parts) > 1
@@ -109,7 +109,7 @@ class _Pieces:
         return not (self._named[one] and self._named[other]) and cut
 
 
-def _is_bag(pos: np.ndarray, part: Part) -> bool:
+def _is_bag(pos: np.ndarray, part: MeshPart) -> bool:
     return len(part.rims) == 1 and 4.0 * np.pi * part.area >= _BAG * rim_length(pos, part.rims[0]) ** 2
 
 

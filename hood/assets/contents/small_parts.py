@@ -12,7 +12,7 @@ from hood.assets.fitting.alterations import drop_faces
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.record import Fitting, Wanted
 from hood.mesh.closest_point.search import SurfaceHit, search_surface
-from hood.mesh.parts import Part, Riders, clusters, find_parts, join_riders, rigid_anchors
+from hood.mesh.parts import MeshPart, Riders, clusters, find_parts, join_riders, rigid_anchors
 
 #: A thing is on the cloth if it is no farther off than this [m]; things no farther apart than the second are one, which is no
 #: larger than the third; larger ones, such as belts, bend with the cloth.
@@ -29,14 +29,14 @@ _NAMED = 3
 class _Kinds:
     """The parts of a file by what becomes of them."""
 
-    cloth: list[Part]
-    rigid: list[Part]  # closed ones, small
-    bent: list[Part]  # closed ones that are long: belts, cords
-    sheets: list[Part]  # pockets, labels
-    off: list[Part]  # closed ones that lie on no cloth
+    cloth: list[MeshPart]
+    rigid: list[MeshPart]  # closed ones, small
+    bent: list[MeshPart]  # closed ones that are long: belts, cords
+    sheets: list[MeshPart]  # pockets, labels
+    off: list[MeshPart]  # closed ones that lie on no cloth
 
     @property
-    def riding(self) -> list[Part]:
+    def riding(self) -> list[MeshPart]:
         return [*self.rigid, *self.bent, *self.sheets]
 
 
@@ -75,14 +75,14 @@ def _sorted(pos: np.ndarray, faces: np.ndarray, fastened: np.ndarray) -> _Kinds:
         bends = part.extent > _RIGID and float((dist <= _AROUND).mean()) >= _LYING
         lies = part.extent <= _RIGID and dist.min() <= _ON
         (found.bent if bends else found.rigid if lies else found.off).append(part)
-    loose: list[Part] = []
+    loose: list[MeshPart] = []
     for part, dist in zip(few, _distances(pos, faces, cloth, few), strict=True):
         (found.sheets if (dist <= _NEAR).mean() >= _LYING else loose).append(part)
     cloth.extend(loose)
     return found
 
 
-def _distances(pos: np.ndarray, faces: np.ndarray, cloth: list[Part], parts: list[Part]) -> list[np.ndarray]:
+def _distances(pos: np.ndarray, faces: np.ndarray, cloth: list[MeshPart], parts: list[MeshPart]) -> list[np.ndarray]:
     """Of every part the distances [m] of its vertices from the cloth."""
     if not parts:
         return []
@@ -90,7 +90,7 @@ def _distances(pos: np.ndarray, faces: np.ndarray, cloth: list[Part], parts: lis
     return np.split(found, np.cumsum([len(part.vertices) for part in parts])[:-1])
 
 
-def _below(pos: np.ndarray, faces: np.ndarray, cloth: list[Part], vertices: np.ndarray) -> SurfaceHit:
+def _below(pos: np.ndarray, faces: np.ndarray, cloth: list[MeshPart], vertices: np.ndarray) -> SurfaceHit:
     """Where vertices (n,) are nearest to the cloth; its faces count along those of all its parts, in their order."""
     table = torch.as_tensor(faces[np.concatenate([one.faces for one in cloth])])
     none = torch.zeros(max(len(pos), len(table)), dtype=torch.int64)
@@ -118,20 +118,20 @@ def _riders(garment: Garment, kinds: _Kinds, scale: float) -> Riders | None:
     return join_riders(found, [0] * len(found), [0] * len(found))
 
 
-def _things(pos: np.ndarray, parts: list[Part]) -> list[list[Part]]:
+def _things(pos: np.ndarray, parts: list[MeshPart]) -> list[list[MeshPart]]:
     """Parts that touch are one thing, as a buckle and its pin; the teeth of a zipper, which all touch, are not."""
     if not parts:
         return []
     label = clusters([pos[part.vertices] for part in parts], _ONE)
     things = [[part for part, own in zip(parts, label, strict=True) if own == number] for number in np.unique(label)]
-    split: list[list[Part]] = []
+    split: list[list[MeshPart]] = []
     for thing in things:
         box = np.max([part.high for part in thing], axis=0) - np.min([part.low for part in thing], axis=0)
         split += [thing] if box.max() <= _RIGID else [[part] for part in thing]
     return split
 
 
-def _group(garment: Garment, parts: list[Part], anchors: np.ndarray, of_anchor: np.ndarray, of_rider: np.ndarray) -> Riders:
+def _group(garment: Garment, parts: list[MeshPart], anchors: np.ndarray, of_anchor: np.ndarray, of_rider: np.ndarray) -> Riders:
     vertices = np.concatenate([part.vertices for part in parts])
     rows = np.concatenate([part.faces for part in parts])
     order = np.argsort(vertices)
@@ -168,15 +168,15 @@ def _note(fitting: Fitting, kinds: _Kinds, wanted: Wanted, pos: np.ndarray) -> N
         fitting.guess("off_cloth", len(kinds.off), what, fix)
 
 
-def _count(parts: list[Part], noun: str) -> str:
+def _count(parts: list[MeshPart], noun: str) -> str:
     return f"{len(parts)} {noun}{'s' if len(parts) > 1 else ''}"
 
 
-def _places(parts: list[Part]) -> str:
+def _places(parts: list[MeshPart]) -> str:
     """Which parts they are and where their middles lie [m], of the first few."""
     named = [f"{part_name(part)} at {np.round(0.5 * (part.low + part.high), 2).tolist()} m" for part in parts[:_NAMED]]
     return ", ".join(named) + (f" and {len(parts) - _NAMED} more" if len(parts) > _NAMED else "")
 
 
-def part_name(part: Part) -> str:
+def part_name(part: MeshPart) -> str:
     return f"part {part.number} of {len(part.vertices)} vertices"

@@ -30,7 +30,7 @@ def metres_per_unit(pos: np.ndarray, faces: np.ndarray, surface: np.ndarray) -> 
     return next(iter(possible(used(pos, faces), surface)), 1.0) if found is None else found
 
 
-def choose(fitting: Fitting, wanted: Wanted, surface: np.ndarray) -> None:
+def take_objects(fitting: Fitting, wanted: Wanted, surface: np.ndarray) -> None:
     """Leave out what is not the garment: objects that are not wanted, a body beside it, faces that are there twice.
 
     Args:
@@ -55,7 +55,7 @@ def mend(fitting: Fitting, wanted: Wanted, surface: np.ndarray | None, open_edge
     elsewhere than they rest, and outfits have been through this.
 
     Args:
-        surface: as of :func:`choose`; None: the garment is in metres.
+        surface: as of :func:`take_objects`; None: the garment is in metres.
         open_edges: vertices of the file, in any shape, that nothing is to be sewn to, such as those along a zipper.
     """
     garment = fitting.garment

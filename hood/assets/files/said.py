@@ -65,7 +65,7 @@ def install(extra: str) -> str:
 _FIRST, _BETWEEN = 5.0, 10.0
 
 
-class Progress:
+class Said:
     """Tells how far a piece of work is.
 
     Args:

@@ -99,14 +99,14 @@ def encoding_of(content: bytes) -> str:
     return "utf-8"
 
 
-def decoded(content: bytes) -> str:
+def decoded_text_file(content: bytes) -> str:
     """The text of a file's bytes, see :func:`encoding_of`, without its mark; bytes that mean nothing there become one sign."""
     return content.decode(encoding_of(content), errors="replace")
 
 
 def read_text(path: Path) -> str:
     """The text of a file, whatever it is encoded in."""
-    return decoded(path.read_bytes())
+    return decoded_text_file(path.read_bytes())
 
 
 _LIST_LIMIT = 64 << 20

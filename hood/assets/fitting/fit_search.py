@@ -1,8 +1,9 @@
 """Where an unbound garment belongs: units, up axis, facing, place and arm angle of its body, searched together.
 
 Every combination of unit, up axis and quarter turn is tried at all translations at once around a few poses (correlation with a
-:class:`~hood.assets.fitting.skin_field.Field`); the best are settled by reweighted least squares, then over the angle of the
-arms. The winner is named only if it is close, surrounds the body, and no different placement is about as close. Deterministic.
+:class:`~hood.assets.fitting.skin_field.SkinField`); the best are settled by reweighted least squares, then over the angle of
+the arms. The winner is named only if it is close, surrounds the body, and no different placement is about as close.
+Deterministic.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hood.assets.fitting.placement import UP_AXES, Placement, Surrounding, find_scale, possible, size_ratio, surrounds, used
-from hood.assets.fitting.skin_field import WIDTH, Field, Size, Skin, find_size, misfit, settle, sleeve_misfit
+from hood.assets.fitting.placement import UPWARD, Placement, Surrounding, find_scale, possible, size_ratio, surrounds, used
+from hood.assets.fitting.skin_field import WIDTH, Size, Skin, SkinField, find_size, misfit, settle_field, sleeve_misfit
 from hood.assets.fitting.worn import lies_in_place
 
 #: Angles [degrees] of the arms around which all translations are tried, the steps of the finer search, and the greatest.
@@ -57,7 +58,7 @@ _SMALL, _ASIDE = 0.3, 0.15
 
 
 @dataclass(frozen=True)
-class Asked:
+class AskedFit:
     """What the user fixed; None: to be found."""
 
     scale: float | None = None
@@ -74,7 +75,7 @@ class Resized(NamedTuple):
     gain: float  # of the misfit, both at the clearance that suits them best
 
 
-class Found(NamedTuple):
+class FoundFit(NamedTuple):
     """The answer of a search."""
 
     placement: Placement
@@ -103,7 +104,7 @@ class Wearer:
     ) -> None:
         self.faces, self.angles = faces, angles
         self.skin = lru_cache(maxsize=None)(lambda angle: Skin(surface_at(angle), faces))
-        self.field = lru_cache(maxsize=None)(lambda angle: Field(self.skin(angle)))
+        self.field = lru_cache(maxsize=None)(lambda angle: SkinField(self.skin(angle)))
 
     @cached_property
     def upper_arms(self) -> np.ndarray:
@@ -123,18 +124,18 @@ class Wearer:
         return np.asarray(np.linalg.norm(self.skin(_LOWERED).points - self.skin(0.0).points, axis=1))
 
 
-def find_placement(pos: np.ndarray, faces: np.ndarray, wearer: Wearer, asked: Asked | None = None) -> Found:
+def find_placement(pos: np.ndarray, faces: np.ndarray, wearer: Wearer, asked: AskedFit | None = None) -> FoundFit:
     """The placement of the garment ``pos`` (V, 3), in units of its file, with ``faces`` (F, 3), on ``wearer``.
 
     A file that fits as it is, stays as it is. So does one that lies around the body, unless it fits closely elsewhere; with
     its unit alone asked for, it stays there in any case. Where no answer can be trusted, ``refusal`` says why.
     """
-    search = _Search(pos, faces, wearer, asked or Asked())
+    search = _Search(pos, faces, wearer, asked or AskedFit())
     if len(search.many) == 0:
-        return Found(_NOWHERE, 1.0, 0.0, "no face has an area; nothing is left of the garment")
+        return FoundFit(_NOWHERE, 1.0, 0.0, "no face has an area; nothing is left of the garment")
     if not search.scales:
         what = f"it is {search.ratio:.3g} times the body's height, which fits no unit; give scale=FACTOR, metres per unit"
-        return Found(_NOWHERE, 1.0, 0.0, what)
+        return FoundFit(_NOWHERE, 1.0, 0.0, what)
     candidates = _distinct([search.settled(start) for start in search.starts()], search.many)
     bests = [next((c for c in candidates if c.placement.scale == scale), None) for scale in search.scales]
     chosen = [c for i, c in enumerate(candidates) if i < _REFINED or any(c is best for best in bests)]
@@ -158,7 +159,7 @@ class _Search:
     pos: np.ndarray
     faces: np.ndarray
     wearer: Wearer
-    asked: Asked
+    asked: AskedFit
 
     def __post_init__(self) -> None:
         self.few, self.many, self.most = (_samples(self.pos, self.faces, count) for count in (_FEW, _MANY, _MOST))
@@ -169,7 +170,7 @@ class _Search:
 
     def starts(self) -> list[Placement]:
         """The best placements by correlation, those of usual size first."""
-        ups = list(UP_AXES) if self.asked.up is None else [self.asked.up]
+        ups = list(UPWARD) if self.asked.up is None else [self.asked.up]
         turns = [0.0, 90.0, 180.0, 270.0] if self.asked.turn is None else [self.asked.turn]
         found = []
         for scale, up, turn, angle in product(self.scales, ups, turns, self.wearer.angles):
@@ -258,24 +259,24 @@ class _Search:
             return None
         offset = np.zeros(3) if asked.offset is None else asked.offset
         start = Placement(asked.scale or 1.0, asked.up or "y", asked.turn or 0.0, offset, self.wearer.angles[0])
-        search = _Search(self.pos, self.faces, self.wearer, Asked(start.scale, start.up, start.turn, offset))
+        search = _Search(self.pos, self.faces, self.wearer, AskedFit(start.scale, start.up, start.turn, offset))
         stay = search.with_angle(search._judged(start))
         if best.misfit <= CLOSE and best.placement.angle != stay.placement.angle:
             stay = min(stay, search._judged(replace(start, angle=best.placement.angle)), key=lambda c: c.misfit)
         return stay if usual or self._worn(stay) else None
 
-    def decided(self, ranked: list[_Candidate], stay: _Candidate | None) -> Found:
+    def decided(self, ranked: list[_Candidate], stay: _Candidate | None) -> FoundFit:
         """The best candidate, or the file as it is; and whether that can be trusted."""
         best = ranked[0]
         if stay is not None and _same(stay, best, self.many, 10 * _SAME) and stay.misfit <= best.misfit + _STAY:
             best = stay
         rivals = [c for c in ranked[1:] if c.odd <= best.odd and not _same(c, best, self.many, _SAME)]
         rival = min(rivals, key=lambda c: c.misfit, default=None)
-        found = Found(best.placement, best.misfit, 1.0 - best.misfit if rival is None else rival.misfit - best.misfit)
+        found = FoundFit(best.placement, best.misfit, 1.0 - best.misfit if rival is None else rival.misfit - best.misfit)
         refusal = self._doubt(best, rival, best is stay) or self._too_small(best, ranked)
         if stay is not None and (best is stay or refusal is not None or self._may_stay(best)) and self._worn(stay):
             margin = found.margin if best is stay else 0.0
-            return Found(stay.placement, stay.misfit, margin, worn=True)
+            return FoundFit(stay.placement, stay.misfit, margin, worn=True)
         return found._replace(refusal=refusal)
 
     def _may_stay(self, best: _Candidate) -> bool:
@@ -285,7 +286,7 @@ class _Search:
         unit_alone = asked.scale is not None and asked.up is None and asked.turn is None and asked.offset is None
         return unit_alone or best.misfit > CLOSE
 
-    def with_size(self, found: Found, ranked: list[_Candidate]) -> Found:
+    def with_size(self, found: FoundFit, ranked: list[_Candidate]) -> FoundFit:
         """``found`` with the sizes that fit, and the place in another size where that explains the garment clearly better."""
         if self.asked.scale is not None:
             return found
@@ -401,7 +402,7 @@ class _Search:
         if self.asked.offset is not None:
             return start
         for width in widths:
-            step = settle(start.apply(points), self.wearer.skin(start.angle), width, rounds)
+            step = settle_field(start.apply(points), self.wearer.skin(start.angle), width, rounds)
             start = replace(start, offset=start.offset + step)
         return start
 

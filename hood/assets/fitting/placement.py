@@ -25,7 +25,7 @@ _LEAST_ROUND = 0.3
 _LOOKED_AT = 4000
 
 #: Rotations (3, 3) that turn the up axis of a file to y.
-UP_AXES = {axis: axes.UP_AXES[axis] for axis in ("y", "z", "x")}
+UPWARD = {axis: axes.UP_AXES[axis] for axis in ("y", "z", "x")}
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Placement:
     @property
     def rotation(self) -> np.ndarray:
         """(3, 3) from the axes of the file to those of the body; exact for quarter turns."""
-        return np.asarray(np.round(Rotation.from_euler("y", self.turn, degrees=True).as_matrix(), 15) @ UP_AXES[self.up])
+        return np.asarray(np.round(Rotation.from_euler("y", self.turn, degrees=True).as_matrix(), 15) @ UPWARD[self.up])
 
     def apply(self, pos: np.ndarray) -> np.ndarray:
         """``pos`` (V, 3), in units of the file, on the body [m]."""
@@ -104,7 +104,7 @@ def inward_share(pos: np.ndarray, faces: np.ndarray, surface: np.ndarray, body_f
 
 
 #: Metres per unit of files, by name.
-UNITS = {1.0: "metres", 0.1: "decimetres", 0.0254: "inches", 0.01: "centimetres", 0.001: "millimetres"}
+LENGTH_UNITS = {1.0: "metres", 0.1: "decimetres", 0.0254: "inches", 0.01: "centimetres", 0.001: "millimetres"}
 #: Metres per unit of the file that are tried when metres do not fit.
 _FACTORS = {0.01: "centimetres", 0.001: "millimetres"}
 #: Diagonals taken as they are, in body heights: from a baby's sock to a bridal train.
@@ -137,8 +137,8 @@ def find_scale(pos: np.ndarray, body_pos: np.ndarray) -> float | None:
 def possible(pos: np.ndarray, body_pos: np.ndarray) -> list[float]:
     """Units in which a garment ``pos`` (V, 3) has a usual size beside ``body_pos`` (W, 3); where none, a possible one."""
     ratio = size_ratio(pos, body_pos)
-    usual = [unit for unit in UNITS if _USUAL[0] <= ratio * unit < _USUAL[1]]
-    return usual or [unit for unit in UNITS if _POSSIBLE[0] <= ratio * unit <= _POSSIBLE[1]]
+    usual = [unit for unit in LENGTH_UNITS if _USUAL[0] <= ratio * unit < _USUAL[1]]
+    return usual or [unit for unit in LENGTH_UNITS if _POSSIBLE[0] <= ratio * unit <= _POSSIBLE[1]]
 
 
 def require_metres(pos: np.ndarray, body_pos: np.ndarray, name: str) -> None:
@@ -154,9 +154,9 @@ def require_metres(pos: np.ndarray, body_pos: np.ndarray, name: str) -> None:
     if not fitting:
         raise ValueError(f"{size}; scale it to metres, hood prepare garment=… scale=FACTOR")
     if len(fitting) > 1:
-        units = " or ".join(f"{UNITS[unit]} (scale={unit:g})" for unit in fitting)
+        units = " or ".join(f"{LENGTH_UNITS[unit]} (scale={unit:g})" for unit in fitting)
         raise ValueError(f"{size}: it may be in {units}; hood prepare garment=… finds out which fits, hood inspect says it")
     (unit,) = fitting
     raise ValueError(
-        f"{size}: it is in {UNITS[unit]}; multiply it by {unit:g}, hood prepare garment=… scale={unit:g} (or auto)"
+        f"{size}: it is in {LENGTH_UNITS[unit]}; multiply it by {unit:g}, hood prepare garment=… scale={unit:g} (or auto)"
     )

@@ -42,7 +42,7 @@ _DEEP, _DEEP_COST = -0.01, 1.0
 _PLANE = 0.04
 
 
-class Measured(NamedTuple):
+class _Measured(NamedTuple):
     """Signed distances to a skin and its outward directions."""
 
     dist: np.ndarray  # (N,) m, negative inside
@@ -65,7 +65,7 @@ class Skin:
         self.surface, self.faces = surface, faces
         self._tree = cKDTree(self.points, leafsize=32, balanced_tree=False, compact_nodes=False)
 
-    def measure(self, points: np.ndarray) -> Measured:
+    def measure(self, points: np.ndarray) -> _Measured:
         """Signed distances of ``points`` (N, 3), to a millimetre or two near the skin."""
         far, index = self._tree.query(points, workers=1)
         offset = points - self.points[index]
@@ -73,20 +73,20 @@ class Skin:
         near = far < _PLANE
         sign = np.where(along < 0, -1.0, 1.0)
         normal = np.where(near[:, None], self.normals[index], sign[:, None] * offset / np.maximum(far, 1e-9)[:, None])
-        return Measured(np.where(near, along, sign * far), normal, index)
+        return _Measured(np.where(near, along, sign * far), normal, index)
 
 
-def misfit(measured: Measured, width: float = WIDTH, clearance: float = _CLEARANCE) -> float:
+def misfit(measured: _Measured, width: float = WIDTH, clearance: float = _CLEARANCE) -> float:
     """Mean cost of the points, 0: all of them at the clearance of worn cloth, 1: none near it or all inside."""
     return float(_cost(_error(measured, clearance), width).mean())
 
 
-def sleeve_misfit(measured: Measured) -> float:
+def sleeve_misfit(measured: _Measured) -> float:
     """The misfit of points on the arms: sleeves are wider than trunks, and turned with what they hang on."""
     return float(_cost(_tightened(measured.dist - _SLEEVE_CLEARANCE), _SLEEVE_WIDTH).mean())
 
 
-def settle(points: np.ndarray, skin: Skin, width: float, rounds: int) -> np.ndarray:
+def settle_field(points: np.ndarray, skin: Skin, width: float, rounds: int) -> np.ndarray:
     """Translation (3,) [m] of ``points`` that lowers their misfit for the cut that they seem to have.
 
     By reweighted Gauss–Newton steps.
@@ -100,7 +100,7 @@ def settle(points: np.ndarray, skin: Skin, width: float, rounds: int) -> np.ndar
     return offset
 
 
-class Cut(NamedTuple):
+class _Cut(NamedTuple):
     """Where points fit best for the clearance that suits them best."""
 
     offset: np.ndarray  # (3,) m
@@ -108,7 +108,7 @@ class Cut(NamedTuple):
     misfit: float
 
 
-def settle_cut(points: np.ndarray, skin: Skin, start: Cut | None, rounds: int) -> Cut:
+def settle_cut(points: np.ndarray, skin: Skin, start: _Cut | None, rounds: int) -> _Cut:
     """Translation of ``points`` and clearance, together, that lower their misfit at width ``WIDTH``, from ``start`` on."""
     offset, clearance = (np.zeros(3), _CLEARANCE) if start is None else (start.offset, start.clearance)
     for _ in range(rounds):
@@ -116,10 +116,10 @@ def settle_cut(points: np.ndarray, skin: Skin, start: Cut | None, rounds: int) -
         offset, clearance = offset + step[:3], float(np.clip(clearance + step[3], *_CUTS))
         if float(np.abs(step).max()) < 1e-4:
             break
-    return Cut(offset, clearance, misfit(skin.measure(points + offset), WIDTH, clearance))
+    return _Cut(offset, clearance, misfit(skin.measure(points + offset), WIDTH, clearance))
 
 
-def _step(measured: Measured, width: float, clearance: float, drawn: float = 0.0) -> np.ndarray:
+def _step(measured: _Measured, width: float, clearance: float, drawn: float = 0.0) -> np.ndarray:
     """A reweighted Gauss–Newton step (4,) [m] of the translation and the clearance, which is ``drawn`` to the usual cut."""
     error = _error(measured, clearance)
     slope = np.where(error < 0, _TIGHT, 1.0)
@@ -134,7 +134,7 @@ def _step(measured: Measured, width: float, clearance: float, drawn: float = 0.0
     return np.asarray(step * min(1.0, 2 * width / max(float(np.linalg.norm(step)), 1e-12)))
 
 
-class Field:
+class SkinField:
     """Closeness to a skin on a grid, correlated with a garment's points: the best of all translations at once."""
 
     def __init__(self, skin: Skin) -> None:
@@ -167,11 +167,11 @@ class Field:
         return found
 
 
-def _error(measured: Measured, clearance: float = _CLEARANCE) -> np.ndarray:
+def _error(measured: _Measured, clearance: float = _CLEARANCE) -> np.ndarray:
     return _tightened(measured.dist - clearance * _hang(measured))
 
 
-def _hang(measured: Measured) -> np.ndarray:
+def _hang(measured: _Measured) -> np.ndarray:
     """(N,) shares of c₀ that are wanted: what hangs rests on skin that faces up, and hangs off skin that faces down."""
     return np.asarray(1 - _HANG * measured.normal[:, 1])
 
@@ -224,7 +224,7 @@ def find_size(points: np.ndarray, skin: Skin) -> Size:
     middle = points.mean(axis=0)
     factors = 1.0 + _STEP * np.arange(-_NUM_STEPS, _NUM_STEPS + 1)
     own = settle_cut(points, skin, None, _ROUNDS_FIRST)
-    cuts: dict[int, Cut] = {_NUM_STEPS: own}
+    cuts: dict[int, _Cut] = {_NUM_STEPS: own}
     for direction in (1, -1):
         cut = own
         for row in range(_NUM_STEPS + direction, _NUM_STEPS + direction * (_NUM_STEPS + 1), direction):

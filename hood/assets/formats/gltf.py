@@ -13,7 +13,7 @@ import numpy as np
 
 from hood.assets.files.guarded import Refused, check_size, guarded
 from hood.assets.files.library import SIZE_LIMIT
-from hood.assets.files.text import decoded
+from hood.assets.files.text import decoded_text_file
 
 _DTYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 _LARGEST = {5120: 127, 5121: 255, 5122: 32767, 5123: 65535, 5125: 4294967295}
@@ -114,7 +114,7 @@ def _read(path: Path) -> Gltf:
         text, binary = chunks[_JSON_CHUNK], chunks.get(_BIN_CHUNK)
     else:
         text = content
-    document = json.loads(decoded(text))
+    document = json.loads(decoded_text_file(text))
     if not isinstance(document, dict):
         raise Refused("its document is no object; the file is damaged")
     for name in document.get("extensionsRequired", []):

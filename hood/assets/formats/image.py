@@ -12,7 +12,7 @@ import numpy as np
 from hood.assets.files.said import install
 
 #: Larger files [bytes] are refused: pages and glTF hold them whole.
-LARGEST = 4_000_000
+_LARGEST = 4_000_000
 #: How a file begins, its kind and the ending of its name.
 _KINDS = ((b"\x89PNG\r\n\x1a\n", "image/png", ".png"), (b"\xff\xd8\xff", "image/jpeg", ".jpg"))
 
@@ -57,14 +57,14 @@ def read_texture(path: Path) -> Texture:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is neither PNG nor JPEG, or larger than :data:`LARGEST`.
+        ValueError: it is neither PNG nor JPEG, or larger than :data:`_LARGEST`.
     """
     if not path.is_file():
         raise FileNotFoundError(f"image {path}: no such file; give a PNG or JPEG image")
     size = path.stat().st_size
-    if size > LARGEST:
+    if size > _LARGEST:
         raise ValueError(
-            f"image {path}: {size / 1e6:.1f} MB, more than {LARGEST / 1e6:g}; save it smaller, or as JPEG, which takes less"
+            f"image {path}: {size / 1e6:.1f} MB, more than {_LARGEST / 1e6:g}; save it smaller, or as JPEG, which takes less"
         )
     content = path.read_bytes()
     for begin, kind, suffix in _KINDS:

@@ -37,7 +37,7 @@ _READERS: dict[str, Callable[[Path], RawMesh]] = {
 _SPLIT_FORMATS = (".stl", ".glb", ".gltf")
 MESH_SUFFIXES = tuple(_READERS)
 #: Their readers, see :mod:`hood.plugins`: a path in; vertices (V, 3) [m] and triangles (F, 3) out, or a :class:`RawMesh`.
-PLUGINS = "meshes"
+_PLUGINS = "meshes"
 #: Files beyond this size [bytes] are not opened.
 MESH_SIZE_LIMIT = 1 << 30
 
@@ -63,7 +63,7 @@ class MeshFile:
 
 def mesh_suffixes() -> tuple[str, ...]:
     """Suffixes of the mesh files that can be read, those of plugins last."""
-    return (*MESH_SUFFIXES, *(f".{name}" for name in plugins.names(PLUGINS)))
+    return (*MESH_SUFFIXES, *(f".{name}" for name in plugins.names(_PLUGINS)))
 
 
 def read_mesh(path: Path, triangulate: bool = False) -> tuple[np.ndarray, np.ndarray]:
@@ -86,7 +86,7 @@ def read_mesh_file(path: Path, split_polygons: bool = False) -> MeshFile:
     suffix = path.suffix.lower()
     if suffix not in mesh_suffixes():
         raise ValueError(f"{path}: unknown mesh format {suffix!r}; give {', '.join(mesh_suffixes())}")
-    read_raw = _READERS.get(suffix) or partial(_read_by_plugin, plugins.find(PLUGINS, suffix[1:]))
+    read_raw = _READERS.get(suffix) or partial(_read_by_plugin, plugins.find(_PLUGINS, suffix[1:]))
     check_size(path, MESH_SIZE_LIMIT)
 
     def read() -> MeshFile | ValueError:

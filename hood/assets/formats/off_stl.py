@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hood.assets.files.text import decoded, read_text
+from hood.assets.files.text import decoded_text_file, read_text
 from hood.assets.formats.raw_mesh import RawMesh, Unreadable
 
 _STL_HEAD = 84
@@ -64,8 +64,8 @@ def read_stl(path: Path) -> RawMesh:
 
 def _text_of(content: bytes) -> str | None:
     """The text of an ASCII file; None of a binary one, whose head may begin with the same word."""
-    head = decoded(content[:4096]).lower()
-    return decoded(content) if head.startswith("solid") and "facet" in head else None
+    head = decoded_text_file(content[:4096]).lower()
+    return decoded_text_file(content) if head.startswith("solid") and "facet" in head else None
 
 
 def _ascii_corners(text: str) -> np.ndarray:

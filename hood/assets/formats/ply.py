@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hood.assets.files.text import decoded
+from hood.assets.files.text import decoded_text_file
 from hood.assets.formats.raw_mesh import RawMesh, Unreadable, unit_colours
 
 _TYPES = {
@@ -59,7 +59,7 @@ def _as_ascii(content: bytes) -> bytes:
     """The file as the format has it, in ASCII: a byte-order mark, and text of two bytes a letter, are other programs' doing."""
     if content.startswith(b"ply"):
         return content
-    text = decoded(content)
+    text = decoded_text_file(content)
     return text.encode("latin-1", errors="replace") if text.startswith("ply") else content
 
 

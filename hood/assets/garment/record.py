@@ -14,7 +14,7 @@ import numpy as np
 
 from hood.assets.formats.mesh_file import PART
 from hood.assets.garment.garment import Garment
-from hood.mesh.parts import Part, part_labels
+from hood.mesh.parts import MeshPart, part_labels
 from hood.mesh.topology import connected_components
 
 
@@ -71,14 +71,14 @@ def start_fitting(garment: Garment, stitches: np.ndarray | None = None) -> Fitti
 _COVERED = 0.9
 
 
-def own_names(garment: Garment, parts: list[Part]) -> list[str | None]:
+def own_names(garment: Garment, parts: list[MeshPart]) -> list[str | None]:
     """For every part the name of the first object, group or material that has all of it and not all of the file; None: the
     file gives it none."""
     panels = {name: mask for name, mask in (garment.panels or {}).items() if not mask.all()}
     return [next((name for name, mask in panels.items() if mask[part.faces].mean() >= _COVERED), None) for part in parts]
 
 
-def names_of(garment: Garment, parts: list[Part]) -> list[str]:
+def names_of_parts(garment: Garment, parts: list[MeshPart]) -> list[str]:
     """A name for every part: its own, else its number; those that fasteners hold together have that of the first of them."""
     own = own_names(garment, parts)
     names = [(name or f"{PART}{part.number}").replace("+", "_") for name, part in zip(own, parts, strict=True)]

@@ -31,7 +31,7 @@ from hood.assets.motion.recording import motion_suffixes
 from hood.assets.motion.sequence import PoseSequence
 
 #: Parts of a split.
-PARTS = ("train", "validation")
+_PARTS = ("train", "validation")
 _LISTS = (".json", ".txt")
 
 
@@ -213,12 +213,12 @@ def _entries(path: Path, part: str) -> list[tuple[str, str]]:
         raise ValueError(f"{path}: not readable as JSON ({error})") from error
     if isinstance(content, dict):
         if part not in content:
-            raise ValueError(f"{path}: has no {part!r} (found {sorted(content)}); a split holds {' and '.join(PARTS)}")
+            raise ValueError(f"{path}: has no {part!r} (found {sorted(content)}); a split holds {' and '.join(_PARTS)}")
         content, name = content[part], part
     else:
         name = "list"
     if not isinstance(content, list) or not all(isinstance(entry, str) for entry in content):
-        raise ValueError(f"{path}: must hold a list of names, files or globs, or one for each of {' and '.join(PARTS)}")
+        raise ValueError(f"{path}: must hold a list of names, files or globs, or one for each of {' and '.join(_PARTS)}")
     return [(f"{name}[{index}]", entry) for index, entry in enumerate(content)]
 
 
@@ -271,7 +271,7 @@ _OFTEN_OTHERS = (*ARRAYS, *TENSORS)
 _NAME_COLUMNS = ("id", "file", "path", "sequence", "name")
 
 
-def expand_sequences(patterns: str | Path | Iterable[str | Path], part: str = "train") -> list[Path]:
+def expand_motions(patterns: str | Path | Iterable[str | Path], part: str = "train") -> list[Path]:
     """Motion files that ``patterns`` stand for: in their order, folders and globs sorted, nothing twice.
 
     A pattern is the name of an embedded motion; a file; a folder, with its motions as in :func:`motions_in`; a glob

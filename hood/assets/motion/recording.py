@@ -18,9 +18,9 @@ import numpy as np
 from hood.assets.files.frame_rates import flat, parse_rate, rates_in
 from hood.assets.files.said import Doubt
 from hood.assets.motion.layouts.content import MOTION_SUFFIXES, motion_suffixes, read_content
-from hood.assets.motion.layouts.people import Person, choose
+from hood.assets.motion.layouts.people import Person, choose_person
 from hood.assets.motion.layouts.read import NUM_FINGER_JOINTS, Track, numbers, people_in, read_track
-from hood.assets.motion.layouts.table import VIDEO_FPS, Layout
+from hood.assets.motion.layouts.table import VIDEO_FPS, MotionLayout
 from hood.assets.motion.skeleton import find_unit, joints_about_pelvis, spread, upright
 
 #: Rates [1/s] that are taken from a file.
@@ -36,7 +36,7 @@ class Rate(NamedTuple):
 
 
 def frame_rate(
-    path: Path, sources: Sequence[Mapping[str, Any]], layout: Layout, given: float | None, is_still: bool = False
+    path: Path, sources: Sequence[Mapping[str, Any]], layout: MotionLayout, given: float | None, is_still: bool = False
 ) -> Rate:
     """The frame rate of a motion, and the doubt where it is assumed or said twice.
 
@@ -78,7 +78,7 @@ def _rate(path: Path, key: str, value: Any) -> float:
     return rate
 
 
-def _reason(layout: Layout) -> str:
+def _reason(layout: MotionLayout) -> str:
     return f"as in {layout.name} files" if layout.name[0].isupper() or layout.name[0].isdigit() else "as in most videos"
 
 
@@ -182,7 +182,7 @@ def read_recording(
         ValueError: no motion, wrong shapes, not finite, no frame rate; names file, key and fix.
     """
     people = people_in(path, read_content(path))
-    chosen = choose(path, people, person)
+    chosen = choose_person(path, people, person)
     track = read_track(path, chosen)
     _check(path, chosen, track)
     own = {chosen.keys.get(key, key): value for key, value in chosen.fields.items()}

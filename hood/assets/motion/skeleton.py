@@ -83,7 +83,7 @@ def some_frames(num_frames: int, fps: float, span: float = _SPAN, most: int = 40
 
 
 #: Metres by unit.
-UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+TRANSLATION_UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _WORDS = {"m": "metres", "cm": "centimetres", "mm": "millimetres"}
 #: Planted feet are slower by this factor in the right unit than in every other, where they move at all [m/s] there.
 _SLOWER, _MOVES = 0.4, 0.005
@@ -108,7 +108,7 @@ class Unit(NamedTuple):
 
     @property
     def metres(self) -> float:
-        return UNITS[self.name]
+        return TRANSLATION_UNITS[self.name]
 
 
 def find_unit(path: Path, key: str, poses: np.ndarray, transl: np.ndarray, fps: float, up: str, given: str = "auto") -> Unit:
@@ -122,8 +122,10 @@ def find_unit(path: Path, key: str, poses: np.ndarray, transl: np.ndarray, fps: 
         ValueError: another word.
     """
     if given != "auto":
-        if given not in UNITS:
-            raise ValueError(f"trans_unit={given}: give {', '.join(UNITS)} or auto, the unit of the translation in the file")
+        if given not in TRANSLATION_UNITS:
+            raise ValueError(
+                f"trans_unit={given}: give {', '.join(TRANSLATION_UNITS)} or auto, the unit of the translation in the file"
+            )
         return Unit(given)
     spans = [_feet_speeds(poses, transl, fps, span) for span in _SPANS]
     by_steps = next(filter(None, map(_by_steps, spans)), None)
@@ -155,7 +157,7 @@ def _feet_speeds(poses: np.ndarray, transl: np.ndarray, fps: float, span: float)
     seconds = step / fps
     return {
         name: float(np.median(np.linalg.norm(change + metres * shift, axis=2).min(axis=1))) / seconds
-        for name, metres in {**UNITS, "none": 0.0}.items()
+        for name, metres in {**TRANSLATION_UNITS, "none": 0.0}.items()
     }
 
 
@@ -164,7 +166,7 @@ def _by_steps(speeds: dict[str, float]) -> str | None:
     of somebody who is carried are still in the smallest unit, and tell nothing."""
     if not speeds:
         return None
-    best = min(UNITS, key=lambda name: speeds[name])
+    best = min(TRANSLATION_UNITS, key=lambda name: speeds[name])
     others = [speed for name, speed in speeds.items() if name != best]
     return best if all(speed > _MOVES and speeds[best] < _SLOWER * speed for speed in others) else None
 
@@ -179,7 +181,7 @@ def _by_floor(poses: np.ndarray, transl: np.ndarray) -> str | None:
         height, lowest = transl[chosen, column], joints[:, :, column].argmin(axis=1)
         if np.isin(lowest, FEET).mean() < _MOSTLY:
             continue
-        low = {name: metres * height + joints[:, :, column].min(axis=1) for name, metres in UNITS.items()}
+        low = {name: metres * height + joints[:, :, column].min(axis=1) for name, metres in TRANSLATION_UNITS.items()}
         if abs(float(np.median(low["m"]))) < _FAR:
             continue
         found |= {name for name, value in low.items() if np.quantile(np.abs(value), 0.8) < _NEAR_FLOOR}

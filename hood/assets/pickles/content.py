@@ -17,7 +17,7 @@ from typing import Any, BinaryIO, ClassVar
 from hood.assets.files.guarded import Refused, check_size, guarded
 from hood.assets.pickles.records import Function, Record, read_raw_array, resolve
 from hood.assets.pickles.torch_file import TorchUnpickler, read_torch_stream
-from hood.assets.pickles.unpickle import SIZE_LIMIT, Bounded
+from hood.assets.pickles.unpickle import PICKLE_LIMIT, Bounded
 
 #: Packages whose objects lie beside the arrays as settings; their content is not kept.
 _BESIDES = ("omegaconf", "pathlib", "typing", "datetime", "easydict", "yacs", "munch")
@@ -31,7 +31,7 @@ _COMPRESSED: dict[bytes, Callable[[], Any]] = {
 }
 
 
-def load_content(path: str | Path, size_limit: int = SIZE_LIMIT) -> Any:
+def load_content(path: str | Path, size_limit: int = PICKLE_LIMIT) -> Any:
     """The content of a pickle file: containers, numbers, text, arrays of numpy, tensors of torch; also as joblib writes it.
 
     Raises:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from hood.assets.files.guarded import Refused, check_size, guarded
 from hood.assets.pickles.records import Function, resolve
-from hood.assets.pickles.unpickle import SIZE_LIMIT, Bounded, RestrictedUnpickler
+from hood.assets.pickles.unpickle import PICKLE_LIMIT, Bounded, RestrictedUnpickler
 
 #: Packages whose objects checkpoints carry beside the weights: configurations, and the classes they describe. Only their
 #: names are kept; none of them is imported.
@@ -33,7 +33,7 @@ _DTYPES = {
 }  # fmt: skip
 
 
-def load_torch(path: str | Path, size_limit: int = SIZE_LIMIT) -> Any:
+def load_torch(path: str | Path, size_limit: int = PICKLE_LIMIT) -> Any:
     """The content of a torch file (zip archive, or the older stream of pickles), tensors on the CPU.
 
     Raises:

@@ -18,12 +18,12 @@ from hood.assets.files.guarded import Refused, check_size, guarded
 from hood.assets.pickles.records import opaque, resolve, stand_in
 
 #: Files beyond this size [bytes] are not opened.
-SIZE_LIMIT = 4 << 30
+PICKLE_LIMIT = 4 << 30
 #: Modules that had another name in Python 2.
 _RENAMED = {"__builtin__": "builtins", "copy_reg": "copyreg"}
 
 
-def load_pickle(path: str | Path, size_limit: int = SIZE_LIMIT) -> Any:
+def load_pickle(path: str | Path, size_limit: int = PICKLE_LIMIT) -> Any:
     """The content of a pickle file: containers, numbers, text, numpy arrays, scipy.sparse matrices; arrays of the
     abandoned package chumpy become numpy arrays. Text of Python 2 is read as latin-1.
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from hood.app.common import read_model
+from hood.app.common import load_stepper
 from hood.app.output.frames import summarise_rate
 from hood.app.scene.garment_files import meant_by, words_of
 from hood.app.scene.placing import explain_unplaced, find_place, unit_alone
@@ -18,12 +18,12 @@ from hood.app.settings.overrides import plain_word
 from hood.app.stepping.guarding import summarise_guard
 from hood.assets.body.body import Body
 from hood.assets.body.load import load_body
-from hood.assets.contents.sort_out import choose, mend
+from hood.assets.contents.sort_out import mend, take_objects
 from hood.assets.files.atomic import is_occupied
 from hood.assets.files.library import locate
 from hood.assets.files.text import read_indices
-from hood.assets.fitting.fit_search import Asked
-from hood.assets.fitting.placement import UNITS, size_ratio, surrounds, used
+from hood.assets.fitting.fit_search import AskedFit
+from hood.assets.fitting.placement import LENGTH_UNITS, size_ratio, surrounds, used
 from hood.assets.fitting.suspicions import suspect_kind, suspect_sides
 from hood.assets.formats.mesh_file import mesh_suffixes, read_mesh_file
 from hood.assets.garment.binding import posed_body
@@ -133,7 +133,7 @@ def _made(finding: Finding, fitting: Fitting, body: Body | MeshMotion, wanted: W
         return garment
     surface = body.points(0) if isinstance(body, MeshMotion) else body.v_template
     finding.facts |= describe_objects(garment, surface)
-    choose(fitting, wanted, surface)
+    take_objects(fitting, wanted, surface)
     mend(fitting, wanted, surface)
     for what, fix in problems_of(finding.file, fitting.changes):
         finding.problem(what, fix, "")
@@ -210,13 +210,13 @@ def _describe_defects(finding: Finding, defects: Defects) -> None:
 
 def _place_beside(finding: Finding, garment: Garment, body: Body, betas: np.ndarray) -> None:
     """Units, up axis, facing, place and pose of an unbound garment: what ``hood prepare`` finds for itself."""
-    found = find_place(garment, body, betas, Asked(), None)
+    found = find_place(garment, body, betas, AskedFit(), None)
     placement = found.placement if found.resized is None else found.resized.placement
     unsure = found.resized is None and found.refusal is not None
     ratio = size_ratio(used(garment.rest_pos, garment.faces), body.shaped(betas)[0])
     unit = {
         "size in body heights": float(f"{found.placement.scale * ratio:.3g}"),
-        "units": UNITS.get(found.placement.scale, "unknown"),
+        "units": LENGTH_UNITS.get(found.placement.scale, "unknown"),
     }
     place = {"up axis": placement.up, "turned by [degrees]": placement.turn, "arms below the T-pose [degrees]": placement.angle}
     finding.facts |= {
@@ -283,7 +283,7 @@ def inspect_moving_mesh(name: str, options: MotionOptions) -> Finding:
 def inspect_checkpoint(name: str) -> Finding:
     """Weights of a model."""
     path = locate("weights", name)
-    simulator = read_model(path, 30.0)
+    simulator = load_stepper(path, 30.0)
     finding = Finding(name, "checkpoint")
     finding.facts = {
         "parameters": sum(parameter.numel() for parameter in simulator.parameters()),
@@ -293,7 +293,7 @@ def inspect_checkpoint(name: str) -> Finding:
             for key in ("features", "output", "latent_dim", "layer_radius", "coarse_edge")
             if key in simulator.config
         },
-        **ranges.describe(simulator.trained_for),
+        **ranges.describe_conditions(simulator.trained_for),
     }
     return finding
 

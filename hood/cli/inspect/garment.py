@@ -15,8 +15,8 @@ import numpy as np
 from hood.app.scene.placing import explain_size, find_place_on_mesh
 from hood.assets.contents.objects import Item, items_of, num_openings
 from hood.assets.contents.sort_out import metres_per_unit
-from hood.assets.fitting.fit_search import Asked, Found
-from hood.assets.fitting.placement import UNITS, find_scale, size_ratio, used
+from hood.assets.fitting.fit_search import AskedFit, FoundFit
+from hood.assets.fitting.placement import LENGTH_UNITS, find_scale, size_ratio, used
 from hood.assets.fitting.suspicions import suspect_place, suspect_sides
 from hood.assets.fitting.worn import way_there
 from hood.assets.garment.binding import signed_distances
@@ -70,7 +70,7 @@ def _in_words(item: Item) -> str:
     return f"{item.num_vertices} vertices, {size} m, {item.seems}"
 
 
-def describe_place(finding: Finding, found: Found, wearer: str, has_joints: bool = True) -> None:
+def describe_place(finding: Finding, found: FoundFit, wearer: str, has_joints: bool = True) -> None:
     """What keeps the garment from lying where it belongs, and the keys that put it there, all of them where one is needed.
 
     ``has_joints``: prepare takes a pose for the body ``wearer``; a mesh has one.
@@ -79,7 +79,7 @@ def describe_place(finding: Finding, found: Found, wearer: str, has_joints: bool
     scale, up, turn, offset = placement.keys()
     far, unit = float(np.linalg.norm(placement.offset)), found.placement.scale
     problems = (
-        (unit != 1.0, f"it is in {UNITS.get(unit, 'another unit')}", found.placement.keys()[0]),
+        (unit != 1.0, f"it is in {LENGTH_UNITS.get(unit, 'another unit')}", found.placement.keys()[0]),
         (placement.up != "y", f"it lies as if {placement.up} were up", up),
         (placement.turn != 0, f"it faces {placement.turn:g} degrees away from {wearer!r}", turn),
         (far > 0, f"it is {far:.2f} m away from where it fits {wearer!r}", offset),
@@ -101,11 +101,11 @@ def place_beside_mesh(finding: Finding, garment: Garment, motion: MeshMotion) ->
     surfaces = [motion.points(0)] + ([] if motion.sequence.rest is None else [motion.sequence.rest])
     pos = garment.worn_pos
     ratio = size_ratio(used(pos, garment.faces), surfaces[0])
-    found = find_place_on_mesh(garment, motion, Asked())
+    found = find_place_on_mesh(garment, motion, AskedFit())
     if found is not None and (found.refusal is None or found.resized is not None):
         finding.facts |= {
             "size in body heights": float(f"{found.placement.scale * ratio:.3g}"),
-            "units": UNITS.get(found.placement.scale, "unknown"),
+            "units": LENGTH_UNITS.get(found.placement.scale, "unknown"),
             "misfit on the body, 0 to 1": round(found.misfit, 3),
         }
         describe_place(finding, found, motion.name, has_joints=False)
@@ -114,13 +114,13 @@ def place_beside_mesh(finding: Finding, garment: Garment, motion: MeshMotion) ->
         factor = find_scale(used(pos, garment.faces), surfaces[0])
         guess = "" if found is None else "by its size alone: "
         finding.facts[f"{guess}size in body heights"] = float(f"{(factor or 1.0) * ratio:.3g}")
-        finding.facts[f"{guess}units"] = "unknown" if factor is None else UNITS[factor]
+        finding.facts[f"{guess}units"] = "unknown" if factor is None else LENGTH_UNITS[factor]
         if factor is None:
             finding.problem("its size fits no unit", "give scale=FACTOR, metres per unit")
             finding.refused = True
             return
         if factor != 1.0:
-            finding.problem(f"it is in {UNITS[factor]}", f"scale={factor:g}, or scale=auto", f"scale={factor:g}")
+            finding.problem(f"it is in {LENGTH_UNITS[factor]}", f"scale={factor:g}, or scale=auto", f"scale={factor:g}")
         pos = factor * pos
     dist, surface = min(
         ((signed_distances(pos, surface, motion.faces), surface) for surface in surfaces),

@@ -31,10 +31,10 @@ from hood.app.settings.compose import ConfigError, load_config, plain, require_c
 from hood.app.settings.overrides import plain_word
 from hood.assets.body.body import Body
 from hood.assets.body.load import load_body
-from hood.assets.contents.sort_out import choose, weld_and_mend
+from hood.assets.contents.sort_out import take_objects, weld_and_mend
 from hood.assets.files.library import locate
 from hood.assets.fitting import alterations
-from hood.assets.fitting.placement import UNITS
+from hood.assets.fitting.placement import LENGTH_UNITS
 from hood.assets.fitting.suspicions import suspect_kind
 from hood.assets.formats.mesh_file import mesh_suffixes, read_mesh_file
 from hood.assets.garment.binding import PosedBody, bind_garment, posed_body
@@ -129,7 +129,7 @@ def _fit(name: str, config: DictConfig, body: Body, betas: np.ndarray) -> _Fitte
     """One garment, read, repaired, put on and bound."""
     path, entry = locate_garment(name)
     fitting, wanted = _read(name), meant_by(entry, path, wanted_of(config))
-    choose(fitting, wanted, body.v_template)
+    take_objects(fitting, wanted, body.v_template)
     if not fitting.garment.bound:
         heed(fitting.garment.name, suspect_kind(fitting.garment.rest_pos, fitting.garment.faces, body.v_template))
     posed = _place(fitting, config, body, betas)
@@ -323,7 +323,7 @@ def _length_lines(part: dict[str, Any]) -> list[str]:
     """What became of a garment's edges: at rest, and where it is worn."""
     rest, worn = part["rest_lengths"], part["worn"]
     factors = [change["details"]["factor"] for change in part["changes"] if change["what"] == "scaled"]
-    resized = "".join(f"{factor:g} times " for factor in factors if factor not in UNITS)
+    resized = "".join(f"{factor:g} times " for factor in factors if factor not in LENGTH_UNITS)
     lines = [
         f"  rest lengths: {resized}the file's to {100 * rest['change_max']:.2f}%; {100 * rest['changed_share']:.1f}% of the "
         f"edges changed by more than {100 * _CHANGED:.0f}%"

@@ -14,12 +14,12 @@ from hood.media.renderer.render import BODY_COLOR
 from hood.rollouts.file.reader import RolloutData
 
 #: Farther from the origin than this [m] float32, which most formats hold, is no longer good to 2 µm.
-FAR = 32.0
+_FAR = 32.0
 PARTS = ("cloth", "body")
 
 
 @dataclass(frozen=True)
-class Part:
+class ClipPart:
     """One moving mesh."""
 
     name: str
@@ -43,7 +43,7 @@ class Part:
 class Clip:
     """Meshes that move together."""
 
-    parts: tuple[Part, ...]
+    parts: tuple[ClipPart, ...]
     fps: float
     origin: np.ndarray  # (3,) m, whole metres; zero for motions near the world's origin
 
@@ -78,7 +78,7 @@ def clip_of(
     if "cloth" in parts:
         meshes += _cloth(data, data.cloth_pos[:count], textures or {})
     if "body" in parts and data.body_pos.shape[1]:
-        meshes.append(Part("body", data.body_pos[:count], data.body_faces, BODY_COLOR))
+        meshes.append(ClipPart("body", data.body_pos[:count], data.body_faces, BODY_COLOR))
     if not meshes:
         raise ValueError("there is no body in it, and the cloth is not asked for; nothing is left to export")
     for mesh in meshes:
@@ -87,13 +87,13 @@ def clip_of(
             frame = int(broken.argmax())
             raise ValueError(f"{mesh.name} has no finite position in frame {frame}; give num_frames={frame} or less")
     farthest = max(float(np.abs(mesh.pos).max(initial=0.0)) for mesh in meshes)
-    origin = np.round(meshes[0].pos[0].astype(np.float64).mean(axis=0)) if farthest > FAR else np.zeros(3)
+    origin = np.round(meshes[0].pos[0].astype(np.float64).mean(axis=0)) if farthest > _FAR else np.zeros(3)
     moved = (np.asarray(mesh.pos, np.float64) - origin for mesh in meshes)
     turned = tuple(replace(mesh, pos=_upright(pos, up)) for mesh, pos in zip(meshes, moved, strict=True))
     return Clip(turned, 1.0 / dt, _upright(origin, up))
 
 
-def _cloth(data: RolloutData, pos: np.ndarray, textures: Mapping[str, Texture]) -> list[Part]:
+def _cloth(data: RolloutData, pos: np.ndarray, textures: Mapping[str, Texture]) -> list[ClipPart]:
     """One part a garment where the file says which vertex belongs to which."""
     found = []
     for rank, piece in enumerate(pieces_of(data)):
@@ -101,7 +101,7 @@ def _cloth(data: RolloutData, pos: np.ndarray, textures: Mapping[str, Texture]) 
         number[piece.vertices] = np.arange(len(piece.vertices))
         faces, texture = number[data.cloth_faces[piece.faces]], textures.get(piece.name)
         own = pos[:, piece.vertices]
-        found.append(Part(piece.name, own, faces, part_colour(rank), piece.uv, piece.uv_faces, texture))
+        found.append(ClipPart(piece.name, own, faces, part_colour(rank), piece.uv, piece.uv_faces, texture))
     return found
 
 

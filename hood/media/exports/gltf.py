@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from hood.assets.formats.image import Texture
-from hood.media.exports.clip import Clip, Part
+from hood.media.exports.clip import Clip, ClipPart
 from hood.media.pieces import split_seams
 
 #: Larger files [bytes] are refused: browsers and game engines keep all morph targets in memory.
-LARGEST = 256 * 2**20
+_LARGEST = 256 * 2**20
 
 _FLOAT, _UNSIGNED = 5126, 5125
 
@@ -29,12 +29,12 @@ def gltf_bytes(clip: Clip) -> bytes:
     """The file. Axes, units and origin: y up, metres; the origin is the translation of the nodes.
 
     Raises:
-        ValueError: above :data:`LARGEST`.
+        ValueError: above :data:`_LARGEST`.
     """
     size = estimated_size(clip)
-    if size > LARGEST:
+    if size > _LARGEST:
         raise ValueError(
-            f"as glb it would have {size / 2**20:.0f} MiB, more than the {LARGEST // 2**20} that programs open with ease; "
+            f"as glb it would have {size / 2**20:.0f} MiB, more than the {_LARGEST // 2**20} that programs open with ease; "
             "give num_frames=, parts=[cloth], or format=usd"
         )
     file = _Buffers()
@@ -72,7 +72,7 @@ def gltf_bytes(clip: Clip) -> bytes:
     return _packed(json.dumps(document).encode(), b"".join(file.chunks))
 
 
-def _mesh(file: _Buffers, part: Part, material: int) -> dict[str, Any]:
+def _mesh(file: _Buffers, part: ClipPart, material: int) -> dict[str, Any]:
     corners, faces, uv = _corners(part)
     base, normals = part.pos[0][corners].astype(np.float32), part.normals(0)[corners].astype(np.float32)
     attributes = {"POSITION": file.add(base, "VEC3", bounds=True), "NORMAL": file.add(normals, "VEC3")}
@@ -93,7 +93,7 @@ def _mesh(file: _Buffers, part: Part, material: int) -> dict[str, Any]:
     return mesh
 
 
-def _corners(part: Part) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+def _corners(part: ClipPart) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Vertex of every point (N,), faces over points, and texture coordinates (N, 2): a vertex on a seam is several points."""
     if part.uv is None or part.uv_faces is None:
         return np.arange(part.pos.shape[1]), part.faces, None

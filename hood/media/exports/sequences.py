@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hood.media.exports.clip import Clip, Part
+from hood.media.exports.clip import Clip, ClipPart
 from hood.media.exports.mesh import obj_faces, obj_points
 
 
@@ -52,12 +52,12 @@ def write_point_cache(folder: Path, clip: Clip) -> None:
         (folder / f"{part.name}.pc2").write_bytes(header + np.ascontiguousarray(part.pos, "<f4").tobytes())
 
 
-def _obj_points(part: Part, frame: int) -> str:
+def _obj_points(part: ClipPart, frame: int) -> str:
     lines = obj_points(part.name, part.pos[frame], part.normals(frame))
     return lines if part.texture is None else f"mtllib {part.name}.mtl\n{lines}"
 
 
-def _obj_faces(folder: Path, part: Part) -> str:
+def _obj_faces(folder: Path, part: ClipPart) -> str:
     """Lines of a part's faces; of one with an image, that and the material with it are written into ``folder``."""
     lines = obj_faces(part.faces, part.faces, part.uv, part.uv_faces)
     if part.texture is None:

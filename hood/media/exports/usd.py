@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hood.media.exports.clip import Clip, Part
+from hood.media.exports.clip import Clip, ClipPart
 
 
 def write_usd(path: Path, clip: Clip, up: str, name: str | None = None) -> None:
@@ -29,7 +29,7 @@ def write_usd(path: Path, clip: Clip, up: str, name: str | None = None) -> None:
         raise OSError(errno.EIO, "cannot be written; is the folder writable, is there space?", str(path)) from error
 
 
-def image_name(stem: str, part: Part) -> str:
+def image_name(stem: str, part: ClipPart) -> str:
     """Name of the image of a part beside the file ``stem.usd``."""
     assert part.texture is not None
     return f"{stem}_{part.name}_texture{part.texture.suffix}"
@@ -57,7 +57,7 @@ def _write(path: Path, clip: Clip, up: str, name: str) -> None:
     stage.GetRootLayer().Save()
 
 
-def _add(mesh: Any, part: Part, geom: Any, vt: Any) -> None:
+def _add(mesh: Any, part: ClipPart, geom: Any, vt: Any) -> None:
     mesh.CreateFaceVertexCountsAttr(vt.IntArray.FromNumpy(np.full(len(part.faces), 3, np.int32)))
     mesh.CreateFaceVertexIndicesAttr(vt.IntArray.FromNumpy(np.ascontiguousarray(part.faces.reshape(-1), np.int32)))
     mesh.CreateSubdivisionSchemeAttr(geom.Tokens.none)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
+_Array = NDArray[np.float64]
 
 NEAR = 0.05
 """Nothing closer to the camera than this is drawn [m]."""
@@ -57,12 +57,12 @@ class Camera:
         """Pixels of a picture of this height that 1 m takes at a distance of 1 m."""
         return float(0.5 * height / np.tan(np.radians(self.fov) / 2))
 
-    def axes(self) -> Array:
+    def axes(self) -> _Array:
         """Rows right, up, forward, shape (3, 3)."""
         return view_axes(np.subtract(self.target, self.position))
 
 
-def view_axes(forward: ArrayLike) -> Array:
+def view_axes(forward: ArrayLike) -> _Array:
     """Rows right, up and forward (3, 3) of a view along `forward` (3,), upright where that is possible."""
     forward = unit(np.asarray(forward, dtype=np.float64))
     up = np.array([0.0, 1.0, 0.0]) if abs(forward[1]) < 0.999 else np.array([0.0, 0.0, -1.0])
@@ -70,17 +70,17 @@ def view_axes(forward: ArrayLike) -> Array:
     return np.stack([right, np.cross(right, forward), forward])
 
 
-def _fit(x: Array, depth: Array, tan: float) -> tuple[float, float]:
+def _fit(x: _Array, depth: _Array, tan: float) -> tuple[float, float]:
     """Centre and distance of the narrowest wedge of the given slope around all points."""
     high, low = float((x - tan * depth).max()), float((x + tan * depth).min())
     return 0.5 * (high + low), (high - low) / (2.0 * tan)
 
 
-def unit(vectors: Array) -> Array:
+def unit(vectors: _Array) -> _Array:
     """Vectors (..., 3) of length one; zero stays zero."""
     length_sq = np.einsum("...i,...i->...", vectors, vectors)[..., None]
     return vectors / np.sqrt(np.maximum(length_sq, 1e-24))
 
 
-def _triple(vector: Array) -> tuple[float, float, float]:
+def _triple(vector: _Array) -> tuple[float, float, float]:
     return float(vector[0]), float(vector[1]), float(vector[2])

@@ -24,7 +24,7 @@ from hood.native.build import optional
 
 SOURCE = Path(native.__file__).with_name("picture.cpp")
 
-Array = NDArray[np.float64]
+_Array = NDArray[np.float64]
 _TRIPLE = REAL * 3
 
 

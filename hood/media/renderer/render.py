@@ -29,7 +29,7 @@ from hood.media.renderer.raster import SeenValues, VisibilityBuffer, address, ba
 from hood.media.renderer.shading import AROUND, REACH, Light, Surface, backdrop, openness
 from hood.mesh.topology import counted_edges
 
-Array = NDArray[np.float64]
+_Array = NDArray[np.float64]
 
 #: Distance [m] that stands for no hem near by.
 FAR = 1.0
@@ -41,7 +41,7 @@ _EDGE_WIDTH, _EDGE_SHADE = 0.0025, 0.3  # m, share of the colour taken
 _SEAM_AT, _SEAM_HALF_WIDTH, _SEAM_SHADE = 0.02, 0.0015, 0.35
 
 
-def hem_distance(pos: ArrayLike, faces: ArrayLike) -> Array:
+def hem_distance(pos: ArrayLike, faces: ArrayLike) -> _Array:
     """Distance [m] of every vertex from the next open edge of its surface, (V,); :data:`FAR` where none is near.
 
     Near is what is near along the surface: a sleeve beside the waist is not.
@@ -67,7 +67,7 @@ def hem_distance(pos: ArrayLike, faces: ArrayLike) -> Array:
     return result
 
 
-def sewn(dist: Array, foot: Array) -> Array:
+def sewn(dist: _Array, foot: _Array) -> _Array:
     """Share (P,) of a colour that is left by the edge of a hem and by its seam, 2 cm from it.
 
     Args:
@@ -77,7 +77,7 @@ def sewn(dist: Array, foot: Array) -> Array:
     edge = np.clip((_EDGE_WIDTH - dist) / foot + 0.5, 0.0, 1.0)
     seam = np.clip((_SEAM_HALF_WIDTH - np.abs(dist - _SEAM_AT)) / foot + 0.5, 0.0, 1.0)
     seam *= np.minimum(1.0, 2.0 * _SEAM_HALF_WIDTH / foot)
-    left: Array = 1.0 - _EDGE_SHADE * edge - _SEAM_SHADE * seam
+    left: _Array = 1.0 - _EDGE_SHADE * edge - _SEAM_SHADE * seam
     return left
 
 
@@ -89,11 +89,11 @@ _SIDE = 1024
 class Print:
     """An image on some faces of a mesh."""
 
-    image: Array  # (H, W, 3) linear colours, the top row first
+    image: _Array  # (H, W, 3) linear colours, the top row first
     faces: NDArray[np.int64]  # (N,) numbers of the faces
-    corners: Array  # (N, 3, 2) texture coordinates of their corners, v up; the image repeats beyond 0 and 1
+    corners: _Array  # (N, 3, 2) texture coordinates of their corners, v up; the image repeats beyond 0 and 1
 
-    def at(self, uv: Array) -> Array:
+    def at(self, uv: _Array) -> _Array:
         """Colours (P, 3) at texture coordinates (P, 2), linear between pixels."""
         height, width = self.image.shape[:2]
         across, down = uv[:, 0] * width - 0.5, (1.0 - uv[:, 1]) * height - 0.5
@@ -107,7 +107,7 @@ class Print:
         return np.asarray((1.0 - low_share) * upper + low_share * lower)
 
 
-def pixels_of(texture: Texture) -> Array:
+def pixels_of(texture: Texture) -> _Array:
     """(H, W, 3) linear colours of an image, of 1,024 pixels a side at most.
 
     Raises:
@@ -117,7 +117,7 @@ def pixels_of(texture: Texture) -> Array:
     return np.asarray((texture.pixels(_SIDE) / 255.0) ** 2.2)
 
 
-def printed(prints: Sequence[tuple[int, Print]], face: NDArray[np.int64], weights: Array) -> Array:
+def printed(prints: Sequence[tuple[int, Print]], face: NDArray[np.int64], weights: _Array) -> _Array:
     """Colours (P, 3) of pixels whose faces have an image; NaN for others.
 
     Args:
@@ -238,7 +238,7 @@ def _written(image: Picture, text: str, size: int, place: tuple[int, int], ancho
 def _join(meshes: Sequence[RenderMesh]) -> Surface:
     if not meshes:
         raise ValueError("render_frame: no meshes given; pass at least one RenderMesh")
-    parts: list[tuple[Array, NDArray[np.int64], Array, Array, Array, Array]] = []
+    parts: list[tuple[_Array, NDArray[np.int64], _Array, _Array, _Array, _Array]] = []
     offset = 0
     for index, mesh in enumerate(meshes):
         pos, faces = np.asarray(mesh.pos, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
@@ -259,7 +259,7 @@ def _join(meshes: Sequence[RenderMesh]) -> Surface:
 
 
 def _draw_surface(
-    image: Array, camera: Camera, light: Light, surface: Surface, prints: Sequence[tuple[int, Print]] = ()
+    image: _Array, camera: Camera, light: Light, surface: Surface, prints: Sequence[tuple[int, Print]] = ()
 ) -> None:
     height, width = image.shape[:2]
     axes = camera.axes()
@@ -306,12 +306,12 @@ def _draw_surface(
 
 
 def _shade_compiled(
-    image: Array,
+    image: _Array,
     camera: Camera,
     light: Light,
     surface: Surface,
-    view: tuple[Array, Array, VisibilityBuffer],
-    own: Array | None,
+    view: tuple[_Array, _Array, VisibilityBuffer],
+    own: _Array | None,
 ) -> None:
     """The rest of :func:`_draw_surface` in C++, from a ``view``: pixels and depths of vertices, and what is seen; with colours
     ``own`` (H, W, 3) of pixels instead of those of vertices, where they are not NaN."""
@@ -330,7 +330,7 @@ def _shade_compiled(
     lib.picture_shade(ctypes.byref(light.values()), ctypes.byref(seen))
 
 
-def _vertex_normals(pos: Array, faces: NDArray[np.int64]) -> Array:
+def _vertex_normals(pos: _Array, faces: NDArray[np.int64]) -> _Array:
     """Area-weighted unit normals (V, 3)."""
     a, b, c = (pos[faces[:, k]] for k in range(3))
     face_normal = np.cross(b - a, c - a)
@@ -340,6 +340,6 @@ def _vertex_normals(pos: Array, faces: NDArray[np.int64]) -> Array:
     return unit(np.stack(total, axis=1))
 
 
-def _blend(weights: Array, values: Array, corners: NDArray[np.int64]) -> Array:
+def _blend(weights: _Array, values: _Array, corners: NDArray[np.int64]) -> _Array:
     a, b, c = (weights[:, k, None] * values[corners[:, k]] for k in range(3))
     return a + b + c

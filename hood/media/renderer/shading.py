@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hood.media.renderer.camera import Camera, unit, view_axes
 from hood.media.renderer.raster import FloorValues, LightValues, VisibilityBuffer, address, library, packed, rasterise
 
-Array = NDArray[np.float64]
+_Array = NDArray[np.float64]
 
 #: Distance [m] within which one surface shades another.
 REACH = 0.09
@@ -24,7 +24,7 @@ _LEAST = 0.1
 _STRENGTH, _DARKEST = 2.2, 0.2
 
 
-def _around() -> Array:
+def _around() -> _Array:
     """Places (4, 6, 2) on the unit disc where a pixel looks, turned by a quarter of their angle among four pixels."""
     turn, index = np.arange(4)[:, None], np.arange(_COUNT)
     angle = 2.0 * np.pi * (2.0 * index / _COUNT * 1.5 + turn / 4.0 / _COUNT * 2.0 + index * 0.08)
@@ -36,8 +36,8 @@ AROUND = np.ascontiguousarray(_around())
 
 
 def openness(
-    buffer: VisibilityBuffer, focal: float, row: NDArray[np.integer], column: NDArray[np.integer], normal: Array
-) -> Array:
+    buffer: VisibilityBuffer, focal: float, row: NDArray[np.integer], column: NDArray[np.integer], normal: _Array
+) -> _Array:
     """Share (P,) of the light from all sides that reaches pixels: 1 in the open, less in creases and gaps.
 
     Every pixel looks at a few others within :data:`REACH`, and counts how far what they see stands above its own tangent
@@ -68,14 +68,14 @@ def openness(
     return np.clip(1.0 - _STRENGTH * kept / _COUNT, _DARKEST, 1.0)
 
 
-def _positions(buffer: VisibilityBuffer, focal: float, row: NDArray[np.integer], column: NDArray[np.integer]) -> Array:
+def _positions(buffer: VisibilityBuffer, focal: float, row: NDArray[np.integer], column: NDArray[np.integer]) -> _Array:
     """Seen points (P, 3) [m] right, up and forward of the eye."""
     height, width = buffer.face.shape
     depth = 1.0 / buffer.nearness[row, column]
     return np.stack([(column + 0.5 - 0.5 * width) / focal * depth, (0.5 * height - row - 0.5) / focal * depth, depth], axis=1)
 
 
-Faces = NDArray[np.int64]
+_Faces = NDArray[np.int64]
 
 _DARK_SIZE, _CELL = 128, 0.03  # cells of the map of shade on the floor along a side, and the side of one [m]
 _SHADOW_SIZE = 640  # pixels of the shadow map
@@ -99,18 +99,18 @@ class Surface:
     """Everything drawn as one mesh: `pos` (V, 3), `faces` (F, 3), linear `color` and unit `normal` (V, 3), distance from
     the next `hem` and how far the vertices are drawn `behind` where they are (V,) [m]."""
 
-    pos: Array
-    faces: Faces
-    color: Array
-    normal: Array
-    hem: Array
-    behind: Array
+    pos: _Array
+    faces: _Faces
+    color: _Array
+    normal: _Array
+    hem: _Array
+    behind: _Array
 
 
 class Light:
     """A key light with a shadow map, a fill light, a hemisphere of sky and bounce light, and a rim."""
 
-    def __init__(self, camera: Camera, pos: Array, faces: NDArray[np.int64]):
+    def __init__(self, camera: Camera, pos: _Array, faces: NDArray[np.int64]):
         right, _, forward = camera.axes()
         flat_forward = unit(np.array([forward[0], 0.0, forward[2]]) + 1e-9)
         self.key = unit(-0.55 * right + 1.0 * np.array([0.0, 1.0, 0.0]) - 0.75 * flat_forward)
@@ -131,7 +131,7 @@ class Light:
         at = (address(value) for value in (self._map, _PROBE_TEXELS, self._axes))
         return LightValues(*at, size, count, low, self._scale, self._texel, *colors)
 
-    def lit(self, pos: Array, spread: float = 1.0) -> Array:
+    def lit(self, pos: _Array, spread: float = 1.0) -> _Array:
         """Share of the key light that reaches `pos` (P, 3): percentage-closer filtering of the shadow map."""
         lib = library()
         if lib is not None:
@@ -148,7 +148,7 @@ class Light:
             shade += self._map[row, column] > bias - seen[:, 2]
         return 1.0 - shade / len(_PROBES)
 
-    def shade(self, pos: Array, normal: Array, view: Array, color: Array, openness: Array) -> Array:
+    def shade(self, pos: _Array, normal: _Array, view: _Array, color: _Array, openness: _Array) -> _Array:
         """Linear colours (P, 3) of points with these unit normals, directions to the eye and colours.
 
         Args:
@@ -169,7 +169,7 @@ class Light:
         return color * received * (0.72 + 0.28 * facing[:, None]) + (gloss + rim)[:, None]
 
 
-def backdrop(camera: Camera, light: Light, surface: Surface, floor: float, width: int, height: int, samples: int) -> Array:
+def backdrop(camera: Camera, light: Light, surface: Surface, floor: float, width: int, height: int, samples: int) -> _Array:
     """Linear colours (samples * height, samples * width, 3) of the floor, which fades into a plain background.
 
     A pixel of the picture of this ``width`` and ``height`` has one colour, in all its ``samples`` rows and columns.
@@ -209,11 +209,11 @@ def backdrop(camera: Camera, light: Light, surface: Surface, floor: float, width
     return _repeated(image, samples)
 
 
-def _repeated(image: Array, samples: int) -> Array:
+def _repeated(image: _Array, samples: int) -> _Array:
     return np.repeat(np.repeat(image, samples, axis=0), samples, axis=1)
 
 
-def _grid_lines(pos: Array, pixel: Array, stretch: Array) -> Array:
+def _grid_lines(pos: _Array, pixel: _Array, stretch: _Array) -> _Array:
     """Coverage of 1 cm lines every half metre, smoothed over the pixel's footprint."""
     lines = np.zeros(len(pos))
     foot = np.maximum(pixel, 1e-4) * np.sqrt(np.maximum(stretch, 1.0))
@@ -224,7 +224,7 @@ def _grid_lines(pos: Array, pixel: Array, stretch: Array) -> Array:
     return lines
 
 
-def _floor_shadow(light: Light, surface: Surface, pos: Array, floor: float, away: Array) -> Array:
+def _floor_shadow(light: Light, surface: Surface, pos: _Array, floor: float, away: _Array) -> _Array:
     """What is left of the light on the floor: the cast shadow, and a soft dark patch under low parts."""
     dark, center = _dark_map(surface, floor), _middle(surface)
     at = (pos[:, [2, 0]] - center[[2, 0]]) / _CELL + _DARK_SIZE / 2 - 0.5
@@ -234,7 +234,7 @@ def _floor_shadow(light: Light, surface: Surface, pos: Array, floor: float, away
     return left
 
 
-def _dark_map(surface: Surface, floor: float) -> Array:
+def _dark_map(surface: Surface, floor: float) -> _Array:
     """Shade under low parts, (_DARK_SIZE, _DARK_SIZE) cells of _CELL along z and x about the surface's middle."""
     center = _middle(surface)
     a, b, c = (surface.pos[surface.faces[:, k]] for k in range(3))
@@ -247,13 +247,13 @@ def _dark_map(surface: Surface, floor: float) -> Array:
     return packed(0.55 * _blur(low, 1.4) + 0.6 * _blur(low, 4.0))
 
 
-def _middle(surface: Surface) -> Array:
+def _middle(surface: Surface) -> _Array:
     """Of the box that holds the surface, (3,)."""
-    middle: Array = 0.5 * (surface.pos.min(axis=0) + surface.pos.max(axis=0))
+    middle: _Array = 0.5 * (surface.pos.min(axis=0) + surface.pos.max(axis=0))
     return middle
 
 
-def _blur(image: Array, sigma: float) -> Array:
+def _blur(image: _Array, sigma: float) -> _Array:
     """Gaussian blur; the image is taken as zero outside."""
     reach = int(3 * sigma + 0.5)
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
@@ -263,7 +263,7 @@ def _blur(image: Array, sigma: float) -> Array:
     return image
 
 
-def _sample(image: Array, at: Array) -> Array:
+def _sample(image: _Array, at: _Array) -> _Array:
     """Bilinear samples (P,) at (row, column) `at` (P, 2); the border is repeated."""
     at = np.clip(at, 0.0, np.array(image.shape) - 1.001)
     low = at.astype(np.int64)
@@ -274,5 +274,5 @@ def _sample(image: Array, at: Array) -> Array:
     return upper * (1 - part[:, 0]) + lower * part[:, 0]
 
 
-def _dot(a: Array, b: Array) -> Array:
+def _dot(a: _Array, b: _Array) -> _Array:
     return np.einsum("pi,pi->p", a, b)

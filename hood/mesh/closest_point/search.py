@@ -61,7 +61,7 @@ class Incidence(NamedTuple):
         return self.around, self.first, self.valence, self.face_edges, self.edge_faces
 
 
-class Span(NamedTuple):
+class _Span(NamedTuple):
     """Triangles as the two edges from their first corner, by components, and products of these."""
 
     u: Sequence[Tensor]  # x, y, z
@@ -78,7 +78,7 @@ class Fans(NamedTuple):
     edges: Tensor  # (W, 6, K) u (to ``following``) and v (to ``preceding``), three components each
     uu: Tensor  # (W, K) squared length of u
 
-    def select(self, index: Tensor) -> Span:
+    def select(self, index: Tensor) -> _Span:
         """The faces around the vertices ``index`` (N,), all arrays (N, K)."""
         # One gather of whole rows and a copy; recomputing the products is faster than gathering them too.
         edges = self.edges.index_select(0, index).transpose(0, 1).contiguous().unbind()
@@ -217,9 +217,9 @@ def build_fans(vertices: Tensor, incidence: Incidence) -> Fans:
     return Fans(edges, _sum_products(u, u))
 
 
-def span(u: Sequence[Tensor], v: Sequence[Tensor]) -> Span:
+def span(u: Sequence[Tensor], v: Sequence[Tensor]) -> _Span:
     uu, vv, uv = _sum_products(u, u), _sum_products(v, v), _sum_products(u, v)
-    return Span(u, v, uu, vv, uv, (uu * vv - uv * uv).clamp_min_(0))
+    return _Span(u, v, uu, vv, uv, (uu * vv - uv * uv).clamp_min_(0))
 
 
 def _nearest_vertices(
@@ -280,7 +280,7 @@ def closest_of_fans(points: Tensor, vertices: Tensor, nearest: Tensor, incidence
     return incidence.face[vertex, slot % num_slots]
 
 
-def gain(p: Sequence[Tensor], fan: Span) -> Tensor:
+def gain(p: Sequence[Tensor], fan: _Span) -> Tensor:
     """Minus half the squared distance from p to the triangles spanned by u and v, all broadcast together.
 
     With p relative to the triangle's first corner, the squared distance from p to the point su + tv is

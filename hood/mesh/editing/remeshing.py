@@ -74,7 +74,7 @@ def laplacian(faces: Faces, num_vertices: int) -> sparse.csr_matrix:
     return (sparse.identity(num_vertices) - sparse.diags(1 / degree) @ adjacency).tocsr()
 
 
-def vertex_normals(verts: Array, faces: Faces) -> Array:
+def remesh_normals(verts: Array, faces: Faces) -> Array:
     """Area-weighted unit normals (V,3)."""
     corner = verts[faces]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
@@ -93,7 +93,7 @@ def relax(verts: Array, faces: Faces, iterations: int = 10, strength: float = 0.
         border[loop] = True
     verts = verts.copy()
     for _ in range(iterations):
-        normal = vertex_normals(verts, faces)
+        normal = remesh_normals(verts, faces)
         move = -(matrix @ verts)
         move -= (move * normal).sum(1, keepdims=True) * normal
         move[border] = 0.0

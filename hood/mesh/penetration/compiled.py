@@ -17,7 +17,7 @@ from hood.native.arguments import COUNT, POINTER, REAL, fields
 from hood.native.build import BuildError, build
 from hood.native.libraries import CROSSING_FLAGS
 
-SOURCE = Path(native.__file__).with_name("crossing.cpp")
+_SOURCE = Path(native.__file__).with_name("crossing.cpp")
 #: Rows that there is room for at first; more are asked for where these do not suffice.
 _ROOM = 4096
 #: Triangles of a leaf, as in the source.
@@ -90,7 +90,7 @@ class Eights:
 def library() -> ctypes.CDLL | None:
     """The compiled passes; None without a compiler."""
     try:
-        lib = build(SOURCE, CROSSING_FLAGS)
+        lib = build(_SOURCE, CROSSING_FLAGS)
     except BuildError:
         return None
     lib.crossing_depth.restype = REAL
@@ -102,7 +102,7 @@ def eights(faces: np.ndarray, pos: np.ndarray) -> Eights | None:
     return None if library() is None else Eights(faces, pos)
 
 
-def find(first: Eights, pos: np.ndarray, second: Eights, other_pos: np.ndarray, touch: float) -> list[np.ndarray]:
+def find_crossings(first: Eights, pos: np.ndarray, second: Eights, other_pos: np.ndarray, touch: float) -> list[np.ndarray]:
     """The three tables of :class:`hood.mesh.penetration.crossing.Crossings` at positions (V, 3) and (W, 3); those of pairs
     within one mesh where ``second`` is ``first``.
 

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hood.mesh.penetration.boxes import overlapping_boxes
-from hood.mesh.penetration.compiled import Eights, eights, find
+from hood.mesh.penetration.compiled import Eights, eights, find_crossings
 
 #: Distance from a plane, in units of the size of the scene, up to which a corner lies in it.
 TOUCH = 1e-10
@@ -57,7 +57,7 @@ def crossings(
     pos, faces, other_pos, other_faces = _arrays(pos, faces) + _arrays(other_pos, other_faces)
     own, other = both or (eights(faces, pos), eights(other_faces, other_pos))
     if own is not None and other is not None:
-        return Crossings(*find(own, pos, other, other_pos, TOUCH))
+        return Crossings(*find_crossings(own, pos, other, other_pos, TOUCH))
     frame = _Frame.around(pos, other_pos)
     first = _triangles(pos, faces, frame)
     second = _triangles(other_pos, other_faces, frame, within=first)
@@ -72,7 +72,7 @@ def self_crossings(pos: np.ndarray, faces: np.ndarray, own: Eights | None = None
     pos, faces = _arrays(pos, faces)
     own = own or eights(faces, pos)
     if own is not None:
-        return find(own, pos, own, pos, TOUCH)[0]
+        return find_crossings(own, pos, own, pos, TOUCH)[0]
     frame = _Frame.around(pos)
     mesh = _triangles(pos, faces, frame)
     return _collect(_crossing(mesh, mesh, _apart(mesh, pairs), frame.touch) for pairs in _near(mesh, mesh)).pairs

@@ -13,7 +13,7 @@ from hood.mesh.penetration.compiled import Eights, depth, eights
 from hood.mesh.penetration.crossing import Crossings
 
 #: Skin farther than this [m] from all cloth is bare.
-REACH = 0.1
+EXPOSURE_REACH = 0.1
 _BEHIND = 0.5  # cosine of 60 degrees
 _NEAREST = 0.8
 
@@ -53,7 +53,7 @@ def skin_depth(
     - lies behind the skin, within 60 degrees of straight inwards: in the bend of a knee the skin looks along the cloth;
     - is not under another part of the skin: no vertex of the skin is nearer to it than 0.8 times as far, as the back of a hand
       is farther from cloth that cuts the palm;
-    - and is no farther away than :data:`REACH`.
+    - and is no farther away than :data:`EXPOSURE_REACH`.
 
     Its height is the distance to that point. It is taken at vertices: of a skin that is coarser than the cloth it is too small.
 
@@ -68,15 +68,15 @@ def skin_depth(
     sheet = Sheet.of(faces) if sheet is None else sheet
     cloth, skin = both or (eights(faces, pos), eights(skin_faces, skin_pos))
     if cloth is not None and skin is not None:
-        return depth(cloth, pos, skin, skin_pos, sheet, cut[:2], (REACH, _BEHIND, _NEAREST))
+        return depth(cloth, pos, skin, skin_pos, sheet, cut[:2], (EXPOSURE_REACH, _BEHIND, _NEAREST))
     suspect = np.zeros(len(faces), dtype=bool)
     suspect[cut.pairs[:, 0]] = True
     suspect |= sunken(pos, sheet.edges, skin_pos, skin_faces, cut)[faces].all(axis=1)
     corners = pos[faces]
     reached = corners[suspect].reshape(-1, 3)
-    low, high = reached.min(axis=0) - REACH, reached.max(axis=0) + REACH
+    low, high = reached.min(axis=0) - EXPOSURE_REACH, reached.max(axis=0) + EXPOSURE_REACH
     close = np.flatnonzero(((skin_pos >= low) & (skin_pos <= high)).all(axis=1))
-    nearest = _nearest(skin_pos[close], np.full(len(close), REACH), corners, np.flatnonzero(suspect))
+    nearest = _nearest(skin_pos[close], np.full(len(close), EXPOSURE_REACH), corners, np.flatnonzero(suspect))
     if nearest is None:
         return 0.0
     which, face, weights, point, dist = nearest

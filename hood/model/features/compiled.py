@@ -231,14 +231,14 @@ def _fill(group: Any, inputs: Inputs, out: Tensor, place: int) -> None:
         fill(group, inputs, out.data_ptr() + 4 * place, out.shape[1])
 
 
-COLUMNS = Columns(node_columns, edge_columns, body_edge_columns)
+COMPILED_COLUMNS = Columns(node_columns, edge_columns, body_edge_columns)
 
 
 # ---- between passes --------------------------------------------------------------------------------------------------
 
 
 def look(inputs: Inputs, sets: Sequence[str]) -> tuple[Tensor, dict[str, Tensor]]:
-    """What :func:`hood.model.features.local.look` shows."""
+    """What :func:`hood.model.features.local.look_local` shows."""
     assert inputs.residual is not None
     assert inputs.local_step is not None
     assert inputs.wide_residual is not None

@@ -1,5 +1,5 @@
 """Feature groups of models that correct their own predictions: what the potential says about positions, of single vertices
-and of neighbourhoods. The same columns, fewer, are seen again between the passes of such a model (:func:`look`)."""
+and of neighbourhoods. The same columns, fewer, are seen again between the passes of such a model (:func:`look_local`)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hood.model.features.feature_set import FeatureSet
 from hood.model.features.groups import EdgeGroup, NodeGroup, cloth_difference
 from hood.model.features.inputs import Inputs
 from hood.model.features.normalizer import FixedScale
-from hood.model.features.physical import GRAVITY, ContactDistance, Residual, length, mean_rest_length, physical
+from hood.model.features.physical import GRAVITY, ContactDistance, Residual, edge_length, mean_rest_length, physical
 
 #: Rounds of diffusion of the residuals of small and of large neighbourhoods.
 WIDE_ROUNDS = (4, 16)
@@ -97,20 +97,20 @@ class EdgeGlobalStep(EdgeGroup):
     def forward(self, inputs: Inputs) -> Tensor:
         unit = inputs.edges.once("mean length", lambda: mean_rest_length(inputs))
         change, before = (cloth_difference(pos, inputs) for pos in (_demand(inputs.global_step), inputs.base))
-        longer = length(before + change) - length(before)
+        longer = edge_length(before + change) - edge_length(before)
         return torch.cat([self.turn(change / unit), self.stretch(longer / unit)], dim=1)
 
 
-#: What :func:`look` reads; they have no parameters.
+#: What :func:`look_local` reads; they have no parameters.
 _RESIDUAL, _LOCAL_STEP, _WIDE, CONTACT, _GLOBAL = Residual(), LocalStep(), WideResidual(), ContactDistance(), GlobalStep()
 
-#: Columns of :func:`look` of nodes and of edges.
+#: Columns of :func:`look_local` of nodes and of edges.
 LOOK_WIDTHS = (3 + 3 + 3 + 1 + 1 + WideResidual.width, 1)
 #: The same where global steps are seen.
 GLOBAL_LOOK_WIDTHS = (LOOK_WIDTHS[0] + GlobalStep.width + 1, LOOK_WIDTHS[1])
 
 
-def look(inputs: Inputs, sets: Sequence[str]) -> tuple[Tensor, dict[str, Tensor]]:
+def look_local(inputs: Inputs, sets: Sequence[str]) -> tuple[Tensor, dict[str, Tensor]]:
     """What is seen of a prediction ``inputs.base`` before the next pass: columns of the cloth nodes (V, 17), or (V, 21) with
     global steps, and the strain (N, 1) of the edge sets ``sets``; fixed scales, outliers compressed by asinh."""
     step = _demand(inputs.local_step)
@@ -120,11 +120,11 @@ def look(inputs: Inputs, sets: Sequence[str]) -> tuple[Tensor, dict[str, Tensor]
         _LOCAL_STEP.cloth(inputs),
         torch.asinh(moved / MOVE),
         CONTACT.cloth(inputs)[:, :1],
-        _LOCAL_STEP.scale(length(step)),
+        _LOCAL_STEP.scale(edge_length(step)),
         _WIDE.cloth(inputs),
     ]
     if inputs.global_step is not None:
-        nodes += [_GLOBAL.cloth(inputs), _GLOBAL.scale(length(inputs.global_step))]
+        nodes += [_GLOBAL.cloth(inputs), _GLOBAL.scale(edge_length(inputs.global_step))]
     return torch.cat(nodes, dim=1), {name: _strain(inputs, name) for name in sets}
 
 
@@ -146,7 +146,7 @@ def local(
 def _strain(inputs: Inputs, name: str) -> Tensor:
     """asinh(100·(length/rest length − 1)) of the edges (N, 1) at the base; 0 for edges of no rest length."""
     rows = inputs.graph.edge_sets[name]
-    now, rest = (length(pos[rows.senders] - pos[rows.receivers]) for pos in (inputs.base, inputs.cloth.rest_pos))
+    now, rest = (edge_length(pos[rows.senders] - pos[rows.receivers]) for pos in (inputs.base, inputs.cloth.rest_pos))
     proper = rest > 1e-6
     return torch.asinh(GAIN * torch.where(proper, now / torch.where(proper, rest, 1.0) - 1, 0.0))
 

@@ -165,7 +165,7 @@ class ScaledShape(EdgeGroup):
 
     def forward(self, inputs: Inputs) -> Tensor:
         current, rest = cloth_difference(inputs.state.pos, inputs), cloth_difference(inputs.cloth.rest_pos, inputs)
-        columns = torch.cat([current, length(current), rest, length(rest)], dim=1)
+        columns = torch.cat([current, edge_length(current), rest, edge_length(rest)], dim=1)
         return columns / inputs.edges.once("mean length", lambda: mean_rest_length(inputs))
 
 
@@ -181,7 +181,7 @@ class Strain(EdgeGroup):
 
     def forward(self, inputs: Inputs) -> Tensor:
         rest = rest_length(inputs)
-        lengths = torch.cat([length(cloth_difference(pos, inputs)) for pos in (inputs.state.pos, inputs.base)], dim=1)
+        lengths = torch.cat([edge_length(cloth_difference(pos, inputs)) for pos in (inputs.state.pos, inputs.base)], dim=1)
         proper = rest > 1e-6
         return self.scale(torch.where(proper, lengths / torch.where(proper, rest, 1.0) - 1, 0.0))
 
@@ -208,7 +208,7 @@ class BaseBodyRelative(EdgeGroup):
 
     def forward(self, inputs: Inputs) -> Tensor:
         vector = body_difference(inputs.base, inputs.obstacle.next_pos, inputs)
-        return self.scale(torch.cat([vector, length(vector)], dim=1))
+        return self.scale(torch.cat([vector, edge_length(vector)], dim=1))
 
 
 class BaseLayerRelative(EdgeGroup):
@@ -224,17 +224,17 @@ class BaseLayerRelative(EdgeGroup):
 
     def forward(self, inputs: Inputs) -> Tensor:
         vectors = [layer_difference(pos, inputs) for pos in (inputs.state.pos, inputs.base)]
-        return self.scale(torch.cat([part for vector in vectors for part in (vector, length(vector))], dim=1))
+        return self.scale(torch.cat([part for vector in vectors for part in (vector, edge_length(vector))], dim=1))
 
 
-def length(vector: Tensor) -> Tensor:
+def edge_length(vector: Tensor) -> Tensor:
     """Norms (N, 1) of the rows of ``vector`` (N, 3)."""
     return vector.norm(dim=1, keepdim=True)
 
 
 def rest_length(inputs: Inputs) -> Tensor:
     """Rest lengths of the cloth edges [m], (N, 1)."""
-    return length(cloth_difference(inputs.cloth.rest_pos, inputs))
+    return edge_length(cloth_difference(inputs.cloth.rest_pos, inputs))
 
 
 def mean_rest_length(inputs: Inputs) -> Tensor:

@@ -62,7 +62,7 @@ def capacity_for(counts: tuple[int, int, int], limits: tuple[int, int, int], hea
 
 
 @dataclass(frozen=True)
-class Layout:
+class StaticLayout:
     """What a fixed graph knows before the step. Make it with :func:`lay_out`."""
 
     static: StaticGraph
@@ -96,17 +96,17 @@ class _Places:
     key: Tensor  # (K,) ascending
 
 
-def lay_out(static: StaticGraph, capacity: Capacity, attachments: Attachments | None = None) -> Layout:
+def lay_out(static: StaticGraph, capacity: Capacity, attachments: Attachments | None = None) -> StaticLayout:
     """Sizes of the graphs of steps that have these ``attachments``. Reads values from the device: not for within a step."""
     sets = dict(static.edge_sets)
     if MESH in sets:
         sets[MESH] = mesh_set(static, attachments, None)
     depth = max((set_level(name) for name in static.edge_sets), default=0)
     deeper = torch.stack([(static.node_level >= level).sum() for level in range(depth + 1)]).tolist()
-    return Layout(static, sets, capacity, tuple(deeper))
+    return StaticLayout(static, sets, capacity, tuple(deeper))
 
 
-def build_fixed_graph(layout: Layout, obstacle: Obstacle | None, nearest: Nearest | None, radius: float) -> FixedGraph:
+def build_fixed_graph(layout: StaticLayout, obstacle: Obstacle | None, nearest: Nearest | None, radius: float) -> FixedGraph:
     """The graph that :func:`hood.model.graph.builder.build_graph` builds, with places to spare.
 
     Args:
@@ -143,7 +143,7 @@ def build_fixed_graph(layout: Layout, obstacle: Obstacle | None, nearest: Neares
     )
 
 
-def _without_body(layout: Layout) -> FixedGraph:
+def _without_body(layout: StaticLayout) -> FixedGraph:
     static = layout.static
     none = static.node_level.new_zeros(0)
     body = EdgeSet(none, none, none, none, none, none, none, static.node_level.new_zeros(1))

@@ -35,7 +35,7 @@ from hood.tensors.dense import is_whole
 #: inference in C++ (:mod:`hood.model.kernels.network`), gradients by torch's operations.
 KERNELS = ("torch", "compiled", "fused")
 #: Widths of latents are a multiple of this: numbers in a register.
-LANES = 16
+_LANES = 16
 SOURCE = Path(native.__file__).with_name("block.cpp")
 _FLAGS = ("-O3", "-std=c++17", "-shared", "-fPIC", "-mfma", *(f"-mavx512{part}" for part in ("f", "bw", "dq", "vl")))
 _HALF_FLAGS = ("-mavx512bf16",)
@@ -80,8 +80,8 @@ def check_kernels(name: str, precision: str, width: int, device: torch.device | 
     if name == "fused":
         _check_fused(precision, width)
         return
-    if width % LANES:
-        raise ValueError(f"kernels=compiled need latents of a multiple of {LANES} columns, not {width}; use kernels=torch")
+    if width % _LANES:
+        raise ValueError(f"kernels=compiled need latents of a multiple of {_LANES} columns, not {width}; use kernels=torch")
     if torch.backends.cpu.get_cpu_capability() != "AVX512":
         raise ValueError("kernels=compiled need a processor with AVX-512; use kernels=torch")
     if precision == "bf16" and not _multiplies_bfloat16():
@@ -100,10 +100,10 @@ def _check_fused(precision: str, width: int) -> None:
 
 def panel(width: int) -> int:
     """Columns of ``width`` whose sums are in registers at a time; tiles of AMX take 32."""
-    return next(columns for columns in (64, 32, 48, LANES) if width % columns == 0)
+    return next(columns for columns in (64, 32, 48, _LANES) if width % columns == 0)
 
 
-def call(function: str, values: ctypes.Structure, width: int, half: bool) -> None:
+def _call(function: str, values: ctypes.Structure, width: int, half: bool) -> None:
     """Run ``forward`` on a :class:`Block` or ``backward`` on a :class:`Gradient`."""
     getattr(library(width, half), function)(ctypes.byref(values))
 
@@ -153,7 +153,7 @@ def applies(x: Tensor, parameters: tuple[Tensor, ...]) -> bool:
     outputs as inputs, d a multiple of :data:`hood.model.kernels.block.LANES`."""
     if type(x) is not Tensor or x.device.type != "cpu" or is_whole() or torch.compiler.is_compiling():
         return False
-    square = parameters[0].shape == parameters[2].shape == (x.shape[1], x.shape[1]) and x.shape[1] % LANES == 0
+    square = parameters[0].shape == parameters[2].shape == (x.shape[1], x.shape[1]) and x.shape[1] % _LANES == 0
     known = x.dtype in (torch.float32, torch.bfloat16)
     return known and square and all(p.dtype == torch.float32 for p in parameters)
 
@@ -206,7 +206,7 @@ class _Compiled(torch.autograd.Function):
         point(values, bias_2=bias_2, bias_3=bias_3, scale=scale, shift=shift)
         if setting.edges is not None:
             point(values, receivers=setting.edges.local_receivers, senders=setting.edges.local_senders)
-        call("forward", values, x.shape[1], x.dtype == torch.bfloat16)
+        _call("forward", values, x.shape[1], x.dtype == torch.bfloat16)
         if setting.keep:
             ctx.save_for_backward(given, first, *parameters, *kept)
             ctx.edges, ctx.rows = setting.edges, 0 if table is None else len(table)
@@ -235,7 +235,7 @@ class _Compiled(torch.autograd.Function):
             grad_table = x.new_zeros(ctx.rows, 2 * x.shape[1], dtype=torch.float32)
             point(values, grad_sum=grad_sum, grad_table=grad_table)
             point(values, receivers=edges.local_receivers, senders=edges.local_senders)
-        call("backward", values, x.shape[1], x.dtype == torch.bfloat16)
+        _call("backward", values, x.shape[1], x.dtype == torch.bfloat16)
         residual = grad if ctx.needs_input_grad[3] else None
         return grad_x, None if grad_table is None else grad_table.to(x.dtype), grad_first, residual, None, *grads
 

@@ -74,7 +74,7 @@ class _Memory(ctypes.Structure):
 
 
 @cache
-def library() -> ctypes.CDLL:
+def _library() -> ctypes.CDLL:
     """The compiled network.
 
     Raises:
@@ -93,7 +93,7 @@ def library() -> ctypes.CDLL:
 
 def check_width(width: int) -> None:
     """Raise ValueError unless latents of ``width`` columns can be computed here, which takes a compiler."""
-    lib = library()
+    lib = _library()
     if width % lib.network_lanes() or width > lib.network_most():
         raise ValueError(
             f"kernels=fused need latents of a multiple of {lib.network_lanes()} columns, at most {lib.network_most()}, "
@@ -136,7 +136,7 @@ class Packed:
     """A network's weights as the library reads them; valid as long as they do not change."""
 
     def __init__(self, network: MeshGraphNet, state: list[tuple[int, int]]) -> None:
-        self._lib, self._kept = library(), list[Any]()
+        self._lib, self._kept = _library(), list[Any]()
         self.state, self.slots = state, _slots(network)  # what changes with the weights, and where they are
         tables = [module._modules for module in network.modules()]
         self.children = [(table, name, child) for table in tables for name, child in table.items()]
@@ -220,7 +220,7 @@ class Inference:
     def __init__(
         self, network: MeshGraphNet, weights: Packed, graph: Graph, nodes: Tensor, edges: Mapping[str, Tensor]
     ) -> None:
-        self._lib, self._weights, self._width = library(), weights, network.latent_dim
+        self._lib, self._weights, self._width = _library(), weights, network.latent_dim
         self._num_cloth, self._passes, self._taken = graph.num_cloth, network.passes, 0
         self.nodes = self._rows(self._weights.node_encoder, nodes)
         encoders = self._weights.edge_encoders

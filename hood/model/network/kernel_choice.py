@@ -38,7 +38,7 @@ _SIDE, _STEPS, _TURNS = 33, 2, 5
 _WIDTH = 8
 
 
-class Choice(NamedTuple):
+class KernelChoice(NamedTuple):
     """A form, and why."""
 
     kernels: str
@@ -48,13 +48,13 @@ class Choice(NamedTuple):
         return f"kernels=auto: {self.kernels} ({self.reason})"
 
 
-def choose_kernels(precision: str, width: int, device: torch.device, training: bool = False) -> Choice:
+def choose_kernels(precision: str, width: int, device: torch.device, training: bool = False) -> KernelChoice:
     """The fastest form for latents of ``width`` columns; of forward and backward pass if ``training``."""
     if device.type != "cpu" or precision not in PRECISIONS:
-        return Choice("torch", "the others are for a CPU")
+        return KernelChoice("torch", "the others are for a CPU")
     folder = cache_folder()
     if folder is None:
-        return Choice("torch", "nothing may be kept, HOOD_CACHE is off, and a timing may end otherwise in the next run")
+        return KernelChoice("torch", "nothing may be kept, HOOD_CACHE is off, and a timing may end otherwise in the next run")
     path = folder / "kernels" / f"choice-{_digest(precision, width, training)}.json"
     known = _read(path, precision, width)
     if known is not None:
@@ -63,18 +63,18 @@ def choose_kernels(precision: str, width: int, device: torch.device, training: b
     try:
         _write(path, choice)
     except OSError:
-        return Choice("torch", f"nothing can be kept in {folder}, and a timing may end otherwise in the next run")
+        return KernelChoice("torch", f"nothing can be kept in {folder}, and a timing may end otherwise in the next run")
     return choice
 
 
-def choose_for(network: MeshGraphNet, precision: str, device: torch.device, training: bool = False) -> Choice:
+def choose_for(network: MeshGraphNet, precision: str, device: torch.device, training: bool = False) -> KernelChoice:
     """The same for a network, which may have parts of an own class."""
     choice = choose_kernels(precision, network.latent_dim, device, training)
     part = network.own_part() if choice.kernels == "fused" else ""
-    return Choice("torch", f"{part} is computed as its class says") if part else choice
+    return KernelChoice("torch", f"{part} is computed as its class says") if part else choice
 
 
-def _measure(precision: str, width: int, training: bool) -> Choice:
+def _measure(precision: str, width: int, training: bool) -> KernelChoice:
     """Time every form that works here."""
     forms, refusals = ["torch"], []
     for name in KERNELS:
@@ -86,12 +86,12 @@ def _measure(precision: str, width: int, training: bool) -> Choice:
         except ValueError as error:
             refusals.append(str(error).removeprefix(f"kernels={name}: ").replace(" or use kernels=torch", ""))
     if len(forms) == 1:
-        return Choice("torch", "; ".join(dict.fromkeys(refusals)))
+        return KernelChoice("torch", "; ".join(dict.fromkeys(refusals)))
     times = time_forms(forms, precision, width, training)
     ranked = sorted(forms, key=times.__getitem__)
     listed = ", ".join(f"{name} {1e3 * times[name]:.1f}" for name in ranked)
     what = "forward and backward" if training else "forward"
-    return Choice(ranked[0], f"ms of {_STEPS} steps at {_SIDE**2:,} vertices, {what}, {precision}: {listed}")
+    return KernelChoice(ranked[0], f"ms of {_STEPS} steps at {_SIDE**2:,} vertices, {what}, {precision}: {listed}")
 
 
 def time_forms(forms: list[str], precision: str, width: int, training: bool) -> dict[str, float]:
@@ -144,17 +144,17 @@ def _digest(precision: str, width: int, training: bool) -> str:
     return hashlib.sha256("\0".join(map(str, parts)).encode()).hexdigest()
 
 
-def _read(path: Path, precision: str, width: int) -> Choice | None:
+def _read(path: Path, precision: str, width: int) -> KernelChoice | None:
     """What was chosen before; None where there is nothing, or nothing that works."""
     try:
         kept = json.loads(path.read_text(encoding="utf-8"))
         check_kernels(kept["kernels"], precision, width)
-        return Choice(str(kept["kernels"]), str(kept["reason"]))
+        return KernelChoice(str(kept["kernels"]), str(kept["reason"]))
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
 
-def _write(path: Path, choice: Choice) -> None:
+def _write(path: Path, choice: KernelChoice) -> None:
     """Under another name first: other processes may be doing the same."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=path.parent, suffix=".partial")

@@ -48,7 +48,7 @@ from hood.tensors.dense import sum_rows
 
 #: Steps of conjugate gradients per square root of the vertices of a scene: a square sheet that hangs from one side is left with
 #: a thousandth of the energy, at every resolution. Never fewer than the second number.
-STEPS = Steps(2.0, 16)
+_STEPS = Steps(2.0, 16)
 
 
 @dataclass(frozen=True)
@@ -154,13 +154,13 @@ def conjugate_gradients(system: EdgeSystem, weight: Tensor, force: Tensor, firm:
         return inverse * (r if less is None else r - less.times(r))
 
     scenes = Scenes(system.scene, system.scene_sizes)
-    return solve(apply, precondition, torch.where(free, force, 0.0), scenes, STEPS)
+    return solve(apply, precondition, torch.where(free, force, 0.0), scenes, _STEPS)
 
 
 def compiled_gradients(system: EdgeSystem, weight: Tensor, force: Tensor, firm: Firm | None = None) -> Tensor:
     """The same by the compiled library, for numbers in float32 on a CPU; every vertex must have an edge."""
     edges, scenes = system.edges, len(system.scene_sizes)
-    steps = torch.tensor([STEPS(size) for size in system.scene_sizes])
+    steps = torch.tensor([_STEPS(size) for size in system.scene_sizes])
     mesh = native.Neighbours(len(force), edges.offsets.data_ptr(), edges.senders.data_ptr())
     u, memory = force.new_empty(len(force), 4), force.new_empty(5, len(force), 4)
     more = (None, None) if firm is None else (firm.weight.contiguous(), firm.normal.contiguous())

@@ -18,7 +18,7 @@ from hood.energies.problem import StepProblem
 from hood.mesh.diffusion import Diffusion, neighbours_of
 from hood.model.features import compiled
 from hood.model.features.inputs import Inputs
-from hood.model.features.local import WIDE_ROUNDS, look
+from hood.model.features.local import WIDE_ROUNDS, look_local
 from hood.model.graph.builder import Graph
 from hood.model.network.model import MeshGraphNet
 from hood.native import features as native
@@ -177,7 +177,7 @@ class CorrectionPasses:
         self._start = replace(self._start, inputs=inputs, force=force)
         self.forces.append(force)
         with torch.no_grad():
-            see = compiled.look if compiled.applies(inputs) else look
+            see = compiled.look if compiled.applies(inputs) else look_local
             return see(inputs, self._network.pass_sets(index + 1))
 
 

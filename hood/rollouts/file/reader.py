@@ -23,7 +23,7 @@ from hood.rollouts.file.step_table import Steps, read_steps, step_paths, still_s
 
 
 @dataclass(frozen=True)
-class Refined:
+class _Refined:
     """The simulated mesh of a rollout that stores a finer one (:class:`hood.mesh.editing.subdivision.Subdivision`)."""
 
     times: int  # that every face was cut into four
@@ -49,12 +49,12 @@ class RolloutData:
     steps: Steps | None = None  # all simulated frames, where those stored have a rate of their own (``output_fps``)
 
     @property
-    def refined(self) -> Refined | None:
+    def refined(self) -> _Refined | None:
         """The simulated mesh where the stored one is finer; None where it is the same."""
         faces = self.still.get("simulated_faces")
         if faces is None:
             return None
-        return Refined(int(self.attributes["refine_mesh"]), int(self.attributes["simulated_vertices"]), faces)
+        return _Refined(int(self.attributes["refine_mesh"]), int(self.attributes["simulated_vertices"]), faces)
 
     @property
     def riding(self) -> tuple[int, int]:

@@ -19,7 +19,7 @@ from hood.mesh.topology import unique_edges
 from hood.rollouts.checks.guard import CHECK, CUT, FORCE, INSIDE, STRAIN
 from hood.rollouts.checks.step_repair import LEFT, NOT_TRIED
 from hood.rollouts.file.reader import RolloutData
-from hood.rollouts.verdict.frames import Cause, Found, mask_of, name_frames
+from hood.rollouts.verdict.frames import Cause, FoundFrames, mask_of, name_frames
 from hood.rollouts.verdict.skin import skin_causes
 from hood.rollouts.verdict.surface import Meshes, surface_metrics, visible, visible_crossings
 
@@ -33,7 +33,7 @@ _TEXTS = {
 }
 
 
-def guard_doubts(data: RolloutData) -> Found:
+def guard_doubts(data: RolloutData) -> FoundFrames:
     """A doubt for each cause of alarms that were not mended in more than 2% of the steps."""
     doubts, steps = [], max(len(data.step_finite) - 1, 1)
     for cause, text in _TEXTS.items():
@@ -46,7 +46,7 @@ def guard_doubts(data: RolloutData) -> Found:
         where = name_frames(mask_of(frames))
         sentence = f"the guard saw {what}, in {where}, and did not mend it; guard=repair, refine=5 or stepper=newton"
         doubts.append(Doubt("guard", sentence, tuple(frames), float(worst["value"])))
-    return Found(doubts=doubts)
+    return FoundFrames(doubts=doubts)
 
 
 #: The metric of :mod:`hood.rollouts.verdict.distance`.
@@ -55,7 +55,7 @@ DISTANCE = "distance_p99"
 _OFTEN, _FAR = 0.25, 2.0
 
 
-def solved_causes(metrics: Mapping[str, np.ndarray], dt: float) -> Found:
+def solved_causes(metrics: Mapping[str, np.ndarray], dt: float) -> FoundFrames:
     """Bad steps of ``dt`` [s], of every stepper by the distance [m] where it was measured: more than one step, and one in four,
     beyond the limit, or one beyond twice as much. Elsewhere a solver is held to its target and, as a
     refinement, to the relative gradient; a network alone to nothing: its steps are no minima, and the force says little."""
@@ -65,13 +65,13 @@ def solved_causes(metrics: Mapping[str, np.ndarray], dt: float) -> Found:
         often = (way > limit).sum() > max(_OFTEN * measured.sum(), 1)
         bad = way > (limit if often else _FAR * limit)
         text = f"steps ended more than {1e3 * limit:.2g} mm from their minimum (p99 over the vertices)"
-        return Found([Cause("distance", text, bad, distance, limit, "m", ".0f", 1e3, " mm", measured)])
+        return FoundFrames([Cause("distance", text, bad, distance, limit, "m", ".0f", 1e3, " mm", measured)])
     found, converged, gradient = [], metrics.get("solver_converged"), _gradient(metrics)
     if converged is not None:
         found.append(Cause("solver_target", "the solver missed its target", converged == 0))
     if gradient is not None:
         found.append(_gradient_cause(gradient, "relative_gradient" in metrics))
-    return Found(found)
+    return FoundFrames(found)
 
 
 def unknown_steps(metrics: Mapping[str, np.ndarray], judged: np.ndarray) -> np.ndarray | None:
@@ -112,7 +112,7 @@ def _gradient_cause(gradient: np.ndarray, measured: bool) -> Cause:
 _SHARE, _LOOKED_AT = 0.01, 4
 
 
-def strain_causes(finite: np.ndarray, strain_p99: np.ndarray, meshes: Meshes) -> Found:
+def strain_causes(finite: np.ndarray, strain_p99: np.ndarray, meshes: Meshes) -> FoundFrames:
     """Frames whose strain p99 is beyond the limit, unless what is stretched so far is pinched in a fold of the body where
     nobody sees it. A frame that is not finite is told as that."""
     limit = STRAIN_UNSOUND.value
@@ -126,7 +126,7 @@ def strain_causes(finite: np.ndarray, strain_p99: np.ndarray, meshes: Meshes) ->
         )
         bad = np.zeros_like(bad)
     text = f"strain p99 is beyond {limit:.0%}"
-    return Found([Cause("strain", text, bad, strain_p99, limit, STRAIN_UNSOUND.unit, ".0%")], notes=notes)
+    return FoundFrames([Cause("strain", text, bad, strain_p99, limit, STRAIN_UNSOUND.unit, ".0%")], notes=notes)
 
 
 def _is_hidden(bad: np.ndarray, meshes: Meshes) -> bool:
@@ -150,7 +150,7 @@ def _is_hidden(bad: np.ndarray, meshes: Meshes) -> bool:
     return True
 
 
-def causes_of(data: RolloutData, meshes: Meshes, finite: np.ndarray, strain: np.ndarray | None) -> Found:
+def causes_of(data: RolloutData, meshes: Meshes, finite: np.ndarray, strain: np.ndarray | None) -> FoundFrames:
     """All of a rollout, but for what is not finite and for parts that have come off.
 
     Args:
@@ -159,7 +159,7 @@ def causes_of(data: RolloutData, meshes: Meshes, finite: np.ndarray, strain: np.
     """
     metrics = {name: values for name, values in data.step_metrics.items() if values.shape == finite.shape}
     surface = surface_metrics(data, meshes)
-    torn = Found() if strain is None else strain_causes(finite, strain, meshes)
+    torn = FoundFrames() if strain is None else strain_causes(finite, strain, meshes)
     return (
         torn
         + solved_causes(metrics, _step_of(data))
@@ -202,9 +202,9 @@ _CROSSINGS = {
 }
 
 
-def crossing_causes(meshes: Meshes, metrics: Mapping[str, np.ndarray]) -> Found:
+def crossing_causes(meshes: Meshes, metrics: Mapping[str, np.ndarray]) -> FoundFrames:
     """Cloth through cloth that a viewer sees."""
-    found, edge = Found(), meshes.edge_length
+    found, edge = FoundFrames(), meshes.edge_length
     most, most_seen = pairs_along(CROSSINGS_UNSOUND.value, edge), pairs_along(CROSSINGS_SEEN.value, edge)
     every_pair = sum((np.nan_to_num(metrics[name]) for name in _CROSSINGS), np.zeros(len(metrics["self_crossings"])))
     looked = visible_crossings(meshes, every_pair, most)
@@ -215,7 +215,7 @@ def crossing_causes(meshes: Meshes, metrics: Mapping[str, np.ndarray]) -> Found:
         first = counts[0] if len(counts) and np.isfinite(counts[0]) else 0.0
         start = f" (frame 0 has {first:.0f} already)" if first > 0 else ""
         bad = (np.nan_to_num(counts) > most) & (not hidden)
-        found += Found([Cause(kind, text + start, bad, counts, most, _PAIRS, ".0f", measured=np.isfinite(counts))])
+        found += FoundFrames([Cause(kind, text + start, bad, counts, most, _PAIRS, ".0f", measured=np.isfinite(counts))])
         if 0 < first <= most:
             found.doubts.append(_of_start(first, what))
     if hidden:

@@ -13,7 +13,7 @@ import numpy as np
 from hood.assets.files.said import Doubt
 
 #: Kinds of reasons, as they stand in ``summary.json``; these words stay.
-KINDS = (
+_KINDS = (
     "empty",  # no frame
     "not_finite",
     "not_worn",  # a part of the garment has come off
@@ -60,15 +60,15 @@ class Cause:
 
 
 @dataclass(frozen=True)
-class Found:
+class FoundFrames:
     """What a part of the rule has found: causes to be weighed, doubts, and what does not count."""
 
     causes: list[Cause] = field(default_factory=list)
     doubts: list[Doubt] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
-    def __add__(self, other: Found) -> Found:
-        return Found(self.causes + other.causes, self.doubts + other.doubts, self.notes + other.notes)
+    def __add__(self, other: FoundFrames) -> FoundFrames:
+        return FoundFrames(self.causes + other.causes, self.doubts + other.doubts, self.notes + other.notes)
 
 
 #: Runs of frames that a sentence names.

@@ -20,7 +20,7 @@ from hood.limits import (
 from hood.mesh.editing.repair import boundary_vertices
 from hood.mesh.penetration.crossing import Crossings, crossings
 from hood.mesh.topology import connected_components, hinges, unique_edges
-from hood.rollouts.verdict.frames import Cause, Found, name_frames
+from hood.rollouts.verdict.frames import Cause, FoundFrames, name_frames
 from hood.rollouts.verdict.surface import Meshes, in_folds, sampled, spread_over, visible
 
 #: Frames that are looked at from all sides, at most, of those in which a larger share of the cloth's triangles is cut.
@@ -32,7 +32,7 @@ _LASTING = ((SPOTS_UNSOUND, SPOTS_LASTING), (SPOTS_LARGE, SPOTS_LARGE_LASTING))
 _CORNER, _FLAT = np.deg2rad(60.0), 0.01
 
 
-def skin_causes(metrics: Mapping[str, np.ndarray], inside: Mapping[str, np.ndarray], meshes: Meshes) -> Found:
+def skin_causes(metrics: Mapping[str, np.ndarray], inside: Mapping[str, np.ndarray], meshes: Meshes) -> FoundFrames:
     """Skin through cloth.
 
     A frame is bad where the skin that a viewer sees cuts more than 1% of the cloth's triangles, or sticks out by more than a
@@ -63,21 +63,21 @@ def skin_causes(metrics: Mapping[str, np.ndarray], inside: Mapping[str, np.ndarr
         Cause("skin_depth", f"spots of skin stick out by more than {1e3 * SPOTS_HEIGHT.value:g} mm, and stay,", lasting,
               depth, SPOTS_HEIGHT.value, "m", ".0f", 1e3, " mm", measured),
     ]  # fmt: skip
-    return Found(causes, notes=_notes(metrics, share, shown)) + inside_causes(inside)
+    return FoundFrames(causes, notes=_notes(metrics, share, shown)) + inside_causes(inside)
 
 
 def cut_text() -> str:
     return f"{CUT_UNSOUND.value:.0%}"
 
 
-def inside_causes(metrics: Mapping[str, np.ndarray]) -> Found:
+def inside_causes(metrics: Mapping[str, np.ndarray]) -> FoundFrames:
     """Cloth inside the body, as far as a rollout measured it: it cuts nothing there."""
     share = metrics.get("penetration_share")
     if share is None:
-        return Found()
+        return FoundFrames()
     text, limit = f"more than {INSIDE_UNSOUND.value:.0%} of the cloth's vertices are inside the body", INSIDE_UNSOUND
     bad = np.nan_to_num(share) > limit.value
-    return Found([Cause("inside_body", text, bad, share, limit.value, limit.unit, ".0%", measured=np.isfinite(share))])
+    return FoundFrames([Cause("inside_body", text, bad, share, limit.value, limit.unit, ".0%", measured=np.isfinite(share))])
 
 
 def _seen(share: np.ndarray, meshes: Meshes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -10,7 +10,7 @@ import numpy as np
 from hood.assets.files.said import Doubt
 from hood.limits import AWAY_UNSOUND, SLIPPED_UNSOUND, SUNK_SETTLING, SUNK_UNSOUND, TOLERATED
 from hood.rollouts.file.reader import RolloutData
-from hood.rollouts.verdict.frames import Cause, Found
+from hood.rollouts.verdict.frames import Cause, FoundFrames
 from hood.rollouts.verdict.surface import Meshes
 from hood.rollouts.verdict.worn import Wear, measure_wear
 
@@ -18,23 +18,23 @@ from hood.rollouts.verdict.worn import Wear, measure_wear
 _LOOKED_AT = 60
 
 
-def worn_causes(data: RolloutData, meshes: Meshes, count: int) -> Found:
+def worn_causes(data: RolloutData, meshes: Meshes, count: int) -> FoundFrames:
     """Every part of the garment that has left its place on the body, by the ``count`` simulated frames. Nothing without a body,
     with ``worn=false``, and from the first event on that lets go of held cloth."""
     config = _config(data)
     if config.get("worn", True) is False or not len(meshes.body_faces) or not len(meshes.faces):
-        return Found()
+        return FoundFrames()
     last = _detached(config, data, len(meshes.cloth))
     notes = _note_on_events(meshes, last)
     finite = np.isfinite(meshes.cloth[:last]).all(axis=(1, 2))
     usable = np.flatnonzero(finite)
     if not len(usable) or usable[0] != 0:
-        return Found(notes=notes)
+        return FoundFrames(notes=notes)
     chosen = usable[np.unique(np.linspace(0, len(usable) - 1, min(len(usable), _LOOKED_AT)).astype(np.int64))]
     wear = measure_wear(meshes.cloth, meshes.faces, meshes.body, meshes.body_faces, chosen.tolist(), meshes.pinned)
     if wear is None:
-        return Found(notes=notes)
-    found = Found(_fallen_before(data, count), notes=notes)
+        return FoundFrames(notes=notes)
+    found = FoundFrames(_fallen_before(data, count), notes=notes)
     for part in range(len(wear.num_vertices)):
         found += _of_part(data, meshes, wear, part, count)
     return found
@@ -61,15 +61,15 @@ def _fallen_before(data: RolloutData, count: int) -> list[Cause]:
     return [Cause("not_worn", text, bad, np.full(count, way), limit.value, limit.unit, ".2f", whole=True)]
 
 
-def _of_part(data: RolloutData, meshes: Meshes, wear: Wear, part: int, count: int) -> Found:
+def _of_part(data: RolloutData, meshes: Meshes, wear: Wear, part: int, count: int) -> FoundFrames:
     away, slipped = wear.away[:, part], wear.slipped[:, part]
     if not np.isfinite(away).any():
-        return Found(doubts=[_not_worn_at_first(data, wear, part)])
+        return FoundFrames(doubts=[_not_worn_at_first(data, wear, part)])
     sunk = wear.sunk[:, part]
     off = (away > AWAY_UNSOUND.value) | (slipped > SLIPPED_UNSOUND.value) | (sunk > SUNK_UNSOUND.value)
     # What has come off stays off; a film does not show a moment.
     if not (off[-1] or off.mean() > TOLERATED.value and off.sum() > 1):
-        return Found()
+        return FoundFrames()
     first = int(np.argmax(off))
     frames = meshes.step[wear.frames]
     bad = np.zeros(count, dtype=bool)
@@ -86,21 +86,21 @@ def _of_part(data: RolloutData, meshes: Meshes, wear: Wear, part: int, count: in
     values = np.full(count, np.nan)
     values[frames] = way
     text = (
-        f"{name_part(data, wear, part)} has come off: from frame {frames[first]} on {how}, by "
+        f"{_name_part(data, wear, part)} has come off: from frame {frames[first]} on {how}, by "
         f"{worst:.2f} m at worst (beyond {limit.value:.2f})"
     )
-    return Found([Cause("not_worn", text, bad, values, limit.value, limit.unit, ".2f", part=part + 1, whole=True)])
+    return FoundFrames([Cause("not_worn", text, bad, values, limit.value, limit.unit, ".2f", part=part + 1, whole=True)])
 
 
 def _not_worn_at_first(data: RolloutData, wear: Wear, part: int) -> Doubt:
     text = (
-        f"{name_part(data, wear, part)} is not worn in frame 0, it is {100 * wear.gap[part]:.0f} cm from the body or hardly "
+        f"{_name_part(data, wear, part)} is not worn in frame 0, it is {100 * wear.gap[part]:.0f} cm from the body or hardly "
         "touches it, so nobody can tell whether it stays on; worn=false says that it need not"
     )
     return Doubt("worn", text, (0,), float(wear.gap[part]), "m")
 
 
-def name_part(data: RolloutData, wear: Wear, part: int) -> str:
+def _name_part(data: RolloutData, wear: Wear, part: int) -> str:
     """A part in words: the garment, or its number, vertices and the lowest of them."""
     garment = str(data.attributes.get("garment", "garment"))
     if len(wear.num_vertices) == 1:

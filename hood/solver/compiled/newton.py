@@ -36,7 +36,7 @@ from hood.solver.derivatives.elements import BENDINGS, face_constants, hinge_con
 from hood.solver.derivatives.points import PointForces, point_forces
 from hood.solver.derivatives.self_contact import grips_of, layers_of
 from hood.solver.derivatives.step_terms import stretch_rate
-from hood.solver.derivatives.vertices import Grip, VertexForces, Walls, attachment_stiffness, known_forces, other_terms
+from hood.solver.derivatives.vertices import Grip, VertexForces, Walls, attachment_stiffness, known_forces, terms_without_form
 from hood.solver.system.iterate import fixed_positions
 
 #: Vertices of a part that is worth a thread: an iteration of conjugate gradients takes 20 us at 1,000 vertices.
@@ -102,7 +102,7 @@ def applies(potential: Potential, problem: StepProblem) -> bool:
     """Whether the compiled solver knows every term of the potential that plays a role in ``problem``, on a CPU."""
     bendings = [type(term) for term in potential.terms.values() if type(term) in BENDINGS and term.applies(problem)]
     about_rest = bendings.count(BendDamping) == 0 or (bendings.count(Bending) == 1 and bendings.count(BendDamping) == 1)
-    others = other_terms(potential, problem)
+    others = terms_without_form(potential, problem)
     known = others is None or all(type(term) in LAYER_TERMS for term in others.terms.values())
     one = len(bendings) - bendings.count(BendDamping) <= 1 and about_rest
     return problem.state.pos.device.type == "cpu" and one and known

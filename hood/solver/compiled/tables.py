@@ -17,7 +17,7 @@ from hood.cloth.cloth import Cloth
 from hood.cloth.state import Attachments
 
 #: Elements that the compiled solver takes at a time.
-LANES = 8
+_LANES = 8
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ def _block_keys(tables: list[np.ndarray], size: int) -> np.ndarray:
     return np.unique(np.concatenate(keys))
 
 
-def _elements(chosen: np.ndarray, corners: np.ndarray, keys: np.ndarray, starts: np.ndarray, lanes: int = LANES) -> Elements:
+def _elements(chosen: np.ndarray, corners: np.ndarray, keys: np.ndarray, starts: np.ndarray, lanes: int = _LANES) -> Elements:
     size, width = len(starts) - 1, corners.shape[1]
     order = np.lexsort(corners.T[::-1]) if len(corners) else np.zeros(0, np.int64)
     corners = corners[order]

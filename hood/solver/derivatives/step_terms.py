@@ -17,7 +17,7 @@ from hood.energies.springs import Attachment, attachment_targets
 from hood.solver.derivatives import elements
 from hood.solver.derivatives.elements import BENDINGS, Corners
 from hood.solver.derivatives.points import point_forces
-from hood.solver.derivatives.vertices import attachment_stiffness, other_terms, vertex_forces
+from hood.solver.derivatives.vertices import attachment_stiffness, terms_without_form, vertex_forces
 
 
 class StepTerms:
@@ -30,7 +30,7 @@ class StepTerms:
         self.points = point_forces(potential, problem)
         self.bendings = [term for term in terms if type(term) in BENDINGS]
         self.springs = [term for term in terms if type(term) is Attachment]
-        self.others = other_terms(potential, problem)
+        self.others = terms_without_form(potential, problem)
         targets = attachment_targets(problem) if self.springs else None
         self.spring_targets = None if targets is None else targets.t()  # (3, A) m
         num_membranes = sum(type(term) is Stretching for term in terms)

@@ -339,7 +339,7 @@ def attachment_stiffness(term: Term, problem: StepProblem) -> Tensor:
     return term.stiffness * attachments.active.to(problem.state.pos.dtype)
 
 
-def other_terms(potential: Potential, problem: StepProblem) -> Potential | None:
+def terms_without_form(potential: Potential, problem: StepProblem) -> Potential | None:
     """The terms that have no closed form here and play a role in the problem; None without any."""
     active = potential.active(problem)
     others = {name: term for name, term in active.items() if type(term) not in CLOSED_FORM}

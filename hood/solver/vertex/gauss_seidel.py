@@ -31,7 +31,7 @@ from hood.solver.system.sparsity import BlockPattern, Scatter, upper_pairs
 
 
 @dataclass(frozen=True)
-class Incidence:
+class _Incidence:
     """Elements that touch the n vertices of a colour; each touches one of them, its *own* corner, and only that."""
 
     element: Tensor  # (M,) rows of the element table
@@ -45,9 +45,9 @@ class Colour:
     """One group of free vertices and what acts on them."""
 
     vertices: Tensor  # (n,)
-    faces: Incidence
-    hinges: Incidence
-    attachments: Incidence | None
+    faces: _Incidence
+    hinges: _Incidence
+    attachments: _Incidence | None
 
 
 def greedy_colours(pattern: BlockPattern) -> np.ndarray:
@@ -89,13 +89,13 @@ def _build(plan: SolverPlan, cloth: Cloth, attachments: Attachments | None) -> l
     return colours
 
 
-def _incidence(table: np.ndarray, place: np.ndarray, size: int, device: torch.device) -> Incidence:
+def _incidence(table: np.ndarray, place: np.ndarray, size: int, device: torch.device) -> _Incidence:
     element, own = np.nonzero(place[table] >= 0)
     target = place[table[element, own]]
     axis, count = np.arange(3)[:, None], len(target)
     mirrored = sorted({(k, *pair) for k, (p, q) in enumerate(upper_pairs(3)) for pair in ((p, q), (q, p))})
     source, row, col = (np.array(part)[:, None] for part in zip(*mirrored, strict=True))
-    return Incidence(
+    return _Incidence(
         torch.as_tensor(element, device=device),
         torch.as_tensor(own, device=device),
         Scatter(3 * target + axis, axis * count + np.arange(count), 3 * size, 3 * count),
@@ -294,7 +294,7 @@ def vertex_systems(
     return gradient, matrix
 
 
-def _around(terms: StepTerms, group: Neighbourhood, pos: Tensor) -> Iterator[tuple[Incidence, Tensor, Tensor]]:
+def _around(terms: StepTerms, group: Neighbourhood, pos: Tensor) -> Iterator[tuple[_Incidence, Tensor, Tensor]]:
     """Gradients (3, M) and upper triangles (6, M) of the elements around a colour's vertices, by their own corners."""
     colour = group.colour
     if terms.has_membrane:

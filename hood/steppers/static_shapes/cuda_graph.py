@@ -67,14 +67,14 @@ def _version(value: Tensor) -> float:
     return torch.nan if value.is_inference() else value._version
 
 
-Function = Callable[..., Any]
+_Function = Callable[..., Any]
 #: Operations that give another view of their argument and start nothing on the device.
 VIEWS = ("view", "_unsafe_view", "t", "transpose", "permute", "expand", "slice", "select", "split", "split_with_sizes",
           "unsqueeze", "squeeze", "unbind", "alias", "detach", "as_strided")  # fmt: skip
 
 
 @torch.no_grad()
-def trace(function: Function, inputs: Sequence[Tensor], fold: bool = True) -> fx.GraphModule:
+def trace(function: _Function, inputs: Sequence[Tensor], fold: bool = True) -> fx.GraphModule:
     """``function(*inputs)`` as a module of single operations for inputs of these shapes.
 
     Tensors that the function holds (weights, the cloth) stay what they are and must not change any more.

@@ -11,7 +11,7 @@ from torch import Tensor
 from hood.cloth.cloth import Cloth
 from hood.energies.potential import keeps_both_sides
 from hood.energies.problem import StepProblem
-from hood.solver.derivatives.vertices import other_terms
+from hood.solver.derivatives.vertices import terms_without_form
 from hood.solver.newton import Report, run
 from hood.solver.step_figures import reason_number
 from hood.solver.system.iterate import rounded
@@ -19,7 +19,7 @@ from hood.solver.system.plan import plan_for
 from hood.steppers.network import Prediction
 from hood.steppers.protocol import Relaxing, Stopwatch, timed
 from hood.steppers.static_shapes.cuda_graph import CudaGraph, InputMemory
-from hood.steppers.static_shapes.newton_pieces import FixedSystem, Piece
+from hood.steppers.static_shapes.newton_pieces import FixedSystem, MaskedStep
 from hood.steppers.static_shapes.problem import (
     Constants,
     problem_from,
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from hood.steppers.newton import NewtonStepper
 
 #: How the solver's step of fixed shapes is taken.
-MODES = ("fixed", "captured")
+_MODES = ("fixed", "captured")
 
 
 class CapturedNewton:
@@ -50,8 +50,8 @@ class CapturedNewton:
     relaxing = Relaxing.SETTLE
 
     def __init__(self, stepper: NewtonStepper, mode: str = "captured") -> None:
-        if mode not in MODES:
-            raise ValueError(f"step={mode} serves networks; the solver takes steps plain, {' or '.join(MODES)}")
+        if mode not in _MODES:
+            raise ValueError(f"step={mode} serves networks; the solver takes steps plain, {' or '.join(_MODES)}")
         if mode == "captured" and stepper.gravity.device.type != "cuda":
             raise ValueError("step=captured needs device=cuda, a CPU has no graphs to replay; use step=fixed or step=plain")
         if stepper.settings.linear != "cg":
@@ -105,7 +105,7 @@ class _Plan:
         self._inputs = InputMemory(step_inputs(problem, surface=True))
         potential, known = settled_potential(stepper.potential, problem), problem.with_fold()
         self._potential, self._folds = potential, keeps_both_sides(potential)
-        others = other_terms(potential, known)
+        others = terms_without_form(potential, known)
         if others is not None:
             raise ValueError(
                 f"losses.terms.{next(iter(others.terms))}: its second derivatives are not written out, which steps of fixed "
@@ -140,7 +140,7 @@ class _Plan:
         return self._potential.with_internal_force(problem, compiled=False)
 
 
-def _recorded(piece: Piece) -> Piece:
+def _recorded(piece: MaskedStep) -> MaskedStep:
     def run_piece() -> tuple[Tensor, ...]:
         piece()
         return ()

@@ -22,7 +22,7 @@ from hood.solver.system.plan import ModelBuilder, QuadraticModel, SolverPlan
 #: Conjugate gradient iterations of a piece: between two looks of the host.
 CG_PIECE = 8
 
-Piece = Callable[[], None]
+MaskedStep = Callable[[], None]
 
 
 class FixedSystem:
@@ -45,15 +45,15 @@ class FixedSystem:
         plan: SolverPlan,
         cg_iterations: int,
         double: bool = True,
-        record: Callable[[Piece], Piece] | None = None,
+        record: Callable[[MaskedStep], MaskedStep] | None = None,
     ) -> None:
         self._potential, self._read, self._plan, self._double = potential, read, plan, double
         self._cg_iterations, self._used = cg_iterations, 0
         self._tables(read())
         named = ("enter", "guess", "take_up", "assemble", "direct", "sharpen", "solve", "judge", "aim", "attempt")
-        self.pieces: dict[str, Piece] = {}
+        self.pieces: dict[str, MaskedStep] = {}
         for name in named:
-            piece: Piece = getattr(self, f"_{name}")
+            piece: MaskedStep = getattr(self, f"_{name}")
             self.pieces[name] = piece if record is None else record(piece)
             if record is not None:
                 # To record computes nothing: what the next piece reads has to be there when it is tried out.

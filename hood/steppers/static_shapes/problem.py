@@ -19,7 +19,7 @@ from hood.energies.term import PreparedTerm
 from hood.energies.wind import Wind
 from hood.mesh.closest_point.search import Incidence, build_incidence
 
-Item = TypeVar("Item")
+_Item = TypeVar("_Item")
 _OBSTACLE = tuple(field.name for field in fields(Obstacle))
 
 
@@ -126,7 +126,7 @@ def step_shape(problem: StepProblem, surface: bool = False) -> tuple[Any, ...]:
     return (step.pin_target is not None, present, sizes)
 
 
-def altered(item: Item, **values: Any) -> Item:
+def altered(item: _Item, **values: Any) -> _Item:
     """A copy with other fields; unlike ``dataclasses.replace`` it checks nothing, since a check would wait for the device."""
     altered = copy.copy(item)
     for name, value in values.items():

@@ -22,7 +22,7 @@ from hood.energies.problem import StepProblem
 from hood.mesh.closest_point.search import Incidence
 from hood.mesh.closest_point.vertices import Nearest
 from hood.model.features.inputs import EdgeRows, Inputs
-from hood.model.graph.static_shapes import Capacity, Layout, build_fixed_graph, capacity_for, lay_out
+from hood.model.graph.static_shapes import Capacity, StaticLayout, build_fixed_graph, capacity_for, lay_out
 from hood.model.kernels import triton_edge
 from hood.native import features as native
 from hood.solver.vertex.block_jacobi import incidence_of
@@ -76,7 +76,7 @@ class FixedStep:
     def __init__(
         self,
         simulator: NetworkStepper,
-        layout: Layout,
+        layout: StaticLayout,
         like: StepProblem,
         dense: bool = False,
         potential: Potential | None = None,
@@ -270,7 +270,7 @@ class _Plan:
         self._simulator, self._prepared, self._precision = simulator, prepared, simulator.network.precision
         potential = self._potential()
         self._constants = Constants(problem, potential)
-        self.layout: Layout = lay_out(prepared.static, capacity, problem.step.attachments)
+        self.layout: StaticLayout = lay_out(prepared.static, capacity, problem.step.attachments)
         self._inputs = InputMemory(self._read(problem))
         memory = self._inputs.tensors
         settled = None if potential is None else settled_potential(potential, problem)

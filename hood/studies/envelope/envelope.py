@@ -27,10 +27,20 @@ from hood.evaluation.table import NEWTON
 from hood.rollouts.file.reader import read_rollout
 from hood.rollouts.verdict.rule import judge_rollout
 from hood.studies.envelope.cells import NOMINAL
-from hood.studies.envelope.judge import FIGURES, Criteria, Run, at_same_times, figures, judge, shares, table, usual_of
-from hood.studies.envelope.page import Curve, View, small_sheet, write_page
+from hood.studies.envelope.judge import (
+    FIGURES,
+    Criteria,
+    JudgedRun,
+    at_same_times,
+    figures,
+    judge,
+    judged_table,
+    shares,
+    usual_of,
+)
+from hood.studies.envelope.page import Curve, View, small_sheet, write_map_page
 from hood.studies.envelope.prose import require_marks, write_section
-from hood.studies.envelope.tasks import REFERENCE, Task, command_of, make_tasks, read_record, weights_of, write_inputs
+from hood.studies.envelope.tasks import REFERENCE, Task, command_of, make_tasks, read_judged, weights_of, write_inputs
 from hood.studies.processes import Ended, interruptible, run_beside
 from hood.training import distributed
 
@@ -38,10 +48,10 @@ _COLUMNS = ("factor", "value", "garment", "model", "class", "reasons", "said", "
 
 
 @dataclass(frozen=True)
-class Found:
+class _Found:
     """What a rollout left."""
 
-    run: Run
+    run: JudgedRun
     pos: np.ndarray | None = None  # (T, V, 3) m
     dt: float = 0.0
 
@@ -52,7 +62,7 @@ def report(config: DictConfig, tasks: Sequence[Task], commands: Mapping[Task, Se
     criteria = Criteria(**{spec.name: float(config[spec.name]) for spec in fields(Criteria)})
     models, views, usual = [str(name) for name in config.models], list[View](), dict[tuple[str, str], set[str]]()
     for _, group in groupby(tasks, key=lambda task: (task.cell, task.garment)):
-        found = {task: read_found(task, folder) for task in group if read_record(task, folder)}
+        found = {task: read_found(task, folder) for task in group if read_judged(task, folder)}
         for task in sorted((task for task in found if task.model in models), key=lambda task: models.index(task.model)):
             known = usual.get((task.garment, task.model), usual.get((str(config.garments[0]), task.model), set()))
             view = view_of(task, found, commands[task], criteria, known, folder)
@@ -62,10 +72,10 @@ def report(config: DictConfig, tasks: Sequence[Task], commands: Mapping[Task, Se
             views.append(view)
     rows = [view.row for view in views]
     write_rows(rows, _COLUMNS, folder, "envelope")
-    page = write_page(views, models, criteria, folder)
+    page = write_map_page(views, models, criteria, folder)
     if config.document is not None:
         write_section(Path(str(config.document)), rows, models)
-    print(table(rows, models))
+    print(judged_table(rows, models))
     for model in models:
         parts = shares([row["class"] for row in rows if row["model"] == model])
         print(f"{model}: " + ", ".join(f"{kind} {share:.0%}" for kind, share in parts.items()))
@@ -73,7 +83,7 @@ def report(config: DictConfig, tasks: Sequence[Task], commands: Mapping[Task, Se
 
 
 def view_of(
-    task: Task, found: Mapping[Task, Found], command: Sequence[str], criteria: Criteria, usual: Collection[str], folder: Path
+    task: Task, found: Mapping[Task, _Found], command: Sequence[str], criteria: Criteria, usual: Collection[str], folder: Path
 ) -> View:
     """What is shown of a rollout: its class and figures, its curve beside the solver's, and pictures where it is not sound."""
     own, against = found[task], found.get(task.beside(REFERENCE if task.model == NEWTON else NEWTON))
@@ -85,25 +95,25 @@ def view_of(
     return View(row, judged, curve_of(own.run), None if solver is None else curve_of(solver), picture)
 
 
-def read_found(task: Task, folder: Path) -> Found:
+def read_found(task: Task, folder: Path) -> _Found:
     """What is on disk of a rollout that has ended."""
-    record, at = read_record(task, folder), task.folder(folder) / "rollout"
+    record, at = read_judged(task, folder), task.folder(folder) / "rollout"
     code, error = int(record["exit_code"]), str(record["error"])
     try:
         summary = json.loads((at / "summary.json").read_text())
         data = read_rollout(at / "rollout.h5")
     except (OSError, ValueError):
-        return Found(Run(code, error, late=code < 0 and bool(error)))
+        return _Found(JudgedRun(code, error, late=code < 0 and bool(error)))
     surface = summary.get("surface")
     warnings = (*summary.get("warnings", ()), *(() if surface is None else surface_warnings(surface)))
     verdict = judge_rollout(data)  # of today's rule, whenever the rollout was made
     unsound = verdict.sentences if verdict.sound is False else ()
     finite = np.isfinite(data.cloth_pos).all(axis=(1, 2))
-    run = Run(code, error, warnings, unsound, {**data.metrics, "finite": finite})
-    return Found(run, data.cloth_pos, float(data.attributes["dt"]))
+    run = JudgedRun(code, error, warnings, unsound, {**data.metrics, "finite": finite})
+    return _Found(run, data.cloth_pos, float(data.attributes["dt"]))
 
 
-def curve_of(run: Run) -> Curve | None:
+def curve_of(run: JudgedRun) -> Curve | None:
     """Strain p99 and cut share by frame, for the page."""
     if run.metrics is None:
         return None
@@ -111,7 +121,7 @@ def curve_of(run: Run) -> Curve | None:
     return Curve(run.metrics.get("strain_p99", blank), run.metrics.get("cut_face_share", blank))
 
 
-def _row(task: Task, found: Found, against: Found | None) -> dict[str, Any]:
+def _row(task: Task, found: _Found, against: _Found | None) -> dict[str, Any]:
     run, measured = found.run, dict.fromkeys(FIGURES)
     if run.metrics is not None and found.pos is not None:
         reference = None
@@ -185,7 +195,7 @@ def _prepare(config: DictConfig, folder: Path, tasks: Sequence[Task]) -> None:
 
 
 def _is_done(task: Task, command: Sequence[str], folder: Path) -> bool:
-    record = read_record(task, folder)
+    record = read_judged(task, folder)
     return record.get("command") == list(command) and record.get("weights") == weights_of(task.model)
 
 

@@ -13,7 +13,7 @@ from hood.mesh.editing.remeshing import closest, isotropic
 from hood.mesh.editing.subdivision import quartered
 from hood.mesh.topology import unique_edges
 
-Array = np.ndarray
+_Array = np.ndarray
 
 #: The sheet [m] along a side, and its edges along it.
 _SIDE, _EDGES = 1.0, 24
@@ -119,7 +119,7 @@ _SMOOTH, _MARKS = ("rest_pos", "skin_pos", "lbs_weights", "shapedirs"), ("pinned
 _NOTHING = dict.fromkeys(("uv", "uv_faces", "normal_faces", "colours", "coarse_edges", "panels"))
 
 
-def _split(garment: Garment, chosen: Array, weights: Array | tuple[float, float, float]) -> Garment:
+def _split(garment: Garment, chosen: _Array, weights: _Array | tuple[float, float, float]) -> Garment:
     """Faces ``chosen`` (N,) split into three at means of their corners by ``weights`` (N, 3) or (3,)."""
     a, b, c = (garment.faces[chosen, corner] for corner in range(3))
     new = len(garment.rest_pos) + np.arange(len(chosen))
@@ -130,26 +130,26 @@ def _split(garment: Garment, chosen: Array, weights: Array | tuple[float, float,
     return _grown(garment, origin, np.broadcast_to(np.asarray(weights), origin.shape), np.concatenate([faces, more]))
 
 
-def _grown(garment: Garment, origin: Array, weights: Array, faces: Array) -> Garment:
+def _grown(garment: Garment, origin: _Array, weights: _Array, faces: _Array) -> Garment:
     """With further vertices at means of others, ``origin`` and ``weights`` (N, K), which are marked like the first of them."""
-    smooth: dict[str, Array | None] = {}
+    smooth: dict[str, _Array | None] = {}
     for key, means in _means(garment, origin, weights).items():
         smooth[key] = None if means is None else np.concatenate([getattr(garment, key), means])
-    marks: dict[str, Array | None] = {}
+    marks: dict[str, _Array | None] = {}
     for key in _MARKS:
         values = getattr(garment, key)
         marks[key] = None if values is None else np.concatenate([values, values[origin[:, 0]]])
     return replace(garment, faces=faces, **smooth, **marks, **_NOTHING)  # type: ignore[arg-type]
 
 
-def _means(garment: Garment, origin: Array, weights: Array) -> dict[str, Array | None]:
+def _means(garment: Garment, origin: _Array, weights: _Array) -> dict[str, _Array | None]:
     """The smooth fields at weighted means of vertices (N, K); None where the garment has none."""
-    found: dict[str, Array | None] = {}
+    found: dict[str, _Array | None] = {}
     for key in _SMOOTH:
         values = getattr(garment, key)
         found[key] = None if values is None else np.einsum("nk,nk...->n...", weights, values[origin].astype(np.float64))
     return found
 
 
-def _taken(values: Array | None, rows: Array) -> Array | None:
+def _taken(values: _Array | None, rows: _Array) -> _Array | None:
     return None if values is None else values[rows]

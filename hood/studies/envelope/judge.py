@@ -38,7 +38,7 @@ class Criteria:
 
 
 @dataclass(frozen=True)
-class Run:
+class JudgedRun:
     """How a rollout of a cell ended."""
 
     exit_code: int
@@ -63,7 +63,7 @@ def form(sentence: str) -> str:
     return _LISTED.sub("frame #", _NUMBER.sub("#", _NAME.sub("''", sentence)))
 
 
-def said(run: Run, usual: Collection[str]) -> tuple[str, ...]:
+def what_was_said(run: JudgedRun, usual: Collection[str]) -> tuple[str, ...]:
     """What a run said of itself: why it is unsound, the error that it ended with, and warnings whose :func:`form` is none of
     the ``usual`` ones, which its method prints where everything is ordinary."""
     error = (run.error,) if run.exit_code and run.error else ()
@@ -78,7 +78,7 @@ def usual_of(warnings: Sequence[str], wanting: bool) -> set[str]:
 
 def judge(
     cell: Cell,
-    run: Run,
+    run: JudgedRun,
     solver: Mapping[str, np.ndarray] | None,
     network: bool,
     criteria: Criteria,
@@ -92,7 +92,7 @@ def judge(
         network: whether a network alone took the steps.
         usual: forms of the warnings that the method prints in the nominal cell.
     """
-    told = said(run, usual)
+    told = what_was_said(run, usual)
     if run.exit_code == 2 and run.error:
         refused = bool(cell.bad_input) and cell.bad_input in run.error
         return Judged(REFUSED if refused else FAILED, (run.error,), told)
@@ -147,7 +147,7 @@ def shares(kinds: Sequence[str]) -> dict[str, float]:
     return {kind: counted.count(kind) / max(len(counted), 1) for kind in CLASSES if kind != REFUSED}
 
 
-def table(rows: Sequence[Mapping[str, Any]], models: Sequence[str]) -> str:
+def judged_table(rows: Sequence[Mapping[str, Any]], models: Sequence[str]) -> str:
     """Factor by method: how many cells are sound, and how many are worse."""
     lines = [f"{'':24}" + "".join(f"{model:>22}" for model in models)]
     for factor in dict.fromkeys(row["factor"] for row in rows):

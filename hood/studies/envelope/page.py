@@ -123,7 +123,7 @@ class View:
     picture: bytes | None = None  # JPEG
 
 
-def write_page(views: Sequence[View], models: Sequence[str], criteria: Criteria, folder: Path) -> Path:
+def write_map_page(views: Sequence[View], models: Sequence[str], criteria: Criteria, folder: Path) -> Path:
     """Write ``index.html``; returns its path."""
     parts = [f"<h1>{TITLE}</h1>", *map(paragraph, _introduction(criteria)), _legend()]
     parts.append(section("Shares", _shares(views, models)))

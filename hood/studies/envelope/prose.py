@@ -36,10 +36,10 @@ def write_section(path: Path, rows: Rows, models: Sequence[str]) -> None:
     require_marks(path)
     text = path.read_text(encoding="utf-8")
     before, after = text[: text.index(BEGIN) + len(BEGIN)], text[text.index(END) :]
-    write_atomically(path, f"{before}\n{section(rows, models)}\n{after}".encode())
+    write_atomically(path, f"{before}\n{map_section(rows, models)}\n{after}".encode())
 
 
-def section(rows: Rows, models: Sequence[str]) -> str:
+def map_section(rows: Rows, models: Sequence[str]) -> str:
     """Shares of the classes, ranges of the factors, and every cell that is not sound, in Markdown.
 
     The cells of a method that is not sound in the nominal scene are counted, not listed: they are most of the map.

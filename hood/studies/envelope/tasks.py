@@ -20,7 +20,7 @@ from hood.assets.files.library import locate
 from hood.evaluation.table import GUESS, NEWTON
 from hood.studies.envelope.cells import NOMINAL, Cell, cells
 from hood.studies.envelope.extreme_files import write_garment, write_motion, write_still_body
-from hood.studies.tradeoff.grid import quoted
+from hood.studies.tradeoff.grid import quoted_word
 
 #: The solver at a quarter of the time step, which the solver itself is held against; and no rollout has more frames per second.
 REFERENCE, _FINER, _MOST_FPS = "newton, dt/4", 4, 1000.0
@@ -138,21 +138,21 @@ def command_of(task: Task, config: DictConfig, folder: Path) -> tuple[str, ...]:
     )
     often = () if any(text.startswith("surface_stride=") for text in settings) else ("surface_stride=1",)
     drawn = (*(often if finer == 1 else ("metrics=strain",)), "video=none", "sheet=false")
-    return ("rollout", *asked, *_method(task.model), *drawn, f"output={quoted(str(task.folder(folder) / 'rollout'))}")
+    return ("rollout", *asked, *_method(task.model), *drawn, f"output={quoted_word(str(task.folder(folder) / 'rollout'))}")
 
 
 def _garment_word(task: Task, folder: Path) -> str:
     if task.cell.fault is not None:
-        return quoted(str(_garment(task.cell, task.garment, folder)))
-    return task.garment if task.garment.startswith("[") else quoted(task.garment)
+        return quoted_word(str(_garment(task.cell, task.garment, folder)))
+    return task.garment if task.garment.startswith("[") else quoted_word(task.garment)
 
 
 def _performed(cell: Cell, config: DictConfig, folder: Path) -> tuple[str, ...]:
     """The body and its motion."""
     if cell.still_body:
-        return (f"body={quoted(str(_still_body(folder)))}", "sequence=none")
+        return (f"body={quoted_word(str(_still_body(folder)))}", "sequence=none")
     motion = _motion(cell, folder) if cell.motion is not None else cell.sequence or config.sequence
-    return (f"sequence={quoted(str(motion))}",)
+    return (f"sequence={quoted_word(str(motion))}",)
 
 
 def _method(model: str) -> tuple[str, ...]:
@@ -180,7 +180,7 @@ def weights_of(model: str) -> str:
     return hashlib.sha256(locate("weights", name).read_bytes()).hexdigest()
 
 
-def read_record(task: Task, folder: Path) -> dict[str, Any]:
+def read_judged(task: Task, folder: Path) -> dict[str, Any]:
     try:
         content = json.loads((task.folder(folder) / "cell.json").read_text())
     except (OSError, ValueError):

@@ -36,14 +36,14 @@ _MOST_POSES, _VERTEX_STRIDE = 60, 16
 
 
 @dataclass(frozen=True)
-class Window:
+class AblationWindow:
     """A stretch of a motion that begins at frame ``first``, and why it was taken."""
 
     first: int
     reason: str
 
 
-def choose_windows(motion: Motion, num_frames: int, count: int, length: int) -> list[Window]:
+def choose_windows(motion: Motion, num_frames: int, count: int, length: int) -> list[AblationWindow]:
     """At most ``count`` windows of ``length`` steps within the first ``num_frames`` frames, none of them twice.
 
     In this order: the start; the body's vertices fastest (m/s, root mean square); the body most bent, which is where its
@@ -58,7 +58,7 @@ def choose_windows(motion: Motion, num_frames: int, count: int, length: int) -> 
     frames = np.unique(np.linspace(0, last, min(last + 1, _MOST_POSES)).round().astype(int))
     if motion.num_vertices == 0 or len(frames) < 4:
         even = np.linspace(0, last, min(count, last + 1)).round().astype(int)
-        return [Window(int(frame), "the start" if frame == 0 else "evenly spread") for frame in even]
+        return [AblationWindow(int(frame), "the start" if frame == 0 else "evenly spread") for frame in even]
     speed, spread = _course(motion, frames)
     change = np.abs(np.gradient(speed, frames))
     picked = {
@@ -68,11 +68,11 @@ def choose_windows(motion: Motion, num_frames: int, count: int, length: int) -> 
         "median speed": int(np.argsort(speed)[len(speed) // 2]),
         "highest acceleration": int(change.argmax()),
     }
-    windows: list[Window] = []
+    windows: list[AblationWindow] = []
     for reason, index in picked.items():
         first = int(frames[index])
         if all(abs(first - known.first) >= length for known in windows) and len(windows) < count:
-            windows.append(Window(first, reason))
+            windows.append(AblationWindow(first, reason))
     return windows
 
 
@@ -133,7 +133,7 @@ class Effect:
 class Begun:
     """A window of the full model: its first state, and the first step as it should be solved."""
 
-    window: Window
+    window: AblationWindow
     frame: int  # of the first state
     state: State
     step: StepProblem  # prepared by the full potential
@@ -143,7 +143,7 @@ class Begun:
 
 
 def begin(
-    full: Variant, windows: Sequence[Window], settle: str, lead: int = LEAD, most_steps: int | None = None
+    full: Variant, windows: Sequence[AblationWindow], settle: str, lead: int = LEAD, most_steps: int | None = None
 ) -> list[Begun]:
     """The full model's state ``lead`` frames into every window, from rest on the still body of the window's first frame.
 
@@ -234,7 +234,7 @@ def world(state: State) -> Tensor:
     return state.pos.cpu().double() + state.origin[0]
 
 
-def measure(
+def measure_ablation(
     full: Variant,
     variants: dict[str, Variant],
     begun: Sequence[Begun],
@@ -264,14 +264,14 @@ def measure(
             effect.gamma.append((phi - lowest) / e0)
             effect.exact.append(exact)
             effect.last.append(lasts[name])
-            half, most = distances(lasts[name], lasts[""])
+            half, most = vertex_distances(lasts[name], lasts[""])
             effect.half_mm.append(half)
             effect.mm.append(most)
         going = [name for name in going if not name or not enough(name, effects[name], effects[""])]
     return effects
 
 
-def distances(one: Tensor, other: Tensor) -> tuple[float, float]:
+def vertex_distances(one: Tensor, other: Tensor) -> tuple[float, float]:
     """Median and 95th percentile [mm] of the distances between points (N, 3) [m]; infinite where one is not finite."""
     apart = (one - other).norm(dim=1)
     if not bool(torch.isfinite(apart).all()):

@@ -29,7 +29,7 @@ MESH, TIME_STEP = "mesh", "time step"
 
 
 @dataclass(frozen=True)
-class Choice:
+class PartChoice:
     """Another mesh or time step.
 
     Args:
@@ -47,12 +47,12 @@ class Choice:
     finer: bool = False
 
 
-def choices_of(config: DictConfig) -> list[Choice]:
+def choices_of(config: DictConfig) -> list[PartChoice]:
     """Of a settled config of ``hood rollout``; the coarsest mesh first, finer ones last."""
     return [*_meshes(config), *_time_steps(config)]
 
 
-def choose_choices(config: DictConfig, asked: list[str]) -> list[Choice]:
+def choose_choices(config: DictConfig, asked: list[str]) -> list[PartChoice]:
     """Those of the names; where none is given all that are coarser, and the shorter time step."""
     there = choices_of(config)
     if asked:
@@ -80,7 +80,7 @@ def levels_of(garment: str) -> dict[str, int]:
     return dict(sorted({stem: 1, **sizes}.items(), key=lambda pair: pair[1]))
 
 
-def _meshes(config: DictConfig) -> list[Choice]:
+def _meshes(config: DictConfig) -> list[PartChoice]:
     own = plain(config.garment)
     levels = levels_of(own) if isinstance(own, str) else {}
     if not levels or _by_vertices(config):
@@ -90,7 +90,7 @@ def _meshes(config: DictConfig) -> list[Choice]:
         if name != own:
             finer = size > levels[own]
             purpose = "narrower folds" if finer else "fewer vertices, wider folds"
-            found.append(Choice(f"mesh {name}", MESH, purpose, (f"garment={name}",), finer=finer))
+            found.append(PartChoice(f"mesh {name}", MESH, purpose, (f"garment={name}",), finer=finer))
     return found
 
 
@@ -101,7 +101,7 @@ def _by_vertices(config: DictConfig) -> bool:
     return any(isinstance(one, int) or str(one).endswith((".txt", ".json")) for one in given if one is not None)
 
 
-def _time_steps(config: DictConfig) -> list[Choice]:
+def _time_steps(config: DictConfig) -> list[PartChoice]:
     """Twice and half as many steps; none for networks, which know the step of their training, and where frames are named."""
     if option_of(config).network or plain(config.events):
         return []
@@ -110,7 +110,7 @@ def _time_steps(config: DictConfig) -> list[Choice]:
         if _LEAST_FPS <= pace * fps <= _MOST_FPS:
             frames = round((int(config.num_frames) - 1) * pace) + 1
             words = (f"fps={pace * fps:g}", f"num_frames={frames}")
-            found.append(Choice(f"{pace * fps:g} fps", TIME_STEP, purpose, words, pace, finer=pace > 1.0))
+            found.append(PartChoice(f"{pace * fps:g} fps", TIME_STEP, purpose, words, pace, finer=pace > 1.0))
     return found
 
 

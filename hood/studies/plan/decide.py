@@ -74,7 +74,7 @@ class Tolerance:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class PlanVerdict:
     """What becomes of a part: ``absent`` (nothing in this scene uses it), ``kept`` or ``left out``, and why."""
 
     decision: str
@@ -85,7 +85,7 @@ class Verdict:
 class Decision:
     """Verdicts by part, and what was measured of all that is left out together; None where nothing is."""
 
-    verdicts: dict[str, Verdict]
+    verdicts: dict[str, PlanVerdict]
     left_out: tuple[str, ...]
     together: Effect | None
 
@@ -132,20 +132,20 @@ def decide(
         measure_together: the full model's and the combination's effect, measured side by side.
     """
     full = effects[""]
-    verdicts = {name: Verdict("absent", reason) for name, reason in absent.items()}
+    verdicts = {name: PlanVerdict("absent", reason) for name, reason in absent.items()}
     passing: dict[str, float] = {}
     for name, effect in effects.items():
         if not name or name in absent:
             continue
         reason = why_kept(name, effect, full, tolerance, stay, priced)
         if reason:
-            verdicts[name] = Verdict("kept", reason)
+            verdicts[name] = PlanVerdict("kept", reason)
         else:
             passing[name] = effect.saving(full)
     for group in rivals:
         ranked = sorted((name for name in group if name in passing), key=lambda name: -passing[name])
         for name in ranked[1:]:
-            verdicts[name] = Verdict("kept", f"{ranked[0]!r} saves more and passes as well")
+            verdicts[name] = PlanVerdict("kept", f"{ranked[0]!r} saves more and passes as well")
             del passing[name]
     together: Effect | None = None
     while passing:
@@ -157,12 +157,12 @@ def decide(
         why = (
             f"with the others left out {tolerance.say(error)}" if error > tolerance.value else "saves nothing beside the others"
         )
-        verdicts[worst] = Verdict("kept", why)
+        verdicts[worst] = PlanVerdict("kept", why)
         del passing[worst]
         together = None
     for name, saving in passing.items():
         said = tolerance.say(tolerance.error(effects[name], full))
-        verdicts[name] = Verdict("left out", f"without it {said}, {100 * saving:.0f}% of a frame saved")
+        verdicts[name] = PlanVerdict("left out", f"without it {said}, {100 * saving:.0f}% of a frame saved")
     return Decision(verdicts, tuple(passing), together)
 
 

@@ -17,11 +17,11 @@ from torch import Tensor
 from hood.cloth.state import State
 from hood.mesh.closest_point.search import search_surface
 from hood.scene.scene import Scene
-from hood.studies.plan.ablation import Variant, advance, distances, rest_at, world
+from hood.studies.plan.ablation import Variant, advance, rest_at, vertex_distances, world
 
 
 @dataclass(frozen=True)
-class Points:
+class _Points:
     """Points that move with a mesh: weights (N, 3) of the vertices ``corners`` (N, 3)."""
 
     corners: Tensor
@@ -32,7 +32,7 @@ class Points:
         return (pos[self.corners] * self.weights.to(pos).unsqueeze(2)).sum(dim=1)
 
 
-def common_points(one: Scene, other: Scene) -> tuple[Points, Points]:
+def common_points(one: Scene, other: Scene) -> tuple[_Points, _Points]:
     """Points that two meshes of a garment share, on ``one`` and on ``other``: the vertices of the coarser mesh, and where they
     lie on the finer one at rest. A fold that the coarser mesh cannot show is no difference there."""
     if other.cloth.num_vertices > one.cloth.num_vertices:
@@ -44,7 +44,7 @@ def common_points(one: Scene, other: Scene) -> tuple[Points, Points]:
     hit = search_surface(points, scenes[0], finer, faces, scenes[1], scenes[2])
     itself = torch.arange(len(points)).unsqueeze(1).expand(-1, 3)
     alone = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64).expand(len(points), 3)
-    return Points(faces[hit.face], hit.bary), Points(itself, alone)
+    return _Points(faces[hit.face], hit.bary), _Points(itself, alone)
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Elsewhere:
     """
 
     variant: Variant
-    points: tuple[Points, Points] | None = None
+    points: tuple[_Points, _Points] | None = None
     pace: float = 1.0
 
     def span(self, first: int, steps: int) -> tuple[int, int]:
@@ -133,7 +133,7 @@ def measure_elsewhere(reference: Reference, other: Elsewhere, firsts: Sequence[i
         there = world(last)
         if other.points is not None:
             end, there = other.points[0].of(end), other.points[1].of(there)
-        half, most = distances(there, end)
+        half, most = vertex_distances(there, end)
         found.half_mm.append(half)
         found.mm.append(most)
     return found

@@ -25,7 +25,7 @@ from hood.steppers.checkpoint import read_header
 from hood.steppers.static_shapes.simulator import network_of
 from hood.studies.plan.ablation import Begun, Effect
 from hood.studies.plan.choices import levels_of
-from hood.studies.plan.page import SHOWN, Difference, write_page
+from hood.studies.plan.page import SHOWN, Difference, write_plan_page
 
 #: Nine tenths of what a push does in one step is felt within so many times the way of a wave.
 _FELT = 2.9
@@ -139,8 +139,8 @@ def differences(ready: Setup, begun: Sequence[Begun], effects: Mapping[str, Effe
 def show(path: Path, plan: Mapping[str, Any], sentence: str, shown: Sequence[Difference]) -> str:
     """Write the page; a line on it. Without the picture libraries it has no pictures."""
     try:
-        write_page(path, plan, sentence, shown)
+        write_plan_page(path, plan, sentence, shown)
     except ImportError as error:
-        write_page(path, plan, sentence, [])
+        write_plan_page(path, plan, sentence, [])
         return f"page in {path}, without pictures: {error}"
     return f"page in {path}"

@@ -35,7 +35,7 @@ class Difference:
     body_faces: np.ndarray
 
 
-def write_page(path: Path, plan: Mapping[str, Any], sentence: str, differences: Sequence[Difference]) -> None:
+def write_plan_page(path: Path, plan: Mapping[str, Any], sentence: str, differences: Sequence[Difference]) -> None:
     """Write the page of ``plan``, as its file holds it; ``sentence`` says what was decided."""
     plan = {**plan, "sentence": sentence}
     parts = ["<h1>What this scene needs</h1>", f'<p class="lead">{escape(sentence)}</p>']

@@ -29,8 +29,8 @@ from hood.studies.plan.decide import QUANTILE, Combination, Tolerance
 from hood.studies.plan.discretisation import Apart
 from hood.studies.plan.mesh_facts import differences, facts, reach_sentence, show
 from hood.studies.plan.page import Difference
-from hood.studies.plan.probe import HOLD, Asked, Probed, probe
-from hood.studies.plan.table import command_line, describe, sentence
+from hood.studies.plan.probe import HOLD, AskedOf, Probed, probe
+from hood.studies.plan.table import describe_plan, plan_command, sentence
 
 #: Words of these keys belong to a training, and to no rollout.
 _TRAINING_GROUPS = ("experiment", "trainer", "data")
@@ -53,7 +53,7 @@ def run(overrides: Sequence[str]) -> int:
         plan, shown = make_plan(words, own)
         write_plan(folder / "plan.json", plan)
         page = show(folder / "plan.html", plan, sentence(plan), shown)
-    print(describe(plan))
+    print(describe_plan(plan))
     print(reach_sentence(plan["facts"]))
     print(page)
     print(f"measured in {plan['cpu_seconds']:.1f} s of the processor")
@@ -67,11 +67,16 @@ def run(overrides: Sequence[str]) -> int:
 
 def _run_training(own: DictConfig, words: list[str], given: Sequence[str]) -> int:
     """The plan of a training."""
-    from hood.studies.plan.training import checked, describe_training, plan_training, write_training_plan  # not for rollouts
+    from hood.studies.plan.training import (  # not for rollouts
+        checked_training,
+        describe_training,
+        plan_training,
+        write_training_plan,
+    )
 
     others = [str(key) for key in own if key not in ("output", *_TRAINING_KEYS)]
     _refuse(given, others, "belongs to the plan of a rollout")
-    config = checked(words, own)
+    config = checked_training(words, own)
     output_folder(own)
     with held_folder(own) as folder:
         plan = plan_training(config, words, int(own.updates), int(own.scenes))
@@ -107,7 +112,7 @@ def make_plan(words: list[str], own: DictConfig, evidence: bool = True) -> tuple
     began, spent = time.perf_counter(), time.process_time()
     ready = set_up(config, make_stepper(config)[0])
     frames = _frames(own, tolerance, budget, min(int(ready.config.num_frames), ready.scene.num_frames))
-    asked = Asked(tolerance, budget, [str(name) for name in own.parts], int(own.windows), frames, evidence=evidence)
+    asked = AskedOf(tolerance, budget, [str(name) for name in own.parts], int(own.windows), frames, evidence=evidence)
     found = probe(ready, asked)
     plan = _record(ready, [*words, *_settled_words(config, ready)], asked, found)
     shown = differences(ready, found.begun, found.effects, asked.frames) if evidence else []
@@ -164,7 +169,7 @@ def _settled_words(asked: DictConfig, ready: Setup) -> list[str]:
     return [f"{key}={ready.config[key]}" for key in keys]
 
 
-def _record(ready: Setup, words: list[str], asked: Asked, found: Probed) -> dict[str, Any]:
+def _record(ready: Setup, words: list[str], asked: AskedOf, found: Probed) -> dict[str, Any]:
     full, begun, tolerance = found.effects[""], found.begun, asked.tolerance
     rows: list[dict[str, Any]] = []
     for part in found.parts:
@@ -187,7 +192,7 @@ def _record(ready: Setup, words: list[str], asked: Asked, found: Probed) -> dict
         "words": words,
         "content": content_digest(words),
         "chosen": found.words,
-        "command": command_line(words, found.words),
+        "command": plan_command(words, found.words),
         "accuracy": {"value": tolerance.value, "unit": tolerance.unit},
         "budget_ms": asked.budget_ms,
         "windows": [{"first": one.window.first, "measured_from": one.frame, "reason": one.window.reason} for one in begun],

@@ -13,25 +13,25 @@ from hood.app.setup import Setup
 from hood.steppers.watched import WatchedStepper, lacking
 from hood.studies.plan.ablation import (
     LEAD,
+    AblationWindow,
     Begun,
     Effect,
     Variant,
-    Window,
     active_terms,
     begin,
     choose_windows,
-    measure,
+    measure_ablation,
     prices,
 )
-from hood.studies.plan.choices import MESH, Choice, Variants, choices_of, choose_choices
+from hood.studies.plan.choices import MESH, PartChoice, Variants, choices_of, choose_choices
 from hood.studies.plan.decide import (
     LEAST_SAVING,
     QUANTILE,
     Combination,
     Option,
+    PlanVerdict,
     Search,
     Tolerance,
-    Verdict,
     cheapest,
     combinations,
     decide,
@@ -52,7 +52,7 @@ HOLD = 15
 
 
 @dataclass(frozen=True)
-class Asked:
+class AskedOf:
     """What a plan is made for.
 
     Args:
@@ -94,13 +94,13 @@ class Probed:
     """
 
     parts: list[Part]
-    choices: list[Choice]
+    choices: list[PartChoice]
     begun: list[Begun]
     effects: dict[str, Effect]
     apart: dict[str, Apart]
     full_ms: float
     price: dict[str, float]
-    verdicts: dict[str, Verdict]
+    verdicts: dict[str, PlanVerdict]
     names: tuple[str, ...]
     words: list[str]
     together: Effect | None
@@ -108,7 +108,7 @@ class Probed:
     limit: float | None
 
 
-def probe(ready: Setup, asked: Asked) -> Probed:
+def probe(ready: Setup, asked: AskedOf) -> Probed:
     """Everything that is measured, and what is chosen by it.
 
     Raises:
@@ -120,7 +120,7 @@ def probe(ready: Setup, asked: Asked) -> Probed:
 class _Probe:
     """One probing: the full model, its windows, and what is measured in them."""
 
-    def __init__(self, ready: Setup, asked: Asked) -> None:
+    def __init__(self, ready: Setup, asked: AskedOf) -> None:
         self.ready, self.asked, self.config = ready, asked, ready.config
         others = [one.name for one in choices_of(self.config)] if asked.evidence else []
         self.parts = choose_parts(self.config, asked.parts, asked.decides, others)
@@ -146,9 +146,9 @@ class _Probe:
             far = self.asked.budget_ms is None and tolerance.hopeless(effect, of_full)
             return name in stay or far or (self.asked.decides and broken(effect, of_full))
 
-        self.effects = measure(self.full, self.variants, self.begun, self.asked.frames, enough)
+        self.effects = measure_ablation(self.full, self.variants, self.begun, self.asked.frames, enough)
         apart = {one.name: self._compare(one) for one in self.choices}
-        verdicts = {name: Verdict("absent", reason) for name, reason in absent.items()}
+        verdicts = {name: PlanVerdict("absent", reason) for name, reason in absent.items()}
         together, search = None, None
         if self.asked.decides:
             search = self._search(self._options(apart, stay))
@@ -170,7 +170,7 @@ class _Probe:
             verdicts, names, self._words_of(names), together, search, limit,
         )  # fmt: skip
 
-    def _windows(self) -> list[Window]:
+    def _windows(self) -> list[AblationWindow]:
         count = min(int(self.config.num_frames), self.ready.scene.num_frames)
         try:
             return choose_windows(self.ready.scene.motion, count, self.asked.windows, LEAD + self.asked.frames + 1)
@@ -196,7 +196,7 @@ class _Probe:
         return found
 
     def _words_of(self, names: Iterable[str]) -> list[str]:
-        rows: list[Part | Choice] = [*self.choices, *self.parts]
+        rows: list[Part | PartChoice] = [*self.choices, *self.parts]
         return list(dict.fromkeys(word for row in rows if row.name in names for word in row.words))
 
     def _limit(self, names: Iterable[str]) -> float:
@@ -228,7 +228,7 @@ class _Probe:
         """The full model and the parts' combination, side by side."""
         if len(names) == 1 and not self._lacking(names):
             return self.effects[""], self.effects[names[0]]
-        found = measure(self.full, {"all": self._watched(names)}, self.begun, self.asked.frames)
+        found = measure_ablation(self.full, {"all": self._watched(names)}, self.begun, self.asked.frames)
         return found[""], found["all"]
 
     @cached_property
@@ -249,7 +249,7 @@ class _Probe:
         """How far a combination is from the full model; in one window where ``few`` will do."""
         return measure_elsewhere(self._reference, self._elsewhere(names), self._firsts(few), LEAD + self.asked.frames)
 
-    def _compare(self, one: Choice) -> Apart:
+    def _compare(self, one: PartChoice) -> Apart:
         """How far a choice is from the full model; one that only informs, in one window."""
         return self._apart((one.name,), few=one.finer or not self.asked.decides)
 

@@ -10,8 +10,8 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from hood.studies.plan.ablation import Effect
-from hood.studies.plan.choices import Choice
-from hood.studies.plan.decide import Tolerance, Verdict, why_kept
+from hood.studies.plan.choices import PartChoice
+from hood.studies.plan.decide import PlanVerdict, Tolerance, why_kept
 from hood.studies.plan.discretisation import Apart
 from hood.studies.plan.parts import Part
 
@@ -19,7 +19,7 @@ from hood.studies.plan.parts import Part
 _CHOSEN = ("left out", "taken")
 
 
-def describe(plan: Mapping[str, Any]) -> str:
+def describe_plan(plan: Mapping[str, Any]) -> str:
     """The table and one paragraph."""
     where = ", ".join(f"{one['measured_from']} ({one['reason']})" for one in plan["windows"])
     lines = [
@@ -94,7 +94,7 @@ def _asked(limit: Mapping[str, Any]) -> str:
     return f"{limit['value']:g} mm" if limit["unit"] == "mm" else f"γ = {limit['value']:g}"
 
 
-def command_line(words: Sequence[str], chosen: Sequence[str]) -> str:
+def plan_command(words: Sequence[str], chosen: Sequence[str]) -> str:
     """``hood rollout`` with the words of the scene and those that were chosen, which stand for earlier ones of the same key."""
     said = {word.partition("=")[0]: word for word in (*words, *chosen)}
     return shlex.join(["hood", "rollout", *said.values(), "output=outputs/mine"])
@@ -124,7 +124,7 @@ def of_parts(
     stay: Mapping[str, str],
     tolerance: Tolerance,
     names: Collection[str],
-) -> dict[str, Verdict]:
+) -> dict[str, PlanVerdict]:
     """By part that was measured, where the combination ``names`` was chosen."""
     found, full = {}, effects[""]
     of_mm = tolerance if tolerance.unit == "mm" else Tolerance(float("inf"), "mm")
@@ -134,33 +134,33 @@ def of_parts(
         effect = effects[part.name]
         far = of_mm.say(effect.worst_mm)
         if part.name in names:
-            verdict = Verdict("left out", f"without it {far}, {100 * effect.saving(full):.0f}% of a frame saved")
+            verdict = PlanVerdict("left out", f"without it {far}, {100 * effect.saving(full):.0f}% of a frame saved")
         elif part.name not in stay and broken(effect, full):
-            verdict = Verdict("kept", f"without it γ = {Tolerance(BROKEN, 'gamma').error(effect, full):.2g} more")
+            verdict = PlanVerdict("kept", f"without it γ = {Tolerance(BROKEN, 'gamma').error(effect, full):.2g} more")
         else:
             reason = why_kept(part.name, effect, full, of_mm, stay, ())
-            verdict = Verdict("kept", reason or f"{far} without it; {_why_else(names)}")
+            verdict = PlanVerdict("kept", reason or f"{far} without it; {_why_else(names)}")
         found[part.name] = with_it(verdict) if part.instead else verdict
     return found
 
 
-def of_choice(one: Choice, apart: Apart, full_ms: float, names: Collection[str] | None) -> Verdict:
+def of_choice(one: PartChoice, apart: Apart, full_ms: float, names: Collection[str] | None) -> PlanVerdict:
     """Of a mesh or time step, where the combination ``names`` was chosen; None where parts alone are decided on, by γ."""
     share = apart.frame_ms(one.pace) / full_ms
     far = f"{max(apart.mm):.2g} mm from what was asked for"
     if one.finer:
-        return Verdict("compared", f"finer: {far}, {share:.1f} times the time")
+        return PlanVerdict("compared", f"finer: {far}, {share:.1f} times the time")
     said = f"{far}, {100 * (1 - share):.0f}% of the time saved"
     if names is None:
-        return Verdict("compared", f"{said}; {_IN_MM}")
-    return Verdict("taken", said) if one.name in names else Verdict("not taken", f"{said}; {_why_else(names)}")
+        return PlanVerdict("compared", f"{said}; {_IN_MM}")
+    return PlanVerdict("taken", said) if one.name in names else PlanVerdict("not taken", f"{said}; {_why_else(names)}")
 
 
 def _why_else(names: Collection[str]) -> str:
     return _OTHERWISE if names else _NOTHING
 
 
-def with_it(verdict: Verdict) -> Verdict:
+def with_it(verdict: PlanVerdict) -> PlanVerdict:
     """Of a way to take the steps, which is there or not."""
     decision = {"left out": "taken", "kept": "not taken"}.get(verdict.decision, verdict.decision)
-    return Verdict(decision, verdict.reason.replace("without it", "with it"))
+    return PlanVerdict(decision, verdict.reason.replace("without it", "with it"))

@@ -40,7 +40,7 @@ _BANDS = 5
 _PARTS = ("scenes", "search", "features", "network", "losses", "backward", "optimiser", "rest")
 
 
-def checked(words: Sequence[str], own: DictConfig) -> DictConfig:
+def checked_training(words: Sequence[str], own: DictConfig) -> DictConfig:
     """The config of the training, with scenes made in this process, before anything is read.
 
     Raises:

@@ -10,7 +10,7 @@ from typing import Any
 from hood.evaluation.table import NEWTON
 from hood.studies.tradeoff.comparison import RESOLUTION, pareto_front
 from hood.studies.tradeoff.grid import Point
-from hood.studies.tradeoff.results import PARTS, Reached
+from hood.studies.tradeoff.results import FRAME_PARTS, Reached
 
 #: Gaps below are not drawn in their place: a logarithm has none for γ ≤ 0, and minima are not known that exactly.
 FLOOR = RESOLUTION
@@ -170,7 +170,7 @@ def cost_chart(reached: Sequence[Reached], title: str) -> Any:
         figure = Figure(figsize=(9.0, 1.7 + 0.22 * len(items)), layout="constrained")
         axes = figure.subplots()
         left = [0.0] * len(items)
-        for name in PARTS:
+        for name in FRAME_PARTS:
             widths = [item.parts[name] for item in items]
             axes.barh(range(len(items)), widths, left=left, color=_PART_COLOURS[name], label=name, height=0.75)
             left = [before + width for before, width in zip(left, widths, strict=True)]
@@ -178,7 +178,7 @@ def cost_chart(reached: Sequence[Reached], title: str) -> Any:
         axes.set_ylim(-0.6, len(items) - 0.4)
         axes.set_xlabel("milliseconds per frame (mean)")
         axes.set_title(title, loc="left")
-        axes.legend(ncols=len(PARTS), loc="lower right", bbox_to_anchor=(1.0, 1.0), fontsize=8)
+        axes.legend(ncols=len(FRAME_PARTS), loc="lower right", bbox_to_anchor=(1.0, 1.0), fontsize=8)
     return figure
 
 

@@ -132,7 +132,7 @@ def at_equal_time(item: Reached, networks: Sequence[Reached]) -> AtEqualTime | N
 
 
 @dataclass(frozen=True)
-class Refined:
+class _Refined:
     """A refined network beside the same one alone, rollout by rollout.
 
     Args:
@@ -158,7 +158,7 @@ class Refined:
         return bool(stretched or np.median(self.reached.penetrations) > np.median(self.plain.penetrations))
 
 
-def refined_networks(reached: Sequence[Reached]) -> list[Refined]:
+def refined_networks(reached: Sequence[Reached]) -> list[_Refined]:
     """Every refined network whose network alone was measured at that size as well."""
     solver = {item.point.size: item.strain_p99 for item in reached if item.point.model == NEWTON}
     plain = {(i.point.model, i.point.precision, i.point.size): i for i in reached if not i.point.alone and not i.point.refine}
@@ -168,7 +168,7 @@ def refined_networks(reached: Sequence[Reached]) -> list[Refined]:
         if own is not None:
             both = (item.strains, own.strains), (item.penetrations, own.penetrations)
             stretched, deeper = (sum(here > there for here, there in zip(*pair, strict=False)) for pair in both)
-            found.append(Refined(item, own, stretched, deeper, solver.get(item.point.size, float("nan"))))
+            found.append(_Refined(item, own, stretched, deeper, solver.get(item.point.size, float("nan"))))
     return found
 
 

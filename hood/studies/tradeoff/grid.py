@@ -13,7 +13,7 @@ from hood.evaluation.table import GUESS, NEWTON, model_name
 
 
 @dataclass(frozen=True)
-class Size:
+class GridSize:
     """Garments of about one size, and what is measured on them.
 
     Args:
@@ -114,7 +114,7 @@ class Grid:
     models: tuple[str, ...]
     precisions: tuple[str, ...]
     methods: tuple[str, ...]
-    sizes: tuple[Size, ...]
+    sizes: tuple[GridSize, ...]
     settings: tuple[str, ...] = ()
     newton: bool = True
     motions: int = 1
@@ -131,7 +131,7 @@ class Grid:
             raise ValueError(f"models: two of them are called {double[0]!r} and could not be told apart; rename a file")
         return [point for size in self.sizes if size.garments for point in self._points_at(size)]
 
-    def _points_at(self, size: Size) -> list[Point]:
+    def _points_at(self, size: GridSize) -> list[Point]:
         names = {model_name(model): model for model in self.models}
         absent = [name for name in size.models if name not in names and name not in self.models]
         if absent:
@@ -152,10 +152,10 @@ class Grid:
             points.append(self._point(size, NEWTON, 0, "fp32", "newton"))
         return points
 
-    def _point(self, size: Size, model: str, refine: int, precision: str, method: str) -> Point:
+    def _point(self, size: GridSize, model: str, refine: int, precision: str, method: str) -> Point:
         settings = [
-            f"models=[{quoted(model + (f'+{refine}' if refine else ''))}]",
-            f"garments=[{','.join(map(quoted, size.garments))}]",
+            f"models=[{quoted_word(model + (f'+{refine}' if refine else ''))}]",
+            f"garments=[{','.join(map(quoted_word, size.garments))}]",
             f"num_frames={size.num_frames}",
             f"gap_states={size.gap_states}",
             *([f"shapes={[list(shape) for shape in size.shapes]}".replace(" ", "")] if size.shapes != ((),) else []),
@@ -167,13 +167,13 @@ class Grid:
         return Point(size.name, model, refine, precision, method, tuple(settings), rollouts)
 
 
-def quoted(text: str) -> str:
+def quoted_word(text: str) -> str:
     """A value as the grammar of overrides reads it inside a list."""
     if re.fullmatch(r"[\w./:+-]+", text):
         return text
     return "'" + text.replace("'", "\\'") + "'"
 
 
-def listed(key: str, values: Sequence[str]) -> str:
+def listed_words(key: str, values: Sequence[str]) -> str:
     """``key=[a,b]``."""
-    return f"{key}=[{','.join(map(quoted, values))}]"
+    return f"{key}=[{','.join(map(quoted_word, values))}]"

@@ -36,7 +36,7 @@ _VERDICTS = {NETWORK: "network faster", SOLVER: "solver faster", OPEN: "open"}
 _TIME_VERDICTS = {REFINED: "refined more accurate", NETWORK: "network alone more accurate", OPEN: "open"}
 
 
-def write_page(study: Study, folder: Path) -> Path:
+def write_tradeoff_page(study: Study, folder: Path) -> Path:
     """Write ``index.html`` and the charts as PNG; returns the page's path."""
     pictures = _pictures(study, folder)
     parts = ["<h1>Speed and accuracy of cloth dynamics</h1>", f'<p class="lead">{escape(study.sentence)}</p>']
@@ -84,7 +84,7 @@ def _choices(study: Study) -> str:
             cells.append("none measured" if best is None else f"{best.label}: {best.ms.value:.0f} ms")
         rows.append([f"{study.at(size)[0].vertices:,} vertices", *cells])
     head = ["size", *(f"γ ≤ {target:g}" for target in _TARGETS)]
-    return section("Which setting to choose", paragraph(CHOICES) + table(head, rows))
+    return section("Which setting to choose", paragraph(_CHOICES) + table(head, rows))
 
 
 def _size_section(study: Study, size: str, pictures: dict[str, str]) -> str:
@@ -179,7 +179,7 @@ def _all_points(study: Study) -> str:
                      _range(item.gap_p95), f"{item.rg:.2g}", f"{item.strain_p99:.1%}", str(item.states), "; ".join(flags),
                      f"<code>{escape(item.point.command)}</code>"])  # fmt: skip
     head = ["size", "setting", "ms median", "ms p95", "γ median", "γ p95", "rg", "p99 strain", "states", "flags", "command"]
-    return section("All points and their commands", paragraph(COMMANDS) + table(head, rows, raw=len(head) - 1))
+    return section("All points and their commands", paragraph(_COMMANDS) + table(head, rows, raw=len(head) - 1))
 
 
 def _left_out(study: Study) -> str:
@@ -200,7 +200,7 @@ def _end(value: float) -> str:
     return "∞" if value == float("inf") else f"{value:.2g}"
 
 
-CHOICES = (
+_CHOICES = (
     "The cheapest setting whose median γ is below the limit with its whole interval, and whose strain stays within "
     f"{OVERSTRETCHED:g} times the converged solver's."
 )
@@ -221,7 +221,7 @@ ABOUT_REFINED = (
     "solver's strain, up or down: worse is what has more strain than without and than the solver, or more penetration in the "
     "median rollout."
 )
-COMMANDS = (
+_COMMANDS = (
     "Every point is one command; run it to check the point. It prints the point's table and writes it to outputs/evaluate. "
     "Flags say where figures are bounds or doubtful."
 )

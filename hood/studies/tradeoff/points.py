@@ -22,8 +22,8 @@ from hood.app.stepping.steppers import find_option
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.library import locate
 from hood.studies.processes import PROGRAM, end, interruptible
-from hood.studies.tradeoff.grid import Point, quoted
-from hood.studies.tradeoff.results import read_record
+from hood.studies.tradeoff.grid import Point, quoted_word
+from hood.studies.tradeoff.results import read_measured
 
 #: Written by ``hood evaluate`` when all its rollouts are done.
 _TABLE = "table.json"
@@ -84,7 +84,7 @@ class Points:
 
     def is_done(self, point: Point) -> bool:
         """Whether it was measured to the end by this very command and with the weights that have that name today."""
-        record = read_record(self.folder_of(point))
+        record = read_measured(self.folder_of(point))
         return record.get("command") == point.command and record.get("weights") == weights_digest(point)
 
     def measure(self, points: Sequence[Point]) -> list[Failure]:
@@ -132,7 +132,7 @@ class Points:
         folder, begun = self.folder_of(point), {"command": point.command, "weights": weights_digest(point)}
         for name in (_TABLE, "point.json"):  # the table's presence says that all rollouts are there
             (folder / name).unlink(missing_ok=True)
-        before = read_record(folder, _TURNS)
+        before = read_measured(folder, _TURNS)
         if {key: before.get(key) for key in begun} != begun:
             for path in folder.glob("rollouts.*.jsonl"):
                 path.unlink(missing_ok=True)
@@ -147,7 +147,7 @@ class Points:
             *self.program,
             "evaluate",
             *point.settings,
-            f"output={quoted(str(folder))}",
+            f"output={quoted_word(str(folder))}",
             f"resume={str(count > 0).lower()}",
             f"max_rollouts={math.ceil(point.rollouts / self.turns)}",
         ]
@@ -163,7 +163,7 @@ class Points:
     def _note_turn(self, item: _Running) -> None:
         turn = {"seconds": time.monotonic() - item.begin, "cpu_seconds": item.cpu_seconds, "load_at_start": item.load}
         folder = self.folder_of(item.point)
-        record = read_record(folder, _TURNS)
+        record = read_measured(folder, _TURNS)
         write_atomically(folder / _TURNS, json.dumps({**record, "turns": [*record["turns"], turn]}).encode())
 
     def _finish(self, item: _Running) -> list[Failure]:
@@ -171,7 +171,7 @@ class Points:
             return [Failure(item.point, self._complaint(item), self.log_of(item.point))]
         if not (self.folder_of(item.point) / _TABLE).exists():
             return [Failure(item.point, "a turn added no rollout and wrote no table", self.log_of(item.point))]
-        turns = read_record(self.folder_of(item.point), _TURNS)["turns"]
+        turns = read_measured(self.folder_of(item.point), _TURNS)["turns"]
         seconds = sum(turn["seconds"] for turn in turns)
         spent = [turn["cpu_seconds"] for turn in turns]
         record: dict[str, Any] = {

@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from hood.evaluation.bootstrap import Estimate, estimate, resample
+from hood.evaluation.bootstrap import Estimate, estimate_interval, resample_rows
 from hood.evaluation.files import RolloutLog
 from hood.evaluation.gap import AGREEMENT
-from hood.evaluation.table import NEWTON, Measured
+from hood.evaluation.table import NEWTON, MeasuredRollout
 from hood.studies.tradeoff.grid import Point
 
 #: Parts of a frame's time, and which entries of a frame belong to each.
-PARTS = {
+FRAME_PARTS = {
     "search": ("ms_search",),
     "features": ("ms_features",),
     "network": ("ms_network",),
@@ -110,31 +110,31 @@ def read_reached(point: Point, folder: Path, vertices: int, record: Mapping[str,
     if not any(measured.frames for measured in rollouts):
         fault = "no rollout was written down" if not rollouts else "every rollout was non-finite before a frame could be timed"
         raise ValueError(f"{folder}: {fault}")
-    return summarise(point, rollouts, vertices, record or {})
+    return summarise_points(point, rollouts, vertices, record or {})
 
 
-def summarise(point: Point, rollouts: Sequence[Measured], vertices: int, record: Mapping[str, Any]) -> Reached:
+def summarise_points(point: Point, rollouts: Sequence[MeasuredRollout], vertices: int, record: Mapping[str, Any]) -> Reached:
     """The rollouts of a point in numbers; those on a standing body, for drift alone, are left out."""
     rollouts = [measured for measured in rollouts if measured.frames or measured.failures or measured.gaps]
     frames = [frame for measured in rollouts for frame in measured.frames]
     gaps = [item for measured in rollouts for item in measured.gaps]
     times = [[frame["ms_total"] for frame in measured.frames] for measured in rollouts]
     gammas = [[item["gamma"] for item in measured.gaps] for measured in rollouts]
-    ms_draws, gap_draws = resample(times, 0.5), resample(gammas, 0.5)
+    ms_draws, gap_draws = resample_rows(times, 0.5), resample_rows(gammas, 0.5)
     return Reached(
         point,
         vertices,
-        estimate(times, 0.5, ms_draws),
-        estimate(times, 0.95),
-        estimate(gammas, 0.5, gap_draws),
-        estimate(gammas, 0.95),
+        estimate_interval(times, 0.5, ms_draws),
+        estimate_interval(times, 0.95),
+        estimate_interval(gammas, 0.5, gap_draws),
+        estimate_interval(gammas, 0.95),
         float(np.median([frame["relative_gradient"] for frame in frames])),
         float(np.median([frame["strain_p99"] for frame in frames])),
         float(np.mean([frame.get("penetration_share", 0.0) for frame in frames])),
         float(np.mean([frame.get("penetration_depth", 0.0) for frame in frames])),
         tuple(_unless_broken(one, "strain_p99", np.median) for one in rollouts),
         tuple(_unless_broken(one, "penetration_share", np.mean) for one in rollouts),
-        {name: float(np.mean([sum(f.get(key, 0.0) for key in keys) for f in frames])) for name, keys in PARTS.items()},
+        {name: float(np.mean([sum(f.get(key, 0.0) for key in keys) for f in frames])) for name, keys in FRAME_PARTS.items()},
         rollouts=len(rollouts),
         frames=len(frames),
         states=len(gaps),
@@ -149,7 +149,7 @@ def summarise(point: Point, rollouts: Sequence[Measured], vertices: int, record:
     )
 
 
-def _unless_broken(measured: Measured, key: str, statistic: Callable[[list[float]], Any]) -> float:
+def _unless_broken(measured: MeasuredRollout, key: str, statistic: Callable[[list[float]], Any]) -> float:
     """Of a rollout's frames; infinite where one of them is not finite."""
     if measured.failures or not measured.frames:
         return float("inf")
@@ -185,7 +185,7 @@ def refinement_tables(reached: Sequence[Reached]) -> dict[str, dict[str, list[di
     return tables
 
 
-def read_record(folder: Path, name: str = "point.json") -> dict[str, Any]:
+def read_measured(folder: Path, name: str = "point.json") -> dict[str, Any]:
     """What was written down about a point, by default when it was done; empty where nothing was."""
     try:
         record = json.loads((folder / name).read_text(encoding="utf-8"))

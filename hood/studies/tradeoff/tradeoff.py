@@ -38,9 +38,9 @@ from hood.steppers.checkpoint import read_header
 from hood.steppers.published import SUFFIXES
 from hood.steppers.refined import METHODS
 from hood.studies.tradeoff.comparison import Study, pareto_front
-from hood.studies.tradeoff.grid import Grid, Point, Size, listed
+from hood.studies.tradeoff.grid import Grid, GridSize, Point, listed_words
 from hood.studies.tradeoff.points import Failure, Points
-from hood.studies.tradeoff.results import Reached, overstretched, read_reached, read_record, refinement_tables
+from hood.studies.tradeoff.results import Reached, overstretched, read_measured, read_reached, refinement_tables
 from hood.tensors.precision import PRECISIONS, TF32, check_precision
 
 #: Keys of ``hood evaluate`` that every point sets by itself.
@@ -50,7 +50,7 @@ _OWN = (
 )  # fmt: skip
 
 
-def check_config(config: DictConfig, sizes: Sequence[str]) -> None:
+def _check_config(config: DictConfig, sizes: Sequence[str]) -> None:
     """Raise ConfigError where a key cannot be meant; names it."""
     require_device(config)
     require_package("matplotlib", "matplotlib", "charts", "hood tradeoff")
@@ -144,7 +144,7 @@ def run(overrides: Sequence[str]) -> int:
     """Run the command; returns the exit code: 1 where points failed and the page is without them."""
     config = load_config("tradeoff", overrides)
     folder = output_folder(config)
-    check_config(config, SIZES)
+    _check_config(config, SIZES)
     check_settings([str(text) for text in config.settings])
     models, absent = chosen_models(config)
     grid = make_grid(config, models)
@@ -182,7 +182,7 @@ def chosen_models(config: DictConfig) -> tuple[list[str], list[str]]:
 def make_grid(config: DictConfig, models: Sequence[str]) -> Grid:
     """The grid that the config describes."""
     sequences = [str(name) for name in config.sequences]
-    shared = [listed("sequences", sequences)]
+    shared = [listed_words("sequences", sequences)]
     if str(config.device) != "cpu":
         shared.append(f"device={config.device}")
     sizes = tuple(_size(config, name, models) for name in SIZES)
@@ -192,7 +192,7 @@ def make_grid(config: DictConfig, models: Sequence[str]) -> Grid:
     return Grid(tuple(models), precisions, methods, sizes, settings, bool(config.newton), motions)
 
 
-def _size(config: DictConfig, name: str, models: Sequence[str]) -> Size:
+def _size(config: DictConfig, name: str, models: Sequence[str]) -> GridSize:
     def values(key: str) -> tuple[Any, ...]:
         return tuple(plain(config[f"{key}_{name}"]))
 
@@ -206,7 +206,7 @@ def _size(config: DictConfig, name: str, models: Sequence[str]) -> Size:
     further = () if name == SIZES[0] else tuple(plain(config[f"refine_{SIZES[0]}"]))
     refined = (_refined_model(config, models), further)
     shapes = tuple(tuple(map(float, shape)) for shape in values("shapes"))
-    return Size(name, garments, values("refine"), values("guess"), *numbers, wanted, precisions, refined, shapes)
+    return GridSize(name, garments, values("refine"), values("guess"), *numbers, wanted, precisions, refined, shapes)
 
 
 def _refined_model(config: DictConfig, models: Sequence[str]) -> str:
@@ -233,7 +233,7 @@ def collect(
             continue
         folder = store.folder_of(point)
         try:
-            reached.append(read_reached(point, folder, vertices[point.size], read_record(folder)))
+            reached.append(read_reached(point, folder, vertices[point.size], read_measured(folder)))
         except ValueError as error:
             failed.append(Failure(point, str(error), store.log_of(point)))
     return reached, failed
@@ -245,13 +245,13 @@ def _write(folder: Path, reached: Sequence[Reached], failures: Sequence[Failure]
         print(f"hood: left out: {failure.point.size} {failure.point.label}: {failure.reason}{log}", file=sys.stderr)
     if not any(item.charted for item in reached):
         raise ValueError(f"{folder}: no point has a time and a gap; the logs in points/*/log.txt say why")
-    from hood.studies.tradeoff.page import write_page
+    from hood.studies.tradeoff.page import write_tradeoff_page
 
     rejected = overstretched(reached)
     left_out = [(failure.point, failure.reason, str(failure.log)) for failure in failures]
     study = Study(list(reached), rejected, left_out, list(absent))
     tables = [folder / "points.csv", *_write_tables(folder, reached)]
-    page = write_page(study, folder)
+    page = write_tradeoff_page(study, folder)
     print(_front_text(reached, rejected))
     if study.warning:
         print(f"\n{study.warning}")

@@ -27,7 +27,7 @@ from scipy.spatial import cKDTree
 
 from hood.assets.body.load import load_body
 from hood.assets.contents.objects import items_of
-from hood.assets.contents.sort_out import choose, mend, metres_per_unit
+from hood.assets.contents.sort_out import mend, metres_per_unit, take_objects
 from hood.assets.formats.mesh_file import read_mesh_file
 from hood.assets.garment.garment import Garment, garment_of_mesh
 from hood.assets.garment.record import Fitting, Wanted, start_fitting
@@ -38,7 +38,7 @@ from hood.mesh.parts import find_parts
 def sorted_out(path: Path, wanted: Wanted | None = None) -> Fitting:
     mesh, wanted, surface = read_mesh_file(path, split_polygons=True), wanted or Wanted(), load_body().v_template
     fitting = start_fitting(garment_of_mesh(path, mesh), mesh.stitches)
-    choose(fitting, wanted, surface)
+    take_objects(fitting, wanted, surface)
     mend(fitting, wanted, surface)
     return fitting
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from garment_kinds import off_text, ply_text, stl_text
 
-from hood.assets.files.text import decoded, encoding_of, read_indices
+from hood.assets.files.text import decoded_text_file, encoding_of, read_indices
 from hood.assets.formats.mesh_file import read_mesh, read_mesh_file
 
 _ENCODINGS = ("utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32", "latin-1")
@@ -21,7 +21,7 @@ _TETRAHEDRON = (
 @pytest.mark.parametrize("encoding", _ENCODINGS)
 def test_a_text_is_the_same_in_every_encoding(encoding: str) -> None:
     text = "o Röckchen\nv 1 2 3\n"
-    assert decoded(text.encode(encoding)) == text
+    assert decoded_text_file(text.encode(encoding)) == text
 
 
 def test_bytes_that_are_not_utf8_are_read_as_windows_letters() -> None:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from hood.assets.body.body import Body
-from hood.assets.fitting.fit_search import Asked, Wearer, find_placement
+from hood.assets.fitting.fit_search import AskedFit, Wearer, find_placement
 from hood.assets.fitting.placement import possible
-from hood.assets.fitting.skin_field import WIDTH, Field, misfit, settle
+from hood.assets.fitting.skin_field import WIDTH, SkinField, misfit, settle_field
 from hood.assets.garment.binding import posed_body, signed_distances
 from hood.assets.garment.garment import Garment
 from hood.assets.motion.sequence_edit import arms_down
@@ -46,7 +46,7 @@ def test_the_misfit_is_least_where_a_garment_belongs(wearer: Wearer, garments: d
     for shift in np.concatenate([np.eye(3), -np.eye(3)]):
         assert misfit(skin.measure(points + 0.04 * shift)) > here + 0.01
     start = np.array([0.02, -0.015, 0.01])
-    assert np.abs(start + settle(points + start, skin, WIDTH, 15)).max() < 0.01
+    assert np.abs(start + settle_field(points + start, skin, WIDTH, 15)).max() < 0.01
 
 
 @pytest.mark.parametrize("name", ["tank", "dress", "trousers", "skirt"])
@@ -59,15 +59,15 @@ def test_the_place_is_right_on_bodies_of_other_shapes(
     other = Wearer(lambda angle: posed_body(body, arms_down(angle), 0, betas).surface, body.faces)
     for angle in (0.0, 70.0):
         pos = worn(garments[name], body, angle, betas)
-        found = find_placement(pos, garments[name].faces, other, Asked(1.0, "y", 0.0))
-        moved = find_placement(pos - [3.0, 2.0, 0.0], garments[name].faces, other, Asked(1.0, "y", 0.0))
+        found = find_placement(pos, garments[name].faces, other, AskedFit(1.0, "y", 0.0))
+        moved = find_placement(pos - [3.0, 2.0, 0.0], garments[name].faces, other, AskedFit(1.0, "y", 0.0))
         assert not found.placement.offset.any()
         assert np.linalg.norm(moved.placement.offset - [3.0, 2.0, 0.0]) < 0.01
 
 
 def test_correlation_finds_the_place_from_anywhere(wearer: Wearer, garments: dict[str, Garment]) -> None:
     points = garments["tank"].tpose(np.zeros(10)) + [7.0, -2.0, 40.0]
-    value, offset = Field(wearer.skin(0.0)).peaks(points, 1)[0]
+    value, offset = SkinField(wearer.skin(0.0)).peaks(points, 1)[0]
     assert np.abs(offset + [7.0, -2.0, 40.0]).max() < 0.05
     assert 0.5 < value <= 1.0
 
@@ -75,7 +75,7 @@ def test_correlation_finds_the_place_from_anywhere(wearer: Wearer, garments: dic
 @pytest.mark.parametrize("angle", [0.0, 30.0, 45.0, 65.0])
 def test_the_angle_of_the_arms_is_found(wearer: Wearer, garments: dict[str, Garment], body: Body, angle: float) -> None:
     for name in ("longsleeve", "tshirt"):
-        found = find_placement(worn(garments[name], body, angle), garments[name].faces, wearer, Asked(1.0, "y", 0.0))
+        found = find_placement(worn(garments[name], body, angle), garments[name].faces, wearer, AskedFit(1.0, "y", 0.0))
         assert abs(found.placement.angle - angle) <= 3.0
         assert found.refusal is None
 
@@ -98,7 +98,7 @@ def test_a_loose_tube_stays_where_its_file_has_it_and_nowhere_else(wearer: Weare
 
 
 def test_strays_change_nothing(wearer: Wearer, garments: dict[str, Garment]) -> None:
-    tank, asked = garments["tank"], Asked(up="y", turn=0.0)
+    tank, asked = garments["tank"], AskedFit(up="y", turn=0.0)
     pos = tank.rest_pos + [0.0, 0.8, 0.0]
     found = find_placement(pos, tank.faces, wearer, asked)
     stray = find_placement(np.concatenate([pos, [[1e3, 0, 0]]]), tank.faces, wearer, asked)

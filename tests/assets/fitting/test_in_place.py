@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hood.assets.body.body import Body
-from hood.assets.fitting.fit_search import Asked, Wearer, find_placement
+from hood.assets.fitting.fit_search import AskedFit, Wearer, find_placement
 from hood.assets.fitting.worn import lies_in_place, way_there
 from hood.assets.garment.binding import posed_body
 from hood.assets.garment.garment import Garment
@@ -76,7 +76,7 @@ def wearer(body: Body) -> Wearer:
 def test_loose_garments_around_the_body_stay(wearer: Wearer, name: str, unit: float | None) -> None:
     """As they are in metres, and with their unit alone given: neither turned, nor moved, nor the arms lowered."""
     pos, faces = LOOSE[name]()
-    found = find_placement(pos / (unit or 1.0), faces, wearer, Asked(scale=unit))
+    found = find_placement(pos / (unit or 1.0), faces, wearer, AskedFit(scale=unit))
     assert found.refusal is None
     assert found.worn
     assert found.placement.keys() == [f"scale={unit or 1.0:g}", "up=y", "turn=0", "offset=[0,0,0]"]
@@ -87,7 +87,7 @@ def test_with_its_unit_alone_a_close_garment_stays_too(wearer: Wearer, garments:
     """A T-shirt 5% wider fits 2 cm lower, too; who says the unit has it where the file has it, with the arms that it has."""
     pos = garments["tshirt"].tpose(np.zeros(10))
     wide = pos.mean(axis=0) + 1.05 * (pos - pos.mean(axis=0))
-    assert find_placement(wide, garments["tshirt"].faces, wearer, Asked(scale=1.0)).placement.keys()[3] == "offset=[0,0,0]"
+    assert find_placement(wide, garments["tshirt"].faces, wearer, AskedFit(scale=1.0)).placement.keys()[3] == "offset=[0,0,0]"
 
 
 def poncho() -> Mesh:

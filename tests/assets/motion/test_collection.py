@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from hood.assets.files.library import DATA_FOLDER
-from hood.assets.motion.motion_files import expand_sequences
+from hood.assets.motion.motion_files import expand_motions
 
 
 @pytest.fixture
@@ -24,11 +24,11 @@ def names(files: list[Path]) -> list[str]:
 
 
 def test_folders_hold_motions_and_other_things(amass: Path) -> None:
-    assert names(expand_sequences(amass)) == ["a_poses.npz", "b_poses.npz", "c.pkl"]
+    assert names(expand_motions(amass)) == ["a_poses.npz", "b_poses.npz", "c.pkl"]
 
 
 def test_names_files_and_globs_in_their_order_without_repetition(amass: Path) -> None:
-    found = expand_sequences([amass / "S2" / "c.pkl", "walk_proud", f"{amass}/**/*_poses.npz", amass])
+    found = expand_motions([amass / "S2" / "c.pkl", "walk_proud", f"{amass}/**/*_poses.npz", amass])
     assert names(found) == ["c.pkl", "walk_proud.npz", "a_poses.npz", "b_poses.npz"]
     assert found[1] == DATA_FOLDER / "motions" / "walk_proud.npz"
 
@@ -37,25 +37,25 @@ def test_lists_start_from_their_own_folder(amass: Path) -> None:
     (amass / "split.txt").write_text("# comment\nS1/a_poses.npz\nwalk_proud\n")
     (amass / "split.json").write_text(json.dumps({"train": ["S1/*_poses.npz"], "validation": ["S2/c.pkl"]}))
     (amass / "split.csv").write_text("id,length,garment\nS2/b_poses,120,dress\nS2/c,90,dress\nS2/b_poses,10,shirt\n")
-    assert names(expand_sequences(amass / "split.txt")) == ["a_poses.npz", "walk_proud.npz"]
-    assert names(expand_sequences(amass / "split.json")) == ["a_poses.npz"]
-    assert names(expand_sequences(amass / "split.json", "validation")) == ["c.pkl"]
-    assert names(expand_sequences(amass / "split.csv")) == ["b_poses.npz", "c.pkl"]
+    assert names(expand_motions(amass / "split.txt")) == ["a_poses.npz", "walk_proud.npz"]
+    assert names(expand_motions(amass / "split.json")) == ["a_poses.npz"]
+    assert names(expand_motions(amass / "split.json", "validation")) == ["c.pkl"]
+    assert names(expand_motions(amass / "split.csv")) == ["b_poses.npz", "c.pkl"]
 
 
 def test_what_is_not_found_is_named(amass: Path, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(ValueError, match="empty: no motions"):
-        expand_sequences(tmp_path / "empty")
+        expand_motions(tmp_path / "empty")
     with pytest.raises(ValueError, match="no file matches"):
-        expand_sequences(f"{amass}/*.bvh*")
+        expand_motions(f"{amass}/*.bvh*")
     with pytest.raises(FileNotFoundError, match="did you mean 'walk_proud'"):
-        expand_sequences("walk_prod")
+        expand_motions("walk_prod")
     with pytest.raises(FileNotFoundError, match="nothing"):
-        expand_sequences(amass / "nothing.csv")
+        expand_motions(amass / "nothing.csv")
     (amass / "bad.csv").write_text("id\nS1/a_poses\nS9/z\n")
     with pytest.raises(FileNotFoundError, match=r"bad\.csv, row 3: S9/z: no such file"):
-        expand_sequences(amass / "bad.csv")
+        expand_motions(amass / "bad.csv")
     (amass / "bad.csv").write_text("id,length\n")
     with pytest.raises(ValueError, match=r"bad\.csv: an empty table"):
-        expand_sequences(amass / "bad.csv")
+        expand_motions(amass / "bad.csv")

@@ -14,7 +14,7 @@ from hood.assets.files.library import locate, names
 from hood.assets.files.said import Doubt
 from hood.assets.motion.load import load_sequence
 from hood.assets.motion.recording import Recording, read_recording
-from hood.assets.motion.skeleton import UNITS, Unit, find_unit
+from hood.assets.motion.skeleton import TRANSLATION_UNITS, Unit, find_unit
 
 
 def unit_of(recording: Recording, transl: np.ndarray, up: str = "z") -> Unit:
@@ -37,7 +37,7 @@ def test_metres_stay_metres(own: Recording) -> None:
 
 @pytest.mark.parametrize("unit", ["cm", "mm"])
 def test_other_units_are_found_on_a_floor(own: Recording, unit: str) -> None:
-    found = unit_of(own, own.transl / UNITS[unit])
+    found = unit_of(own, own.transl / TRANSLATION_UNITS[unit])
     assert (found.name, found.sure) == (unit, True)
     assert not isinstance(found.note, Doubt)
     assert "trans_unit=m" in str(found.note)
@@ -48,7 +48,7 @@ def test_a_walk_tells_its_unit_without_a_floor(unit: str, tmp_path: Path) -> Non
     """In slow motion too: feet that stand still do not depend on the frame rate."""
     clean = world("z").transl - world("z").transl.mean(axis=0)
     for rate in (30.0, 6.0):
-        path = write(tmp_path / "m.npz", amass(trans=clean / UNITS[unit], mocap_framerate=rate))
+        path = write(tmp_path / "m.npz", amass(trans=clean / TRANSLATION_UNITS[unit], mocap_framerate=rate))
         with pytest.warns(UserWarning, match="feet stand still only so"):
             sequence = load_sequence(path, rate, up="z")
         assert np.abs(sequence.transl - clean @ np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])).max() < 1e-9
@@ -66,7 +66,7 @@ def test_a_body_that_is_carried_is_a_doubt() -> None:
 
 def test_the_unit_can_be_given(tmp_path: Path) -> None:
     path = write(tmp_path / "m.npz", amass())
-    for unit, metres in UNITS.items():
+    for unit, metres in TRANSLATION_UNITS.items():
         found = read_recording(path, trans_unit=unit)
         np.testing.assert_allclose(found.transl, world("z").transl * metres)
         assert found.notes == ()

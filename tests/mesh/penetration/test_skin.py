@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hood.mesh.penetration.crossing import crossings
-from hood.mesh.penetration.exposure import REACH, closest_on_triangles, skin_depth, sunken
+from hood.mesh.penetration.exposure import EXPOSURE_REACH, closest_on_triangles, skin_depth, sunken
 from hood.mesh.topology import unique_edges
 from hood.testing import grid, random_rotation, sphere
 
@@ -84,7 +84,7 @@ def test_skin_under_another_layer_is_that_layers() -> None:
 def test_what_is_too_far_is_not_looked_for() -> None:
     pos, faces = sheet(40, 1.0)
     big = 3 * BALL + [0.013, 0.007, 0.12 - 3 * RADIUS]
-    assert REACH - 0.02 < depth(pos, faces, big) <= REACH * (1 + 1e-6)
+    assert EXPOSURE_REACH - 0.02 < depth(pos, faces, big) <= EXPOSURE_REACH * (1 + 1e-6)
 
 
 def test_the_far_side_of_the_body_does_not_stick_out() -> None:

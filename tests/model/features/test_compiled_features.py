@@ -11,7 +11,7 @@ from hood.cloth.state import State
 from hood.model.features import compiled, feature_set, physical
 from hood.model.features.feature_set import FeatureSet
 from hood.model.features.inputs import Inputs
-from hood.model.features.local import local, look
+from hood.model.features.local import local, look_local
 from hood.native import features as native
 from hood.scene.scene import Scene
 
@@ -37,7 +37,7 @@ def assert_close(found: Tensor, expected: Tensor) -> None:
 @torch.no_grad()
 def both(features: FeatureSet, inputs: Inputs) -> None:
     assert compiled.applies(inputs)
-    nodes, edges = features(inputs, compiled.COLUMNS)
+    nodes, edges = features(inputs, compiled.COMPILED_COLUMNS)
     expected_nodes, expected_edges = features(inputs)
     assert_close(nodes, expected_nodes)
     assert list(edges) == list(expected_edges)
@@ -87,7 +87,7 @@ def test_another_timestep_is_told(band_scene: Scene) -> None:
 def test_what_is_seen_between_passes_is_what_torch_sees(name: str, request: pytest.FixtureRequest) -> None:
     inputs = moving_inputs(request.getfixturevalue(name))
     nodes, edges = compiled.look(inputs, ("mesh", "coarse0"))
-    expected_nodes, expected_edges = look(inputs, ("mesh", "coarse0"))
+    expected_nodes, expected_edges = look_local(inputs, ("mesh", "coarse0"))
     assert_close(nodes, expected_nodes)
     for name, expected in expected_edges.items():
         torch.testing.assert_close(edges[name], expected, rtol=3e-6, atol=3e-4)  # a hundred times the strain
@@ -97,7 +97,7 @@ def test_what_is_seen_between_passes_is_what_torch_sees(name: str, request: pyte
 @torch.no_grad()
 def test_the_same_bits_in_every_run(band_scene: Scene) -> None:
     inputs, features = moving_inputs(band_scene), local(2)
-    (first, edges), (second, again) = (features(inputs, compiled.COLUMNS) for _ in range(2))
+    (first, edges), (second, again) = (features(inputs, compiled.COMPILED_COLUMNS) for _ in range(2))
     assert torch.equal(first, second)
     assert all(torch.equal(edges[name], again[name]) for name in edges)
 

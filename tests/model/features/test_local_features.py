@@ -7,7 +7,7 @@ import torch
 
 from hood.contact.contact import find_contact
 from hood.model.features.inputs import Inputs
-from hood.model.features.local import GLOBAL_LOOK_WIDTHS, LOOK_WIDTHS, local, look
+from hood.model.features.local import GLOBAL_LOOK_WIDTHS, LOOK_WIDTHS, local, look_local
 from hood.model.graph.builder import build_graph, build_static
 from hood.model.graph.hierarchy import build_hierarchy
 from hood.scene.scene import Scene
@@ -32,7 +32,7 @@ def test_widths_are_those_promised(band_scene: Scene) -> None:
     assert nodes.shape[1] == features.node_width
     for group in features.node:
         assert group(inputs).shape[1] == group.width
-    nodes, edges = look(inputs, ("mesh",))
+    nodes, edges = look_local(inputs, ("mesh",))
     assert nodes.shape == (inputs.num_cloth, LOOK_WIDTHS[0])
     assert list(edges) == ["mesh"]
     assert edges["mesh"].shape == (inputs.graph.edge_sets["mesh"].num_edges, LOOK_WIDTHS[1])
@@ -42,8 +42,8 @@ def test_global_steps_are_seen_where_there_are_any(band_scene: Scene) -> None:
     inputs, features = make_inputs(band_scene), local(2, together=True)
     step = 1e-3 * torch.randn_like(inputs.base)
     seen = replace(inputs, global_step=step)
-    nodes, _ = look(seen, ())
-    plain, _ = look(inputs, ())
+    nodes, _ = look_local(seen, ())
+    plain, _ = look_local(inputs, ())
     assert nodes.shape[1] == GLOBAL_LOOK_WIDTHS[0]
     assert torch.equal(nodes[:, : LOOK_WIDTHS[0]], plain)
     assert torch.allclose(nodes[:, LOOK_WIDTHS[0] : -1], (step / 1e-3).asinh())
@@ -56,11 +56,11 @@ def test_global_steps_are_seen_where_there_are_any(band_scene: Scene) -> None:
 def test_strain_is_read_at_the_prediction(band_scene: Scene) -> None:
     inputs = make_inputs(band_scene)
     stretched = replace(inputs, base_pos=1.1 * inputs.cloth.rest_pos)
-    assert torch.allclose(look(stretched, ("mesh", "coarse0"))[1]["coarse0"], torch.tensor(10.0).asinh(), atol=1e-3)
-    assert torch.allclose(look(stretched, ("mesh",))[1]["mesh"], torch.tensor(10.0).asinh(), atol=1e-3)
+    assert torch.allclose(look_local(stretched, ("mesh", "coarse0"))[1]["coarse0"], torch.tensor(10.0).asinh(), atol=1e-3)
+    assert torch.allclose(look_local(stretched, ("mesh",))[1]["mesh"], torch.tensor(10.0).asinh(), atol=1e-3)
 
 
 def test_views_that_are_missing_are_asked_for(band_scene: Scene) -> None:
     inputs = replace(make_inputs(band_scene), local_step=None)
     with pytest.raises(ValueError, match="local_step"):
-        look(inputs, ("mesh",))
+        look_local(inputs, ("mesh",))

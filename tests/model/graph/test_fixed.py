@@ -12,7 +12,7 @@ from hood.cloth.state import Attachments, Obstacle, StepInput
 from hood.mesh.closest_point.vertices import Nearest
 from hood.model.graph.builder import BODY, MESH, EdgeSet, Graph, StaticGraph, build_graph, build_static, coarse_name
 from hood.model.graph.hierarchy import build_hierarchy
-from hood.model.graph.static_shapes import Capacity, FixedGraph, Layout, build_fixed_graph, capacity_for, lay_out
+from hood.model.graph.static_shapes import Capacity, FixedGraph, StaticLayout, build_fixed_graph, capacity_for, lay_out
 from hood.testing import grid, sphere
 
 RADIUS = 0.03
@@ -134,7 +134,7 @@ def test_no_body(static: StaticGraph) -> None:
 
 def test_closed_attachments_are_part_of_the_layout(static: StaticGraph) -> None:
     buttons = Attachments(torch.tensor([[0, 55], [1, 54]]), torch.tensor([True, False]))
-    layout: Layout = lay_out(static, Capacity(1, 1), buttons)
+    layout: StaticLayout = lay_out(static, Capacity(1, 1), buttons)
     plain = build_graph(static, StepInput(torch.ones(1), attachments=buttons))
     for name in ("senders", "receivers", "source", "offsets"):
         assert torch.equal(getattr(layout.edge_sets[MESH], name), getattr(plain.edge_sets[MESH], name))

@@ -26,7 +26,7 @@ from hood.scene.scene import Scene
 from hood.steppers.newton import Stepper
 from hood.studies.envelope.cells import Cell, cells
 from hood.studies.envelope.extreme_files import write_garment, write_motion
-from hood.studies.envelope.judge import SOUND, Criteria, Judged, Run, judge
+from hood.studies.envelope.judge import SOUND, Criteria, Judged, JudgedRun, judge
 
 FRAMES = 20
 #: Steps of the solver's reference in one of its own.
@@ -58,7 +58,7 @@ class Battery:
     def __init__(self, folder: Path) -> None:
         self._folder, self.dress = folder, folder / "dress.npz"
         write_garment(self.dress, "dress", "remesh:300")
-        self._runs: dict[tuple[Cell, str, str, int], Run] = {}
+        self._runs: dict[tuple[Cell, str, str, int], JudgedRun] = {}
         self._configs: dict[str, DictConfig] = {}
         self._network: Stepper | None = None
 
@@ -86,14 +86,14 @@ class Battery:
         assert metrics is not None
         return metrics
 
-    def run(self, cell: Cell, method: str, mode: str, finer: int = 1) -> Run:
+    def run(self, cell: Cell, method: str, mode: str, finer: int = 1) -> JudgedRun:
         """A rollout of :meth:`_run`, made once."""
         key = (cell, method, mode, finer)
         if key not in self._runs:
             self._runs[key] = self._run(*key)
         return self._runs[key]
 
-    def _run(self, cell: Cell, method: str, mode: str, finer: int) -> Run:
+    def _run(self, cell: Cell, method: str, mode: str, finer: int) -> JudgedRun:
         """A rollout as of ``hood rollout``, of ``finer`` times as many frames, and what it says of itself.
 
         Two things that it says of every cell do not count: that networks were not trained on so coarse a dress, and how much
@@ -117,7 +117,7 @@ class Battery:
             reason for reason in verdict.reasons if reason.value is None or reason.value > ORDINARY.get(reason.kind, -1.0)
         ]
         unsound = tuple(reason.sentence for reason in counted) if verdict.sound is False else ()
-        return Run(3 if unsound else 0, "", (*warned, *([told] if told else [])), unsound, {**metrics, "finite": finite})
+        return JudgedRun(3 if unsound else 0, "", (*warned, *([told] if told else [])), unsound, {**metrics, "finite": finite})
 
     def _config(self, cell: Cell, method: str, mode: str) -> DictConfig:
         """Composed once a method: to do so takes longer than a rollout."""

@@ -13,7 +13,7 @@ import pytest
 
 from hood.rollouts.file.recorder import RolloutWriter
 from hood.studies.envelope.judge import CLASSES, FIGURES, REFUSED, SILENT, SOUND, Criteria, Judged
-from hood.studies.envelope.page import Curve, View, curve_svg, small_sheet, write_page
+from hood.studies.envelope.page import Curve, View, curve_svg, small_sheet, write_map_page
 from hood.testing import grid, sphere
 
 
@@ -30,7 +30,7 @@ def view(value: str, model: str, kind: str, **more: Any) -> View:
 
 
 def page(folder: Path, views: list[View]) -> ElementTree.Element:
-    text = write_page(views, ["newton", "ours"], Criteria(), folder).read_text()
+    text = write_map_page(views, ["newton", "ours"], Criteria(), folder).read_text()
     assert not re.search(r"<script|<link|src=\"(?!data:)|url\(", text)
     assert "http" not in text.replace("http://www.w3.org/2000/svg", "")
     return ElementTree.fromstring(text.removeprefix("<!DOCTYPE html>\n"))

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from hood.studies.envelope.judge import DEGRADED, REFUSED, SILENT, SOUND
-from hood.studies.envelope.prose import BEGIN, END, holds, section, write_section
+from hood.studies.envelope.prose import BEGIN, END, holds, map_section, write_section
 
 
 def rows(factor: str, kinds: dict[str, str], model: str = "newton", garment: str = "dress") -> list[dict[str, Any]]:
@@ -62,7 +62,7 @@ def test_methods_that_fail_in_the_nominal_scene_are_counted_alone() -> None:
     good, bad = ({"model": model, "weights": "none"} for model in ("newton", "ours"))
     found = [row | good for row in rows("nominal", {"all": SOUND}) + rows("spin", {"1": SOUND, "2": SILENT})]
     found += [row | bad for row in rows("nominal", {"all": DEGRADED}) + rows("spin", {"1": SOUND, "2": DEGRADED})]
-    text = section(sorted(found, key=lambda row: (row["factor"], row["value"])), ["newton", "ours"])
+    text = map_section(sorted(found, key=lambda row: (row["factor"], row["value"])), ["newton", "ours"])
     assert "- **spin 2 (dress)** newton: silent, too far at 2\n" in text
     assert text.endswith(
         "- **ours** is not sound in the nominal scene: degraded and said, too far at all. The page has its 2 settings"
@@ -71,7 +71,7 @@ def test_methods_that_fail_in_the_nominal_scene_are_counted_alone() -> None:
 
 
 def test_a_map_without_a_fault_says_so_and_marks_are_needed(tmp_path: Path) -> None:
-    assert "Every setting is sound for every method." in section(rows("spin", {"1": SOUND}), ["newton"])
+    assert "Every setting is sound for every method." in map_section(rows("spin", {"1": SOUND}), ["newton"])
     path = tmp_path / "page.md"
     with pytest.raises(ValueError, match="no such file"):
         write_section(path, [], [])

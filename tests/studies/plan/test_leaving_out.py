@@ -12,13 +12,13 @@ from hood.scene.scene import Scene
 from hood.solver.newton import NewtonSettings
 from hood.steppers.newton import NewtonStepper
 from hood.studies.plan.ablation import (
+    AblationWindow,
     Effect,
     Variant,
-    Window,
     active_terms,
     begin,
     choose_windows,
-    measure,
+    measure_ablation,
     prices,
     rest_at,
     take_steps,
@@ -37,9 +37,9 @@ def full(tank_scene: Scene) -> Variant:
 
 
 def test_gamma_is_the_gap_of_the_first_step(full: Variant, tank_scene: Scene) -> None:
-    begun = begin(full, [Window(0, "the start")], "paper", lead=0)
+    begun = begin(full, [AblationWindow(0, "the start")], "paper", lead=0)
     limp = variant(tank_scene, "bending")
-    found = measure(full, {"limp": limp}, begun, 1)["limp"]
+    found = measure_ablation(full, {"limp": limp}, begun, 1)["limp"]
     pos, _ = take_steps(limp, begun[0], 1, Effect())
     expected = gap(full.potential, begun[0].step, pos)
     assert found.gamma[0] == pytest.approx(float(expected.gamma), rel=2e-2)
@@ -47,8 +47,10 @@ def test_gamma_is_the_gap_of_the_first_step(full: Variant, tank_scene: Scene) ->
 
 
 def test_the_full_model_loses_nothing_against_itself(full: Variant, tank_scene: Scene) -> None:
-    begun = begin(full, [Window(0, "the start")], "paper", lead=0)
-    effects = measure(full, {"same": variant(tank_scene), "bare": variant(tank_scene, "friction", "collision")}, begun, 2)
+    begun = begin(full, [AblationWindow(0, "the start")], "paper", lead=0)
+    effects = measure_ablation(
+        full, {"same": variant(tank_scene), "bare": variant(tank_scene, "friction", "collision")}, begun, 2
+    )
     assert effects["same"].mm == effects[""].mm == [0.0]
     assert effects["same"].gamma == effects[""].gamma
     assert 0.0 <= effects[""].gamma[0] < 1e-5
@@ -67,12 +69,12 @@ def test_a_rough_rest_is_near_the_rest(full: Variant) -> None:
 
     near = [apart(rest_at(full, 0, "equilibrium", count)) for count in (1, 8)]
     assert near[1] < near[0] < 0.1
-    (rough,) = begin(full, [Window(0, "the start")], "equilibrium", lead=0, most_steps=1)
+    (rough,) = begin(full, [AblationWindow(0, "the start")], "equilibrium", lead=0, most_steps=1)
     assert apart(rough.rest) == pytest.approx(near[0])
 
 
 def test_weight_is_one_and_absent_terms_have_no_price(full: Variant) -> None:
-    begun = begin(full, [Window(0, "the start")], "paper", lead=0)
+    begun = begin(full, [AblationWindow(0, "the start")], "paper", lead=0)
     price = prices(full, begun)
     assert price["gravity"] == pytest.approx(1.0, rel=1e-6)
     assert set(price) == active_terms(full, begun)
@@ -82,7 +84,7 @@ def test_weight_is_one_and_absent_terms_have_no_price(full: Variant) -> None:
 def test_windows_begin_at_the_start_and_do_not_overlap(tank_scene: Scene) -> None:
     count = tank_scene.num_frames
     found = choose_windows(tank_scene.motion, count, 3, 2)
-    assert found[0] == Window(0, found[0].reason)
+    assert found[0] == AblationWindow(0, found[0].reason)
     firsts = sorted(window.first for window in found)
     assert all(second - first >= 1 for first, second in zip(firsts, firsts[1:], strict=False))
     assert firsts[-1] + 2 <= count - 1

@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from hood.studies.plan.page import Difference, write_page
+from hood.studies.plan.page import Difference, write_plan_page
 from hood.testing import cylinder, sphere
 
 ROWS = [
@@ -36,7 +36,7 @@ def plan(*rows: dict[str, Any], **facts: Any) -> dict[str, Any]:
 
 
 def written(tmp_path: Path, given: dict[str, Any], shown: list[Difference]) -> str:
-    write_page(tmp_path / "plan.html", given, "Left out: bending.", shown)
+    write_plan_page(tmp_path / "plan.html", given, "Left out: bending.", shown)
     text = (tmp_path / "plan.html").read_text(encoding="utf-8")
     ElementTree.fromstring(text.partition("\n")[2])
     assert "http" not in text

@@ -52,9 +52,9 @@ def test_every_part_is_measured_and_decided(made: Path) -> None:
 
 
 def test_the_printed_table_names_parts_and_command(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from hood.studies.plan.table import describe
+    from hood.studies.plan.table import describe_plan
 
-    text = describe(read(made))
+    text = describe_plan(read(made))
     assert "bending" in text
     assert "Needed for this accuracy: " in text
     row = read(made)["rows"][0]

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import pytest
 
-from hood.studies.tradeoff.grid import Grid, Size, quoted
+from hood.studies.tradeoff.grid import Grid, GridSize, quoted_word
 
-SMALL = Size("1k", ("tshirt", "dress"), (0, 5), (2, 10), 40, 3)
-LARGE = Size("12k", ("dress_12k",), (0,), (5,), 20, 4, models=("ours",))
+SMALL = GridSize("1k", ("tshirt", "dress"), (0, 5), (2, 10), 40, 3)
+LARGE = GridSize("12k", ("dress_12k",), (0,), (5,), 20, 4, models=("ours",))
 GRID = Grid(("runs/ours/model.safetensors", "fine15"), ("fp32", "bf16"), ("newton",), (SMALL, LARGE), ("sequences=[plie]",))
 
 
@@ -46,7 +46,7 @@ def test_the_solver_alone_has_no_precision_and_no_network() -> None:
 
 
 def test_without_iterations_methods_are_one() -> None:
-    both = Grid(("net",), ("fp32",), ("newton", "sweeps"), (Size("1k", ("dress",), (0, 5), (2,), 40, 3),), newton=False)
+    both = Grid(("net",), ("fp32",), ("newton", "sweeps"), (GridSize("1k", ("dress",), (0, 5), (2,), 40, 3),), newton=False)
     assert [(p.name, p.refine, p.method) for p in both.points()] == [
         ("net", 0, "newton"), ("net", 5, "newton"), ("net", 5, "sweeps"), ("guess", 2, "newton"), ("guess", 2, "sweeps"),
     ]  # fmt: skip
@@ -54,7 +54,7 @@ def test_without_iterations_methods_are_one() -> None:
 
 
 def test_one_model_is_measured_with_every_number_of_iterations_and_a_size_with_some_precisions() -> None:
-    size = Size("4k", ("dress_4k",), (0, 5), (2,), 24, 5, refined=("ours", (0, 1, 10)))
+    size = GridSize("4k", ("dress_4k",), (0, 5), (2,), 24, 5, refined=("ours", (0, 1, 10)))
     grid = Grid(("runs/ours/model.safetensors", "fine15"), ("fp32", "bf16"), ("newton",), (size,), newton=False)
     found = [(p.name, p.precision, p.refine) for p in grid.points() if not p.alone]
     assert found == [
@@ -68,7 +68,7 @@ def test_one_model_is_measured_with_every_number_of_iterations_and_a_size_with_s
 
 
 def test_a_size_without_garments_is_left_out() -> None:
-    empty = Size("4k", (), (0,), (2,), 40, 3)
+    empty = GridSize("4k", (), (0,), (2,), 40, 3)
     assert Grid(("net",), ("fp32",), ("newton",), (empty,)).points() == []
 
 
@@ -80,5 +80,5 @@ def test_models_that_cannot_be_told_apart_or_are_not_there_are_refused() -> None
 
 
 def test_names_that_need_it_are_quoted() -> None:
-    assert quoted("runs/a-1/m.safetensors+5") == "runs/a-1/m.safetensors+5"
-    assert quoted("my runs/it's.safetensors") == "'my runs/it\\'s.safetensors'"
+    assert quoted_word("runs/a-1/m.safetensors+5") == "runs/a-1/m.safetensors+5"
+    assert quoted_word("my runs/it's.safetensors") == "'my runs/it\\'s.safetensors'"

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from measured_points import point, reached, rollout, solver, write_point
 
-from hood.evaluation.files import RolloutLog, Unit
-from hood.evaluation.table import Measured
+from hood.evaluation.files import EvaluationUnit, RolloutLog
+from hood.evaluation.table import MeasuredRollout
 from hood.steppers.stopping import floor_from_table
 from hood.studies.tradeoff.comparison import Study
-from hood.studies.tradeoff.results import overstretched, read_reached, read_record, refinement_tables, summarise
+from hood.studies.tradeoff.results import overstretched, read_measured, read_reached, refinement_tables, summarise_points
 
 
 def test_a_folder_is_read_as_it_was_written(tmp_path: Path) -> None:
@@ -21,7 +21,7 @@ def test_a_folder_is_read_as_it_was_written(tmp_path: Path) -> None:
     broken = rollout([40.0], [0.4], strain=0.3, converged=0.0)
     broken.failures.append(9)
     write_point(tmp_path, one, [rollout([10.0, 20.0], [-0.1, 0.2]), rollout([30.0], [0.3], spread=0.5), broken])
-    found = read_reached(one, tmp_path, 1014, read_record(tmp_path))
+    found = read_reached(one, tmp_path, 1014, read_measured(tmp_path))
     assert found.ms.value == 25.0
     assert found.ms_p95.value == pytest.approx(np.quantile([10, 20, 30, 40], 0.95))
     assert found.gap.value == pytest.approx(0.25)
@@ -59,14 +59,16 @@ def test_what_was_not_measured_is_none_in_the_files(tmp_path: Path) -> None:
 
 
 def test_rollouts_measured_again_replace_those_with_other_weights(tmp_path: Path) -> None:
-    RolloutLog(tmp_path).write(Unit(0, "tank", "walk"), "old", rollout([10.0], [9.0]))
-    RolloutLog(tmp_path).write(Unit(0, "tank", "walk"), "new", rollout([20.0], [1.0]))
+    RolloutLog(tmp_path).write(EvaluationUnit(0, "tank", "walk"), "old", rollout([10.0], [9.0]))
+    RolloutLog(tmp_path).write(EvaluationUnit(0, "tank", "walk"), "new", rollout([20.0], [1.0]))
     found = read_reached(point(), tmp_path, 1000)
     assert (found.rollouts, found.ms.value, found.gap.value) == (1, 20.0, 1.0)
 
 
-@pytest.mark.parametrize("rollouts, words", [([], "no rollout was written"), ([Measured(failures=[1])], "non-finite before")])
-def test_a_folder_that_says_nothing_is_refused(rollouts: list[Measured], words: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "rollouts, words", [([], "no rollout was written"), ([MeasuredRollout(failures=[1])], "non-finite before")]
+)
+def test_a_folder_that_says_nothing_is_refused(rollouts: list[MeasuredRollout], words: str, tmp_path: Path) -> None:
     write_point(tmp_path, point(), rollouts)
     with pytest.raises(ValueError, match=words):
         read_reached(point(), tmp_path, 1000)
@@ -81,7 +83,7 @@ def test_too_much_strain_is_twice_the_converged_solvers_at_that_size() -> None:
 
 def test_points_of_different_machines_are_not_compared_silently() -> None:
     records = {"device": "CPU (a)", "jobs": 2}, {"device": "CPU (a)", "jobs": 1}, {"device": "CPU (b)", "jobs": 2}
-    items = [summarise(point("net", k), [rollout([1.0], [0.1])], 1000, record) for k, record in enumerate(records)]
+    items = [summarise_points(point("net", k), [rollout([1.0], [0.1])], 1000, record) for k, record in enumerate(records)]
     assert "not all measured on one machine" in Study([items[0], items[1]], set()).warning
     assert "not all measured on one machine" in Study([items[0], items[2]], set()).warning
     assert Study([items[0]], set()).warning == ""
@@ -91,14 +93,14 @@ def test_steps_that_the_solver_left_unsolved_are_counted() -> None:
     measured = rollout([1.0, 1.0], [0.1])
     measured.frames[0]["solver_converged"] = 0.0
     measured.frames[1]["solver_converged"] = 1.0
-    assert summarise(point("newton"), [measured], 1000, {}).unsolved == 0.5
-    assert summarise(point(), [rollout([1.0], [0.1])], 1000, {}).unsolved == 0.0
+    assert summarise_points(point("newton"), [measured], 1000, {}).unsolved == 0.5
+    assert summarise_points(point(), [rollout([1.0], [0.1])], 1000, {}).unsolved == 0.0
 
 
 def test_a_shared_processor_is_noticed_on_a_cpu() -> None:
     def measured(device: str, share: float | None) -> Study:
-        item = summarise(point(), [rollout([1.0], [0.1])], 1000, {"device": device, "cpu_share": share})
-        other = summarise(point("net", 5), [rollout([1.0], [0.1])], 1000, {"device": device, "cpu_share": 0.99})
+        item = summarise_points(point(), [rollout([1.0], [0.1])], 1000, {"device": device, "cpu_share": share})
+        other = summarise_points(point("net", 5), [rollout([1.0], [0.1])], 1000, {"device": device, "cpu_share": 0.99})
         return Study([item, other], set())
 
     assert "1 of 2 settings had their processor for only a part of the time (down to 40%)" in measured("CPU (a)", 0.4).warning

@@ -26,7 +26,7 @@ from hood.steppers.network import build_simulator
 from hood.studies.tradeoff import page as tradeoff_page
 from hood.studies.tradeoff import tradeoff
 from hood.studies.tradeoff.comparison import LEAST_ROLLOUTS
-from hood.studies.tradeoff.grid import Grid, Size
+from hood.studies.tradeoff.grid import Grid, GridSize
 from hood.studies.tradeoff.points import Points
 from hood.studies.tradeoff.tradeoff import chosen_models, make_grid
 
@@ -165,7 +165,7 @@ def test_a_point_that_does_not_go_on_is_a_failure_and_ends() -> None:
 
 
 def test_a_turn_is_a_share_of_the_rollouts() -> None:
-    sizes = (Size("1k", ("tank", "dress"), (0,), (), 5, 1),)
+    sizes = (GridSize("1k", ("tank", "dress"), (0,), (), 5, 1),)
     points = Grid(("untrained:small",), ("fp32",), ("newton",), sizes, newton=False, motions=2).points()
     store(turns=3).measure(points)
     assert "max_rollouts=2" in store().log_of(points[0]).read_text()

@@ -12,7 +12,7 @@ from measured_points import point, reached, solver
 
 from hood.studies.tradeoff import page as tradeoff_page
 from hood.studies.tradeoff.comparison import Study
-from hood.studies.tradeoff.page import write_page
+from hood.studies.tradeoff.page import write_tradeoff_page
 from hood.studies.tradeoff.results import overstretched
 
 CURVE = {k: (10.0 * k, 1.0 / k**2) for k in (1, 2, 5, 10)}
@@ -33,7 +33,7 @@ def study() -> Study:
 @pytest.fixture(scope="module")
 def page(study: Study, tmp_path_factory: pytest.TempPathFactory) -> str:
     folder = tmp_path_factory.mktemp("page")
-    path = write_page(study, folder)
+    path = write_tradeoff_page(study, folder)
     names = sorted(item.name for item in folder.iterdir())
     assert names == ["cost_1k.png", "cost_4k.png", "front_1k.png", "front_4k.png", "index.html"]
     return path.read_text(encoding="utf-8")
@@ -93,6 +93,6 @@ def test_verdicts_are_given_where_intervals_separate(page: str) -> None:
 def test_without_the_converged_solver_nothing_is_called_too_much(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tradeoff_page, "_pictures", lambda study, folder: collections.defaultdict(str))
     items = [reached("net", 0, 10.0, 0.1, strain=5.0), reached("guess", 2, 10.0, 0.1)]
-    text = words(write_page(Study(items, overstretched(items)), tmp_path).read_text(encoding="utf-8"))
+    text = words(write_tradeoff_page(Study(items, overstretched(items)), tmp_path).read_text(encoding="utf-8"))
     assert "The converged solver was not measured at this size" in text
     assert "Nothing: every point of the grid gave a result." in text

@@ -19,7 +19,7 @@ from hood.assets.pickles.torch_file import load_torch
 ARCHIVES, ARRAYS, PICKLES, TENSORS = (".npz",), (".npy",), (".pkl", ".pickle", ".pk", ".p", ".joblib"), (".pt", ".pth")
 MOTION_SUFFIXES = (*ARCHIVES, *PICKLES, *ARRAYS, *TENSORS)
 #: Readers of other formats, see :mod:`hood.plugins`: a path in; the arrays of one of the layouts out, by key.
-PLUGINS = "motions"
+_PLUGINS = "motions"
 #: Containers within each other beyond this number hold no motion that anyone writes.
 _DEEPEST = 8
 
@@ -33,7 +33,7 @@ class Unread:
 
 def motion_suffixes() -> tuple[str, ...]:
     """Suffixes of the motion files that can be read, those of plugins last."""
-    return (*MOTION_SUFFIXES, *(f".{name}" for name in plugins.names(PLUGINS)))
+    return (*MOTION_SUFFIXES, *(f".{name}" for name in plugins.names(_PLUGINS)))
 
 
 def read_content(path: Path) -> Any:
@@ -45,21 +45,21 @@ def read_content(path: Path) -> Any:
     """
     suffix = path.suffix.lower()
     if suffix in ARCHIVES:
-        return plain(read_arrays(path, (), "AMASS motion", objects=_object))
+        return plain_content(read_arrays(path, (), "AMASS motion", objects=_object))
     if suffix in ARRAYS:
-        return plain(_read_array(path))
+        return plain_content(_read_array(path))
     if suffix in PICKLES:
-        return plain(load_content(path, SIZE_LIMIT))
+        return plain_content(load_content(path, SIZE_LIMIT))
     if suffix in TENSORS:
-        return plain(load_torch(path, SIZE_LIMIT))
-    if suffix[1:] in plugins.names(PLUGINS):
-        return plain(_read_by_plugin(path))
+        return plain_content(load_torch(path, SIZE_LIMIT))
+    if suffix[1:] in plugins.names(_PLUGINS):
+        return plain_content(_read_by_plugin(path))
     raise ValueError(
         f"{path}: unknown motion format {path.suffix!r}; give an AMASS .npz or a .pkl with body_pose, global_orient, transl"
     )
 
 
-def plain(item: Any, depth: int = 0) -> Any:
+def plain_content(item: Any, depth: int = 0) -> Any:
     """``item`` with tensors as arrays, arrays of objects as lists (one object as itself), and keys as text."""
     if depth > _DEEPEST:
         return None
@@ -67,12 +67,12 @@ def plain(item: Any, depth: int = 0) -> Any:
         item = item.detach().cpu()
         return (item.float() if item.dtype is torch.bfloat16 else item).numpy()
     if isinstance(item, np.ndarray) and item.dtype == object:
-        return plain(item.item() if item.ndim == 0 else item.tolist(), depth)
+        return plain_content(item.item() if item.ndim == 0 else item.tolist(), depth)
     if isinstance(item, Mapping):
-        return {_text(key): plain(value, depth + 1) for key, value in item.items()}
+        return {_text(key): plain_content(value, depth + 1) for key, value in item.items()}
     if isinstance(item, (list, tuple)):
         table = _table(item)
-        return table if table is not None else [plain(entry, depth + 1) for entry in item]
+        return table if table is not None else [plain_content(entry, depth + 1) for entry in item]
     return item
 
 
@@ -126,7 +126,7 @@ def _read_by_plugin(path: Path) -> Mapping[str, Any]:
     Raises:
         ValueError: the reader refuses the file, or gives no arrays by key; names the file.
     """
-    read = plugins.find(PLUGINS, path.suffix.lower()[1:])
+    read = plugins.find(_PLUGINS, path.suffix.lower()[1:])
     try:
         fields = read(path)
     except (KeyError, IndexError, TypeError, ValueError) as error:

@@ -26,7 +26,7 @@ _FEATURES = {263: "HumanML3D", 251: "KIT-ML"}
 _WEIGHTS = ("statedict", "modelstatedict", "optimizer", "pytorchlightningversion", "epoch")
 
 
-def unknown(path: Path, content: Any) -> str:
+def unknown_motion(path: Path, content: Any) -> str:
     """The sentence for content in which no layout is found."""
     if isinstance(content, np.ndarray):
         return f"{path}: {_bare(content)}"

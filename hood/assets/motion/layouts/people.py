@@ -12,7 +12,7 @@ import numpy as np
 from hood.assets.files.frame_rates import flat, squeezed
 from hood.assets.files.guarded import listed
 from hood.assets.motion.layouts.content import Unread, length
-from hood.assets.motion.layouts.table import LAYOUTS, Layout, find_layout, sizes_of
+from hood.assets.motion.layouts.table import LAYOUTS, MotionLayout, find_layout, layout_sizes
 
 #: Entries of a list that are looked into.
 _MOST = 1000
@@ -23,7 +23,7 @@ class Person:
     """What a file holds of one person: values by squeezed key, and the keys as they are written."""
 
     name: str
-    layout: Layout
+    layout: MotionLayout
     fields: Mapping[str, Any]
     keys: Mapping[str, str]
     around: tuple[Mapping[str, Any], ...] = ()  # the dicts that this one stands in, innermost first
@@ -57,7 +57,7 @@ def find_people(content: Any) -> list[Person]:
     return people
 
 
-def choose(path: Path, people: list[Person], name: int | str | None) -> Person:
+def choose_person(path: Path, people: list[Person], name: int | str | None) -> Person:
     """The person called ``name``, or at that place; the only one where ``name`` is None.
 
     Raises:
@@ -107,7 +107,7 @@ def _named(people: list[Person]) -> list[Person]:
 
 def _is_pose(person: Person) -> bool:
     for key in person.layout.poses:
-        value, sizes = person.fields[key], sizes_of(key)
+        value, sizes = person.fields[key], layout_sizes(key)
         first = value[0] if isinstance(value, list) and value else value
         shape = first.shape if isinstance(first, np.ndarray) else ()
         if not any(int(np.prod(shape[axis:])) in sizes for axis in range(len(shape))):
@@ -144,7 +144,7 @@ def _of_rows(person: Person, name: str, chosen: np.ndarray, total: int) -> Perso
 def _entries_a_person(person: Person) -> int | None:
     """How many people the first axis of the poses, or their list, is over; None where it is over frames."""
     key = person.layout.poses[-1]
-    value, sizes = person.fields[key], sizes_of(key)
+    value, sizes = person.fields[key], layout_sizes(key)
     if isinstance(value, list):
         # A list of tables is one of people, a list of rows one of frames.
         many = [entry for entry in value if isinstance(entry, np.ndarray) and entry.ndim >= 2 and entry.size not in sizes]

@@ -10,7 +10,7 @@ import numpy as np
 from hood.assets.files.frame_rates import flat
 from hood.assets.files.said import Doubt
 from hood.assets.motion.layouts.content import Unread
-from hood.assets.motion.layouts.foreign import are_weights, is_like_motion, unknown, unplaced
+from hood.assets.motion.layouts.foreign import are_weights, is_like_motion, unknown_motion, unplaced
 from hood.assets.motion.layouts.frames import gather_frames
 from hood.assets.motion.layouts.people import Person, find_people
 from hood.assets.motion.layouts.rotations import TRANSPOSED, Turns, as_turns, to_vectors
@@ -49,7 +49,7 @@ def people_in(path: Path, content: Any) -> list[Person]:
     """
     people = _found(path, content)
     if not people:
-        raise ValueError(unknown(path, content))
+        raise ValueError(unknown_motion(path, content))
     return people
 
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from hood.assets.motion.skeleton import ELBOWS, KNEES
 
 #: Numbers of one rotation → what they are.
-KINDS = {3: "axis-angle vectors", 4: "quaternions", 6: "6D rotations", 9: "rotation matrices"}
+_KINDS = {3: "axis-angle vectors", 4: "quaternions", 6: "6D rotations", 9: "rotation matrices"}
 #: Joints that hardly turn in anyone: spine, feet, neck, collars, head.
 _STEADY = (3, 6, 9, 10, 11, 12, 13, 14, 15)
 #: The median turn [rad] of these joints is below the first in the right order of a quaternion, beyond the second in the wrong.
@@ -37,7 +37,7 @@ class Turns(NamedTuple):
 
     @property
     def kind(self) -> str:
-        return KINDS[self.values.shape[2]]
+        return _KINDS[self.values.shape[2]]
 
 
 def as_turns(path: Path, key: str, array: np.ndarray, counts: Sequence[int], first: int) -> Turns:
@@ -49,7 +49,7 @@ def as_turns(path: Path, key: str, array: np.ndarray, counts: Sequence[int], fir
     if array.size == 0:
         raise ValueError(f"{path}: {key} has no frames (its shape is {array.shape}); give at least one")
     for count in counts:
-        for per in KINDS:
+        for per in _KINDS:
             found = _split(array, count, per)
             if found is not None:
                 return Turns(found, tuple(range(first, first + count)))
@@ -85,9 +85,9 @@ def to_vectors(path: Path, key: str, parts: Sequence[Turns]) -> tuple[np.ndarray
     read = {way: _read(parts, kind, way) for way in ways[kind]}
     if len(read) == 1:
         way, vectors = next(iter(read.items()))
-        if kind == KINDS[9] and _bends(joints, vectors) < -_ONE_WAY:
+        if kind == _KINDS[9] and _bends(joints, vectors) < -_ONE_WAY:
             return _read(parts, kind, TRANSPOSED), f"{kind}, {TRANSPOSED}"
-        return vectors, None if kind == KINDS[3] else way if way == kind else f"{kind}, {way}"
+        return vectors, None if kind == _KINDS[3] else way if way == kind else f"{kind}, {way}"
     for way, vectors in read.items():
         if all(_is_better(joints, vectors, other, kind) for name, other in read.items() if name != way):
             return vectors, f"{kind}, {way} by the joints"
@@ -95,11 +95,11 @@ def to_vectors(path: Path, key: str, parts: Sequence[Turns]) -> tuple[np.ndarray
 
 
 _OPEN = {
-    KINDS[4]: (
+    _KINDS[4]: (
         "neither w first nor w last makes a plain pose of them; save poses as axis-angle vectors, scipy's "
         "Rotation.from_quat(q[..., [1, 2, 3, 0]]).as_rotvec() where w is first"
     ),
-    KINDS[6]: (
+    _KINDS[6]: (
         "knees and elbows do not tell whether they are rows or columns of the matrices; save poses as axis-angle vectors, "
         "scipy's Rotation.from_matrix(…).as_rotvec()"
     ),
@@ -108,12 +108,12 @@ _OPEN = {
 
 def _ways(path: Path, key: str, part: Turns) -> list[str]:
     """How the numbers of a part can be read, without a look at the skeleton."""
-    if part.kind == KINDS[3]:
+    if part.kind == _KINDS[3]:
         return [part.kind]
     values = part.values.reshape(-1, part.values.shape[2])
-    if part.kind == KINDS[9]:
+    if part.kind == _KINDS[9]:
         ways = [part.kind] if _are_matrices(values.reshape(-1, 3, 3)) else []
-    elif part.kind == KINDS[4]:
+    elif part.kind == _KINDS[4]:
         ways = ["w first", "w last"] if _near(np.linalg.norm(values, axis=1), 1.0) else []
     else:
         ways = _six_ways(values)
@@ -145,12 +145,12 @@ def _read(parts: Sequence[Turns], kind: str, way: str) -> np.ndarray:
 def _vectors(part: Turns, way: str) -> np.ndarray:
     """(N, J, 3) rad."""
     flat = part.values.reshape(-1, part.values.shape[2])
-    if part.kind == KINDS[3]:
+    if part.kind == _KINDS[3]:
         return part.values
-    if part.kind == KINDS[9]:
+    if part.kind == _KINDS[9]:
         found = Rotation.from_matrix(_nearest(flat.reshape(-1, 3, 3)))
         found = found.inv() if way == TRANSPOSED else found
-    elif part.kind == KINDS[4]:
+    elif part.kind == _KINDS[4]:
         found = Rotation.from_quat(flat[:, [1, 2, 3, 0]] if way == "w first" else flat)
     else:
         pair = flat.reshape(-1, 3, 2).transpose(0, 2, 1) if way == _SIX[2] else flat.reshape(-1, 2, 3)
@@ -182,7 +182,7 @@ def _near(values: np.ndarray, wanted: np.ndarray | float) -> bool:
 
 
 def _is_better(joints: list[int], one: np.ndarray, other: np.ndarray, kind: str) -> bool:
-    if kind == KINDS[4]:
+    if kind == _KINDS[4]:
         return _steadiness(joints, one) < _SMALL and _steadiness(joints, other) > _LARGE
     return _bends(joints, one) > _ONE_WAY and _bends(joints, other) < -_ONE_WAY
 

@@ -25,7 +25,7 @@ VIDEO_FPS = 30.0
 
 
 @dataclass(frozen=True)
-class Layout:
+class MotionLayout:
     """How a published file is told by its keys; keys are in lower case, without signs.
 
     ``fps`` is the rate that recordings of the layout are known to have where no file says it; None: a file must say it.
@@ -55,7 +55,7 @@ def counts_of(key: str) -> tuple[tuple[int, ...], int]:
     return _COUNTS.get(key, (WHOLE, 0))
 
 
-def sizes_of(key: str) -> set[int]:
+def layout_sizes(key: str) -> set[int]:
     """How many numbers a pose under a squeezed key of rotations may have, in whatever representation."""
     return {count * per for count in counts_of(key)[0] for per in PER_TURN}
 
@@ -63,41 +63,42 @@ def sizes_of(key: str) -> set[int]:
 _TRACKS = ("trackids", "trackedids", "tid", "subjectids")
 #: In the order in which they are tried: those told by special keys before those whose keys others have as well.
 LAYOUTS = (
-    Layout("AIST++", ("smplposes",), ("smpltrans",), ("smplscaling",), fps=60.0, family="smpl", scaling="smplscaling"),
-    Layout("3DPW", ("poses",), marks=("poses60hz", "vtemplateclothed", "camposevalid", "camposes"), family="smpl"),
-    Layout("EMDB", ("posesroot", "posesbody"), family="smpl"),
-    Layout("BEDLAM labels", ("poseworld",), ("transworld",), marks=("imgname",), family="smplx"),
-    Layout("BEDLAM labels", ("posecam",), ("transcam",), marks=("imgname",), camera=True, up="-y", family="smplx"),
-    Layout("WHAM", ("poseworld",), ("transworld",), family="smpl"),
-    Layout("GVHMR", ("globalorient", "bodypose"), above="smplparamsglobal", family="smplx"),
-    Layout("GVHMR, in its camera", ("globalorient", "bodypose"), above="smplparamsincam", camera=True, up="-y", family="smplx"),
-    Layout(
+    MotionLayout("AIST++", ("smplposes",), ("smpltrans",), ("smplscaling",), fps=60.0, family="smpl", scaling="smplscaling"),
+    MotionLayout("3DPW", ("poses",), marks=("poses60hz", "vtemplateclothed", "camposevalid", "camposes"), family="smpl"),
+    MotionLayout("EMDB", ("posesroot", "posesbody"), family="smpl"),
+    MotionLayout("BEDLAM labels", ("poseworld",), ("transworld",), marks=("imgname",), family="smplx"),
+    MotionLayout("BEDLAM labels", ("posecam",), ("transcam",), marks=("imgname",), camera=True, up="-y", family="smplx"),
+    MotionLayout("WHAM", ("poseworld",), ("transworld",), family="smpl"),
+    MotionLayout("GVHMR", ("globalorient", "bodypose"), above="smplparamsglobal", family="smplx"),
+    MotionLayout("GVHMR, in its camera", ("globalorient", "bodypose"), above="smplparamsincam", camera=True, up="-y",
+           family="smplx"),
+    MotionLayout(
         "SLAHMR", ("rootorient", "posebody"), marks=("trackmask", "floorplane", "worldscale", "latentpose", "camr"),
         camera=True, up="-y", family="smplh",
     ),
-    Layout("TRACE", ("worldglobalrots", "smplthetas"), ("worldtrans",), family="smpl", up="-y", camera=True, ids=_TRACKS),
-    Layout("ROMP", ("smplthetas",), CAMERA_TRANSL, camera=True, up="-y", family="smpl", ids=_TRACKS),
-    Layout("TRAM", ("predrotmat",), CAMERA_TRANSL, camera=True, up="-y", family="smpl"),
-    Layout("Motion-X", ("rootorient", "posebody"), above="motionx", family="smplx"),
-    Layout("MDM", ("thetas",), ("roottranslation",), fps=20.0, family="smpl"),
-    Layout("GRAB", ("fullpose",), above="params", fps=None, up="z"),
-    Layout("SMPL-X stage ii", ("fullpose",), marks=("stageiidebugdetails", "markerslatent"), fps=None, up="z"),
-    Layout("fullpose", ("fullpose",), fps=None, up="z"),
-    Layout("PHC", ("poseaa",), ("trans", "transorig", "roottransoffset"), up="z"),
-    Layout("HybrIK", ("predthetas",), ("transl", *CAMERA_TRANSL), camera=True, up="-y", family="smpl"),
-    Layout("AMASS", ("poses",), fps=None, up="z"),
-    Layout("AMASS", ("rootorient", "posebody"), fps=None, up="z"),
-    Layout("body_pose", ("globalorient", "bodypose")),
-    Layout("pose and translation", ("pose",)),
-    Layout("image estimator", ("globalorient", "bodypose"), CAMERA_TRANSL, CAMERA_TRANSL, camera=True, up="-y"),
-    Layout("image estimator", ("pose",), CAMERA_TRANSL, CAMERA_TRANSL, camera=True, up="-y"),
-    Layout("SMPL poses", ("smplposes",)),
-    Layout("SMPL poses", ("smplpose",)),
-    Layout("SMPL poses", ("thetas",)),
+    MotionLayout("TRACE", ("worldglobalrots", "smplthetas"), ("worldtrans",), family="smpl", up="-y", camera=True, ids=_TRACKS),
+    MotionLayout("ROMP", ("smplthetas",), CAMERA_TRANSL, camera=True, up="-y", family="smpl", ids=_TRACKS),
+    MotionLayout("TRAM", ("predrotmat",), CAMERA_TRANSL, camera=True, up="-y", family="smpl"),
+    MotionLayout("Motion-X", ("rootorient", "posebody"), above="motionx", family="smplx"),
+    MotionLayout("MDM", ("thetas",), ("roottranslation",), fps=20.0, family="smpl"),
+    MotionLayout("GRAB", ("fullpose",), above="params", fps=None, up="z"),
+    MotionLayout("SMPL-X stage ii", ("fullpose",), marks=("stageiidebugdetails", "markerslatent"), fps=None, up="z"),
+    MotionLayout("fullpose", ("fullpose",), fps=None, up="z"),
+    MotionLayout("PHC", ("poseaa",), ("trans", "transorig", "roottransoffset"), up="z"),
+    MotionLayout("HybrIK", ("predthetas",), ("transl", *CAMERA_TRANSL), camera=True, up="-y", family="smpl"),
+    MotionLayout("AMASS", ("poses",), fps=None, up="z"),
+    MotionLayout("AMASS", ("rootorient", "posebody"), fps=None, up="z"),
+    MotionLayout("body_pose", ("globalorient", "bodypose")),
+    MotionLayout("pose and translation", ("pose",)),
+    MotionLayout("image estimator", ("globalorient", "bodypose"), CAMERA_TRANSL, CAMERA_TRANSL, camera=True, up="-y"),
+    MotionLayout("image estimator", ("pose",), CAMERA_TRANSL, CAMERA_TRANSL, camera=True, up="-y"),
+    MotionLayout("SMPL poses", ("smplposes",)),
+    MotionLayout("SMPL poses", ("smplpose",)),
+    MotionLayout("SMPL poses", ("thetas",)),
 )  # fmt: skip
 
 
-def find_layout(keys: Mapping[str, str], above: str = "") -> Layout | None:
+def find_layout(keys: Mapping[str, str], above: str = "") -> MotionLayout | None:
     """The layout of a dict with the squeezed ``keys``; one whose translation is there goes before one where it is not."""
     fitting = [layout for layout in LAYOUTS if layout.fits(keys, above)]
     return next((layout for layout in fitting if any(key in keys for key in layout.transl)), next(iter(fitting), None))
