@@ -39,7 +39,7 @@ from hood.energies.problem import StepProblem
 from hood.evaluation.gap import REFERENCE, StepSample, starts
 from hood.model.graph.builder import MESH, Graph, StaticGraph, build_graph, edge_set
 from hood.model.readout.edges import EdgeOutput
-from hood.model.readout.network_step import Held, Moved, NetworkStep
+from hood.model.readout.network_step import Dirichlet, Moved, NetworkStep
 from hood.rollouts.loop import simulate
 from hood.scene.scene import Scene, build_scene
 from hood.solver.newton import minimize
@@ -89,7 +89,7 @@ class Case:
         target = problem.state.pos
         if step.pin_target is not None:
             target = torch.where(cloth.pinned.unsqueeze(1), step.pin_target, target)
-        self.held, self.head = Held(cloth.free, target), EdgeOutput()
+        self.held, self.head = Dirichlet(cloth.free, target), EdgeOutput()
         self.base = torch.where(cloth.free.unsqueeze(1), self.head.base(problem), target)
         static = StaticGraph(len(target), cloth.edges, {MESH: edge_set(cloth.edges)}, torch.zeros(len(target)).long())
         self.graph: Graph = build_graph(static, StepInput(step.dt))

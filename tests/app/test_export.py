@@ -198,7 +198,7 @@ def test_too_large_a_glb_is_refused_before_it_is_made(
 ) -> None:
     from hood.media.exports import gltf
 
-    monkeypatch.setattr(gltf, "LARGEST", 1000)
+    monkeypatch.setattr(gltf, "_LARGEST", 1000)
     assert main(["export", str(_rollout(tmp_path)), "format=glb"]) == 2
     assert "num_frames=" in capsys.readouterr().err
     assert not (tmp_path / "rollout.glb").exists()

@@ -181,7 +181,7 @@ def test_images_that_nothing_would_show_are_refused(tmp_path: Path, png: Path, c
 def test_a_large_image_is_refused(
     tmp_path: Path, png: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(texture_module, "LARGEST", 100)
+    monkeypatch.setattr(texture_module, "_LARGEST", 100)
     assert main(["view", str(_rollout(tmp_path)), f"texture={png}", f"output={tmp_path / 'page.html'}"]) == 2
     assert "save it smaller" in capsys.readouterr().err
     assert not (tmp_path / "page.html").exists()

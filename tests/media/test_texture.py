@@ -47,7 +47,7 @@ def test_what_is_no_image_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyP
     with pytest.raises(ValueError, match="neither PNG nor JPEG"):
         read_texture(path)
     path.write_bytes(encoded(QUARTERS))
-    monkeypatch.setattr(texture_module, "LARGEST", path.stat().st_size - 1)
+    monkeypatch.setattr(texture_module, "_LARGEST", path.stat().st_size - 1)
     with pytest.raises(ValueError, match="save it smaller"):
         read_texture(path)
     with pytest.raises(ValueError, match="cannot be decoded"):

@@ -279,6 +279,6 @@ def test_without_a_compiler_the_error_names_the_way_out(monkeypatch):
     def missing() -> None:
         raise BuildError("no C++ compiler: install g++ or clang++ (or name one in CXX)")
 
-    monkeypatch.setattr(compiled_network, "library", missing)
+    monkeypatch.setattr(compiled_network, "_library", missing)
     with pytest.raises(ValueError, match=r"kernels=fused: no C\+\+ compiler.* or use kernels=torch"):
         check_kernels("fused", "fp32", 48)
