@@ -12,6 +12,7 @@ from torch import Tensor
 from hood.contact.activation_distance import REACHES, vertex_reach
 from hood.contact.contact import CentroidContact, Contact, LaggedContact, find_centroid_contact, find_lagged_contact
 from hood.contact.sample_points import PLACES
+from hood.energies.laws import contact_energy
 from hood.energies.problem import StepProblem, sum_per_scene
 
 #: Which skin a vertex between two parts of the body is kept off: of the nearest alone, or of both.
@@ -132,12 +133,12 @@ class Collision:
         energy = next_pos.new_zeros(problem.num_scenes)
         for contact in self.contacts(problem):
             depth, _ = self.depth(problem, contact, next_pos)
-            energy = energy + problem.sum_vertices(self.weight * depth.clamp_min(0.0) ** 3)
+            energy = energy + problem.sum_vertices(contact_energy(self.weight, depth))
         points = problem.points_at(self.contact)
         if points is None:
             return energy
         dist = ((points.at(next_pos) - points.next_point) * points.next_normal).sum(dim=1)
-        pressed = self.weight * points.share * (self.epsilon - dist).clamp_min(0.0) ** 3
+        pressed = contact_energy(self.weight * points.share, self.epsilon - dist)
         return energy + sum_per_scene(pressed, points.scene, problem.num_scenes)
 
 

@@ -11,6 +11,7 @@ from hood.contact.activation_distance import vertex_reach
 from hood.contact.contact import Contact, LaggedContact
 from hood.contact.sample_points import PointContact
 from hood.energies.contact import checked_contact, contacts_of, lagged_contact, weighted, with_lagged_centroids, with_places
+from hood.energies.laws import lagged_contact_force, mollified_norm
 from hood.energies.problem import StepProblem, sum_per_scene
 
 
@@ -148,7 +149,7 @@ class Friction(LaggedFriction):
 
     def point_force(self, problem: StepProblem, points: PointContact) -> Tensor:
         """Lagged normal forces [N] (N,) at the points."""
-        force = 3.0 * self.weight * (self.epsilon - points.dist).clamp_min(0.0) ** 2
+        force = lagged_contact_force(self.weight, self.epsilon - points.dist)
         pull = problem.searched_internal_force
         if pull is not None:
             carried = problem.cloth.mass[points.vertices].mul(points.weights).sum(dim=1)
@@ -160,8 +161,7 @@ class Friction(LaggedFriction):
     def normal_force(self, problem: StepProblem, contact: Contact) -> Tensor:
         touching = contact.valid & (problem.cloth.mass > 0)
         reach = vertex_reach(self.reach, self.epsilon, problem.cloth, contact, problem.state.pos)
-        depth = torch.where(touching, reach - contact.dist, 0.0).clamp_min(0.0)
-        force = 3.0 * self.weight * depth**2
+        force = lagged_contact_force(self.weight, torch.where(touching, reach - contact.dist, 0.0))
         pull = problem.searched_internal_force
         if pull is None:
             return force
@@ -273,11 +273,3 @@ def _slipping(force: Tensor, moved: Tensor, normal: Tensor, limit: Tensor) -> Te
     slip = torch.where(force.unsqueeze(1) > 0, moved, 0.0)
     slip = slip - (slip * normal).sum(dim=1, keepdim=True) * normal
     return force * mollified_norm((slip * slip).sum(dim=1), limit)
-
-
-def mollified_norm(norm_sq: Tensor, limit: Tensor) -> Tensor:
-    """f(y) for y² = ``norm_sq``: y²/e - y³/(3e²) + e/3 below e = ``limit``, y above; C¹, flat at y = 0."""
-    positive = norm_sq > 0
-    norm = torch.where(positive, torch.where(positive, norm_sq, 1.0).sqrt(), 0.0)
-    small = norm_sq / limit * (1.0 - norm / (3.0 * limit)) + limit / 3.0
-    return torch.where(norm < limit, small, norm)

@@ -66,6 +66,21 @@ def weave_stress(roots: Tensor, strain: tuple[Tensor, Tensor, Tensor]) -> tuple[
     return roots[0] * first, 2.0 * roots[3] * roots[3] * e12, torch.addcmul(roots[1] * first, roots[2] * roots[2], e22)
 
 
+def isotropic_density(mu: Tensor, lam: Tensor, strain: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+    """Energy density μ tr G² + ½ λ tr² G [J/m³] (N,) of Green strains G₀₀, G₀₁, G₁₁ by Lamé parameters (N,) [Pa]."""
+    g00, g01, g11 = strain
+    trace = g00 + g11
+    square = g00 * g00 + g11 * g11 + 2.0 * g01 * g01
+    return mu * square + 0.5 * lam * trace * trace
+
+
+def isotropic_stress(mu: Tensor, lam: Tensor, strain: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    """Second Piola-Kirchhoff stresses 2 μ G + λ tr(G) I, S₀₀, S₀₁, S₁₁ [Pa] (N,), of such strains."""
+    g00, g01, g11 = strain
+    pressure = lam * (g00 + g11)
+    return 2.0 * mu * g00 + pressure, 2.0 * mu * g01, 2.0 * mu * g11 + pressure
+
+
 class Stretching:
     """StVK membrane energy [J], the sum over faces of A h (μ tr G² + ½ λ tr² G) (HOOD paper, section 3.3;
     SNUG).
@@ -95,10 +110,7 @@ def membrane_density(cloth: Cloth, strain: tuple[Tensor, Tensor, Tensor]) -> Ten
     roots = weave_roots(cloth)
     if roots is not None:
         return weave_density(roots, strain)
-    g00, g01, g11 = strain
-    trace = g00 + g11
-    square = g00 * g00 + g11 * g11 + 2.0 * g01 * g01
-    return cloth.lame_mu * square + 0.5 * cloth.lame_lambda * trace * trace
+    return isotropic_density(cloth.lame_mu, cloth.lame_lambda, strain)
 
 
 def green_strain(pos: Tensor, faces: Tensor, rest_inverse: Tensor) -> tuple[Tensor, Tensor, Tensor]:

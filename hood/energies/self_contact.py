@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from hood.contact.self_contact import SceneLayers
+from hood.energies.laws import contact_energy
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem, sum_per_scene
 from hood.energies.self_friction import LayerFriction, fading
@@ -68,8 +69,8 @@ class SignedSelfContactPenalty:
         """Energy [J] (B,) at ``next_pos`` (V, 3)."""
         pairs = problem.sides
         assert pairs is not None
-        depth = (pairs.room.clamp_max(self.epsilon) - self.distances(problem, next_pos)).clamp_min(0.0)
-        return sum_per_scene(self.weight * depth**3, pairs.scene, problem.num_scenes)
+        depth = pairs.room.clamp_max(self.epsilon) - self.distances(problem, next_pos)
+        return sum_per_scene(contact_energy(self.weight, depth), pairs.scene, problem.num_scenes)
 
 
 def layer_sides(weight: float = 0.0, epsilon: float = 3e-3, reach: float = 2e-2) -> SignedSelfContactPenalty | None:

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from hood.contact.self_contact import SceneLayers
-from hood.energies.friction import ballistic_position, mollified_norm
+from hood.energies.friction import ballistic_position
+from hood.energies.laws import mollified_norm
 from hood.energies.problem import StepProblem, sum_per_scene
 from hood.mesh.cloth_proximity import Contacts, library
 from hood.native.arguments import COUNT, POINTER, fields

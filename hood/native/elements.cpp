@@ -13,13 +13,8 @@
 
 namespace {
 
-constexpr double EPS = 2.220446049250313e-16, TINY = 2.2250738585072014e-308;
-constexpr double DEGENERATE = (8.0 * EPS) * (8.0 * EPS);  // square of a sine, as in hood.mesh.geometry
-constexpr double TURN = 6.283185307179586476925;
-
 inline V8 larger(V8 a, V8 b) { return a > b ? a : b; }
 inline V8 largest(const V8* a) { return larger(magnitude(a[0]), larger(magnitude(a[1]), magnitude(a[2]))); }
-inline I8 regular(V8 cross_sq, V8 product_sq) { return (cross_sq > DEGENERATE * product_sq) & (cross_sq > all(TINY / EPS)); }
 
 // One corner of eight elements.
 inline void gather(const double* pos, const int32_t* corner, V8* x) {
@@ -82,9 +77,9 @@ void elements_faces(const Faces* faces, const double* pos, double* energy, doubl
             add_energy(0.5 * weight * (a * a + b * b + c * c), faces->scene + i, count, energy);
             s00 = weight * first * a, s01 = weight * turn * c, s11 = weight * (coupled * a + second * b);
         } else {
-            const V8 trace = g00 + g11, square = g00 * g00 + g11 * g11 + 2.0 * g01 * g01;
+            const V8 trace = g00 + g11;
             const V8 mu = load<V8>(faces->mu + i), lambda = load<V8>(faces->lambda + i);
-            add_energy(weight * (mu * square + 0.5 * lambda * trace * trace), faces->scene + i, count, energy);
+            add_energy(weight * isotropic_density(mu, lambda, g00, g01, g11), faces->scene + i, count, energy);
             s00 = weight * (2.0 * mu * g00 + lambda * trace), s01 = weight * 2.0 * mu * g01;
             s11 = weight * (2.0 * mu * g11 + lambda * trace);
         }
@@ -118,12 +113,7 @@ void elements_hinges(const Hinges* hinges, const double* pos, double* energy, do
         const V8 length = root(edge_sq), along = dot(n1, arm_b), level = dot(n1, n2);
         const V8 angle = angle_of(sound ? -length * along : zero, sound ? level : one);
         const V8 weight = load<V8>(hinges->weight + i), factor = hinges->current_length ? weight * dot(e, e) : weight;
-        V8 bend = angle;
-        if (!hinges->current_length) {
-            bend -= load<V8>(hinges->rest_angle + i);
-            // Both angles are within a half turn, so at most one turn is off.
-            bend -= bend > 0.5 * TURN ? all(TURN) : bend < -0.5 * TURN ? all(-TURN) : zero;
-        }
+        const V8 bend = hinges->current_length ? angle : bend_of(angle, load<V8>(hinges->rest_angle + i));
         add_energy(0.5 * factor * bend * bend, hinges->scene + i, count, energy);
         if (!gradient) continue;
         // The angle's slopes at the opposite vertices; those at the edge's ends follow from no net force and torque.
@@ -167,7 +157,7 @@ void elements_vertices(const Vertices* all, const double* pos, const double* acc
             energy[(2 + w) * scenes + scene] += wall_energy(wall, v, x);
             const double depth = depth_of(wall, v, x);
             if (depth <= 0.0) continue;
-            for (int k = 0; k < 3; ++k) force[k] -= 3.0 * weight_of(wall, v) * depth * depth * wall.normal[3 * v + k];
+            for (int k = 0; k < 3; ++k) force[k] -= contact_force(weight_of(wall, v), depth) * wall.normal[3 * v + k];
         }
         for (int64_t w = 0; w < all->num_grips; ++w) {
             const Grip& grip = all->grips[w];
@@ -227,7 +217,7 @@ void elements_grip(const Contact* all, const Reach* reach, double weight, double
         double pressed = 0.0;
         if (touches(*all, v)) {
             const double apart = reach_of(*all, *reach, v), depth = std::max(apart - all->dist[v], 0.0);
-            pressed = 3.0 * weight * depth * depth;
+            pressed = contact_force(weight, depth);
             if (all->pull && pressed > 0.0) {
                 double gap[3];
                 for (int k = 0; k < 3; ++k) gap[k] = pos[k] + dt * (all->vel[3 * v + k] + dt * all->gravity[k]) - goal[k];

@@ -201,14 +201,11 @@ double face_energy(const Engine& e, const double* pos, Range range) {
     for (int64_t i = range.begin; i < range.end; i += LANES) {
         Strain s;
         strain_of(e, pos, i, s);
-        const V8 trace = s.g00 + s.g11, square = s.g00 * s.g00 + s.g11 * s.g11 + 2.0 * s.g01 * s.g01;
-        const V8 density = load<V8>(e.mu + i) * square + 0.5 * load<V8>(e.lambda + i) * trace * trace;
-        sum += total(load<V8>(e.area + i) * density);
+        const V8 mu = load<V8>(e.mu + i), lambda = load<V8>(e.lambda + i);
+        sum += total(load<V8>(e.area + i) * isotropic_density(mu, lambda, s.g00, s.g01, s.g11));
         if (!e.face_rate) continue;
         since_start(e, i, s);
-        const V8 added = s.g00 + s.g11, both = s.g00 * s.g00 + s.g11 * s.g11 + 2.0 * s.g01 * s.g01;
-        const V8 viscous = load<V8>(e.mu + i) * both + 0.5 * load<V8>(e.lambda + i) * added * added;
-        sum += total(load<V8>(e.area + i) * load<V8>(e.face_rate + i) * viscous);
+        sum += total(load<V8>(e.area + i) * load<V8>(e.face_rate + i) * isotropic_density(mu, lambda, s.g00, s.g01, s.g11));
     }
     return sum;
 }
@@ -290,11 +287,6 @@ struct Hinge {
     I8 regular;
 };
 
-inline I8 regular(V8 cross_sq, V8 product_sq) {
-    const double eps = 2.220446049250313e-16, tiny = 2.2250738585072014e-308, ulps = 8.0 * eps;
-    return (cross_sq > ulps * ulps * product_sq) & (cross_sq > all(tiny / eps));
-}
-
 inline void hinge_of(const Engine& e, const double* pos, int64_t i, Hinge& h, V8* span) {
     V8 x[4][3];
     for (int c = 0; c < 4; ++c) gather(pos, e.hinge_corners + c * e.num_hinges + i, x[c]);
@@ -315,14 +307,6 @@ inline void hinge_of(const Engine& e, const double* pos, int64_t i, Hinge& h, V8
     h.length = root(h.edge_sq);
     const V8 sine = h.regular ? -h.length * dot(h.n1, h.b) : all(0.0);
     h.angle = angle_of(sine, h.regular ? dot(h.n1, h.n2) : one);
-}
-
-inline V8 bend_of(V8 angle, V8 rest_angle) {
-    const double turn = 6.283185307179586476925;
-    const V8 bend = angle - rest_angle, zero = all(0.0);
-    // Both angles are within a half turn, so at most one turn is off.
-    const V8 off = bend > 0.5 * turn ? all(turn) : bend < -0.5 * turn ? all(-turn) : zero;
-    return bend - off;
 }
 
 double hinge_energy(const Engine& e, const double* pos, Range range) {
@@ -411,8 +395,8 @@ template <class Set> inline bool add_contact(const Set& set, int64_t v, const do
         const double depth = depth_of(wall, v, pos);
         if (!(depth > 0.0)) continue;
         const double weight = weight_of(wall, v), *normal = wall.normal + 3 * v;
-        for (int k = 0; k < 3; ++k) gradient[k] -= 3.0 * weight * depth * depth * normal[k];
-        add_outer(upper, 6.0 * weight * depth, normal);
+        for (int k = 0; k < 3; ++k) gradient[k] -= contact_force(weight, depth) * normal[k];
+        add_outer(upper, contact_curvature(weight, depth), normal);
         any = true;
     }
     for (int64_t w = 0; w < set.num_grips; ++w) {
@@ -422,8 +406,7 @@ template <class Set> inline bool add_contact(const Set& set, int64_t v, const do
         any = true;
         double slip[3];
         const double *normal = grip.normal + 3 * v, limit = grip.limit[v], size = slip_of(grip, v, pos, slip);
-        const double ratio = size / limit, slope = slope_of(grip, v, size);
-        const double along = size < limit ? force * 2.0 * (1.0 - ratio) / limit : 0.0;
+        const double slope = slope_of(grip, v, size), along = slip_curvature(force, size, limit);
         for (int k = 0; k < 3; ++k) gradient[k] += slope * slip[k];
         upper[0] += slope, upper[3] += slope, upper[5] += slope;
         add_outer(upper, -slope, normal);
@@ -1054,19 +1037,6 @@ template <class T> void prepare_path(const Engine& e) {
     for (int64_t s = 0; s < e.num_points; ++s) prepare_points<T>(e, e.points[s]);
 }
 
-// Force that takes contact from the depth where the Newton model leads to the one where the whole penalty balances that model.
-inline double push_of(double cubic, double start, double end, double compliance) {
-    // The model's own force at the end, and the stiffness of everything else.
-    const double force = cubic * start * (2.0 * end - start);
-    double rest = 1.0 / compliance - 2.0 * cubic * start;
-    if (rest < 0.1 / compliance) rest = 0.1 / compliance;
-    double load = force + rest * end;
-    if (load < 0.0) load = 0.0;
-    // cubic q^2 + rest (q - end) = force for the depth q >= 0.
-    const double balance = 2.0 * load / (rest + std::sqrt(rest * rest + 4.0 * cubic * load));
-    return end > balance ? (end - balance) / compliance : 0.0;
-}
-
 // Points ask their vertices to give way; a vertex takes the mean of what those that push ask, see hood.solver.system.line_search.
 void walk_points(const Engine& e, const Points& set) {
     for (int64_t w = 0; w < set.num_walls; ++w) {
@@ -1078,7 +1048,7 @@ void walk_points(const Engine& e, const Points& set) {
             stop[12] = 0.0;
             if (stop[11] == 0.0) continue;
             point_at(set, i, e.trial_pos, x);
-            stop[12] = push_of(3.0 * weight_of(wall, i), stop[10], depth_of(wall, i, x), stop[9]);
+            stop[12] = contact_push(weight_of(wall, i), stop[10], depth_of(wall, i, x), stop[9]);
         }
         for (int64_t row = 0; row < e.num_rows; ++row) {
             double moved[3] = {0.0, 0.0, 0.0}, count = 0.0;
@@ -1101,14 +1071,13 @@ void walk(const Engine& e, double length) {
         for (int k = 0; k < 3; ++k) e.trial_acc[4 * row + k] = e.acc[4 * row + k] + step * e.direction[4 * row + k];
     for (int64_t w = 0; w < e.num_walls; ++w) {
         const Wall& wall = e.walls[w];
-        const double cubic = 3.0 * wall.weight;
         for (int64_t row = 0; row < e.num_rows; ++row) {
             const double* stop = e.path + 8 * (w * e.num_rows + row);
             if (stop[5] == 0.0) continue;
             const int64_t v = e.vertex[row];
             double *acc = e.trial_acc + 4 * row, pos[3];
             for (int k = 0; k < 3; ++k) pos[k] = e.base[3 * v + k] + e.dt_sq * acc[k];
-            const double push = push_of(cubic, stop[4], depth_of(wall, v, pos), stop[3]) / e.dt_sq;
+            const double push = contact_push(wall.weight, stop[4], depth_of(wall, v, pos), stop[3]) / e.dt_sq;
             if (!(push > 0.0)) continue;
             for (int k = 0; k < 3; ++k) acc[k] += push * stop[k];
         }
@@ -1220,7 +1189,7 @@ void guess(const Engine& e, const double* mass, const double* gravity, bool fall
         double pos[3];
         for (int k = 0; k < 3; ++k) pos[k] = e.base[3 * v + k] + (falls ? e.dt_sq * gravity[k] : 0.0);
         if (walled) {
-            const double out = depth_of(e.walls[0], v, pos) - std::sqrt(mass[v] * size / (3.0 * e.walls[0].weight));
+            const double out = depth_of(e.walls[0], v, pos) - contact_depth(e.walls[0].weight, mass[v] * size);
             if (out > 0.0)
                 for (int k = 0; k < 3; ++k) pos[k] += out * e.walls[0].normal[3 * v + k];
         }

@@ -3,6 +3,8 @@
 #include <cmath>
 #include <cstdint>
 
+#include "laws.h"
+
 extern "C" {
 
 // A collision term as planes, or a friction term; rows of original vertices, zero where nothing acts.
@@ -35,7 +37,7 @@ inline double depth_of(const Wall& wall, int64_t v, const double* pos) {
 inline double wall_energy(const Wall& wall, int64_t v, const double* pos) {
     const double depth = depth_of(wall, v, pos);
     // Not-a-number is no depth to leave out.
-    return depth <= 0.0 ? 0.0 : weight_of(wall, v) * depth * depth * depth;
+    return depth <= 0.0 ? 0.0 : contact_energy(weight_of(wall, v), depth);
 }
 
 // Tangential slip; returns its length.
@@ -46,10 +48,6 @@ inline double slip_of(const Grip& grip, int64_t v, const double* pos, double* sl
     for (int k = 0; k < 3; ++k) slip[k] -= along * normal[k];
     return std::sqrt(dot3(slip, slip));
 }
-
-// The law of slip by the length of the slip, and its slope over that length.
-inline double mollified(double y, double limit) { return y < limit ? y * y / limit * (1.0 - y / (3.0 * limit)) + limit / 3.0 : y; }
-inline double mollified_slope(double y, double limit) { return y < limit ? (2.0 - y / limit) / limit : 1.0 / y; }
 
 inline double grip_energy(const Grip& grip, int64_t v, const double* pos) {
     if (!(grip.force[v] > 0.0)) return 0.0;
@@ -74,7 +72,7 @@ inline double drag_energy(const Drag& drag, int64_t v, const double* pos) {
 
 // Force along the slip, of length ``size``, in units of it.
 inline double slope_of(const Grip& grip, int64_t v, double size) {
-    return grip.force[v] * mollified_slope(size, grip.limit[v]);
+    return slip_slope(grip.force[v], size, grip.limit[v]);
 }
 
 }  // namespace

@@ -19,7 +19,7 @@ from torch import Tensor
 from hood.cloth.cloth import Cloth
 from hood.energies.bending import Bending, CurrentLengthBending, bending_weight
 from hood.energies.damping import BendDamping
-from hood.energies.membrane import weave_density, weave_roots, weave_stress
+from hood.energies.membrane import isotropic_density, isotropic_stress, weave_density, weave_roots, weave_stress
 from hood.energies.potential import Term
 from hood.tensors.dense import is_whole
 
@@ -101,10 +101,7 @@ def _density(strain: tuple[Tensor, Tensor, Tensor], constants: FaceConstants) ->
     """Energy density [J/m³] (N,) of Green strains."""
     if constants.weave is not None:
         return weave_density(constants.weave, strain)
-    g00, g01, g11 = strain
-    trace = g00 + g11
-    square = g00 * g00 + g11 * g11 + 2.0 * g01 * g01
-    return constants.lame_mu * square + 0.5 * constants.lame_lambda * trace * trace
+    return isotropic_density(constants.lame_mu, constants.lame_lambda, strain)
 
 
 def face_model(x: Tensor, constants: FaceConstants, num_corners: int = 3, out: Tensor | None = None) -> FaceModel:
@@ -150,9 +147,7 @@ def _stress(strain: tuple[Tensor, Tensor, Tensor], constants: FaceConstants) -> 
         strain = tuple((1.0 + rate) * now - rate * then for now, then in zip(strain, constants.before, strict=True))  # type: ignore[assignment]
     if constants.weave is not None:
         return weave_stress(constants.weave, strain)
-    g00, g01, g11 = strain
-    mu, pressure = constants.lame_mu, constants.lame_lambda * (g00 + g11)
-    return 2.0 * mu * g00 + pressure, 2.0 * mu * g01, 2.0 * mu * g11 + pressure
+    return isotropic_stress(constants.lame_mu, constants.lame_lambda, strain)
 
 
 def _strain(x: Tensor, shape: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]]:

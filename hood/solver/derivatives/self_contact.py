@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from hood.contact.self_contact import SceneLayers
+from hood.energies.laws import slip_slope
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem
 from hood.energies.self_contact import has_layers
@@ -82,8 +83,7 @@ def _grip_rows(grips: LayerGrips, pos: Tensor) -> list[Tensor]:
     which majorises friction as at single vertices (:meth:`hood.solver.derivatives.vertices.VertexForces.model`)."""
     slip = grips.slip(pos.to(grips.weights))
     size = torch.linalg.vector_norm(slip, dim=1)
-    small = size < grips.limit
-    slope = grips.force * torch.where(small, (2.0 - size / grips.limit) / grips.limit, 1.0 / torch.where(small, 1.0, size))
+    slope = grips.force * slip_slope(size, grips.limit)
     axis = torch.eye(3).to(slip)[grips.normal.abs().argmin(dim=1)]
     one = torch.nn.functional.normalize(torch.linalg.cross(grips.normal, axis), dim=1)
     both = one, torch.linalg.cross(grips.normal, one)

@@ -14,8 +14,9 @@ from torch import Tensor
 from hood.contact.contact import Contact
 from hood.energies.contact import CentroidCollision, Collision
 from hood.energies.damping import StretchDamping
-from hood.energies.friction import CodedFriction, Friction, LaggedFriction, WeightFriction, mollified_norm
+from hood.energies.friction import CodedFriction, Friction, LaggedFriction, WeightFriction
 from hood.energies.inertia import Gravity, Inertia
+from hood.energies.laws import contact_curvature, contact_energy, contact_force, mollified_norm, slip_curvature, slip_slope
 from hood.energies.membrane import Stretching
 from hood.energies.potential import Potential, Term
 from hood.energies.problem import StepProblem
@@ -49,8 +50,7 @@ class Walls:
 
     def pressure(self, pos: Tensor) -> Tensor:
         """Force (N,) [N] along the normals at ``pos`` (N, 3)."""
-        depth = self.depth(pos).clamp_min(0.0)
-        return 3.0 * self.weight * depth * depth
+        return contact_force(self.weight, self.depth(pos))
 
     def take(self, rows: Tensor) -> Walls:
         weight = self.weight[rows] if isinstance(self.weight, Tensor) else self.weight
@@ -117,7 +117,7 @@ class VertexForces:
 
     def contact_energies(self, pos: Tensor) -> list[Tensor]:
         """Those of contact, friction and drag alone."""
-        parts = [wall.weight * wall.depth(pos).clamp_min(0.0) ** 3 for wall in self.walls]
+        parts = [contact_energy(wall.weight, wall.depth(pos)) for wall in self.walls]
         for grip in self.grips:
             slip = grip.slip(pos)
             parts.append(grip.force * mollified_norm(_rows(slip, slip), grip.limit))
@@ -145,9 +145,9 @@ class VertexForces:
         matrix = torch.diag_embed(self.stiffness.unsqueeze(1).expand(-1, 3))
         indefinite_part = None
         for wall in self.walls:
-            depth = wall.depth(pos).clamp_min(0.0)
-            gradient = gradient - wall.pressure(pos)[:, None] * wall.normal
-            matrix += _outer((6.0 * wall.weight * depth)[:, None] * wall.normal, wall.normal)
+            depth = wall.depth(pos)
+            gradient = gradient - contact_force(wall.weight, depth)[:, None] * wall.normal
+            matrix += _outer(contact_curvature(wall.weight, depth)[:, None] * wall.normal, wall.normal)
         for grip in self.grips:
             force, block, less = _friction(grip, pos)
             gradient, matrix = gradient + force, matrix.add_(block)
@@ -209,15 +209,13 @@ def _slope(grip: Grip, pos: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Slip (N, 3) [m], its size (N,) and the force along it in units of it (N,) [N/m]."""
     slip = grip.slip(pos)
     size = _rows(slip, slip).sqrt()
-    small = size < grip.limit
-    slope = grip.force * torch.where(small, (2.0 - size / grip.limit) / grip.limit, 1.0 / torch.where(small, 1.0, size))
-    return slip, size, slope
+    return slip, size, grip.force * slip_slope(size, grip.limit)
 
 
 def _friction(grip: Grip, pos: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Gradient, matrix and indefinite part."""
     normal, (slip, size, slope) = grip.normal, _slope(grip, pos)
-    along = grip.force * torch.where(size < grip.limit, 2.0 * (1.0 - size / grip.limit) / grip.limit, 0.0)
+    along = grip.force * slip_curvature(size, grip.limit)
     heading = slip / torch.where(size > 0, size, 1.0)[:, None]
     matrix = torch.diag_embed(slope.unsqueeze(1).expand(-1, 3)) - _outer(slope[:, None] * normal, normal)
     return slope[:, None] * slip, matrix, _outer((along - slope)[:, None] * heading, heading)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from hood.cloth.cloth import Cloth
 from hood.energies.contact import Collision
+from hood.energies.laws import contact_depth
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem, inertial_guess
 from hood.energies.self_contact import without_layers
@@ -138,7 +139,7 @@ def projected_guess(potential: Potential, problem: StepProblem, falls: bool = Tr
     guess = inertial_guess(problem.state, problem.step, cloth.vertex_scene) + (dt**2 * gravity if falls else 0.0)
     term = next((term for term in potential.terms.values() if isinstance(term, Collision)), None)
     if problem.contact is not None and term is not None and term.weight > 0:
-        carried = (cloth.mass * gravity.norm() / (3.0 * term.weight)).sqrt()
+        carried = contact_depth(term.weight, cloth.mass * gravity.norm())
         depth, normal = term.depth(problem, problem.contact, guess)
         guess = guess + (depth - carried).clamp_min(0.0)[:, None] * normal
     return torch.where(cloth.free.unsqueeze(1), guess, fixed_positions(problem))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from hood.energies.laws import contact_push
 from hood.solver.derivatives.points import PointForces
 from hood.solver.derivatives.vertices import Walls
 from hood.solver.system.iterate import Iterate, Unknowns
@@ -88,7 +89,7 @@ class Stop:
 
     def correction(self, pos: Tensor) -> Tensor:
         """Displacement (n, 3) of vertices that the Newton model has put at ``pos`` (n, 3)."""
-        push = _push(self._wall, self._depth, self._wall.depth(pos), self._compliance)
+        push = contact_push(self._wall.weight, self._depth, self._wall.depth(pos), self._compliance)
         return push[:, None] * self._give
 
 
@@ -114,25 +115,12 @@ class _PointStop:
     def correction(self, pos: Tensor) -> Tensor:
         """Displacement (V, 3) of vertices that the Newton model has put at ``pos`` (V, 3)."""
         points = self._points
-        push = _push(self._wall, self._depth, self._wall.depth(points.at(pos)), self._compliance)
+        push = contact_push(self._wall.weight, self._depth, self._wall.depth(points.at(pos)), self._compliance)
         target = points.vertices.reshape(-1)
         total = torch.zeros_like(pos).index_add(0, target, (push[:, None, None] * self._give).reshape(-1, 3))
         asked = ((push > 0)[:, None] & (points.weights > 0)).to(pos.dtype).reshape(-1)
         count = pos.new_zeros(len(pos)).index_add(0, target, asked)
         return total / count.clamp_min(1.0)[:, None]
-
-
-def _push(wall: Walls, start: Tensor, end: Tensor, compliance: Tensor) -> Tensor:
-    """Force (n,) [N] that takes contact from the depth ``end`` where the Newton model leads to the one where the whole
-    penalty balances that model; ``start`` is the depth at the state, at least 0."""
-    cubic = 3.0 * wall.weight
-    # The model's own force at the end, and the stiffness of everything else.
-    force = cubic * start * (2.0 * end - start)
-    rest = torch.maximum(1.0 / compliance - 2.0 * cubic * start, 0.1 / compliance)
-    # cubic q² + rest (q - end) = force for the depth q >= 0.
-    load = (force + rest * end).clamp_min(0.0)
-    balance = 2.0 * load / (rest + (rest * rest + 4.0 * cubic * load).sqrt())
-    return torch.where(end > balance, end - balance, 0.0) / compliance
 
 
 def backtrack(unknowns: Unknowns, path: Path, now: Iterate, slope: Tensor, searching: Tensor) -> tuple[Iterate, Tensor]:

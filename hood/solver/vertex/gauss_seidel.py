@@ -15,6 +15,7 @@ from torch import Tensor
 
 from hood.cloth.cloth import Cloth
 from hood.cloth.state import Attachments
+from hood.energies.laws import contact_balance, contact_force
 from hood.energies.potential import Potential, relative_gradient
 from hood.energies.problem import StepProblem
 from hood.energies.self_contact import has_layers
@@ -261,8 +262,8 @@ def _push(wall: Walls, pos: Tensor, inverse: Tensor) -> Tensor:
     """
     depth = wall.depth(pos).clamp_min(0.0)
     give = _apply(inverse, wall.normal)
-    left = 2.0 * depth / (1.0 + (1.0 + 12.0 * wall.weight * (give * wall.normal).sum(1) * depth).sqrt())
-    return (3.0 * wall.weight * left * left)[:, None] * give
+    left = contact_balance(wall.weight, depth, (give * wall.normal).sum(1))
+    return contact_force(wall.weight, left)[:, None] * give
 
 
 def _apply(matrix: Tensor, vector: Tensor) -> Tensor:
