@@ -5,11 +5,9 @@ Every name here is also a name of the package: ``hood.simulate(…)``.
 
 from __future__ import annotations
 
-import contextlib
 import inspect
-import io
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +15,10 @@ import numpy as np
 from tqdm import tqdm
 
 from hood.app.common import load_stepper
+from hood.app.notices import Bar, Item, collected, tell_how_far
 from hood.app.output.frames import at_output_fps, finer_mesh, on_finer_mesh, output_rate
 from hood.app.plan_file import plan_mode, plan_path, planned, rollout_config
-from hood.app.settings.compose import ConfigError, load_config
+from hood.app.settings.compose import ConfigError
 from hood.app.settings.python_words import overrides
 from hood.app.setup import Setup, check_config, make_stepper, set_up
 from hood.app.stepping.cautions import idle_in_rollout
@@ -69,7 +68,9 @@ class Simulation:
 
     def __iter__(self) -> Iterator[Frame]:
         config = self._ready.config
-        guard = make_guard(config, self.stepper, self.potential)
+        with collected() as told:
+            guard = make_guard(config, self.stepper, self.potential)
+        self.notes += [line for line in told if line not in self.notes]
         steps = frames.simulate(
             self.stepper,
             self.scene,
@@ -83,7 +84,7 @@ class Simulation:
             guard=guard,
             afresh=plan_mode(config) == "full",
         )
-        seen = tqdm(steps, total=self._simulated, unit="frame", disable=not self._progress)
+        seen = _bar(self._progress)(steps, self._simulated, "simulation")
         yield from on_finer_mesh(at_output_fps(seen, config, self.scene, self._simulated), self._finer, self.scene)
         if guard is not None and guard.stopped is not None:
             raise GuardStopped(f"guard=strict: the simulation ends before frame {guard.stopped.frame}, which cannot be trusted")
@@ -148,8 +149,7 @@ def simulate(
         usual = {key: parameter.default for key, parameter in inspect.signature(simulate).parameters.items()}
         named = {key: value for key, value in named.items() if usual.get(key) != value}
     notes: list[str] = []
-    told = io.StringIO()
-    with contextlib.redirect_stdout(told):  # choices are told to whoever reads the notes
+    with collected() as told:  # choices are told to whoever reads the notes
         config = rollout_config(planned(overrides(named)))
         check_config(config)
         notes += idle_in_rollout(overrides(named), config)
@@ -161,17 +161,29 @@ def simulate(
             material if isinstance(material, Material) else None,
             tell=notes.append,
         )
-    return Simulation(ready, [*told.getvalue().splitlines(), *notes], progress)
+    return Simulation(ready, [*told, *notes], progress)
 
 
-def rollout(**keys: Any) -> dict[str, Any]:
-    """Run ``hood rollout`` with its keys: files in ``output``, and the summary as a dictionary.
+class Summary(dict[str, Any]):
+    """What ``summary.json`` of a rollout holds. ``notes``: what ``hood rollout`` prints, a line each."""
+
+    def __init__(self, content: Mapping[str, Any], notes: list[str]) -> None:
+        super().__init__(content)
+        self.notes = notes
+
+
+def rollout(*, tell: Callable[[str], None] | None = None, progress: bool = False, **keys: Any) -> Summary:
+    """Run ``hood rollout`` with its keys: files in ``output``, and the summary as a dictionary. Nothing is printed.
 
     Args:
+        tell: is called with every line that the command prints, and every few seconds with how far the work is:
+            ``tell=print``.
+        progress: whether a progress bar is shown.
         keys: those of ``hood rollout --help``, such as ``garment="dress", num_frames=60, output="outputs/dress"``.
 
     Returns:
-        What ``summary.json`` holds. ``summary["sound"]`` is False where the cloth cannot be trusted.
+        What ``summary.json`` holds. ``summary["sound"]`` is False where the cloth cannot be trusted; ``summary.notes`` has the
+        lines, warnings among them.
 
     Raises:
         ValueError, OSError: keys or files that cannot be used.
@@ -179,28 +191,30 @@ def rollout(**keys: Any) -> dict[str, Any]:
 
     Examples:
         >>> import hood
-        >>> summary = hood.rollout(garment="tank", num_frames=3, video="none", output="outputs/tank")
+        >>> summary = hood.rollout(garment="tank", num_frames=3, video="none", output="outputs/tank", tell=print)
         stepper=newton: the solver, the default on a CPU; ...
         tank: 3 frames, all finite
         ...
         >>> summary["num_frames"]
         3
+        >>> summary.notes[-1]
+        'files in outputs/tank: config.yaml, contact_sheet.png, rollout.h5, summary.json, versions.json'
     """
-    from hood.app.rollout import run
+    from hood.app.rollout import rollout as simulated
 
-    words = overrides(keys)
-    if run(words) == 130:
+    with collected(tell):
+        done = simulated(overrides(keys), _bar(progress))
+    if done.interrupted:
         raise KeyboardInterrupt
-    folder = Path(str(rollout_config(words).output)).expanduser()
-    summary: dict[str, Any] = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-    return summary
+    return Summary(json.loads((done.folder / "summary.json").read_text(encoding="utf-8")), done.notes)
 
 
-def export(rollout: str | Path, **keys: Any) -> Path:
-    """Run ``hood export``: a rollout as a file that other programs open.
+def export(rollout: str | Path, *, tell: Callable[[str], None] | None = None, **keys: Any) -> Path:
+    """Run ``hood export``: a rollout as a file that other programs open. Nothing is printed.
 
     Args:
         rollout: its ``rollout.h5``, or the folder of it.
+        tell: is called with every line that the command prints: ``tell=print``.
         keys: those of ``hood export --help``, such as ``format="usd", output="dance.usd"``. Positions are written in metres.
 
     Returns:
@@ -212,22 +226,26 @@ def export(rollout: str | Path, **keys: Any) -> Path:
     Examples:
         >>> import hood
         >>> _ = hood.rollout(garment="tank", num_frames=3, video="none", output="outputs/tank")
-        stepper=newton: the solver, the default on a CPU; ...
-        tank: 3 frames, all finite
-        ...
-        >>> hood.export("outputs/tank", format="glb").name
+        >>> hood.export("outputs/tank", format="glb", tell=print).name
         outputs/tank/rollout.glb: ...
         'rollout.glb'
     """
     from hood.app.output.export import export as write
 
-    return write([str(Path(rollout)), *overrides(keys)])
+    with collected(tell):
+        target, said = write([str(Path(rollout)), *overrides(keys)])
+    if tell is not None:
+        for line in said:
+            tell(line)
+    return target
 
 
-def train(**keys: Any) -> Path:
-    """Run ``hood train`` with its keys.
+def train(*, tell: Callable[[str], None] | None = None, **keys: Any) -> Path:
+    """Run ``hood train`` with its keys. Nothing is printed.
 
     Args:
+        tell: is called with every line that the command prints, and every few seconds with how far the training is:
+            ``tell=print``.
         keys: those of ``hood train --help``, such as ``experiment="quickstart", output="runs/mine"``. A dictionary stands for a
             group: ``trainer={"iterations": 100}``.
 
@@ -240,18 +258,30 @@ def train(**keys: Any) -> Path:
 
     Examples:
         >>> import hood
-        >>> weights = hood.train(model="small", trainer={"iterations": 1, "kernels": "torch"}, output="runs/first")
+        >>> small = {"iterations": 1, "kernels": "torch"}
+        >>> weights = hood.train(model="small", trainer=small, output="runs/first", tell=print)
         432,579 parameters, 7 garments, 22 motions
         ...
         >>> weights.name
         'model.safetensors'
     """
-    from hood.app.train import run
+    from hood.app.train import train as trained
 
-    words = overrides(keys)
-    if run(words) != 0:
+    with collected(tell):
+        done = trained(overrides(keys))
+    if done.interrupted:
         raise KeyboardInterrupt
-    return Path(str(load_config("train", words).output)).expanduser() / "model.safetensors"
+    return done.weights
+
+
+def _bar(progress: bool) -> Bar:
+    """What shows how far a loop is: a bar, or lines for who is told."""
+    return _shown if progress else tell_how_far
+
+
+def _shown(items: Iterable[Item], total: int, what: str) -> Iterable[Item]:
+    shown: Iterable[Item] = tqdm(items, total=total, desc=what, unit="frame")
+    return shown
 
 
 def load_model(name: str | Path = "quickstart", fps: float = 30.0, device: str = "cpu") -> NetworkStepper:

@@ -146,6 +146,20 @@ def test_few_modules_ask_for_the_class_of_an_energy() -> None:
     assert len(set(found)) <= 48, sorted(set(found))
 
 
+def test_the_command_line_alone_prints() -> None:
+    """Rooms below say what they have to say (:func:`hood.assets.files.said.say`), and whoever listens prints or keeps it."""
+    found = []
+    for path in OWN:
+        if path.relative_to(HOOD).parts[0] in ("cli", "studies"):
+            continue
+        for node in ast.walk(TREES[path]):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print":
+                found.append(f"{dotted(path)}:{node.lineno}")
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "sys":
+                found += [f"{dotted(path)}:{node.lineno}"] if node.attr in ("stdout", "stderr") else []
+    assert not found
+
+
 def hasattr_call(node: ast.ClassDef) -> bool:
     """Whether a class computes an energy."""
     return any(isinstance(item, ast.FunctionDef) and item.name == "__call__" for item in node.body)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import sys
 import warnings
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from omegaconf import DictConfig
@@ -18,7 +17,7 @@ from omegaconf import DictConfig
 from hood.app.settings.compose import ConfigError, load_config, plain, require_choice, shown
 from hood.app.settings.record import read_record
 from hood.assets.files.atomic import occupy
-from hood.assets.files.said import install
+from hood.assets.files.said import install, say
 from hood.model.kernels.block import check_kernels, why_slow
 from hood.model.network.kernel_choice import AUTO, KernelChoice, choose_for
 from hood.steppers.checkpoint import load_simulator
@@ -28,14 +27,24 @@ from hood.steppers.published import SUFFIXES, load_reference_checkpoint
 from hood.tensors.precision import check_precision
 from hood.training import distributed
 
+Result = TypeVar("Result")
+
 #: ``checkpoint=untrained``: seeded random weights instead of a file.
 UNTRAINED = "untrained"
 #: A body drawn thinner than this [mm] is another body.
 _THINNEST = 20.0
 
 
-def together(command: Callable[[], int]) -> int:
-    """Run a command that torchrun may have started several times; an error of process 0 that ends all is told once."""
+class GivenUpError(Exception):
+    """A process that torchrun started ends, and has said why."""
+
+
+def together(command: Callable[[], Result]) -> Result:
+    """Run a command that torchrun may have started several times; an error of process 0 that ends all is told once.
+
+    Raises:
+        GivenUpError: instead of another process's ValueError, OSError or ImportError.
+    """
     distributed.start()
     try:
         return command()
@@ -43,8 +52,8 @@ def together(command: Callable[[], int]) -> int:
         if distributed.rank() == 0:
             raise
         if not distributed.is_told(error):
-            print(f"hood: process {distributed.rank()}: {error}", file=sys.stderr)
-        return 2
+            say(f"hood: process {distributed.rank()}: {error}", error=True)
+        raise GivenUpError(str(error)) from error
     finally:
         distributed.stop()
 
@@ -210,9 +219,9 @@ def warn_if_slow(key: str, precision: str, device: torch.device) -> None:
 
 @cache
 def tell_choice(choice: KernelChoice) -> None:
-    """Print what ``kernels=auto`` has chosen, once."""
+    """Say what ``kernels=auto`` has chosen, once."""
     if distributed.rank() == 0:
-        print(choice, flush=True)
+        say(choice)
 
 
 def require_same_config(config: DictConfig, folder: Path, free: Sequence[str], free_below: Sequence[str] = ()) -> None:

@@ -4,26 +4,22 @@ from __future__ import annotations
 
 import json
 import os
-import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 from omegaconf import DictConfig
-from tqdm import tqdm
 
 from hood.app.batch.batch import Job, find_jobs, share, with_one_stepper, write_overview
 from hood.app.batch.folders import as_begun, motion_attributes, refuse_others, resumed
 from hood.app.common import output_folder, prepare_folder, thinning, together
-from hood.app.notices import Heard, heard
-from hood.app.output.export import check_outputs, export_beside, remove_earlier
+from hood.app.notices import Bar, Heard, collected, heard, say, tell_how_far
+from hood.app.output.export import check_outputs, check_worn, export_beside, lay_on, read_textures, remove_earlier
 from hood.app.output.frames import at_output_fps, finer_mesh, on_finer_mesh, planned_steps, refined_still
 from hood.app.output.summary import describe, describe_all, summarise
-from hood.app.output.textures import check_worn, lay_on, read_textures
-from hood.app.output.verdict import exit_code
 from hood.app.plan_file import plan_mode, plan_path, plan_sentences, planned, rollout_config, summarise_plan, without_accuracy
 from hood.app.scene.events import describe_held, fastening_attributes, summarise_held
 from hood.app.scene.garments import describe_ease, summarise_ease
@@ -49,45 +45,89 @@ from hood.steppers.static_shapes.simulator import network_of
 from hood.training import distributed
 
 
-def run(overrides: Sequence[str]) -> int:
-    """Run the command; returns the exit code: 130 where the user interrupted it, else 2 where a motion of many could not be
-    used, else 3 where a result is unsound (:mod:`hood.rollouts.verdict`), else 0."""
+@dataclass(frozen=True)
+class Rollouts:
+    """What came of one rollout, or of one for each of many motions.
+
+    Args:
+        config: what was asked for.
+        summaries: of every motion what its ``summary.json`` holds, or ``{"error": …}`` where it could not be used; one for
+            one motion, none on processes of torchrun that had none.
+        interrupted: by the user; the frames done are kept.
+        notes: what was said meanwhile, a line each.
+    """
+
+    config: DictConfig
+    summaries: tuple[dict[str, Any], ...]
+    interrupted: bool
+    notes: list[str]
+
+    @property
+    def folder(self) -> Path:
+        """Where the files are."""
+        return output_folder(self.config)
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """Of the one motion, or the first."""
+        return self.summaries[0] if self.summaries else {}
+
+
+def rollout(overrides: Sequence[str], bar: Bar = tell_how_far) -> Rollouts:
+    """Run what the words of ``hood rollout`` ask for.
+
+    Args:
+        bar: shows how far simulations and films are.
+
+    Raises:
+        ConfigError, ValueError, OSError: words or files that cannot be used.
+        hood.app.common.GivenUpError: on another process of torchrun.
+    """
+    with collected() as notes:
+        config, summaries, interrupted = _rollout(overrides, bar)
+    return Rollouts(config, tuple(summaries), interrupted, notes)
+
+
+_Made = tuple[DictConfig, list[dict[str, Any]], bool]
+
+
+def _rollout(overrides: Sequence[str], bar: Bar) -> _Made:
     config = rollout_config(without_accuracy(overrides))
     check_config(config)
     check_outputs(config)
     if distributed.is_first():
         _tell(idle_in_rollout(overrides, config))
-    return together(lambda: _run(rollout_config(distributed.on_main(lambda: planned(overrides)))))
+    return together(lambda: _run(rollout_config(distributed.on_main(lambda: planned(overrides))), bar))
 
 
-def _run(config: DictConfig) -> int:
+def _run(config: DictConfig, bar: Bar) -> _Made:
     """One motion, or each of many in a folder of its own; processes that torchrun started share the many."""
     output = output_folder(config)
     jobs = distributed.on_main(lambda: find_jobs(str(config.sequence), output, config.root))
     if jobs is not None:
-        return _run_all(config, jobs, output)
+        return _run_all(config, jobs, output, bar)
     if distributed.rank() != 0:
-        return 0
+        return config, [], False
     config = as_begun(config, [(str(config.sequence), output)])
     stepper, digest = make_stepper(config)
     summary, interrupted = resumed(config, digest), False
     if summary is None:
-        summary, interrupted = _run_one(config, stepper, digest)
+        summary, interrupted = _run_one(config, stepper, digest, bar)
     else:
-        print(f"resume=true: {output} holds this rollout, finished with the same settings; it stays")
-    return 130 if interrupted else exit_code([summary], bool(config.allow_unsound), str(config.doubts))
+        say(f"resume=true: {output} holds this rollout, finished with the same settings; it stays")
+    return config, [summary], interrupted
 
 
-def _run_one(config: DictConfig, stepper: Stepper, digest: str, alone: bool = True) -> tuple[dict[str, Any], bool]:
+def _run_one(config: DictConfig, stepper: Stepper, digest: str, bar: Bar, alone: bool = True) -> tuple[dict[str, Any], bool]:
     """The rollout of one motion with all its files: the summary, and whether the user interrupted it. Where many are run
     none may replace another's, and none is the place for advice on the stepper."""
     with heard() as warned:
-        return _run_heard(config, stepper, digest, warned, alone)
+        return _run_heard(config, stepper, digest, warned, bar, alone)
 
 
 def _tell(sentences: Sequence[str]) -> None:
     for sentence in sentences:
-        print(sentence)
+        say(sentence)
 
 
 def _keep_plan(config: DictConfig, folder: Path) -> None:
@@ -103,24 +143,28 @@ def _first_positions(path: Path, count: int) -> np.ndarray:
         return np.asarray(file["cloth/pos"][0, :count], dtype=np.float64)
 
 
-def _run_heard(config: DictConfig, stepper: Stepper, digest: str, warned: Heard, alone: bool) -> tuple[dict[str, Any], bool]:
+def _run_heard(
+    config: DictConfig, stepper: Stepper, digest: str, warned: Heard, bar: Bar, alone: bool
+) -> tuple[dict[str, Any], bool]:
     """The rollout of one motion; ``warned`` is what has been warned about when the summary is written."""
     ready = set_up(config, stepper)
     check_worn(read_textures(config), ready.scene.garment)
     with occupy(prepare_folder(output_folder(config))):
         if not alone:
             refuse_others(output_folder(config), str(config.sequence))
-        return _run_there(ready, config, digest, warned, alone)
+        return _run_there(ready, config, digest, warned, bar, alone)
 
 
-def _run_there(ready: Setup, asked: DictConfig, digest: str, warned: Heard, advise: bool) -> tuple[dict[str, Any], bool]:
+def _run_there(
+    ready: Setup, asked: DictConfig, digest: str, warned: Heard, bar: Bar, advise: bool
+) -> tuple[dict[str, Any], bool]:
     """The rollout in its folder, which is there and held."""
     config, scene, stepper = ready.config, ready.scene, ready.stepper
     folder = output_folder(config)
     remove_earlier(folder, config)
     save_run_record(folder, config, int(config.seed))
     eases: list[Ease | None] = []
-    interrupted = _simulate_to_disk(ready, digest, folder / "rollout.h5", asked, eases, warned.doubts)
+    interrupted = _simulate_to_disk(ready, digest, folder / "rollout.h5", asked, eases, warned.doubts, bar)
     summary = summarise(folder / "rollout.h5")
     if eases:
         summary |= summarise_ease(eases[0], eases[-1])
@@ -130,7 +174,7 @@ def _run_there(ready: Setup, asked: DictConfig, digest: str, warned: Heard, advi
     summary["choice"] = asdict(ready.choice)
     summary |= summarise_plan(folder / "rollout.h5", config)
     _keep_plan(config, folder)
-    print(describe(summary))
+    say(describe(summary))
     _tell(describe_held(summary))
     _tell(describe_ease(summary))
     _tell(plan_sentences(summary))
@@ -139,22 +183,19 @@ def _run_there(ready: Setup, asked: DictConfig, digest: str, warned: Heard, advi
     simulator = network_of(stepper)
     try:
         if not interrupted:
-            _draw(config, folder)
+            _draw(config, folder, bar)
             _tell(export_beside(folder / "rollout.h5", [str(form) for form in config.formats], read_textures(config)))
     finally:
         summary["kernels"] = None if simulator is None else simulator.network.kernels
         summary["warnings"] = list(warned)
         _write_json(folder / "summary.json", summary)
-    print(f"files in {folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
+    say(f"files in {folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
     if interrupted:
-        print(
-            f"hood: interrupted; the {summary['num_frames']} frames done are kept in {folder / 'rollout.h5'}",
-            file=sys.stderr,
-        )
+        say(f"hood: interrupted; the {summary['num_frames']} frames done are kept in {folder / 'rollout.h5'}", error=True)
     return summary, interrupted
 
 
-def _run_all(config: DictConfig, jobs: list[Job], output: Path) -> int:
+def _run_all(config: DictConfig, jobs: list[Job], output: Path, bar: Bar) -> _Made:
     """Every motion in its folder, and ``summary.json`` over all of them; one stepper for all."""
     config = distributed.on_main(lambda: with_one_stepper(config, jobs))
     stepper, digest = make_stepper(config)
@@ -162,26 +203,22 @@ def _run_all(config: DictConfig, jobs: list[Job], output: Path) -> int:
     def work(job: Job) -> tuple[dict[str, Any], bool]:
         one = job.of(config)
         done = resumed(one, digest)
-        return (done | {"skipped": True}, False) if done is not None else _run_one(one, stepper, digest, alone=False)
+        return (done | {"skipped": True}, False) if done is not None else _run_one(one, stepper, digest, bar, alone=False)
 
     outcome = share(jobs, work)
     if distributed.rank() == 0:
         overview = write_overview(prepare_folder(output), outcome.rows, {job.sequence: job.folder for job in jobs})
-        print(describe_all(outcome.rows, len(jobs)))
-        print(f"summary of all in {overview}")
+        say(describe_all(outcome.rows, len(jobs)))
+        say(f"summary of all in {overview}")
         if len(outcome.rows) < len(jobs):
-            print("hood: not all done; the same command with resume=true goes on", file=sys.stderr)
+            say("hood: not all done; the same command with resume=true goes on", error=True)
     if outcome.hopeless is not None:
         raise outcome.hopeless
-    if outcome.interrupted:
-        return 130
-    if any("error" in row for row in outcome.rows.values()):
-        return 2
-    return exit_code(outcome.rows.values(), bool(config.allow_unsound), str(config.doubts))
+    return config, list(outcome.rows.values()), outcome.interrupted
 
 
 def _simulate_to_disk(
-    ready: Setup, digest: str, path: Path, asked: DictConfig, eases: list[Ease | None], doubts: Sequence[Doubt]
+    ready: Setup, digest: str, path: Path, asked: DictConfig, eases: list[Ease | None], doubts: Sequence[Doubt], bar: Bar
 ) -> bool:
     """Stream the rollout into ``path``; True when the user interrupted it. ``asked`` is the config with ``auto`` in it,
     ``doubts`` those about its inputs. Where a size was asked for, how the garment sat is added to ``eases``, at the beginning
@@ -190,7 +227,7 @@ def _simulate_to_disk(
     guard = make_guard(config, stepper, potential)
     count = min(int(config.num_frames), scene.num_frames)
     if count < int(config.num_frames):
-        print(f"{scene.motion.name} has {count} frames at {1 / scene.dt:g} fps; the rollout ends there")
+        say(f"{scene.motion.name} has {count} frames at {1 / scene.dt:g} fps; the rollout ends there")
     attributes = {
         "material": plain(config.material),
         "config": plain(config),
@@ -248,7 +285,7 @@ def _simulate_to_disk(
 
     def simulated() -> Iterator[Frame]:
         """The simulated frames, each noted before it is passed on."""
-        for frame in tqdm(frames, total=count, desc=f"rollout {scene.garment.name}", unit="frame", disable=_quiet()):
+        for frame in bar(frames, count, f"rollout {scene.garment.name}"):
             if steps is not None:
                 writer.append_step(frame.world_pos.numpy(), frame.metrics)
             if scene.sizes != Sizes() and frame.index in (0, count - 1):
@@ -274,21 +311,22 @@ def _simulate_to_disk(
     return False
 
 
-def _draw(config: DictConfig, folder: Path) -> None:
+def _draw(config: DictConfig, folder: Path, bar: Bar) -> None:
     """Contact sheet and video, when the picture libraries are installed."""
     if str(config.video) == "none" and not bool(config.sheet):
         return
     try:
         from hood.media.film import write_sheet, write_video
     except ImportError as error:
-        print(f"no pictures: {error}", file=sys.stderr)
+        say(f"no pictures: {error}", error=True)
         return
     data, colour, thinner = read_rollout(folder / "rollout.h5"), str(config.colour), thinning(config)
     textures = lay_on(read_textures(config), [data])[0]
     if bool(config.sheet):
         write_sheet(data, folder / "contact_sheet.png", colour, thinner, textures)
     if str(config.video) != "none":
-        frames = tqdm(range(0, len(data.cloth_pos), int(config.video_stride)), desc="video", unit="frame", disable=_quiet())
+        chosen = range(0, len(data.cloth_pos), int(config.video_stride))
+        frames = bar(chosen, len(chosen), "video")
         write_video(data, folder / f"rollout.{config.video}", frames, int(config.video_stride), colour, thinner, textures)
 
 
@@ -296,8 +334,3 @@ def _write_json(path: Path, value: dict[str, Any]) -> None:
     temporary = path.with_name(path.name + ".partial")
     temporary.write_text(json.dumps(value, indent=1), encoding="utf-8")
     os.replace(temporary, path)
-
-
-def _quiet() -> bool | None:
-    """For progress bars: shown on a terminal, by one process."""
-    return True if distributed.rank() else None

@@ -11,6 +11,7 @@ import torch
 from omegaconf import DictConfig
 
 from hood.app.common import require_device, thinning
+from hood.app.notices import say
 from hood.app.output.frames import check_output_fps, check_refine_mesh
 from hood.app.output.verdict import DOUBTS
 from hood.app.plan_file import plan_path, read_watch
@@ -79,7 +80,7 @@ def set_up(
     stepper: Stepper,
     garment: Garment | None = None,
     material: Material | None = None,
-    tell: Callable[[str], None] = print,
+    tell: Callable[[str], None] = say,
 ) -> Setup:
     """The scene that the config names, and ``stepper`` with its steps refined as the config, or the scene, needs.
 

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import signal
-import sys
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
-from tqdm import tqdm
 
 from hood.app.common import (
     held_folder,
@@ -25,6 +24,7 @@ from hood.app.common import (
     together,
     warn_if_slow,
 )
+from hood.app.notices import collected, say
 from hood.app.scene.garments import as_simulated
 from hood.app.scene.motion import check_rate
 from hood.app.settings.compose import ConfigError, build, load_config, plain, require_choice, shown
@@ -32,6 +32,7 @@ from hood.app.settings.record import save_run_record
 from hood.app.stepping.cautions import idle_in_training
 from hood.assets.body.load import load_body
 from hood.assets.files.library import locate, motion_split, unknown
+from hood.assets.files.said import ProgressLines
 from hood.assets.garment.garment import load_garment
 from hood.assets.material import Material
 from hood.assets.motion.axes import UP_AXES
@@ -65,14 +66,59 @@ _BOOKKEEPING = (
 )
 
 
-def run(overrides: Sequence[str]) -> int:
-    """Run the command; returns the exit code."""
+#: Is told the iteration, and what was measured in it, None where it was validated.
+Tick = Callable[[int, dict[str, float] | None], None]
+#: From the iterations in all and those done, what shows how far a training is.
+TrainingBar = Callable[[int, int], AbstractContextManager[Tick]]
+
+
+@contextmanager
+def tell_iterations(total: int, done: int) -> Iterator[Tick]:
+    """A :data:`TrainingBar` that says how far it is every few seconds."""
+    progress = ProgressLines("train")
+
+    def tick(iteration: int, report: dict[str, float] | None) -> None:
+        if report is not None:
+            progress.tell(f"{iteration} of {total}, relative gradient {report['relative_gradient']:.2f}")
+
+    yield tick
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What came of a training.
+
+    Args:
+        weights: their file.
+        iteration: how many iterations are done.
+        interrupted: by the user; the checkpoint is kept.
+        notes: what was said meanwhile, a line each.
+    """
+
+    weights: Path
+    iteration: int
+    interrupted: bool
+    notes: list[str]
+
+
+def train(overrides: Sequence[str], bar: TrainingBar = tell_iterations) -> Trained:
+    """Run what the words of ``hood train`` ask for.
+
+    Raises:
+        ConfigError, ValueError, OSError: words or files that cannot be used.
+        hood.app.common.GivenUpError: on another process of torchrun.
+    """
+    with collected() as notes:
+        return _train(overrides, bar, notes)
+
+
+def _train(overrides: Sequence[str], bar: TrainingBar, notes: list[str]) -> Trained:
     config = load_config("train", overrides)
     require_device(config)
     if distributed.is_first():
         for sentence in idle_in_training(overrides, config):
-            print(sentence)
-    return together(lambda: _train(config))
+            say(sentence)
+    return together(lambda: _in_folder(config, bar, notes))
 
 
 def _check_values(config: DictConfig) -> None:
@@ -87,13 +133,14 @@ def _check_values(config: DictConfig) -> None:
         raise ConfigError("data.garments=[]: give at least one, such as data.garments=[dress]")
 
 
-def _train(config: DictConfig) -> int:
+def _in_folder(config: DictConfig, bar: TrainingBar, notes: list[str]) -> Trained:
     trainer = make_trainer(config)
     with held_folder(config) as folder:
-        return _run(config, trainer, folder)
+        return Trained(folder / "model.safetensors", *_run(config, trainer, folder, bar), notes)
 
 
-def _run(config: DictConfig, trainer: Trainer, folder: Path) -> int:
+def _run(config: DictConfig, trainer: Trainer, folder: Path, bar: TrainingBar) -> tuple[int, bool]:
+    """How many iterations are done, and whether the user interrupted them."""
     main = distributed.rank() == 0
     if distributed.on_main(lambda: _is_resumed(config, folder, trainer.checkpoint_path)):
         trainer.resume(trainer.checkpoint_path)
@@ -102,34 +149,29 @@ def _run(config: DictConfig, trainer: Trainer, folder: Path) -> int:
         tell_choice(trainer.choice)
     if main:
         parameters = sum(p.numel() for p in trainer.simulator.parameters())
-        print(
+        say(
             f"{parameters:,} parameters, {len(trainer.slots.sampler.garments)} garments, "
             f"{len(trainer.slots.sampler.sequences)} motions"
         )
     try:
-        finished = _run_with_progress(trainer)
+        finished = _run_with_progress(trainer, bar)
     except OSError:
         if main and trainer.checkpoint_path.exists():
-            print(
+            say(
                 f"hood: stopped at iteration {trainer.iteration}; {trainer.checkpoint_path} is intact, the same command with "
                 "resume=true goes on from it",
-                file=sys.stderr,
+                error=True,
             )
         raise
     if trainer.skipped:
         why, tried = trainer.why_skipped(), trainer.skipped + trainer.made
         if main:
-            print(f"hood: {trainer.skipped} of {tried} updates were skipped, the last one{why}", file=sys.stderr)
+            say(f"hood: {trainer.skipped} of {tried} updates were skipped, the last one{why}", error=True)
     if main:
-        print(f"weights in {folder / 'model.safetensors'}, checkpoint in {trainer.checkpoint_path}")
-    if not finished:
-        if main:
-            print(
-                f"hood: stopped at iteration {trainer.iteration}; the same command with resume=true goes on",
-                file=sys.stderr,
-            )
-        return 130
-    return 0
+        say(f"weights in {folder / 'model.safetensors'}, checkpoint in {trainer.checkpoint_path}")
+    if main and not finished:
+        say(f"hood: stopped at iteration {trainer.iteration}; the same command with resume=true goes on", error=True)
+    return trainer.iteration, not finished
 
 
 def make_trainer(config: DictConfig) -> Trainer:
@@ -200,7 +242,7 @@ def _open_motions(config: DictConfig, names: list[str], fps: float, min_frames: 
     skip = str(config.data.unusable) == "skip"
     motions = MotionFiles(names, load, fps, min_frames, skip, file_fps=reading["file_fps"])
     if motions.skipped and distributed.rank() == 0:
-        print(f"hood: {len(motions.skipped)} of {len(names)} motions skipped, first: {motions.skipped[0]}", file=sys.stderr)
+        say(f"hood: {len(motions.skipped)} of {len(names)} motions skipped, first: {motions.skipped[0]}", error=True)
     return motions
 
 
@@ -241,12 +283,12 @@ def _is_resumed(config: DictConfig, folder: Path, checkpoint: Path) -> bool:
     if bool(config.resume) and any(folder.glob("*.safetensors")):
         raise ConfigError(f"{folder}: nothing to resume, checkpoint.pt is missing")
     if bool(config.resume):
-        print(f"resume=true: no training in {folder} yet, this one begins", flush=True)
+        say(f"resume=true: no training in {folder} yet, this one begins")
     return False
 
 
-def _run_with_progress(trainer: Trainer) -> bool:
-    """Train under a progress bar; SIGTERM and Ctrl-C end it after the current iteration, with a checkpoint."""
+def _run_with_progress(trainer: Trainer, bar: TrainingBar) -> bool:
+    """Train under what shows how far it is; SIGTERM and Ctrl-C end it after the current iteration, with a checkpoint."""
     stop = {"asked": False}
 
     def ask(signum: int, frame: object) -> None:
@@ -254,23 +296,8 @@ def _run_with_progress(trainer: Trainer) -> bool:
 
     previous = {number: signal.signal(number, ask) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
-        with tqdm(
-            total=trainer.settings.iterations,
-            initial=trainer.iteration,
-            desc="train",
-            unit="it",
-            disable=distributed.rank() != 0 or None,
-        ) as bar:
-
-            def progress(iteration: int, report: dict[str, float] | None) -> None:
-                if report is None:
-                    bar.unpause()  # a validation is no part of the rate
-                    return
-                bar.update(iteration - bar.n)
-                if iteration % 20 == 0:
-                    bar.set_postfix(rg=f"{report['relative_gradient']:.2f}", horizon=int(report["horizon"]), refresh=False)
-
-            return trainer.run(progress, lambda: stop["asked"])
+        with bar(trainer.settings.iterations, trainer.iteration) as tick:
+            return trainer.run(tick, lambda: stop["asked"])
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from hood import plugins
 from hood.app.output.verdict import exit_code_lines
-from hood.assets.files.said import DISTRIBUTION
+from hood.assets.files.said import DISTRIBUTION, listening
 
 # For the C library and OpenMP. Cloth steps allocate and free tensors of a few MB many times a frame: keeping them mapped is
 # worth 1.15–1.9×. Waiting threads that spin slow a busy machine down 6× and more. Both figures and the times below are of an
@@ -46,17 +46,17 @@ COMMANDS = {
 
 #: Where each of them lives; the others, and those of installed packages, are registered (:mod:`hood.plugins`).
 _HOMES = {
-    "rollout": "hood.app.rollout",
-    "view": "hood.cli.view",
-    "compare": "hood.cli.compare",
-    "export": "hood.app.output.export",
-    "inspect": "hood.cli.inspect.inspect",
-    "prepare": "hood.cli.prepare.prepare",
-    "fabric": "hood.cli.fabric",
-    "sizes": "hood.cli.sizes",
-    "train": "hood.app.train",
-    "evaluate": "hood.cli.evaluate",
-    "convert": "hood.cli.convert",
+    "rollout": "hood.cli.rollout:run",
+    "view": "hood.cli.compare:view",
+    "compare": "hood.cli.compare:run",
+    "export": "hood.cli.export:run",
+    "inspect": "hood.cli.inspect.inspect:run",
+    "prepare": "hood.cli.prepare.prepare:run",
+    "fabric": "hood.cli.fabric:run",
+    "sizes": "hood.cli.sizes:run",
+    "train": "hood.cli.rollout:train",
+    "evaluate": "hood.cli.evaluate:run",
+    "convert": "hood.cli.export:convert",
 }
 
 _LESS_MEMORY = "free some, raise the limit (ulimit -v), or take a smaller garment, fewer frames or a smaller model"
@@ -94,13 +94,22 @@ def script(name: str) -> None:
     entry([name, *sys.argv[1:]])
 
 
+def aloud(sentence: str, error: bool, passing: bool) -> None:
+    """Print what is said while a command runs, see :func:`hood.assets.files.said.say`."""
+    print(sentence, file=sys.stderr if error else sys.stdout, flush=passing)
+
+
 def _run(name: str, overrides: Sequence[str]) -> int:
     try:
         command = _command(name)
+        from hood.app.common import GivenUpError
         from hood.app.notices import heard
 
-        with heard():
-            return command(overrides)
+        try:
+            with listening(aloud), heard():
+                return command(overrides)
+        except GivenUpError:  # it has said why
+            return 2
     except KeyboardInterrupt:
         print("hood: interrupted", file=sys.stderr)
         return 130
@@ -147,8 +156,8 @@ def _fail(message: str) -> int:
 def _command(name: str) -> Callable[[Sequence[str]], int]:
     from importlib import import_module
 
-    known = name in _HOMES
-    run: Callable[[Sequence[str]], int] = import_module(_HOMES[name]).run if known else plugins.find("commands", name)
+    module, _, function = _HOMES.get(name, "").partition(":")
+    run: Callable[[Sequence[str]], int] = getattr(import_module(module), function) if module else plugins.find("commands", name)
     gc.freeze()  # modules stay until the end: looking through them for garbage is 4% of a solver's frame
     return run
 

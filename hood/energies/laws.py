@@ -11,7 +11,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-Weight = TypeVar("Weight", float, Tensor)
+Weight = TypeVar("Weight", float, Tensor, float | Tensor)
 
 
 def contact_energy(weight: float | Tensor, depth: Tensor) -> Tensor:

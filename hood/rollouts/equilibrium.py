@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from hood.assets.files.said import Said
+from hood.assets.files.said import ProgressLines
 from hood.cloth.cloth import Cloth
 from hood.cloth.state import Attachments, State, StepInput
 from hood.energies.potential import Potential
@@ -146,7 +146,7 @@ class _Way:
 
     def settle(self, potential: Potential, most_steps: int) -> tuple[int, float]:
         """Number of steps taken, and the speed [m/s] in the last, until the cloth is at rest, lost, or out of steps."""
-        dt, speed, progress = _SHORTEST, math.inf, Said("settling the cloth")
+        dt, speed, progress = _SHORTEST, math.inf, ProgressLines("settling the cloth")
         count, last = 0, most_steps
         while count < last:
             count += 1

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hood.assets.files.said import Said
+from hood.assets.files.said import ProgressLines
 from hood.cloth.cloth import Cloth
 from hood.cloth.state import Obstacle
 from hood.contact.contact import match_surface
@@ -119,7 +119,7 @@ def smooth_out(cloth: Cloth, faces: np.ndarray, pos: Tensor, obstacle: Obstacle 
     start, end = cloth.edges.unbind(dim=1)
     both, other = torch.cat([start, end]), torch.cat([end, start])
     count = torch.zeros_like(pos[:, 0]).index_add(0, both, torch.ones_like(pos[:, 0])[both]).clamp_min(1.0)[:, None]
-    progress = Said("smoothing places where the garment passes through itself")
+    progress = ProgressLines("smoothing places where the garment passes through itself")
     for turn in range(_SMOOTHED):
         pairs = self_crossings(pos.double().cpu().numpy(), faces)
         progress.tell(f"round {turn + 1} of at most {_SMOOTHED}, {len(pairs)} pairs of triangles are left")
@@ -306,7 +306,7 @@ def _take_apart(
     """The garments apart in one order; the best of the rounds. What is not yet as the order has it counts as one crossing."""
     course = _Course(outfit, pos, obstacle, clearance, order)
     best, found, clean = Separation(pos, order, before, before + len(turned), _longest(outfit, pos), turned), 0, 0
-    progress = Said("taking garments apart")
+    progress = ProgressLines("taking garments apart")
     for number in range(_ROUNDS):
         progress.tell(f"round {number + 1} of at most {_ROUNDS}, {best.after} pairs of triangles are left")
         course.round(inner_share, lengths=number > 0, carried=clean > 0)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -23,7 +22,7 @@ import numpy as np
 from torch import Tensor
 
 from hood.assets.files.atomic import write_atomically
-from hood.assets.files.said import install
+from hood.assets.files.said import install, say
 from hood.energies.potential import scale
 from hood.energies.problem import StepProblem
 
@@ -69,7 +68,7 @@ class MetricsLog:
         self.path = folder / "metrics.jsonl"
         self._open(iteration)
         if self._board is None:
-            print(f"hood: no TensorBoard events: {_missing()}; all numbers are in {self.path}", file=sys.stderr)
+            say(f"hood: no TensorBoard events: {_missing()}; all numbers are in {self.path}", error=True)
 
     def write(self, iteration: int, values: dict[str, float]) -> None:
         """One record, on disk at once, so that a killed run keeps it; what is not a finite number becomes null."""
@@ -114,7 +113,7 @@ class MetricsLog:
             getattr(self._board, method)(*values, **options)
         except (OSError, ImportError) as error:
             self._board = None
-            print(f"hood: no more TensorBoard events: {error}", file=sys.stderr)
+            say(f"hood: no more TensorBoard events: {error}", error=True)
 
 
 class LogWindow:

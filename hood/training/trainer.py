@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
@@ -14,6 +13,7 @@ import torch
 from torch import Tensor
 
 from hood.assets.files.atomic import write_atomically
+from hood.assets.files.said import say
 from hood.energies.potential import Potential, relative_gradient, scale
 from hood.energies.problem import StepProblem
 from hood.energies.self_contact import for_networks
@@ -259,14 +259,14 @@ class Trainer:
     def resume(self, path: Path) -> None:
         """Go on from a checkpoint of a run with the same model and data, on any number of processes.
 
-        Where the newest checkpoint is missing or damaged the previous one is taken, and a line on stderr says so.
+        Where the newest checkpoint is missing or damaged the previous one is taken, and a line says so.
 
         Raises:
             ValueError: the checkpoint is of another model, seed or batch size.
         """
         state, note = distributed.on_main(lambda: load_last_good(path))
         if note and distributed.rank() == 0:
-            print(f"hood: {note}", file=sys.stderr)
+            say(f"hood: {note}", error=True)
             set_aside(path)
         if state["model"] != self.simulator.config:
             raise ValueError(f"{path}: trained with model {state['model']}, this run has {self.simulator.config}")
@@ -351,7 +351,7 @@ class Trainer:
         self.rollbacks, self._rollbacks_in_row = self.rollbacks + 1, self._rollbacks_in_row + 1
         self._failed_at = max(failed, self._failed_at)
         if distributed.rank() == 0:
-            print(f"hood: iteration {failed} is not finite; back to iteration {self.iteration}, other scenes", file=sys.stderr)
+            say(f"hood: iteration {failed} is not finite; back to iteration {self.iteration}, other scenes", error=True)
         note = {"rolled_back_from": float(failed), "rollbacks": float(self.rollbacks), "skipped": float(self.skipped)}
         self._log(note, cut=True)
 

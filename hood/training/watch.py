@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import io
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from hood.assets.files.atomic import write_atomically
+from hood.assets.files.said import say
 from hood.evaluation.validation import Validation, summarise_validation
 from hood.rollouts.frames import KeptFrames
 from hood.steppers.network import NetworkStepper
@@ -58,7 +58,7 @@ class ValidationWatch:
             return Film(film.data(), _WIDTH, _HEIGHT).sheet(self.pictures, self.pictures)
         except ImportError as error:
             if not self._said:
-                print(f"hood: no validation pictures: {error}", file=sys.stderr)
+                say(f"hood: no validation pictures: {error}", error=True)
             self._said = True
             return None
 

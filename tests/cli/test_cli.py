@@ -312,7 +312,7 @@ def test_faults_of_the_machine_are_one_sentence(
 
 
 def test_other_errors_of_a_program_keep_their_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
-    import hood.app.rollout as command
+    import hood.cli.rollout as command
 
     def fail(words: object) -> int:
         raise RuntimeError("a fault of the program")

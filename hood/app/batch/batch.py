@@ -18,6 +18,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from hood.app.batch.folders import as_begun, place_motions, refuse_others
+from hood.app.notices import say
 from hood.app.settings.compose import ConfigError
 from hood.app.setup import make_scene, make_stepper
 from hood.app.stepping.automatic import AUTO, choose, decided
@@ -166,7 +167,7 @@ def find_jobs(entry: str, output: Path, root: str | None = None) -> list[Job] | 
     folders, start = place_motions(found, output, root)
     for name, folder in zip(found, folders, strict=True):
         refuse_others(folder, name)
-    print(f"{len(found)} motions, their folders in {output} are named from {start} (root)")
+    say(f"{len(found)} motions, their folders in {output} are named from {start} (root)")
     return [Job(name, folder) for name, folder in zip(found, folders, strict=True)]
 
 
@@ -208,5 +209,5 @@ def with_one_stepper(config: DictConfig, jobs: Sequence[Job]) -> DictConfig:
         choice = choose(first, make_stepper(first)[0], make_scene(first))
         settled, why = with_stepper(config, choice.stepper), choice.why
     for sentence in why:
-        print(sentence)
+        say(sentence)
     return settled

@@ -16,6 +16,7 @@ import h5py
 from omegaconf import DictConfig, OmegaConf
 
 from hood.app.common import output_folder
+from hood.app.notices import say
 from hood.app.output.summary import summarise
 from hood.app.settings.compose import ConfigError, brief, load_config, options, plain
 from hood.app.stepping.automatic import AUTO
@@ -146,7 +147,7 @@ def as_begun(config: DictConfig, motions: Iterable[tuple[str, Path]]) -> DictCon
             continue
         same = with_stepper(config, str(attributes["stepper"]))
         if not _other_settings(OmegaConf.merge(same, {"sequence": sequence}), attributes):
-            print(f"resume=true: stepper={same.stepper}, as in {folder}")
+            say(f"resume=true: stepper={same.stepper}, as in {folder}")
             return same
     return config
 
@@ -159,7 +160,7 @@ def resumed(config: DictConfig, digest: str) -> dict[str, Any] | None:
     done = finished(config, digest, folder)
     sentence = made_otherwise(config, folder) if done is None else None
     if sentence is not None:
-        print(sentence)
+        say(sentence)
     return done
 
 

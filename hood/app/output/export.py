@@ -1,5 +1,7 @@
 """``hood export rollout.h5 format=usd``: a rollout as files that other programs open.
 
+``texture=``: images on the garments of rollouts.
+
 Files of the rollout that was in a folder before: without them, what lies there is of one rollout.
 """
 
@@ -14,16 +16,19 @@ from typing import Any
 from omegaconf import DictConfig
 
 from hood.app.common import frame_count, split_words
-from hood.app.output.textures import lay_on, read_textures
 from hood.app.settings.compose import ConfigError, plain, require_choice
 from hood.assets.files.atomic import write_atomically
+from hood.assets.files.library import unknown
 from hood.assets.files.said import install
-from hood.assets.formats.image import Texture
+from hood.assets.formats.image import Texture, read_texture
+from hood.assets.garment.garment import Garment
 from hood.media.exports.clip import PARTS, Clip, clip_of
 from hood.media.exports.gltf import gltf_bytes
 from hood.media.exports.sequences import write_obj_sequence, write_ply_sequence, write_point_cache
 from hood.media.exports.usd import image_name, write_usd
+from hood.media.pieces import GarmentPiece, pieces_by, pieces_of, plain_name
 from hood.rollouts.file.reader import RolloutData, read_rollout
+from hood.rollouts.file.recorder import still_of
 
 _SUFFIXES = {"usd": (".usd", ".usdc", ".usda"), "glb": (".glb",)}
 _FOLDERS: dict[str, Callable[[Path, Clip], None]] = {
@@ -36,14 +41,8 @@ FORMATS = ("usd", "glb", *_FOLDERS)
 _TEXTURED = ("usd", "glb", "pc2", "obj")
 
 
-def run(arguments: Sequence[str]) -> int:
-    """Run the command; returns the exit code."""
-    export(arguments)
-    return 0
-
-
-def export(arguments: Sequence[str]) -> Path:
-    """Write what the command's words ask for; returns the file or folder."""
+def export(arguments: Sequence[str]) -> tuple[Path, list[str]]:
+    """Write what the command's words ask for: the file or folder, and what there is to say of it."""
     files, config = split_words("export", arguments)
     if len(files) != 1:
         raise ConfigError(f"number of rollouts given: {len(files)}; give one, hood export rollout.h5")
@@ -57,10 +56,11 @@ def export(arguments: Sequence[str]) -> Path:
         raise ConfigError(f"texture: parts={parts} leaves the garments out; leave texture= out, or take parts=[cloth,body]")
     target = _target(config, source, form)
     data = read_checked(source, "fabric")
-    print(_export(source, data, target, form, textures, clip_arguments=(parts, count, up)))
+    said = [_export(source, data, target, form, textures, clip_arguments=(parts, count, up))]
     if not bool(data.attributes.get("complete", True)):
-        print(f"the rollout is not finished: {len(data.time)} of {data.attributes.get('num_planned', '?')} frames are there")
-    return target
+        there = f"{len(data.time)} of {data.attributes.get('num_planned', '?')} frames are there"
+        said.append(f"the rollout is not finished: {there}")
+    return target, said
 
 
 def check_outputs(config: DictConfig) -> None:
@@ -89,7 +89,7 @@ def export_beside(source: Path, forms: Sequence[str], textures: Mapping[str, Tex
     """Write all of the rollout ``source`` in every format beside it, in place of what an earlier run has left there.
 
     Args:
-        textures: images of garments, of :func:`hood.app.output.textures.read_textures`.
+        textures: images of garments, of :func:`read_textures`.
 
     Returns:
         A sentence about each.
@@ -258,3 +258,71 @@ def _words(value: Any) -> Iterator[str]:
     elif isinstance(value, (dict, list)):
         for item in value.values() if isinstance(value, dict) else value:
             yield from _words(item)
+
+
+#: The one image of all garments.
+_EVERY = ""
+
+
+def read_textures(config: DictConfig) -> dict[str, Texture]:
+    """The images that ``config.texture`` names, by garment; empty where it names none.
+
+    Raises:
+        ConfigError: it is neither a file nor a table of garments and files.
+        FileNotFoundError: a file is not there.
+        ValueError: a file is no image that can be used.
+    """
+    value = plain(config.texture)
+    if value is None:
+        return {}
+    table = value if isinstance(value, dict) else {_EVERY: value}
+    if not table or not all(isinstance(file, str) and file for file in table.values()):
+        raise ConfigError(
+            f"texture={value}: give an image, texture=plaid.png, or one a garment, texture={{tank:a.png,skirt:b.png}}"
+        )
+    return {str(name): read_texture(Path(file).expanduser()) for name, file in table.items()}
+
+
+def lay_on(textures: Mapping[str, Texture], rollouts: Sequence[RolloutData]) -> list[dict[str, Texture]]:
+    """Of every rollout the images of its garments, by the names of :func:`hood.media.pieces.pieces_of`.
+
+    Args:
+        textures: of :func:`read_textures`.
+
+    Raises:
+        ValueError: no rollout has such a garment, or it has no texture coordinates.
+    """
+    return _laid_on_all(textures, [pieces_of(data) for data in rollouts])
+
+
+def check_worn(textures: Mapping[str, Texture], garment: Garment) -> None:
+    """Refuse images that :func:`lay_on` would refuse for a rollout of ``garment``, before it is made.
+
+    Raises:
+        ValueError: see there.
+    """
+    _laid_on_all(textures, [pieces_by(garment.name, len(garment.rest_pos), garment.faces, still_of(garment))])
+
+
+def _laid_on_all(textures: Mapping[str, Texture], worn: Sequence[Sequence[GarmentPiece]]) -> list[dict[str, Texture]]:
+    names = list(dict.fromkeys(piece.name for pieces in worn for piece in pieces))
+    for name in textures:
+        if name != _EVERY and plain_name(name) not in names:
+            raise ValueError(f"texture: {unknown('garment', name, names)}")
+    asked = {name if name == _EVERY else plain_name(name): texture for name, texture in textures.items()}
+    return [_laid_on(asked, pieces) for pieces in worn]
+
+
+def _laid_on(textures: Mapping[str, Texture], pieces: Sequence[GarmentPiece]) -> dict[str, Texture]:
+    found = {}
+    for piece in pieces:
+        texture: Any = textures.get(piece.name, textures.get(_EVERY))
+        if texture is None:
+            continue
+        if not piece.is_mapped:
+            raise ValueError(
+                f"texture: garment {piece.name!r} has no texture coordinates; "
+                "unwrap it where it was made, save it with them, and simulate it again"
+            )
+        found[piece.name] = texture
+    return found

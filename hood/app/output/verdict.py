@@ -7,7 +7,6 @@ What a rollout's file says about the cloth's surface: skin through cloth and clo
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -171,25 +170,23 @@ def _describe_distance(summary: Mapping[str, Any]) -> list[str]:
     return [f"relative gradient {summary['relative_gradient_median']:.2g}{worst_text}"]
 
 
-def exit_code(summaries: Iterable[Mapping[str, Any]], allow_unsound: bool, doubts: str = REPORT) -> int:
+def exit_code(summaries: Iterable[Mapping[str, Any]], allow_unsound: bool, doubts: str = REPORT) -> tuple[int, list[str]]:
     """3 where a guard has ended one of the rollouts, one is unsound, unless that is allowed, or one has doubts that are to be
-    refused; says so."""
+    refused; and the sentences that say so."""
     summaries = list(summaries)
     if any((summary.get("guard") or {}).get("stopped") is not None for summary in summaries):
-        return UNSOUND
+        return UNSOUND, []
+    said: list[str] = []
     unsound = sum(summary.get("sound") is False for summary in summaries)
     doubtful = sum(bool(summary.get("doubts")) for summary in summaries) if doubts == REFUSE else 0
     if unsound and allow_unsound:
-        print(f"hood: {_are(unsound)} unsound, which allow_unsound=true allows", file=sys.stderr)
+        said.append(f"{_are(unsound)} unsound, which allow_unsound=true allows")
         unsound = 0
     if unsound:
-        print(
-            f"hood: {_are(unsound)} unsound; its files are kept, exit code {UNSOUND} (0 with allow_unsound=true)",
-            file=sys.stderr,
-        )
+        said.append(f"{_are(unsound)} unsound; its files are kept, exit code {UNSOUND} (0 with allow_unsound=true)")
     if doubtful:
-        print(f"hood: {_are(doubtful)} doubtful; exit code {UNSOUND}, as doubts=refuse asks", file=sys.stderr)
-    return UNSOUND if unsound or doubtful else 0
+        said.append(f"{_are(doubtful)} doubtful; exit code {UNSOUND}, as doubts=refuse asks")
+    return UNSOUND if unsound or doubtful else 0, said
 
 
 def _are(count: int) -> str:

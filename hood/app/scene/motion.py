@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from dataclasses import replace
 from typing import Any
 
@@ -14,6 +13,7 @@ import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from hood.app.notices import say
 from hood.app.settings.compose import ConfigError, brief, plain, require_choice, shown
 from hood.assets.body.body import body_part
 from hood.assets.files.library import names
@@ -112,7 +112,7 @@ def make_motion(config: DictConfig, dtype: torch.dtype = torch.float32) -> Motio
             raise ConfigError(
                 f"sequence={config.sequence}: body={config.body} {has}; leave sequence out, or give a body of the SMPL family"
             )
-        print(f"body={config.body} {has}: sequence={config.sequence} is not used", file=sys.stderr)
+        say(f"body={config.body} {has}: sequence={config.sequence} is not used", error=True)
     return load_motion(str(config.body), str(config.sequence), motion_options(config), dtype, str(config.device))
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
+from hood.app.notices import say
 from hood.app.settings.compose import ConfigError, plain, require_choice
 from hood.app.stepping.refinement import chosen
 from hood.app.stepping.steppers import MAY, losses_of, option_of
@@ -87,7 +88,7 @@ def tell_if_off(config: DictConfig, garments: int) -> None:
             f"outfit: the {garments} garments are not kept apart, and not taken apart at the start: {reason}", stacklevel=2
         )
     elif reason and not _rough(config):
-        print(f"cloth_contact=auto: off; {reason}")
+        say(f"cloth_contact=auto: off; {reason}")
 
 
 def _hindrance(config: DictConfig, potential: Potential | None = None) -> str:

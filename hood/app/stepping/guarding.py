@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
+from hood.app.notices import say
 from hood.app.settings.compose import ConfigError, build, require_choice
 from hood.energies.potential import Potential
 from hood.rollouts.checks.guard import (
@@ -77,7 +78,7 @@ def make_guard(config: DictConfig, stepper: Stepper, potential: Potential) -> Gu
     if mode == OFF:
         return None
     if str(config.step) != "plain" and str(config.metrics) != "all":
-        print(f"guard=off: step={config.step} with metrics={config.metrics} measures nothing that a guard could look at")
+        say(f"guard=off: step={config.step} with metrics={config.metrics} measures nothing that a guard could look at")
         return None
     return Guard(mode, stepper, potential, build(config.solver), int(config.refine_most))
 

@@ -1,14 +1,17 @@
 """Doubts: what a command goes on with although it may be wrong, as a warning that a script can read.
 
+Sentences for the user: told to whoever listens, the command line or a program; nobody here prints.
+
 What pip calls this package and its extras: one place for every message that says what to install.
 
-Lines about work that takes long, on the error stream: none in its first seconds, then one now and then.
+Lines about work that takes long: none in its first seconds, then one now and then.
 """
 
 from __future__ import annotations
 
-import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 #: What a doubt can be about; these words stand in ``summary.json`` and stay.
@@ -61,11 +64,42 @@ def install(extra: str) -> str:
     return f'pip install "{DISTRIBUTION}[{extra}]"'
 
 
+#: What hears a sentence, whether it belongs on the error stream, and whether it tells how far a piece of work is.
+Listener = Callable[[str, bool, bool], None]
+_LISTENERS: list[Listener] = []
+
+
+def listen(listener: Listener) -> None:
+    """From now on ``listener`` hears every sentence, as the others do that listen already."""
+    _LISTENERS.append(listener)
+
+
+@contextmanager
+def listening(listener: Listener) -> Iterator[None]:
+    """The same inside alone."""
+    listen(listener)
+    try:
+        yield
+    finally:
+        _LISTENERS.remove(listener)
+
+
+def say(sentence: object, error: bool = False, passing: bool = False) -> None:
+    """Tell all listeners a sentence; nobody hears it where nobody listens.
+
+    Args:
+        error: the command line prints it on the error stream.
+        passing: it tells how far a piece of work is, and is of no interest later.
+    """
+    for listener in tuple(_LISTENERS):
+        listener(str(sentence), error, passing)
+
+
 #: Seconds before the first line, and between two.
 _FIRST, _BETWEEN = 5.0, 10.0
 
 
-class Said:
+class ProgressLines:
     """Tells how far a piece of work is.
 
     Args:
@@ -76,8 +110,8 @@ class Said:
         self._what, self._next = what, time.monotonic() + _FIRST
 
     def tell(self, sentence: str) -> None:
-        """Print how far it is, unless that was done a moment ago."""
+        """Say how far it is, unless that was done a moment ago."""
         now = time.monotonic()
         if now >= self._next:
             self._next = now + _BETWEEN
-            print(f"hood: {self._what}: {sentence}", file=sys.stderr, flush=True)
+            say(f"hood: {self._what}: {sentence}", error=True, passing=True)

@@ -99,9 +99,6 @@ def read_rollout(path: Path | str) -> RolloutData:
     Examples:
         >>> import hood
         >>> _ = hood.rollout(garment="tank", num_frames=3, video="none", sheet=False, output="outputs/tank")
-        stepper=newton: the solver, the default on a CPU; ...
-        tank: 3 frames, all finite
-        ...
         >>> hood.read_rollout("outputs/tank/rollout.h5").cloth_pos.shape
         (3, 1016, 3)
     """

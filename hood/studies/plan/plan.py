@@ -17,6 +17,7 @@ from omegaconf import DictConfig
 
 from hood import __version__
 from hood.app.common import held_folder, output_folder
+from hood.app.notices import say
 from hood.app.plan_file import FREE, content_digest, plan_path, read_plan, write_plan
 from hood.app.settings.compose import ConfigError, load_config, with_words
 from hood.app.settings.overrides import plain_word
@@ -279,13 +280,13 @@ def planned(overrides: Sequence[str]) -> list[str]:
     path = (output_folder(config) if cache is None else cache / "plans") / f"plan-{_digest(words, str(config.accuracy))}.json"
     if path.is_file():
         plan = read_plan(path)
-        print(f"plan of {path}, made before")
+        say(f"plan of {path}, made before")
     else:
         plan, _ = make_plan(words, own, evidence=False)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_plan(path, plan)
-        print(f"planned in {plan['seconds']:.1f} s, kept in {path}")
-    print(sentence(plan))
+        say(f"planned in {plan['seconds']:.1f} s, kept in {path}")
+    say(sentence(plan))
     return [*rest, f"plan='{path}'"]
 
 

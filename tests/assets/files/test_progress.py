@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from hood.assets.files.said import Said
+from hood.assets.files.said import ProgressLines
 
 
 def test_lines_come_after_a_while_and_not_too_often(
@@ -14,7 +14,7 @@ def test_lines_come_after_a_while_and_not_too_often(
 ) -> None:
     now = [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    progress = Said("settling")
+    progress = ProgressLines("settling")
     for second in range(30):
         now[0] = float(second)
         progress.tell(f"step {second}")

@@ -1,4 +1,7 @@
-"""``hood convert``: published HOOD weights in, a model file of this project out; or a model file at half its size."""
+"""``hood export``: a rollout as files that other programs open.
+
+``hood convert``: published HOOD weights in, a model file of this project out; or a model file at half its size.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ import torch
 from omegaconf import DictConfig
 
 from hood.app.common import prepare_folder
+from hood.app.output.export import export
 from hood.app.settings.compose import ConfigError, load_config
 from hood.assets.files.library import locate
 from hood.steppers.checkpoint import load_simulator, read_header, save_simulator
@@ -19,8 +23,15 @@ from hood.steppers.published import SUFFIXES, read_reference_checkpoint
 _MODEL = ".safetensors"
 
 
-def run(overrides: Sequence[str]) -> int:
-    """Run the command; returns the exit code."""
+def run(arguments: Sequence[str]) -> int:
+    """Run the command ``export``; returns the exit code."""
+    _, said = export(arguments)
+    print("\n".join(said))
+    return 0
+
+
+def convert(overrides: Sequence[str]) -> int:
+    """Run the command ``convert``; returns the exit code."""
     config = load_config("convert", overrides)
     source, target = _paths(config)
     simulator, header = _read(source)

@@ -1,0 +1,62 @@
+"""``hood rollout`` and ``hood train``: progress bars and exit codes of :mod:`hood.app.rollout` and :mod:`hood.app.train`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+
+from tqdm import tqdm
+
+from hood.app.notices import Item
+from hood.app.output.verdict import exit_code
+from hood.app.rollout import Rollouts, rollout
+from hood.app.train import Tick
+from hood.app.train import train as trained
+from hood.training import distributed
+
+
+def run(overrides: Sequence[str]) -> int:
+    """Run the command; returns the exit code: 130 where the user interrupted it, else 2 where a motion of many could not be
+    used, else 3 where a result is unsound (:mod:`hood.rollouts.verdict`), else 0."""
+    return code_of(rollout(overrides, bar))
+
+
+def bar(items: Iterable[Item], total: int, what: str) -> Iterable[Item]:
+    """A progress bar, shown on a terminal, by one process."""
+    shown: Iterable[Item] = tqdm(items, total=total, desc=what, unit="frame", disable=True if distributed.rank() else None)
+    return shown
+
+
+def code_of(done: Rollouts) -> int:
+    """The exit code; what there is to say of it is printed."""
+    if done.interrupted:
+        return 130
+    if any("error" in summary for summary in done.summaries):
+        return 2
+    code, said = exit_code(done.summaries, bool(done.config.allow_unsound), str(done.config.doubts))
+    for sentence in said:
+        print(f"hood: {sentence}", file=sys.stderr)
+    return code
+
+
+def train(overrides: Sequence[str]) -> int:
+    """Run the command; returns the exit code: 130 where the user interrupted it, else 0."""
+    return 130 if trained(overrides, training_bar).interrupted else 0
+
+
+@contextmanager
+def training_bar(total: int, done: int) -> Iterator[Tick]:
+    """A progress bar of ``total`` iterations, shown on a terminal, by one process."""
+    quiet = distributed.rank() != 0 or None
+    with tqdm(total=total, initial=done, desc="train", unit="it", disable=quiet) as shown:
+
+        def tick(iteration: int, report: dict[str, float] | None) -> None:
+            if report is None:
+                shown.unpause()  # a validation is no part of the rate
+                return
+            shown.update(iteration - shown.n)
+            if iteration % 20 == 0:
+                shown.set_postfix(rg=f"{report['relative_gradient']:.2f}", horizon=int(report["horizon"]), refresh=False)
+
+        yield tick
