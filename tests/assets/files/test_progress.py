@@ -6,16 +6,15 @@ import time
 
 import pytest
 
-from hood.assets.files.said import ProgressLines
+from hood.assets.files.said import ProgressLines, listening
 
 
-def test_lines_come_after_a_while_and_not_too_often(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    now = [0.0]
+def test_lines_come_after_a_while_and_not_too_often(monkeypatch: pytest.MonkeyPatch) -> None:
+    now, heard = [0.0], []
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
     progress = ProgressLines("settling")
-    for second in range(30):
-        now[0] = float(second)
-        progress.tell(f"step {second}")
-    assert capsys.readouterr().err.splitlines() == [f"hood: settling: step {second}" for second in (5, 15, 25)]
+    with listening(lambda *said: heard.append(said)):
+        for second in range(30):
+            now[0] = float(second)
+            progress.tell(f"step {second}")
+    assert heard == [(f"hood: settling: step {second}", True, True) for second in (5, 15, 25)]
