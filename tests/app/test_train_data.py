@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from torch import Tensor
 
+from hood.app.notices import collected
 from hood.app.settings.compose import ConfigError, load_config
 from hood.app.train import make_trainer
 from hood.assets.material import Material
@@ -52,12 +53,13 @@ def test_globs_and_splits_on_the_command_line(tmp_path: Path) -> None:
     assert [s.name for s in both.watch.validation.motions] == ["a_poses"]
 
 
-def test_motions_shorter_than_a_rollout(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_motions_shorter_than_a_rollout(tmp_path: Path) -> None:
     entries = f"data.sequences=[{write(tmp_path / 'short.npz', 40)},{write(tmp_path / 'long.npz', 80)}]"
     with pytest.raises(ValueError, match=r"short\.npz: 40 frames at 30 fps, at least 63.*data\.unusable=skip"):
         trainer(entries)
-    assert [s.name for s in trainer(entries, "data.unusable=skip").slots.sampler.sequences] == ["long"]
-    assert "1 of 2 motions skipped, first: " in capsys.readouterr().err
+    with collected() as said:
+        assert [s.name for s in trainer(entries, "data.unusable=skip").slots.sampler.sequences] == ["long"]
+    assert "1 of 2 motions skipped, first: " in said[-1]
     with pytest.raises(ConfigError, match="did you mean 'skip'"):
         trainer(entries, "data.unusable=skipp")
 

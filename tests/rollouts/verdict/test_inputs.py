@@ -135,8 +135,7 @@ def test_fabrics_of_another_unit_are_told(changes: dict[str, float], what: str) 
 
 
 def test_the_fabrics_that_ship_are_cloth() -> None:
-    from hood.api import load_config
-    from hood.app.settings.compose import build
+    from hood.app.settings.compose import build, load_config
 
     pos = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0.0]])
     faces = np.array([[0, 1, 2], [1, 3, 2]])
