@@ -28,7 +28,8 @@ class Range(NamedTuple):
     reason: str
 
 
-_RULE, _GUARD, _BODY = "hood.rollouts.verdict.rule", "hood.rollouts.checks.guard", "hood.rollouts.verdict.doubts"
+_RULE, _CAUSES, _SKIN = "hood.rollouts.verdict.rule", "hood.rollouts.verdict.causes", "hood.rollouts.verdict.skin"
+_WORN, _DOUBTS, _GUARD = "hood.rollouts.verdict.unworn", "hood.rollouts.verdict.doubts", "hood.rollouts.checks.guard"
 
 #: Of the frames that are judged this share may be bad.
 TOLERATED = Limit(0.02, "share of frames", _RULE, "one frame in fifty is not seen in a film")
@@ -37,53 +38,52 @@ SETTLING = Limit(5, "frames", _RULE, "a start by relaxing steps swings for a six
 
 #: Strain, the 99th percentile over the edges. What is torn is unsound; what no ordinary fabric does makes the guard look at the
 #: step; what would snap back makes the start be smoothed.
-STRAIN_UNSOUND = Limit(0.5, "share of the length", _RULE, "soft, heavy and tight cloth reaches 40%, torn cloth 80%")
+STRAIN_UNSOUND = Limit(0.5, "share of the length", _CAUSES, "soft, heavy and tight cloth reaches 40%, torn cloth 80%")
 STRAIN_TORN = Limit(1.0, "share of the length", _RULE, "torn also where the start still settles: no start has swung so")
 STRAIN_ALARM = Limit(0.25, "share of the length", _GUARD, "seven garments on four motions reach 19%")
 STRAIN_RATIO = Limit(1.5, "times the solver's strain", _GUARD, "soft, heavy and tight cloth is strained so by the solver, too")
 STRAIN_START = Limit(0.04, "share of the length", "hood.scene.start", "more would show as a jerk in frame 1")
 
 #: How far the 99th percentile of the vertices still had to go to the minimum of a step, over the time step: 25 mm at 30 fps.
-DISTANCE_UNSOUND = Limit(0.75, "m/s", _RULE, "of 374 rollouts the right ones, but for one, reach 0.68")
+DISTANCE_UNSOUND = Limit(0.75, "m/s", _CAUSES, "of 374 rollouts the right ones, but for one, reach 0.68")
 #: Where no distance was measured: the unbalanced force over the weight.
-GRADIENT_UNSOUND = Limit(100.0, "times the weight", _RULE, "a coarse stand-in, wrong both ways by a factor of ten")
+GRADIENT_UNSOUND = Limit(100.0, "times the weight", _CAUSES, "a coarse stand-in, wrong both ways by a factor of ten")
 
 #: Skin through cloth, apart from folds of the skin.
-CUT_UNSOUND = Limit(0.01, "share of the cloth's triangles", _RULE, "pictures show ten of a thousand triangles")
+CUT_UNSOUND = Limit(0.01, "share of the cloth's triangles", _SKIN, "pictures show ten of a thousand triangles")
 CUT_ALARM = Limit(0.02, "share of the cloth's triangles", _GUARD, "the worst of 28 ordinary rollouts is 1.4%")
-DEPTH_UNSOUND = Limit(0.01, "m", _RULE, "skin that sticks out so far is seen from every side")
+DEPTH_UNSOUND = Limit(0.01, "m", _SKIN, "skin that sticks out so far is seen from every side")
 DEPTH_GROSS = Limit(0.03, "m", _RULE, "a hand that has gone through the cloth: one frame is seen")
-SPOTS_UNSOUND = Limit(0.002, "share of the cloth's triangles", _RULE, "four of two thousand: smaller spots are not seen")
-SPOTS_HEIGHT = Limit(0.0015, "m", _RULE, "lower spots flicker")
-SPOTS_LASTING = Limit(0.45, "share of frames", _RULE, "spots that come and go are not seen")
+SPOTS_UNSOUND = Limit(0.002, "share of the cloth's triangles", _SKIN, "four of two thousand: smaller spots are not seen")
+SPOTS_HEIGHT = Limit(0.0015, "m", _SKIN, "lower spots flicker")
+SPOTS_LASTING = Limit(0.45, "share of frames", _SKIN, "spots that come and go are not seen")
 #: Larger spots count where they last less long.
 SPOTS_LARGE = Limit(
-    0.004, "share of the cloth's triangles", _RULE, "498 rollouts: right ones have them in one of the frames looked at, at most"
+    0.004, "share of the cloth's triangles", _SKIN, "498 rollouts: right ones have them in one of the frames looked at, at most"
 )
-SPOTS_LARGE_LASTING = Limit(0.25, "share of frames", _RULE, "a right one of four looked at reaches a quarter")
+SPOTS_LARGE_LASTING = Limit(0.25, "share of frames", _SKIN, "a right one of four looked at reaches a quarter")
 #: Cloth that is under the skin as a whole cuts nothing.
-INSIDE_UNSOUND = Limit(0.05, "share of the vertices", _RULE, "2 mm deep in the body; ordinary rollouts have less than 1%")
+INSIDE_UNSOUND = Limit(0.05, "share of the vertices", _SKIN, "2 mm deep in the body; ordinary rollouts have less than 1%")
 INSIDE_ALARM = Limit(0.01, "m", _GUARD, "contact pushes out from 10 mm, from deeper it may push through the limb")
 #: Cloth through cloth where a viewer can see it: the length along which pairs of triangles are counted.
-CROSSINGS_UNSOUND = Limit(0.4, "m", _RULE, "the length of a forearm; shorter ones look like a fold")
-CROSSINGS_SEEN = Limit(0.25, "m", _RULE, "the length of a hand, of what a viewer can see of them")
+CROSSINGS_UNSOUND = Limit(0.4, "m", _CAUSES, "the length of a forearm; shorter ones look like a fold")
+CROSSINGS_SEEN = Limit(0.25, "m", _CAUSES, "the length of a hand, of what a viewer can see of them")
 
 #: Worn, see hood.rollouts.verdict.worn.
-AWAY_UNSOUND = Limit(0.20, "m", "hood.rollouts.verdict.worn", "43 rollouts: worn at most 0.11, come off at least 0.28")
-SLIPPED_UNSOUND = Limit(0.15, "m", "hood.rollouts.verdict.worn", "498 rollouts: worn at most 0.14, come off at least 0.15")
-SUNK_UNSOUND = Limit(0.06, "m", "hood.rollouts.verdict.worn", "498 rollouts: worn at most 0.04, come off at least 0.07")
-SUNK_SETTLING = Limit(0.12, "m", "hood.rollouts.verdict.unworn", "worn at most 0.11, but for a band; come off at least 0.14")
+AWAY_UNSOUND = Limit(0.20, "m", _WORN, "43 rollouts: worn at most 0.11, come off at least 0.28")
+SLIPPED_UNSOUND = Limit(0.15, "m", _WORN, "498 rollouts: worn at most 0.14, come off at least 0.15")
+SUNK_UNSOUND = Limit(0.06, "m", _WORN, "498 rollouts: worn at most 0.04, come off at least 0.07")
+SUNK_SETTLING = Limit(0.12, "m", _WORN, "worn at most 0.11, but for a band; come off at least 0.14")
 
 #: The body.
-HEAD_DOWN = Limit(0.5, "share of frames", _BODY, "cartwheels are shorter, and handstands stand on the hands")
-FLOOR_OFF = Limit(0.3, "m", _BODY, "soles and recorded floors differ by less")
-BODY_SPEED = Limit(12.0, "m/s", _BODY, "the fastest sprint is 12.4 m/s, captured motions reach 3")
-BODY_OVERLAP = Limit(0.0175, "share of the body's triangles", _BODY, "jumps have 1.2%, squats 2.3%, arms in the trunk 3.6%")
-BODY_JUMP = Limit(5.0, "m/s", _BODY, "faster than in the steps around; captured motions reach 0.3")
+HEAD_DOWN = Limit(0.5, "share of frames", _DOUBTS, "cartwheels are shorter, and handstands stand on the hands")
+FLOOR_OFF = Limit(0.3, "m", _DOUBTS, "soles and recorded floors differ by less")
+BODY_SPEED = Limit(12.0, "m/s", _DOUBTS, "the fastest sprint is 12.4 m/s, captured motions reach 3")
+BODY_OVERLAP = Limit(0.0175, "share of the body's triangles", _DOUBTS, "jumps have 1.2%, squats 2.3%, arms in the trunk 3.6%")
+BODY_JUMP = Limit(5.0, "m/s", _DOUBTS, "faster than in the steps around; captured motions reach 0.3")
 
 #: Fabrics.
-_FABRIC = "hood.rollouts.verdict.doubts"
-DENSITY_KNOWN = Range(0.005, 1.2, "kg/m²", _FABRIC, "silk gauze to coats of leather")
-SHEAR_KNOWN = Range(1.0, 1e6, "N/m", _FABRIC, "nets to sailcloth")
-STRETCH_KNOWN = Range(5.0, 1e7, "N/m", _FABRIC, "fishnet to sailcloth")
-BENDING_KNOWN = Range(0.0, 0.1, "N·m", _FABRIC, "threads to saddle leather")
+DENSITY_KNOWN = Range(0.005, 1.2, "kg/m²", _DOUBTS, "silk gauze to coats of leather")
+SHEAR_KNOWN = Range(1.0, 1e6, "N/m", _DOUBTS, "nets to sailcloth")
+STRETCH_KNOWN = Range(5.0, 1e7, "N/m", _DOUBTS, "fishnet to sailcloth")
+BENDING_KNOWN = Range(0.0, 0.1, "N·m", _DOUBTS, "threads to saddle leather")

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import ast
 import graphlib
+import re
 from collections import Counter, defaultdict
 from pathlib import Path
 
 import grimp
 import pytest
-
-import hood.energies
 
 ROOT = Path(__file__).parents[1]
 HOOD = ROOT / "hood"
@@ -20,8 +19,8 @@ TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in MODULES}
 
 #: Modules of the package in all, in one folder, and lines of one.
 MOST_MODULES, MOST_IN_A_FOLDER, LONGEST = 320, 20, 450
-#: Functions with more lines are listed, with a reason, in docs/architecture.md.
-LONG_FUNCTION = 60
+#: Modules and functions with more lines are listed, with a reason, in docs/architecture.md.
+LONG_MODULE, LONG_FUNCTION = 300, 60
 #: Rooms in the order of the page: each imports only those before it.
 ROOMS = (
     *("native", "tensors", "mesh", "assets", "cloth", "contact", "scene", "energies", "solver", "model", "steppers"),
@@ -39,6 +38,10 @@ def imported() -> dict[str, set[str]]:
     """Modules that each module imports, inside functions too; not for type checkers alone."""
     graph = grimp.build_graph("hood", exclude_type_checking_imports=True, cache_dir=None)
     return {module: graph.find_modules_directly_imported_by(module) for module in graph.modules}
+
+
+def lines_of(path: Path) -> int:
+    return len(path.read_text(encoding="utf-8").splitlines())
 
 
 def dotted(path: Path) -> str:
@@ -65,7 +68,8 @@ def test_every_module_begins_with_a_sentence_on_what_it_is() -> None:
 
 
 def test_the_page_has_every_room_with_its_first_sentence(architecture: str) -> None:
-    rows = {line.split("`")[1]: line.split("|")[2].strip() for line in architecture.splitlines() if line.startswith("| `hood/")}
+    cells = [line.split("|") for line in architecture.splitlines() if re.match(r"\| `hood/\w+/`", line)]
+    rows = {cell[1].strip(" `"): cell[2].strip() for cell in cells}
     folders = {path.parent.name for path in HOOD.glob("*/__init__.py")}
     assert [*rows] == [f"hood/{room}/" for room in ROOMS]
     assert folders == set(ROOMS)
@@ -79,14 +83,14 @@ def test_modules_are_few_and_none_is_long() -> None:
     assert len(OWN) <= MOST_MODULES
     folders = Counter(path.parent for path in OWN)
     assert max(folders.values()) <= MOST_IN_A_FOLDER, folders.most_common(1)
-    long = {dotted(path): count for path in OWN if (count := len(path.read_text(encoding="utf-8").splitlines())) > LONGEST}
-    assert not long
+    assert not [dotted(path) for path in OWN if lines_of(path) > LONGEST]
 
 
-def test_long_functions_are_listed_with_their_reasons(architecture: str) -> None:
+def test_long_modules_and_functions_are_listed_with_their_reasons(architecture: str) -> None:
     section = architecture.split("## What is long, and why")[1]
     listed = {word for line in section.splitlines() if line.startswith("| `") for word in line.split("|")[1].split("`")[1::2]}
-    long = {
+    long = {path.relative_to(ROOT).as_posix() for path in MODULES if lines_of(path) > LONG_MODULE}
+    long |= {
         f"{dotted(path)}.{node.name}"
         for path in MODULES
         for node in ast.walk(TREES[path])
@@ -106,7 +110,7 @@ def test_few_short_modules_serve_a_single_one(imported: dict[str, set[str]]) -> 
     for module, needed in imported.items():
         for one in needed:
             importers[one].add(module)
-    short = {dotted(path) for path in OWN if len(path.read_text(encoding="utf-8").splitlines()) < 70}
+    short = {dotted(path) for path in OWN if lines_of(path) < 70}
     assert len([module for module in short if len(importers[module]) == 1]) <= 8
 
 
@@ -120,30 +124,29 @@ def test_few_public_names_stand_in_several_modules() -> None:
                 if not name.startswith("_"):
                     places[name].add(dotted(path))
     several = {name: sorted(modules) for name, modules in places.items() if len(modules) > 1}
-    assert len(several) <= 45, several
+    assert len(several) <= 30, several
 
 
 def test_few_modules_ask_for_the_class_of_an_energy() -> None:
     """Where a term is told by its class, a new energy has to be added: elsewhere than in its own room that is rare."""
     classes = set()
     for path in sorted((HOOD / "energies").glob("*.py")):
-        classes |= {node.name for node in TREES[path].body if isinstance(node, ast.ClassDef) and hasattr_call(node)}
+        classes |= {node.name for node in TREES[path].body if isinstance(node, ast.ClassDef) and computes_energy(node)}
     found = []
     for path in OWN:
         if path.parent == HOOD / "energies":
             continue
         for node in ast.walk(TREES[path]):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ("isinstance", "issubclass"):
-                found += [f"{dotted(path)}:{node.lineno}" for name in ast.walk(node.args[1]) if is_one(name, classes)]
+                found += [f"{dotted(path)}:{node.lineno}" for name in ast.walk(node.args[1]) if names_one(name, classes)]
             if isinstance(node, ast.Compare):
                 found += [
                     f"{dotted(path)}:{node.lineno}"
                     for one in node.comparators
                     for name in ast.walk(one)
-                    if is_one(name, classes)
+                    if names_one(name, classes)
                 ]
-    assert hood.energies
-    assert len(set(found)) <= 48, sorted(set(found))
+    assert len(set(found)) <= 37, sorted(set(found))
 
 
 def test_the_command_line_alone_prints() -> None:
@@ -160,10 +163,10 @@ def test_the_command_line_alone_prints() -> None:
     assert not found
 
 
-def hasattr_call(node: ast.ClassDef) -> bool:
+def computes_energy(node: ast.ClassDef) -> bool:
     """Whether a class computes an energy."""
     return any(isinstance(item, ast.FunctionDef) and item.name == "__call__" for item in node.body)
 
 
-def is_one(node: ast.AST, classes: set[str]) -> bool:
+def names_one(node: ast.AST, classes: set[str]) -> bool:
     return isinstance(node, ast.Name) and node.id in classes

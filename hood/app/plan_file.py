@@ -98,9 +98,14 @@ def plan_mode(config: Mapping[Any, Any]) -> str:
     return "full" if config.get("plan") is not None and str(config["plan"]) == "full" else "auto"
 
 
+def key_of(word: str) -> str:
+    """The key of a word ``key=value``, without the signs that add or remove it."""
+    return word.partition("=")[0].lstrip("+~")
+
+
 def without_accuracy(overrides: Sequence[str]) -> list[str]:
     """The words of the full model of a rollout that may plan first."""
-    return [word for word in overrides if word.partition("=")[0].lstrip("+~") != "accuracy"]
+    return [word for word in overrides if key_of(word) != "accuracy"]
 
 
 def planned(overrides: Sequence[str]) -> list[str]:

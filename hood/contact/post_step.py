@@ -2,8 +2,8 @@
 
 Contact acts at vertices, and how far off it holds them is an estimate of how deep the flat triangles between them chord error
 (:mod:`hood.contact.activation_distance`). Where cloth is heavy, very soft or coarse, or lands fast, the estimate can be too
-small. Where a step
-has left triangles in the skin is known afterwards: their corners are held farther off, and the step is taken to its end again.
+small. Where a step has left triangles in the skin is known afterwards: their corners are held farther off, and the step is
+taken to its end again.
 
 The skin that a step led into: contact for vertices that ended inside the body where none of their planes showed it.
 

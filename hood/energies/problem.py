@@ -202,7 +202,7 @@ class StepProblem:
             ValueError: there is a body, but nobody asked for the pull.
         """
         if self.internal_force is None and self.step.obstacle is not None:
-            raise ValueError("step problem: pull not known yet; pass the problem through Potential.prepare once")
+            raise ValueError("step problem: internal force not known yet; pass the problem through Potential.prepare once")
         return self.internal_force
 
     @property

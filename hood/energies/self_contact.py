@@ -22,9 +22,9 @@ class SignedSelfContactPenalty:
 
     d = ± n · (x_v - x_f) is the distance of the vertex from the face's plane, both at t + 1, positive on the side on which the
     vertex is at t (:func:`hood.contact.self_contact.find_sides`). A vertex on the wrong side at t + 1 is pushed back, however
-    deep
-    it went: where :class:`hood.energies.self_contact.LayerBarrier` is infinite or blind, this term has a slope. Cloth that is
-    crossed at t stays so. Rigid-motion invariant; no net force or torque; twice differentiable but for faces without an area.
+    deep it went: where :class:`hood.energies.self_contact.LayerBarrier` is infinite or blind, this term has a slope. Cloth that
+    is crossed at t stays so. Rigid-motion invariant; no net force or torque; twice differentiable but for faces without an
+    area.
 
     Pairs are found once a step. What comes from beyond the reach within one, passes two edges through each other, or slides off
     its face, is not seen, or felt where nothing is: good enough to learn from, or to take garments apart; the solver and

@@ -1,6 +1,5 @@
 """The search of :func:`hood.mesh.closest_point.search.search_surface` without a shape that depends on data and without a wait
-for the
-device: what a captured graph can hold."""
+for the device: what a captured graph can hold."""
 
 from __future__ import annotations
 

@@ -21,10 +21,8 @@ def check_triangles(pos: np.ndarray, faces: np.ndarray, name: str) -> None:
         name: what the message calls the mesh, such as ``"garment 'dress'"`` or a file path.
 
     Raises:
-        ValueError: naming the mesh, the index and the fix: empty mesh, wrong shape, quads or polygons,
-            non-integer
-            or out-of-range indices, a vertex repeated within a face, duplicate faces, NaN or infinite
-            positions, zero area.
+        ValueError: naming the mesh, the index and the fix: empty mesh, wrong shape, quads or polygons, non-integer or
+            out-of-range indices, a vertex repeated within a face, duplicate faces, NaN or infinite positions, zero area.
     """
     pos, faces = np.asarray(pos), np.asarray(faces)
     _check_shapes(pos, faces, name)

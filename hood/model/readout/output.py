@@ -192,8 +192,7 @@ class LocalStepOutput(VelocityBaseOutput):
 
     The raw output of a pass (V, 5) is a displacement in units of ``scale`` (``late_scale`` after the first pass), the share of
     the local step that is taken (:mod:`hood.solver.vertex.block_jacobi`; ``gain`` more after the first pass) and the share of
-    the pass
-    before: the network says how far, the physics where to. After every pass the cloth is taken out of the body.
+    the pass before: the network says how far, the physics where to. After every pass the cloth is taken out of the body.
     """
 
     width = 5

@@ -1,9 +1,8 @@
 """Energies, first and positive second derivatives, element by element, in closed form.
 
-Every matrix here is positive semi-definite: exact where the energy is convex, otherwise larger than the exact one. What
-was added comes along as *indefinite part*, the exact second derivative minus the matrix, where it is written out. Elements come
-last
-in every table: sums over three axes are slow in torch where those are the last ones. Element matrices are given by the
+Every matrix here is positive semi-definite: exact where the energy is convex, otherwise larger than the exact one. What was
+added comes along as *indefinite part*, the exact second derivative minus the matrix, where it is written out. Elements come
+last in every table: sums over three axes are slow in torch where those are the last ones. Element matrices are given by the
 rows of their upper triangle, see :func:`hood.solver.system.sparsity.upper_pairs`.
 """
 

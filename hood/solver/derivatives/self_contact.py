@@ -1,8 +1,8 @@
 """Cloth near cloth in the torch form of the solver: the barrier's curvature beside the pattern, and moves that cross nothing.
 
 Energy and gradient come from the term itself (:class:`hood.energies.self_contact.LayerBarrier`). Its pairs change with the
-positions,
-so that their curvature cannot lie in the fixed pattern of the Hessian: it is a sum of outer products of rows of four vertices.
+positions, so that their curvature cannot lie in the fixed pattern of the Hessian: it is a sum of outer products of rows of four
+vertices.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from omegaconf import DictConfig
 from hood import __version__
 from hood.app.common import held_folder, output_folder
 from hood.app.notices import say
-from hood.app.plan_file import FREE, content_digest, plan_path, read_plan, write_plan
+from hood.app.plan_file import FREE, content_digest, key_of, plan_path, read_plan, write_plan
 from hood.app.settings.compose import ConfigError, load_config, with_words
 from hood.app.settings.overrides import plain_word
 from hood.app.setup import Setup, check_config, make_stepper, set_up
@@ -94,7 +94,7 @@ def is_training(words: Sequence[str]) -> bool:
 
 def _refuse(given: Sequence[str], keys: Sequence[str], why: str) -> None:
     for word in given:
-        if word.partition("=")[0].lstrip("+~") in keys:
+        if key_of(word) in keys:
             raise ConfigError(f"{word}: {why}; drop it")
 
 
@@ -149,7 +149,7 @@ def _frames(own: DictConfig, tolerance: Tolerance, budget: float | None, num_fra
 def _split(overrides: Sequence[str]) -> tuple[DictConfig, list[str]]:
     """The plan's own config, and the words of the rollout."""
     own = {str(key) for key in load_config("plan")}
-    mine = [word for word in overrides if word.partition("=")[0].lstrip("+~") in own]
+    mine = [word for word in overrides if key_of(word) in own]
     words = [word for word in overrides if word not in mine]
     if any(word.partition("=")[0] == "plan" for word in words):
         raise ConfigError("plan=…: a plan is made of the full model; drop plan=…")
@@ -273,8 +273,8 @@ def planned(overrides: Sequence[str]) -> list[str]:
         return list(overrides)
     if plan_path(config) is not None or str(config.plan) == "full":
         raise ConfigError(f"accuracy={config.accuracy}: belongs to plan=auto, not to plan={config.plan}; drop one of the two")
-    rest = [word for word in overrides if _key(word) not in ("accuracy", "plan")]
-    words = [word for word in rest if _key(word) not in FREE or _key(word) == "num_frames"]
+    rest = [word for word in overrides if key_of(word) not in ("accuracy", "plan")]
+    words = [word for word in rest if key_of(word) not in FREE or key_of(word) == "num_frames"]
     own = with_words(load_config("plan"), [f"accuracy={config.accuracy}"])
     cache = cache_folder()
     path = (output_folder(config) if cache is None else cache / "plans") / f"plan-{_digest(words, str(config.accuracy))}.json"
@@ -288,10 +288,6 @@ def planned(overrides: Sequence[str]) -> list[str]:
         say(f"planned in {plan['seconds']:.1f} s, kept in {path}")
     say(sentence(plan))
     return [*rest, f"plan='{path}'"]
-
-
-def _key(word: str) -> str:
-    return word.partition("=")[0].lstrip("+~")
 
 
 def _digest(words: Sequence[str], accuracy: str) -> str:

@@ -227,3 +227,10 @@ def test_several_values_of_a_key_are_refused_with_the_loop(command: str, word: s
         load_config(command, [word])
     assert values in str(told.value)
     assert "\n" not in str(told.value)
+
+
+def test_trainers_have_the_same_keys() -> None:
+    """A key that one of them lacks could not be given beside it."""
+    keys = {name: {*load_config("train", [f"trainer={name}"]).trainer} for name in options("trainer")}
+    assert len(keys) >= 3
+    assert len({frozenset(found) for found in keys.values()}) == 1, keys
