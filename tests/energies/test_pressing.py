@@ -128,7 +128,7 @@ def test_who_does_not_ask_gets_no_pull_and_who_asks_too_late_is_refused() -> Non
     assert reference_potential().prepare(problem).internal_force is None
     assert default_potential(friction_coefficient=0.0).prepare(problem).internal_force is None
     potential = default_potential()
-    with pytest.raises(ValueError, match="pull not known yet"):
+    with pytest.raises(ValueError, match="internal force not known yet"):
         potential.total(problem.with_fold(), problem.state.pos)
 
 
