@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_dir
-from hydra.core.override_parser.types import Override
+from hydra.core.override_parser.types import Override, OverrideType
 from hydra.errors import HydraException
 from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
@@ -102,7 +102,10 @@ def _loaded(folder: Path, plugins_of: tuple[str, ...], name: str, overrides: tup
                 if not _is_group(override):
                     _check_key(override, known)
                     _check_brackets(name, override, known)
-            config = copy.deepcopy(known) if words == groups else compose(name, plugins + words)
+            keys = [override for text, override in chosen if text in words and not _is_group(override)]
+            config = _with_keys(known, keys)
+            if config is None:
+                config = compose(name, plugins + words)
             _decode_keys(config, [override for text, override in chosen if is_coded(text)])
             _check_sources(config)
             OmegaConf.resolve(config)
@@ -120,6 +123,19 @@ def _loaded(folder: Path, plugins_of: tuple[str, ...], name: str, overrides: tup
 def _composed(folder: Path, name: str, words: tuple[str, ...]) -> DictConfig:
     """A composition that is read and never changed; several commands in one process need the same ones."""
     return compose(name, list(words))
+
+
+def _with_keys(known: DictConfig, keys: Sequence[Override]) -> DictConfig | None:
+    """A copy of a composition with other values of its keys; None where Hydra has to compose it, or to say what is wrong."""
+    config = copy.deepcopy(known)
+    try:
+        for override in keys:
+            if override.type is not OverrideType.CHANGE or override.is_sweep_override() or override.package is not None:
+                return None
+            OmegaConf.update(config, override.key_or_group, override.value(), merge=True)
+    except OmegaConfBaseException:
+        return None
+    return config
 
 
 def build(node: DictConfig | dict[str, Any], **extra: Any) -> Any:

@@ -6,7 +6,9 @@ import json
 from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 
+from hood.app.settings import compose
 from hood.app.settings.compose import ConfigError, build, groups, load_config, options, plain, require_choice, with_words
 from hood.app.settings.record import save_run_record
 from hood.assets.material import Material
@@ -234,3 +236,26 @@ def test_trainers_have_the_same_keys() -> None:
     keys = {name: {*load_config("train", [f"trainer={name}"]).trainer} for name in options("trainer")}
     assert len(keys) >= 3
     assert len({frozenset(found) for found in keys.values()}) == 1, keys
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["num_frames=7", "garment=[tank,skirt]", "betas=[1.5,0]"],
+        ["material=denim", "material.density=0.4", "losses=reference", "losses.terms.friction.coefficient=0.2"],
+        [
+            "losses.terms.bending=null",
+            "losses.terms.collision.weight=3e6",
+            "solver.target_rg=1e-3",
+            "solver={max_iterations: 3}",
+        ],
+        ["size={sleeves: 1.05}", "events=[{time: 2.0, open: front_buttons}]", "stepper=refine", "refine=5"],
+    ],
+)
+def test_keys_in_a_kept_composition_are_those_that_hydra_sets(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    compose._loaded.cache_clear()
+    quick = OmegaConf.to_yaml(load_config("rollout", words))
+    monkeypatch.setattr(compose, "_with_keys", lambda known, keys: None)
+    compose._loaded.cache_clear()
+    assert OmegaConf.to_yaml(load_config("rollout", words)) == quick
+    compose._loaded.cache_clear()
