@@ -18,7 +18,7 @@ from hood.assets.motion.load import load_sequence
 from hood.cloth.cloth import Cloth
 from hood.cloth.state import State, StepInput
 from hood.energies.bending import Bending, bending_weight
-from hood.energies.inertia import Gravity
+from hood.energies.mass_points import Gravity
 from hood.energies.membrane import Stretching
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem

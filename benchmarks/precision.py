@@ -23,8 +23,8 @@ from hood.cloth.state import Obstacle, State
 from hood.contact.contact import find_contact
 from hood.energies.bending import Bending
 from hood.energies.contact import Collision
-from hood.energies.inertia import Inertia
 from hood.energies.laws import mollified_norm
+from hood.energies.mass_points import Inertia
 from hood.energies.membrane import Stretching
 from hood.energies.potential import Potential
 from hood.mesh.geometry import dihedral_angles, face_normals, vertex_normals

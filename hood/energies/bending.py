@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import math
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
 from hood.energies.problem import StepProblem, sum_per_scene
+from hood.energies.term import Energy, Form, Passes, Role
 from hood.mesh.geometry import dihedral_angles
 
 
-class Bending:
+class HingeForm(NamedTuple):
+    """What of the angles of hinges an energy is: ½ weight (θ - θ₀)², or one that differs in this."""
+
+    by_length: bool = False  # about flat, with the length of the edge now in place of that at rest
+    damping: float | None = None  # s, retardation time of an energy about the angles at t; None: elastic
+
+
+class Bending(Energy):
     """Discrete-shell bending energy [J], the sum over hinges of ½ k l₀² / (4 (A₁ + A₂)) (θ - θ₀)².
 
     Rest length l₀ and rest angle θ₀ make the rest shape, curved or flat, a state of zero energy; HOOD's
@@ -25,6 +33,8 @@ class Bending:
     """
 
     kind: ClassVar[str] = "Bending"
+    role = Role.ELASTIC
+    form = Form.HINGES
 
     def applies(self, problem: StepProblem) -> bool:
         return problem.cloth.hinges.shape[0] > 0
@@ -37,8 +47,11 @@ class Bending:
         energy = 0.5 * bending_weight(cloth.bending_stiffness, cloth.hinge_rest_length**2, cloth.hinge_area) * bend * bend
         return sum_per_scene(energy, cloth.hinge_scene, cloth.num_scenes)
 
+    def closed_form(self, problem: StepProblem, passes: Passes | None = None) -> HingeForm:
+        return HingeForm()
 
-class CurrentLengthBending:
+
+class CurrentLengthBending(Energy):
     """Bending as in HOOD's published code [J], the sum over hinges of ½ k l² / (4 (A₁ + A₂)) θ².
 
     l is the *current* length of the hinge's edge and the rest angle is 0 whatever the rest shape, so that curved
@@ -51,6 +64,8 @@ class CurrentLengthBending:
     """
 
     kind: ClassVar[str] = "CurrentLengthBending"
+    role = Role.ELASTIC
+    form = Form.HINGES
 
     def applies(self, problem: StepProblem) -> bool:
         return problem.cloth.hinges.shape[0] > 0
@@ -62,6 +77,9 @@ class CurrentLengthBending:
         edge = next_pos[cloth.hinges[:, 1]] - next_pos[cloth.hinges[:, 0]]
         weight = bending_weight(cloth.bending_stiffness, (edge * edge).sum(dim=1), cloth.hinge_area)
         return sum_per_scene(0.5 * weight * angle * angle, cloth.hinge_scene, cloth.num_scenes)
+
+    def closed_form(self, problem: StepProblem, passes: Passes | None = None) -> HingeForm:
+        return HingeForm(by_length=True)
 
 
 def bending_weight(stiffness: Tensor, length_sq: Tensor, hinge_area: Tensor) -> Tensor:

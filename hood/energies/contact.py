@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple, Self, TypeVar, cast
 
 import torch
@@ -11,9 +11,10 @@ from torch import Tensor
 
 from hood.contact.activation_distance import REACHES, vertex_reach
 from hood.contact.contact import CentroidContact, Contact, LaggedContact, find_centroid_contact, find_lagged_contact
-from hood.contact.sample_points import PLACES
-from hood.energies.laws import contact_energy
-from hood.energies.problem import StepProblem, sum_per_scene
+from hood.contact.sample_points import PLACES, PointContact
+from hood.energies.laws import contact_depth, contact_energy, contact_force
+from hood.energies.problem import StepProblem, dot_rows, sum_per_scene
+from hood.energies.term import Energy, Form, Passes, Role
 
 #: Which skin a vertex between two parts of the body is kept off: of the nearest alone, or of both.
 SIDES = ("both", "nearest")
@@ -54,7 +55,30 @@ class _Planes(NamedTuple):
     normal: Tensor  # (V, 3) outward unit normal
 
 
-class Collision:
+@dataclass(frozen=True)
+class Walls:
+    """A collision term as N planes; rows without one are zero and feel nothing."""
+
+    weight: float | Tensor  # J/m³, one for all or (N,)
+    point: Tensor  # (N, 3) m
+    normal: Tensor  # (N, 3)
+    reach: Tensor  # (N,) m, distance at which the penalty sets in
+
+    def depth(self, pos: Tensor) -> Tensor:
+        """Depth ε - d (N,) [m] of ``pos`` (N, 3) in the contact zone, negative outside."""
+        return self.reach - dot_rows(pos - self.point, self.normal)
+
+    def pressure(self, pos: Tensor) -> Tensor:
+        """Force (N,) [N] along the normals at ``pos`` (N, 3)."""
+        return contact_force(self.weight, self.depth(pos))
+
+    def take(self, rows: Tensor) -> Walls:
+        """Those of some rows."""
+        weight = self.weight[rows] if isinstance(self.weight, Tensor) else self.weight
+        return Walls(weight, self.point[rows], self.normal[rows], self.reach[rows])
+
+
+class Collision(Energy):
     """Collision energy [J], the sum over vertices of w max(ε - d, 0)³ (HOOD paper, section 3.3).
 
     d is the signed distance to the tangent plane, on the body at t+1, of the surface point that was closest
@@ -84,6 +108,8 @@ class Collision:
     """
 
     kind: ClassVar[str] = "Collision"
+    role = Role.CONTACT
+    form = Form.PLANES
 
     def __init__(
         self,
@@ -141,6 +167,35 @@ class Collision:
         pressed = contact_energy(self.weight * points.share, self.epsilon - dist)
         return energy + sum_per_scene(pressed, points.scene, problem.num_scenes)
 
+    def walls(self, problem: StepProblem, contact: Contact) -> Walls:
+        """The planes and where the penalty sets in, of one of :meth:`contacts`."""
+        planes = self.planes(problem, contact)
+        reach = torch.where(planes.touching, self.reaches(problem, contact), 0.0)
+        return Walls(self.weight, planes.point, planes.normal, reach)
+
+    def closed_form(self, problem: StepProblem, passes: Passes | None = None) -> list[Walls]:
+        """One of each contact."""
+        contacts = self.contacts(problem)
+        rows = [None if passes is None else passes(contact) for contact in contacts]
+        return [
+            self.walls(problem, contact) if row is None else Walls(self.weight, *row.planes(self))
+            for contact, row in zip(contacts, rows, strict=True)
+        ]
+
+    def closed_form_at(self, problem: StepProblem, points: PointContact) -> Walls | None:
+        if self.contact != points.place:
+            return None
+        reach = torch.full_like(points.dist, self.epsilon)
+        return Walls(self.weight * points.share, points.next_point, points.next_normal, reach)
+
+    def out_of_contact(self, problem: StepProblem, pos: Tensor) -> Tensor:
+        """Just inside the contact distance, where the penalty carries the weight: outside it has no curvature."""
+        if problem.contact is None or not self.weight > 0:
+            return pos
+        carried = contact_depth(self.weight, problem.cloth.mass * problem.gravity.to(problem.vertex_dt).norm())
+        depth, normal = self.depth(problem, problem.contact, pos)
+        return pos + (depth - carried).clamp_min(0.0)[:, None] * normal
+
 
 class CentroidCollision(Collision):
     """Collision with the planes of HOOD's published code: those of the face whose *centroid* was nearest at t.
@@ -156,6 +211,8 @@ class CentroidCollision(Collision):
     """
 
     kind: ClassVar[str] = "CentroidCollision"
+    form = Form.PLANES
+    published = True
 
     def __init__(self, weight: float = 5e5, epsilon: float = 2e-3, lagged: bool = False) -> None:
         super().__init__(weight, epsilon, reach="constant", sides="nearest")
@@ -173,6 +230,10 @@ class CentroidCollision(Collision):
         if not isinstance(contact, CentroidContact):
             raise ValueError("collision with centroids: not searched for yet; pass the problem through Potential.prepare once")
         return _planes(problem, contact.facing, contact.next_centroid, contact.next_face_normal)
+
+    def closed_form(self, problem: StepProblem, passes: Passes | None = None) -> list[Walls]:
+        """One of each contact; the compiled pass knows no centroids."""
+        return super().closed_form(problem)
 
 
 def with_places(problem: StepProblem, contact: str, sides: str) -> StepProblem:

@@ -8,13 +8,14 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from hood.energies.bending import bending_weight
+from hood.energies.bending import HingeForm, bending_weight
 from hood.energies.membrane import green_strain, membrane_density
 from hood.energies.problem import StepProblem, sum_per_scene
+from hood.energies.term import Energy, Form, Passes, Role
 from hood.mesh.geometry import dihedral_angles
 
 
-class StretchDamping:
+class StretchDamping(Energy):
     """Viscosity of the membrane as a dissipative potential of the step [J], Σ A h (η / dt) (μ tr ΔG² + ½ λ tr² ΔG).
 
     ΔG = G(x) - G(x_t) is the Green strain that the step adds: a Kelvin-Voigt solid, whose viscous stress is η times the rate
@@ -27,6 +28,8 @@ class StretchDamping:
     """
 
     kind: ClassVar[str] = "StretchDamping"
+    role = Role.DAMPING
+    form = Form.MEMBRANE_DAMPING
 
     def __init__(self, time: float) -> None:
         self.time = _checked("stretch_damping", time)
@@ -43,8 +46,12 @@ class StretchDamping:
         rate = self.time / problem.step.dt[cloth.face_scene]
         return sum_per_scene(rate * cloth.rest_area * cloth.thickness * density, cloth.face_scene, cloth.num_scenes)
 
+    def closed_form(self, problem: StepProblem, passes: Passes | None = None) -> float:
+        """Retardation time [s]."""
+        return self.time
 
-class BendDamping:
+
+class BendDamping(Energy):
     """Viscosity of bending as a dissipative potential of the step [J], Σ ½ k l₀² / (4 (A₁ + A₂)) (η / dt) (θ - θ_t)².
 
     The same of :class:`hood.energies.bending.Bending` as :class:`StretchDamping` is of stretching; hinges with a
@@ -55,6 +62,8 @@ class BendDamping:
     """
 
     kind: ClassVar[str] = "BendDamping"
+    role = Role.DAMPING
+    form = Form.HINGES
 
     def __init__(self, time: float) -> None:
         self.time = _checked("bend_damping", time)
@@ -70,6 +79,9 @@ class BendDamping:
         rate = self.time / problem.step.dt[cloth.hinge_scene]
         weight = bending_weight(cloth.bending_stiffness, cloth.hinge_rest_length**2, cloth.hinge_area)
         return sum_per_scene(0.5 * rate * weight * bend * bend, cloth.hinge_scene, cloth.num_scenes)
+
+    def closed_form(self, problem: StepProblem, passes: Passes | None = None) -> HingeForm:
+        return HingeForm(damping=self.time)
 
 
 def stretch_damping(time: float = 0.0) -> StretchDamping | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import ClassVar, Self
 
 import torch
@@ -12,7 +13,8 @@ from hood.contact.contact import Contact, LaggedContact
 from hood.contact.sample_points import PointContact
 from hood.energies.contact import checked_contact, contacts_of, lagged_contact, weighted, with_lagged_centroids, with_places
 from hood.energies.laws import lagged_contact_force, mollified_norm
-from hood.energies.problem import StepProblem, sum_per_scene
+from hood.energies.problem import StepProblem, dot_rows, sum_per_scene
+from hood.energies.term import Energy, Form, Passes, Role
 
 
 def scaled_by_body_friction(problem: StepProblem, face: Tensor, force: Tensor) -> Tensor:
@@ -21,7 +23,26 @@ def scaled_by_body_friction(problem: StepProblem, face: Tensor, force: Tensor) -
     return force if grip is None else force * grip.to(force)[face.clamp_min(0)]
 
 
-class LaggedFriction:
+@dataclass(frozen=True)
+class Grip:
+    """A friction term on N vertices, force f at most along the tangential slip; rows without any are zero."""
+
+    force: Tensor  # (N,) N, the coefficient included
+    normal: Tensor  # (N, 3)
+    anchor: Tensor  # (N, 3) m, where the vertex would be if it stuck
+    limit: Tensor  # (N,) m, slip below which it counts as sticking
+
+    def slip(self, pos: Tensor) -> Tensor:
+        """Tangential slip (N, 3) [m] of ``pos`` (N, 3)."""
+        slip = torch.where((self.force > 0)[:, None], pos - self.anchor, 0.0)
+        return slip - dot_rows(slip, self.normal)[:, None] * self.normal
+
+    def take(self, rows: Tensor) -> Grip:
+        """Those of some rows."""
+        return Grip(self.force[rows], self.normal[rows], self.anchor[rows], self.limit[rows])
+
+
+class LaggedFriction(Energy):
     """Friction energy [J], the sum over vertices of μ_f φ N f(‖u_T‖); subclasses say what the normal force N is.
 
     u_T is the tangential slip from t to t+1 relative to the matched body point, N is taken at t (lagged, so that
@@ -36,6 +57,8 @@ class LaggedFriction:
         coefficient: μ_f.
         slip_speed: ε_v [m/s], speed below which friction counts as static.
     """
+
+    role = Role.FRICTION
 
     def __init__(self, coefficient: float, slip_speed: float) -> None:
         if coefficient < 0 or slip_speed <= 0:
@@ -82,6 +105,20 @@ class LaggedFriction:
             energy = energy + problem.sum_vertices(_slipping(force, moved, normal, limit))
         return energy
 
+    def grip(self, problem: StepProblem, contact: Contact) -> Grip:
+        """The forces and what the slip is measured against, of one of :meth:`contacts`."""
+        force = self.greatest(problem, contact)
+        # Rows without a match may hold infinite or undefined numbers.
+        sliding = (force > 0)[:, None]
+        carried, normal = self.carrier(contact)
+        anchor = problem.state.pos + torch.where(sliding, carried, 0.0)
+        limit = self.slip_speed * problem.vertex_dt.squeeze(1)
+        return Grip(force, torch.where(sliding, normal, 0.0), anchor, limit)
+
+    def closed_form(self, problem: StepProblem, passes: Passes | None = None) -> list[Grip]:
+        """One of each contact."""
+        return [self.grip(problem, contact) for contact in self.contacts(problem)]
+
 
 class Friction(LaggedFriction):
     """Friction by the contact's own force: N = 3 w max(ε - d_t, 0)², that of the collision term at t, but no more than what
@@ -104,6 +141,7 @@ class Friction(LaggedFriction):
     """
 
     kind: ClassVar[str] = "Friction"
+    form = Form.GRIPS
 
     def __init__(
         self,
@@ -171,6 +209,25 @@ class Friction(LaggedFriction):
         inertia = problem.cloth.mass / problem.vertex_dt.squeeze(1) ** 2
         return torch.minimum(force, _pressing(inertia, depth, pull, normal))
 
+    def needs_internal_force(self, problem: StepProblem) -> bool:
+        return self.coefficient > 0 and problem.contact is not None
+
+    def closed_form(self, problem: StepProblem, passes: Passes | None = None) -> list[Grip]:
+        """One of each contact, by the compiled pass where there is one."""
+        contacts = self.contacts(problem)
+        rows = [None if passes is None else passes(contact) for contact in contacts]
+        return [
+            self.grip(problem, contact) if row is None else _as_grip(*row.grips(self))
+            for contact, row in zip(contacts, rows, strict=True)
+        ]
+
+    def closed_form_at(self, problem: StepProblem, points: PointContact) -> Grip | None:
+        if self.contact != points.place:
+            return None
+        anchor = points.at(problem.state.pos) + points.next_point - points.point
+        limit = self.slip_speed * problem.step.dt[points.scene]
+        return Grip(self.greatest_at(problem, points), points.next_normal, anchor, limit)
+
 
 class WeightFriction(LaggedFriction):
     """Friction by weight, as HOOD's published code means it: N = m ‖g‖ max(n·up, 0) within ``radius`` of the surface.
@@ -189,6 +246,8 @@ class WeightFriction(LaggedFriction):
     """
 
     kind: ClassVar[str] = "WeightFriction"
+    form = Form.GRIPS
+    published = True
 
     def __init__(self, coefficient: float = 0.5, slip_speed: float = 5e-3, radius: float = 3e-3) -> None:
         super().__init__(coefficient, slip_speed)
@@ -225,6 +284,8 @@ class CodedFriction(LaggedFriction):
     """
 
     kind: ClassVar[str] = "CodedFriction"
+    form = Form.GRIPS
+    published = True
 
     def __init__(self, coefficient: float = 0.5, slip_speed: float = 5e-3, radius: float = 3e-3) -> None:
         super().__init__(coefficient, slip_speed)
@@ -250,6 +311,10 @@ class CodedFriction(LaggedFriction):
         """The way of the matched centroids from t-1 to t and the normals at t."""
         assert isinstance(contact, LaggedContact)
         return contact.lagged_motion, contact.lagged_normal
+
+
+def _as_grip(normal: Tensor, anchor: Tensor, force: Tensor, limit: Tensor) -> Grip:
+    return Grip(force, normal, anchor, limit)
 
 
 def ballistic_position(problem: StepProblem) -> Tensor:

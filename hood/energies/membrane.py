@@ -31,6 +31,7 @@ from torch import Tensor
 
 from hood.cloth.cloth import Cloth
 from hood.energies.problem import StepProblem, sum_per_scene
+from hood.energies.term import Energy, Form, Passes, Role
 
 
 def weave_roots(cloth: Cloth, dtype: torch.dtype | None = None) -> Tensor | None:
@@ -81,7 +82,7 @@ def isotropic_stress(mu: Tensor, lam: Tensor, strain: tuple[Tensor, Tensor, Tens
     return 2.0 * mu * g00 + pressure, 2.0 * mu * g01, 2.0 * mu * g11 + pressure
 
 
-class Stretching:
+class Stretching(Energy):
     """StVK membrane energy [J], the sum over faces of A h (μ tr G² + ½ λ tr² G) (HOOD paper, section 3.3;
     SNUG).
 
@@ -94,6 +95,8 @@ class Stretching:
     """
 
     kind: ClassVar[str] = "Stretching"
+    role = Role.ELASTIC
+    form = Form.MEMBRANE
 
     def applies(self, problem: StepProblem) -> bool:
         return True
@@ -103,6 +106,9 @@ class Stretching:
         cloth = problem.cloth
         density = membrane_density(cloth, green_strain(next_pos, cloth.faces, cloth.rest_inverse))
         return sum_per_scene(cloth.rest_area * cloth.thickness * density, cloth.face_scene, cloth.num_scenes)
+
+    def closed_form(self, problem: StepProblem, passes: Passes | None = None) -> bool:
+        return True
 
 
 def membrane_density(cloth: Cloth, strain: tuple[Tensor, Tensor, Tensor]) -> Tensor:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import cache
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,29 +12,12 @@ from torch import Tensor
 from hood.energies.bending import Bending, CurrentLengthBending
 from hood.energies.compiled_elements import energies_and_gradient
 from hood.energies.contact import CentroidCollision, Collision
-from hood.energies.friction import CodedFriction, Friction, LaggedFriction, WeightFriction
-from hood.energies.inertia import Gravity, Inertia
+from hood.energies.friction import CodedFriction, Friction, WeightFriction
+from hood.energies.mass_points import Attachment, Gravity, Inertia
 from hood.energies.membrane import Stretching
 from hood.energies.problem import STANDARD_GRAVITY, StepProblem, sum_per_scene
-from hood.energies.self_friction import LayerFriction
-from hood.energies.springs import Attachment
-from hood.energies.term import PreparedTerm, RestingTerm, checked, kind_of
+from hood.energies.term import NOT_INTERNAL, Energy, checked, kind_of, prepared
 from hood.energies.term import Term as Term
-
-
-@cache
-def _prepares(kind: type) -> bool:
-    """Whether terms of a class are of :class:`PreparedTerm`; to ask every term of every step takes 0.3 ms of it."""
-    return issubclass(kind, PreparedTerm)
-
-
-@cache
-def _may_rest(kind: type) -> bool:
-    return issubclass(kind, RestingTerm)
-
-
-#: What a pull leaves out, see :meth:`Potential.with_internal_force`.
-_NOT_INTERNAL = (Inertia, Gravity, Collision, LaggedFriction, LayerFriction)
 
 
 class Potential:
@@ -74,8 +56,7 @@ class Potential:
         The problem itself where no term asks for more than it holds; contact that is there already is not searched again.
         """
         for term in self.terms.values():
-            if _prepares(type(term)):
-                problem = cast(PreparedTerm, term).prepare(problem)
+            problem = prepared(term, problem)
         return self.with_internal_force(problem)
 
     @torch.no_grad()
@@ -156,14 +137,13 @@ def keeps_both_sides(potential: Potential) -> bool:
 
 
 def _counts_as_internal(term: Term, problem: StepProblem) -> bool:
-    rests = _may_rest(type(term)) and cast(RestingTerm, term).rests(problem)
-    return not (rests or isinstance(term, _NOT_INTERNAL))
+    if not isinstance(term, Energy):
+        return True
+    return not (term.role in NOT_INTERNAL or term.is_inactive(problem))
 
 
 def _needs_internal_force(term: Term, problem: StepProblem) -> bool:
-    if isinstance(term, Friction):
-        return term.coefficient > 0 and problem.contact is not None
-    return isinstance(term, LayerFriction) and term.applies(problem)
+    return isinstance(term, Energy) and term.needs_internal_force(problem)
 
 
 def default_potential(

@@ -243,3 +243,8 @@ def sum_per_scene(values: Tensor, scene: Tensor, num_scenes: int) -> Tensor:
     if values.dtype in (torch.float16, torch.bfloat16):
         raise ValueError(f"energies cannot be computed in {values.dtype}; give positions in float32 or float64")
     return values.new_zeros(num_scenes).index_add(0, scene, values)
+
+
+def dot_rows(a: Tensor, b: Tensor) -> Tensor:
+    """Products (N,) of rows (N, 3); a sum over so short an axis would be slow."""
+    return torch.mv(a * b, a.new_ones(3))

@@ -5,6 +5,7 @@ Penalty that keeps cloth on the side of other cloth that it is on at t: a signal
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
@@ -14,10 +15,11 @@ from hood.contact.self_contact import SceneLayers
 from hood.energies.laws import contact_energy
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem, sum_per_scene
-from hood.energies.self_friction import LayerFriction, fading
+from hood.energies.self_friction import fading
+from hood.energies.term import LAYER_FORMS, Energy, Form, Passes, Role, Term, having
 
 
-class SignedSelfContactPenalty:
+class SignedSelfContactPenalty(Energy):
     """Energy [J] of layers of cloth, a sum over pairs of a vertex and a face near each other at t: w max(ε - d, 0)³.
 
     d = ± n · (x_v - x_f) is the distance of the vertex from the face's plane, both at t + 1, positive on the side on which the
@@ -37,6 +39,7 @@ class SignedSelfContactPenalty:
     """
 
     kind: ClassVar[str] = "SignedSelfContactPenalty"
+    role = Role.TRAINING
 
     def __init__(self, weight: float = 5e5, epsilon: float = 3e-3, reach: float = 2e-2) -> None:
         if weight < 0 or epsilon <= 0 or reach < epsilon:
@@ -82,7 +85,7 @@ def layer_sides(weight: float = 0.0, epsilon: float = 3e-3, reach: float = 2e-2)
 _LEAST = 1e-12
 
 
-class LayerBarrier:
+class LayerBarrier(Energy):
     """Energy [J] that keeps layers of cloth apart, a sum over pairs of features that share no vertex: p A r b(d / r).
 
     A pair is a vertex and a face, or two edges; d [m] is their exact distance, r the reach, A the area at rest that the pair
@@ -102,6 +105,8 @@ class LayerBarrier:
     """
 
     kind: ClassVar[str] = "LayerBarrier"
+    role = Role.SELF_CONTACT
+    form = Form.LAYERS
 
     def __init__(self, reach: float = 3e-3, pressure: float = 20.0, between: bool = False) -> None:
         if not (reach > 0 and pressure > 0):
@@ -121,7 +126,7 @@ class LayerBarrier:
             raise ValueError("step problem: layers not searched for yet; pass the problem through Potential.prepare once")
         return True
 
-    def rests(self, problem: StepProblem) -> bool:
+    def is_inactive(self, problem: StepProblem) -> bool:
         """Whether no pair is within its reach at x_t."""
         near = (len(scene.near_at_start(problem.state.pos).corners) for scene in problem.layers)
         return bool(problem.layers) and not any(near)
@@ -148,25 +153,26 @@ class LayerBarrier:
         # Pairs of a vertex and a face have 0 to fade below.
         return (energy * fading((normal * normal).sum(dim=1), parallel)).sum()
 
-
-#: Terms that act between layers; of other classes the solvers know nothing.
-LAYER_TERMS = (LayerBarrier, LayerFriction)
+    def closed_form(self, problem: StepProblem, passes: Passes | None = None) -> bool:
+        return True
 
 
 def has_layers(potential: Potential) -> bool:
     """Whether the potential keeps layers of cloth apart."""
-    return any(type(term) is LayerBarrier for term in potential.terms.values())
+    return bool(having(potential.terms, Form.LAYERS))
 
 
 def without_layers(potential: Potential) -> Potential:
     """The potential without what acts between layers of cloth; itself where there is nothing of the kind."""
-    if not any(type(term) in LAYER_TERMS for term in potential.terms.values()):
-        return potential
-    return potential.only({name: term for name, term in potential.terms.items() if type(term) not in LAYER_TERMS})
+    return _without(potential, having(potential.terms, *LAYER_FORMS))
 
 
 def for_networks(potential: Potential) -> Potential:
     """What a network is shown of the potential, and known to have been trained with: no feature tells of layers of cloth."""
-    return potential.only(
-        {name: term for name, term in potential.terms.items() if type(term) not in (*LAYER_TERMS, SignedSelfContactPenalty)}
-    )
+    return potential.only(_without(potential, having(potential.terms, *LAYER_FORMS, Role.TRAINING)).terms)
+
+
+def _without(potential: Potential, left_out: Mapping[str, Term]) -> Potential:
+    if not left_out:
+        return potential
+    return potential.only({name: term for name, term in potential.terms.items() if name not in left_out})

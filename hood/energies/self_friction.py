@@ -14,6 +14,7 @@ from hood.contact.self_contact import SceneLayers
 from hood.energies.friction import ballistic_position
 from hood.energies.laws import mollified_norm
 from hood.energies.problem import StepProblem, sum_per_scene
+from hood.energies.term import Energy, Form, Passes, Role
 from hood.mesh.cloth_proximity import Contacts, library
 from hood.native.arguments import COUNT, POINTER, fields
 
@@ -35,7 +36,7 @@ class LayerGrips:
         return moved - _dot(moved, self.normal).unsqueeze(1) * self.normal
 
 
-class LayerFriction:
+class LayerFriction(Energy):
     """Friction energy [J] between layers, the sum over pairs of features of μ N f(‖u_T‖).
 
     The pairs are those within the reach of :class:`hood.energies.self_contact.LayerBarrier` at t, u_T is the tangential motion
@@ -58,6 +59,8 @@ class LayerFriction:
     """
 
     kind: ClassVar[str] = "LayerFriction"
+    role = Role.SELF_FRICTION
+    form = Form.PAIRS
 
     def __init__(self, coefficient: float = 0.5, slip_speed: float = 5e-3) -> None:
         if coefficient < 0 or slip_speed <= 0:
@@ -96,6 +99,12 @@ class LayerFriction:
         force = self.coefficient * torch.minimum(pairs.force, _pressing(problem, pairs))
         limit = self.slip_speed * problem.step.dt.to(force)[pairs.scene]
         return LayerGrips(pairs.corners, pairs.weights, pairs.normal, force, limit, pairs.scene)
+
+    def needs_internal_force(self, problem: StepProblem) -> bool:
+        return self.applies(problem)
+
+    def closed_form(self, problem: StepProblem, passes: Passes | None = None) -> LayerGrips:
+        return self.grips(problem)
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from hood.energies.problem import StepProblem, sum_per_scene
+from hood.energies.term import Energy, Form, Passes, Role
 
 #: Waves that gusts are the sum of, and the band of their frequencies in units of 1/(2π gust_time).
 _WAVES, _BAND = 24, (0.05, 20.0)
@@ -29,7 +30,7 @@ class DragRows(NamedTuple):
     along: Tensor  # (F,) J/m³, the same of the slip in the plane of the face
 
 
-class Wind:
+class Wind(Energy):
     """Drag of the air on every triangle, as a dissipative potential of the step [J]: dt Σ ½ ρ A (C_n |u_n|³ + C_t |u_t|³) / 3.
 
     u = (x̄ - x̄_t) / dt - w is the velocity of the triangle's centroid x̄ against the air, u_n and u_t its parts along the normal
@@ -55,6 +56,8 @@ class Wind:
     """
 
     kind: ClassVar[str] = "Wind"
+    role = Role.EXTERNAL
+    form = Form.DRAG
 
     def __init__(
         self,
@@ -119,6 +122,13 @@ class Wind:
         since = (time.to(place)[scene] - late).unsqueeze(1)
         gust = (size * torch.sin(frequency * since + phase)).sum(dim=1)
         return (1.0 + gust).unsqueeze(1) * mean
+
+    def varies_in_time(self) -> bool:
+        return self.gusts > 0
+
+    def closed_form(self, problem: StepProblem, passes: Passes | None = None) -> Drag:
+        """The drag on the faces of a step, at their centroids."""
+        return Drag(*self.rows(problem))
 
 
 def air(velocity: float | Sequence[float] | None = None, **settings: Any) -> Wind | None:
@@ -189,11 +199,6 @@ class Drag:
         slip = slip - across[:, None] * self.normal
         size = torch.mv(slip * slip, slip.new_ones(3)).sqrt()
         return slip, across, size, slip / torch.where(size > 0, size, 1.0)[:, None]
-
-
-def drag_of(term: Wind, problem: StepProblem) -> Drag:
-    """The drag of a term on the faces of a step, at their centroids."""
-    return Drag(*term.rows(problem))
 
 
 def _outer(a: Tensor, b: Tensor) -> Tensor:

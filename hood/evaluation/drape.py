@@ -20,7 +20,7 @@ from hood.assets.material import Material
 from hood.cloth.cloth import Cloth, build_cloth
 from hood.cloth.state import State, StepInput
 from hood.energies.bending import Bending
-from hood.energies.inertia import Gravity, Inertia
+from hood.energies.mass_points import Gravity, Inertia
 from hood.energies.membrane import Stretching
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem

@@ -17,7 +17,8 @@ from torch import Tensor
 
 from hood.energies.potential import Potential, relative_gradient
 from hood.energies.problem import StepProblem
-from hood.energies.self_contact import SignedSelfContactPenalty, without_layers
+from hood.energies.self_contact import without_layers
+from hood.energies.term import Role, having
 from hood.native.build import BuildError
 from hood.solver.compiled import newton as compiled_newton
 from hood.solver.compiled.system import CompiledSystem
@@ -228,12 +229,11 @@ def system_of(
     Raises:
         ValueError: a term is for training alone.
     """
-    for name, term in potential.terms.items():
-        if type(term) is SignedSelfContactPenalty:
-            raise ValueError(
-                f"losses.terms.{name} is for training: where it sets in the solver does not converge; layers of cloth are kept "
-                "apart by cloth_contact=on"
-            )
+    for name in having(potential.terms, Role.TRAINING):
+        raise ValueError(
+            f"losses.terms.{name} is for training: where it sets in the solver does not converge; layers of cloth are kept "
+            "apart by cloth_contact=on"
+        )
     if (
         settings.engine != "torch"
         and settings.double

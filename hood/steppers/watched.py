@@ -12,7 +12,8 @@ from torch import Tensor
 from hood.energies.compiled_elements import energies_and_gradient
 from hood.energies.potential import Potential, scale
 from hood.energies.problem import StepProblem
-from hood.energies.self_contact import LayerBarrier, for_networks
+from hood.energies.self_contact import for_networks
+from hood.energies.term import Form, form_of
 from hood.scene.scene import Scene
 from hood.steppers.network import Prediction
 from hood.steppers.newton import Stepper
@@ -49,7 +50,7 @@ def vertex_bounds(potential: Potential, names: Sequence[str], problem: StepProbl
     terms = {name: term for name, term in potential.active(problem).items() if name in names}
     if not terms:
         return torch.zeros(len(pos), dtype=torch.float64)
-    others = {name: term for name, term in terms.items() if type(term) is not LayerBarrier}
+    others = {name: term for name, term in terms.items() if form_of(term) is not Form.LAYERS}
     gradient, _ = energies_and_gradient(potential.only(others), problem, pos)
     if len(others) < len(terms):  # written out, where autograd takes as long as the step
         gradient = gradient.double().clone()
@@ -178,7 +179,7 @@ class WatchedStepper:
         self._mistaken += 1
         sums = {name: float(bounds.sum()) for name, bounds in self._bounds.items()}
         for name, bound in sums.items():
-            if 2.0 * bound >= max(sums.values()) and type(self._potential.terms[name]) is not LayerBarrier:
+            if 2.0 * bound >= max(sums.values()) and form_of(self._potential.terms[name]) is not Form.LAYERS:
                 overstated = bound / max(MARGIN * worth, bound / MOST_OVERSTATED)
                 self._known[name] = _Known(max(overstated, 1.0), GROWTH * self._bounds[name], REMEMBERED)
 
@@ -206,7 +207,7 @@ class WatchedStepper:
     def _priced(self, name: str, bounds: Tensor) -> float:
         """The bounds of an energy (V,) less what they overstate, as far as that is known; a step less is left of it."""
         whole = float(bounds.sum())
-        if type(self._potential.terms[name]) is LayerBarrier:
+        if form_of(self._potential.terms[name]) is Form.LAYERS:
             return whole
         known = self._known.pop(name, None)
         if known is None:

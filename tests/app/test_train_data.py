@@ -16,7 +16,7 @@ from hood.app.train import make_trainer
 from hood.assets.material import Material
 from hood.assets.motion.motion_files import MotionFiles
 from hood.cli.main import main
-from hood.energies.inertia import Gravity
+from hood.energies.mass_points import Gravity
 from hood.energies.problem import StepProblem
 from hood.steppers.checkpoint import read_header
 from hood.training.trainer import Trainer

@@ -20,7 +20,6 @@ from hood.energies.problem import StepProblem
 from hood.mesh.closest_point.search import build_incidence
 from hood.mesh.penetration.crossing import crossings
 from hood.scene.start import push_out_of_body, settle
-from hood.solver.derivatives.vertices import walls_of
 from hood.solver.newton import NewtonSettings
 from hood.steppers.newton import implicit_euler
 from hood.testing import Mesh, cylinder, grid, make_problem, sphere
@@ -110,7 +109,7 @@ def test_collision_friction_and_walls_read_the_same_reach() -> None:
     depth = collision.reaches(problem, contact) - contact.dist
     assert int((depth > 0).sum()) == problem.cloth.num_vertices  # 2 mm off: outside a constant reach
     torch.testing.assert_close(collision.depth(problem, contact, problem.state.pos)[0], depth, rtol=0, atol=5e-5)
-    assert torch.equal(walls_of(collision, problem, contact).reach, collision.reaches(problem, contact))
+    assert torch.equal(collision.walls(problem, contact).reach, collision.reaches(problem, contact))
     assert float(friction.normal_force(problem, contact).min()) > 0
     for other in (default_potential(reach="constant"), reference_potential(), coded_potential()):
         term = other.terms["collision"]

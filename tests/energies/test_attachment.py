@@ -10,8 +10,8 @@ import torch
 from hood.assets.material import Material
 from hood.cloth.cloth import build_cloth
 from hood.cloth.state import Attachments, StepInput, concatenate_step_inputs
+from hood.energies.mass_points import Attachment, attachment_targets
 from hood.energies.problem import StepProblem
-from hood.energies.springs import Attachment, attachment_targets
 from hood.testing import grid, make_problem
 
 F64 = torch.float64

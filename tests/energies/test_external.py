@@ -9,10 +9,9 @@ from hood.cloth.cloth import build_cloth
 from hood.cloth.state import Attachments
 from hood.energies.contact import Collision
 from hood.energies.friction import Friction, WeightFriction
-from hood.energies.inertia import Gravity, Inertia
 from hood.energies.laws import mollified_norm
+from hood.energies.mass_points import Attachment, Gravity, Inertia
 from hood.energies.potential import Potential
-from hood.energies.springs import Attachment
 from hood.testing import grid, make_problem, plane_contact, random_rotation
 
 F64 = torch.float64

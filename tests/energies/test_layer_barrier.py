@@ -150,9 +150,9 @@ def test_layers_pull_where_they_are_near(gap: float, rests: bool) -> None:
     """Where none is, the term is not asked: what it would add is nothing."""
     near, term = _two_sheets(gap), LayerBarrier()
     prepared = term.prepare(near)
-    assert term.rests(prepared) == rests
+    assert term.is_inactive(prepared) == rests
     _, gradient = _alone(term, prepared, near.state.pos)
     assert bool((gradient == 0.0).all()) == rests
     with pytest.raises(ValueError, match="layers not searched for yet"):
         Potential({"layers": term}).energies(near, near.state.pos)
-    assert not term.rests(near)
+    assert not term.is_inactive(near)

@@ -11,7 +11,7 @@ import torch
 from hood.assets.material import Material
 from hood.cloth.cloth import Cloth, build_cloth
 from hood.cloth.state import State
-from hood.energies.inertia import Inertia
+from hood.energies.mass_points import Inertia
 from hood.energies.membrane import Stretching
 from hood.energies.potential import Potential
 from hood.scene.scene import recentre

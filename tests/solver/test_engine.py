@@ -14,7 +14,7 @@ from test_plan import states, touching_sheet
 from hood.assets.material import Material
 from hood.cloth.cloth import build_cloth
 from hood.energies.damping import BendDamping, StretchDamping
-from hood.energies.inertia import Gravity
+from hood.energies.mass_points import Gravity
 from hood.energies.potential import default_potential, reference_potential
 from hood.energies.wind import Wind
 from hood.native import build as native_build

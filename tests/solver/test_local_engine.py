@@ -11,9 +11,9 @@ from hood.energies.bending import CurrentLengthBending
 from hood.energies.contact import CentroidCollision
 from hood.energies.damping import BendDamping, StretchDamping
 from hood.energies.friction import WeightFriction
+from hood.energies.mass_points import Attachment
 from hood.energies.potential import Potential, default_potential
 from hood.energies.problem import StepProblem
-from hood.energies.springs import Attachment
 from hood.energies.wind import Wind
 from hood.native.build import BuildError
 from hood.scene.scene import Scene

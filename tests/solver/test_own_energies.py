@@ -15,7 +15,7 @@ from hood.cloth.cloth import build_cloth
 from hood.energies.damping import BendDamping, StretchDamping
 from hood.energies.potential import default_potential, relative_gradient
 from hood.energies.problem import StepProblem
-from hood.energies.term import Term
+from hood.energies.term import Energy, Form, Term, form_of, having, role_of
 from hood.energies.wind import Wind
 from hood.solver.derivatives.vertices import energies_and_gradient, total_energy
 from hood.solver.newton import NewtonSettings, minimize
@@ -73,3 +73,50 @@ def test_the_solver_tells_how_far_its_minimum_is(name: str, engine: str, sliding
     true = relative_gradient(problem, potential.gradient(problem, pos)[0])
     torch.testing.assert_close(report.relative_gradient, true, rtol=1e-6, atol=1e-9)
     assert bool(report.converged.all()) or name in ("stretching", "collision", "friction")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_subclass_begins_without_the_form_of_its_parent(name: str) -> None:
+    parent = POTENTIAL.terms[name]
+    own = doubled(parent)
+    assert form_of(parent) is not None
+    assert form_of(own) is None
+    assert role_of(own) is role_of(parent)
+    assert not having({name: own}, *Form)
+
+
+def test_a_subclass_may_say_that_it_keeps_the_energy() -> None:
+    class Windier(Wind):
+        form = Form.DRAG
+
+    class Renamed(Windier):
+        pass
+
+    assert form_of(Windier()) is Form.DRAG
+    assert form_of(Renamed()) is None
+
+
+def test_what_a_plugin_leaves_out_has_its_defaults(sliding: StepProblem) -> None:
+    """Two methods are enough, with or without the base class."""
+
+    class Bare:
+        def applies(self, problem: StepProblem) -> bool:
+            return True
+
+        def __call__(self, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> Tensor:
+            return problem.sum_vertices(next_pos[:, 0])
+
+    class Based(Energy):
+        def __call__(self, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> Tensor:
+            return problem.sum_vertices(next_pos[:, 0])
+
+    found = []
+    for term in (Bare(), Based()):
+        assert form_of(term) is None
+        potential = default_potential().with_terms(own=term)
+        problem = potential.prepare(sliding)
+        found.append((problem.internal_force, potential.gradient(problem, problem.state.pos)[0]))
+    for one, other in zip(*found, strict=True):
+        assert one is not None
+        torch.testing.assert_close(one, other, rtol=0, atol=0)
+    assert float((found[0][0] - default_potential().prepare(sliding).internal_force).abs().max()) > 0.5  # it presses, too

@@ -13,10 +13,9 @@ from hood.assets.material import Material
 from hood.cloth.cloth import build_cloth
 from hood.cloth.state import Attachments
 from hood.energies import compiled_elements
-from hood.energies.inertia import Gravity
+from hood.energies.mass_points import Attachment, Gravity
 from hood.energies.potential import Potential, default_potential, relative_gradient, scale
 from hood.energies.problem import StepProblem, inertial_guess
-from hood.energies.springs import Attachment
 from hood.solver.derivatives import compiled_vertices
 from hood.solver.step_figures import StepFigures
 from hood.testing import grid, make_problem, plane_contact

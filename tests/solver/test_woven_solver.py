@@ -14,7 +14,7 @@ from torch import Tensor
 from hood.assets.material import Material, stretch_stiffness
 from hood.cloth.cloth import Cloth, build_cloth, concatenate_cloths
 from hood.energies.damping import BendDamping, StretchDamping
-from hood.energies.inertia import Gravity, Inertia
+from hood.energies.mass_points import Gravity, Inertia
 from hood.energies.membrane import Stretching
 from hood.energies.potential import Potential, default_potential
 from hood.energies.problem import StepProblem

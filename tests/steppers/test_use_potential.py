@@ -8,7 +8,7 @@ from small_simulators import make
 from torch import Tensor
 
 from hood.assets.files.library import locate
-from hood.energies.inertia import Gravity
+from hood.energies.mass_points import Gravity
 from hood.energies.potential import Potential, default_potential, reference_potential
 from hood.energies.problem import StepProblem
 from hood.rollouts.loop import simulate

@@ -9,7 +9,7 @@ import pytest
 
 from hood.app.settings.compose import build, load_config
 from hood.energies.friction import Friction
-from hood.energies.inertia import Gravity
+from hood.energies.mass_points import Gravity
 from hood.energies.potential import default_potential, reference_potential
 from hood.training.curriculum import CollisionRamp, Horizon, InverseRoot, StepDecay, WarmupCosine
 from hood.training.settings import TrainerSettings

@@ -15,11 +15,9 @@ from omegaconf import DictConfig
 from hood.app.settings.compose import NETWORK_KEYS, plain
 from hood.app.stepping.steppers import option_of
 from hood.energies.potential import Potential, default_potential
-from hood.energies.self_contact import LAYER_TERMS, SignedSelfContactPenalty
-from hood.energies.term import named
+from hood.energies.term import Form, Role, having, named
 from hood.scene.body_motion.motion import BodyMotion
 from hood.scene.scene import Scene
-from hood.solver.derivatives.vertices import CLOSED_FORM
 from hood.steppers.newton import Stepper
 from hood.steppers.ranges import Conditions, different, outside, scene_conditions
 from hood.steppers.refined import RefinedStepper
@@ -104,8 +102,8 @@ def known_by_slope(stepper: Stepper, potential: Potential) -> list[str]:
     """One sentence on energies whose curvature the solver does not know, where it takes or refines the steps; else none."""
     if network_of(stepper) is not None and not _is_refined(stepper):
         return []
-    known = (*CLOSED_FORM, *LAYER_TERMS, SignedSelfContactPenalty)
-    names = [named(name, term) for name, term in potential.terms.items() if type(term) not in known]
+    known = having(potential.terms, *Form, Role.TRAINING)
+    names = [named(name, term) for name, term in potential.terms.items() if name not in known]
     if not names:
         return []
     return [f"{', '.join(names)}: the solver knows the slope alone, not how stiff it is; stiff terms take many iterations"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,19 +13,15 @@ from hood.app.notices import say
 from hood.app.settings.compose import ConfigError, plain, require_choice
 from hood.app.stepping.refinement import chosen
 from hood.app.stepping.steppers import MAY, losses_of, option_of
-from hood.energies.contact import CentroidCollision, Collision
-from hood.energies.friction import CodedFriction, LaggedFriction, WeightFriction
 from hood.energies.potential import Potential
 from hood.energies.self_contact import LayerBarrier
 from hood.energies.self_friction import LayerFriction
-from hood.energies.term import Term
+from hood.energies.term import Role, Term, having
 from hood.mesh import cloth_proximity
 from hood.native.build import BuildError
 from hood.solver.step_figures import LAYER_METRICS
 
 _CHOICES = ("auto", "on", "off", "layers")
-#: Contact of the published code, which has none of cloth with cloth. A subclass is somebody's own.
-PUBLISHED = (CentroidCollision, WeightFriction, CodedFriction)
 
 
 def check_cloth_contact(config: DictConfig) -> None:
@@ -103,7 +99,7 @@ def _hindrance(config: DictConfig, potential: Potential | None = None) -> str:
         return f"step={config.step} has fixed shapes, which contact of cloth with cloth has not; use step=plain"
     if str(config.cloth_contact) == "auto" and str(config.device) != "cpu":
         return "its search is done on the CPU, between steps on another device; cloth_contact=on does so"
-    terms = (potential or losses_of(config)).terms.values()
+    terms = (potential or losses_of(config)).terms
     if str(config.cloth_contact) == "auto" and _are_published(terms):
         return "losses=… are those of published code, which has none; cloth_contact=on adds it"
     try:
@@ -113,11 +109,11 @@ def _hindrance(config: DictConfig, potential: Potential | None = None) -> str:
     return ""
 
 
-def _are_published(terms: Iterable[Term]) -> bool:
+def _are_published(terms: Mapping[str, Term]) -> bool:
     """Whether contact with the body is that of published code, and no other."""
-    kinds = [type(term) for term in terms if isinstance(term, (Collision, LaggedFriction))]
-    others = [kind for kind in kinds if issubclass(kind, Collision) and kind not in PUBLISHED]
-    return not others and any(kind in PUBLISHED for kind in kinds)
+    found = having(terms, Role.CONTACT, Role.FRICTION).values()
+    others = [term for term in found if term.role is Role.CONTACT and not term.published]
+    return not others and any(term.published for term in found)
 
 
 def _rough(config: DictConfig) -> bool:

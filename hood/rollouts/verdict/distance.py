@@ -16,7 +16,7 @@ from torch import Tensor
 
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem
-from hood.energies.self_contact import SignedSelfContactPenalty
+from hood.energies.term import Role, having
 from hood.limits import DISTANCE_UNSOUND
 from hood.solver.newton import Further
 
@@ -51,8 +51,7 @@ class Distance(NamedTuple):
 def distance_metrics(potential: Potential, problem: StepProblem, next_pos: Tensor) -> dict[str, float]:
     """:data:`DISTANCE_METRICS` of the step to ``next_pos`` (V, 3) m; NaN where that is not finite, and of a potential that is
     for training alone. Arguments as of :func:`estimate`."""
-    for_training = any(type(term) is SignedSelfContactPenalty for term in potential.terms.values())
-    if for_training or not bool(torch.isfinite(next_pos).all()):
+    if having(potential.terms, Role.TRAINING) or not bool(torch.isfinite(next_pos).all()):
         return dict.fromkeys(DISTANCE_METRICS, float("nan"))
     limit = DISTANCE_UNSOUND.value * float(problem.step.dt.max())
     found = estimate(potential, problem, next_pos, limit)

@@ -18,25 +18,26 @@ from torch import Tensor
 from hood import native
 from hood.cloth.cloth import Cloth
 from hood.contact.self_contact import SceneLayers
-from hood.energies.bending import Bending, CurrentLengthBending
-from hood.energies.damping import BendDamping
-from hood.energies.membrane import Stretching, green_strain
-from hood.energies.potential import Potential, Term
+from hood.energies.bending import HingeForm
+from hood.energies.contact import Walls
+from hood.energies.friction import Grip
+from hood.energies.mass_points import attachment_targets
+from hood.energies.membrane import green_strain
+from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem, inertial_guess
-from hood.energies.self_contact import LAYER_TERMS
 from hood.energies.self_friction import LayerGrips
-from hood.energies.springs import Attachment, attachment_targets
+from hood.energies.term import LAYER_FORMS, Form, having
 from hood.mesh.geometry import dihedral_angles
 from hood.native.arguments import COUNT, POINTER, REAL, fields
 from hood.native.build import NATIVE_FLAGS, build
 from hood.native.libraries import WIDE_FLAGS
 from hood.solver.compiled.tables import Tables
 from hood.solver.derivatives.compiled_vertices import whole
-from hood.solver.derivatives.elements import BENDINGS, face_constants, hinge_constants
+from hood.solver.derivatives.elements import face_constants, hinge_constants
 from hood.solver.derivatives.points import PointForces, point_forces
 from hood.solver.derivatives.self_contact import grips_of, layers_of
 from hood.solver.derivatives.step_terms import stretch_rate
-from hood.solver.derivatives.vertices import Grip, VertexForces, Walls, attachment_stiffness, known_forces, terms_without_form
+from hood.solver.derivatives.vertices import VertexForces, known_forces, terms_without_form
 from hood.solver.system.iterate import fixed_positions
 
 #: Vertices of a part that is worth a thread: an iteration of conjugate gradients takes 20 us at 1,000 vertices.
@@ -100,11 +101,13 @@ def library(wide: bool = False) -> ctypes.CDLL:
 
 def applies(potential: Potential, problem: StepProblem) -> bool:
     """Whether the compiled solver knows every term of the potential that plays a role in ``problem``, on a CPU."""
-    bendings = [type(term) for term in potential.terms.values() if type(term) in BENDINGS and term.applies(problem)]
-    about_rest = bendings.count(BendDamping) == 0 or (bendings.count(Bending) == 1 and bendings.count(BendDamping) == 1)
+    active = potential.active(problem)
+    hinges = [term.closed_form(problem) for term in having(active, Form.HINGES).values()]
+    damped, elastic = ([form for form in hinges if (form.damping is None) == whether] for whether in (False, True))
+    about_rest = not damped or (len(damped) == 1 and [form.by_length for form in elastic] == [False])
     others = terms_without_form(potential, problem)
-    known = others is None or all(type(term) in LAYER_TERMS for term in others.terms.values())
-    one = len(bendings) - bendings.count(BendDamping) <= 1 and about_rest
+    known = others is None or len(having(others.terms, *LAYER_FORMS)) == len(others.terms)
+    one = len(elastic) <= 1 and about_rest and not having(active, Form.BLOCKS)
     return problem.state.pos.device.type == "cpu" and one and known
 
 
@@ -168,10 +171,11 @@ class CompiledStep:
 
 def compiled_step(potential: Potential, problem: StepProblem) -> CompiledStep:
     """The step ``problem``, in float64 and prepared, with the terms of ``potential``."""
-    terms = [term for term in potential.terms.values() if term.applies(problem)]
+    active = potential.active(problem)
+    hinges = [term.closed_form(problem) for term in having(active, Form.HINGES).values()]
     forces: VertexForces = known_forces(potential, problem)
-    bending = next((term for term in terms if type(term) in BENDINGS and type(term) is not BendDamping), None)
-    springs = [attachment_stiffness(term, problem) for term in terms if type(term) is Attachment]
+    bending = next((form for form in hinges if form.damping is None), None)
+    springs = [term.closed_form(problem) for term in having(active, Form.SPRINGS).values()]
     stiffness = torch.stack(springs).sum(0) if springs else problem.state.pos.new_zeros(_num_attachments(problem))
     base = inertial_guess(problem.state, problem.step, problem.cloth.vertex_scene)
     return CompiledStep(
@@ -186,12 +190,12 @@ def compiled_step(potential: Potential, problem: StepProblem) -> CompiledStep:
         walls=tuple(Walls(w.weight, *(whole(t) for t in (w.point, w.normal, w.reach))) for w in forces.walls),
         grips=tuple(Grip(*(whole(t) for t in (g.force, g.normal, g.anchor, g.limit))) for g in forces.grips),
         points=point_forces(potential, problem),
-        bending=0 if bending is None else 2 if type(bending) is CurrentLengthBending else 1,
-        membrane=sum(type(term) is Stretching for term in terms),
+        bending=0 if bending is None else 2 if bending.by_length else 1,
+        membrane=len(having(active, Form.MEMBRANE)),
         layers=layers_of(potential, problem),
         layer_grips=grips_of(potential, problem),
         stretch_damping=_stretch_damping(potential, problem),
-        bend_damping=_bend_damping(terms, problem),
+        bend_damping=_bend_damping(hinges, problem),
     )
 
 
@@ -203,11 +207,11 @@ def _stretch_damping(potential: Potential, problem: StepProblem) -> tuple[np.nda
     return _array(rate), _array(torch.stack(before))
 
 
-def _bend_damping(terms: list[Term], problem: StepProblem) -> tuple[np.ndarray, np.ndarray] | None:
-    term = next((term for term in terms if type(term) is BendDamping), None)
-    if term is None:
+def _bend_damping(hinges: list[HingeForm], problem: StepProblem) -> tuple[np.ndarray, np.ndarray] | None:
+    time = next((form.damping for form in hinges if form.damping is not None), None)
+    if time is None:
         return None
-    rate = term.time / problem.step.dt[problem.cloth.hinge_scene]
+    rate = time / problem.step.dt[problem.cloth.hinge_scene]
     return _array(rate), _array(dihedral_angles(problem.state.pos.double(), problem.cloth.hinges))
 
 

@@ -18,14 +18,14 @@ from torch import Tensor
 from hood.contact.activation_distance import chord_error
 from hood.contact.contact import Contact
 from hood.energies.compiled_elements import library
-from hood.energies.contact import Collision
-from hood.energies.friction import Friction, scaled_by_body_friction
+from hood.energies.contact import Collision, Walls
+from hood.energies.friction import Friction, Grip, scaled_by_body_friction
 from hood.energies.problem import StepProblem
 from hood.native.arguments import COUNT, POINTER, REAL, fields
 
 if TYPE_CHECKING:
     from hood.energies.wind import Drag
-    from hood.solver.derivatives.vertices import Grip, VertexForces, Walls
+    from hood.solver.derivatives.vertices import VertexForces
 
 
 class WallStructure(ctypes.Structure):

@@ -16,13 +16,10 @@ import torch
 from torch import Tensor
 
 from hood.cloth.cloth import Cloth
-from hood.energies.bending import Bending, CurrentLengthBending, bending_weight
-from hood.energies.damping import BendDamping
+from hood.energies.bending import HingeForm, bending_weight
 from hood.energies.membrane import isotropic_density, isotropic_stress, weave_density, weave_roots, weave_stress
-from hood.energies.potential import Term
 from hood.tensors.dense import is_whole
 
-BENDINGS = (Bending, CurrentLengthBending, BendDamping)
 #: As in hood.mesh.geometry: a triangle is degenerate when a sine in it is below this many units of rounding.
 _DEGENERATE_ULPS = 8.0
 _TURN = 2.0 * math.pi
@@ -228,11 +225,11 @@ class HingeConstants:
         """The same with what damping needs to know of a step of ``dt`` (N,) from ``pos`` (V, 3)."""
         return replace(self, before=_angles(Corners(hinges)(pos), self.rest_length)[0], per_dt=1.0 / dt)
 
-    def of(self, term: Term) -> HingeConstants:
-        """Constants of the rest shape that ``term`` is about: itself, or of damping the shape at t."""
-        if type(term) is not BendDamping or self.before is None or self.per_dt is None:
+    def of(self, form: HingeForm) -> HingeConstants:
+        """Constants of the shape that an energy is about: that at rest, or of damping that at t."""
+        if form.damping is None or self.before is None or self.per_dt is None:
             return self
-        return HingeConstants(self.before, term.time * self.per_dt * self.weight, self.rest_length)
+        return HingeConstants(self.before, form.damping * self.per_dt * self.weight, self.rest_length)
 
 
 def hinge_constants(cloth: Cloth) -> HingeConstants:
@@ -241,26 +238,26 @@ def hinge_constants(cloth: Cloth) -> HingeConstants:
     return HingeConstants(cloth.rest_angle, weight, cloth.hinge_rest_length)
 
 
-def hinge_energy(term: Term, x: Tensor, constants: HingeConstants) -> Tensor:
+def hinge_energy(form: HingeForm, x: Tensor, constants: HingeConstants) -> Tensor:
     """Energy [J] (N,) of hinges with corners ``x`` (4, 3, N): edge start, edge end, opposite vertices."""
-    constants = constants.of(term)
+    constants = constants.of(form)
     angle, _ = _angles(x, constants.rest_length)
-    if type(term) is CurrentLengthBending:
+    if form.by_length:
         edge = x[1] - x[0]
         return 0.5 * constants.weight * (angle / constants.rest_length) ** 2 * _dot(edge, edge)
     return 0.5 * constants.weight * _bend(angle, constants) ** 2
 
 
-def hinge_model(term: Term, x: Tensor, constants: HingeConstants) -> tuple[Tensor, Tensor]:
+def hinge_model(form: HingeForm, x: Tensor, constants: HingeConstants) -> tuple[Tensor, Tensor]:
     """Bending: gradient (4, 3, N) and the one row (4, 3, N) of its Gauss-Newton matrix.
 
     The energy is ½ weight r² with r = θ - θ₀, or θ l / l₀ in the published code's form, where l is the edge's length now:
     the gradient is weight r ∇r and the row √weight ∇r.
     """
-    constants = constants.of(term)
+    constants = constants.of(form)
     angle, geometry = _angles(x, constants.rest_length)
     slope = geometry.slope()
-    if type(term) is CurrentLengthBending:
+    if form.by_length:
         edge = x[1] - x[0]
         length = _dot(edge, edge).sqrt()
         residual = angle * length / constants.rest_length

@@ -14,13 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hood.contact.sample_points import PointContact
-from hood.energies.contact import Collision
-from hood.energies.friction import Friction
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem
-from hood.energies.wind import Drag, Wind, drag_of
-from hood.solver.derivatives.vertices import Grip, VertexForces, VertexModel, Walls
+from hood.energies.term import Form, having
+from hood.energies.wind import Drag
+from hood.solver.derivatives.vertices import VertexForces, VertexModel
 from hood.solver.system.sparsity import BlockPattern
 
 
@@ -64,16 +62,17 @@ class PointForces:
 
 def point_forces(potential: Potential, problem: StepProblem) -> tuple[PointForces, ...]:
     """The potential's terms that act at points inside edges and faces, place by place."""
-    terms = potential.active(problem).values()
+    active = potential.active(problem)
+    planes, grips = (list(having(active, form).values()) for form in (Form.PLANES, Form.GRIPS))
     found = []
     for points in problem.point_contacts:
-        walls = [_walls(term, points) for term in terms if type(term) is Collision and term.contact == points.place]
-        grips = [_grip(term, points, problem) for term in terms if type(term) is Friction and term.contact == points.place]
-        if walls or grips:
+        there = [[term.closed_form_at(problem, points) for term in terms] for terms in (planes, grips)]
+        walls, held = (tuple(one for one in terms if one is not None) for terms in there)
+        if walls or held:
             none = torch.zeros_like(points.dist)
-            forces = VertexForces(none[:, None], none, torch.zeros_like(points.point), tuple(walls), tuple(grips))
+            forces = VertexForces(none[:, None], none, torch.zeros_like(points.point), walls, held)
             found.append(PointForces(points.vertices, points.weights, points.scene, forces))
-    drags = tuple(drag_of(term, problem) for term in terms if type(term) is Wind)
+    drags = tuple(term.closed_form(problem) for term in having(active, Form.DRAG).values())
     return (*found, _at_centroids(problem, drags)) if drags else tuple(found)
 
 
@@ -83,17 +82,6 @@ def _at_centroids(problem: StepProblem, drags: tuple[Drag, ...]) -> PointForces:
     forces = VertexForces(none[:, None], none, torch.zeros_like(drags[0].normal), (), (), drags)
     thirds = torch.full_like(drags[0].normal, 1.0 / 3.0)
     return PointForces(cloth.faces, thirds, cloth.face_scene, forces, centroids=True)
-
-
-def _walls(term: Collision, points: PointContact) -> Walls:
-    reach = torch.full_like(points.dist, term.epsilon)
-    return Walls(term.weight * points.share, points.next_point, points.next_normal, reach)
-
-
-def _grip(term: Friction, points: PointContact, problem: StepProblem) -> Grip:
-    anchor = points.at(problem.state.pos) + points.next_point - points.point
-    limit = term.slip_speed * problem.step.dt[points.scene]
-    return Grip(term.greatest_at(problem, points), points.next_normal, anchor, limit)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,8 @@ from hood.energies.laws import slip_slope
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem
 from hood.energies.self_contact import has_layers
-from hood.energies.self_friction import LayerFriction, LayerGrips
+from hood.energies.self_friction import LayerGrips
+from hood.energies.term import Form, having
 
 
 def layers_of(potential: Potential, problem: StepProblem) -> tuple[SceneLayers, ...]:
@@ -28,10 +29,10 @@ def layers_of(potential: Potential, problem: StepProblem) -> tuple[SceneLayers, 
 
 def grips_of(potential: Potential, problem: StepProblem) -> LayerGrips | None:
     """What grips what by the potential's friction between layers; None where nothing does."""
-    terms = [term for term in potential.terms.values() if type(term) is LayerFriction and term.applies(problem)]
+    terms = [term for term in having(potential.terms, Form.PAIRS).values() if term.applies(problem)]
     if not terms:
         return None
-    parts = [term.grips(problem) for term in terms]
+    parts = [term.closed_form(problem) for term in terms]
     columns = ([getattr(part, field.name) for part in parts] for field in fields(LayerGrips))
     return LayerGrips(*(torch.cat(column) for column in columns))
 

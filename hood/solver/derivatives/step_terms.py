@@ -6,18 +6,21 @@ every iteration reads lie as its arithmetic wants them.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
 from torch import Tensor
 
-from hood.energies.damping import BendDamping, StretchDamping
-from hood.energies.membrane import Stretching
-from hood.energies.potential import Potential
+from hood.energies.bending import HingeForm
+from hood.energies.mass_points import attachment_targets
+from hood.energies.potential import Potential, Term
 from hood.energies.problem import StepProblem, sum_per_scene
-from hood.energies.springs import Attachment, attachment_targets
+from hood.energies.term import BlockForm, Form, having
 from hood.solver.derivatives import elements
-from hood.solver.derivatives.elements import BENDINGS, Corners
+from hood.solver.derivatives.elements import Corners
 from hood.solver.derivatives.points import point_forces
-from hood.solver.derivatives.vertices import attachment_stiffness, terms_without_form, vertex_forces
+from hood.solver.derivatives.vertices import VertexModel, terms_without_form, vertex_forces
 
 
 class StepTerms:
@@ -25,22 +28,23 @@ class StepTerms:
 
     def __init__(self, potential: Potential, problem: StepProblem) -> None:
         self.problem = problem
-        cloth, terms = problem.cloth, list(potential.active(problem).values())
+        cloth, active = problem.cloth, potential.active(problem)
         self.vertices = vertex_forces(potential, problem)
         self.points = point_forces(potential, problem)
-        self.bendings = [term for term in terms if type(term) in BENDINGS]
-        self.springs = [term for term in terms if type(term) is Attachment]
+        self.bendings: list[HingeForm] = _forms(active, problem, Form.HINGES)
+        self.springs = list(having(active, Form.SPRINGS).values())
+        self.blocks: list[BlockForm] = _forms(active, problem, Form.BLOCKS)
         self.others = terms_without_form(potential, problem)
         targets = attachment_targets(problem) if self.springs else None
         self.spring_targets = None if targets is None else targets.t()  # (3, A) m
-        num_membranes = sum(type(term) is Stretching for term in terms)
+        num_membranes = len(having(active, Form.MEMBRANE))
         self.has_membrane = num_membranes > 0
         self.face_constants = elements.face_constants(cloth, num_membranes)
         self.hinge_constants = elements.hinge_constants(cloth)
         rate = stretch_rate(potential, problem)
         if rate is not None:
             self.face_constants = self.face_constants.damped(rate, problem.state.pos, cloth.faces)
-        if any(type(term) is BendDamping for term in self.bendings):
+        if any(form.damping is not None for form in self.bendings):
             dt = problem.step.dt[cloth.hinge_scene]
             self.hinge_constants = self.hinge_constants.moving(problem.state.pos, cloth.hinges, dt)
         self._face_corners, self._hinge_corners = Corners(cloth.faces), Corners(cloth.hinges)
@@ -54,10 +58,18 @@ class StepTerms:
             parts.append((elements.face_energy(self._face_corners(pos), self.face_constants), cloth.face_scene))
         if self.bendings:
             x = self._hinge_corners(pos)
-            parts += [(elements.hinge_energy(term, x, self.hinge_constants), cloth.hinge_scene) for term in self.bendings]
+            parts += [(elements.hinge_energy(form, x, self.hinge_constants), cloth.hinge_scene) for form in self.bendings]
         sums = [_sum(values, scene, problem.num_scenes) for values, scene in parts]
-        sums += [term(problem, pos, acc) for term in self.springs]
+        sums += [term(problem, pos, acc) for term in self.springs] + [block.energy(pos) for block in self.blocks]
         return sums + ([] if self.others is None else list(self.others.energies(problem, pos, acc).values()))
+
+    def vertex_model(self, pos: Tensor, acc: Tensor) -> VertexModel:
+        """Derivatives of what acts on single vertices, and of what is bounded there, at ``pos`` (V, 3) reached with ``acc``."""
+        model = self.vertices.model(pos, acc)
+        for block in self.blocks:
+            gradient, matrix = block.derivatives(pos)
+            model = VertexModel(model.gradient + gradient, model.matrix + matrix, model.indefinite_part)
+        return model
 
     def faces(self, pos: Tensor, out: Tensor | None = None) -> elements.FaceModel | None:
         """The membrane at ``pos`` (V, 3), its matrix in ``out``; None without such a term."""
@@ -68,7 +80,7 @@ class StepTerms:
         if not self.bendings:
             return []
         x = self._hinge_corners(pos)
-        return [elements.hinge_model(term, x, self.hinge_constants) for term in self.bendings]
+        return [elements.hinge_model(form, x, self.hinge_constants) for form in self.bendings]
 
     def attachments(self, pos: Tensor) -> tuple[Tensor, Tensor] | None:
         """Gradient and matrix of the springs, see :func:`hood.solver.derivatives.elements.spring_model`; None without any."""
@@ -79,7 +91,7 @@ class StepTerms:
 
     def spring_stiffness(self) -> Tensor:
         """Spring constants [N/m] (A,), of all terms together."""
-        return torch.stack([attachment_stiffness(term, self.problem) for term in self.springs]).sum(0)
+        return torch.stack([term.closed_form(self.problem) for term in self.springs]).sum(0)
 
     def other_gradient(self, pos: Tensor, acc: Tensor) -> Tensor | None:
         """Gradient (V, 3) [N] of the energies that have no closed form here, by autograd; None without any."""
@@ -88,9 +100,13 @@ class StepTerms:
 
 def stretch_rate(potential: Potential, problem: StepProblem) -> Tensor | None:
     """Viscous stress of the membrane in units of the elastic one of the step's strain, (F,); None without damping."""
-    terms = potential.active(problem).values()
-    time, elastic = sum(term.time for term in terms if type(term) is StretchDamping), sum(type(t) is Stretching for t in terms)
+    active = potential.active(problem)
+    time, elastic = sum(_forms(active, problem, Form.MEMBRANE_DAMPING)), len(having(active, Form.MEMBRANE))
     return time / elastic / problem.step.dt[problem.cloth.face_scene] if time and elastic else None
+
+
+def _forms(active: Mapping[str, Term], problem: StepProblem, form: Form) -> list[Any]:
+    return [term.closed_form(problem) for term in having(active, form).values()]
 
 
 def _sum(values: Tensor, scene: Tensor, num_scenes: int) -> Tensor:

@@ -12,67 +12,16 @@ import torch
 from torch import Tensor
 
 from hood.contact.contact import Contact
-from hood.energies.contact import CentroidCollision, Collision
-from hood.energies.damping import StretchDamping
-from hood.energies.friction import CodedFriction, Friction, LaggedFriction, WeightFriction
-from hood.energies.inertia import Gravity, Inertia
+from hood.energies.contact import Walls
+from hood.energies.friction import Grip
 from hood.energies.laws import contact_curvature, contact_energy, contact_force, mollified_norm, slip_curvature, slip_slope
-from hood.energies.membrane import Stretching
 from hood.energies.potential import Potential, Term
-from hood.energies.problem import StepProblem
-from hood.energies.springs import Attachment
-from hood.energies.wind import Drag, Wind
+from hood.energies.problem import StepProblem, dot_rows
+from hood.energies.term import MATRIX_FORMS, VERTEX_FORMS, Form, having
+from hood.energies.wind import Drag
 from hood.solver.derivatives import compiled_vertices
 from hood.solver.derivatives.compiled_vertices import ContactPass, VertexPass, contact_pass
-from hood.solver.derivatives.elements import BENDINGS
 from hood.tensors.weak_cache import forget
-
-COLLISIONS = (Collision, CentroidCollision)
-FRICTIONS = (Friction, WeightFriction, CodedFriction)
-#: Terms whose derivatives are written out. A subclass may compute something else and does not count.
-CLOSED_FORM = (Stretching, StretchDamping, *BENDINGS, Attachment, Inertia, Gravity, *COLLISIONS, *FRICTIONS, Wind)
-#: Those that act on single vertices.
-SINGLE = (Inertia, Gravity, *COLLISIONS, *FRICTIONS)
-
-
-@dataclass(frozen=True)
-class Walls:
-    """A collision term as N planes; rows without one are zero and feel nothing."""
-
-    weight: float | Tensor  # J/m³, one for all or (N,)
-    point: Tensor  # (N, 3) m
-    normal: Tensor  # (N, 3)
-    reach: Tensor  # (N,) m, distance at which the penalty sets in
-
-    def depth(self, pos: Tensor) -> Tensor:
-        """Depth ε - d (N,) [m] of ``pos`` (N, 3) in the contact zone, negative outside."""
-        return self.reach - _rows(pos - self.point, self.normal)
-
-    def pressure(self, pos: Tensor) -> Tensor:
-        """Force (N,) [N] along the normals at ``pos`` (N, 3)."""
-        return contact_force(self.weight, self.depth(pos))
-
-    def take(self, rows: Tensor) -> Walls:
-        weight = self.weight[rows] if isinstance(self.weight, Tensor) else self.weight
-        return Walls(weight, self.point[rows], self.normal[rows], self.reach[rows])
-
-
-@dataclass(frozen=True)
-class Grip:
-    """A friction term on N vertices, force f at most along the tangential slip; rows without any are zero."""
-
-    force: Tensor  # (N,) N, the coefficient included
-    normal: Tensor  # (N, 3)
-    anchor: Tensor  # (N, 3) m, where the vertex would be if it stuck
-    limit: Tensor  # (N,) m, slip below which it counts as sticking
-
-    def slip(self, pos: Tensor) -> Tensor:
-        """Tangential slip (N, 3) [m] of ``pos`` (N, 3)."""
-        slip = torch.where((self.force > 0)[:, None], pos - self.anchor, 0.0)
-        return slip - _rows(slip, self.normal)[:, None] * self.normal
-
-    def take(self, rows: Tensor) -> Grip:
-        return Grip(self.force[rows], self.normal[rows], self.anchor[rows], self.limit[rows])
 
 
 @dataclass(frozen=True)
@@ -113,14 +62,14 @@ class VertexForces:
     def energies(self, pos: Tensor, acc: Tensor, dt: Tensor) -> list[Tensor]:
         """Energies [J] (N,) of the terms at positions and accelerations (N, 3); time step ``dt`` (N, 1)."""
         moved = dt**2 * acc
-        return [0.5 * self.stiffness * _rows(moved, moved), -_rows(self.weight, pos), *self.contact_energies(pos)]
+        return [0.5 * self.stiffness * dot_rows(moved, moved), -dot_rows(self.weight, pos), *self.contact_energies(pos)]
 
     def contact_energies(self, pos: Tensor) -> list[Tensor]:
         """Those of contact, friction and drag alone."""
         parts = [contact_energy(wall.weight, wall.depth(pos)) for wall in self.walls]
         for grip in self.grips:
             slip = grip.slip(pos)
-            parts.append(grip.force * mollified_norm(_rows(slip, slip), grip.limit))
+            parts.append(grip.force * mollified_norm(dot_rows(slip, slip), grip.limit))
         return parts + [drag.energy(pos) for drag in self.drags]
 
     def gradient(self, pos: Tensor, acc: Tensor) -> Tensor:
@@ -159,7 +108,7 @@ class VertexForces:
 
 
 def vertex_forces(potential: Potential, problem: StepProblem, compiled: bool = False) -> VertexForces:
-    """The potential's terms of :data:`CLOSED_FORM` that act on single vertices; ``compiled`` may leave torch."""
+    """The potential's terms of :data:`hood.energies.term.VERTEX_FORMS`; ``compiled`` may leave torch."""
     mass, pos = problem.cloth.mass, problem.state.pos
     inertia, weight = torch.zeros_like(mass), torch.zeros_like(pos)
     walls: list[Walls] = []
@@ -167,48 +116,27 @@ def vertex_forces(potential: Potential, problem: StepProblem, compiled: bool = F
     passes: dict[int, ContactPass | None] = {}
 
     def pass_of(contact: Contact) -> ContactPass | None:
-        if compiled and id(contact) not in passes:
+        if id(contact) not in passes:
             passes[id(contact)] = contact_pass(problem, contact)
-        return passes.get(id(contact))
+        return passes[id(contact)]
 
-    for term in potential.active(problem).values():
-        if type(term) is Inertia:
-            inertia = inertia + mass
-        elif type(term) is Gravity:
-            weight = weight + mass[:, None] * problem.gravity.to(pos)
-        elif isinstance(term, Collision) and type(term) in COLLISIONS:
-            walls += [walls_of(term, problem, contact, pass_of(contact)) for contact in term.contacts(problem)]
-        elif isinstance(term, LaggedFriction) and type(term) in FRICTIONS:
-            grips += [_grip(term, problem, contact, pass_of(contact)) for contact in term.contacts(problem)]
+    for term in having(potential.active(problem), *VERTEX_FORMS).values():
+        found = term.closed_form(problem, pass_of if compiled else None)
+        if term.form is Form.MASS:
+            inertia = inertia + found
+        elif term.form is Form.WEIGHT:
+            weight = weight + found
+        elif term.form is Form.PLANES:
+            walls += found
+        else:
+            grips += found
     return VertexForces(inertia[:, None], inertia / problem.vertex_dt.squeeze(1) ** 2, weight, tuple(walls), tuple(grips))
-
-
-def walls_of(term: Collision, problem: StepProblem, contact: Contact, compiled: ContactPass | None = None) -> Walls:
-    """The planes of a collision term at one of its contacts, by the ``compiled`` pass where there is one."""
-    if compiled is not None and type(term) is Collision:
-        return Walls(term.weight, *compiled.planes(term))
-    planes = term.planes(problem, contact)
-    reach = torch.where(planes.touching, term.reaches(problem, contact), 0.0)
-    return Walls(term.weight, planes.point, planes.normal, reach)
-
-
-def _grip(term: LaggedFriction, problem: StepProblem, contact: Contact, compiled: ContactPass | None) -> Grip:
-    if compiled is not None and type(term) is Friction:
-        normal, anchor, force, limit = compiled.grips(term)
-        return Grip(force, normal, anchor, limit)
-    force = term.greatest(problem, contact)
-    # Rows without a match may hold infinite or undefined numbers.
-    sliding = (force > 0)[:, None]
-    carried, normal = term.carrier(contact)
-    anchor = problem.state.pos + torch.where(sliding, carried, 0.0)
-    limit = term.slip_speed * problem.vertex_dt.squeeze(1)
-    return Grip(force, torch.where(sliding, normal, 0.0), anchor, limit)
 
 
 def _slope(grip: Grip, pos: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Slip (N, 3) [m], its size (N,) and the force along it in units of it (N,) [N/m]."""
     slip = grip.slip(pos)
-    size = _rows(slip, slip).sqrt()
+    size = dot_rows(slip, slip).sqrt()
     return slip, size, grip.force * slip_slope(size, grip.limit)
 
 
@@ -242,7 +170,7 @@ def known_forces(potential: Potential, problem: StepProblem) -> VertexForces:
 @torch.no_grad()
 def known(potential: Potential, problem: StepProblem) -> KnownForces:
     """The same, with the terms that they are of."""
-    key, terms = id(problem), {name: term for name, term in potential.terms.items() if type(term) in SINGLE}
+    key, terms = id(problem), having(potential.terms, *VERTEX_FORMS)
     last = _KNOWN.get(key)
     if last is None or last.problem() is not problem or not _same(last.terms, terms):
         found, names = vertex_forces(potential, problem, compiled=True), _names(potential.only(terms).active(problem), problem)
@@ -256,14 +184,13 @@ def _same(terms: Mapping[str, Term], others: Mapping[str, Term]) -> bool:
 
 def _names(terms: Mapping[str, Term], problem: StepProblem) -> list[str] | None:
     """Names of terms in the order of :meth:`VertexForces.energies`, "" for none; None where two share a place."""
-    inertia, gravity = ([name for name, term in terms.items() if isinstance(term, kind)] for kind in (Inertia, Gravity))
+    inertia, gravity = ([*having(terms, form)] for form in (Form.MASS, Form.WEIGHT))
     if max(len(inertia), len(gravity)) > 1:
         return None
     names = [(inertia or [""])[0], (gravity or [""])[0]]
-    for kinds in (COLLISIONS, FRICTIONS):
-        for name, term in terms.items():
-            if isinstance(term, (Collision, LaggedFriction)) and isinstance(term, kinds):
-                names += [name] * len(term.contacts(problem))
+    for form in (Form.PLANES, Form.GRIPS):
+        for name, term in having(terms, form).items():
+            names += [name] * len(term.contacts(problem))
     return names
 
 
@@ -299,8 +226,8 @@ def split(potential: Potential) -> tuple[Potential, Potential]:
     """The terms that act on single vertices alone, and the others."""
     single = {
         name: term
-        for name, term in potential.terms.items()
-        if type(term) in SINGLE and getattr(term, "contact", "vertices") == "vertices"
+        for name, term in having(potential.terms, *VERTEX_FORMS).items()
+        if getattr(term, "contact", "vertices") == "vertices"
     }
     return potential.only(single), potential.only({n: term for n, term in potential.terms.items() if n not in single})
 
@@ -329,26 +256,14 @@ def _single(
     return energies, gradient
 
 
-def attachment_stiffness(term: Term, problem: StepProblem) -> Tensor:
-    """Spring constants [N/m] (A,) of the step's attachments, 0 where open."""
-    attachments = problem.step.attachments
-    assert attachments is not None
-    assert isinstance(term, Attachment)
-    return term.stiffness * attachments.active.to(problem.state.pos.dtype)
-
-
 def terms_without_form(potential: Potential, problem: StepProblem) -> Potential | None:
     """The terms that have no closed form here and play a role in the problem; None without any."""
     active = potential.active(problem)
-    others = {name: term for name, term in active.items() if type(term) not in CLOSED_FORM}
-    if not any(type(term) is Stretching for term in active.values()):  # the two share a closed form
-        others |= {name: term for name, term in active.items() if type(term) is StretchDamping}
+    known = having(active, *MATRIX_FORMS)
+    if not having(active, Form.MEMBRANE):  # the two share a closed form
+        known = {name: term for name, term in known.items() if term.form is not Form.MEMBRANE_DAMPING}
+    others = {name: term for name, term in active.items() if name not in known}
     return potential.only(others) if others else None
-
-
-def _rows(a: Tensor, b: Tensor) -> Tensor:
-    """Products (N,) of rows (N, 3); a sum over so short an axis would be slow."""
-    return torch.mv(a * b, a.new_ones(3))
 
 
 def _outer(a: Tensor, b: Tensor) -> Tensor:

@@ -10,11 +10,10 @@ import torch
 from torch import Tensor
 
 from hood.cloth.cloth import Cloth
-from hood.energies.contact import Collision
-from hood.energies.laws import contact_depth
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem, inertial_guess
 from hood.energies.self_contact import without_layers
+from hood.energies.term import Role, having
 from hood.mesh.cloth_proximity import EASED
 from hood.solver.derivatives.self_contact import approached, eased, layers_of, limits
 from hood.solver.derivatives.step_terms import StepTerms
@@ -137,11 +136,8 @@ def projected_guess(potential: Potential, problem: StepProblem, falls: bool = Tr
     cloth, dt = problem.cloth, problem.vertex_dt
     gravity = problem.gravity.to(dt)
     guess = inertial_guess(problem.state, problem.step, cloth.vertex_scene) + (dt**2 * gravity if falls else 0.0)
-    term = next((term for term in potential.terms.values() if isinstance(term, Collision)), None)
-    if problem.contact is not None and term is not None and term.weight > 0:
-        carried = contact_depth(term.weight, cloth.mass * gravity.norm())
-        depth, normal = term.depth(problem, problem.contact, guess)
-        guess = guess + (depth - carried).clamp_min(0.0)[:, None] * normal
+    for term in list(having(potential.terms, Role.CONTACT).values())[:1]:
+        guess = term.out_of_contact(problem, guess)
     return torch.where(cloth.free.unsqueeze(1), guess, fixed_positions(problem))
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from hood.energies.contact import Walls
 from hood.energies.laws import contact_push
 from hood.solver.derivatives.points import PointForces
-from hood.solver.derivatives.vertices import Walls
 from hood.solver.system.iterate import Iterate, Unknowns
 
 ARMIJO = 1e-4

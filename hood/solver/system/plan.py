@@ -137,7 +137,7 @@ class ModelBuilder:
     def __call__(self, pos: Tensor, acc: Tensor) -> QuadraticModel:
         """The model at ``pos`` (V, 3) reached with ``acc`` (V, 3)."""
         terms, plan = self.terms, self.plan
-        vertices = terms.vertices.model(pos, acc)
+        vertices = terms.vertex_model(pos, acc)
         gradient = vertices.gradient
         self._vertices.copy_(vertices.matrix.view(-1))
         if vertices.indefinite_part is not None:

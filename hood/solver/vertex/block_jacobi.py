@@ -11,12 +11,11 @@ from torch import Tensor
 from torch.nn import functional
 
 from hood.cloth.cloth import Cloth
-from hood.energies.inertia import Inertia
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem
+from hood.energies.term import MATRIX_FORMS, Form, form_of, having
 from hood.solver.derivatives.elements import FaceModel
 from hood.solver.derivatives.step_terms import StepTerms
-from hood.solver.derivatives.vertices import CLOSED_FORM
 from hood.solver.system.linear import invert_blocks
 from hood.solver.vertex.cg_step import STEPS, PositiveMatrix, global_step
 from hood.tensors.conjugate_gradients import Steps
@@ -49,7 +48,7 @@ class LocalTerms:
         """The view at positions (V, 3)."""
         terms, cloth = self.terms, self.problem.cloth
         acc = self.problem.acceleration(pos)
-        own = terms.vertices.model(pos, acc)
+        own = terms.vertex_model(pos, acc)
         gradient, matrix = own.gradient, own.matrix
         faces, hinges = terms.faces(pos), terms.hinges(pos)
         if faces is not None or hinges:
@@ -94,12 +93,12 @@ def check_local(potential: Potential) -> None:
     """Raise ValueError where local steps of ``potential`` are not known: they take second derivatives of every term, and a
     positive one of every vertex, which inertia alone is sure to have."""
     for name, term in potential.terms.items():
-        if type(term) not in CLOSED_FORM:
+        if form_of(term) not in MATRIX_FORMS:
             raise ValueError(
                 f"losses.terms.{name} is a {type(term).__name__}: its second derivatives are not written out "
                 f"(hood/solver/derivatives/vertices.py, elements.py), and what single vertices would do about it is not known"
             )
-    if not any(type(term) is Inertia for term in potential.terms.values()):
+    if not having(potential.terms, Form.MASS):
         raise ValueError("losses.terms: no inertia, without which what single vertices would do is not determined")
 
 

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from hood.cloth.cloth import Cloth
 from hood.cloth.state import Attachments
+from hood.energies.contact import Walls
 from hood.energies.laws import contact_balance, contact_force
 from hood.energies.potential import Potential, relative_gradient
 from hood.energies.problem import StepProblem
@@ -23,7 +24,7 @@ from hood.solver.derivatives import elements
 from hood.solver.derivatives.elements import Corners, FaceConstants, HingeConstants
 from hood.solver.derivatives.points import PointForces
 from hood.solver.derivatives.step_terms import StepTerms
-from hood.solver.derivatives.vertices import VertexForces, Walls
+from hood.solver.derivatives.vertices import VertexForces
 from hood.solver.step_figures import MOST_ITERATIONS, NO_PROGRESS, NOT_FINITE, STOPPED
 from hood.solver.system.iterate import Iterate, Proceed, Progress, Unknowns, first_iterate, in_double, rounded
 from hood.solver.system.linear import invert_blocks
@@ -282,6 +283,9 @@ def vertex_systems(
     forces = group.forces if contact else group.forces.without_walls()
     model = forces.model(pos[rows], acc[rows])
     gradient, matrix = model.gradient, model.matrix
+    for form in terms.blocks:
+        slope, bound = form.derivatives(pos)
+        gradient, matrix = gradient + slope[rows], matrix + bound[rows]
     other = terms.other_gradient(pos, acc)
     if other is not None:
         gradient = gradient + other[rows]
@@ -304,8 +308,8 @@ def _around(terms: StepTerms, group: Neighbourhood, pos: Tensor) -> Iterator[tup
     if terms.bendings:
         x, own = group.hinge_corners(pos), colour.hinges.own
         each = torch.arange(len(own), device=own.device)
-        for term in terms.bendings:
-            slope, row = elements.hinge_model(term, x, group.hinge_constants)
+        for form in terms.bendings:
+            slope, row = elements.hinge_model(form, x, group.hinge_constants)
             row = row[own, :, each].t()
             block = row.new_empty(6, len(own))
             elements.outer_upper(row, block)

@@ -15,8 +15,7 @@ from hood.contact.contact import SecondContact, find_contact, find_fixed_contact
 from hood.contact.second_side import find_second_side
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem, free_flight
-from hood.energies.term import PreparedTerm
-from hood.energies.wind import Wind
+from hood.energies.term import Energy, prepared
 from hood.mesh.closest_point.search import Incidence, build_incidence
 
 _Item = TypeVar("_Item")
@@ -49,12 +48,12 @@ def settled_potential(potential: Potential, problem: StepProblem) -> Potential:
     """
     with_contact = problem.with_fold()
     for name, term in potential.terms.items():
-        if isinstance(term, Wind) and term.gusts > 0:
+        if isinstance(term, Energy) and term.varies_in_time():
             raise ValueError(
                 f"losses.terms.{name} has gusts, which are another in every step and place; steps of fixed shapes have no form "
                 "of that: use step=plain, or gusts=0"
             )
-        if isinstance(term, PreparedTerm) and term.prepare(with_contact) is not with_contact:
+        if prepared(term, with_contact) is not with_contact:
             raise ValueError(
                 f"losses.terms.{name} is a {type(term).__name__}, which searches for more than contact with the body's "
                 "surface; steps of fixed shapes have no form of that: use step=plain"

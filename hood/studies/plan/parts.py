@@ -12,7 +12,7 @@ from hood.app.stepping.cloth_contact import acts
 from hood.app.stepping.refinement import chosen, other_refinement_keys
 from hood.app.stepping.steppers import losses_of
 from hood.assets.files.library import unknown
-from hood.energies.contact import Collision
+from hood.energies.term import Role, role_of
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def _folds(config: DictConfig) -> bool:
 
 def _collision(config: DictConfig, key: str, value: str) -> bool:
     term = losses_of(config).terms.get("collision")
-    return isinstance(term, Collision) and getattr(term, key, None) == value
+    return term is not None and role_of(term) is Role.CONTACT and getattr(term, key, None) == value
 
 
 def _iterations(config: DictConfig) -> int:

@@ -9,7 +9,7 @@ import torch
 from hood.assets.material import Material
 from hood.cloth.cloth import build_cloth
 from hood.energies.contact import Collision
-from hood.energies.inertia import Gravity, Inertia
+from hood.energies.mass_points import Gravity, Inertia
 from hood.energies.membrane import Stretching
 from hood.energies.potential import Potential, default_potential
 from hood.energies.problem import StepProblem

@@ -15,7 +15,7 @@ from hood.assets.files.library import locate
 from hood.assets.garment.garment import Garment
 from hood.assets.motion.sequence import PoseSequence
 from hood.cloth.state import Attachments
-from hood.energies.inertia import Gravity
+from hood.energies.mass_points import Gravity
 from hood.energies.potential import Potential, default_potential, reference_potential
 from hood.energies.problem import StepProblem
 from hood.mesh.closest_point import tree
