@@ -27,8 +27,7 @@ from layer_scenes import SCENES
 
 from hood.energies.potential import Potential, default_potential
 from hood.energies.problem import StepProblem
-from hood.energies.self_contact import LayerBarrier
-from hood.energies.self_friction import LayerFriction
+from hood.energies.self_contact import LayerBarrier, LayerFriction
 from hood.media.pieces import outfit_colours
 from hood.media.renderer.camera import Camera
 from hood.media.renderer.render import BODY_COLOR, Picture, RenderMesh, contact_sheet, render_frame

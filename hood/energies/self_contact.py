@@ -1,22 +1,215 @@
-"""Barrier between layers of cloth: of one garment folded on itself, and of garments over each other.
+"""Energies between layers of cloth: of one garment folded on itself, and of garments over each other.
 
-Penalty that keeps cloth on the side of other cloth that it is on at t: a signal for training, and for taking apart.
+A barrier that keeps layers apart, Coulomb friction between them as a lagged potential, and a penalty that keeps cloth on the
+side of other cloth that it is on at t: a signal for training, and for taking apart.
 """
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from hood.contact.self_contact import SceneLayers
-from hood.energies.laws import contact_energy
+from hood.energies.friction import ballistic_position
+from hood.energies.laws import contact_energy, mollified_norm
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem, sum_per_scene
-from hood.energies.self_friction import fading
 from hood.energies.term import LAYER_FORMS, Energy, Form, Passes, Role, Term, having
+from hood.mesh.cloth_proximity import Contacts, library
+from hood.native.arguments import COUNT, POINTER, fields
+
+
+@dataclass(frozen=True)
+class LayerGrips:
+    """N pairs of features that grip each other during a step."""
+
+    corners: Tensor  # (N, 4) vertices
+    weights: Tensor  # (N, 4), of the corners in the gap between the nearest points at t; their sum is 0
+    normal: Tensor  # (N, 3), along the gap
+    force: Tensor  # (N,) N, the coefficient included
+    limit: Tensor  # (N,) m, slip below which they count as sticking
+    scene: Tensor  # (N,)
+
+    def slip(self, pos: Tensor) -> Tensor:
+        """Tangential motion (N, 3) [m] since t of the nearest points relative to each other, at ``pos`` (V, 3)."""
+        moved = (self.weights.unsqueeze(2) * pos[self.corners]).sum(dim=1)  # at t it is along the normal
+        return moved - _dot(moved, self.normal).unsqueeze(1) * self.normal
+
+
+class LayerFriction(Energy):
+    """Friction energy [J] between layers, the sum over pairs of features of μ N f(‖u_T‖).
+
+    The pairs are those within the reach of :class:`hood.energies.self_contact.LayerBarrier` at t, u_T is the tangential motion
+    from t to t+1 of their nearest points relative to each other, f the law of slip of
+    :class:`hood.energies.friction.LaggedFriction`. N is the barrier's force at t, but no more than either side can bring during
+    the step,
+
+        P = m/dt² max(r - d̂, 0) + L,
+
+    with m the side's mass at the pair, d̂ the distance at t+1 if both sides flew under their weight, and L what the cloth around
+    the side and the layers behind it press it on with at t. Vertices share m and L among their pairs by the load of these. A
+    side that is held, or lies on the body, can bring anything. Layers that lie still are pressed with exactly N.
+
+    No net force: a pair pulls its sides by as much, in opposite directions. These act as far apart as the layers are, at most
+    the reach, which leaves that couple.
+
+    Args:
+        coefficient: μ.
+        slip_speed: speed [m/s] below which friction counts as static.
+    """
+
+    kind: ClassVar[str] = "LayerFriction"
+    role = Role.SELF_FRICTION
+    form = Form.PAIRS
+
+    def __init__(self, coefficient: float = 0.5, slip_speed: float = 5e-3) -> None:
+        if coefficient < 0 or slip_speed <= 0:
+            raise ValueError(
+                f"layer friction: coefficient is {coefficient}, slip_speed {slip_speed}; "
+                "give coefficient >= 0 and slip_speed > 0"
+            )
+        self.coefficient, self.slip_speed = coefficient, slip_speed
+
+    def prepare(self, problem: StepProblem) -> StepProblem:
+        """The problem with the pairs that are near each other at t.
+
+        Raises:
+            ValueError: no term before this one has searched for layers.
+        """
+        if self.coefficient == 0:
+            return problem
+        if not problem.layers:
+            raise ValueError("layer friction: no layers are searched for; add a LayerBarrier to the potential, before it")
+        return problem.with_layers_at_start()
+
+    def applies(self, problem: StepProblem) -> bool:
+        return self.coefficient > 0 and any(len(_lagged(scene).corners) > 0 for scene in problem.layers)
+
+    def __call__(self, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> Tensor:
+        """Energy [J] (B,) at ``next_pos`` (V, 3)."""
+        grips = self.grips(problem)
+        slip = grips.slip(next_pos.to(grips.weights))
+        energy = grips.force * mollified_norm(_dot(slip, slip), grips.limit)
+        return sum_per_scene(energy, grips.scene, problem.num_scenes)
+
+    @torch.no_grad()
+    def grips(self, problem: StepProblem) -> LayerGrips:
+        """What grips what during the step; the problem must have been prepared."""
+        pairs = _pairs(problem)
+        force = self.coefficient * torch.minimum(pairs.force, _pressing(problem, pairs))
+        limit = self.slip_speed * problem.step.dt.to(force)[pairs.scene]
+        return LayerGrips(pairs.corners, pairs.weights, pairs.normal, force, limit, pairs.scene)
+
+    def needs_internal_force(self, problem: StepProblem) -> bool:
+        return self.applies(problem)
+
+    def closed_form(self, problem: StepProblem, passes: Passes | None = None) -> LayerGrips:
+        return self.grips(problem)
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    """N pairs near each other at t, of a whole batch, in float64."""
+
+    corners: Tensor  # (N, 4)
+    weights: Tensor  # (N, 4)
+    edges: Tensor  # (N,) bool, two edges
+    normal: Tensor  # (N, 3), from the second side to the first
+    force: Tensor  # (N,) N, of the barrier
+    reach: Tensor  # (N,) m
+    scene: Tensor  # (N,)
+
+
+def _lagged(scene: SceneLayers) -> Contacts:
+    if scene.at_start is None:
+        raise ValueError("layer friction: pairs not searched for yet; pass the problem through Potential.prepare once")
+    return scene.at_start
+
+
+def _pairs(problem: StepProblem) -> _Pairs:
+    pos = problem.state.pos.double()
+    parts = [_scene_pairs(scene, pos, index) for index, scene in enumerate(problem.layers)]
+    return _Pairs(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
+
+
+def _scene_pairs(scene: SceneLayers, pos: Tensor, index: int) -> tuple[Tensor, ...]:
+    found = _lagged(scene)
+    device = pos.device
+    corners = torch.as_tensor(found.corners + scene.first, device=device)
+    weights = torch.as_tensor(found.weights, device=device)
+    edges = torch.as_tensor(found.edges, device=device)
+    x = pos[corners]
+    gap = (weights.unsqueeze(2) * x).sum(dim=1)
+    dist = torch.linalg.vector_norm(gap, dim=1).clamp_min(1e-12)
+    reach, area, parallel = (torch.as_tensor(values, device=device) for values in (found.reach, found.area, found.parallel))
+    force = scene.layers.pressure * area * barrier_force(dist / reach)
+    cross = torch.linalg.cross(x[:, 1] - x[:, 0], x[:, 3] - x[:, 2])
+    force = torch.where(edges, force * fading(_dot(cross, cross), parallel), force)
+    return corners, weights, edges, gap / dist.unsqueeze(1), force, reach, torch.full_like(corners[:, 0], index)
+
+
+def barrier_force(share: Tensor) -> Tensor:
+    """-b'(s) for distances s = ``share`` (N,) in units of the reach, of the barrier b(s) = -(1 - s)² ln s."""
+    rest = 1.0 - share
+    return rest * (rest / share - 2.0 * share.log())
+
+
+def fading(square: Tensor, parallel: Tensor) -> Tensor:
+    """Share (N,) of the barrier of two edges the ``square`` of whose cross product is below ``parallel``; 1 for others."""
+    ratio = torch.where(parallel > 0, square / torch.where(parallel > 0, parallel, 1.0), 1.0).clamp_max(1.0)
+    return ratio * (2.0 - ratio)
+
+
+class _Pressing(ctypes.Structure):
+    """``LayerPressing`` of ``layer_pressing.h``."""
+
+    _fields_ = [
+        *fields("count num_vertices", COUNT),
+        *fields("corners edges weights normal force reach inertia there pull backed", POINTER),
+    ]
+
+
+def _pressing(problem: StepProblem, pairs: _Pairs) -> Tensor:
+    """P [N] (N,), of the side that can bring less; ``hood/native/layer_pressing.h``."""
+    cloth = problem.cloth
+    there = torch.where(cloth.free.unsqueeze(1), ballistic_position(problem), _held(problem))
+    inertia = cloth.mass.double() / problem.vertex_dt.squeeze(1).double() ** 2
+    vectors = (pairs.weights, pairs.normal, pairs.force, pairs.reach, inertia, there)
+    arrays = [np.ascontiguousarray(values.cpu().numpy(), np.int64) for values in (pairs.corners, pairs.edges)]
+    arrays += [np.ascontiguousarray(values.double().cpu().numpy()) for values in vectors]
+    pull = None if problem.internal_force is None else np.ascontiguousarray(problem.internal_force.double().cpu().numpy())
+    backed = np.ascontiguousarray((~cloth.free | _on_body(problem)).cpu().numpy(), np.uint8)
+    pointers = [array.ctypes.data for array in arrays] + [None if pull is None else pull.ctypes.data, backed.ctypes.data]
+    pressing = np.empty(len(pairs.force))
+    library().layers_pressing(ctypes.byref(_Pressing(len(pressing), len(there), *pointers)), pressing.ctypes.data)
+    return torch.from_numpy(pressing).to(pairs.force.device)
+
+
+def _held(problem: StepProblem) -> Tensor:
+    target = problem.step.pin_target
+    return problem.state.pos if target is None else torch.where(problem.cloth.pinned.unsqueeze(1), target, problem.state.pos)
+
+
+def _on_body(problem: StepProblem) -> Tensor:
+    """Vertices (V,) bool that the body may press on."""
+    contact = problem.contact
+    if contact is None:
+        return torch.zeros_like(problem.cloth.free)
+    return contact.valid & (contact.dist < _TOUCH)
+
+
+#: Distance [m] from the body below which it may carry cloth: where contact sets in at most.
+_TOUCH = 1e-2
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    return (a * b).sum(dim=1)
 
 
 class SignedSelfContactPenalty(Energy):

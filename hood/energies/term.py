@@ -46,9 +46,9 @@ class Form(Enum):
     MEMBRANE_DAMPING = "membrane_damping"  # s, retardation time of the membrane
     HINGES = "hinges"  # hood.energies.bending.HingeForm
     SPRINGS = "springs"  # (A,) N/m, of the step's attachments
-    BLOCKS = "blocks"  # BlockForm: any energy with a bound on its curvature
+    BLOCKS = "blocks"  # BlockForm: any energy, with a bound on its curvature by vertices; the solver then runs in torch
     LAYERS = "layers"  # True: the barrier between layers of cloth
-    PAIRS = "pairs"  # hood.energies.self_friction.LayerGrips
+    PAIRS = "pairs"  # hood.energies.self_contact.LayerGrips
 
 
 #: Forms that act on single vertices, those of the solver's matrix, and those that add to it beside its pattern.
@@ -65,8 +65,8 @@ class BlockForm(Protocol):
         ...
 
     def derivatives(self, pos: Tensor) -> tuple[Tensor, Tensor]:
-        """Gradient [N] (V, 3) and one symmetric matrix [N/m] (V, 3, 3) a vertex, positive semi-definite: together no less than
-        the second derivative there, so that a step does not overshoot."""
+        """Gradient [N] (V, 3) and one symmetric matrix [N/m] (V, 3, 3) a vertex, positive semi-definite: a bound on the second
+        derivative where steps would overshoot without, 0 where other energies are stiffer."""
         ...
 
 

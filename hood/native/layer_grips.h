@@ -1,4 +1,4 @@
-// Friction between layers of cloth, found at the start of a step: see hood/energies/self_friction.py.
+// Friction between layers of cloth, found at the start of a step: see hood/energies/self_contact.py.
 #pragma once
 #include <cmath>
 #include <cstdint>

@@ -1,4 +1,4 @@
-// What presses pairs of features of cloth onto each other in a step: see hood/energies/self_friction.py.
+// What presses pairs of features of cloth onto each other in a step: see hood/energies/self_contact.py.
 #pragma once
 #include <algorithm>
 #include <cmath>

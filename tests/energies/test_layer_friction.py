@@ -13,8 +13,7 @@ from hood.assets.material import Material
 from hood.cloth.cloth import build_cloth, concatenate_cloths
 from hood.energies.potential import Potential, default_potential
 from hood.energies.problem import StepProblem
-from hood.energies.self_contact import LayerBarrier, without_layers
-from hood.energies.self_friction import LayerFriction, barrier_force
+from hood.energies.self_contact import LayerBarrier, LayerFriction, barrier_force, without_layers
 from hood.solver.newton import NewtonSettings, minimize
 from hood.steppers.newton import implicit_euler
 from hood.testing import grid, make_problem

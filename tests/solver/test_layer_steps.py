@@ -14,8 +14,7 @@ from hood.cloth.state import concatenate_states, concatenate_step_inputs
 from hood.energies.contact import Collision
 from hood.energies.potential import Potential, default_potential
 from hood.energies.problem import StepProblem
-from hood.energies.self_contact import LayerBarrier
-from hood.energies.self_friction import LayerFriction
+from hood.energies.self_contact import LayerBarrier, LayerFriction
 from hood.mesh.penetration.crossing import self_crossings
 from hood.solver.newton import NewtonSettings, minimize
 from hood.solver.vertex.gauss_seidel import sweep

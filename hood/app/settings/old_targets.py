@@ -19,7 +19,7 @@ _MOVED = {
     "hood.losses.friction": "hood.energies.friction",
     "hood.losses.gravity": "hood.energies.mass_points",
     "hood.losses.inertia": "hood.energies.mass_points",
-    "hood.losses.layer_friction": "hood.energies.self_friction",
+    "hood.losses.layer_friction": "hood.energies.self_contact",
     "hood.losses.layer_sides": "hood.energies.self_contact",
     "hood.losses.layers": "hood.energies.self_contact",
     "hood.losses.potential": "hood.energies.potential",

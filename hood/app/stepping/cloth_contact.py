@@ -14,8 +14,7 @@ from hood.app.settings.compose import ConfigError, plain, require_choice
 from hood.app.stepping.refinement import chosen
 from hood.app.stepping.steppers import MAY, losses_of, option_of
 from hood.energies.potential import Potential
-from hood.energies.self_contact import LayerBarrier
-from hood.energies.self_friction import LayerFriction
+from hood.energies.self_contact import LayerBarrier, LayerFriction
 from hood.energies.term import Role, Term, having
 from hood.mesh import cloth_proximity
 from hood.native.build import BuildError

@@ -25,7 +25,7 @@ from hood.energies.mass_points import attachment_targets
 from hood.energies.membrane import green_strain
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem, inertial_guess
-from hood.energies.self_friction import LayerGrips
+from hood.energies.self_contact import LayerGrips
 from hood.energies.term import LAYER_FORMS, Form, having
 from hood.mesh.geometry import dihedral_angles
 from hood.native.arguments import COUNT, POINTER, REAL, fields

@@ -13,7 +13,7 @@ from hood.cloth.cloth import Cloth
 from hood.contact.self_contact import SceneLayers
 from hood.energies.potential import Potential
 from hood.energies.problem import STANDARD_GRAVITY, StepProblem
-from hood.energies.self_friction import LayerGrips
+from hood.energies.self_contact import LayerGrips
 from hood.mesh.cloth_proximity import EASED, LEFT
 from hood.native.arguments import POINTER, num_parts
 from hood.native.build import BuildError

@@ -17,8 +17,7 @@ from hood.contact.self_contact import SceneLayers
 from hood.energies.laws import slip_slope
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem
-from hood.energies.self_contact import has_layers
-from hood.energies.self_friction import LayerGrips
+from hood.energies.self_contact import LayerGrips, has_layers
 from hood.energies.term import Form, having
 
 

@@ -15,7 +15,7 @@ from hood.cloth.state import Attachments
 from hood.contact.self_contact import SceneLayers
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem
-from hood.energies.self_friction import LayerGrips
+from hood.energies.self_contact import LayerGrips
 from hood.solver.derivatives import elements
 from hood.solver.derivatives.points import PointBlocks, point_blocks
 from hood.solver.derivatives.self_contact import LayerRows, layer_rows

@@ -24,8 +24,7 @@ from hood.assets.motion.sequence import PoseSequence
 from hood.cli.main import main
 from hood.energies.contact import Collision
 from hood.energies.potential import coded_potential, default_potential
-from hood.energies.self_contact import LayerBarrier, SignedSelfContactPenalty
-from hood.energies.self_friction import LayerFriction
+from hood.energies.self_contact import LayerBarrier, LayerFriction, SignedSelfContactPenalty
 from hood.scene.scene import Scene, build_scene
 from hood.solver.newton import NewtonSettings
 from hood.steppers.checkpoint import load_simulator, save_simulator
