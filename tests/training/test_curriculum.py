@@ -95,7 +95,7 @@ def test_a_contact_of_another_package_keeps_its_own_weight_if_it_says_so() -> No
     applied = ramp.apply(potential, 0)
     assert applied.terms["collision"] is potential.terms["collision"]
     assert applied.terms["friction"].weight == 1e3  # type: ignore[attr-defined]
-    with pytest.raises(ValueError, match=r"terms\.collision \(hood\.energies\.inertia\.Gravity\).*no method with_weight"):
+    with pytest.raises(ValueError, match=r"terms\.collision \(hood\.energies\.mass_points\.Gravity\).*no method with_weight"):
         ramp.require_its_weight(potential.with_terms(collision=Gravity()))
 
 
