@@ -46,7 +46,7 @@ class Form(Enum):
     MEMBRANE_DAMPING = "membrane_damping"  # s, retardation time of the membrane
     HINGES = "hinges"  # hood.energies.bending.HingeForm
     SPRINGS = "springs"  # (A,) N/m, of the step's attachments
-    BLOCKS = "blocks"  # BlockForm: any energy, with a bound on its curvature by vertices; the solver then runs in torch
+    BLOCKS = "blocks"  # BlockForm: any energy, with a bound on its curvature by vertices
     LAYERS = "layers"  # True: the barrier between layers of cloth
     PAIRS = "pairs"  # hood.energies.self_contact.LayerGrips
 

@@ -49,6 +49,14 @@ struct Points {
     double* path;   // (W, N, 14) of the line search: give of the corners, compliance, depth, 1 where it acts, push
 };
 
+// Energies that the caller computes: J at positions (V, 4), and of free vertices, where ``model`` was called last, gradient (N, 3)
+// and upper triangles of a positive block (N, 6).
+struct OtherTerms {
+    double (*energy)(const double* pos);
+    void (*model)(const double* pos);
+    const double *gradient, *own;
+};
+
 struct Engine {
     // The cloth: constant as long as its plan.
     int64_t num_vertices, num_rows, num_faces, num_hinges, num_blocks, num_springs, most_blocks;  // elements padded to a multiple of 8
@@ -101,6 +109,7 @@ struct Engine {
     double kept;                     // share of a distance that a move leaves
     double eased;                    // share of a move below which it is bent around cloth
     const LayerGrips* layer_grips;   // friction between them; none where there is no such term
+    const OtherTerms* others;        // none where this file knows every term
 };
 }
 
@@ -524,6 +533,11 @@ inline void add_layer_grips(const Engine& e, int64_t row, double* gradient, doub
     for (int k = 0; k < 6; ++k) upper[k] += grips.own[6 * row + k], indefinite_part[k] += grips.own_indefinite_part[6 * row + k];
 }
 
+inline void add_others(const OtherTerms& others, int64_t row, double* gradient, double* upper) {
+    for (int k = 0; k < 3; ++k) gradient[k] += others.gradient[3 * row + k];
+    for (int k = 0; k < 6; ++k) upper[k] += others.own[6 * row + k];
+}
+
 // Adds the blocks beside the diagonal to q = H p; returns their p . q.
 template <class T> double couple_layers(const Engine& e) {
     typedef typename Four<T>::type V4;
@@ -624,6 +638,7 @@ void energy(const Engine& e, const double* pos, const double* acc, double* phi, 
     if (e.num_springs) add(springs);
     if (e.layers) add(energy_of_layers(e, pos));
     if (e.layer_grips) add(layer_grip_energy(*e.layer_grips, pos));
+    if (e.others) add(e.others->energy(pos));
     *phi = sum;
     *noise = 8.0 * 2.220446049250313e-16 * size;
 }
@@ -650,6 +665,7 @@ template <class T> void gather_gradient(const Engine& e, Range range, bool near)
         add_points(e, row, gradient, upper, indefinite_part);
         if (near) add_layers(e, row, gradient, upper);
         if (e.layer_grips) add_layer_grips(e, row, gradient, upper, indefinite_part);
+        if (e.others) add_others(*e.others, row, gradient, upper);
         D4 force = D4{gradient[0], gradient[1], gradient[2], 0.0};
         if (e.membrane) force += pull_of<3>(e.face_force, 10, e.face_starts, e.face_uses, row);
         if (e.bending) force += pull_of<4>(e.hinge_force, 14, e.hinge_starts, e.hinge_uses, row);
@@ -792,6 +808,7 @@ template <class T> void differentiate(const Engine& e) {
     });
     const bool near = model_layers(e);
     if (e.layer_grips) model_layer_grips(*e.layer_grips, e.num_vertices, e.pos);
+    if (e.others) e.others->model(e.pos);
     for_parts(e.parts, [&](int64_t part) { gather_gradient<T>(e, rows_of(e, part), near); });
 }
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from hood.energies.potential import Potential, relative_gradient
 from hood.energies.problem import StepProblem
 from hood.energies.self_contact import without_layers
-from hood.energies.term import Form, Role, having
+from hood.energies.term import Role, having
 from hood.native.build import BuildError
 from hood.solver.compiled import newton as compiled_newton
 from hood.solver.compiled.system import CompiledSystem
@@ -246,11 +246,6 @@ def system_of(
             if settings.engine == "compiled":
                 raise BuildError(f"solver.engine=compiled: {error} or use solver.engine=torch") from error
             _say_once(f"the solver runs in torch, about six times slower than compiled: {error}")
-    elif settings.engine != "torch":
-        for name in having(potential.active(problem), Form.BLOCKS):
-            _say_once(
-                f"the solver runs in torch, about six times slower than compiled, which does not know losses.terms.{name}"
-            )
     return TorchSystem(potential, problem, plan, settings)
 
 

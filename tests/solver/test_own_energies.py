@@ -120,3 +120,32 @@ def test_what_a_plugin_leaves_out_has_its_defaults(sliding: StepProblem) -> None
         assert one is not None
         torch.testing.assert_close(one, other, rtol=0, atol=0)
     assert float((found[0][0] - default_potential().prepare(sliding).internal_force).abs().max()) > 0.5  # it presses, too
+
+
+class Refuses(Energy):
+    """An energy that computes nothing after its first calls."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def __call__(self, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> Tensor:
+        self.calls += 1
+        if self.calls > 3:
+            raise ZeroDivisionError("no more")
+        return 0.0 * problem.sum_vertices(next_pos[:, 0])
+
+
+@pytest.mark.parametrize("engine", ["compiled", "torch"])
+def test_what_an_energy_raises_is_raised(engine: str, sliding: StepProblem) -> None:
+    potential = default_potential().with_terms(own=Refuses())
+    with pytest.raises(ZeroDivisionError, match="no more"):
+        minimize(potential, sliding, settings=NewtonSettings(target_rg=1e-9, engine=engine))
+
+
+def test_an_energy_without_form_runs_in_the_compiled_solver(sliding: StepProblem) -> None:
+    potential = default_potential().with_terms(air=doubled(Wind((3.0, 0.0, 1.0))))
+    found, same = (
+        minimize(potential, sliding, settings=NewtonSettings(target_rg=1e-8, engine=engine))[0]
+        for engine in ("compiled", "torch")
+    )
+    torch.testing.assert_close(found, same, rtol=0.0, atol=1e-8)

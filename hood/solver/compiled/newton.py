@@ -26,7 +26,7 @@ from hood.energies.membrane import green_strain
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem, inertial_guess
 from hood.energies.self_contact import LayerGrips
-from hood.energies.term import LAYER_FORMS, Form, having
+from hood.energies.term import LAYER_FORMS, BlockForm, Form, having
 from hood.mesh.geometry import dihedral_angles
 from hood.native.arguments import COUNT, POINTER, REAL, fields
 from hood.native.build import NATIVE_FLAGS, build
@@ -71,7 +71,7 @@ class _Engine(ctypes.Structure):
         *fields("cg_used parts reach", COUNT),
         *fields("spill layers vertex_of_scene", POINTER),
         *fields("kept eased", REAL),
-        ("layer_grips", POINTER),
+        *fields("layer_grips others", POINTER),
     ]
 
 
@@ -79,6 +79,14 @@ class _LayerGrips(ctypes.Structure):
     """``LayerGrips`` of ``layer_grips.h``."""
 
     _fields_ = [("count", COUNT), *fields("corners weights normal force limit model gradient own own_indefinite_part", POINTER)]
+
+
+ENERGY = ctypes.CFUNCTYPE(REAL, POINTER)
+MODEL = ctypes.CFUNCTYPE(None, POINTER)
+
+
+class _OtherTerms(ctypes.Structure):
+    _fields_ = [("energy", ENERGY), ("model", MODEL), *fields("gradient own", POINTER)]
 
 
 @cache
@@ -100,15 +108,13 @@ def library(wide: bool = False) -> ctypes.CDLL:
 
 
 def applies(potential: Potential, problem: StepProblem) -> bool:
-    """Whether the compiled solver knows every term of the potential that plays a role in ``problem``, on a CPU."""
+    """Whether the compiled solver takes the terms of the potential that play a role in ``problem``, on a CPU."""
     active = potential.active(problem)
     hinges = [term.closed_form(problem) for term in having(active, Form.HINGES).values()]
     damped, elastic = ([form for form in hinges if (form.damping is None) == whether] for whether in (False, True))
     about_rest = not damped or (len(damped) == 1 and [form.by_length for form in elastic] == [False])
-    others = terms_without_form(potential, problem)
-    known = others is None or len(having(others.terms, *LAYER_FORMS)) == len(others.terms)
-    one = len(elastic) <= 1 and about_rest and not having(active, Form.BLOCKS)
-    return problem.state.pos.device.type == "cpu" and one and known
+    one = len(elastic) <= 1 and about_rest
+    return problem.state.pos.device.type == "cpu" and one
 
 
 @dataclass(frozen=True)
@@ -165,6 +171,7 @@ class CompiledStep:
     membrane: int  # how many such terms
     layers: tuple[SceneLayers, ...]  # one per scene, or none
     layer_grips: LayerGrips | None  # of the whole batch
+    others: tuple[BlockForm, ...]  # computed in torch
     stretch_damping: tuple[np.ndarray, np.ndarray] | None  # (F,) rates and (3, F) strains at t
     bend_damping: tuple[np.ndarray, np.ndarray] | None  # (H,) rates and (H,) angles at t
 
@@ -194,9 +201,40 @@ def compiled_step(potential: Potential, problem: StepProblem) -> CompiledStep:
         membrane=len(having(active, Form.MEMBRANE)),
         layers=layers_of(potential, problem),
         layer_grips=grips_of(potential, problem),
+        others=_others(potential, problem),
         stretch_damping=_stretch_damping(potential, problem),
         bend_damping=_bend_damping(hinges, problem),
     )
+
+
+@dataclass(frozen=True)
+class WithoutForm:
+    """Energies whose derivatives are not written out: their slope by autograd, and no curvature."""
+
+    potential: Potential
+    problem: StepProblem
+
+    def energy(self, pos: Tensor) -> Tensor:
+        """Energy [J] (B,) at ``pos`` (V, 3)."""
+        pos = pos.to(self.problem.state.pos.dtype)
+        energies = self.potential.energies(self.problem, pos, self.problem.acceleration(pos))
+        return torch.stack(list(energies.values())).sum(dim=0)
+
+    def derivatives(self, pos: Tensor) -> tuple[Tensor, Tensor]:
+        """Gradient [N] (V, 3) at ``pos`` (V, 3), and matrices (V, 3, 3) of zeros."""
+        pos = pos.to(self.problem.state.pos.dtype)
+        gradient, _ = self.potential.gradient(self.problem, pos, self.problem.acceleration(pos))
+        return gradient, pos.new_zeros(len(pos), 3, 3)
+
+
+def _others(potential: Potential, problem: StepProblem) -> tuple[BlockForm, ...]:
+    blocks = [term.closed_form(problem) for term in having(potential.active(problem), Form.BLOCKS).values()]
+    others = terms_without_form(potential, problem)
+    if others is not None:
+        layers = having(others.terms, *LAYER_FORMS)
+        unknown = {name: term for name, term in others.terms.items() if name not in layers}
+        blocks += [WithoutForm(potential.only(unknown), problem)] if unknown else []
+    return tuple(blocks)
 
 
 def _stretch_damping(potential: Potential, problem: StepProblem) -> tuple[np.ndarray, np.ndarray] | None:

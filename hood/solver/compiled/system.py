@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 from typing import Any
 
 import numpy as np
@@ -15,15 +16,18 @@ from hood.energies.potential import Potential
 from hood.energies.problem import STANDARD_GRAVITY, StepProblem
 from hood.energies.self_contact import LayerGrips
 from hood.mesh.cloth_proximity import EASED, LEFT
-from hood.native.arguments import POINTER, num_parts
+from hood.native.arguments import POINTER, REAL, num_parts
 from hood.native.build import BuildError
 from hood.solver.compiled.newton import (
     _ROWS,
+    ENERGY,
+    MODEL,
     CompiledStep,
     Fabric,
     _array,
     _Engine,
     _LayerGrips,
+    _OtherTerms,
     _Points,
     build_fabric,
     compiled_step,
@@ -43,6 +47,7 @@ class CompiledScene:
         self.tables = tables
         self.step: CompiledStep | None = None  # what was taken up last
         self._kept: dict[str, Any] = {}  # what the structure points to
+        self._others: _OtherForces | None = None
         self._fabric: tuple[tuple[Tensor | float | None, ...], Fabric] | None = None
         self.values = _Engine(
             num_vertices=len(tables.vertex),
@@ -130,6 +135,8 @@ class CompiledScene:
         self._take_damping(step)
         self._take_layers(step.layers[scene] if step.layers else None)
         self._take_layer_grips(step.layer_grips, scene, step.cloth.num_vertices)
+        self._others = _OtherForces(step, self.tables, scene) if step.others else None
+        values.others = None if self._others is None else ctypes.addressof(self._others.values)
         self.share(num_parts(values.num_rows, _ROWS))
 
     def _take_damping(self, step: CompiledStep) -> None:
@@ -176,14 +183,18 @@ class CompiledScene:
     def start(self, acc: np.ndarray) -> None:
         """Take up accelerations (V, 3) of all vertices of the cloth."""
         self._lib.newton_start(self._address, acc.ctypes.data_as(POINTER))
+        self._raise()
 
     def guess(self, mass: np.ndarray, gravity: np.ndarray) -> None:
         """Take up the better of the two first guesses; masses [kg] (V,) of the cloth, gravity (3,) m/s²."""
         self._lib.newton_guess(self._address, mass.ctypes.data_as(POINTER), gravity.ctypes.data_as(POINTER))
+        self._raise()
 
     def model(self) -> float:
         """Gradient at the state; its norm [N]."""
-        return float(self._lib.newton_model(self._address))
+        norm = float(self._lib.newton_model(self._address))
+        self._raise()
+        return norm
 
     def matrix(self, indefinite_share: float = 0.0) -> None:
         """The matrix of the model with a share of its indefinite part; a move makes its own."""
@@ -191,7 +202,9 @@ class CompiledScene:
 
     def move(self, residual: float, cg_iterations: int) -> bool:
         """Take a Newton step from a state whose model has been made; whether it led anywhere."""
-        return bool(self._lib.newton_move(self._address, residual, cg_iterations))
+        moved = bool(self._lib.newton_move(self._address, residual, cg_iterations))
+        self._raise()
+        return moved
 
     def read(self, pos: np.ndarray, acc: np.ndarray) -> None:
         """Write positions and accelerations (V, 3) of this scene's vertices into arrays of the whole cloth."""
@@ -206,11 +219,16 @@ class CompiledScene:
         """Write force [N] and local step [m] of this scene's free vertices at positions: addresses of tables (V, 3) of the
         whole cloth, in float32."""
         self._lib.newton_alone(self._address, pos, force, step)
+        self._raise()
 
     def together(self, force: int, damping: int, cg_iterations: int, step: int) -> None:
         """Write the global step [m] of the free vertices under forces [N] with the matrix where :meth:`alone` has looked and
         more on its diagonal [N/m]: addresses of tables (V, 3), (V,) and (V, 3) of the whole cloth."""
         self._lib.newton_together(self._address, force, damping, cg_iterations, step)
+
+    def _raise(self) -> None:
+        if self._others is not None and self._others.error is not None:
+            raise self._others.error
 
     def array(self, name: str) -> np.ndarray:
         """An array that the structure points to, by its name there."""
@@ -261,6 +279,49 @@ class _ScenePoints:
         for name, array in arrays.items():
             setattr(self.values, name, array.ctypes.data)
         self.values.walls, self.values.grips, self.values.drags = (ctypes.addressof(one) for one, _ in structures)
+
+
+class _OtherForces:
+    """Terms of one scene that the compiled solver asks torch for; what :attr:`values` points to lives as long.
+
+    Attributes:
+        error: what a term raised; the energy is then NaN.
+    """
+
+    def __init__(self, step: CompiledStep, tables: Tables, scene: int) -> None:
+        self._forms, self._scene, self._vertex = step.others, scene, torch.from_numpy(tables.vertex)
+        self._fixed, self._rows = torch.from_numpy(step.fixed), tables.num_rows
+        self._gradient, self._own = np.zeros((tables.num_rows, 3)), np.zeros((tables.num_rows, 6))
+        self._upper = torch.triu_indices(3, 3)
+        self.error: BaseException | None = None
+        self.values = _OtherTerms(
+            energy=ENERGY(self._energy),
+            model=MODEL(self._model),
+            gradient=self._gradient.ctypes.data,
+            own=self._own.ctypes.data,
+        )
+
+    def _pos(self, address: int) -> Tensor:
+        rows = np.ctypeslib.as_array((REAL * (4 * len(self._vertex))).from_address(address)).reshape(-1, 4)
+        return self._fixed.index_copy(0, self._vertex, torch.from_numpy(rows[:, :3].copy()))
+
+    def _energy(self, address: int) -> float:
+        try:
+            pos = self._pos(address)
+            return float(sum(form.energy(pos)[self._scene] for form in self._forms))
+        except BaseException as error:  # it would be lost on its way through compiled code
+            self.error = error
+            return math.nan
+
+    def _model(self, address: int) -> None:
+        try:
+            free, pos = self._vertex[: self._rows], self._pos(address)
+            gradients, matrices = zip(*(form.derivatives(pos) for form in self._forms), strict=True)
+            self._gradient[:] = sum(gradients)[free].numpy()
+            self._own[:] = sum(matrices)[free][:, self._upper[0], self._upper[1]].numpy()
+        except BaseException as error:
+            self.error = error
+            self._gradient[:] = math.nan
 
 
 def _aligned(count: int, kind: type) -> np.ndarray:
