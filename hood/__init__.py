@@ -30,6 +30,7 @@ _HOMES = {
     "Garment": "hood.assets.garment.garment",
     "Body": "hood.assets.body.body",
     "PoseSequence": "hood.assets.motion.sequence",
+    "BodyMesh": "hood.assets.motion.animated_mesh",
     "Material": "hood.assets.material",
     "FaceField": "hood.assets.material",
     "EdgeField": "hood.assets.material",

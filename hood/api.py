@@ -8,6 +8,7 @@ from __future__ import annotations
 import inspect
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +19,18 @@ from hood.app.common import load_stepper
 from hood.app.notices import Bar, Item, collected, tell_how_far
 from hood.app.output.frames import at_output_fps, finer_mesh, on_finer_mesh, output_rate
 from hood.app.plan_file import plan_mode, plan_path, planned, rollout_config
+from hood.app.scene.motion import NAMED, Own
 from hood.app.settings.compose import ConfigError
 from hood.app.settings.python_words import overrides
 from hood.app.setup import Setup, check_config, make_stepper, set_up
 from hood.app.stepping.cautions import idle_in_rollout
 from hood.app.stepping.guarding import GuardStopped, make_guard
+from hood.assets.body.body import Body
 from hood.assets.files.library import locate
 from hood.assets.garment.garment import Garment, checked_garment
 from hood.assets.material import Material
+from hood.assets.motion.animated_mesh import BodyMesh
+from hood.assets.motion.sequence import PoseSequence, checked_sequence
 from hood.energies.potential import Potential
 from hood.rollouts import loop as frames
 from hood.rollouts.frame import Frame
@@ -85,15 +90,18 @@ class Simulation:
             afresh=plan_mode(config) == "full",
         )
         seen = _bar(self._progress)(steps, self._simulated, "simulation")
-        yield from on_finer_mesh(at_output_fps(seen, config, self.scene, self._simulated), self._finer, self.scene)
+        yield from on_finer_mesh(
+            at_output_fps(seen, config, self.scene, self._simulated, self._ready.own), self._finer, self.scene
+        )
         if guard is not None and guard.stopped is not None:
             raise GuardStopped(f"guard=strict: the simulation ends before frame {guard.stopped.frame}, which cannot be trusted")
 
 
 def simulate(
-    garment: str | Path | list[str] | Garment = "dress",
-    sequence: str | Path = "walk_proud",
+    garment: str | Path | Garment | list[str] | list[Garment] | list[str | Garment] = "dress",
+    sequence: str | Path | PoseSequence | BodyMesh = "walk_proud",
     *,
+    body: str | Path | Body | BodyMesh = "default",
     material: str | Material | Mapping[str, Any] | None = None,
     stepper: str | Stepper = "auto",
     progress: bool = False,
@@ -102,14 +110,15 @@ def simulate(
     """Dress a moving body. Nothing is written to disk; frames come one by one as they are computed.
 
     Args:
-        garment: a name, a file, a list of them for an outfit, or a :class:`hood.Garment`.
-        sequence: a name or a file of a motion.
+        garment: a name, a file or a :class:`hood.Garment`, or a list of these for an outfit.
+        sequence: a name or a file of a motion, or a :class:`hood.PoseSequence`.
+        body: a name, a file or a :class:`hood.Body`, or a :class:`hood.BodyMesh`, which performs its own motion.
         material: a name (``denim``), a :class:`hood.Material`, or a dictionary of properties. None: the default fabric.
         stepper: ``network``, ``newton``, ``refine``, another option of ``hood rollout``, or an own stepper. ``auto``: the
             network where ``checkpoint``, ``refine`` or another key of it is given; else ``newton`` on a CPU, and on a GPU the
             faster of the two that is as accurate.
         progress: whether a progress bar is shown.
-        keys: all keys of ``hood rollout --help`` that concern the simulation: ``body``, ``checkpoint``, ``num_frames``,
+        keys: all keys of ``hood rollout --help`` that concern the simulation: ``checkpoint``, ``num_frames``,
             ``fps`` and ``output_fps`` [1/s], ``betas``, ``refine``, ``device``, … A dictionary stands for a group:
             ``solver={"target_rg": 1e-3}``.
 
@@ -128,23 +137,16 @@ def simulate(
         1 (1016, 3)
         2 (1016, 3)
     """
-    named: dict[str, Any] = {"sequence": sequence, **keys}
-    if not isinstance(garment, Garment):
-        named["garment"] = garment
-    else:
-        garment = checked_garment(garment)
-    if isinstance(material, (str, Mapping)):
-        named["material"] = material
-    elif material is not None and not isinstance(material, Material):
-        raise ConfigError(f"material is of type {type(material).__name__}; give a name, such as denim, or a hood.Material")
+    own, named = _own(garment, body, sequence, material)
+    named |= keys
     if stepper is None or isinstance(stepper, str):
         named["stepper"] = stepper
     else:
         require_stepper(stepper)
         named["stepper"] = "network"  # what may be said of a network's steps may be said of these
     key = "accuracy" if named.get("accuracy") is not None else "plan" if plan_path(named) is not None else None
-    if key is not None and (isinstance(garment, Garment) or isinstance(material, Material) or not isinstance(stepper, str)):
-        raise ConfigError(f"{key}={named[key]}: a plan names garment, material and stepper; leave them out")
+    if key is not None and (own != NAMED or not isinstance(stepper, str)):
+        raise ConfigError(f"{key}={named[key]}: a plan names garment, body, sequence, material and stepper; leave them out")
     if key == "plan":  # then what is not said is the plan's
         usual = {key: parameter.default for key, parameter in inspect.signature(simulate).parameters.items()}
         named = {key: value for key, value in named.items() if usual.get(key) != value}
@@ -154,14 +156,46 @@ def simulate(
         check_config(config)
         notes += idle_in_rollout(overrides(named), config)
         taken = make_stepper(config)[0] if isinstance(stepper, str) else stepper
-        ready = set_up(
-            config,
-            taken,
-            garment if isinstance(garment, Garment) else None,
-            material if isinstance(material, Material) else None,
-            tell=notes.append,
-        )
+        ready = set_up(config, taken, own, tell=notes.append)
     return Simulation(ready, [*told, *notes], progress)
+
+
+def _own(garment: Any, body: Any, sequence: Any, material: Any) -> tuple[Own, dict[str, Any]]:
+    """What :func:`simulate` is given as objects, checked, and the keys of what it is given by name."""
+    named, own = {"garment": garment, "sequence": sequence} | ({} if body == "default" else {"body": body}), NAMED
+    if isinstance(sequence, BodyMesh):
+        if body != "default":
+            raise ConfigError("sequence: a hood.BodyMesh is body and motion in one; leave body or sequence out")
+        body, sequence = sequence, "walk_proud"
+        named |= {"body": body, "sequence": sequence}
+    if isinstance(garment, Garment) or (isinstance(garment, list) and any(isinstance(one, Garment) for one in garment)):
+        own = replace(own, garment=_garments(garment))
+        del named["garment"]
+    if isinstance(body, Body | BodyMesh):
+        own = replace(own, body=body)
+        del named["body"]
+        if isinstance(body, BodyMesh) and sequence != "walk_proud":
+            raise ConfigError("sequence: body is a hood.BodyMesh, which performs its own motion; leave sequence out")
+    if isinstance(sequence, PoseSequence):
+        own = replace(own, sequence=checked_sequence(sequence))
+        del named["sequence"]
+    if isinstance(material, (str, Mapping)):
+        named["material"] = material
+    elif isinstance(material, Material):
+        own = replace(own, material=material)
+    elif material is not None:
+        raise ConfigError(f"material is of type {type(material).__name__}; give a name, such as denim, or a hood.Material")
+    return own, named
+
+
+def _garments(given: Garment | list[Any]) -> Garment | list[Garment | str]:
+    """A garment of arrays, or an outfit with some, checked."""
+    if isinstance(given, Garment):
+        return checked_garment(given)
+    for place, one in enumerate(given):
+        if not isinstance(one, (Garment, str, Path)):
+            raise ConfigError(f"garment[{place}] is of type {type(one).__name__}; give a name, a file or a hood.Garment")
+    return [checked_garment(one) if isinstance(one, Garment) else str(one) for one in given]
 
 
 class Summary(dict[str, Any]):

@@ -187,10 +187,11 @@ def test_arguments_of_another_kind_are_refused_in_a_sentence() -> None:
     tank, body, plie = hood.load_garment("tank"), hood.load_body(), hood.load_sequence("plie")
     cases = [
         (lambda: hood.simulate("tank", stepper=object()), "type object, which has no gravity.*Stepper"),
-        (lambda: hood.simulate("tank", plie), "sequence is given by a name .*type PoseSequence"),
+        (lambda: hood.rollout(sequence=plie), "sequence is given by a name .*type PoseSequence"),
         (lambda: hood.simulate("tank", np.zeros((9, 24, 3))), r"sequence is given by .*array \(9, 24, 3\)"),
-        (lambda: hood.simulate("tank", body=body), "body is given by a name .*type Body"),
-        (lambda: hood.simulate([tank, tank]), "garment is given by .*list of an object of type Garment"),
+        (lambda: hood.rollout(body=body), "body is given by a name .*type Body"),
+        (lambda: hood.rollout(garment=[tank, tank]), "garment is given by .*list of an object of type Garment"),
+        (lambda: hood.simulate([tank, 3]), r"garment\[1\] is of type int; give a name"),
         (lambda: hood.simulate("tank", sequence=np.zeros((99, 3)).tolist()), "sequence=.*…: give one text"),
         (lambda: hood.simulate("tank", pins=np.zeros(999)), "pins=.*…: give vertex numbers"),
         (lambda: hood.simulate("tank", betas=np.zeros(999)), "betas=.*: give at most 10"),

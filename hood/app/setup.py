@@ -18,8 +18,8 @@ from hood.app.plan_file import plan_path, read_watch
 from hood.app.scene.events import checked_events, with_events
 from hood.app.scene.fabrics import checked_fabrics, fabric_of
 from hood.app.scene.garment_files import wanted_of
-from hood.app.scene.garments import checked_sizes, cut_to_size, heed, layer_order, names_of, read_outfit
-from hood.app.scene.motion import check_motion_options, make_motion, with_body_friction
+from hood.app.scene.garments import checked_sizes, cut_to_size, heed, layer_order, names_of, names_of_own, read_outfit
+from hood.app.scene.motion import NAMED, Own, check_motion_options, make_motion, with_body_friction
 from hood.app.settings.compose import ConfigError, load_config, require_choice
 from hood.app.stepping.automatic import Choice, choose, decided
 from hood.app.stepping.cautions import known_by_slope, scene_cautions, warn
@@ -28,7 +28,6 @@ from hood.app.stepping.guarding import check_guard
 from hood.app.stepping.refinement import AUTO, check_refinement, chosen, refined
 from hood.app.stepping.steppers import PLAIN, losses_of, make_network, make_solver, option_of
 from hood.assets.garment.garment import Garment
-from hood.assets.material import Material
 from hood.energies.potential import Potential
 from hood.model.kernels.block import KERNELS
 from hood.rollouts.frame import METRIC_CHOICES, SETTLE_CHOICES
@@ -52,6 +51,7 @@ class Setup:
     stepper: Stepper
     choice: Choice
     potential: Potential  # what steps are judged by; of a plan, that of the full model
+    own: Own = NAMED
 
 
 def check_config(config: DictConfig) -> None:
@@ -78,29 +78,27 @@ def check_config(config: DictConfig) -> None:
 def set_up(
     config: DictConfig,
     stepper: Stepper,
-    garment: Garment | None = None,
-    material: Material | None = None,
+    own: Own = NAMED,
     tell: Callable[[str], None] = say,
 ) -> Setup:
     """The scene that the config names, and ``stepper`` with its steps refined as the config, or the scene, needs.
 
     Args:
-        garment: worn instead of ``config.garment``.
-        material: of the cloth, instead of ``config.material``.
+        own: objects that stand for names of the config.
         tell: is called with every choice that was made, a sentence each.
 
     Raises:
         ConfigError, ValueError, FileNotFoundError: keys, files or assets that cannot be used.
     """
     config, why = decided(config)
-    scene = make_scene(config, garment, material)
+    scene = make_scene(config, own)
     choice = choose(config, stepper, scene)
     choice.why[:0] = why
     settled = choice.settle(config)
     for sentence in choice.why:
         tell(sentence)
     if solves_in_double(settled) != solves_in_double(config):
-        scene = make_scene(settled, garment, material)
+        scene = make_scene(settled, own)
     if acts(settled):
         scene = with_held_layers_apart(scene)
     if not option_of(settled).network and network_of(stepper) is not None:
@@ -117,7 +115,7 @@ def set_up(
     path = plan_path(config)
     if path is not None:
         stepper, potential = _watched(settled, stepper, scene, path)
-    return Setup(settled, scene, stepper, choice, potential)
+    return Setup(settled, scene, stepper, choice, potential, own)
 
 
 def _watched(config: DictConfig, reduced: Stepper, scene: Scene, path: Path) -> tuple[Stepper, Potential]:
@@ -132,15 +130,15 @@ def _watched(config: DictConfig, reduced: Stepper, scene: Scene, path: Path) -> 
     return WatchedStepper(reduced, full, (potential, everything), scene, watch.limit, watch.hold), everything
 
 
-def make_scene(config: DictConfig, garment: Garment | None = None, material: Material | None = None) -> Scene:
-    """Assets named in the config, put together; ``garment`` and ``material`` stand for those of the config where given."""
-    motion = make_motion(config, torch.float64 if solves_in_double(config) else torch.float32)
-    given = config.garment if garment is None else garment
-    ordered = garment is None
+def make_scene(config: DictConfig, own: Own = NAMED) -> Scene:
+    """Assets named in the config, or given, put together."""
+    motion = make_motion(config, torch.float64 if solves_in_double(config) else torch.float32, own)
+    given = config.garment if own.garment is None else own.garment
+    names = names_of_own(own.garment) or names_of(config.garment)
     garment = read_outfit(given, motion, bool(config.triangulate), config.pins, wanted_of(config))
-    order = layer_order(config.layers, _names_in(garment, names_of(config.garment))) if ordered else None
+    order = None if isinstance(given, Garment) else layer_order(config.layers, _names_in(garment, names))
     garment = cut_to_size(config, garment, motion)
-    fabric = fabric_of(config, garment, motion) if material is None else material
+    fabric = fabric_of(config, garment, motion) if own.material is None else own.material
     scene = with_events(replace(dress(garment, motion, fabric, checked_sizes(config)), layers=order), config)
     scene = with_body_friction(scene, config)
     found = misplacement(scene)

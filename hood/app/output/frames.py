@@ -15,14 +15,13 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from hood.app.scene.motion import motion_options
+from hood.app.scene.motion import NAMED, Own, motion_options, perform
 from hood.app.settings.compose import ConfigError, shown
 from hood.mesh.editing.subdivision import Subdivision
 from hood.rollouts.file.reader import RolloutData
 from hood.rollouts.file.step_table import OutputRate, StepPlan
 from hood.rollouts.frame import Frame
 from hood.rollouts.frames import output_frames, refined_frames
-from hood.scene.body_motion.load import load_motion
 from hood.scene.jumps import find_jumps
 from hood.scene.scene import Scene
 
@@ -49,14 +48,14 @@ def output_rate(config: DictConfig) -> OutputRate | None:
     return OutputRate(float(config.output_fps), float(config.fps))
 
 
-def at_output_fps(frames: Iterable[Frame], config: DictConfig, scene: Scene, count: int) -> Iterator[Frame]:
+def at_output_fps(frames: Iterable[Frame], config: DictConfig, scene: Scene, count: int, own: Own = NAMED) -> Iterator[Frame]:
     """The frames to store of ``count`` simulated ones: all of them where there is no ``output_fps``."""
     rate = output_rate(config)
     if rate is None:
         yield from frames
         return
     jumps = find_jumps(scene.motion, 1.0 / scene.dt)
-    yield from output_frames(frames, rate, jumps, None if rate.whole else _posed(config, scene, rate.count(count)))
+    yield from output_frames(frames, rate, jumps, None if rate.whole else _posed(config, scene, rate.count(count), own))
 
 
 def planned_steps(config: DictConfig, scene: Scene, count: int) -> StepPlan | None:
@@ -75,7 +74,7 @@ def _watched(scene: Scene) -> list[int]:
     return sorted(found)
 
 
-def _posed(config: DictConfig, scene: Scene, count: int) -> Callable[[int], Tensor] | None:
+def _posed(config: DictConfig, scene: Scene, count: int, own: Own) -> Callable[[int], Tensor] | None:
     """The body at the moments of stored frames, posed by the motion itself; None where its parts are joined at simulated
     frames, so that another rate would move the joints: it is interpolated then, as the cloth is."""
     if int(config.loop) != 1 or float(config.blend_in) != 0:
@@ -83,7 +82,7 @@ def _posed(config: DictConfig, scene: Scene, count: int) -> Callable[[int], Tens
     options = replace(motion_options(config), fps=float(config.output_fps), num_frames=count)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what is said of the motion has been said
-        motion = load_motion(str(config.body), str(config.sequence), options, scene.motion.dtype, scene.motion.device)
+        motion = perform(config, own, options, scene.motion.dtype, scene.motion.device)
 
     def surface(index: int) -> Tensor:
         origin = motion.translation[index]

@@ -44,13 +44,18 @@ def names_of(given: Any, key: str = "garment") -> list[str]:
     return [str(name) for name in names]
 
 
+def names_of_own(given: Garment | Sequence[Garment | str] | None) -> list[str]:
+    """Names of what stands for ``garment`` of a config; none where nothing does, or one garment alone."""
+    return [] if given is None or isinstance(given, Garment) else [getattr(one, "name", str(one)) for one in given]
+
+
 def read_outfit(
     given: Any, motion: Motion, triangulate: bool = False, pins: Any = None, wanted: Wanted | None = None
 ) -> Garment:
     """The garment or garments named by a config value, as one garment that can follow ``motion``.
 
     Args:
-        given: a name, a file, a list of them, or a garment that is read already.
+        given: a name, a file, a garment that is read already, or a list of these.
         triangulate: split polygons of mesh files instead of refusing them.
         pins: what is held instead of the files' own pins, see :func:`hood.assets.garment.pins.pin_mask`; None: the files' own.
         wanted: what is asked of files that are not one sheet of cloth; None: what is usual.
@@ -62,7 +67,11 @@ def read_outfit(
         garments = [given]
     else:
         beside, wanted = _measured_against(motion), wanted or Wanted()
-        garments = [read_garment(name, wanted, beside, triangulate) for name in names_of(given)]
+        own = isinstance(given, Sequence) and any(isinstance(one, Garment) for one in given)
+        garments = [
+            one if isinstance(one, Garment) else read_garment(str(one), wanted, beside, triangulate)
+            for one in (given if own else names_of(given))
+        ]
     for garment in garments:
         if not garment.bound:
             heed(garment.name, suspect_seams(garment.rest_pos, garment.faces))

@@ -6,7 +6,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,14 +16,35 @@ from omegaconf import DictConfig, OmegaConf
 
 from hood.app.notices import say
 from hood.app.settings.compose import ConfigError, brief, plain, require_choice, shown
-from hood.assets.body.body import body_part
+from hood.assets.body.body import Body, body_part
 from hood.assets.files.library import names
-from hood.assets.motion.animated_mesh import body_kind
+from hood.assets.garment.garment import Garment
+from hood.assets.material import Material
+from hood.assets.motion.animated_mesh import BodyMesh, body_kind
 from hood.assets.motion.load import HANDS
+from hood.assets.motion.sequence import PoseSequence
 from hood.assets.motion.skeleton import TRANSLATION_UNITS
 from hood.scene.body_motion.load import NO_MOTION, MotionOptions, load_motion
 from hood.scene.body_motion.motion import BodyMotion, Motion
 from hood.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class Own:
+    """Objects that stand for what a config names; None: what it names.
+
+    Args:
+        garment: one, or a list of objects and names.
+    """
+
+    garment: Garment | Sequence[Garment | str] | None = None
+    material: Material | None = None
+    body: Body | BodyMesh | None = None
+    sequence: PoseSequence | None = None
+
+
+#: A config that names everything.
+NAMED = Own()
 
 
 def checked_friction(config: DictConfig) -> dict[str, float]:
@@ -95,7 +117,7 @@ def check_rate(config: DictConfig, key: str = "fps") -> None:
         raise ConfigError(f"{key}={value}: give the simulation's frames per second, 1 to 1000")
 
 
-def make_motion(config: DictConfig, dtype: torch.dtype = torch.float32) -> Motion:
+def make_motion(config: DictConfig, dtype: torch.dtype = torch.float32, own: Own = NAMED) -> Motion:
     """What moves in the scene, in ``dtype`` on the config's device.
 
     A body that performs no motion but its own does so beside an embedded motion, the default, and says that; a file was
@@ -105,7 +127,9 @@ def make_motion(config: DictConfig, dtype: torch.dtype = torch.float32) -> Motio
         FileNotFoundError, ValueError: from :func:`hood.scene.body_motion.load.load_motion`.
         ConfigError: a value of the wrong kind, or a motion file that the body cannot perform; names the key.
     """
-    kind = body_kind(str(config.body))
+    kind = "model" if own.body is not None else body_kind(str(config.body))
+    if kind != "model" and own.sequence is not None:
+        raise ConfigError(f"sequence: body={config.body} has its own motion, or none; leave sequence out")
     if kind != "model" and str(config.sequence) != NO_MOTION:
         has = "performs its own motion" if kind == "mesh" else "does not move"
         if str(config.sequence) not in names("motions"):
@@ -113,7 +137,14 @@ def make_motion(config: DictConfig, dtype: torch.dtype = torch.float32) -> Motio
                 f"sequence={config.sequence}: body={config.body} {has}; leave sequence out, or give a body of the SMPL family"
             )
         say(f"body={config.body} {has}: sequence={config.sequence} is not used", error=True)
-    return load_motion(str(config.body), str(config.sequence), motion_options(config), dtype, str(config.device))
+    return perform(config, own, motion_options(config), dtype, str(config.device))
+
+
+def perform(config: DictConfig, own: Own, options: MotionOptions, dtype: torch.dtype, device: torch.device | str) -> Motion:
+    """The body and the motion that the config names, or that are given, with these options."""
+    body = str(config.body) if own.body is None else own.body
+    sequence = str(config.sequence) if own.sequence is None else own.sequence
+    return load_motion(body, sequence, options, dtype, device)
 
 
 def motion_options(config: DictConfig) -> MotionOptions:

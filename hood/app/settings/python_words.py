@@ -19,9 +19,9 @@ _WORDS = ("null", "true", "false", "nan", "inf")
 _KEY = re.compile(r"[\w./+@-]+")
 #: Keys of what is read from files, and how they are given.
 _NAMES = {
-    "garment": "a name, a file or a list of them, and to hood.simulate also by one hood.Garment",
-    "sequence": "a name (hood.names('motions')) or a file",
-    "body": "a name or a file",
+    "garment": "a name, a file or a list of them, and to hood.simulate also by hood.Garment objects",
+    "sequence": "a name (hood.names('motions')) or a file, and to hood.simulate also by a hood.PoseSequence",
+    "body": "a name or a file, and to hood.simulate also by a hood.BodyMesh or a hood.Body",
     "checkpoint": "a name (hood.names('weights')) or a file",
 }
 

@@ -57,6 +57,23 @@ class Garment:
     riders: Riders | None = None  # buttons and the like, which ride on the cloth
     file_numbers: np.ndarray | None = None  # (V of the file,) present number of each of its vertices, -1: gone; None: as there
 
+    @classmethod
+    def from_arrays(cls, positions: Any, faces: Any, pins: Any = (), name: str = "garment") -> Garment:
+        """A garment of arrays, as :func:`hood.simulate` takes it.
+
+        Args:
+            positions: (V, 3) m, y up, around the body's T-pose; of a body that is a mesh as it is worn in its first frame.
+            faces: (F, 3) vertex numbers from 0.
+            pins: vertices that are held: numbers, or (V,) true and false.
+            name: for messages.
+
+        Raises:
+            ValueError: arrays that cannot be simulated; names the argument, the index and the fix.
+        """
+        where = f"garment {name!r}"
+        garment = checked_garment(cls(name, positions, faces, np.zeros(len(_array(where, "positions", positions)), bool)))
+        return replace(garment, pinned=_held(where, _array(where, "pins", pins), len(garment.rest_pos)))
+
     @property
     def bound(self) -> bool:
         return self.lbs_weights is not None and self.shapedirs is not None
@@ -208,6 +225,23 @@ def _array(where: str, key: str, value: Any) -> np.ndarray:
     if array.ndim == 0:
         raise ValueError(f"{where}: {key} is of type {type(value).__name__}; give an array")
     return array
+
+
+def _held(where: str, pins: np.ndarray, count: int) -> np.ndarray:
+    """(V,) bool: ``pins`` as such, or the vertices that it numbers."""
+    if pins.dtype == bool:
+        if pins.shape != (count,):
+            raise ValueError(f"{where}: pins have shape {pins.shape}; give one of true and false a vertex, ({count},)")
+        return pins
+    if pins.ndim != 1 or (pins.size and pins.dtype.kind not in "iu"):
+        raise ValueError(f"{where}: pins are {pins.dtype} of shape {pins.shape}; give vertex numbers, or true and false of all")
+    outside = (pins < 0) | (pins >= count)
+    if outside.any():
+        row = int(outside.argmax())
+        raise ValueError(f"{where}: pins[{row}] is {pins[row]}; give vertex numbers from 0 to {count - 1}")
+    held = np.zeros(count, dtype=bool)
+    held[pins.astype(np.int64)] = True
+    return held
 
 
 def _same(given: Any, checked: Any) -> bool:

@@ -1,4 +1,4 @@
-"""Reading a moving mesh that serves as a body, at the frame rate of the simulation."""
+"""Reading a moving mesh that serves as a body, at the frame rate of the simulation; or one of arrays."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import mmap
 import warnings
 import zipfile
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from hood.assets.formats.vertex_files import (
 )
 from hood.assets.motion.axes import require_up
 from hood.assets.motion.mesh_sequence import MeshSequence, loop_mesh, resample_mesh, trim_mesh, turn_mesh
+from hood.assets.motion.sequence import rate_of, real_rows
 from hood.mesh import topology
 from hood.mesh.editing.repair import sew_moving
 
@@ -49,6 +50,51 @@ _LARGE_UNITS, _TALL, _FLAT = (0.3048, 0.1), 0.8, 0.4
 #: A body stands along z where it is so many times longer than along y, and no plane: at least this share as thick, and not
 #: filled like a box [share of it].
 _LONGER, _THICK, _FILLED = 2.5, 0.1, 0.4
+
+
+@dataclass(frozen=True)
+class BodyMesh:
+    """A body of arrays: a mesh that moves, or stands still, as :func:`hood.simulate` takes it for ``body``.
+
+    Cloth needs an inside and an outside: the mesh is closed, its faces look outwards.
+
+    Args:
+        vertices: (T, W, 3) m, y up, of every frame; (W, 3) for a body that stands still. Moved linearly between frames.
+        faces: (G, 3) vertex numbers from 0.
+        fps: frames per second of ``vertices``.
+        name: for messages.
+
+    Raises:
+        ValueError: arrays of another shape or type, not finite, or faces without vertices; names the argument, the index and
+            the fix.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    fps: float = _DEFAULT_FPS
+    name: str = "body"
+
+    def __post_init__(self) -> None:
+        vertices = real_rows("body", "vertices", self.vertices, "(frames, vertices, 3)", (2, 3), 3)
+        vertices = vertices[None] if vertices.ndim == 2 else vertices
+        faces = _triangles(self.faces, vertices.shape[1])
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "faces", faces)
+        object.__setattr__(self, "fps", rate_of("body", self.fps))
+
+
+def _triangles(given: Any, count: int) -> np.ndarray:
+    """(G, 3) int64: faces of ``count`` vertices."""
+    faces = np.asarray(given.detach().cpu() if hasattr(given, "detach") else given)
+    if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
+        raise ValueError(f"body: faces have shape {faces.shape}; give (faces, 3), polygons split into triangles")
+    if faces.dtype.kind not in "iu":
+        raise ValueError(f"body: faces are of type {faces.dtype}; give whole numbers, faces.astype(int)")
+    outside = ((faces < 0) | (faces >= count)).any(axis=1)
+    if outside.any():
+        row = int(outside.argmax())
+        raise ValueError(f"body: faces[{row}] is {faces[row].tolist()}; give vertex numbers from 0 to {count - 1}")
+    return np.ascontiguousarray(faces, dtype=np.int64)
 
 
 def body_kind(name: str | Path) -> str:
@@ -115,6 +161,40 @@ def load_mesh_sequence(
         warnings.warn(Doubt("frame_rate", sentence, value=rate, unit="fps"), stacklevel=2)
     bones = _bones(path, content)
     sequence = MeshSequence(path.stem, verts, faces, rate, bones, content.rest, content.weights, fps_assumed=assumed)
+    return _performed(path, sequence, fps, up, start, stop, loop, scale)
+
+
+def perform_mesh(
+    mesh: BodyMesh,
+    fps: float = 30.0,
+    up: str = "auto",
+    *,
+    start: float | str | None = None,
+    stop: float | str | None = None,
+    loop: int = 1,
+    scale: float | None = None,
+) -> MeshSequence:
+    """The same of arrays, as they were read from a file that says its frame rate; see :func:`load_mesh_sequence`.
+
+    Raises:
+        ValueError: an option out of range, or a mesh in other units.
+    """
+    require_up(up)
+    sequence = MeshSequence(mesh.name, mesh.vertices, mesh.faces, mesh.fps)
+    return _performed(mesh.name, sequence, fps, up, start, stop, loop, scale)
+
+
+def _performed(
+    path: Path | str,
+    sequence: MeshSequence,
+    fps: float,
+    up: str,
+    start: float | str | None,
+    stop: float | str | None,
+    loop: int,
+    scale: float | None,
+) -> MeshSequence:
+    """A mesh as it is to be performed; ``path`` names it in messages."""
     sequence = turn_mesh(sequence, 1.0 if scale is None else float(scale), up)
     _check_size(path, sequence, scale)
     if up == "auto":
@@ -210,7 +290,7 @@ def _rate(path: Path, value: Any) -> float:
     return rate
 
 
-def _check_size(path: Path, sequence: MeshSequence, scale: float | None) -> None:
+def _check_size(path: Path | str, sequence: MeshSequence, scale: float | None) -> None:
     extent = float(np.ptp(sequence.verts[0], axis=0).max())
     if extent <= 0:
         raise ValueError(f"{path}: all vertices of its first frame are at one point; it is no surface")
@@ -238,7 +318,7 @@ def _is_upright(box: np.ndarray) -> bool:
     return bool(box[1] >= _TALL * box.max() and box.min() <= _FLAT * box.max())
 
 
-def _check_bearing(path: Path, sequence: MeshSequence) -> None:
+def _check_bearing(path: Path | str, sequence: MeshSequence) -> None:
     """Warn of a mesh that lies along z in its first frame, as a body does that stands in a file with z up."""
     points = sequence.verts[0].astype(np.float64)
     box = np.ptp(points, axis=0)
@@ -257,7 +337,7 @@ def _volume(points: np.ndarray, faces: np.ndarray) -> float:
     return float(np.einsum("fi,fi->", a, np.cross(b, c))) / 6.0
 
 
-def _sewn(path: Path, sequence: MeshSequence) -> np.ndarray:
+def _sewn(path: Path | str, sequence: MeshSequence) -> np.ndarray:
     """The faces, with vertices that seams double joined: inside and outside need a closed body."""
     before = len(topology.boundary_loops(sequence.faces))
     if not before:
@@ -277,7 +357,7 @@ def _sewn(path: Path, sequence: MeshSequence) -> np.ndarray:
     return faces
 
 
-def _outward(path: Path, sequence: MeshSequence) -> np.ndarray:
+def _outward(path: Path | str, sequence: MeshSequence) -> np.ndarray:
     """The faces, turned over where a closed mesh is inside out: cloth would be drawn into it."""
     faces, points = sequence.faces, sequence.verts[0].astype(np.float64)
     closed = 2 * len(topology.unique_edges(faces)) == 3 * len(faces)

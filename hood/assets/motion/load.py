@@ -6,6 +6,7 @@ The up axis of a recorded motion, found from the whole skeleton: where the head 
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,7 +17,7 @@ from hood.assets.files.said import Doubt
 from hood.assets.motion import sequence_edit as edit
 from hood.assets.motion.axes import UP_AXES, require_up
 from hood.assets.motion.recording import NUM_BODY_JOINTS, Recording, read_recording
-from hood.assets.motion.sequence import PoseSequence, resample, still, turn_world
+from hood.assets.motion.sequence import PoseSequence, checked_sequence, resample, still, turn_world
 from hood.assets.motion.skeleton import joints_about_pelvis, some_frames, spread
 
 #: The head is over the feet along an axis where the unit vector between them has this component there, and a body stands
@@ -248,6 +249,58 @@ def load_sequence(
         warnings.warn(note, stacklevel=2)
     axis = _up_axis(path, recording) if up == "auto" else up
     sequence = _sequence(path.stem, recording, hands)
+    return _performed(
+        sequence,
+        fps=fps,
+        axis=axis,
+        start=start,
+        stop=stop,
+        loop=loop,
+        blend_in=blend_in,
+        blend_from=blend_from,
+        num_frames=num_frames,
+    )
+
+
+def perform_poses(
+    sequence: PoseSequence,
+    fps: float = 30.0,
+    up: str = "auto",
+    *,
+    start: float | str | None = None,
+    stop: float | str | None = None,
+    loop: int = 1,
+    blend_in: float = 0.0,
+    blend_from: str = "t",
+    hands: str = "flat",
+    num_frames: int | None = None,
+) -> PoseSequence:
+    """The same of a motion that is there already, see :func:`load_sequence`; y is up where ``up`` is "auto".
+
+    Raises:
+        ValueError: arrays that are no motion, or an option out of range.
+    """
+    require_up(up)
+    sequence = checked_sequence(sequence)
+    if hands == "flat":
+        poses = sequence.poses.copy()
+        poses[:, NUM_BODY_JOINTS:] = 0.0
+        sequence = replace(sequence, poses=poses, fingers=None)
+    return _performed(sequence, fps, "y" if up == "auto" else up, start, stop, loop, blend_in, blend_from, num_frames)
+
+
+def _performed(
+    sequence: PoseSequence,
+    fps: float,
+    axis: str,
+    start: float | str | None,
+    stop: float | str | None,
+    loop: int,
+    blend_in: float,
+    blend_from: str,
+    num_frames: int | None,
+) -> PoseSequence:
+    """A motion in the world of its file, with ``axis`` up, as it is to be performed."""
     if sequence.num_frames == 1:
         sequence = still(sequence, fps, num_frames)
     else:

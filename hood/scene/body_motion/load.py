@@ -10,10 +10,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from hood.assets.body.body import Body
 from hood.assets.body.load import load_body
 from hood.assets.files.said import Doubt
-from hood.assets.motion.animated_mesh import NO_BODY, body_kind, load_mesh_sequence
-from hood.assets.motion.load import load_sequence
+from hood.assets.motion.animated_mesh import NO_BODY, BodyMesh, body_kind, load_mesh_sequence, perform_mesh
+from hood.assets.motion.load import load_sequence, perform_poses
+from hood.assets.motion.sequence import PoseSequence
 from hood.scene.body_motion.mesh_motion import NoBody, mesh_motion
 from hood.scene.body_motion.motion import Motion, body_motion
 
@@ -53,8 +55,8 @@ class MotionOptions:
 
 
 def load_motion(
-    body: str | Path = "default",
-    sequence: str | Path = "walk_proud",
+    body: str | Path | Body | BodyMesh = "default",
+    sequence: str | Path | PoseSequence = "walk_proud",
     options: MotionOptions | None = None,
     dtype: torch.dtype = torch.float32,
     device: torch.device | str = "cpu",
@@ -63,8 +65,9 @@ def load_motion(
 
     Args:
         body: embedded name, model file of the SMPL family or a folder of them, a moving or still mesh
-            (:func:`hood.assets.motion.animated_mesh.load_mesh_sequence`), or "none".
-        sequence: embedded name or motion file; a mesh performs its own, and "none" has none: not looked at then.
+            (:func:`hood.assets.motion.animated_mesh.load_mesh_sequence`), or "none"; or the body itself.
+        sequence: embedded name or motion file, or the motion itself; a mesh performs its own, and "none" has none: it is not
+            looked at then.
 
     Raises:
         FileNotFoundError: unknown name or missing file.
@@ -72,6 +75,13 @@ def load_motion(
             and the fix.
     """
     options = options or MotionOptions()
+    if isinstance(body, BodyMesh):
+        performed = perform_mesh(
+            body, options.fps, options.up, start=options.start, stop=options.stop, loop=options.loop, scale=options.scale
+        )
+        return mesh_motion(performed, options.num_frames, dtype, device)
+    if isinstance(body, Body):
+        return _posed_body(body, sequence, options, dtype, device)
     kind = body_kind(body)
     if kind == NO_BODY:
         return NoBody(options.num_frames, options.fps, dtype, torch.device(device))
@@ -86,13 +96,35 @@ def load_motion(
             f"body={body} has no motion of its own and sequence=none; give a motion, sequence=walk_proud or a file, or a mesh "
             "that stands still as body"
         )
-    poses = load_sequence(
+    return _posed_body(body, sequence, options, dtype, device)
+
+
+def _posed_body(
+    body: str | Path | Body,
+    sequence: str | Path | PoseSequence,
+    options: MotionOptions,
+    dtype: torch.dtype,
+    device: torch.device | str,
+) -> Motion:
+    """A body with joints performing a motion."""
+    if isinstance(sequence, PoseSequence):
+        poses = perform_poses(
+            sequence, options.fps, options.up, start=options.start, stop=options.stop, loop=options.loop,
+            blend_in=options.blend_in, blend_from=options.blend_from, hands=options.hands, num_frames=options.num_frames,
+        )  # fmt: skip
+    else:
+        poses = _read(sequence, options)
+    model = body if isinstance(body, Body) else load_body(body, options.gender or poses.gender)
+    return body_motion(model, poses, _betas(options.betas, model.subject_betas(poses)), dtype, device)
+
+
+def _read(sequence: str | Path, options: MotionOptions) -> PoseSequence:
+    """The motion of a file, as it is to be performed."""
+    return load_sequence(
         sequence, options.fps, options.up, start=options.start, stop=options.stop, loop=options.loop,
         blend_in=options.blend_in, blend_from=options.blend_from, hands=options.hands, file_fps=options.file_fps,
         person=options.person, trans_unit=options.trans_unit, num_frames=options.num_frames,
     )  # fmt: skip
-    model = load_body(body, options.gender or poses.gender)
-    return body_motion(model, poses, _betas(options.betas, model.subject_betas(poses)), dtype, device)
 
 
 def _betas(given: Sequence[float] | None, recorded: np.ndarray) -> np.ndarray:
