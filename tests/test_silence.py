@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import subprocess
 import sys
 from pathlib import Path
@@ -10,23 +9,6 @@ from pathlib import Path
 import pytest
 
 import hood
-
-HOOD = Path(hood.__file__).parent
-#: Rooms that may print: the command line, and studies, which are commands.
-PRINTING = ("cli", "studies")
-
-
-def test_nothing_below_the_command_line_prints() -> None:
-    found = []
-    for path in sorted(HOOD.rglob("*.py")):
-        if path.relative_to(HOOD).parts[0] in PRINTING:
-            continue
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            called = isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
-            stream = isinstance(node, ast.Attribute) and node.attr in ("stdout", "stderr") and ast.unparse(node.value) == "sys"
-            bar = isinstance(node, ast.ImportFrom) and node.module == "tqdm" and path.name != "api.py"
-            found += [f"{path.relative_to(HOOD)}:{node.lineno}"] if called or stream or bar else []  # type: ignore[attr-defined]
-    assert not found
 
 
 def test_python_prints_nothing_and_loads_no_command_line(tmp_path: Path) -> None:
