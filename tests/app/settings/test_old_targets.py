@@ -38,7 +38,8 @@ def test_lists_and_other_values_stay(make) -> None:
 
 def test_the_record_of_an_old_run_has_the_classes_of_today(tmp_path: Path) -> None:
     (tmp_path / "config.yaml").write_text("losses:\n  terms:\n    inertia: {_target_: hood.losses.inertia.Inertia}\n")
-    assert (
+    found = read_record(tmp_path / "config.yaml")["losses"]["terms"]["inertia"]["_target_"]
+    assert found == "hood.energies.mass_points.Inertia"
         read_record(tmp_path / "config.yaml")["losses"]["terms"]["inertia"]["_target_"] == "hood.energies.mass_points.Inertia"
     )
 
