@@ -9,7 +9,6 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from hood.app.output.verdict import exit_code_lines
 from hood.app.settings.compose import CONFIG_FOLDER, headings, load_config, notes, options, plain, shown
 from hood.assets.files import library
 
@@ -119,7 +118,7 @@ def describe(name: str) -> str:
     lines += _elsewhere(config, [group for group in groups if group not in _LISTED.get(name, {})])
     if groups or name in ("tradeoff", "envelope"):
         lines += _names(config)
-    lines += ["", "examples:", *(f"  {example}" for example in _EXAMPLES[name]), "", *exit_code_lines()]
+    lines += ["", "examples:", *(f"  {example}" for example in _EXAMPLES[name])]
     return "\n".join(lines)
 
 

@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from hood import plugins
-from hood.app.output.verdict import exit_code_lines
 from hood.assets.files.said import DISTRIBUTION, listening
 
 # For the C library and OpenMP. Cloth steps allocate and free tensors of a few MB many times a frame: keeping them mapped is
@@ -59,6 +58,15 @@ _HOMES = {
     "convert": "hood.cli.export:convert",
 }
 
+#: Where several hold, 130 comes before 2, and 2 before 3.
+EXIT_CODES = {
+    0: "done",
+    1: "inspect: something needs repair; tradeoff: points failed, the page is without them",
+    2: "an error, told in one line; rollout: a motion of many could not be used, the others are there",
+    3: "rollout: a result is unsound, or doubtful with doubts=refuse, or guard=strict ended it; see summary.json",
+    130: "interrupted; what is done is kept",
+}
+
 _LESS_MEMORY = "free some, raise the limit (ulimit -v), or take a smaller garment, fewer frames or a smaller model"
 
 #: Commands that take steps: libraries for these are compiled while torch is loaded, where that has not been done before.
@@ -84,7 +92,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name in COMMANDS and any(word in ("-h", "--help") for word in overrides):
         from hood.cli.help import describe
 
-        print(describe(name))
+        print("\n".join([describe(name), "", *exit_code_lines()]))
         return 0
     return _run(name, overrides)
 
@@ -160,6 +168,14 @@ def _command(name: str) -> Callable[[Sequence[str]], int]:
     run: Callable[[Sequence[str]], int] = getattr(import_module(module), function) if module else plugins.find("commands", name)
     gc.freeze()  # modules stay until the end: looking through them for garbage is 4% of a solver's frame
     return run
+
+
+def exit_code_lines() -> list[str]:
+    """The table for a terminal."""
+    return [
+        "exit codes (where several hold: 130, then 2, then 3):",
+        *(f"  {code:<6}{text}" for code, text in EXIT_CODES.items()),
+    ]
 
 
 def _usage() -> str:

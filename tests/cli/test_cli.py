@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -235,6 +236,23 @@ def test_names_stand_behind_keys_of_the_command(command: str, capsys: pytest.Cap
     if command == "train":
         assert keys == ["data.garments", "data.sequences", "data.body", "weights"]
         assert f"keys of model.*, losses.* stand in the files of the options:\n  {CONFIG_FOLDER}/GROUP/" in text
+
+
+def test_the_process_is_set_up_before_torch_is_loaded() -> None:
+    """OpenMP reads the number of threads when torch is loaded; a step takes twice the time and more on two."""
+    code = """
+import sys
+from hood.cli import main
+main.main([])
+main.main(["--version"])
+assert "torch" not in sys.modules, "the usage loads torch"
+main._keep_memory_mapped()
+import torch
+assert torch.get_num_threads() == 1, torch.get_num_threads()
+"""
+    environment = {key: value for key, value in os.environ.items() if key != "OMP_NUM_THREADS"}
+    done = subprocess.run([sys.executable, "-P", "-c", code], env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 def test_usage_and_version(capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,8 +7,7 @@ import re
 import pytest
 from pages import ROOT, text_of
 
-from hood.app.output.verdict import EXIT_CODES, exit_code_lines
-from hood.cli.main import main
+from hood.cli.main import EXIT_CODES, exit_code_lines, main
 
 ROW = re.compile(r"^\| (\d+) \| (.+) \|$", re.MULTILINE)
 
