@@ -59,9 +59,9 @@ SPOTS_HEIGHT = Limit(0.0015, "m", _SKIN, "lower spots flicker")
 SPOTS_LASTING = Limit(0.45, "share of frames", _SKIN, "spots that come and go are not seen")
 #: Larger spots count where they last less long.
 SPOTS_LARGE = Limit(
-    0.004, "share of the cloth's triangles", _SKIN, "498 rollouts: right ones have them in one of the frames looked at, at most"
+    0.004, "share of the cloth's triangles", _SKIN, "498 rollouts: good ones have them in one frame looked at, at most"
 )
-SPOTS_LARGE_LASTING = Limit(0.25, "share of frames", _SKIN, "a right one of four looked at reaches a quarter")
+SPOTS_LARGE_LASTING = Limit(0.25, "share of frames", _SKIN, "of four frames looked at, good rollouts have them in one")
 #: Cloth that is under the skin as a whole cuts nothing.
 INSIDE_UNSOUND = Limit(0.05, "share of the vertices", _SKIN, "2 mm deep in the body; ordinary rollouts have less than 1%")
 INSIDE_ALARM = Limit(0.01, "m", _GUARD, "contact pushes out from 10 mm, from deeper it may push through the limb")

@@ -1,6 +1,7 @@
-"""The scalar laws of contact and friction, each with its slope and curvature, for every form of these energies in Python.
+"""The scalar laws of contact and friction, each with its slope and curvature: what training, solver and refinement compute.
 
-The compiled forms take the same laws from ``hood/native/laws.h``. Orders of operations are part of a law: results of earlier
+The compiled forms take the same laws from ``hood/native/laws.h``. A friction law f(y) must be flat at 0 and have
+f'' <= f' / y, which the solvers rely on. Orders of operations are part of a law: results of earlier
 versions stay the same to the last bit.
 """
 
@@ -88,5 +89,5 @@ def slip_slope(norm: Tensor, limit: Tensor) -> Tensor:
 
 
 def slip_curvature(norm: Tensor, limit: Tensor) -> Tensor:
-    """f''(y) [1/m] (N,) of :func:`mollified_norm`: never above :func:`slip_slope`, and 0 beyond the limit."""
+    """f''(y) [1/m] (N,) of :func:`mollified_norm`, 0 beyond the limit."""
     return torch.where(norm < limit, 2.0 * (1.0 - norm / limit) / limit, 0.0)

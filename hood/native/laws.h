@@ -1,5 +1,5 @@
-// The laws of contact, friction, membrane and bending as numbers of one element: the compiled forms of hood/energies/laws.py.
-// Every compiled pass takes them from here. Orders of operations are part of a law: bits depend on them.
+// The laws of contact and friction, the compiled forms of hood/energies/laws.py, and those of membrane and bending, of
+// hood/energies/membrane.py and bending.py. Every compiled pass takes them from here. Orders of operations are part of a law: bits depend on them.
 #pragma once
 #include <cmath>
 
@@ -31,12 +31,12 @@ inline double contact_push(double weight, double start, double end, double compl
 
 // ---- friction: a force times f(y) of the slip's length y, see hood.energies.laws.mollified_norm -----------------------------
 
-inline double mollified(double y, double limit) { return y < limit ? y * y / limit * (1.0 - y / (3.0 * limit)) + limit / 3.0 : y; }
-// f' / y, without and with the force.
-inline double mollified_slope(double y, double limit) { return y < limit ? (2.0 - y / limit) / limit : 1.0 / y; }
-inline double slip_slope(double force, double y, double limit) { return force * mollified_slope(y, limit); }
-// The force times f''.
-inline double slip_curvature(double force, double y, double limit) { return y < limit ? force * 2.0 * (1.0 - y / limit) / limit : 0.0; }
+inline double mollified_norm(double y, double limit) { return y < limit ? y * y / limit * (1.0 - y / (3.0 * limit)) + limit / 3.0 : y; }
+// f' / y, and the slope of the energy F f(y) by the slip, over y.
+inline double slip_slope(double y, double limit) { return y < limit ? (2.0 - y / limit) / limit : 1.0 / y; }
+inline double friction_slope(double force, double y, double limit) { return force * slip_slope(y, limit); }
+// F f''. The solvers need f'' <= f' / y: the difference is what may make a matrix indefinite.
+inline double friction_curvature(double force, double y, double limit) { return y < limit ? force * 2.0 * (1.0 - y / limit) / limit : 0.0; }
 
 // ---- membrane: mu tr G^2 + lambda / 2 tr^2 G of the Green strain, eight faces at a time --------------------------------------
 

@@ -33,7 +33,7 @@ template <class T> inline double layer_slip(const LayerGrips& g, int64_t i, cons
 
 double layer_grip_energy(const LayerGrips& g, const double* pos) {
     double sum = 0.0, slip[3];
-    for (int64_t i = 0; i < g.count; ++i) sum += g.force[i] * mollified(layer_slip(g, i, pos, slip), g.limit[i]);
+    for (int64_t i = 0; i < g.count; ++i) sum += g.force[i] * mollified_norm(layer_slip(g, i, pos, slip), g.limit[i]);
     return sum;
 }
 
@@ -51,8 +51,8 @@ void model_layer_grips(const LayerGrips& g, int64_t num_vertices, const double* 
     for (int64_t i = 0; i < g.count; ++i) {
         double slip[3], block[6] = {}, less[6] = {}, *model = g.model + 5 * i;
         const double size = layer_slip(g, i, pos, slip), force = g.force[i], limit = g.limit[i];
-        const double slope = slip_slope(force, size, limit);
-        const double along = slip_curvature(force, size, limit);
+        const double slope = friction_slope(force, size, limit);
+        const double along = friction_curvature(force, size, limit);
         for (int k = 0; k < 3; ++k) model[k] = size > 0.0 ? slip[k] / size : 0.0;
         model[3] = slope, model[4] = size > 0.0 ? along - slope : 0.0;
         block[0] = block[3] = block[5] = slope;

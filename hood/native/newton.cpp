@@ -415,7 +415,7 @@ template <class Set> inline bool add_contact(const Set& set, int64_t v, const do
         any = true;
         double slip[3];
         const double *normal = grip.normal + 3 * v, limit = grip.limit[v], size = slip_of(grip, v, pos, slip);
-        const double slope = slope_of(grip, v, size), along = slip_curvature(force, size, limit);
+        const double slope = slope_of(grip, v, size), along = friction_curvature(force, size, limit);
         for (int k = 0; k < 3; ++k) gradient[k] += slope * slip[k];
         upper[0] += slope, upper[3] += slope, upper[5] += slope;
         add_outer(upper, -slope, normal);

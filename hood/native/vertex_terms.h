@@ -52,7 +52,7 @@ inline double slip_of(const Grip& grip, int64_t v, const double* pos, double* sl
 inline double grip_energy(const Grip& grip, int64_t v, const double* pos) {
     if (!(grip.force[v] > 0.0)) return 0.0;
     double slip[3];
-    return grip.force[v] * mollified(slip_of(grip, v, pos, slip), grip.limit[v]);
+    return grip.force[v] * mollified_norm(slip_of(grip, v, pos, slip), grip.limit[v]);
 }
 
 // Slip against the air in the plane of the normal, its length, and the slip along the normal.
@@ -72,7 +72,7 @@ inline double drag_energy(const Drag& drag, int64_t v, const double* pos) {
 
 // Force along the slip, of length ``size``, in units of it.
 inline double slope_of(const Grip& grip, int64_t v, double size) {
-    return slip_slope(grip.force[v], size, grip.limit[v]);
+    return friction_slope(grip.force[v], size, grip.limit[v]);
 }
 
 }  // namespace

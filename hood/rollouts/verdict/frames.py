@@ -13,7 +13,7 @@ import numpy as np
 from hood.assets.files.said import Doubt
 
 #: Kinds of reasons, as they stand in ``summary.json``; these words stay.
-_KINDS = (
+KINDS = (
     "empty",  # no frame
     "not_finite",
     "not_worn",  # a part of the garment has come off
@@ -33,7 +33,7 @@ _KINDS = (
 class Cause:
     """One kind of badness in the frames of a rollout."""
 
-    kind: str  # of KINDS
+    kind: str  # of :data:`KINDS`
     text: str  # what is so in the bad frames; a whole sentence where ``whole``
     bad: np.ndarray  # (S,) bool
     values: np.ndarray | None = None  # (S,) of which the largest is named, in ``unit``

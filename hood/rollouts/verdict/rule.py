@@ -33,7 +33,7 @@ from hood.rollouts.verdict.unworn import worn_causes
 class Reason:
     """Why a rollout is unsound."""
 
-    kind: str  # a stable word, see :data:`hood.rollouts.verdict.causes.KINDS`
+    kind: str  # a stable word, see :data:`hood.rollouts.verdict.frames.KINDS`
     sentence: str
     frames: tuple[tuple[int, int], ...] = ()  # runs of bad frames, first and last
     value: float | None = None  # the worst
