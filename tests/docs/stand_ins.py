@@ -50,6 +50,7 @@ class Desk:
             (r"(my_)?walk\.npz|my_amass_file\.npz|amass(/.*)?", self.recording),
             (r"(first|second)\.txt", self.list_of_motions),
             (r"hero\.glb", self.hero),
+            (r"models/SMPLX_NEUTRAL\.npz", self.smplx),
             (r"pieces/.*\.npz", self.piece),
             (r"skirt\.obj|twirl\.npz|skirt_prepared\.npz", self.of_tutorial),
             (r"hood/studies/notes/stability\.md", self.page),
@@ -175,6 +176,10 @@ class Desk:
 
     def hero(self, name: str, words: Sequence[str]) -> Path:
         return Path(self.workshop.body("gltf_skin"))
+
+    def smplx(self, name: str, words: Sequence[str]) -> Path:
+        """A body model of this layout."""
+        return Path(self.workshop.body("smplx_npz"))
 
     def piece(self, name: str, words: Sequence[str]) -> Path:
         def make(folder: Path) -> None:
