@@ -1,7 +1,8 @@
-"""Membrane energy of cloth with a warp and a weft: orthotropic where :mod:`hood.energies.membrane` is isotropic.
+"""Stretching: the membrane energy of St. Venant-Kirchhoff cloth, isotropic, or orthotropic with a warp and a weft.
 
-Linear orthotropic elasticity of a thin sheet (Jones, "Mechanics of Composite Materials", 1999, chapter 2), on the Green strain
-as in St. Venant-Kirchhoff's material. E is the strain in the frame of the face's warp (1) and weft (2):
+Of cloth with warp and weft: linear orthotropic elasticity of a thin sheet (Jones, "Mechanics of Composite Materials", 1999,
+chapter 2), on the Green strain as in St. Venant-Kirchhoff's material. E is the strain in the frame of the face's warp (1) and
+weft (2):
 
     A (½ k_warp E₁₁² + ½ k_weft E₂₂² + k_coupling E₁₁ E₂₂ + 2 k_shear E₁₂²)
 
@@ -18,8 +19,6 @@ is (λ + 2 μ)² > λ², which μ > 0 and μ + λ > 0 make true. With all factor
 
 Symbols: A → ``cloth.rest_area`` [m²], h → ``cloth.thickness`` [m], λ, μ → ``cloth.lame_lambda``, ``cloth.lame_mu`` [Pa]; warp,
 weft, shear → the columns of ``cloth.weave``. The first column of ``cloth.rest_inverse`` is the warp.
-
-Membrane energy of St. Venant-Kirchhoff cloth; that of cloth with warp and weft is in :mod:`hood.energies.membrane`.
 """
 
 from __future__ import annotations
@@ -91,7 +90,7 @@ class Stretching(Energy):
 
     A → ``cloth.rest_area`` [m²], h → ``cloth.thickness`` [m], μ, λ → ``cloth.lame_mu``, ``cloth.lame_lambda``
     [Pa], D_m⁻¹ → ``cloth.rest_inverse`` [1/m]. Cloth that has a ``weave`` has the orthotropic energy of
-    :mod:`hood.energies.membrane` instead.
+    this module instead.
     """
 
     kind: ClassVar[str] = "Stretching"

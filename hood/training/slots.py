@@ -94,7 +94,7 @@ class _Slot:
 
 
 class Slots:
-    """Running rollouts, a batch of them for every bucket of garments of similar size (:mod:`hood.training.slots`).
+    """Running rollouts, a batch of them for every bucket of garments of similar size.
 
     Scene number ``draws`` of slot *i* is a function of (seed, i, draws), the bucket of an update one of their number: a
     checkpoint stores these numbers and the states, nothing else. Garments go round the slots of their bucket, so that every

@@ -1,4 +1,4 @@
-"""Triangle rasteriser in numpy; compiled where there is a compiler (:mod:`hood.media.renderer.raster`).
+"""Triangle rasteriser in numpy; compiled where there is a compiler.
 
 Triangles are expanded twice into flat arrays, first into (triangle, row) pairs and then into the pixels
 of each row, whose first and last column follow from the three edge functions in closed form. So no pixel

@@ -195,7 +195,7 @@ _SHORTEST = 1e-9
 
 
 class EdgeOutput(VelocityBaseOutput):
-    """Corrections to the edges of the base, and one linear solve for the positions (:mod:`hood.model.readout.edges`).
+    """Corrections to the edges of the base, and one linear solve for the positions.
 
     The raw output of an edge (N, 5) turns its vector, takes a share of the way to its rest length, and stretches it by
     hundredths. That of a vertex (V, 5) is a displacement of its anchor in units of ``scale``, and the logarithms of how much

@@ -39,7 +39,7 @@ The body turns by 4.2 degrees and moves by 0.14 m at most. What is beyond 50 is 
 spins twice a second takes the force of quickstart from 1 to 17 and more, and rg of
 quickstart+5 beyond 50 six frames before its strain leaves 24% for 180%.
 
-Alarms of a guard (:mod:`hood.rollouts.checks.guard`): what can be beyond a limit, in which frame, and what was done about it.
+Its alarms: what can be beyond a limit, in which frame, and what was done about it.
 """
 
 from __future__ import annotations
