@@ -22,7 +22,7 @@ from hood.app.plan_file import plan_mode, plan_path, planned, rollout_config
 from hood.app.scene.motion import NAMED, Own
 from hood.app.settings.compose import ConfigError
 from hood.app.settings.python_words import overrides
-from hood.app.setup import Setup, check_config, make_stepper, set_up
+from hood.app.setup import Setup, check_config, make_stepper, set_up, start_of
 from hood.app.stepping.cautions import idle_in_rollout
 from hood.app.stepping.guarding import GuardStopped, make_guard
 from hood.assets.body.body import Body
@@ -76,16 +76,17 @@ class Simulation:
         with collected() as told:
             guard = make_guard(config, self.stepper, self.potential)
         self.notes += [line for line in told if line not in self.notes]
+        settle, relaxing = start_of(config)
         steps = frames.simulate(
             self.stepper,
             self.scene,
             self.potential,
             self._simulated,
-            int(config.relaxing_steps),
+            relaxing,
             metrics=str(config.metrics),
             fields=tuple(config.export),
             surface_stride=int(config.surface_stride),
-            settle=str(config.settle),
+            settle=settle,
             guard=guard,
             afresh=plan_mode(config) == "full",
         )

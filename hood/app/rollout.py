@@ -25,7 +25,7 @@ from hood.app.scene.events import describe_held, fastening_attributes, summarise
 from hood.app.scene.garments import describe_ease, summarise_ease
 from hood.app.settings.compose import plain
 from hood.app.settings.record import save_run_record
-from hood.app.setup import Setup, check_config, make_stepper, set_up, solves_in_double
+from hood.app.setup import Setup, check_config, make_stepper, set_up, solves_in_double, start_of
 from hood.app.stepping.automatic import advice
 from hood.app.stepping.cautions import idle_in_rollout, warn
 from hood.app.stepping.cloth_contact import why_not
@@ -225,6 +225,7 @@ def _simulate_to_disk(
     and the end."""
     config, scene, stepper, potential = ready.config, ready.scene, ready.stepper, ready.potential
     guard = make_guard(config, stepper, potential)
+    settle, relaxing = start_of(config)
     count = min(int(config.num_frames), scene.num_frames)
     if count < int(config.num_frames):
         say(f"{scene.motion.name} has {count} frames at {1 / scene.dt:g} fps; the rollout ends there")
@@ -259,7 +260,7 @@ def _simulate_to_disk(
         ridden_faces(garment.faces if finer is None else finer.faces, len(stored_rest), riders),
         scene.motion.faces,
         scene.motion.num_vertices,
-        metric_names(potential, stepper, str(config.metrics), str(config.settle), guard is not None),
+        metric_names(potential, stepper, str(config.metrics), settle, guard is not None),
         scene.dt if steps is None else 1.0 / steps.rate.fps,
         attributes,
         farthest=float(np.abs(scene.motion.translation).max()),
@@ -274,11 +275,11 @@ def _simulate_to_disk(
         scene,
         potential,
         count,
-        int(config.relaxing_steps),
+        relaxing,
         metrics=str(config.metrics),
         fields=exported(config),
         surface_stride=int(config.surface_stride),
-        settle=str(config.settle),
+        settle=settle,
         guard=guard,
         afresh=plan_mode(config) == "full",
     )

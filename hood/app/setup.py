@@ -59,7 +59,7 @@ def check_config(config: DictConfig) -> None:
     require_device(config)
     require_choice(config, "video", ("mp4", "gif", "none"))
     require_choice(config, "metrics", METRIC_CHOICES)
-    require_choice(config, "settle", SETTLE_CHOICES)
+    start_of(config)
     require_choice(config, "doubts", DOUBTS)
     _check_numbers(config)
     checked_fabrics(config)
@@ -73,6 +73,23 @@ def check_config(config: DictConfig) -> None:
     check_refinement(config)
     check_guard(config)
     check_cloth_contact(config)
+
+
+def start_of(config: DictConfig) -> tuple[str, int]:
+    """What ``settle`` says: one of :data:`hood.rollouts.frame.SETTLE_CHOICES`, and the number of relaxing steps.
+
+    Raises:
+        ConfigError: it says something else.
+    """
+    value = config.settle
+    if isinstance(value, int):
+        if value < 0:
+            raise ConfigError(
+                f"settle={value}: give a number of relaxing steps, at least 0, or one of {', '.join(SETTLE_CHOICES)}"
+            )
+        return "paper", value
+    require_choice(config, "settle", SETTLE_CHOICES)
+    return str(value), 1
 
 
 def set_up(
@@ -174,20 +191,16 @@ def make_stepper(config: DictConfig) -> tuple[Stepper, str]:
 
 
 def _check_start(config: DictConfig, stepper: Stepper, scene: Scene, tell: Callable[[str], None]) -> None:
-    """A line where a rollout has a start of its own; ConfigError where the number of relaxing steps would play no role."""
+    """A line where a rollout has a start of its own."""
     if str(config.settle) != "equilibrium":
         return
     reason = own_start(stepper, scene)
     if reason is not None:
         tell(f"settle=paper: {reason}")
-    elif int(config.relaxing_steps) != 1:
-        raise ConfigError(
-            f"relaxing_steps={config.relaxing_steps}: belongs to settle=paper, settle=equilibrium has none; add settle=paper"
-        )
 
 
 def _check_numbers(config: DictConfig) -> None:
-    for key, least in (("num_frames", 1), ("relaxing_steps", 0), ("video_stride", 1), ("surface_stride", 1), ("seed", 0)):
+    for key, least in (("num_frames", 1), ("video_stride", 1), ("surface_stride", 1), ("seed", 0)):
         if int(config[key]) < least:
             raise ConfigError(f"{key}={config[key]}: must be at least {least}")
     thinning(config)

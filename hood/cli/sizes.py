@@ -16,7 +16,7 @@ from hood.app.common import output_folder, prepare_folder, require_package
 from hood.app.scene.garments import FITS
 from hood.app.settings.compose import ConfigError, load_config, plain, require_choice, shown
 from hood.app.settings.python_words import overrides
-from hood.app.setup import check_config, make_stepper, set_up
+from hood.app.setup import check_config, make_stepper, set_up, start_of
 from hood.assets.files.atomic import write_atomically
 from hood.media.film import Film
 from hood.media.renderer.render import contact_sheet
@@ -109,7 +109,7 @@ def _wear(size: str, shape: tuple[float, ...], config: DictConfig, stepper: Step
     """The garment after the frames of its rollout."""
     ready = set_up(config, stepper, tell=lambda sentence: None)
     scene, count = ready.scene, min(int(config.num_frames), ready.scene.num_frames)
-    frames = simulate(ready.stepper, scene, ready.potential, count, metrics="none", settle=str(ready.config.settle))
+    frames = simulate(ready.stepper, scene, ready.potential, count, metrics="none", settle=start_of(ready.config)[0])
     (frame,) = deque(frames, maxlen=1)
     ease = measure_ease(scene, scene.cloth_at(frame.index), frame.state, frame.index)
     assert ease is not None  # there is a body

@@ -18,7 +18,7 @@ from hood.scene.holding import SPEED
 from hood.testing import grid
 
 ROLLOUT = ["rollout", "garment=flag.npz", "body=none", "sequence=none", "stepper=newton", "cloth_contact=off", "video=none",
-           "sheet=false", "metrics=strain", "settle=paper", "relaxing_steps=0", "guard=off", "output=run"]  # fmt: skip
+           "sheet=false", "metrics=strain", "settle=0", "guard=off", "output=run"]  # fmt: skip
 UNTRAINED = ["checkpoint=untrained", "model=small", "model.latent_dim=4", "model.schedule='1x(mesh)'"]
 ROW = np.array([[9, 12], [10, 13], [11, 14]])
 
@@ -99,7 +99,7 @@ def test_many_motions_and_resuming_know_the_events() -> None:
     for name in ("a", "b"):
         np.savez(Path("motions") / f"{name}.npz", **still, mocap_framerate=30.0, gender="neutral")
     words = ["rollout", "garment=shirt", "sequence=motions", "up=y", "stepper=newton", "cloth_contact=off", "num_frames=3",
-             "metrics=none", "video=none", "sheet=false", "settle=paper", "relaxing_steps=0", "guard=off", "resume=true",
+             "metrics=none", "video=none", "sheet=false", "settle=0", "guard=off", "resume=true",
              "output=many"]  # fmt: skip
     events, times = "events=[{frame: 1, open: front_buttons}]", []
     for given in ([events], [events], []):

@@ -42,7 +42,7 @@ def test_networks_and_the_solver_start_from_the_same_state() -> None:
 
 
 def test_paper_leaves_no_trace(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([*QUICK, "settle=paper", "relaxing_steps=0"]) == 0
+    assert main([*QUICK, "settle=0"]) == 0
     assert json.loads(Path("run/summary.json").read_text())["settled"] is None
     assert not any("settle" in name for name in read_rollout(Path("run/rollout.h5")).metrics)
     assert "settled in" not in capsys.readouterr().out
@@ -52,7 +52,7 @@ def test_paper_leaves_no_trace(capsys: pytest.CaptureFixture[str]) -> None:
     "overrides, words",
     [
         (["settle=soon"], "unknown value for settle 'soon': known are equilibrium, paper"),
-        (["relaxing_steps=0"], "relaxing_steps=0: belongs to settle=paper, settle=equilibrium has none; add settle=paper"),
+        (["settle=-1"], "settle=-1: give a number of relaxing steps, at least 0, or one of equilibrium, paper"),
     ],
 )
 def test_what_does_not_fit_is_refused(

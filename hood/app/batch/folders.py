@@ -19,6 +19,7 @@ from hood.app.common import output_folder
 from hood.app.notices import say
 from hood.app.output.summary import summarise
 from hood.app.settings.compose import ConfigError, brief, load_config, options, plain
+from hood.app.settings.record import read_settings
 from hood.app.stepping.automatic import AUTO
 from hood.app.stepping.steppers import GROUP, with_stepper
 from hood.assets.files.library import locate, names
@@ -196,14 +197,14 @@ def _complete(folder: Path) -> dict[str, Any] | None:
 def _other_settings(config: Any, attributes: dict[str, Any]) -> dict[str, Any]:
     """What a rollout was made with where that is not what ``config`` says, by key."""
     try:
-        before = json.loads(attributes["asked"])
+        before = read_settings(attributes["asked"])
     except ValueError:
         return {"asked": None}
     now = plain(config)
     before["plan"] = before.get("plan") or now["plan"]
     before.setdefault("stepping", now["stepping"])  # rollouts from before there were options are known by their word
     if before.get("stepper") == AUTO != now["stepper"]:  # what it became
-        before |= {key: value for key, value in json.loads(attributes["config"]).items() if key in ("stepper", "stepping")}
+        before |= {key: value for key, value in read_settings(attributes["config"]).items() if key in ("stepper", "stepping")}
     # What had no key yet was what its default says now.
     before = {**plain(load_config("rollout")), **before}
     other = {key: before.get(key) for key in now if key not in _FREE and before.get(key) != now[key]}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,6 +19,7 @@ from hood.app.output.verdict import (
     summarise_verdict,
 )
 from hood.app.scene.events import describe_fasteners, summarise_fasteners
+from hood.app.settings.record import read_settings
 from hood.app.stepping.cloth_contact import describe_cloth_contact, summarise_cloth_contact
 from hood.app.stepping.guarding import summarise_guard
 from hood.app.stepping.refinement import describe_refinement, summarise_refinement
@@ -69,9 +69,9 @@ def summarise(path: Path) -> dict[str, Any]:
         "ms_per_frame": times,
         **solver,
         **summarise_cloth_contact(
-            json.loads(data.attributes["config"]), data.step_metrics, str(data.attributes.get("cloth_contact_off", ""))
+            read_settings(data.attributes["config"]), data.step_metrics, str(data.attributes.get("cloth_contact_off", ""))
         ),
-        **summarise_refinement(json.loads(data.attributes["config"]), data.step_metrics),
+        **summarise_refinement(read_settings(data.attributes["config"]), data.step_metrics),
         **summarise_fasteners(data),
         **summarise_guard(data),
         **summarise_verdict(data),

@@ -17,6 +17,7 @@ from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from hood.app.settings.old_keys import todays_words
 from hood.app.settings.old_targets import rename_targets
 from hood.app.settings.overrides import decoded, decoded_text, is_coded, loop, parse, quoted, readable
 from hood.assets.files.library import unknown
@@ -75,8 +76,20 @@ def load_config(name: str, overrides: Sequence[str] = ()) -> DictConfig:
         ConfigError: misspelt key, group option or type; Hydra's own complaints in one line.
     """
     folders = tuple(str(folder) for folder in config_folders())
-    words = with_network(overrides) if name == "rollout" else tuple(overrides)
+    words = with_network(rollout_words(overrides)) if name == "rollout" else tuple(overrides)
     return copy.deepcopy(_loaded(CONFIG_FOLDER, folders, name, words))
+
+
+def rollout_words(words: Sequence[str]) -> tuple[str, ...]:
+    """The words of a rollout by today's keys, see :func:`hood.app.settings.old_keys.todays_words`.
+
+    Raises:
+        ConfigError: a word contradicts another.
+    """
+    try:
+        return todays_words(words)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
 
 
 def with_network(words: Sequence[str]) -> tuple[str, ...]:

@@ -21,6 +21,8 @@ _SHOWN_VALUES = 3
 _QUOTED = re.compile(r"'(?:[^'\\]|\\.)*'|\"(?:[^\"\\]|\\.)*\"", re.DOTALL)
 _BRACKETS = {"[": "]", "{": "}", "(": ")"}
 _NUMBER = re.compile(r"[+-]?(\d[\d_]*\.?\d*|\.\d+)([eE][+-]?\d+)?|nan|inf|null|true|false", re.IGNORECASE)
+#: Strings that Hydra reads as they are.
+_BARE, _WORDS = re.compile(r"[A-Za-z_][A-Za-z0-9_./+-]*"), ("null", "true", "false", "nan", "inf")
 #: Keys of names: 2024_01 is a folder there, not a number.
 _NAMES = ("output", "garment", "sequence", "body", "checkpoint", "texture")
 #: What the grammar does not read in the key of a table, and how it is written there instead.
@@ -85,6 +87,11 @@ def loop(command: str, key: str = "seed", values: Sequence[str] = ("0", "1")) ->
 def quoted(text: str) -> str:
     """Text as Hydra reads it whatever it holds."""
     return "'" + re.sub(r"(\\+)(?=')|(\\+)$", lambda found: 2 * found[0], text).replace("'", "\\'") + "'"
+
+
+def bare_or_quoted(text: str) -> str:
+    """Text as Hydra reads it, in quotes where it needs them."""
+    return text if _BARE.fullmatch(text) and text.lower() not in _WORDS else quoted(text)
 
 
 def plain_word(key: str, value: str) -> str:

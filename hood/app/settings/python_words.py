@@ -9,12 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from hood.app.settings.compose import TABLES, ConfigError
-from hood.app.settings.overrides import coded, quoted
+from hood.app.settings.overrides import bare_or_quoted, coded
 from hood.assets.material import NO_GRADIENT
 
-#: Strings that Hydra reads as they are; all others are quoted.
-_BARE = re.compile(r"[A-Za-z_][A-Za-z0-9_./+-]*")
-_WORDS = ("null", "true", "false", "nan", "inf")
 #: Keys of tables: names of parts in any alphabet, and of files.
 _KEY = re.compile(r"[\w./+@-]+")
 #: Keys of what is read from files, and how they are given.
@@ -64,10 +61,7 @@ def _word(value: Any, key: str) -> str:
     if isinstance(value, Mapping):
         return "{" + ",".join(f"{_key(name, key)}:{_word(item, key)}" for name, item in value.items()) + "}"
     if isinstance(value, (str, Path)):
-        text = str(value)
-        if _BARE.fullmatch(text) and text.lower() not in _WORDS:
-            return text
-        return quoted(text)
+        return bare_or_quoted(str(value))
     raise ConfigError(f"{key}={_sort(value)}: give a number, a word, a path, a list or a table of them, or None")
 
 

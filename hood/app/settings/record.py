@@ -12,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from hood.app.settings.compose import _REASON, ConfigError, _one_line
+from hood.app.settings.old_keys import put_todays_keys
 from hood.app.settings.old_targets import rename_targets
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.guarded import check_size
@@ -39,7 +40,22 @@ def read_record(path: Path) -> dict[str, Any]:
     if not isinstance(record, dict):
         raise ConfigError(f"{path}: not the record of a run (it holds no keys); use another output")
     rename_targets(record)
-    return {str(key): value for key, value in record.items()}
+    named = {str(key): value for key, value in record.items()}
+    put_todays_keys(named)
+    return named
+
+
+def read_settings(text: str) -> dict[str, Any]:
+    """The settings of a rollout as its file keeps them, by today's keys.
+
+    Raises:
+        ValueError: the text is no JSON, or holds none.
+    """
+    settings = json.loads(text)
+    if not isinstance(settings, dict):
+        raise ValueError("not the settings of a rollout")
+    put_todays_keys(settings)
+    return settings
 
 
 def _require_plain(text: str) -> None:

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from hood.app.settings.compose import ConfigError
-from hood.app.setup import Setup
+from hood.app.setup import Setup, start_of
 from hood.steppers.watched import WatchedStepper, lacking
 from hood.studies.plan.ablation import (
     LEAD,
@@ -131,7 +131,7 @@ class _Probe:
             raise ConfigError("parts: this rollout has none that could be left out")
         self.made = Variants(ready)
         self.full = self.made.full
-        self.settle = str(self.config.settle)
+        self.settle, _ = start_of(self.config)
         self.begun = begin(self.full, self._windows(), self.settle, most_steps=None if asked.decides else _ROUGH)
 
     def run(self) -> Probed:

@@ -149,7 +149,7 @@ def test_events_are_reported_of_simulated_frames() -> None:
     events = (
         "events=[{frame: 8, open: seam}, {frame: 13, close: seam}, {frame: 20, detach: pins}, {frame: 24, attach: [0, 1, 2]}]"
     )
-    words = ("garment=flag.npz", "body=none", "sequence=none", "start=null", "metrics=strain", "relaxing_steps=0", "guard=off",
+    words = ("garment=flag.npz", "body=none", "sequence=none", "start=null", "metrics=strain", "settle=0", "guard=off",
              "num_frames=45", "events_speed=0.6", events)  # fmt: skip
     _, usual = rollout(*words, output="every")
     _, summary = rollout(*words, "output_fps=12")

@@ -1,0 +1,109 @@
+"""Keys of ``hood rollout`` by their earlier names: words and records that have them are read as those of today."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from typing import Any, NamedTuple
+
+from hydra.errors import HydraException
+
+from hood.app.settings.overrides import bare_or_quoted, coded, decoded, parse, readable
+from hood.assets.files.said import say
+
+
+class _Old(NamedTuple):
+    """An earlier key.
+
+    Args:
+        into: the key of today.
+        value: of today's key, from that of then and from all that is set; None where the earlier key did nothing.
+        idle: why it did nothing.
+        beside: whether a value of today's key may be given beside the earlier key.
+    """
+
+    into: str
+    value: Callable[[Any, Mapping[str, Any]], Any]
+    idle: str
+    beside: Callable[[Any], bool] = lambda given: False
+
+
+def _settle(steps: Any, settings: Mapping[str, Any]) -> Any:
+    """Only what has a start of its own took another number of relaxing steps than 1 without ``settle=paper``."""
+    return steps if steps != 1 else "paper" if settings.get("settle") == "paper" else None
+
+
+#: Earlier keys, in the order in which they are read.
+_OLD = {
+    "relaxing_steps": _Old("settle", _settle, "settle=equilibrium takes none", lambda given: given == "paper"),
+}
+
+
+def todays_words(words: Sequence[str]) -> tuple[str, ...]:
+    """The words of a rollout by today's keys. Every earlier key among them is said, each word once in a process.
+
+    Raises:
+        ValueError: a word contradicts another.
+    """
+    given = {word.partition("=")[0]: word for word in words if "=" in word}
+    old_ones = [key for key in _OLD if key in given]
+    if not old_ones:
+        return tuple(words)
+    known = {*old_ones, *(_OLD[key].into for key in old_ones)}
+    settings = {key: _value(word) for key, word in given.items() if key in known}
+    said = {key: given[key] for key in known if key in given}
+    made: dict[str, str] = {}  # words of today
+    for key in old_ones:
+        into, value = _OLD[key].into, _OLD[key].value(settings[key], settings)
+        if value is None:
+            _tell(f"{given[key]} has no effect: {_OLD[key].idle}")
+            continue
+        before = settings.get(into)
+        if before not in (None, value) and (into in made or not _OLD[key].beside(before)):
+            raise ValueError(f"{said[into]} and {given[key]} contradict each other; give one of them")
+        settings[into], said[into], made[into] = value, given[key], f"{into}={_written(value)}"
+        _tell(f"{given[key]} is called {made[into]} now")
+    return (*(word for word in words if word.partition("=")[0] not in {*old_ones, *made}), *made.values())
+
+
+def put_todays_keys(record: dict[str, Any]) -> None:
+    """Put today's keys into the record of a rollout, in place of earlier ones; others stay as they are."""
+    for key, old in _OLD.items():
+        value = old.value(record[key], record) if key in record else None
+        if value is not None:
+            _put(record, old.into.split("."), value)
+    for key in _OLD:
+        record.pop(key, None)
+
+
+def _put(record: Any, path: Sequence[str], value: Any) -> None:
+    """Set what is below ``path``; nothing where the record ends before it."""
+    for name in path[:-1]:
+        record = record.get(name) if isinstance(record, dict) else None
+    if isinstance(record, dict):
+        record[path[-1]] = value
+
+
+def _value(word: str) -> Any:
+    try:
+        return decoded(parse(readable(word, several=True)).value())
+    except HydraException as error:
+        raise ValueError(f"cannot read {word!r}: write key=value") from error
+
+
+def _written(value: Any) -> str:
+    if isinstance(value, list):
+        return "[" + ",".join(map(_written, value)) + "]"
+    if isinstance(value, dict):
+        return "{" + ",".join(f"{coded(str(key))}:{_written(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, str):
+        return bare_or_quoted(value)
+    return "null" if value is None else str(value).lower() if isinstance(value, bool) else repr(value)
+
+
+@cache
+def _tell(sentence: str) -> None:
+    from hood.training import distributed  # torch, which few commands need at once
+
+    if distributed.is_first():
+        say(sentence)
