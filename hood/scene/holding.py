@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,6 +30,7 @@ class Event:
     frame: int
     name: str
     closes: bool
+    speed: float = SPEED  # m/s at which the two sides come together, where it closes
 
 
 @dataclass(frozen=True)
@@ -43,17 +45,16 @@ class Fastening:
     row: Tensor  # (A,) int64, the row that a pair belongs to
     pairs: Attachments  # all of them closed
     events: tuple[Event, ...] = ()
-    _known: dict[tuple[bool, ...], Attachments] = field(default_factory=dict, repr=False, compare=False)
+    _known: dict[Any, Attachments] = field(default_factory=dict, repr=False, compare=False)
 
-    def with_events(self, events: Sequence[Event], speed: float = SPEED) -> Fastening:
-        """The same rows with these events, in any order; pairs come together at ``speed`` [m/s]."""
-        assert self.pairs.length is not None
-        pairs = replace(self.pairs, speed=torch.full_like(self.pairs.length, speed))
-        return Fastening(self.names, self.row, pairs, tuple(sorted(events, key=lambda event: event.frame)))
+    def with_events(self, events: Sequence[Event]) -> Fastening:
+        """The same rows with these events, in any order."""
+        return Fastening(self.names, self.row, self.pairs, tuple(sorted(events, key=lambda event: event.frame)))
 
     def still(self, frame: int) -> Fastening:
         """The same rows as they are at ``frame``, without events from there on."""
-        kept = [Event(-1, name, closed) for name, closed in zip(self.names, self.closed(frame), strict=True)]
+        state = zip(self.names, self.closed(frame), self.speeds(frame), strict=True)
+        kept = [Event(-1, name, closed, speed) for name, closed, speed in state]
         return replace(self, events=tuple(kept), _known={})
 
     def closed(self, frame: int) -> tuple[bool, ...]:
@@ -65,12 +66,24 @@ class Fastening:
             state.append(passed[-1] if passed else not (own and own[0].closes))
         return tuple(state)
 
+    def speeds(self, frame: int) -> tuple[float, ...]:
+        """Of each row the speed [m/s] at which its pairs come together in that step: that of the event that has closed it, or
+        of the first that will."""
+        found = []
+        for name in self.names:
+            closing = [event for event in self.events if event.name == name and event.closes]
+            passed = [event.speed for event in closing if event.frame <= frame]
+            found.append(passed[-1] if passed else closing[0].speed if closing else SPEED)
+        return tuple(found)
+
     def at(self, frame: int) -> Attachments:
         """The attachments of the step ``frame`` → ``frame + 1``: always the same edges, those of open rows inactive."""
-        key = self.closed(frame)
+        key = self.closed(frame), self.speeds(frame)
         if key not in self._known:
-            state = torch.tensor(key, dtype=torch.bool, device=self.row.device)
-            self._known[key] = replace(self.pairs, active=state[self.row])
+            assert self.pairs.length is not None
+            state = torch.tensor(key[0], dtype=torch.bool, device=self.row.device)
+            speed = torch.tensor(key[1], dtype=self.pairs.length.dtype, device=self.row.device)
+            self._known[key] = replace(self.pairs, active=state[self.row], speed=speed[self.row])
         return self._known[key]
 
 
@@ -99,6 +112,7 @@ class Grasp:
     frame: int
     vertices: Tensor  # (V,) bool
     holds: bool
+    speed: float = SPEED  # m/s at which they come to where they are held
 
 
 @dataclass(frozen=True)
@@ -106,11 +120,10 @@ class Holding:
     """Which vertices are held in which step: those that the cloth has pinned at first, and what ``grasps`` make of that.
 
     Held vertices go where the skinned garment has them, as pins do. Those that are taken hold of elsewhere come to it at
-    ``speed`` [m/s] beside the motion of the body. What is let go moves on as it was moved.
+    the speed of their grasp beside the motion of the body. What is let go moves on as it was moved.
     """
 
     grasps: tuple[Grasp, ...]  # by frame
-    speed: float
     _known: dict[int, tuple[Cloth, Cloth]] = field(default_factory=dict, repr=False, compare=False)
 
     def cloth(self, cloth: Cloth, frame: int) -> Cloth:
@@ -143,8 +156,16 @@ class Holding:
             return there
         off = pos - here
         far = torch.linalg.vector_norm(off, dim=1, keepdim=True)
-        left = (far - self.speed * dt).clamp_min(0.0) / torch.where(far > 0, far, 1.0)
+        left = (far - (self._speed(frame, pos) * dt).to(far)).clamp_min(0.0) / torch.where(far > 0, far, 1.0)
         return torch.where(grasped.unsqueeze(1) & (left > 0), there + left * off, there)
+
+    def _speed(self, frame: int, pos: Tensor) -> Tensor:
+        """(V, 1) float64 m/s of the last grasp that holds a vertex of ``pos`` (V, 3); 0 where none does."""
+        speed = pos.new_zeros(len(pos), 1, dtype=torch.float64)
+        for grasp in self.grasps[: self._passed(frame)]:
+            if grasp.holds:
+                speed[grasp.vertices] = grasp.speed
+        return speed
 
     def _passed(self, frame: int) -> int:
         return sum(grasp.frame <= frame for grasp in self.grasps)

@@ -49,8 +49,8 @@ def off(data: RolloutData) -> np.ndarray:
 
 def test_a_row_opens_and_closes_without_a_jump(capsys: pytest.CaptureFixture[str]) -> None:
     usual, _ = rollout("num_frames=40")
-    words = "events=[{time: 0.5, close: seam}, {frame: 10, open: [seam]}]"
-    data, summary = rollout("num_frames=40", words, "events_speed=0.6")
+    words = "events=[{time: 0.5, close: seam, speed: 0.6}, {frame: 10, open: [seam]}]"
+    data, summary = rollout("num_frames=40", words)
     assert np.array_equal(data.cloth_pos[:11], usual.cloth_pos[:11])  # the step from frame 10 is the first without it
     gap, free = off(data), 9.81 / 30**2
     assert np.abs(gap[:11]).max() < 1e-3
@@ -113,8 +113,8 @@ def test_many_motions_and_resuming_know_the_events() -> None:
 
 
 def test_vertices_are_let_go_and_held_again(capsys: pytest.CaptureFixture[str]) -> None:
-    words = "events=[{frame: 4, detach: pins}, {frame: 8, attach: [0, 1, 2]}]"
-    data, summary = rollout("num_frames=30", words, "events_speed=0.6")
+    words = "events=[{frame: 4, detach: pins}, {frame: 8, attach: [0, 1, 2], speed: 0.6}]"
+    data, summary = rollout("num_frames=30", words)
     height = data.cloth_pos[:, :3, 1]
     assert (height[:5] == height[0]).all()
     np.testing.assert_allclose(height[4] - height[5], 9.81 / 30**2, rtol=0.1)
@@ -156,7 +156,8 @@ def test_events_of_a_config() -> None:
         (["events=[{frame: 1.5, open: a}]"], "frame is 1.5; give a whole number"),
         (["events=[{frame: 1, open: []}]"], r"open is \[\]; give a name or a list of names"),
         (["events=[{frame: 1, open: [3]}]"], r"open is \[3\]; give a name or a list of names"),
-        (["events_speed=0"], "events_speed=0: give a speed > 0 in m/s"),
+        (["events=[{time: 1, close: a, speed: 0}]"], r"events\[0\]: speed is 0; give a speed > 0 in m/s, such as speed: 0.25"),
+        (["events=[{time: 1, open: a, speed: 1}]"], r"events\[0\]: speed belongs to close and attach; open acts at once"),
         (["events=[{frame: 1, attach: hem}]", "step=fixed"], r"events\[0\]: step=fixed has fixed shapes"),
     ],
 )
@@ -197,5 +198,6 @@ def test_garments_without_fasteners_say_what_to_do(capsys: pytest.CaptureFixture
     assert message in capsys.readouterr().err
 
 
-def test_the_speed_is_one_from_the_command_line_and_from_python() -> None:
-    assert load_config("rollout").events_speed == SPEED
+def test_an_event_has_a_speed_of_its_own() -> None:
+    words = ["events=[{time: 1, close: a, speed: 3}, {time: 2, close: a}]"]
+    assert [one.speed for one in checked_events(load_config("rollout", words))] == [3.0, SPEED]

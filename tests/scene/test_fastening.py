@@ -14,20 +14,19 @@ from hood.scene.scene import Scene
 ROWS = {"zip": np.array([[0, 1], [2, 3]]), "buttons": np.array([[4, 5]])}
 
 
-def fastening(*events: Event, speed: float = SPEED) -> Fastening:
+def fastening(*events: Event) -> Fastening:
     pos = torch.zeros(6, 3)
     pos[1::2, 0] = torch.tensor([0.004, 0.005, 0.006])
     made = fastening_of(ROWS, pos)
     assert made is not None
-    return made.with_events(events, speed)
+    return made.with_events(events)
 
 
 def test_pairs_keep_the_distance_that_they_have_at_rest() -> None:
-    made = fastening(speed=0.2)
+    made = fastening()
     assert made.names == ("buttons", "zip")
     assert made.pairs.edges.tolist() == [[4, 5], [0, 1], [2, 3]]
     torch.testing.assert_close(made.pairs.length, torch.tensor([0.006, 0.004, 0.005]))
-    assert made.pairs.speed.tolist() == pytest.approx([0.2] * 3)
     assert fastening_of(None, torch.zeros(6, 3)) is None
     assert fastening_of({}, torch.zeros(6, 3)) is None
 
@@ -40,6 +39,16 @@ def test_events_act_from_their_frame_on_in_any_order() -> None:
     assert made.at(4).active.tolist() == [False, False, False]
     assert made.at(5).active.tolist() == [True, False, False]
     assert fastening().at(7).active.all()
+
+
+def test_a_row_comes_together_at_the_speed_of_what_closes_it() -> None:
+    made = fastening(Event(9, "zip", True, 0.5), Event(3, "zip", False), Event(5, "zip", True, 2.0))
+    assert [made.speeds(frame) for frame in (0, 4, 5, 8, 9)] == [
+        (SPEED, 2.0), (SPEED, 2.0), (SPEED, 2.0), (SPEED, 2.0), (SPEED, 0.5)
+    ]  # fmt: skip
+    assert made.at(5).speed.tolist() == [SPEED, 2.0, 2.0]
+    assert made.at(9).speed.tolist() == made.still(9).at(0).speed.tolist() == [SPEED, 0.5, 0.5]
+    assert fastening().at(0).speed.tolist() == [SPEED] * 3
 
 
 def test_the_edges_are_the_same_object_in_all_steps() -> None:

@@ -19,7 +19,7 @@ def some(scene: Scene, *vertices: int) -> torch.Tensor:
 
 def test_the_cloth_is_one_object_from_event_to_event(tank_scene: Scene) -> None:
     grasps = (Grasp(2, some(tank_scene, 0, 1), True), Grasp(5, some(tank_scene, 1), False))
-    scene = replace(tank_scene, holding=Holding(grasps, 0.3))
+    scene = replace(tank_scene, holding=Holding(grasps))
     assert scene.cloth_of_step(1) is scene.cloth
     assert scene.cloth_of_step(2) is scene.cloth_of_step(4)
     assert scene.cloth_of_step(3).pinned.nonzero().squeeze(1).tolist() == [0, 1]
@@ -29,7 +29,7 @@ def test_the_cloth_is_one_object_from_event_to_event(tank_scene: Scene) -> None:
 
 
 def test_what_is_taken_hold_of_comes_at_its_speed_beside_the_body(tank_scene: Scene) -> None:
-    scene = replace(tank_scene, holding=Holding((Grasp(2, some(tank_scene, 0, 1), True),), 0.3))
+    scene = replace(tank_scene, holding=Holding((Grasp(2, some(tank_scene, 0, 1), True, 0.3),)))
     state = scene.start()
     origin = state.origin[0].numpy()
     here, there = (scene.motion.skinned(scene.garment, frame, origin) for frame in (2, 3))
@@ -47,7 +47,7 @@ def test_what_is_taken_hold_of_comes_at_its_speed_beside_the_body(tank_scene: Sc
 
 def test_pins_that_were_there_are_where_they_were(skirt_scene: Scene) -> None:
     hem = int(skirt_scene.cloth.rest_pos[:, 1].argmin())
-    scene = replace(skirt_scene, holding=Holding((Grasp(3, some(skirt_scene, hem), True),), 0.3))
+    scene = replace(skirt_scene, holding=Holding((Grasp(3, some(skirt_scene, hem), True, 0.3),)))
     state = scene.start()
     for frame in (1, 4):
         found, usual = (one.step_input(frame, state).pin_target for one in (scene, skirt_scene))

@@ -152,6 +152,9 @@ def describe_held(summary: Mapping[str, Any]) -> list[str]:
 #: What an event does: to rows of fasteners, whether that closes them, and to vertices, whether that holds them.
 ROWS, VERTICES = {"open": False, "close": True}, {"detach": False, "attach": True}
 ACTIONS = (*ROWS, *VERTICES)
+#: Those that bring together what is apart, at their speed.
+TOGETHER = tuple(name for name, together in (ROWS | VERTICES).items() if together)
+_KEYS = ("time", "frame", "speed", *ACTIONS)
 _FORM = "events=[{time: 2.0, open: front_buttons}, {frame: 120, close: front_buttons}, {time: 3.0, detach: waistband}]"
 #: The pins that the garment has, as a name in attach and detach.
 PINS = "pins"
@@ -166,6 +169,7 @@ class Asked:
     in_frames: bool
     action: str
     names: tuple[str | int, ...]
+    speed: float = SPEED  # m/s
 
     def first_step(self, dt: float) -> int:
         """The frame whose step is the first with it."""
@@ -176,14 +180,11 @@ def checked_events(config: DictConfig) -> tuple[Asked, ...]:
     """The events that the config asks for, in its order.
 
     Raises:
-        ConfigError: something else than events, or ``events_speed`` is no speed; names the event by its place, from 0.
+        ConfigError: something else than events; names the event by its place, from 0.
     """
     given = plain(config.events)
     if not isinstance(given, list):
         raise ConfigError(f"events={given}: give a list, {_FORM}")
-    speed = config.events_speed
-    if isinstance(speed, bool) or not isinstance(speed, (int, float)) or not 0.0 < speed < math.inf:
-        raise ConfigError(f"events_speed={speed}: give a speed > 0 in m/s, such as {SPEED:g}")
     asked = tuple(_asked(index, event) for index, event in enumerate(given))
     held = next((one for one in asked if one.action in VERTICES), None)
     if held is not None and str(config.step) != "plain":
@@ -198,8 +199,8 @@ def _asked(index: int, event: Any) -> Asked:
     if not isinstance(event, dict):
         raise ConfigError(f"{where} is {event}; give a time and what happens, {_FORM}")
     for key in event:
-        if key not in ("time", "frame", *ACTIONS):
-            raise ConfigError(f"{where}: {unknown('key', str(key), ['time', 'frame', *ACTIONS])}")
+        if key not in _KEYS:
+            raise ConfigError(f"{where}: {unknown('key', str(key), _KEYS)}")
     moments, actions = [key for key in ("time", "frame") if key in event], [key for key in ACTIONS if key in event]
     if len(moments) != 1:
         raise ConfigError(f"{where} has {len(moments)} of time and frame; give one: time: 2.0 (s) or frame: 60")
@@ -210,7 +211,19 @@ def _asked(index: int, event: Any) -> Asked:
     if not number or (moments[0] == "frame" and value != int(value)):
         fix = "seconds >= 0, such as time: 2.0" if moments[0] == "time" else "a whole number >= 0, such as frame: 60"
         raise ConfigError(f"{where}: {moments[0]} is {value}; give {fix}")
-    return Asked(index, value, moments[0] == "frame", action, _names(where, action, event[action]))
+    return Asked(
+        index, value, moments[0] == "frame", action, _names(where, action, event[action]), _speed(where, action, event)
+    )
+
+
+def _speed(where: str, action: str, event: dict[str, Any]) -> float:
+    """At which what comes together does [m/s]."""
+    speed = event.get("speed", SPEED)
+    if isinstance(speed, bool) or not isinstance(speed, (int, float)) or not 0.0 < speed < math.inf:
+        raise ConfigError(f"{where}: speed is {speed}; give a speed > 0 in m/s, such as speed: {SPEED:g}")
+    if "speed" in event and action not in TOGETHER:
+        raise ConfigError(f"{where}: speed belongs to {' and '.join(TOGETHER)}; {action} acts at once, leave speed out")
+    return float(speed)
 
 
 def _names(where: str, action: str, given: Any) -> tuple[str | int, ...]:
@@ -228,14 +241,14 @@ def with_events(scene: Scene, config: DictConfig) -> Scene:
     Raises:
         ConfigError: the garment has no such fasteners or vertices, or an event contradicts another or does nothing; names it.
     """
-    asked, speed = checked_events(config), float(config.events_speed)
+    asked = checked_events(config)
     for one in asked:
         _warn_if_late(one, one.first_step(scene.dt), min(int(config.num_frames), scene.num_frames), scene.dt)
-    scene = _with_rows(scene, [one for one in asked if one.action in ROWS], speed)
-    return _with_grasps(scene, [one for one in asked if one.action in VERTICES], speed)
+    scene = _with_rows(scene, [one for one in asked if one.action in ROWS])
+    return _with_grasps(scene, [one for one in asked if one.action in VERTICES])
 
 
-def _with_rows(scene: Scene, asked: list[Asked], speed: float) -> Scene:
+def _with_rows(scene: Scene, asked: list[Asked]) -> Scene:
     if scene.fastening is None:
         if asked:
             raise ConfigError(
@@ -255,11 +268,11 @@ def _with_rows(scene: Scene, asked: list[Asked], speed: float) -> Scene:
                     f"events[{one.index}]: {one.action}s {name} in frame {frame}, where events[{other[0]}] does the opposite; "
                     "give them different times"
                 )
-            events[frame, name] = one.index, Event(frame, name, ROWS[one.action])
-    return replace(scene, fastening=scene.fastening.with_events([event for _, event in events.values()], speed))
+            events[frame, name] = one.index, Event(frame, name, ROWS[one.action], one.speed)
+    return replace(scene, fastening=scene.fastening.with_events([event for _, event in events.values()]))
 
 
-def _with_grasps(scene: Scene, asked: list[Asked], speed: float) -> Scene:
+def _with_grasps(scene: Scene, asked: list[Asked]) -> Scene:
     if not asked:
         return scene
     held, grasps = scene.cloth.pinned, list[Grasp]()
@@ -278,8 +291,8 @@ def _with_grasps(scene: Scene, asked: list[Asked], speed: float) -> Scene:
                 f"{where}: {one.action}: another event in frame {frame} does the opposite to some of these vertices"
             )
         held = held | vertices if holds else held & ~vertices
-        grasps.append(Grasp(frame, vertices, holds))
-    return replace(scene, holding=Holding(tuple(grasps), speed))
+        grasps.append(Grasp(frame, vertices, holds, one.speed))
+    return replace(scene, holding=Holding(tuple(grasps)))
 
 
 def _vertices(scene: Scene, names: tuple[str | int, ...]) -> Tensor:

@@ -11,6 +11,9 @@ from hydra.errors import HydraException
 from hood.app.settings.overrides import bare_or_quoted, coded, decoded, parse, readable
 from hood.assets.files.said import say
 
+#: Values of then that mean nothing else than what is usual.
+_SPEED = 0.25
+
 
 class _Old(NamedTuple):
     """An earlier key.
@@ -33,9 +36,20 @@ def _settle(steps: Any, settings: Mapping[str, Any]) -> Any:
     return steps if steps != 1 else "paper" if settings.get("settle") == "paper" else None
 
 
+def _events(speed: Any, settings: Mapping[str, Any]) -> Any:
+    """Of the events that bring something together and have no speed of their own."""
+    events = settings.get("events")
+    if not isinstance(events, list) or speed == _SPEED:
+        return events or None
+    moved = [isinstance(event, dict) and bool({"close", "attach"} & event.keys()) for event in events]
+    pairs = zip(events, moved, strict=True)
+    return [{**event, "speed": event.get("speed", speed)} if own else event for event, own in pairs] or None
+
+
 #: Earlier keys, in the order in which they are read.
 _OLD = {
     "relaxing_steps": _Old("settle", _settle, "settle=equilibrium takes none", lambda given: given == "paper"),
+    "events_speed": _Old("events", _events, "events are not given", lambda given: True),
 }
 
 

@@ -189,8 +189,9 @@ def _changes() -> Iterator[Cell]:
         yield Cell("growth", f"sleeves ×{factor:g}", (f"size={{sleeves:{factor:g}}}",), garment="longsleeve")
     for garment, row in (("shirt", "front_buttons"), ("jacket", "front_zip")):
         turns = f"[{{time: 0.4, open: {row}}}, {{time: 1.0, close: {row}}}]"
+        fast = f"[{{time: 0.4, open: {row}}}, {{time: 1.0, close: {row}, speed: 3}}]"
         yield Cell("events", f"{garment}, slowly", (f"events={turns}",), garment=garment)
-        yield Cell("events", f"{garment}, 3 m/s", (f"events={turns}", "events_speed=3"), garment=garment)
+        yield Cell("events", f"{garment}, 3 m/s", (f"events={fast}",), garment=garment)
         yield Cell("events", f"{garment}, jog", (f"events={turns}",), garment=garment, sequence="jog")
     yield Cell("events", "skirt comes off", ("events=[{time: 0.5, detach: pins}]",), garment="skirt")
 

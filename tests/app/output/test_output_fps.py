@@ -147,10 +147,11 @@ def test_events_are_reported_of_simulated_frames() -> None:
     pos, both = np.concatenate([upper, lower]), np.concatenate([faces, faces + 12])
     save_garment(Path("flag.npz"), Garment("flag", pos, both, np.arange(24) < 3, fasteners=rows))
     events = (
-        "events=[{frame: 8, open: seam}, {frame: 13, close: seam}, {frame: 20, detach: pins}, {frame: 24, attach: [0, 1, 2]}]"
+        "events=[{frame: 8, open: seam}, {frame: 13, close: seam, speed: 0.6}, {frame: 20, detach: pins}, "
+        "{frame: 24, attach: [0, 1, 2], speed: 0.6}]"
     )
     words = ("garment=flag.npz", "body=none", "sequence=none", "start=null", "metrics=strain", "settle=0", "guard=off",
-             "num_frames=45", "events_speed=0.6", events)  # fmt: skip
+             "num_frames=45", events)  # fmt: skip
     _, usual = rollout(*words, output="every")
     _, summary = rollout(*words, "output_fps=12")
     assert summary["fasteners"]["seam"]["events"][1]["within_frame"] is not None

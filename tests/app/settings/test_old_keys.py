@@ -27,6 +27,12 @@ def unsaid() -> None:
         ("relaxing_steps=0", "settle=0", "relaxing_steps=0 is called settle=0 now"),
         ("settle=paper relaxing_steps=1", "settle=paper", "relaxing_steps=1 is called settle=paper now"),
         ("relaxing_steps=1", "", "relaxing_steps=1 has no effect: settle=equilibrium takes none"),
+        (
+            "events=[{time:1,close:a},{time:2,open:a},{time:3,close:a,speed:2}] events_speed=0.5",
+            "events=[{time:1,close:a,speed:0.5},{time:2,open:a},{time:3,close:a,speed:2}]",
+            "events_speed=0.5 is called events=[{time:1,close:a,speed:0.5},{time:2,open:a},{time:3,close:a,speed:2}] now",
+        ),
+        ("events_speed=0.5", "", "events_speed=0.5 has no effect: events are not given"),
     ],
 )
 def test_words_of_then_are_those_of_today_and_told_once(then: str, today: str, said: str) -> None:
@@ -49,7 +55,7 @@ def test_words_that_contradict_each_other_are_refused(words: str) -> None:
 
 
 #: Earlier keys and their defaults: every record of then has all of them.
-THEN = {"relaxing_steps": 1}
+THEN = {"relaxing_steps": 1, "events_speed": 0.25}
 
 
 @pytest.mark.parametrize(
@@ -59,6 +65,11 @@ THEN = {"relaxing_steps": 1}
         ({"settle": "paper"}, {"settle": "paper"}),
         ({"settle": "paper", "relaxing_steps": 3}, {"settle": 3}),
         ({"settle": "equilibrium", "relaxing_steps": 0}, {"settle": 0}),  # of what has a start of its own
+        (
+            {"events": [{"frame": 3, "attach": "hem"}], "events_speed": 1.0},
+            {"events": [{"frame": 3, "attach": "hem", "speed": 1.0}]},
+        ),
+        ({"events": [{"frame": 3, "close": "zip"}]}, {"events": [{"frame": 3, "close": "zip"}]}),
     ],
 )
 def test_records_of_then_are_read_as_those_of_today(then: dict[str, object], today: dict[str, object]) -> None:

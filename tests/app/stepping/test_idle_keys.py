@@ -27,7 +27,6 @@ IDLE = [
     (["blend_from=a"], "blend_from=a has no effect: blend_in is 0"),
     (["size_seconds=3"], "size_seconds=3 has no effect: size_end is not given"),
     (["fabrics_seam=0.1"], "fabrics_seam=0.1 has no effect: fabrics are not given"),
-    (["events_speed=0.1"], "events_speed=0.1 has no effect: events are not given"),
     (["metrics=strain", "surface_stride=2"], "surface_stride=2 has no effect: the surface is measured with metrics=all alone"),
     (["video=none", "video_stride=2"], "video_stride=2 has no effect: video=none"),
     (["video=none", "sheet=false", "thin_body=8"], "thin_body=8 has no effect: nothing is drawn"),
