@@ -21,7 +21,7 @@ import numpy as np
 from omegaconf import DictConfig
 
 from hood import plugins
-from hood.app.settings.compose import ConfigError, load_config, rollout_words
+from hood.app.settings.compose import ConfigError, load_config, named_today
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.guarded import check_size
 from hood.assets.files.library import locate
@@ -122,7 +122,7 @@ def rollout_config(overrides: Sequence[str]) -> DictConfig:
     Raises:
         ConfigError: unknown keys or values, a file that is no plan, or a word that the plan was not made for.
     """
-    overrides = rollout_words(overrides)
+    overrides = named_today(overrides)
     config = load_config("rollout", overrides)
     path = plan_path(config)
     if config.accuracy is not None:
@@ -196,7 +196,7 @@ def _checked_words(path: Path) -> list[str]:
             f"{shlex.join(['hood', 'plan', *_with_stepper(plan['words']), 'output=…'])}",
             stacklevel=2,
         )
-    return list(rollout_words([*_with_stepper(plan["words"]), *plan["chosen"]]))
+    return list(named_today([*_with_stepper(plan["words"]), *plan["chosen"]]))
 
 
 def _with_stepper(words: Sequence[str]) -> list[str]:

@@ -23,7 +23,7 @@ def test_defaults_of_the_config_are_those_of_the_code() -> None:
 
 def test_every_key_reaches_the_options() -> None:
     words = (
-        "fps=25 up=y file_fps=90 start=10f stop=2.5 loop=3 blend_in=0.5 blend_from=a betas=[1,-2.5] gender=male hands=file "
+        "fps=25 up=y file_fps=90 start=10f stop=2.5 loop=3 blend_in=[0.5,a] betas=[1,-2.5] gender=male hands=file "
         "body_scale=0.01 animation=Walk body_parts=[Body,Shoes] num_frames=7"
     )
     expected = MotionOptions(

@@ -15,7 +15,7 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from hood.app.scene.motion import NAMED, Own, motion_options, perform
+from hood.app.scene.motion import NAMED, Own, is_blended, motion_options, perform
 from hood.app.settings.compose import ConfigError, shown
 from hood.mesh.editing.subdivision import Subdivision
 from hood.rollouts.file.reader import RolloutData
@@ -77,7 +77,7 @@ def _watched(scene: Scene) -> list[int]:
 def _posed(config: DictConfig, scene: Scene, count: int, own: Own) -> Callable[[int], Tensor] | None:
     """The body at the moments of stored frames, posed by the motion itself; None where its parts are joined at simulated
     frames, so that another rate would move the joints: it is interpolated then, as the cloth is."""
-    if int(config.loop) != 1 or float(config.blend_in) != 0:
+    if int(config.loop) != 1 or is_blended(config):
         return None
     options = replace(motion_options(config), fps=float(config.output_fps), num_frames=count)
     with warnings.catch_warnings():

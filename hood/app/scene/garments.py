@@ -185,6 +185,8 @@ def shape_coefficients(given: Any, key: str = "betas") -> np.ndarray:
     return np.array([*values, *[0.0] * (10 - len(values))], dtype=np.float64)
 
 
+#: Seconds in which a garment grows or shrinks.
+_GROWING = 2.0
 #: Whether the pattern follows the body's shape, or is that of the mean body for everybody.
 FITS = ("betas", "none")
 
@@ -195,13 +197,10 @@ def checked_sizes(config: DictConfig) -> Sizes:
     Raises:
         ConfigError: they are none, or they change in steps of fixed shapes.
     """
-    end, parts = plain(config.size_end), checked_parts(config)
+    (end, seconds), parts = _end_of(config), checked_parts(config)
     require_choice(config, "fit", FITS)
     if parts and end is not None:
         raise ConfigError(f"size_end={end}: parts of a garment keep their size; give size as one factor or three")
-    seconds = float(config.size_seconds)
-    if not seconds > 0:
-        raise ConfigError(f"size_seconds={config.size_seconds}: give seconds above 0, such as size_seconds=2")
     size = 1.0 if parts else plain(config.size)
     for key, value in (("size", size), ("size_end", size if end is None else end)):
         try:
@@ -214,6 +213,21 @@ def checked_sizes(config: DictConfig) -> Sizes:
             f"size_end={end}: step={config.step} has fixed shapes, which a garment that grows has not; use step=plain"
         )
     return replace(sizes, to_measure=str(config.fit) == "betas")
+
+
+def _end_of(config: DictConfig) -> tuple[Any, float]:
+    """What ``size_end`` says: the last size, None where it stays, and the seconds until then."""
+    value = plain(config.size_end)
+    if not isinstance(value, dict):
+        return value, _GROWING
+    seconds = value.get("seconds", _GROWING)
+    if not {"size"} <= value.keys() <= {"size", "seconds"} or value["size"] is None:
+        raise ConfigError(
+            f"size_end={shown(value)}: give a size, or a size and seconds, such as size_end={{size:1.1,seconds:3}}"
+        )
+    if isinstance(seconds, bool) or not isinstance(seconds, (int, float)) or not seconds > 0:
+        raise ConfigError(f"size_end: seconds is {shown(seconds)}; give seconds above 0, such as {{size:1.1,seconds:3}}")
+    return value["size"], float(seconds)
 
 
 def checked_parts(config: DictConfig) -> dict[str, float]:

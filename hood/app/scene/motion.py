@@ -88,11 +88,12 @@ def with_body_friction(scene: Scene, config: DictConfig) -> Scene:
 
 
 #: Values of the keys that take numbers.
-_SUCH_AS = {"fps": 30, "file_fps": 120, "blend_in": 1, "body_scale": 0.01}
+_SUCH_AS = {"fps": 30, "file_fps": 120, "body_scale": 0.01}
+#: From which the body moves into the motion: arms out, or lowered by 45 degrees.
+_POSES = ("t", "a")
 #: Keys of one word and their words; a null is the file's own.
 _WORDS = {
     "hands": HANDS,
-    "blend_from": ("t", "a"),
     "gender": ("neutral", "male", "female"),
     "trans_unit": (*TRANSLATION_UNITS, "auto"),
 }
@@ -103,6 +104,7 @@ def check_motion_options(config: DictConfig) -> None:
     for key, known in _WORDS.items():
         if config[key] is not None:
             require_choice(config, key, known)
+    _blend(config)
     for key in ("file_fps", "body_scale"):
         value = _optional(config, key)
         if value is not None and not value > 0:
@@ -163,8 +165,8 @@ def motion_options(config: DictConfig) -> MotionOptions:
         num_frames=int(config.num_frames),
         betas=_betas(plain(config.betas)),
         gender=None if config.gender is None else str(config.gender),
-        blend_in=_number(config, "blend_in"),
-        blend_from=str(config.blend_from),
+        blend_in=_blend(config)[0],
+        blend_from=_blend(config)[1],
         hands=str(config.hands),
         person=None if config.person is None else str(config.person),
         trans_unit=str(config.trans_unit or "auto"),
@@ -172,6 +174,21 @@ def motion_options(config: DictConfig) -> MotionOptions:
         animation=config.animation,
         parts=_names(config, "body_parts"),
     )
+
+
+def is_blended(config: DictConfig) -> bool:
+    """Whether the body moves into the motion from a standing pose."""
+    return _blend(config)[0] != 0
+
+
+def _blend(config: DictConfig) -> tuple[float, str]:
+    """What ``blend_in`` says: seconds, and the pose in which they begin."""
+    value = plain(config.blend_in)
+    seconds, pose = value if isinstance(value, list) and len(value) == 2 else (value, _POSES[0])
+    if isinstance(seconds, bool) or not isinstance(seconds, (int, float)) or pose not in _POSES:
+        poses = " or ".join(_POSES)
+        raise ConfigError(f"blend_in={shown(value)}: give seconds, blend_in=1, or seconds and a pose, {poses}, blend_in=[1,a]")
+    return float(seconds), str(pose)
 
 
 def _number(config: DictConfig, key: str) -> float:

@@ -27,9 +27,9 @@ _PACKAGE = Path(__file__).resolve().parents[2]
 #: Installed packages carry the configs inside; a clone has them beside the package.
 CONFIG_FOLDER = _PACKAGE / "configs" if (_PACKAGE / "configs").is_dir() else _PACKAGE.parent / "configs"
 #: Keys that take one word or number, or a list.
-_ONE_OR_MORE = ("garment", "offset", "layers", "size")
+_ONE_OR_MORE = ("garment", "offset", "layers", "size", "blend_in")
 #: Keys that take a table of parts, some beside numbers and lists.
-TABLES = ("size", "fabrics")
+TABLES = ("size", "size_end", "fabrics")
 #: Keys in here may be null: an energy that is left out.
 _OPTIONAL = "losses.terms."
 #: A key that its command checks itself.
@@ -76,18 +76,19 @@ def load_config(name: str, overrides: Sequence[str] = ()) -> DictConfig:
         ConfigError: misspelt key, group option or type; Hydra's own complaints in one line.
     """
     folders = tuple(str(folder) for folder in config_folders())
-    words = with_network(rollout_words(overrides)) if name == "rollout" else tuple(overrides)
+    words = named_today(overrides, name)
+    words = with_network(words) if name == "rollout" else words
     return copy.deepcopy(_loaded(CONFIG_FOLDER, folders, name, words))
 
 
-def rollout_words(words: Sequence[str]) -> tuple[str, ...]:
-    """The words of a rollout by today's keys, see :func:`hood.app.settings.old_keys.todays_words`.
+def named_today(words: Sequence[str], command: str = "rollout") -> tuple[str, ...]:
+    """The words of a command by today's keys, see :func:`hood.app.settings.old_keys.todays_words`.
 
     Raises:
         ConfigError: a word contradicts another.
     """
     try:
-        return todays_words(words)
+        return todays_words(words, command)
     except ValueError as error:
         raise ConfigError(str(error)) from error
 

@@ -1,4 +1,4 @@
-"""Keys of ``hood rollout`` by their earlier names: words and records that have them are read as those of today."""
+"""Keys of ``hood rollout`` and ``hood inspect`` by their earlier names: words and records of then read as those of today."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hood.app.settings.overrides import bare_or_quoted, coded, decoded, parse, r
 from hood.assets.files.said import say
 
 #: Values of then that mean nothing else than what is usual.
-_SPEED = 0.25
+_SPEED, _SECONDS = 0.25, 2.0
 
 
 class _Old(NamedTuple):
@@ -46,21 +46,35 @@ def _events(speed: Any, settings: Mapping[str, Any]) -> Any:
     return [{**event, "speed": event.get("speed", speed)} if own else event for event, own in pairs] or None
 
 
+def _blend_in(pose: Any, settings: Mapping[str, Any]) -> Any:
+    seconds = settings.get("blend_in") or None
+    return seconds if pose == "t" or seconds is None else [seconds, pose]
+
+
+def _size_end(seconds: Any, settings: Mapping[str, Any]) -> Any:
+    size = settings.get("size_end")
+    return size if seconds == _SECONDS or size is None else {"size": size, "seconds": seconds}
+
+
 #: Earlier keys, in the order in which they are read.
 _OLD = {
     "relaxing_steps": _Old("settle", _settle, "settle=equilibrium takes none", lambda given: given == "paper"),
     "events_speed": _Old("events", _events, "events are not given", lambda given: True),
+    "size_seconds": _Old("size_end", _size_end, "size_end is not given", lambda given: not isinstance(given, dict)),
+    "blend_from": _Old("blend_in", _blend_in, "blend_in is 0", lambda given: not isinstance(given, list)),
 }
+#: Those that ``hood inspect`` had as well.
+_OF_INSPECT = ("blend_from",)
 
 
-def todays_words(words: Sequence[str]) -> tuple[str, ...]:
-    """The words of a rollout by today's keys. Every earlier key among them is said, each word once in a process.
+def todays_words(words: Sequence[str], command: str = "rollout") -> tuple[str, ...]:
+    """The words of a command by today's keys. Every earlier key among them is said, each word once in a process.
 
     Raises:
         ValueError: a word contradicts another.
     """
     given = {word.partition("=")[0]: word for word in words if "=" in word}
-    old_ones = [key for key in _OLD if key in given]
+    old_ones = [key for key in {"rollout": _OLD, "inspect": _OF_INSPECT}.get(command, ()) if key in given]
     if not old_ones:
         return tuple(words)
     known = {*old_ones, *(_OLD[key].into for key in old_ones)}

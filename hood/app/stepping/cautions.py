@@ -136,8 +136,6 @@ def _is_drawn(config: DictConfig) -> bool:
 
 
 _ROLLOUT = (
-    _Rule("blend_from", lambda config: float(config.blend_in) > 0, "blend_in is 0"),
-    _Rule("size_seconds", lambda config: config.size_end is not None, "size_end is not given"),
     _Rule("fabrics_seam", lambda config: config.fabrics is not None, "fabrics are not given"),
     _Rule("surface_stride", lambda config: str(config.metrics) == "all", "the surface is measured with metrics=all alone"),
     _Rule("video_stride", lambda config: str(config.video) != "none", "video=none"),

@@ -184,7 +184,7 @@ def _cloth() -> Iterator[Cell]:
 def _changes() -> Iterator[Cell]:
     """Garments that grow and shrink, and what opens, closes and comes off on the way."""
     for first, last in ((0.9, 1.1), (1.3, 0.9), (1.0, 1.5)):
-        yield Cell("growth", f"×{first:g} to ×{last:g}", (f"size={first:g}", f"size_end={last:g}", "size_seconds=1"))
+        yield Cell("growth", f"×{first:g} to ×{last:g}", (f"size={first:g}", f"size_end={{size:{last:g},seconds:1}}"))
     for factor in (0.8, 1.2):
         yield Cell("growth", f"sleeves ×{factor:g}", (f"size={{sleeves:{factor:g}}}",), garment="longsleeve")
     for garment, row in (("shirt", "front_buttons"), ("jacket", "front_zip")):

@@ -19,7 +19,7 @@ from hood import __version__
 from hood.app.common import held_folder, output_folder
 from hood.app.notices import say
 from hood.app.plan_file import FREE, content_digest, key_of, plan_path, read_plan, write_plan
-from hood.app.settings.compose import ConfigError, load_config, rollout_words, with_words
+from hood.app.settings.compose import ConfigError, load_config, named_today, with_words
 from hood.app.settings.overrides import plain_word
 from hood.app.setup import Setup, check_config, make_stepper, set_up
 from hood.assets.files.library import locate
@@ -153,7 +153,7 @@ def _split(overrides: Sequence[str]) -> tuple[DictConfig, list[str]]:
     words = [word for word in overrides if word not in mine]
     if any(word.partition("=")[0] == "plan" for word in words):
         raise ConfigError("plan=…: a plan is made of the full model; drop plan=…")
-    return load_config("plan", mine), words if is_training(words) else list(rollout_words(words))
+    return load_config("plan", mine), words if is_training(words) else list(named_today(words))
 
 
 def _tolerance(own: DictConfig) -> Tolerance:
@@ -268,7 +268,7 @@ def planned(overrides: Sequence[str]) -> list[str]:
     Raises:
         ConfigError: ``accuracy`` beside a plan that is not ``auto``, and what ``hood plan`` refuses.
     """
-    overrides = rollout_words(overrides)
+    overrides = named_today(overrides)
     config = load_config("rollout", overrides)
     if config.accuracy is None:
         return list(overrides)

@@ -8,6 +8,7 @@ import torch
 from hood.app.scene.garments import checked_sizes, cut_to_size, describe_ease, summarise_ease
 from hood.app.scene.motion import make_motion
 from hood.app.settings.compose import ConfigError, build, load_config
+from hood.app.settings.python_words import overrides
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.parts import lengths_of
 from hood.energies.damping import BendDamping, StretchDamping
@@ -21,8 +22,12 @@ from hood.scene.sizing import Sizes
 def test_a_size_is_one_factor_or_three_and_may_change() -> None:
     assert checked_sizes(load_config("rollout")) == Sizes()
     assert checked_sizes(load_config("rollout", ["size=[1,1.05,1]"])).start == (1.0, 1.05, 1.0)
-    growing = checked_sizes(load_config("rollout", ["size=0.9", "size_end=[1.1,1,1]", "size_seconds=3"]))
+    growing = checked_sizes(load_config("rollout", ["size=0.9", "size_end={size:[1.1,1,1],seconds:3}"]))
     assert growing == Sizes((0.9,) * 3, (1.1, 1.0, 1.0), 3.0)
+    assert checked_sizes(load_config("rollout", ["size_end=0.8"])) == Sizes((1.0,) * 3, (0.8,) * 3, 2.0)
+    assert checked_sizes(load_config("rollout", ["size_end={size:0.8}"])) == Sizes((1.0,) * 3, (0.8,) * 3, 2.0)
+    given = overrides({"size_end": {"size": 0.8, "seconds": 0.5}})
+    assert checked_sizes(load_config("rollout", given)) == Sizes((1.0,) * 3, (0.8,) * 3, 0.5)
 
 
 @pytest.mark.parametrize(
@@ -30,6 +35,8 @@ def test_a_size_is_one_factor_or_three_and_may_change() -> None:
     [
         (["size=[1,2]"], r"size=\[1,2\].*give one factor, such as 1.1, or three"),
         (["size=20"], "size=20.*give a factor of the garment, 0.2 to 5"),
+        (["size_end={sleeves:1.2}"], r"size_end={sleeves:1.2}: give a size, or a size and seconds"),
+        (["size_end={size:wide}"], "size_end=.*give one factor"),
         (["size_end=large"], "size_end=large.*give one factor"),
         (["size={sleeves:1.2}", "size_end=1.1"], "size_end=1.1: parts of a garment keep their size"),
         (["size={sleeves:wide}"], "size: sleeves is 'wide'; give a factor of the part"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -33,6 +34,16 @@ def unsaid() -> None:
             "events_speed=0.5 is called events=[{time:1,close:a,speed:0.5},{time:2,open:a},{time:3,close:a,speed:2}] now",
         ),
         ("events_speed=0.5", "", "events_speed=0.5 has no effect: events are not given"),
+        (
+            "size_end=[1.1,1,1] size_seconds=3",
+            "size_end={size:[1.1,1,1],seconds:3}",
+            "size_seconds=3 is called size_end={size:[1.1,1,1],seconds:3} now",
+        ),
+        ("size_end=0.8 size_seconds=2", "size_end=0.8", "size_seconds=2 is called size_end=0.8 now"),
+        ("size_seconds=3", "", "size_seconds=3 has no effect: size_end is not given"),
+        ("blend_in=1.5 blend_from=a", "blend_in=[1.5,a]", "blend_from=a is called blend_in=[1.5,a] now"),
+        ("blend_from=t blend_in=2", "blend_in=2", "blend_from=t is called blend_in=2 now"),
+        ("blend_from=a", "", "blend_from=a has no effect: blend_in is 0"),
     ],
 )
 def test_words_of_then_are_those_of_today_and_told_once(then: str, today: str, said: str) -> None:
@@ -47,15 +58,19 @@ def test_words_of_then_are_those_of_today_and_told_once(then: str, today: str, s
     [
         "settle=equilibrium relaxing_steps=3",
         "settle=2 relaxing_steps=3",
+        "blend_in=[1,t] blend_from=a",
+        "size_end={size:1.1,seconds:2} size_seconds=3",
     ],
 )
 def test_words_that_contradict_each_other_are_refused(words: str) -> None:
-    with pytest.raises(ConfigError, match=f"^{words.replace(' ', ' and ')} contradict each other; give one of them$"):
+    with pytest.raises(
+        ConfigError, match=f"^{re.escape(words.replace(' ', ' and '))} contradict each other; give one of them$"
+    ):
         load_config("rollout", words.split())
 
 
 #: Earlier keys and their defaults: every record of then has all of them.
-THEN = {"relaxing_steps": 1, "events_speed": 0.25}
+THEN = {"relaxing_steps": 1, "events_speed": 0.25, "blend_from": "t", "size_seconds": 2.0}
 
 
 @pytest.mark.parametrize(
@@ -69,6 +84,11 @@ THEN = {"relaxing_steps": 1, "events_speed": 0.25}
             {"events": [{"frame": 3, "attach": "hem"}], "events_speed": 1.0},
             {"events": [{"frame": 3, "attach": "hem", "speed": 1.0}]},
         ),
+        ({"blend_in": 1.0, "blend_from": "a"}, {"blend_in": [1.0, "a"]}),
+        ({"size_end": 0.8, "size_seconds": 3.0}, {"size_end": {"size": 0.8, "seconds": 3.0}}),
+        ({"size_end": 0.8}, {"size_end": 0.8}),
+        ({"blend_in": 1.0}, {"blend_in": 1.0}),
+        ({"blend_from": "a"}, {}),
         ({"events": [{"frame": 3, "close": "zip"}]}, {"events": [{"frame": 3, "close": "zip"}]}),
     ],
 )
@@ -79,6 +99,12 @@ def test_records_of_then_are_read_as_those_of_today(then: dict[str, object], tod
     assert record == {**usual, **today}
     put_todays_keys(record)
     assert record == {**usual, **today}
+
+
+def test_a_file_is_inspected_with_the_same_words() -> None:
+    assert load_config("inspect", ["blend_in=1", "blend_from=a"]) == load_config("inspect", ["blend_in=[1,a]"])
+    with pytest.raises(ConfigError, match="unknown key 'relaxing_steps'"):
+        load_config("inspect", ["relaxing_steps=3"])
 
 
 def test_the_record_in_a_folder_is_read_so(tmp_path: Path) -> None:

@@ -24,8 +24,6 @@ IDLE = [
         ["stepper=guess", "model=small", "model.latent_dim=8"],
         "model=small model.latent_dim=8 has no effect: with stepper=guess",
     ),
-    (["blend_from=a"], "blend_from=a has no effect: blend_in is 0"),
-    (["size_seconds=3"], "size_seconds=3 has no effect: size_end is not given"),
     (["fabrics_seam=0.1"], "fabrics_seam=0.1 has no effect: fabrics are not given"),
     (["metrics=strain", "surface_stride=2"], "surface_stride=2 has no effect: the surface is measured with metrics=all alone"),
     (["video=none", "video_stride=2"], "video_stride=2 has no effect: video=none"),
@@ -36,8 +34,6 @@ IDLE = [
 BUSY = [
     ["checkpoint=ours", "precision=bf16"],
     ["stepper=network", "kernels=torch"],
-    ["blend_from=a", "blend_in=0.5"],
-    ["size_end=1.1", "size_seconds=3"],
     ["video=none", "thin_body=8"],
     ["video=none", "sheet=false", "colour=rg"],  # it is stored as well
     ["cloth_friction=0.5"],

@@ -22,9 +22,9 @@ SIZES = [
     Scene("longsleeve_wide", "other sizes", "newton", "longsleeve", frames=24, keys=(*WALK, "size=1.3")),
     Scene("skirt_tight", "other sizes", "newton", "skirt", frames=24, keys=(*WALK, "size=0.9")),
     Scene("dress_too_small", "too small", "newton", "dress", frames=20, keys=(*WALK, "size=0.6")),
-    Scene("dress_growing", "growing", "newton", "dress", "stand_sway", 36, ("size=0.95", "size_end=1.2", "size_seconds=1")),
+    Scene("dress_growing", "growing", "newton", "dress", "stand_sway", 36, ("size=0.95", "size_end={size:1.2,seconds:1}")),
     Scene("trousers_growing_off", "growing", "newton", "trousers", "stand_sway", 40,
-          ("pins=none", "size=0.9", "size_end=1.5", "size_seconds=0.6")),
+          ("pins=none", "size=0.9", "size_end={size:1.5,seconds:0.6}")),
 ]  # fmt: skip
 
 PARTS = [

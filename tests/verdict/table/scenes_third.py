@@ -65,7 +65,7 @@ FITS_FABRICS = [
     Scene("jacket_size_135", "two sizes off", "newton", "jacket", "walk_curve", 18, (*LATE, "size=1.35")),
     Scene("dress_size_140_back", "two sizes off", "newton", "dress", "walk_back", 24, (*LATE, "size=1.4")),
     Scene("skirt_grows_bare", "grows slowly", "newton", "skirt", "stand_sway", 30,
-          ("pins=none", "size_end=1.3", "size_seconds=0.5")),
+          ("pins=none", "size_end={size:1.3,seconds:0.5}")),
     Scene("dress_wool", "a tailor's fabrics", "newton", "dress", "walk_circle", 18, (*LATE, "material=wool_suiting")),
     Scene("jacket_leather_network", "a tailor's fabrics", "quickstart", "jacket", "walk_tired", 20,
           (*LATE, "material=nappa_leather")),
