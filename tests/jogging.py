@@ -10,7 +10,7 @@ from hood.cli.main import main
 from hood.rollouts.file.reader import RolloutData, read_rollout
 
 #: Without contact cloth passes through itself.
-WORDS = ["sequence=jog", "start=1.0", "stepper=newton", "cloth_contact=off", "allow_unsound=true", "video=none", "sheet=false",
+WORDS = ["sequence=jog", "start=1.0", "stepper=newton", "cloth_contact=off", "fail_on=nothing", "video=none", "sheet=false",
          "settle=paper"]  # fmt: skip
 
 

@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 from hood.app.common import require_device, thinning
 from hood.app.notices import say
 from hood.app.output.frames import check_output_fps, check_refine_mesh
-from hood.app.output.verdict import DOUBTS
+from hood.app.output.verdict import FAIL_ON
 from hood.app.plan_file import plan_path, read_watch
 from hood.app.scene.events import checked_events, with_events
 from hood.app.scene.fabrics import checked_fabrics, fabric_of
@@ -60,7 +60,7 @@ def check_config(config: DictConfig) -> None:
     require_choice(config, "video", ("mp4", "gif", "none"))
     require_choice(config, "metrics", METRIC_CHOICES)
     start_of(config)
-    require_choice(config, "doubts", DOUBTS)
+    require_choice(config, "fail_on", FAIL_ON)
     _check_numbers(config)
     checked_fabrics(config)
     checked_sizes(config)

@@ -63,7 +63,7 @@ EXIT_CODES = {
     0: "done",
     1: "inspect: something needs repair; tradeoff: points failed, the page is without them",
     2: "an error, told in one line; rollout: a motion of many could not be used, the others are there",
-    3: "rollout: a result is unsound, or doubtful with doubts=refuse, or guard=strict ended it; see summary.json",
+    3: "rollout: a result is unsound, or doubtful with fail_on=doubts, or guard=strict ended it; see summary.json",
     130: "interrupted; what is done is kept",
 }
 

@@ -34,7 +34,7 @@ def code_of(done: Rollouts) -> int:
         return 130
     if any("error" in summary for summary in done.summaries):
         return 2
-    code, said = exit_code(done.summaries, bool(done.config.allow_unsound), str(done.config.doubts))
+    code, said = exit_code(done.summaries, str(done.config.fail_on))
     for sentence in said:
         print(f"hood: {sentence}", file=sys.stderr)
     return code

@@ -138,7 +138,7 @@ def test_the_product_has_both_kinds() -> None:
 
 @pytest.mark.parametrize("case", FEW_VALID, ids=name_of)
 def test_a_rollout(case: Case, workshop: Workshop, tmp_path: Path) -> None:
-    check_valid(case, workshop, tmp_path, *UNTRAINED, "allow_unsound=true")
+    check_valid(case, workshop, tmp_path, *UNTRAINED, "fail_on=nothing")
 
 
 @pytest.mark.parametrize("case", FEW_INVALID, ids=name_of)

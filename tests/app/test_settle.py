@@ -12,7 +12,7 @@ from hood.cli.main import main
 from hood.rollouts.file.reader import read_rollout
 
 QUICK = ["rollout", "stepper=newton", "garment=tank", "num_frames=2", "metrics=none", "video=none", "sheet=false",
-         "allow_unsound=true", "output=run"]  # fmt: skip
+         "fail_on=nothing", "output=run"]  # fmt: skip
 UNTRAINED = [*(key for key in QUICK if not key.startswith("stepper")), "checkpoint=untrained", "model=small"]
 
 

@@ -52,7 +52,7 @@ def residual(data: RolloutData, frame: int) -> float:
 
 @pytest.mark.parametrize("kind", SOLVED)
 def test_the_stored_positions_are_as_good_as_said(kind: str) -> None:
-    assert main([*ROLLOUT, *SOLVED[kind], "allow_unsound=true"]) == 0
+    assert main([*ROLLOUT, *SOLVED[kind], "fail_on=nothing"]) == 0
     data = read_rollout(Path("out/rollout.h5"))
     assert data.cloth_pos.dtype == data.rest_pos.dtype == np.float64
     said = data.metrics["relative_gradient"]
@@ -67,7 +67,7 @@ def test_the_stored_positions_are_as_good_as_said(kind: str) -> None:
 
 @pytest.mark.parametrize("words", [NETWORK, ["stepper=newton", "solver.double=false"]], ids=["network", "float32 solver"])
 def test_what_is_computed_in_float32_is_stored_so(words: list[str]) -> None:
-    assert main([*ROLLOUT, *words, "num_frames=2", "allow_unsound=true"]) == 0
+    assert main([*ROLLOUT, *words, "num_frames=2", "fail_on=nothing"]) == 0
     assert read_rollout(Path("out/rollout.h5")).cloth_pos.dtype == np.float32
 
 
@@ -84,5 +84,5 @@ def test_why_refinements_stopped(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*ROLLOUT, "stepper=refine", "target_rg=0.5", "refine_most=30"]) == 0
     assert "frames met it" in capsys.readouterr().out
     assert json.loads(Path("out/summary.json").read_text())["refinement"]["steps_ended"] == {"stopped": 4}
-    assert main([*ROLLOUT, "stepper=refine", "refine=2", "allow_unsound=true"]) == 0
+    assert main([*ROLLOUT, "stepper=refine", "refine=2", "fail_on=nothing"]) == 0
     assert "; steps ended: 4 max iterations\n" in capsys.readouterr().out

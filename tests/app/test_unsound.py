@@ -41,7 +41,7 @@ def test_a_trunk_that_turns_at_once_ends_with_3(capsys: pytest.CaptureFixture[st
     assert f"worst {worst['value']:.0%} in frame {worst['frame']}" in reasons[0]
     assert f"UNSOUND: {reasons[0]}\n" in shown.out
     assert f"(worst {100 * worst['value']:.1f}% in frame {worst['frame']})" in shown.out
-    assert "exit code 3 (0 with allow_unsound=true)" in shown.err
+    assert "exit code 3 (0 with fail_on=nothing)" in shown.err
     assert main(["inspect", "out/rollout.h5"]) == 1
     shown = capsys.readouterr()
     assert "! unsound: " in shown.out
@@ -53,9 +53,9 @@ def test_a_study_may_allow_it(capsys: pytest.CaptureFixture[str]) -> None:
     write_walk(Path("twist.npz"), 9, twist_at=7)
     command = [*CHEAP, "sequence=twist.npz", "num_frames=9"]
     assert main(command) == 3
-    assert main([*command, "allow_unsound=true"]) == 0
+    assert main([*command, "fail_on=nothing"]) == 0
     assert summary()["sound"] is False
-    assert "unsound, which allow_unsound=true allows" in capsys.readouterr().err
+    assert "unsound, which fail_on=nothing allows" in capsys.readouterr().err
 
 
 def test_a_quiet_walk_is_sound(capsys: pytest.CaptureFixture[str]) -> None:
@@ -100,7 +100,7 @@ def test_batches_count_the_unsound(capsys: pytest.CaptureFixture[str]) -> None:
     # What is finished is not simulated again, and as unsound as before.
     before = Path("out/twist/rollout.h5").stat().st_mtime_ns
     assert main([*command, "resume=true"]) == 3
-    assert main([*command, "resume=true", "allow_unsound=true"]) == 0
+    assert main([*command, "resume=true", "fail_on=nothing"]) == 0
     forgetful = {key: value for key, value in summary("out/twist").items() if key not in ("sound", "unsound_reasons")}
     Path("out/twist/summary.json").write_text(json.dumps(forgetful))  # as earlier versions wrote it
     assert main([*command, "resume=true"]) == 3
@@ -123,9 +123,9 @@ def test_doubts_are_told_kept_and_refused_where_that_is_asked(capsys: pytest.Cap
     assert f"doubt: {doubt['sentence']}\nsound, with 1 doubt\n" in shown.out
     assert main(["inspect", "out/rollout.h5"]) == 1
     assert "! doubt: garment 'belt': its bending stiffness is 0.2 N·m" in capsys.readouterr().out
-    assert main([*command, "doubts=refuse"]) == 3
-    assert "the rollout is doubtful; exit code 3, as doubts=refuse asks" in capsys.readouterr().err
-    assert main([*command, "doubts=never"]) == 2
+    assert main([*command, "fail_on=doubts"]) == 3
+    assert "the rollout is doubtful; exit code 3, as fail_on=doubts asks" in capsys.readouterr().err
+    assert main([*command, "fail_on=never"]) == 2
 
 
 def test_batches_count_and_refuse_the_doubtful(capsys: pytest.CaptureFixture[str]) -> None:
@@ -137,4 +137,4 @@ def test_batches_count_and_refuse_the_doubtful(capsys: pytest.CaptureFixture[str
     assert "2 of 2 motions simulated, 2 doubtful" in shown
     assert "; doubt: garment 'belt': its bending" in shown
     # What is finished is judged by the exit code that is asked for now.
-    assert main([*command, "resume=true", "doubts=refuse"]) == 3
+    assert main([*command, "resume=true", "fail_on=doubts"]) == 3

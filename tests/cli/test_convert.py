@@ -35,7 +35,7 @@ def test_published_and_converted_weights_give_the_same_rollout(weights: Path, ca
     assert header["layout"] == "postcvpr"
     assert json.loads(header["model"])["velocity"] == "carried"
     # Random weights: what they do is not sound.
-    arguments = ["garment=skirt", "num_frames=3", "video=none", "sheet=false", "allow_unsound=true"]
+    arguments = ["garment=skirt", "num_frames=3", "video=none", "sheet=false", "fail_on=nothing"]
     runs = []
     for checkpoint in ("postcvpr.pth", "new/model.safetensors"):
         assert main(["rollout", f"checkpoint={checkpoint}", *arguments, "output=run"]) == 0

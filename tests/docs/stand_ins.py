@@ -82,7 +82,7 @@ class Desk:
     def rollout(self, name: str, words: Sequence[str]) -> Path:
         def make(folder: Path) -> None:
             drawn = ["num_frames=12", "video=none", "sheet=false", "export=[rg]"]
-            assert main(["rollout", "garment=dress", "stepper=guess", *drawn, "allow_unsound=true", "output=made"]) == 0
+            assert main(["rollout", "garment=dress", "stepper=guess", *drawn, "fail_on=nothing", "output=made"]) == 0
 
         made = self._once("rollout", make) / "made"
         return made / "rollout.h5" if name.endswith(".h5") else made

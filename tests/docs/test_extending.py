@@ -31,7 +31,7 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "extending.md"
 BLOCK = re.compile(r"(?P<before>[^\n]*)\n\n```(?P<language>\w*)\n(?P<body>.*?)^```$", re.DOTALL | re.MULTILINE)
 #: What makes a command of the page short; words of its own stand.
 SHORT = {
-    "rollout": ["garment=tank", "sequence=walk_proud", "num_frames=3", "video=none", "sheet=false", "allow_unsound=true"],
+    "rollout": ["garment=tank", "sequence=walk_proud", "num_frames=3", "video=none", "sheet=false", "fail_on=nothing"],
     "train": [
         "model.latent_dim=4", "model.schedule='1x(mesh)'", "trainer.iterations=2", "trainer.batch_size=1",
         "trainer.log_every=1", "data.garments=[tank]", "data.sequences=[walk_proud]",

@@ -61,7 +61,7 @@ def test_its_wheel_has_its_options_and_works_from_any_folder(builder: str, tmp_p
     assert {*zipfile.ZipFile(wheel).namelist()} >= {*OPTIONS, "my_cloth/wind.py"}
     (tmp_path / "elsewhere").mkdir()
     words = ("losses=windy", "material=felt", "stepper=damped", "garment=tank", "num_frames=2", "video=none", "sheet=false")
-    command = ("-m", "hood", "rollout", *words, "output=out", "allow_unsound=true")
+    command = ("-m", "hood", "rollout", *words, "output=out", "fail_on=nothing")
     done = python(*command, where=tmp_path / "elsewhere", path=tmp_path / "site")
     assert done.returncode == 0, done.stderr
     with h5py.File(tmp_path / "elsewhere" / "out" / "rollout.h5") as file:

@@ -130,7 +130,7 @@ def _asked(attributes: Mapping[str, Any]) -> str:
 
 
 #: Keys that change nothing in a rollout; its motion is compared by its file.
-_FREE = ("resume", "output", "root", "allow_unsound", "doubts", "sequence")
+_FREE = ("resume", "output", "root", "fail_on", "sequence")
 
 
 def as_begun(config: DictConfig, motions: Iterable[tuple[str, Path]]) -> DictConfig:

@@ -101,8 +101,8 @@ def _mean_and_worst(values: np.ndarray) -> dict[str, Any]:
 
 #: Metrics of which the worst frame is named beside the median.
 _WORST = ("strain_p99", "distance_p99", "relative_gradient")
-#: What doubts do to the exit code.
-DOUBTS = REPORT, REFUSE = "report", "refuse"
+#: What ends with exit code 3; doubts are what ends so beside unsound results.
+FAIL_ON = FAIL_ON_UNSOUND, FAIL_ON_DOUBTS, FAIL_ON_NOTHING = "unsound", "doubts", "nothing"
 
 
 def summarise_verdict(data: RolloutData) -> dict[str, Any]:
@@ -152,22 +152,22 @@ def _describe_distance(summary: Mapping[str, Any]) -> list[str]:
     return [f"relative gradient {summary['relative_gradient_median']:.2g}{worst_text}"]
 
 
-def exit_code(summaries: Iterable[Mapping[str, Any]], allow_unsound: bool, doubts: str = REPORT) -> tuple[int, list[str]]:
-    """3 where a guard has ended one of the rollouts, one is unsound, unless that is allowed, or one has doubts that are to be
-    refused; and the sentences that say so."""
+def exit_code(summaries: Iterable[Mapping[str, Any]], fail_on: str = FAIL_ON_UNSOUND) -> tuple[int, list[str]]:
+    """3 where a guard has ended one of the rollouts, or one is what ``fail_on`` says, one of :data:`FAIL_ON`; and the sentences
+    that say so."""
     summaries = list(summaries)
     if any((summary.get("guard") or {}).get("stopped") is not None for summary in summaries):
         return UNSOUND, []
     said: list[str] = []
     unsound = sum(summary.get("sound") is False for summary in summaries)
-    doubtful = sum(bool(summary.get("doubts")) for summary in summaries) if doubts == REFUSE else 0
-    if unsound and allow_unsound:
-        said.append(f"{_are(unsound)} unsound, which allow_unsound=true allows")
+    doubtful = sum(bool(summary.get("doubts")) for summary in summaries) if fail_on == FAIL_ON_DOUBTS else 0
+    if unsound and fail_on == FAIL_ON_NOTHING:
+        said.append(f"{_are(unsound)} unsound, which fail_on=nothing allows")
         unsound = 0
     if unsound:
-        said.append(f"{_are(unsound)} unsound; its files are kept, exit code {UNSOUND} (0 with allow_unsound=true)")
+        said.append(f"{_are(unsound)} unsound; its files are kept, exit code {UNSOUND} (0 with fail_on=nothing)")
     if doubtful:
-        said.append(f"{_are(doubtful)} doubtful; exit code {UNSOUND}, as doubts=refuse asks")
+        said.append(f"{_are(doubtful)} doubtful; exit code {UNSOUND}, as fail_on=doubts asks")
     return UNSOUND if unsound or doubtful else 0, said
 
 

@@ -56,10 +56,24 @@ def _size_end(seconds: Any, settings: Mapping[str, Any]) -> Any:
     return size if seconds == _SECONDS or size is None else {"size": size, "seconds": seconds}
 
 
+def _allow_unsound(allowed: Any, settings: Mapping[str, Any]) -> Any:
+    if settings.get("doubts") == "refuse":
+        return None
+    kept = "doubts" if settings.get("fail_on") == "doubts" else "unsound"
+    return "nothing" if allowed is True else kept if allowed is False else allowed
+
+
+def _doubts(doubts: Any, settings: Mapping[str, Any]) -> Any:
+    kept = "nothing" if settings.get("fail_on") == "nothing" else "unsound"
+    return {"refuse": "doubts", "report": kept}.get(str(doubts), doubts)
+
+
 #: Earlier keys, in the order in which they are read.
 _OLD = {
     "relaxing_steps": _Old("settle", _settle, "settle=equilibrium takes none", lambda given: given == "paper"),
     "events_speed": _Old("events", _events, "events are not given", lambda given: True),
+    "allow_unsound": _Old("fail_on", _allow_unsound, "doubts=refuse is fail_on=doubts now, and unsound results fail as well"),
+    "doubts": _Old("fail_on", _doubts, ""),
     "size_seconds": _Old("size_end", _size_end, "size_end is not given", lambda given: not isinstance(given, dict)),
     "blend_from": _Old("blend_in", _blend_in, "blend_in is 0", lambda given: not isinstance(given, list)),
 }

@@ -14,7 +14,7 @@ from hood.app.settings.compose import ConfigError
 from hood.cli.main import main
 
 QUICK = ["rollout", "stepper=guess", "garment=tank", "num_frames=2", "settle=paper", "metrics=none", "guard=off",
-         "cloth_contact=off", "video=none", "sheet=false", "allow_unsound=true", "output=out"]  # fmt: skip
+         "cloth_contact=off", "video=none", "sheet=false", "fail_on=nothing", "output=out"]  # fmt: skip
 
 
 @pytest.fixture

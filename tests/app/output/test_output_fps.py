@@ -101,7 +101,7 @@ def test_a_body_of_joined_motions_is_interpolated_as_the_cloth_is() -> None:
         "blend_in=0.17",
         "metrics=none",
         "guard=off",
-        "allow_unsound=true",
+        "fail_on=nothing",
     )
     every, _ = rollout(*words, output="every")
     data, _ = rollout(*words, "output_fps=60")

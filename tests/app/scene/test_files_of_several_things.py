@@ -272,7 +272,7 @@ def test_parts_with_names_are_garments() -> None:
 
 
 def test_an_order_of_parts_says_that_they_are_garments() -> None:
-    assert run(sleeve_off(0.03), "layers=[part_2,part_1]", "allow_unsound=true")[0].cloth_pos.shape[0] == 2
+    assert run(sleeve_off(0.03), "layers=[part_2,part_1]", "fail_on=nothing")[0].cloth_pos.shape[0] == 2
 
 
 @pytest.mark.parametrize(("unit", "count"), [(1.0, 1), (0.01, 3)])

@@ -41,6 +41,12 @@ def unsaid() -> None:
         ),
         ("size_end=0.8 size_seconds=2", "size_end=0.8", "size_seconds=2 is called size_end=0.8 now"),
         ("size_seconds=3", "", "size_seconds=3 has no effect: size_end is not given"),
+        ("doubts=refuse", "fail_on=doubts", "doubts=refuse is called fail_on=doubts now"),
+        ("doubts=report", "", "doubts=report is called fail_on=unsound now"),
+        ("doubts=report fail_on=nothing", "fail_on=nothing", "doubts=report is called fail_on=nothing now"),
+        ("allow_unsound=true", "fail_on=nothing", "allow_unsound=true is called fail_on=nothing now"),
+        ("allow_unsound=false", "", "allow_unsound=false is called fail_on=unsound now"),
+        ("allow_unsound=false fail_on=doubts", "fail_on=doubts", "allow_unsound=false is called fail_on=doubts now"),
         ("blend_in=1.5 blend_from=a", "blend_in=[1.5,a]", "blend_from=a is called blend_in=[1.5,a] now"),
         ("blend_from=t blend_in=2", "blend_in=2", "blend_from=t is called blend_in=2 now"),
         ("blend_from=a", "", "blend_from=a has no effect: blend_in is 0"),
@@ -53,12 +59,27 @@ def test_words_of_then_are_those_of_today_and_told_once(then: str, today: str, s
     assert configs == 2 * [load_config("rollout", today.split())]
 
 
+def test_what_nothing_says_today_is_the_stricter() -> None:
+    """Then doubts failed, and what was unsound did not."""
+    with collected() as told:
+        config = load_config("rollout", ["allow_unsound=true", "doubts=refuse"])
+    assert config == load_config("rollout", ["fail_on=doubts"])
+    assert told == [
+        "allow_unsound=true has no effect: doubts=refuse is fail_on=doubts now, and unsound results fail as well",
+        "doubts=refuse is called fail_on=doubts now",
+    ]
+
+
 @pytest.mark.parametrize(
     "words",
     [
         "settle=equilibrium relaxing_steps=3",
         "settle=2 relaxing_steps=3",
         "blend_in=[1,t] blend_from=a",
+        "fail_on=doubts allow_unsound=true",
+        "fail_on=nothing allow_unsound=false",
+        "fail_on=unsound doubts=refuse",
+        "fail_on=doubts doubts=report",
         "size_end={size:1.1,seconds:2} size_seconds=3",
     ],
 )
@@ -70,7 +91,14 @@ def test_words_that_contradict_each_other_are_refused(words: str) -> None:
 
 
 #: Earlier keys and their defaults: every record of then has all of them.
-THEN = {"relaxing_steps": 1, "events_speed": 0.25, "blend_from": "t", "size_seconds": 2.0}
+THEN = {
+    "relaxing_steps": 1,
+    "events_speed": 0.25,
+    "blend_from": "t",
+    "size_seconds": 2.0,
+    "allow_unsound": False,
+    "doubts": "report",
+}
 
 
 @pytest.mark.parametrize(
@@ -87,6 +115,9 @@ THEN = {"relaxing_steps": 1, "events_speed": 0.25, "blend_from": "t", "size_seco
         ({"blend_in": 1.0, "blend_from": "a"}, {"blend_in": [1.0, "a"]}),
         ({"size_end": 0.8, "size_seconds": 3.0}, {"size_end": {"size": 0.8, "seconds": 3.0}}),
         ({"size_end": 0.8}, {"size_end": 0.8}),
+        ({"doubts": "refuse"}, {"fail_on": "doubts"}),
+        ({"allow_unsound": True}, {"fail_on": "nothing"}),
+        ({"allow_unsound": True, "doubts": "refuse"}, {"fail_on": "doubts"}),
         ({"blend_in": 1.0}, {"blend_in": 1.0}),
         ({"blend_from": "a"}, {}),
         ({"events": [{"frame": 3, "close": "zip"}]}, {"events": [{"frame": 3, "close": "zip"}]}),

@@ -26,7 +26,7 @@ from hood.steppers.newton import NewtonStepper
 from hood.steppers.ranges import Conditions, scene_conditions
 from hood.steppers.refined import RefinedStepper
 
-QUICK = ["rollout", "video=none", "sheet=false", "metrics=none", "allow_unsound=true", "garment=tank", "num_frames=3",
+QUICK = ["rollout", "video=none", "sheet=false", "metrics=none", "fail_on=nothing", "garment=tank", "num_frames=3",
          "checkpoint=small.safetensors", "output=out"]  # fmt: skip
 
 

@@ -156,7 +156,7 @@ def test_a_rollout_warns_once_and_writes_it_down(
     known = paper.clone().eval()
     known.trained_for = scene_conditions(tank_scene.garment, tank_scene.cloth, 1 / 30, DEFAULT)
     save_simulator(tmp_path / "paper.safetensors", known)
-    quick = ["num_frames=2", "video=none", "sheet=false", "metrics=none", "allow_unsound=true", "garment=tank"]
+    quick = ["num_frames=2", "video=none", "sheet=false", "metrics=none", "fail_on=nothing", "garment=tank"]
     quick += ["guard=off", f"checkpoint={tmp_path}/paper.safetensors"]
     (tmp_path / "list.txt").write_text("walk_proud\nplie\n")
     monkeypatch.chdir(tmp_path)

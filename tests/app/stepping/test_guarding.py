@@ -86,7 +86,7 @@ def test_strict_ends_before_the_first_alarm(capsys: pytest.CaptureFixture[str]) 
     plain = positions()
     capsys.readouterr()
     assert main([*HASTY, "guard=strict"]) == 3
-    assert main([*HASTY, "guard=strict", "allow_unsound=true"]) == 3
+    assert main([*HASTY, "guard=strict", "fail_on=nothing"]) == 3
     data = read_rollout(Path("out/rollout.h5"))
     assert np.array_equal(data.cloth_pos, plain[:4])
     assert data.attributes["complete"] == np.False_

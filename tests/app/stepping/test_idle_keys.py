@@ -63,7 +63,7 @@ def test_validation_that_never_happens_is_told() -> None:
 
 def test_commands_and_python_say_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     quick = ["garment=tank", "num_frames=2", "metrics=none", "video=none", "sheet=false", f"output={tmp_path / 'out'}"]
-    assert main(["rollout", *quick, "stepper=guess", "checkpoint=ours", "allow_unsound=true"]) == 0
+    assert main(["rollout", *quick, "stepper=guess", "checkpoint=ours", "fail_on=nothing"]) == 0
     line = "checkpoint=ours has no effect: with stepper=guess no network takes the steps"
     assert capsys.readouterr().out.splitlines().count(line) == 1
     assert line in hood.simulate("tank", num_frames=2, stepper="guess", checkpoint="ours").notes

@@ -74,7 +74,7 @@ def test_a_garment_from_the_wild_runs(capsys: pytest.CaptureFixture[str], garmen
     start = report["starts"]["tpose"]
     assert start["stretch_max"] < 0.1
     assert start["depth_max"] < 2e-3
-    assert main(["rollout", "garment=wild.npz", "output=out", "num_frames=3", *UNTRAINED, "allow_unsound=true"]) == 0
+    assert main(["rollout", "garment=wild.npz", "output=out", "num_frames=3", *UNTRAINED, "fail_on=nothing"]) == 0
     data = read_rollout(Path("out/rollout.h5"))
     assert data.cloth_pos.shape == (3, len(garment.rest_pos), 3)
     assert np.isfinite(data.cloth_pos).all()
@@ -215,7 +215,7 @@ def test_garments_of_other_poses(
 
 
 def test_an_outfit_in_one_command(capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["garment=[tshirt,trousers]", "pins=waistband", "output=out", "num_frames=3", "allow_unsound=true"]
+    words = ["garment=[tshirt,trousers]", "pins=waistband", "output=out", "num_frames=3", "fail_on=nothing"]
     assert main(["rollout", *words, *UNTRAINED]) == 0
     assert "tshirt+trousers: 3 frames, all finite" in capsys.readouterr().out
     shirt, trousers = load_garment("tshirt"), load_garment("trousers")
