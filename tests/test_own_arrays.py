@@ -134,7 +134,7 @@ BROKEN: dict[str, tuple[Callable[[], Any], str]] = {
     "body quads": (lambda: hood.BodyMesh(TETRAHEDRON, [[0, 1, 2, 3]]), r"faces have shape \(1, 4\); give .* triangles"),
     "body units": (
         lambda: hood.simulate("tank", body=hood.BodyMesh(100 * TETRAHEDRON, SIDES)),
-        "100 m large; .*body_scale=0.01",
+        "100 m large; .*unit=0.01",
     ),
     "pins": (lambda: hood.Garment.from_arrays(TETRAHEDRON, SIDES, [9]), r"pins\[0\] is 9; give vertex numbers from 0 to 3"),
     "mask": (lambda: hood.Garment.from_arrays(TETRAHEDRON, SIDES, [True]), r"pins have shape \(1,\); .*\(4,\)"),

@@ -36,7 +36,7 @@ BROKEN: dict[str, tuple[list[str], tuple[str, ...], Callable[[], object] | None]
     "gender": (["rollout", "gender=man"], ("gender 'man'", "known are neutral, male, female"), None),
     "fingers": (["rollout", "hands=open"], ("hands 'open'", "known are flat, file"), None),
     "first pose": (["rollout", "blend_in=[1,x]"], ("blend_in=[1,x]: give seconds", "a pose, t or a, blend_in=[1,a]"), None),
-    "unit of the body": (["rollout", "body_scale=0"], ("body_scale=0: give a number above 0, such as body_scale=0.01",), None),
+    "unit of the body": (["rollout", "unit=0"], ("unit=0: give m, cm, mm, or metres per unit", "such as unit=0.01"), None),
     "rate of the file": (["rollout", "file_fps=fast"], ("file_fps=fast: give a number, such as file_fps=120",), None),
     "iterations": (["rollout", "refine=many"], ("refine=many: give a whole number of iterations, or auto",), None),
     "parts of an iteration": (["rollout", "refine=2.5"], ("refine=2.5: give a whole number of iterations, or auto",), None),

@@ -66,7 +66,7 @@ def test_the_rollout_on_a_mesh_has_its_unit_and_axis(
     assert main(["prepare", "garment=tank.obj", "body=body.obj", "body_scale=0.01", "body_up=z"]) == 0
     command, *words = printed(capsys.readouterr().out.splitlines()[-1], "run it with: ")
     config = load_config(command, words)
-    assert (config.body_scale, config.up) == (0.01, "z")
+    assert (config.unit, config.up) == (0.01, "z")
     quiet = ["stepper=guess", "refine=0", "num_frames=1", "video=none", "sheet=false", "metrics=none", "sequence=none"]
     assert main([command, *words, *quiet]) in (0, 3)
 

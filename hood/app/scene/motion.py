@@ -88,14 +88,13 @@ def with_body_friction(scene: Scene, config: DictConfig) -> Scene:
 
 
 #: Values of the keys that take numbers.
-_SUCH_AS = {"fps": 30, "file_fps": 120, "body_scale": 0.01}
+_SUCH_AS = {"fps": 30, "file_fps": 120}
 #: From which the body moves into the motion: arms out, or lowered by 45 degrees.
 _POSES = ("t", "a")
 #: Keys of one word and their words; a null is the file's own.
 _WORDS = {
     "hands": HANDS,
     "gender": ("neutral", "male", "female"),
-    "trans_unit": (*TRANSLATION_UNITS, "auto"),
 }
 
 
@@ -105,10 +104,10 @@ def check_motion_options(config: DictConfig) -> None:
         if config[key] is not None:
             require_choice(config, key, known)
     _blend(config)
-    for key in ("file_fps", "body_scale"):
-        value = _optional(config, key)
-        if value is not None and not value > 0:
-            raise ConfigError(f"{key}={shown(config[key])}: give a number above 0, such as {key}={_SUCH_AS[key]}")
+    _unit(config)
+    rate = _optional(config, "file_fps")
+    if rate is not None and not rate > 0:
+        raise ConfigError(f"file_fps={shown(config.file_fps)}: give a number above 0, such as file_fps={_SUCH_AS['file_fps']}")
     check_rate(config)
 
 
@@ -169,8 +168,8 @@ def motion_options(config: DictConfig) -> MotionOptions:
         blend_from=_blend(config)[1],
         hands=str(config.hands),
         person=None if config.person is None else str(config.person),
-        trans_unit=str(config.trans_unit or "auto"),
-        scale=_optional(config, "body_scale"),
+        trans_unit=_unit(config)[0],
+        scale=_unit(config)[1],
         animation=config.animation,
         parts=_names(config, "body_parts"),
     )
@@ -189,6 +188,19 @@ def _blend(config: DictConfig) -> tuple[float, str]:
         poses = " or ".join(_POSES)
         raise ConfigError(f"blend_in={shown(value)}: give seconds, blend_in=1, or seconds and a pose, {poses}, blend_in=[1,a]")
     return float(seconds), str(pose)
+
+
+def _unit(config: DictConfig) -> tuple[str, float | None]:
+    """What ``unit`` says: the name of the unit, "auto" where it says nothing, and its metres."""
+    value = config.unit
+    if value is None:
+        return "auto", None
+    if value in TRANSLATION_UNITS:
+        return str(value), TRANSLATION_UNITS[value]
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < math.inf:
+        names = ", ".join(TRANSLATION_UNITS)
+        raise ConfigError(f"unit={brief(value)}: give {names}, or metres per unit of the file, above 0, such as unit=0.01")
+    return next((name for name, metres in TRANSLATION_UNITS.items() if metres == value), f"{value:g}"), float(value)
 
 
 def _number(config: DictConfig, key: str) -> float:

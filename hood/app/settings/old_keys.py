@@ -68,17 +68,23 @@ def _doubts(doubts: Any, settings: Mapping[str, Any]) -> Any:
     return {"refuse": "doubts", "report": kept}.get(str(doubts), doubts)
 
 
+def _unit(unit: Any, _: Mapping[str, Any]) -> Any:
+    return None if unit == "auto" else unit
+
+
 #: Earlier keys, in the order in which they are read.
 _OLD = {
     "relaxing_steps": _Old("settle", _settle, "settle=equilibrium takes none", lambda given: given == "paper"),
     "events_speed": _Old("events", _events, "events are not given", lambda given: True),
     "allow_unsound": _Old("fail_on", _allow_unsound, "doubts=refuse is fail_on=doubts now, and unsound results fail as well"),
     "doubts": _Old("fail_on", _doubts, ""),
+    "trans_unit": _Old("unit", _unit, "the unit is found"),
+    "body_scale": _Old("unit", _unit, "the file is in metres"),
     "size_seconds": _Old("size_end", _size_end, "size_end is not given", lambda given: not isinstance(given, dict)),
     "blend_from": _Old("blend_in", _blend_in, "blend_in is 0", lambda given: not isinstance(given, list)),
 }
 #: Those that ``hood inspect`` had as well.
-_OF_INSPECT = ("blend_from",)
+_OF_INSPECT = ("blend_from", "trans_unit", "body_scale")
 
 
 def todays_words(words: Sequence[str], command: str = "rollout") -> tuple[str, ...]:

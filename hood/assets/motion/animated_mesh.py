@@ -298,19 +298,23 @@ def _check_size(path: Path | str, sequence: MeshSequence, scale: float | None) -
         return
     given = 1.0 if scale is None else float(scale)
     factor = min(_UNITS, key=lambda unit: abs(np.log(unit * extent / given / _USUAL)))
-    fix = f"pass body_scale={factor:g}, which makes it {factor * extent / given:.3g} m"
-    fix += "" if factor == 1.0 else " (body_scale=1 takes it as it is)"
+    fix = f"{_pass_unit(factor)}, which makes it {factor * extent / given:.3g} m"
+    fix += "" if factor == 1.0 else " (unit=m takes it as it is)"
     if extent > _LARGEST:
-        unit = "its unit is not the metre" if scale is None else f"body_scale={scale:g} is not its unit"
+        unit = "its unit is not the metre" if scale is None else f"unit={scale:g} is not that of the file"
         raise ValueError(f"{path}: the mesh is {extent:.4g} m large; {unit}, {fix}")
     if scale is None and extent > _PERSONS[1] and _is_upright(np.ptp(sequence.verts[0], axis=0)):
         factor = min(_LARGE_UNITS, key=lambda unit: abs(np.log(unit * extent / _USUAL)))
-        fix = f"pass body_scale={factor:g}, which makes it {factor * extent:.3g} m (body_scale=1 takes it as it is)"
+        fix = f"{_pass_unit(factor)}, which makes it {factor * extent:.3g} m (unit=m takes it as it is)"
         sentence = f"{path}: the body is {extent:.3g} m tall, its unit seems not to be the metre; {fix}"
         warnings.warn(Doubt("units", sentence, value=extent, unit="m"), stacklevel=3)
     if scale is not None and not _PERSONS[0] <= extent <= _PERSONS[1] and factor != scale:
-        sentence = f"{path}: the mesh is {extent:.3g} m large with body_scale={scale:g}; {fix}"
+        sentence = f"{path}: the mesh is {extent:.3g} m large with unit={scale:g}; {fix}"
         warnings.warn(Doubt("units", sentence, value=extent, unit="m"), stacklevel=3)
+
+
+def _pass_unit(metres: float) -> str:
+    return f"pass unit={metres:g} (body_scale={metres:g} in hood prepare)"
 
 
 def _is_upright(box: np.ndarray) -> bool:

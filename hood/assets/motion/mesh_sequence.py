@@ -69,7 +69,7 @@ def turn_mesh(sequence: MeshSequence, scale: float, up: str) -> MeshSequence:
         ValueError: ``scale`` is not a positive number.
     """
     if not np.isfinite(scale) or scale <= 0:
-        raise ValueError(f"body_scale={scale}: give metres per unit of the file, more than zero")
+        raise ValueError(f"unit={scale}: give metres per unit of the file, more than zero")
     turn = UP_AXES["y" if up == "auto" else up]
     if scale == 1.0 and np.array_equal(turn, np.eye(3)):
         return sequence

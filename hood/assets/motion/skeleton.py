@@ -124,7 +124,7 @@ def find_unit(path: Path, key: str, poses: np.ndarray, transl: np.ndarray, fps: 
     if given != "auto":
         if given not in TRANSLATION_UNITS:
             raise ValueError(
-                f"trans_unit={given}: give {', '.join(TRANSLATION_UNITS)} or auto, the unit of the translation in the file"
+                f"unit={given}: give {', '.join(TRANSLATION_UNITS)} or auto, the unit of the translation in the file"
             )
         return Unit(given)
     spans = [_feet_speeds(poses, transl, fps, span) for span in _SPANS]
@@ -136,13 +136,13 @@ def find_unit(path: Path, key: str, poses: np.ndarray, transl: np.ndarray, fps: 
         return Unit("m", sure=_stands_on_floor(poses, transl, up))
     if found is not None:
         why = "its feet stand still only so" if by_steps else "its feet are on the floor only so"
-        said = f"{path}: {key} is in {_WORDS[found]}, {why}; it is taken so (trans_unit=m takes it as metres)"
+        said = f"{path}: {key} is in {_WORDS[found]}, {why}; it is taken so (unit=m takes it as metres)"
         return Unit(found, UserWarning(said))
     fastest = float(np.quantile(_root_speed(transl, fps), _MOSTLY)) if len(transl) > 1 else 0.0
     far = np.ptp(transl, axis=0).max()
     said = (
         f"{path}: {key} may not be in metres (the body moves at {fastest:.3g} m/s, {far:.3g} m far), and is taken so; "
-        "trans_unit=cm or mm converts it, trans_unit=m says that it is right"
+        "unit=cm or mm converts it (data.trans_unit in hood train), unit=m says that it is right"
     )
     return Unit("m", Doubt("units", said, value=fastest, unit="m/s"), sure=False)
 

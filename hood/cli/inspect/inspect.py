@@ -59,7 +59,7 @@ def inspect_motion(name: str, options: MotionOptions) -> Finding:
         _add(finding, path, note)
     doubted = any(isinstance(note, Doubt) and note.kind == "units" for note in recording.notes)
     if not doubted and float(np.quantile(_root_speed(recording), 0.99)) > _FASTEST:
-        fix = "its unit or frame rate may be wrong: trans_unit=cm or file_fps=…"
+        fix = "its unit or frame rate may be wrong: unit=cm or file_fps=…"
         finding.problem(f"the root moves faster than {_FASTEST:g} m/s", fix)
     return finding
 
@@ -225,7 +225,8 @@ def _wearer(body: str, config: DictConfig) -> list[str]:
         return [plain_word("body", body)] * (body != "default") + betas
     if body_kind(body) == NO_BODY:
         return []
-    scale = [] if config.body_scale is None else [f"body_scale={config.body_scale:g}"]
+    metres = _options(config).scale
+    scale = [] if metres is None else [f"body_scale={metres:g}"]
     return [plain_word("body", body), *scale, *([f"body_up={config.up}"] if str(config.up) != "auto" else [])]
 
 

@@ -191,7 +191,7 @@ def _text(report: dict[str, Any], config: DictConfig) -> str:
         lines.append(f"  now {part['result']}")
     start = report["starts"]["first frame"]
     words = [plain_word("garment", report["output"]), plain_word("body", body)]
-    words += [] if config.body_scale is None else [f"body_scale={config.body_scale:g}"]
+    words += [] if config.body_scale is None else [f"unit={config.body_scale:g}"]
     words += [] if str(config.body_up) == "auto" else [f"up={config.body_up}"]
     run = shlex.join(["hood", "rollout", *words])
     return "\n".join(

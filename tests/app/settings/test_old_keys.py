@@ -47,6 +47,9 @@ def unsaid() -> None:
         ("allow_unsound=true", "fail_on=nothing", "allow_unsound=true is called fail_on=nothing now"),
         ("allow_unsound=false", "", "allow_unsound=false is called fail_on=unsound now"),
         ("allow_unsound=false fail_on=doubts", "fail_on=doubts", "allow_unsound=false is called fail_on=doubts now"),
+        ("trans_unit=cm", "unit=cm", "trans_unit=cm is called unit=cm now"),
+        ("trans_unit=auto", "", "trans_unit=auto has no effect: the unit is found"),
+        ("body_scale=0.01", "unit=0.01", "body_scale=0.01 is called unit=0.01 now"),
         ("blend_in=1.5 blend_from=a", "blend_in=[1.5,a]", "blend_from=a is called blend_in=[1.5,a] now"),
         ("blend_from=t blend_in=2", "blend_in=2", "blend_from=t is called blend_in=2 now"),
         ("blend_from=a", "", "blend_from=a has no effect: blend_in is 0"),
@@ -76,6 +79,8 @@ def test_what_nothing_says_today_is_the_stricter() -> None:
         "settle=equilibrium relaxing_steps=3",
         "settle=2 relaxing_steps=3",
         "blend_in=[1,t] blend_from=a",
+        "unit=m trans_unit=cm",
+        "trans_unit=cm body_scale=0.1",
         "fail_on=doubts allow_unsound=true",
         "fail_on=nothing allow_unsound=false",
         "fail_on=unsound doubts=refuse",
@@ -98,6 +103,8 @@ THEN = {
     "size_seconds": 2.0,
     "allow_unsound": False,
     "doubts": "report",
+    "trans_unit": None,
+    "body_scale": None,
 }
 
 
@@ -118,6 +125,8 @@ THEN = {
         ({"doubts": "refuse"}, {"fail_on": "doubts"}),
         ({"allow_unsound": True}, {"fail_on": "nothing"}),
         ({"allow_unsound": True, "doubts": "refuse"}, {"fail_on": "doubts"}),
+        ({"trans_unit": "mm"}, {"unit": "mm"}),
+        ({"body_scale": 0.01}, {"unit": 0.01}),
         ({"blend_in": 1.0}, {"blend_in": 1.0}),
         ({"blend_from": "a"}, {}),
         ({"events": [{"frame": 3, "close": "zip"}]}, {"events": [{"frame": 3, "close": "zip"}]}),
@@ -134,6 +143,7 @@ def test_records_of_then_are_read_as_those_of_today(then: dict[str, object], tod
 
 def test_a_file_is_inspected_with_the_same_words() -> None:
     assert load_config("inspect", ["blend_in=1", "blend_from=a"]) == load_config("inspect", ["blend_in=[1,a]"])
+    assert load_config("inspect", ["body_scale=0.01"]) == load_config("inspect", ["unit=0.01"])
     with pytest.raises(ConfigError, match="unknown key 'relaxing_steps'"):
         load_config("inspect", ["relaxing_steps=3"])
 

@@ -197,7 +197,9 @@ def test_up_axis_units_and_parts_of_the_motion(tmp_path: Path) -> None:
     np.testing.assert_array_equal(load_mesh_sequence(path, start="2f", stop="4f").verts, moving()[2:5])
     np.testing.assert_allclose(load_mesh_sequence(path, 30.0, file_fps=60.0).verts, moving()[::2], atol=1e-15)
     np.savez(tmp_path / "large.npz", verts=100 * moving(), faces=FACES)
-    with pytest.raises(ValueError, match=r"large\.npz: the mesh is 10.* m large.*body_scale=0\.01"):
+    with pytest.raises(
+        ValueError, match=r"large\.npz: the mesh is 10.* m large.*unit=0\.01 \(body_scale=0\.01 in hood prepare\)"
+    ):
         load_mesh_sequence(tmp_path / "large.npz")
     assert load_mesh_sequence(tmp_path / "large.npz", scale=1.0).num_frames == COUNT
     np.testing.assert_allclose(load_mesh_sequence(tmp_path / "large.npz", scale=0.01).verts, moving(), atol=1e-12)
@@ -355,15 +357,15 @@ def test_other_meshes_say_nothing_of_their_axis(tmp_path: Path, body: Body, case
 @pytest.mark.parametrize("unit", [0.01, 0.001])
 def test_the_unit_that_makes_a_person_is_named(tmp_path: Path, body: Body, unit: float) -> None:
     write_obj(tmp_path / "body.obj", body.v_template / unit, body.faces)
-    advice = rf"pass body_scale={unit:g}, which makes it 1\.72 m \(body_scale=1 takes it as it is\)"
+    advice = rf"pass unit={unit:g} \(.*\), which makes it 1\.72 m \(unit=m takes it as it is\)"
     with pytest.raises(ValueError, match=advice):
         load_mesh_sequence(tmp_path / "body.obj")
     wrong = 10 * unit
-    with pytest.warns(UserWarning, match=rf"17\.2 m large with body_scale={wrong:g}; {advice}"):
+    with pytest.warns(UserWarning, match=rf"17\.2 m large with unit={wrong:g}; {advice}"):
         load_mesh_sequence(tmp_path / "body.obj", scale=wrong)
-    with pytest.warns(UserWarning, match=rf"0\.172 m large with body_scale={unit / 10:g}; {advice}"):
+    with pytest.warns(UserWarning, match=rf"0\.172 m large with unit={unit / 10:g}; {advice}"):
         load_mesh_sequence(tmp_path / "body.obj", scale=unit / 10)
-    with pytest.raises(ValueError, match=f"body_scale={50 * unit:g} is not its unit, {advice}"):
+    with pytest.raises(ValueError, match=f"unit={50 * unit:g} is not that of the file, {advice}"):
         load_mesh_sequence(tmp_path / "body.obj", scale=50 * unit)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -374,7 +376,10 @@ def test_the_unit_that_makes_a_person_is_named(tmp_path: Path, body: Body, unit:
 
 def test_a_unit_that_shrinks_a_mesh_in_metres_is_told(tmp_path: Path, body: Body) -> None:
     write_obj(tmp_path / "body.obj", body.v_template, body.faces)
-    with pytest.warns(UserWarning, match=r"0\.0172 m large with body_scale=0\.01; pass body_scale=1, which makes it 1\.72 m$"):
+    with pytest.warns(
+        UserWarning,
+        match=r"0\.0172 m large with unit=0\.01; pass unit=1 \(body_scale=1 in hood prepare\), which makes it 1\.72 m$",
+    ):
         load_mesh_sequence(tmp_path / "body.obj", scale=0.01)
 
 
@@ -382,7 +387,7 @@ def test_a_unit_that_shrinks_a_mesh_in_metres_is_told(tmp_path: Path, body: Body
 def test_a_person_of_4_to_30_metres_is_told(tmp_path: Path, body: Body, unit: float) -> None:
     """In feet or decimetres. A hall and a floor of that size are taken as they are, and so is who says so."""
     write_obj(tmp_path / "body.obj", body.v_template / unit, body.faces)
-    with pytest.warns(UserWarning, match=rf"seems not to be the metre; pass body_scale={unit:g}, which makes it 1\.72 m"):
+    with pytest.warns(UserWarning, match=rf"seems not to be the metre; pass unit={unit:g} .*, which makes it 1\.72 m"):
         load_mesh_sequence(tmp_path / "body.obj")
     with warnings.catch_warnings():
         warnings.simplefilter("error")

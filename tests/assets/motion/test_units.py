@@ -40,7 +40,7 @@ def test_other_units_are_found_on_a_floor(own: Recording, unit: str) -> None:
     found = unit_of(own, own.transl / TRANSLATION_UNITS[unit])
     assert (found.name, found.sure) == (unit, True)
     assert not isinstance(found.note, Doubt)
-    assert "trans_unit=m" in str(found.note)
+    assert "unit=m" in str(found.note)
 
 
 @pytest.mark.parametrize("unit", ["cm", "mm"])
@@ -61,7 +61,7 @@ def test_a_body_that_is_carried_is_a_doubt() -> None:
     found = unit_of(own, slide)
     assert isinstance(found.note, Doubt)
     assert (found.name, found.sure, found.note.kind) == ("m", False, "units")
-    assert all(word in str(found.note) for word in ("trans_unit=cm", "trans_unit=m "))
+    assert all(word in str(found.note) for word in ("unit=cm", "unit=m "))
 
 
 def test_the_unit_can_be_given(tmp_path: Path) -> None:
@@ -70,5 +70,5 @@ def test_the_unit_can_be_given(tmp_path: Path) -> None:
         found = read_recording(path, trans_unit=unit)
         np.testing.assert_allclose(found.transl, world("z").transl * metres)
         assert found.notes == ()
-    with pytest.raises(ValueError, match="trans_unit=inch: give m, cm, mm or auto"):
+    with pytest.raises(ValueError, match="unit=inch: give m, cm, mm or auto"):
         read_recording(path, trans_unit="inch")

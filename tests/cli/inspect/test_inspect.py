@@ -104,7 +104,7 @@ def test_kinds(tmp_path: Path) -> None:
 def test_errors_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     for words, expected in (
         ([], "no file is given"),
-        (["tank", "body_scal=0.01"], "unknown key 'body_scal': did you mean 'body_scale'"),
+        (["tank", "body_part=[a]"], "unknown key 'body_part': did you mean 'body_parts'"),
         (["tank", "scale=0.01"], "unknown key 'scale'"),
         (["tank", "--fast"], "unknown option '--fast'"),
     ):

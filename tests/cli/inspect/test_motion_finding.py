@@ -72,7 +72,7 @@ def test_what_was_given_is_no_fact_of_the_file(tmp_path: Path, capsys: pytest.Ca
     _, found = told(capsys, path)
     assert found["facts"]["unit of the translation"] == "cm"
     assert "is in centimetres" in found["problems"][0]["problem"]
-    _, found = told(capsys, path, "trans_unit=cm", "up=-z", "file_fps=60")
+    _, found = told(capsys, path, "unit=cm", "up=-z", "file_fps=60")
     facts = found["facts"]
     assert (facts["unit of the translation"], facts["up axis taken"]) == ("cm, as given", "-z, as given")
     assert (facts["frames per second"], found["problems"]) == (60.0, [])

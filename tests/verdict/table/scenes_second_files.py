@@ -136,7 +136,7 @@ CAPTURES = [
     Scene("longsleeve_sinking_network", "off the floor", "quickstart", "longsleeve", takes.rising("walk_march", 60, -6.0), 16),
     Scene("shirt_millimetres", "other units", "newton", "shirt", takes.rising("walk_march", 60, 0.0, scale=1000.0), 12),
     Scene("tank_centimetres_kept", "other units", "newton", "tank", takes.rising("walk_march", 60, 0.0, scale=100.0), 12,
-          ("trans_unit=m",)),
+          ("unit=m",)),
     Scene("longsleeve_trembling_arm", "trembling capture", "newton", "longsleeve",
           takes.trembling("walk_stroll", 60, 8.0, (16, 18)), 20),
     Scene("trousers_trembling_legs", "trembling capture", "guess+5", "trousers",
