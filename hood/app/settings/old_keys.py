@@ -80,6 +80,7 @@ _OLD = {
     "doubts": _Old("fail_on", _doubts, ""),
     "trans_unit": _Old("unit", _unit, "the unit is found"),
     "body_scale": _Old("unit", _unit, "the file is in metres"),
+    "gusts": _Old("losses.terms.air.gusts", lambda gusts, _: gusts, ""),
     "size_seconds": _Old("size_end", _size_end, "size_end is not given", lambda given: not isinstance(given, dict)),
     "blend_from": _Old("blend_in", _blend_in, "blend_in is 0", lambda given: not isinstance(given, list)),
 }

@@ -61,7 +61,8 @@ def shared_moments(rollouts: Sequence[tuple[str, RolloutData]]) -> list[tuple[in
 def wind_of(data: RolloutData) -> str:
     """``wind 3 m/s, gusts 20%``, or nothing where there is no air."""
     settings = _settings(data)
-    wind, gusts = settings.get("wind"), settings.get("gusts")
+    wind, air = settings.get("wind"), ((settings.get("losses") or {}).get("terms") or {}).get("air") or {}
+    gusts = air.get("gusts")
     if wind is None:
         return ""
     speed = f"({', '.join(f'{part:g}' for part in wind)})" if isinstance(wind, list) else f"{wind:g}"

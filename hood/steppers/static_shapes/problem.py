@@ -51,7 +51,7 @@ def settled_potential(potential: Potential, problem: StepProblem) -> Potential:
         if isinstance(term, Energy) and term.varies_in_time():
             raise ValueError(
                 f"losses.terms.{name} has gusts, which are another in every step and place; steps of fixed shapes have no form "
-                "of that: use step=plain, or gusts=0"
+                f"of that: use step=plain, or losses.terms.{name}.gusts=0"
             )
         if prepared(term, with_contact) is not with_contact:
             raise ValueError(

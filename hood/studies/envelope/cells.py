@@ -162,7 +162,7 @@ def _air() -> Iterator[Cell]:
     """Wind, from still air to a storm, and damping of the fabric."""
     for wind, word in (("0", "still air"), ("5", "5 m/s"), ("20", "20 m/s"), ("[40,0,0]", "40 m/s from a side")):
         yield Cell("wind", word, (f"wind={wind}",))
-    yield Cell("wind", "10 m/s, gusts of half as much", ("wind=10", "gusts=0.5"))
+    yield Cell("wind", "10 m/s, gusts of half as much", ("wind=10", "losses.terms.air.gusts=0.5"))
     for seconds in (1e-3, 1e-2, 0.1, 1.0):
         yield Cell("damping", f"{seconds:g} s", (f"damping={seconds:g}",))
 

@@ -82,7 +82,7 @@ def test_how_a_garment_sits_is_said_of_both_ends() -> None:
 
 def test_wind_and_damping_reach_the_potential_and_are_left_out_by_default() -> None:
     assert not {"air", "stretch_damping", "bend_damping"} & set(build(load_config("rollout").losses).terms)
-    words = ["losses=reference", "wind=3", "gusts=0.2", "seed=5", "damping=0.002"]
+    words = ["losses=reference", "wind=3", "losses.terms.air.gusts=0.2", "seed=5", "damping=0.002"]
     terms = build(load_config("rollout", words).losses).terms
     assert isinstance(terms["air"], Wind)
     assert (terms["air"].x, terms["air"].y, terms["air"].z, terms["air"].gusts, terms["air"].seed) == (0, 0, -3, 0.2, 5)
@@ -91,4 +91,4 @@ def test_wind_and_damping_reach_the_potential_and_are_left_out_by_default() -> N
         assert terms[name].time == 0.002
     assert build(load_config("rollout", ["wind=[1,2,0]"]).losses).terms["air"].y == 2.0
     with pytest.raises(ValueError, match="gusts is 0.2, but there is no wind"):
-        build(load_config("rollout", ["gusts=0.2"]).losses)
+        build(load_config("rollout", ["losses.terms.air.gusts=0.2"]).losses)

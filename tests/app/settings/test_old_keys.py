@@ -50,6 +50,7 @@ def unsaid() -> None:
         ("trans_unit=cm", "unit=cm", "trans_unit=cm is called unit=cm now"),
         ("trans_unit=auto", "", "trans_unit=auto has no effect: the unit is found"),
         ("body_scale=0.01", "unit=0.01", "body_scale=0.01 is called unit=0.01 now"),
+        ("wind=3 gusts=0.2", "wind=3 losses.terms.air.gusts=0.2", "gusts=0.2 is called losses.terms.air.gusts=0.2 now"),
         ("blend_in=1.5 blend_from=a", "blend_in=[1.5,a]", "blend_from=a is called blend_in=[1.5,a] now"),
         ("blend_from=t blend_in=2", "blend_in=2", "blend_from=t is called blend_in=2 now"),
         ("blend_from=a", "", "blend_from=a has no effect: blend_in is 0"),
@@ -79,6 +80,7 @@ def test_what_nothing_says_today_is_the_stricter() -> None:
         "settle=equilibrium relaxing_steps=3",
         "settle=2 relaxing_steps=3",
         "blend_in=[1,t] blend_from=a",
+        "losses.terms.air.gusts=0.1 gusts=0.2",
         "unit=m trans_unit=cm",
         "trans_unit=cm body_scale=0.1",
         "fail_on=doubts allow_unsound=true",
@@ -105,6 +107,7 @@ THEN = {
     "doubts": "report",
     "trans_unit": None,
     "body_scale": None,
+    "gusts": 0.0,
 }
 
 

@@ -68,9 +68,9 @@ def test_files_made_otherwise_say_nothing(attributes: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     "settings, words",
     [
-        ({"wind": None, "gusts": 0.0}, ""),
-        ({"wind": 3, "gusts": 0.0}, "wind 3 m/s"),
-        ({"wind": [1, 0, -2.5], "gusts": 0.2}, "wind (1, 0, -2.5) m/s, gusts 20%"),
+        ({"wind": None}, ""),
+        ({"wind": 3, "losses": {"terms": {"air": {"gusts": 0.0}}}}, "wind 3 m/s"),
+        ({"wind": [1, 0, -2.5], "losses": {"terms": {"air": {"gusts": 0.2}}}}, "wind (1, 0, -2.5) m/s, gusts 20%"),
         ({"wind": 0}, "wind 0 m/s"),
     ],
 )

@@ -65,7 +65,7 @@ LOOSE = [
     Scene("tube_top", "bare minimum", "newton", made.band("tank", 0.18, 0.40), "walk_brisk", 30, WALK),
     Scene("armband", "bare minimum", "newton", made.armband(), "wave_and_reach", 30, WALK),
     Scene("dress_breeze", "wind", "newton", "dress", "walk_stroll", 30, (*WALK, "wind=4")),
-    Scene("skirt_storm", "wind", "newton", "skirt", "walk_stroll", 30, (*WALK, "wind=[12,0,0]", "gusts=0.2")),
+    Scene("skirt_storm", "wind", "newton", "skirt", "walk_stroll", 30, (*WALK, "wind=[12,0,0]", "losses.terms.air.gusts=0.2")),
     Scene("tshirt_gale", "wind", "quickstart+5", "tshirt", "walk_stroll", 20, (*WALK, "wind=25")),
     Scene("skirt_blown_up", "wind", "newton", "skirt", "walk_stroll", 20, (*WALK, "wind=[0,14,0]")),
 ]

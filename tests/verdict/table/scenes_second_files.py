@@ -143,7 +143,7 @@ CAPTURES = [
           takes.trembling("walk_stroll", 60, 15.0, (1, 2, 4, 5)), 14),
     Scene("skirt_said_240", "wrong rate", "newton", "skirt", takes.as_said("jog", 60, 240.0), 16),
     Scene("tshirt_said_15", "wrong rate", "quickstart", "tshirt", takes.as_said("jog", 60, 15.0), 16),
-    Scene("dress_gust", "strong wind", "newton", "dress", "walk_stroll", 20, (*WALK, "wind=[-10,0,0]", "gusts=0.3")),
+    Scene("dress_gust", "strong wind", "newton", "dress", "walk_stroll", 20, (*WALK, "wind=[-10,0,0]", "losses.terms.air.gusts=0.3")),
     Scene("skirt_gale_network", "strong wind", "quickstart", "skirt", "walk_stroll", 16, (*WALK, "wind=30")),
     Scene("tank_trousers_jacket", "three garments", "newton", "[tank,trousers,jacket]", "stand_sway", 8),
     Scene("tank_shorts_shirt_network", "three garments", "quickstart", "[tank,shorts,shirt]", "walk_curve", 14, WALK),
