@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import torch
 from omegaconf import DictConfig
 
-from hood.app.settings.compose import ConfigError, load_config, plain, require_choice, shown
+from hood.app.settings.compose import ConfigError, brief, load_config, plain, require_choice, shown
 from hood.app.settings.record import read_record
 from hood.assets.files.atomic import occupy
 from hood.assets.files.said import install, say
@@ -31,6 +31,7 @@ Result = TypeVar("Result")
 
 #: ``checkpoint=untrained``: seeded random weights instead of a file.
 UNTRAINED = "untrained"
+_VIDEOS = ("mp4", "gif", "none")
 #: A body drawn thinner than this [mm] is another body.
 _THINNEST = 20.0
 
@@ -83,6 +84,21 @@ def frame_count(config: DictConfig) -> int | None:
     if count is not None and (isinstance(count, bool) or not isinstance(count, int) or count < 1):
         raise ConfigError(f"num_frames={count}: must be a whole number, at least 1")
     return None if count is None else int(count)
+
+
+def video_of(config: DictConfig) -> tuple[str, int]:
+    """What ``video`` of a rollout says: mp4, gif or none, and of how many frames one is drawn.
+
+    Raises:
+        ConfigError: it says something else.
+    """
+    value = plain(config.video)
+    if not isinstance(value, list):
+        require_choice(config, "video", _VIDEOS)
+        return str(value), 1
+    if len(value) != 2 or value[0] not in _VIDEOS[:2] or type(value[1]) is not int or value[1] < 1:
+        raise ConfigError(f"video={brief(value)}: give mp4 or gif, and every how many frames is drawn, such as video=[mp4,3]")
+    return str(value[0]), value[1]
 
 
 def output_folder(config: DictConfig) -> Path:

@@ -77,7 +77,7 @@ _LIMIT = 1 << 20
 #: Keys that say nothing about the model, so they may be given beside a plan.
 FREE = (
     "output", "num_frames", "guard", "fail_on", "resume", "metrics", "surface_stride", "export", "colour",
-    "thin_body", "video", "video_stride", "sheet", "output_fps", "refine_mesh", "formats", "texture",
+    "thin_body", "video", "sheet", "output_fps", "refine_mesh", "formats", "texture",
 )  # fmt: skip
 
 

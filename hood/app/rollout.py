@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 
 from hood.app.batch.batch import Job, find_jobs, share, with_one_stepper, write_overview
 from hood.app.batch.folders import as_begun, motion_attributes, refuse_others, resumed
-from hood.app.common import output_folder, prepare_folder, thinning, together
+from hood.app.common import output_folder, prepare_folder, thinning, together, video_of
 from hood.app.notices import Bar, Heard, collected, heard, say, tell_how_far
 from hood.app.output.export import check_outputs, check_worn, export_beside, lay_on, read_textures, remove_earlier
 from hood.app.output.frames import at_output_fps, finer_mesh, on_finer_mesh, planned_steps, refined_still
@@ -314,7 +314,8 @@ def _simulate_to_disk(
 
 def _draw(config: DictConfig, folder: Path, bar: Bar) -> None:
     """Contact sheet and video, when the picture libraries are installed."""
-    if str(config.video) == "none" and not bool(config.sheet):
+    kind, stride = video_of(config)
+    if kind == "none" and not bool(config.sheet):
         return
     try:
         from hood.media.film import write_sheet, write_video
@@ -325,10 +326,10 @@ def _draw(config: DictConfig, folder: Path, bar: Bar) -> None:
     textures = lay_on(read_textures(config), [data])[0]
     if bool(config.sheet):
         write_sheet(data, folder / "contact_sheet.png", colour, thinner, textures)
-    if str(config.video) != "none":
-        chosen = range(0, len(data.cloth_pos), int(config.video_stride))
+    if kind != "none":
+        chosen = range(0, len(data.cloth_pos), stride)
         frames = bar(chosen, len(chosen), "video")
-        write_video(data, folder / f"rollout.{config.video}", frames, int(config.video_stride), colour, thinner, textures)
+        write_video(data, folder / f"rollout.{kind}", frames, stride, colour, thinner, textures)
 
 
 def _write_json(path: Path, value: dict[str, Any]) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from omegaconf import DictConfig
 
-from hood.app.common import require_device, thinning
+from hood.app.common import require_device, thinning, video_of
 from hood.app.notices import say
 from hood.app.output.frames import check_output_fps, check_refine_mesh
 from hood.app.output.verdict import FAIL_ON
@@ -57,7 +57,7 @@ class Setup:
 def check_config(config: DictConfig) -> None:
     """Raise ConfigError where keys of ``hood rollout`` have values that no rollout can have, before a file is read."""
     require_device(config)
-    require_choice(config, "video", ("mp4", "gif", "none"))
+    video_of(config)
     require_choice(config, "metrics", METRIC_CHOICES)
     start_of(config)
     require_choice(config, "fail_on", FAIL_ON)
@@ -200,7 +200,7 @@ def _check_start(config: DictConfig, stepper: Stepper, scene: Scene, tell: Calla
 
 
 def _check_numbers(config: DictConfig) -> None:
-    for key, least in (("num_frames", 1), ("video_stride", 1), ("surface_stride", 1), ("seed", 0)):
+    for key, least in (("num_frames", 1), ("surface_stride", 1), ("seed", 0)):
         if int(config[key]) < least:
             raise ConfigError(f"{key}={config[key]}: must be at least {least}")
     thinning(config)

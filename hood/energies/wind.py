@@ -145,7 +145,8 @@ def air(velocity: float | Sequence[float] | None = None, **settings: Any) -> Win
     if velocity is None:
         if gusts:
             raise ValueError(
-                f"wind: gusts is {gusts}, but there is no wind that they could be a share of; give wind=3, or losses.terms.air.gusts=0"
+                f"wind: gusts is {gusts}, but there is no wind that they could be a share of; give wind=3, or "
+                "losses.terms.air.gusts=0"
             )
         return None
     if isinstance(velocity, (int, float)):

@@ -27,7 +27,7 @@ _PACKAGE = Path(__file__).resolve().parents[2]
 #: Installed packages carry the configs inside; a clone has them beside the package.
 CONFIG_FOLDER = _PACKAGE / "configs" if (_PACKAGE / "configs").is_dir() else _PACKAGE.parent / "configs"
 #: Keys that take one word or number, or a list.
-_ONE_OR_MORE = ("garment", "offset", "layers", "size", "blend_in")
+_ONE_OR_MORE = ("garment", "offset", "layers", "size", "blend_in", "video")
 #: Keys that take a table of parts, some beside numbers and lists.
 TABLES = ("size", "size_end", "fabrics")
 #: Keys in here may be null: an energy that is left out.

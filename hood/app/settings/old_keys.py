@@ -72,6 +72,11 @@ def _unit(unit: Any, _: Mapping[str, Any]) -> Any:
     return None if unit == "auto" else unit
 
 
+def _video(stride: Any, settings: Mapping[str, Any]) -> Any:
+    video = settings.get("video", "mp4")
+    return None if video == "none" else video if stride == 1 else [video, stride]
+
+
 #: Earlier keys, in the order in which they are read.
 _OLD = {
     "relaxing_steps": _Old("settle", _settle, "settle=equilibrium takes none", lambda given: given == "paper"),
@@ -81,6 +86,7 @@ _OLD = {
     "trans_unit": _Old("unit", _unit, "the unit is found"),
     "body_scale": _Old("unit", _unit, "the file is in metres"),
     "gusts": _Old("losses.terms.air.gusts", lambda gusts, _: gusts, ""),
+    "video_stride": _Old("video", _video, "video=none", lambda given: not isinstance(given, list)),
     "size_seconds": _Old("size_end", _size_end, "size_end is not given", lambda given: not isinstance(given, dict)),
     "blend_from": _Old("blend_in", _blend_in, "blend_in is 0", lambda given: not isinstance(given, list)),
 }

@@ -138,7 +138,6 @@ def _is_drawn(config: DictConfig) -> bool:
 _ROLLOUT = (
     _Rule("fabrics_seam", lambda config: config.fabrics is not None, "fabrics are not given"),
     _Rule("surface_stride", lambda config: str(config.metrics) == "all", "the surface is measured with metrics=all alone"),
-    _Rule("video_stride", lambda config: str(config.video) != "none", "video=none"),
     _Rule("thin_body", _is_drawn, "nothing is drawn: video=none sheet=false"),
     _Rule("colour", lambda config: _is_drawn(config) or str(config.colour) == "rg", "nothing is drawn: video=none sheet=false"),
     _Rule("cloth_friction", lambda config: str(config.cloth_contact) != "off", "cloth_contact=off"),

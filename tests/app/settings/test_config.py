@@ -66,7 +66,10 @@ def test_names_that_look_like_numbers_are_names() -> None:
         (["num_frames=2.5"], ("num_frames=2.5: give a whole number",)),
         (["num_frames=null"], ("num_frames=null: give a whole number",)),
         (["sheet=3"], ("sheet=3: give true or false, such as sheet=true",)),
-        (["video=false"], ("video=false: give text, such as video=mp4; hood rollout --help says of video: mp4, gif or none",)),
+        (
+            ["video=false"],
+            ("such as video=mp4; hood rollout --help says of video: mp4, gif or none; [mp4,3] draws every third",),
+        ),
         (["sequence=null"], ("sequence=null: give text, such as sequence=walk_proud",)),
         (["sequence=[walk_proud,plie]"], ("give one text, not a list", "a list file")),
         (["size=big"], ("size=big: give a number or a list in brackets, such as size=1",)),

@@ -51,6 +51,9 @@ def unsaid() -> None:
         ("trans_unit=auto", "", "trans_unit=auto has no effect: the unit is found"),
         ("body_scale=0.01", "unit=0.01", "body_scale=0.01 is called unit=0.01 now"),
         ("wind=3 gusts=0.2", "wind=3 losses.terms.air.gusts=0.2", "gusts=0.2 is called losses.terms.air.gusts=0.2 now"),
+        ("video_stride=3", "video=[mp4,3]", "video_stride=3 is called video=[mp4,3] now"),
+        ("video_stride=3 video=gif", "video=[gif,3]", "video_stride=3 is called video=[gif,3] now"),
+        ("video=none video_stride=3", "video=none", "video_stride=3 has no effect: video=none"),
         ("blend_in=1.5 blend_from=a", "blend_in=[1.5,a]", "blend_from=a is called blend_in=[1.5,a] now"),
         ("blend_from=t blend_in=2", "blend_in=2", "blend_from=t is called blend_in=2 now"),
         ("blend_from=a", "", "blend_from=a has no effect: blend_in is 0"),
@@ -80,6 +83,7 @@ def test_what_nothing_says_today_is_the_stricter() -> None:
         "settle=equilibrium relaxing_steps=3",
         "settle=2 relaxing_steps=3",
         "blend_in=[1,t] blend_from=a",
+        "video=[mp4,2] video_stride=3",
         "losses.terms.air.gusts=0.1 gusts=0.2",
         "unit=m trans_unit=cm",
         "trans_unit=cm body_scale=0.1",
@@ -108,6 +112,7 @@ THEN = {
     "trans_unit": None,
     "body_scale": None,
     "gusts": 0.0,
+    "video_stride": 1,
 }
 
 
@@ -130,6 +135,8 @@ THEN = {
         ({"allow_unsound": True, "doubts": "refuse"}, {"fail_on": "doubts"}),
         ({"trans_unit": "mm"}, {"unit": "mm"}),
         ({"body_scale": 0.01}, {"unit": 0.01}),
+        ({"video_stride": 2}, {"video": ["mp4", 2]}),
+        ({"video": "none", "video_stride": 2}, {"video": "none"}),
         ({"blend_in": 1.0}, {"blend_in": 1.0}),
         ({"blend_from": "a"}, {}),
         ({"events": [{"frame": 3, "close": "zip"}]}, {"events": [{"frame": 3, "close": "zip"}]}),

@@ -26,7 +26,6 @@ IDLE = [
     ),
     (["fabrics_seam=0.1"], "fabrics_seam=0.1 has no effect: fabrics are not given"),
     (["metrics=strain", "surface_stride=2"], "surface_stride=2 has no effect: the surface is measured with metrics=all alone"),
-    (["video=none", "video_stride=2"], "video_stride=2 has no effect: video=none"),
     (["video=none", "sheet=false", "thin_body=8"], "thin_body=8 has no effect: nothing is drawn"),
     (["video=none", "sheet=false", "colour=strain"], "colour=strain has no effect: nothing is drawn"),
     (["cloth_contact=off", "cloth_friction=0.5"], "cloth_friction=0.5 has no effect: cloth_contact=off"),
