@@ -83,7 +83,7 @@ def test_a_solver_that_misses_every_step(metrics: str, capsys: pytest.CaptureFix
 
 def test_what_nobody_measured_is_not_judged(capsys: pytest.CaptureFixture[str]) -> None:
     write_walk(Path("walk.npz"), 7)
-    command = [*CHEAP, "sequence=walk.npz", "refine=0", "budget_ms=0.001"]  # nothing is refined, no gradient computed
+    command = [*CHEAP, "sequence=walk.npz", "refine=0.001ms"]  # nothing is refined, no gradient computed
     assert main(command) == 0
     assert summary()["sound"] is None
     assert "\nnot judged: how far the steps to frames 1–6 ended from their minimum was not measured" in capsys.readouterr().out

@@ -47,7 +47,7 @@ _REASON = 300
 #: Keys of a rollout that say which network takes the steps and how it computes, and how they are refined: who gives one means
 #: the network, unless another stepper is named.
 NETWORK_KEYS = ("checkpoint", "model", "precision", "kernels")
-_REFINING = ("refine", "target_rg", "budget_ms", "max_strain", "refine_method", "refine_most", "refine_table")
+_REFINING = ("refine", "refine_method", "refine_most", "refine_table")
 #: Keys that people look for under another word.
 _OTHER_WORDS = {
     "motion": ("sequence", "sequences"),

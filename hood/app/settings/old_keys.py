@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from decimal import Decimal
 from functools import cache
 from typing import Any, NamedTuple
 
 from hydra.errors import HydraException
 
-from hood.app.settings.overrides import bare_or_quoted, coded, decoded, parse, readable
+from hood.app.settings.overrides import bare_or_quoted, coded, decoded, parse, plain_word, readable
 from hood.assets.files.said import say
 
 #: Values of then that mean nothing else than what is usual.
@@ -77,6 +78,19 @@ def _video(stride: Any, settings: Mapping[str, Any]) -> Any:
     return None if video == "none" else video if stride == 1 else [video, stride]
 
 
+def _goal(unit: str, times: int = 1) -> Callable[[Any, Mapping[str, Any]], Any]:
+    def refine(value: Any, _: Mapping[str, Any]) -> Any:
+        if value is None or isinstance(value, bool) or not isinstance(value, (int, float)):
+            return value if value is None else f"{value}{unit}"
+        return f"{(Decimal(repr(value)) * times).normalize():f}{unit}"
+
+    return refine
+
+
+def _is_unrefined(given: Any) -> bool:
+    return given in (0, "auto")
+
+
 #: Earlier keys, in the order in which they are read.
 _OLD = {
     "relaxing_steps": _Old("settle", _settle, "settle=equilibrium takes none", lambda given: given == "paper"),
@@ -87,6 +101,9 @@ _OLD = {
     "body_scale": _Old("unit", _unit, "the file is in metres"),
     "gusts": _Old("losses.terms.air.gusts", lambda gusts, _: gusts, ""),
     "video_stride": _Old("video", _video, "video=none", lambda given: not isinstance(given, list)),
+    "target_rg": _Old("refine", _goal("rg"), "null asks for nothing", _is_unrefined),
+    "budget_ms": _Old("refine", _goal("ms"), "null asks for nothing", _is_unrefined),
+    "max_strain": _Old("refine", _goal("%", 100), "null asks for nothing", _is_unrefined),
     "size_seconds": _Old("size_end", _size_end, "size_end is not given", lambda given: not isinstance(given, dict)),
     "blend_from": _Old("blend_in", _blend_in, "blend_in is 0", lambda given: not isinstance(given, list)),
 }
@@ -116,7 +133,7 @@ def todays_words(words: Sequence[str], command: str = "rollout") -> tuple[str, .
         before = settings.get(into)
         if before not in (None, value) and (into in made or not _OLD[key].beside(before)):
             raise ValueError(f"{said[into]} and {given[key]} contradict each other; give one of them")
-        settings[into], said[into], made[into] = value, given[key], f"{into}={_written(value)}"
+        settings[into], said[into], made[into] = value, given[key], _word(into, value)
         _tell(f"{given[key]} is called {made[into]} now")
     return (*(word for word in words if word.partition("=")[0] not in {*old_ones, *made}), *made.values())
 
@@ -144,6 +161,10 @@ def _value(word: str) -> Any:
         return decoded(parse(readable(word, several=True)).value())
     except HydraException as error:
         raise ValueError(f"cannot read {word!r}: write key=value") from error
+
+
+def _word(key: str, value: Any) -> str:
+    return plain_word(key, value) if isinstance(value, str) else f"{key}={_written(value)}"
 
 
 def _written(value: Any) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 from omegaconf import DictConfig
 
 from hood.app.stepping.cloth_contact import potential_of
-from hood.app.stepping.refinement import AUTO, other_refinement_keys, refined
+from hood.app.stepping.refinement import AUTO, refined
 from hood.app.stepping.steppers import losses_of, make_solver, option_of, with_stepper
 from hood.energies.potential import Potential, default_potential
 from hood.rollouts.loop import simulate
@@ -102,7 +102,7 @@ def solver(config: DictConfig) -> Stepper:
 def _iterations(config: DictConfig, stepper: Stepper, scene: Scene, choice: Choice) -> int:
     """Refinement that the garment's size needs: none where the weights know it, or do not say what they know."""
     network = network_of(stepper)
-    if network is None or network.trained_for is None or other_refinement_keys(config):
+    if network is None or network.trained_for is None:
         return 0
     asked = scene_conditions(scene.garment, scene.cloth, scene.dt, default_potential())
     (_, vertices), (_, known) = asked.spans["vertices"], network.trained_for.spans.get("vertices", (0.0, float("inf")))

@@ -1,10 +1,13 @@
-"""The keys of refinement (``refine``, ``target_rg``, ``budget_ms``, ``max_strain``): checked, applied, reported."""
+"""How far steps are refined (``refine``): checked, applied, reported."""
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Mapping
+from decimal import Decimal
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from omegaconf import DictConfig
@@ -26,12 +29,15 @@ from hood.steppers.stopping import (
     floor_from_table,
 )
 
-#: The ways to say how far a step is refined; a user gives one of them.
-REFINEMENT_KEYS = ("refine", "target_rg", "budget_ms", "max_strain")
 #: ``refine=auto``: as the garment's size needs (:mod:`hood.app.stepping.automatic`).
 AUTO = "auto"
 _COLOURS = ("none", "strain", "rg", "contact")
-_BEGIN_FROM_TABLE = ("budget_ms", "max_strain")
+#: Units of goals, and an example of each: the unbalanced force as a share of the weight, the milliseconds of a frame, the 99th
+#: percentile of the edge strain.
+_SUCH_AS = {"rg": "0.1rg", "ms": "20ms", "%": "5%"}
+_GOAL = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?) ?(rg|ms|%)")
+_WAYS = "refine=5, refine=0.1rg, refine=20ms or refine=5%"
+_BEGIN_FROM_TABLE = ("ms", "%")
 #: An iteration in units of a frame without any, where none was taken: 0.3 of garments of 1,000 to 4,000 vertices; and how
 #: much more than the median frame is given.
 _ITERATION, _ROOM = 0.4, 1.1
@@ -39,31 +45,36 @@ _ITERATION, _ROOM = 0.4, 1.1
 _DETAILS = {"refine_method": "newton", "refine_most": 50, "refine_table": None}
 
 
-def chosen(config: Mapping[Any, Any]) -> tuple[str, float] | None:
-    """Name and value of the refinement key that is set; None where there is none, and while it is left to ``auto``.
+class AskedRefinement(NamedTuple):
+    """What ``refine`` asks for: iterations where ``unit`` is empty, else a goal, a share where it is ``rg`` or ``%``."""
+
+    value: float
+    unit: str
+    text: str  # refine=5
+
+
+def chosen(config: Mapping[Any, Any]) -> AskedRefinement | None:
+    """What ``refine`` asks for; None where nothing is refined, and while it is left to ``auto``.
 
     Raises:
-        ConfigError: two are set, or the value is no number.
+        ConfigError: it is neither a number of iterations nor a goal.
     """
-    given = [*(["refine"] if config.get("refine") not in (None, 0, AUTO) else []), *other_refinement_keys(config)]
-    if len(given) > 1:
-        text = " and ".join(f"{name}={config[name]}" for name in given)
-        raise ConfigError(
-            f"{text}: these say in {len(given)} ways how far a step is refined; give one of {', '.join(REFINEMENT_KEYS)}"
-        )
-    if not given:
+    value = config.get("refine")
+    if value in (None, 0, AUTO):
         return None
-    value = config[given[0]]
-    whole = given[0] != "refine" or (isinstance(value, (int, float)) and float(value).is_integer())
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not whole:
-        what = "a whole number of iterations, or auto" if given[0] == "refine" else "a number"
-        raise ConfigError(f"{given[0]}={brief(value)}: give {what}")
-    return given[0], float(value)
-
-
-def other_refinement_keys(config: Mapping[Any, Any]) -> list[str]:
-    """The refinement keys but ``refine`` that are set."""
-    return [name for name in REFINEMENT_KEYS if name != "refine" and config.get(name) is not None]
+    if isinstance(value, (int, float)) and not isinstance(value, bool) and float(value).is_integer():
+        return AskedRefinement(float(value), "", f"refine={value:g}")
+    found = _GOAL.fullmatch(str(value))
+    if found is None:
+        raise ConfigError(
+            f"refine={brief(value)}: give a whole number of iterations, or auto, or a goal such as 0.1rg (unbalanced force), "
+            "20ms (time of a frame) or 5% (strain)"
+        )
+    number, unit = found.groups()
+    goal = float(Decimal(number) / 100 if unit == "%" else Decimal(number))
+    if not 0.0 < goal < math.inf:
+        raise ConfigError(f"refine={value}: give a goal above 0, such as {_SUCH_AS[unit]}")
+    return AskedRefinement(goal, unit, f"refine={value}")
 
 
 def check_refinement(config: DictConfig) -> None:
@@ -78,22 +89,16 @@ def check_refinement(config: DictConfig) -> None:
         raise ConfigError(f"refine_most={config.refine_most}: must be at least 1")
     if asked is None:
         if option_of(config).refinement == ALWAYS:
-            raise ConfigError(
-                f"stepper={config.stepper} takes its steps by refinement alone; give one of {', '.join(REFINEMENT_KEYS)}"
-            )
+            raise ConfigError(f"stepper={config.stepper} takes its steps by refinement alone; give {_WAYS}")
         for name, default in _DETAILS.items():
             if config[name] != default:
-                raise ConfigError(
-                    f"{name}={config[name]}: nothing is refined; give one of {', '.join(REFINEMENT_KEYS)} as well"
-                )
+                raise ConfigError(f"{name}={config[name]}: nothing is refined; give {_WAYS} as well")
         return
     if option_of(config).refinement == NEVER:
+        raise ConfigError(f"{asked.text}: stepper={config.stepper} goes as far as solver.* says; use stepper=refine instead")
+    if config.refine_table is not None and asked.unit not in _BEGIN_FROM_TABLE:
         raise ConfigError(
-            f"{asked[0]}={config[asked[0]]}: stepper={config.stepper} goes as far as solver.* says; use stepper=refine instead"
-        )
-    if config.refine_table is not None and asked[0] not in _BEGIN_FROM_TABLE:
-        raise ConfigError(
-            f"refine_table={config.refine_table}: says where {' and '.join(_BEGIN_FROM_TABLE)} begin; {asked[0]} needs none"
+            f"refine_table={config.refine_table}: says where refine=20ms and refine=5% begin; {asked.text} needs none"
         )
     make_goal(config, num_vertices=1000)
 
@@ -123,20 +128,19 @@ def make_goal(config: DictConfig, num_vertices: int) -> StoppingCriterion | None
     asked = chosen(config)
     if asked is None:
         return None
-    name, value = asked
     most = int(config.refine_most)
-    if name == "refine":
-        return Count(int(value))
-    if name == "target_rg":
-        return TargetResidual(value, most)
+    if not asked.unit:
+        return Count(int(asked.value))
+    if asked.unit == "rg":
+        return TargetResidual(asked.value, most)
     table = None if config.refine_table is None else Path(str(config.refine_table)).expanduser()
     method = str(config.refine_method)
-    if name == "budget_ms":
-        return Budget(value, most, None if table is None else costs_from_table(table, num_vertices, method))
+    if asked.unit == "ms":
+        return Budget(asked.value, most, None if table is None else costs_from_table(table, num_vertices, method))
     return (
-        MaxStrain(value, most)
+        MaxStrain(asked.value, most)
         if table is None
-        else MaxStrain(value, most, floor_from_table(table, value, num_vertices, method))
+        else MaxStrain(asked.value, most, floor_from_table(table, asked.value, num_vertices, method))
     )
 
 
@@ -151,17 +155,16 @@ def refined(stepper: Stepper, config: DictConfig, num_vertices: int, potential: 
 
 
 def summarise_refinement(config: Mapping[str, Any], metrics: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Entry ``refinement`` of a summary: the key, iterations and accuracy reached, frames that met it and that missed it.
+    """Entry ``refinement`` of a summary: what was asked for, iterations and accuracy, frames that met it and that missed it.
 
-    Frames count from the first step on. A frame meets ``budget_ms`` with its time from one frame to the next, ``ms_total``.
+    Frames count from the first step on. A frame meets a time with its own from one frame to the next, ``ms_total``.
     """
     asked = chosen(config)
     if asked is None or "refine_iterations" not in metrics:
         return {}
-    name, value = asked
     iterations, residual = metrics["refine_iterations"][1:], metrics["refine_rg"][1:]
     entry: dict[str, Any] = {
-        "asked": f"{name}={value:g}",
+        "asked": asked.text,
         "method": str(config["refine_method"]),
         "iterations_median": _of(np.median, iterations),
         "iterations_max": _of(np.max, iterations),
@@ -170,12 +173,12 @@ def summarise_refinement(config: Mapping[str, Any], metrics: Mapping[str, np.nda
         "steps_ended": count_reasons(metrics.get("refine_reason", np.zeros(0))),
     }
     met = metrics.get("refine_met")
-    if name == "budget_ms":
+    if asked.unit == "ms":
         times = metrics["ms_total"]
-        met = np.where(np.isfinite(times), times <= value, np.nan)
+        met = np.where(np.isfinite(times), times <= asked.value, np.nan)
         entry["ms_p95"] = _of(lambda values: np.quantile(values, 0.95), times)
         entry |= _unrefined(iterations, times[1:], metrics.get("ms_refine", times)[1:])
-        entry["budget_used_median"] = _of(lambda values: np.median(values) / value, times)
+        entry["budget_used_median"] = _of(lambda values: np.median(values) / asked.value, times)
     if met is not None:
         seen = met[1:][np.isfinite(met[1:])]
         entry |= {"frames_met": int((seen == 1).sum()), "frames_missed": int((seen == 0).sum())}
@@ -220,7 +223,7 @@ def _describe_unrefined(entry: Mapping[str, Any]) -> list[str]:
     count, total = entry["frames_unrefined"], entry["frames_met"] + entry["frames_missed"]
     return [
         f"{entry['asked']} is used up before the first iteration in {count} of {total} frames, which are not refined at all "
-        f"and take {entry['ms_unrefined']:.1f} ms; about budget_ms={entry['budget_for_one']:g} has room for one"
+        f"and take {entry['ms_unrefined']:.1f} ms; about refine={entry['budget_for_one']:g}ms has room for one"
     ]
 
 

@@ -9,7 +9,7 @@ from omegaconf import DictConfig
 
 from hood.app.settings.compose import ConfigError
 from hood.app.stepping.cloth_contact import acts
-from hood.app.stepping.refinement import chosen, other_refinement_keys
+from hood.app.stepping.refinement import chosen
 from hood.app.stepping.steppers import losses_of
 from hood.assets.files.library import unknown
 from hood.energies.term import Role, role_of
@@ -69,7 +69,7 @@ def _collision(config: DictConfig, key: str, value: str) -> bool:
 def _iterations(config: DictConfig) -> int:
     """Iterations after the network, or from the guess; 0 where none are counted."""
     asked = None if _solver(config) else chosen(config)
-    return int(asked[1]) if asked is not None and asked[0] == "refine" else 0
+    return int(asked.value) if asked is not None and not asked.unit else 0
 
 
 def _target(share: float) -> Callable[[DictConfig], bool]:
@@ -179,7 +179,8 @@ def parts_of(config: DictConfig, steppers: bool = False) -> list[Part]:
 
 def _steppers(config: DictConfig) -> list[Part]:
     """Other ways to take the steps: of a solver a network and fewer iterations, of a network the solver."""
-    if other_refinement_keys(config) or str(config.step) != "plain":
+    goal = chosen(config)
+    if (goal is not None and goal.unit) or str(config.step) != "plain":
         return []
     asked = str(config.stepper)
     ways: list[tuple[str, str, tuple[str, ...]]] = []

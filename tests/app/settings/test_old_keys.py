@@ -54,6 +54,12 @@ def unsaid() -> None:
         ("video_stride=3", "video=[mp4,3]", "video_stride=3 is called video=[mp4,3] now"),
         ("video_stride=3 video=gif", "video=[gif,3]", "video_stride=3 is called video=[gif,3] now"),
         ("video=none video_stride=3", "video=none", "video_stride=3 has no effect: video=none"),
+        ("target_rg=0.1", "refine=0.1rg", "target_rg=0.1 is called refine=0.1rg now"),
+        ("budget_ms=20 refine=auto", "refine=20ms", "budget_ms=20 is called refine=20ms now"),
+        ("refine=0 budget_ms=20.0", "refine=20ms", "budget_ms=20.0 is called refine=20ms now"),
+        ("max_strain=0.05", "refine=5%", "max_strain=0.05 is called refine=5% now"),
+        ("max_strain=0.005 refine_most=9", "refine=0.5% refine_most=9", "max_strain=0.005 is called refine=0.5% now"),
+        ("target_rg=null", "", "target_rg=null has no effect: null asks for nothing"),
         ("blend_in=1.5 blend_from=a", "blend_in=[1.5,a]", "blend_from=a is called blend_in=[1.5,a] now"),
         ("blend_from=t blend_in=2", "blend_in=2", "blend_from=t is called blend_in=2 now"),
         ("blend_from=a", "", "blend_from=a has no effect: blend_in is 0"),
@@ -83,6 +89,9 @@ def test_what_nothing_says_today_is_the_stricter() -> None:
         "settle=equilibrium relaxing_steps=3",
         "settle=2 relaxing_steps=3",
         "blend_in=[1,t] blend_from=a",
+        "refine=5 budget_ms=20",
+        "refine=20ms budget_ms=30",
+        "target_rg=0.1 max_strain=0.1",
         "video=[mp4,2] video_stride=3",
         "losses.terms.air.gusts=0.1 gusts=0.2",
         "unit=m trans_unit=cm",
@@ -113,6 +122,9 @@ THEN = {
     "body_scale": None,
     "gusts": 0.0,
     "video_stride": 1,
+    "target_rg": None,
+    "budget_ms": None,
+    "max_strain": None,
 }
 
 
@@ -137,6 +149,10 @@ THEN = {
         ({"body_scale": 0.01}, {"unit": 0.01}),
         ({"video_stride": 2}, {"video": ["mp4", 2]}),
         ({"video": "none", "video_stride": 2}, {"video": "none"}),
+        ({"refine": "auto", "target_rg": 0.1}, {"refine": "0.1rg"}),
+        ({"refine": 0, "budget_ms": 20.0}, {"refine": "20ms"}),
+        ({"refine": 0, "max_strain": 0.05}, {"refine": "5%"}),
+        ({"refine": 5}, {"refine": 5}),
         ({"blend_in": 1.0}, {"blend_in": 1.0}),
         ({"blend_from": "a"}, {}),
         ({"events": [{"frame": 3, "close": "zip"}]}, {"events": [{"frame": 3, "close": "zip"}]}),
@@ -167,3 +183,9 @@ def test_keys_of_then_are_no_keys_of_today() -> None:
     keys = yaml.safe_load((CONFIG_FOLDER / "rollout.yaml").read_text(encoding="utf-8"))
     assert not THEN.keys() & keys.keys()
     assert THEN.keys() == old_keys._OLD.keys()
+
+
+def test_a_rollout_has_few_keys() -> None:
+    """A new one is first looked for as a value of another."""
+    keys = yaml.safe_load((CONFIG_FOLDER / "rollout.yaml").read_text(encoding="utf-8"))
+    assert len(keys.keys() - {"defaults"}) <= 68

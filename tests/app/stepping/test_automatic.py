@@ -76,12 +76,12 @@ def test_a_larger_garment_is_not_left_to_the_network(capsys: pytest.CaptureFixtu
 
 
 @pytest.mark.parametrize(
-    "key", ["refine=0", "refine=2", "target_rg=0.5", "checkpoint=known.safetensors", "checkpoint=silent.safetensors"]
+    "key", ["refine=0", "refine=2", "refine=0.5rg", "checkpoint=known.safetensors", "checkpoint=silent.safetensors"]
 )
 def test_what_is_given_wins_and_what_is_known_needs_nothing(key: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*QUICK, key]) == 0
     assert "refine=5: " not in capsys.readouterr().out
-    asked = {"refine=2": "refine=2", "target_rg=0.5": "target_rg=0.5"}.get(key)
+    asked = {"refine=2": "refine=2", "refine=0.5rg": "refine=0.5rg"}.get(key)
     assert summary().get("refinement", {}).get("asked") == asked
 
 
@@ -108,8 +108,8 @@ def test_on_a_cpu_the_solver_is_the_default_and_nothing_is_measured(
         (["checkpoint=quickstart"], "network"),
         (["refine=5"], "network"),
         (["refine=0"], "network"),
-        (["stepper=auto", "target_rg=0.1"], "network"),
-        (["budget_ms=9"], "network"),
+        (["stepper=auto", "refine=0.1rg"], "network"),
+        (["refine=9ms"], "network"),
         (["precision=bf16"], "network"),
         (["model=small", "model.latent_dim=8"], "network"),
         (["step=compiled"], "network"),

@@ -1,4 +1,4 @@
-"""Refinement keys on the command line: what is refused, what is written, what is reported."""
+"""Refinement on the command line: what is refused, what is written, what is reported."""
 
 from __future__ import annotations
 
@@ -8,29 +8,30 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hood.app.stepping.refinement import describe_refinement, summarise_refinement
+from hood.app.settings.compose import load_config
+from hood.app.settings.python_words import overrides
+from hood.app.stepping.refinement import chosen, describe_refinement, summarise_refinement
 from hood.cli.main import main
 from hood.rollouts.file.reader import read_rollout
 
 UNTRAINED = ["checkpoint=untrained", "model=small", "model.latent_dim=4", "model.schedule='1x(mesh)'"]
 SHORT = ["rollout", *UNTRAINED, "garment=tank", "num_frames=4", "video=none", "sheet=false", "output=run"]
 REFUSED = {
-    "two keys": (["refine=3", "target_rg=0.1"], "refine=3 and target_rg=0.1: these say in 2 ways"),
-    "three keys": (["max_strain=0.1", "target_rg=0.1", "budget_ms=40"], "in 3 ways how far a step is refined; give one of"),
+    "another unit": (["refine=5kg"], "refine=5kg: give a whole number of iterations, or auto, or a goal such as 0.1rg"),
     "a key on the solver": (["stepper=newton", "refine=3"], "stepper=newton goes as far as solver.* says"),
     "refinement of nothing by nothing": (["stepper=refine"], "stepper=refine takes its steps by refinement alone"),
     "details without a key": (["refine_method=sweeps"], "refine_method=sweeps: nothing is refined"),
     "a table for another key": (
         ["refine=2", "refine_table=t.json"],
-        "says where budget_ms and max_strain begin; refine needs none",
+        "says where refine=20ms and refine=5% begin; refine=2 needs none",
     ),
-    "no such table": (["max_strain=0.1", "refine_table=t.json"], "t.json: no such file"),
-    "no such table of times": (["budget_ms=50", "refine_table=t.json"], "t.json: no such file"),
+    "no such table": (["refine=10%", "refine_table=t.json"], "t.json: no such file"),
+    "no such table of times": (["refine=50ms", "refine_table=t.json"], "t.json: no such file"),
     "misspelt method": (["refine=2", "refine_method=sweep"], "'sweeps'"),
-    "zero budget": (["budget_ms=0"], "budget_ms is 0; give the milliseconds of a frame"),
+    "zero budget": (["refine=0ms"], "refine=0ms: give a goal above 0, such as 20ms"),
     "negative count": (["refine=-1"], "refine is -1; give 0 or more iterations"),
-    "a word": (["target_rg=low"], "target_rg=low: give a number"),
-    "no iterations": (["target_rg=0.1", "refine_most=0"], "refine_most=0: must be at least 1"),
+    "a word": (["refine=lowrg"], "refine=lowrg: give a whole number of iterations"),
+    "no iterations": (["refine=0.1rg", "refine_most=0"], "refine_most=0: must be at least 1"),
     "unknown export": (["export=[gamma]"], "unknown 'gamma'; give some of"),
     "unknown colour": (["colour=heat"], "unknown value for colour 'heat'"),
 }
@@ -52,7 +53,7 @@ def test_what_does_not_fit_together_is_refused(case: str, capsys: pytest.Capture
 
 
 def test_a_target_is_reported_frame_by_frame(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([*SHORT, "target_rg=0.5", "refine_most=4", "colour=rg", "sheet=true", "num_frames=3"]) == 0
+    assert main([*SHORT, "refine=0.5rg", "refine_most=4", "colour=rg", "sheet=true", "num_frames=3"]) == 0
     assert Path("run/contact_sheet.png").stat().st_size > 0
     data = read_rollout(Path("run/rollout.h5"))
     met, reached = data.metrics["refine_met"], data.metrics["refine_rg"]
@@ -62,7 +63,7 @@ def test_a_target_is_reported_frame_by_frame(capsys: pytest.CaptureFixture[str])
     assert (data.metrics["refine_iterations"] <= 4)[1:].all()
     assert (data.metrics["ms_refine"] > 0)[1:].all()
     entry = json.loads(Path("run/summary.json").read_text())["refinement"]
-    assert entry["asked"] == "target_rg=0.5"
+    assert entry["asked"] == "refine=0.5rg"
     assert (entry["frames_met"], entry["frames_missed"]) == ((met == 1).sum(), (met == 0).sum())
     assert f"{entry['frames_met']} frames met it, {entry['frames_missed']} missed it\n" in capsys.readouterr().out
     assert data.fields["rg"].shape == data.cloth_pos.shape[:2]
@@ -87,9 +88,28 @@ def test_off_is_off() -> None:
     assert first.fields == {}
 
 
+@pytest.mark.parametrize(
+    ("value", "goal", "unit"),
+    [
+        ("0.1rg", 0.1, "rg"),
+        ("1e-3rg", 1e-3, "rg"),
+        ("20ms", 20.0, "ms"),
+        ("5%", 0.05, "%"),
+        ("12.3 %", 0.123, "%"),
+        (5, 5.0, ""),
+    ],
+)
+def test_a_goal_is_a_value_with_its_unit(value: object, goal: float, unit: str) -> None:
+    found = chosen({"refine": value})
+    assert found is not None
+    assert (found.value, found.unit) == (goal, unit)
+    assert chosen(load_config("rollout", overrides({"refine": value}))) == found
+    assert chosen(load_config("rollout", [f"refine={value}"])) == found
+
+
 def test_a_budget_counts_whole_frames() -> None:
     """Frame 0 has no step; what is not finite is not counted."""
-    config = {"budget_ms": 100.0, "refine": 0, "refine_method": "newton"}
+    config = {"refine": "100ms", "refine_method": "newton"}
     times = np.array([np.nan, 90.0, 100.0, 110.0, np.nan])
     metrics = {"ms_total": times, "refine_iterations": np.array([np.nan, 3, 2, 4, np.nan]), "refine_rg": times / 100}
     entry = summarise_refinement(config, metrics)["refinement"]
@@ -103,17 +123,17 @@ def test_a_budget_counts_whole_frames() -> None:
 @pytest.mark.parametrize(
     ("iterations", "refining", "told"),
     [
-        ([0, 0, 0], [0.1, 0.1, 0.1], "in 3 of 3 frames, which are not refined at all and take 10.0 ms; about budget_ms=16 has"),
-        ([0, 0, 2], [0.1, 0.1, 8.0], "in 2 of 3 frames, which are not refined at all and take 10.0 ms; about budget_ms=16 has"),
+        ([0, 0, 0], [0.1, 0.1, 0.1], "in 3 of 3 frames, which are not refined at all and take 10.0 ms; about refine=16ms has"),
+        ([0, 0, 2], [0.1, 0.1, 8.0], "in 2 of 3 frames, which are not refined at all and take 10.0 ms; about refine=16ms has"),
         ([0, 1, 2], [0.1, 3.0, 8.0], None),
     ],
 )
 def test_a_budget_that_is_used_up_before_an_iteration_is_told(iterations: list, refining: list, told: str | None) -> None:
-    config = {"budget_ms": 3.0, "refine": 0, "refine_method": "newton"}
+    config = {"refine": "3ms", "refine_method": "newton"}
     metrics = {
         "refine_iterations": np.array([np.nan, *iterations]), "refine_rg": np.full(4, np.nan),
         "ms_total": np.array([np.nan, 10.0, 10.0, 10.0]), "ms_refine": np.array([np.nan, *refining]),
     }  # fmt: skip
     lines = describe_refinement(summarise_refinement(config, metrics))
     assert len(lines) == (1 if told is None else 2)
-    assert told is None or f"budget_ms=3 is used up before the first iteration {told} room for one" in lines[1]
+    assert told is None or f"refine=3ms is used up before the first iteration {told} room for one" in lines[1]
