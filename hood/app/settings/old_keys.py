@@ -158,9 +158,12 @@ def _put(record: Any, path: Sequence[str], value: Any) -> None:
 
 def _value(word: str) -> Any:
     try:
-        return decoded(parse(readable(word, several=True)).value())
+        override = parse(readable(word, several=True))
     except HydraException as error:
         raise ValueError(f"cannot read {word!r}: write key=value") from error
+    if override.is_sweep_override():
+        raise ValueError(f"{word}: give one value")
+    return decoded(override.value())
 
 
 def _word(key: str, value: Any) -> str:

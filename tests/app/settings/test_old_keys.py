@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
+import h5py
 import pytest
 import yaml
 
+import hood
 from hood.app.notices import collected
+from hood.app.output.summary import summarise
+from hood.app.plan_file import rollout_config, write_plan
 from hood.app.settings import old_keys
 from hood.app.settings.compose import CONFIG_FOLDER, ConfigError, load_config, plain
 from hood.app.settings.old_keys import put_todays_keys
 from hood.app.settings.record import read_record
+from hood.app.setup import check_config
+from hood.cli.main import main
 
 
 @pytest.fixture(autouse=True)
@@ -167,6 +174,28 @@ def test_records_of_then_are_read_as_those_of_today(then: dict[str, object], tod
     assert record == {**usual, **today}
 
 
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("relaxing_steps=range(1,3)", "give one value"),
+        ("relaxing_steps=[1", "close every bracket"),
+        ("relaxing_steps=many", "unknown value for settle 'many'"),
+        ("budget_ms=soon", "refine=soonms: give a whole number of iterations"),
+        ("video_stride=0", r"video=\[mp4,0\]: give mp4 or gif"),
+        ("doubts=never", "unknown value for fail_on 'never'"),
+        ("body_scale=x", "unit=x: give m, cm, mm"),
+    ],
+)
+def test_values_that_never_were_are_refused(word: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        check_config(load_config("rollout", [word]))
+
+
+def test_python_takes_and_notes_them() -> None:
+    simulation = hood.simulate("tank", "plie", num_frames=1, stepper="newton", gusts=0.0, metrics="none", settle="paper")
+    assert "gusts=0.0 is called losses.terms.air.gusts=0.0 now" in simulation.notes
+
+
 def test_a_file_is_inspected_with_the_same_words() -> None:
     assert load_config("inspect", ["blend_in=1", "blend_from=a"]) == load_config("inspect", ["blend_in=[1,a]"])
     assert load_config("inspect", ["body_scale=0.01"]) == load_config("inspect", ["unit=0.01"])
@@ -177,6 +206,34 @@ def test_a_file_is_inspected_with_the_same_words() -> None:
 def test_the_record_in_a_folder_is_read_so(tmp_path: Path) -> None:
     (tmp_path / "config.yaml").write_text(yaml.safe_dump({**THEN, "settle": "paper", "relaxing_steps": 2}))
     assert read_record(tmp_path / "config.yaml")["settle"] == 2
+
+
+def test_a_plan_of_then_is_followed(tmp_path: Path) -> None:
+    write_plan(tmp_path / "plan.json", {"words": ["garment=tank", "settle=paper", "relaxing_steps=2"], "chosen": ["refine=0"]})
+    config = rollout_config([f"plan={tmp_path / 'plan.json'}", "video_stride=3"])
+    assert (config.garment, config.settle, config.video) == ("tank", 2, ["mp4", 3])
+    with pytest.raises(ConfigError, match="settle=3: .* was made for settle=2"):
+        rollout_config([f"plan={tmp_path / 'plan.json'}", "relaxing_steps=3"])
+
+
+def test_a_rollout_of_then_is_resumed_and_summarised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ["rollout", "stepper=refine", "garment=tank", "num_frames=2", "settle=paper", "guard=off", "sheet=false"]
+    words += ["metrics=none", "video=none", "output=out", "resume=true"]
+    assert main([*words, "refine=90%"]) == 0
+    file = Path("out/rollout.h5")
+    with h5py.File(file, "r+") as stored:
+        for name in ("config", "asked"):
+            settings = json.loads(stored.attrs[name])
+            del settings["fail_on"], settings["unit"]
+            settings |= {**THEN, "refine": "auto" if name == "asked" else 0, "max_strain": 0.9}
+            stored.attrs[name] = json.dumps(settings)
+    before = file.stat().st_mtime_ns
+    assert main([*words, "max_strain=0.9"]) == 0
+    assert file.stat().st_mtime_ns == before
+    assert summarise(file)["refinement"]["asked"] == "refine=90%"
+    assert main([*words, "refine=80%"]) == 0
+    assert file.stat().st_mtime_ns != before
 
 
 def test_keys_of_then_are_no_keys_of_today() -> None:
