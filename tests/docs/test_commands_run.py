@@ -80,7 +80,7 @@ CHOICES = {
     r"weights=NAME": "weights=quickstart model=passes",
     r"inspect FILE$": "inspect my_shirt.obj",
     r"checkpoint=…": "checkpoint=A/model.safetensors",
-    r"budget_ms=…": "budget_ms=50",
+    r"refine=…ms": "refine=50ms",
     r" size=…": " size=1.1",
     r",…\]": "]",
 }
