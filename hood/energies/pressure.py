@@ -124,7 +124,7 @@ class ClosedSurface:
 
 @dataclass(frozen=True)
 class Inflation:
-    """A pressure [Pa] in closed surfaces: what :class:`Pressure` is written out as."""
+    """A pressure [Pa] in closed surfaces: the closed form of :class:`Pressure`."""
 
     pascal: float
     surface: ClosedSurface

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from enum import Enum
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, runtime_checkable
@@ -35,7 +36,7 @@ NOT_INTERNAL = frozenset({Role.INERTIA, Role.GRAVITY, Role.CONTACT, Role.FRICTIO
 
 
 class Form(Enum):
-    """As what the derivatives of an energy are written out, and what :meth:`Energy.closed_form` gives then."""
+    """The kind of an energy's closed-form derivatives, and what :meth:`Energy.closed_form` returns of it."""
 
     MASS = "mass"  # (V,) kg, that resists acceleration
     WEIGHT = "weight"  # (V, 3) N, constant forces
@@ -87,7 +88,7 @@ class Term(Protocol):
         ...
 
 
-class Energy:
+class Energy(ABC):
     """An energy that says what it is for, and may have its derivatives written out: nobody else asks for its class.
 
     ``form`` and ``published`` hold for the class that states them alone. A subclass may compute another energy, so it begins
@@ -96,7 +97,7 @@ class Energy:
     Attributes:
         kind: name of the class in files.
         role: what the energy is for.
-        form: as what its derivatives are written out; None: the solver takes the slope by autograd and knows no curvature.
+        form: the kind of its closed-form derivatives; None: the solver takes the gradient by autograd and knows no Hessian.
         published: contact and friction as published code has them.
     """
 
@@ -116,9 +117,9 @@ class Energy:
         """Whether the energy can be anything but a constant zero for this problem."""
         return True
 
+    @abstractmethod
     def __call__(self, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> Tensor:
         """Energy [J] (B,) at ``next_pos`` (V, 3) [m], reached with acceleration ``acc`` (V, 3) [m/s²]."""
-        raise NotImplementedError
 
     def prepare(self, problem: StepProblem) -> StepProblem:
         """The problem with what the term needs to know of the step; itself when it is there already."""
@@ -137,7 +138,7 @@ class Energy:
         return False
 
     def closed_form(self, problem: StepProblem, passes: Passes | None = None) -> Any:
-        """What its ``form`` is made of in a prepared problem, see :class:`Form`.
+        """The closed form of the kind ``form`` in a prepared problem, see :class:`Form`.
 
         Args:
             passes: the compiled pass over a contact, where there is one.
@@ -175,7 +176,7 @@ def role_of(term: Term) -> Role | None:
 
 
 def form_of(term: Term) -> Form | None:
-    """As what the derivatives of an energy are written out."""
+    """The kind of an energy's closed-form derivatives; None of one without."""
     return term.form if isinstance(term, Energy) else None
 
 

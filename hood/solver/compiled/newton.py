@@ -81,12 +81,13 @@ class _LayerGrips(ctypes.Structure):
     _fields_ = [("count", COUNT), *fields("corners weights normal force limit model gradient own own_indefinite_part", POINTER)]
 
 
-ENERGY = ctypes.CFUNCTYPE(REAL, POINTER)
-MODEL = ctypes.CFUNCTYPE(None, POINTER)
+#: Functions of Python that ``OtherTerms`` of ``newton.cpp`` calls with the address of positions (V, 4) in the solver's order.
+ENERGY_CALLBACK = ctypes.CFUNCTYPE(REAL, POINTER)
+MODEL_CALLBACK = ctypes.CFUNCTYPE(None, POINTER)
 
 
 class _OtherTerms(ctypes.Structure):
-    _fields_ = [("energy", ENERGY), ("model", MODEL), *fields("gradient own", POINTER)]
+    _fields_ = [("energy", ENERGY_CALLBACK), ("model", MODEL_CALLBACK), *fields("gradient own", POINTER)]
 
 
 @cache

@@ -20,8 +20,8 @@ from hood.native.arguments import POINTER, REAL, num_parts
 from hood.native.build import BuildError
 from hood.solver.compiled.newton import (
     _ROWS,
-    ENERGY,
-    MODEL,
+    ENERGY_CALLBACK,
+    MODEL_CALLBACK,
     CompiledStep,
     Fabric,
     _array,
@@ -295,8 +295,8 @@ class _OtherForces:
         self._upper = torch.triu_indices(3, 3)
         self.error: BaseException | None = None
         self.values = _OtherTerms(
-            energy=ENERGY(self._energy),
-            model=MODEL(self._model),
+            energy=ENERGY_CALLBACK(self._energy),
+            model=MODEL_CALLBACK(self._model),
             gradient=self._gradient.ctypes.data,
             own=self._own.ctypes.data,
         )
