@@ -75,7 +75,7 @@ class BodyMesh:
     name: str = "body"
 
     def __post_init__(self) -> None:
-        vertices = real_rows("body", "vertices", self.vertices, "(frames, vertices, 3)", (2, 3), 3)
+        vertices = real_rows("body", "vertices", self.vertices, "(frames, vertices, 3)", (2, 3), 3, single=True)
         vertices = vertices[None] if vertices.ndim == 2 else vertices
         faces = _triangles(self.faces, vertices.shape[1])
         object.__setattr__(self, "vertices", vertices)

@@ -119,14 +119,17 @@ def checked_sequence(sequence: PoseSequence) -> PoseSequence:
     return replace(sequence, poses=poses, transl=transl, fps=fps, betas=betas)
 
 
-def real_rows(argument: str, key: str, value: Any, form: str, ndims: tuple[int, ...], last: int | None = None) -> np.ndarray:
-    """An array of finite reals that somebody gives, float64 unless it is float32 already.
+def real_rows(
+    argument: str, key: str, value: Any, form: str, ndims: tuple[int, ...], last: int | None = None, single: bool = False
+) -> np.ndarray:
+    """An array of finite reals that somebody gives, in float64.
 
     Args:
         argument, key: what it is, for messages.
         form: shape that is asked for, in words.
         ndims: numbers of axes that it may have.
         last: length of its last axis.
+        single: leave float32 as it is: a long mesh sequence would take twice the memory.
 
     Raises:
         ValueError: something else; names the first index that is not finite.
@@ -144,7 +147,7 @@ def real_rows(argument: str, key: str, value: Any, form: str, ndims: tuple[int, 
     if not np.isfinite(array).all():
         place = tuple(map(int, np.argwhere(~np.isfinite(array))[0]))
         raise ValueError(f"{argument}: {key}[{', '.join(map(str, place))}] is {array[place]}; give finite numbers")
-    return array if array.dtype == np.float32 and argument == "body" else array.astype(np.float64)
+    return array if single and array.dtype == np.float32 else array.astype(np.float64)
 
 
 def rate_of(argument: str, fps: Any) -> float:
