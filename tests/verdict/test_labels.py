@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hood.app.settings.compose import load_config, named_today
 from hood.assets.files.said import KINDS
 from hood.testing import grid, sphere
 from tests.verdict.table import counts
@@ -67,6 +68,20 @@ def test_the_fast_scenes_are_of_many_kinds_and_half_of_them_broken() -> None:
     assert len(FAST) == len(set(FAST)) == 20
     assert len({SCENES[name].kind for name in FAST}) >= 18
     assert Counter(LABELS[name]["label"] for name in FAST) == {"right": 10, "broken": 10}
+
+
+@pytest.mark.parametrize("scenes", [SCENES, SECOND, THIRD, REFUSED], ids=["first", "second", "third", "refused"])
+def test_every_scene_is_asked_for_in_keys_of_today(scenes: dict[str, Scene]) -> None:
+    asked = {(*STEPPERS[scene.stepper], f"num_frames={scene.frames}", *scene.keys) for scene in scenes.values()}
+    for told in asked:
+        words = tuple(word.replace("{folder}", "folder") for word in told)
+        assert named_today(words) == words
+        load_config("rollout", words)
+
+
+def test_one_text_is_no_list_of_keys() -> None:
+    with pytest.raises(TypeError, match="curtain.*tuple of overrides"):
+        Scene("curtain", "held sheets", "newton", "tshirt", keys="start=1")  # type: ignore[arg-type]
 
 
 def test_points_in_a_ball_are_found() -> None:

@@ -66,6 +66,10 @@ class Scene:
     body: str | Maker = "default"
     needs: str = ""
 
+    def __post_init__(self) -> None:
+        if isinstance(self.keys, str):
+            raise TypeError(f"{self.name}: keys is a tuple of overrides, not the text {self.keys!r}")
+
     def overrides(self, folder: Path) -> list[str]:
         """Arguments of ``hood rollout``; writes the inputs into ``folder``/inputs and asks for the results in ``folder``."""
         inputs = folder / "inputs"

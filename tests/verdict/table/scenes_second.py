@@ -131,7 +131,7 @@ FITS = [
     Scene("shorts_huge", "far too large", "newton", "shorts", "stand_sway", 24, ("size=1.5", "pins=none")),
     Scene("tank_shrinking", "changing size", "newton", "tank", "stand_sway", 24,
           ("size=1.1", "size_end={size:0.85,seconds:0.6}")),
-    Scene("tshirt_growing", "changing size", "quickstart+5", "tshirt", "stand_sway", 24, ("size_end={size:1.3,seconds:0.6}")),
+    Scene("tshirt_growing", "changing size", "quickstart+5", "tshirt", "stand_sway", 24, ("size_end={size:1.3,seconds:0.6}",)),
     Scene("skirt_held_aside", "held at one side", "newton", "skirt", "walk_stroll", 24, (*WALK, "pins=[0,1,2]")),
     Scene("trousers_let_go", "let go", "newton", "trousers", "jumps", 28, (*WALK, "events=[{frame: 4, detach: waistband}]")),
     Scene("tank_body_slim", "other people", "newton", "tank", "walk_march", 16, (*WALK, "betas=[-2.5,-1]")),
