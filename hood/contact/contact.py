@@ -258,6 +258,7 @@ class LaggedContact(CentroidContact):
     """
 
     lagged_facing: Tensor  # (V,) bool
+    lagged_face: Tensor  # (V,) of the body
     lagged_dist: Tensor  # (V,) m, from x_t to the centroid at t - 1
     lagged_centroid: Tensor  # (V, 3) m, the same centroid at t
     lagged_motion: Tensor  # (V, 3) m, of the centroid from t - 1 to t
@@ -271,15 +272,15 @@ def find_lagged_contact(contact: CentroidContact, pos: Tensor, vertex_scene: Ten
     if len(obstacle.faces) == 0:
         nowhere = torch.zeros_like(pos)
         return LaggedContact(
-            **vars(contact), lagged_facing=matched, lagged_dist=dist, lagged_centroid=nowhere, lagged_motion=nowhere,
-            lagged_normal=nowhere,
+            **vars(contact), lagged_facing=matched, lagged_face=face, lagged_dist=dist, lagged_centroid=nowhere,
+            lagged_motion=nowhere, lagged_normal=nowhere,
         )  # fmt: skip
     corners = obstacle.faces[face]
     centroid, before = obstacle.pos[corners].mean(dim=1), obstacle.prev_pos[corners].mean(dim=1)
     normal = geometry.face_normals(obstacle.pos, corners)
     return LaggedContact(
-        **vars(contact), lagged_facing=matched & normal.any(dim=1), lagged_dist=dist, lagged_centroid=centroid,
-        lagged_motion=centroid - before, lagged_normal=normal,
+        **vars(contact), lagged_facing=matched & normal.any(dim=1), lagged_face=face, lagged_dist=dist,
+        lagged_centroid=centroid, lagged_motion=centroid - before, lagged_normal=normal,
     )  # fmt: skip
 
 

@@ -9,12 +9,17 @@ import torch
 from torch import Tensor
 
 from hood.contact.activation_distance import vertex_reach
-from hood.contact.contact import Contact, LaggedContact
+from hood.contact.contact import Contact
 from hood.contact.sample_points import PointContact
 from hood.energies.contact import checked_contact, contacts_of, lagged_contact, weighted, with_lagged_centroids, with_places
 from hood.energies.laws import lagged_contact_force, mollified_norm
 from hood.energies.problem import StepProblem, dot_rows, sum_per_scene
 from hood.energies.term import Energy, Form, Passes, Role
+from hood.mesh.closest_point.vertices import nearest_centroids
+from hood.mesh.geometry import face_normals
+
+#: What the published code adds to sin² α.
+_LEAST_SINE_SQ = 1e-4
 
 
 def scaled_by_body_friction(problem: StepProblem, face: Tensor, force: Tensor) -> Tensor:
@@ -237,7 +242,7 @@ class WeightFriction(LaggedFriction):
     friction than cloth that just lies there, and cloth hovering within the radius gets as much: the default
     follows the contact force. For comparisons with that code only.
 
-    What that code does is another matter, see :class:`CodedFriction`. Here the distance is a distance (signed, to the
+    What that code computes is another thing, see :class:`CodedFriction`. Here the distance is a distance (signed, to the
     closest point of the surface: penetrating vertices count), up is the problem's, and the body moves from t to t+1 as it
     does for the collision.
 
@@ -265,33 +270,37 @@ class WeightFriction(LaggedFriction):
         return problem.cloth.mass * (-(normal * problem.gravity.to(normal)).sum(dim=1)).clamp_min(0.0)
 
 
-class CodedFriction(LaggedFriction):
-    """Friction by weight, as HOOD's published code computes it: N = m ‖g‖ |n_z| where ‖x_t - c‖² < ``radius``.
+class CodedFriction(Energy):
+    """Friction as HOOD's published code computes it, the sum over vertices of μ_f m ‖g‖ √(sin² α + 1e-4) ‖δ_T‖.
 
-    c is the nearest face centroid of the body at t-1, n the normal of that face at t; the slip is measured against the way of
-    the centroid from t-1 to t. Each differs from what was meant (:class:`WeightFriction`):
+    δ is the way of the vertex from t to t+1 less that of a face of the body from t-1 to t: the face whose centroid at t-1 is
+    nearest to x_t. δ_T = δ - (δ·n) n with n the mean of two unit normals, of that face at t-1 and of the face whose centroid at
+    t is nearest to the predicted vertex; n is not made unit again. α is the angle between δ_T and the axis z. Vertices count
+    whose *squared* distances to both centroids, of x_t at t-1 and of x_t+1 at t, are below ``radius``.
 
-    - the squared distance is compared with the radius itself, so that 3e-3 reaches 5.5 cm, nearly all of a shirt;
-    - z counts as up while gravity acts along y: walls in front and behind grip, shoulders do not;
-    - the body is one frame behind that of the collision.
+    Each differs from what was meant (:class:`WeightFriction`):
 
-    Two details are not known for certain. The sign of n_z is taken to play no role: the code is reported to act on 1,011 of
-    a shirt's 1,014 vertices, which is every vertex in reach; those with n_z > 0 are half of them. The law of slip near rest
-    is that of :class:`LaggedFriction`; beyond ``slip_speed`` the force is μ_f N in any case.
+    - squared distances are compared with the radius itself, so that 3e-3 reaches 5.5 cm, nearly all of a shirt;
+    - the weight depends on the direction of the slip, not on the slope of the surface, and z counts as up while gravity acts
+      along y: slip along z is nearly free;
+    - the body is one frame behind that of the collision;
+    - there is no static friction: the energy has a kink where nothing slips, and there is no force at it.
+
+    The normals and faces of the predicted position are taken as they are at each evaluation; no gradient goes through them.
 
     Args:
+        coefficient: μ_f.
         radius: [m²] in effect; the code takes it for metres.
     """
 
     kind: ClassVar[str] = "CodedFriction"
-    form = Form.GRIPS
+    role = Role.FRICTION
     published = True
 
-    def __init__(self, coefficient: float = 0.5, slip_speed: float = 5e-3, radius: float = 3e-3) -> None:
-        super().__init__(coefficient, slip_speed)
-        if radius <= 0:
-            raise ValueError(f"friction: radius is {radius}; give radius > 0")
-        self.radius = radius
+    def __init__(self, coefficient: float = 0.5, radius: float = 3e-3) -> None:
+        if coefficient < 0 or radius <= 0:
+            raise ValueError(f"friction: coefficient is {coefficient}, radius {radius}; give coefficient >= 0 and radius > 0")
+        self.coefficient, self.radius = coefficient, radius
 
     def with_weight(self, weight: float) -> Self:
         """The term itself: the weight of a collision term plays no role in it."""
@@ -301,16 +310,38 @@ class CodedFriction(LaggedFriction):
         """The problem with the body at t-1 searched, once per step, if there is friction."""
         return with_lagged_centroids(problem) if self.coefficient > 0 else problem
 
-    def normal_force(self, problem: StepProblem, contact: Contact) -> Tensor:
-        contact = lagged_contact(problem)
-        near = contact.lagged_facing & (contact.lagged_dist**2 < self.radius)
-        weight = problem.cloth.mass * problem.gravity.norm().to(problem.cloth.mass)
-        return torch.where(near, weight * contact.lagged_normal[:, 2].abs(), 0.0)
+    def applies(self, problem: StepProblem) -> bool:
+        return self.coefficient > 0 and problem.searched_contact is not None
 
-    def carrier(self, contact: Contact) -> tuple[Tensor, Tensor]:
-        """The way of the matched centroids from t-1 to t and the normals at t."""
-        assert isinstance(contact, LaggedContact)
-        return contact.lagged_motion, contact.lagged_normal
+    def greatest(self, problem: StepProblem, next_pos: Tensor) -> Tensor:
+        """μ_f φ m ‖g‖ [N] (V,) of the vertices that count at ``next_pos`` (V, 3), 0 of others."""
+        return self._reached(problem, next_pos)[0]
+
+    def __call__(self, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> Tensor:
+        """Energy [J] (B,) at ``next_pos`` (V, 3)."""
+        contact, obstacle = lagged_contact(problem), problem.step.obstacle
+        if obstacle is None or len(obstacle.faces) == 0:
+            return next_pos.new_zeros(problem.num_scenes)
+        force, face = self._reached(problem, next_pos)
+        before = face_normals(obstacle.prev_pos, obstacle.faces[contact.lagged_face])
+        normal = 0.5 * (before + face_normals(obstacle.pos, obstacle.faces[face]))
+        # where() before the arithmetic: rows without a match may hold infinite or undefined numbers.
+        slip = torch.where((force > 0)[:, None], next_pos - problem.state.pos - contact.lagged_motion, 0.0)
+        slip = slip - dot_rows(slip, normal)[:, None] * normal
+        # sin² α ‖δ_T‖² is the part of the slip across z, squared.
+        size_sq = slip[:, 0] ** 2 + slip[:, 1] ** 2 + _LEAST_SINE_SQ * dot_rows(slip, slip)
+        moving = size_sq > 0
+        return problem.sum_vertices(force * torch.where(moving, torch.where(moving, size_sq, 1.0).sqrt(), 0.0))
+
+    def _reached(self, problem: StepProblem, next_pos: Tensor) -> tuple[Tensor, Tensor]:
+        """:meth:`greatest`, and the faces (V,) of the body at t whose centroids are nearest to ``next_pos``."""
+        contact, obstacle, scene = lagged_contact(problem), problem.step.obstacle, problem.cloth.vertex_scene
+        assert obstacle is not None
+        face, dist = nearest_centroids(next_pos.detach(), scene, obstacle.pos, obstacle.faces, obstacle.face_scene)
+        near = contact.lagged_facing & (contact.lagged_dist**2 < self.radius) & (dist**2 < self.radius)
+        weight = problem.cloth.mass * problem.gravity.norm().to(problem.cloth.mass) * problem.cloth.friction
+        force = self.coefficient * scaled_by_body_friction(problem, contact.lagged_face, weight)
+        return torch.where(near, force, 0.0), face
 
 
 def _as_grip(normal: Tensor, anchor: Tensor, force: Tensor, limit: Tensor) -> Grip:

@@ -212,7 +212,6 @@ def coded_potential(
     collision_epsilon: float = 2e-3,
     collision_lagged: bool = False,
     friction_coefficient: float = 0.5,
-    friction_slip_speed: float = 5e-3,
     friction_radius: float = 3e-3,
     attachment_stiffness: float = 1e3,
 ) -> Potential:
@@ -220,7 +219,7 @@ def coded_potential(
     ``collision_lagged`` its ``cvpr`` collision."""
     return reference_potential(attachment_stiffness=attachment_stiffness).with_terms(
         collision=CentroidCollision(collision_weight, collision_epsilon, collision_lagged),
-        friction=CodedFriction(friction_coefficient, friction_slip_speed, friction_radius),
+        friction=CodedFriction(friction_coefficient, friction_radius),
     )
 
 
