@@ -20,6 +20,8 @@ from hood.mesh.geometry import face_normals
 
 #: What the published code adds to sin² α.
 _LEAST_SINE_SQ = 1e-4
+#: Slip [m] below which the solver takes the kink of that code's friction for round.
+_LEAST_SLIP = 1e-6
 
 
 def scaled_by_body_friction(problem: StepProblem, face: Tensor, force: Tensor) -> Tensor:
@@ -284,7 +286,8 @@ class CodedFriction(Energy):
     - the weight depends on the direction of the slip, not on the slope of the surface, and z counts as up while gravity acts
       along y: slip along z is nearly free;
     - the body is one frame behind that of the collision;
-    - there is no static friction: the energy has a kink where nothing slips, and there is no force at it.
+    - it has no mollifier: the energy has a kink where nothing slips. Where cloth sticks a solver ends at the kink, with a force
+      that is not balanced; it says how large (``relative_gradient``).
 
     The normals and faces of the predicted position are taken as they are at each evaluation; no gradient goes through them.
 
@@ -295,6 +298,7 @@ class CodedFriction(Energy):
 
     kind: ClassVar[str] = "CodedFriction"
     role = Role.FRICTION
+    form = Form.BLOCKS
     published = True
 
     def __init__(self, coefficient: float = 0.5, radius: float = 3e-3) -> None:
@@ -319,19 +323,27 @@ class CodedFriction(Energy):
 
     def __call__(self, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> Tensor:
         """Energy [J] (B,) at ``next_pos`` (V, 3)."""
+        force, slip, _ = self.slipping(problem, next_pos)
+        size_sq = _across(slip)
+        moving = size_sq > 0
+        return problem.sum_vertices(force * torch.where(moving, torch.where(moving, size_sq, 1.0).sqrt(), 0.0))
+
+    def closed_form(self, problem: StepProblem, passes: Passes | None = None) -> CodedSlip:
+        return CodedSlip(self, problem)
+
+    def slipping(self, problem: StepProblem, next_pos: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """:meth:`greatest` (V,), δ_T (V, 3) [m] and n (V, 3); all 0 where the first is."""
         contact, obstacle = lagged_contact(problem), problem.step.obstacle
         if obstacle is None or len(obstacle.faces) == 0:
-            return next_pos.new_zeros(problem.num_scenes)
+            return next_pos.new_zeros(len(next_pos)), torch.zeros_like(next_pos), torch.zeros_like(next_pos)
         force, face = self._reached(problem, next_pos)
         before = face_normals(obstacle.prev_pos, obstacle.faces[contact.lagged_face])
         normal = 0.5 * (before + face_normals(obstacle.pos, obstacle.faces[face]))
         # where() before the arithmetic: rows without a match may hold infinite or undefined numbers.
-        slip = torch.where((force > 0)[:, None], next_pos - problem.state.pos - contact.lagged_motion, 0.0)
-        slip = slip - dot_rows(slip, normal)[:, None] * normal
-        # sin² α ‖δ_T‖² is the part of the slip across z, squared.
-        size_sq = slip[:, 0] ** 2 + slip[:, 1] ** 2 + _LEAST_SINE_SQ * dot_rows(slip, slip)
-        moving = size_sq > 0
-        return problem.sum_vertices(force * torch.where(moving, torch.where(moving, size_sq, 1.0).sqrt(), 0.0))
+        held = (force > 0)[:, None]
+        normal = torch.where(held, normal, 0.0).to(next_pos.dtype)
+        slip = torch.where(held, next_pos - problem.state.pos - contact.lagged_motion, 0.0)
+        return force, slip - dot_rows(slip, normal)[:, None] * normal, normal
 
     def _reached(self, problem: StepProblem, next_pos: Tensor) -> tuple[Tensor, Tensor]:
         """:meth:`greatest`, and the faces (V,) of the body at t whose centroids are nearest to ``next_pos``."""
@@ -342,6 +354,34 @@ class CodedFriction(Energy):
         weight = problem.cloth.mass * problem.gravity.norm().to(problem.cloth.mass) * problem.cloth.friction
         force = self.coefficient * scaled_by_body_friction(problem, contact.lagged_face, weight)
         return torch.where(near, force, 0.0), face
+
+
+@dataclass(frozen=True)
+class CodedSlip:
+    """:class:`CodedFriction` in one step, for the solver. Near its kink the curvature is that of a slip of a micrometre."""
+
+    term: CodedFriction
+    problem: StepProblem
+
+    def energy(self, pos: Tensor) -> Tensor:
+        """Energy [J] (B,) at ``pos`` (V, 3)."""
+        return self.term(self.problem, pos, pos)
+
+    def derivatives(self, pos: Tensor) -> tuple[Tensor, Tensor]:
+        """Gradient [N] (V, 3), and F PᵀAP / √s [N/m] (V, 3, 3), which bounds the second derivative of F √s with s = δᵀPᵀAPδ."""
+        force, slip, normal = self.term.slipping(self.problem, pos)
+        weights = slip.new_tensor([1.0, 1.0, 0.0]) + _LEAST_SINE_SQ  # A
+        projected = torch.eye(3).to(slip) - normal.unsqueeze(2) * normal.unsqueeze(1)  # P, symmetric
+        size = _across(slip).sqrt()
+        gradient = torch.bmm(projected, (weights * slip).unsqueeze(2)).squeeze(2)
+        gradient = (force / torch.where(size > 0, size, 1.0))[:, None] * gradient
+        matrix = torch.bmm(projected, weights[:, None] * projected)
+        return gradient, (force / size.clamp_min(_LEAST_SLIP))[:, None, None] * matrix
+
+
+def _across(slip: Tensor) -> Tensor:
+    """(sin² α + 1e-4) ‖δ_T‖² [m²] (V,): the part of slips (V, 3) across z, squared, and a little of all."""
+    return slip[:, 0] ** 2 + slip[:, 1] ** 2 + _LEAST_SINE_SQ * dot_rows(slip, slip)
 
 
 def _as_grip(normal: Tensor, anchor: Tensor, force: Tensor, limit: Tensor) -> Grip:

@@ -238,3 +238,18 @@ def test_searched_once_and_demanded(case: Case) -> None:
     assert CodedFriction().with_weight(1.0).radius == 3e-3
     with pytest.raises(ValueError, match="radius"):
         CodedFriction(radius=0.0)
+
+
+def test_what_the_solver_is_given_of_the_coded_friction(case: Case) -> None:
+    """Its gradient is that of autograd, its matrices are no less than the second derivative, vertex by vertex."""
+    term = CodedFriction()
+    problem = coded_potential().prepare(case.problem)
+    x = case.pos.clone().requires_grad_(True)
+    (slope,) = torch.autograd.grad(term(problem, x, x).sum(), x, create_graph=True)
+    form = term.closed_form(problem)
+    gradient, matrix = form.derivatives(case.pos)
+    torch.testing.assert_close(form.energy(case.pos), term(problem, case.pos, case.pos))
+    torch.testing.assert_close(gradient, slope.detach(), rtol=1e-9, atol=1e-12)
+    rows = [torch.autograd.grad(slope[:, axis].sum(), x, retain_graph=True)[0] for axis in range(3)]
+    left = torch.linalg.eigvalsh(matrix - torch.stack(rows, dim=1))
+    assert float(left.min()) >= -1e-9 * float(matrix.abs().max())
